@@ -4,6 +4,9 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 PYTHONS ?= python3.12 python3.13
 LOCKED := --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements-dev.lock
+# Tests run in many processes: what the first compiles, the others need not (an empty value counts as none).
+TESTS := -m pytest -n 4 --dist loadfile --no-loadscope-reorder
+test coverage lowest newest pythons: export PYTHONDONTWRITEBYTECODE :=
 ITSELF := --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 
 .PHONY: $(shell sed -n 's/^\([a-z -]*\):.*\#\# .*/\1/p' $(firstword $(MAKEFILE_LIST)))
@@ -31,7 +34,7 @@ demo: setup ## simulate three flights, fit, evaluate, localize; writes demo/repo
 	$(BIN)/calib report demo/train.uwb --tests demo/test1.uwb demo/test2.uwb -o demo/report.html --force
 
 test: setup ## run the whole test suite; four processes, for two cores: many tests wait for boards
-	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python $(TESTS)
 
 docs: setup ## build the documentation site into docs/_build/html; warnings are errors (a minute)
 	$(BIN)/python -m sphinx -q -W --keep-going -j 2 docs docs/_build/html
@@ -39,7 +42,7 @@ docs: setup ## build the documentation site into docs/_build/html; warnings are 
 	@echo "open docs/_build/html/index.html"
 
 coverage: setup ## run the whole test suite and measure what it reaches (10 minutes); fails below 92 %
-	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder --cov --cov-report=term-missing
+	$(BIN)/python $(TESTS) --cov --cov-report=term-missing
 
 rooms: setup ## print which room imports which, floor by floor
 	$(BIN)/python -m tests.rooms
@@ -49,14 +52,14 @@ lowest newest: ## run the whole test suite on the lowest versions that pyproject
 	$(PYTHON) -m tests.bounds $@ > .venv-$@/requirements.txt
 	.venv-$@/bin/python -m pip install --quiet --disable-pip-version-check --upgrade -r .venv-$@/requirements.txt
 	.venv-$@/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation .
-	.venv-$@/bin/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
+	.venv-$@/bin/python $(TESTS)
 
 pythons: ## run the whole test suite on other Pythons, with the locked versions; PYTHONS names them (10 minutes each)
 	for python in $(PYTHONS); do \
 		own=.venv-$$(basename $$python); \
 		$$python -m venv $$own && $$own/bin/python -m pip install $(LOCKED) && \
 		$$own/bin/python -m pip install $(ITSELF) && \
-		$$own/bin/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder || exit; \
+		$$own/bin/python $(TESTS) || exit; \
 	done
 
 fuzz: setup ## run commands on 2000 damaged files and options (10 minutes)
@@ -82,8 +85,8 @@ format: setup ## rewrite the code in the house style
 notebooks: setup ## run the notebooks and store what they print and draw
 	$(BIN)/python -m docs.site.notebooks
 
-picture: setup ## draw the README's picture
-	$(BIN)/python -m benchmarks.picture
+picture: setup ## draw the README's picture; DATA=folder, with public data sets, adds a recorded flight
+	$(BIN)/python -m benchmarks.picture $(DATA)
 
 bench: setup ## measure speed and memory, and beside plain scripts; prints the first two tables of docs/speed.md
 	$(BIN)/python -m benchmarks
@@ -147,6 +150,10 @@ bench-boards: setup ## measure driver, recorder and served boards (5 minutes)
 
 twins: setup ## how well twins of simulated recordings find what was planted, over six seeds (3 minutes)
 	$(BIN)/python -m benchmarks.twins --seeds 6
+
+scoreboard: setup ## write docs/real-data.md from public data sets in a folder: make scoreboard DATA=folder (3 minutes)
+	@test -n "$(DATA)" || { echo "make scoreboard DATA=folder: which folder has the data sets?"; exit 2; }
+	$(BIN)/python -m benchmarks.scoreboard "$(DATA)"
 
 fidelity: setup ## write a section of docs/accuracy.md, simulated beside measured
 	$(BIN)/python -m benchmarks.fidelity

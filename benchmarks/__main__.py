@@ -118,8 +118,8 @@ def timed(work: Callable[[], object]) -> float:
 
 def simulating(*settings: str, passive: bool = False, contention: bool = True) -> float:
     """Return how many exchanges of the training flight are simulated in a second, with settings besides."""
+    from uwbsim import simulate
     from uwbsim.scenario.loading import load
-    from uwbsim.simulation.run import simulate
 
     scenario = load(TRAIN, [*settings, *(f"tags.{k}.passive=true" for k in range(6) if passive)])
     count = len(simulate(scenario, contention=contention).exchanges)

@@ -25,9 +25,9 @@ LENGTH_S: Final = 60.0
 COLUMNS: Final = (
     "the training flight",
     "ranges",
-    "delays off by, rms",
-    "half of their 95 % intervals",
-    "corrections of another flight off by, rms",
+    "delays off by, rms (ps)",
+    "half of their 95 % intervals (ps)",
+    "corrections of another flight off by, rms (mm)",
 )
 HEAD: Final = f"| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|\n"
 
@@ -107,7 +107,7 @@ def row(case: str, seeds: int) -> str:
     if not figures:
         return f"| {case} | | refused | | |\n"
     count, delays, half, correction = np.median(np.array(figures), axis=0)
-    return f"| {case} | {count:.0f} | {delays:.0f} ps | {half:.0f} ps | {correction:.1f} mm |\n"
+    return f"| {case} | {count:.0f} | {delays:.0f} | {half:.0f} | {correction:.1f} |\n"
 
 
 def main(seeds: int) -> None:

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,8 +22,8 @@ import numpy as np
 import calib
 from benchmarks.flights import FIRST_REPORTED, LIGHT, TICKS, Flight, Plan, fly
 from uwblink.recording.schema import Fault
+from uwbsim import simulate
 from uwbsim.scenario.loading import load
-from uwbsim.simulation.run import simulate
 
 PAGE = Path(__file__).parents[1] / "docs" / "doctor.md"
 BEGIN, END = "<!-- table -->", "<!-- end of table -->"
@@ -409,44 +410,47 @@ def said(case: Case, seed: int) -> set[str]:
     return {finding.fault for finding in calib.examine(case.plant(fly(case.plan, seed), rng))}
 
 
-def row(case: Case, seeds: range) -> tuple[str, int, int]:
-    """Return a row of the table, hits and runs with a false alarm."""
+def judged(case: Case, seeds: range) -> tuple[int, int, Counter[str]]:
+    """Return hits, runs with a false alarm, and how often each false finding was reported."""
     found = [said(case, seed) for seed in seeds]
-    hits = sum(bool(one & case.expected) for one in found)
-    wrong = Counter(fault for one in found for fault in one - case.expected - case.also)
-    alarms = sum(bool(one - case.expected - case.also) for one in found)
-    also = Counter(fault for one in found for fault in one & case.also)
-    told = ", ".join(f"{fault} ({n})" for fault, n in wrong.most_common())
-    true = ", ".join(f"{fault} ({n})" for fault, n in also.most_common())
-    named_by = " or ".join(sorted(case.expected))
-    share = f"{hits} of {len(found)}" if case.expected else ""
-    return f"| {case.name} | {named_by} | {share} | {told} | {true} |", hits, alarms
+    wrong = [one - case.expected - case.also for one in found]
+    return sum(bool(one & case.expected) for one in found), sum(map(bool, wrong)), Counter(chain.from_iterable(wrong))
 
 
 def table(first: int) -> str:
-    """Return the table, from cases on all cores."""
-    jobs = [(case, range(first, first + CLEAN_SEEDS)) for case in CLEAN]
-    jobs += [(case, range(first + OF_FAULTS, first + OF_FAULTS + SEEDS)) for case in FAULTS]
+    """Return the lines of the page, from cases on all cores."""
     with ProcessPoolExecutor(2) as pool:
-        rows = list(pool.map(_row_by_number, range(len(jobs)), [first] * len(jobs)))
-    clean, faulty = rows[: len(CLEAN)], rows[len(CLEAN) :]
-    runs = sum(len(seeds) for _, seeds in jobs[: len(CLEAN)])
-    alarms, hits = sum(one[2] for one in clean), sum(one[1] for one in faulty)
-    planted = sum(len(seeds) for _, seeds in jobs[len(CLEAN) :])
-    beside = sum(one[2] for one in faulty)
-    head = "| planted | expected finding | found | false | further, true |\n|---|---|---|---|---|"
+        count = len(CLEAN) + len(FAULTS)
+        return lines_of(list(pool.map(_judged_by_number, range(count), [first] * count)))
+
+
+def lines_of(found: list[tuple[int, int, Counter[str]]]) -> str:
+    """Return what was found in all cases, and the table of faults by the findings that they should give."""
+    cases = [*CLEAN, *FAULTS]
+    clean, faulty = found[: len(CLEAN)], found[len(CLEAN) :]
+    runs, planted = CLEAN_SEEDS * len(CLEAN), SEEDS * len(FAULTS)
+    alarms, hits, beside = sum(one[1] for one in clean), sum(one[0] for one in faulty), sum(one[1] for one in faulty)
+    misses = [(case.name, SEEDS - one[0]) for case, one in zip(FAULTS, faulty, strict=True) if one[0] < SEEDS]
+    told = [f"{name} ({n} of {SEEDS} missed)" for name, n in misses]
+    for case, (_, _, wrong) in zip(cases, found, strict=True):
+        told += [f"{case.name} ({fault}, false, {n})" for fault, n in wrong.items()]
+    named: dict[str, list[str]] = {}
+    for case in FAULTS:
+        named.setdefault(" or ".join(sorted(case.expected)), []).append(case.name)
     return "\n".join([
         f"Sound recordings: {alarms} of {runs} with a false alarm ({100 * alarms / runs:.1f} %). Planted faults: "
-        f"{hits} of {planted} found ({100 * hits / planted:.0f} %), {beside} with a false finding besides.",
-        "", head,
-        *(one[0] for one in clean), *(one[0] for one in faulty),
+        f"{hits} of {planted} found ({100 * hits / planted:.0f} %), {beside} with a false finding besides. "
+        f"Not as they should: {'; '.join(told) or 'none'}.",
+        "", f"Sound: {'; '.join(case.name for case in CLEAN)}.",
+        "", "| finding | planted |", "|---|---|",
+        *(f"| {fault} | {'; '.join(names)} |" for fault, names in named.items()),
     ])  # fmt: skip
 
 
-def _row_by_number(number: int, first: int) -> tuple[str, int, int]:
+def _judged_by_number(number: int, first: int) -> tuple[int, int, Counter[str]]:
     if number < len(CLEAN):
-        return row(CLEAN[number], range(first, first + CLEAN_SEEDS))
-    return row(FAULTS[number - len(CLEAN)], range(first + OF_FAULTS, first + OF_FAULTS + SEEDS))
+        return judged(CLEAN[number], range(first, first + CLEAN_SEEDS))
+    return judged(FAULTS[number - len(CLEAN)], range(first + OF_FAULTS, first + OF_FAULTS + SEEDS))
 
 
 def main() -> None:

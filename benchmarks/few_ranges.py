@@ -22,7 +22,7 @@ def main() -> None:
     """Print a row a world: delays are compared about their mean."""
     print("| ranges | tags | reflections | rms (promised), ps | inside 95 % | z-scores, rms |\n" + "|---" * 6 + "|")
     for count, tags in ((110, 3), (150, 4), (300, 4), (300, 6)):
-        for name, more in (("each range on its own", {}), ("last 1 s, share by pair", LASTING)):
+        for name, more in (("independent", {}), ("lasting", LASTING)):
             recipe = Recipe(tags=tags, seconds=count / PER_SECOND, per_second=PER_SECOND, **more)
             errors, stds = np.array([_one(recipe, FIRST_REPORTED + seed) for seed in range(SEEDS)]).swapaxes(0, 1)
             scores, rms = errors / stds, [1e3 * np.sqrt(np.mean(some**2)) for some in (errors, stds)]

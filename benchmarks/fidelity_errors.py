@@ -6,7 +6,7 @@ import itertools
 import os
 import tarfile
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -21,8 +21,7 @@ from uwblink.arrays import Floats, Ints
 from uwblink.importers import import_recording, read_source
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import delay_weights, raw_range
-from uwbsim import twin
-from uwbsim.simulation.simulated import Simulated, write
+from uwbsim import Simulated, twin
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("UWBCAL_DATA", ROOT.parent / "shared" / "data"))
@@ -41,7 +40,7 @@ def error_rows(train: Simulated, one: Simulated, two: Simulated) -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         parts = []
         for name, run in (("train", train), ("test1", one), ("test2", two)):
-            write(run, Path(folder) / f"{name}.uwb")
+            run.save(Path(folder) / f"{name}.uwb")
             parts.append(load_ranges(Path(folder) / f"{name}.uwb"))
     tests = concatenate(parts[1:])
     error = tests.raw_m - tests.truth_m
@@ -186,22 +185,15 @@ def trace_db(error: Floats, power_dbm: Floats) -> float:
     return float(np.median(power_dbm[~tail]) - np.median(power_dbm[tail]))
 
 
-def twin_rows() -> list[Sequence[str]]:
-    """Quantities of the real flight and of a scenario that was fitted to it."""
+def twin_verdicts() -> list[str]:
+    """Return, for each verdict, the quantities of the real flight and its twin, with their largest differences."""
     with tempfile.TemporaryDirectory() as folder:
         real = read_source(_unpacked(folder), importer="miluv")
     found = twin(real, read_miluv(DATA / "miluv_published_calibration.json"))
-    return [
-        (
-            f"{one.name} ({one.unit})",
-            f"{one.measured.low:.2f}, {one.measured.median:.2f}, {one.measured.high:.2f}",
-            f"{one.simulated.low:.2f}, {one.simulated.median:.2f}, {one.simulated.high:.2f}",
-            f"{one.measured.lag1:.2f}, {one.simulated.lag1:.2f}",
-            f"{100 * one.distance:.0f} %",
-            one.verdict,
-        )
-        for one in found.compare(seeds=3)
-    ]
+    quantities: dict[str, list[str]] = {}
+    for one in found.compare(seeds=3):
+        quantities.setdefault(one.verdict, []).append(f"{one.name} ({100 * one.distance:.0f} %)")
+    return [f"{verdict}: {', '.join(names)}" for verdict, names in quantities.items()]
 
 
 def _unpacked(folder: str) -> Path:

@@ -104,11 +104,11 @@ def rows(path: Path) -> list[str]:
         held[f"fifth {number} of powers" + (", beyond the fitted ones" if number in (1, PARTS) else "")] = part
     found = {name: judged(lifted, bias, chosen) for name, chosen in held.items()}
     return [
-        '| held back | z-std | "95 %" holds | rms | a plain cubic\'s rms | mean | mean, less what is expected |',
+        '| held back | z-std | "95 %" holds | rms (mm) | a plain cubic\'s rms | mean | mean, less what is expected |',
         "|---|---|---|---|---|---|---|",
         *(
-            f"| {name} | {one.z_std:.2f} | {100 * one.inside_95:.1f} % | {1e3 * one.rms_m:.1f} mm | "
-            f"{1e3 * one.cubic_rms_m:.1f} mm | {1e3 * one.mean_m:+.1f} mm | {1e3 * one.left_m:+.1f} mm |"
+            f"| {name} | {one.z_std:.2f} | {100 * one.inside_95:.1f} % | {1e3 * one.rms_m:.1f} | "
+            f"{1e3 * one.cubic_rms_m:.1f} | {1e3 * one.mean_m:+.1f} | {1e3 * one.left_m:+.1f} |"
             for name, one in found.items()
         ),
     ]

@@ -1,9 +1,12 @@
-"""Draws docs/figures/first_result.svg, the README's picture: a flight's ranges before and after a calibration.
+"""Draws docs/figures/first_result.svg, the README's picture: ranges of two flights before and after a calibration.
 
-The calibration is fitted to the training flight of scenarios/icra2023 and drawn on the first test flight, which it has
-not seen; both are simulated anew, so the picture is what the README's commands give.
+Left: the first test flight of scenarios/icra2023, calibrated by its training flight; both are simulated anew, so the
+picture is what the README's commands give. Right: the second flight of STAR-loc, calibrated by the first; it needs the
+folder of public data sets (see `benchmarks.scoreboard`) and is left out without one.
 """
 
+import argparse
+import tempfile
 from pathlib import Path
 from typing import Final
 
@@ -11,9 +14,11 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 import calib
 import uwbsim
+from benchmarks.scoreboard import DATA_SETS, Lab
 from uwblink.arrays import Floats
 
 PICTURE: Final = Path("docs/figures/first_result.svg")
@@ -24,13 +29,35 @@ BINS: Final = 24
 FEWEST: Final = 60
 
 
-def errors_cm(train: str, test: str) -> tuple[dict[str, Floats], Floats]:
-    """Return the errors (n,) of a test flight's ranges before and after, and their mean first-path powers in dBm."""
-    calibration = calib.fit(uwbsim.simulate(uwbsim.load(train))).calibration
-    ranges = calib.load_ranges(uwbsim.simulate(uwbsim.load(test)))
+Errors = tuple[dict[str, Floats], Floats]
+"""Errors (n,) of a flight's ranges in cm before and after, and their mean first-path powers (n,) in dBm."""
+
+
+def errors_cm(calibration: calib.Calibration, ranges: calib.Ranges) -> Errors:
+    """Return the errors of ranges by a calibration."""
     applied = calibration.apply(ranges)
     stages = {"as reported": applied.raw_m, "corrected": applied.corrected_m}
     return {name: 100 * (m - ranges.truth_m) for name, m in stages.items()}, (ranges.fpp1_dbm + ranges.fpp2_dbm) / 2
+
+
+def simulated() -> Errors:
+    """Simulate two flights, fit the first and return the errors of the second."""
+    train, test = (uwbsim.simulate(uwbsim.load(f"scenarios/icra2023/{name}.toml")) for name in ("train", "test1"))
+    return errors_cm(calib.fit(train).calibration, calib.load_ranges(test))
+
+
+def recorded(data: Path) -> Errors:
+    """Run STAR-loc's recipe as far as a calibration by the first flight and return the errors of the second."""
+    starloc = next(one for one in DATA_SETS if one.name == "STAR-loc")
+    with tempfile.TemporaryDirectory() as folder:
+        lab = Lab(Path(folder))
+        first, second = starloc.prepare(data / starloc.archive, lab.folder)
+        for flight in (first, second):
+            lab.run(f"uwblink import guess {flight}.csv -o {flight}.toml")
+            lab.run(f"uwblink import csv {flight}.csv --map {flight}.toml -o {flight}.uwb")
+        lab.run(f"calib fit {first}.uwb -o {first}.json --minimum-norm")
+        calibration = calib.load_calibration(lab.folder / f"{first}.json")
+        return errors_cm(calibration, calib.load_ranges(lab.folder / f"{second}.uwb"))
 
 
 def draw_shares(axes: Axes, errors: dict[str, Floats]) -> None:
@@ -58,18 +85,32 @@ def draw_over_power(axes: Axes, errors: dict[str, Floats], power_dbm: Floats) ->
     axes.set(xlabel="first-path power (dBm)", ylabel="median error, middle 2/3 (cm)")
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Simulate, fit, draw."""
-    errors, power_dbm = errors_cm("scenarios/icra2023/train.toml", "scenarios/icra2023/test1.toml")
+    options = argparse.ArgumentParser(prog="benchmarks.picture", description=f"Draw {PICTURE}.")
+    options.add_argument("data", type=Path, nargs="?", help="folder with the archive of STAR-loc")
+    data = options.parse_args(arguments).data
+    flights = {"simulated flight": simulated()}
+    if data is None:
+        print("without a folder of data, the real flight is left out")
+    else:
+        flights["recorded flight (STAR-loc)"] = recorded(data)
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "uwbcal"}):
-        figure = Figure(figsize=(8.4, 3.3), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        draw_shares(left, errors)
-        draw_over_power(right, errors, power_dbm)
-        for axes in (left, right):
+        figure = Figure(figsize=(8.4, 5.6), layout="constrained")
+        grid = figure.subplots(2, len(flights), squeeze=False, sharey="row")
+        for number, (title, (errors, power_dbm)) in enumerate(flights.items()):
+            shares, over_power = grid[:, number]
+            shares.set_title(title)
+            draw_shares(shares, errors)
+            draw_over_power(over_power, errors, power_dbm)
+        for axes in grid.flat:
             axes.spines[["top", "right"]].set_visible(False)
             axes.grid(alpha=0.25)
-        left.legend(frameon=False, loc="upper right")
+            axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+            axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+        for axes in grid[:, 1:].flat:
+            axes.set_ylabel("")
+        grid[0, 0].legend(frameon=False, loc="upper right")
         PICTURE.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(PICTURE, metadata={"Date": None})
     print(f"{PICTURE}: {PICTURE.stat().st_size / 1000:.0f} kB")

@@ -22,8 +22,9 @@ import calib
 import uwbsim
 from benchmarks import doctor
 from benchmarks.flights import Plan, fly
+from calib.checks import offsets, reflected
 
-FIRST_SEED: Final = 50_000
+FIRST_SEED: Final = 70_000
 """Seeds from here on have chosen nothing, here or in `benchmarks.doctor`."""
 
 MINUTE: Final = Plan(seconds=60)
@@ -49,9 +50,13 @@ WORLDS: Final[dict[str, Callable[[int], Any]]] = {
 }
 """Worlds without a fault: four of the simulator, four of a generator that shares nothing with it."""
 
+TRUE_OF: Final = {"simulator, room": {reflected.LASTING, reflected.MANY, offsets.OPEN, offsets.ASTRAY}}
+"""Findings that are true of a world: in the room a metal cabinet stands between tag 1 and the third quadcopter, so that
+half of their ranges are 0.2 to 1.5 m too long, and ranges of other pairs are reflected for seconds."""
+
 
 def said_of_sound(job: tuple[str, int]) -> tuple[str, int, list[str], list[str]]:
-    """Return a world and seed with the faults that `examine` finds, and the warnings of a fit."""
+    """Return a world and seed with the faults that `examine` finds and that are not true, and warnings of a fit."""
     name, seed = job
     data = WORLDS[name](seed)
     ranges = calib.Ranges.from_exchanges(data.exchanges, poses=data.poses, tags=data.tags).usable()
@@ -59,7 +64,8 @@ def said_of_sound(job: tuple[str, int]) -> tuple[str, int, list[str], list[str]]
         warnings = calib.fit(ranges).warnings
     except calib.UnanswerableError as error:
         warnings = [f"refused: {error}"]
-    return name, seed, [finding.fault for finding in calib.examine(data)], warnings
+    found = [one.fault for one in calib.examine(data)]
+    return name, seed, [fault for fault in found if fault not in TRUE_OF.get(name, ())], warnings
 
 
 def said_of_planted(job: tuple[int, int]) -> tuple[str, int, bool, list[str]]:

@@ -52,16 +52,16 @@ WORLDS: dict[str, dict[str, Any]] = {
 
 
 HEAD = """\
-| world | seeds | delays, rms | promised | in 95 % | delays left out | refused |
-|---|---|---|---|---|---|---|"""
+| world | delays, rms (ps) | promised | in 95 % | delays left out | refused |
+|---|---|---|---|---|---|"""
 
 LABELS: dict[str, dict[str, Any]] = {
     f"line, {share} % reflected, labels exchanged": LINE | {"reflected": share / 100, "said": "wrongly"}
     for share in (0, 5, 10)
 }
 LABELS_HEAD = """\
-| two labels exchanged in one arrangement | seeds | found, the two named | another two named as well |
-|---|---|---|---|"""
+| two labels exchanged in one arrangement | found, the two named | another two named as well |
+|---|---|---|"""
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def row(name: str, outcomes: dict[int, Outcome]) -> str:
     some = {seed: found for seed, found in outcomes.items() if not found.refused}
     refused = len(outcomes) - len(some)
     if not some:
-        return f"| {name} | {len(outcomes)} | - | - | - | - | {refused} |"
+        return f"| {name} | - | - | - | - | {refused} |"
     errors = np.concatenate([found.errors_ns for found in some.values()])
     scores = errors / np.concatenate([found.std_ns for found in some.values()])
     spreads = []
@@ -164,13 +164,13 @@ def row(name: str, outcomes: dict[int, Outcome]) -> str:
     rms, promise = (float(np.sqrt(np.mean(v**2))) for v in (errors, every[np.isfinite(every)]))
     left = sum(settings["boards"] - len(found.tags) for found in some.values())
     cells = [
-        f"{1e3 * rms:.0f} ps",
-        f"{1e3 * promise:.0f} ps",
+        f"{1e3 * rms:.0f}",
+        f"{1e3 * promise:.0f}",
         f"{100 * float(np.mean(np.abs(scores) < 1.96)):.1f} %",
         str(left),
         str(refused),
     ]
-    return f"| {name} | {len(outcomes)} | {' | '.join(cells)} |"
+    return f"| {name} | {' | '.join(cells)} |"
 
 
 def _curve_size_m(settings: dict[str, Any]) -> float:
@@ -185,7 +185,7 @@ def labels_row(name: str, outcomes: dict[int, Outcome]) -> str:
         told = one.refused.split(" stand")[0]
         good = told.startswith(f"{where}: boards ") and two in told
         found, others = found + good, others + (good and ", or " in told)
-    return f"| {name} | {len(outcomes)} | {found} | {others} |"
+    return f"| {name.removesuffix(', labels exchanged')} | {found} | {others} |"
 
 
 def outcomes_of(name: str, seeds: int, results: Path | None, pool: Executor) -> dict[int, Outcome]:

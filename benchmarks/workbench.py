@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -83,12 +84,12 @@ def full() -> str:
     return _rate(conditions_of(load(TEST1, ["radio.tx_noise_ps=40"])))
 
 
-def _rate(conditions: object, count: int = 4_000_000) -> str:
+def _rate(conditions: Any, count: int = 4_000_000) -> str:
     from uwblink.protocols.table import PROTOCOLS
-    from uwbsim.protocols.monte_carlo import error_pieces
+    from uwbsim.protocols.monte_carlo import range_errors_m
 
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    seconds = timed(lambda: [None for _ in error_pieces(PROTOCOLS["ds"], conditions, 1, count)])  # type: ignore[arg-type]
+    seconds = timed(lambda: range_errors_m(PROTOCOLS["ds"], conditions, 1, count))
     return f"{count / seconds / 1e6:.1f}"
 
 
@@ -96,11 +97,11 @@ def engines() -> tuple[np.ndarray, np.ndarray, float]:
     """A million ranges by integer stamps and by floats, over the same states; the standard error of a difference."""
     from uwblink.protocols.table import PROTOCOLS
     from uwblink.twr import raw_range
+    from uwbsim import simulate
     from uwbsim.protocols.conditions import conditions_of
     from uwbsim.protocols.monte_carlo import range_errors_m
     from uwbsim.protocols.prediction import predict
     from uwbsim.scenario.loading import load
-    from uwbsim.simulation.run import simulate
 
     settings = ["ranging.rate_hz=250", "run.duration_s=4000", "radio.tx_noise_ps=40"]
     scenario = load(TEST1, settings)
@@ -138,8 +139,8 @@ def sweep(workers: str, seeds: str = "120") -> str:
 
 def calibrations(workers: str, seeds: int = 40) -> str:
     """Processor time of a run that calibrates, start of processes included, less that of its flight."""
+    from uwbsim import simulate
     from uwbsim.scenario.loading import load
-    from uwbsim.simulation.run import simulate
     from uwbsim.sweep.design import load_design
     from uwbsim.sweep.runner import run_sweep
 
@@ -169,17 +170,16 @@ def dask() -> str:
 
     from uwbsim.sweep.design import load_design
     from uwbsim.sweep.executors import Work, run_chunk
-    from uwbsim.sweep.runner import _task
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.toml"
         path.write_text(SWEEP.format(scenario="icra2023/test1", seeds=40))
         plan = load_design(path)
         work = Work.of_here(plan.scenario.stem, plan.protocols, plan.settings.ranges)
-        _, once = run_chunk([_task(plan, 0)], work)
-        _, once = run_chunk([_task(plan, 1)], work)
+        _, once = run_chunk([plan.loaded(0)], work)
+        _, once = run_chunk([plan.loaded(1)], work)
         size = max(int(1 / once), 1)
-        chunk = [_task(plan, k % plan.total) for k in range(size)]
+        chunk = [plan.loaded(k % plan.total) for k in range(size)]
         with (
             LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
             Client(cluster) as client,

@@ -25,6 +25,9 @@ BUDGET: Final = 0.01
 OF_A_FIT: Final = BUDGET / 2
 """Share of sound fits with any finding by chance, all alternatives together; the other half is the recording's."""
 
+SMALLEST_NS: Final = 0.02
+"""Error of a delay below which no fault is named: 3 mm of a range."""
+
 STRETCHES: Final = 16
 """Stretches of time over which a statistic is averaged: their variance is then known to about a third."""
 

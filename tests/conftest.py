@@ -3,18 +3,27 @@
 from typing import Final
 
 LONGEST: Final = (
-    "tests/test_readme.py",
-    "tests/test_pages.py",
-    "tests/loop/test_wire.py",
-    "tests/calib/report/test_report.py",
     "tests/uwbsim/sweep/test_sweep.py",
+    "tests/test_readme.py",
+    "tests/calib/report/test_report.py",
+    "tests/test_pages.py",
     "tests/calib/report/test_files.py",
-    "tests/loop/test_accuracy.py",
+    "tests/calib/checks/test_checks.py",
     "tests/uwblink/boards/test_recorder.py",
-    "tests/contract/test_habits.py",
+    "tests/loop/test_wire.py",
+    "tests/calib/surveys/test_surveying.py",
+    "tests/calib/estimation/test_doubts.py",
     "tests/test_full_disk.py",
-    "tests/test_bad_input.py",
-    "tests/loop/test_icra2023.py",
+    "tests/calib/trajectories/test_real_flight.py",
+    "tests/uwblink/importers/test_table_forms.py",
+    "tests/uwblink/streaming/test_stream.py",
+    "tests/test_security.py",
+    "tests/calib/planning/test_flights.py",
+    "tests/contract/test_habits.py",
+    "tests/calib/estimation/test_fitting.py",
+    "tests/uwbsim/twins/test_real_flight.py",
+    "tests/uwbsim/sweep/test_machine_faults.py",
+    "tests/calib/trajectories/test_fitting.py",
 )
 
 

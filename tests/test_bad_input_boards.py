@@ -129,7 +129,7 @@ def test_a_second_server_does_not_take_the_links_of_the_first(tmp_path):
     from uwblink.errors import PortError
 
     first = Terminal(tmp_path / "tag1")
-    with pytest.raises(PortError, match="somebody serves"):
+    with pytest.raises(PortError, match="in use by another server"):
         Terminal(tmp_path / "tag1")
     first.unplug()
     (tmp_path / "tag1").symlink_to(tmp_path / "gone")

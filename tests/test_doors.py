@@ -16,13 +16,11 @@ BESIDE = {
     "uwblink.importers.guess.guess_map": "what import suggests where no map is given; read_source takes the map",
     "uwblink.__version__": "what --version prints",
     "uwblink.cli.starting": "Ctrl-C while a command is being imported, and what must come before",
-    "uwblink.cli.waiting": "the line that a command shows while it works, alike in the three commands",
     "uwblink.settings": "fields of settings that Python and the command line share",
     "calib.settings": "the settings of a fit, of which its options are made",
-    "uwblink.cli.options": "options that mean the same in the three commands",
-    "uwblink.cli.guide": "panels, examples and completion, alike in the three commands",
+    "uwblink.cli.guide": "options, panels, examples and completion that the three commands share",
     "uwblink.exporters.EXPORTERS": "names of the forms that a recording can leave in, for a shell to complete",
-    "uwblink.cli.shared": "options, errors and interrupts that the three commands have in common",
+    "uwblink.cli.shared": "errors, interrupts and progress, alike in the three commands",
 }
 
 

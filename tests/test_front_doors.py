@@ -2,7 +2,6 @@
 
 import doctest
 import importlib
-import pkgutil
 import subprocess
 import sys
 
@@ -61,34 +60,8 @@ def test_everything_but_errors_has_an_example(package, name):
     assert shown(getattr(importlib.import_module(package), name))
 
 
-def rooms_of(package):
-    top = importlib.import_module(package)
-    inner = (m.name for m in pkgutil.walk_packages(top.__path__, f"{package}.") if m.ispkg)
-    return [importlib.import_module(name) for name in (package, *inner)]
-
-
-@pytest.mark.parametrize("package", PACKAGES)
-def test_nothing_offered_has_the_name_of_a_module_beside_it(package):
-    """Whoever imports the module would find it in place of what is offered."""
-    for room in rooms_of(package):
-        modules = {module.name for module in pkgutil.iter_modules(room.__path__)}
-        assert modules & set(getattr(room, "__all__", ())) == set(), room.__name__
-
-
 @pytest.mark.parametrize("package", PACKAGES)
 def test_importing_a_package_costs_nothing(package):
     """Not a matter of seconds, which depend on the machine: nothing large is loaded."""
     code = f"import sys, {package}; print(*(m for m in {HEAVY} if m in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split() == []
-
-
-@pytest.mark.parametrize("package", PACKAGES)
-def test_no_name_is_that_of_a_module_beside_it(package):
-    """A module that is imported becomes an attribute of its package: it would take the name's place."""
-    rooms = [
-        package,
-        *(m.name for m in pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}.") if m.ispkg),
-    ]
-    for room in map(importlib.import_module, rooms):
-        beside = {module.name for module in pkgutil.iter_modules(room.__path__)}
-        assert sorted(beside & set(getattr(room, "__all__", ()))) == [], room.__name__

@@ -73,7 +73,6 @@ COMMANDS = (
     ("calib add-tag {f.uwb} -c {five.json} --tag 6 -o out.json", 1_000),
     ("calib survey {string.uwb} --known line -o out.json", 100),
     ("calib plan survey 4 --on line -o out.html", 1_000),
-    ("calib plan survey 4 --on line --figures out", 1_000),
     ("calib import miluv {miluv.json} -o out.json", 100),
     ("calib sample -o out.uwb -n 100", 20_000),
     ("calib apply {f.uwb} -c {c.json} -o out.uwb", 50_000),
@@ -88,20 +87,21 @@ COMMANDS = (
     ("calib export {c.json} --to c-header -o out.h", 100),
     ("calib localize {f.uwb} -c {c.json} --tum out", 1_000),
     ("calib compare {c.json} {five.json} --figures out", 1_000),
-    ("calib report {f.uwb} -o out.html", 1_000),
 )
 
 SAME = {
     # One function writes what is drawn (uwblink.pages.blocks), and drawing takes seconds.
     "calib localize --figures": "calib compare --figures",
     "calib evaluate --figures": "calib compare --figures",
-    "calib evaluate --report": "calib report --output",
-    "calib report --pdf": "calib report --output",
+    "calib evaluate --report": "calib plan survey --output",
+    "calib report --output": "calib plan survey --output",
+    "calib report --pdf": "calib plan survey --output",
     "calib report --figures": "calib compare --figures",
-    "calib survey --report": "calib report --output",
+    "calib survey --report": "calib plan survey --output",
     "calib survey --plot": "uwblink cir --plot",
     "calib plan flight --output": "calib plan survey --output",
-    "calib plan flight --figures": "calib plan survey --figures",
+    "calib plan survey --figures": "calib compare --figures",
+    "calib plan flight --figures": "calib compare --figures",
     # The same function imports whatever form a source has.
     "uwblink import miluv --output": "uwblink import csv --output",
 }

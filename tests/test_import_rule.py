@@ -19,7 +19,7 @@ CONFINED = {
     "pypdf": lambda path: path == "uwblink/pages/pdf.py",
     "typer": lambda path: "/cli/" in path,
     "rich": lambda path: "/cli/" in path,
-    "duckdb": lambda path: path.startswith("uwblink/") or path in {"uwbsim/sweep/results.py", "uwbsim/tables.py"},
+    "duckdb": lambda path: path.startswith("uwblink/") or path in {"uwbsim/sweep/runner.py", "uwbsim/tables.py"},
     "pydantic": lambda path: path.startswith(("uwbsim/", "calib/calibration/")),
     "threadpoolctl": lambda path: (
         path
@@ -29,6 +29,7 @@ CONFINED = {
             "calib/planning/flights.py",
             "calib/surveys/survey.py",
             "calib/trajectories/fitting.py",
+            "uwbsim/sweep/executors.py",
             "uwbsim/twins/fitting.py",
         }
     ),

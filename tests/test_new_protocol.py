@@ -9,16 +9,17 @@ import pytest
 import calib.cli
 import uwblink.cli
 import uwbsim.cli
+from tests import pages
 from tests.uwblink.test_register_protocol import SYMMETRIC, TARGETS
 from uwblink.protocols.table import PROTOCOLS, register_protocol
 from uwblink.recording.file import Recording
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import delay_weights, raw_range
+from uwbsim import simulate
 from uwbsim.protocols.conditions import Conditions
 from uwbsim.protocols.monte_carlo import range_errors_m
 from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.model import Scenario
-from uwbsim.simulation.run import simulate
 
 SCENARIO = "scenarios/noiseless.toml"
 MAINS = {"uwblink": uwblink.cli.main, "uwbsim": uwbsim.cli.main, "calib": calib.cli.main}
@@ -101,7 +102,8 @@ def test_run_show_and_fit(row, command, tmp_path):
     assert found == pytest.approx(planted, abs=5e-3)
 
 
-def test_compare_optimum_and_predict_know_it_without_being_told(row, command, tmp_path):
+def test_compare_optimum_and_predict_know_it_without_being_told(row, command, tmp_path, monkeypatch):
+    monkeypatch.setattr("uwblink.pages.figures.drawn", pages.outline)
     compared = json.loads(command("uwbsim", "compare", SCENARIO, "-o", tmp_path / "out", "-n", 4096, "--json"))
     assert [line["protocol"] for line in compared["protocols"]] == list(PROTOCOLS)
     assert (

@@ -8,6 +8,7 @@ import pytest
 from matplotlib import pyplot
 
 from tests import pages
+from uwblink.pages import figures
 
 mpl.use("Agg")
 
@@ -41,6 +42,7 @@ def test_the_blocks_of_a_page_work(page, recordings, tmp_path, monkeypatch):
     if page.parent == pages.DOCS:
         shutil.copyfile(recordings / "test.uwb", tmp_path / "flight.uwb")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(figures, "drawn", pages.outline)
     runner = pages.Runner()
     for block in pages.blocks(page):
         if block.mark:

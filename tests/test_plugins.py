@@ -39,7 +39,7 @@ import numpy as np
 
 from uwblink import Contents, Exchanges
 from uwblink.importers import Importer
-from uwblink.protocols.rows import ProtocolMessage, RangingProtocol
+from uwblink.protocols.table import ProtocolMessage, RangingProtocol
 
 
 def flight_ticks(t):

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from uwblink.boards.record import record
     from uwblink.errors import UwblinkError
     from uwblink.importers import import_recording, register_importer
-    from uwblink.protocols.rows import ProtocolMessage, RangingProtocol
-    from uwblink.protocols.table import PROTOCOLS, register_protocol
+    from uwblink.protocols.table import PROTOCOLS, ProtocolMessage, RangingProtocol, register_protocol
     from uwblink.recording.contents import Contents, load
     from uwblink.recording.file import Recording
     from uwblink.recording.schema import Arrangement, KnownDistance, Poses, Tag
@@ -68,9 +67,9 @@ _HOMES: Final = {
     "KnownDistance": "uwblink.recording.schema",
     "Listener": "uwblink.boards.listeners",
     "Poses": "uwblink.recording.schema",
-    "ProtocolMessage": "uwblink.protocols.rows",
+    "ProtocolMessage": "uwblink.protocols.table",
     "RangingPlan": "uwblink.boards.ranging_plan",
-    "RangingProtocol": "uwblink.protocols.rows",
+    "RangingProtocol": "uwblink.protocols.table",
     "Recording": "uwblink.recording.file",
     "StreamedRange": "uwblink.streaming.sources",
     "Tag": "uwblink.recording.schema",

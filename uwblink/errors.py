@@ -1,4 +1,4 @@
-"""The errors of `uwblink`; each is also the standard exception that fits it."""
+"""The errors of `uwblink`; each is also derived from a matching standard exception."""
 
 
 class OfParameter(Exception):  # noqa: N818 - the base of the bases
@@ -9,7 +9,7 @@ class OfParameter(Exception):  # noqa: N818 - the base of the bases
     """
 
     def __init__(self, text: str, *, parameter: str | None = None) -> None:
-        """Say what, where and what to do; a parameter's name goes before the text."""
+        """`text` is a line: what is wrong, where, and what to do; the parameter's name is added before it."""
         # Texts quote names and cells of any length; the end of the text says what to do.
         if len(text) > 2000:
             text = f"{text[:1500]} ... {text[-500:]}"
@@ -18,7 +18,7 @@ class OfParameter(Exception):  # noqa: N818 - the base of the bases
 
 
 class UwblinkError(OfParameter):
-    """Base of the errors of this package; the text says what, where and what to do."""
+    """Base of the errors of this package; the text is a line: what is wrong, where, and what to do."""
 
 
 class ArgumentError(UwblinkError, ValueError):
@@ -26,7 +26,7 @@ class ArgumentError(UwblinkError, ValueError):
 
 
 class PluginWarning(UserWarning):
-    """A plug-in of another distribution cannot be used, and why."""
+    """A plug-in of another distribution cannot be used, with the reason."""
 
 
 class FrameError(UwblinkError, ValueError):
@@ -42,15 +42,15 @@ class RecordingInUseError(RecordingError):
 
 
 class RecordingExistsError(UwblinkError, FileExistsError):
-    """The output is already there and was not to be replaced."""
+    """The output exists and must not be replaced."""
 
 
 class OutputError(UwblinkError, OSError):
-    """A file that cannot be written, for want of space or permission."""
+    """A file that cannot be written, for example without space or permission."""
 
 
 class RecordingMissingError(UwblinkError, FileNotFoundError):
-    """The recording to read is not there."""
+    """The recording to read does not exist."""
 
 
 class ImportTableError(UwblinkError, ValueError):
@@ -58,11 +58,11 @@ class ImportTableError(UwblinkError, ValueError):
 
 
 class PlanError(UwblinkError, ValueError):
-    """A ranging plan that cannot be played."""
+    """A ranging plan that cannot be executed."""
 
 
 class PortError(UwblinkError, OSError):
-    """A serial port that cannot be used; says which and why."""
+    """A serial port that cannot be used, with its name and the reason."""
 
     def __str__(self) -> str:
         """Return the message (an `OSError` would print its arguments)."""
@@ -74,7 +74,7 @@ class PortMissingError(PortError, FileNotFoundError):
 
 
 class PortPermissionError(PortError, PermissionError):
-    """The port belongs to somebody else; says which group to join."""
+    """No permission for the port; the text names the group to join."""
 
 
 class PortBusyError(PortError):
@@ -86,11 +86,11 @@ class PortLostError(PortError, ConnectionError):
 
 
 class BoardError(UwblinkError):
-    """A board that did not do what it was asked to."""
+    """A board that did not execute a command."""
 
 
 class NoAnswerError(BoardError, TimeoutError):
-    """A board did not answer in time; says what was sent and what was heard."""
+    """A board did not answer in time; the text has the sent and the received bytes."""
 
 
 class RangingFailedError(BoardError):
@@ -98,7 +98,7 @@ class RangingFailedError(BoardError):
 
 
 class RefusedError(BoardError, ValueError):
-    """A request that would harm the board, or that it would not understand; nothing was sent."""
+    """A command that would harm the board or is unknown to it; nothing was sent."""
 
 
 def first_line(error: Exception) -> str:

@@ -75,7 +75,7 @@ def whole(path: Path, *, force: bool) -> Iterator[Path]:
             yield partial
             take_name(partial, path)
     except UwblinkError:
-        raise  # of this or of another file of several
+        raise  # also of other files in the block
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
@@ -90,8 +90,8 @@ def place_beside(path: Path) -> Iterator[Path]:
     # File systems take names of 255 bytes, of which `tempfile` draws eight.
     if len(os.fsencode(prefix)) > 255 - len(PARTIAL) - 8:
         prefix = "."
-    # It goes at the end of the process at the latest, wherever an interrupt hits.
-    with interrupts_held():  # one between making the folder and knowing of it would leave it behind
+    # It is removed at the end of the process at the latest, also after an interrupt.
+    with interrupts_held():  # an interrupt between creating and storing it would leave the folder
         made = TemporaryDirectory(PARTIAL, prefix, path.absolute().parent, ignore_cleanup_errors=True)
     with made as folder:
         yield Path(folder) / path.name

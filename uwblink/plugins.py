@@ -47,7 +47,6 @@ class Named(Protocol):
     @property
     def name(self) -> str:
         """The name."""
-        ...
 
 
 Row = TypeVar("Row", bound=Named)
@@ -61,7 +60,7 @@ class Registry(Mapping[str, Row], Generic[Row]):
     """
 
     def __init__(self, kind: str, group: str, rows: Iterable[Row], check: Callable[[Any], None]) -> None:
-        """Hold the project's own `rows`; `kind` is what a row is called in messages."""
+        """Start with the project's own `rows`; `kind` is the word for a row in messages."""
         self._kind, self._group, self._check = kind, group, check
         self._rows = {row.name: row for row in rows}
         self._own = frozenset(self._rows)
@@ -82,7 +81,7 @@ class Registry(Mapping[str, Row], Generic[Row]):
         self._rows[row.name] = row
 
     def remove(self, name: str) -> None:
-        """Take out a row that was added; raises `ArgumentError` for any other name."""
+        """Remove a row that was added; raises `ArgumentError` for other names."""
         if name in self._own or name not in self._rows:
             raise ArgumentError(f"{self._kind} {name!r}: was not registered, so it cannot be removed")
         del self._rows[name]

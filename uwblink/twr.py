@@ -17,8 +17,7 @@ from uwblink import arrays
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.display import first_few
 from uwblink.errors import ArgumentError
-from uwblink.protocols.rows import Intervals, RangingProtocol
-from uwblink.protocols.table import PROTOCOLS
+from uwblink.protocols.table import PROTOCOLS, Intervals, RangingProtocol
 from uwblink.ticks import COUNTER_BITS, METRES_PER_TICK, REPORT_BITS, SPEED_OF_LIGHT, TICK_S, elapsed
 
 STAMPS: Final = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
@@ -54,7 +53,7 @@ class Exchanges(ColumnTable):
     bits: int = REPORT_BITS
 
     @classmethod
-    def from_arrays(  # noqa: PLR0913 - one parameter a column, most of which nobody needs to give
+    def from_arrays(  # noqa: PLR0913 - one parameter for each column, most of them optional
         cls,
         initiator: ArrayLike,
         target: ArrayLike,

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from uwbsim.scenario.faults import load_faults
     from uwbsim.scenario.loading import load, shipped_scenarios
     from uwbsim.scenario.model import Scenario
-    from uwbsim.simulation.run import simulate
-    from uwbsim.simulation.simulated import Simulated, through_wire
+    from uwbsim.simulation.run import Simulated, simulate, through_wire
     from uwbsim.sweep.design import load_design
     from uwbsim.sweep.runner import run_sweep
     from uwbsim.twins.fitting import Twin, twin
@@ -62,7 +61,7 @@ _HOMES: Final = {
     "Scenario": "uwbsim.scenario.model",
     "ScenarioError": "uwbsim.errors",
     "Server": "uwbsim.boards.server",
-    "Simulated": "uwbsim.simulation.simulated",
+    "Simulated": "uwbsim.simulation.run",
     "State": "uwbsim.protocols.prediction",
     "Twin": "uwbsim.twins.fitting",
     "UwbsimError": "uwbsim.errors",
@@ -79,7 +78,7 @@ _HOMES: Final = {
     "shipped_scenarios": "uwbsim.scenario.loading",
     "show": "uwbsim.pages.documents",
     "simulate": "uwbsim.simulation.run",
-    "through_wire": "uwbsim.simulation.simulated",
+    "through_wire": "uwbsim.simulation.run",
     "twin": "uwbsim.twins.fitting",
 }
 

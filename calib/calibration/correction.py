@@ -101,5 +101,5 @@ def _append(written: Recording, exchanges: Exchanges, applied: CorrectedRanges) 
     }
     with written.transaction():
         written.append_exchanges(replace(exchanges, range_m=corrected_m))
-        written.append_columns("corrected", table)
+        written.append("corrected", table)
     return len(exchanges), int(np.count_nonzero(applied.clamped & powered)), int(np.count_nonzero(~powered))

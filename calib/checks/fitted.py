@@ -19,7 +19,7 @@ from calib.estimator.range_rows import Mixture
 from calib.estimator.score_tests import Family, FoundOffset, Slopes, Tested, search, widening
 from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.estimator.to_calibration import bias_curves
-from calib.findings import OF_A_FIT
+from calib.findings import OF_A_FIT, SMALLEST_NS
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -34,7 +34,7 @@ DECIBEL = float(10**0.1)
 MATTERS, CLEARLY = 1.0, 4.0
 """A finding is named that moves some delay by so many of its standard errors, a small one by so many."""
 
-SMALLEST_M, SMALLEST_NS = 0.01, 0.02
+SMALLEST_M = 0.01
 """An offset of less is nobody's fault: it widens intervals, and is not named unless it matters clearly."""
 
 SUGGESTED = 2.5
@@ -47,8 +47,8 @@ FAR_M, MOSTLY, OFTEN, FOUR = 0.12, 0.8, 0.45, 4
 """Detours of less may as well be an error that wanders. A pair, or all pairs of a tag, with such shares of reflected
 ranges are named; over four tags a pair's offset and that of the two others leave the same trace."""
 
-SCALE, CONFOUNDED_M = 0.01, 0.006
-"""An error of distances by distance that a recording may have and not show, and what of it in a curve is said."""
+SCALE = 0.01
+"""Relative error of true distances that a recording may have and not show: a judgement."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,14 +61,9 @@ class Doubts:
 
 def examine_fit(found: KnownDistances) -> Doubts:
     """Hold a fit against alternatives, and widen the delays' covariance by what does not fit."""
-    search_of = found.searches[0]
-    layout = search_of.optimum.layout
-    delays = np.zeros((len(found.delays), layout.size))
-    where = layout.where["delay"]
-    delays[:, where] = np.eye(len(found.delays))
-    slopes = Slopes(search_of.rows, search_of.optimum, found.blocks, delays)
+    slopes = slopes_of(found)
     louder, alone = change_per_decibel(found), len(found.searches) > 1
-    tested = [slopes.test(family) for family in families(found, louder, beside_curve=not alone)]
+    tested = slopes.tests(list(families(found, louder, beside_curve=not alone)))
     findings = _without_repeats(search(tested, OF_A_FIT))
     findings += list(_wrong_decibels(findings, tested))
     plain = found.covariances["delay"]
@@ -92,19 +87,12 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
     clock leaves it whose skew is not corrected, and what all ranges share. A fit whose curve comes after its delays is
     not `beside_curve`: the curve is in its errors, and follows distance as power does.
     """
-    model, ranges, layout = found.model, found.model.ranges, found.searches[0].optimum.layout
-    tags, count = model.tags, len(found.model.ranges)
+    model, ranges, tags, count = found.model, found.model.ranges, found.model.tags, len(found.model.ranges)
     ends = np.searchsorted(tags, model.pairs.ends)[model.pairs.number]
     names = [f"tag {tag}" for tag in tags]
     named = [f"pair {a}-{b}" for a, b in model.pairs.ends.tolist()]
-    both, ones = np.ones(2), np.ones(count)
-    pair = model.pairs.number[:, None]
-    yield Family(
-        kind="pair",
-        names=named,
-        derivative=_columns(pair, ones, len(named)),
-        fitted=layout.indices(["offset of pair"]),
-    )
+    both = np.ones(2)
+    yield of_pairs(found)
     several = int(min(max(found.blocks.seconds / SPAN_S, 2), SEGMENTS))
     span = np.arange(count) * several // count
     yield Family(
@@ -129,6 +117,26 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
     if shared:
         columns = sparse.csr_matrix(np.column_stack(list(shared.values())))
         yield Family(kind="shared", names=list(shared), derivative=columns)
+
+
+def of_pairs(found: KnownDistances) -> Family:
+    """Return the offsets of pairs."""
+    names = [f"pair {a}-{b}" for a, b in found.model.pairs.ends.tolist()]
+    number = found.model.pairs.number
+    return Family(
+        kind="pair",
+        names=names,
+        derivative=_columns(number[:, None], np.ones(len(number)), len(names)),
+        fitted=found.searches[0].optimum.layout.indices(["offset of pair"]),
+    )
+
+
+def slopes_of(found: KnownDistances) -> Slopes:
+    """Return the slopes of the fit of the delays."""
+    search = found.searches[0]
+    delays = np.zeros((len(found.delays), search.optimum.layout.size))
+    delays[:, search.optimum.layout.where["delay"]] = np.eye(len(found.delays))
+    return Slopes(search.rows, search.optimum, found.blocks, delays)
 
 
 def _columns(columns: Ints, values: Floats, size: int) -> sparse.csr_matrix:
@@ -338,14 +346,25 @@ def sentence_of(finding: FoundOffset) -> str:
     return sentences[finding.kind]
 
 
-def _reflected(found: KnownDistances) -> list[str]:
-    """Name the pairs of which hardly a range is direct, and tags most of whose are not, where that was fitted."""
-    errors = found.searches[-1].rows.errors
-    if not isinstance(errors, Mixture) or "odds of pair" not in found.values:
-        return []
-    values, ends = found.values, found.model.pairs.ends
+def has_shares(found: KnownDistances) -> bool:
+    """Return whether the share of reflected ranges was fitted by pair."""
+    return isinstance(found.searches[-1].rows.errors, Mixture) and "odds of pair" in found.values
+
+
+def shares_of_pairs(found: KnownDistances) -> tuple[Floats, Floats]:
+    """Return the share of reflected ranges of each pair (k,) and their mean detour (k,), metres."""
+    values = found.values
     share = 1 / (1 + np.exp(-values["odds level"] - values["odds of pair"]))
     detour = np.exp(values["least detour"]) + np.exp(values["detour level"] + values["detour of pair"])
+    return share, detour
+
+
+def _reflected(found: KnownDistances) -> list[str]:
+    """Name the pairs of which hardly a range is direct, and tags most of whose are not, where that was fitted."""
+    if not has_shares(found):
+        return []
+    share, detour = shares_of_pairs(found)
+    ends = found.model.pairs.ends
     tags, far = np.unique(ends), detour > FAR_M
     sentences = []
     for number in np.flatnonzero((share > MOSTLY) & far).tolist():
@@ -379,8 +398,8 @@ def _short(found: KnownDistances) -> list[str]:
 def _confounded(found: KnownDistances, slopes: Slopes) -> list[str]:
     """Say where a small error that grows with the distance would pass for a curve over power.
 
-    The curve is fitted beside such an error, of which `SCALE` is known beforehand, and what that takes of its certainty
-    is held against the band that is printed.
+    The curve is fitted beside such an error, of which `SCALE` is known beforehand. It is named where it adds more to
+    the variance of the curve than all else does.
     """
     model, truth_m = found.model, found.model.ranges.truth_m
     if model.curve is None or len(found.searches) > 1 or not np.ptp(truth_m) > 0:
@@ -398,7 +417,7 @@ def _confounded(found: KnownDistances, slopes: Slopes) -> list[str]:
     more = float(np.sqrt(np.mean((rows @ taken[own_columns] * slope) ** 2)))
     variance = np.einsum("ij,jk,ik->i", rows, found.covariances["curve"], rows)
     band = float(np.sqrt(max(float(np.mean(variance)), 0.0)))
-    if more < max(CONFOUNDED_M, 2 * band):
+    if more < band:
         return []
     return [
         f"power and distance are confounded: true distances {100 * SCALE:.0f} % off would pass for {1e3 * more:.0f} mm "

@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM, equal_bins, lifted_power
-from calib.checks.pairs import LOOKED_AT, RANGES_OF_A_SHARE, SHORTEST_M, share_by_distance
 from calib.data.clocks import LeftSkew, corrected
 from calib.data.ranges import NO_STAMPS, STATIC, Ranges
 from calib.estimator.known_distances import KnownDistances
@@ -21,12 +20,6 @@ from uwblink.twr import names_in
 
 RANGES_A_MEDIAN: Final = 20
 """Ranges at one power from which their median error is told."""
-
-LEFT_BY_DISTANCE: Final = 0.215
-"""Share of the lifted power's variance that distance must leave unexplained.
-
-Tags on turning quadcopters leave a third and more, an anchor on a pole and a board on a tripod, outdoors, a fifth.
-"""
 
 MANY_MISSING: Final = 0.05
 MANY_OUTLIERS: Final = 0.4
@@ -55,13 +48,6 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
         yield (
             f"{_pairs(len(model.pairs.ends))}: antenna delays stay unknown, other pairs cannot be corrected, and "
             "what else is constant in the ranges of a pair (an obstacle, a wrong lever arm) is in its constant"
-        )
-    some = ranges[slice(None, None, max(len(ranges) // LOOKED_AT, 1))]
-    share = explained_by_distance(_lifted(some), some.truth_m) if model.curve is not None else None
-    if share is not None:
-        yield (
-            f"distance explains {100 * share:.0f} % of the power's variance: the curve may hold what belongs to "
-            "distance; turn the antennas while recording, or fit with `delays_only`"
         )
     if model.curve is None and model.looked_for_curve and model.powered.any():
         yield (
@@ -158,19 +144,6 @@ def _pinned(ranges: Ranges, residuals_m: Floats) -> str:
         "curve only: the delays are those that were given; what they have in common that is wrong is in the curve, "
         f"where they differ it stays in the ranges (medians of pairs lie within {_length(float(np.ptp(medians)))})"
     )
-
-
-def explained_by_distance(lifted: Floats, truth_m: Floats) -> float | None:
-    """Return the share of the variance of lifted powers (n,) that distance explains, where it is too much, else None.
-
-    A curve over power then learns what belongs to distance.
-    """
-    good = np.isfinite(lifted) & np.isfinite(truth_m) & (truth_m > 0)
-    if np.count_nonzero(good) < RANGES_OF_A_SHARE or np.ptp(truth_m[good]) < SHORTEST_M:
-        return None
-    # Lifted powers near the antennas outweigh all others, their decibels do not; either way is too much.
-    share = max(share_by_distance(power, truth_m[good]) for power in (lifted[good], np.log(lifted[good])))
-    return share if share > 1 - LEFT_BY_DISTANCE else None
 
 
 def warnings_of(ranges: Ranges, inliers: float, free: list[list[int]], seconds: float) -> list[str]:

@@ -7,20 +7,26 @@ tested for one more unknown (`calib.estimator.score_tests`). Errors that last wi
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from scipy import sparse
+from scipy import sparse, special
 
+from calib.checks.fitted import has_shares, of_pairs, shares_of_pairs, slopes_of
 from calib.checks.geometry import Displaced, displaced, place_m, standing
 from calib.checks.pairs import standing_still
 from calib.checks.quick_fit import QuickFit, quick_fit
 from calib.checks.recording_view import RecordingView, chosen
-from calib.estimator.score_tests import Family, findings
+from calib.data.ranges import Ranges
+from calib.errors import CalibError
+from calib.estimator.known_distances import FEWEST_RANGES, KnownDistances, Recipe, fit_known_distances
+from calib.estimator.pairs import pairs_of
+from calib.estimator.score_tests import Family, Tested, findings
 from calib.findings import BUDGET, Candidate, exceeds, positive, stretches
-from uwblink.arrays import Bools, Floats
+from calib.spread import robust_spread
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
 MOVED: Final = "delay changed mid-flight"
@@ -49,8 +55,9 @@ LOUD_M: Final = 0.3
 CUTS: Final = 47
 """Times at which a delay is tested for a change: so close that a step between two of them loses 1 % of its size."""
 
-MARGIN: Final = 0.06
-"""Part of a recording at either end in which no change is looked for: two of the stretches of time of its scores."""
+MARGIN: Final = 1 / 8
+"""Part of a recording at either end in which no change is looked for: four of the stretches of time of its scores. Sums
+over fewer are far from normal where reflections last, and their variance is not known."""
 
 MOST_COLUMNS: Final = 2500
 """Shifts of pairs at several times that are tested together: their covariance takes 50 MB."""
@@ -64,6 +71,13 @@ OTHERS: Final = 0.4
 
 MOST_NAMED: Final = 3
 """Tags of a recording that are named: faults are few."""
+
+MOST_REPEATED: Final = 5
+SETTLED_M: Final = 0.01
+"""Fits that find how far a pair is off, and the change of an offset below which they have."""
+
+MOSTLY: Final = 0.5
+"""Share of reflected ranges of a pair beyond which its ranges may as well be off by a constant."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,24 +99,55 @@ class Shift:
 
 def closures(view: RecordingView) -> Iterator[Candidate]:
     """Pairs with an offset that the delays of their tags do not explain; those that explain it as well are named."""
-    fit = quick_fit([view], constants="tag")
-    if fit is None:
+    rows = np.flatnonzero(np.isfinite(view.error_m))
+    if len(rows) < FEWEST_RANGES:
         return
-    names = [fit.named(pair) for pair in range(len(fit.ends))]
-    one_each = sparse.csr_matrix((np.ones(len(fit.pair)), (np.arange(len(fit.pair)), fit.pair)))
-    family = Family(kind="pair", names=names, derivative=one_each)
-    tolerance = PAIR_M + (CURVE_M if standing_still(view) is not None else 0.0)
-    for one in findings(fit.slopes.test(family), len(names), BUDGET, tolerance):
-        pair = names.index(one.names[0])
-        # A slope at no offset says too little of a large one, so that it is taken again.
-        rest = fit.less(np.where(fit.pair == pair, one.offset_m, 0.0))
-        offset_m = one.offset_m + float(rest.offsets(family)[0][pair])
+    ranges = Ranges.from_exchanges(view.exchanges[rows], view.truth_m[rows])
+    pairs = pairs_of(ranges.initiator, ranges.target, ranges.tags())
+    offset_m, tested, spread_m = np.zeros(len(pairs.ends)), None, 0.0
+    for _ in range(MOST_REPEATED):
+        moved = replace(ranges, truth_m=ranges.truth_m + offset_m[pairs.number])
+        try:
+            found = fit_known_distances(moved, Recipe(fixed_ns={}, groups={}, minimum_norm=True))
+        except CalibError:
+            return
+        at = np.flatnonzero((pairs.ends[:, None] == found.model.pairs.ends).all(axis=2).any(axis=1))
+        beside = slopes_of(found).test(of_pairs(found))
+        spread_m = robust_spread(beside.total / np.maximum(np.diag(beside.information), 1e-300), 0.0)
+        tested = replace(beside, total=beside.total - beside.information @ offset_m[at])
+        before, offset_m = offset_m, _offsets(found, tested, at, offset_m)
+        if np.max(np.abs(offset_m - before)) < SETTLED_M:
+            break
+    if tested is None:
+        return
+    # Where reflections make all pairs differ, one of them has to stand out among these.
+    tolerance = max(PAIR_M, float(special.ndtri(1 - BUDGET / (2 * len(offset_m)))) * spread_m)
+    if standing_still(view) is not None:
+        tolerance += CURVE_M
+    for one in findings(tested, len(offset_m), BUDGET, tolerance):
         yield Candidate(
             OPEN,
-            f"ranges of pair {' or '.join(one.names)} are {100 * abs(offset_m):.1f} cm too "
-            f"{'long' if offset_m > 0 else 'short'} for the delays of their tags, by closed loops of the other pairs",
+            f"ranges of {' or '.join(one.names)} are {100 * abs(one.offset_m):.1f} cm too "
+            f"{'long' if one.offset_m > 0 else 'short'} for the delays of their tags, by closed loops of the other "
+            "pairs",
             one.p_value,
         )
+
+
+def _offsets(found: KnownDistances, tested: Tested, at: Ints, before_m: Floats) -> Floats:
+    """Return the offsets of pairs that residuals ask for, in metres; pairs of the fit stand `at` places among all.
+
+    Slopes at no offset say too little of a large one, which the error model takes for reflections of all ranges of a
+    pair: such a pair moves by the median of what it is off.
+    """
+    offset_m = np.zeros_like(before_m)
+    names = list(tested.family.names)
+    for one in findings(tested, len(names), BUDGET):
+        offset_m[at[names.index(one.names[0])]] = one.offset_m
+    if has_shares(found):
+        for k in np.flatnonzero(shares_of_pairs(found)[0] > MOSTLY).tolist():
+            offset_m[at[k]] = before_m[at[k]] + np.median(found.residuals[found.model.pairs.number == k])
+    return offset_m
 
 
 def astray(view: RecordingView) -> Iterator[Candidate]:

@@ -84,9 +84,9 @@ def no_truth(view: RecordingView) -> Iterator[Candidate]:
 
 
 CONFOUNDED: Final = "power confounded with distance"
-EXPLAINED: Final = 0.8
-"""Share of the power's variance that distance may explain: beyond, what is fitted over power has more than five times
-the variance that it would have alone (variance inflation, Marquardt 1970)."""
+EXPLAINED: Final = 0.9
+"""Share of the power's variance that distance may explain: beyond, what is fitted over power has more than ten times
+the variance that it would have alone, which is too much (variance inflation, Marquardt 1970)."""
 
 FROM_DISTANCE: Final = 0.5
 """Share of the readings' variance, noise and all, below which it is not distance that powers are made of."""

@@ -15,6 +15,7 @@ from scipy.special import ndtr
 
 from calib.estimator.known_distances import KnownDistances
 from calib.estimator.score_tests import Slopes, Tested
+from calib.findings import SMALLEST_NS
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 
@@ -52,7 +53,7 @@ class OfPlaces:
         # What all delays have in common hangs on the curve as well, and is less known by far.
         apart = np.eye(len(before_ns2)) - 1 / max(len(before_ns2), 1)
         own, more = (np.diag(apart @ one @ apart) for one in (before_ns2, self.widening_ns2))
-        if not self.certain or not np.any(more > np.maximum(own, 1e-30)):
+        if not self.certain or not np.any(more > np.maximum(own, SMALLEST_NS**2)):
             return []
         return [
             "errors belong to places or directions: ranges between the same two bodies are wrong together, as walls "

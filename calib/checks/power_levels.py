@@ -16,6 +16,7 @@ from calib.calibration.model import Calibration
 from calib.calibration.power_curves import lifted_power
 from calib.checks.plausibility import MEDIAN
 from calib.data.ranges import Ranges
+from calib.findings import SMALLEST_NS
 from calib.spread import TWO_SIDED_95, robust_spread
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -34,8 +35,6 @@ SAME_LEVEL_DB: Final = 0.5
 
 LEVELS_DIFFER: Final = 4.0
 """Standard errors beyond which levels differ; readings of one place come together, so that these are a little small."""
-
-SMALLEST_NS: Final = 0.02
 
 
 def unlike_powers(ranges: Ranges, calibration: Calibration) -> Iterator[str]:

@@ -119,7 +119,10 @@ RADIO: Final = (
     Check(
         "Do ranges follow the true distances within 30 cm?",
         "mean absolute error of a pair, its median aside", f"{ALONE}, for all pairs",
-        {offsets.ASTRAY: "see whether numbers of anchors belong to other places, and times to another clock"},
+        {
+            offsets.ASTRAY: "see whether numbers of anchors belong to other places, and times to another clock; or "
+            "whether a wall stands between these tags"
+        },
         offsets.astray,
     ),
     Check(
@@ -214,8 +217,8 @@ STRUCTURE: Final = (
         pairs.still,
     ),
     Check(
-        "Does distance explain more than 80 % of the power?",
-        "share of variance between distances, noise of readings aside (variance inflation of 5)", CERTAIN,
+        "Does distance explain more than 90 % of the power?",
+        "share of variance between distances, noise of readings aside (variance inflation of 10)", CERTAIN,
         {
             pairs.CONFOUNDED: "turn the antennas while recording; until then the curve may hold what belongs to "
             "distance, and `delays_only` fits none"

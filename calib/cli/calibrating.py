@@ -24,9 +24,20 @@ from calib.cli.shared import (
 )
 from calib.errors import BadInputError, UnanswerableError
 from calib.settings import FitSettings, FlightSettings, check_choice, read_fixed
-from uwblink.cli.guide import add, choice, tags_of
-from uwblink.cli.options import AsJson, CalibrationFile, Force, Plot, ReportFile, Seed, count, output
-from uwblink.cli.waiting import waiting
+from uwblink.cli.guide import (
+    AsJson,
+    CalibrationFile,
+    Force,
+    Plot,
+    ReportFile,
+    Seed,
+    add,
+    choice,
+    count,
+    output,
+    tags_of,
+)
+from uwblink.cli.shared import waiting
 
 if TYPE_CHECKING:
     import calib

@@ -8,9 +8,8 @@ from typing import Annotated, Final
 import typer
 
 from calib.cli.shared import known_calibration, warn
-from uwblink.cli.guide import add, choice, epilog
-from uwblink.cli.options import CalibrationFile, Force, Group, output
-from uwblink.cli.waiting import waiting
+from uwblink.cli.guide import CalibrationFile, Force, Group, add, choice, epilog, output
+from uwblink.cli.shared import waiting
 
 MILUV: Final = "calib import miluv uwb_calib.json -o calibration.json"
 

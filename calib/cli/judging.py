@@ -12,10 +12,8 @@ import typer
 
 from calib.cli.shared import STOPPED, Recordings, TrimStatic, command_line, known_calibration, warn, with_flags
 from calib.settings import FitSettings
-from uwblink.cli.guide import add, choice
-from uwblink.cli.options import AsJson, CalibrationFile, Figures, Force, ReportFile, Seeds, output
-from uwblink.cli.starting import keep_imported
-from uwblink.cli.waiting import waiting
+from uwblink.cli.guide import AsJson, CalibrationFile, Figures, Force, ReportFile, Seeds, add, choice, output
+from uwblink.cli.shared import waiting
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -64,7 +62,6 @@ def evaluate(
         from calib.report import check_places
 
         check_places(report, None, figures, force=force)
-        keep_imported()
     known = known_calibration(calibration, recordings)
     with waiting("evaluating"):
         parts = load_each(recordings, need_power=known.needs_power)
@@ -276,7 +273,6 @@ def report(
     from calib.report import check_places
 
     check_places(output, pdf, figures, force=force)
-    keep_imported()
     with Console(file=sys.stderr).status("loading") as status:
         campaign = calib.run_campaign(
             recordings,
@@ -344,8 +340,8 @@ def _remarks(evaluation: Evaluation) -> Iterator[str]:
     )
     split = evaluation.split
     yield (
-        f"of the calibrated errors, {100 * split.within_m:.1f} cm (standard deviation) are within pairs, "
-        f"{100 * split.between_pairs_m:.1f} cm between pairs"
+        f"of the calibrated errors, {100 * split.within_m:.1f} cm (standard deviation) are within pairs"
+        + (f", {100 * split.between_pairs_m:.1f} cm between pairs" if len(evaluation.pairs) > 1 else "")
         + (f", {100 * split.between_sessions_m:.1f} cm between sessions" if split.sessions > 1 else "")
     )
     covered = ", ".join(f"{100 * share:.1f} % for {name} %" for name, share in group.coverage.items())

@@ -11,9 +11,8 @@ import typer
 
 from calib.errors import BadInputError
 from calib.planning import FlightPlanSettings, SurveyPlanSettings, read_whole
-from uwblink.cli.guide import add, epilog
-from uwblink.cli.options import AsJson, Figures, Force, Group, output
-from uwblink.cli.waiting import waiting
+from uwblink.cli.guide import AsJson, Figures, Force, Group, add, epilog, output
+from uwblink.cli.shared import waiting
 
 if TYPE_CHECKING:
     import calib

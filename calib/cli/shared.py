@@ -13,7 +13,7 @@ import typer
 
 from calib.settings import FitSettings, FlightSettings
 from uwblink.cli import shared
-from uwblink.cli.options import output
+from uwblink.cli.guide import output
 from uwblink.settings import flags_of
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ from typing import Final
 import numpy as np
 
 from uwblink.arrays import Bools, Floats
-from uwblink.protocols.rows import Intervals
-from uwblink.protocols.table import PROTOCOLS, is_single_sided
+from uwblink.protocols.table import PROTOCOLS, Intervals, is_single_sided
 from uwblink.recording import IMPOSSIBLE_PPM, target_faster_ppm
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import Exchanges, intervals, names_in, without_stamps

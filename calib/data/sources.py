@@ -40,7 +40,7 @@ from uwblink.recording.antenna_delays import AntennaDelays, delays_in_meta
 from uwblink.recording.distances import Tracks
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, Fault, KnownDistance, Poses, Tag
-from uwblink.recording.target_reports import single_exchange_blocks, single_reports
+from uwblink.recording.target_reports import single_report_blocks, single_reports
 from uwblink.twr import Exchanges, names_in
 
 EXCHANGES_AT_ONCE: Final = 131_072
@@ -287,8 +287,8 @@ def _blocks(source: Source) -> Iterator[tuple[Exchanges, Parts]]:
         yield exchanges, [(exchanges, None if complete else source.poses)]
         return
     windows = source.recording.pose_windows()
-    for block in single_exchange_blocks(source.recording, EXCHANGES_AT_ONCE):
-        if len(block):
+    for reports in single_report_blocks(source.recording, EXCHANGES_AT_ONCE):
+        if len(block := reports.exchanges):
             complete = bool(np.isfinite(block.truth_m).all())
             yield block, [(block, None)] if complete else windows.tracks_beside(block)
 

@@ -1,18 +1,19 @@
 """The one loop: from a start to the top of the log likelihood of all rows and priors.
 
-Steps are Newton's with the information of the rows (squared slopes of a likelihood), shortened or lengthened by how
-much of what their slope promised they kept; the weights of priors that data determine are estimated along.
+Steps are Newton's with the information of the rows (squared slopes of a likelihood), corrected by how slopes changed
+over the last steps; the weights of priors that data determine are estimated along.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from calib.estimator.inverse import Inverse, Matrix, inverse_of
-from calib.estimator.rows import Rows, sum_rows
+from calib.estimator.rows import Rows, Sums, sum_rows
 from calib.estimator.unknowns import Layout, Priors
 from uwblink.arrays import Floats, Ints
 
@@ -22,14 +23,28 @@ SETTLED = 1e-2
 ROUGHLY = 0.3
 """The same for all unknowns together, where only some are asked for: a share of nothing may be any small number."""
 
-EVIDENCE_STEPS = 12
-"""Steps in which weights of priors are estimated: they converge as fast as the unknowns do, and then stand."""
+EVIDENCE_STEPS = 9
+"""Steps near the top in which weights of priors are estimated: they converge as fast as the unknowns do, then stand."""
 
-MOST_STEPS = 60
-"""Steps after which a search is given up: sound ones take ten to thirty."""
+MOST_STEPS = 100
+"""Steps after which a search is given up: sound ones take ten to sixty."""
 
 CHANGE = 0.05
 """Relative change of a weight below which it has settled."""
+
+SHORTENED = 8
+"""How many times a step is shortened before it is taken as it is: to a thousandth or less."""
+
+REMEMBERED = 10
+"""Steps from whose changes of slopes the inverse curvature is corrected: 3 to 20 do alike (Nocedal and Wright 2006,
+section 7.2)."""
+
+LONGER = 4.0
+"""How many times longer a corrected step may be than one by the information alone, in standard errors: a judgement.
+Without a limit, logarithms of shares overflowed in a fit of 3.8 million ranges."""
+
+LEAST_CURVATURE = 0.2
+"""Curvature along a step over that of the information, below which it is damped (Powell's constant)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,54 +80,52 @@ def maximize(
 
     `longest` returns which share of a step (p,) may be taken at most, where unknowns are not linear.
 
-    A likelihood that falls halves the step. Squared slopes are not quite the curvature: a step to the top keeps half of
-    what its slope promises, one that keeps nearly all was short, and the next one is taken longer.
+    Squared slopes are not quite the curvature: their inverse is corrected by the changes of slopes over the last steps
+    (L-BFGS: Nocedal and Wright 2006, algorithm 7.4). A likelihood that falls shortens the step.
     """
     layout, free = priors.layout, priors.layout.free()
-    best, top, step, shorter, length, promised = -np.inf, x, np.zeros_like(x), 0, 1.0, 0.0
-    most = MOST_STEPS if steps is None else steps
-    for taken in range(1, most + 1):
+    most, near, shorter = MOST_STEPS if steps is None else steps, 0, 0
+    changes = deque[tuple[Floats, Floats]](maxlen=REMEMBERED)
+    sums = Sums(-np.inf, np.zeros_like(x), np.zeros((0, 0)))
+    best, gain, promised, settled, taken = -np.inf, np.inf, 0.0, False, 0
+    top, slope, step = x, np.zeros_like(x), np.zeros_like(x)
+    while taken < most and not settled:
+        taken += 1
         found = sum_rows(rows, x)
         value = found.value + priors.value(x)
-        if value < best - tolerance and shorter < 8:
-            step, shorter, promised = 0.3 * step, shorter + 1, 0.0
+        if gain < len(free):
+            changes.append((x - top, sums.gradient - found.gradient))
+        if not value >= best - tolerance and shorter < SHORTENED:
+            # To the top of the parabola through both values and the slope (Nocedal and Wright 2006, equation 3.58).
+            share = 0.5 * promised / (promised + best - value)
+            step *= float(np.clip(share, 0.1, 0.5)) if np.isfinite(share) else 0.1
+            promised, shorter = float(slope @ step), shorter + 1
             x = top + step
             continue
-        if promised > 0:
-            # Along a parabola the best length keeps a half of what the slope promises, one h times as long 1 - h/2.
-            kept = (value - best) / promised
-            length = float(np.clip(length * np.clip(0.5 / max(1 - kept, 1e-3), 0.5, 2.0) ** 0.7, 0.25, 8.0))
-        sums, shorter = found, 0
-        covariance = inverse_of(sums.information + priors.precision(), free, layout.local())
+        top, sums, shorter = x, found, 0
+        precision = priors.precision()
+        known = sums.information + precision
+        covariance = inverse_of(known, free, layout.local())
         slope = sums.gradient + priors.pull(x)
-        step = covariance @ slope
-        gain = float(slope @ step)
+        bent = [(moved, _damped(moved, fell + precision @ moved, known @ moved)) for moved, fell in changes]
+        step = _corrected(covariance, slope, bent)
+        reach = float(slope @ (covariance @ slope)) / max(float(step @ known @ step), 1e-300)
+        step *= min(1.0, LONGER * reach**0.5) if reach > 0 else 1.0
+        gain, best = float(slope @ step), value
         settled = gain < tolerance
         if asked is not None:
             settled = abs(float(slope[asked] @ step[asked])) < tolerance and gain < max(ROUGHLY, tolerance)
-        if taken <= evidence_steps:
+        near += gain < len(free)
+        if near < evidence_steps:
             before = list(priors.weights)
             # At the start nothing has moved yet, and says nothing of how far it may.
             priors.update(x + step, covariance)
-            moved = [abs(np.log(a / b)) for a, b in zip(priors.weights, before, strict=True)]
-            settled = settled and max(moved, default=0.0) < CHANGE
+            change = [abs(np.log(a / b)) for a, b in zip(priors.weights, before, strict=True)]
+            settled = settled and max(change, default=0.0) < CHANGE
             best = sums.value + priors.value(x)
-        else:
-            best = value
-        if settled:
-            return Optimum(
-                layout=layout,
-                priors=priors,
-                x=x,
-                covariance=covariance,
-                information=sums.information,
-                value=value,
-                steps=taken,
-                success=True,
-            )
-        step *= min(length, np.inf if longest is None else longest(step))
+        step *= 1.0 if longest is None else min(1.0, longest(step))
         promised = float(slope @ step)
-        top, x = x, x + step
+        x = top + step
     return Optimum(
         layout=layout,
         priors=priors,
@@ -120,6 +133,34 @@ def maximize(
         covariance=covariance,
         information=sums.information,
         value=best,
-        steps=most,
-        success=False,
+        steps=taken,
+        success=settled,
     )
+
+
+def _damped(moved: Floats, fell: Floats, expected: Floats) -> Floats:
+    """Return by how much slopes fell (p,) over a move (p,), no less than a fifth of what was expected (p,).
+
+    Powell's damping (Nocedal and Wright 2006, procedure 18.2) keeps the curvature positive.
+    """
+    whole, own = float(moved @ expected), float(moved @ fell)
+    if own >= LEAST_CURVATURE * whole:
+        return fell
+    share = (1 - LEAST_CURVATURE) * whole / (whole - own)
+    return share * fell + (1 - share) * expected
+
+
+def _corrected(covariance: Inverse, slope: Floats, changes: Sequence[tuple[Floats, Floats]]) -> Floats:
+    """Return the step (p,) from a slope (p,) by an inverse curvature that agrees with changes over earlier steps.
+
+    `changes` are how far unknowns moved (p,) and by how much slopes fell (p,), the last one last.
+    """
+    kept = [(moved, fell, float(moved @ fell)) for moved, fell in changes if float(moved @ fell) > 0]
+    rest, shares = slope.copy(), []
+    for moved, fell, product in reversed(kept):
+        shares.append(float(moved @ rest) / product)
+        rest -= shares[-1] * fell
+    step = np.asarray(covariance @ rest)
+    for (moved, fell, product), share in zip(kept, reversed(shares), strict=True):
+        step += (share - float(fell @ step) / product) * moved
+    return step

@@ -15,7 +15,8 @@ from scipy import sparse
 from scipy.special import stdtr
 
 from calib.estimator.optimize import Optimum
-from calib.estimator.range_rows import RESIDUAL, RangeRows
+from calib.estimator.range_rows import RangeRows
+from calib.estimator.rows import Terms
 from calib.estimator.time_blocks import Persistence, TimeBlocks, persistence
 from uwblink.arrays import Floats, Ints
 
@@ -108,82 +109,91 @@ class Tested:
     blocks: int
 
 
-@dataclass(frozen=True, slots=True)
-class _Known:
-    """What links a unit offset of each range (n,) to the unknowns: `weight` (n,) times its `several` entries.
+@dataclass(slots=True)
+class _Sums:
+    """Sums over ranges for offsets of a family (k).
 
-    Entries lie in one piece: of millions of ranges there is no room for parts and their whole.
+    By block of time, `plain` (blocks, k) of slopes and `known` (blocks, k) of what residuals know; `square` (k, k) is
+    what offsets know of each other, `link` (k, p) what they share with the unknowns.
     """
 
-    weight: Floats
-    entries: Floats
-    columns: Ints
-    several: int
+    plain: Floats
+    known: Floats
+    square: Floats
+    link: Floats
 
     @classmethod
-    def of(cls, count: int, several: int) -> _Known:
-        """Return room for so many ranges."""
-        return cls(np.empty(count), np.empty(count * several), np.empty(count * several, dtype=np.int32), several)
-
-    def put(self, rows: slice, weight: Floats, entries: sparse.csr_matrix) -> None:
-        """Fill in some ranges."""
-        where = slice(rows.start * self.several, rows.stop * self.several)
-        self.weight[rows], self.entries[where], self.columns[where] = weight, entries.data, entries.indices
-
-    def link(self, kept: sparse.csr_matrix, size: int) -> Floats:
-        """Return what links offsets, as derivatives (n, k) of kept ranges, to all unknowns (k, size)."""
-        count = len(self.weight)
-        matrix = sparse.csr_matrix((self.entries, self.columns, self.several * np.arange(count + 1)), (count, size))
-        return np.asarray(((sparse.diags(self.weight) @ kept).T @ matrix).todense())
+    def empty(cls, count: int, blocks: int, size: int) -> _Sums:
+        """Return sums over no ranges."""
+        return cls(*(np.zeros(shape) for shape in ((blocks, count), (blocks, count), (count, count), (count, size))))
 
 
 class Slopes:
-    """The slopes of a fit's ranges by the residual and by all unknowns, as sums and products that tests are made of."""
+    """The slopes of a fit's ranges by the residual and by all unknowns, as sums and products that tests are made of.
+
+    `score` (n,) are the slopes by residuals, `tells` (n,) what residuals know, in the order of the rows. Slopes by
+    unknowns are evaluated anew for tests: those of millions of ranges take gigabytes.
+    """
 
     def __init__(self, rows: RangeRows, optimum: Optimum, blocks: TimeBlocks, delays: Floats) -> None:
         """Take rows at their optimum; `delays` (tags, p) turns unknowns into delays in ns."""
-        self.optimum, self.blocks, self.delays = optimum, blocks, delays
-        count, size, at = len(rows), optimum.layout.size, 0
-        self.order = rows.order
-        self.score, self.tells = np.empty(count), np.zeros(count)
+        self.rows, self.optimum, self.blocks, self.delays = rows, optimum, blocks, delays
+        self.order, size = rows.order, optimum.layout.size
+        self.score, self.tells = np.empty(len(rows)), np.zeros(len(rows))
         self.own = np.zeros((blocks.count, size))
-        self._known: list[_Known] = []
-        for terms, by in rows.terms_and_scores(optimum.x):
-            which = slice(at, at + len(by))
-            in_block = sparse.csr_matrix(
-                (np.ones(len(by)), (blocks.number[rows.order[which]], np.arange(len(by)))),
-                shape=(blocks.count, len(by)),
-            )
-            self.own += (in_block @ terms.as_matrix(terms.slopes, size)).toarray()
+        for which, terms, by in self._pieces():
+            self.own += (self._in_block(which) @ terms.as_matrix(terms.slopes, size)).toarray()
             self.score[which] = by
-            for k, part in enumerate(part for part in (terms, terms.beside) if part is not None):
-                entries = part.slopes if part.entries is None else part.entries
-                if k == len(self._known):
-                    self._known.append(_Known.of(count, len(entries)))
-                residual = np.ones(len(by)) if part.residual is None else part.residual
-                weighed = residual if part.weight is None else residual * part.weight
-                self._known[k].put(which, weighed, part.as_matrix(entries, size))
-                self.tells[which] += residual * weighed
-            at = which.stop
-        self._in_block = sparse.csr_matrix(
-            (np.ones(count), (blocks.number[self.order], np.arange(count))), shape=(blocks.count, count)
-        )
+            for part, weight in _weighed(terms):
+                self.tells[which] += weight if part.residual is None else weight * part.residual
+
+    def _pieces(self) -> Iterator[tuple[slice, Terms, Floats]]:
+        """Yield which rows, their terms, and their slopes by the residual."""
+        at = 0
+        for terms, by in self.rows.terms_and_scores(self.optimum.x):
+            yield slice(at, at + len(by)), terms, by
+            at += len(by)
+
+    def _in_block(self, which: slice) -> sparse.csr_matrix:
+        """Return a matrix (blocks, rows) that sums some rows by block of time."""
+        number = self.blocks.number[self.order[which]]
+        place = (number, np.arange(len(number)))
+        return sparse.csr_matrix((np.ones(len(number)), place), shape=(self.blocks.count, len(number)))
 
     def link(self, derivative: sparse.csr_matrix) -> Floats:
         """Return what links offsets, as derivatives (n, k) of given ranges, to all unknowns (k, p)."""
-        return self._link(derivative[self.order])
-
-    def _link(self, kept: sparse.csr_matrix) -> Floats:
-        size = self.optimum.layout.size
-        return sum((known.link(kept, size) for known in self._known), np.zeros((kept.shape[1], size)))
+        return self._sums([derivative])[0].link
 
     def test(self, family: Family) -> Tested:
         """Return a family's efficient slopes."""
-        derivative = family.derivative[self.order]
-        plain = np.asarray((self._in_block @ sparse.diags(self.score) @ derivative).todense())
-        known = np.asarray((self._in_block @ sparse.diags(self.tells) @ derivative.power(2)).todense())
-        square = np.asarray((derivative.T @ sparse.diags(self.tells) @ derivative).todense())
-        link = self._link(derivative)
+        return self.tests([family])[0]
+
+    def tests(self, families: Sequence[Family]) -> list[Tested]:
+        """Return the efficient slopes of families, whose sums are taken in one pass over the ranges."""
+        sums = self._sums([family.derivative for family in families])
+        return [self._tested(family, own) for family, own in zip(families, sums, strict=True)]
+
+    def _sums(self, derivatives: Sequence[sparse.csr_matrix]) -> list[_Sums]:
+        """Return sums over all ranges for offsets with derivatives (n, k) of given ranges."""
+        sums = [_Sums.empty(each.shape[1], *self.own.shape) for each in derivatives]
+        for which, terms, by in self._pieces():
+            in_block = self._in_block(which)
+            matrices = [
+                (weight, part.as_matrix(part.slopes if part.entries is None else part.entries, self.own.shape[1]))
+                for part, weight in _weighed(terms)
+            ]
+            for own, derivative in zip(sums, derivatives, strict=True):
+                kept = derivative[self.order[which]]
+                told = sparse.diags(self.tells[which])
+                own.plain += (in_block @ sparse.diags(by) @ kept).toarray()
+                own.known += (in_block @ told @ kept.power(2)).toarray()
+                own.square += (kept.T @ told @ kept).toarray()
+                for weight, matrix in matrices:
+                    own.link += (kept.T @ sparse.diags(weight) @ matrix).toarray()
+        return sums
+
+    def _tested(self, family: Family, sums: _Sums) -> Tested:
+        plain, known, square, link = sums.plain, sums.known, sums.square, sums.link
         taken = self._taken(link, family.fitted)
         efficient, information = plain - self.own @ taken.T, square - taken @ link.T
         whole = max(float(np.diag(square).max()), 1e-300)
@@ -218,6 +228,14 @@ class Slopes:
             taken = taken - columns @ np.linalg.solve(columns[fitted], taken[fitted])
             taken[fitted] = 0.0
         return taken.T
+
+
+def _weighed(terms: Terms) -> Iterator[tuple[Terms, Floats]]:
+    """Yield rows and what is beside them, with the weight (n,) by which a unit offset of each goes with its entries."""
+    for part in (terms, terms.beside):
+        if part is not None:
+            unit = np.ones(part.slopes.shape[1]) if part.residual is None else part.residual
+            yield part, unit if part.weight is None else unit * part.weight
 
 
 def search(tested: Sequence[Tested], rate: float) -> list[FoundOffset]:
@@ -289,6 +307,3 @@ def widening(tested: Tested) -> Floats:
     trace = float(np.trace(reach.T @ inverse @ reach))
     variance = max(float(slope @ inverse @ slope) - freedom, 0.0) / max(trace, 1e-300)
     return np.asarray(variance * tested.effects @ tested.effects.T)
-
-
-__all__ = ["RESIDUAL", "Family", "FoundOffset", "Slopes", "Tested", "findings", "search", "widening"]

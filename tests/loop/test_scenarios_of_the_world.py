@@ -10,16 +10,15 @@ from calib.errors import UnanswerableError
 from calib.evaluation.statistics import evaluate, pair_rows
 from calib.fitting.fitting import fit
 from uwblink.ticks import SPEED_OF_LIGHT
+from uwbsim import simulate
 from uwbsim.scenario.loading import load
-from uwbsim.simulation.run import simulate
-from uwbsim.simulation.simulated import write
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
 
 def ranges(tmp_path, name, *settings):
     path = tmp_path / "f.uwb"
-    write(simulate(load(SCENARIOS / name, settings)), path, force=True)
+    simulate(load(SCENARIOS / name, settings)).save(path, force=True)
     return load_ranges(path)
 
 
@@ -94,7 +93,7 @@ def test_a_fit_of_boards_that_warm_up_says_that_delays_moved(tmp_path):
     """Ranges grow by 2.15 mm/K for each of two tags, and shrink by 5.35 cm/V as batteries sag."""
     path = tmp_path / "warm.uwb"
     flight = simulate(load(SCENARIOS / "warm_up" / "warm_up.toml"), contention=False)
-    write(flight, path)
+    flight.save(path)
     r = load_ranges(path)
     error, time_s = r.raw_m - r.truth_m, r.time_ns * 1e-9
     grown = np.mean(error[time_s > 220]) - np.mean(error[time_s < 20])

@@ -9,8 +9,16 @@ from tests.uwblink.test_twr import exchange
 from uwblink import twr
 from uwblink.errors import ArgumentError
 from uwblink.plugins import Registry
-from uwblink.protocols.rows import ProtocolMessage, RangingProtocol, half_delays
-from uwblink.protocols.table import PROTOCOLS, check_protocol, register_protocol, single_sided, third_from_target
+from uwblink.protocols.table import (
+    PROTOCOLS,
+    ProtocolMessage,
+    RangingProtocol,
+    check_protocol,
+    half_delays,
+    register_protocol,
+    single_sided,
+    third_from_target,
+)
 from uwblink.ticks import TICK_S
 from uwblink.twr import delay_weights, intervals, raw_range, time_of_flight
 

@@ -1,4 +1,4 @@
-"""A board at a serial port, for scripts and notebooks: ask it for ranges, listen to what it reports.
+"""A board at a serial port, for scripts and notebooks: commands, ranges, and reports.
 
 ```python
 from uwblink.boards.board import Board
@@ -41,9 +41,9 @@ Reply = TypeVar("Reply", bound=Message)
 
 
 class Board(Closing):
-    """One board. Not for use from several threads at once; one board a thread is fine.
+    """One board, for use in one thread at a time.
 
-    `Board.open("/dev/ttyACM0")` opens a board on a serial port; here are two that are simulated:
+    `Board.open("/dev/ttyACM0")` opens a board on a serial port. An example with two simulated boards:
 
     >>> import uwblink, uwbsim
     >>> ports = uwbsim.VirtualPorts(
@@ -68,7 +68,7 @@ class Board(Closing):
     def __init__(
         self, transport: Transport, *, answer_s: float = ANSWER_S, connection: Connection | None = None
     ) -> None:
-        """Talk over an open transport, or go on with its `connection`; `open` is for a port by name."""
+        """Use an open transport, and its `connection` if it has one; `open` takes the name of a port."""
         self._transport = transport
         self._connection = connection or Connection(transport.name, answer_s)
         self._reports: deque[Event] = deque(maxlen=10_000)
@@ -90,7 +90,7 @@ class Board(Closing):
 
     @property
     def id(self) -> int:
-        """The board's id; asked for once."""
+        """The board's id; the board is asked once."""
         if self._id is None:
             self._id = self._ask(GetId(), IdReport).board
         return self._id
@@ -110,7 +110,7 @@ class Board(Closing):
         except NoAnswerError as error:
             self._revive(error)
             if isinstance(command, Broadcast | Bootloader):
-                raise  # it may have been done, and is not to be done twice
+                raise  # it may have been executed, and must not be executed twice
         return self._exchange(command)
 
     def range(
@@ -139,7 +139,7 @@ class Board(Closing):
         raise NoAnswerError(f"{self.name}: no channel impulse response within 200 ms of the range")
 
     def set_passive(self, on: bool) -> None:
-        """Listen to the exchanges of others, or stop to; forgotten at a power cycle."""
+        """Listen to the exchanges of others, or stop listening; the setting is lost at a power cycle."""
         self.request(SetPassive(on))
 
     def set_response_delay(self, delay_uus: int) -> None:
@@ -151,18 +151,18 @@ class Board(Closing):
         self.request(Broadcast(data))
 
     def test(self) -> TestsDone:
-        """Have one field of each kind echoed; raises `BoardError` when the echo is wrong."""
+        """Test that the board echoes one field of each kind; raises `BoardError` if the echo is wrong."""
         sent = DoTests(12345, "uwblink", True, 1.25, b"\x00|\r\n\xff")
         echo = self._ask(sent, TestsDone)
         wrong = [n for n in DoTests.FIELDS if getattr(echo, n) != getattr(sent, n)]
         if wrong:
             raise BoardError(f"{self.name}: the echo differs in {', '.join(wrong)}: {echo}")
         if echo.error:
-            raise BoardError(f"{self.name}: the board says its radio's id disagrees with its own (error {echo.error})")
+            raise BoardError(f"{self.name}: the id of its radio differs from its own (error {echo.error})")
         return echo
 
     def reports(self, timeout_s: float) -> Iterator[Event]:
-        """Yield what the board says unasked, messages and lines of text, until nothing came for `timeout_s`."""
+        """Yield messages and lines of text that are no replies, until none came for `timeout_s`."""
         while True:
             while self._reports:
                 yield self._reports.popleft()
@@ -171,7 +171,7 @@ class Board(Closing):
                 return
 
     def _revive(self, error: NoAnswerError) -> None:
-        """Send a fence with a long time-out: firmware that waits for a frame in vain does not answer for a while."""
+        """Send a fence with a long time-out: firmware that waits for a frame answers late."""
         try:
             self._exchange(FENCE)
         except NoAnswerError as still:

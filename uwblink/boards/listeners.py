@@ -11,8 +11,8 @@ uwblink.record(["/dev/ttyACM0", "/dev/ttyACM1"], "flight.uwb", uwblink.RangingPl
 
 A listener is a function of one `Heard`, or an object of a class derived from `Listener`: the writer of the file, the
 live table and the user's callback are all listeners. They are called in the recorder's own loop, in their order, so
-they must be quick: 0.1 ms a message is plenty, and what takes longer belongs into a thread of the listener's own, as
-the file writer's does. An exception that one raises ends the recording, with everything that came before in the file.
+they must be quick: at most 0.1 ms for a message. Slower work belongs in a thread of the listener, as in the file
+writer. An exception of a listener ends the recording; the file keeps everything before.
 
 Ranges are corrected by other distributions, because uwblink does not import packages that depend on it. An entry point
 of the group `uwbcal.corrections` names a function that takes the path of a calibration and returns a function that
@@ -32,6 +32,7 @@ from uwblink.arrays import Bools, Floats
 from uwblink.errors import PlanError
 from uwblink.recording.antenna_delays import AntennaDelays, delays_differ
 from uwblink.recording.schema import Fault
+from uwblink.recording.summary import counted
 from uwblink.ticks import DELAYED_TX_GRID
 from uwblink.twr import STAMPS, Exchanges
 from uwblink.wire.codec import Event
@@ -77,7 +78,7 @@ class Heard:
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """One turn of the plan: who was to range with whom, the report (None: it failed), and when it ended."""
+    """One turn of the plan: its pair, the report (None: the exchange failed), and when it ended."""
 
     time_ns: int
     pair: Pair
@@ -116,29 +117,29 @@ class Listener:
     """
 
     def on_start(self, pairs: Sequence[Pair]) -> None:
-        """Note which pairs will range; what this raises refuses the recording before anything is written."""
+        """Take the pairs that will range; an exception here ends the recording before anything is written."""
 
     def on_bytes(self, time_ns: int, port: str, direction: str, data: bytes) -> None:
-        """Note bytes that came "in" from a port or went "out" to it."""
+        """Take bytes that came "in" from a port or went "out" to it."""
 
     def on_message(self, heard: Heard) -> None:
-        """Note a message or a line of text of a board."""
+        """Take a message or a line of text of a board."""
 
     def on_turn(self, turn: Turn) -> None:
-        """Note that a turn of the plan has ended."""
+        """Take the result of a turn of the plan."""
 
     def on_fault(self, fault: Fault) -> None:
-        """Note that something went wrong."""
+        """Take a fault."""
 
     def check(self) -> None:
         """Raise to end the recording; called often."""
 
     def close(self) -> None:
-        """End: nothing more will come."""
+        """End: nothing follows."""
 
 
 class CallbackListener(Listener):
-    """Calls a function with everything that boards say."""
+    """Calls a function with every message of boards."""
 
     def __init__(self, callback: Callable[[Heard], object]) -> None:
         """Call `callback` with each `Heard`."""
@@ -150,7 +151,7 @@ class CallbackListener(Listener):
 
 
 def as_listeners(listeners: Iterable[Listener | Callable[[Heard], object]]) -> list[Listener]:
-    """Return listeners, functions made into some; raises `TypeError` for what is neither."""
+    """Return listeners, and functions as listeners; raises `TypeError` for other objects."""
     found: list[Listener] = []
     for listener in listeners:
         if isinstance(listener, Listener):
@@ -206,8 +207,35 @@ class Progress(Listener):
         """Exchanges that were begun and ended."""
         return sum(p.tried for p in self.pairs.values())
 
+    def rows(self) -> list[tuple[Pair, list[str]]]:
+        """Return each pair's rate (Hz), success, last range (m) and its first-path power (dBm) as texts."""
+        return [
+            (
+                pair,
+                [
+                    f"{state.rate_hz(self.time_s):.1f}",
+                    f"{100 * state.good / state.tried:.0f} %" if state.tried else "",
+                    f"{state.range_m:.3f}" if state.good else "",
+                    f"{state.fpp_dbm:.1f}" if state.good else "",
+                ],
+            )
+            for pair, state in list(self.pairs.items())
+        ]
+
+    def __str__(self) -> str:
+        """Return the counts as one line."""
+        others = {"overheard": self.overheard, "impulse responses": self.cirs}
+        counts = "".join(f", {count} {name}" for name, count in others.items() if count)
+        return (
+            f"{self.exchanges} of {self.tried} exchanges in {self.time_s:.1f} s{counts}; faults: {self.fault_counts()}"
+        )
+
+    def fault_counts(self) -> str:
+        """Return the number of faults of each kind as text."""
+        return counted(dict(sorted(self.faults.items())))
+
     def on_message(self, heard: Heard) -> None:
-        """Count what has no turn of its own."""
+        """Count messages without a turn of their own."""
         self.overheard += isinstance(heard.message, Overheard)
         self.cirs += isinstance(heard.message, Cir)
 
@@ -227,7 +255,7 @@ class Progress(Listener):
 
 
 class WrongDelayError(PlanError):
-    """Boards have other antenna delays than were said to be programmed into them."""
+    """Boards have other antenna delays than those that were given."""
 
 
 class DelayCheck(Listener):
@@ -238,14 +266,14 @@ class DelayCheck(Listener):
     """
 
     def __init__(self, delays: AntennaDelays) -> None:
-        """Take what is programmed into each board."""
+        """Check stamps against the programmed `delays` of boards."""
         self._expected = {
             (board, name): getattr(delay, name) for board, delay in delays.items() for name in ("tx", "reply")
         }
         self._rests: dict[tuple[int | None, str], deque[int]] = {}
 
     def on_turn(self, turn: Turn) -> None:
-        """Look at the stamps of a report; a delay that was found to be right is not looked at again."""
+        """Check the stamps of a report; a delay that was confirmed is not checked again."""
         report = turn.report
         if report is None or not self._expected:
             return
@@ -267,8 +295,8 @@ class DelayCheck(Listener):
             elif len(rests) == 3 and len(set(rests)) == 1:
                 board, name = which
                 raise WrongDelayError(
-                    f"board {board}: {name} = {delay} is taken to be programmed, but by its stamps it is "
-                    f"{delay + rest}; say what is programmed into the boards",
+                    f"board {board}: {name} = {delay} was given, but its stamps show {delay + rest}; "
+                    "give the delays that are programmed into the boards",
                     parameter="antenna_delays",
                 )
 
@@ -277,7 +305,7 @@ class ReportCheck:
     """Compares each report with the last report of the other board of its pair."""
 
     def __init__(self) -> None:
-        """Compare nothing yet."""
+        """Start without reports."""
         self._last: dict[Pair, tuple[int, RangeReport]] = {}
 
     def add(self, board: int, report: RangeReport) -> str | None:
@@ -298,10 +326,10 @@ class ReportCheck:
 
 
 Correction = Callable[[Exchanges], Mapping[str, Floats | Bools]]
-"""Returns what is known of exchanges (n,), by name: columns (n,).
+"""Returns columns (n,) for exchanges (n,), by name.
 
-`corrected_m` and `sigma_m` in metres, and whatever else whoever corrects can say; NaN where a value is not known.
-Raises a `ValueError` for exchanges that it cannot correct, as of a tag that is not calibrated.
+`corrected_m` and `sigma_m` in metres, and other columns of the correction; NaN where a value is not known.
+Raises a `ValueError` for exchanges that it cannot correct, for example of a tag that is not calibrated.
 """
 
 

@@ -14,17 +14,17 @@ import shutil
 import sys
 import threading
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from uwblink.boards.listeners import Correction, Listener, Pair, PairState, Progress, Turn, check_pairs
+from uwblink.boards.listeners import Correction, Listener, Pair, Progress, Turn, check_pairs
 from uwblink.closing import Closing
 from uwblink.errors import PortError
-from uwblink.pages.html import CSS
+from uwblink.pages.blocks import CSS
 from uwblink.recording.schema import Fault
 from uwblink.wire.bulk import exchanges_of
 
@@ -72,11 +72,11 @@ class LivePage(Closing, Listener):
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """The address of the page."""
         return f"http://127.0.0.1:{self._server.server_address[1]}/"
 
     def on_start(self, pairs: Sequence[Pair]) -> None:
-        """Raise what the correction raises where it cannot correct ranges of a pair."""
+        """Raise the error of the correction if it cannot correct ranges of a pair."""
         check_pairs(self._correct, pairs)
 
     def on_turn(self, turn: Turn) -> None:
@@ -123,14 +123,12 @@ class LivePage(Closing, Listener):
             series = {pair: list(points) for pair, points in self._series.items()}
             faults = list(reversed(self._faults))
         progress = self._progress
-        counts = [f"{progress.time_s:.0f} s, {progress.exchanges} of {progress.tried} exchanges"]
-        others = ((progress.overheard, "overheard"), (progress.cirs, "impulse responses"))
-        counts += [f"{count} {name}" for count, name in others if count]
+        items = "".join(f"<li>board {escape(f.board)}: {escape(f.kind)}: {escape(f.detail)}</li>" for f in faults)
         parts = (
             f"<h1>recording {escape(self._path.name)}</h1>",
-            f"<p>{', '.join(counts)}</p>",
+            f"<p>{escape(str(progress))}</p>",
             _table(progress, series, corrected=self._correct is not None),
-            _faults(progress, faults),
+            f"<ul>{items}</ul>" if items else "",
             self._disk(),
         )
         return "".join(parts)
@@ -168,7 +166,7 @@ class LivePage(Closing, Listener):
                     _send(self, found())
 
             def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the library's name
-                """Say nothing: the terminal belongs to the recorder."""
+                """Print nothing: the recorder uses the terminal."""
 
         return Handler
 
@@ -178,7 +176,7 @@ class _Server(ThreadingHTTPServer):
     request_queue_size = 128
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Say nothing of a browser that goes away, which is no error; the terminal belongs to the recorder."""
+        """Ignore lost connections; the recorder uses the terminal."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 
@@ -207,33 +205,19 @@ def _table(progress: Progress, series: Mapping[Pair, Sequence[Point]], *, correc
     names = ["pair", "rate (Hz)", "success", "range (m)", *(["corrected (m)"] if corrected else []), "FPP (dBm)"]
     head = "".join(f"<th>{name}</th>" for name in names)
     drawn = "<b class='range'>range</b>" + (", <b class='corrected'>corrected</b>" if corrected else "")
-    rows = (
-        _row(pair, state, series.get(pair, ()), progress.time_s, corrected=corrected)
-        for pair, state in list(progress.pairs.items())
-    )
+    rows = ""
+    for pair, cells in progress.rows():
+        points = series.get(pair, ())
+        corrected_m = f"{points[-1].corrected_m:.3f}" if points and math.isfinite(points[-1].corrected_m) else ""
+        cells[3:3] = [corrected_m] if corrected else []
+        cells = [f"{pair[0]}&nbsp;&rarr;&nbsp;{pair[1]}", *cells, picture(points)]
+        state = progress.pairs[pair]
+        silent = " class='silent'" if state.tried and state.rate_hz(progress.time_s) == 0 else ""
+        rows += f"<tr{silent}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
     return (
         f"<div class='wide live'><table><thead><tr>{head}<th>last minute: {drawn}</th></tr></thead>"
-        f"<tbody>{''.join(rows)}</tbody></table></div>"
+        f"<tbody>{rows}</tbody></table></div>"
     )
-
-
-def _row(pair: Pair, state: PairState, points: Sequence[Point], time_s: float, *, corrected: bool) -> str:
-    rate_hz = state.rate_hz(time_s)
-    cells = [
-        f"{pair[0]}&nbsp;&rarr;&nbsp;{pair[1]}",
-        f"{rate_hz:.1f}",
-        f"{100 * state.good / state.tried:.0f} %" if state.tried else "",
-        _metres(state.range_m),
-        *([_metres(points[-1].corrected_m if points else math.nan)] if corrected else []),
-        f"{state.fpp_dbm:.1f}" if state.good else "",
-        picture(points),
-    ]
-    silent = " class='silent'" if state.tried and rate_hz == 0 else ""
-    return f"<tr{silent}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
-
-
-def _metres(value: float) -> str:
-    return f"{value:.3f}" if math.isfinite(value) else ""
 
 
 def picture(points: Sequence[Point]) -> str:
@@ -258,10 +242,3 @@ def picture(points: Sequence[Point]) -> str:
         f'<svg role="img" aria-label="{label}" viewBox="0 0 {WIDTH} {HEIGHT}" preserveAspectRatio="none">'
         f"<title>{label}</title>{lines}</svg>"
     )
-
-
-def _faults(progress: Progress, last: Iterable[Fault]) -> str:
-    """Return the count of each kind of fault, and the last ones, the newest first."""
-    kinds = ", ".join(f"{escape(kind)} {n}" for kind, n in sorted(dict(progress.faults).items())) or "none"
-    items = "".join(f"<li>board {escape(f.board)}: {escape(f.kind)}: {escape(f.detail)}</li>" for f in last)
-    return f"<p>faults: {kinds}</p>" + (f"<ul>{items}</ul>" if items else "")

@@ -1,4 +1,4 @@
-"""Serial ports: which there are, opening one, and moving bytes; and pseudo-terminals that stand in for them.
+"""Serial ports: their list, opening, reading and writing; and pseudo-terminals in their place.
 
 A port is a device (`/dev/ttyACM0`), a link to one, or any pyserial URL (`socket://`, `rfc2217://`). This is the only
 file that uses pyserial.
@@ -30,53 +30,43 @@ except ImportError:  # pragma: no cover - Windows has no pseudo-terminals
 
 
 class Transport(Protocol):
-    """What the driver needs of a port; `uwbsim` has one whose time is virtual."""
+    """What the driver needs of a port; `uwbsim` has one with virtual time."""
 
     name: str
 
     def read(self, timeout_s: float) -> bytes:
-        """Return what came, at once if there is any, empty when the time is over."""
-        ...
+        """Return received bytes as soon as there are any; empty after the time-out."""
 
     def write(self, data: bytes) -> None:
         """Send bytes in one write."""
-        ...
 
     def now_s(self) -> float:
         """Return a time that never goes back, in seconds."""
-        ...
 
     def close(self) -> None:
-        """Give the port back."""
-        ...
+        """Close the port."""
 
 
 class Ports(Protocol):
-    """What a recorder needs of ports together; `uwbsim.VirtualPorts` are ones whose time is virtual."""
+    """What a recorder needs of all ports; `uwbsim.VirtualPorts` has virtual time."""
 
     def open(self, name: str) -> Transport:
         """Open a port and watch it; raises one of the `PortError`s."""
-        ...
 
     def close(self, port: Transport) -> None:
         """Close a port that was opened here."""
-        ...
 
     def wait(self, timeout_s: float) -> Sequence[Transport]:
         """Return ports at which bytes may be waiting, none when the time is over."""
-        ...
 
     def now_s(self) -> float:
         """Return a time that never goes back, in seconds; that of the ports."""
-        ...
 
     def host_ns(self) -> int:
         """Return the same time as nanoseconds since the Unix epoch."""
-        ...
 
     def moved(self, name: str, number: str | None) -> str | None:
-        """Return what a port is called now whose device has the USB serial number `number`, None while it is away."""
-        ...
+        """Return the present name of a port by its USB serial number `number`, None while it is unplugged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +108,7 @@ class SerialPort:
             os.set_blocking(self.fileno, False)
 
     def read(self, timeout_s: float) -> bytes:
-        """Return what came, at once if there is any, empty when the time is over; raises `PortLostError`."""
+        """Return received bytes as soon as there are any; empty after the time-out. Raises `PortLostError`."""
         if self.fileno is None:
             return self._read_pyserial(timeout_s)
         if not select.select([self.fileno], [], [], max(timeout_s, 0.0))[0]:
@@ -169,7 +159,7 @@ class SerialPort:
 
 
 def _since_boot_ns() -> int:
-    """Return a clock that nobody sets, and that goes on while the computer is suspended, where the system has one."""
+    """Return a clock that is never set and runs while the computer is suspended, if the system has one."""
     boot = getattr(time, "CLOCK_BOOTTIME", None)
     return time.monotonic_ns() if boot is None else time.clock_gettime_ns(boot)
 
@@ -178,7 +168,7 @@ class SerialPorts:
     """The serial ports of this computer."""
 
     def __init__(self) -> None:
-        """Watch no port; the clock starts now."""
+        """Start the clock; no port is open."""
         self._selector = selectors.SelectSelector()
         self._pyserial: list[SerialPort] = []
         # No change of the wall clock moves the times of a recording.
@@ -237,24 +227,24 @@ def _opened(name: str) -> Any:
 
 
 def _explained(name: str, error: Exception) -> PortError:
-    """Return the error of a port that cannot be opened, by the system's number or, on other systems, its words."""
+    """Return the error of a port that cannot be opened, by the number of the error or by its text."""
     code, text = getattr(error, "errno", None), str(error)
 
-    def told(words: str, *codes: int) -> bool:
+    def matches(words: str, *codes: int) -> bool:
         return code in codes or words in text
 
-    if told("No such file", errno.ENOENT):
+    if matches("No such file", errno.ENOENT):
         return PortMissingError(f"{name}: no such port; `uwblink ports` lists the boards that are plugged in")
-    if told("Permission denied", errno.EACCES, errno.EPERM):
+    if matches("Permission denied", errno.EACCES, errno.EPERM):
         group = _group(name)
         return PortPermissionError(
             f"{name}: permission denied; join the group {group} (sudo usermod -aG {group} $USER) and log in again"
         )
-    if told("exclusively lock", errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
+    if matches("exclusively lock", errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
         return PortBusyError(f"{name}: another process has this port open; close it first")
     if os.path.isdir(name):
         return PortError(f"{name.rstrip('/')}: is a folder; name the ports in it, as with {name.rstrip('/')}/*")
-    if told("Inappropriate ioctl", errno.ENOTTY) or "configure port" in text:
+    if matches("Inappropriate ioctl", errno.ENOTTY) or "configure port" in text:
         return PortError(f"{name}: not a serial port")
     return PortError(f"{name}: cannot be opened ({text})")
 
@@ -270,7 +260,7 @@ def _group(name: str) -> str:
 
 
 def wait_until(due_s: float, stop: Callable[[], bool]) -> bool:
-    """Wait for a time of the monotonic clock; returns whether nobody said to stop meanwhile."""
+    """Wait for a time of the monotonic clock; returns False if `stop` returned true before."""
     while (wait_s := due_s - time.monotonic()) > 0:
         if stop():
             return False
@@ -281,8 +271,8 @@ def wait_until(due_s: float, stop: Callable[[], bool]) -> bool:
 class Terminal:
     """A pseudo-terminal that stands in for a serial port: opened raw, linked under a stable name, and unplugged.
 
-    The far end behaves like the boards' USB: what does not fit because nobody reads is lost, and while the port is
-    unplugged its name is gone. `name` is what a client opens: the link if there is one, else the device's path.
+    The far end behaves like the boards' USB: bytes that do not fit because no client reads are lost, and an unplugged
+    port has no name. `name` is what a client opens: the link if there is one, else the device's path.
     """
 
     def __init__(self, link: Path | None = None) -> None:
@@ -301,7 +291,7 @@ class Terminal:
 
     @property
     def name(self) -> str:
-        """What a client opens."""
+        """The name that a client opens."""
         if self._link:
             return str(self._link)
         return os.ttyname(self._ends[1]) if self._ends else "(unplugged)"
@@ -330,7 +320,7 @@ class Terminal:
         self._ends = None
 
     def read(self) -> bytes:
-        """Return what the client has written since, without waiting."""
+        """Return what the client has written, without waiting."""
         if not self._ends:
             return b""
         try:
@@ -339,7 +329,7 @@ class Terminal:
             return b""
 
     def write(self, data: bytes) -> None:
-        """Send bytes in one piece; what does not fit is lost, and counted."""
+        """Send bytes in one piece; bytes that do not fit are lost and counted."""
         if not self._ends:
             self.lost_bytes += len(data)
             return
@@ -352,7 +342,7 @@ class Terminal:
 
 def _point(link: Path, device: str) -> None:
     if link.is_symlink() and link.exists():
-        raise PortError(f"{link}: is a port that somebody serves; choose another folder, or remove the link")
+        raise PortError(f"{link}: is a port in use by another server; choose another folder, or remove the link")
     try:
         link.parent.mkdir(parents=True, exist_ok=True)
         if link.is_symlink():  # left behind by a server that was killed

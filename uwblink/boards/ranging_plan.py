@@ -7,12 +7,12 @@ protocol = "ds"                # or "ss"
 target_reports = false         # have the target report each exchange too
 get_cir = false                # have the initiator print its channel impulse response
 
-[[tags]]                       # optional: where each board sits, for truth from motion capture
+[[tags]]                       # optional: places of boards, for true distances by motion capture
 id = 10
 body = "ifo001"
 lever_arm_m = [0.17, -0.17, -0.05]
 
-[antenna_delays.tags.10]       # optional: what was programmed into a board; without any, 16436 into all
+[antenna_delays.tags.10]       # optional: programmed antenna delays of a board; by default 16436 for all
 tx = 16446
 rx = 16449
 reply = 16446
@@ -43,9 +43,9 @@ FILE_KEYS: Final = (
     FileKey(
         "get_cir", "true or false", "false", "Whether the initiator prints its channel impulse response; this is slow."
     ),
-    FileKey("tags[].id", "whole number, 0 to 254", "needed", "A board whose place on a body is known."),
-    FileKey("tags[].body", "text", "needed", "The body that carries it, as motion capture calls it."),
-    FileKey("tags[].lever_arm_m", "3 numbers, m", "[0.0, 0.0, 0.0]", "Where its antenna sits in the body's frame."),
+    FileKey("tags[].id", "whole number, 0 to 254", "needed", "A board with a known place on a body."),
+    FileKey("tags[].body", "text", "needed", "Its body, by the name of motion capture."),
+    FileKey("tags[].lever_arm_m", "3 numbers, m", "[0.0, 0.0, 0.0]", "Position of its antenna in the body's frame."),
     *DELAY_KEYS,
 )
 """The keys of a plan's file, for its reader and the reference."""
@@ -55,9 +55,9 @@ FILE_KEYS: Final = (
 class RangingPlan:
     """A ranging plan: `pairs` of (initiator, target) in the order in which they take turns, "all", or () to listen.
 
-    `rate_hz` exchanges a second in total, as fast as boards answer without it. `tags` say where boards sit, and
-    `antenna_delays` what was programmed into them (under None: into those not named), 16436 into all where it is empty.
-    Raises `PlanError` for what cannot be played.
+    `rate_hz` is exchanges a second in total, by default as many as the boards answer. `tags` are places of boards, and
+    `antenna_delays` the programmed delays (under None: of boards not named), by default 16436 ticks for all.
+    Raises `PlanError` for a plan that cannot be executed.
 
     >>> import uwblink
     >>> uwblink.RangingPlan().turns([10, 20, 30])
@@ -86,23 +86,23 @@ class RangingPlan:
                 raise PlanError(f'pairs: found {pair!r:.60}, expected "all" or pairs of two different ids')
 
     def delays(self) -> AntennaDelays:
-        """Return what is programmed into boards: what is said of it, else the 16436 of their firmware into all."""
+        """Return the programmed antenna delays; by default the 16436 ticks of the firmware for all boards."""
         return self.antenna_delays or {None: AntennaDelay()}
 
     def programmed(self, present: Iterable[int]) -> AntennaDelays:
-        """Return what is programmed into boards that are present; raises `PlanError` where only some are told."""
+        """Return the programmed delays of boards that are present; raises `PlanError` if only some are given."""
         found = known_delays(self.delays(), sorted(present))
         if unknown := sorted({*present} - found.keys()):
             raise PlanError(
-                f"antenna_delays: nothing is said of board {_listed(unknown)}; say what is programmed into it, or give "
-                "tx, rx and reply for all that are not named"
+                f"antenna_delays: none are given for board {_listed(unknown)}; give what is programmed into it, or "
+                "tx, rx and reply for all boards that are not named"
             )
         return found
 
     def turns(self, present: Sequence[int]) -> tuple[tuple[int, int], ...]:
-        """Return the pairs among boards that are present, none to only listen; raises `PlanError` naming absent ones.
+        """Return the pairs to range, none to only listen; raises `PlanError` with the names of absent boards.
 
-        "all" means every two boards once, except two on one body, whose distance says nothing.
+        "all" means every two boards once, except two on one body, which have a fixed distance.
         """
         if self.pairs == "all":
             body = {tag.tag: tag.body for tag in self.tags}

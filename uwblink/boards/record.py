@@ -43,8 +43,7 @@ LONGEST_BACKLOG_S: Final = 20.0
 """Longest delay of the disk that is tolerated; busy disks take a second or two."""
 
 LONG_LOG: Final = 8 * 2**20
-"""Half of the bytes at which DuckDB puts its log into the file within a commit, which takes a second on a busy machine.
-"""
+"""Half of the size at which DuckDB checkpoints its log within a commit, which takes a second on a busy machine."""
 
 
 def record(  # noqa: PLR0913 - the settings of a recording, by keyword
@@ -63,7 +62,7 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
     listeners: Iterable[Listener | Callable[[Heard], object]] = (),
     using: Ports | None = None,
 ) -> Progress:
-    """Record from boards until `stop` says so or the time is over; returns what was done.
+    """Record from boards until `stop` returns true or the time is over; returns the counts.
 
     `ports` are names or pyserial URLs, `watch` is called four times a second, `listeners` are called with everything
     that the file gets (see `uwblink.boards.listeners`), and `using` are ports other than this computer's serial ports
@@ -111,16 +110,16 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
             seats = {tag.tag: tag for tag in plan.tags}
             recording.append_tags(seats.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
             with RecordingWriter(recording) as writer:
-                told = [writer, DelayCheck(delays), *others]
-                recorder = Recorder(found, plan, turns, told, passive=passive, ports=using)
+                listening = [writer, DelayCheck(delays), *others]
+                recorder = Recorder(found, plan, turns, listening, passive=passive, ports=using)
 
-                def tell(progress: Progress) -> None:
+                def report(progress: Progress) -> None:
                     progress.waiting, progress.behind_s = writer.waiting, writer.behind_s
                     if watch:
                         watch(progress)
 
                 try:
-                    recorder.run(duration_s, stop, tell)
+                    recorder.run(duration_s, stop, report)
                 finally:
                     recorder.close()
             if arrangement:
@@ -150,7 +149,7 @@ def _check_boards(found: Mapping[int, str], plan: RangingPlan, mark: Arrangement
     if seats and not seats & found.keys():
         seated = ", ".join(map(str, sorted(seats)))
         raise PlanError(
-            f"the plan says where {seated} sit, but the boards at the ports are {there}: is it that of others?"
+            f"the plan has places of the tags {seated}, but the boards at the ports are {there}; check the plan"
         )
 
 
@@ -164,7 +163,7 @@ def _meta(found: Mapping[int, str], plan: RangingPlan, turns: Iterable[Pair], pa
 
 
 def identify(names: Iterable[str], ports: Ports | None = None) -> dict[int, str]:
-    """Return which board is at each port; raises `PlanError` when two have one id, and what `Board.open` raises."""
+    """Return the port of each board by id; raises `PlanError` if two have one id, and what `Board.open` raises."""
     using = ports or SerialPorts()
     found: dict[int, str] = {}
     for name in names:
@@ -174,7 +173,7 @@ def identify(names: Iterable[str], ports: Ports | None = None) -> dict[int, str]
         finally:
             using.close(port)
         if number in found:
-            raise PlanError(f"{found[number]} and {name} both say they are board {number}; ids must differ")
+            raise PlanError(f"{found[number]} and {name} both have the id {number}; ids must differ")
         found[number] = name
     return found
 
@@ -225,7 +224,7 @@ class RecordingWriter(Listener):
     """A listener that writes a live recording. A context manager: leaving it writes what is left."""
 
     def __init__(self, recording: Recording) -> None:
-        """Begin writing; raises `RecordingError` where what would be written cannot be read back."""
+        """Start writing; raises `RecordingError` if rows cannot be read back as they were written."""
         check_writing(recording)
         self._recording = recording
         self._batch = Batch()
@@ -247,7 +246,7 @@ class RecordingWriter(Listener):
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Write what is left; raises what `check` raises, unless something else is already on its way up."""
+        """Write the rest; raises what `check` raises, unless the block raised already."""
         try:
             self.close()
         except RecordingError:
@@ -271,12 +270,12 @@ class RecordingWriter(Listener):
 
     @property
     def waiting(self) -> int:
-        """How many pieces of bytes wait to be written."""
+        """Number of pieces of bytes that wait to be written."""
         return len(self._batch.frames)
 
     @property
     def behind_s(self) -> float:
-        """How long ago the last commit ended, in seconds, less what this process was stopped since."""
+        """Time since the last commit in seconds, without the time for which this process was stopped."""
         return time.monotonic() - self._written_s - self._stopped_s
 
     def check(self) -> None:
@@ -295,7 +294,7 @@ class RecordingWriter(Listener):
             )
 
     def close(self) -> None:
-        """Write what is left; raises what `check` raises."""
+        """Write the rest; raises what `check` raises."""
         self._ended.set()
         self._thread.join(LONGEST_BACKLOG_S)
         self.check()
@@ -312,7 +311,7 @@ class RecordingWriter(Listener):
                 self._check_file()
             except RecordingError as error:
                 self._error = error
-            except Exception as error:  # an exception would end the thread unnoticed
+            except Exception as error:  # it would end the thread unnoticed
                 self._error = RecordingError(
                     f"{self._recording.path}: cannot be written any more ({type(error).__name__}: {error}). "
                     "What was written before is kept"
@@ -334,12 +333,12 @@ class RecordingWriter(Listener):
         except OSError:
             return
 
-        def put_away() -> None:
+        def checkpoint() -> None:
             with suppress(RecordingError):  # the next commit reports problems of the disk
                 self._recording.shorten_log()
 
         if long:
-            self._shortening = threading.Thread(target=put_away, name="uwblink log", daemon=True)
+            self._shortening = threading.Thread(target=checkpoint, name="uwblink log", daemon=True)
             self._shortening.start()
 
     def _check_file(self) -> None:
@@ -387,7 +386,7 @@ def check_writing(recording: Recording) -> None:
         }
         if not all(same.values()):
             wrong = ", ".join(table for table, good in same.items() if not good)
-            raise RecordingError(f"{recording.path}: what is written comes back otherwise (tables: {wrong})")
+            raise RecordingError(f"{recording.path}: written rows are read back differently (tables: {wrong})")
         raise _Withdrawn("tried")
 
 

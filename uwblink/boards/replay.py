@@ -21,7 +21,7 @@ from uwblink.wire.messages import TextLine
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """What the stored bytes hold: exchanges in order of time, overheard ones and impulse responses, and counts."""
+    """Decoded bytes: exchanges in order of time, overheard exchanges, impulse responses, and counts."""
 
     exchanges: Exchanges
     others: Batch
@@ -31,7 +31,7 @@ class Decoded:
 
 
 def decode_again(recording: Recording) -> Decoded:
-    """Decode every byte that came from a board; raises `RecordingError` when the recording holds none."""
+    """Decode all bytes from boards; raises `RecordingError` if there are none."""
     frames = _heard(recording)
     ids = board_ids(recording)
     decoders: dict[str, ColumnDecoder] = {}
@@ -57,13 +57,13 @@ def decode_again(recording: Recording) -> Decoded:
 
 
 def board_ids(recording: Recording) -> dict[str, int]:
-    """Return which board was at each port when the recording began."""
+    """Return the board at each port at the start of the recording."""
     ports = recording.meta().get("ports", {})
     return {str(name): int(board) for board, name in ports.items()} if isinstance(ports, dict) else {}
 
 
 def rewrite(source: Recording, decoded: Decoded, output: Path, *, force: bool = False) -> None:
-    """Write a recording with what was decoded in place of what was stored; raises what `Recording.create` raises."""
+    """Write a copy of a recording with decoded exchanges; raises what `Recording.create` raises."""
     with source.copying(output, without=("exchanges", "overheard", "cirs"), force=force) as written:
         written.append_exchanges(decoded.exchanges)
         decoded.others.append_to(written)
@@ -79,8 +79,8 @@ def play(
 ) -> int:
     """Play the bytes from boards back on one pseudo-terminal each; returns how many frames were played.
 
-    `ready` is told what each board's port is now called, before the first byte. Raises `RecordingError` when the
-    recording holds no bytes.
+    `ready` is called with the new name of each board's port before the first byte. Raises `RecordingError` if the
+    recording has no bytes.
     """
     frames = _heard(recording)
     ids = board_ids(recording)
@@ -100,7 +100,7 @@ def play(
 
 
 def summarize(recording: Recording, decoded: Decoded) -> dict[str, Any]:
-    """Compare what was decoded now with what was stored then, JSON-ready."""
+    """Return the numbers of decoded and of stored rows, for JSON."""
     totals = {name: getattr(decoded, name) for name in ("messages", "skipped_bytes", "texts")}
     tables: dict[str, Sized] = {
         "exchanges": decoded.exchanges,

@@ -1,4 +1,4 @@
-"""Commands that talk to one board."""
+"""Commands for one board."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import uwblink
-from uwblink.cli.guide import add, choice, starting
-from uwblink.cli.options import AsJson, Force, Plot, count
-from uwblink.cli.shared import INTERRUPTED, interrupts, print_json
+from uwblink.cli.guide import AsJson, Force, Plot, add, choice, count, starting
+from uwblink.cli.shared import INTERRUPTED, interrupts, print_result
 from uwblink.errors import RangingFailedError, RecordingError, RefusedError, UwblinkError
 from uwblink.output import check_output
 
@@ -70,17 +69,15 @@ def ports(
                 row["board"] = board.id
         except UwblinkError as error:
             row["error"] = str(error)
-    if as_json:
-        print_json(rows)
-        return
-    if not rows:
-        typer.echo(
-            "no serial device with the boards' USB identity (0483:5740) is plugged in; "
-            "name other ports on the command line, or make simulated ones with `uwbsim serve`"
-        )
-    for row in rows:
-        found = f"board {row['board']}" if "board" in row else row.get("error", row["description"])
-        typer.echo(f"{row['device']}  {found}")
+    none = (
+        "no serial device with the boards' USB identity (0483:5740) is plugged in; "
+        "name other ports on the command line, or make simulated ones with `uwbsim serve`"
+    )
+    lines = [
+        f"{row['device']}  " + (f"board {row['board']}" if "board" in row else row.get("error", row["description"]))
+        for row in rows
+    ]
+    print_result(rows, "\n".join(lines) or none, as_json=as_json)
 
 
 def info(port: Port, as_json: AsJson = False) -> None:
@@ -96,13 +93,11 @@ def info(port: Port, as_json: AsJson = False) -> None:
             "longest_frame_bytes": longest.length if isinstance(longest, MaxFrameReport) else None,
             "usb_serial_number": serial_number(port),
         }
-    if as_json:
-        print_json(facts)
-        return
-    typer.echo(
+    text = (
         f"{port}: board {facts['board']}, frames of up to {facts['longest_frame_bytes']} bytes, "
         f"USB serial number {facts['usb_serial_number'] or 'none'}"
     )
+    print_result(facts, text, as_json=as_json)
 
 
 def twr(
@@ -112,7 +107,7 @@ def twr(
     exchanges: Annotated[int, count("Number of exchanges.")] = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Range with another board; a line for each range, and a summary at the end, also after Ctrl-C."""
+    """Range with another board; prints a line for each range, and a summary at the end, also after Ctrl-C."""
 
     ranges: list[float] = []
     failures: list[RangingFailedError] = []
@@ -162,7 +157,7 @@ def _fields(report: RangeReport) -> dict[str, float]:
 
 
 def test(port: Port) -> None:
-    """Have a board echo one field of each kind."""
+    """Test that a board echoes one field of each kind."""
 
     with uwblink.Board.open(port) as board:
         board.test()
@@ -183,7 +178,7 @@ def set_delay(
 def passive(
     port: Port, state: Annotated[str, typer.Argument(help="Whether to listen.", **choice("on", "off"))]
 ) -> None:
-    """Have a board listen to the exchanges of others, or stop listening."""
+    """Make a board listen to the exchanges of others, or stop listening."""
 
     if state not in ("on", "off"):
         raise RefusedError(f"passive: found {state!r}, expected on or off")
@@ -195,7 +190,7 @@ def passive(
 def send(port: Port, text: Annotated[str, typer.Argument(help="Up to 57 bytes in UTF-8.")]) -> None:
     """Broadcast a text to every board in range."""
 
-    data = os.fsencode(text)  # the bytes that were typed, whatever they are
+    data = os.fsencode(text)  # exactly the bytes of the command line
     with uwblink.Board.open(port) as board:
         board.send(data)
     typer.echo(f"{port}: {len(data)} bytes sent; delivery is not confirmed")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,10 +11,21 @@ import typer
 
 import uwblink
 from uwblink.cli import boards, recording
-from uwblink.cli.guide import add, apart, choice, epilog, plain
-from uwblink.cli.options import AsJson, Command, Force, Group, LinkDir, PlaybackSpeed, output
-from uwblink.cli.shared import new_app, print_json
-from uwblink.cli.waiting import waiting
+from uwblink.cli.guide import (
+    AsJson,
+    Command,
+    Force,
+    Group,
+    LinkDir,
+    PlaybackSpeed,
+    add,
+    apart,
+    choice,
+    epilog,
+    output,
+    plain,
+)
+from uwblink.cli.shared import new_app, print_json, print_result, waiting
 from uwblink.display import printable
 from uwblink.errors import ImportTableError
 from uwblink.output import check_output, write_text
@@ -39,15 +50,15 @@ def _exporters() -> list[str]:
 
 
 class ImportGroup(Group):
-    """A group whose commands are the importers, those of other distributions included, each made when asked for."""
+    """A group with one command for each importer, those of other distributions included."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Return the names of the importers."""
+        """Return the names of the importers, and `guess`."""
         return [*_importers(), "guess"]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return the command of one importer, None where there is none of the name."""
-        text = "Look at a table and write the map that it would be imported with."
+        """Return a command by its name, None if there is none."""
+        text = "Propose the map of a table."
         if cmd_name == "guess":
             run, example = guess, "uwblink import guess ranges.csv -o map.toml"
         elif cmd_name in _importers():
@@ -63,7 +74,7 @@ class ImportGroup(Group):
 
 imports = typer.Typer(
     cls=ImportGroup,
-    help="Turn other files into recordings.",
+    help="Import other files as recordings.",
     epilog=epilog(
         "uwblink import guess ranges.csv -o map.toml",
         "uwblink import csv ranges.csv --map map.toml -o ranges.uwb",
@@ -76,7 +87,7 @@ imports = typer.Typer(
 
 @imports.callback()
 def _imports() -> None:
-    """Hold one command for each importer; a group of typer must have something of its own."""
+    """Do nothing: a group of typer needs a callback."""
 
 
 def guess(
@@ -84,7 +95,7 @@ def guess(
     output: Annotated[Path | None, output("Map to write (.toml); else printed.")] = None,
     force: Force = False,
 ) -> None:
-    """Look at a table and write the map that it would be imported with, and why."""
+    """Propose the map of a table: names and units of its columns, with the reason for each line."""
     from uwblink.importers.guess import guess_map
 
     if output is not None:
@@ -96,12 +107,12 @@ def guess(
         return
     write_text(output, found.text, force=force)
     then = f"uwblink import csv {quote(str(table))} --map {quote(str(output))} -o {quote(table.name.split('.')[0])}.uwb"
-    asked = f"say {' and '.join(found.asked)} in it" if found.asked else "look at it"
+    asked = f"set {' and '.join(found.asked)} in it" if found.asked else "check it"
     typer.echo(f"{output}: {asked if found.complete else 'fill in what is missing'}, then {then}")
 
 
 def _importing(row: Importer) -> Callable[..., None]:
-    """Return the command of an importer: its parameters depend on the row, and typer reads their annotations."""
+    """Return the command of an importer. Typer reads its parameters from the annotations, which depend on the row."""
 
     def run(table: Any, output: Path, map_file: Path | None = None, force: bool = False) -> None:
         from uwblink.importers import import_file
@@ -140,7 +151,7 @@ def show(
     recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
     as_json: AsJson = False,
 ) -> None:
-    """Print what a recording holds."""
+    """Print a summary of a recording."""
 
     with waiting("counting"), uwblink.Recording.open(recording) as opened:
         summary = opened.show()
@@ -153,49 +164,20 @@ def show(
 
 
 def print_summary(summary: Summary, console: Console) -> None:
-    """Print what a recording holds; text from a file or a board is escaped, since it may be anyone's."""
+    """Print a summary; text from files and boards is escaped, because it can have markup and control characters."""
     from rich.markup import escape
     from rich.table import Table
 
-    from uwblink.recording import counted
-
-    def number(value: float | None, form: str) -> str:
-        return "" if value is None else f"{value:{form}}"
-
-    def show_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    console.print(escape(summary.headline()))
+    for header, *rows in summary.tables():
         table = Table(*header)
         for row in rows:
-            table.add_row(*(escape(printable(value)) for value in row))
-        console.print(table)
-
-    console.print(escape(summary.headline()))
-    show_table(
-        ("tag", "body", "lever arm (m)"),
-        ((tag.tag, tag.body, " ".join(f"{v:+.3f}" for v in tag.lever_arm_m)) for tag in summary.tags),
-    )
-    show_table(
-        ("initiator", "target", "exchanges", "rate (Hz)", "success"),
-        (
-            (p.initiator, p.target, p.exchanges, number(p.rate_hz, ".1f"), number(p.success, ".1%"))
-            for p in summary.pairs
-        ),
-    )
-    if summary.skews:
-        forms = {"stamps_ppm": "+.2f", "carrier_ppm": "+.2f", "slope": ".3f", "residual_ppm": ".2f"}
-        signs = {True: "same", False: "OTHER", None: ""}
-        show_table(
-            ("pair", "by stamps (ppm)", "by carriers", "slope", "residual", "sign"),
-            (
-                (s.pair, *(number(getattr(s, name), form) for name, form in forms.items()), signs[s.same_sign])
-                for s in summary.skews
-            ),
-        )
-    if summary.reported_twice:
-        console.print(f"{summary.reported_twice} reported by both ends, {summary.contradictory} of them differently")
-    console.print(f"poses: {escape(counted(summary.poses))}")
-    console.print(f"faults: {escape(counted(summary.faults))}")
-    for key, value in summary.provenance.items():
-        console.print(escape(printable(f"  {key}: {value}")))
+            table.add_row(*(escape(printable(cell)) for cell in row))
+        if rows:
+            console.print(table)
+    provenance = (printable(f"  {key}: {value}") for key, value in summary.provenance.items())
+    for line in (*summary.lines(), *provenance):
+        console.print(escape(line))
 
 
 def export(
@@ -232,7 +214,7 @@ def poses(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Add motion-capture truth to a recording of boards; --force replaces the poses that it has."""
+    """Add poses of motion capture to a recording; --force replaces its poses."""
     from uwblink.importers import add_poses
 
     sources: Any = Path(source[0])
@@ -248,7 +230,7 @@ def poses(
 
 
 def _by_body(option: str, what: str, words: list[str]) -> dict[str, str]:
-    """Return what stands behind each body; raises `ImportTableError` for words that are not BODY=SOMETHING."""
+    """Return the values of BODY=VALUE by body; raises `ImportTableError`."""
     found: dict[str, str] = {}
     for word in words:
         body, _, rest = word.partition("=")
@@ -271,7 +253,7 @@ def replay(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Decode the stored bytes again, or play them back as boards would have sent them."""
+    """Decode the stored bytes of boards again, or play them back on pseudo-terminals."""
     from uwblink.boards import decode_again, play, rewrite, summarize
 
     if output:
@@ -286,15 +268,13 @@ def replay(
             summary = summarize(opened, decoded)
             if output:
                 rewrite(opened, decoded, output, force=force)
-    if as_json:
-        print_json(summary)
-        return
-    typer.echo(f"{summary['messages']} messages, {summary['skipped_bytes']} bytes skipped")
+    lines = [f"{summary['messages']} messages, {summary['skipped_bytes']} bytes skipped"]
     for table in ("exchanges", "overheard", "cirs"):
-        typer.echo(f"  {table}: {summary[table]['decoded']} decoded now, {summary[table]['stored']} stored then")
+        lines.append(f"  {table}: {summary[table]['decoded']} decoded now, {summary[table]['stored']} in the recording")
+    print_result(summary, "\n".join(lines), as_json=as_json)
 
 
-app = new_app("Talk to ranging boards, record and stream them, and look at, import and replay recordings.")
+app = new_app("Command ranging boards, record and stream their ranges, and import, export and show recordings.")
 boards.add_to(app)
 recording.add_to(app)
 add(app, show, "uwblink show flight.uwb", panel="Recordings")

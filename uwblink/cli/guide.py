@@ -1,8 +1,8 @@
-"""Help of commands: examples, panels, completion, and options that are made of settings."""
+"""Options that the commands share, old names of options, examples, panels, completion, and options made of settings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import Field, fields, is_dataclass
 from functools import wraps
 from inspect import Parameter, Signature, signature
@@ -10,13 +10,94 @@ from pathlib import Path
 from typing import Annotated, Any, Final, get_type_hints
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-from uwblink.cli.options import Command
-from uwblink.errors import OfParameter
+from uwblink.errors import ArgumentError, OfParameter
 from uwblink.settings import flags_of
 
+Force = Annotated[bool, typer.Option("--force", help="Replace existing output.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON (SI units; delays in ns).")]
+CalibrationFile = Annotated[Path, typer.Option("-c", "--calibration", help="Calibration file (.json).")]
+OptionalCalibration = Annotated[Path | None, typer.Option("-c", "--calibration", help="Calibration file (.json).")]
+AntennaDelays = Annotated[
+    Path | None,
+    typer.Option(help="Antenna delays programmed into the boards (.toml, as calib export writes them)."),
+]
+Duration = Annotated[float | None, typer.Option(min=0.001, help="Duration in seconds.")]
+Rate = Annotated[float | None, typer.Option(min=0.001, help="Exchanges per second, all pairs together (Hz).")]
+PlanFile = Annotated[Path | None, typer.Option("--plan", help="Ranging plan: which pairs range, and how (.toml).")]
+PlaybackSpeed = Annotated[
+    float, typer.Option("--speed", min=0.001, help="Playback speed as a factor; inf: as fast as possible.")
+]
+LinkDir = Annotated[Path | None, typer.Option(help="Folder for links with stable names to the pseudo-terminals.")]
+Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the random numbers.")]
+Seeds = Annotated[int | None, typer.Option(min=1, help="Number of simulated runs, each with another seed.")]
+Figures = Annotated[
+    Path | None, typer.Option("--figures", help="Folder for the figures (.pdf and .svg, one and two columns wide).")
+]
+ReportFile = Annotated[Path | None, typer.Option("--report", help="Report to write (.html or .pdf).")]
+Plot = Annotated[Path | None, typer.Option("--plot", help="Picture to write (.png, .svg or .pdf).")]
+
+
+def output(sentence: str) -> Any:
+    """Return the option for an output, as in `Annotated[Path, output("Recording to write (.uwb).")]`."""
+    return typer.Option("-o", "--output", help=sentence)
+
+
+def count(sentence: str, *, min: int = 1, max: int | None = None) -> Any:  # noqa: A002 - as in typer
+    """Return the option for a number of things, as in `Annotated[int, count("Number of exchanges.")]`."""
+    return typer.Option("-n", "--count", help=sentence, min=min, max=max)
+
+
+def refuse_old_names(words: Sequence[str], renamed: Mapping[str, str]) -> None:
+    """Raise `ArgumentError` with the new name of an option that is given by its old name."""
+    for word in words:
+        old = word.partition("=")[0]
+        if old in renamed:
+            raise ArgumentError(f"{old} is now {renamed[old]}")
+
+
+class Command(TyperCommand):
+    """A command that shows no type for flags, and rejects old names of its options with the new ones."""
+
+    renamed: Mapping[str, str] = {}
+
+    def get_params(self, ctx: Any) -> Any:
+        """Return the parameters; flags are shown without a value."""
+        return _without_type(super().get_params(ctx))
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the command line; raises `ArgumentError` for an old name."""
+        if not ctx.resilient_parsing:
+            refuse_old_names(args, self.renamed)
+        return super().parse_args(ctx, args)
+
+
+class Group(TyperGroup):
+    """A group of commands that shows no type for flags; `moved` is the error for an unknown command."""
+
+    moved = ""
+
+    def get_params(self, ctx: Any) -> Any:
+        """Return the parameters; flags are shown without a value."""
+        return _without_type(super().get_params(ctx))
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the command line; raises `ArgumentError` if the group is called as the command that it was before."""
+        if self.moved and not ctx.resilient_parsing and args and args[0] not in (*self.list_commands(ctx), "--help"):
+            raise ArgumentError(self.moved)
+        return super().parse_args(ctx, args)
+
+
+def _without_type(parameters: Any) -> Any:
+    for one in parameters:
+        if getattr(one, "is_flag", False):
+            one.metavar = ""
+    return parameters
+
+
 WRITTEN: Final = ("output", "pdf", "figures", "report", "tum", "plot")
-"""Parameters of commands that name what is written; all other paths are read."""
+"""Parameters of commands that are outputs; all other paths are inputs."""
 
 
 def add(
@@ -29,9 +110,8 @@ def add(
 ) -> None:
     """Register a command in a panel of the list of commands, with examples below its own help.
 
-    A parameter that is a dataclass of settings (`uwblink.settings`) becomes one option per field, and errors name its
-    fields by their options. `renamed` maps old
-    names of options to what the command answers: "--old is now --new".
+    A parameter that is a dataclass of settings (`uwblink.settings`) becomes one option for each field, and errors name
+    its fields by their options. `renamed` maps old names of options to the new ones for the error "--old is now --new".
     """
     kind = type("RenamedCommand", (Command,), {"renamed": renamed}) if renamed else Command
     app.command(name, cls=kind, rich_help_panel=panel, epilog=epilog(*examples))(apart(with_settings(command)))
@@ -94,7 +174,7 @@ def _parameter(field: Field[Any], kind: Any) -> Parameter:
 
 
 def _parsed(field: Field[Any], value: Any) -> Any:
-    """Return the value of a field from what was typed; an error of parsing names the field."""
+    """Return the value of a field from the command line; an error of parsing names the field."""
     parse = field.metadata["parse"]
     try:
         return parse(value) if parse else value
@@ -131,7 +211,7 @@ def epilog(*examples: str) -> str | None:
 
 
 def plain(text: str) -> str:
-    """Return a text in which nothing is markup: rich escapes it, and is loaded only where there is a bracket."""
+    """Return a text with its markup escaped; rich is loaded only if there is a bracket."""
     if "[" not in text:
         return text
     from rich.markup import escape
@@ -140,22 +220,22 @@ def plain(text: str) -> str:
 
 
 def choice(*names: str, more: Callable[[], Iterable[str]] | None = None) -> dict[str, Any]:
-    """Return what `typer.Option` and `typer.Argument` take for one of `names`: shown in the help, and completed.
+    """Return arguments of `typer.Option` and `typer.Argument` for one of `names`: shown in the help, and completed.
 
-    `more` returns the names where plug-ins may add some. The package that is called says what it does not know, so
-    that the command and Python say the same.
+    `more` returns all names if plug-ins can add some. Unknown names are rejected by the package that is called, so that
+    the command and Python have the same errors.
     """
 
     def complete(incomplete: str) -> list[str]:
         return starting(incomplete, names if more is None else more())
 
     together = "|".join(names)
-    # Where they do not fit in their column of 20 letters (of 80), they are broken between names.
+    # Names that do not fit in their column of 20 letters are broken into lines.
     return {"metavar": together if len(together) <= 20 else " | ".join(names), "autocompletion": complete}
 
 
 def several(names: Callable[[], Iterable[str]]) -> dict[str, Any]:
-    """Return what `typer.Option` takes for names with commas between, whose last one is completed."""
+    """Return arguments of `typer.Option` for names separated by commas; the last one is completed."""
 
     def complete(incomplete: str) -> list[str]:
         before, comma, last = incomplete.rpartition(",")
@@ -166,14 +246,14 @@ def several(names: Callable[[], Iterable[str]]) -> dict[str, Any]:
 
 
 def starting(incomplete: str, names: Iterable[str]) -> list[str]:
-    """Return the names that begin with what was typed."""
+    """Return the names that begin with a text."""
     return [name for name in names if name.startswith(incomplete)]
 
 
 def tags_of(form: str = "{}") -> Callable[[typer.Context, str], list[str]]:
-    """Return a completion with the tags of the recordings that stand on the command line before the option.
+    """Return a completion with the tags of the recordings on the command line before the option.
 
-    Those are what is left over of the line: it ends where the option wants a value, so it has not been parsed.
+    These are the remaining arguments: the line ends at an option without its value, so it was not parsed.
     """
 
     def complete(ctx: typer.Context, incomplete: str) -> list[str]:

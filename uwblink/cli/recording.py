@@ -1,4 +1,4 @@
-"""The commands that play a ranging plan on boards: `record` into a file, `stream` to whoever listens."""
+"""The commands that execute a ranging plan: `record` into a file, `stream` to other programs."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import uwblink
-from uwblink.cli.guide import add, choice
-from uwblink.cli.options import (
+from uwblink.cli.guide import (
     AntennaDelays,
     Duration,
     Force,
@@ -23,6 +22,8 @@ from uwblink.cli.options import (
     PlanFile,
     PlaybackSpeed,
     Rate,
+    add,
+    choice,
     output,
 )
 from uwblink.cli.shared import interrupts
@@ -33,7 +34,6 @@ from uwblink.output import check_output
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from uwblink import RangingPlan, StreamedRange
     from uwblink.boards import Correction, LivePage, Progress
 
 
@@ -70,7 +70,7 @@ def record(
     known: Annotated[
         str,
         typer.Option(
-            help="What is known of the arrangement: all boards on a line or on a plane.", **choice("line", "plane")
+            help="Known shape of the arrangement: all boards on a line or on a plane.", **choice("line", "plane")
         ),
     ] = "",
     order: Annotated[
@@ -86,7 +86,7 @@ def record(
     calibration: OptionalCalibration = None,
     force: Force = False,
 ) -> None:
-    """Play a ranging plan on boards and record everything they send.
+    """Execute a ranging plan on boards and record everything they send.
 
     Ends after --duration, else with Ctrl-C. The page of --live shows ranges that --calibration corrects, too. Without
     --antenna-delays, and without those of a plan, 16436 ticks in each board are assumed.
@@ -98,7 +98,7 @@ def record(
     if pairs not in (None, "all", "none"):
         raise PlanError(f"--pairs: found {pairs!r}, expected all or none; a plan file can name pairs")
     if calibration and not live:
-        raise PlanError("--calibration: corrected ranges are shown on the page of --live; give that, too")
+        raise PlanError("--calibration: corrected ranges are shown on the page of --live; add --live")
     chosen = _plan(plan, rate, antenna_delays, pairs="all" if pairs == "all" else ())
     if cir:
         chosen = replace(chosen, get_cir=True)
@@ -123,7 +123,7 @@ def record(
             watch=watch_all,
             listeners=[page] if page else [],
         )
-    typer.echo(f"{output}: {_summary(progress)}")
+    typer.echo(f"{output}: {progress}")
 
 
 def stream(
@@ -145,9 +145,9 @@ def stream(
     force: Force = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print no ranges.")] = False,
 ) -> None:
-    """Print ranges as they come, one line of JSON each, and send them on.
+    """Print ranges as they arrive, one line of JSON each, and send them on.
 
-    Every two boards range, without --plan. Ends after --duration, else with the recording or Ctrl-C. Without
+    Without --plan, every two boards range. Ends after --duration, else with the recording or Ctrl-C. Without
     --antenna-delays, and without those of a plan, 16436 ticks in each board are assumed.
     """
     from uwblink.boards import Progress
@@ -156,12 +156,14 @@ def stream(
     of_boards = not (len(source) == 1 and source[0].endswith(".uwb"))
     if not of_boards and (plan or rate or output or antenna_delays):
         raise PlanError(
-            f"{source[0]}: it is streamed as it is; --plan, --rate, --antenna-delays and --output are for boards"
+            f"{source[0]}: a recording takes no --plan, --rate, --antenna-delays and --output; they are for boards"
         )
     seen, count = Progress(), 0
-    senders: list[Callable[[StreamedRange], object]] = [] if quiet else [lambda found: typer.echo(found.to_json())]
+    senders: list[Callable[[uwblink.StreamedRange], object]] = (
+        [] if quiet else [lambda found: typer.echo(found.to_json())]
+    )
 
-    def send_on(found: StreamedRange) -> None:
+    def send_on(found: uwblink.StreamedRange) -> None:
         nonlocal count
         count += 1
         for send in senders:
@@ -196,15 +198,15 @@ def stream(
                 for found in ranges:
                     send_on(found)
         except BrokenPipeError:
-            # The reader of the lines went away, which ends the stream; Python must not write what is left at its end.
+            # The reader of the lines closed, which ends the stream; Python must not write the rest at its end.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    typer.echo(f"{count} ranges" + (f"; faults: {_faults(seen)}" if seen.faults else ""), err=True)
+    typer.echo(f"{count} ranges" + (f"; faults: {seen.fault_counts()}" if seen.faults else ""), err=True)
 
 
 def _plan(
     path: Path | None, rate: float | None, antenna_delays: Path | None, pairs: str | tuple[()] = "all"
-) -> RangingPlan:
-    """Return a plan of a file, or of `pairs`; raises `PlanError` where it has antenna delays of its own."""
+) -> uwblink.RangingPlan:
+    """Return the plan of a file, or one for `pairs`; raises `PlanError` if antenna delays are given twice."""
     from uwblink.boards import load_plan
     from uwblink.recording import load_antenna_delays
 
@@ -218,8 +220,8 @@ def _plan(
     return replace(chosen, rate_hz=rate) if rate else chosen
 
 
-def _correction(path: Path | None, plan: RangingPlan | None, recording: str | None = None) -> Correction | None:
-    """Return the correction of a calibration, and warn where it is of other antenna delays than the ranges."""
+def _correction(path: Path | None, plan: uwblink.RangingPlan | None, recording: str | None = None) -> Correction | None:
+    """Return the correction of a calibration, and warn if its antenna delays differ from those of the ranges."""
     from uwblink.boards import delays_warning, load_correction
     from uwblink.recording import delays_in_meta
 
@@ -245,7 +247,9 @@ def _ids(text: str) -> tuple[int, ...]:
 
 
 @contextmanager
-def _page(path: Path, calibration: Path | None, port: int, live: bool, plan: RangingPlan) -> Iterator[LivePage | None]:
+def _page(
+    path: Path, calibration: Path | None, port: int, live: bool, plan: uwblink.RangingPlan
+) -> Iterator[LivePage | None]:
     """Serve the live page, if it was asked for."""
     if not live:
         yield None
@@ -276,22 +280,9 @@ def _watcher() -> Iterator[Callable[[Progress], None]]:
             typer.echo(f"{progress.time_s:7.1f} s  {printable(fault)}", err=True)
         if progress.time_s >= next_s:
             next_s = progress.time_s + 2.0
-            typer.echo(f"{progress.time_s:7.1f} s  {_summary(progress)}", err=True)
+            typer.echo(f"{progress.time_s:7.1f} s  {progress}", err=True)
 
     yield watch
-
-
-def _summary(progress: Progress) -> str:
-    others = {"overheard": progress.overheard, "impulse responses": progress.cirs}
-    counts = "".join(f", {count} {name}" for name, count in others.items() if count)
-    return (
-        f"{progress.exchanges} of {progress.tried} exchanges in {progress.time_s:.1f} s{counts}; "
-        f"faults: {_faults(progress) or 'none'}"
-    )
-
-
-def _faults(progress: Progress) -> str:
-    return ", ".join(f"{kind} {count}" for kind, count in sorted(progress.faults.items()))
 
 
 def _progress_table(progress: Progress) -> Table:
@@ -299,19 +290,10 @@ def _progress_table(progress: Progress) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
-    from uwblink.recording import counted
-
-    table = Table(title=f"{progress.time_s:.1f} s, {progress.exchanges} of {progress.tried} exchanges")
+    table = Table(title=str(progress))
     for name in ("pair", "rate (Hz)", "success", "range (m)", "FPP (dBm)"):
         table.add_column(name, justify="right")
-    for (initiator, target), pair in progress.pairs.items():
-        table.add_row(
-            f"{initiator} -> {target}",
-            f"{pair.rate_hz(progress.time_s):.1f}",
-            f"{100 * pair.good / pair.tried:.0f} %" if pair.tried else "",
-            f"{pair.range_m:.3f}" if pair.good else "",
-            f"{pair.fpp_dbm:.1f}" if pair.good else "",
-        )
-    last = f"\n{escape(printable(progress.last_fault))}" if progress.last_fault else ""
-    table.caption = f"faults: {escape(counted(progress.faults))}{last}"
+    for (initiator, target), cells in progress.rows():
+        table.add_row(f"{initiator} -> {target}", *cells)
+    table.caption = escape(printable(progress.last_fault))
     return table

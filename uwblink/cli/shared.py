@@ -1,4 +1,4 @@
-"""What the three commands have in common: options, version, errors as one line, and how they end."""
+"""What the three commands share: version, errors as one line, interrupts, JSON, and the line that shows progress."""
 
 from __future__ import annotations
 
@@ -10,26 +10,28 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from threading import Event, Thread
+from time import monotonic
 from typing import Annotated, Any, Final, NoReturn
 
 import typer
 
 from uwblink import __version__
-from uwblink.cli.options import AsJson as AsJson
-from uwblink.cli.options import Force as Force
-from uwblink.cli.options import Group
+from uwblink.cli.guide import AsJson as AsJson
+from uwblink.cli.guide import Force as Force
+from uwblink.cli.guide import Group
 from uwblink.cli.starting import INTERRUPTED as INTERRUPTED
 from uwblink.errors import PluginWarning, UwblinkError
 
 FLAGS: Final = {"map_file": "--map", "tags_from": "--tags", "duration_s": "--duration"}
-"""Parameters of uwblink whose flag is called otherwise; all others are spelt alike, with dashes."""
+"""Flags of parameters of uwblink that differ from the parameter's name with dashes."""
 
 Flags = Mapping[str, str]
-"""What stands for a parameter on a command line, by its name, where it is spelt otherwise."""
+"""Flags by parameter, where they differ from the parameter's name with dashes."""
 
 
 def new_app(text: str) -> typer.Typer:
-    """Return a command without sub-commands yet, whose help begins with `text`, and which knows `--version`."""
+    """Return a command with `--version` and without sub-commands; `text` begins its help."""
     app = typer.Typer(cls=Group, help=text, no_args_is_help=True, pretty_exceptions_enable=False)
 
     @app.callback(invoke_without_command=True)
@@ -47,12 +49,11 @@ def new_app(text: str) -> typer.Typer:
 
 
 def _versions(command: str) -> Iterator[str]:
-    """Yield the version of a command, and on a line of its own those of what its results depend on."""
+    """Yield the version of a command, and those of the libraries on which its results depend."""
     from importlib.metadata import PackageNotFoundError, version
 
     yield f"{command.split()[-1]} {__version__}"
     found = [f"Python {platform.python_version()}"]
-    # Results, files and figures depend on their versions.
     for name in ("numpy", "scipy", "duckdb", "pydantic", "simpy", "matplotlib"):
         with suppress(PackageNotFoundError):
             found.append(f"{name} {version(name)}")
@@ -66,10 +67,11 @@ def run(
     arguments: Sequence[str] | None = None,
     flags: Flags = FLAGS,
 ) -> NoReturn:
-    """Run a command and end the process: an error of `errors`, or of uwblink, is one line and status 2, Ctrl-C 130.
+    """Run a command and end the process. Errors of `errors` and of uwblink print one line; the status is 2, 130 after
+    Ctrl-C.
 
-    `statuses` gives kinds of errors another status; `arguments` replaces those of the process; `flags` are
-    those of parameters that are spelt otherwise, as `with_flags` takes them.
+    `statuses` gives kinds of errors another status; `arguments` replaces those of the process; for `flags` see
+    `with_flags`.
     """
     mistakes: tuple[type[Exception], ...] = (UwblinkError, *errors)
     status = 0
@@ -78,27 +80,27 @@ def run(
             app(args=list(sys.argv[1:] if arguments is None else arguments))
         except (Exception, KeyboardInterrupt, SystemExit) as error:
             if not interrupted():
-                text = _said(error, mistakes)
+                text = _message(error, mistakes)
                 if text is None:
                     raise
                 typer.echo(f"error: {one_line(with_flags(text, FLAGS | dict(flags)))}", err=True)
                 found = (number for kind, number in (statuses or {}).items() if isinstance(error, kind))
                 status = next(found, 2)
     if interrupted():
-        # Whatever a library made of it: an error of its own, or nothing at all.
+        # A library may have turned the interrupt into an error of its own, or swallowed it.
         typer.echo("interrupted", err=True)
         status = INTERRUPTED
     sys.exit(status)
 
 
-def _said(error: BaseException, mistakes: tuple[type[Exception], ...]) -> str | None:
-    """Return what to say of an error that comes of what the command was given; None for one of the program."""
+def _message(error: BaseException, mistakes: tuple[type[Exception], ...]) -> str | None:
+    """Return the message for an error caused by input or by the machine; None for an error of the program."""
     if isinstance(error, mistakes):
         return str(error)
     if isinstance(error, RuntimeWarning):
         return f"numbers beyond what can be computed with ({error}); nothing was written"
     if isinstance(error, OSError):
-        # Of the machine, wherever it met it: a name too long, a folder gone, a disk full.
+        # For example a name that is too long, a folder that was removed, or a full disk.
         return f"{error.filename}: {error.strerror}" if error.filename else str(error)
     if isinstance(error, MemoryError):
         return "not enough memory for that; nothing was written"
@@ -106,7 +108,7 @@ def _said(error: BaseException, mistakes: tuple[type[Exception], ...]) -> str | 
 
 
 def one_line(text: str) -> str:
-    """Return a text with what is no printable character as an escape; names and cells of files may hold anything."""
+    """Return a text with escapes for characters that are not printable, which names and cells of files may have."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
@@ -120,12 +122,17 @@ def print_json(document: Any) -> None:
     typer.echo(json.dumps(document, indent=1))
 
 
+def print_result(document: Any, text: str, *, as_json: bool) -> None:
+    """Print a result as JSON or as text."""
+    typer.echo(json.dumps(document, indent=1) if as_json else text)
+
+
 @contextmanager
 def interrupts(*, at_once: bool = False) -> Iterator[Callable[[], bool]]:
-    """Turn Ctrl-C and a polite kill into a question to ask; a second one interrupts.
+    """Yield a function that returns whether SIGINT or SIGTERM came; a second signal raises `KeyboardInterrupt`.
 
-    With `at_once` the first one interrupts, too, and the question is whether one did. The second one then is not taken:
-    it would interrupt the tidying up. A third one ends what hangs.
+    With `at_once` the first signal raises it, too, and the second one is ignored, because it would interrupt the
+    cleaning up. A third one raises it again, for programs that hang.
     """
     asked: list[int] = []
 
@@ -144,7 +151,7 @@ def interrupts(*, at_once: bool = False) -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Print what is wrong with plug-ins as one line, as errors are; take overflows and the like for errors."""
+    """Print warnings about plug-ins as one line, and raise overflows and the like as errors."""
     shown = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
@@ -154,6 +161,42 @@ def _plain_warnings() -> Iterator[None]:
             shown(message, category, *where, **more)
 
     with warnings.catch_warnings():
-        warnings.simplefilter("error", RuntimeWarning)  # of NumPy: what comes after them is nonsense
+        warnings.simplefilter("error", RuntimeWarning)  # of NumPy: results after an overflow are meaningless
         warnings.showwarning = show
         yield
+
+
+@contextmanager
+def waiting(what: str, *, after_s: float = 1.0) -> Iterator[Callable[[str], object]]:
+    """Show on a terminal what the block does, as in "fitting", if it takes longer than `after_s` seconds.
+
+    Nothing is shown elsewhere, and the line is gone after the block, which must not print. Yields a function that
+    replaces the text.
+    """
+    if not sys.stderr.isatty():
+        yield lambda _what: None
+        return
+    texts, done = [what], Event()
+    line = Thread(target=_show, args=(texts, done, after_s, monotonic()), daemon=True)
+    line.start()
+    try:
+        yield texts.append
+    finally:
+        done.set()
+        line.join()
+
+
+def _show(texts: list[str], done: Event, after_s: float, began_s: float) -> None:
+    """Show the last of the texts until the work is done."""
+    if done.wait(after_s):
+        return
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn("line"), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as line:
+        task = line.add_task(escape(texts[-1]), total=None)
+        line.tasks[task].start_time = began_s
+        while not done.wait(0.1):
+            line.update(task, description=escape(texts[-1]))

@@ -28,10 +28,10 @@ READINGS: Final = {
     "height": ("body", "height_m"),
     "temperature": ("tag", "temperature_c", "supply_v"),
 }
-"""Tables of readings, with whose they are and what is in them."""
+"""Tables of readings: the column of the body or tag, and the columns of values."""
 
 TimedRow = tuple[int, str, Any, Any]
-"""Time in nanoseconds, table, whose row it is, and its values; of ranges their index, of faults the fault."""
+"""Time in nanoseconds, table, body, tag or pair, and values; the index of a range, the fault itself."""
 
 
 _MEASURED: Final = ("range_m", "truth_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")
@@ -69,7 +69,7 @@ SCHEMAS: Final = _schemas()
 
 
 def stamped(time_ns: int, content: dict[str, Any]) -> dict[str, Any]:
-    """Return a message with its time, which Foxglove wants as seconds and nanoseconds."""
+    """Return a message with its time, in seconds and nanoseconds as Foxglove requires."""
     sec, nsec = divmod(time_ns, 1_000_000_000)
     return {"timestamp": {"sec": sec, "nsec": nsec}} | content
 
@@ -122,7 +122,7 @@ def write_mcap(recording: Path, folder: Path) -> dict[str, int]:
                 data = json.dumps(stamped(time_ns, content), allow_nan=False).encode()
             except ValueError as error:
                 raise RecordingError(
-                    f"{recording}: {topic}: holds a number that is none, which JSON cannot say"
+                    f"{recording}: {topic}: has a number that is not finite, which JSON cannot represent"
                 ) from error
             writer.add_message(channels[topic], time_ns, data, time_ns, count & 0xFFFFFFFF)
             count += 1
@@ -145,7 +145,7 @@ def _ranges(held: Contents, by_poses: Floats) -> Callable[[int], dict[str, Any]]
     e = replace(held.exchanges, truth_m=np.where(np.isfinite(held.exchanges.truth_m), held.exchanges.truth_m, by_poses))
     columns = {name: getattr(e, name).tolist() for name in ("initiator", "target", "protocol", *_MEASURED)}
     if fits_exchanges(held):
-        columns["range_m"] = held.corrected["raw_m"].tolist()  # as it was measured
+        columns["range_m"] = held.corrected["raw_m"].tolist()  # the measured range
         columns |= {n: column.tolist() for n, column in held.corrected.items() if n not in (*ENDS, "raw_m")}
     return lambda k: _known({name: column[k] for name, column in columns.items()})
 

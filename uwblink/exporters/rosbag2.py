@@ -81,12 +81,12 @@ class _Messages:
                 message = self._new("sensor_msgs/Temperature", self._header(time_ns, f"uwb_{whose}"), values[0], 0.0)
                 yield time_ns, f"/temperature/uwb_{whose}", "sensor_msgs/msg/Temperature", message
             else:
-                said = (30, whose, f"{values.kind}: {values.detail}", "", "", 0)  # a warning
+                warning = (30, whose, f"{values.kind}: {values.detail}", "", "", 0)
                 yield (
                     time_ns,
                     "/faults",
                     "rcl_interfaces/msg/Log",
-                    self._new("rcl_interfaces/Log", self._stamp(time_ns), *said),
+                    self._new("rcl_interfaces/Log", self._stamp(time_ns), *warning),
                 )
 
     def _new(self, kind: str, *values: Any) -> Any:
@@ -117,10 +117,12 @@ class _Messages:
 
     def _imu(self, time_ns: int, body: str, values: list[float]) -> Any:
         turn, pull = (self._new("geometry_msgs/Vector3", *part) for part in (values[:3], values[3:]))
-        level, unsaid = self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0), np.zeros(9)
+        level, unknown = self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0), np.zeros(9)
         # -1 stands first in the covariance of what an Imu does not measure, by the definition of the message.
         unmeasured = np.array([-1.0] + [0.0] * 8)
-        return self._new("sensor_msgs/Imu", self._header(time_ns, body), level, unmeasured, turn, unsaid, pull, unsaid)
+        return self._new(
+            "sensor_msgs/Imu", self._header(time_ns, body), level, unmeasured, turn, unknown, pull, unknown
+        )
 
 
 def _variances(held: Contents) -> Floats:

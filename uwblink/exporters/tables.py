@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import duckdb
 import numpy as np
 
 from uwblink.database import check_log, connect, log_of
@@ -20,9 +20,6 @@ from uwblink.errors import RecordingError, first_line
 from uwblink.recording.contents import READING_MB, distances_by_poses_m, pieces
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM, Poses
-
-if TYPE_CHECKING:
-    import duckdb
 
 
 def write_csv(recording: Path, folder: Path) -> dict[str, int]:
@@ -37,8 +34,6 @@ def write_parquet(recording: Path, folder: Path) -> dict[str, int]:
 
 
 def _write(recording: Path, folder: Path, suffix: str, options: str, cells: Mapping[str, str]) -> dict[str, int]:
-    import duckdb
-
     with Recording.open(recording) as opened:
         # The checks of every reader, before DuckDB reads the file directly.
         counts = {table: opened.count(table) for table in TABLES}

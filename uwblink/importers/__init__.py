@@ -83,15 +83,10 @@ def check_importer(row: Any) -> None:
     )
 
 
-def read_tables(sources: Sequence[Path], map_file: Path | None = None) -> Contents:
-    """Return the exchanges of several files with the same columns as one table; raises `ImportTableError`."""
-    with open_tables(sources, map_file) as found:
+def read_table(source: Path | Sequence[Path], map_file: Path | None = None) -> Contents:
+    """Return the exchanges of one table, all tables of a folder, or several tables; raises `ImportTableError`."""
+    with open_tables([source] if isinstance(source, Path) else source, map_file) as found:
         return found.contents()
-
-
-def read_table(source: Path, map_file: Path | None = None) -> Contents:
-    """Return the exchanges of a table, or of all tables in a folder as one; raises `ImportTableError`."""
-    return read_tables([source], map_file)
 
 
 def _read_bag(source: Path, map_file: Path | None = None) -> Contents:
@@ -109,7 +104,7 @@ IMPORTERS: Final[Registry[Importer]] = Registry(
             read_table,
             "Import exchanges, messages or ranges from a table: CSV, Parquet or JSON lines.",
             map_help="Names, units and constants (.toml).",
-            read_all=read_tables,
+            read_all=read_table,
             open_all=open_tables,
         ),
         Importer(

@@ -43,12 +43,13 @@ OWN_COLUMNS: Final = {
 class Bag:
     """An open bag: the message type of each topic, such as `geometry_msgs/msg/PoseStamped`, and the messages.
 
-    `messages(topics)` yields topic, type, recording time in nanoseconds, and message; it raises `ImportTableError`.
+    `messages(topics)` yields topic, type, recording time in nanoseconds, and the message as a dictionary of JSON types;
+    it raises `ImportTableError`.
     """
 
     path: Path
     kinds: Mapping[str, str]
-    messages: Callable[[Iterable[str]], Iterator[tuple[str, str, int, Any]]]
+    messages: Callable[[Iterable[str]], Iterator[tuple[str, str, int, dict[str, Any]]]]
 
 
 @contextmanager
@@ -83,17 +84,19 @@ def open_bag(path: Path) -> Iterator[Bag]:
 def _ros_bag(path: Path, reader: Any) -> Bag:
     """Return a bag of ROS messages, in any storage format."""
 
-    def messages(topics: Iterable[str]) -> Iterator[tuple[str, str, int, Any]]:
+    def messages(topics: Iterable[str]) -> Iterator[tuple[str, str, int, dict[str, Any]]]:
         wanted = set(topics)
         used = [connection for connection in reader.connections if connection.topic in wanted]
         for connection in used:
-            # Every bag defines its own message types, except bags of ROS 2 before Iron that are stored in SQLite.
+            # All bags define their message types, except bags in SQLite of ROS 2 before Iron.
             if connection.msgtype not in reader.typestore.types:
                 raise ImportTableError(
-                    f"{path}: does not say what a {connection.msgtype} is; convert it to MCAP in ROS, which does"
+                    f"{path}: has no definition of {connection.msgtype}; "
+                    "convert it to MCAP with ROS, which stores definitions"
                 )
         for connection, time_ns, raw in reader.messages(connections=used):
-            yield connection.topic, connection.msgtype, int(time_ns), reader.deserialize(raw, connection.msgtype)
+            message = _plain(reader.deserialize(raw, connection.msgtype))
+            yield connection.topic, connection.msgtype, int(time_ns), message
 
     return Bag(path, {connection.topic: connection.msgtype for connection in reader.connections}, messages)
 
@@ -110,13 +113,13 @@ def _json_bag(path: Path) -> Bag:
     """Return an MCAP file of JSON messages, as `uwblink export --to mcap` and Foxglove's libraries write them."""
     channels = {number: (topic, kind) for number, topic, kind, encoding in _channels(path) if encoding == "json"}
 
-    def messages(topics: Iterable[str]) -> Iterator[tuple[str, str, int, Any]]:
+    def messages(topics: Iterable[str]) -> Iterator[tuple[str, str, int, dict[str, Any]]]:
         wanted = set(topics)
         for record in _records(path):
             topic, kind = channels.get(record.channel_id, ("", "")) if isinstance(record, Message) else ("", "")
             if isinstance(record, Message) and topic in wanted:
                 try:
-                    message = json.loads(record.data)
+                    message = _plain(json.loads(record.data))
                 except (ValueError, RecursionError) as error:
                     raise ImportTableError(f"{path}: a message of {topic[:80]!r} is not JSON") from error
                 if not isinstance(message, dict):
@@ -214,7 +217,7 @@ def _with_topics(bag: Bag, column_map: ColumnMap) -> ColumnMap:
         return column_map
     if not own and len(bag.kinds) != 1:
         raise ImportTableError(
-            f'{bag.path}: a `map_file` must say which topics, as [topics."/name"]; there are {listed}'
+            f'{bag.path}: a `map_file` must name the topics, as [topics."/name"]; there are {listed}'
         )
     topics: dict[str, dict[str, float | str]] = {topic: {} for topic in own or bag.kinds}
     if not own:
@@ -228,8 +231,8 @@ def _rows(bag: Bag, column_map: ColumnMap) -> Iterator[dict[str, Any]]:
     each = column_map.each
     for topic, kind, time_ns, message in bag.messages(column_map.topics):
         # The project's own messages leave out unknown values.
-        fields = (dict.fromkeys(OWN_COLUMNS.values()) if kind == RANGE else {}) | _plain(message)
-        row = {**fields, "topic": topic, "log_time": time_ns, **column_map.topics[topic]}
+        fields = (dict.fromkeys(OWN_COLUMNS.values()) if kind == RANGE else {}) | message
+        row: dict[str, Any] = {**fields, "topic": topic, "log_time": time_ns, **column_map.topics[topic]}
         if each is None:
             yield row
         elif isinstance(row.get(each), list):

@@ -49,9 +49,9 @@ from uwblink.twr import BITS, LARGEST_ID, STAMPS
 
 POSITIONS: Final = tuple(f"{end}_{axis}_m" for end in ("from", "to") for axis in "xyz")
 DISTANCES: Final = ("range_m", "gt_range_m", *POSITIONS)
-IDS: Final = {"from_id": "who begins each exchange", "to_id": "who answers"}
+IDS: Final = {"from_id": "the initiator of each exchange", "to_id": "its target"}
 ASKED: Final = "?"
-"""Placeholder that `uwblink import guess` writes for a value that the user must give."""
+"""Placeholder of `uwblink import guess` for a value that the user must give."""
 
 NAMES: Final = (
     "time_s", *IDS, *STAMPS, "fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2", *DISTANCES,
@@ -73,27 +73,27 @@ FILE_KEYS: Final = (
     FileKey(
         "layout",
         '"exchanges", "messages", "stamps", "parts" or "ranges"',
-        "by the columns that there are; parts must be said",
-        "What a row is: an exchange; a message; a stamp with `message`, as devices log their own; one part of an "
-        "exchange, as where both devices report; a range without stamps.",
+        "by the columns; parts must be stated",
+        "What a row is: an exchange; a message; a stamp with `message`, as devices log their own; a part of an "
+        "exchange, for example if both devices report; a range without stamps.",
     ),
-    FileKey("bits", "32 or 40", "32 where the stamps fit, else 40", "Width of the counter that the stamps come from."),
+    FileKey("bits", "32 or 40", "32 if the stamps fit, else 40", "Width of the counter of the stamps, in bits."),
     FileKey(
         "counter",
         '"wrapped", "signed" or "unwrapped"',
         "by the numbers",
-        "Whether it goes from 0 to 2^bits, is negative in its upper half, or counts on.",
+        "Stamps from 0 to 2^bits; negative in the upper half; or without wraps.",
     ),
     FileKey(
         "protocol",
         '"ss", "ss-cfo", "ds", "ds-alt", "ds-sym" or a registered one',
-        "ds where there are six stamps, or ds-alt where only that makes ranges; else ss",
+        "ds if there are six stamps, or ds-alt if only that makes plausible ranges; else ss",
         "The protocol of the exchanges.",
     ),
-    FileKey("delimiter", "one of , ; tab | and blank", "by the first lines", "What stands between cells."),
-    FileKey("decimal", '"." or ","', "by the first lines", "What stands in numbers."),
-    FileKey("within_s", "number, s", "1", "Rows of one exchange lie no further apart."),
-    FileKey("columns.NAME", "text", "our name", "What the table calls the column NAME of ours."),
+    FileKey("delimiter", "one of , ; tab | and blank", "by the first lines", "Separator of cells."),
+    FileKey("decimal", '"." or ","', "by the first lines", "Decimal mark of numbers."),
+    FileKey("within_s", "number, s", "1", "Longest time between rows of one exchange."),
+    FileKey("columns.NAME", "text", "our name", "The name of the column NAME in the table."),
     FileKey(
         "units.stamps",
         '"ticks", "ps", "ns", "us", "s", or the length of a unit in seconds',
@@ -103,48 +103,52 @@ FILE_KEYS: Final = (
     FileKey(
         "units.time",
         '"s", "ms", "us", "ns" or "iso"',
-        "s, or iso where the column holds no number",
-        "Unit of `time_s`; iso is as 2024-05-06T07:08:09.5+02:00, UTC where no zone is named.",
+        "s, or iso if the column has no numbers",
+        "Unit of `time_s`; iso: 2024-05-06T07:08:09.5+02:00, in UTC without a zone.",
     ),
     FileKey(
         "units.distance",
         '"m", "cm", "mm", "ft" or "in"',
-        "m, where the numbers can be metres; else it must be said",
+        "m if the numbers can be metres; otherwise it must be stated",
         "Unit of ranges, true distances and positions.",
     ),
     FileKey(
         "units.power",
         '"dBm" or "-dBm"',
-        "dBm, where the numbers are negative; else it must be said",
-        "Unit of powers; -dBm is for those that are written without their sign.",
+        "dBm if the numbers are negative; otherwise it must be stated",
+        "Unit of powers; -dBm: written without their sign.",
     ),
     FileKey(
-        "constants.NAME", "number; text for an id", "none", "A value for all rows, for a column that is not there."
+        "constants.NAME", "number; text for an id", "none", "A value for all rows, for a column that the table lacks."
     ),
     FileKey(
-        'ids."WORD"', "whole number", "free ones, in the order of the words", "The number of an id that is a word."
+        'ids."WORD"', "whole number", "the next free ones, in alphabetical order", "The number of an id that is a word."
     ),
     FileKey("antenna_delays.unit", '"ticks" or "ns"', "ticks", "Unit of the antenna delays below."),
     FileKey(
         "antenna_delays.tx",
         "number",
         "not known; 16436 is assumed",
-        "What was programmed into all devices for sending.",
+        "Transmit antenna delay that was programmed into all devices.",
     ),
     FileKey(
         "antenna_delays.rx",
         "number",
         "not known; 16436 is assumed",
-        "What was programmed into all devices for receiving; 0 where nothing was.",
+        "Receive antenna delay that was programmed into all devices; 0 if none was.",
     ),
-    FileKey("antenna_delays.tags.ID.tx", "number", "as all", "What was programmed into one device for sending."),
-    FileKey("antenna_delays.tags.ID.rx", "number", "as all", "What was programmed into one device for receiving."),
+    FileKey(
+        "antenna_delays.tags.ID.tx", "number", "as all", "Transmit antenna delay that was programmed into one device."
+    ),
+    FileKey(
+        "antenna_delays.tags.ID.rx", "number", "as all", "Receive antenna delay that was programmed into one device."
+    ),
     FileKey("each", "text", "a message is a row", "Of bags: the list in a message whose elements are the rows."),
     FileKey(
         'topics."TOPIC"',
         "table of constants",
         "the only topic of the bag",
-        "Of bags: a topic to read, and what its messages do not say.",
+        "Of bags: a topic to read, and constants that its messages lack.",
     ),
 )
 

@@ -1,7 +1,7 @@
 """Tables of exchanges, of messages or of plain ranges, as CSV, Parquet or JSON lines, one file or several.
 
-The steps: stage the table (`staging`), combine the rows of each exchange (`long_tables`), record unusable rows as
-faults (`usable_rows`), write the exchanges in blocks. A table is refused if half of its rows or more are unusable.
+The steps: stage the table (`staging`), combine the rows of each exchange (`exchange_rows`), record unusable rows as
+faults (`exchange_rows`), write the exchanges in blocks. A table is refused if half of its rows or more are unusable.
 `range_m` is the range that the device reported, or else the range by the stamps. `gt_range_m`, or the distance between
 the two antenna positions (`from_x_m` ... `to_z_m`), is stored as the true distance of the exchange; antennas with
 positions become bodies with poses.
@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -22,27 +23,35 @@ import numpy as np
 from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import IDS, POSITIONS, ColumnMap, load_map
-from uwblink.importers.long_tables import assemble_exchanges
-from uwblink.importers.staging import ROWS_AT_ONCE, Staging, Watch, staged
-from uwblink.importers.stamps import (
+from uwblink.importers.exchange_rows import (
+    ENDS,
+    Faults,
+    UsableRows,
+    assemble_exchanges,
+    usable_exchanges,
+    usable_ranges,
+)
+from uwblink.importers.plausibility import (
     ACCEPTED_SHARE,
     MIN_ROWS,
     SAMPLE_ROWS,
     Reading,
     Sample,
     Trial,
+    check_units,
     clocks,
     find_other_reading,
+    optional,
     stamps_of,
     to_ticks,
+    truth_m,
 )
+from uwblink.importers.staging import ROWS_AT_ONCE, Staging, Watch, staged
 from uwblink.importers.tables import Columns
-from uwblink.importers.units import check_units, optional, truth_m
-from uwblink.importers.usable_rows import ENDS, Faults, UsableRows, usable_exchanges, usable_ranges
 from uwblink.recording.antenna_delays import AntennaDelay, delay_of, meta_of_delays
-from uwblink.recording.contents import Contents
+from uwblink.recording.contents import Contents, load
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Fault, Poses, Tag
+from uwblink.recording.schema import Poses, Tag
 from uwblink.ticks import ANTENNA_DELAY_TICKS, METRES_PER_TICK
 from uwblink.twr import LARGEST_ID, STAMPS, Exchanges, raw_range
 
@@ -126,7 +135,7 @@ def _notes(staging: Staging) -> list[str]:
         more = f" and {len(names) - 12} more" if len(names) > 12 else ""
         notes.append(f"{len(names)} ids are words or too large, and get numbers: {some}{more}")
     if not staging.rows.has("time_s"):
-        notes.append("there is no time; rows are put a millisecond apart, in their order")
+        notes.append("there are no times; rows are taken as a millisecond apart, in their order")
     return notes
 
 
@@ -166,7 +175,7 @@ def _reading(column_map: ColumnMap, path: Path, rows: Columns, reading: Reading,
     if contradicted:
         raise ImportTableError(
             f'{path}: by protocol "{reading.protocol}" its ranges are {_span(first)}; '
-            f"with {difference} they are {_span(other)}: say so in the map"
+            f"with {difference} they are {_span(other)}: state that in the map"
         )
     notes.append(f'read with {difference}: by protocol "{reading.protocol}" the ranges would be {_span(first)}')
     return other.reading
@@ -230,14 +239,18 @@ class TableImport:
 
         Raises what `Recording.create` raises.
         """
-        notes, faults = self._notes_and_faults()
+        notes, faults = self.notes, iter(self.faults)
+        if count := len(self.faults) + self.faults.count_too_long():
+            first = next(faults)
+            rest = f"rows cannot be used and are kept as faults; the first: {first[0].detail}"
+            notes, faults = [*notes, f"{count} of {self.total} {rest}"], chain([first], faults)
         counts = {"exchanges": 0, "poses": 0, "powers": 0, "faults": 0}
         with Recording.create(path, meta=self._meta(notes), force=force, memory_mb=250) as recording:
             recording.append_tags(self._tags())
             for exchanges, powers in self._exchanges():
                 with recording.transaction():
                     recording.append_exchanges(exchanges)
-                    recording.append_columns("powers", powers)
+                    recording.append("powers", powers)
                 counts["exchanges"] += len(exchanges)
                 counts["powers"] += len(exchanges) if powers else 0
             for poses in self._poses():
@@ -250,24 +263,10 @@ class TableImport:
 
     def contents(self) -> Contents:
         """Return the same in memory."""
-        notes, faults = self._notes_and_faults()
-        exchanges, powers = zip(*self._exchanges(), strict=True)
-        return Contents(
-            exchanges=Exchanges.concatenate(exchanges),
-            tags=self._tags(),
-            poses=Poses.concatenate([Poses.from_arrays([], "", (0.0, 0.0, 0.0)), *self._poses()]),
-            powers={name: np.concatenate([some[name] for some in powers]) for name in powers[0]},
-            faults=list(chain.from_iterable(faults)),
-            meta=self._meta(notes),
-        )
-
-    def _notes_and_faults(self) -> tuple[list[str], Iterator[list[Fault]]]:
-        faults, count = iter(self.faults), len(self.faults) + self.faults.count_too_long()
-        if not count:
-            return self.notes, faults
-        first = next(faults)
-        said = f"{count} of {self.total} rows cannot be used and are kept as faults; the first: {first[0].detail}"
-        return [*self.notes, said], chain([first], faults)
+        with TemporaryDirectory(prefix="uwblink-") as folder:
+            path = Path(folder) / "imported.uwb"
+            _, notes = self.write(path)
+            return replace(load(path), meta=self._meta(notes))
 
     def _exchanges(self) -> Iterator[tuple[Exchanges, Columns]]:
         """Yield blocks of exchanges in the order of their rows, and their columns of the table `powers`."""
@@ -361,5 +360,5 @@ def note_on_repeats(rows: Columns) -> str:
     after, others = (f"{1e3 * np.median(some):.3g} ms" for some in (gap[equal], gap[~equal]))
     return (
         f"{np.count_nonzero(equal)} of {len(pair)} ranges are exactly the one before of the same two devices, {after} "
-        f"after it where others come after {others}: are exchanges there twice, from the logs of both? They are kept"
+        f"after it, and others after {others}: the table may hold exchanges twice, from the logs of both; all are kept"
     )

@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+
+import duckdb
 
 from uwblink.errors import ImportTableError, first_line
 from uwblink.importers.tables import connect_to
@@ -13,14 +14,11 @@ from uwblink.recording.contents import Contents, load
 from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM
 from uwblink.recording.store import Store
 
-if TYPE_CHECKING:
-    import duckdb
-
 
 def read_exported(folder: Path, _map_file: Path | None = None) -> Contents:
     """Read an export to CSV or Parquet; raises `ImportTableError`."""
     if not folder.is_dir():
-        raise ImportTableError(f"{folder}: no such folder; expected what 'uwblink export' wrote")
+        raise ImportTableError(f"{folder}: no such folder; expected one that 'uwblink export' wrote")
     paths = {table: _path(folder, table) for table in TABLES}
     if paths["exchanges"] is None:
         raise ImportTableError(f"{folder}: holds no exchanges.csv or exchanges.parquet, as 'uwblink export' writes")
@@ -41,13 +39,11 @@ def _path(folder: Path, table: str) -> Path | None:
 
 
 def _take(store: Store, table: str, source: Path) -> None:
-    import duckdb
-
     with connect_to([source]) as db:
         try:
             store.insert(table, dict(db.execute(_query(db, table, source), [str(source)]).fetchnumpy()))
         except (duckdb.Error, UnicodeDecodeError, csv.Error) as error:
-            raise ImportTableError(f"{source}: not as 'uwblink export' wrote it ({first_line(error)})") from error
+            raise ImportTableError(f"{source}: not in the form of 'uwblink export' ({first_line(error)})") from error
 
 
 def _query(db: duckdb.DuckDBPyConnection, table: str, source: Path) -> str:

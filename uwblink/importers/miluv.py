@@ -3,7 +3,7 @@
 A folder holds one folder a robot with `uwb_range.csv`, and optionally `uwb_passive.csv`, `uwb_cir.csv`, `mocap.csv`,
 `imu_px4.csv` and `height.csv`, and beside those `timeshift.yaml`, `tags.yaml` (lever arms) and `anchors.yaml`
 (constellations). Stamps are those before the authors' correction (`tx1_raw` ...): unwrapped nanoseconds, which become
-ticks again. All files of a folder share one clock; `timeshift.yaml` says when it began.
+ticks again. All files of a folder have one clock; `timeshift.yaml` has its start.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import yaml
 
 from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError, first_line
-from uwblink.importers.stamps import MISSING, clocks, to_ticks, whole
+from uwblink.importers.plausibility import MISSING, clocks, to_ticks, whole
 from uwblink.importers.tables import Columns, Table
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
@@ -72,8 +72,7 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
     ranging = {*exchanges.initiator.tolist(), *exchanges.target.tolist()} - {tag.tag for tag in tags}
     tags += [Tag(number, f"tag{number}", (0.0, 0.0, 0.0)) for number in ranging]
     heard = _read_overheard(flight)
-    ids, taps = {"board": "my_id", **_ENDS}, {"magnitudes": "cir"}
-    cirs = _read(flight, "uwb_cir.csv", ids, {"first_path_index": "idx"}, lists=taps)
+    cirs = _read(flight, "uwb_cir.csv", {"board": "my_id", **_ENDS}, {"first_path_index": "idx"}, taps="cir")
     sensed = {f"w{axis}": f"angular_velocity.{axis}" for axis in "xyz"}
     sensed |= {f"a{axis}": f"linear_acceleration.{axis}" for axis in "xyz"}
     imu, height = _read(flight, "imu_px4.csv", {}, sensed), _read(flight, "height.csv", {}, {"height_m": "range"})
@@ -105,7 +104,7 @@ def _constellation(map_file: Path | None) -> str | None:
 
 def _meta(flight: Flight, start_ns: int, constellation: str | None, off_m: float) -> dict[str, Any]:
     doubled, lost = sum(flight.doubled.values()), len(flight.faults)
-    notes = [f"{doubled} rows stand in the files of two robots, and are taken once"] if doubled else []
+    notes = [f"{doubled} rows are in the files of two robots, and are imported once"] if doubled else []
     notes += [f"{lost} rows cannot be used and are kept as faults"] if lost else []
     if constellation is not None:
         notes.append(f"anchors of constellation {constellation}, {100 * off_m:.1f} cm off gt_range")
@@ -127,13 +126,13 @@ def _read(
     optional: Mapping[str, str] = {},
     stamps: Mapping[str, str] = {},
     by_clock: tuple[tuple[str, ...], ...] = (),
-    lists: Mapping[str, str] = {},
+    taps: str = "",
 ) -> Columns:
     """Return the rows of all robots' files of one name in order of time; an empty dictionary if there are none.
 
     `ids`, `numbers` and so on map names of columns to those of the files; `{raw}` is replaced by `_raw` if a file has
-    such columns. Duplicates of rows with ids are dropped; rows without ids belong to the robot's body. Rows that lack
-    a number that is not optional are faults.
+    such columns. `taps` is the column of a list. Duplicates of rows with ids are dropped; rows without ids belong to
+    the robot's body. Rows that lack a number that is not optional are faults.
     """
     parts: list[Columns] = []
     for robot in flight.robots:
@@ -141,32 +140,27 @@ def _read(
             continue
         with Table(robot / name) as table:
             raw = "_raw" if any("_raw" in header for header in table.names) else ""
-            named = {n: header.format(raw=raw) for n, header in {**ids, **numbers, **stamps}.items()}
-            extra = {n: header for n, header in optional.items() if header in table.names}
-            found = table.read(["timestamp", *named.values(), *extra.values()])[0]
-            taps = {
-                n: table.query({"taps": f"TRY_CAST({table.word(h)} AS USMALLINT[])"})["taps"] for n, h in lists.items()
-            }
-        time_ns = whole(found["timestamp"] * 1e9)
-        good, count = time_ns != MISSING, len(time_ns)
-        columns: Columns = {"time_ns": time_ns}
+            headers = {n: h.format(raw=raw) for n, h in {**ids, **numbers, **stamps, "time_s": "timestamp"}.items()}
+            headers |= {n: header for n, header in optional.items() if header in table.names}
+            found = table.read(headers.values())[0]
+            lists = table.query({"taps": f"TRY_CAST({table.word(taps)} AS USMALLINT[])"})["taps"] if taps else None
+        values = {n: found[header] for n, header in headers.items()}
+        count, all_ids = len(values["time_s"]), range(LARGEST_ID + 1)
+        columns: Columns = {"time_ns": whole(values["time_s"] * 1e9)}
+        columns |= {n: whole(np.where(np.isin(values[n], all_ids), values[n], np.nan)) for n in ids}
+        columns |= to_ticks(values, by_clock, TICKS_PER_SECOND * 1e-9, REPORT_BITS)
+        good = np.all([column != MISSING for column in columns.values()], axis=0)
+        good &= np.all([np.ones(count), *(np.isfinite(values[n]) for n in numbers)], axis=0)
+        columns |= {n: values.get(n, np.full(count, np.nan)) for n in (*numbers, *optional)}
         if not ids:
             columns["body"] = np.full(count, robot.name)
-        for ours in ids:
-            values = found[named[ours]]
-            good &= (values >= 0) & (values <= LARGEST_ID) & (values == np.rint(values))
-            columns[ours] = whole(values)
-        ticks = to_ticks({n: found[named[n]] for n in stamps}, by_clock, TICKS_PER_SECOND * 1e-9, REPORT_BITS)
-        good &= np.all([column != MISSING for column in [time_ns, *ticks.values()]], axis=0)
-        columns |= ticks | {ours: found[named[ours]] for ours in numbers}
-        good &= np.all([np.ones(count), *(np.isfinite(columns[ours]) for ours in numbers)], axis=0)
-        columns |= {n: found[extra[n]] if n in extra else np.full(count, np.nan) for n in optional}
-        for ours, column in taps.items():
-            good &= ~np.ma.getmaskarray(column)
-            columns[ours] = np.ma.getdata(column)
-        for row in np.flatnonzero(~good).tolist():
-            detail = f"{robot.name}/{name}: row {row + 2}: a number is missing or none"
-            flight.faults.append(Fault(0, name, "unusable row", detail))
+        if lists is not None:
+            good &= ~np.ma.getmaskarray(lists)
+            columns["taps"] = np.ma.getdata(lists)
+        flight.faults += [
+            Fault(0, name, "unusable row", f"{robot.name}/{name}: row {row + 2}: a number is missing or none")
+            for row in np.flatnonzero(~good).tolist()
+        ]
         parts.append({n: column[good] for n, column in columns.items()})
     if not sum(len(part["time_ns"]) for part in parts):
         return {}
@@ -211,7 +205,7 @@ def _cir_rows(columns: Columns) -> list[CirRow]:
     if not columns:
         return []
     plain = [columns[name].tolist() for name in ("time_ns", "board", "initiator", "target", "first_path_index")]
-    taps = [tuple(row.tolist()) for row in columns["magnitudes"]]
+    taps = [tuple(row.tolist()) for row in columns["taps"]]
     return [CirRow(*row) for row in zip(*plain, taps, strict=True)]
 
 
@@ -269,8 +263,7 @@ def _find_anchors(
     chosen = [one for one in found if one[1] == wanted or (wanted is None and one[0] < 0.05)]
     if not chosen:
         raise ImportTableError(
-            f"{path}: which constellation the flight was beside cannot be told from gt_range; "
-            f"choose one of {', '.join(known)}"
+            f"{path}: gt_range does not determine the constellation; choose one of {', '.join(known)}"
         )
     off_m, name, places = min(chosen)
     return name, off_m, places

@@ -9,27 +9,26 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints, few_words
 from uwblink.errors import ImportTableError, RecordingExistsError
 from uwblink.importers.bags import open_bag
+from uwblink.importers.plausibility import other_unit
 from uwblink.importers.tables import Table
-from uwblink.importers.units import other_unit
 from uwblink.recording.distances import distances_m, find_offset
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import POSE, Poses, Tag
 from uwblink.recording.tags import load_places
 from uwblink.text_files import read_text, require_regular
 from uwblink.twr import LATEST_NS, Exchanges, raw_range
-
-Place = Callable[[int, str], tuple[int, str]]
-"""Returns the line number of a pose, counted from 0, and the text of one of its cells."""
 
 MESSAGES: Final = {
     "geometry_msgs/msg/PoseStamped": ("pose.position", "pose.orientation", False),
@@ -95,88 +94,67 @@ def _from_table(path: Path, body: str | None) -> Poses:
                 "expected a first line of time_s or time_ns, body (or `body` for all rows), x, y, z, qx, qy, qz, qw, "
                 "in metres and between commas"
             )
-        cells = {name: table.number(name) for name in (*POSE, time)}
+        seconds = f"{table.number(time)} * {1.0 if time == 'time_ns' else 1e9!r}"
+        in_reach = f"{seconds} BETWEEN -{LATEST_NS} AND {LATEST_NS}"
+        # Floats are not exact for nanoseconds since 1970.
+        exact = f"coalesce({table.whole_number(time)}, CAST({seconds} AS BIGINT))" if time == "time_ns" else seconds
         # One query only: a file that is still being written would be longer the second time.
-        cells |= {"exact": table.whole_number(time)} if time == "time_ns" else {}
-        cells |= {} if body else {"body": table.word("body")}
-        found = table.query(cells)
+        cells = {name: table.number(name) for name in POSE} | {
+            time: f"CASE WHEN {in_reach} THEN CAST({exact} AS BIGINT) END"
+        }
+        found = table.query(cells | ({} if body else {"body": f"nullif({table.word('body')}, '')"}))
         if len(lines := table.rejected()):
             raise ImportTableError(f"{path}: row {lines[0]}: more cells than the header has")
-        numbers = {name: np.ma.filled(found[name], np.nan) for name in (*POSE, time)}
-        count = len(numbers["x"])
-
-        def place(row: int, name: str) -> tuple[int, str]:
-            return int(table.lines(np.array([row]))[0]), table.words_at([name], np.array([row]))[row][name]
-
-        bodies = np.full(count, body) if body else np.ma.filled(found["body"], "").astype(np.str_)
-        if (bodies == "").any():
-            raise ImportTableError(
-                f"{path}: row {place(int(np.argmax(bodies == '')), 'body')[0]}: column 'body' is empty"
-            )
-        seconds = numbers.pop(time)
-        time_ns = _nanoseconds(path, time, seconds, place)
-        if "exact" in cells:  # floats are not exact for nanoseconds since 1970
-            time_ns = np.where(np.ma.getmaskarray(found["exact"]), time_ns, np.ma.getdata(found["exact"]))
-        values = np.column_stack([numbers[name] for name in POSE])
-        return _poses(path, time_ns, bodies, values, place)
+        for name, column in found.items():
+            if np.ma.is_masked(column):
+                row = np.flatnonzero(np.ma.getmaskarray(column))[:1]
+                (cell,) = table.words_at([name], row)[int(row[0])].values()
+                expected = {time: "a time", "body": "a name"}.get(name, "a number")
+                raise ImportTableError(
+                    f"{path}: row {table.lines(row)[0]}: column {name!r}: found {cell!r}, expected {expected}"
+                )
+        bodies = np.full(len(found["x"]), body) if body else np.asarray(found["body"], np.str_)
+        values = np.column_stack([np.ma.getdata(found[name]) for name in POSE])
+        return _poses(path, np.ma.getdata(found[time]), bodies, values)
 
 
 def _from_lines(path: Path, body: str | None, *, euroc: bool) -> Poses:
     """Return the poses of a TUM or a EuRoC file."""
-    kind, mark, time, names = "TUM", None, "time_s", POSE
+    kind, delimiter, time, names = "TUM", None, "time_s", POSE
     if euroc:
-        kind, mark, time, names = "EuRoC", ",", "time_ns", ("x", "y", "z", "qw", "qx", "qy", "qz")
+        kind, delimiter, time, names = "EuRoC", ",", "time_ns", ("x", "y", "z", "qw", "qx", "qy", "qz")
     if body is None:
-        raise ImportTableError(f"{path}: a {kind} file does not say whose poses it holds; name it as `body`")
-    lines, exact, seconds, values = array("q"), array("q"), array("d"), array("d")
+        raise ImportTableError(f"{path}: a {kind} file has no names of bodies; name its body with `body`")
+    time_ns, values, scale = array("q"), array("d"), 1 if euroc else 10**9
     text = read_text(path, ImportTableError, f"{kind} file").removeprefix("\ufeff").splitlines()
-    for number, line in enumerate(text, start=1):
-        cells = line.split(mark)
+    for row, line in enumerate(text, start=1):
+        cells = line.split(delimiter)
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         if len(cells) < 8 or (len(cells) > 8 and not euroc):
-            expected = f"{time.removesuffix('_s')} {' '.join(names)}" if mark is None else f"{time}, {', '.join(names)}"
-            raise ImportTableError(f"{path}: row {number}: found {len(cells)} cells, {kind} has 8: {expected}")
-        lines.append(number)
-        seconds.append(_number(cells[0]))
-        whole = euroc and len(cells[0]) < 20 and cells[0].strip().lstrip("-").isdecimal()
-        exact.append(int(cells[0]) if whole and abs(seconds[-1]) <= LATEST_NS else 0)
-        values.extend(map(_number, cells[1:8]))
-
-    def place(row: int, name: str) -> tuple[int, str]:
-        return lines[row], text[lines[row] - 1].split(mark)[(time, *names).index(name)]
-
-    order = [names.index(name) for name in POSE]
-    time_ns = _nanoseconds(path, time, np.array(seconds), place)
-    time_ns = np.where(np.array(exact, dtype=np.int64) != 0, exact, time_ns)  # floats are not exact for these
-    return _poses(path, time_ns, np.full(len(lines), body), np.array(values).reshape(-1, 7)[:, order], place)
+            expected = (delimiter or " ").join((time, *names))
+            raise ImportTableError(f"{path}: row {row}: found {len(cells)} cells, {kind} has 8: {expected}")
+        numbers = dict(zip((time, *names), map(_number, cells), strict=False))
+        for name, cell in zip(numbers, cells, strict=False):
+            if not numbers[name].is_finite() or (name == time and abs(numbers[name]) * scale > LATEST_NS):
+                expected = "a time" if name == time else "a number"
+                raise ImportTableError(f"{path}: row {row}: column {name!r}: found {cell!r}, expected {expected}")
+        time_ns.append(round(numbers[time] * scale))
+        values.extend(float(numbers[name]) for name in POSE)
+    return _poses(path, np.array(time_ns), np.full(len(time_ns), body), np.array(values).reshape(-1, 7))
 
 
-def _number(cell: str) -> float:
+def _number(cell: str) -> Decimal:
+    """Return a cell as a decimal number, infinity if it is none; floats are not exact for nanoseconds since 1970."""
     try:
-        return float(cell)
-    except ValueError:
-        return math.nan
+        number = Decimal(cell.strip())
+    except InvalidOperation:
+        return Decimal("inf")
+    return number if number.is_finite() and math.isfinite(number) else Decimal("inf")
 
 
-def _nanoseconds(path: Path, name: str, times: Floats, place: Place) -> Ints:
-    """Return times of a column in seconds or nanoseconds as whole nanoseconds."""
-    # Seconds since 1970 have ten digits; a float of them is good to 0.2 us.
-    scaled = times if name == "time_ns" else times * 1e9
-    wrong = ~(np.abs(scaled) <= LATEST_NS)
-    if wrong.any():
-        line, cell = place(int(np.argmax(wrong)), name)
-        raise ImportTableError(f"{path}: row {line}: column {name!r}: found {cell!r}, expected a time")
-    return np.rint(scaled).astype(np.int64)
-
-
-def _poses(path: Path, time_ns: Ints, body: np.ndarray, values: Floats, place: Place | None = None) -> Poses:
-    """Return poses in order of time; `values` (n, 7) are the columns of `POSE`. `place` is for messages of errors."""
-    wrong = ~np.isfinite(values)
-    if place is not None and wrong.any():
-        row, column = (int(k) for k in np.argwhere(wrong)[0])
-        line, cell = place(row, POSE[column])
-        raise ImportTableError(f"{path}: row {line}: column {POSE[column]!r}: found {cell!r}, expected a number")
+def _poses(path: Path, time_ns: Ints, body: NDArray[np.str_], values: Floats) -> Poses:
+    """Return poses in order of time; `values` (n, 7) are the columns of `POSE`."""
     norm = np.linalg.norm(values[:, 3:], axis=1)
     bad = np.flatnonzero((norm < 0.9) | (norm > 1.1))
     if len(bad):
@@ -200,7 +178,7 @@ def _from_bag(path: Path, topics: Mapping[str, str] | None) -> Poses:
                     bodies.append(wanted[topic] or child or body_of(topic))
                     values.extend(numbers)
             except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
-                # JSON need not hold what its schema is called after.
+                # The content of JSON messages need not agree with the name of their schema.
                 raise ImportTableError(f"{path}: a message of {topic[:80]!r} is no {kind}") from error
     return _poses(path, np.array(times, dtype=np.int64), np.array(bodies, np.str_), np.array(values).reshape(-1, 7))
 
@@ -234,25 +212,25 @@ def _chosen_topics(path: Path, kinds: Mapping[str, str], topics: Mapping[str, st
     )
 
 
-def _of_message(kind: str, message: Any) -> Iterator[tuple[int, str, list[float]]]:
+def _of_message(kind: str, message: dict[str, Any]) -> Iterator[tuple[int, str, list[float]]]:
     """Yield time in nanoseconds, body (empty if the message has none), and the values of `POSE` for each pose."""
-    position, attitude, named = MESSAGES[kind]
-    for one in message.transforms if kind == "tf2_msgs/msg/TFMessage" else [message]:
-        is_json = isinstance(one, dict)
-        stamp = _at(one, "timestamp" if is_json else "header.stamp")
-        time_ns = int(_at(stamp, "sec")) * 1_000_000_000 + int(_at(stamp, "nsec" if is_json else "nanosec"))
-        places = [(position, axis) for axis in "xyz"] + [(attitude, axis) for axis in "xyzw"]
-        numbers = [float(_at(one, f"{part}.{axis}")) for part, axis in places]
-        if is_json and (abs(time_ns) > LATEST_NS or not all(map(math.isfinite, numbers))):
+    (position, attitude, has_body), is_json = MESSAGES[kind], kind.startswith("foxglove.")
+    for one in message["transforms"] if kind == "tf2_msgs/msg/TFMessage" else [message]:
+        time_ns = _field(one, "timestamp" if is_json else "header.stamp")
+        names = [*(f"{position}.{axis}" for axis in "xyz"), *(f"{attitude}.{axis}" for axis in "xyzw")]
+        numbers = [_field(one, name) for name in names]
+        if abs(time_ns) > LATEST_NS or (is_json and None in numbers):
             raise ValueError
-        child = str(one.get("child_frame_id", "") if is_json else one.child_frame_id) if named else ""
-        yield time_ns, _body_in(child), numbers  # Vicon's frames are called vicon/drone/drone
+        child = str(one.get("child_frame_id", "")) if has_body else ""
+        # A driver of ROS may give NaN, here None, while it does not see a body.
+        known = [math.nan if number is None else float(number) for number in numbers]
+        yield time_ns, _body_in(child), known  # Vicon's frames are called vicon/drone/drone
 
 
-def _at(message: Any, path: str) -> Any:
-    """Return a field of a field of a message, of ROS or of JSON."""
+def _field(message: Any, path: str) -> Any:
+    """Return a field of a field of a message."""
     for name in path.split("."):
-        message = message[name] if isinstance(message, dict) else getattr(message, name)
+        message = message[name]
     return message
 
 
@@ -304,7 +282,7 @@ def add_poses(
             found = ", ".join(sorted({tag.body for tag in seats})) or "none"
             raise ImportTableError(
                 f"{what}: its bodies are {', '.join(sorted(bodies))}, those of the tags {found}; "
-                "say in `tags_from` where the tags sit"
+                "give the bodies of the tags with `tags_from`"
             )
         if shift_ns is None:
             _check_units(what, exchanges, poses, seats, int(exchanges.time_ns.min() - poses.time_ns.min()))
@@ -366,7 +344,7 @@ def _offset_ns(text: str) -> int:
     value = _number(text)
     if not abs(value) <= 4e9:
         raise ImportTableError(f"`offset`: found {text!r}, expected seconds or auto")
-    return round(value * 1e9)
+    return round(value * 10**9)
 
 
 def _apart(exchanges_ns: np.ndarray, poses_ns: np.ndarray) -> str:

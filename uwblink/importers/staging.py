@@ -11,17 +11,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+import duckdb
 import numpy as np
 
 from uwblink.errors import ImportTableError, first_line
 from uwblink.importers.column_map import DISTANCES, IDS, NAMES, POWERS, TIME_UNITS, ColumnMap
 from uwblink.importers.tables import Columns, Table, connect_to
 from uwblink.twr import LARGEST_ID, LATEST_NS, STAMPS
-
-if TYPE_CHECKING:
-    import duckdb
 
 ROWS_AT_ONCE: Final = 245_760
 """Two row groups of DuckDB: smaller blocks would remain separate row groups in a recording."""
@@ -77,14 +75,12 @@ def staged(paths: Sequence[Path], column_map: ColumnMap, watch: Watch | None = N
 
     Columns are read if the map names them, or if their names are in `NAMES`.
     """
-    import duckdb
-
     with TemporaryDirectory(prefix="uwblink-") as folder, connect_to(paths, folder) as db:
         try:
             yield Staging(db, paths, column_map, watch)
         except (duckdb.OutOfMemoryException, duckdb.IOException) as error:
             raise ImportTableError(
-                f"{gettempdir()}: what does not fit into memory cannot be put there ({first_line(error)}); "
+                f"{gettempdir()}: what does not fit into memory cannot be written there ({first_line(error)}); "
                 "TMPDIR names another folder"
             ) from error
 
@@ -120,7 +116,7 @@ class Staging:
         names, header = self.tables[0].names, self.column_map.header(name)
         remedy = "a `map_file` can rename columns or give constants, and `uwblink import guess` proposes one"
         if {"qx", "qy", "qz", "qw"} <= {name.lower() for name in names}:
-            remedy = "these are poses, which `uwblink poses` puts into a recording"
+            remedy = "these are poses, which `uwblink poses` adds to a recording"
         there = ", ".join(names)[:400]
         return ImportTableError(f"{self.paths[0]}: column {header!r} is missing; there are {there}; {remedy}")
 

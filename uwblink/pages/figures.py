@@ -87,16 +87,16 @@ def sheet(
 
 
 def label(axes: Axes, x: str, y: str) -> None:
-    """Name the axes, draw a grid, and take the upper and right edges away."""
+    """Label the axes, draw a grid, and hide the upper and right edges."""
     axes.set_xlabel(x)
     axes.set_ylabel(y)
-    axes.grid(True, color=GRID, linewidth=STYLE["grid.linewidth"])  # also in axes of somebody who has another style
+    axes.grid(True, color=GRID, linewidth=STYLE["grid.linewidth"])  # also in axes with another style
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 
 
 def legend(figure: Figure, axes: Axes | None = None, *, texts: Sequence[str] = ()) -> None:
-    """Put the legend of some axes above the panels, in as many columns as fit; `texts` names only these entries."""
+    """Draw the legend of some axes above the panels, in as many columns as fit; `texts` selects entries."""
     handles, labels = (axes or figure.axes[0]).get_legend_handles_labels()
     kept = [k for k, text in enumerate(labels) if not texts or text in texts]
     if not kept:
@@ -124,9 +124,9 @@ def outlines(
     *,
     ends: bool = True,
 ) -> None:
-    """Draw the distribution of each of some samples (n,) in bins between edges, in per cent; `lines` say how.
+    """Draw histograms of samples (n,) in bins between edges, in per cent; `lines` are the styles of the samples.
 
-    The outermost bins hold everything beyond them; the axis says so where `ends`.
+    The outermost bins include all values beyond them; with `ends` the axis is labelled so.
     """
     low, high = float(edges[0]), float(edges[-1])
     for name, values in samples.items():

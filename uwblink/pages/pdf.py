@@ -1,4 +1,4 @@
-"""A document as PDF on A4: Matplotlib sets text and tables, pypdf puts the drawn figures in, with links and outline.
+"""A document as PDF on A4: Matplotlib sets text and tables, pypdf inserts the figures, links and the outline.
 
 Lengths are points (1/72 inch) from the upper left corner of a page.
 """
@@ -75,7 +75,7 @@ def to_pdf(document: Document, figures: Mapping[str, bytes]) -> bytes:
 
 
 class _Pages:
-    """The pages of a document with room for figures of some heights, and what is to be put on them.
+    """The pages of a document with room for figures of given heights, and the places of figures and links.
 
     `placed` are name, page and lower edge of each figure, `sections` headings with their pages, `contents` page and
     upper edge of the lines that list them.
@@ -131,7 +131,7 @@ class _Pages:
         self.y = MARGIN
 
     def _need(self, height: float) -> bool:
-        """Begin a page unless so much is left of this one; return whether it was begun."""
+        """Begin a new page if the height does not fit on this one; returns whether it did."""
         full = self.y + height > PAPER[1] - 45
         if full:
             self._new_page()
@@ -158,7 +158,7 @@ class _Pages:
         family: str = "DejaVu Sans",
         below: float = 4.0,
     ) -> None:
-        """Write a paragraph over the width of the page, on a ground of its own where it has one."""
+        """Write a paragraph over the width of the page, on a filled ground if `fill` is given."""
         if not text:
             return
         font = FontProperties(family=family, weight="bold" if bold else "normal", size=size)
@@ -188,7 +188,7 @@ class _Pages:
         return height if not table.words and height < (PAPER[1] - 2 * MARGIN) / 2 else 0.0
 
     def _table(self, table: Table, columns: list[int], widths: list[float]) -> None:
-        """Set some columns of a table; where it goes on on another page, its headings come again."""
+        """Set some columns of a table; its headings are repeated on every page."""
         over = [name for name, span in table.above for _ in range(span)]
         edges = [MARGIN + sum(widths[:k]) for k in range(len(widths) + 1)]
         self._need(self._whole(table))

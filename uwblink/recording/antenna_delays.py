@@ -4,7 +4,7 @@
 [antenna_delays]           # of all devices that are not named
 tx = 16436                 # register of the transmitter, in ticks of 15.65 ps
 rx = 16436                 # register of the receiver
-reply = 16436              # what the firmware adds to the time at which it told the chip to send a reply
+reply = 16436              # added by the firmware to the time at which it schedules a reply
 
 [antenna_delays.tags.7]    # of one device
 tx = 16446
@@ -41,7 +41,10 @@ FILE_KEYS: Final = tuple(
     for name, meaning in (
         ("tx", "Transmit antenna delay register of {}."),
         ("rx", "Receive antenna delay register of {}."),
-        ("reply", "What the firmware of {} adds to the stamps of its delayed replies; 16436, or that of tx."),
+        (
+            "reply",
+            "Constant that the firmware of {} adds to the stamps of its delayed replies; 16436, or the value of tx.",
+        ),
     )
 )
 
@@ -85,7 +88,7 @@ def delays_in_meta(meta: Mapping[str, Any]) -> AntennaDelays:
         for tag, row in rows.items():
             found[tag] = AntennaDelay(int(row["tx"]), int(row["rx"]), int(row.get("reply", row["tx"])))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"does not say what was programmed into its devices ({ALL})") from error
+        raise ValueError(f"has no usable antenna delays of its devices ({ALL})") from error
     return found
 
 
@@ -168,18 +171,18 @@ def delays_differ(then: AntennaDelays, now: AntennaDelays, tags: Iterable[int]) 
     the sum between the two registers has no effect.
     """
     pairs = {tag: (delay_of(then, tag), delay_of(now, tag)) for tag in sorted(tags)}
-    told, far_m = [], 0.0
+    changes, far_m = [], 0.0
     for tag, (before, after) in pairs.items():
         if before is None or after is None:
             continue
         longer = after.tx + after.rx - before.tx - before.rx
         if longer or after.reply - after.tx != before.reply - before.tx:
-            told.append(f"tag {tag}: {before} then, {after} now")
+            changes.append(f"tag {tag}: {before} then, {after} now")
             far_m = max(far_m, abs(longer) / 2 * TICK_S * SPEED_OF_LIGHT)
-    if not told:
+    if not changes:
         return ""
-    more = f" and {len(told) - 3} more" if len(told) > 3 else ""
+    more = f" and {len(changes) - 3} more" if len(changes) > 3 else ""
     return (
-        "it was fitted while other antenna delays were programmed than in these ranges, which it makes wrong by up to "
-        f"{100 * far_m:.1f} cm a tag ({'; '.join(told[:3])}{more}); fit anew"
+        "it was fitted with other programmed antenna delays than these ranges have, which makes them wrong by up to "
+        f"{100 * far_m:.1f} cm for each tag ({'; '.join(changes[:3])}{more}); fit again"
     )

@@ -30,10 +30,10 @@ READING_MB: Final = 300
 
 @dataclass(frozen=True, kw_only=True)
 class Contents:
-    """What a recording holds; only the exchanges are needed to make one.
+    """The contents of a recording; all fields but the exchanges are optional.
 
     `overheard`, `imu`, `height`, `powers`, `temperature` and `corrected` have the columns of the tables of these names,
-    or none; `meta` is what is known of the whole.
+    or none; `meta` are the entries of the table `meta`.
 
     >>> from uwblink import Contents, Exchanges, Tag
     >>> x = Exchanges.from_arrays([1, 2], [2, 3], tx1=[0, 9], rx1=[5, 3], tx2=[1005, 1003], rx2=[3000, 3009])
@@ -123,7 +123,7 @@ class Contents:
                 recording.append({"known_distances": "distances"}.get(table, table), getattr(self, table))
 
     def __repr__(self) -> str:
-        """Return a headline, what else there is, and the first exchanges."""
+        """Return a headline, the numbers of other rows, and the first exchanges."""
         return f"{self._line()}\n{self.exchanges!r}"
 
     def _repr_html_(self) -> str:
@@ -142,7 +142,7 @@ class Contents:
         return {"exchanges": len(self.exchanges), "poses": len(self.poses)} | columns | lists
 
     def counts(self) -> dict[str, int]:
-        """Return how many rows there are by table: the exchanges, and of the others those that have any."""
+        """Return the number of rows by table: exchanges, and other tables that have any."""
         return {name: n for name, n in self._numbers().items() if n or name == "exchanges"}
 
     def _bounds(self, start_s: float | None, stop_s: float | None) -> tuple[int, int]:

@@ -1,10 +1,10 @@
-"""The recording: one DuckDB file (`.uwb`) that simulator, recorder and importers write alike.
+"""The recording: one DuckDB file (`.uwb`), which simulator, recorder and importers write.
 
 Column meanings are those of `uwblink.twr.Exchanges`; the tables are listed in docs/architecture.md.
 
-DuckDB lets one process have a file. So a reader that finds a recording in use puts a request beside it, an empty hidden
-file; the writer copies what it has committed into a file beside the request, on a second connection of its own, so
-that recording goes on meanwhile; and the reader opens that file and deletes its name. Nothing is left behind.
+Only one process can open a DuckDB file for writing. A reader of a recording in use creates a request beside it, an
+empty hidden file; the writer copies the committed rows into a file beside the request, on a second connection, while
+recording continues; and the reader opens that file and deletes its name. No files remain.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 from uuid import uuid4
 
 from uwblink.database import log_of
@@ -27,19 +27,17 @@ from uwblink.output import PARTIAL, check_output, place_beside
 from uwblink.recording.intake import is_locked
 from uwblink.recording.schema import FORMAT_VERSION, SUFFIX, TABLES, standard_meta
 from uwblink.recording.store import Store
+from uwblink.recording.summary import Summary, summarize
 from uwblink.recording.tables import Tables, known_tables
 from uwblink.text_files import require_regular
-
-if TYPE_CHECKING:
-    from uwblink.recording.summary import Summary
 
 WANTED: Final = ".wanted"
 BEGUN: Final = ".partial-begun"
 READY: Final = ".snapshot"
-"""Endings of a request for a snapshot, of one that is being worked on, and of the snapshot."""
+"""Endings of a request for a snapshot, of a request in progress, and of the snapshot."""
 
 PATIENCE_S: Final = 30.0
-"""How long a snapshot may take: a disk of 100 MB/s copies 3 GB in this time."""
+"""Longest time for a snapshot: a disk of 100 MB/s copies 3 GB in this time."""
 
 Opened = TypeVar("Opened")
 
@@ -68,7 +66,7 @@ class Recording(Tables):
         self.path = store.path
         self._partial = partial
         self._place = ExitStack()
-        """The folder of `partial`, which goes when this is closed."""
+        """The folder of `partial`, which is removed at the end."""
 
     @classmethod
     def create(
@@ -80,12 +78,11 @@ class Recording(Tables):
         live: bool = False,
         memory_mb: int | None = None,
     ) -> Self:
-        """Start a recording beside `path`; it takes that name when the `with` block ends well.
+        """Start a recording beside `path`; it takes that name at the end of the `with` block without an error.
 
-        A `live` one has its name from the start, and what was appended stays whatever happens. Of what was
-        written no more than `memory_mb` is kept in memory, for those who write a long one some rows at a time. Raises
-        `RecordingExistsError` if `path` is there and not `force`, `RecordingError` where it cannot be written. When
-        the block raises, nothing is left behind of one that is not live.
+        A `live` recording has its name from the start, and keeps all appended rows after an error; otherwise nothing
+        remains. At most `memory_mb` of the written data is kept in memory. Raises `RecordingExistsError` if `path`
+        exists and not `force`, and `RecordingError` if it cannot be written.
         """
         final = Path(path)
         check_output(final, force=force, recording=True)
@@ -109,10 +106,9 @@ class Recording(Tables):
     def open(cls, path: str | os.PathLike[str], *, update: bool = False, memory_mb: int | None = None) -> Self:
         """Open a recording for reading, or to `update` it in place.
 
-        Of what was read from the file no more than `memory_mb` is kept in memory, for those who read a long one some
-        rows at a time; sorting more than that takes more.
+        At most `memory_mb` of the read data is kept in memory; sorting can take more.
 
-        Of one that is being recorded a snapshot is opened, which its recorder makes: everything until now. Raises
+        A recording in progress is opened as a snapshot of everything until now, which its recorder makes. Raises
         `RecordingMissingError` or `RecordingError` (a directory, not a recording, truncated, tables or columns missing,
         a newer format, in use by something that makes no snapshots).
         """
@@ -152,9 +148,9 @@ class Recording(Tables):
         value: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close; a written file takes its name, or vanishes if the block raised.
+        """Close; a written file takes its name, or is removed if the block raised.
 
-        Raises `RecordingError` where the disk does not take all of it.
+        Raises `RecordingError` if it cannot be written completely.
         """
         with self._place:
             try:
@@ -166,7 +162,7 @@ class Recording(Tables):
                 self._store.close()
 
     def _complete(self) -> None:
-        """Put everything into the file, close it, and give it its name."""
+        """Write everything into the file, close it, and give it its name."""
         self._store.finish()
         self._store.close()
         if self._partial:
@@ -174,17 +170,15 @@ class Recording(Tables):
             self._partial.replace(self.path)
 
     def snapshot(self, place: str | os.PathLike[str]) -> None:
-        """Write everything committed so far to a new file, while others go on appending; raises `RecordingError`."""
+        """Write all committed rows to a new file while other threads append; raises `RecordingError`."""
         self._store.copy_to(Path(place))
 
     def shorten_log(self) -> None:
-        """Put the log beside the file into the file, while others go on appending; raises `RecordingError`."""
+        """Write the log beside the file into the file while other threads append; raises `RecordingError`."""
         self._store.shorten_log()
 
     def show(self) -> Summary:
-        """Return what the recording holds, as a summary that prints itself."""
-        from uwblink.recording.summary import summarize
-
+        """Return the summary of the recording, which has a text form."""
         return summarize(self)
 
     def copy(
@@ -197,9 +191,9 @@ class Recording(Tables):
     ) -> None:
         """Write this recording again at `path`: every row of every table, in its order, except what is replaced.
 
-        `replacing` maps names of `TABLES` to what stands there instead: what the method of that name returns
-        (`{"exchanges": corrected}`; an empty list empties a table of rows). `meta` adds entries, or replaces those
-        with the same keys. Raises what `create` raises, and `RecordingError` for a table that recordings do not have.
+        `replacing` maps names of `TABLES` to their new content, in the form in which it is read
+        (`{"exchanges": corrected}`; an empty list for an empty table). `meta` adds entries, or replaces those
+        with the same keys. Raises what `create` raises, and `RecordingError` for an unknown table.
         """
         instead = dict(replacing or {})
         entries = dict(instead.get("meta", {})) | dict(meta or {})
@@ -216,9 +210,9 @@ class Recording(Tables):
         meta: Mapping[str, Any] | None = None,
         force: bool = False,
     ) -> Iterator[Self]:
-        """Yield a copy in the making: all tables but those `without`, to which the block appends what it likes.
+        """Yield an incomplete copy: all tables except those in `without`, which the block appends.
 
-        What the block appends need not be in memory at once. Raises what `copy` raises.
+        These do not need to be in memory at once. Raises what `copy` raises.
         """
         known_tables(without)
         entries = {} if "meta" in without else self.meta()
@@ -232,13 +226,13 @@ class Recording(Tables):
 
 
 class SnapshotMaker:
-    """The writer's side: makes a snapshot for every request, in a thread of its own.
+    """Makes a snapshot for every request, in a thread of its own; used by the writer.
 
-    `make(place)` writes what is committed to a new file. Where it raises `RecordingError` there is no snapshot.
+    `make(place)` writes the committed rows to a new file. If it raises `RecordingError` there is no snapshot.
     """
 
     def __init__(self, recording: Path, make: Callable[[Path], None]) -> None:
-        """Answer requests for a recording; removes what processes that were killed have left."""
+        """Answer requests for a recording; removes files of processes that were killed."""
         self._recording, self._make = recording, make
         self._thread: threading.Thread | None = None
         for left in (place for kind in (WANTED, BEGUN, READY, PARTIAL) for place in _beside(recording, kind)):
@@ -248,7 +242,7 @@ class SnapshotMaker:
                 left.unlink(missing_ok=True)
 
     def look(self) -> None:
-        """Start on requests, unless earlier ones are still being worked on; cheap enough for ten times a second."""
+        """Start to answer requests, unless earlier ones are in progress; for ten calls a second."""
         if self._thread is not None and self._thread.is_alive():
             return
         wanted = _beside(self._recording, WANTED)
@@ -265,7 +259,7 @@ class SnapshotMaker:
         for request in wanted:
             begun = request.with_suffix(BEGUN)
             with suppress(OSError, RecordingError):
-                request.rename(begun)  # the reader sees that somebody works on it
+                request.rename(begun)  # the reader then waits
                 with place_beside(self._recording) as place:
                     self._make(place)
                     place.rename(request.with_suffix(READY))
@@ -273,10 +267,10 @@ class SnapshotMaker:
 
 
 def open_snapshot(recording: Path, reopen: Callable[[Path], Opened]) -> Opened:
-    """Ask a recording's writer for a snapshot, and open it; the recording itself, if its writer ends meanwhile.
+    """Request a snapshot from a recording's writer and open it, or open the recording if its writer ends meanwhile.
 
-    Raises `RecordingInUseError` where the writer makes none (another program, an older version), the folder cannot be
-    written, or the disk is full.
+    Raises `RecordingInUseError` if the writer makes no snapshots (another program, an older version), the folder cannot
+    be written, or the disk is full.
     """
     request = recording.with_name(f".{recording.name}.{uuid4().hex}{WANTED}")
     ready, begun = request.with_suffix(READY), request.with_suffix(BEGUN)

@@ -1,8 +1,8 @@
 """Checks of a file before anything in it is read: its lock, its length, and that it holds tables and nothing else.
 
-A DuckDB file can carry views, macros, types and defaults, which are programs: they run when somebody reads what they
-stand for, and a macro can even replace a function of the database itself. So the catalogue is checked first, by names
-that nothing in a file can take (`system.main.`), and the file is refused if it holds any.
+A DuckDB file can have views, macros, types and defaults, which are programs: they run when they are read, and a macro
+can even replace a function of the database. So the catalogue is checked first, by names that a file cannot redefine
+(`system.main.`), and a file with any of them is refused.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MOST_META_BYTES: Final = 64_000_000
 
 ROWS_OF_ANY_FILE: Final = 20_000_000
 """Rows that any file may hold. Further rows take at least two bytes each in a file: stamps and powers are noise, which
-does not compress. A file with more was made to fill a memory."""
+does not compress. A file with more rows was made to exhaust memory."""
 
 _REFUSED: Final = (
     # Macros first, because older versions of DuckDB would take a macro of the file for what the others ask.
@@ -47,16 +47,16 @@ _REFUSED: Final = (
     ("a constraint", "constraint_text", "duckdb_constraints()"),
     ("an index", "index_name", "duckdb_indexes()"),
 )
-"""What recordings do not have: the word for it, and the column and the function of DuckDB that find its name."""
+"""Objects that recordings do not have: a word, and the column and the function of DuckDB with their names."""
 
 COLUMNS: Final = (
     "SELECT table_name, column_name, data_type FROM system.main.duckdb_columns() "
     "WHERE NOT internal AND schema_name = 'main'"
 )
-"""The query for a file's columns, by names that the file cannot replace."""
+"""The query for a file's columns, by names that the file cannot redefine."""
 
 _ROWS: Final = "SELECT table_name, estimated_size FROM system.main.duckdb_tables() WHERE NOT internal"
-"""The query for how many rows its tables have."""
+"""The query for the number of rows of its tables."""
 
 IMPORTED_AS: Final = {
     **dict.fromkeys((".csv", ".tsv", ".txt", ".gz", ".parquet", ".jsonl", ".ndjson"), "csv"),
@@ -73,7 +73,7 @@ def check_tables(ask: Ask, path: Path, size: int, tables: Mapping[str, Mapping[s
         if found:
             raise RecordingError(
                 f"{path}: holds {word}, {printable(str(found[0][0]))}, and such files consist of tables alone; "
-                "it is not read, because such things are programs"
+                "it is not read, because such objects are programs"
             )
     for table, column, kind_found in ask(COLUMNS):
         expected = tables.get(table, {}).get(column)

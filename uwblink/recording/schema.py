@@ -1,4 +1,4 @@
-"""What a recording consists of: its tables and columns, and the rows that are not exchanges."""
+"""The tables and columns of a recording, and the rows that are not exchanges."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FORMAT_VERSION: Final = 1
 SUFFIX: Final = ".uwb"
 
 POSE: Final = ("x", "y", "z", "qx", "qy", "qz", "qw")
-"""What a pose is beside its time and body: a position in metres and a quaternion."""
+"""The columns of a pose besides time and body: a position in metres and a quaternion."""
 
 TABLES: Final[dict[str, dict[str, str]]] = {
     "meta": {"key": "VARCHAR", "value": "VARCHAR"},
@@ -86,7 +86,7 @@ TABLES: Final[dict[str, dict[str, str]]] = {
 
 TRUTH_FROM: Final = "truth_from"
 BY_POSES: Final = "poses"
-"""The column of exported exchanges that says where `truth_m` is from, and what it says of distances by poses."""
+"""The column of exported exchanges with the origin of `truth_m`, and its value for distances by poses."""
 
 ADDED_LATER: Final = {
     "faults": frozenset({"initiator", "target"}),
@@ -95,12 +95,12 @@ ADDED_LATER: Final = {
         for table in ("imu", "height", "powers", "temperature", "corrected", "arrangements", "distances")
     },
 }
-"""Columns that a recording may lack, because it is older than they are; where all of a table's are, the table."""
+"""Columns that older recordings may lack; if these are all columns of a table, the table."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tag:
-    """Where a tag sits: its body, and its lever arm in that body's frame in metres.
+    """The place of a tag: its body, and its lever arm in that body's frame in metres.
 
     >>> from uwblink import Tag
     >>> Tag(1, "drone", (0.17, -0.17, -0.05)).body
@@ -129,10 +129,10 @@ class Poses(ColumnTable):
     def from_arrays(
         cls, time_ns: ArrayLike, body: ArrayLike, position_m: ArrayLike, quaternion: ArrayLike | None = None
     ) -> Poses:
-        """Return poses from lists or arrays, put in order of time; one body, position or attitude stands for all rows.
+        """Return poses from lists or arrays, in order of time; one body, position or attitude stands for all rows.
 
-        Without `quaternion` nothing is turned. Quaternions are brought to length 1. Raises `ArgumentError`, which names
-        the column and the row.
+        Without `quaternion` bodies are not rotated. Quaternions are normalised. Raises `ArgumentError` with the column
+        and the row.
 
         >>> from uwblink import Poses
         >>> poses = Poses.from_arrays([2, 1], "drone", [[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
@@ -163,9 +163,9 @@ class Poses(ColumnTable):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Something that went wrong while recording: a time-out, garbage, a failed exchange.
+    """An event of a recording such as a time-out, garbage, or a failed exchange.
 
-    `initiator` and `target` say which exchange failed; None where it was none.
+    `initiator` and `target` are those of a failed exchange, None for other faults.
     """
 
     time_ns: int
@@ -177,14 +177,14 @@ class Fault:
 
 
 SHAPES: Final = ("", "line", "plane")
-"""What may be known of where the boards of an arrangement stand: nothing, on a straight line, in a plane."""
+"""Known shapes of an arrangement of boards: none, a straight line, a plane."""
 
 
 @dataclass(frozen=True, slots=True)
 class Arrangement:
-    """A stretch of time in which boards stood still: its name, and whether on a "line" or a "plane" ("": not known).
+    """A span of time in which boards stood still: its name, and whether on a "line" or a "plane" ("": not known).
 
-    `order` are the tags as they were put along a line, from either end; empty where nobody said it.
+    `order` are the tags in their order along a line, from either end; empty if unknown.
 
     >>> from uwblink import Arrangement
     >>> Arrangement("A", 0, 60_000_000_000, "line", (3, 1, 2)).order
@@ -200,9 +200,9 @@ class Arrangement:
 
 @dataclass(frozen=True, slots=True)
 class KnownDistance:
-    """A distance between two tags' antennas that was measured otherwise (a tape, a laser), and its standard deviation.
+    """An independently measured distance between two tags' antennas (tape, laser), and its standard deviation.
 
-    It holds in one arrangement, or in all where that is "".
+    It is valid in one arrangement, or in all if `arrangement` is "".
 
     >>> from uwblink import KnownDistance
     >>> KnownDistance(1, 2, 3.06, 0.005).sigma_m
@@ -242,7 +242,7 @@ class FrameRow:
 
 
 def standard_meta() -> dict[str, Any]:
-    """Return the entries that every recording carries."""
+    """Return the entries of `meta` that every recording has."""
     return {
         "format_version": FORMAT_VERSION,
         "writer": "uwbcal",

@@ -32,21 +32,21 @@ from uwblink.recording.intake import (
 from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
 
 ROWS_AT_A_TIME: Final = 100_000
-"""Rows that a copy holds in memory at once; of impulse responses, the largest rows, this is 0.2 GB."""
+"""Rows that a copy holds in memory at once; 0.2 GB of impulse responses, which are the largest rows."""
 
 _UNFIT: Final = (duckdb.DataError, duckdb.InvalidInputException, duckdb.BinderException)
-"""What DuckDB raises for values that do not fit into a table; all else is the file's fault."""
+"""DuckDB's errors for values that do not fit into a table; other errors are of the file."""
 
 
 class Store:
-    """An open file with the tables of `TABLES`; `path` is what messages call it."""
+    """An open file with the tables of `TABLES`; `path` is its name in messages."""
 
     def __init__(
         self, connection: duckdb.DuckDBPyConnection, path: Path, size: int = 0, *, writes: bool, vanishes: bool = False
     ) -> None:
-        """Wrap an open connection to a file of `size` bytes, which bounds how long reading may take.
+        """Wrap an open connection to a file of `size` bytes, which limits the time of reading.
 
-        It may be one that `writes`; where that fails, the file of one that `vanishes` is removed by its owner.
+        `writes`: the file is open for writing. `vanishes`: its owner removes it if writing fails.
         """
         self._db, self._second = connection, connection.cursor()
         self._second_lock = threading.Lock()
@@ -114,9 +114,9 @@ class Store:
         self._db.close()
 
     def finish(self) -> None:
-        """Put everything into the file itself, nothing left in the log beside it; raises `RecordingError`.
+        """Write everything into the file itself, so that the log beside it is empty; raises `RecordingError`.
 
-        Closing does so too, but reports nothing where it cannot.
+        Closing does so too, but does not report failures.
         """
         try:
             self._db.execute("CHECKPOINT")
@@ -129,7 +129,7 @@ class Store:
             ) from error
 
     def shorten_log(self) -> None:
-        """Put what is in the log into the file, while others go on writing; raises `RecordingError`."""
+        """Write the log into the file while other threads continue to write; raises `RecordingError`."""
         try:
             with self._second_lock:
                 self._second.execute("CHECKPOINT")
@@ -169,7 +169,7 @@ class Store:
         return RecordingError(f"{self.path}: cannot be written any more ({reason} What was written before is kept")
 
     def insert(self, table: str, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Add rows from columns with the table's names; what is masked in them is missing in the table.
+        """Add rows from columns with the table's names; masked values are missing in the table.
 
         Raises `RecordingError` for values that do not fit into the table.
         """
@@ -193,12 +193,12 @@ class Store:
         self._db.unregister("batch")
 
     def read(self, query: str) -> dict[str, NDArray[Any]]:
-        """Return what a query finds, as columns; masked where it is missing. Raises `RecordingError`."""
+        """Return the result of a query as columns, masked where values are missing; raises `RecordingError`."""
         with self._reading():
             return dict(self._db.execute(query).fetchnumpy())
 
     def rows(self, query: str) -> list[tuple[Any, ...]]:
-        """Return what a query finds, as rows; raises `RecordingError`."""
+        """Return the result of a query as rows; raises `RecordingError`."""
         with self._reading():
             return self._db.execute(query).fetchall()
 
@@ -222,7 +222,7 @@ class Store:
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Have everything inserted in the block written at once, or not at all; raises `RecordingError`."""
+        """Return a context: everything inserted in it is written at once, or not at all; raises `RecordingError`."""
         try:
             self.execute("BEGIN")
             yield
@@ -262,7 +262,7 @@ class Store:
 
 
 def _value(name: str, kind: str, column: NDArray[Any], arrays: dict[str, NDArray[Any]], bound: list[Any]) -> str:
-    """Return the SQL of a column's values; adds to `arrays` what DuckDB scans, and to `bound` what is bound."""
+    """Return the SQL of a column's values; adds to `arrays` the arrays to scan, and to `bound` the bound values."""
     arrays[name], value = np.ascontiguousarray(np.ma.getdata(column)), f'"{name}"'
     if (coded := few_words(column)) is not None:
         # DuckDB would sort an array of words, which takes longer than the rest of an insertion.

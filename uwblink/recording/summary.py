@@ -1,11 +1,11 @@
-"""What a recording holds: a summary that prints itself, and as JSON; and how fast its clocks run."""
+"""Summary of a recording, as text, HTML and JSON; and the relative rates of its clocks."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -13,26 +13,28 @@ from uwblink.arrays import Floats
 from uwblink.display import as_html, cut, first_few, printable
 from uwblink.protocols.table import PROTOCOLS, third_from_target
 from uwblink.recording.schema import TABLES, Fault, Tag
+from uwblink.recording.tables import Tables
 from uwblink.recording.target_reports import single_report_blocks
 from uwblink.twr import Exchanges, intervals, names_in
 
-if TYPE_CHECKING:
-    from uwblink.recording.file import Recording
-
 IMPOSSIBLE_PPM: Final = 1000.0
-"""Skew beyond this is of a damaged stamp: boards differ by 40 ppm at most (20 ppm each, DW1000 data sheet, table 7)."""
+"""A larger skew is due to a damaged stamp: boards differ by up to 40 ppm (20 ppm each, DW1000 data sheet, table 7)."""
 
 CLEAR_PPM: Final = 0.5
-"""A smaller skew has no sign that readings of the carriers, which scatter by 0.2 ppm, could have the wrong way."""
+"""The sign of a smaller skew cannot be compared with readings of the carriers, which scatter by 0.2 ppm."""
+
+
+SIGNS: Final = {True: "same sign", False: "OTHER SIGN", None: ""}
+"""Words for whether the skews by stamps and by carriers have the same sign; None: too small to tell."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClockSkew:
-    """A pair, the smaller id first: by how many ppm the second's clock is faster than the first's.
+    """Relative rate of the clocks of a pair, the smaller id first, in ppm; positive if the second clock is faster.
 
-    `stamps_ppm` says so by the third leg of `count` exchanges, `carrier_ppm` by the carriers' readings, None where
-    there are none; `slope` is the one over the other, `residual_ppm` how far single ones scatter about their median,
-    `same_sign` None where the skew is too small to tell.
+    `stamps_ppm` is that by the third leg of `count` exchanges, `carrier_ppm` by readings of the carriers, None without
+    any; `slope` is the ratio of the second to the first, `residual_ppm` the scatter of readings about their median.
+    `same_sign` is None if the skew is too small.
     """
 
     pair: str
@@ -44,7 +46,7 @@ class ClockSkew:
 
     @property
     def slope(self) -> float | None:
-        """Return carrier over stamps, None where the skew is too small to tell."""
+        """Return the skew by carriers over that by stamps, None if the latter is too small."""
         if self.carrier_ppm is None or abs(self.stamps_ppm) <= CLEAR_PPM:
             return None
         return self.carrier_ppm / self.stamps_ppm
@@ -53,19 +55,19 @@ class ClockSkew:
         """Return stamps, carriers, slope, residual and sign in one line."""
         if self.carrier_ppm is None or self.residual_ppm is None:
             return f"pair {self.pair}: {self.stamps_ppm:+.2f} ppm by the stamps, carriers not read"
-        signs = {True: ", same sign", False: ", OTHER SIGN", None: ""}
         slope = "" if self.slope is None else f", slope {self.slope:.3f}"
+        sign = f", {SIGNS[self.same_sign]}" if SIGNS[self.same_sign] else ""
         return (
             f"pair {self.pair}: {self.stamps_ppm:+.2f} ppm by the stamps, {self.carrier_ppm:+.2f} by the carriers"
-            f"{slope}, residual {self.residual_ppm:.2f}{signs[self.same_sign]}"
+            f"{slope}, residual {self.residual_ppm:.2f}{sign}"
         )
 
 
 def target_faster_ppm(exchanges: Exchanges) -> Floats:
-    """Return by how much the target's clock is faster, by the stamps of three messages (n,); of two, no number.
+    """Return the rate of the target's clock relative to the initiator's in ppm, by stamps of three messages (n,).
 
-    Two messages of one sender are as far apart where they are received: the second and the third, if the target sends
-    both, else the first and the third. Antenna delays cancel.
+    Not finite for exchanges of two messages. Two messages of one sender have the same distance in time at the receiver:
+    the second and the third if the target sends both, else the first and the third. Antenna delays cancel.
     """
     spans = intervals(exchanges)
     from_target = np.isin(exchanges.protocol, third_from_target(names_in(exchanges.protocol)))
@@ -78,7 +80,7 @@ def target_faster_ppm(exchanges: Exchanges) -> Floats:
 def clock_skews(exchanges: Exchanges | Iterable[Exchanges]) -> list[ClockSkew]:
     """Return the skew of every pair with at least five double-sided exchanges, in the pairs' order.
 
-    `exchanges` are all, or come some at a time, as from `Recording.exchange_blocks`.
+    `exchanges` are all of them, or blocks as from `Recording.exchange_blocks`.
     """
     pairs, stamps, carriers = [np.empty(0, np.uint32)], [np.empty(0)], [np.empty(0)]
     for some in [exchanges] if isinstance(exchanges, Exchanges) else exchanges:
@@ -108,8 +110,8 @@ def _skew(pair: int, by_stamps: Floats, by_carriers: Floats) -> ClockSkew:
     return ClockSkew(f"{pair >> 16}-{pair & 0xFFFF}", len(by_stamps), stamps, carrier, spread, alike)
 
 
-def _told(skews: Sequence[ClockSkew]) -> str:
-    """Return pairs' skews in one line: how well carriers follow the stamps, and in how many pairs by the other sign."""
+def skew_summary(skews: Sequence[ClockSkew]) -> str:
+    """Return pairs' skews in one line: how well carriers agree with stamps, and how many pairs have the other sign."""
     slopes = [one.slope for one in skews if one.slope is not None]
     residuals = [one.residual_ppm for one in skews if one.residual_ppm is not None]
     if not slopes or not residuals:
@@ -121,7 +123,7 @@ def _told(skews: Sequence[ClockSkew]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class PairSummary:
-    """Exchanges of one pair: how many were recorded and failed, and how many a second (None: all at once)."""
+    """Numbers of recorded and of failed exchanges of a pair, and their rate (None: all at one time)."""
 
     initiator: int
     target: int
@@ -131,18 +133,18 @@ class PairSummary:
 
     @property
     def success(self) -> float | None:
-        """Return the share of exchanges that did not fail, None where there are none."""
+        """Return the share of exchanges that did not fail, None without exchanges."""
         tried = self.exchanges + self.failed
         return self.exchanges / tried if tried else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Summary:
-    """What a recording holds: rows by table, tags, pairs, exchanges by protocol, faults by kind, poses by body.
+    """Summary of a recording: rows by table, tags, pairs, exchanges by protocol, faults by kind, poses by body.
 
-    An exchange counts once: `reported_twice` are those that both ends reported, `contradictory` those of them whose two
-    reports differ. `span_s` is the time from the first to the last exchange; `provenance` is what `meta` says of where
-    it comes from, without the scenario and what was planted. `skews` are those of pairs that range double-sided.
+    An exchange counts once: `reported_twice` is the number of exchanges with reports of both ends, `contradictory` that
+    of those with different reports. `span_s` is the time from the first to the last exchange; `provenance` are the
+    entries of `meta` without scenario and planted values. `skews` are those of pairs with double-sided exchanges.
     """
 
     file: str
@@ -170,44 +172,67 @@ class Summary:
             f"protocols {counted(self.protocols)}"
         )
 
+    def tables(self) -> list[list[list[str]]]:
+        """Return tags, pairs and clock skews as tables of texts, each with its header."""
+        tags = [[str(t.tag), t.body, " ".join(f"{v:+.3f}" for v in t.lever_arm_m)] for t in self.tags]
+        pairs = [
+            [
+                *map(str, (p.initiator, p.target, p.exchanges, p.failed)),
+                _number(p.rate_hz, ".1f"),
+                _number(p.success, ".1%"),
+            ]
+            for p in self.pairs
+        ]
+        forms = {"stamps_ppm": "+.2f", "carrier_ppm": "+.2f", "slope": ".3f", "residual_ppm": ".2f"}
+        skews = [
+            [s.pair, *(_number(getattr(s, name), form) for name, form in forms.items()), SIGNS[s.same_sign]]
+            for s in self.skews
+        ]
+        return [
+            [["tag", "body", "lever arm (m)"], *tags],
+            [["initiator", "target", "exchanges", "failed", "rate (Hz)", "success"], *pairs],
+            [["pair", "by stamps (ppm)", "by carriers", "slope", "residual", "sign"], *skews],
+        ]
+
+    def lines(self) -> list[str]:
+        """Return lines about what the tables do not show: exchanges with two reports, poses, faults, other tables."""
+        rows = {
+            name: n for name, n in self.counts.items() if n and name not in ("exchanges", "tags", "poses", "faults")
+        }
+        twice = f"{self.reported_twice} reported by both ends, {self.contradictory} of them differently"
+        return [
+            *([twice] if self.reported_twice else []),
+            f"poses: {counted(self.poses)}",
+            f"faults: {counted(self.faults)}",
+            *([f"also: {counted(rows)}"] if rows else []),
+        ]
+
     def __str__(self) -> str:
         """Return at most 24 lines of 79 characters."""
+        tags = first_few(f"{tag.tag} on {printable(tag.body)}" for tag in self.tags)
+        skews = [f"clock skew: {skew_summary(self.skews)}"] if self.skews else []
         shown = self.pairs[:12]
-        pairs = [f"  {p.initiator:>5} -> {p.target:<5} {p.exchanges:>9} exchanges{_rate(p)}" for p in shown]
-        more = [f"  and {len(self.pairs) - len(shown)} pairs more"] if len(self.pairs) > len(shown) else []
-        return "\n".join(map(cut, [self.headline(), *self._lines(), *pairs, *more]))
+        pairs = [f"{p.initiator:>5} -> {p.target:<5} {p.exchanges:>9} exchanges{_rate(p)}" for p in shown]
+        more = [f"and {len(self.pairs) - len(shown)} pairs more"] if len(self.pairs) > len(shown) else []
+        lines = [f"tags: {tags}", *self.lines(), *skews, *pairs, *more]
+        return "\n".join([cut(self.headline()), *(cut(f"  {line}") for line in lines)])
 
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
         """Return the same for a notebook."""
-        names = ["initiator", "target", "exchanges", "failed", "rate (Hz)"]
-        rows = [[str(p.initiator), str(p.target), str(p.exchanges), str(p.failed), _hertz(p)] for p in self.pairs]
-        return as_html("; ".join([self.headline(), *(line.strip() for line in self._lines())]), [names, *rows])
-
-    def _lines(self) -> list[str]:
-        rows = {
-            name: n for name, n in self.counts.items() if n and name not in ("exchanges", "tags", "poses", "faults")
-        }
-        twice = f"  {self.reported_twice} reported by both ends, {self.contradictory} of them differently"
-        return [
-            *([twice] if self.reported_twice else []),
-            f"  tags: {first_few(f'{tag.tag} on {printable(tag.body)}' for tag in self.tags)}",
-            f"  poses: {counted(self.poses)}",
-            f"  faults: {counted(self.faults)}",
-            *([f"  also: {counted(rows)}"] if rows else []),
-            *([f"  clock skew: {_told(self.skews)}"] if self.skews else []),
-        ]
+        _, pairs, _ = self.tables()
+        return as_html("; ".join([self.headline(), *self.lines()]), pairs)
 
 
-def summarize(recording: Recording) -> Summary:
-    """Return what a recording holds, read some of it at a time; raises what its readers raise."""
+def summarize(recording: Tables) -> Summary:
+    """Return the summary of a recording, which is read in blocks; raises what its readers raise."""
     pairs, protocols, times = Counter[tuple[int, int]](), Counter[str](), list[int]()
     repeated = contradictory = 0
 
     def counting() -> Iterator[Exchanges]:
         nonlocal repeated, contradictory
-        for reports, _ in single_report_blocks(recording):
+        for reports in single_report_blocks(recording):
             e = reports.exchanges
             repeated += reports.repeated
             contradictory += len(reports.differing)
@@ -255,10 +280,10 @@ def counted(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{printable(name)} {count}" for name, count in counts.items()) or "none"
 
 
-def _hertz(pair: PairSummary) -> str:
-    return "" if pair.rate_hz is None else f"{pair.rate_hz:.1f}"
+def _number(value: float | None, form: str) -> str:
+    return "" if value is None else f"{value:{form}}"
 
 
 def _rate(pair: PairSummary) -> str:
-    rate = "" if pair.rate_hz is None else f", {_hertz(pair)} Hz"
+    rate = "" if pair.rate_hz is None else f", {pair.rate_hz:.1f} Hz"
     return f"{rate}, {pair.failed} failed" if pair.failed else rate

@@ -13,7 +13,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.arrays import Ints
 from uwblink.display import printable
 from uwblink.errors import RecordingError
 from uwblink.protocols.table import PROTOCOLS
@@ -42,7 +41,7 @@ ROWS_AT_ONCE: Final = 131_072
 
 
 class Tables:
-    """Reads and appends; each method raises `RecordingError` where it cannot.
+    """Methods that read and append rows; each raises `RecordingError` if it fails.
 
     Methods with `start_ns` and `end_ns` return the rows from the first until before the second.
     """
@@ -51,7 +50,7 @@ class Tables:
     path: Path
 
     def append(self, table: str, what: Any) -> None:
-        """Add to one of `TABLES` what the method of that name returns: exchanges, poses, columns, or rows."""
+        """Append exchanges, poses, columns or rows to one of `TABLES`, in the form in which they are read."""
         known_tables([table])
         if isinstance(what, Mapping):
             self._store.insert(table, what)
@@ -90,36 +89,28 @@ class Tables:
         self.append("faults", faults)
 
     def append_arrangements(self, arrangements: Iterable[Arrangement]) -> None:
-        """Add stretches of time in which boards stood still."""
+        """Add spans of time in which boards stood still."""
         self.append("arrangements", arrangements)
-
-    def append_distances(self, distances: Iterable[KnownDistance]) -> None:
-        """Add distances that were measured otherwise."""
-        self.append("distances", distances)
 
     def append_frames(self, rows: Iterable[FrameRow]) -> None:
         """Add raw bytes, in one transaction."""
         self.append("frames", rows)
 
     def append_overheard(self, rows: Iterable[Mapping[str, float]]) -> None:
-        """Add passively heard exchanges, one mapping of the table's columns each; NaN where there was nothing."""
+        """Add overheard exchanges, one mapping of the table's columns each; NaN for missing values."""
         listed = list(rows)
         self.append("overheard", {n: np.array([row[n] for row in listed]) for n in TABLES["overheard"]})
-
-    def append_columns(self, table: str, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Add rows to one of `TABLES` from columns with its names, in one transaction."""
-        self.append(table, columns)
 
     def append_cirs(self, rows: Iterable[CirRow]) -> None:
         """Add impulse responses, in one transaction."""
         self.append("cirs", rows)
 
     def transaction(self) -> AbstractContextManager[None]:
-        """Have everything appended in the block written at once, or not at all."""
+        """Return a context: everything appended in it is written at once, or not at all."""
         return self._store.transaction()
 
     def replace_poses(self, poses: Poses, meta: Mapping[str, Any], tags: Iterable[Tag] | None = None) -> None:
-        """Put poses, and tags where given, in place of those there are."""
+        """Replace the poses, and the tags if given."""
         with self.transaction():
             self._store.execute("DELETE FROM poses")
             self.append_poses(poses)
@@ -141,9 +132,9 @@ class Tables:
         return int(self._store.rows(f"SELECT count(*) FROM {table}")[0][0])  # noqa: S608 - a key of TABLES
 
     def tally(self, table: str, *columns: str) -> dict[tuple[Any, ...], int]:
-        """Return how many rows of one of `TABLES` have the same values, by these values in order.
+        """Return the number of rows of one of `TABLES` by the values of some columns, in ascending order.
 
-        Rows without one of the values are left out; where the file is older than a column, all are.
+        Rows with a missing value are left out; if the file lacks a column, all are.
         """
         known_tables([table])
         if not set(columns) <= self._store.columns().get(table, set()) & TABLES[table].keys():
@@ -155,28 +146,19 @@ class Tables:
 
     def exchanges(self) -> Exchanges:
         """Return all exchanges in the order in which they were written."""
-        return self._numbered()[0]
+        return self._exchanges()
 
     def exchanges_between(self, start_ns: int, end_ns: int) -> Exchanges:
         """Return the exchanges from `start_ns` until before `end_ns`, in the order in which they were written."""
-        return self.numbered_between(start_ns, end_ns)[0]
+        return self._exchanges(f"{_within(start_ns, end_ns)} ORDER BY rowid")
 
     def exchange_blocks(self, rows: int = ROWS_AT_ONCE) -> Iterator[Exchanges]:
         """Yield all exchanges in the same order, about so many `rows` at once."""
-        for block, _ in self.numbered_blocks(rows):
-            yield block
-
-    def numbered_between(self, start_ns: int, end_ns: int) -> tuple[Exchanges, Ints]:
-        """Return the exchanges of `exchanges_between`, and the number of each one's row."""
-        return self._numbered(f"{_within(start_ns, end_ns)} ORDER BY rowid")
-
-    def numbered_blocks(self, rows: int = ROWS_AT_ONCE) -> Iterator[tuple[Exchanges, Ints]]:
-        """Yield the exchanges of `exchange_blocks`, and the number of each one's row."""
         ((last,),) = self._store.rows("SELECT max(rowid) FROM exchanges")
         for start in range(0, 0 if last is None else int(last) + 1, rows):
-            yield self._numbered(f"WHERE rowid >= {start} AND rowid < {start + rows}")
+            yield self._exchanges(f"WHERE rowid >= {start} AND rowid < {start + rows}")
 
-    def _numbered(self, where: str = "") -> tuple[Exchanges, Ints]:
+    def _exchanges(self, where: str = "") -> Exchanges:
         bits = self.meta().get("timestamp_bits", REPORT_BITS)
         if isinstance(bits, bool) or bits not in BITS:
             listed = " or ".join(map(str, BITS))
@@ -186,15 +168,14 @@ class Tables:
         for names in ([row.name for row in PROTOCOLS.known()], PROTOCOLS):
             known = list(names)
             code = f"list_position({known}, protocol)::TINYINT"
-            query = f"SELECT {plain}, rowid, {code} AS protocol FROM exchanges {where}"  # noqa: S608 - names are checked words
-            columns = self._store.read(query)
+            columns = self._store.read(f"SELECT {plain}, {code} AS protocol FROM exchanges {where}")  # noqa: S608 - names are checked words
             if not np.ma.is_masked(columns["protocol"]):
                 break
         else:
             raise RecordingError(f"{self.path}: exchanges of an unknown protocol; known are {', '.join(known)}")
         found = {name: filled(column) for name, column in columns.items()}
-        protocol, numbers = np.array(known)[found.pop("protocol") - 1], found.pop("rowid")
-        return Exchanges(protocol=protocol, bits=int(bits), **found), numbers
+        protocol = np.array(known)[found.pop("protocol") - 1]
+        return Exchanges(protocol=protocol, bits=int(bits), **found)
 
     def stretches(self, rows: int) -> list[tuple[int, int]]:
         """Return consecutive spans of time (start, end in ns) with about `rows` exchanges each."""
@@ -258,9 +239,9 @@ class Tables:
         return {name: column[order] for name, column in found.items()}
 
     def overheard(self) -> Columns:
-        """Return the passively heard exchanges as columns of the table `overheard`, in order of time.
+        """Return the overheard exchanges as columns of the table `overheard`, in order of time.
 
-        Integers are int64, everything else is float64: NaN where there was nothing.
+        Integers are int64, other numbers float64, NaN for missing values.
         """
         return self._by_time("overheard")
 
@@ -273,7 +254,7 @@ class Tables:
         return self._by_time("height", start_ns, end_ns)
 
     def powers(self) -> Columns:
-        """Return the total powers of exchanges as columns of the table `powers`, in order of time; NaN where none."""
+        """Return the total powers of exchanges as columns of the table `powers`, in order of time; NaN if unknown."""
         return self._by_time("powers")
 
     def temperatures(self, start_ns: int | None = None, end_ns: int | None = None) -> Columns:
@@ -286,12 +267,12 @@ class Tables:
     def corrected(self, start_ns: int | None = None, end_ns: int | None = None) -> Columns:
         """Return the corrections of a calibration as columns of the table `corrected`, in the order of the exchanges.
 
-        NaN where there is none; recordings whose ranges are as they were measured have no rows.
+        NaN if unknown; recordings of uncorrected ranges have no rows.
         """
         return self._readings("corrected", start_ns, end_ns)
 
     def corrected_is_of_exchanges(self) -> bool:
-        """Return whether the rows of the table `corrected` are those of the exchanges; False if it is empty."""
+        """Return whether the table `corrected` has one row for each exchange; False if it is empty."""
         if not self.count("corrected"):
             return False
         differs = " OR ".join(f"e.{n} IS DISTINCT FROM c.{n}" for n in ("time_ns", "initiator", "target"))
@@ -323,7 +304,7 @@ class Tables:
         return [Fault(*row) for row in self._rows("faults", "time_ns", _within(start_ns, end_ns), blank=True)]
 
     def arrangements(self) -> list[Arrangement]:
-        """Return the stretches of time in which boards stood still, in order of time; none in older files.
+        """Return the spans of time in which boards stood still, in order of time; none in older files.
 
         Raises `RecordingError` for unknown shapes, and for orders of tags that are not on a line.
         """
@@ -340,13 +321,13 @@ class Tables:
         return found
 
     def known_distances(self) -> list[KnownDistance]:
-        """Return the distances between tags that were measured otherwise, in order of tags; none in older files."""
+        """Return the independently measured distances between tags, in order of tags; none in older files."""
         return [KnownDistance(*row) for row in self._rows("distances", "first, second")]
 
     def _rows(self, table: str, order: str, where: str = "", *, blank: bool = False) -> list[tuple[Any, ...]]:
-        """Return the rows of a table in an order; raises where a value is missing.
+        """Return the rows of a table in an order; raises `RecordingError` for a missing value.
 
-        Where they may be `blank`, missing words, numbers and lists are "", NaN and [], the ends of a fault None.
+        If values may be `blank`, missing words, numbers and lists are "", NaN and [], and the ends of a fault None.
         """
         present = self._store.columns().get(table, set())
         if not present:

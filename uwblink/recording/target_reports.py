@@ -7,7 +7,7 @@ first report is used. Differences of the second one are faults, because both are
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -27,14 +27,12 @@ COMPARED: Final = (*STAMPS, "range_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "ske
 class SingleReports:
     """Exchanges without second reports, in their order; `repeated` is the number of those.
 
-    `differing` (k, 2) are the rows of reports that differ, the initiator's first; `seconds` (repeated,) are the rows of
-    all second reports. Rows are those of the given exchanges.
+    `differing` (k, 2) are the rows of reports that differ, the initiator's first, among the given exchanges.
     """
 
     exchanges: Exchanges
     repeated: int
     differing: Ints
-    seconds: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
 def single_reports(exchanges: Exchanges) -> SingleReports:
@@ -54,7 +52,7 @@ def single_reports(exchanges: Exchanges) -> SingleReports:
         differs |= _unequal(getattr(exchanges, name), first, second)
     keep = np.ones(len(exchanges), dtype=bool)
     keep[second] = False
-    return SingleReports(exchanges[keep], int(known.sum()), np.column_stack([first, second])[differs], second)
+    return SingleReports(exchanges[keep], int(known.sum()), np.column_stack([first, second])[differs])
 
 
 def repeated_rows(exchanges: Exchanges) -> Bools:
@@ -80,48 +78,14 @@ def from_targets(exchanges: Exchanges) -> Bools:
     return np.asarray((exchanges.reporter == exchanges.target) & (exchanges.initiator != exchanges.target))
 
 
-def single_report_blocks(recording: Tables) -> Iterator[tuple[SingleReports, Exchanges]]:
-    """Yield the result of `single_reports` and its input for blocks of a recording."""
-    if not _has_target_reports(recording):
-        for block in recording.exchange_blocks(ROWS_AT_ONCE):
-            yield single_reports(block), block
-        return
-    for found, both, _ in _by_stretches(recording):
-        yield found, both
+def single_report_blocks(recording: Tables, rows: int = ROWS_AT_ONCE) -> Iterator[SingleReports]:
+    """Yield the exchanges of a recording, each once, in blocks of about `rows`.
 
-
-def single_exchange_blocks(recording: Tables, rows: int = ROWS_AT_ONCE) -> Iterator[Exchanges]:
-    """Yield blocks of about `rows` exchanges of a recording without second reports, in the order of their rows."""
-    if not _has_target_reports(recording):
-        yield from recording.exchange_blocks(rows)
-        return
-    second = [numbers[found.seconds] for found, _, numbers in _by_stretches(recording)]
-    left_out = np.concatenate([np.empty(0, np.int64), *second])
-    for block, numbers in recording.numbered_blocks(rows):
-        yield block[~np.isin(numbers, left_out)]
-
-
-def _has_target_reports(recording: Tables) -> bool:
-    """Return whether some exchanges were reported by their targets."""
-    ends = recording.tally("exchanges", "initiator", "target", "reporter")
-    return any(reporter == target != initiator for initiator, target, reporter in ends)
-
-
-def _by_stretches(recording: Tables) -> Iterator[tuple[SingleReports, Exchanges, Ints]]:
-    """Yield single reports by stretches of time, the exchanges they are from, and the numbers of these rows.
-
-    Each stretch is read with a margin, because the two reports of an exchange can be on either side of its edge. The
-    results within the margin are left out.
+    A recording with reports of targets is one block, because the two reports of an exchange can be apart.
     """
-    for start_ns, end_ns in recording.stretches(ROWS_AT_ONCE):
-        both, numbers = recording.numbered_between(start_ns - APART_NS, end_ns + APART_NS)
-        here = (both.time_ns >= start_ns) & (both.time_ns < end_ns)
-        found = single_reports(both)
-        kept = np.ones(len(both), dtype=bool)
-        kept[found.seconds] = False
-        seconds = found.seconds[here[found.seconds]]
-        differing = found.differing[here[found.differing[:, 1]]]
-        yield SingleReports(both[kept & here], len(seconds), differing, seconds), both, numbers
+    ends = recording.tally("exchanges", "initiator", "target", "reporter")
+    twice = any(reporter == target != initiator for initiator, target, reporter in ends)
+    return map(single_reports, [recording.exchanges()] if twice else recording.exchange_blocks(rows))
 
 
 def differences(exchanges: Exchanges, first: int, second: int) -> list[str]:

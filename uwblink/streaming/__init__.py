@@ -1,4 +1,4 @@
-"""Ranges as they come, corrected: from boards, or from a recording in its own time; and ways to send them on."""
+"""Streams of ranges, optionally corrected, from boards or a recording; and senders by UDP and WebSocket."""
 
 from uwblink.streaming.senders import FoxgloveServer, UdpSender
 from uwblink.streaming.sources import RangeListener, StreamedRange, stream

@@ -40,10 +40,10 @@ Stream = Generator["StreamedRange", None, None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamedRange:
-    """A range in metres, when its exchange began (host time, Unix epoch), and of whom.
+    """A range in metres, the time of its exchange (host time, Unix epoch), and its pair.
 
-    `range_m` is as the board reported it. `corrected_m` and its standard deviation `sigma_m` are NaN without a
-    calibration, and for tags that it does not know; `more` is what else the correction says, such as `clamped`.
+    `range_m` is the reported range. `corrected_m` and its standard deviation `sigma_m` are NaN without a
+    calibration, and for tags that are not calibrated; `more` are other columns of the correction, such as `clamped`.
 
     >>> import uwblink
     >>> x = uwblink.Exchanges.from_arrays([1], [2], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
@@ -65,7 +65,7 @@ class StreamedRange:
     more: Mapping[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what is known, by name; numbers that are not finite are left out, because JSON has none."""
+        """Return the known values by name; numbers that are not finite are left out, because JSON has none."""
         ends = {name: getattr(self, name) for name in ("time_ns", "initiator", "target")}
         levels = {name: getattr(self, name) for name in ("range_m", "corrected_m", "sigma_m", *_LEVELS)}
         return ends | {name: value for name, value in (levels | dict(self.more)).items() if math.isfinite(value)}
@@ -104,8 +104,8 @@ def stream(
 
     `source` is the path of a recording, or names of ports, on which `plan` is played (every two boards in turns without
     one). `calibration` corrects: a file's path, or a function as `uwblink.boards.load_correction` returns. A recording
-    plays `speed` times as fast as it was made; `inf` does not wait at all. `listeners` and `using` are for boards, as
-    `uwblink.record` takes them. Whoever takes ranges slowly delays the boards: one loop does both. Raises
+    plays `speed` times as fast as it was made; `inf` does not wait. `listeners` and `using` are for boards, as
+    in `uwblink.record`. A slow consumer of the ranges delays the boards, because one loop does both. Raises
     `ArgumentError`, `PlanError` and what `Recording.open` and `Board.open` raise before the first range. Closing the
     iterator closes the ports.
 
@@ -133,16 +133,16 @@ def stream(
     correct = _correction(calibration)
     if isinstance(source, str | os.PathLike):
         return _play(_exchanges(Path(source), correct), correct, duration_s, speed, stop)
-    chosen, told, ports = plan or RangingPlan(), as_listeners(listeners), using or SerialPorts()
+    chosen, ports = plan or RangingPlan(), using or SerialPorts()
     found = identify(source, ports)
     turns = chosen.turns(sorted(found))
     ranges: deque[StreamedRange] = deque()
-    told = [RangeListener(ranges.append, correct), DelayCheck(chosen.programmed(found)), *told]
-    for listener in told:
+    listening = [RangeListener(ranges.append, correct), DelayCheck(chosen.programmed(found)), *as_listeners(listeners)]
+    for listener in listening:
         listener.on_start(turns)
 
     def live() -> Stream:
-        recorder = Recorder(found, chosen, turns, told, ports=ports)
+        recorder = Recorder(found, chosen, turns, listening, ports=ports)
         try:
             for _ in recorder.steps(duration_s, stop):
                 while ranges:
@@ -198,7 +198,7 @@ class RangeListener(Listener):
         check_pairs(self._correct, pairs)
 
     def on_message(self, heard: Heard) -> None:
-        """Note when a report came."""
+        """Store the time of a report."""
         if isinstance(heard.message, RangeReport):
             self._came_ns[heard.board] = heard.time_ns
 

@@ -1,9 +1,9 @@
 """The codec: messages to bytes and back, without any I/O.
 
-Bytes go in as they come, in pieces of any size; messages, known text lines and counted skips come out, and every byte
-is in one of them. A message starts at the beginning, after something understood, or after a line end.
-After damage a message with fields is also taken up in the middle of a line, because the damage may have hit the line
-end before it; one without fields (`R00`) is not, because the payload of a damaged broadcast could spell it.
+The input are bytes in pieces of any size; the output are messages, known text lines and counted skips, and every byte
+is in one of them. A message starts at the beginning, after a decoded message or text, or after a line end. After
+damage a message with fields is also decoded in the middle of a line, because the line end before it may be damaged;
+one without fields (`R00`) is not, because the payload of a damaged broadcast could contain it.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def _terminator(key: bytes) -> bytes:
 
 
 class Decoder:
-    """Decodes one direction of one port. `messages` and `skipped_bytes` count what came out."""
+    """Decodes one direction of one port. `messages` and `skipped_bytes` are counts of the output."""
 
     def __init__(self, table: Mapping[bytes, type[Message]]) -> None:
         """Decode the messages of `COMMANDS` or of `REPORTS`."""
@@ -73,7 +73,7 @@ class Decoder:
         return self._drain(final=False)
 
     def take_back(self) -> bytes:
-        """Return the bytes of a message that has only begun, and forget them; none while in the middle of damage."""
+        """Remove and return the bytes of an incomplete message; none within damaged bytes."""
         if not self._clean(b""):
             return b""
         data, self._buffer = self._buffer, b""
@@ -81,23 +81,23 @@ class Decoder:
 
     @property
     def between_messages(self) -> bool:
-        """Whether everything so far was understood or skipped, and the next byte begins a message."""
+        """Whether all bytes so far are decoded or skipped, so that the next byte begins a message."""
         return self._clean(b"") and not self._buffer
 
     @property
     def begun(self) -> bytes:
-        """The key of a message that has begun and is not complete, empty without one."""
+        """The key of an incomplete message, empty without one."""
         return self._buffer[:3] if self._clean(b"") else b""
 
     def finish(self) -> list[Event]:
-        """Return what is left when no more bytes will come."""
+        """Return the remaining events after the last byte."""
         return self._drain(final=True)
 
     def _drain(self, *, final: bool) -> list[Event]:
-        """Return the events of the buffer, and keep what only more bytes can decide.
+        """Return the events of the buffer, and keep the bytes that need more bytes for a decision.
 
-        Places are tried one after the other, and what a place holds depends on the bytes before it and on as many
-        after it as it takes to decide. So events do not depend on the pieces in which the bytes came.
+        Positions are tried in order. The event at a position depends on the bytes before it and on as many after it as
+        the decision needs, so events do not depend on how the bytes were divided into pieces.
         """
         events: list[Event] = []
         buffer, start, at = self._buffer, 0, 0  # buffer[start:at] is no message
@@ -126,11 +126,11 @@ class Decoder:
         return [Skipped(data, "not a message")]
 
     def _clean(self, skipped: bytes) -> bool:
-        """Whether a line ends with the last of these skipped bytes, which may hold its end in part."""
+        """Whether a line ends with the last of these skipped bytes, which may contain a part of the line end."""
         return (self._before + skipped).endswith(self._terminator)
 
     def _understand(self, buffer: bytes, at: int, *, clean: bool) -> tuple[Event, int]:
-        """Return the message or text at a place and where it ends, or say why there is none."""
+        """Return the message or text at a position and its end; raises `NeedMore` or `Malformed`."""
         key = buffer[at : at + 3]
         kind = self._table.get(key)
         if kind is not None and (clean or buffer[at + 3 : at + 4] == b"|"):
@@ -181,7 +181,7 @@ def _expect(buffer: bytes, at: int, what: bytes) -> int:
 
 
 def _from_parts(kind: type[Message], parts: list[bytes]) -> Message:
-    """Build a message from its fields; `parts[0]` is what stands between key and first bar."""
+    """Build a message from its fields; `parts[0]` is the text between key and first bar."""
     if parts[0]:
         raise Malformed
     del parts[0]

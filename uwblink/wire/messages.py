@@ -40,7 +40,7 @@ Layout = Mapping[str, Kind]
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """What every message has: a key of three bytes and a layout."""
+    """Base of messages: a key of three bytes and a layout."""
 
     KEY: ClassVar[bytes] = b""
     FIELDS: ClassVar[Layout] = {}
@@ -57,7 +57,7 @@ def wire(kind: Kind, *, default: Any = MISSING) -> Any:
 
 @dataclass_transform(frozen_default=True, field_specifiers=(wire,))
 def message(key: bytes) -> Callable[[type[_Kind]], type[_Kind]]:
-    """Make a class a message: a frozen dataclass whose fields declared with `wire` are its layout, in their order.
+    """Make a class a message: a frozen dataclass. Its layout are the fields declared with `wire`, in their order.
 
     `key` is the letter of the direction (C: command to a board; R: its answer; S: sent unasked) and two digits. Raises
     `ArgumentError` for any other.
@@ -76,7 +76,7 @@ def message(key: bytes) -> Callable[[type[_Kind]], type[_Kind]]:
 
 @message(b"C00")
 class SetIdle(Message):
-    """C00: does nothing but answer."""
+    """C00: no effect; the board answers."""
 
 
 @message(b"C01")
@@ -102,7 +102,7 @@ class DoTests(Message):
 
 @message(b"C04")
 class SetPassive(Message):
-    """C04: listen to the exchanges of others, or stop to."""
+    """C04: listen to the exchanges of others, or stop listening."""
 
     on: bool = wire(BOOL)
 
@@ -228,7 +228,7 @@ class Overheard(Message):
     """S01: an exchange heard by a passive listener.
 
     Plain stamps, powers and skews are the listener's own; those ending in `_n` came in the frames.
-    Zero where there was nothing; `fpp3_dbm` and `skew3_ppm` are None after a single-sided exchange.
+    Zero for missing values; `fpp3_dbm` and `skew3_ppm` are None after a single-sided exchange.
     """
 
     initiator: int = wire(ID)
@@ -293,14 +293,14 @@ class Cir(Message):
 
 @dataclass(frozen=True, slots=True)
 class TextLine:
-    """A line of plain text that the firmware is known to print; the ending is as it was sent."""
+    """A known line of text of the firmware, with its line end as sent."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Skipped:
-    """Bytes that are no message, and why."""
+    """Bytes that are no message, and the reason."""
 
     data: bytes
     reason: str

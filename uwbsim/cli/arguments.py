@@ -1,4 +1,4 @@
-"""Arguments that several commands share, and the bar that shows how far long work has come."""
+"""Arguments of several commands, and their progress bar."""
 
 from __future__ import annotations
 
@@ -10,39 +10,34 @@ from typing import Annotated
 
 import typer
 
-from uwblink.cli import shared
+import uwbsim
 from uwblink.cli.guide import starting
 
 
 def shipped(incomplete: str) -> list[str]:
-    """Return the scenarios that come along, for a shell; it completes files itself where nothing was typed yet."""
-    from uwbsim import shipped_scenarios
-
-    return starting(incomplete, shipped_scenarios()) if incomplete else []
+    """Complete the name of a shipped scenario; where nothing was typed yet, the shell completes files."""
+    return starting(incomplete, uwbsim.shipped_scenarios()) if incomplete else []
 
 
 ScenarioFile = Annotated[
-    Path, typer.Argument(help="Scenario file (.toml), or the name of one that comes along.", autocompletion=shipped)
+    Path, typer.Argument(help="Scenario file (.toml), or the name of a shipped one.", autocompletion=shipped)
 ]
-Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value; repeatable.")
+]
 AllowFiles = Annotated[
     list[Path] | None,
-    typer.Option(metavar="DIR", help="Folder of files that a scenario may name, beside its own; as often as needed."),
+    typer.Option(metavar="DIR", help="Further folder in which files that the scenario names may lie; repeatable."),
 ]
-AsJson = shared.AsJson
-Force = shared.Force
 
 
 @contextmanager
-def progress(name: str, *, eta: bool = False) -> Iterator[Callable[[float], None] | None]:
-    """Show a bar on a terminal, and nothing elsewhere."""
-    if not sys.stderr.isatty():
-        yield None
-        return
+def progress(name: str, *, eta: bool = False) -> Iterator[Callable[[float], None]]:
+    """Show on a terminal how far work has come, and nothing elsewhere; yields a function of the done fraction."""
     from rich.console import Console
     from rich.markup import escape
     from rich.progress import Progress
 
-    with Progress(console=Console(stderr=True), transient=not eta) as bar:
+    with Progress(console=Console(stderr=True), transient=not eta, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task(escape(name), total=1.0)
         yield lambda fraction: bar.update(task, completed=fraction)

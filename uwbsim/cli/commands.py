@@ -1,32 +1,26 @@
-"""All sub-commands of `uwbsim`; here those on one scenario: run, serve, show, validate, schema, scenarios."""
+"""The commands of one scenario (run, serve, show, validate, schema, scenarios), and the list of all commands."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Any, Final
 
 import typer
 
-from uwblink.cli.guide import add
-from uwblink.cli.shared import interrupts, new_app, print_json
-from uwblink.cli.waiting import waiting
+import uwbsim
+from uwblink.cli import guide
+from uwblink.cli.guide import AntennaDelays, AsJson, Duration, Force, LinkDir, Seed, add
+from uwblink.cli.shared import interrupts, new_app, print_json, waiting
+from uwblink.output import check_output
 from uwbsim.cli import workbench
-from uwbsim.cli.arguments import AllowFiles, AsJson, Force, Overrides, ScenarioFile, progress, shipped
-
-if TYPE_CHECKING:
-    from uwbsim import Scenario
-
-
-AntennaDelays = Annotated[
-    Path | None, typer.Option(help="What is programmed into the tags, as calib export wrote it (.toml).")
-]
+from uwbsim.cli.arguments import AllowFiles, Overrides, ScenarioFile, progress, shipped
 
 
 def run(
     scenario: ScenarioFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")],
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed instead of the file's.")] = None,
+    output: Annotated[Path, guide.output("Recording to write (.uwb).")],
+    seed: Seed = None,
     overrides: Overrides = None,
     allow_files: AllowFiles = None,
     antenna_delays: AntennaDelays = None,
@@ -35,23 +29,19 @@ def run(
     ] = False,
     contention: Annotated[
         bool,
-        typer.Option(help="Let exchanges meet in the event loop; without, none disturbs another, and it is faster."),
+        typer.Option(help="Simulate collisions of exchanges; without, none disturbs another, and it is faster."),
     ] = True,
     force: Force = False,
 ) -> None:
     """Simulate a scenario and write what its boards and motion capture record."""
-    import uwbsim
-    from uwblink.output import check_output
-
     check_output(output, force=force, recording=True)
     loaded = _programmed(uwbsim.load(scenario, overrides or (), seed, allow_files=allow_files or ()), antenna_delays)
     with progress(loaded.run.name) as report:
         simulated = uwbsim.simulate(loaded, report, contention=contention)
+    frames: list[Any] = []
     if wire:
         simulated, frames = uwbsim.through_wire(simulated)
-        simulated.save(output, frames=frames, force=force)
-    else:
-        simulated.save(output, force=force)
+    simulated.save(output, frames=frames, force=force)
     typer.echo(
         f"{output}: {len(simulated.exchanges)} exchanges of {len(loaded.tags)} tags in "
         f"{len(loaded.pairs())} pairs, {loaded.run.duration_s:g} s, "
@@ -59,7 +49,7 @@ def run(
     )
 
 
-def _programmed(scenario: Scenario, path: Path | None) -> Scenario:
+def _programmed(scenario: uwbsim.Scenario, path: Path | None) -> uwbsim.Scenario:
     """Return a scenario with the antenna delays of a file programmed into its tags."""
     from uwbsim.scenario import with_antenna_delays
 
@@ -73,11 +63,11 @@ def scenarios(
         list[str] | None,
         typer.Argument(metavar="[NAME]...", help="Scenarios, or folders of them; else all.", autocompletion=shipped),
     ] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to copy them into.")] = None,
+    output: Annotated[Path | None, guide.output("Folder to copy them into.")] = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """List the scenarios that come along, or copy them to be changed."""
+    """List the shipped scenarios, or copy them."""
     from uwbsim.scenario import copy_scenarios, listed
 
     if output is not None:
@@ -100,19 +90,18 @@ def scenarios(
 
 def serve(
     scenario: ScenarioFile,
-    link_dir: Annotated[Path | None, typer.Option(help="Folder for stable links, tag10 and so on.")] = None,
-    faults: Annotated[Path | None, typer.Option(help="What goes wrong (.toml).")] = None,
-    poses: Annotated[Path | None, typer.Option(help="Motion capture to write as it goes (.csv), in host time.")] = None,
-    duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until Ctrl-C.")] = None,
+    link_dir: LinkDir = None,
+    faults: Annotated[Path | None, typer.Option(help="Faults of boards and of the air (.toml).")] = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="Motion capture to write while serving (.csv), in host time.")
+    ] = None,
+    duration: Duration = None,
     antenna_delays: AntennaDelays = None,
     overrides: Overrides = None,
     allow_files: AllowFiles = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the poses if they exist.")] = False,
 ) -> None:
     """Have the boards of a scenario answer on pseudo-terminals, as powered boards do on serial ports."""
-    import uwbsim
-    from uwblink.output import check_output
-
     if poses:
         check_output(poses, force=force)
     loaded = _programmed(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()), antenna_delays)
@@ -137,15 +126,12 @@ def serve(
 
 def show(
     scenario: ScenarioFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Page (.html) or picture (.png, .svg, .pdf).")],
+    output: Annotated[Path, guide.output("Page (.html) or picture (.png, .svg, .pdf).")],
     overrides: Overrides = None,
     allow_files: AllowFiles = None,
     force: Force = False,
 ) -> None:
     """Draw the room, the flights, and one exchange of each protocol."""
-    import uwbsim
-    from uwblink.output import check_output
-
     check_output(output, force=force)
     with waiting("drawing"):
         uwbsim.show(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()), output, force=force)
@@ -159,16 +145,15 @@ def validate(
     as_json: AsJson = False,
 ) -> None:
     """Summarise what a scenario will do, without running it."""
-    import uwbsim
-
     found = uwbsim.preview(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()))
-    typer.echo(json.dumps(found.to_dict(), indent=1) if as_json else str(found))
+    if as_json:
+        print_json(found.to_dict())
+    else:
+        typer.echo(found)
 
 
 def schema() -> None:
     """Print the JSON Schema of scenario files."""
-    import uwbsim
-
     typer.echo(json.dumps(uwbsim.Scenario.model_json_schema(), indent=2))
 
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from uwblink.cli.guide import add, choice, several
-from uwblink.cli.shared import INTERRUPTED, interrupts
-from uwblink.cli.waiting import waiting
-from uwbsim.cli.arguments import AllowFiles, AsJson, Force, Overrides, ScenarioFile, progress
+import uwbsim
+from uwblink.cli import guide
+from uwblink.cli.guide import AsJson, CalibrationFile, Force, Seeds, add, choice, several
+from uwblink.cli.shared import INTERRUPTED, interrupts, print_json, waiting
+from uwblink.output import check_folder, check_output
+from uwbsim.cli.arguments import AllowFiles, Overrides, ScenarioFile, progress
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    import uwbsim
+    from uwblink import RangingProtocol
     from uwbsim.twins import Compared
 
 
@@ -31,7 +32,7 @@ def _protocols() -> list[str]:
 
 
 Protocols = Annotated[
-    str, typer.Option(help="Names, separated by commas, or all.", **several(lambda: ["all", *_protocols()]))
+    str, typer.Option(help="Protocols, separated by commas, or all.", **several(lambda: ["all", *_protocols()]))
 ]
 
 
@@ -49,7 +50,7 @@ def add_to(app: typer.Typer) -> None:
 
 def compare(
     scenario: ScenarioFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for compare.html, .csv and .parquet.")],
+    output: Annotated[Path, guide.output("Folder for compare.html, .csv and .parquet.")],
     protocols: Protocols = "all",
     count: Annotated[int, typer.Option("-n", "--ranges", help="Ranges with each protocol.")] = 1_000_000,
     overrides: Overrides = None,
@@ -58,28 +59,26 @@ def compare(
     force: Force = False,
 ) -> None:
     """Simulate ranges of every protocol in the same random world, and compare their errors and costs."""
-    import uwbsim
-    from uwblink.output import check_folder
     from uwbsim.pages import FILES, write_comparison
-    from uwbsim.protocols import chosen
 
-    rows = chosen(_names(protocols))
+    rows = _rows(protocols)
     loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
     check_folder(output, FILES, force=force)
     with progress(loaded.run.name) as report:
         found = uwbsim.compare(loaded, rows, count, report)
     write_comparison(found, output, force=force)
     if as_json:
-        typer.echo(json.dumps(found.to_dict(), indent=1))
+        print_json(found.to_dict())
         return
     _print_outcomes(found)
     typer.echo(f"{output / FILES[0]}, {', '.join(FILES[1:])}")
 
 
-def _names(protocols: str) -> list[str]:
-    from uwblink import PROTOCOLS
+def _rows(protocols: str) -> list[RangingProtocol]:
+    """Return the protocols of these names, separated by commas, or all."""
+    from uwbsim.protocols import chosen
 
-    return list(PROTOCOLS) if protocols == "all" else [name.strip() for name in protocols.split(",") if name.strip()]
+    return chosen(None if protocols == "all" else [name.strip() for name in protocols.split(",") if name.strip()])
 
 
 def _print_outcomes(found: uwbsim.Comparison) -> None:
@@ -118,50 +117,49 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], gap: int, title:
 def predict(
     protocol: Annotated[
         str,
-        typer.Option(
-            help="Protocol, or a registered one.", **choice("ss", "ss-cfo", "ds", "ds-alt", "ds-sym", more=_protocols)
-        ),
+        typer.Option(help="Protocol by its name.", **choice("ss", "ss-cfo", "ds", "ds-alt", "ds-sym", more=_protocols)),
     ] = "ds",
     skew_ppm: Annotated[
-        float, typer.Option(rich_help_panel="Tags", help="How much faster the initiator's clock runs.")
+        float, typer.Option(rich_help_panel="Tags", help="Skew of the initiator's clock relative to the target's.")
     ] = 0.0,
     reply_delay_us: Annotated[
-        float, typer.Option(min=0.0, rich_help_panel="Timing", help="The target's reply, dt32.")
+        float, typer.Option(min=0.0, rich_help_panel="Timing", help="Delay of the target's reply (dt32).")
     ] = 300.0,
     final_delay_us: Annotated[
         float | None,
         typer.Option(
             min=0.0,
             rich_help_panel="Timing",
-            help="The third message's delay, dt53 (of ds, ds-alt): else 1538.7.",
+            help="Delay of the third message (dt53; only ds, ds-alt); by default 1538.7.",
         ),
     ] = None,
     distance_m: Annotated[float, typer.Option(min=0.0, rich_help_panel="Tags", help="Distance.")] = 5.0,
-    speed_mps: Annotated[float, typer.Option(rich_help_panel="Tags", help="Speed apart.")] = 0.0,
+    speed_mps: Annotated[float, typer.Option(rich_help_panel="Tags", help="Speed at which the distance grows.")] = 0.0,
     drift_ppm_per_s: Annotated[float, typer.Option(rich_help_panel="Tags", help="Change of the relative skew.")] = 0.0,
     tx_noise_ps: Annotated[
-        float, typer.Option(min=0.0, rich_help_panel="Noise", help="Noise of transmit stamps.")
+        float, typer.Option(min=0.0, rich_help_panel="Noise", help="Standard deviation of transmit stamps.")
     ] = 0.0,
     rx_noise_ps: Annotated[
-        float, typer.Option(min=0.0, rich_help_panel="Noise", help="Noise of receive stamps.")
+        float, typer.Option(min=0.0, rich_help_panel="Noise", help="Standard deviation of receive stamps.")
     ] = 150.0,
     carrier_noise_ppm: Annotated[
-        float, typer.Option(min=0.0, rich_help_panel="Noise", help="Noise of the carrier integrator.")
+        float,
+        typer.Option(min=0.0, rich_help_panel="Noise", help="Standard deviation of the carrier integrator's reading."),
     ] = 0.2,
-    carrier_bias_ppm: Annotated[float, typer.Option(rich_help_panel="Noise", help="Its bias.")] = 0.0,
+    carrier_bias_ppm: Annotated[
+        float, typer.Option(rich_help_panel="Noise", help="Bias of the carrier integrator's reading.")
+    ] = 0.0,
     delay_initiator_ns: Annotated[
         float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the initiator.")
     ] = 0.0,
     delay_target_ns: Annotated[float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the target.")] = 0.0,
     whole_ticks: Annotated[
         bool,
-        typer.Option("--whole-ticks", rich_help_panel="Noise", help="Stamps are whole ticks of 15.65 ps."),
+        typer.Option("--whole-ticks", rich_help_panel="Noise", help="Round stamps to ticks of 15.65 ps."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Predict the bias and standard deviation of a range analytically."""
-    import uwbsim
-
     found = uwbsim.predict_state(
         uwbsim.State(
             protocol=protocol,
@@ -180,29 +178,26 @@ def predict(
             whole_ticks=whole_ticks,
         )
     )
-    typer.echo(json.dumps(found.to_dict(), indent=1) if as_json else str(found))
+    if as_json:
+        print_json(found.to_dict())
+    else:
+        typer.echo(found)
 
 
 def optimum(
     scenario: ScenarioFile,
     protocols: Protocols = "all",
-    overhead_us: Annotated[float, typer.Option(min=0.0, help="What an exchange takes besides.")] = 0.0,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Folder for pictures of the curves (.png).")
-    ] = None,
+    overhead_us: Annotated[float, typer.Option(min=0.0, help="Additional time of an exchange, microseconds.")] = 0.0,
+    output: Annotated[Path | None, guide.output("Folder for pictures of the curves (.png).")] = None,
     overrides: Overrides = None,
     allow_files: AllowFiles = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
     """Find the delay of the scheduled message at which the mean of a second of a pair's ranges errs least."""
-    import uwbsim
-    from uwbsim.protocols import chosen
-
-    rows = chosen(_names(protocols))
+    rows = _rows(protocols)
     loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
     if output:
-        from uwblink.output import check_folder
         from uwbsim.pages import optimum_file, write_optima
 
         check_folder(output, [optimum_file(row.name) for row in rows], force=force)
@@ -211,7 +206,7 @@ def optimum(
     if output:
         write_optima(found, output, force=force)
     if as_json:
-        typer.echo(json.dumps([one.to_dict() for one in found], indent=1))
+        print_json([one.to_dict() for one in found])
         return
     typer.echo(f"{'protocol':10s}{'best delay':>12s}{'one range':>12s}{'takes':>10s}{'mean of 1 s':>14s}")
     for one in found:
@@ -222,22 +217,19 @@ def optimum(
 
 
 def sweep(
-    plan: Annotated[Path, typer.Argument(help="What to vary (.toml).")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")],
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; all cores if not given.")] = None,
-    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler that runs already.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on where a killed sweep ended.")] = False,
+    plan: Annotated[Path, typer.Argument(help="Sweep file: what varies (.toml).")],
+    output: Annotated[Path, guide.output("Folder for the results.")],
+    workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; by default one per core.")] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a running Dask scheduler.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue a sweep that was interrupted.")] = False,
     allow_files: AllowFiles = None,
 ) -> None:
-    """Run a scenario many times with other settings and seeds; killed and resumed it repeats nothing."""
-    import uwbsim
-
+    """Run a scenario many times with varied settings and seeds; an interrupted sweep can be resumed."""
     loaded = uwbsim.load_design(plan, allow_files=allow_files or ())
     with interrupts() as stop, progress(loaded.name, eta=True) as report:
 
         def go_on(share: float) -> None:
-            if report:
-                report(share)
+            report(share)
             if stop():  # between two chunks, when nothing is being written
                 raise KeyboardInterrupt
 
@@ -259,15 +251,13 @@ def sweep(
 
 def twin(
     recording: Annotated[Path, typer.Argument(help="Recording with poses and first-path powers (.uwb).")],
-    calibration: Annotated[Path, typer.Option("-c", "--calibration", help="Calibration of its tags (.json).")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Scenario to write (.toml).")],
-    seeds: Annotated[int | None, typer.Option(min=1, help="Simulated flights to compare with.")] = None,
+    calibration: CalibrationFile,
+    output: Annotated[Path, guide.output("Scenario to write (.toml).")],
+    seeds: Seeds = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Fit a scenario to a recording, and compare what it makes with what was measured, on a page beside it."""
-    import uwbsim
-    from uwblink.output import check_output
+    """Fit a scenario to a recording, and compare its simulation with the measurements on a page."""
     from uwbsim.pages import write_twin
     from uwbsim.twins import check_name
 
@@ -286,7 +276,7 @@ def twin(
     write_twin(found, compared, page, force=force)
     if as_json:
         rows = [one.to_dict() for one in compared]
-        typer.echo(json.dumps({"found": found.found, "unknown": found.unknown, "compared": rows}, indent=1))
+        print_json({"found": found.found, "unknown": found.unknown, "compared": rows})
         return
     _print(compared, _console(150))
     typer.echo(", ".join(map(str, (*files, page))))

@@ -1,4 +1,4 @@
-"""Scenes, comparisons, sweeps and twins as pages: one HTML file each that needs no other."""
+"""Pages of scenes, comparisons, sweeps and twins: one HTML file each, without other files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ import numpy as np
 from uwblink.output import check_folder, check_output, made_folder, write_bytes, write_files, write_text
 from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text, to_html
 from uwblink.pages.figures import picture
-from uwblink.protocols.rows import RangingProtocol
 from uwblink.protocols.table import PROTOCOLS
 from uwbsim.errors import ScenarioError
 from uwbsim.pages import figures
@@ -26,14 +25,13 @@ from uwbsim.protocols.conditions import conditions_of
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 from uwbsim.sweep.design import SweepDesign
-from uwbsim.sweep.results import Store
-from uwbsim.sweep.runner import STORE
-from uwbsim.tables import write_csv, write_parquet
+from uwbsim.sweep.runner import STORE, Store
+from uwbsim.tables import write_tables
 from uwbsim.twins import LEVEL, Compared, Twin
 
 
 def show(scenario: Scenario | Source, path: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Write the scene: .html has the room, the timing of every protocol and the preview; a picture has the room.
+    """Write a page (.html: room, preview and timing of every protocol) or a picture of the room (.png, .svg, .pdf).
 
     `scenario` is whatever `load` takes, or a `Scenario`. Raises `ScenarioError` for a suffix other than .html, .png,
     .svg and .pdf, and what `check_output` raises.
@@ -66,29 +64,29 @@ def show(scenario: Scenario | Source, path: str | os.PathLike[str], *, force: bo
 
 
 def scene(scenario: Scenario) -> Document:
-    """Return the scene: its room, the preview, and an exchange of each protocol."""
-    # One protocol of each course of messages: formulas make no difference to a picture of them.
-    distinct: dict[Any, tuple[str, RangingProtocol]] = {}
+    """Return the page of a scene: its room, the preview, and an exchange of each protocol."""
+    # Protocols of equal messages differ in their formulas only, which no picture shows: the first of them is drawn.
+    distinct: dict[Any, str] = {}
     for name, row in PROTOCOLS.items():
-        distinct.setdefault(row.messages, (name, row))
+        distinct.setdefault(row.messages, name)
     blocks: list[Block] = [
         Picture(
             "room",
             partial(figures.room, scenario=scenario),
-            "Bodies' paths (two minutes at most), tags where they start, obstacles, the room's walls; to scale.",
+            "Paths of bodies (two minutes at most), tags at the start, obstacles and walls of the room, to scale.",
         ),
-        Heading("What will happen"),
+        Heading("Preview"),
         Listing(str(preview(scenario)), table=True),
         Heading("One exchange"),
         Text(
-            "Every stamp, and what the paper calls it; pale: preamble and start of frame, full: header and data. dt41 "
-            "is the initiator's round trip, dt32 the target's reply, dt53 and dt64 the third leg as its sender and its "
-            "receiver have it."
+            "All stamps, with their names in the paper; pale: preamble and start of frame, full: header and data. dt41 "
+            "is the initiator's round trip, dt32 the target's reply, dt53 and dt64 the third interval by the clocks of "
+            "its sender and of its receiver."
         ),
     ]
-    for name, row in distinct.values():
+    for name in distinct.values():
         draw = partial(figures.timing, scenario=scenario, name=name)
-        blocks.append(Picture(f"timing-{name}", draw, f"{row.title}."))
+        blocks.append(Picture(f"timing-{name}", draw, f"{PROTOCOLS[name].title}."))
     return Document(scenario.run.name, blocks)
 
 
@@ -106,10 +104,10 @@ COLUMNS: Final[dict[str, Callable[[ProtocolErrors], str]]] = {
     "radio on (µs)": lambda o: f"{1e6 * o.radio_on_s:.0f}",
     "rate (1/s)": lambda o: f"{o.rate_hz:.0f}",
 }
-"""What tables on the page and on the terminal show of a protocol."""
+"""Columns of tables of protocols, on the page and on the terminal."""
 
 FILES: Final = ("compare.html", "compare.csv", "compare.parquet")
-"""What `write_comparison` writes into its folder."""
+"""Names of the files of `write_comparison`."""
 
 
 def write_comparison(found: Comparison, folder: Path, *, force: bool = False) -> None:
@@ -121,13 +119,12 @@ def write_comparison(found: Comparison, folder: Path, *, force: bool = False) ->
     text, rows = to_html(comparison(found)), [one.to_dict() for one in found.outcomes]
     html, table, packed = (folder / name for name in FILES)
     with made_folder(folder):
-        write_parquet(packed, rows, force=force)  # first, because it asks most of the folder's name
+        write_tables(table, packed, rows, force=force)  # first, because Parquet asks most of the folder's name
         write_text(html, text, force=force)
-        write_csv(table, rows, force=force)
 
 
 def comparison(found: Comparison) -> Document:
-    """Return the comparison of protocols: what they know, what they cost, which wins where, and errors over what."""
+    """Return the page of a comparison: errors, costs, the best protocol by delay, and curves of errors."""
     scenario, outcomes, samples = found.scenario, found.outcomes, found.samples
     protocols = {row.name: row for row in found.protocols}
     states = conditions_of(scenario)
@@ -146,15 +143,15 @@ def comparison(found: Comparison) -> Document:
         (
             {name: over_state(row, states, states.distance_m, samples[name]) for name, row in protocols.items()},
             "distance (m)",
-            "Error over distance: bins of as many ranges each.",
+            "Error over distance, in bins of equal numbers of ranges.",
         ),
         (
             {name: over_state(row, states, states.power_dbm, samples[name]) for name, row in protocols.items()},
             "first-path power (dBm)",
-            "Error over first-path power, likewise.",
+            "Error over first-path power, in bins of equal numbers of ranges.",
         ),
     ]
-    # Two tables, what protocols know and what they cost, each whole on a screen.
+    # Two tables, errors and costs, each narrow enough for a screen.
     cut = list(COLUMNS).index("messages")
     halves = [list(COLUMNS)[:cut], ["protocol", *list(COLUMNS)[cut:]]]
     winners = [
@@ -168,32 +165,33 @@ def comparison(found: Comparison) -> Document:
     ]
     blocks: list[Block] = [
         Text(
-            f"{outcomes[0].ranges:,} raw ranges with each protocol in the same world, with the same noise. Errors are "
-            "those of raw ranges: antenna delays, power bias and reflections are in them."
+            f"{outcomes[0].ranges:,} raw ranges per protocol, in the same world and with the same noise. Errors are "
+            "those of raw ranges, with antenna delays, power bias and reflections."
         ),
         *(Table(names, [[COLUMNS[name](one) for name in names] for one in outcomes]) for names in halves),
         Text(
-            "Predicted: by the protocol's formulas, without simulating. Air: sum of the frames' lengths; duration: "
-            "from the first to the last; radio on: sending and listening, of both radios together, a proxy of energy; "
-            "rate: exchanges one after the other.",
+            "Predicted: analytically, without simulation. Air: total duration of the frames; duration: from the start "
+            "of the first frame to the end of the last; radio on: time for which the two radios send or listen, a "
+            "proxy of energy; rate: exchanges per second, one after the other.",
             "note",
         ),
         Picture(
             "errors",
             partial(figures.histograms, samples=samples),
-            "Errors. The outermost bins hold everything beyond them.",
+            "Distribution of errors. The outermost bins include all values beyond them.",
         ),
-        Heading("Which wins where"),
+        Heading("Best protocol by delay"),
         Text(
-            "By prediction, once delays and power bias are calibrated, without reflections. One range: the least error "
-            "of a single range. Per second: the least error of the mean of what fits into a second."
+            "Predicted, after calibration of delays and power bias, without reflections. One range: the protocol with "
+            "the least error of a single range. Per second: that with the least error of the mean of the ranges of a "
+            "second."
         ),
         Table(["scheduled delay (µs)", "one range", "per second", *(f"{name} (cm)" for name in protocols)], winners),
-        Heading("Over what"),
+        Heading("Errors over skew, delay, distance and power"),
         Text(
-            "Points are simulated, lines predicted; the first two without delays, power bias and reflections. Axes "
-            "that cover decades are logarithmic, and say so; biases have a sign, so theirs is to scale up to ± "
-            "1 cm and logarithmic beyond."
+            "Points are simulated, lines predicted; the first two figures are without antenna delays, power bias and "
+            "reflections. Axes that cover decades are logarithmic and labelled so; the axis of biases is linear up "
+            "to ± 1 cm and logarithmic beyond."
         ),
     ]
     for curves, x, caption in over:
@@ -203,7 +201,7 @@ def comparison(found: Comparison) -> Document:
 
 
 def optimum_file(protocol: str) -> str:
-    """Return what `write_optima` calls the picture of a protocol."""
+    """Return the name of the picture of a protocol that `write_optima` writes."""
     return f"optimum-{protocol}.png"
 
 
@@ -227,29 +225,30 @@ RESULTS: Final = {
     "curve_rms_m": "",
     "correction_rms_m": "",
     "median_m": "median error of raw ranges",
-    "low_m": "what 2.5 % of the errors of raw ranges lie below",
-    "high_m": "what 2.5 % of the errors of raw ranges lie above",
-    "predicted_bias_m": "mean error as it is predicted without simulating",
-    "predicted_std_m": "standard deviation as it is predicted without simulating",
+    "low_m": "2.5 % quantile of the errors of raw ranges",
+    "high_m": "97.5 % quantile of the errors of raw ranges",
+    "predicted_bias_m": "predicted mean error",
+    "predicted_std_m": "predicted standard deviation",
 }
-"""What results of a sweep are, in words; the first eight are drawn before anything else."""
+"""Descriptions of the results of a sweep; the first eight are drawn first."""
 
 
 def write_sweep_page(plan: SweepDesign, folder: Path) -> Path:
-    """Write the page of a sweep into the folder of its results, in the place of one that is there; return its path.
+    """Write the page of a sweep into the folder of its results, replacing an earlier one; return its path.
 
     Raises `TableError` where the folder has no results.
     """
-    most = 200_000  # rows of which a page is made; of more the tables are there for whoever looks
+    most = 200_000  # rows of which a page is made; the tables have all
     with Store.open(folder / STORE) as store:
-        rows = list(islice(store.rows(), most + 1))
-    path = folder / "results.html"
-    told = [Text(f"Of more than {most:,} rows the first are drawn.", "warning")] if len(rows) > most else []
-    write_text(path, to_html(_swept(plan, rows, told)), force=True)
+        rows = list(islice(store, most + 1))
+    path, document = folder / "results.html", _swept(plan, rows)
+    if len(rows) > most:
+        document.blocks.append(Text(f"Only the first {most:,} rows are drawn; the tables have all.", "warning"))
+    write_text(path, to_html(document), force=True)
     return path
 
 
-def _swept(plan: SweepDesign, rows: Sequence[Mapping[str, Any]], told: list[Text]) -> Document:
+def _swept(plan: SweepDesign, rows: Sequence[Mapping[str, Any]]) -> Document:
     good = [row for row in rows if row.get("status") == "ok"]
     keys = list(plan.axes) if plan.rows is None else list(dict.fromkeys(key for row in plan.rows for key in row))
     varied = [key for key in keys if len({str(row.get(key)) for row in good}) > 1]
@@ -257,35 +256,30 @@ def _swept(plan: SweepDesign, rows: Sequence[Mapping[str, Any]], told: list[Text
     blocks: list[Block] = [
         Text(
             f"{plan.total:,} runs over {', '.join(keys) or 'nothing'}, {len(plan.seeds)} "
-            f"seed{'s' * (len(plan.seeds) > 1)} each, of which {failed:,} failed. Lines are medians, bands reach from "
-            "the least to the largest over seeds and over all other keys; maps are medians over seeds. The tables "
-            "beside this page have every run."
+            f"seed{'s' * (len(plan.seeds) > 1)} each, of which {failed:,} failed. Lines are medians, bands the full "
+            "range over seeds and over all other keys; maps are medians over seeds. The tables beside this page have "
+            "every run."
         ),
-        *told,
     ]
     found, most = _results(good, keys) if varied else {}, 8
     if not found:
-        blocks.append(Text("Nothing to draw: no run gave a number that changes with a key.", "warning"))
+        blocks.append(Text("Nothing to draw: no result of a run is a number that changes.", "warning"))
     protocols = [str(row.get("protocol", "")) for row in good]
     swept = figures.Swept({key: [row.get(key) for row in good] for key in varied}, protocols, np.zeros(0))
     for name in list(found)[:most]:
-        stem, _, unit = name.rpartition("_")
-        shown, scale = name.replace("_", " "), 1.0
-        if unit == "m":
-            shown, scale = f"{stem.replace('_', ' ')} (cm)", 100.0
-        elif unit in ("ns", "s", "hz", "ps", "ppm", "dbm"):
-            shown = f"{stem.replace('_', ' ')} ({unit})"
-        told_of = f": {RESULTS[name]}" if RESULTS.get(name) else ""
-        own = replace(swept, figure=scale * found[name])
-        draw = partial(figures.figure_over_keys, swept=own, name=shown)
-        blocks.append(Picture(name, draw, f"{shown}{told_of}."))
+        stem, _, unit = name.replace("_", " ").rpartition(" ")
+        unit, scale = ("cm", 100.0) if unit == "m" else (unit, 1.0)
+        shown = f"{stem} ({unit})" if unit in ("cm", "ns", "s", "hz", "ps", "ppm", "dbm") else f"{stem} {unit}".strip()
+        described = f": {RESULTS[name]}" if RESULTS.get(name) else ""
+        draw = partial(figures.result_over_keys, swept=replace(swept, result=scale * found[name]), name=shown)
+        blocks.append(Picture(name, draw, f"{shown}{described}."))
     if len(found) > most:
         blocks.append(Text(f"Not drawn: {', '.join(list(found)[most:])}.", "note"))
     return Document(f"Sweep: {plan.name}", blocks)
 
 
 def _results(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> dict[str, Any]:
-    """Return the results that are numbers and change, as columns (rows,), the telling ones first."""
+    """Return the results that are numbers and change, as columns (rows,); those of `RESULTS` first."""
     beside = {"scenario", "number", "seed", "uwbcal", "numpy", "python", "status", "error", "protocol", *keys}
     found = {}
     for name in dict.fromkeys(name for row in rows for name in row if name not in beside):
@@ -305,12 +299,12 @@ TWIN_COLUMNS: Final[dict[str, Callable[[Compared], str]]] = {
     "median": lambda c: _both(c.measured.median, c.simulated.median),
     "10 %": lambda c: _both(c.measured.low, c.simulated.low),
     "90 %": lambda c: _both(c.measured.high, c.simulated.high),
-    "to a pair's next": lambda c: _both(c.measured.lag1, c.simulated.lag1, ".2f"),
-    "worth": lambda c: f"{c.measured.worth:.0f} of {c.measured.count}",
-    "D, seen": lambda c: f"{c.distance:.2f}, {c.detectable:.2f}",
+    "lag-1 corr.": lambda c: _both(c.measured.lag1, c.simulated.lag1, ".2f"),
+    "effective n": lambda c: f"{c.measured.worth:.0f} of {c.measured.count}",
+    "D, detect.": lambda c: f"{c.distance:.2f}, {c.detectable:.2f}",
     "p": lambda c: f"{np.nanmin([c.probability, c.lag1_probability]):.2g}",
 }
-"""What tables on the page and on the terminal show of a quantity: measured, then simulated."""
+"""Columns of tables of compared quantities, on the page and on the terminal: measured, then simulated."""
 
 
 def _both(measured: float, simulated: float, form: str = ".3g") -> str:
@@ -318,7 +312,7 @@ def _both(measured: float, simulated: float, form: str = ".3g") -> str:
 
 
 def write_twin(found: Twin, compared: Sequence[Compared], path: Path, *, force: bool = False) -> None:
-    """Write the page of a twin beside its recording; raises what `check_output` raises."""
+    """Write the page of a twin; raises what `check_output` raises."""
     check_output(path, force=force)
     write_text(path, to_html(_twin(found, compared)), force=force)
 
@@ -330,33 +324,33 @@ def _twin(found: Twin, compared: Sequence[Compared]) -> Document:
     blocks: list[Block] = [
         Text(
             f"A scenario fitted to {len(found.measured):,} exchanges of {len(found.measured.pairs)} pairs, with the "
-            f"delays and the bias curve of {Path(found.calibration).name} as truth, and what it makes beside what "
-            f"was measured. {alike} of {len(compared)} quantities are alike."
+            f"delays and the bias curve of {Path(found.calibration).name} as truth, and a comparison of its "
+            f"simulation with the measurements. {alike} of {len(compared)} quantities are alike."
         ),
         Heading("Measured and simulated"),
         Text(
-            "Each cell has the measured value, then the simulated one. To a pair's next is the autocorrelation to the "
-            "pair's next exchange, and worth how many independent values the measured ones are worth. D is the largest "
-            "difference of the cumulative distributions, beside the one that would be seen in nine of ten such "
-            "recordings. p is how likely chance makes D (Kolmogorov and Smirnov, with sizes as the values are worth) "
-            "or the difference of the autocorrelations so large, the smaller of the two. Below "
-            f"{LEVEL / 2:g} they differ; too few are values of which a D of 0.2 would not be seen. The scenario was "
-            "fitted to these same exchanges, so the test is of its form, not of what it predicts."
+            "Each cell has the measured value, then the simulated one. The lag-1 correlation is that of consecutive "
+            "exchanges of a pair. The effective n is the number of independent values with the same information "
+            "as the measured ones. D is the largest difference of the cumulative distributions, followed by the one "
+            "that is detected in nine of ten such recordings. p is the smaller p-value of two tests: of D (Kolmogorov "
+            "and Smirnov, with effective n) and of the difference of the lag-1 correlations. Below "
+            f"{LEVEL / 2:g} the quantities differ; there are too few values where a D of 0.2 would not be detected. "
+            "The scenario was fitted to the same exchanges, so this tests its form, not its predictions."
         ),
         Table(list(TWIN_COLUMNS), [[show(one) for show in TWIN_COLUMNS.values()] for one in compared]),
         Picture(
             "marginals",
             partial(figures.marginals, found=compared),
-            "Distributions. The outermost bins hold what lies beyond them.",
+            "Distributions. The outermost bins include all values beyond them.",
         ),
-        Heading("Pair by pair"),
+        Heading("By pair"),
     ]
     if pairs:
-        caption = "A dot a pair of five exchanges or more; on the line both agree."
+        caption = "One dot per pair of five exchanges or more; on the line both are equal."
         blocks.append(Picture("pairs", partial(figures.by_pair, found=pairs), caption))
     blocks += [
-        Heading("What was found"),
-        Table(["what", "value"], [[name, _shown(value)] for name, value in numbers.items()]),
+        Heading("Fitted values"),
+        Table(["quantity", "value"], [[name, _shown(value)] for name, value in numbers.items()]),
     ]
     for name in ("tags", "pairs"):
         rows = found.found[name]
@@ -364,15 +358,13 @@ def _twin(found: Twin, compared: Sequence[Compared]) -> Document:
         cells = [[key, *(_shown(row[column]) for column in columns)] for key, row in rows.items()]
         blocks.append(Table([name[:-1], *columns], cells))
     blocks += [
-        Heading("What the recording cannot tell"),
-        Table(
-            ["kept at its default, or decided without the recording"], [[text] for text in found.unknown], words=True
-        ),
+        Heading("What the recording does not determine"),
+        Table(["kept at its default, or chosen without the recording"], [[text] for text in found.unknown], words=True),
     ]
     return Document(f"The twin of {Path(found.recording).name}", blocks)
 
 
 def _shown(value: object) -> str:
     if value is None:
-        return "not told"
+        return "not determined"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -11,12 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import LogLocator, NullLocator
+from numpy.typing import NDArray
+from scipy.stats import binned_statistic_2d
 
-from uwblink.arrays import Floats
+from uwblink.arrays import Bools, Floats
 from uwblink.pages.colours import BLUE, GRID, INK, MUTED, PALE, SERIES, VERMILION, look
 from uwblink.pages.figures import NARROW_IN, label, legend, mark, outlines, sheet
-from uwblink.protocols.rows import RangingProtocol
-from uwblink.protocols.table import PROTOCOLS
+from uwblink.protocols.table import PROTOCOLS, RangingProtocol
 from uwblink.ticks import TICK_S
 from uwbsim.protocols.comparison import ErrorCurve, Optimum
 from uwbsim.protocols.conditions import interval_stamps
@@ -30,19 +32,12 @@ from uwbsim.world.reception import Medium
 from uwbsim.world.world import World
 
 
-def _plain_ticks(axis: Axis, least: float = 0.0) -> None:
-    """Put plain numbers at 1, 2 and 5 of each decade within view, at fewer where they are many; `least` is the lowest.
-
-    Negative numbers stand as those above zero.
-    """
-    low, high = sorted(axis.get_view_interval())
-    for parts in ((1, 2, 5), (1, 3), (1,)):
-        above = [t for k in range(-2, 7) for part in parts if (t := part * 10.0**k) >= least]
-        ticks = [t for t in (*(-t for t in above), 0.0, *above) if low <= t <= high]
-        if len(ticks) < 9:
-            break
-    axis.set_ticks(ticks, labels=[f"{value:g}".replace("-", "−") for value in ticks])
-    axis.set_ticks([], minor=True)
+def _plain_ticks(axis: Axis) -> None:
+    """Label a logarithmic axis with plain numbers: 1, 2 and 5 of each decade, or decades where it crosses zero."""
+    if axis.get_scale() == "log":
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_locator(NullLocator())
 
 
 def histograms(width_in: float, samples: Mapping[str, Floats]) -> Figure:
@@ -79,7 +74,7 @@ def error_over(width_in: float, curves: Mapping[str, ErrorCurve], x: str, *, log
         # Biases have a sign: to scale about zero, logarithmic beyond a centimetre.
         left.set_ylabel("bias (cm), log axis")
         left.set_yscale("symlog", linthresh=1.0)
-        _plain_ticks(left.yaxis, 1.0)
+        _plain_ticks(left.yaxis)
     if spreads.max() > 10 * spreads.min():
         right.set_ylabel("std (cm), log axis")
         right.set_yscale("log")
@@ -280,66 +275,55 @@ def _one_exchange(scenario: Scenario, protocol: RangingProtocol) -> tuple[Stampe
 
 @dataclass(frozen=True, slots=True)
 class Swept:
-    """Rows of a sweep as columns: `values` (rows,) by key, `protocol` (rows,), and one figure (rows,), NaN if none."""
+    """Rows of a sweep as columns: `values` (rows,) by key, `protocol` (rows,), and one result (rows,), NaN if none."""
 
     values: dict[str, Sequence[Any]]
     protocol: Sequence[str]
-    figure: Floats
+    result: Floats
 
-    def protocols(self) -> list[str]:
-        """Return the protocols, in the order of the rows."""
-        return list(dict.fromkeys(self.protocol))
-
-    def rows_of(self, protocol: str) -> Any:
-        """Return which rows are of a protocol and have the figure (rows,)."""
-        return np.array([name == protocol for name in self.protocol]) & np.isfinite(self.figure)
-
-    def numbers(self, key: str) -> Floats | None:
-        """Return the values of a key as numbers (rows,), or None where one is none."""
-        values = self.values[key]
-        if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
-            return None
-        return np.array(values, dtype=np.float64)
+    def protocols(self) -> dict[str, Bools]:
+        """Return the rows (rows,) of each protocol that have the result, in the order of the rows."""
+        found = np.isfinite(self.result)
+        return {name: found & (np.array(self.protocol) == name) for name in dict.fromkeys(self.protocol)}
 
 
-def figure_over_keys(width_in: float, swept: Swept, name: str) -> Figure:
-    """Draw a figure: as heat map over two keys of numbers that form a grid, else over each key, as medians in bands.
+def result_over_keys(width_in: float, swept: Swept, name: str) -> Figure:
+    """Draw a result: as heat map over two keys of numbers that form a grid, else over each key, as medians in bands.
 
     A band holds all seeds and all values of the other keys.
     """
-    keys = list(swept.values)
-    grid = [numbers for key in keys if (numbers := swept.numbers(key)) is not None]
-    if len(keys) == len(grid) == 2:
-        sizes = [len(np.unique(numbers)) for numbers in grid]
+    columns = {key: np.array(values) for key, values in swept.values.items()}
+    grid = [column for column in columns.values() if column.dtype.kind in "iuf"]
+    if len(columns) == len(grid) == 2:
+        sizes = [len(np.unique(column)) for column in grid]
         # Unless all combinations are there, a map would be mostly holes.
-        if len(np.unique(np.column_stack(grid), axis=0)) == sizes[0] * sizes[1] and sizes[0] > 1:
-            return _heat_maps(width_in, swept, grid, name)
-    figure, panels = sheet(width_in, max(len(keys), 1), height_in=2.6)
-    for axes, key in zip(panels, keys, strict=False):
-        _lines(axes, swept, key)
+        if len(np.unique(grid, axis=1).T) == sizes[0] * sizes[1] and sizes[0] > 1:
+            return _heat_maps(width_in, swept, name)
+    figure, panels = sheet(width_in, max(len(columns), 1), height_in=2.6)
+    for axes, (key, column) in zip(panels, columns.items(), strict=False):
+        _lines(axes, swept, column)
         label(axes, key.replace(".", ".\N{ZERO WIDTH SPACE}"), name)
     legend(figure, panels[0])
     return figure
 
 
-def _lines(axes: Axes, swept: Swept, key: str) -> None:
-    """Draw medians over a key, a line a protocol, in bands from the least to the largest."""
-    numbers, words = swept.numbers(key), [str(value) for value in swept.values[key]]
-    names, places = np.unique(words, return_inverse=True)
-    at = places.astype(np.float64) if numbers is None else numbers
-    for k, protocol in enumerate(swept.protocols()):
-        rows = swept.rows_of(protocol)
+def _lines(axes: Axes, swept: Swept, column: NDArray[Any]) -> None:
+    """Draw medians over the values of a key (rows,), a line a protocol, in bands from the least to the largest."""
+    numeric = column.dtype.kind in "iuf"
+    names, places = np.unique(column, return_inverse=True)
+    at = np.asarray(column if numeric else places, dtype=np.float64)
+    for k, (protocol, rows) in enumerate(swept.protocols().items()):
         if not rows.any():
             continue
         x, group = _grouped(at[rows])
-        y = swept.figure[rows]
+        y = swept.result[rows]
         low, middle, high = np.array([np.quantile(y[group == g], (0, 0.5, 1)) for g in range(len(x))]).T
         if np.any(high > low):
             axes.fill_between(x, low, high, color=look(k).colour, alpha=0.18, lw=0)
         mark(axes.plot(x, middle, label=protocol, **look(k).line())[0], protocol)
-    if numbers is None:
+    if not numeric:
         axes.set_xticks(np.arange(len(names)), list(names))
-    elif numbers.min() > 0 and numbers.max() > 30 * numbers.min():
+    elif at.min() > 0 and at.max() > 30 * at.min():
         axes.set_xscale("log")
 
 
@@ -354,21 +338,21 @@ def _grouped(places: Floats, most: int = 12) -> tuple[Floats, Any]:
     return np.array([np.median(places[group == g]) for g in range(len(kept))]), group
 
 
-def _heat_maps(width_in: float, swept: Swept, grid: list[Floats], name: str) -> Figure:
+def _heat_maps(width_in: float, swept: Swept, name: str) -> Figure:
     """Draw medians over seeds as colours over two keys, a panel a protocol, four at most."""
-    protocols = swept.protocols()[:4]
+    protocols = dict(list(swept.protocols().items())[:4])
     across = 1 if width_in < NARROW_IN else min(2, len(protocols))
     figure, panels = sheet(width_in, len(protocols), height_in=2.6, across=across, sharex=True, sharey=True)
-    (x, column), (y, row) = (np.unique(numbers, return_inverse=True) for numbers in grid)
-    shown = np.full((len(protocols), len(y), len(x)), np.nan)
-    for k, protocol in enumerate(protocols):
-        rows = swept.rows_of(protocol)
-        for at in set(zip(row[rows].tolist(), column[rows].tolist(), strict=True)):
-            shown[k, at[0], at[1]] = np.median(swept.figure[rows & (row == at[0]) & (column == at[1])])
+    (x, column), (y, row) = (np.unique(values, return_inverse=True) for values in swept.values.values())
+    cells = [np.arange(len(y) + 1), np.arange(len(x) + 1)]
+    shown = [
+        binned_statistic_2d(row[rows], column[rows], swept.result[rows], "median", cells).statistic
+        for rows in protocols.values()
+    ]
     # "cividis" grows lighter evenly, and alike for all eyes.
     colours: dict[str, Any] = {"cmap": "cividis", "vmin": np.nanmin(shown), "vmax": np.nanmax(shown)}
     for axes, protocol, values in zip(panels, protocols, shown, strict=True):
-        image = axes.pcolormesh(np.arange(len(x) + 1), np.arange(len(y) + 1), values, **colours)
+        image = axes.pcolormesh(cells[1], cells[0], values, **colours)
         for axis, own in ((axes.xaxis, x), (axes.yaxis, y)):
             kept = np.arange(len(own))[:: max(1, len(own) // 6)]
             axis.set_ticks(kept + 0.5, labels=[f"{own[k]:g}" for k in kept])

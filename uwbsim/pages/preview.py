@@ -1,4 +1,4 @@
-"""What a scenario will do, worked out without running it."""
+"""What to expect of a scenario: rates, distances, powers and warnings, without running it."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -47,8 +45,37 @@ class Preview:
     duration_s: float
 
     def __repr__(self) -> str:
-        """Return it in words, a line a thing to know; warnings begin with "warning:"."""
-        return "\n".join(_sentences(self))
+        """Return what to expect, a line each; warnings begin with "warning:"."""
+        scenario, ranging = self.scenario, self.scenario.ranging
+        plan = ranging.plan if isinstance(ranging.plan, str) else ranging.plan.file
+        lines = [
+            f"{scenario.run.name}: {PROTOCOLS[ranging.protocol].title}, plan {plan}, {self.duration_s:g} s",
+            f"{self.exchanges} exchanges planned among {len(self.pairs)} pairs, {self.rate_hz:.3g} a second "
+            f"(one after the other at most {self.fastest_hz:.0f}); "
+            f"frames on the air {100 * self.air_share:.1f} % of the time",
+            f"{'pair':>10s}{'exchanges':>11s}{'Hz':>7s}{'metres':>17s}{'dBm':>18s}  SS-TWR's bias (cm)",
+        ]
+        lines += [
+            f"{pair.initiator:3d} -> {pair.target:3d}{pair.exchanges:11d}{pair.rate_hz:7.3g}"
+            f"{pair.distance_m[0]:8.2f} to {pair.distance_m[1]:5.2f}{pair.power_dbm[0]:8.1f} to "
+            f"{pair.power_dbm[1]:6.1f}{100 * pair.ss_bias_m:+20.1f}"
+            for pair in self.pairs
+        ]
+        lines += [
+            f"warning: {pair.initiator} and {pair.target} hear each other {100 * pair.audible:.0f} % of the time "
+            f"(sensitivity {scenario.radio.sensitivity_dbm:g} dBm)"
+            for pair in self.pairs
+            if pair.audible < 0.9
+        ]
+        # A range has the sum of two tags' delays: these sums determine the delays if their matrix has full rank.
+        ends = np.array([(pair.initiator, pair.target) for pair in self.pairs]).reshape(-1, 2)
+        tags = np.unique(ends)
+        if len(tags) and np.linalg.matrix_rank((ends[:, :, None] == tags).sum(axis=1)) < len(tags):
+            lines.append(
+                "warning: the pairs split the tags into two groups that range only with each other; their antenna "
+                "delays will not be determined"
+            )
+        return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `uwbsim validate --json` prints: the figures, without the scenario."""
@@ -57,7 +84,7 @@ class Preview:
 
 
 def preview(scenario: Scenario | Source) -> Preview:
-    """Work out what a scenario will do, without running it; raises `ScenarioError`.
+    """Predict what a scenario will do, without running it; raises `ScenarioError`.
 
     `scenario` is whatever `load` takes, or a `Scenario`.
 
@@ -107,53 +134,3 @@ def preview(scenario: Scenario | Source) -> Preview:
         air_share=scenario.ranging.air_share(radio.preamble_symbols),
         duration_s=duration,
     )
-
-
-def _sentences(found: Preview) -> list[str]:
-    """Return the preview in words, a line each; warnings begin with "warning:"."""
-    scenario = found.scenario
-    protocol = PROTOCOLS[scenario.ranging.protocol]
-    plan = scenario.ranging.plan if isinstance(scenario.ranging.plan, str) else scenario.ranging.plan.file
-    lines = [
-        f"{scenario.run.name}: {protocol.title}, plan {plan}, {found.duration_s:g} s",
-        f"{found.exchanges} exchanges planned among {len(found.pairs)} pairs, {found.rate_hz:.3g} a second "
-        f"(one after the other at most {found.fastest_hz:.0f}); "
-        f"frames on the air {100 * found.air_share:.1f} % of the time",
-        f"{'pair':>10s}{'exchanges':>11s}{'Hz':>7s}{'metres':>17s}{'dBm':>18s}  SS-TWR's bias (cm)",
-    ]
-    lines += [
-        f"{pair.initiator:3d} -> {pair.target:3d}{pair.exchanges:11d}{pair.rate_hz:7.3g}"
-        f"{pair.distance_m[0]:8.2f} to {pair.distance_m[1]:5.2f}{pair.power_dbm[0]:8.1f} to "
-        f"{pair.power_dbm[1]:6.1f}{100 * pair.ss_bias_m:+20.1f}"
-        for pair in found.pairs
-    ]
-    lines += [
-        f"warning: {pair.initiator} and {pair.target} hear each other {100 * pair.audible:.0f} % of the time "
-        f"(sensitivity {scenario.radio.sensitivity_dbm:g} dBm)"
-        for pair in found.pairs
-        if pair.audible < 0.9
-    ]
-    if _is_bipartite([(p.initiator, p.target) for p in found.pairs]):
-        lines.append(
-            "warning: the pairs split the tags into two groups that range only with each other; their antenna delays "
-            "will not be determined"
-        )
-    return lines
-
-
-def _is_bipartite(pairs: list[tuple[int, int]]) -> bool:
-    """Return whether a connected part of the graph of pairs has no odd cycle: a direction of its delays stays free.
-
-    Such a part, and no other, falls into two in the double cover of the graph, whose edges lead from one copy of the
-    nodes to the other.
-    """
-    if not pairs:
-        return False
-    nodes, ends = np.unique(pairs, return_inverse=True)
-    first, second = ends.reshape(-1, 2).T
-    count, ones = len(nodes), np.ones(2 * len(pairs))
-    graph = coo_array((ones[::2], (first, second)), shape=(count, count))
-    cover_ends = (np.concatenate([first, second]), np.concatenate([second, first]) + count)
-    cover = coo_array((ones, cover_ends), shape=(2 * count, 2 * count))
-    parts, cover_parts = (connected_components(one, directed=False)[0] for one in (graph, cover))
-    return bool(cover_parts > parts)

@@ -1,9 +1,9 @@
-"""Protocols side by side in the same random world: errors, costs, error curves, and the best delay of a reply."""
+"""Comparison of protocols in the same random world: errors, costs, error curves, and the best delay of a reply."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from uwblink.arrays import Floats
-from uwblink.protocols.rows import RangingProtocol
+from uwblink.protocols.table import RangingProtocol
 from uwbsim.errors import ParameterError
 from uwbsim.protocols.conditions import Conditions, Protocols, calibrated, chosen, conditions_of
 from uwbsim.protocols.monte_carlo import range_errors_m
@@ -31,11 +31,11 @@ from uwbsim.scenario.ranging import (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProtocolErrors:
-    """One protocol in a world: errors of raw ranges in metres, simulated and predicted, and what an exchange costs.
+    """One protocol: errors of raw ranges in metres, simulated and predicted, and the cost of an exchange.
 
-    `air_s` is how long its frames are on the air, `duration_s` how long it takes from the first preamble to the end of
-    the last frame, `radio_on_s` how long the two radios send and listen together (a proxy of energy), `rate_hz` how
-    many exchanges a second follow one another.
+    `air_s` is the total duration of its frames, `duration_s` the time from the first preamble to the end of the last
+    frame, `radio_on_s` the time for which the two radios send or listen (a proxy of energy), `rate_hz` the number of
+    exchanges per second, one after the other.
     """
 
     protocol: str
@@ -62,7 +62,7 @@ class ProtocolErrors:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Comparison:
-    """Protocols beside each other in a scenario: what came out, and a sample of each one's errors in metres, by name.
+    """A comparison of protocols in a scenario: their outcomes, and samples of their errors in metres, by name.
 
     >>> import uwbsim
     >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
@@ -88,8 +88,30 @@ class Comparison:
 
     @cached_property
     def winners(self) -> list[dict[str, Any]]:
-        """Return which protocol errs least at some delays of the scheduled reply, after a calibration."""
-        return winners(self.scenario, self.protocols)
+        """Return by prediction which protocol has the least error at some delays of the scheduled reply.
+
+        After a calibration; by `rmse`, a single range; by `per_second`, the mean of as many as one pair has in a second
+        of its own (`PredictedErrors.mean_of`), which is what counts where the air is full and ranges are averaged.
+        """
+        world = calibrated(conditions_of(self.scenario, 2048))
+        rows = []
+        for delay_us in (300, 600, 1000, 1500, 2000, 3000, 5000):
+            here = world.with_columns(scheduled=delay_us * 1e-6)
+            rmse, score = {}, {}
+            for protocol in self.protocols:
+                found = predict(protocol, here)
+                duration = costs(self.scenario, protocol, delay_us * 1e-6)["duration_s"] + TURNAROUND_S
+                rmse[protocol.name] = float(np.sqrt(found.mean_of(1)))
+                score[protocol.name] = found.mean_of(1 / duration)
+            rows.append(
+                {
+                    "scheduled_us": delay_us,
+                    "rmse": min(rmse, key=lambda name: rmse[name]),
+                    "per_second": min(score, key=lambda name: score[name]),
+                    **{f"rmse_m {name}": value for name, value in rmse.items()},
+                }
+            )
+        return rows
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `uwbsim compare --json` prints."""
@@ -114,7 +136,7 @@ def compare(
     count: int = 1_000_000,
     progress: Callable[[float], None] | None = None,
 ) -> Comparison:
-    """Range `count` times with each protocol in one random world, with the same noise; return how raw ranges err.
+    """Simulate `count` ranges with each protocol in one random world, with the same noise; return their errors.
 
     `scenario` is whatever `load` takes, or a `Scenario`; `protocols` are names or rows of `PROTOCOLS`, None for all,
     those included that were registered. `progress` is called with the done fraction, 0 to 1. Raises `ParameterError`
@@ -138,7 +160,7 @@ def compare(
     (10000,)
     """
     scenario, rows = as_scenario(scenario), chosen(protocols)
-    most = 50_000_000  # of which quantiles are taken exactly: 400 MB of errors a protocol
+    most = 50_000_000  # 400 MB of errors per protocol, for exact quantiles
     if not 1 <= count <= most:
         raise ParameterError(f"found {count}, expected 1 to {most}", parameter="count")
     conditions = conditions_of(scenario)
@@ -180,7 +202,7 @@ def _outcome(scenario: Scenario, protocol: RangingProtocol, conditions: Conditio
 
 
 def costs(scenario: Scenario, protocol: RangingProtocol, scheduled_s: float | None = None) -> dict[str, float]:
-    """Return what an exchange takes: `air_s`, `duration_s`, `radio_on_s`.
+    """Return the durations of an exchange: `air_s`, `duration_s`, `radio_on_s`.
 
     `scheduled_s` replaces the scenario's delay.
     """
@@ -202,36 +224,9 @@ def costs(scenario: Scenario, protocol: RangingProtocol, scheduled_s: float | No
     }
 
 
-def winners(scenario: Scenario, protocols: Sequence[RangingProtocol]) -> list[dict[str, Any]]:
-    """Return which protocol wins at which delay of the scheduled reply after a calibration, by prediction.
-
-    By `rmse`, a single range; by `per_second`, the mean of as many as one pair has in a second of its own
-    (`Prediction.mean_of`), which is what counts where the air is full and ranges are averaged.
-    """
-    world = calibrated(conditions_of(scenario, 2048))
-    rows = []
-    for delay_us in (300, 600, 1000, 1500, 2000, 3000, 5000):
-        here = world.with_columns(scheduled=delay_us * 1e-6)
-        rmse, score = {}, {}
-        for protocol in protocols:
-            found = predict(protocol, here)
-            duration = costs(scenario, protocol, delay_us * 1e-6)["duration_s"] + TURNAROUND_S
-            rmse[protocol.name] = float(np.sqrt(found.mean_of(1)))
-            score[protocol.name] = found.mean_of(1 / duration)
-        rows.append(
-            {
-                "scheduled_us": delay_us,
-                "rmse": min(rmse, key=lambda name: rmse[name]),
-                "per_second": min(score, key=lambda name: score[name]),
-                **{f"rmse_m {name}": value for name, value in rmse.items()},
-            }
-        )
-    return rows
-
-
 @dataclass(frozen=True, slots=True)
 class ErrorCurve:
-    """Error over something: where, simulated mean and spread, predicted mean and spread, metres, (n,) each."""
+    """Error over a quantity `x`: mean and standard deviation, simulated and predicted, metres, (n,) each."""
 
     x: Floats
     bias_m: Floats
@@ -241,24 +236,30 @@ class ErrorCurve:
 
 
 def over_skew(scenario: Scenario, protocol: RangingProtocol, count: int = 16_384) -> ErrorCurve:
-    """Error over the relative skew of the two clocks, in ppm, everything else as in the scenario."""
-    world = calibrated(conditions_of(scenario, 2048))
+    """Return the error over the relative skew of the two clocks in ppm, all else as in the scenario."""
     skews = np.linspace(-20, 20, 17)
-    worlds = [world.with_columns(rate_initiator=s * 0.5e-6, rate_target=-s * 0.5e-6) for s in skews]
-    return _curve(protocol, skews, worlds, scenario.run.seed, count)
+    return _curve(
+        scenario, protocol, count, skews, lambda ppm: {"rate_initiator": ppm * 0.5e-6, "rate_target": -ppm * 0.5e-6}
+    )
 
 
 def over_reply(scenario: Scenario, protocol: RangingProtocol, count: int = 16_384) -> ErrorCurve:
-    """Error over the delay of the scheduled message, in microseconds."""
+    """Return the error over the delay of the scheduled message in microseconds."""
+    return _curve(scenario, protocol, count, np.geomspace(300, 6000, 15), lambda delay: {"scheduled": delay * 1e-6})
+
+
+def _curve(
+    scenario: Scenario,
+    protocol: RangingProtocol,
+    count: int,
+    x: Floats,
+    columns: Callable[[float], Mapping[str, float]],
+) -> ErrorCurve:
+    """Return the error over values (n,) for which `columns` of the calibrated conditions change."""
     world = calibrated(conditions_of(scenario, 2048))
-    delays = np.geomspace(300, 6000, 15)
-    worlds = [world.with_columns(scheduled=delay * 1e-6) for delay in delays]
-    return _curve(protocol, delays, worlds, scenario.run.seed, count)
-
-
-def _curve(protocol: RangingProtocol, x: Floats, worlds: Sequence[Conditions], seed: int, count: int) -> ErrorCurve:
-    errors = [range_errors_m(protocol, world, seed, count) for world in worlds]
-    pooled = np.array([predict(protocol, world).pooled() for world in worlds])
+    worlds = [world.with_columns(**columns(value)) for value in x.tolist()]
+    errors = [range_errors_m(protocol, one, scenario.run.seed, count) for one in worlds]
+    pooled = np.array([predict(protocol, one).pooled() for one in worlds])
     means, spreads = (np.array([f(e) for e in errors]) for f in (np.mean, np.std))
     return ErrorCurve(x, means, spreads, pooled[:, 0], np.sqrt(pooled[:, 1]))
 
@@ -266,7 +267,7 @@ def _curve(protocol: RangingProtocol, x: Floats, worlds: Sequence[Conditions], s
 def over_state(
     protocol: RangingProtocol, conditions: Conditions, values: Floats, errors: Floats, groups: int = 14
 ) -> ErrorCurve:
-    """Error over something that the states have, `values` (states,), from `errors` that met them in turn."""
+    """Return the error over a property of the states, `values` (states,), from `errors` of ranges in these in turn."""
     used = np.resize(np.arange(len(conditions)), len(errors))
     prediction = predict(protocol, conditions)
     parts = np.array_split(np.argsort(values), groups)
@@ -287,9 +288,9 @@ def over_state(
 class Optimum:
     """The best delay, and the curve: delays in seconds, mean squared error of a range and of a second of them in m^2.
 
-    `rms_m` is the error of one range, `second_rms_m` that of the mean of as many as a pair has in a second: noise
-    averages away with their number, what skew leaves does not. `duration_s` is how long one takes, turnaround included.
-    `on_edge` says that the best delay is the shortest or the longest one that boards take.
+    `rms_m` is the error of one range, `second_rms_m` that of the mean of all ranges of a pair in a second: noise
+    decreases with their number, the bias by skew does not. `duration_s` is the time of one, turnaround included.
+    `on_edge` says that the best delay is the shortest or the longest one that boards accept.
     """
 
     protocol: str
@@ -320,10 +321,10 @@ def optimum(scenario: Scenario | Source, protocol: str | RangingProtocol = "ds",
     """Minimise the mean squared error of the mean of a second's exchanges over the delay of the scheduled message.
 
     A second holds 1/duration exchanges of a pair, one after the other at the boards' turnaround. The variance of their
-    mean is that of one times the duration; the bias that skew, drift and motion leave is that of one. Antenna delays,
-    power bias and reflections are left out: calibration deals with them, and no delay does. `scenario` is whatever
-    `load` takes, or a `Scenario`, `protocol` a name or a row of `PROTOCOLS`; `overhead_s` is what an exchange takes
-    besides, in seconds (others on the air). Raises `ParameterError`.
+    mean is that of one times the duration; the bias by skew, drift and motion is that of one. Antenna delays, power
+    bias and reflections are left out: they do not depend on the delay, and calibration removes them. `scenario` is
+    whatever `load` takes, or a `Scenario`, `protocol` a name or a row of `PROTOCOLS`; `overhead_s` is additional time
+    per exchange in seconds (others on the air). Raises `ParameterError`.
 
     >>> import uwbsim
     >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))

@@ -1,4 +1,4 @@
-"""What exchanges meet apart from chance: distances, clocks, powers, delays, sampled from a scenario as columns."""
+"""Conditions of exchanges apart from noise: distances, clocks, powers, delays, sampled from a scenario as columns."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from uwblink.arrays import Floats, Ints
-from uwblink.protocols.rows import RangingProtocol
-from uwblink.protocols.table import PROTOCOLS
+from uwblink.protocols.table import PROTOCOLS, Intervals, RangingProtocol
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, UUS_TICKS
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.random_streams import stream
@@ -31,7 +30,7 @@ STATES: Final = 16_384
 class Conditions:
     """The state of the world in exchanges, columns of length n; times of flight and delays in seconds.
 
-    `flight` is that of the straight line, `excess` what the first path takes longer: an error of the range.
+    `flight` is that of the straight line, `excess` the additional time of the first path: an error of the range.
     Clocks run at 1 + rate; `drift` is the change of the rate in 1/s, `white` its white noise, a fraction times the root
     of a second (of flicker and random walk there is only the rate that they have reached). `late` is what power adds to
     each reception and `rx_std` its noise, both on average over the two directions; `tx_std` that of transmissions.
@@ -129,6 +128,14 @@ def interval_stamps(protocol: RangingProtocol) -> dict[str, tuple[str, str]]:
         ends = ("tx2", "rx2") if protocol.messages[2].sender == "target" else ("rx2", "tx2")
         found |= {"dt53": ("tx3", ends[0]), "dt64": ("rx3", ends[1])}
     return found
+
+
+def intervals_of(protocol: RangingProtocol, stamps: dict[str, Floats], carrier_ppm: Floats) -> Intervals:
+    """Return the intervals of exchanges with stamps in ticks, (n,) each; 1 for those that a protocol does not have."""
+    spans = dict.fromkeys(("dt53", "dt64"), np.ones_like(stamps["tx1"]))
+    for name, (later, earlier) in interval_stamps(protocol).items():
+        spans[name] = stamps[later] - stamps[earlier]
+    return Intervals(**spans, carrier_ppm=carrier_ppm)
 
 
 def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:

@@ -7,16 +7,16 @@ same noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from itertools import cycle
 from typing import Final
 
 import numpy as np
 
 from uwblink.arrays import Floats
-from uwblink.protocols.rows import Intervals, ProtocolMessage, RangingProtocol
+from uwblink.protocols.table import ProtocolMessage, RangingProtocol
 from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, METRES_PER_TICK, TICK_S
-from uwbsim.protocols.conditions import STATES, Conditions, interval_stamps
+from uwbsim.protocols.conditions import STATES, Conditions, intervals_of
 from uwbsim.random_streams import stream
 from uwbsim.world.clocks import RATE_SPAN_S
 
@@ -35,28 +35,17 @@ def range_errors_m(
     An error is the range by the protocol's formula less the mean distance at its first two messages, before any
     calibration. `progress` is called with the done fraction.
     """
-    errors = np.empty(count)
-    begin = 0
-    for part in error_pieces(protocol, conditions, seed, count):
-        errors[begin : begin + len(part)] = part
-        begin += len(part)
-        if progress:
-            progress(begin / count)
-    return errors
-
-
-def error_pieces(protocol: RangingProtocol, conditions: Conditions, seed: int, count: int) -> Iterator[Floats]:
-    """Yield the same errors in pieces as long as there are states, at most `STATES`, so that memory stays flat."""
-    source = _Noise(protocol, conditions, seed)
+    noise = _Noise(protocol, conditions, seed)
     length = min(len(conditions), STATES)
-    pieces = [_Ticks(conditions[k : k + length]) for k in range(0, len(conditions), length)]
-    done, turn = 0, 0
+    pieces = cycle([_Ticks(conditions[k : k + length]) for k in range(0, len(conditions), length)])
+    errors, done = np.empty(count), 0
     while done < count:
-        ticks = pieces[turn % len(pieces)]
-        error = _execute(protocol, ticks, source.draw(len(ticks.flight)))
-        yield error[: count - done]
-        done += len(error)
-        turn += 1
+        part = _execute(protocol, next(pieces), noise)[: count - done]
+        errors[done : done + len(part)] = part
+        done += len(part)
+        if progress:
+            progress(done / count)
+    return errors
 
 
 class _Ticks:
@@ -89,17 +78,6 @@ class _Ticks:
         self.moving = bool(np.any(c.flight_rate))
 
 
-@dataclass(frozen=True, slots=True)
-class _Draws:
-    """Standard draws for one piece; None where the conditions need none."""
-
-    frames: list[Floats] | None
-    carrier: Floats | None
-    phase: dict[str, Floats] | None
-    detour: Floats | None
-    clocks: dict[str, list[Floats]] | None
-
-
 class _Wander:
     """The phase of a clock whose rate has white noise, in ticks, at one instant after another."""
 
@@ -119,92 +97,86 @@ class _Wander:
 
 
 class _Noise:
-    """The named streams that an engine draws from, one after the other in the order of exchanges."""
+    """Named streams of random numbers, drawn from in the order of exchanges; none where conditions need none."""
 
     def __init__(self, protocol: RangingProtocol, c: Conditions, seed: int) -> None:
-        numbers = range(len(protocol.messages))
-        noisy = np.any(c.tx_std) or np.any(c.rx_std)
-        self._frames = [stream(seed, "frame noise", k) for k in numbers] if noisy else None
-        self._carrier = stream(seed, "skew reading", 2) if c.carrier_std_ppm else None
-        self._phase = {side: stream(seed, "counter phase", side) for side in SIDES} if c.quantize else None
-        self._hit = stream(seed, "multipath") if c.multipath else None
+        numbers = range(len(protocol.messages)) if np.any(c.tx_std) or np.any(c.rx_std) else ()
         white = np.any(c.white_initiator) or np.any(c.white_target)
-        self._clocks = {side: stream(seed, "clock noise", side) for side in SIDES} if white else None
-        self._instants = len(numbers) + 2
-        self._share = c.multipath
+        self.frames = [stream(seed, "frame noise", k) for k in numbers]
+        self.carrier = stream(seed, "skew reading", 2) if c.carrier_std_ppm else None
+        self.counters = {side: stream(seed, "counter phase", side) for side in SIDES} if c.quantize else {}
+        self.clocks = {side: stream(seed, "clock noise", side) for side in SIDES} if white else {}
+        self._hit, self._share = stream(seed, "multipath"), c.multipath
 
-    def draw(self, count: int) -> _Draws:
-        """Draw for the next `count` exchanges."""
-        detour = None
-        if self._hit is not None:
-            hit = self._hit.random(count)
-            # What is left of a uniform draw below a threshold is uniform again: one draw decides both.
-            detour = np.where(hit < self._share, -np.log(np.maximum(hit / self._share, 1e-300)), 0.0)
-        return _Draws(
-            [g.standard_normal(count) for g in self._frames] if self._frames else None,
-            self._carrier.standard_normal(count) if self._carrier else None,
-            {side: g.random(count) * DELAYED_TX_GRID for side, g in self._phase.items()} if self._phase else None,
-            detour,
-            {side: [g.standard_normal(count) for _ in range(self._instants)] for side, g in self._clocks.items()}
-            if self._clocks
-            else None,
-        )
+    def detours(self, count: int) -> Floats | float:
+        """Return the detours of the next exchanges, (count,), in units of their mean."""
+        if not self._share:
+            return 0.0
+        hit = self._hit.random(count)
+        # What is left of a uniform draw below a threshold is uniform again: one draw decides both.
+        return np.where(hit < self._share, -np.log(np.maximum(hit / self._share, 1e-300)), 0.0)
 
 
-def _execute(protocol: RangingProtocol, c: _Ticks, draws: _Draws) -> Floats:
+def _execute(protocol: RangingProtocol, c: _Ticks, noise: _Noise) -> Floats:
     """Return range errors in metres of one piece."""
     stamps: dict[str, Floats] = {}
     flights: list[Floats] = []
-    wander = {side: _Wander(c.white[side], steps) for side, steps in draws.clocks.items()} if draws.clocks else None
-    carrier_noise: Floats | float = 0.0
-    path = c.way if draws.detour is None else c.way + draws.detour * c.detour
+    count, instants = len(c.flight), len(protocol.messages) + 2
+    # A counter shows its phase at the start.
+    phases = {side: own.random(count) * DELAYED_TX_GRID for side, own in noise.counters.items()}
+    wander = {
+        side: _Wander(c.white[side], [own.standard_normal(count) for _ in range(instants)])
+        for side, own in noise.clocks.items()
+    }
+    carrier = c.carrier_ppm
+    path = c.way + noise.detours(count) * c.detour
     for k, message in enumerate(protocol.messages):
         sender = message.sender
         receiver = SIDES[1 - SIDES.index(sender)]
-        printed = _transmission(message, stamps, c, draws)
+        printed = _transmission(message, stamps, c, phases)
         departure = (printed - c.tx_delay[sender]) * c.slower[sender]
         half = c.half_drift[sender]
         if half is not None:
             departure -= half * departure**2
-        if wander is not None:
+        if wander:
             if k == 1:
-                carrier_noise = _carrier_ppm(wander, departure)
+                carrier = carrier + c.carrier_sign * _carrier_ppm(wander, departure)
             departure = departure - wander[sender].at(departure)
-        flight = c.flight + c.flight_rate * departure if c.moving else c.flight
-        arrival = departure + (path if not c.moving else path + c.flight_rate * departure)
+        moved = c.flight_rate * departure if c.moving else 0.0
+        arrival = departure + (path + moved)
         seen = arrival * c.faster[receiver]
         half = c.half_drift[receiver]
         if half is not None:
             seen += half * arrival**2
-        if wander is not None:
+        if wander:
             seen += wander[receiver].at(arrival)
         seen += c.rx_late[receiver]
-        if draws.frames is not None:
-            seen += draws.frames[k] * c.noise_std[sender]
-        if draws.phase is not None:
-            phase = draws.phase[receiver]
-            seen += phase
+        if noise.frames:
+            seen += noise.frames[k].standard_normal(count) * c.noise_std[sender]
+        if phases:
+            seen += phases[receiver]
             np.rint(seen, out=seen)
-            seen -= phase
+            seen -= phases[receiver]
         stamps[f"tx{k + 1}"], stamps[f"rx{k + 1}"] = printed, seen
-        flights.append(flight)
-    spans = _intervals(protocol, stamps, c, draws, carrier_noise)
+        flights.append(c.flight + moved)
+    if noise.carrier is not None:
+        carrier = carrier + noise.carrier.standard_normal(count) * c.carrier_std_ppm
     truth = (flights[0] + flights[1]) / 2
-    return np.asarray((protocol.flight_ticks(spans) - truth) * METRES_PER_TICK)
+    return np.asarray((protocol.flight_ticks(intervals_of(protocol, stamps, carrier)) - truth) * METRES_PER_TICK)
 
 
-def _transmission(message: ProtocolMessage, stamps: dict[str, Floats], c: _Ticks, draws: _Draws) -> Floats:
+def _transmission(message: ProtocolMessage, stamps: dict[str, Floats], c: _Ticks, phases: dict[str, Floats]) -> Floats:
     """Return the printed transmit stamp, in ticks since the start: the poll's is near nought."""
     due = stamps[message.after] + c.reply[message.timing] if message.after else np.zeros_like(c.flight)
-    if draws.phase is None:
+    if not phases:
         return due
-    # The counter shows `phase` at the start; delayed transmissions begin on its grid.
-    phase = draws.phase[message.sender]
-    due = due + phase
-    if message.timing == "scheduled":
-        return np.asarray(np.floor(due / DELAYED_TX_GRID) * DELAYED_TX_GRID + ANTENNA_DELAY_TICKS - phase)
-    latency = due - ANTENNA_DELAY_TICKS
-    return np.asarray(np.ceil(latency / DELAYED_TX_GRID) * DELAYED_TX_GRID + ANTENNA_DELAY_TICKS - phase)
+    # Transmissions begin on the grid of the counter; the software's latency runs to the antenna.
+    # Boards round a scheduled transmission down to the grid of their counter, and send others at its next instant.
+    due = due + phases[message.sender]
+    slot = due // DELAYED_TX_GRID
+    if message.timing == "at once":
+        slot = np.ceil((due - ANTENNA_DELAY_TICKS) / DELAYED_TX_GRID)
+    return np.asarray(slot * DELAYED_TX_GRID + ANTENNA_DELAY_TICKS - phases[message.sender])
 
 
 def _carrier_ppm(wander: dict[str, _Wander], departure: Floats) -> Floats:
@@ -213,13 +185,3 @@ def _carrier_ppm(wander: dict[str, _Wander], departure: Floats) -> Floats:
     begun = {side: path.at(departure - span) for side, path in wander.items()}
     gained = {side: path.at(departure) - begun[side] for side, path in wander.items()}
     return np.asarray((gained["initiator"] - gained["target"]) / span * 1e6)
-
-
-def _intervals(
-    protocol: RangingProtocol, stamps: dict[str, Floats], c: _Ticks, draws: _Draws, carrier_noise: Floats | float
-) -> Intervals:
-    carrier = c.carrier_ppm + c.carrier_sign * carrier_noise
-    if draws.carrier is not None:
-        carrier = carrier + draws.carrier * c.carrier_std_ppm
-    spans = {name: stamps[later] - stamps[earlier] for name, (later, earlier) in interval_stamps(protocol).items()}
-    return Intervals(**({"dt53": c.flight, "dt64": c.flight} | spans), carrier_ppm=carrier)

@@ -1,4 +1,4 @@
-"""Mean and variance of a protocol's error without simulating it (docs/theory.md, "Predicting a protocol").
+"""Analytical mean and variance of a protocol's error (docs/theory.md, "Predicting a protocol").
 
 The mean is the protocol's formula at the intervals that exchanges without noise have; the variance propagates the
 errors of stamps through the formula to first order. Both come from the protocol's row, for as many states of the world
@@ -7,17 +7,16 @@ at once as there are; `predict_state` describes a single one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from uwblink.arrays import Floats
-from uwblink.protocols.rows import Intervals, RangingProtocol
+from uwblink.protocols.table import RangingProtocol
 from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S
 from uwbsim.errors import ParameterError
-from uwbsim.protocols.conditions import Conditions, chosen, interval_stamps
+from uwbsim.protocols.conditions import Conditions, chosen, intervals_of
 from uwbsim.scenario.devices import TX_SHARE
 from uwbsim.world.clocks import RATE_SPAN_S
 
@@ -55,67 +54,64 @@ class PredictedErrors:
 
 def predict(protocol: RangingProtocol, c: Conditions) -> PredictedErrors:
     """Predict the error of a protocol under conditions (n,)."""
-    spans, (leave, arrive) = _noiseless(protocol, c)
+    stamps, leave, arrive = _noiseless(protocol, c)
+    carrier = c.carrier_sign * (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
+    readings = stamps | {"carrier": carrier}
+
+    def flight(**errors: float) -> Floats:
+        """Return the flight in ticks where readings have some errors, by their names."""
+        read = readings | {name: readings[name] + error for name, error in errors.items()}
+        return protocol.flight_ticks(intervals_of(protocol, read, read["carrier"]))
+
+    # The formulas are smooth over thousands of ticks, and over ppm.
+    steps = {name: 1.0 if name == "carrier" else 16.0 for name in readings}
+    slopes = {name: (flight(**{name: h}) - flight(**{name: -h})) / (2 * h) for name, h in steps.items()}
+    squares = {end: sum(slopes[name] ** 2 for name in stamps if name.startswith(end)) for end in ("tx", "rx")}
     truth = ((arrive[0] - leave[0] + arrive[1] - leave[1]) / 2 - c.excess) / TICK_S
-    slopes = dict(_slopes(protocol, spans))
-    stamps = _by_stamp(protocol, slopes)
-    squares = {kind: _sum_of_squares(stamps, kind) for kind in ("tx", "rx")}
     # A detour of all messages lengthens the two flights of the first round trip; the formulas hold it to the same
     # precision as the flight itself.
     p, detour = c.multipath, c.detour_s * SPEED_OF_LIGHT
-    flight = protocol.flight_ticks(spans) - truth
     return PredictedErrors(
-        mean_m=np.asarray(flight * METRES_PER_TICK + p * detour),
+        mean_m=np.asarray((flight() - truth) * METRES_PER_TICK + p * detour),
         transmit_m2=np.asarray(squares["tx"] * (c.tx_std * SPEED_OF_LIGHT) ** 2),
         receive_m2=np.asarray(squares["rx"] * (c.rx_std * SPEED_OF_LIGHT) ** 2),
         quantization_m2=np.asarray(squares["rx"] * METRES_PER_TICK**2 / 12 * c.quantize),
-        carrier_m2=np.asarray((slopes["carrier_ppm"] * c.carrier_std_ppm * METRES_PER_TICK) ** 2),
-        clock_m2=_white_clocks(protocol, slopes, stamps, leave, arrive, c) * SPEED_OF_LIGHT**2,
+        carrier_m2=np.asarray((slopes["carrier"] * c.carrier_std_ppm * METRES_PER_TICK) ** 2),
+        clock_m2=_white_clocks(protocol, slopes, leave, arrive, c) * SPEED_OF_LIGHT**2,
         multipath_m2=np.full(len(c), p * (2 - p) * detour**2),
     )
 
 
-def _noiseless(protocol: RangingProtocol, c: Conditions) -> tuple[Intervals, tuple[list[Floats], list[Floats]]]:
-    """Return the intervals of exchanges without noise in ticks, and true seconds at which messages leave and arrive.
+def _noiseless(protocol: RangingProtocol, c: Conditions) -> tuple[dict[str, Floats], list[Floats], list[Floats]]:
+    """Return stamps of exchanges without noise in ticks, and true seconds at which messages leave and arrive.
 
-    From true durations: what a clock reads of one is its length times 1 + rate, plus half of drift times the difference
-    of squares of its ends; what antennas and power add to stamps comes on top.
+    A clock reads 1 + rate times the true time, plus half of drift times its square; what antennas and power add to
+    stamps comes on top.
     """
-    ticks = 1 / TICK_S
+    sides = ("initiator", "target")
     tx = {"initiator": c.tx_delay_initiator, "target": c.tx_delay_target}
     rx = {"initiator": c.rx_delay_initiator + c.late, "target": c.rx_delay_target + c.late}
     rate = {"initiator": c.rate_initiator, "target": c.rate_target}
     drift = {"initiator": c.drift_initiator, "target": c.drift_target}
-    replies = [_reply_s(protocol, k, c) for k in range(1, len(protocol.messages))]
-    # True instants at the antennas, from the departure of the poll.
-    leave = [np.zeros(len(c))]
     way = c.flight + c.excess
-    arrive = [way]
-    for k, message in enumerate(protocol.messages[1:], start=1):
-        side, before = message.sender, message.after
-        since = arrive[k - 1] if before.startswith("rx") else leave[k - 1]
-        # The printed reply runs from stamp to stamp; at the antenna it is shorter by what antenna and power add.
-        added = tx[side] - (rx[side] if before.startswith("rx") else tx[side])
-        true = (replies[k - 1] - added) / (1 + rate[side])
-        leave.append(since + true)
-        arrive.append(leave[k] + way + c.flight_rate * leave[k])
-
-    def stamp(name: str) -> tuple[str, Floats, Floats]:
-        """Return whose stamp it is, its true time, and what antenna and power add to it."""
-        k, sent = int(name[2]) - 1, name.startswith("tx")
-        side = protocol.messages[k].sender
-        if sent:
-            return side, leave[k], tx[side]
-        other = "target" if side == "initiator" else "initiator"
-        return other, arrive[k], rx[other]
-
-    spans = {"dt53": np.ones(len(c)), "dt64": np.ones(len(c))}
-    for name, ends in interval_stamps(protocol).items():
-        (owner, later, added), (_, earlier, early) = map(stamp, ends)
-        true = (1 + rate[owner]) * (later - earlier) + drift[owner] / 2 * (later**2 - earlier**2)
-        spans[name] = (true + added - early) * ticks
-    carrier = c.carrier_sign * (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
-    return Intervals(**spans, carrier_ppm=carrier), (leave, arrive)
+    # True instants at the antennas, from the departure of the poll.
+    leave: list[Floats] = []
+    arrive: list[Floats] = []
+    stamps = {}
+    for k, message in enumerate(protocol.messages):
+        side, other = message.sender, sides[1 - sides.index(message.sender)]
+        left = np.zeros(len(c))
+        if message.after:
+            received = message.after.startswith("rx")
+            # The printed reply runs from stamp to stamp; at the antenna it is shorter by what antenna and power add.
+            added = tx[side] - (rx if received else tx)[side]
+            left = (arrive if received else leave)[k - 1] + (_reply_s(protocol, k, c) - added) / (1 + rate[side])
+        leave.append(left)
+        arrive.append(left + way + c.flight_rate * left)
+        for name, owner, time, late in (("tx", side, left, tx[side]), ("rx", other, arrive[k], rx[other])):
+            shown = (1 + rate[owner]) * time + drift[owner] / 2 * time**2 + late
+            stamps[f"{name}{k + 1}"] = shown / TICK_S
+    return stamps, leave, arrive
 
 
 def _reply_s(protocol: RangingProtocol, k: int, c: Conditions) -> Floats:
@@ -129,29 +125,9 @@ def _reply_s(protocol: RangingProtocol, k: int, c: Conditions) -> Floats:
     return reply - half + ANTENNA_DELAY_TICKS * TICK_S if scheduled else reply + half
 
 
-def _slopes(protocol: RangingProtocol, spans: Intervals) -> Iterator[tuple[str, Floats]]:
-    """Yield the derivative of the flight by each interval, and by the carrier's ppm."""
-    for name in ("dt41", "dt32", "dt53", "dt64", "carrier_ppm"):
-        # The formulas are smooth over thousands of ticks, and over ppm.
-        step = 16.0 if name != "carrier_ppm" else 1.0
-        value = getattr(spans, name)
-        up, down = (protocol.flight_ticks(replace(spans, **{name: value + s})) for s in (step, -step))
-        yield name, np.asarray((up - down) / (2 * step))
-
-
-def _by_stamp(protocol: RangingProtocol, slopes: dict[str, Floats]) -> dict[str, Floats]:
-    """Return the derivative of the flight by the error of each stamp."""
-    found: dict[str, Floats] = {}
-    for interval, (later, earlier) in interval_stamps(protocol).items():
-        found[later] = found.get(later, 0.0) + slopes[interval]
-        found[earlier] = found.get(earlier, 0.0) - slopes[interval]
-    return found
-
-
 def _white_clocks(
     protocol: RangingProtocol,
     slopes: dict[str, Floats],
-    stamps: dict[str, Floats],
     leave: list[Floats],
     arrive: list[Floats],
     c: Conditions,
@@ -163,22 +139,18 @@ def _white_clocks(
     rate over the preamble of the second message.
     """
     # How the flight changes with what the phase gains during the preamble.
-    gain = c.carrier_sign * slopes["carrier_ppm"] * 1e6 * TICK_S / RATE_SPAN_S
+    gain = c.carrier_sign * slopes["carrier"] * 1e6 * TICK_S / RATE_SPAN_S
     total = np.zeros(len(c))
     for side, white, sign in (("initiator", c.white_initiator, 1), ("target", c.white_target, -1)):
         read = [(leave[1] - RATE_SPAN_S, -sign * gain), (leave[1], sign * gain)]
         for k, message in enumerate(protocol.messages):
             name, time = ("tx", leave[k]) if message.sender == side else ("rx", arrive[k])
-            read.append((time, stamps.get(f"{name}{k + 1}", np.zeros(len(c)))))
+            read.append((time, slopes[f"{name}{k + 1}"]))
         read.sort(key=lambda pair: float(pair[0][0]))
         after = np.cumsum([slope for _, slope in reversed(read)], axis=0)[::-1]
         gaps = np.diff([time for time, _ in read], axis=0)
         total += white**2 * np.sum(after[1:] ** 2 * np.maximum(gaps, 0), axis=0)
     return total
-
-
-def _sum_of_squares(stamps: dict[str, Floats], kind: str) -> Floats:
-    return np.asarray(sum(slope**2 for name, slope in stamps.items() if name.startswith(kind)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -228,9 +200,9 @@ def _check(q: State) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Prediction:
-    """What a raw range in one state errs by: `bias_m`, `std_m`, `variance_m2`, and in ps of the time of flight.
+    """The predicted error of a raw range in one state: `bias_m`, `std_m`, `variance_m2`, and in ps of time of flight.
 
-    `parts_m` is the standard deviation in metres that each cause alone leaves.
+    `parts_m` are the standard deviations in metres by each cause alone.
 
     >>> import uwbsim
     >>> print(uwbsim.predict_state(uwbsim.State(protocol="ss", skew_ppm=2.0)))
@@ -253,7 +225,7 @@ class Prediction:
     parts_m: dict[str, float]
 
     def __repr__(self) -> str:
-        """Return a line a figure, in cm."""
+        """Return one line per figure, in cm."""
         lines = [
             self.title,
             f"  bias                    {100 * self.bias_m:+10.4f} cm",
@@ -268,9 +240,9 @@ class Prediction:
 
 
 def predict_state(q: State) -> Prediction:
-    """Return bias and standard deviation of a raw range without simulating any, and the parts of the latter.
+    """Predict bias and standard deviation of a raw range analytically, and the parts of the latter.
 
-    Raises `ParameterError` for a number that cannot be, and for an unknown protocol.
+    Raises `ParameterError` for a number out of range, and for an unknown protocol.
 
     >>> import uwbsim
     >>> found = uwbsim.predict_state(uwbsim.State(protocol="ss", skew_ppm=2.0, reply_delay_us=1000.0, rx_noise_ps=0.0))

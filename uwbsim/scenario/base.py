@@ -1,14 +1,17 @@
-"""What all tables of a scenario file have in common: kinds of numbers, and the largest value of each unit.
+"""Base of all tables of a scenario file: kinds of numbers, and the largest value of each unit.
 
-Beyond these limits a simulation would go on with numbers that overflow, and write stamps that mean nothing.
+Beyond these limits numbers of a simulation would overflow, and its stamps mean nothing.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Annotated, Any, Final, NamedTuple, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 
 class Limit(NamedTuple):
@@ -19,32 +22,32 @@ class Limit(NamedTuple):
 
 
 BY_UNIT: Final = {
-    "_per_k": Limit(1e4, "no board moves so far by a kelvin"),
-    "_per_v": Limit(1e4, "no board moves so far by a volt"),
-    "_mps2": Limit(1e5, "nothing that flies takes that"),
-    "_dps": Limit(1e4, "nothing that flies turns so fast"),
-    "_dps_per_sqrt_hz": Limit(1e3, "no sensor is so noisy"),
-    "_mps2_per_sqrt_hz": Limit(1e3, "no sensor is so noisy"),
-    "_mps": Limit(1e4, "nothing in air is so fast"),
-    "_dbm": Limit(500.0, "between noise of nothing and a lightning"),
-    "_db": Limit(500.0, "more than any two powers differ by"),
+    "_per_k": Limit(1e4, "effects of a kelvin are far smaller"),
+    "_per_v": Limit(1e4, "effects of a volt are far smaller"),
+    "_mps2": Limit(1e5, "bodies accelerate far less"),
+    "_dps": Limit(1e4, "bodies turn far more slowly"),
+    "_dps_per_sqrt_hz": Limit(1e3, "sensors have far less noise"),
+    "_mps2_per_sqrt_hz": Limit(1e3, "sensors have far less noise"),
+    "_mps": Limit(1e4, "bodies are far slower"),
+    "_dbm": Limit(500.0, "powers of radios are far smaller"),
+    "_db": Limit(500.0, "differences of powers are far smaller"),
     "_ppm": Limit(1e4, "a crystal is good to some 20 ppm"),
     "_ppm_per_s": Limit(1e4, "a crystal is good to some 20 ppm"),
     "_ppm_per_sqrt_s": Limit(1e4, "a crystal is good to some 20 ppm"),
     "_ppm_sqrt_s": Limit(1e4, "a crystal is good to some 20 ppm"),
-    "_hz": Limit(1e6, "a frame takes longer"),
+    "_hz": Limit(1e6, "a frame lasts longer than the interval"),
     "_ns": Limit(1e6, "an antenna delays by less than a microsecond"),
     "_ps": Limit(1e6, "a receiver times first paths to some nanoseconds"),
     "_m": Limit(1e6, "the radio reaches some hundred metres"),
-    "_rad": Limit(1e3, "a turn is 6.3"),
-    "_deg": Limit(1e6, "a turn is 360"),
+    "_rad": Limit(1e3, "a full turn is 6.3"),
+    "_deg": Limit(1e6, "a full turn is 360"),
     "_s": Limit(1e7, "time is simulated for 36 hours"),
     "_ms": Limit(1e9, "time is simulated for 36 hours"),
-    "_c": Limit(1e3, "boards melt before"),
+    "_c": Limit(1e3, "boards melt at lower temperatures"),
     "_v": Limit(1e3, "boards take 3.6 V"),
-    "": Limit(1e6, "no setting has sense so far out"),
+    "": Limit(1e6, "settings are far smaller"),
 }
-"""By the unit at a key's end: what physics and the chip leave sense in."""
+"""Limits by the unit at the end of a key: beyond what physics and the chip allow."""
 
 
 def limit_of(key: str) -> Limit:
@@ -55,41 +58,44 @@ def limit_of(key: str) -> Limit:
 
 def check_limits(key: str, value: Any) -> None:
     """Raise `ValueError` for a number beyond the limit of its key, alone or in tuples; anything else passes."""
-    if isinstance(value, tuple):
-        leaf: Any = value
-        while isinstance(leaf, tuple) and leaf:
-            leaf = leaf[0]
-        if not _is_number(leaf):
-            return
-        try:
-            found = float(np.max(np.abs(np.asarray(value, dtype=np.float64))))
-        except (ValueError, OverflowError):  # of several lengths, or mixed
-            for item in value:
-                check_limits(key, item)
-            return
-    elif _is_number(value):
-        found = abs(value)
-    else:
+    if not isinstance(value, int | float | tuple):
+        return
+    try:
+        found = float(np.max(np.abs(np.asarray(value, dtype=np.float64)), initial=0.0))
+    except OverflowError:
+        found = math.inf
+    except (TypeError, ValueError):  # tables, texts, rows of several lengths: these have checks of their own
         return
     limit = limit_of(key)
     if found > limit.most:
         shown = f"{found:g}" if found < 1e300 else "a number of hundreds of digits"
-        raise ValueError(f"{key}: found {shown}, at most {limit.most:g} can be ({limit.reason})")
+        raise ValueError(f"{key}: found {shown}, at most {limit.most:g} is allowed ({limit.reason})")
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+def _increasing(values: Sequence[float]) -> Sequence[float]:
+    if any(b <= a for a, b in pairwise(values)):
+        raise ValueError("found a value that is not above the one before; they must increase")
+    return values
+
+
+def not_decreasing(values: Sequence[float]) -> Sequence[float]:
+    """Raise `ValueError` for values that do not increase or stay."""
+    if any(b < a for a, b in pairwise(values)):
+        raise ValueError("found a value that is below the one before; they must not decrease")
+    return values
 
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Vector = tuple[float, float, float]
+Increasing = Annotated[tuple[float, ...], AfterValidator(_increasing)]
+NotDecreasing = Annotated[tuple[float, ...], AfterValidator(not_decreasing)]
 TagId = Annotated[int, Field(ge=0, le=254)]
 
 
 def _limits_in_schema(schema: dict[str, Any]) -> None:
-    """Put the limits of units beside those that a key has of its own."""
+    """Add the limits of units to those of a key's own."""
     for key, described in schema.get("properties", {}).items():
         if key == "seed":  # which measures nothing
             continue

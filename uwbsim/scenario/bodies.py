@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from uwbsim.scenario.base import NotNegative, Positive, Section, Vector
+from uwbsim.scenario.base import Increasing, NotNegative, Positive, Section, Vector
 
 
 class Box(Section):
@@ -33,7 +34,7 @@ class RandomFlight(Box):
     box_max_m: Vector = Field(description="Highest corner of the box.")
     speed_mps: Positive = Field(
         1.0,
-        description="Speed, roughly: that at which it would go straight from each point to the next.",
+        description="Approximate speed: that of straight legs between the points.",
     )
 
 
@@ -41,31 +42,26 @@ class Waypoints(Section):
     """Through points: at times, on a smooth spline; or straight, with limits of speed and acceleration."""
 
     model: Literal["waypoints"] = Field(description="Through given points.")
-    points_m: tuple[Vector, ...] = Field(description="The points, two or more.")
-    times_s: tuple[float, ...] | None = Field(
+    points_m: Annotated[tuple[Vector, ...], Field(min_length=2)] = Field(description="The points, two or more.")
+    times_s: Increasing | None = Field(
         None,
-        description="When it is at each of them, on a smooth spline; or give speed_mps.",
+        description="Time at each point, for a smooth spline; or give speed_mps.",
     )
     speed_mps: Positive | None = Field(
         None,
-        description="Highest speed on straight ways between the points; or give times_s.",
+        description="Highest speed on straight legs between the points; or give times_s.",
     )
-    acceleration_mps2: Positive = Field(2.0, description="Highest acceleration on straight ways.")
+    acceleration_mps2: Positive = Field(2.0, description="Highest acceleration on straight legs.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if (self.times_s is None) == (self.speed_mps is None):
             raise ValueError("times_s: give either times_s or speed_mps")
-        if len(self.points_m) < 2:
-            raise ValueError(f"points_m: found {len(self.points_m)} points, give two or more")
-        if self.times_s is not None:
-            if len(self.times_s) != len(self.points_m):
-                raise ValueError(
-                    f"points_m: found {len(self.points_m)} points at {len(self.times_s)} times, give one time each"
-                )
-            if any(b <= a for a, b in zip(self.times_s, self.times_s[1:], strict=False)):
-                raise ValueError("times_s: must increase")
-        if any(a == b for a, b in zip(self.points_m, self.points_m[1:], strict=False)) and self.times_s is None:
+        if self.times_s is not None and len(self.times_s) != len(self.points_m):
+            raise ValueError(
+                f"points_m: found {len(self.points_m)} points at {len(self.times_s)} times, give one time each"
+            )
+        if self.times_s is None and any(a == b for a, b in pairwise(self.points_m)):
             raise ValueError("points_m: found the same point twice in a row")
         return self
 
@@ -73,45 +69,41 @@ class Waypoints(Section):
 class Figure(Section):
     """A structured training figure around a centre, turning all the way: every direction and distance comes up."""
 
-    model: Literal["figure"] = Field(description="A training figure, turning all the way.")
+    model: Literal["figure"] = Field(description="A training figure, with a steady turn of the body.")
     shape: Literal["circle", "eight", "helix"] = Field(description="Which figure.")
     centre_m: Vector = Field(description="Its centre.")
     radius_m: Positive = Field(description="Its radius.")
-    period_s: Positive = Field(12.0, description="How long one round takes.")
-    climb_m: float = Field(0.0, description="How far its lowest point is below its highest.")
-    phase_deg: float = Field(0.0, description="Where on it the body begins.")
-    turns_per_period: float = Field(1.0, description="How often the body turns about its z axis in a round.")
+    period_s: Positive = Field(12.0, description="Duration of one round.")
+    climb_m: float = Field(0.0, description="Height of its highest point above its lowest.")
+    phase_deg: float = Field(0.0, description="Phase at the start.")
+    turns_per_period: float = Field(1.0, description="Turns of the body about its z axis per round.")
 
 
 class Static(Section):
     """A body that does not move, such as an anchor."""
 
     model: Literal["static"] = Field(description="Does not move, such as an anchor.")
-    position_m: Vector = Field(description="Where it stands.")
-    yaw_deg: float = Field(0.0, description="How far it is turned about the z axis.")
+    position_m: Vector = Field(description="Its position.")
+    yaw_deg: float = Field(0.0, description="Its rotation about the z axis.")
 
 
 class Carried(Section):
     """A body that stands still in one place after the other, and is carried from each to the next; then stays."""
 
-    model: Literal["carried"] = Field(description="Put in one place after the other.")
-    places_m: tuple[Vector, ...] = Field(description="The places, one or more, in the order of its stays.")
-    stay_s: Positive = Field(description="How long it stands in each place.")
-    carry_s: Positive = Field(10.0, description="How long it is carried from a place to the next.")
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if not self.places_m:
-            raise ValueError("places_m: found no place, give one or more")
-        return self
+    model: Literal["carried"] = Field(description="Stands still in one place after the other.")
+    places_m: Annotated[tuple[Vector, ...], Field(min_length=1)] = Field(
+        description="The places, one or more, in the order of its stays."
+    )
+    stay_s: Positive = Field(description="Duration of each stay.")
+    carry_s: Positive = Field(10.0, description="Duration of each move from a place to the next.")
 
 
 class Recorded(Section):
     """A trajectory from a file: TUM, CSV, or the poses of a recording, of `body` there; filled in on reading."""
 
-    model: Literal["recorded"] = Field(description="As a file says.")
+    model: Literal["recorded"] = Field(description="From a file.")
     file: str = Field(description="TUM, CSV, or a recording (.uwb); from the folder of the scenario.")
-    body: str | None = Field(None, description="Which body of the file; needed where it has several.")
+    body: str | None = Field(None, description="Body of the file; needed if it has several.")
     times_s: tuple[float, ...] = Field((), description="Filled in on reading.")
     positions_m: tuple[Vector, ...] = Field((), description="Filled in on reading.")
     quaternions: tuple[tuple[float, float, float, float], ...] = Field(
@@ -149,9 +141,9 @@ class Imu(Section):
     """
 
     grade: Literal["consumer", "industrial", "tactical", "perfect"] = Field(
-        "consumer", description="How good it is: consumer, industrial, tactical or perfect."
+        "consumer", description="Grade of the sensor, which sets the defaults of its errors."
     )
-    rate_hz: Positive = Field(200.0, description="Readings a second.")
+    rate_hz: Positive = Field(200.0, description="Readings per second.")
     gyro_bias_dps: NotNegative | None = Field(
         None, description="Standard deviation of the gyroscope's constant bias an axis, degrees a second."
     )
@@ -165,7 +157,7 @@ class Imu(Section):
         None, description="White noise of the accelerometer, m/s^2 a root of Hz."
     )
     vibration_mps2: NotNegative = Field(
-        0.0, description="What propellers add to each reading of the accelerometer, standard deviation."
+        0.0, description="Standard deviation of vibration in each reading of the accelerometer."
     )
 
     def errors(self, which: str) -> Errors:
@@ -181,7 +173,7 @@ class Imu(Section):
 class Height(Section):
     """A sensor of the height of a body's middle above the world's zero."""
 
-    rate_hz: Positive = Field(30.0, description="Readings a second.")
+    rate_hz: Positive = Field(30.0, description="Readings per second.")
     noise_m: NotNegative = Field(0.02, description="White noise of a reading, standard deviation.")
     bias_m: NotNegative = Field(0.0, description="Standard deviation of its constant bias.")
 
@@ -205,7 +197,7 @@ wet tissue). Excess delay is (index - 1) times the thickness."""
 class Material(Section):
     """What an obstacle is made of: loss in dB a metre, and refractive index."""
 
-    loss_db_per_m: NotNegative = Field(description="Loss of waves on their way through.")
+    loss_db_per_m: NotNegative = Field(description="Loss of waves inside.")
     index: Annotated[float, Field(ge=1)] = Field(1.0, description="Refractive index.")
 
 
@@ -219,12 +211,12 @@ KnownMaterial = Annotated[str | Material, AfterValidator(_known)]
 
 
 class Obstacle(Box):
-    """A box that waves go through, at a loss and late. `material` is a name or a table of its own.
+    """A box that attenuates and delays waves. `material` is a name or a table of its own.
 
     In the geometric model its faces reflect; `roughness_mm` is the standard deviation of their heights.
     """
 
-    name: str = Field("obstacle", description="What it is called.")
+    name: str = Field("obstacle", description="Its name.")
     min_m: Vector = Field(description="Lowest corner.")
     max_m: Vector = Field(description="Highest corner.")
     material: KnownMaterial = Field(description="A known material by its name, or a table of its own.")
@@ -252,8 +244,8 @@ class Room(Box):
     max_m: Vector = Field(description="Highest corner.")
     reflection_loss_db: NotNegative | None = Field(
         None,
-        description="How much weaker surfaces give waves back; they reflect nothing where it is left out. Not in the "
-        "geometric model.",
+        description="Loss of a reflection by a surface; by default surfaces do not reflect. Not in the geometric "
+        "model.",
     )
     material: KnownMaterial = Field("concrete", description="Of walls, in the geometric model.")
     floor: KnownMaterial | None = Field(None, description="Material of the floor, if not that of the walls.")
@@ -269,8 +261,8 @@ class Room(Box):
 
 
 class Shadow(Section):
-    """The part of a body that waves do not pass unharmed: an ellipsoid in the body's frame."""
+    """The part of a body that attenuates waves: an ellipsoid in the body's frame."""
 
     semi_axes_m: tuple[Positive, Positive, Positive] = Field(description="Semi-axes of the ellipsoid along x, y, z.")
     centre_m: Vector = Field((0.0, 0.0, 0.0), description="Its centre in the frame of the body.")
-    loss_db_per_m: NotNegative = Field(40.0, description="Loss of waves on their way through.")
+    loss_db_per_m: NotNegative = Field(40.0, description="Loss of waves inside.")

@@ -12,7 +12,7 @@ from uwblink.errors import PlanError
 from uwblink.recording.antenna_delays import REGISTER_MAX, delay_of, load_antenna_delays
 from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S
 from uwbsim.errors import ScenarioError
-from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, Vector
+from uwbsim.scenario.base import Increasing, NotNegative, Positive, Section, TagId, Vector
 from uwbsim.scenario.bodies import Height, Imu, Motion, Shadow
 
 
@@ -34,15 +34,15 @@ class Ramp(Section):
 
 
 class WarmUp(Section):
-    """From one value to another as what is heated does: the distance shrinks by e in every `time_constant_s`.
+    """From one value towards another exponentially: the difference shrinks by e in every `time_constant_s`.
 
     Constant before `begin_s`; a negative one means that part of it is over when the run begins.
     """
 
-    model: Literal["warm-up"] = Field(description="From one value to another, ever more slowly.")
+    model: Literal["warm-up"] = Field(description="From one value towards another, exponentially.")
     start: float = Field(description="The value before.")
-    end: float = Field(description="The value that it comes close to.")
-    time_constant_s: Positive = Field(description="In which time the distance shrinks by e.")
+    end: float = Field(description="The value in the limit.")
+    time_constant_s: Positive = Field(description="Time in which the difference shrinks by e.")
     begin_s: float = Field(0.0, description="When it begins; negative: part of it is over when the run begins.")
 
 
@@ -58,15 +58,13 @@ class Table(Section):
         description="CSV file with the columns time_s and the key that it stands at; times_s and values are then read "
         "from it.",
     )
-    times_s: tuple[float, ...] = Field(description="When; increasing.")
+    times_s: Increasing = Field(description="When; increasing.")
     values: tuple[float, ...] = Field(description="The value at each of these times.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if not self.times_s or len(self.times_s) != len(self.values):
             raise ValueError(f"values: found {len(self.values)} at {len(self.times_s)} times, give one a time")
-        if any(b <= a for a, b in itertools.pairwise(self.times_s)):
-            raise ValueError("times_s: must increase")
         return self
 
 
@@ -81,7 +79,7 @@ Profile = Annotated[
 
 
 class Devices(Section):
-    """What temperature and supply voltage do to boards, and what boards tell of them.
+    """Effects of temperature and supply voltage on boards, and the boards' readings of them.
 
     A tag's antenna delay grows by twice what each end of a range lengthens it, 0.44 of it before transmissions and 0.56
     in receptions. Typical values are from the DW1000's manual (8.3.1), which gives no sign. Tags may have their own.
@@ -90,20 +88,18 @@ class Devices(Section):
 
     range_mm_per_k: float = Field(
         0.0,
-        description="By how much each of the two tags of a range lengthens it, a kelvin above reference_c (typically "
-        "2.15 by the DW1000's manual).",
+        description="Increase of a range per tag and kelvin above reference_c (typically 2.15 by the DW1000's manual).",
     )
     range_cm_per_v: float = Field(
         0.0,
-        description="By how much each of the two tags of a range lengthens it, a volt above reference_v (typically "
-        "5.35 by the DW1000's manual).",
+        description="Increase of a range per tag and volt above reference_v (typically 5.35 by the DW1000's manual).",
     )
-    skew_ppm_per_k: float = Field(0.0, description="What a kelvin above reference_c adds to the rate of clocks.")
+    skew_ppm_per_k: float = Field(0.0, description="Increase of clocks' rates per kelvin above reference_c.")
     reference_c: float = Field(23.0, description="The temperature at which delays and skews are as the tags say.")
     reference_v: float = Field(3.3, description="The supply voltage at which delays are as the tags say.")
     readings_hz: Positive = Field(
         1.0,
-        description="How often a tag that has a temperature or a voltage reads it, a second.",
+        description="Readings per second of tags that have a temperature or a voltage.",
     )
     reading_noise_k: NotNegative = Field(0.0, description="Standard deviation of temperatures read.")
     reading_noise_v: NotNegative = Field(0.0, description="Standard deviation of voltages read.")
@@ -184,15 +180,15 @@ class Body(Section):
     motion: Motion = Field(description="How it moves.")
     shadow: Shadow | None = Field(
         None,
-        description="The part of it that waves do not pass unharmed; none where it is left out.",
+        description="The part of it that attenuates waves; by default none.",
     )
     temperature_c: Profile | None = Field(
         None,
-        description="Temperature of those of its tags that have none of their own, over time.",
+        description="Temperature over time of its tags, unless they have their own.",
     )
     supply_v: Profile | None = Field(
         None,
-        description="Supply voltage of those of its tags that have none of their own, over time.",
+        description="Supply voltage over time of its tags, unless they have their own.",
     )
     imu: Imu | None = Field(None, description="Its inertial sensor, whose readings the recording has.")
     height: Height | None = Field(None, description="Its height sensor, whose readings the recording has.")
@@ -219,26 +215,26 @@ class Tag(Section):
 
     id: TagId = Field(description="Number of the board; no two have the same.")
     body: str = Field(description="Name of the body that carries it.")
-    lever_arm_m: Vector = Field((0.0, 0.0, 0.0), description="Where its antenna sits in the frame of the body.")
+    lever_arm_m: Vector = Field((0.0, 0.0, 0.0), description="Position of its antenna in the frame of the body.")
     delay_ns: float | None = Field(
         None,
         description="Aggregate antenna delay, transmit less receive, split 0.44 / 0.56; 0 where no delay is given.",
     )
     tx_delay_ns: float | None = Field(
         None,
-        description="What the antenna adds to transmit stamps; give rx_delay_ns, too, and not delay_ns.",
+        description="Delay added to transmit stamps; requires rx_delay_ns, excludes delay_ns.",
     )
     rx_delay_ns: float | None = Field(
         None,
-        description="What the antenna adds to receive stamps; give tx_delay_ns, too, and not delay_ns.",
+        description="Delay added to receive stamps; requires tx_delay_ns, excludes delay_ns.",
     )
     antenna_delay: Programmed = Field(
         Programmed(),
-        description="What is programmed into the board; by default the 16436 ticks that delays are relative to.",
+        description="Antenna delays programmed into the board; delay_ns is relative to the default of 16436 ticks.",
     )
     skew_ppm: Annotated[float, Field(ge=-100, le=100)] = Field(
         0.0,
-        description="How much faster than true time the clock runs at first.",
+        description="Rate of the clock relative to true time at the start.",
     )
     drift_ppm_per_sqrt_s: NotNegative = Field(
         0.0,
@@ -255,36 +251,36 @@ class Tag(Section):
     ramp_ppm_per_s: float = Field(0.0, description="Steady change of the clock's rate.")
     warm_up_ppm: float = Field(
         0.0,
-        description="How much faster the clock runs at first, by a transient that dies out.",
+        description="Amplitude of an exponential transient of the clock's rate.",
     )
-    warm_up_s: Positive = Field(60.0, description="Over which time that transient decays by e.")
+    warm_up_s: Positive = Field(60.0, description="Time constant of that transient.")
     temperature_c: Profile | None = Field(
         None,
-        description="Its temperature over time; that of its body where it is left out.",
+        description="Its temperature over time; by default that of its body.",
     )
     supply_v: Profile | None = Field(
         None,
-        description="Its supply voltage over time; that of its body where it is left out.",
+        description="Its supply voltage over time; by default that of its body.",
     )
-    range_mm_per_k: float | None = Field(None, description="In the place of devices.range_mm_per_k, for this tag.")
-    range_cm_per_v: float | None = Field(None, description="In the place of devices.range_cm_per_v, for this tag.")
-    skew_ppm_per_k: float | None = Field(None, description="In the place of devices.skew_ppm_per_k, for this tag.")
+    range_mm_per_k: float | None = Field(None, description="Overrides devices.range_mm_per_k for this tag.")
+    range_cm_per_v: float | None = Field(None, description="Overrides devices.range_cm_per_v for this tag.")
+    skew_ppm_per_k: float | None = Field(None, description="Overrides devices.skew_ppm_per_k for this tag.")
     group_delay: GroupDelay | None = Field(
         None,
-        description="Group delay of its antenna over direction; that of radio.group_delay where it is left out.",
+        description="Group delay of its antenna over direction; by default radio.group_delay.",
     )
     passive: bool = Field(False, description="Whether it records the exchanges that it overhears.")
-    tx_power_db: float = Field(0.0, description="How much stronger than others it sends.")
-    power_offset_db: float = Field(0.0, description="How much too high it reads powers.")
+    tx_power_db: float = Field(0.0, description="Offset of its transmit power.")
+    power_offset_db: float = Field(0.0, description="Offset of its power readings.")
     pattern_db: tuple[float, ...] = Field(
         (),
-        description="What its own antenna adds to radio.antenna by direction in its body's frame: 1, 4, 9, 16 or 25 "
+        description="Gain of its antenna relative to radio.antenna by direction in its body's frame: 1, 4, 9, 16 or 25 "
         "coefficients of real spherical harmonics of degree 0, 1 and so on (m from -l to l), whose root "
         "mean square over all directions is one.",
     )
     clock_offset_s: NotNegative | None = Field(
         None,
-        description="What its clock shows when the run begins; drawn from the seed where it is left out.",
+        description="Reading of its clock at the start of the run; by default drawn from the seed.",
     )
 
     @model_validator(mode="after")
@@ -296,16 +292,10 @@ class Tag(Section):
             raise ValueError(f"pattern_db: found {len(self.pattern_db)} coefficients, expected 1, 4, 9, 16, 25 or none")
         return self
 
-    @property
-    def antenna_delays_s(self) -> tuple[float, float]:
-        """Return what is added to a transmit and to a receive stamp beyond what belongs there, in seconds."""
-        transmit, receive = self.delays_ns()
-        return transmit * 1e-9, receive * 1e-9
-
     def delays_ns(self) -> tuple[float, float]:
-        """Return what is added to a transmit and to a receive stamp beyond what belongs there, in nanoseconds.
+        """Return the errors of a transmit and of a receive stamp, in nanoseconds.
 
-        That is what the antenna adds, and what is programmed above or below 16436.
+        These are the antenna's delays, and differences of the programmed delays from 16436 ticks.
         """
         aggregate = self.delay_ns or 0.0
         transmit = TX_SHARE * aggregate if self.tx_delay_ns is None else self.tx_delay_ns

@@ -1,7 +1,8 @@
-"""What `uwbsim serve --faults` makes go wrong between virtual boards and host."""
+"""Faults between virtual boards and host, for `uwbsim serve --faults`."""
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,30 +16,31 @@ from uwbsim.scenario.base import NotNegative, Positive, Section, Share, TagId
 from uwbsim.scenario.loading import parse_toml, validated
 
 
-class Bytes(Section):
+class Random(Section):
+    """A fault that occurs with a probability, at one board or at all."""
+
+    share: Share = Field(description="Probability for each byte, or for each message.")
+    tag: TagId | None = Field(None, description="Board; by default all.")
+
+
+class Bytes(Random):
     """Each byte to the host is dropped, or replaced by a random one, with a probability."""
 
-    kind: Literal["drop-bytes", "garble-bytes"] = Field(description="What happens to bytes.")
-    share: Share = Field(description="Probability for each byte.")
-    tag: TagId | None = Field(None, description="Which board; all where it is left out.")
+    kind: Literal["drop-bytes", "garble-bytes"] = Field(description="Bytes are dropped, or replaced by random ones.")
 
 
-class SplitWrites(Section):
+class SplitWrites(Random):
     """Messages come in two pieces with a gap between, with a probability."""
 
-    kind: Literal["split-writes"] = Field(description="Messages come in two pieces.")
-    share: Share = Field(description="Probability for each message.")
-    gap_ms: NotNegative = Field(2.0, description="Between the pieces.")
-    tag: TagId | None = Field(None, description="Which board; all where it is left out.")
+    kind: Literal["split-writes"] = Field(description="Messages arrive in two pieces.")
+    gap_ms: NotNegative = Field(2.0, description="Gap between the pieces.")
 
 
-class LateReplies(Section):
+class LateReplies(Random):
     """Messages come late, with a probability."""
 
-    kind: Literal["late-replies"] = Field(description="Messages come late.")
-    share: Share = Field(description="Probability for each message.")
-    delay_ms: Positive = Field(200.0, description="How late.")
-    tag: TagId | None = Field(None, description="Which board; all where it is left out.")
+    kind: Literal["late-replies"] = Field(description="Messages arrive late.")
+    delay_ms: Positive = Field(200.0, description="Delay.")
 
 
 class LoseFrames(Section):
@@ -52,17 +54,17 @@ class Hang(Section):
     """A board goes into its hard-fault loop until it is unplugged."""
 
     kind: Literal["hang"] = Field(description="A board hangs until it is unplugged.")
-    tag: TagId = Field(description="Which board.")
-    at_s: NotNegative = Field(description="When, after the start.")
+    tag: TagId = Field(description="Board.")
+    at_s: NotNegative = Field(description="Time after the start.")
 
 
 class Unplug(Section):
     """A board is unplugged, and plugged in again after a while."""
 
     kind: Literal["unplug"] = Field(description="A board is unplugged for a while.")
-    tag: TagId = Field(description="Which board.")
-    at_s: NotNegative = Field(description="When, after the start.")
-    for_s: Positive = Field(1.0, description="For how long.")
+    tag: TagId = Field(description="Board.")
+    at_s: NotNegative = Field(description="Time after the start.")
+    for_s: Positive = Field(1.0, description="Duration.")
 
 
 Fault = Annotated[Bytes | SplitWrites | LateReplies | LoseFrames | Hang | Unplug, Field(discriminator="kind")]
@@ -71,15 +73,11 @@ Fault = Annotated[Bytes | SplitWrites | LateReplies | LoseFrames | Hang | Unplug
 class Faults(Section):
     """A file of faults."""
 
-    faults: tuple[Fault, ...] = Field((), description="What goes wrong, in any order.")
+    faults: tuple[Fault, ...] = Field((), description="The faults, in any order.")
 
     def lost_share(self) -> float:
         """Return the share of frames that are lost on the air."""
-        kept = 1.0
-        for fault in self.faults:
-            if isinstance(fault, LoseFrames):
-                kept *= 1 - fault.share
-        return 1 - kept
+        return 1 - math.prod(1 - fault.share for fault in self.faults if isinstance(fault, LoseFrames))
 
 
 def load_faults(path: str | os.PathLike[str], tags: Iterable[int]) -> Faults:

@@ -1,7 +1,7 @@
-"""Files that a scenario names: antenna tables, trajectories, plans. Their contents take the place of their names.
+"""Files that a scenario names: antenna tables, trajectories, plans. Their contents replace their names.
 
-Names are relative to the scenario's folder, and lead to regular files in it or below, whatever links stand there: who
-runs an untrusted scenario opens no other file.
+Names are relative to the scenario's folder and must lead to regular files in it or below, links resolved: an untrusted
+scenario opens no other file.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ import csv
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
-from itertools import islice
+from contextlib import suppress
+from itertools import islice, product
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,7 +28,7 @@ Folders = Iterable[str | os.PathLike[str]]
 
 
 def fill_in(table: dict[str, Any], scenario: Path, folders: Folders = ()) -> None:
-    """Read what a scenario's table names, in place; raises `ScenarioError`. What is not a table is left alone.
+    """Read the files that a scenario's tables name, in place; raises `ScenarioError`. Other values are left alone.
 
     Files lie in the scenario's folder, in one of `folders`, or below one of these.
     """
@@ -47,7 +48,7 @@ def fill_in(table: dict[str, Any], scenario: Path, folders: Folders = ()) -> Non
                     raise ScenarioError(f"{where}: found {named['file']!r}, expected the name of a file")
                 path = scenario.parent / named["file"]
                 path = check_linked(path, f"{where}: found {named['file']!r}", scenario.parent, folders)
-                held = read(path, key, named, _duration(table))
+                held = read(path, key, named)
                 # A table of antenna gains has no key of its own for its file.
                 one[key] = held if key == "antenna" else named | held
 
@@ -76,12 +77,6 @@ def check_linked(path: Path, where: str, beside: Path, folders: Folders) -> Path
     return path
 
 
-def _duration(table: dict[str, Any]) -> float:
-    settings = table.get("run")
-    value = settings.get("duration_s") if isinstance(settings, dict) else None
-    return float(value) if isinstance(value, int | float) else 0.0
-
-
 def _rows(path: Path, columns: tuple[str, ...]) -> list[list[float]]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -100,13 +95,11 @@ def _rows(path: Path, columns: tuple[str, ...]) -> list[list[float]]:
 
 
 def _number(path: Path, line: int, column: str, cell: str | None) -> float:
-    try:
+    with suppress(ValueError):
         value = float(cell or "")
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ScenarioError(f"{path}: row {line}: column {column!r}: found {cell!r}, expected a number")
-    return value
+        if math.isfinite(value):
+            return value
+    raise ScenarioError(f"{path}: row {line}: column {column!r}: found {cell!r}, expected a number")
 
 
 def _grid(path: Path, name: str) -> dict[str, Any]:
@@ -116,13 +109,9 @@ def _grid(path: Path, name: str) -> dict[str, Any]:
     found = {(row[0], row[1]): row[2] for row in rows}
     if len(found) != len(rows):
         raise ScenarioError(f"{path}: two rows are for the same direction")
-    for a in azimuth:
-        for e in elevation:
-            if (a, e) not in found:
-                what = (
-                    "a hole in the antenna table: no gain" if name == "gain_db" else f"a hole in the table: no {name}"
-                )
-                raise ScenarioError(f"{path}: {what} at azimuth {a:g}, elevation {e:g} degrees")
+    for a, e in product(azimuth, elevation):
+        if (a, e) not in found:
+            raise ScenarioError(f"{path}: a hole in the table: no {name} at azimuth {a:g}, elevation {e:g} degrees")
     return {
         "azimuth_deg": azimuth,
         "elevation_deg": elevation,
@@ -142,7 +131,7 @@ def _profile(path: Path, key: str, *_: Any) -> dict[str, Any]:
     return {"times_s": [row[0] for row in rows], "values": [row[1] for row in rows]}
 
 
-def _trajectory(path: Path, _key: str, named: Mapping[str, Any], duration_s: float) -> dict[str, Any]:
+def _trajectory(path: Path, _key: str, named: Mapping[str, Any]) -> dict[str, Any]:
     body = named.get("body")
     try:
         if path.suffix == ".uwb":
@@ -156,13 +145,8 @@ def _trajectory(path: Path, _key: str, named: Mapping[str, Any], duration_s: flo
     except UwblinkError as error:
         raise ScenarioError(str(error)) from error
     one = _of_body(path, poses, body)
-    time_s = (one.time_ns - one.time_ns[0]) * 1e-9
-    if time_s[-1] < duration_s:
-        raise ScenarioError(
-            f"{path}: its trajectory lasts {time_s[-1]:.1f} s and does not cover the run of {duration_s:g} s"
-        )
     return {
-        "times_s": time_s.tolist(),
+        "times_s": ((one.time_ns - one.time_ns[0]) * 1e-9).tolist(),
         "positions_m": one.position_m.tolist(),
         "quaternions": one.quaternion.tolist(),
     }
@@ -178,7 +162,7 @@ def _of_body(path: Path, poses: Poses, body: str | None) -> Poses:
     return Poses(poses.time_ns[rows], poses.body[rows], poses.position_m[rows], poses.quaternion[rows])
 
 
-READERS: Final[dict[str, tuple[str | None, Callable[[Path, str, Mapping[str, Any], float], dict[str, Any]]]]] = {
+READERS: Final[dict[str, tuple[str | None, Callable[[Path, str, Mapping[str, Any]], dict[str, Any]]]]] = {
     "antenna": (None, lambda path, *_: _grid(path, "gain_db")),
     "plan": (None, _plan),
     "group_delay": ("table", lambda path, *_: _grid(path, "delay_cm")),
@@ -188,5 +172,5 @@ READERS: Final[dict[str, tuple[str | None, Callable[[Path, str, Mapping[str, Any
 }
 """Keys whose tables can name a file, of which model these tables are then, and what the file holds.
 
-Readers are called with the file, the key, its table, and the duration of the run in seconds.
+Readers are called with the file, the key and its table.
 """

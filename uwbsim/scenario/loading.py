@@ -1,4 +1,4 @@
-"""Reads a scenario file, or one that comes with the package; every mistake becomes one line that says where it is."""
+"""Reading and validation of scenarios, from files or shipped with the package; errors are one line with the place."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
+from itertools import takewhile
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar, get_args
@@ -48,7 +49,7 @@ def _folder() -> Path:
 def found(path: Path) -> Path:
     """Return the file of a shipped scenario by its name, as in icra2023/train; another path as it is.
 
-    A file that is there goes before a name.
+    An existing file takes precedence over a name.
     """
     if os.path.exists(path) or path.is_absolute():  # False, where Path.exists raises: for want of permission
         return path
@@ -56,27 +57,25 @@ def found(path: Path) -> Path:
 
 
 def nearest(path: Path) -> str:
-    """Return `, did you mean ...?` with the shipped scenarios that a path could stand for; nothing where none is."""
+    """Return `, did you mean ...?` with shipped scenarios of similar names; empty without any."""
     plain, known = path.as_posix().removesuffix(".toml"), list(shipped_scenarios())
     parts = [name for name in known if plain in name.split("/")]
     near = [] if os.path.lexists(path) else parts or difflib.get_close_matches(plain, known, 2)
     return f", did you mean {' or '.join(near)}?" if near else ""
 
 
-def title(path: Path) -> str:
-    """Return what a scenario is about: the first sentence of the comment that it begins with, else its run's name."""
-    head = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        if not line.startswith("#"):
-            break
-        head.append(line.lstrip("# "))
-    sentence = re.split(r"(?<=[.:])\s", " ".join(head))[0].rstrip(".:")
-    return sentence or str(tomllib.loads(path.read_text(encoding="utf-8"))["run"].get("name", ""))
-
-
 def listed(names: Iterable[str] = ()) -> dict[str, str]:
-    """Return what shipped scenarios are about, by name; raises what `copy_scenarios` raises for `names`."""
-    return {name: title(path) for name, path in _chosen(list(names)).items()}
+    """Return titles of shipped scenarios by name; raises what `copy_scenarios` raises for `names`.
+
+    A title is the first sentence of the comment at the head of the file, else the name of its run.
+    """
+    found = {}
+    for name, path in _chosen(list(names)).items():
+        text = path.read_text(encoding="utf-8")
+        head = [line.lstrip("# ") for line in takewhile(lambda line: line.startswith("#"), text.splitlines())]
+        sentence = re.split(r"(?<=[.:])\s", " ".join(head))[0].rstrip(".:")
+        found[name] = sentence or str(tomllib.loads(text)["run"].get("name", ""))
+    return found
 
 
 def copy_scenarios(names: Iterable[str], folder: Path, *, force: bool = False) -> list[Path]:
@@ -198,34 +197,27 @@ def _split(text: str) -> tuple[str, Any]:
 
 
 def _override(table: dict[str, Any], key: str, value: Any) -> None:
+    """Set the value at a path of keys and indices, in place; tables that are not there are made."""
     keys = [k.strip() for k in key.split(".")]
     if not all(keys):
         raise ParameterError(
             f"found key {key!r}, expected key.path=value, as in ranging.rate_hz=50", parameter="overrides"
         )
     node: Any = table
-    for step in keys[:-1]:
-        node = _step(node, step, key)
-    last: Any = keys[-1]
-    if isinstance(node, list):
-        last = _index(node, last, key)
-    elif not isinstance(node, dict):
-        raise UnknownKeyError(f"{key}: {keys[-2]} is not a table")
-    node[last] = value
-
-
-def _step(node: Any, step: str, key: str) -> Any:
-    if isinstance(node, list):
-        return node[_index(node, step, key)]
-    if isinstance(node, dict):
-        return node.setdefault(step, {})
-    raise UnknownKeyError(f"{key}: nothing lies below {step!r}")
-
-
-def _index(node: list[Any], step: str, key: str) -> int:
-    if step.isdecimal() and len(step) < 9 and int(step) < len(node):
-        return int(step)
-    raise UnknownKeyError(f"{key}: found {step!r}, expected an index 0 to {len(node) - 1}")
+    for k, step in enumerate(keys):
+        place: Any = step
+        if isinstance(node, list):
+            if not (step.isdecimal() and len(step) < 9 and int(step) < len(node)):
+                raise UnknownKeyError(f"{key}: found {step!r}, expected an index 0 to {len(node) - 1}")
+            place = int(step)
+        elif not isinstance(node, dict):
+            raise UnknownKeyError(f"{key}: {keys[k - 1]} is not a table")
+        elif k < len(keys) - 1:
+            node.setdefault(step, {})
+        if k == len(keys) - 1:
+            node[place] = value
+        else:
+            node = node[place]
 
 
 Model = TypeVar("Model", bound=BaseModel)

@@ -1,11 +1,12 @@
 """The scenario: what a TOML file may say, validated. Units are in the key names, and leave here as SI properties.
 
 `uwbsim.scenario.loading.load` turns every mistake into one `ScenarioError` line. The models here and in `ranging`,
-`radio`, `multipath`, `surroundings`, `tags`, `devices` and `motion` are the whole schema, with what each key means.
+`radio`, `devices` and `bodies` are the whole schema, with descriptions of all keys.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import combinations
 from typing import Annotated, Any, Final, Self
 
@@ -13,7 +14,7 @@ from pydantic import Field, model_validator
 
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.base import NotNegative, Positive, Section, Vector
-from uwbsim.scenario.bodies import Carried, Obstacle, RandomFlight, Room, Static, Waypoints
+from uwbsim.scenario.bodies import Motion, Obstacle, Recorded, Room
 from uwbsim.scenario.devices import Body, Devices, Tag
 from uwbsim.scenario.radio import GeometricMultipath, Radio, Spline, TwoStateMultipath
 from uwbsim.scenario.ranging import Ranging
@@ -24,41 +25,41 @@ WAVELENGTH_M: Final = SPEED_OF_LIGHT / 3993.6e6
 class RunSettings(Section):
     """Name, seed and length of the simulation."""
 
-    name: str = Field("unnamed", description="What the run is called, in recordings and pages.")
+    name: str = Field("unnamed", description="Name of the run, in recordings and on pages.")
     seed: Annotated[int, Field(ge=0)] = Field(
         0,
-        description="Where all random numbers come from: the same seed makes the same bytes.",
+        description="Seed of all random numbers: the same seed gives the same bytes.",
     )
-    duration_s: Positive = Field(description="How long the simulated flight lasts.")
+    duration_s: Positive = Field(description="Duration of the simulated flight.")
 
 
 class Mocap(Section):
     """The motion capture that writes the poses of the recording."""
 
-    rate_hz: Positive = Field(100.0, description="Poses a second of each body.")
+    rate_hz: Positive = Field(100.0, description="Poses of each body per second.")
     position_noise_m: NotNegative = Field(0.0, description="Standard deviation of each coordinate.")
     attitude_noise_rad: NotNegative = Field(0.0, description="Standard deviation of the attitude about each axis.")
-    latency_ms: float = Field(0.0, description="How late the times of the poses are.")
-    gaps_per_min: NotNegative = Field(0.0, description="How many times a minute it loses sight of each body.")
-    gap_s: Positive = Field(0.5, description="For how long it does.")
+    latency_ms: float = Field(0.0, description="Delay of the times of poses.")
+    gaps_per_min: NotNegative = Field(0.0, description="Mean number of gaps per minute and body.")
+    gap_s: Positive = Field(0.5, description="Duration of a gap.")
 
 
 class Scenario(Section):
     """A whole scenario file."""
 
     run: RunSettings = Field(description="Name, seed and length.")
-    ranging: Ranging = Field(description="Who ranges with whom: protocol, rate, pairs, plan, delays.")
-    radio: Radio = Field(Radio(), description="Power, noise, bias and reflections of every radio.")
+    ranging: Ranging = Field(description="Ranging: protocol, rate, pairs, plan, delays.")
+    radio: Radio = Field(Radio(), description="Radios: power, noise, bias and reflections.")
     mocap: Mocap = Field(Mocap(), description="The motion capture that writes the poses.")
-    devices: Devices = Field(Devices(), description="What temperature and supply voltage do to boards.")
-    room: Room | None = Field(None, description="The room; none where it is left out.")
-    obstacles: tuple[Obstacle, ...] = Field((), description="Boxes in the way of waves.")
+    devices: Devices = Field(Devices(), description="Effects of temperature and supply voltage on boards.")
+    room: Room | None = Field(None, description="Room; by default none.")
+    obstacles: tuple[Obstacle, ...] = Field((), description="Boxes that attenuate and delay waves.")
     min_separation_m: NotNegative = Field(
         0.0,
-        description="How far apart bodies stay, at least: random flights are drawn until they do.",
+        description="Least distance between bodies: random flights are drawn again until they keep it.",
     )
     bodies: Annotated[tuple[Body, ...], Field(min_length=1)] = Field(
-        description="What carries tags: robots, people, tripods.",
+        description="Bodies that carry tags: robots, people, tripods.",
     )
     tags: Annotated[tuple[Tag, ...], Field(min_length=2)] = Field(description="The boards, two or more.")
 
@@ -85,7 +86,7 @@ class Scenario(Section):
                 f"at most {fastest:.0f}"
             )
         if not self.pairs():
-            raise ValueError("ranging.pairs: no two tags sit on different bodies, so nobody ranges")
+            raise ValueError("ranging.pairs: no two tags sit on different bodies, so no exchange is possible")
         return self
 
     def _check_tags(self, ids: list[int]) -> None:
@@ -117,9 +118,16 @@ class Scenario(Section):
             )
 
     def _check_places(self) -> None:
-        """Bodies must be inside the room, and tags of one body further apart than a wavelength."""
+        """Bodies must be inside the room, and recorded for the whole run; their tags a wavelength apart or more."""
         for k, body in enumerate(self.bodies):
-            for key, point in _named_points(body):
+            if isinstance(body.motion, Recorded):
+                lasts_s = max(body.motion.times_s, default=0.0)
+                if lasts_s < self.run.duration_s:
+                    raise ValueError(
+                        f"bodies[{k}].motion.file: its trajectory lasts {lasts_s:.1f} s and does not cover the run of "
+                        f"{self.run.duration_s:g} s"
+                    )
+            for key, point in _named_points(body.motion):
                 if self.room and any(
                     not lo <= v <= hi for lo, v, hi in zip(self.room.min_m, point, self.room.max_m, strict=True)
                 ):
@@ -171,15 +179,11 @@ class Scenario(Section):
         }
 
 
-def _named_points(body: Body) -> list[tuple[str, Vector]]:
-    """The points that a body's motion is known to reach, with their keys."""
-    motion = body.motion
-    if isinstance(motion, Static):
-        return [("position_m", motion.position_m)]
-    if isinstance(motion, Carried):
-        return [(f"places_m[{k}]", place) for k, place in enumerate(motion.places_m)]
-    if isinstance(motion, RandomFlight):
-        return [("box_min_m", motion.box_min_m), ("box_max_m", motion.box_max_m)]
-    if isinstance(motion, Waypoints):
-        return [(f"points_m[{k}]", point) for k, point in enumerate(motion.points_m)]
-    return []
+def _named_points(motion: Motion) -> Iterator[tuple[str, Vector]]:
+    """Yield the points that a motion is known to reach, with their keys."""
+    for key in ("position_m", "box_min_m", "box_max_m"):
+        if hasattr(motion, key):
+            yield key, getattr(motion, key)
+    for key in ("places_m", "points_m"):
+        for k, point in enumerate(getattr(motion, key, ())):
+            yield f"{key}[{k}]", point

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from uwbsim.scenario.base import NotNegative, Positive, Section, Share, TagId
+from uwbsim.scenario.base import NotDecreasing, NotNegative, Positive, Section, Share, TagId
 from uwbsim.scenario.devices import GroupDelay, check_grid
 
 _AUGUST: Final = [0.014173673264269979] * 4 + [1.599984520527571] * 4
@@ -71,16 +72,16 @@ class IndependentMultipath(Section):
     """
 
     model: Literal["independent"] = Field("independent", description="Drawn for each exchange alone.")
-    probability: Share = Field(description="Share of exchanges that travel a detour.")
+    probability: Share = Field(description="Share of exchanges whose first path is a detour.")
     mean_excess_m: Positive = Field(description="Mean excess length of detours, which is exponential.")
 
 
 class PairMultipath(Section):
-    """What a pair of tags has of reflections where it is known; the rest is drawn."""
+    """Known properties of the reflections of a pair of tags; the others are drawn."""
 
     tags: tuple[TagId, TagId] = Field(description="The two tags.")
-    share: Share | None = Field(None, description="Their share of time in reflections.")
-    life_s: Positive | None = Field(None, description="Their time between redraws.")
+    share: Share | None = Field(None, description="Share of time in which their first path is a reflection.")
+    life_s: Positive | None = Field(None, description="Mean time between redraws of their path.")
     mean_excess_m: Positive | None = Field(None, description="Mean excess length of their reflections.")
 
 
@@ -107,16 +108,16 @@ class TwoStateMultipath(Section):
     )
     first_path_loss_db: NotNegative = Field(
         8.0,
-        description="How much weaker a reflected first path is than the direct one, on average.",
+        description="Mean loss of a reflected first path relative to the direct one.",
     )
-    loss_std_db: NotNegative = Field(2.0, description="Standard deviation of that.")
-    total_loss_db: NotNegative = Field(2.0, description="How much weaker all paths together are then.")
-    rise_ns: Positive = Field(6.0, description="How much later most of the power comes then, on average.")
+    loss_std_db: NotNegative = Field(2.0, description="Standard deviation of first_path_loss_db.")
+    total_loss_db: NotNegative = Field(2.0, description="Loss of the total power while the first path is a reflection.")
+    rise_ns: Positive = Field(6.0, description="Mean delay of the strongest path after a reflected first path.")
     direct_std_m: NotNegative = Field(
         0.0,
-        description="Standard deviation of by how much a direct path seems longer or shorter, for as long as it lasts.",
+        description="Standard deviation of an error of the length of direct paths, constant between redraws.",
     )
-    pairs: tuple[PairMultipath, ...] = Field((), description="What is known of single pairs; the rest is drawn.")
+    pairs: tuple[PairMultipath, ...] = Field((), description="Known properties of single pairs; the others are drawn.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -139,30 +140,30 @@ class TwoStateMultipath(Section):
 
 
 class Fading(Section):
-    """Power that comes and goes with the place, alike in both directions of a pair of tags.
+    """Fading: a random change of received power, the same in both directions of a pair of tags.
 
     At random instants, `life_s` apart on average, it is drawn anew, with the standard deviation `std_db`; so its
     autocorrelation is exp(-dt/life). With `levels_db` it has these quantiles instead, from 0 to 1 in equal steps.
     """
 
     std_db: NotNegative = Field(0.0, description="Standard deviation of the power; or give levels_db.")
-    levels_db: tuple[float, ...] = Field(
+    levels_db: NotDecreasing = Field(
         (),
-        description="Quantiles of the power from 0 to 1 in equal steps; or give std_db.",
+        description="Quantiles of the power from 0 to 1 in equal steps, two or more; or give std_db.",
     )
     life_s: Annotated[float, Field(ge=0.01)] = Field(0.5, description="Mean time between redraws.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if len(self.levels_db) == 1 or list(self.levels_db) != sorted(self.levels_db):
-            raise ValueError("levels_db: give two or more, which do not decrease")
+        if len(self.levels_db) == 1:
+            raise ValueError("levels_db: found one, give two or more")
         if self.levels_db and self.std_db:
             raise ValueError("levels_db: give either levels_db or std_db")
         return self
 
 
 class Outages(Section):
-    """Whiles in which two tags do not hear each other, for no reason that the scenario has: `share` of the time.
+    """Intervals in which two tags do not hear each other, without another cause in the scenario: `share` of the time.
 
     At random instants, `life_s` apart on average, it is drawn anew whether a pair is out.
     """
@@ -190,21 +191,23 @@ class GeometricMultipath(Section):
     model: Literal["geometric"] = Field(description="One impulse response from geometry.")
     scatterers: Annotated[int, Field(ge=0, le=500)] = Field(
         32,
-        description="How many things stand in the room at places drawn from the seed.",
+        description="Number of scatterers in the room, at places drawn from the seed.",
     )
     scatter_loss_db: float = Field(
         1.0,
-        description="How much less than a mirror in its place each gives back, on average.",
+        description="Mean loss of a scatterer relative to a mirror in its place.",
     )
-    decay_ns: Positive = Field(12.0, description="Over which time the power of what bounces around it dies out by e.")
+    decay_ns: Positive = Field(12.0, description="Time constant in which the power scattered by one decays by e.")
     step_ms: Annotated[float, Field(ge=0.1, le=100)] = Field(
         5.0,
-        description="How often the response of each pair is computed.",
+        description="Interval at which the response of each pair is computed.",
     )
-    stamp_noise: bool = Field(True, description="Whether the noise of stamps follows from the leading edge.")
+    stamp_noise: bool = Field(
+        True, description="Whether the noise of stamps is computed from the slope of the leading edge."
+    )
     threshold_to_noise: Positive = Field(
         12.0,
-        description="How many times below the first path's threshold the noise is.",
+        description="Ratio of the first path's threshold to the noise.",
     )
 
 
@@ -221,7 +224,7 @@ Multipath = Annotated[
 class Spline(Section):
     """A B-spline over lifted first-path power 10^((fpp_dbm + 82)/10), held constant beyond its ends."""
 
-    knots: tuple[float, ...] = Field(description="Knots over lifted power, not decreasing.")
+    knots: NotDecreasing = Field(description="Knots over lifted power, not decreasing.")
     coefficients: tuple[float, ...] = Field(
         description="Coefficients in metres, as many as knots less degree less one.",
     )
@@ -234,8 +237,8 @@ class Spline(Section):
                 f"knots: found {len(self.knots)}, a spline of degree {self.degree} with "
                 f"{len(self.coefficients)} coefficients has {len(self.coefficients) + self.degree + 1}"
             )
-        if list(self.knots) != sorted(self.knots) or self.knots[0] == self.knots[-1]:
-            raise ValueError("knots: must not decrease, and must span a range")
+        if self.knots[0] == self.knots[-1]:
+            raise ValueError("knots: must span a range")
         return self
 
 
@@ -260,8 +263,7 @@ class BiasTable(Section):
             raise ValueError(
                 f"bias_m: found {len(self.bias_m)} values at {len(self.power_dbm)} powers, give two or more of each"
             )
-        steps = [b - a for a, b in zip(self.power_dbm, self.power_dbm[1:], strict=False)]
-        if not (all(s > 0 for s in steps) or all(s < 0 for s in steps)):
+        if len({b > a for a, b in pairwise(self.power_dbm)}) > 1 or len(set(self.power_dbm)) < len(self.power_dbm):
             raise ValueError("power_dbm: must go one way")
         return self
 
@@ -303,7 +305,7 @@ class Radio(Section):
     first_path_at_1m_dbm: float = Field(-80.0, description="First-path power at a metre.")
     path_loss_exponent: NotNegative = Field(
         2.0,
-        description="By which power of the distance the received power falls; 2 in free space.",
+        description="Exponent of the path loss over distance; 2 in free space.",
     )
     antenna: Literal["isotropic", "dipole"] | AntennaTable = Field(
         "isotropic",
@@ -311,31 +313,29 @@ class Radio(Section):
     )
     shadowing_db: NotNegative = Field(
         0.0,
-        description="Standard deviation of what the surroundings of a tag add to its gain over azimuth, smoothly, "
-        "drawn for each.",
+        description="Standard deviation of a random gain of each tag that varies smoothly with azimuth.",
     )
-    power_noise_db: NotNegative = Field(0.0, description="Standard deviation of what is drawn for each reception.")
+    power_noise_db: NotNegative = Field(0.0, description="Standard deviation of the noise of each power reading.")
     saturation_dbm: float | None = Field(
         None,
-        description="Where readings of first-path power end; the chip's fall behind above -85, and those of the ICRA "
-        "2023 flights end at -80. Nowhere where it is left out.",
+        description="Power at which readings of first-path power saturate; by default they do not. The chip's deviate "
+        "above -85, and those of the ICRA 2023 flights end at -80.",
     )
-    sensitivity_dbm: float = Field(-105.0, description="First-path power below which a frame is not received.")
-    tx_noise_ps: NotNegative = Field(0.0, description="Standard deviation of transmissions about their stamps.")
+    sensitivity_dbm: float = Field(-105.0, description="First-path power below which no frame is received.")
+    tx_noise_ps: NotNegative = Field(0.0, description="Standard deviation of transmit stamps.")
     rx_noise_ps: NotNegative = Field(
         116.0,
-        description="Standard deviation of receive stamps that does not depend on power.",
+        description="Standard deviation of receive stamps, the same at all powers.",
     )
     skew_noise_ppm: NotNegative = Field(0.20, description="Standard deviation of the carrier integrator's reading.")
     skew_bias_ppm: float = Field(-0.13, description="Bias of the carrier integrator's reading at -90 dBm and below.")
     skew_bias_ppm_per_db: float = Field(
         0.0,
-        description="By how much that bias grows above -90 dBm of first-path power.",
+        description="Change of skew_bias_ppm per dB of first-path power above -90 dBm.",
     )
     carrier_sign: Literal[-1, 1] = Field(
         1,
-        description="1 where boards print by how much their clock is ahead of the sender's; -1 where by how much the "
-        "sender is.",
+        description="1 if boards print how much faster their clock is than the sender's; -1 if how much slower.",
     )
     group_delay: GroupDelay | None = Field(
         None,
@@ -344,15 +344,15 @@ class Radio(Section):
     quantize: bool = Field(True, description="Whether stamps are whole ticks, as on boards.")
     preamble_symbols: Literal[64, 128, 256, 512, 1024, 1536, 2048, 4096] = Field(
         128,
-        description="Length of the preamble, which is most of the time a frame takes.",
+        description="Length of the preamble in symbols.",
     )
     capture_db: NotNegative = Field(
         6.0,
-        description="How much stronger a frame must be than another on the air to be received all the same.",
+        description="Least ratio of a frame's power to that of an overlapping frame at which it is received.",
     )
     dynamic_range_db: Positive = Field(
         15.0,
-        description="How far below the strongest path the first one may be and still be found.",
+        description="Largest ratio of the strongest path to a first path that is still detected.",
     )
     bias: Annotated[Spline | BiasTable | None, _named(BIAS)] = Field(
         None,
@@ -363,14 +363,14 @@ class Radio(Section):
         None,
         description="Standard deviation of ranges over lifted power: a spline, or the name of a published curve.",
     )
-    multipath: Multipath | None = Field(None, description="Reflections; none where it is left out.")
+    multipath: Multipath | None = Field(None, description="Reflections; by default none.")
     fading: Fading | None = Field(
         None,
-        description="Power that comes and goes with the place; none where it is left out.",
+        description="Fading; by default none.",
     )
     outages: Outages | None = Field(
         None,
-        description="Whiles in which pairs do not hear each other; none where it is left out.",
+        description="Intervals in which pairs do not hear each other; by default none.",
     )
 
     @property

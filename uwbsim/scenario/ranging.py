@@ -1,4 +1,4 @@
-"""Who ranges with whom in a scenario, how often, how soon boards reply, and how long frames are on the air."""
+"""Ranging of a scenario: pairs, plan, rate and reply delays, and the durations of frames and exchanges."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from uwblink.arrays import Floats
-from uwblink.protocols.rows import RangingProtocol
-from uwblink.protocols.table import PROTOCOLS
-from uwbsim.scenario.base import NotNegative, Positive, Section, TagId
+from uwblink.protocols.table import PROTOCOLS, RangingProtocol
+from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, not_decreasing
 
 PREAMBLE_SYMBOL_S: Final = 508 / 499.2e6
 """Of a preamble at a pulse repetition frequency of 64 MHz (DW1000 User Manual, section 10)."""
@@ -89,14 +88,14 @@ PlanName = Literal["round-robin", "tdma", "aloha", "common-list"]
 class BoardReply(Section):
     """The reply latency measured on boards: two modes near 304 and 306 us, a tail to 386 us."""
 
-    model: Literal["boards"] = Field("boards", description="Replies take as long as was measured on boards.")
+    model: Literal["boards"] = Field("boards", description="Latencies as measured on boards.")
 
 
 class FixedReply(Section):
     """A reply latency that is always the same."""
 
-    model: Literal["fixed"] = Field(description="All replies take equally long.")
-    delay_us: Annotated[float, Field(ge=180, le=6000)] = Field(description="From the reception to the reply.")
+    model: Literal["fixed"] = Field(description="The same latency for all replies.")
+    delay_us: Annotated[float, Field(ge=180, le=6000)] = Field(description="Time from the reception to the reply.")
 
     @property
     def delay_s(self) -> float:
@@ -107,16 +106,10 @@ class FixedReply(Section):
 class QuantileReply(Section):
     """Reply latencies by their quantiles, from 0 to 1 in equal steps, with all values in between equally likely."""
 
-    model: Literal["quantiles"] = Field(description="Replies take as long as these quantiles say.")
-    delays_us: Annotated[tuple[Annotated[float, Field(ge=180, le=6000)], ...], Field(min_length=2)] = Field(
-        description="Quantiles from 0 to 1 in equal steps, two or more, not decreasing.",
-    )
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if list(self.delays_us) != sorted(self.delays_us):
-            raise ValueError("delays_us: must not decrease")
-        return self
+    model: Literal["quantiles"] = Field(description="Latencies with the given quantiles.")
+    delays_us: Annotated[
+        tuple[Annotated[float, Field(ge=180, le=6000)], ...], Field(min_length=2), AfterValidator(not_decreasing)
+    ] = Field(description="Quantiles from 0 to 1 in equal steps, two or more, not decreasing.")
 
     def at_s(self, share: Floats) -> Floats:
         """Return the latencies in seconds that shares (n,) of all replies stay below."""
@@ -144,22 +137,22 @@ class Ranging(Section):
 
     protocol: ProtocolName = Field(
         "ds",
-        description="How the messages of an exchange go, and what is computed of them.",
+        description="Ranging protocol.",
     )
-    rate_hz: Positive = Field(description="Exchanges a second, all pairs together.")
+    rate_hz: Positive = Field(description="Exchanges per second, all pairs together.")
     pairs: Literal["between-bodies"] | tuple[tuple[TagId, TagId], ...] = Field(
         "between-bodies",
-        description="Who ranges with whom, as [initiator, target]; or every two tags on different bodies.",
+        description="Pairs, as [initiator, target]; or all pairs of tags on different bodies.",
     )
     plan: PlanName | PlanFile = Field(
         "round-robin",
-        description="Who comes when: in turns, in slots of synchronized hosts (tdma), at random (aloha), each robot by "
-        "a common list (common-list), or a file.",
+        description="Order of exchanges: in turns, in slots of synchronized hosts (tdma), at random (aloha), by a list "
+        "that all robots share (common-list), or by a file.",
     )
     sync_error_ms: NotNegative = Field(0.1, description="Standard deviation of the hosts' clocks, with plan tdma.")
     list_timeout_ms: NotNegative = Field(
         10.0,
-        description="How long a robot waits for an exchange that it cannot hear, with plan common-list.",
+        description="Time for which a robot waits for an exchange that it cannot hear, with plan common-list.",
     )
     response_delay_uus: Annotated[int, Field(ge=280, le=6500)] = Field(
         1500,
@@ -167,7 +160,7 @@ class Ranging(Section):
     )
     reply: Annotated[BoardReply | FixedReply | QuantileReply, Field(discriminator="model")] = Field(
         BoardReply(),
-        description="How long a reply at once takes.",
+        description="Latency of replies that are sent at once.",
     )
     get_cir: bool = Field(False, description="Whether initiators print their channel impulse responses.")
 

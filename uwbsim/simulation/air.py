@@ -1,7 +1,7 @@
-"""The plans of a scenario, and the discrete-event loop that plays them: who sends when, what collides, what fails.
+"""The plans of a scenario, and the discrete-event loop that executes them: transmissions, collisions, failures.
 
-A host is whoever commands boards one after the other. In a round robin one host commands all; otherwise every initiator
-has its own, and nothing keeps two from talking at once but the plan.
+A host commands boards one after the other. In a round robin one host commands all; otherwise every initiator has its
+own, and only the plan keeps two from sending at once.
 
 The loop decides what happens and in which order. It runs on nominal delays, within a few tens of nanoseconds of the
 exact instants, on which nothing in it depends; those are computed afterwards in batches (`timestamps`).
@@ -21,7 +21,7 @@ import numpy as np
 import simpy
 
 from uwblink.arrays import Bools, Floats, Ints
-from uwblink.protocols.rows import RangingProtocol
+from uwblink.protocols.table import RangingProtocol
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Radio
@@ -74,7 +74,7 @@ def schedule(scenario: Scenario) -> Schedule:
 
 
 def _aloha(scenario: Scenario, pairs: Ints) -> Schedule:
-    """Every initiator ranges at random times with one of its targets; the rates add up to the plan's."""
+    """Return exchanges of every initiator at random times with random targets; their rates add up to the plan's."""
     initiators = np.unique(pairs[:, 0])
     duration, rate = scenario.run.duration_s, scenario.ranging.rate_hz / len(initiators)
     parts = []
@@ -102,25 +102,11 @@ Powers = Callable[[int, int], Floats]
 
 
 @dataclass(frozen=True, slots=True)
-class Slot:
-    """One planned exchange: who, and what the radios will make of each message.
-
-    `heard[k]` says whether message k is above the receiver's sensitivity, `delay[k]` is the sub-ticks from the stamp
-    it waits for until message k leaves, `number` its place in the plan.
-    """
-
-    number: int
-    initiator: int
-    target: int
-    heard: tuple[bool, ...]
-    delay: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class Slots:
     """A plan of n exchanges as columns: when, who, and what the radios will make of each message.
 
-    `pause` is what the initiator waits first, `heard` and `delay` (messages, n) are those of a `Slot`.
+    `pause` is what the initiator waits first, in sub-ticks; `heard` (messages, n) says whether a message is above the
+    receiver's sensitivity, `delay` (messages, n) is the sub-ticks from the stamp it waits for until it leaves.
     """
 
     start: list[int]
@@ -130,20 +116,10 @@ class Slots:
     heard: Bools
     delay: Ints
 
-    def slot(self, number: int) -> Slot:
-        """Return one exchange."""
-        return Slot(
-            number,
-            self.initiator[number],
-            self.target[number],
-            tuple(self.heard[:, number].tolist()),
-            tuple(self.delay[:, number].tolist()),
-        )
-
 
 @dataclass(slots=True)
 class Outcomes:
-    """What became of each slot: when its poll left (-1: never), the message that was lost (-1: none), and why."""
+    """The outcome of each slot: when its poll left (-1: never), the lost message (-1: none), and the reason."""
 
     start: list[int]
     lost: list[int]
@@ -179,13 +155,14 @@ class Air:
         self._frames: list[_Frame] = []
         self._busy_until = [0] * tags
         self._soonest = [0] * hosts
+        self._played = 0
         self._lengths = self._undisturbed()
         self.outcomes = Outcomes([-1] * len(slots.start), [-1] * len(slots.start), [""] * len(slots.start))
 
-    def play(self, host: int, numbers: Sequence[int], report: Callable[[int], None] | None = None) -> Steps:
-        """Play the slots of one host, one after the other."""
+    def play(self, host: int, numbers: Sequence[int], progress: Callable[[float], None] | None = None) -> Steps:
+        """Play the slots of one host, one after the other; `progress` is called with the done share of all slots."""
         env, slots, soonest, never = self.env, self._slots, self._soonest, 1 << 62
-        for count, number in enumerate(numbers):
+        for number in numbers:
             begin = max(soonest[host], slots.start[number])
             soonest[host] = begin
             if begin > env.now:
@@ -197,11 +174,12 @@ class Air:
                 soonest[host] = 0
                 if slots.pause[number]:
                     yield env.timeout(slots.pause[number])
-                yield from self._exchange(slots.slot(number))
+                yield from self._exchange(number)
                 end = int(env.now)
             soonest[host] = end + self._turnaround
-            if report and not count % 500:
-                report(count)
+            self._played += 1
+            if progress and not self._played % 500:
+                progress(self._played / len(slots.start))
         soonest[host] = never
 
     def _undisturbed(self) -> list[int]:
@@ -214,7 +192,7 @@ class Air:
         return lengths
 
     def _alone(self, number: int, begin: int) -> bool:
-        """Whether an exchange that begins now is over before anything else can happen."""
+        """Return whether an exchange that begins now ends before any other event."""
         length, busy = self._lengths[number], self._busy_until
         return (
             length >= 0
@@ -224,16 +202,16 @@ class Air:
         )
 
     def _succeed(self, number: int, begin: int) -> int:
-        """Note an exchange that nothing disturbs; return when its last frame has ended."""
+        """Record an undisturbed exchange; return the end of its last frame."""
         self.outcomes.start[number] = begin + self._before
         end = begin + self._lengths[number]
         self._busy_until[self._slots.initiator[number]] = self._busy_until[self._slots.target[number]] = end
         return end
 
-    def _exchange(self, slot: Slot) -> Steps:
+    def _exchange(self, number: int) -> Steps:
         """Send the messages of an exchange in turn; stop, after the wait for it, at one that is not received."""
-        env, outcomes, number = self.env, self.outcomes, slot.number
-        busy, me, other = self._busy_until, slot.initiator, slot.target
+        env, outcomes, delays = self.env, self.outcomes, self._slots.delay[:, number].tolist()
+        busy, me, other = self._busy_until, self._slots.initiator[number], self._slots.target[number]
         if busy[me] > env.now:  # a board that answers somebody takes its own command when it is done
             yield env.timeout(busy[me] - int(env.now))
         marker = int(env.now) + self._before
@@ -241,12 +219,12 @@ class Air:
         listening_since = marker
         for k, message in enumerate(self._messages):
             if k:
-                marker += slot.delay[k]
+                marker += delays[k]
             sender, receiver = (me, other) if message.sender == "initiator" else (other, me)
             frame = _Frame(marker - self._before, marker + self._after[k], sender, number)
             self._frames.append(frame)
             yield env.timeout(frame.end - int(env.now))
-            reason = self._fate(slot, k, frame, receiver, listening_since, marker)
+            reason = self._fate(k, frame, receiver, listening_since, marker)
             if reason:
                 outcomes.lost[number], outcomes.reason[number] = k, reason
                 # Whoever waits for the missing message gives up when its preamble does not come.
@@ -257,28 +235,28 @@ class Air:
             listening_since = frame.end
             if not k:
                 # From now on both are in this exchange; the target will send its last frame whatever becomes of others.
-                busy[me] = busy[other] = marker + sum(slot.delay[1:]) + self._after[-1]
+                busy[me] = busy[other] = marker + sum(delays[1:]) + self._after[-1]
 
-    def _fate(self, slot: Slot, k: int, frame: _Frame, receiver: int, since: int, marker: int) -> str:
-        """Why a frame that has just ended was not received, empty if it was."""
-        if not slot.heard[k]:
+    def _fate(self, k: int, frame: _Frame, receiver: int, since: int, marker: int) -> str:
+        """Return why a frame that has just ended was not received, empty if it was."""
+        if not self._slots.heard[k, frame.exchange]:
             return WEAK
         if k and frame.start - since > self._patience:
             return LATE
         if not k and self._busy_until[receiver] > frame.start:
             return BUSY
         if len(self._frames) > 1:
-            return self._interference(slot, k, frame, receiver, since)
+            return self._interference(k, frame, receiver, since)
         self._frames.clear()
         return ""
 
-    def _interference(self, slot: Slot, k: int, frame: _Frame, receiver: int, since: int) -> str:
-        """What the other frames on the air do to one: collide with it, or come in the place of it."""
+    def _interference(self, k: int, frame: _Frame, receiver: int, since: int) -> str:
+        """Return whether another frame on the air collides with one, or is received in its place; empty if not."""
         now = int(self.env.now)
         oldest = now - 2 * self._patience
         self._frames = [f for f in self._frames if f.end > oldest]
         earliest = min(since, frame.start) if k else frame.start
-        others = [f for f in self._frames if f.exchange != slot.number and f.end > earliest and f.start < frame.end]
+        others = [f for f in self._frames if f.exchange != frame.exchange and f.end > earliest and f.start < frame.end]
         if not others:
             return ""
         signal = float(self._powers(frame.sender, frame.start)[receiver])
@@ -307,22 +285,9 @@ def run(
     radio: Radio,
     progress: Callable[[float], None] | None = None,
 ) -> Outcomes:
-    """Play a plan, whose slots by their numbers are each host's in order; returns what became of every slot."""
-    total = len(slots.start)
+    """Play a plan; `hosts` are the numbers of each host's slots, in order. Returns what became of every slot."""
     air = Air(protocol, slots, tags, len(hosts), powers, radio)
-    counts = [0] * len(hosts)
-
-    def reporter(host: int) -> Callable[[int], None] | None:
-        if progress is None:
-            return None
-
-        def report(count: int) -> None:
-            counts[host] = count
-            progress(sum(counts) / max(total, 1))
-
-        return report
-
-    processes = [air.env.process(air.play(h, numbers, reporter(h))) for h, numbers in enumerate(hosts)]
+    processes = [air.env.process(air.play(host, numbers, progress)) for host, numbers in enumerate(hosts)]
     air.env.run(until=air.env.all_of(processes))
     return air.outcomes
 

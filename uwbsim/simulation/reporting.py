@@ -1,4 +1,4 @@
-"""What boards report of a run: exchanges, failures, what passive tags overhear, impulse responses, provenance."""
+"""Reports of boards: exchanges, failures, overheard exchanges, impulse responses; and the recording's provenance."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
-from uwblink.protocols.rows import RangingProtocol
+from uwblink.protocols.table import RangingProtocol
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, meta_of_delays
 from uwblink.recording.schema import CirRow, Fault
 from uwblink.ticks import REPORT_BITS
@@ -64,7 +64,7 @@ def _readings(medium: Medium, number: int, kept: Ints, planned: int, stamped: St
 
 
 def reported_faults(scenario: Scenario, begun: Ints, plan: Schedule, outcomes: air.Outcomes) -> list[Fault]:
-    """Return what became of the exchanges that failed, each under its initiator's name."""
+    """Return the failed exchanges, with their reasons and initiators."""
     ids = [tag.id for tag in scenario.tags]
     found = []
     for k in np.flatnonzero(np.array(outcomes.lost) >= 0):
@@ -84,14 +84,14 @@ def reported_faults(scenario: Scenario, begun: Ints, plan: Schedule, outcomes: a
 
 
 def _programmed(scenario: Scenario) -> AntennaDelays:
-    """Return what is programmed into tags; under None what is usual, and the others by their ids."""
+    """Return antenna delays programmed into tags: under None the default, others by the ids of their tags."""
     found = {tag.id: AntennaDelay(**tag.antenna_delay.model_dump()) for tag in scenario.tags}
     return {None: AntennaDelay(), **{tag: one for tag, one in found.items() if one != AntennaDelay()}}
 
 
 def provenance(scenario: Scenario) -> dict[str, Any]:
     """Return a recording's `meta` of a simulated flight: the scenario whole, its seed, and what it planted."""
-    # A scenario's text does not say what strangers added to the channel, and the flight cannot be repeated without.
+    # Channel effects of plug-ins are not part of the scenario, but the flight cannot be repeated without them.
     added = [name for name in CHANNEL_EFFECTS if name not in OWN_EFFECTS]
     return {
         "source": "simulation",
@@ -123,7 +123,7 @@ def overhear(medium: Medium, stamped: Stamped, exchanges: Exchanges) -> dict[str
 
 
 def _look_ahead(medium: Medium, stamped: Stamped) -> None:
-    """Let the world work out what all listeners will ask for: together it takes half the time."""
+    """Compute the responses of all listeners at once, which takes half the time."""
     listeners = np.array([me for me, tag in enumerate(medium.scenario.tags) if tag.passive], dtype=np.int64)
     if not len(listeners) or not isinstance(medium.links, World):
         return

@@ -1,15 +1,25 @@
-"""Runs a scenario: plan, event loop, stamps, and what boards would have reported of the flight."""
+"""Simulation of a scenario: plan, event loop, stamps and reports of boards, and the flight that comes of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uwblink.arrays import Bools, Floats, Ints
-from uwblink.protocols.table import PROTOCOLS
-from uwblink.recording.schema import Tag
-from uwblink.ticks import UUS_TICKS
+from uwblink.protocols.table import ON_BOARDS, PROTOCOLS
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import CirRow, Fault, FrameRow, Poses, Tag
+from uwblink.ticks import TICK_S, UUS_TICKS, elapsed
+from uwblink.twr import Exchanges, raw_range
+from uwblink.wire.bulk import ColumnDecoder
+from uwblink.wire.codec import encode
+from uwblink.wire.messages import RangeReport
 from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import Source, as_scenario
@@ -18,24 +28,109 @@ from uwbsim.scenario.ranging import before_marker_s
 from uwbsim.simulation import air
 from uwbsim.simulation.air import Schedule, schedule
 from uwbsim.simulation.reporting import overhear, provenance, reported_exchanges, reported_faults, responses
-from uwbsim.simulation.simulated import Simulated
 from uwbsim.simulation.timestamps import Begun, Draws, draw, stamp
-from uwbsim.world.clocks import LONGEST_RUN_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.clocks import LONGEST_RUN_S, NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks, readings
 from uwbsim.world.reception import Medium
-from uwbsim.world.temperature import readings
 from uwbsim.world.trajectories import height_readings, inertial_readings
 from uwbsim.world.world import SampledWorld, World
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Simulated:
+    """A simulated flight in memory: what a recording of it holds, and the truth, which none does.
+
+    `exchanges` are n exchanges in order of time and `truth_m` (n,) their true distances in metres, each the mean over
+    the first two messages; `poses` are those of motion capture; `tags` say which body carries which tag, and where;
+    `faults` are the exchanges that failed. `overheard` are the columns of what passive tags heard, `cirs` impulse
+    responses (time_ns, board, initiator, target, first path in taps, 1016 magnitudes). `meta` is the recording's
+    provenance. `temperature` are the columns of what tags with a temperature or a supply voltage read of them, `imu`
+    and `height` those of bodies' inertial and height sensors.
+
+    >>> import uwbsim
+    >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
+    >>> flight = uwbsim.simulate(
+    ...     {
+    ...         "run": {"name": "two", "duration_s": 2.0},
+    ...         "ranging": {"rate_hz": 50.0},
+    ...         "bodies": [{"name": "mast", "motion": mast}, {"name": "drone", "motion": drone}],
+    ...         "tags": [{"id": 1, "body": "mast"}, {"id": 2, "body": "drone"}],
+    ...     }
+    ... )
+    >>> print(flight)
+    Simulated 'two': 100 exchanges (ds) of 2 tags on 2 bodies in 2 s
+      raw range less truth: median +0.3 cm, standard deviation 2.8 cm
+      failed: none
+      poses: 414; overheard: 0; impulse responses: 0
+    >>> flight.save("two.uwb")
+    """
+
+    exchanges: Exchanges
+    poses: Poses
+    tags: list[Tag]
+    faults: list[Fault]
+    overheard: dict[str, NDArray[Any]]
+    cirs: list[CirRow]
+    truth_m: Floats
+    meta: dict[str, Any]
+    temperature: dict[str, NDArray[Any]] = field(default_factory=dict)
+    imu: dict[str, NDArray[Any]] = field(default_factory=dict)
+    height: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+    @property
+    def planted(self) -> dict[str, Any]:
+        """Return what a calibration should find: `delays_ns` by tag, `bias_curve`, `sigma_curve`, `alpha_dbm`."""
+        planted: dict[str, Any] = self.meta["planted"]
+        return planted
+
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        frames: Sequence[FrameRow] = (),
+        force: bool = False,
+    ) -> None:
+        """Write a recording (.uwb), with the bytes of boards where there are any (`through_wire`).
+
+        Raises `RecordingExistsError` where the file is there already, unless `force` says to replace it.
+        """
+        with Recording.create(path, meta=self.meta, force=force) as recording:
+            recording.append_tags(self.tags)
+            recording.append_poses(self.poses)
+            recording.append_exchanges(self.exchanges)
+            recording.append_faults(self.faults)
+            for table in ("overheard", "temperature", "imu", "height"):
+                recording.append(table, getattr(self, table))
+            recording.append_cirs(self.cirs)
+            recording.append_frames(frames)
+
+    def __repr__(self) -> str:
+        """Return a few lines: what was simulated, how the raw ranges err, and what failed."""
+        run, ranging = (self.meta["scenario"][name] for name in ("run", "ranging"))
+        error = raw_range(self.exchanges) - self.truth_m
+        reasons = Counter(fault.kind for fault in self.faults)
+        failed = ", ".join(f"{count} {reason}" for reason, count in sorted(reasons.items())) or "none"
+        lines = [
+            f"Simulated {run['name']!r}: {len(self.exchanges)} exchanges ({ranging['protocol']}) of "
+            f"{len(self.tags)} tags on {len({tag.body for tag in self.tags})} bodies in {run['duration_s']:g} s",
+            f"  failed: {failed}",
+            f"  poses: {len(self.poses)}; overheard: {len(self.overheard.get('time_ns', ()))}; "
+            f"impulse responses: {len(self.cirs)}",
+        ]
+        if len(error):
+            median, spread = (100 * float(v) for v in (np.median(error), np.std(error)))
+            lines.insert(1, f"  raw range less truth: median {median:+.1f} cm, standard deviation {spread:.1f} cm")
+        return "\n".join(lines)
 
 
 def simulate(
     scenario: Scenario | Source, progress: Callable[[float], None] | None = None, *, contention: bool = True
 ) -> Simulated:
-    """Simulate a scenario: give exchanges and truth in memory; the same scenario gives the same on every machine.
+    """Simulate a scenario in memory; the same scenario gives the same exchanges on every machine.
 
     `scenario` is a `Scenario`, a file (.toml), TOML text of more than one line, or the same as nested tables. Without
-    `contention` there is no event loop: every exchange begins when it is planned and disturbs no other, so where
-    exchanges do not meet the stamps are the same, sooner. `progress` is called with the done fraction, 0 to 1. Raises
-    `ScenarioError` for a scenario that cannot be, and for one longer than the integer true time carries (36 h).
+    `contention` there is no event loop: every exchange begins when planned and disturbs no other; stamps of exchanges
+    that do not overlap are the same, and simulation is faster. `progress` is called with the done fraction, 0 to 1.
+    Raises `ScenarioError` for an invalid scenario, and for one longer than the integer true time can hold (36 h).
 
     >>> import uwbsim
     >>> flight = uwbsim.simulate(
@@ -99,7 +194,7 @@ def _delays(scenario: Scenario, draws: Draws) -> dict[str, Ints]:
 
 
 def _slots(medium: Medium, world: World, plan: Schedule, draws: Draws) -> air.Slots:
-    """Give the event loop what it needs, as plain integers: it does no arithmetic of its own."""
+    """Return the plan as the event loop takes it: integers, and which messages are strong enough."""
     scenario, delays = medium.scenario, _delays(medium.scenario, draws)
     none = np.zeros(len(plan.start), dtype=np.int64)
     if scenario.ranging.plan == "common-list" and len(none) > 1:
@@ -121,7 +216,7 @@ def _slots(medium: Medium, world: World, plan: Schedule, draws: Draws) -> air.Sl
 
 
 def _undisturbed(medium: Medium, world: World, plan: Schedule, draws: Draws) -> air.Outcomes:
-    """Return what becomes of exchanges that do not meet: only a message too weak to be heard is lost."""
+    """Return the outcomes of exchanges without contention: only messages too weak to be heard are lost."""
     heard = _heard(medium, world, plan, draws)
     lost = np.where(heard.all(axis=0), -1, np.argmin(heard, axis=0))
     marker = round(before_marker_s(medium.scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)
@@ -148,3 +243,47 @@ def _heard(medium: Medium, world: World, plan: Schedule, draws: Draws) -> Bools:
         powers.append(powers[0] if same else world.link(*ends, time).power_dbm)
     fading = stream(scenario.run.seed, "fading").normal(size=(len(messages), len(time)))
     return medium.heard(np.array(powers), fading)
+
+
+def through_wire(simulated: Simulated) -> tuple[Simulated, list[FrameRow]]:
+    """Return a flight whose exchanges were decoded from the boards' bytes, and those bytes.
+
+    Raises `ScenarioError` for a protocol that the boards do not know.
+
+    >>> import uwbsim
+    >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
+    >>> flight = uwbsim.simulate(
+    ...     {
+    ...         "run": {"duration_s": 2.0},
+    ...         "ranging": {"rate_hz": 50.0},
+    ...         "bodies": [{"name": "mast", "motion": mast}, {"name": "drone", "motion": drone}],
+    ...         "tags": [{"id": 1, "body": "mast"}, {"id": 2, "body": "drone"}],
+    ...     }
+    ... )
+    >>> decoded, frames = uwbsim.through_wire(flight)
+    >>> len(frames), bool((decoded.exchanges.rx2 == flight.exchanges.rx2).all())
+    (100, True)
+    >>> decoded.save("wire.uwb", frames=frames)
+    """
+    e = simulated.exchanges
+    strange = sorted(set(np.unique(e.protocol).tolist()) - set(ON_BOARDS))
+    if strange:
+        raise ScenarioError(
+            f"ranging.protocol: found {strange[0]!r}, but the boards report only {', '.join(ON_BOARDS)}"
+        )
+    last = np.where(e.rx3 != 0, e.rx3, e.rx2)
+    time_ns = e.time_ns + np.rint(elapsed(last, e.tx1) * (TICK_S * NS_PER_S)).astype(np.int64)
+    names = [name for name in RangeReport.FIELDS if name != "neighbour"]
+    columns = [e.target.tolist(), *(getattr(e, name).tolist() for name in names)]
+    reports = (encode(RangeReport(*row)) for row in zip(*columns, strict=True))
+    frames = [
+        FrameRow(t, f"board {i}", "in", data)
+        for t, i, data in zip(time_ns.tolist(), e.initiator.tolist(), reports, strict=True)
+    ]
+    decoders = {f"board {i}": ColumnDecoder(int(i)) for i in np.unique(simulated.exchanges.initiator)}
+    for frame in frames:
+        decoders[frame.board].feed(frame.data, frame.time_ns)
+    parts = [d.exchanges() for d in decoders.values()] or [simulated.exchanges]  # nothing was received
+    exchanges = Exchanges.concatenate(parts).in_time_order()
+    ports = {name.removeprefix("board "): name for name in decoders}
+    return replace(simulated, exchanges=exchanges, meta=simulated.meta | {"ports": ports}), frames

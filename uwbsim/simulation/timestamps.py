@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from uwblink.arrays import Floats, Ints
-from uwblink.protocols.rows import ProtocolMessage, RangingProtocol
+from uwblink.protocols.table import ProtocolMessage, RangingProtocol
 from uwblink.ticks import (
     ANTENNA_DELAY_TICKS,
     DELAYED_TX_GRID,
@@ -29,10 +29,10 @@ Ticks = TypeVar("Ticks", Ints, int)
 
 @dataclass(slots=True)
 class Draws:
-    """What chance decides, one row a planned slot, so that a lost exchange shifts no other draw.
+    """Random numbers of planned slots, one row per slot, so that a lost exchange shifts no others.
 
     `transmit` and `receive` are standard normal, shape (messages, n); `reply_s` is the latency of a
-    reply sent at once; `excess_m` the detour of the multipath.
+    reply sent at once; `excess_m` the detour by multipath.
     """
 
     transmit: Floats
@@ -56,10 +56,10 @@ class Begun:
 
 @dataclass(slots=True)
 class Stamped:
-    """Stamps in whole ticks, not wrapped, and what the messages met on their way, (n,) each; one list item a message.
+    """Stamps in whole ticks, not wrapped, and links of the messages, (n,) each; one list item per message.
 
-    `frames` are the messages with their senders, receivers and departures; `detour_m` (n,) what all travel further by
-    chance.
+    `frames` are the messages with their senders, receivers and departures; `detour_m` (n,) the random detour of all
+    messages.
     """
 
     stamps: dict[str, Ints]
@@ -135,7 +135,7 @@ def stamp(
 
 
 def _transmission(message: ProtocolMessage, reference: Ints, reply_s: Floats, delay_uus: int) -> Ints:
-    """Return when by the sender's counter, before any antenna delay, a message leaves that waits for `reference`."""
+    """Return the sender's counter, without antenna delay, when a message leaves that replies to `reference`."""
     if message.timing == "scheduled":
         due = reference + delay_uus * UUS_TICKS
         # The chip ignores the low nine bits of the time at which it is told to send.
@@ -145,5 +145,5 @@ def _transmission(message: ProtocolMessage, reference: Ints, reply_s: Floats, de
 
 
 def next_grid(ticks: Ticks) -> Ticks:
-    """Return the first instants in ticks, at or after some, at which the chip sends."""
+    """Return the first instants of the grid of transmissions at or after `ticks`."""
     return -(-ticks // DELAYED_TX_GRID) * DELAYED_TX_GRID

@@ -1,4 +1,4 @@
-"""What a sweep varies: a grid, a Latin hypercube or a list over any keys of a scenario, several seeds each."""
+"""Design of a sweep: a grid, a Latin hypercube or a list over any keys of a scenario, with several seeds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import hashlib
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -34,20 +34,22 @@ class _Table(BaseModel):
 class SweepSettings(_Table):
     """The table [sweep] of the file of a sweep."""
 
-    name: str | None = Field(None, description="What the sweep is called; by default as the file.")
-    scenario: str = Field(description="The scenario that varies, from the folder of this file, or a shipped one.")
+    name: str | None = Field(None, description="Name of the sweep; by default that of the file.")
+    scenario: str = Field(
+        description="The scenario to vary: a file relative to the folder of this one, or the name of a shipped one."
+    )
     kind: Literal["compare", "calibrate"] = Field(
-        "compare", description="What a run does: compare protocols, or simulate a flight, calibrate and judge."
+        "compare", description="What a run does: compare protocols, or simulate a flight, calibrate and evaluate."
     )
     protocols: Annotated[tuple[ProtocolName, ...], Field(min_length=1)] | None = Field(
         None, description='The protocols of each run; by default all, or ["ds"] to calibrate.'
     )
-    ranges: Count = Field(100_000, description="Ranges with each protocol in a run.")
+    ranges: Count = Field(100_000, description="Ranges per protocol and run.")
     seeds: Count | Annotated[tuple[Annotated[int, Field(strict=True, ge=0)], ...], Field(min_length=1)] = Field(
-        1, description="How many seeds each point gets, or which."
+        1, description="Number of seeds per point, or a list of seeds."
     )
     design: Literal["grid", "latin-hypercube", "list"] = Field(
-        "grid", description="Every combination of values; points spread over spans; or points one by one."
+        "grid", description="All combinations of values; points spread over spans; or a list of points."
     )
     samples: Count = Field(16, description="Points of a Latin hypercube.")
 
@@ -57,14 +59,14 @@ class Span(_Table):
 
     low: float = Field(strict=True, description="The lower end of the span.")
     high: float = Field(strict=True, description="The upper end of the span.")
-    scale: Literal["linear", "log"] = Field("linear", description="How points are spread over the span.")
-    whole: bool | None = Field(None, description="Whether values are whole numbers; by default where low and high are.")
+    scale: Literal["linear", "log"] = Field("linear", description="Distribution of points over the span.")
+    whole: bool | None = Field(None, description="Whether values are whole numbers; by default if low and high are.")
 
 
 class SweepFile(_Table):
     """The file of a sweep."""
 
-    sweep: SweepSettings = Field(description="What a run does, and how many there are.")
+    sweep: SweepSettings = Field(description="What a run does, and the number of runs.")
     vary: dict[str, Any] = Field(
         {},
         description='By key of the scenario, such as "radio.tx_noise_ps": a list of values of a grid, or the span of '
@@ -77,11 +79,16 @@ class SweepFile(_Table):
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One run: its number, the values of what varies, and the seed."""
+    """One run: its number, the values of what varies, and the seed.
+
+    Workers get it with the `scenario` as JSON, or with the `error` that these values gave.
+    """
 
     number: int
     values: dict[str, Any]
     seed: int
+    scenario: str = ""
+    error: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,16 +124,27 @@ class SweepDesign:
         """Return a run by its number, 0 to `total` - 1; made when asked for, so that any number of runs fits."""
         point, seed = divmod(number, len(self.seeds))
         if self.rows is not None:
-            return Run(number, self.rows[point], self.seeds[seed])
-        places = np.unravel_index(point, [len(v) for v in self.axes.values()])
-        values = {key: listed[int(k)] for (key, listed), k in zip(self.axes.items(), places, strict=True)}
+            values = self.rows[point]
+        else:
+            places = np.unravel_index(point, [len(v) for v in self.axes.values()])
+            values = {key: listed[int(k)] for (key, listed), k in zip(self.axes.items(), places, strict=True)}
         return Run(number, values, self.seeds[seed])
+
+    def loaded(self, number: int) -> Run:
+        """Return a run with its scenario; one that cannot be is an error that travels with it."""
+        run = self.run(number)
+        try:
+            scenario = load(self.scenario, run.values, run.seed, allow_files=self.allow_files)
+        except ScenarioError as error:
+            # Where the file lies is no part of a result.
+            return replace(run, error=str(error).removeprefix(f"{self.scenario}: "))
+        return replace(run, scenario=scenario.model_dump_json())
 
 
 def load_design(path: str | os.PathLike[str], *, allow_files: Folders = ()) -> SweepDesign:
-    """Read what a sweep varies (.toml); nothing is run yet, and runs are made when they are asked for by number.
+    """Read the design of a sweep (.toml), without running it.
 
-    Its scenario, where it is none that comes along, lies in the folder of the file or below, and the files that the
+    Its scenario, unless it is a shipped one, lies in the folder of the file or below, and the files that the
     scenario names in that of the scenario; `allow_files` are other folders in which they may lie.
 
     Raises `ScenarioError` that says where, what, and the near key where one is misspelt.

@@ -1,7 +1,7 @@
-"""One run of a sweep as a worker does it, and the workers: this process, processes, or a Dask cluster.
+"""The runs of a sweep, and its workers: a thread of this process, processes, or a Dask cluster.
 
-A run goes from plain data to plain rows, the same on every worker. Workers are other processes, perhaps on other
-machines: functions of plug-ins reach them by module and name.
+A run takes plain data and gives plain rows, the same with every worker. Workers may be other processes on other
+machines, which import functions of plug-ins by module and name.
 """
 
 from __future__ import annotations
@@ -15,7 +15,14 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -26,45 +33,34 @@ from threading import Thread
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 import uwblink
 from uwblink.errors import UwblinkError
-from uwblink.protocols.rows import RangingProtocol
-from uwblink.protocols.table import PROTOCOLS, register_protocol
+from uwblink.protocols.table import PROTOCOLS, RangingProtocol, register_protocol
 from uwbsim.errors import ParameterError, UwbsimError
 from uwbsim.protocols.comparison import compare
 from uwbsim.scenario.model import Scenario
-from uwbsim.simulation.run import simulate
-from uwbsim.simulation.simulated import Simulated
+from uwbsim.simulation.run import Simulated, simulate
+from uwbsim.sweep.design import Run
 from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, ChannelEffect
 
 Evaluate = Callable[[Simulated], Mapping[str, Any]]
-"""Returns the figures of a flight as columns of one row: numbers, texts or None."""
+"""Returns the results of a flight as columns of one row: numbers, texts or None."""
 
 Row = dict[str, Any]
 Result = tuple[int, list[Row]]
 """A run's number, and its rows."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Task:
-    """One run: what varies, and the scenario as JSON, or the error that it gave."""
-
-    number: int
-    seed: int
-    values: Mapping[str, Any]
-    scenario: str = ""
-    error: str = ""
-
-
-Chunk = list[Task]
+Chunk = list[Run]
 Done = tuple[Chunk, list[Result] | None, float]
-"""A chunk, its rows by number (None: its worker died), and the seconds that it took."""
+"""A chunk, its results (None: its worker died), and the seconds that it took."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Work:
-    """What all runs of a sweep have in common: scenario's name, protocols, what is done, and plug-ins of this process.
+    """What all runs of a sweep have in common: name of the scenario, protocols, evaluation, and plug-ins.
 
     With `evaluate` each protocol's flight is simulated and evaluated; without, protocols are compared by `ranges`.
     """
@@ -77,13 +73,13 @@ class Work:
 
     @classmethod
     def of_here(cls, name: str, protocols: Iterable[str], ranges: int, evaluate: Evaluate | None = None) -> Work:
-        """Return the work of a sweep with the rows of protocols and the channel effects that this process has."""
+        """Return the work of a sweep with the protocols and channel effects that are registered in this process."""
         effects = tuple((name, effect) for name, effect in CHANNEL_EFFECTS.items() if name not in OWN_EFFECTS)
         rows = tuple(PROTOCOLS[name] for name in protocols)
         return cls(name=name, protocols=rows, ranges=ranges, evaluate=evaluate, effects=effects)
 
     def check(self) -> None:
-        """Raise `ParameterError` where another process would not find a function by its name."""
+        """Raise `ParameterError` for a function that another process cannot import by its name."""
         named: dict[str, object] = {f"channel effect {name!r}": effect for name, effect in self.effects}
         for row in self.protocols:
             named |= {
@@ -100,26 +96,26 @@ class Work:
                     parameter=what,
                 )
 
-    def do(self, task: Task) -> Result:
-        """Return the rows of a run, one a protocol; a failure is a row."""
+    def do(self, run: Run) -> Result:
+        """Do a run: return its rows, one per protocol; a failure is a row."""
         try:
-            if task.error:
-                raise UwbsimError(task.error)
-            scenario = Scenario.model_validate_json(task.scenario)
+            if run.error:
+                raise UwbsimError(run.error)
+            scenario = Scenario.model_validate_json(run.scenario)
             rows = self._compared(scenario) if self.evaluate is None else self._evaluated(scenario, self.evaluate)
         except (UwbsimError, UwblinkError, ArithmeticError, ValueError, MemoryError) as error:
-            return self.failed(task, str(error) or type(error).__name__)
-        return task.number, [self._head(task) | {"status": "ok", "error": None} | row for row in rows]
+            return self.failed(run, str(error) or type(error).__name__)
+        return run.number, [self._head(run) | {"status": "ok", "error": None} | row for row in rows]
 
-    def failed(self, task: Task, reason: str) -> Result:
+    def failed(self, run: Run, reason: str) -> Result:
         """Return the row of a run that failed."""
         error = reason.splitlines()[0][:300] if reason else "unknown"
-        return task.number, [self._head(task) | {"status": "failed", "error": error}]
+        return run.number, [self._head(run) | {"status": "failed", "error": error}]
 
-    def _head(self, task: Task) -> Row:
+    def _head(self, run: Run) -> Row:
         versions = {"uwbcal": uwblink.__version__, "numpy": np.__version__, "python": platform.python_version()}
-        values = {k: v if isinstance(v, int | float | str | bool) else json.dumps(v) for k, v in task.values.items()}
-        return {"scenario": self.name, "number": task.number, "seed": task.seed} | versions | values
+        values = {k: v if isinstance(v, int | float | str | bool) else json.dumps(v) for k, v in run.values.items()}
+        return {"scenario": self.name, "number": run.number, "seed": run.seed} | versions | values
 
     def _compared(self, scenario: Scenario) -> list[Row]:
         return [outcome.to_dict() for outcome in compare(scenario, self.protocols, self.ranges).outcomes]
@@ -139,20 +135,22 @@ class Work:
         return found
 
 
-def run_chunk(tasks: Sequence[Task], work: Work) -> tuple[list[Result], float]:
-    """Do some runs; return their rows by number, and how long they took together in seconds."""
+def run_chunk(runs: Sequence[Run], work: Work) -> tuple[list[Result], float]:
+    """Do some runs; return their results, and the seconds that they took together."""
     start = time.perf_counter()
-    # What this process knows already stays.
+    # Registrations of this process are kept.
     for row in work.protocols:
         if row.name not in PROTOCOLS:
             register_protocol(row)
     for name, effect in work.effects:
         CHANNEL_EFFECTS.setdefault(name, effect)
-    return [work.do(task) for task in tasks], time.perf_counter() - start
+    # One thread of linear algebra for each worker, so that results do not depend on the number of cores.
+    with threadpool_limits(limits=1, user_api="blas"):
+        return [work.do(run) for run in runs], time.perf_counter() - start
 
 
 def evaluator(kind: str) -> Evaluate:
-    """Return the function that installed distributions offer for a kind of sweep; raises `ParameterError`."""
+    """Return the entry point of an installed distribution for a kind of sweep; raises `ParameterError`."""
     group = "uwbcal.evaluators"
     for entry in entry_points(group=group, name=kind):
         try:
@@ -170,15 +168,15 @@ def evaluator(kind: str) -> Evaluate:
 
 
 class ClusterLostError(UwbsimError, ConnectionError):
-    """The scheduler of a cluster went away while it worked."""
+    """The connection to the scheduler of a cluster was lost."""
 
 
 class WorkersLostError(UwbsimError):
-    """Processes that end as they begin."""
+    """Worker processes end at their start."""
 
 
 class Workers:
-    """Does chunks of runs, in whatever order, `size` of them at once: in this process, one after the other."""
+    """Workers that do chunks of runs, `size` of them at once, in any order: threads of this process."""
 
     died: type[Exception] = BrokenProcessPool
     """Raised by the future of a chunk whose worker died."""
@@ -186,16 +184,20 @@ class Workers:
     def __init__(self, size: int, work: Work) -> None:
         """`size` is how many chunks are worked on at once."""
         self.size, self._work = size, work
-        self._running: dict[Any, Chunk] = {}
+        self._running: dict[Future[tuple[list[Result], float]], Chunk] = {}
+        self._pool = self._start_pool()
+
+    def _start_pool(self) -> Any:  # an `Executor`, of whatever kind
+        return ThreadPoolExecutor(self.size)
 
     def submit(self, chunk: Chunk) -> None:
-        """Take on a chunk."""
-        self._running[self._start(chunk)] = chunk
+        """Submit a chunk."""
+        self._running[self._pool.submit(run_chunk, chunk, self._work)] = chunk
 
     def finished(self) -> Sequence[Done]:
-        """Wait until something is done, and return all that is."""
+        """Wait until a chunk is done, and return all chunks that are."""
         found: list[Done] = []
-        for future in self._wait():
+        for future in wait(self._running, return_when=FIRST_COMPLETED).done:
             chunk = self._running.pop(future)
             try:
                 found.append((chunk, *future.result()))
@@ -203,57 +205,45 @@ class Workers:
                 found.append((chunk, None, 0.0))
         return found
 
-    def _start(self, chunk: Chunk) -> Any:
-        return Future()
-
-    def _wait(self) -> Iterable[Any]:
-        future, chunk = next(iter(self._running.items()))
-        future.set_result(run_chunk(chunk, self._work))
-        return [future]
-
     def close(self) -> None:
-        """Release the workers, without waiting for what they do."""
+        """Release the workers, without waiting for running chunks."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
 
 
 class Processes(Workers):
-    """Processes of this machine; when one dies the pool is made anew, and its chunks come back as lost.
+    """Processes of this machine; if one dies, the pool is replaced, and its chunks are returned as lost.
 
-    They end with this process, however that ends: each waits for the end of a pipe that this process holds.
+    They end with this process, even if it is killed: each watches a pipe that this process holds open. Raises
+    `ParameterError` for plug-ins that they could not import, and `WorkersLostError` where they end as they begin.
     """
 
-    def __init__(self, size: int, work: Work) -> None:
-        """Start `size` processes; raises `ParameterError` for plug-ins that they could not import."""
-        work.check()
-        super().__init__(size, work)
-        self._start_pool()
-
-    def _start_pool(self) -> None:
+    def _start_pool(self) -> Any:
+        self._work.check()
         context = multiprocessing.get_context("spawn")
         held, self._held = context.Pipe(duplex=False)
-        self._pool = ProcessPoolExecutor(self.size, context, initializer=_end_with, initargs=(held,))
+        pool = ProcessPoolExecutor(self.size, context, initializer=_end_with, initargs=(held,))
         try:
-            with _inherited():
-                list(self._pool.map(abs, range(self.size)))
+            with _interrupts_blocked():
+                list(pool.map(abs, range(self.size)))
         except BrokenProcessPool as error:
-            self.close()
+            self._held.close()
             raise WorkersLostError(
                 "`workers`: a process ended as it began: is there memory for so many, and does the script begin its "
                 "work below `if __name__ == '__main__':`? With 1 the work is done in this process"
             ) from error
+        return pool
 
-    def _start(self, chunk: Chunk) -> Any:
-        with _inherited():  # a process may be started for it
+    def submit(self, chunk: Chunk) -> None:
+        """Submit a chunk; a process may be started for it."""
+        with _interrupts_blocked():
             try:
-                return self._pool.submit(run_chunk, chunk, self._work)
+                super().submit(chunk)
             except BrokenProcessPool:
-                self._start_pool()
-                return self._pool.submit(run_chunk, chunk, self._work)
-
-    def _wait(self) -> Iterable[Any]:
-        return wait(self._running, return_when=FIRST_COMPLETED).done
+                self._pool = self._start_pool()
+                super().submit(chunk)
 
     def close(self) -> None:
-        """End the processes, those that still have a chunk at once."""
+        """End the processes, without waiting for running chunks."""
         if self._running:
             self._held.close()
         self._pool.shutdown(cancel_futures=True)
@@ -264,27 +254,30 @@ class Cluster(Workers):
     """A Dask cluster by the address of its scheduler; `distributed` moves the work of a dead worker to another."""
 
     connect_s = 10
-    """How long a cluster may take to answer: chosen, some round trips to a busy scheduler."""
+    """Timeout of the connection in seconds: chosen, some round trips to a busy scheduler."""
 
     def __init__(self, address: str, work: Work) -> None:
         """Connect; raises `ParameterError` where no scheduler answers in time."""
         work.check()
         self._address = address
         try:
-            self._dask: Any = import_module("distributed")
+            dask: Any = import_module("distributed")
         except ImportError as error:
             raise ParameterError(
                 "needs the extra 'cluster': pip install 'uwbcal[cluster]'", parameter="scheduler"
             ) from error
-        self.died = self._dask.KilledWorker
+        self.died = dask.KilledWorker
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
         try:
-            self._client = self._dask.Client(address, timeout=self.connect_s, set_as_default=False)
+            self._client = dask.Client(address, timeout=self.connect_s, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
             raise ParameterError(
                 f"{address} does not answer within {self.connect_s} s", parameter="scheduler"
             ) from error
         super().__init__(max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1), work)
+
+    def _start_pool(self) -> Any:
+        return self._client.get_executor(pure=False)
 
     def finished(self) -> Sequence[Done]:
         """Wait for the first chunk that is done."""
@@ -295,21 +288,13 @@ class Cluster(Workers):
                 f"{self._address}: the scheduler is gone; results so far are kept, go on with `resume`"
             ) from error
 
-    def _start(self, chunk: Chunk) -> Any:
-        return self._client.submit(run_chunk, chunk, self._work, pure=False)
-
-    def _wait(self) -> Iterable[Any]:
-        with self._client.as_current():
-            done: Iterable[Any] = self._dask.wait(list(self._running), return_when="FIRST_COMPLETED").done
-        return done
-
     def close(self) -> None:
-        """Leave the cluster as it was."""
+        """Disconnect from the cluster."""
         self._client.close()
 
 
 def workers_for(count: int | None, scheduler: str | None, work: Work) -> Workers:
-    """Return the workers that were asked for: a cluster by address, or processes, or this one if one is enough."""
+    """Return the workers for a sweep: a cluster by its address, else processes, or this process for one worker."""
     if scheduler:
         return Cluster(scheduler, work)
     # Not every system says which cores this process may use.
@@ -319,7 +304,7 @@ def workers_for(count: int | None, scheduler: str | None, work: Work) -> Workers
 
 
 def _end_with(held: Connection) -> None:
-    """Have this process end when the other end of a pipe is closed: by its holder, or by that one's end."""
+    """End this process when the other end of a pipe is closed, by its holder or with it."""
 
     def wait_for_end() -> None:
         with suppress(EOFError, OSError):
@@ -330,20 +315,13 @@ def _end_with(held: Connection) -> None:
 
 
 @contextmanager
-def _inherited() -> Iterator[None]:
-    """Start processes with one thread each in linear algebra, and with Ctrl-C blocked.
-
-    A terminal sends that to all of them, and it is this process that answers.
-    """
-    threads = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ[name] for name in threads if name in os.environ}
-    os.environ.update(dict.fromkeys(threads, "1"))
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT]) if hasattr(signal, "pthread_sigmask") else None
+def _interrupts_blocked() -> Iterator[None]:
+    """Start processes that ignore Ctrl-C, which a terminal sends to all of them; this process handles it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield
     finally:
-        if mask is not None:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for name in threads:
-            del os.environ[name]
-        os.environ.update(before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)

@@ -1,26 +1,33 @@
-"""[sweep.runner] Runs a sweep: hands out chunks, stores what comes back, and goes on where a killed one ended.
+"""Runs a sweep: submits chunks of runs to workers, stores their results, and resumes an interrupted sweep.
 
-A result depends on its run alone, so neither the number of workers nor their order changes a bit of it. At most a few
-chunks are out at a time and every result goes to the store at once, so memory does not grow with the number of runs.
+A result depends on its run alone, not on the number of workers or their order. Few chunks are submitted at a time and
+results are stored at once, so memory does not grow with the number of runs.
 """
 
 from __future__ import annotations
 
+import json
 import os
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
+
+import duckdb
 
 import uwblink
-from uwblink.output import check_folder
+from uwblink.database import connect
+from uwblink.errors import UwblinkError, first_line
+from uwblink.output import check_folder, is_utf8
+from uwblink.recording.intake import check_tables, interrupted_after, longest_read_s
 from uwbsim.errors import ParameterError, ScenarioError
-from uwbsim.scenario.loading import load
 from uwbsim.sweep.design import SweepDesign
-from uwbsim.sweep.executors import Chunk, Evaluate, Result, Task, Work, Workers, evaluator, workers_for
-from uwbsim.sweep.results import Store, export
+from uwbsim.sweep.executors import Chunk, Evaluate, Result, Work, Workers, evaluator, workers_for
+from uwbsim.tables import write_tables
 
 STORE: Final = "results.duckdb"
 """Name of the file that keeps the results of a sweep, in its folder."""
@@ -28,7 +35,7 @@ STORE: Final = "results.duckdb"
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """How a sweep went: runs done now, of which failed, and runs whose results were there already."""
+    """Numbers of runs of a sweep: done now, failed among these, and skipped because their results were stored."""
 
     done: int
     failed: int
@@ -45,13 +52,13 @@ def run_sweep(
     evaluate: Evaluate | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Summary:
-    """Run what is not done yet, and write results.csv and results.parquet in the order of the runs.
+    """Do the runs that have no results yet, and write results.csv and results.parquet in the order of the runs.
 
     Runs of kind `compare` compare protocols; those of kind `calibrate` simulate a flight and have `evaluate(flight)`
-    return its figures, a mapping of column to number, text or None. Where that is not given it is what an installed
-    distribution offers as entry point `calibrate` of the group `uwbcal.evaluators`. The work is done by
-    `workers` processes (None: all cores), or by the Dask cluster whose `scheduler` has this address; both import
-    `evaluate` by its name. `progress` is called with the done fraction, 0 to 1.
+    return its results, a mapping of column to number, text or None; by default the entry point `calibrate` of the group
+    `uwbcal.evaluators` of an installed distribution. Runs are done by `workers` processes (None: all cores), or by the
+    Dask cluster at the address `scheduler`; both import `evaluate` by its name. `progress` is called with the done
+    fraction, 0 to 1.
 
     Raises `ScenarioError` where the folder holds another sweep's results, or the same one's without `resume`, and
     `ParameterError` where the scheduler does not answer; nothing is written then.
@@ -91,7 +98,7 @@ def run_sweep(
         with Store.open(path) if Store.begun(path) else Store.create(path, _identity(plan)) as store:
             known = store.done()
             done, failed = _do(plan, store, team, work, known, progress)
-            export(store, folder / "results.csv", folder / "results.parquet")
+            write_tables(folder / "results.csv", folder / "results.parquet", store, force=True)
     finally:
         team.close()
     return Summary(done, failed, len(known))
@@ -133,15 +140,15 @@ def _do(
     known: set[int],
     progress: Callable[[float], None] | None,
 ) -> tuple[int, int]:
-    """Do the runs whose numbers are not `known`; return how many were done, and how many of them failed."""
+    """Do the runs whose numbers are not `known`; return the numbers of done and of failed runs."""
     numbers = (number for number in range(plan.total) if number not in known)
-    # Work that was lost with its worker is done first, one run at a time, so that only a run that kills is to blame.
+    # Runs of a worker that died are done again first, one at a time, to find the run that kills its worker.
     again: list[Chunk] = []
     attempts: Counter[int] = Counter()
     out, done, failed, size = 0, 0, 0, 1
     while True:
         while out < 2 * team.size:
-            chunk = again.pop() if again else [_task(plan, number) for number in islice(numbers, size)]
+            chunk = again.pop() if again else [plan.loaded(number) for number in islice(numbers, size)]
             if not chunk:
                 break
             team.submit(chunk)
@@ -153,7 +160,7 @@ def _do(
             if rows is None:
                 rows = _lost(chunk, work, attempts, again)
             else:
-                # A chunk should take a second: long beside handing it out, short beside a patience.
+                # A chunk takes about a second: long compared with its submission, short for a user who waits.
                 size = min(max(int(len(chunk) / max(seconds, 1e-6)), 1), 512)
             store.append(rows)
             done += len(rows)
@@ -163,24 +170,137 @@ def _do(
 
 
 def _lost(chunk: Chunk, work: Work, attempts: Counter[int], again: list[Chunk]) -> list[Result]:
-    """Queue the runs of a lost chunk one by one; return the rows of those that took their worker down three times."""
+    """Queue the runs of a lost chunk one by one; return the rows of those whose worker died three times."""
     rows = []
-    for task in chunk:
-        attempts[task.number] += 1
-        if attempts[task.number] >= 3:
-            rows.append(work.failed(task, "its worker died 3 times"))
+    for run in chunk:
+        attempts[run.number] += 1
+        if attempts[run.number] >= 3:
+            rows.append(work.failed(run, "its worker died 3 times"))
         else:
-            again.append([task])
+            again.append([run])
     return rows
 
 
-def _task(plan: SweepDesign, number: int) -> Task:
-    """Return a run as plain data; a scenario that cannot be is an error that travels with it."""
-    run = plan.run(number)
-    task = Task(number=number, seed=run.seed, values=run.values)
+class TableError(UwblinkError, ValueError):
+    """A table or store that cannot be read or written: what, where, what to do."""
+
+
+TABLES: Final = {
+    "identity": {"key": "VARCHAR", "value": "VARCHAR"},
+    "results": {"number": "BIGINT", "part": "BIGINT", "document": "VARCHAR"},
+}
+
+
+class Store:
+    """Results by number of run, committed as they come: a killed sweep loses only results not yet committed."""
+
+    def __init__(self, connection: Any, path: Path) -> None:
+        """Wrap an open database; use `create` or `open`."""
+        self._db, self._path = connection, path
+
+    @classmethod
+    def create(cls, path: Path, identity: Mapping[str, Any]) -> Self:
+        """Make a new store; `identity` identifies the sweep whose results it holds."""
+        db = _connect(path)
+        with _writing(path):
+            db.execute("BEGIN")
+            for table, columns in TABLES.items():
+                db.execute(f"CREATE TABLE {table} ({', '.join(f'{name} {kind}' for name, kind in columns.items())})")
+            db.executemany("INSERT INTO identity VALUES (?, ?)", [[k, json.dumps(v)] for k, v in identity.items()])
+            db.execute("COMMIT")
+        return cls(db, path)
+
+    @staticmethod
+    def begun(path: Path) -> bool:
+        """Return whether a file exists and has tables: a sweep killed at its start leaves an empty one."""
+        if not path.exists():
+            return False
+        with _connect(path) as db, _reading(path):
+            return bool(db.execute("SELECT 1 FROM system.main.duckdb_tables() WHERE NOT internal").fetchall())
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """Open a store from an untrusted file; raises `TableError` if it is not a store, or its rows are too long."""
+        db = _connect(path)
+        try:
+            with _reading(path), interrupted_after(longest_read_s(path.stat().st_size), db.interrupt):
+                check_tables(lambda query: db.execute(query).fetchall(), path, path.stat().st_size, TABLES)
+                found = set(db.execute("SELECT table_name, column_name FROM system.main.duckdb_columns()").fetchall())
+                if not {(table, column) for table, columns in TABLES.items() for column in columns} <= found:
+                    raise TableError(f"{path}: not a store of results")
+                ((longest,),) = db.execute("SELECT coalesce(max(strlen(document)), 0) FROM results").fetchall()
+                # Fifty times what a run has with a hundred figures; 5000 rows are read at a time, 0.5 GB.
+                most = 100_000
+                if longest > most:
+                    raise TableError(f"{path}: a row of {longest} letters, and results have at most {most}")
+        except UwblinkError:
+            db.close()
+            raise
+        return cls(db, path)
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the store."""
+        self._db.close()
+
+    def identity(self) -> dict[str, Any]:
+        """Return the identity of the sweep whose results it holds."""
+        with _reading(self._path):
+            rows = self._db.execute("SELECT key, value FROM identity").fetchall()
+            return {key: json.loads(value) for key, value in rows}
+
+    def done(self) -> set[int]:
+        """Return the numbers of the runs that have results."""
+        with _reading(self._path):
+            return {int(row[0]) for row in self._db.execute("SELECT DISTINCT number FROM results").fetchall()}
+
+    def append(self, results: Sequence[tuple[int, Sequence[Mapping[str, Any]]]]) -> None:
+        """Commit results, each a number and its rows, all or none; raises `TableError`."""
+        rows = [(n, k, json.dumps(row)) for n, some in results for k, row in enumerate(some)]
+        if not rows:
+            return
+        # One statement and one commit, however many rows: a statement a row took most of a sweep's own time.
+        columns = [list(column) for column in zip(*rows, strict=True)]
+        with _writing(self._path):
+            self._db.execute("INSERT INTO results SELECT unnest(?), unnest(?), unnest(?)", columns)
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """Yield all rows in the order of their numbers; raises `TableError` where one is damaged."""
+        with _reading(self._path):
+            cursor = self._db.cursor()
+            cursor.execute("SELECT document FROM results ORDER BY number, part")
+            while batch := cursor.fetchmany(5000):
+                for (document,) in batch:
+                    yield dict(json.loads(document))
+
+
+def _connect(path: Path) -> Any:
+    if not is_utf8(path):
+        raise TableError(f"{path}: its name and those of its folders must be UTF-8; give another one")
+    if path.is_symlink():
+        raise TableError(f"{path}: is a link; give the folder in which the sweep was begun")
     try:
-        scenario = load(plan.scenario, run.values, run.seed, allow_files=plan.allow_files)
-        return replace(task, scenario=scenario.model_dump_json())
-    except ScenarioError as error:
-        # Where the file lies is no part of a result.
-        return replace(task, error=str(error).removeprefix(f"{plan.scenario}: "))
+        return connect(path)
+    except duckdb.Error as error:
+        reason = str(error).splitlines()[0]
+        if "lock" in reason:
+            raise TableError(f"{path}: another sweep writes its results there; give another folder") from error
+        raise TableError(f"{path}: cannot be opened ({reason[:120]})") from error
+
+
+@contextmanager
+def _naming(path: Path, text: str) -> Iterator[None]:
+    """Raise errors of a store as a `TableError` that names it; `text` has a place for the reason."""
+    try:
+        yield
+    except UwblinkError:
+        raise
+    except (duckdb.Error, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise TableError(f"{path}: {text.format(first_line(error))}") from error
+
+
+_reading: Final = partial(_naming, text="its results are damaged ({}); begin in another folder")
+_writing: Final = partial(_naming, text="cannot be written ({}); is the disk full? Results so far are kept")

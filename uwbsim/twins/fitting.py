@@ -1,4 +1,4 @@
-"""Makes the twin of a recording, a scenario fitted to it, and compares the two distribution by distribution."""
+"""The twin of a recording: a scenario fitted to it, and the comparison of their distributions."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any, Final, Self
 import numpy as np
 from pydantic import ValidationError
 from scipy.special import kolmogi, kolmogorov, ndtr, ndtri
+from scipy.stats import ks_2samp
 from threadpoolctl import threadpool_limits
 
 from uwblink.arrays import Floats, Ints
@@ -30,15 +31,15 @@ from uwbsim.twins.range_errors import CalibrationSource, KnownDevices, fit_range
 from uwbsim.twins.scenario import Fitted, receive_noise, scenario_text, tables, unknowns
 
 LEVEL: Final = 0.01
-"""Probability below which chance does not explain a difference."""
+"""Significance level of the comparison of a quantity."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Side:
     """One quantity in a recording or in its twin: `count` values, their quantiles at 10, 50 and 90 %.
 
-    `lag1` is the autocorrelation to the pair's next value, about the mean of all, with a standard error; `worth` is how
-    many independent values the values are worth.
+    `lag1` is the autocorrelation of consecutive values of a pair, about the mean of all, with a standard error; `worth`
+    is the effective number of independent values.
     """
 
     count: int
@@ -62,10 +63,10 @@ class Side:
 class Compared:
     """One quantity in a recording and in its twin.
 
-    `distance` is the largest difference of the cumulative shares, and `probability` how likely chance makes it as large
-    where both are the same (Kolmogorov and Smirnov, with sizes as the values are worth); `lag1_probability` is that of
-    the difference of the autocorrelations (normal). `detectable` and `lag1_detectable` are the differences that nine of
-    ten such recordings would show. `drawn` are some values of both sides, for figures; `pairs` both sides by pair.
+    `distance` is the largest difference of the cumulative distributions, and `probability` its p-value (Kolmogorov and
+    Smirnov, with the effective numbers of values); `lag1_probability` is that of the difference of the autocorrelations
+    (normal). `detectable` and `lag1_detectable` are the differences that are detected in nine of ten such recordings.
+    `drawn` are some values of both sides, for figures; `pairs` both sides by pair.
     """
 
     name: str
@@ -82,10 +83,10 @@ class Compared:
 
     @property
     def verdict(self) -> str:
-        """Return "differ" where chance explains no such difference, "alike" where a larger one would have shown.
+        """Return "differ" for a significant difference, else "alike", or "too few" if a large one were not detected.
 
-        A larger one is 0.2, as two normal distributions have it whose means are half a standard deviation apart; where
-        it would not have shown, "too few". Either test may differ by chance in half of `LEVEL`.
+        A large difference is 0.2, that of two normal distributions whose means are half a standard deviation apart.
+        Each of the two tests has half of `LEVEL`.
         """
         if min(self.probability, np.nan_to_num(self.lag1_probability, nan=1.0)) < LEVEL / 2:
             return "differ"
@@ -120,29 +121,7 @@ QUANTITIES: Final[dict[str, tuple[str, Column]]] = {
     "ratio less carrier readings": ("ppm", lambda f: f.ratio_ppm - (f.exchanges.skew2_ppm - f.exchanges.skew1_ppm) / 2),
     "residual of calibrated ranges": ("m", lambda f: f.residual_m),
 }
-"""What is compared, of which unit, one value an exchange; columns without values are left out."""
-
-
-def compare_flights(
-    measured: Flight,
-    known: KnownDevices,
-    scenario: Scenario,
-    seeds: int | None = None,
-    progress: Callable[[float], None] | None = None,
-) -> list[Compared]:
-    """Simulate a scenario with seeds 1, 2 and so on, and compare; raises `ParameterError` for less than one seed."""
-    if seeds is not None and (isinstance(seeds, bool) or not isinstance(seeds, int) or seeds < 1):
-        raise ParameterError(f"found {seeds!r}, expected a whole number from 1 on", parameter="seeds")
-    # Without a wish 6000 simulated exchanges or more, by eight seeds at most.
-    count = seeds or int(np.clip(-(-6000 // len(measured)), 1, 8))
-    flights = []
-    for k in range(count):
-        one = scenario.model_copy(update={"run": scenario.run.model_copy(update={"seed": k + 1})})
-        flights.append(Flight.of(simulate(one), known, "the simulated twin", fewest=2))
-        if progress:
-            progress((k + 1) / count)
-    found = [_compared(name, measured, flights) for name in QUANTITIES]
-    return [one for one in found if one is not None]
+"""The compared quantities with their units, one value per exchange; those without values are left out."""
 
 
 def _compared(name: str, measured: Flight, flights: list[Flight]) -> Compared | None:
@@ -164,10 +143,8 @@ def _compared(name: str, measured: Flight, flights: list[Flight]) -> Compared | 
         own, rows = mine[group == k], np.flatnonzero(pair == k)
         if len(own) and len(rows):
             pairs[f"{a}-{b}"] = Side.of(own, np.zeros(len(own), np.int64)), Side.of(theirs[rows], seed[rows])
-    # The largest difference of the two cumulative shares.
-    at = np.sort(np.concatenate([mine, theirs]))
-    shares = [np.searchsorted(np.sort(values), at, side="right") / len(values) for values in (mine, theirs)]
-    distance, root = float(np.max(np.abs(shares[0] - shares[1]))), np.sqrt(1 / (1 / one.worth + 1 / other.worth))
+    distance = float(ks_2samp(mine, theirs, method="asymp").statistic)
+    root = np.sqrt(1 / (1 / one.worth + 1 / other.worth))
     spread = float(np.hypot(one.lag1_std, other.lag1_std))
     # A share has the standard deviation 1/2 at most; 1.28 of them leave a tenth below.
     tenth = float(-ndtri(0.1))
@@ -195,8 +172,8 @@ def _finite(values: Floats, pair: Ints) -> tuple[Floats, Ints]:
 class Twin:
     """A scenario fitted to a recording.
 
-    `scenario` can be simulated as it is; `found` has what was fitted, JSON-ready; `unknown` says what the recording
-    cannot tell and so keeps its default, one sentence each. `compare` simulates it beside the recording, `save` writes
+    `scenario` can be simulated as it is; `found` has the fitted values, JSON-ready; `unknown` describes what the
+    recording does not determine, one sentence each. `compare` compares its simulation with the recording, `save` writes
     it as a file.
 
     >>> import calib
@@ -226,11 +203,22 @@ class Twin:
     table: dict[str, Any]
 
     def compare(self, seeds: int | None = None, progress: Callable[[float], None] | None = None) -> list[Compared]:
-        """Simulate the twin with a number of seeds, and compare it with the recording, distribution by distribution.
+        """Simulate the twin with a number of seeds, and compare its distributions with those of the recording.
 
-        Without `seeds` there are as many as make the simulated exchanges some times the measured ones.
+        Without `seeds` there are as many as make 6000 simulated exchanges or more, eight at most. Raises
+        `ParameterError` for less than one.
         """
-        return compare_flights(self.measured, self.known, self.scenario, seeds, progress)
+        if seeds is not None and (isinstance(seeds, bool) or not isinstance(seeds, int) or seeds < 1):
+            raise ParameterError(f"found {seeds!r}, expected a whole number from 1 on", parameter="seeds")
+        count = seeds or int(np.clip(-(-6000 // len(self.measured)), 1, 8))
+        flights = []
+        for k in range(count):
+            one = self.scenario.model_copy(update={"run": self.scenario.run.model_copy(update={"seed": k + 1})})
+            flights.append(Flight.of(simulate(one), self.known, "the simulated twin", fewest=2))
+            if progress:
+                progress((k + 1) / count)
+        found = [_compared(name, self.measured, flights) for name in QUANTITIES]
+        return [one for one in found if one is not None]
 
     def files(self, output: str | os.PathLike[str]) -> tuple[Path, ...]:
         """Return the names of what `save` writes: the scenario, and beside it its poses and its plan where needed."""
@@ -247,21 +235,18 @@ class Twin:
             check_output(file, force=force)
         table = _linked(self.table, path)
         if self.paths:
-            order = np.argsort(np.concatenate([one.time_ns for one in self.paths.values()]), kind="stable")
-            columns = ("time_ns", "body", "position_m", "quaternion")
-            poses = Poses(*(np.concatenate([getattr(p, name) for p in self.paths.values()]) for name in columns))
             with Recording.create(
                 path.with_suffix(".poses.uwb"), meta={"source": "uwbsim twin"}, force=force
             ) as recording:
                 recording.append_tags([Tag(tag.id, tag.body, tag.lever_arm_m) for tag in self.scenario.tags])
-                recording.append_poses(poses[order])
+                recording.append_poses(Poses.concatenate(list(self.paths.values())).in_time_order())
         if isinstance(table["ranging"].get("plan"), dict):
             slots = self.table["ranging"]["plan"]["slots"]
             rows = [dict(zip(("time_s", "initiator", "target"), slot, strict=True)) for slot in slots]
             write_csv(path.with_suffix(".plan.csv"), rows, force=force)
         head = (
             f"The twin of {Path(self.recording).name} with {Path(self.calibration).name}: fitted to it by "
-            "`uwbsim twin`, which also wrote what lies beside this file. What nothing is said of here has its default."
+            "`uwbsim twin`, which also wrote the files that it names. Keys that are left out have their defaults."
         )
         write_text(path, scenario_text(table, head), force=force)
 
@@ -273,12 +258,12 @@ class Twin:
 
 
 def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
-    """Fit a scenario to a recording, with what a calibration knows of the devices as their truth.
+    """Fit a scenario to a recording, with delays and bias curve of a calibration as the truth.
 
-    `recording` is a file (.uwb) or what one holds in memory (`uwblink.Contents`, a simulated flight); `calibration` its
+    `recording` is a file (.uwb) or its contents in memory (`uwblink.Contents`, a simulated flight); `calibration` its
     file (.json), its JSON as nested tables, or a `calib.Calibration`. The recording needs poses, first-path powers
-    and some hundred exchanges. Raises `ScenarioError` where these lack or the calibration does not know all tags, and
-    what `Recording.open` raises.
+    and some hundred exchanges. Raises `ScenarioError` if these are missing or the calibration lacks a tag, and what
+    `Recording.open` raises.
 
     >>> import calib
     >>> import uwbsim
@@ -317,7 +302,7 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))
-        raise ScenarioError(f"{where}: its twin cannot be: {place}: {first['msg']}") from error
+        raise ScenarioError(f"{where}: the fitted scenario is not valid: {place}: {first['msg']}") from error
     return Twin(
         scenario=scenario,
         found=summary(flight, fitted),

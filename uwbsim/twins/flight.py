@@ -1,7 +1,7 @@
-"""A recording as the columns that a twin is fitted to and compared by, statistics of such columns, and the schedule.
+"""The columns of a recording to which a twin is fitted and compared, their statistics, and the schedule.
 
-Lives of reflections and fading are time constants of autocovariances within pairs: nothing is assumed of what is drawn
-when, or of what makes a quantity last. The schedule is who ranged when, how soon boards replied, and what was lost.
+Lives of reflections and fading are time constants of autocovariances within pairs, without a model of their causes.
+The schedule is who ranged when, how soon boards replied, and which exchanges were lost.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
 from uwblink.arrays import Bools, Floats, Ints
-from uwblink.protocols.rows import RangingProtocol
-from uwblink.protocols.table import PROTOCOLS
+from uwblink.protocols.table import PROTOCOLS, RangingProtocol
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import antennas_m
 from uwblink.recording.file import Recording
@@ -29,18 +28,18 @@ from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S, UUS_TICKS
 from uwblink.twr import Exchanges, intervals, without_stamps
 from uwbsim.errors import ScenarioError, UnanswerableError
 from uwbsim.random_streams import stream
-from uwbsim.simulation.simulated import Simulated
+from uwbsim.simulation.run import Simulated
 
 if TYPE_CHECKING:
     from uwbsim.twins.range_errors import KnownDevices
 
 
 def lasting(time_s: Floats, pair: Ints, value: Floats, span_s: float) -> tuple[float, float | None]:
-    """Return variance and life in seconds of what lasts in values (n,) of pairs, about their pair's mean.
+    """Return variance and time constant in seconds of the persistent part of values (n,), about the means of pairs.
 
-    An exponential is fitted to the autocovariance over all pairs. Means of pairs are those of a flight as long as it
-    is (`span_s`), which takes a little off every lag; that is in the fit. The life is None, and the variance 0, where
-    the lags that there are do not tell.
+    An exponential is fitted to the autocovariance over all pairs. Subtracting means over a flight of finite length
+    (`span_s`) lowers the autocovariance at every lag, which the fit takes into account. The time constant is None, and
+    the variance 0, where the lags do not determine them.
     """
     centred = value - (np.bincount(pair, value) / np.maximum(np.bincount(pair), 1))[pair]
     variance = float(np.mean(centred**2))
@@ -101,7 +100,7 @@ def _autocovariance(time_s: Floats, pair: Ints, centred: Floats, span_s: float) 
 
 
 def effective_size(value: Floats, group: Ints) -> float:
-    """Return how many independent values n values are worth, in order of time within groups.
+    """Return the effective number of independent values among n values, in order of time within groups.
 
     n / (1 + 2 sum of autocorrelations), about the mean of all so that groups which differ count as less; the sum ends
     before the first pair of lags whose sum is not positive (Geyer, Statistical Science 7, 1992).
@@ -132,7 +131,7 @@ def some_rows(count: int, most: int) -> Ints:
 
 
 def bulk_spread(value: Floats) -> float:
-    """Return half the distance of the quantiles at 16 and 84 %, a standard deviation that outliers do not move."""
+    """Return half the distance of the quantiles at 16 and 84 %: a standard deviation robust to outliers."""
     low, high = np.quantile(value, [0.16, 0.84])
     return float(high - low) / 2
 
@@ -156,14 +155,14 @@ def lag_one(value: Floats, group: Ints) -> tuple[float, float]:
 
 
 RecordingSource = str | os.PathLike[str] | Contents | Simulated
-"""A recording: its file (.uwb), or what one holds, in memory."""
+"""A recording: its file (.uwb), or its contents in memory."""
 
 
 def read_flight(source: RecordingSource) -> tuple[Contents | Simulated, str]:
-    """Return what a recording holds and what messages call it; raises what `Recording.open` raises."""
+    """Return the contents of a recording and its name in messages; raises what `Recording.open` raises."""
     if not isinstance(source, str | os.PathLike):
         if not all(hasattr(source, name) for name in ("exchanges", "tags", "poses", "faults")):
-            raise ScenarioError(f"recording: found {source!r:.60}, expected a file (.uwb) or what one holds")
+            raise ScenarioError(f"recording: found {source!r:.60}, expected a file (.uwb) or its contents")
         return source, "recording"
     with Recording.open(Path(source)) as file:
         held = Contents(exchanges=file.exchanges(), tags=file.tags(), poses=file.poses(), faults=file.faults())
@@ -225,7 +224,7 @@ class Flight:
 
     @property
     def interval_s(self) -> float:
-        """Return how soon a pair mostly ranges again, in seconds."""
+        """Return the median interval between the exchanges of a pair, in seconds."""
         order = np.lexsort((self.time_s, self.pair))
         apart = np.diff(self.time_s[order])[np.diff(self.pair[order]) == 0]
         return float(np.median(apart)) if len(apart) else float("inf")
@@ -239,7 +238,7 @@ class Flight:
     def of(
         cls, flown: Contents | Simulated, known: KnownDevices, where: str = "recording", *, fewest: int = 100
     ) -> Self:
-        """Take the columns; raises `ScenarioError` where a recording cannot have a twin.
+        """Return the columns of a recording; raises `ScenarioError` where no twin can be fitted.
 
         That is with less than `fewest` exchanges: of 100, the quantiles of residuals are wrong by a tenth of their
         spread.
@@ -340,7 +339,7 @@ def _ratio_ppm(exchanges: Exchanges, row: RangingProtocol) -> Floats:
 
 
 SHORTEST_LIFE_S: Final = 0.01
-"""The shortest life that a scenario can give to paths, fading and outages."""
+"""The shortest `life_s` of paths, fading and outages in a scenario."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -367,7 +366,7 @@ class ScheduleFit:
         return float(np.mean(self.lost))
 
     def outage_life_s(self) -> float:
-        """Return how long a pair's outages last on average, from what is lost next after a loss of the pair."""
+        """Return the mean duration of a pair's outages, from the autocorrelation of its losses."""
         pair = np.minimum(self.initiator, self.target) * 1000 + np.maximum(self.initiator, self.target)
         again, _ = lag_one(self.lost.astype(np.float64), pair)
         if not again > 0.02:
@@ -379,25 +378,25 @@ class ScheduleFit:
 
 
 def fit_schedule(flight: Flight, faults: list[Fault]) -> ScheduleFit:
-    """Take the slots of a flight and of the exchanges that failed while it lasted."""
+    """Return the schedule of a flight, with the exchanges that failed meanwhile."""
     time, first, second, lost = _slots(flight, faults)
-    turns = _turns(first, second)
-    regular, rate = False, (len(time) - 1) / max(float(time[-1]), 1e-3)
-    if turns:
-        regular, beat = _beat(time, first, second, turns)
-        if regular:
-            # Slots of a round robin that left nothing at all are lost, too.
-            rate, slot = 1 / beat, np.rint(time / beat).astype(np.int64)
-            every = np.arange(slot[-1] + 1)
-            time, lost = every * beat, ~np.isin(every, slot[~lost])
-            first, second = np.array(turns)[every % len(turns)].T
+    turns, rate = _turns(first, second), (len(time) - 1) / max(float(time[-1]), 1e-3)
+    beat = _beat(time, first, second, turns) if turns else None
+    if beat:
+        # Slots of a round robin that left nothing at all are lost, too.
+        rate, slot = 1 / beat, np.rint(time / beat).astype(np.int64)
+        every = np.arange(slot[-1] + 1)
+        time, lost = every * beat, ~np.isin(every, slot[~lost])
+        first, second = np.array(turns)[every % len(turns)].T
+    else:
+        turns = sorted(set(zip(first.tolist(), second.tolist(), strict=True)))
     return ScheduleFit(
         time_s=time,
         initiator=first,
         target=second,
         lost=lost,
-        regular=regular,
-        turns=tuple(turns) if regular else tuple(sorted(set(zip(first.tolist(), second.tolist(), strict=True)))),
+        regular=beat is not None,
+        turns=tuple(turns),
         rate_hz=rate,
         delay_uus=_scheduled_uus(flight),
         replies_us=_replies_us(flight),
@@ -434,23 +433,19 @@ def _turns(first: Ints, second: Ints) -> list[tuple[int, int]]:
     return turns
 
 
-def _beat(time: Floats, first: Ints, second: Ints, turns: list[tuple[int, int]]) -> tuple[bool, float]:
-    """Return whether slots keep to their turns and to a beat, nine of ten, and its length in seconds."""
+def _beat(time: Floats, first: Ints, second: Ints, turns: list[tuple[int, int]]) -> float | None:
+    """Return the interval of a round robin in seconds; None unless nine of ten slots keep to it and to their turns."""
     regular_share = 0.9
     number = {pair: k for k, pair in enumerate(turns)}
     turn = np.array([number[pair] for pair in zip(first.tolist(), second.tolist(), strict=True)])
     step, apart = np.diff(turn) % len(turns), np.diff(time)
     in_turn = step == 1 % len(turns)
-    if np.mean(in_turn) < regular_share / 2 or not len(apart):
-        return False, 0.0
-    beat = float(np.median(apart[in_turn]))
-    if beat <= 0:
-        return False, 0.0
+    if not len(apart) or np.mean(in_turn) < regular_share / 2 or np.median(apart[in_turn]) <= 0:
+        return None
+    beat = float(np.sum(apart) / max(np.sum(np.rint(apart / np.median(apart[in_turn]))), 1))
     slots = np.rint(apart / beat)
-    beat = float(np.sum(apart) / max(np.sum(slots), 1))
-    near = np.abs(apart / beat - np.rint(apart / beat)) < 0.25
-    fits = near & (np.rint(apart / beat) % len(turns) == step)
-    return bool(np.mean(fits) >= regular_share), beat
+    fits = (np.abs(apart / beat - slots) < 0.25) & (slots % len(turns) == step)
+    return beat if np.mean(fits) >= regular_share else None
 
 
 def _scheduled_uus(flight: Flight) -> int | None:

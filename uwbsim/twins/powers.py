@@ -19,7 +19,7 @@ MIN_REFLECTED: Final = 5.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PowerFit:
-    """What powers are made of: levels in dBm and dB.
+    """The model of first-path powers: levels in dBm and dB.
 
     `saturation_dbm` is where readings end, None where nothing shows that they do. `exponent` is None where distances
     do not differ enough. `tx_db`, `offset_db` (tags,) and `pattern_db` (tags, harmonics) are of tags, by place.

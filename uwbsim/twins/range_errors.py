@@ -1,4 +1,4 @@
-"""What calibrations say of a flight: delays, the bias curve, and what `calib.fit` finds the errors of ranges to be.
+"""Calibrations for twins, and the error model of ranges that `calib.fit` fits to a flight.
 
 This is the one place where `uwbsim` imports `calib`. The error model is that of every fit: direct ranges with normal
 noise, reflections by pair, outliers. How long reflections last follows from autocovariances.
@@ -31,7 +31,7 @@ CalibrationSource = str | os.PathLike[str] | Mapping[str, Any] | Any
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KnownDevices:
-    """What a calibration knows, `where` it is from, and its bias curve over the scenario's lifted power."""
+    """A calibration, `where` it is from, and its bias curve over the scenario's lifted power."""
 
     where: str
     calibration: Calibration
@@ -56,7 +56,7 @@ class KnownDevices:
 
 
 def read_calibration(source: CalibrationSource) -> KnownDevices:
-    """Return what a calibration knows of devices; raises `ScenarioError`, one line that names file and key."""
+    """Read a calibration; raises `ScenarioError`, one line that names file and key."""
     from calib import CalibError, Calibration, load_calibration
 
     where = str(source) if isinstance(source, str | os.PathLike) else "calibration"

@@ -1,4 +1,4 @@
-"""A fitted flight as the tables of a scenario, their text, and what the recording could not tell."""
+"""The scenario of a twin: its tables from fitted values, their text, and what the recording does not determine."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ WIDTH: Final = 120
 """Columns of a line of a scenario file."""
 
 AFTER_S: Final = 0.2
-"""How long a scenario goes on after its last exchange, which may take so long."""
+"""Time that a scenario lasts beyond the start of its last exchange, which takes less."""
 
 
 def scenario_text(table: Mapping[str, Any], head: str) -> str:
-    """Return a scenario file: a comment, and a table each; long values have a table of their own."""
+    """Return the text of a scenario file: a comment and its tables; long values have a table of their own."""
     parts = ["\n".join(f"# {line}" for line in textwrap.wrap(head, WIDTH - 2))]
     for name, section in table.items():
         if isinstance(section, list):
@@ -70,7 +70,7 @@ def _toml(value: Any) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fitted:
-    """Everything that was fitted to a flight."""
+    """All that was fitted to a flight."""
 
     clocks: ClockFit
     noise: ReceiveNoise
@@ -81,7 +81,7 @@ class Fitted:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReceiveNoise:
-    """The noise of receive stamps over first-path power in dBm, seconds: one value where powers are no different."""
+    """The noise of receive stamps in seconds over first-path power in dBm; one value where it does not depend on it."""
 
     power_dbm: Floats
     std_s: Floats
@@ -94,7 +94,7 @@ class ReceiveNoise:
 
 
 def receive_noise(flight: Flight, clocks: ClockFit) -> ReceiveNoise:
-    """Return the noise of stamps that ratios show, by the power at their receiver, the initiator."""
+    """Return the noise of receive stamps from ratios, by the power at their receiver, the initiator."""
     noise, power = clocks.receive_noise_s(flight), flight.exchanges.fpp2_dbm
     good = np.isfinite(noise)
     if not good.any():
@@ -139,7 +139,7 @@ def tables(
 
 
 def _given(**table: Any) -> dict[str, Any]:
-    """Return a table without what is None: it keeps its default."""
+    """Return a table without the values that are None, which keep their defaults."""
     return {key: value for key, value in table.items() if value is not None}
 
 
@@ -243,7 +243,7 @@ def _tag(flight: Flight, known: KnownDevices, fitted: Fitted, k: int) -> dict[st
 
 
 def _bodies(flight: Flight, poses: Poses, duration_s: float) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Return the bodies' tables, and the poses of those that move, from the origin to a little after the end."""
+    """Return the bodies' tables, and the poses of those that move, from the origin to after the end."""
     found, paths = [], {}
     for body in dict.fromkeys(tag.body for tag in flight.tags):
         mine = poses[np.flatnonzero(poses.body == body)]
@@ -266,7 +266,7 @@ def _bodies(flight: Flight, poses: Poses, duration_s: float) -> tuple[list[dict[
 
 
 def _still(mine: Poses) -> dict[str, Any] | None:
-    """Return place and heading of a body that stands level where it is, None for any other."""
+    """Return position and heading of a body that does not move and stands level; None for any other."""
     middle = np.median(mine.position_m, axis=0)
     if np.max(np.linalg.norm(mine.position_m - middle, axis=1)) > 0.01:
         return None
@@ -295,64 +295,65 @@ def _cut(mine: Poses, origin_ns: int, duration_s: float) -> Poses:
     return Poses(wanted, np.full(len(wanted), str(mine.body[0])), position, turns.as_quat())
 
 
-ALWAYS: Final = (
-    "How fast true time runs: rates of clocks are about their mean at the start (skew_ppm), which no range depends on.",
-    "White and flicker noise of clocks (white_ppm_sqrt_s, flicker_ppm: none): in a flight they look like noise of "
-    "stamps and like a walk of the rate.",
-    "Noise of transmissions (tx_noise_ps: none): it is in that of receptions.",
-    "How a delay splits into transmission and reception: 0.44 to 0.56.",
-    "What a reflection does to total power and to impulse responses (total_loss_db, rise_ns).",
-    "Which of antenna, transmitter and receiver makes a tag's powers weak: what differs between the two directions is "
-    "put on one of transmitter and receiver (the median tag has no difference), and the rest on the antenna.",
-    "Powers that were never heard: sensitivity_dbm is the default or just below the weakest reading; capture_db and "
+NOT_DETERMINED: Final = (
+    "The common rate of all clocks: skew_ppm is relative to their mean at the start, on which no range depends.",
+    "White and flicker noise of clocks (white_ppm_sqrt_s, flicker_ppm: none): in a flight they cannot be told from "
+    "noise of stamps and from a random walk of the rate.",
+    "Noise of transmit stamps (tx_noise_ps: none): it is included in that of receive stamps.",
+    "The split of a delay into transmission and reception: 0.44 to 0.56.",
+    "Effects of reflections on total power and on impulse responses (total_loss_db, rise_ns).",
+    "The split of a tag's power offsets between antenna, transmitter and receiver: a difference between the two "
+    "directions is assigned to transmitter or receiver (none for the median tag), the rest to the antenna.",
+    "Limits of reception: sensitivity_dbm is the default or just below the weakest reading; capture_db and "
     "dynamic_range_db have their defaults.",
-    "Errors of poses: those recorded are taken for true, so what they add is in direct_std_m.",
-    "Walls, obstacles and shadows of bodies: what they do is in antennas, fading and reflections of pairs, and stays "
-    "when bodies take other ways.",
+    "Errors of poses: recorded poses are taken as true, so their errors are included in direct_std_m.",
+    "Walls, obstacles and shadows of bodies: their effects are included in antennas, fading and reflections of pairs, "
+    "and do not change with other trajectories.",
 )
 
-SOMETIMES: Final[tuple[tuple[Callable[[Flight, Fitted], bool], str], ...]] = (
+NOT_DETERMINED_IF: Final[tuple[tuple[Callable[[Flight, Fitted], bool], str], ...]] = (
     (
         lambda flight, fitted: not len(fitted.noise.std_s),
         "Noise of stamps apart from that of ranges: only a third message from the target shows it. All noise of ranges "
-        "is taken to last as long as a path (direct_std_m).",
+        "is assigned to direct_std_m, which is constant between redraws of a path.",
     ),
     (
         lambda flight, fitted: abs(fitted.clocks.ratio_bias_ppm) > 0.02,
-        "Why dt64/dt53 is off by {ratio_bias:+.2g} ppm against the carrier readings: nothing in a scenario makes that.",
+        "The difference of {ratio_bias:+.2g} ppm between dt64/dt53 and the carrier readings: a scenario has no key "
+        "for it.",
     ),
     (
         lambda flight, fitted: fitted.errors.life_s is None and fitted.errors.share > 0,
-        "How long reflections last (life_s): a pair ranges again after {interval:.2g} s, and by then nothing is left "
-        "that is seen.",
+        "The duration of reflections (life_s): a pair ranges every {interval:.2g} s, and consecutive ranges show no "
+        "correlation.",
     ),
     (
         lambda flight, fitted: fitted.powers.exponent is None,
-        "The path-loss exponent: all distances are much the same.",
+        "The path-loss exponent: distances differ too little.",
     ),
     (
         lambda flight, fitted: fitted.powers.fading_db >= 0.1 and fitted.powers.fading_life_s is None,
-        "How long fading lasts (radio.fading.life_s): a pair ranges again after {interval:.2g} s.",
+        "The duration of fading (radio.fading.life_s): a pair ranges every {interval:.2g} s.",
     ),
     (
         lambda flight, fitted: fitted.powers.reflection_loss_db is None,
-        "How much weaker reflections are: there are too few.",
+        "The loss of reflections: there are too few.",
     ),
     (
         lambda flight, fitted: fitted.powers.pattern_db.shape[1] == 1,
-        "Antennas of tags by direction: each has too few readings.",
+        "Antenna patterns of tags: each has too few readings.",
     ),
     (
         lambda flight, fitted: fitted.schedule.lost_share == 0,
-        "How many exchanges fail: the recording has no failed ones and no gaps in a round robin.",
+        "The share of failed exchanges: the recording has none, and no gaps in a round robin.",
     ),
 )
 
 
 def unknowns(flight: Flight, fitted: Fitted) -> Iterator[str]:
-    """Yield a sentence for everything that keeps its default, or was decided without the recording."""
+    """Yield a sentence for each property that keeps its default, or was chosen without the recording."""
     interval = flight.interval_s
-    for untold, text in SOMETIMES:
-        if untold(flight, fitted):
+    for applies, text in NOT_DETERMINED_IF:
+        if applies(flight, fitted):
             yield text.format(interval=interval, ratio_bias=fitted.clocks.ratio_bias_ppm)
-    yield from ALWAYS
+    yield from NOT_DETERMINED

@@ -17,7 +17,7 @@ from uwbsim.scenario.devices import TX_SHARE
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Radio
 from uwbsim.world.channel import Link
-from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks, lengthening_m
 from uwbsim.world.radio import (
     printed_power_dbm,
     printed_skew_ppm,
@@ -25,7 +25,6 @@ from uwbsim.world.radio import (
     reception_noise_s,
     reported_dbm,
 )
-from uwbsim.world.temperature import lengthening_m
 from uwbsim.world.world import SampledWorld, World
 
 
@@ -48,7 +47,7 @@ class AntennaDelays:
         """Return the antenna delays of a scenario's tags."""
         now = np.zeros(1)
         moving = [k for k, tag in enumerate(scenario.tags) if lengthening_m(scenario, tag, now) is not None]
-        return cls(scenario, np.array([tag.antenna_delays_s for tag in scenario.tags]), tuple(moving))
+        return cls(scenario, np.array([tag.delays_ns() for tag in scenario.tags]) * 1e-9, tuple(moving))
 
     def transmit_s(self, tag: Ints, time: Ints) -> Floats:
         """Return what is added to the transmit stamps of tags (n,) at true times (n,) in sub-ticks, in seconds."""

@@ -149,17 +149,12 @@ class World:
         # A little longer than the run, so that the last exchange lies between two poses.
         count = int(np.ceil((settings.duration_s + 0.05) * mocap.rate_hz)) + 2
         time_ns = np.rint(np.arange(count) * NS_PER_S / mocap.rate_hz).astype(np.int64)
+        shown_ns = time_ns + round((mocap.latency_ms * 1e-3) * NS_PER_S)
         parts = [
-            (name, rows, *self._seen(name, time_ns))
+            Poses(shown_ns, np.full(count, name), *self._seen(name, time_ns))[self._gaps(name, time_ns)]
             for name in self.trajectories
-            for rows in [self._gaps(name, time_ns)]
         ]
-        names = np.concatenate([np.full(np.count_nonzero(rows), name) for name, rows, _, _ in parts])
-        times = np.concatenate([time_ns[rows] for _, rows, _, _ in parts]) + round((mocap.latency_ms * 1e-3) * NS_PER_S)
-        position = np.concatenate([p[rows] for _, rows, p, _ in parts])
-        quaternion = np.concatenate([q[rows] for _, rows, _, q in parts])
-        order = np.argsort(times, kind="stable")
-        return Poses(times[order], names[order], position[order], quaternion[order])
+        return Poses.concatenate(parts).in_time_order()
 
     def _gaps(self, name: str, time_ns: Ints) -> Bools:
         """Which poses of a body are seen."""

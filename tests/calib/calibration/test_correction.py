@@ -31,7 +31,7 @@ def full_recording(path):
         for table in ("imu", "height", "powers", "temperature", "arrangements", "distances"):
             kinds = {"BIGINT": np.array([11]), "VARCHAR": np.array(["b1"]), "DOUBLE": np.array([0.5])}
             kinds |= {"USMALLINT": np.array([3])}
-            recording.append_columns(table, {name: kinds[kind] for name, kind in TABLES[table].items()})
+            recording.append(table, {name: kinds[kind] for name, kind in TABLES[table].items()})
     return exchanges
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import calib
+import uwbsim
 from benchmarks import doctor as planted
 from benchmarks.flights import Flight, Plan, fly
 from calib.checks.table import CHECKS, LEVEL
@@ -294,3 +295,29 @@ def test_logs_of_both_robots_are_doubled_exchanges(tmp_path):
     twice = once[np.sort(np.concatenate([np.arange(len(once)), np.arange(123)]))]
     (found,) = calib.examine(Flight(twice, fly(SHORT, 1).poses[:0], []))
     assert found.evidence.startswith("123 of 440 rows")
+
+
+@pytest.mark.parametrize("seed", [50_000, 50_001])
+def test_a_sound_recording_among_anchors_has_no_finding(seed):
+    """Anchors keep one power for each pair, and distance explains up to 83 % of it."""
+    scenario = uwbsim.load("anchors_and_tag/anchors_and_tag", {"run.duration_s": 60.0, "run.seed": seed})
+    assert faults(uwbsim.simulate(scenario)) == []
+
+
+@pytest.mark.parametrize(("plan", "seed"), [(Plan(seconds=60), 60_017), (replace(planted.ONE, seconds=60), 60_003)])
+def test_reflections_in_the_last_seconds_are_no_change_of_a_delay(plan, seed):
+    assert faults(fly(plan, seed)) == []
+
+
+def test_pairs_that_a_cabinet_hides_are_named():
+    """Tag 1 sees the third quadcopter through metal: medians of its two pairs are 25 and 17 cm too long."""
+    room = uwbsim.simulate(uwbsim.load("room/room", {"run.duration_s": 60.0, "run.seed": 50_004}))
+    named = [one.evidence.split()[3] for one in calib.examine(room) if one.fault == "pairs that do not close"]
+    assert sorted(named) == ["1-30", "1-31"]
+
+
+def test_a_fit_in_a_room_settles():
+    """Steps by the information alone do not settle here in a hundred."""
+    room = uwbsim.simulate(uwbsim.load("room/room", {"run.duration_s": 60.0, "run.seed": 50_000}))
+    ranges = calib.Ranges.from_exchanges(room.exchanges, poses=room.poses, tags=room.tags)
+    assert calib.fit(ranges.usable()).success

@@ -11,9 +11,8 @@ from calib.checks.stamps import VACUUM_OVER_AIR
 from uwblink.recording.schema import Fault
 from uwblink.ticks import TICKS_PER_SECOND
 from uwblink.twr import STAMPS, board_range
+from uwbsim import Simulated, simulate
 from uwbsim.scenario.loading import load
-from uwbsim.simulation.run import simulate
-from uwbsim.simulation.simulated import Simulated, write
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 
@@ -24,7 +23,7 @@ def flight() -> Simulated:
 
 
 def faults(simulated, tmp_path):
-    write(simulated, tmp_path / "f.uwb", force=True)
+    simulated.save(tmp_path / "f.uwb", force=True)
     return [finding.fault for finding in examine(tmp_path / "f.uwb")]
 
 
@@ -168,13 +167,13 @@ def test_two_boards_on_a_bench_are_too_few_and_too_still(tmp_path):
 
 
 def test_the_offset_is_estimated(flight, tmp_path):
-    write(late_poses(flight), tmp_path / "f.uwb", force=True)
+    late_poses(flight).save(tmp_path / "f.uwb", force=True)
     (finding,) = examine(tmp_path / "f.uwb")
     assert float(finding.remedy.split()[-1]) == pytest.approx(-0.4, abs=0.02)
 
 
-def test_power_and_distance_are_confounded_outdoors(tmp_path):
-    """Two boards on tripods, 2 to 60 m apart: within one distance, power says nothing of the bias."""
+def test_power_and_distance_are_not_confounded_outdoors(tmp_path):
+    """Two boards on tripods, 2 to 60 m apart: distance explains 82 % of the power, and leaves enough."""
     from tests.shared_data import ROOT, shared
     from uwblink.importers import import_recording
 
@@ -183,7 +182,6 @@ def test_power_and_distance_are_confounded_outdoors(tmp_path):
     # A pole and a tripod do not move, so what is reflected is so for as long as they stand.
     assert {f.fault for f in examine(tmp_path / "h.uwb")} == {
         "too few pairs",
-        "power confounded with distance",
         "single-sided without carrier readings",
         "reflections that last",
     }

@@ -47,3 +47,15 @@ def test_constants_of_pairs_by_commands(folder):
     shown = run("calib", "show", folder / "q.json").stdout
     assert "fitted: curve only" in shown
     assert "warning: curve only" in shown
+
+
+def test_one_pair_is_evaluated_without_a_number_between_pairs(folder):
+    head, *rows = (folder / "ranges.csv").read_text().splitlines()
+    kept = [row for row in rows if sorted(row.split(",")[1:3], key=int) == ["1", "11"]]
+    (folder / "one.csv").write_text("\n".join([head, *kept]) + "\n")
+    run("uwblink", "import", "csv", folder / "one.csv", "-o", folder / "one.uwb")
+    run("calib", "fit", folder / "one.uwb", "-o", folder / "one.json", "--constants", "pair", "--delays-only")
+    told = run("calib", "evaluate", folder / "one.uwb", "-c", folder / "one.json").stdout
+    assert "are within pairs" in told
+    assert "nan" not in told
+    assert "between pairs" in run("calib", "evaluate", folder / "ranges.uwb", "-c", folder / "p.json").stdout

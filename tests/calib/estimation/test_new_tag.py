@@ -51,14 +51,13 @@ def test_what_cannot_be_added(known):
 
 
 def test_the_scenario_of_a_new_tag(tmp_path, known):
+    from uwbsim import simulate
     from uwbsim.scenario.loading import load as read
-    from uwbsim.simulation.run import simulate
-    from uwbsim.simulation.simulated import write
 
     train = tmp_path / "train.uwb"
-    write(simulate(read(ROOT / "scenarios" / "icra2023" / "train.toml", ["run.duration_s=120"])), train)
+    simulate(read(ROOT / "scenarios" / "icra2023" / "train.toml", ["run.duration_s=120"])).save(train)
     new = tmp_path / "new.uwb"
-    write(simulate(read(ROOT / "scenarios" / "new_tag" / "new_tag.toml")), new)
+    simulate(read(ROOT / "scenarios" / "new_tag" / "new_tag.toml")).save(new)
     calibration = fit(load_ranges(train)).calibration
     added = add_tag(load_ranges(new), calibration, 7)
     planted = load_ranges(new).planted["delays_ns"]

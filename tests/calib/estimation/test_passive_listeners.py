@@ -12,9 +12,8 @@ from calib.data.sources import load_ranges
 from calib.fitting.fitting import fit
 from calib.fitting.passive_listeners import heard_delays
 from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT
+from uwbsim import simulate
 from uwbsim.scenario.loading import load
-from uwbsim.simulation.run import simulate
-from uwbsim.simulation.simulated import write
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 PASSIVE = [f"tags.{k}.passive=true" for k in range(6)]
@@ -22,7 +21,7 @@ PASSIVE = [f"tags.{k}.passive=true" for k in range(6)]
 
 def recorded(tmp_path, scenario, *settings):
     path = tmp_path / "f.uwb"
-    write(simulate(load(SCENARIOS / scenario, settings)), path, force=True)
+    simulate(load(SCENARIOS / scenario, settings)).save(path, force=True)
     return path
 
 
@@ -78,7 +77,7 @@ def test_the_split_leaves_no_trace_in_what_anyone_computes(tmp_path):
             for tag in scenario.tags
         ]
         path = tmp_path / f"{share}-{more_ns}.uwb"
-        write(simulate(scenario.model_copy(update={"tags": tuple(tags)})), path)
+        simulate(scenario.model_copy(update={"tags": tuple(tags)})).save(path)
         return load_ranges(path), heard_delays(path, nothing(range(1, 7)))
 
     (first, heard), (second, heard_again), (longer, heard_longer) = flown(0.2, 1.0), flown(0.8, 1.0), flown(0.2, 1.6)

@@ -18,9 +18,8 @@ from calib.evaluation.tracking import FilterRanges, Run, Settings, run_filters
 from calib.fitting.fitting import fit
 from calib.report.figures import rmse_bars
 from uwblink.pages.figures import style
+from uwbsim import simulate
 from uwbsim.scenario.loading import load
-from uwbsim.simulation.run import simulate
-from uwbsim.simulation.simulated import write
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios" / "icra2023"
 
@@ -29,7 +28,7 @@ SCENARIOS = Path(__file__).parents[3] / "scenarios" / "icra2023"
 def flights(tmp_path_factory):
     folder = tmp_path_factory.mktemp("flights")
     for name in ("train", "test1", "test2"):
-        write(simulate(load(SCENARIOS / f"{name}.toml")), folder / f"{name}.uwb")
+        simulate(load(SCENARIOS / f"{name}.toml")).save(folder / f"{name}.uwb")
     return {name: load_flight(folder / f"{name}.uwb") for name in ("train", "test1", "test2")}
 
 

@@ -10,8 +10,10 @@ from functools import partial
 import numpy as np
 import pytest
 from pypdf import PdfReader
+from typer.testing import CliRunner
 
 import calib
+from calib.cli.commands import app
 from calib.data.samples import sample_flight
 from calib.report import Heading, Picture, Table, Text, check_places
 from calib.report.figures import arrangement
@@ -45,7 +47,15 @@ def run(folder, *words, status=0):
     return done
 
 
-def test_a_campaign_is_what_the_command_makes(folder, tmp_path, monkeypatch):
+@pytest.fixture
+def sections(monkeypatch):
+    """The sections without figures, which take seconds to draw."""
+    few = {name: SECTIONS[name] for name in ("verdict", "warnings", "recordings", "determined", "provenance")}
+    monkeypatch.setattr("calib.report.sections.SECTIONS", few)
+    return few
+
+
+def test_a_campaign_is_what_the_command_makes(folder, tmp_path, monkeypatch, sections):
     opened, whole = [], Recording.open
 
     def noted(path, **kwargs):
@@ -61,7 +71,9 @@ def test_a_campaign_is_what_the_command_makes(folder, tmp_path, monkeypatch):
     assert repr(campaign).splitlines()[-1] == "judged on b.uwb"
     campaign = replace(campaign, origin=replace(campaign.origin, files={}))
     campaign.write(tmp_path / "python.html")
-    done = run(folder, "report", "a.uwb", "--tests", "b.uwb", "-o", "command.html", "--loss", "huber", "--json")
+    monkeypatch.chdir(folder)
+    words = ["report", "a.uwb", "--tests", "b.uwb", "-o", "command.html", "--loss", "huber", "--json"]
+    done = CliRunner().invoke(app, words, catch_exceptions=False)
     assert json.loads(done.stdout) == json.loads(json.dumps(campaign.to_dict()))
     pages = [(tmp_path / "python.html").read_text(), (folder / "command.html").read_text()]
     # When, by which command, and from which files is not the same.
@@ -118,20 +130,12 @@ def weather(campaign):
     return [Heading("Weather"), Text(f"Dry over {len(campaign.judged)} ranges; <wet> tomorrow.")]
 
 
-@pytest.fixture
-def sections():
-    before = dict(SECTIONS)
-    yield SECTIONS
-    SECTIONS.clear()
-    SECTIONS.update(before)
-
-
 def test_a_section_of_ones_own_is_in_the_report(campaign, tmp_path, sections):
-    calib.register_report_section("weather", weather, before="outliers")
+    calib.register_report_section("weather", weather, before="determined")
     campaign.write(tmp_path / "r.html", tmp_path / "r.pdf")
     page = (tmp_path / "r.html").read_text()
     titles = re.findall("<h2 id='s[0-9]+'>(.*?)</h2>", page)
-    assert titles[titles.index("Weather") + 1] == "Outliers"
+    assert titles[titles.index("Weather") + 1] == "Is it determined?"
     assert "Dry over 270 ranges; &lt;wet&gt; tomorrow." in page
     assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")
 
@@ -139,7 +143,7 @@ def test_a_section_of_ones_own_is_in_the_report(campaign, tmp_path, sections):
 @pytest.mark.parametrize(
     ("name", "section", "before", "parameter"),
     [
-        ("outliers", weather, "provenance", "name"),
+        ("determined", weather, "provenance", "name"),
         ("weather", weather, "nowhere", "before"),
         ("weather", "text", "provenance", "section"),
     ],
@@ -162,27 +166,32 @@ def test_a_section_that_returns_no_blocks_is_named(campaign, tmp_path, blocks, s
 @pytest.mark.parametrize(
     ("words", "names"),
     [
-        (["evaluate", "a.uwb", "-c", "b.json"], {"delays", "errors", "bias", "sigma", "residuals", "over-time-1"}),
         (["localize", "a.uwb", "-c", "b.json", "--seeds", "1"], {"rmse", "track-a-robot1", "track-a-robot3"}),
         (["compare", "a.json", "b.json"], {"differences", "curves"}),
     ],
 )
 def test_commands_draw_what_they_find(folder, words, names):
+    draws(folder, words, names)
+
+
+def draws(folder, words, names):
+    """Hold that a command draws figures of some names, and that it does not replace them."""
     shutil.rmtree(folder / "out", ignore_errors=True)
     run(folder, *words, "--figures", "out")
     assert {f"{name}-{form}" for name in names for form in FORMS} <= {path.name for path in (folder / "out").iterdir()}
     again = run(folder, *words, "--figures", "out", status=2)
-    assert re.search("out.*--force", again.stderr)
+    assert re.search("(out|r.html).*--force", again.stderr)
     assert len(again.stderr.splitlines()) == 1
 
 
-def test_an_evaluation_is_a_page_with_its_origin_or_a_pdf(folder):
-    run(folder, "evaluate", "a.uwb", "-c", "b.json", "--report", "r.pdf")
-    assert (folder / "r.pdf").read_bytes().startswith(b"%PDF")
-    run(folder, "evaluate", "a.uwb", "-c", "b.json", "--report", "r.html")
+def test_an_evaluation_is_a_page_with_its_origin_or_a_pdf(folder, tmp_path, sections):
+    words = ["evaluate", "a.uwb", "-c", "b.json", "--report", "r.html"]
+    draws(folder, words, {"delays", "errors", "bias", "sigma", "residuals", "over-time-1"})
     page = (folder / "r.html").read_text()
     assert "calib evaluate a.uwb -c b.json --report r.html" in page
     assert page.count("SHA-256 ") == 2, "of the recording and of the calibration"
+    calib.write_report(tmp_path / "r.pdf", folder / "a.uwb", calib.load_calibration(folder / "b.json"))
+    assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_one_file_does_not_take_the_place_of_another(folder, tmp_path):

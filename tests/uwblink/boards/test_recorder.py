@@ -58,7 +58,9 @@ def test_what_cannot_be_known_of_an_arrangement_is_refused(tmp_path, given, name
 def test_a_plan_that_seats_other_boards_is_refused_before_anything_is_recorded(tmp_path):
     ports, out = VirtualPorts(bench_scenario()), tmp_path / "a.uwb"
     seats = [Tag(number, "drone", (0.1, 0.0, 0.0)) for number in (20, 10)]
-    with pytest.raises(PlanError, match="the plan says where 10, 20 sit, but the boards at the ports are 1, 2, 3"):
+    with pytest.raises(
+        PlanError, match="the plan has places of the tags 10, 20, but the boards at the ports are 1, 2, 3"
+    ):
         record(ports.names.values(), out, RangingPlan(tags=tuple(seats)), duration_s=0.5, using=ports)
     assert not out.exists()
     some = RangingPlan(rate_hz=50.0, tags=(Tag(1, "drone", (0.1, 0.0, 0.0)),))
@@ -183,7 +185,7 @@ def test_a_hanging_board_and_damage_on_the_line_are_faults_and_no_invented_range
 def test_two_boards_with_one_id_and_absent_ports_are_refused_before_anything_is_written(tmp_path):
     path = tmp_path / "f.uwb"
     with served() as one, served() as two:
-        with pytest.raises(PlanError, match="both say they are board 1"):
+        with pytest.raises(PlanError, match="both have the id 1"):
             record([one.names[1], two.names[1]], path, RangingPlan())
         with pytest.raises(PortMissingError, match="no such port"):
             record([one.names[1], "/dev/nothing"], path, RangingPlan())

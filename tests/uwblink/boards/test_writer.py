@@ -49,7 +49,7 @@ def test_a_library_that_writes_otherwise_is_found_before_anything_is_recorded(li
         plain(store, name, columns)
 
     monkeypatch.setattr(Store, "insert", spoiling)
-    with pytest.raises(RecordingError, match=rf"live\.uwb: what is written comes back otherwise \(tables: {table}\)"):
+    with pytest.raises(RecordingError, match=rf"live\.uwb: written rows are read back differently \(tables: {table}\)"):
         RecordingWriter(live)
     assert live.count(table) == 0
 

@@ -26,27 +26,3 @@ def test_linear_algebra_takes_one_thread_unless_asked_for_more(asked, threads):
         environment |= {"OPENBLAS_NUM_THREADS": asked, "MKL_NUM_THREADS": asked}
     done = subprocess.run([sys.executable, "-c", THREADS], capture_output=True, text=True, env=environment, check=True)
     assert set(done.stdout.split()) == {threads}
-
-
-ENDING = """
-from uwblink.cli.starting import keep_imported, start
-
-def command():
-    import {first}
-    import numpy
-    keep_imported()
-    print(gc.get_freeze_count() > 5000)
-    import duckdb
-    duckdb.connect().execute("SELECT 1").fetchall()
-
-import gc
-start(command)
-"""
-
-
-@pytest.mark.parametrize(("first", "kept"), [("numpy", "True"), ("duckdb", "False")])
-def test_what_is_kept_to_the_end_is_no_word_at_the_end(first, kept):
-    done = subprocess.run(
-        [sys.executable, "-c", ENDING.format(first=first)], capture_output=True, text=True, check=True
-    )
-    assert (done.stdout.strip(), done.stderr) == (kept, "")

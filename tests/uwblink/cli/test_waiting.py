@@ -4,7 +4,7 @@ import io
 import sys
 import time
 
-from uwblink.cli.waiting import waiting
+from uwblink.cli.shared import waiting
 
 
 class Terminal(io.StringIO):

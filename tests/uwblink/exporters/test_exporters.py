@@ -93,7 +93,7 @@ def test_a_folder_that_is_no_export(whole, tmp_path):
     export_recording(whole, tmp_path / "out", to="csv")
     path = tmp_path / "out" / "exchanges.csv"
     path.write_text(path.read_text().replace(",", ",x", 1).replace("\n", "\nx", 1))
-    with pytest.raises(ImportTableError, match="not as 'uwblink export' wrote it"):
+    with pytest.raises(ImportTableError, match="not in the form of 'uwblink export'"):
         import_recording(tmp_path / "out", tmp_path / "o.uwb", importer="exported")
     assert not (tmp_path / "o.uwb").exists()
 

@@ -76,7 +76,9 @@ def test_every_message_is_there_in_order_of_time(recording, tmp_path):
     assert by_topic["/faults"][1]["message"] == 'time-out: no "answer"'
 
 
-@pytest.mark.parametrize(("time_ns", "x", "said"), [(-5, 1.0, "before 1970"), (5, np.nan, "a number that is none")])
+@pytest.mark.parametrize(
+    ("time_ns", "x", "said"), [(-5, 1.0, "before 1970"), (5, np.nan, "a number that is not finite")]
+)
 def test_what_json_cannot_say_is_one_line(tmp_path, time_ns, x, said):
     sample = Exchanges.from_arrays([1], [2], time_ns=[time_ns], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
     poses = Poses(np.array([9]), np.array(["drone"]), np.array([[x, 1.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))

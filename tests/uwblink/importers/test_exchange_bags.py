@@ -120,7 +120,7 @@ def test_a_list_of_ranges_in_each_message_of_one_topic_of_several(tmp_path):
 def test_what_a_bag_does_not_hold_is_said(tmp_path):
     bag = ros2(tmp_path / "b", RANGED)
     for text, said in (
-        ("", r"`map_file` must say which topics.*there are /tag/ranges \(uwb_msgs/msg/Ranges\), /uwb"),
+        ("", r"`map_file` must name the topics.*there are /tag/ranges \(uwb_msgs/msg/Ranges\), /uwb"),
         ('[topics."/none"]\n', "no topic '/none'; there are /tag/ranges"),
         ('each = "ranges"\n[topics."/uwb"]\n', "a message of /uwb has no list 'ranges'"),
         ('[topics."/uwb"]\n', "column 'from_id' is missing; there are header.stamp, header.frame_id, a, b, stamps"),
@@ -149,5 +149,5 @@ def test_a_kind_that_the_bag_does_not_define_is_named(tmp_path):
 
     with closing(sqlite3.connect(bag / "b.db3")) as db, db:
         db.execute("DELETE FROM message_definitions")
-    with pytest.raises(ImportTableError, match="does not say what a uwb_msgs/msg/Exchange is"):
+    with pytest.raises(ImportTableError, match="has no definition of uwb_msgs/msg/Exchange"):
         read_source(bag, importer="bag")

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from uwblink.importers import csv_text
-from uwblink.importers.csv_text import lines_of
+from uwblink.importers import tables
+from uwblink.importers.tables import lines_of
 
 LINES = ["1,2,3", "4,5,6", "é,1", "", " ", "\t", "\u00a0", '"a', 'b",3', '"x",4', "\ufeff", "\ufeff7,8"]
 ENDS = ["\n", "\n", "\n", "\r\n", "\r"]
@@ -49,7 +49,7 @@ def test_rows_are_found_a_piece_of_the_file_at_a_time(folder, lines, skip, rejec
     expected = beginnings(path, skip, rejected)
     out = np.array(sorted(rejected), dtype=np.int64)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(csv_text, "PIECE_BYTES", piece)
+        patch.setattr(tables, "PIECE_BYTES", piece)
         assert lines_of(path, skip, out, np.arange(len(expected))).tolist() == expected
         some = np.arange(len(expected))[::-3]
         assert lines_of(path, skip, out, some).tolist() == [expected[k] for k in some]

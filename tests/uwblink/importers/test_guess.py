@@ -216,7 +216,7 @@ def test_messages_that_are_words_are_told_by_their_order(tmp_path):
 
 @pytest.mark.parametrize(
     ("ids", "todo"),
-    [({"src": 1, "dst": 2}, "look at it"), ({"src": 1}, "say to_id in it"), ({}, "say from_id and to_id")],
+    [({"src": 1, "dst": 2}, "check it"), ({"src": 1}, "set to_id in it"), ({}, "set from_id and to_id")],
 )
 def test_the_command_says_what_to_do_and_how_to_go_on(tmp_path, ids, todo):
     write(tmp_path / "my log.csv", [{"t_s": k, **ids, "range_m": 3.0} for k in range(30)])

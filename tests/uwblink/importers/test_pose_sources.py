@@ -101,7 +101,7 @@ def test_euroc(tmp_path):
     assert poses.time_ns.tolist() == [1403636579758555393]
     assert poses.position_m.tolist() == [[1.0, 2.0, 3.0]]
     np.testing.assert_allclose(poses.quaternion, [TURNED])
-    with pytest.raises(ImportTableError, match="does not say whose poses"):
+    with pytest.raises(ImportTableError, match="name its body with `body`"):
         read_poses(path)
     path.write_text(head + "1,2,3\n")
     with pytest.raises(ImportTableError, match="row 2: found 3 cells"):

@@ -5,7 +5,7 @@ import pytest
 
 from tests import processes
 from tests.uwblink.importers.test_table_forms import HEADER, flights, wrapped, write
-from uwblink.importers import read_table, read_tables
+from uwblink.importers import read_table
 from uwblink.recording.contents import load
 
 
@@ -26,7 +26,7 @@ def test_the_same_stamps_of_the_same_devices_are_one_exchange(tmp_path):
 def test_logs_in_files_of_their_own(tmp_path):
     rows = wrapped(flights(90))
     one, other = write(tmp_path / "a.csv", rows[:60]), write(tmp_path / "b.csv", rows[30:])
-    found = read_tables([one, other])
+    found = read_table([one, other])
     assert found.exchanges.tx1.tolist() == [row["tx1"] for row in rows]
     assert "30 of 120 rows" in found.meta["notes"][0]
 

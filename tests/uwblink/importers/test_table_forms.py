@@ -10,7 +10,7 @@ import pytest
 
 from tests import processes
 from uwblink.errors import ArgumentError, ImportTableError
-from uwblink.importers import import_recording, read_source, read_table, read_tables
+from uwblink.importers import import_recording, read_source, read_table
 from uwblink.recording.contents import load
 
 TICKS = 128 * 499_200_000
@@ -77,7 +77,7 @@ def same(found, rows, bits=32):
 
 def test_poses_are_told_from_exchanges(tmp_path):
     path = write(tmp_path / "t.csv", [dict.fromkeys(("time_s", "body", "x", "y", "z", "qx", "qy", "qz", "qw"), 1)] * 3)
-    with pytest.raises(ImportTableError, match="these are poses, which `uwblink poses` puts into"):
+    with pytest.raises(ImportTableError, match="these are poses, which `uwblink poses` adds to"):
         read_table(path)
 
 
@@ -122,7 +122,7 @@ def test_parquet_and_json_lines(tmp_path):
 def test_several_files_are_one_table(tmp_path):
     rows = flights()
     paths = [write(tmp_path / f"{k}.csv", wrapped(rows[k::2])) for k in (0, 1)]
-    same(read_tables(paths), rows[0::2] + rows[1::2])
+    same(read_table(paths), rows[0::2] + rows[1::2])
     same(read_source(paths), rows[0::2] + rows[1::2])
     assert len(read_table(tmp_path).exchanges) == len(rows)
     done = processes.run("uwblink", "import", "csv", *paths, "-o", tmp_path / "o.uwb")

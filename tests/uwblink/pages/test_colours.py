@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
+from uwblink.pages.blocks import CSS
 from uwblink.pages.colours import DARK, GRID, INK, MUTED, PALE, SERIES, look
-from uwblink.pages.html import CSS
 
 # Machado, Oliveira and Fernandes 2009, severity 1, on linear RGB.
 EYES = {

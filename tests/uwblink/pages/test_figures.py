@@ -9,10 +9,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from tests.browser import lies_well
-from uwblink.pages.blocks import Block, Document, Listing, Picture, Table, Text, to_html
+from uwblink.pages.blocks import VARIABLES, Block, Document, Listing, Picture, Table, Text, inline, table_html, to_html
 from uwblink.pages.colours import BLUE, DARK, INK, look
 from uwblink.pages.figures import WIDTHS, drawn, label, legend, mark, picture, sheet
-from uwblink.pages.html import VARIABLES, inline, table_html
 
 
 def two_panels(width_in):

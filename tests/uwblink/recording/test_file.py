@@ -1,5 +1,6 @@
 """The recording: what goes in comes out, and what is not a recording says so."""
 
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -24,15 +25,20 @@ def random_exchanges(n=50, seed=1):
     return Exchanges(**columns)
 
 
-@pytest.fixture
-def recording(tmp_path):
-    path = tmp_path / "flight.uwb"
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    path = tmp_path_factory.mktemp("written") / "flight.uwb"
     with Recording.create(path, meta={"seed": 7}) as r:
         r.append_exchanges(random_exchanges())
         r.append_tags([Tag(3, "b", (0.1, 0.2, 0.3)), Tag(1, "a", (0, 0, 0))])
         r.append_poses(Poses(np.array([5, 6]), np.array(["a", "b"]), np.ones((2, 3)), np.zeros((2, 4))))
         r.append_faults([Fault(9, "1", "time-out", "no answer")])
     return path
+
+
+@pytest.fixture
+def recording(written, tmp_path):
+    return shutil.copyfile(written, tmp_path / "flight.uwb")
 
 
 def test_everything_comes_back_bit_for_bit(recording):

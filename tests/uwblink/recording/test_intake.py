@@ -1,6 +1,7 @@
 """Files from strangers: what is a program in them is refused before it runs, what is too much before it is read."""
 
 import json
+import shutil
 import threading
 import time
 
@@ -15,12 +16,17 @@ from uwblink.recording.schema import Tag
 from uwblink.recording.store import Store
 
 
-@pytest.fixture
-def file(tmp_path):
-    path = tmp_path / "stranger.uwb"
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    path = tmp_path_factory.mktemp("sound") / "sound.uwb"
     with Recording.create(path) as recording:
         recording.append_tags([Tag(1, "drone", (0.0, 0.0, 0.0))])
     return path
+
+
+@pytest.fixture
+def file(sound, tmp_path):
+    return shutil.copyfile(sound, tmp_path / "stranger.uwb")
 
 
 def change(path, *statements):

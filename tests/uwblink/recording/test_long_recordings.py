@@ -1,6 +1,5 @@
 """A recording that is read some rows at a time says what it says as a whole, wherever the pieces begin and end."""
 
-from collections import Counter
 from dataclasses import replace
 from typing import Any
 
@@ -8,10 +7,8 @@ import numpy as np
 import pytest
 
 from uwblink import Contents, Exchanges, Recording
-from uwblink.recording import target_reports
 from uwblink.recording.schema import Fault
 from uwblink.recording.summary import clock_skews
-from uwblink.recording.target_reports import single_report_blocks, single_reports
 
 COUNT = 700
 
@@ -71,33 +68,18 @@ def test_blocks_of_any_size_are_all_exchanges_in_their_order(written, rows):
         np.testing.assert_array_equal(np.concatenate([getattr(part, name) for part in parts]), column)
 
 
-@pytest.mark.parametrize("rows", [23, 101, 400])
-def test_reports_of_both_ends_are_told_apart_across_the_edges_of_stretches(written, monkeypatch, rows):
-    both, differing = reported_by_both(exchanges(2), seed=rows)
-    monkeypatch.setattr(target_reports, "ROWS_AT_ONCE", rows)
-    at_once = single_reports(both)
-    with Recording.open(written(both)) as recording:
-        found = [(reports, of) for reports, of in single_report_blocks(recording)]
-    assert len(found) >= len(both) // rows  # there are edges at all
-    assert sum(reports.repeated for reports, _ in found) == at_once.repeated == len(both) - COUNT
-    assert sum(len(reports.differing) for reports, _ in found) == len(at_once.differing) == differing
-    kept = [zip(r.exchanges.time_ns.tolist(), r.exchanges.tx1.tolist(), strict=True) for r, _ in found]
-    alone = zip(at_once.exchanges.time_ns.tolist(), at_once.exchanges.tx1.tolist(), strict=True)
-    assert Counter(row for part in kept for row in part) == Counter(alone)
-
-
-@pytest.mark.parametrize("rows", [50, 300])
-def test_a_summary_does_not_depend_on_how_it_was_read(written, monkeypatch, rows):
-    both, _ = reported_by_both(exchanges(3), seed=7)
+def test_reports_of_both_ends_count_once_in_a_summary(written):
+    both, differing = reported_by_both(exchanges(3), seed=7)
     faults = [Fault(5, "1", "time-out", "", 1, 2), Fault(6, "1", "garbage", "x"), Fault(7, "2", "time-out", "", 1, 2)]
-    path = written(both, faults=faults)
-    with Recording.open(path) as recording:
-        as_one = recording.show()
-        monkeypatch.setattr(target_reports, "ROWS_AT_ONCE", rows)
-        assert recording.show() == as_one
-    assert as_one.counts["exchanges"] == COUNT
-    assert as_one.faults == {"garbage": 1, "time-out": 2}
-    assert {(p.initiator, p.target): p.failed for p in as_one.pairs}[1, 2] == 2
+    with Recording.open(written(both, faults=faults)) as recording:
+        found = recording.show()
+    assert (found.counts["exchanges"], found.reported_twice, found.contradictory) == (
+        COUNT,
+        len(both) - COUNT,
+        differing,
+    )
+    assert found.faults == {"garbage": 1, "time-out": 2}
+    assert {(p.initiator, p.target): p.failed for p in found.pairs}[1, 2] == 2
 
 
 def test_clocks_of_pairs_are_the_same_from_blocks(written):

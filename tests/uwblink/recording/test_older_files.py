@@ -39,7 +39,7 @@ def test_an_older_file_is_copied_and_added_to(older, tmp_path):
         recording.copy(tmp_path / "copy.uwb")
     height = {"time_ns": np.array([5]), "body": np.array(["drone"]), "height_m": np.array([0.25])}
     with Recording.open(older, update=True) as recording:
-        recording.append_columns("height", height)
+        recording.append("height", height)
     for path, count in ((older, 1), (tmp_path / "copy.uwb", 0)):
         with Recording.open(path) as recording:
             assert recording.tags()[0].body == "drone"

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from uwblink.recording.summary import _told as told
-from uwblink.recording.summary import clock_skews
+from uwblink.recording.summary import clock_skews, skew_summary
 from uwblink.twr import Exchanges
 
 TICKS = 128 * 499.2e6
@@ -44,13 +43,13 @@ def test_both_see_what_was_planted(protocol):
         assert found[pair].slope == pytest.approx(1, abs=0.01)
         assert found[pair].residual_ppm == pytest.approx(0, abs=1e-9)
         assert found[pair].same_sign is True
-    assert told(list(found.values())) == "carriers over stamps 1.000, residual 0.00 ppm, same sign"
+    assert skew_summary(list(found.values())) == "carriers over stamps 1.000, residual 0.00 ppm, same sign"
 
 
 def test_the_other_sign_is_said():
     found = clock_skews(exchanges("ds", sign=-1.0))
     assert [one.same_sign for one in found] == [False] * 3
-    assert "OTHER SIGN in 3 of 3 pairs" in told(found)
+    assert "OTHER SIGN in 3 of 3 pairs" in skew_summary(found)
     assert "OTHER SIGN" in str(found[0])
 
 

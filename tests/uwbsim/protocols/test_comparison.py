@@ -10,13 +10,13 @@ import pytest
 from tests import processes
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwbsim.protocols.comparison import compare, costs, optimum, over_reply, over_skew, winners
+from uwbsim import simulate
+from uwbsim.protocols.comparison import compare, costs, optimum, over_reply, over_skew
 from uwbsim.protocols.conditions import calibrated, conditions_of
 from uwbsim.protocols.monte_carlo import range_errors_m
 from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.loading import load
 from uwbsim.scenario.ranging import TURNAROUND_S
-from uwbsim.simulation.run import simulate
 
 ROOT = Path(__file__).parents[3]
 TEST1 = ROOT / "scenarios" / "icra2023" / "test1.toml"
@@ -55,7 +55,7 @@ def test_an_exchange_takes_what_its_frames_and_replies_take(scenario):
 
 
 def test_the_table_says_which_wins_where(scenario):
-    rows = winners(scenario, [PROTOCOLS["ss-cfo"], PROTOCOLS["ds"]])
+    rows = compare(scenario, ["ss-cfo", "ds"], 100).winners
     # Short replies leave the carrier integrator little to spoil, and cost double-sided ranging its short third leg.
     assert (rows[0]["rmse"], rows[-1]["rmse"]) == ("ss-cfo", "ds")
     # What the carrier reads wrong on average stays, however many ranges are averaged.

@@ -28,7 +28,7 @@ def test_the_reference_has_every_key_and_what_it_is(root):
 
 def test_the_reference_says_unit_default_and_range():
     page = reference(SCHEMAS["Scenario"], "Scenario")
-    assert "`rate_hz`\n: Exchanges a second, all pairs together.\n\n  *number; Hz; above 0 to 10⁶; needed*" in page
+    assert "`rate_hz`\n: Exchanges per second, all pairs together.\n\n  *number; Hz; above 0 to 10⁶; needed*" in page
     assert "*number; ps; from 0 to 10⁶; default `116.0`*" in page
     assert "*3 × number; m; default `[0.0, 0.0, 0.0]`*" in page
 

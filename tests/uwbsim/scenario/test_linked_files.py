@@ -10,9 +10,9 @@ from tests import processes
 from uwblink.recording.file import Recording
 from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT
 from uwblink.twr import delay_weights, raw_range
+from uwbsim import simulate
 from uwbsim.errors import ScenarioError
 from uwbsim.scenario.loading import load
-from uwbsim.simulation.run import simulate
 from uwbsim.world.world import World
 
 ROOT = Path(__file__).parents[3]
@@ -71,7 +71,7 @@ def test_worlds_that_cannot_be(tmp_path, old, new, fragments):
 @pytest.mark.parametrize(
     ("damaged", "fragment"),
     [
-        (lambda lines: [*lines[:20], *lines[21:]], "a hole in the antenna table: no gain at azimuth -150, elevation"),
+        (lambda lines: [*lines[:20], *lines[21:]], "a hole in the table: no gain_db at azimuth -150, elevation"),
         (lambda lines: [*lines, lines[-1]], r"monopole\.csv: two rows"),
     ],
 )

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from uwblink.ticks import METRES_PER_TICK, elapsed
+from uwbsim import simulate
 from uwbsim.scenario.model import Scenario
-from uwbsim.simulation.run import simulate
 
 PLACES = {1: (0.0, 0.0, 0.0), 2: (4.0, 0.0, 0.0), 3: (1.0, 3.0, 0.0), 4: (60.0, 0.0, 0.0)}
 

@@ -5,8 +5,8 @@ import pytest
 
 from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT, elapsed
 from uwblink.twr import delay_weights, intervals, raw_range
+from uwbsim import simulate
 from uwbsim.scenario.model import Scenario
-from uwbsim.simulation.run import simulate
 
 
 def bench(protocol="ds", skews=(0.0, 0.0), reply_us=305.0, delay=1500, n=400, delays=(0.0, 0.0), seed=1, **radio):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from uwbsim import simulate
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.air import schedule
-from uwbsim.simulation.run import simulate
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 
 

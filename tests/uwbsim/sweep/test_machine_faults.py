@@ -17,8 +17,7 @@ from tests.processes import CONTEXT, run
 from tests.uwbsim.sweep.test_sweep import HEAD, plan, rows
 from uwblink.errors import UwblinkError
 from uwbsim.sweep.executors import ClusterLostError
-from uwbsim.sweep.results import Store, TableError
-from uwbsim.sweep.runner import run_sweep
+from uwbsim.sweep.runner import Store, TableError, run_sweep
 
 SMALL = HEAD + 'ranges = 100\n[vary]\n"radio.rx_noise_ps" = [0.0, 50.0]\n'
 
@@ -156,10 +155,10 @@ def test_a_scheduler_that_goes_away_is_named_and_what_was_done_is_kept(tmp_path)
 def test_results_that_are_none_are_no_rows(tmp_path):
     with Store.create(tmp_path / "r.duckdb", {"name": "x"}) as store:
         store.append([(1, [{"a": 1}]), (2, [])])
-        assert list(store.rows()) == [{"a": 1}]
+        assert list(store) == [{"a": 1}]
         with pytest.raises(TableError, match="damaged"):
             store._db.execute("UPDATE results SET document = 'x'")
-            list(store.rows())
+            list(store)
 
 
 def test_results_of_another_version_are_not_gone_on_with(done):

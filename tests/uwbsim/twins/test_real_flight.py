@@ -88,5 +88,5 @@ def test_robots_warm_up_and_it_is_seen(compared):
 
 def test_what_such_a_flight_cannot_tell_is_said(compared):
     words = " ".join(compared[0].unknown)
-    assert "How long reflections last (life_s): a pair ranges again after" in words
-    assert "Why dt64/dt53 is off by -0.11 ppm" in words
+    assert "The duration of reflections (life_s): a pair ranges every" in words
+    assert "The difference of -0.11 ppm between dt64/dt53 and the carrier readings" in words

@@ -112,7 +112,7 @@ def test_the_command_writes_a_scenario_and_a_page(tmp_path):
     assert done.exit_code == 0, done.output
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c.json", "f.uwb", "t.html", "t.poses.uwb", "t.toml"]
     page = (tmp_path / "t.html").read_text()
-    assert "What the recording cannot tell" in page
+    assert "What the recording does not determine" in page
     assert "residual of calibrated ranges" in page
     assert uwbsim.load(tmp_path / "t.toml").run.name == "twin of f"
 

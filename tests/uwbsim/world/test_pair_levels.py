@@ -73,7 +73,7 @@ def test_replies_follow_the_quantiles_that_are_given():
     dt32_us = np.asarray((x.tx2 - x.rx1) % 2**32) / 63897.6
     # Replies leave at the next multiple of 8 ns.
     assert np.quantile(dt32_us, [0, 1 / 3, 2 / 3, 1]) == pytest.approx(table, rel=0.01)
-    with pytest.raises(uwbsim.ScenarioError, match=r"reply.delays_us: must not decrease"):
+    with pytest.raises(uwbsim.ScenarioError, match=r"reply.delays_us: .* must not decrease"):
         flight({}, reply={"model": "quantiles", "delays_us": [302.0, 301.0]})
 
 

@@ -1,0 +1,116 @@
+"""The scoreboard's figures are those of what its commands write, computed here by NumPy alone."""
+
+import csv
+import re
+
+import numpy as np
+import pytest
+
+from benchmarks import scoreboard
+from tests import processes
+from tests.shared_data import shared
+
+CM = 100
+
+
+@pytest.fixture
+def folder(tmp_path, request):
+    """A folder that has the files of one data set, and no other."""
+    here = tmp_path / "data"
+    here.mkdir()
+    for name in request.param:
+        (here / name).symlink_to(shared(name))
+    return here
+
+
+def table(page):
+    """The rows of the first table, by ranges and calibration."""
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")]
+    return {(row[0], row[1]): row[2:] for row in rows[1:]}
+
+
+def number(cell):
+    return float(cell.split()[0])
+
+
+def spread(errors):
+    return 1.4826 * np.median(np.abs(errors - np.median(errors)))
+
+
+def corrected(work, recording, calibration):
+    """Raw and corrected errors in metres (n,) of a recording, and their sigma, by what `calib apply` writes."""
+    done = processes.run("calib", "apply", recording, "-c", calibration, "-o", "applied", "--to", "csv", cwd=work)
+    assert done.returncode == 0, done.stderr
+    columns = []
+    for name in ("exchanges", "corrected"):
+        with (work / "applied" / f"{name}.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        columns.append({key: np.array([float(row[key] or "nan") for row in rows]) for key in rows[0] if key in WANTED})
+    exchanges, applied = columns
+    return applied["raw_m"] - exchanges["truth_m"], applied["corrected_m"] - exchanges["truth_m"], applied["sigma_m"]
+
+
+WANTED = ("truth_m", "raw_m", "corrected_m", "sigma_m")
+PAPER = ["icra2023_bias_fpp.csv", "icra2023_published_fits.json"]
+MILUV = ["miluv_cirObstacles_3_random_0.tar.xz", "miluv_published_calibration.json"]
+
+
+def holds(row, errors):
+    """A row has the median and the robust deviation of errors in metres, to the millimetre that it shows."""
+    assert int(row[0]) == len(errors)
+    assert number(row[1]) == pytest.approx(CM * np.median(errors), abs=0.0501)
+    assert number(row[2]) == pytest.approx(CM * spread(errors), abs=0.0501)
+
+
+def forked(line, *, cwd, **_):
+    return processes.run(*line[line.index("-m") + 1 :], cwd=cwd)
+
+
+def written(folder, tmp_path, monkeypatch):
+    """The page of a folder with one data set, and where the files of its commands are."""
+    monkeypatch.setattr("benchmarks.scoreboard.subprocess.run", forked)
+    work = tmp_path / "work"
+    work.mkdir()
+    assert scoreboard.main([str(folder), "--page", str(tmp_path / "page.md"), "--work", str(work)]) == 1
+    (there,) = work.iterdir()
+    return (tmp_path / "page.md").read_text(), there
+
+
+@pytest.mark.parametrize("folder", [PAPER], indirect=True)
+def test_rows_are_what_calib_apply_gives_and_data_sets_that_are_absent_are_named(folder, tmp_path, monkeypatch):
+    page, work = written(folder, tmp_path, monkeypatch)
+    rows = table(page)
+    raw, ours, _ = corrected(work, "half2.uwb", "half1.json")
+    # The samples are biases, so what is written has them unchanged: every second one.
+    bias = np.loadtxt(folder / PAPER[0], delimiter=",", skiprows=1)[1::2, 1]
+    assert np.sort(raw) == pytest.approx(np.sort(bias), abs=1e-6)
+    holds(rows["half2", "none"], raw)
+    holds(rows["half2", "ours, by half1"], ours)
+    assert 93 < number(rows["half2", "ours, by half1"][3]) < 97
+    assert [name for name, said in rows if said == "not in the folder"] == [
+        one.name for one in scoreboard.DATA_SETS if one.archive not in PAPER
+    ]
+    assert "error: samples.csv: no column" in page
+    # Recipes stand for all, there or not.
+    assert page.count("```sh") == len(scoreboard.DATA_SETS)
+
+
+@pytest.mark.parametrize("folder", [MILUV], indirect=True)
+def test_a_flight_is_judged_with_the_published_calibration_and_on_what_was_held_out(folder, tmp_path, monkeypatch):
+    page, work = written(folder, tmp_path, monkeypatch)
+    rows = table(page)
+    flight = "cirObstacles_3_random_0"
+    raw, published, sigma = corrected(work, f"{flight}.uwb", "published.json")
+    holds(rows[flight, "none"], raw)
+    holds(rows[flight, "authors'"], published)
+    inside = 100 * np.mean(np.abs(published) <= 1.96 * sigma)
+    assert number(rows[flight, "authors'"][3]) == pytest.approx(inside, abs=0.06)
+    held = rows[f"{flight}, held out", "ours, by the rest"]
+    assert 0.25 < int(held[0]) / len(raw) < 0.35
+    assert all(re.fullmatch(r"\d\.\d\d", rows[flight, name][4]) for name in ("none", "authors'"))
+
+
+def test_a_folder_without_any_data_set_is_one_line(tmp_path, capsys):
+    assert scoreboard.main([str(tmp_path), "--page", str(tmp_path / "page.md")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "page.md").exists()
