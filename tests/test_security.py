@@ -382,16 +382,19 @@ def test_a_log_left_by_the_file_that_is_replaced_goes_with_it(place):
     assert 7 not in {tag.tag for tag in uwblink.load(path).tags}
 
 
-def test_an_output_that_cannot_be_written_leaves_the_folder_that_it_would_have_replaced(place, monkeypatch):
-    from uwblink.exporters import Exporter, export_recording, register_exporter
+def test_an_output_that_cannot_be_written_leaves_the_folder_that_it_would_have_replaced(place):
+    from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
 
     def write(recording, folder):
         (folder / "half.txt").write_text("half")
         raise uwblink.errors.RecordingError("no more")
 
-    register_exporter(Exporter("half", write, "half a file"), replace=True)
-    with pytest.raises(uwblink.errors.RecordingError, match="no more"):
-        export_recording(place / "f.uwb", place / "results", to="half", force=True)
+    register_exporter(Exporter("half", write, "half a file"))
+    try:
+        with pytest.raises(uwblink.errors.RecordingError, match="no more"):
+            export_recording(place / "f.uwb", place / "results", to="half", force=True)
+    finally:
+        EXPORTERS.remove("half")
     assert "results/results.csv" in names(place)
     assert not [name for name in names(place) if "half" in name or "partial" in name]
 

@@ -90,7 +90,7 @@ def test_an_import_that_is_interrupted_is_one_line_and_leaves_nothing(tmp_path):
     row = "{0}.25,{1},9,{2:.3f},-80.5,-81.5\n"
     with (tmp_path / "t.csv").open("w") as file:
         file.write("time_s,from_id,to_id,range_m,fpp1,fpp2\n")
-        file.writelines(row.format(k, k % 5, 3 + k % 7) for k in range(1_200_000))
+        file.writelines(row.format(k, k % 5, 3.25 + k % 7) for k in range(1_200_000))
     process = started("uwblink", "import", "csv", str(tmp_path / "t.csv"), "-o", str(tmp_path / "t.uwb"))
     wait_for(lambda: is_working(process), process)
     time.sleep(0.2)

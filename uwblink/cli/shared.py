@@ -132,13 +132,16 @@ def interrupts(*, at_once: bool = False) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether SIGINT or SIGTERM came; a second signal raises `KeyboardInterrupt`.
 
     With `at_once` the first signal raises it, too, and the second one is ignored, because it would interrupt the
-    cleaning up. A third one raises it again, for programs that hang.
+    cleaning up. A third one ends the process without cleaning up, also where a library waits for ever.
     """
     asked: list[int] = []
 
     def note(number: int, _frame: Any) -> None:
         asked.append(number)
-        if len(asked) != (2 if at_once else 1):
+        if len(asked) == 2:
+            for each in before:
+                signal.signal(each, signal.SIG_DFL)
+        if len(asked) == (1 if at_once else 2):
             raise KeyboardInterrupt
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}

@@ -16,14 +16,15 @@ INTERRUPTED: Final = 130
 
 def start(command: Callable[[], NoReturn]) -> NoReturn:
     """Import and run a command; Ctrl-C before it handles signals itself prints one line and exits with status 130."""
-    before = signal.signal(signal.SIGINT, _leave)
+    signal.signal(signal.SIGINT, _leave)
     # Matrices are small here, and idle threads of the linear algebra use processor time.
     for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # read when NumPy is imported
         os.environ.setdefault(name, "1")
     try:
         command()
     finally:
-        signal.signal(signal.SIGINT, before)
+        # The command is done. Its status stays true if Ctrl-C comes while the interpreter ends.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _leave(_number: int, _frame: Any) -> NoReturn:

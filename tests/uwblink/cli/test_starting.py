@@ -1,6 +1,7 @@
 """What a command does before anything is imported for it."""
 
 import os
+import signal
 import subprocess
 import sys
 
@@ -26,3 +27,47 @@ def test_linear_algebra_takes_one_thread_unless_asked_for_more(asked, threads):
         environment |= {"OPENBLAS_NUM_THREADS": asked, "MKL_NUM_THREADS": asked}
     done = subprocess.run([sys.executable, "-c", THREADS], capture_output=True, text=True, env=environment, check=True)
     assert set(done.stdout.split()) == {threads}
+
+
+INTERRUPTED_AT_THE_END = """
+import atexit, os, signal
+from uwblink.cli.starting import start
+
+def command():
+    # Registered first, so called last: when the command has ended and its files are written.
+    atexit.register(os.kill, os.getpid(), signal.SIGINT)
+
+start(command)
+"""
+
+
+def test_a_command_that_is_done_keeps_its_status_when_it_is_interrupted():
+    done = subprocess.run([sys.executable, "-c", INTERRUPTED_AT_THE_END], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+STUCK = """
+import os, signal, sys, time
+import typer
+from uwblink.cli.shared import run
+
+app = typer.Typer()
+
+@app.command()
+def wait():
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(10)
+    finally:  # cleaning up, which the second signal leaves alone and the third one ends
+        os.kill(os.getpid(), signal.SIGINT)
+        print("cleaned", flush=True)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(10)
+
+run(app, arguments=[])
+"""
+
+
+def test_a_third_interrupt_ends_a_command_that_hangs():
+    done = subprocess.run([sys.executable, "-c", STUCK], capture_output=True, text=True, timeout=9)
+    assert (done.returncode, done.stdout) == (-signal.SIGINT, "cleaned\n")
