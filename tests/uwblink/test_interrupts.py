@@ -19,14 +19,18 @@ BIN = Path(sys.executable).parent
 
 
 def started(*words):
-    return subprocess.Popen(
-        [str(BIN / words[0]), *words[1:]], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    environment = os.environ | {"PYTHONFAULTHANDLER": "1"}
+    command = [str(BIN / words[0]), *words[1:]]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 
 
 def ended(process, number=signal.SIGINT):
     process.send_signal(number)
-    out, err = process.communicate(timeout=60)
+    try:
+        out, err = process.communicate(timeout=60)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGABRT)  # it prints where it stands
+        raise AssertionError(process.communicate()) from None
     assert "Traceback" not in err, err
     return out, err
 

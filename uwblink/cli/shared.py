@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from threading import Event, Thread
 from time import monotonic
+from types import FrameType
 from typing import Annotated, Any, Final, NoReturn
 
 import typer
@@ -25,6 +26,9 @@ from uwblink.errors import PluginWarning, UwblinkError
 
 FLAGS: Final = {"map_file": "--map", "tags_from": "--tags", "duration_s": "--duration"}
 """Flags of parameters of uwblink that differ from the parameter's name with dashes."""
+
+IMPORT_POLL_S: Final = 0.02
+"""Time between looks whether an import has ended that delays an interrupt; shorter than a person notices."""
 
 Flags = Mapping[str, str]
 """Flags by parameter, where they differ from the parameter's name with dashes."""
@@ -132,24 +136,44 @@ def interrupts(*, at_once: bool = False) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether SIGINT or SIGTERM came; a second signal raises `KeyboardInterrupt`.
 
     With `at_once` the first signal raises it, too, and the second one is ignored, because it would interrupt the
-    cleaning up. A third one ends the process without cleaning up, also where a library waits for ever.
+    cleaning up. A third one ends the process without cleaning up, also where a library waits for ever. While a module
+    is being imported it is raised after the import: Python drops exceptions in the callbacks of its import system, and
+    the command would go on.
     """
     asked: list[int] = []
 
-    def note(number: int, _frame: Any) -> None:
+    def note(number: int, frame: FrameType | None) -> None:
         asked.append(number)
         if len(asked) == 2:
             for each in before:
                 signal.signal(each, signal.SIG_DFL)
         if len(asked) == (1 if at_once else 2):
+            leave(number, frame)
+
+    def leave(_number: int, frame: FrameType | None) -> None:
+        if hasattr(signal, "setitimer") and _is_importing(frame):
+            signal.signal(signal.SIGALRM, leave)
+            signal.setitimer(signal.ITIMER_REAL, IMPORT_POLL_S)
+        else:
             raise KeyboardInterrupt
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield lambda: bool(asked)
     finally:
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, 0)
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    """Return whether a frame was called by Python's import system."""
+    while frame is not None:
+        if frame.f_globals.get("__name__") == "importlib._bootstrap":
+            return True
+        frame = frame.f_back
+    return False
 
 
 @contextmanager

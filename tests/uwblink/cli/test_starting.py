@@ -71,3 +71,36 @@ run(app, arguments=[])
 def test_a_third_interrupt_ends_a_command_that_hangs():
     done = subprocess.run([sys.executable, "-c", STUCK], capture_output=True, text=True, timeout=9)
     assert (done.returncode, done.stdout) == (-signal.SIGINT, "cleaned\n")
+
+
+IMPORTED = """
+import os, signal, weakref
+
+class Lock:
+    pass
+
+# As the import system has it: an exception in a weak reference's callback is printed and dropped.
+lock = Lock()
+reference = weakref.ref(lock, lambda _: os.kill(os.getpid(), signal.SIGINT))
+del lock
+"""
+
+
+def test_an_interrupt_during_an_import_is_not_dropped(tmp_path):
+    (tmp_path / "imported.py").write_text(IMPORTED)
+    command = (
+        STUCK.split("app =")[0]
+        + """
+app = typer.Typer()
+
+@app.command()
+def work():
+    import imported
+    time.sleep(10)
+    print("went on")
+
+run(app, arguments=[])
+"""
+    )
+    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, timeout=9, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
