@@ -10,7 +10,7 @@ import numpy as np
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.checks.recording_view import RecordingView, pair_ids
 from calib.data.ranges import measured_powers
-from calib.estimator.identifiability import identifiable_directions, square_of
+from calib.estimator.identifiability import free_directions, square_of
 from calib.findings import Candidate, more_often
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.summary import failures_by_pair
@@ -34,7 +34,7 @@ def pairs(view: RecordingView) -> Iterator[Candidate]:
         return
     tags = sorted({*e.initiator[good].tolist(), *e.target[good].tolist()})
     square, ends = square_of(tags, e.initiator[good], e.target[good], first[good], second[good])
-    _, free = identifiable_directions(square, tags, ends)
+    _, free = free_directions(square, tags, ends)
     if free:
         groups = "; ".join(", ".join(map(str, group)) for group in free)
         yield Candidate("too few pairs", f"the pairs do not determine the delays of tags {groups}")

@@ -30,20 +30,17 @@ def square_of(tags: list[int], initiator: Ints, target: Ints, first: Floats, sec
     return summed(one, one, first**2) + summed(two, two, second**2) + across + across.T, pairs
 
 
-def identifiable_directions(square: Floats, tags: list[int], pairs: Ints) -> tuple[Floats, list[list[int]]]:
-    """Return the directions that ranges determine, (tags, rank), and the tags left free.
+def free_directions(square: Floats, tags: list[int], pairs: Ints) -> tuple[Floats, list[list[int]]]:
+    """Return the directions that ranges leave free, (tags, k) of length one, and the tags that they shift.
 
     `square` (tags, tags) is that of the derivatives of ranges by the delays, `pairs` (pairs, 2) are the ids that range.
     The free tags come in groups that shift together: tags that range only with tags of another group (anchors against
-    robots, a single pair) can shift by +a and -a without a trace in any range. Where nothing is free, the directions
-    are the tags themselves.
+    robots, a single pair) can shift by +a and -a without a trace in any range.
     """
     values, vectors = np.linalg.eigh(square)
     loose = values < UNDETERMINED * values[-1]
-    if not loose.any():
-        return np.eye(len(tags)), []
-    free = {tag for tag, row in zip(tags, vectors[:, loose], strict=True) if np.abs(row).max() > 1e-3}
-    return np.asarray(vectors[:, ~loose]), _connected(free, {(low, high) for low, high in pairs.tolist()})
+    free = {tag for tag, row in zip(tags, vectors[:, loose], strict=True) if np.abs(row).max(initial=0.0) > 1e-3}
+    return np.asarray(vectors[:, loose]), _connected(free, {(low, high) for low, high in pairs.tolist()})
 
 
 def _connected(tags: set[int], pairs: set[tuple[int, int]]) -> list[list[int]]:

@@ -15,7 +15,7 @@ from scipy import sparse
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.covariance import Covariance, Kept, sandwich
-from calib.estimator.identifiability import identifiable_directions, square_of
+from calib.estimator.identifiability import free_directions, square_of
 from calib.estimator.losses import LOSSES, MIXTURE
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import METRES_A_NS, RangeModel, Spline
@@ -114,7 +114,8 @@ def fit_known_distances(ranges: Ranges, recipe: Recipe) -> KnownDistances:
     """
     model = model_of(ranges, recipe)
     error = model.ranges.raw_m - model.ranges.truth_m
-    groups = _free_tags(model, recipe)
+    directions, groups = _free_tags(model, recipe)
+    model = replace(model, held=directions)
     blocks = time_blocks(model.ranges.time_ns, model.ranges.session)
     if recipe.sequential and model.curve is not None and not set(model.tags) <= set(recipe.fixed_ns):
         return _in_sequence(model, error, recipe, blocks, groups)
@@ -172,15 +173,19 @@ def model_of(ranges: Ranges, recipe: Recipe, *, trimmed: bool = True) -> RangeMo
     return model
 
 
-def _free_tags(model: RangeModel, recipe: Recipe) -> list[list[int]]:
-    """Return groups of tags whose delays the pairs leave free; raises `UnanswerableError` without `minimum_norm`."""
+def _free_tags(model: RangeModel, recipe: Recipe) -> tuple[Floats, list[list[int]]]:
+    """Return the directions of delays (tags, k) that the pairs leave free, and their tags; raises `UnanswerableError`
+    without `minimum_norm`."""
     ranges, free = model.ranges, [k for k, tag in enumerate(model.tags) if tag not in recipe.fixed_ns]
+    directions = np.zeros((len(model.tags), 0))
     if recipe.constants == "pair" or not free:
-        return []
+        return directions, []
     square, pairs = square_of(
         model.tags, ranges.initiator, ranges.target, ranges.weight_initiator, ranges.weight_target
     )
-    groups = identifiable_directions(square[np.ix_(free, free)], [model.tags[k] for k in free], pairs)[1]
+    own, groups = free_directions(square[np.ix_(free, free)], [model.tags[k] for k in free], pairs)
+    directions = np.zeros((len(model.tags), own.shape[1]))
+    directions[free] = own
     if groups and not recipe.minimum_norm:
         named = "; ".join(", ".join(map(str, group)) for group in groups)
         raise UnanswerableError(
@@ -189,7 +194,7 @@ def _free_tags(model: RangeModel, recipe: Recipe) -> list[list[int]]:
             "`fixed_ns` (`minimum_norm` fits regardless, and says so; `constants` pair gives each pair its own)",
             undetermined=groups,
         )
-    return groups
+    return directions, groups
 
 
 def robust_fit(

@@ -7,7 +7,7 @@ and differ only in the source of distances.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -27,6 +27,9 @@ METRES_A_NS = SPEED_OF_LIGHT * 1e-9
 DELAY_NS = 600.0
 """Prior standard deviation of a delay: a board without a programmed delay has 514 ns. The prior decides only
 combinations that no range determines, and chooses the smallest delays there."""
+
+HELD_NS, HELD_M = 1e-3, 1e-5
+"""Standard deviations of what is set to zero because no range determines it: far below those of any result."""
 
 CURVE_M = 0.5
 """Prior standard deviation of the bias over power: published curves reach 0.2 m (DW1000 user manual, APS011)."""
@@ -88,7 +91,8 @@ class RangeModel:
     """Unknowns and parts of `ranges` (n,), with curves over `lifted` powers within `span`.
 
     `unknowns` are delays, curves and offsets; `error_model` adds those of errors. `gauged` tells for each group whether
-    its curve is zero at `reference`; the others keep a constant that pinned delays determine.
+    its curve is zero at `reference`; the others keep a constant that pinned delays determine. Delays have no part
+    along the directions `held` (tags, k), which no range determines.
     """
 
     ranges: Ranges
@@ -106,6 +110,7 @@ class RangeModel:
     reference: float | None
     constants: str
     looked_for_curve: bool
+    held: Floats = field(default_factory=lambda: np.zeros((0, 0)))
 
     @classmethod
     def of(  # noqa: PLR0913 - keyword-only settings of one fit
@@ -198,14 +203,21 @@ class RangeModel:
         return key
 
     def gauge_rows(self, layout: Layout) -> list[NormalRows]:
-        """Return rows that set curves to zero at the reference power, where delays can take the constant."""
+        """Return rows that set free directions of delays to zero, and curves at the reference power, where delays can
+        take the constant."""
+        rows = [
+            NormalRows(
+                value=np.zeros(1), std=np.full(1, HELD_NS), entries=one[None], columns=layout.indices(["delay"])[None]
+            )
+            for one in self.held.T
+        ]
         if self.curve is None or self.reference is None:
-            return []
+            return rows
         at = Spline.at(np.array([self.reference]), self.curve.knots)
-        return [
+        return rows + [
             NormalRows(
                 value=np.zeros(1),
-                std=np.full(1, 1e-5),
+                std=np.full(1, HELD_M),
                 entries=at.values,
                 columns=at.columns + layout.where[kind].start,
             )

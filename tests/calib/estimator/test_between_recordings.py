@@ -81,6 +81,9 @@ def test_a_flight_predicts_the_errors_of_another_day(starloc, one, other, least)
     found = calib.fit(starloc[one], minimum_norm=True).calibration
     # Two pairs of sixteen moved by 12 cm, and one is behind something in the second flight: 95 % is not reached.
     assert calib.evaluate(starloc[other], found).overall.inside_95 > least
+    # The smallest delays: what both tags of the rig have more and all anchors less is not in the data.
+    of_tags = sum(found.delays_ns[tag] for tag in (1, 2))
+    assert of_tags == pytest.approx(sum(found.delays_ns.values()) - of_tags, abs=0.01)
     # Sound worlds show less than half a centimetre (above).
     assert 0.008 < found.errors.between_m < 0.05
 
