@@ -1,20 +1,83 @@
-"""The commands of one scenario (run, serve, show, validate, schema, scenarios), and the list of all commands."""
+"""The commands of `uwbsim`, and the arguments that several of them share."""
 
 from __future__ import annotations
 
 import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 import uwbsim
 from uwblink.cli import guide
-from uwblink.cli.guide import AntennaDelays, AsJson, Duration, Force, LinkDir, Seed, add
-from uwblink.cli.shared import interrupts, new_app, print_json, waiting
-from uwblink.output import check_output
-from uwbsim.cli import workbench
-from uwbsim.cli.arguments import AllowFiles, Overrides, ScenarioFile, progress, shipped
+from uwblink.cli.guide import (
+    AntennaDelays,
+    AsJson,
+    CalibrationFile,
+    Duration,
+    Force,
+    LinkDir,
+    Seed,
+    Seeds,
+    add,
+    choice,
+    several,
+    starting,
+)
+from uwblink.cli.shared import INTERRUPTED, interrupts, new_app, print_json, waiting
+from uwblink.output import check_folder, check_output
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from uwblink import RangingProtocol
+    from uwbsim.twins import Compared
+
+
+def shipped(incomplete: str) -> list[str]:
+    """Complete the name of a shipped scenario; where nothing was typed yet, the shell completes files."""
+    return starting(incomplete, uwbsim.shipped_scenarios()) if incomplete else []
+
+
+ScenarioFile = Annotated[
+    Path, typer.Argument(help="Scenario file (.toml), or the name of a shipped one.", autocompletion=shipped)
+]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value; repeatable.")
+]
+AllowFiles = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="DIR", help="Further folder in which files that the scenario names may lie; repeatable."),
+]
+
+
+@contextmanager
+def progress(name: str, *, eta: bool = False) -> Iterator[Callable[[float], None]]:
+    """Show on a terminal how far work has come, and nothing elsewhere; yields a function of the done fraction."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=not eta, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task(escape(name), total=1.0)
+        yield lambda fraction: bar.update(task, completed=fraction)
+
+
+def _protocols() -> list[str]:
+    from uwblink import PROTOCOLS
+
+    return list(PROTOCOLS)
+
+
+Protocols = Annotated[
+    str, typer.Option(help="Protocols, separated by commas, or all.", **several(lambda: ["all", *_protocols()]))
+]
 
 
 def run(
@@ -157,21 +220,272 @@ def schema() -> None:
     typer.echo(json.dumps(uwbsim.Scenario.model_json_schema(), indent=2))
 
 
+def compare(
+    scenario: ScenarioFile,
+    output: Annotated[Path, guide.output("Folder for compare.html, .csv and .parquet.")],
+    protocols: Protocols = "all",
+    count: Annotated[int, typer.Option("-n", "--ranges", help="Ranges with each protocol.")] = 1_000_000,
+    overrides: Overrides = None,
+    allow_files: AllowFiles = None,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Simulate ranges of every protocol in the same random world, and compare their errors and costs."""
+    from uwbsim.pages import FILES, write_comparison
+
+    rows = _rows(protocols)
+    loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
+    check_folder(output, FILES, force=force)
+    with progress(loaded.run.name) as report:
+        found = uwbsim.compare(loaded, rows, count, report)
+    write_comparison(found, output, force=force)
+    if as_json:
+        print_json(found.to_dict())
+        return
+    _print_outcomes(found)
+    typer.echo(f"{output / FILES[0]}, {', '.join(FILES[1:])}")
+
+
+def _rows(protocols: str) -> list[RangingProtocol]:
+    """Return the protocols of these names, separated by commas, or all."""
+    from uwbsim.protocols import chosen
+
+    return chosen(None if protocols == "all" else [name.strip() for name in protocols.split(",") if name.strip()])
+
+
+def _print_outcomes(found: uwbsim.Comparison) -> None:
+    from uwbsim.pages import COLUMNS
+
+    cells = [[show(outcome) for show in COLUMNS.values()] for outcome in found.outcomes]
+    heads = [name.strip().replace(" (", "\n(").replace("95 % of errors", "95 % of\nerrors") for name in COLUMNS]
+    console = _console(140)
+    narrow = console.width < 116  # what all columns of the table take
+    if narrow:
+        # A narrow terminal has no room for all columns: then each protocol is one.
+        heads, *cells = ([name, *row] for name, row in zip(COLUMNS, zip(*cells, strict=True), strict=True))
+    console.print(_table(heads, cells, 1))
+
+
+def _console(width: int) -> Console:
+    """Return a console as wide as the terminal, or of a width elsewhere."""
+    from rich.console import Console
+
+    return Console(width=None if sys.stdout.isatty() else width)
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], gap: int, title: str | None = None) -> Table:
+    """Return a table of texts, the first column left-aligned; cells that are too wide go on in a second line."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, gap, 0, 0), title=title, title_justify="left")
+    for k, head in enumerate(heads):
+        table.add_column(head, justify="right" if k else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def predict(
+    protocol: Annotated[
+        str,
+        typer.Option(help="Protocol by its name.", **choice("ss", "ss-cfo", "ds", "ds-alt", "ds-sym", more=_protocols)),
+    ] = "ds",
+    skew_ppm: Annotated[
+        float, typer.Option(rich_help_panel="Tags", help="Skew of the initiator's clock relative to the target's.")
+    ] = 0.0,
+    reply_delay_us: Annotated[
+        float, typer.Option(min=0.0, rich_help_panel="Timing", help="Delay of the target's reply (dt32).")
+    ] = 300.0,
+    final_delay_us: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            rich_help_panel="Timing",
+            help="Delay of the third message (dt53; only ds, ds-alt); by default 1538.7.",
+        ),
+    ] = None,
+    distance_m: Annotated[float, typer.Option(min=0.0, rich_help_panel="Tags", help="Distance.")] = 5.0,
+    speed_mps: Annotated[float, typer.Option(rich_help_panel="Tags", help="Speed at which the distance grows.")] = 0.0,
+    drift_ppm_per_s: Annotated[float, typer.Option(rich_help_panel="Tags", help="Change of the relative skew.")] = 0.0,
+    tx_noise_ps: Annotated[
+        float, typer.Option(min=0.0, rich_help_panel="Noise", help="Standard deviation of transmit stamps.")
+    ] = 0.0,
+    rx_noise_ps: Annotated[
+        float, typer.Option(min=0.0, rich_help_panel="Noise", help="Standard deviation of receive stamps.")
+    ] = 150.0,
+    carrier_noise_ppm: Annotated[
+        float,
+        typer.Option(min=0.0, rich_help_panel="Noise", help="Standard deviation of the carrier integrator's reading."),
+    ] = 0.2,
+    carrier_bias_ppm: Annotated[
+        float, typer.Option(rich_help_panel="Noise", help="Bias of the carrier integrator's reading.")
+    ] = 0.0,
+    delay_initiator_ns: Annotated[
+        float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the initiator.")
+    ] = 0.0,
+    delay_target_ns: Annotated[float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the target.")] = 0.0,
+    whole_ticks: Annotated[
+        bool,
+        typer.Option("--whole-ticks", rich_help_panel="Noise", help="Round stamps to ticks of 15.65 ps."),
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Predict the bias and standard deviation of a range analytically."""
+    found = uwbsim.predict_state(
+        uwbsim.State(
+            protocol=protocol,
+            skew_ppm=skew_ppm,
+            reply_delay_us=reply_delay_us,
+            final_delay_us=final_delay_us,
+            distance_m=distance_m,
+            speed_mps=speed_mps,
+            drift_ppm_per_s=drift_ppm_per_s,
+            tx_noise_ps=tx_noise_ps,
+            rx_noise_ps=rx_noise_ps,
+            carrier_noise_ppm=carrier_noise_ppm,
+            carrier_bias_ppm=carrier_bias_ppm,
+            delay_initiator_ns=delay_initiator_ns,
+            delay_target_ns=delay_target_ns,
+            whole_ticks=whole_ticks,
+        )
+    )
+    if as_json:
+        print_json(found.to_dict())
+    else:
+        typer.echo(found)
+
+
+def optimum(
+    scenario: ScenarioFile,
+    protocols: Protocols = "all",
+    overhead_us: Annotated[float, typer.Option(min=0.0, help="Additional time of an exchange, microseconds.")] = 0.0,
+    output: Annotated[Path | None, guide.output("Folder for pictures of the curves (.png).")] = None,
+    overrides: Overrides = None,
+    allow_files: AllowFiles = None,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Find the delay of the scheduled message at which the mean of a second of a pair's ranges errs least."""
+    rows = _rows(protocols)
+    loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
+    if output:
+        from uwbsim.pages import optimum_file, write_optima
+
+        check_folder(output, [optimum_file(row.name) for row in rows], force=force)
+    with waiting("searching"):
+        found = [uwbsim.optimum(loaded, row, overhead_us * 1e-6) for row in rows]
+    if output:
+        write_optima(found, output, force=force)
+    if as_json:
+        print_json([one.to_dict() for one in found])
+        return
+    typer.echo(f"{'protocol':10s}{'best delay':>12s}{'one range':>12s}{'takes':>10s}{'mean of 1 s':>14s}")
+    for one in found:
+        typer.echo(
+            f"{one.protocol:10s}{1e6 * one.delay_s:9.0f} µs{100 * one.rms_m:9.2f} cm{1e6 * one.duration_s:7.0f} µs"
+            f"{100 * one.second_rms_m:11.4f} cm" + ("  (the edge of what boards take)" if one.on_edge else "")
+        )
+
+
+def sweep(
+    plan: Annotated[Path, typer.Argument(help="Sweep file: what varies (.toml).")],
+    output: Annotated[Path, guide.output("Folder for the results.")],
+    workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; by default one per core.")] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a running Dask scheduler.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue a sweep that was interrupted.")] = False,
+    allow_files: AllowFiles = None,
+) -> None:
+    """Run a scenario many times with varied settings and seeds; an interrupted sweep can be resumed."""
+    loaded = uwbsim.load_design(plan, allow_files=allow_files or ())
+    with interrupts() as stop, progress(loaded.name, eta=True) as report:
+
+        def go_on(share: float) -> None:
+            report(share)
+            if stop():  # between two chunks, when nothing is being written
+                raise KeyboardInterrupt
+
+        try:
+            summary = uwbsim.run_sweep(
+                loaded, output, workers=workers, scheduler=scheduler, resume=resume, progress=go_on
+            )
+        except KeyboardInterrupt:
+            typer.echo(f"{output}: interrupted; what was done is kept, and --resume goes on with it")
+            raise typer.Exit(INTERRUPTED) from None
+    from uwbsim.pages import write_sweep_page
+
+    page = write_sweep_page(loaded, output)
+    typer.echo(
+        f"{output}: {summary.done} runs of {loaded.total}, {summary.failed} failed, {summary.skipped} were there "
+        f"already; results.csv, results.parquet, {page.name}"
+    )
+
+
+def twin(
+    recording: Annotated[Path, typer.Argument(help="Recording with poses and first-path powers (.uwb).")],
+    calibration: CalibrationFile,
+    output: Annotated[Path, guide.output("Scenario to write (.toml).")],
+    seeds: Seeds = None,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Fit a scenario to a recording, and compare its simulation with the measurements on a page."""
+    from uwbsim.pages import write_twin
+    from uwbsim.twins import check_name
+
+    check_name(output)
+    page = output.with_suffix(".html")
+    for path in (output, page):
+        check_output(path, force=force)
+    with waiting("fitting"):
+        found = uwbsim.twin(recording, calibration)
+    files = found.files(output)
+    for path in files:
+        check_output(path, force=force)
+    with progress(output.name) as report:
+        compared = found.compare(seeds, report)
+    found.save(output, force=force)
+    write_twin(found, compared, page, force=force)
+    if as_json:
+        rows = [one.to_dict() for one in compared]
+        print_json({"found": found.found, "unknown": found.unknown, "compared": rows})
+        return
+    _print(compared, _console(150))
+    typer.echo(", ".join(map(str, (*files, page))))
+
+
+def _print(compared: Sequence[Compared], console: Console) -> None:
+    from uwbsim.pages import TWIN_COLUMNS
+
+    rows = [[show(one) for show in TWIN_COLUMNS.values()] for one in compared]
+    console.print(_table(list(TWIN_COLUMNS), rows, 1 if console.width > 80 else 0, "measured / simulated"))
+
+
 app = new_app("Simulate tags that range with ultra-wideband radios.")
-for _command, *_examples in (
-    (scenarios, "uwbsim scenarios", "uwbsim scenarios icra2023 -o scenarios"),
+for _panel, _command, *_examples in (
+    ("Scenarios", scenarios, "uwbsim scenarios", "uwbsim scenarios icra2023 -o scenarios"),
     (
+        "Scenarios",
         run,
         "uwbsim run icra2023/train -o train.uwb",
         "uwbsim run scenario.toml -o short.uwb --set run.duration_s=60",
     ),
-    (serve, "uwbsim serve scenario.toml --link-dir ports --poses poses.csv"),
-    (show, "uwbsim show scenario.toml -o scene.html"),
-    (validate, "uwbsim validate scenario.toml"),
-    (schema, "uwbsim schema > scenario.schema.json"),
+    ("Scenarios", serve, "uwbsim serve scenario.toml --link-dir ports --poses poses.csv"),
+    ("Scenarios", show, "uwbsim show scenario.toml -o scene.html"),
+    ("Scenarios", validate, "uwbsim validate scenario.toml"),
+    ("Scenarios", schema, "uwbsim schema > scenario.schema.json"),
+    ("Protocols and studies", compare, "uwbsim compare scenario.toml -o comparison -n 200000"),
+    ("Protocols and studies", predict, "uwbsim predict --protocol ss-cfo --skew-ppm 10 --reply-delay-us 300"),
+    ("Protocols and studies", optimum, "uwbsim optimum scenario.toml --protocols ds,ds-alt"),
+    (
+        "Protocols and studies",
+        sweep,
+        "uwbsim sweep plan.toml -o results",
+        "uwbsim sweep plan.toml -o results --resume",
+    ),
+    ("From measurements", twin, "uwbsim twin flight.uwb -c calibration.json -o twin.toml"),
 ):
-    add(app, _command, *_examples, panel="Scenarios")
-workbench.add_to(app)
+    add(app, _command, *_examples, panel=_panel)
 
 FLAGS: Final = {"count": "-n/--ranges", "overhead_s": "--overhead-us", "overrides": "--set", "evaluate": "evaluate"}
 """Of parameters that are spelt otherwise; what evaluates a sweep is a plug-in, which no flag names."""

@@ -12,8 +12,7 @@ import uwbsim
 from tests.uwbsim.twins.worlds import known, world
 from uwblink import Poses, UwblinkError, load
 from uwbsim.cli import main
-from uwbsim.cli.commands import app
-from uwbsim.cli.workbench import _print
+from uwbsim.cli.commands import _print, app
 from uwbsim.twins import LEVEL
 
 
