@@ -51,8 +51,7 @@ def pairs(folder: Path) -> list[Pair]:
     from calib.fitting.fitting import fit
     from uwblink.protocols.table import PROTOCOLS
     from uwblink.ticks import SPEED_OF_LIGHT
-    from uwbsim.protocols.conditions import STATES, Conditions
-    from uwbsim.protocols.monte_carlo import range_errors_m
+    from uwbsim.protocols.conditions import STATES, Conditions, range_errors_m
 
     scenario = uwbsim.load(TRAIN)
     flight = uwbsim.simulate(scenario)

@@ -86,7 +86,7 @@ def full() -> str:
 
 def _rate(conditions: Any, count: int = 4_000_000) -> str:
     from uwblink.protocols.table import PROTOCOLS
-    from uwbsim.protocols.monte_carlo import range_errors_m
+    from uwbsim.protocols.conditions import range_errors_m
 
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     seconds = timed(lambda: range_errors_m(PROTOCOLS["ds"], conditions, 1, count))
@@ -98,8 +98,7 @@ def engines() -> tuple[np.ndarray, np.ndarray, float]:
     from uwblink.protocols.table import PROTOCOLS
     from uwblink.twr import raw_range
     from uwbsim import simulate
-    from uwbsim.protocols.conditions import conditions_of
-    from uwbsim.protocols.monte_carlo import range_errors_m
+    from uwbsim.protocols.conditions import conditions_of, range_errors_m
     from uwbsim.protocols.prediction import predict
     from uwbsim.scenario.loading import load
 

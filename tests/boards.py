@@ -3,8 +3,7 @@
 import threading
 from contextlib import contextmanager
 
-from uwbsim.boards.server import Server
-from uwbsim.scenario.faults import Faults
+from uwbsim.boards.server import Faults, Server
 from uwbsim.scenario.model import Scenario
 
 

@@ -16,8 +16,7 @@ from uwblink.recording.file import Recording
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import delay_weights, raw_range
 from uwbsim import simulate
-from uwbsim.protocols.conditions import Conditions
-from uwbsim.protocols.monte_carlo import range_errors_m
+from uwbsim.protocols.conditions import Conditions, range_errors_m
 from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.model import Scenario
 

@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
-    from uwbsim.boards.server import Server
+    from uwbsim.boards.server import Server, load_faults
     from uwbsim.boards.virtual_port import VirtualPorts
     from uwbsim.errors import ParameterError, ScenarioError, UwbsimError
     from uwbsim.pages.documents import show
     from uwbsim.pages.preview import preview
     from uwbsim.protocols.comparison import Comparison, compare, optimum
     from uwbsim.protocols.prediction import Prediction, State, predict_state
-    from uwbsim.scenario.faults import load_faults
     from uwbsim.scenario.loading import load, shipped_scenarios
     from uwbsim.scenario.model import Scenario
     from uwbsim.simulation.run import Simulated, simulate, through_wire
@@ -69,7 +68,7 @@ _HOMES: Final = {
     "compare": "uwbsim.protocols.comparison",
     "load": "uwbsim.scenario.loading",
     "load_design": "uwbsim.sweep.design",
-    "load_faults": "uwbsim.scenario.faults",
+    "load_faults": "uwbsim.boards.server",
     "optimum": "uwbsim.protocols.comparison",
     "predict_state": "uwbsim.protocols.prediction",
     "preview": "uwbsim.pages.preview",

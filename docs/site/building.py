@@ -12,8 +12,8 @@ from docs.site import checks, commands, doors, file_keys, schema
 from uwblink.boards.ranging_plan import FILE_KEYS as PLAN
 from uwblink.cli.commands import app as uwblink_app
 from uwblink.importers.column_map import FILE_KEYS as COLUMN_MAP
+from uwbsim.boards.server import Faults
 from uwbsim.cli.commands import app as uwbsim_app
-from uwbsim.scenario.faults import Faults
 from uwbsim.scenario.model import Scenario
 from uwbsim.sweep.design import SweepFile
 

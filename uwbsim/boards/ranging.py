@@ -29,7 +29,7 @@ from uwbsim.boards.frames import (
     ResponsePayload,
 )
 from uwbsim.scenario.ranging import PREAMBLE_TIMEOUT_S
-from uwbsim.simulation.reporting import MASK
+from uwbsim.simulation.timestamps import MASK
 from uwbsim.world.clocks import NS_PER_S
 from uwbsim.world.impulse_response import impulse_response, in_transfers
 

@@ -1,34 +1,122 @@
-"""Virtual boards behind pseudo-terminals, in wall time, with live motion capture.
+"""Virtual boards behind pseudo-terminals, in wall time, with live motion capture and faults (`uwbsim serve`).
 
-One loop: the bench's clock follows the wall clock, bytes from clients go to the boards as they come, and what the
-boards print goes out when it is due.
+One loop advances the simulated time of the bench to the wall clock, passes bytes from clients to the boards, and sends
+the boards' output at its time. The models of faults come first: they are the schema of a file of faults.
 """
 
 from __future__ import annotations
 
 import heapq
 import math
+import os
 import selectors
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats
 from uwblink.boards.ports import Terminal
 from uwblink.output import new_file
+from uwblink.text_files import read_text
 from uwbsim.boards.frames import NS_PER_MS
 from uwbsim.boards.virtual_board import Bench, VirtualBoard
+from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
+from uwbsim.scenario.base import NotNegative, Positive, Section, Share, TagId
 from uwbsim.scenario.bodies import Carried
-from uwbsim.scenario.faults import Bytes, Fault, Faults, Hang, LateReplies, SplitWrites, Unplug
+from uwbsim.scenario.loading import parse_toml, validated
 from uwbsim.scenario.model import Scenario
 from uwbsim.world.clocks import LONGEST_RUN_S, NS_PER_S
 from uwbsim.world.world import World
+
+
+class Random(Section):
+    """A fault that occurs with a probability, at one board or at all."""
+
+    share: Share = Field(description="Probability for each byte, or for each message.")
+    tag: TagId | None = Field(None, description="Board; by default all.")
+
+
+class Bytes(Random):
+    """Each byte to the host is dropped, or replaced by a random one, with a probability."""
+
+    kind: Literal["drop-bytes", "garble-bytes"] = Field(description="Bytes are dropped, or replaced by random ones.")
+
+
+class SplitWrites(Random):
+    """Messages come in two pieces with a gap between, with a probability."""
+
+    kind: Literal["split-writes"] = Field(description="Messages arrive in two pieces.")
+    gap_ms: NotNegative = Field(2.0, description="Gap between the pieces.")
+
+
+class LateReplies(Random):
+    """Messages come late, with a probability."""
+
+    kind: Literal["late-replies"] = Field(description="Messages arrive late.")
+    delay_ms: Positive = Field(200.0, description="Delay.")
+
+
+class LoseFrames(Section):
+    """Frames on the air are lost with a probability."""
+
+    kind: Literal["lose-frames"] = Field(description="Frames on the air are lost.")
+    share: Share = Field(description="Probability for each frame.")
+
+
+class Hang(Section):
+    """A board goes into its hard-fault loop until it is unplugged."""
+
+    kind: Literal["hang"] = Field(description="A board hangs until it is unplugged.")
+    tag: TagId = Field(description="Board.")
+    at_s: NotNegative = Field(description="Time after the start.")
+
+
+class Unplug(Section):
+    """A board is unplugged, and plugged in again after a while."""
+
+    kind: Literal["unplug"] = Field(description="A board is unplugged for a while.")
+    tag: TagId = Field(description="Board.")
+    at_s: NotNegative = Field(description="Time after the start.")
+    for_s: Positive = Field(1.0, description="Duration.")
+
+
+Fault = Annotated[Bytes | SplitWrites | LateReplies | LoseFrames | Hang | Unplug, Field(discriminator="kind")]
+
+
+class Faults(Section):
+    """A file of faults."""
+
+    faults: tuple[Fault, ...] = Field((), description="The faults, in any order.")
+
+    def lost_share(self) -> float:
+        """Return the share of frames that are lost on the air."""
+        return 1 - math.prod(1 - fault.share for fault in self.faults if isinstance(fault, LoseFrames))
+
+
+def load_faults(path: str | os.PathLike[str], tags: Iterable[int]) -> Faults:
+    """Read a file of faults of boards with these tags; raises `ScenarioError` that says where it is wrong.
+
+    >>> from pathlib import Path
+    >>> import uwbsim
+    >>> _ = Path("faults.toml").write_text("faults = [{ kind = 'unplug', tag = 10, at_s = 0.5, for_s = 0.1 }]\\n")
+    >>> uwbsim.load_faults("faults.toml", [10, 20]).faults[0].at_s
+    0.5
+    """
+    tags, path = list(tags), Path(path)
+    faults = validated(Faults, parse_toml(read_text(path, ScenarioError, "file of faults (.toml)"), path), path)
+    for number, fault in enumerate(faults.faults):
+        tag = getattr(fault, "tag", None)
+        if tag is not None and tag not in tags:
+            raise ScenarioError(f"{path}: faults[{number}].tag: found {tag}, the tags are {', '.join(map(str, tags))}")
+    return faults
 
 
 def stays_s(scenario: Scenario) -> list[tuple[float, float]]:

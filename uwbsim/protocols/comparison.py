@@ -13,8 +13,7 @@ import numpy as np
 from uwblink.arrays import Floats
 from uwblink.protocols.table import RangingProtocol
 from uwbsim.errors import ParameterError
-from uwbsim.protocols.conditions import Conditions, Protocols, calibrated, chosen, conditions_of
-from uwbsim.protocols.monte_carlo import range_errors_m
+from uwbsim.protocols.conditions import Conditions, Protocols, calibrated, chosen, conditions_of, range_errors_m
 from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario

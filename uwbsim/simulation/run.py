@@ -27,8 +27,17 @@ from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.ranging import before_marker_s
 from uwbsim.simulation import air
 from uwbsim.simulation.air import Schedule, schedule
-from uwbsim.simulation.reporting import overhear, provenance, reported_exchanges, reported_faults, responses
-from uwbsim.simulation.timestamps import Begun, Draws, draw, stamp
+from uwbsim.simulation.timestamps import (
+    Begun,
+    Draws,
+    draw,
+    overhear,
+    provenance,
+    reported_exchanges,
+    reported_faults,
+    responses,
+    stamp,
+)
 from uwbsim.world.clocks import LONGEST_RUN_S, NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks, readings
 from uwbsim.world.reception import Medium
 from uwbsim.world.trajectories import height_readings, inertial_readings

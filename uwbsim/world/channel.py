@@ -117,19 +117,15 @@ class Ends:
 
 
 def paths_heard(link: Link, detour_m: float = 0.0) -> PathsHeard:
-    """Return what a response shows of a single link, whose first path is `detour_m` longer still by chance."""
+    """Return the paths of a single link for its response; its first path has a random detour of `detour_m`."""
     power = float(link.power_dbm[0])
     if link.paths_m is None or link.paths_dbm is None:
-        return PathsHeard(power_dbm=power, echoes=[])
-    # Echoes that come within 1 cm of the first path, or are 80 dB weaker, change no tap.
+        return PathsHeard(power, np.zeros(0), np.zeros(0))
     later_m = link.paths_m[0] - float(link.distance_m[0] + link.excess_m[0]) - detour_m
     shares = 10 ** ((link.paths_dbm[0] - power) / 20)
-    echoes = [
-        (later / SPEED_OF_LIGHT, share)
-        for later, share in zip(later_m.tolist(), shares.tolist(), strict=True)
-        if later > 0.01 and share > 1e-4
-    ]
-    return PathsHeard(power_dbm=power, echoes=echoes)
+    # Echoes within 1 cm of the first path, or 80 dB weaker, change no tap.
+    kept = (later_m > 0.01) & (shares > 1e-4)
+    return PathsHeard(power, later_m[kept] / SPEED_OF_LIGHT, shares[kept])
 
 
 ChannelEffect = Callable[[Link, Ends], Link]

@@ -4,15 +4,15 @@ True time is an integer count of sub-ticks, 1024 to a device tick (15.3 fs, 4.6 
 hours, and a stamp at hour 30 is as exact as one at second 1: the large count is never rounded, only the small deviation
 of a clock from true time is a float.
 
-White and flicker noise of a rate: the phase is a sum of tents, one on each interval of an octave of lengths (a Haar
-series of the rate). With peaks of h sqrt(length)/2 it is a Brownian motion (Levy's construction), the phase of white
-noise of the rate with the Allan deviation h/sqrt(tau). With peaks proportional to the length every octave adds the same
-variance of the rate, which is flicker noise (Wornell, IEEE Trans. Inf. Theory 36, 1990). There the sum over all octaves
-telescopes: steps of +r and -r have the Allan variance 2 r^2 at every tau, averaged over where the intervals begin,
-which is drawn.
+White and flicker noise of a rate: the phase is a sum of triangular pulses, one on each interval of an octave of lengths
+(a Haar series of the rate). With peaks of h sqrt(length)/2 it is a Brownian motion (Levy's construction), the phase of
+white noise of the rate with the Allan deviation h/sqrt(tau). With peaks proportional to the length every octave adds
+the same variance of the rate, which is flicker noise (Wornell, IEEE Trans. Inf. Theory 36, 1990). There the sum over
+all octaves telescopes: steps of +r and -r have the Allan variance 2 r^2 at every tau, averaged over the random start of
+the intervals.
 
-The height of a tent follows from a hash of its number, so the phase at an instant does not depend on which other
-instants are evaluated, or in which order. Octaves above a grid are summed once; those below it for every instant.
+The height of a pulse is a hash of its number, so the phase at an instant does not depend on which other instants are
+evaluated, or in which order. Octaves above a grid are summed once, those below it for every instant.
 """
 
 from __future__ import annotations
@@ -35,29 +35,27 @@ from uwbsim.tables import Columns, in_time_order
 NS_PER_S: Final = 1_000_000_000
 
 SUBTICKS: Final = 1024
-"""To a device tick, so that rounding instants adds nothing to a stamp."""
+"""Sub-ticks of a device tick: rounding an instant to them adds no error to a stamp."""
 
 SUBTICKS_PER_SECOND: Final = SUBTICKS * TICKS_PER_SECOND
 
-
 SHORTEST_OCTAVE: Final = 30
-"""The shortest tents are 2^30 sub-ticks or 16 us long: a second difference over 1 ms misses 0.4 % of its variance."""
+"""The shortest pulses are 2^30 sub-ticks or 16 us long: a second difference over 1 ms misses 0.4 % of its variance."""
 
 GRID_OCTAVE: Final = 42
-"""Tents longer than 2^42 sub-ticks, 67 ms, are added up once on a grid of this step."""
+"""Pulses longer than 2^42 sub-ticks, 67 ms, are summed once on a grid of this step."""
 
 LONGEST_OCTAVE: Final = 59
-"""The longest tents are 2^59 sub-ticks, 8810 s: flicker ends below that frequency, white noise goes on."""
-
+"""The longest pulses are 2^59 sub-ticks, 8810 s: flicker ends below that frequency, white noise does not."""
 
 WALK_STEP_S: Final = 0.1
-"""Steps of random walks and temperature: short beside the tens of seconds over which rates change."""
+"""Step of random walks and temperature: short compared with the tens of seconds over which rates change."""
 
 RATE_SPAN_S: Final = 130e-6
 """Length of the boards' preambles: 128 symbols of 1.02 us."""
 
 LONGEST_RUN_S: Final = 36 * 3600.0
-"""The counts of true time last 39 hours."""
+"""Chosen below the 39 hours that 63 bits of sub-ticks last."""
 
 Words = NDArray[np.uint64]
 
@@ -66,8 +64,8 @@ Words = NDArray[np.uint64]
 class ClockNoise:
     """The phases of all tags' clocks, in columns by a tag's place in the scenario; octaves in rows, from 2^30 on.
 
-    `keys` seed the hash and `peaks` are the tents' deviations in sub-ticks, (octaves, tags) each; `shift` is where the
-    intervals begin, (tags,); `knots` the sum of the long ones at multiples of the grid's step from time zero.
+    `keys` seed the hash and `peaks` are the standard deviations of pulses in sub-ticks, (octaves, tags) each; `shift`
+    is the start of the intervals, (tags,); `knots` the sum of long pulses at multiples of the grid's step from zero.
     """
 
     keys: Words
@@ -83,36 +81,34 @@ class ClockNoise:
         drawn = [stream(seed, "clock noise", tag.id) for tag in tags]
         octaves = np.arange(SHORTEST_OCTAVE, LONGEST_OCTAVE + 1)
         keys = np.stack([rng.integers(0, 1 << 63, len(octaves), dtype=np.uint64) for rng in drawn], axis=1)
-        # A whole number of steps, so that the grid begins at time zero; less than 2^62, so that no run overflows.
+        # The shift is a whole number of steps, so that the grid begins at time zero, and below 2^62, so that no run
+        # overflows.
         steps = np.array([rng.integers(0, 1 << (62 - GRID_OCTAVE), dtype=np.uint64) for rng in drawn])
         count = int(duration_s * SUBTICKS_PER_SECOND / 2**GRID_OCTAVE) + 64
         peaks = np.stack([_peaks(tag, octaves) for tag in tags], axis=1)
         knots = np.zeros((len(tags), count))
         noise = cls(keys, peaks, steps << np.uint64(GRID_OCTAVE), knots)
-        time = np.arange(count, dtype=np.int64) << GRID_OCTAVE
+        time, long = np.arange(count, dtype=np.int64) << GRID_OCTAVE, slice(GRID_OCTAVE + 1 - SHORTEST_OCTAVE, None)
         for place, (tag, rng) in enumerate(zip(tags, drawn, strict=True)):
-            which = np.full(count, place)
-            coarse = noise._tents(which, time, slice(GRID_OCTAVE + 1 - SHORTEST_OCTAVE, None)) + noise._trend(
-                place, tag, rng, time
-            )
+            coarse = noise._pulses(np.full(count, place), time, long) + noise._trend(place, tag, rng, time)
             knots[place] = coarse - coarse[0]
         return noise
 
     def phase(self, tag: Ints, time: Ints) -> Floats:
-        """Return by how many sub-ticks the clocks of tags (n,) are ahead for their noise at true times (n,)."""
+        """Return the phase noise of the clocks of tags (n,) at true times (n,), in sub-ticks; positive is ahead."""
         cell = np.clip(time >> GRID_OCTAVE, 0, self.knots.shape[1] - 2)
         into = (time - (cell << GRID_OCTAVE)) * 2.0**-GRID_OCTAVE
         low = self.knots[tag, cell]
         return np.asarray(low + into * (self.knots[tag, cell + 1] - low) + self._fine(tag, time))
 
     def _fine(self, tag: Ints, time: Ints) -> Floats:
-        """Add up the octaves below the grid, piece by piece."""
+        """Sum the octaves below the grid, in pieces."""
         octaves, piece = slice(0, GRID_OCTAVE + 1 - SHORTEST_OCTAVE), 2048  # which fits into a core's cache
         cuts = range(0, max(len(time), 1), piece)
-        return np.concatenate([self._tents(tag[k : k + piece], time[k : k + piece], octaves) for k in cuts])
+        return np.concatenate([self._pulses(tag[k : k + piece], time[k : k + piece], octaves) for k in cuts])
 
-    def _tents(self, tag: Ints, time: Ints, octaves: slice) -> Floats:
-        """Add up the tents of some octaves, (n,), from the shortest to the longest."""
+    def _pulses(self, tag: Ints, time: Ints, octaves: slice) -> Floats:
+        """Sum the triangular pulses of some octaves, (n,), from the shortest to the longest."""
         exponents = np.arange(SHORTEST_OCTAVE, LONGEST_OCTAVE + 1, dtype=np.uint64)[octaves]
         at = time.astype(np.uint64) + self.shift[tag]
         index = at >> exponents[:, None]
@@ -121,7 +117,7 @@ class ClockNoise:
         return np.asarray(np.sum(height * (1 - np.abs(2 * into - 1)), axis=0))
 
     def _trend(self, place: int, tag: Tag, rng: np.random.Generator, time: Ints) -> Floats:
-        """Return the random walk of white noise from one of the longest intervals to the next, linear in between."""
+        """Return the random walk of white noise over the longest intervals, linear between their ends."""
         at = (time.astype(np.uint64) + self.shift[place]).astype(np.float64) * 2.0**-LONGEST_OCTAVE
         step = (tag.white_ppm_sqrt_s * 1e-6) * np.sqrt(2.0**LONGEST_OCTAVE * SUBTICKS_PER_SECOND)
         walk = np.cumsum(rng.normal(0, 1, 1 << (64 - LONGEST_OCTAVE))) * step
@@ -129,7 +125,7 @@ class ClockNoise:
 
 
 def _peaks(tag: Tag, octaves: Ints) -> Floats:
-    """Return the standard deviations of tents' heights by octave, in sub-ticks."""
+    """Return the standard deviations of the pulses' heights by octave, in sub-ticks."""
     length_s = 2.0**octaves / SUBTICKS_PER_SECOND
     white = (tag.white_ppm_sqrt_s * 1e-6) * np.sqrt(length_s) / 2
     flicker = (tag.flicker_ppm * 1e-6) / np.sqrt(2) * length_s / 2
@@ -137,7 +133,7 @@ def _peaks(tag: Tag, octaves: Ints) -> Floats:
 
 
 def _normal(index: Words, key: Words) -> Floats:
-    """Return standard normal draws that belong to numbers and keys: a multiplicative hash into a table of quantiles."""
+    """Return standard normal values for numbers and keys: a multiplicative hash selects from a table of quantiles."""
     word = (index + key) * np.uint64(0x9E3779B97F4A7C15)
     word = (word ^ (word >> np.uint64(32))) * np.uint64(0xBF58476D1CE4E5B9)
     word = (word ^ (word >> np.uint64(29))) * np.uint64(0x94D049BB133111EB)
@@ -168,10 +164,9 @@ class Clocks:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
-        """Build the clocks of a scenario; offsets not given and random walks come from its seed."""
+        """Create the clocks of a scenario; random walks, and offsets that it does not give, are drawn from its seed."""
         seed, duration = scenario.run.seed, scenario.run.duration_s
-        steps = int(duration / WALK_STEP_S) + 20
-        offsets, rates = [], []
+        steps, offsets, rates = int(duration / WALK_STEP_S) + 20, [], []
         for tag in scenario.tags:
             rng = stream(seed, "clock", tag.id)
             drawn = rng.integers(0, 1 << COUNTER_BITS)
@@ -197,18 +192,17 @@ class Clocks:
 
     def when(self, tag: Ints, reading: Ints) -> Ints:
         """Return the true times (n,) at which clocks show `reading`: the inverse of `read`."""
-        bare = reading - self.offset[tag]
-        time = bare
+        time = bare = reading - self.offset[tag]
         # Each pass shrinks the error by the skew, so three take 0.1 s of deviation below a sub-tick.
         for _ in range(4):
             time = bare - self._deviation(tag, time)
         return time
 
     def rate(self, tag: Ints, time: Ints, span_s: float = RATE_SPAN_S) -> Floats:
-        """Return how much faster than true time the clocks run, as a fraction, (n,).
+        """Return the clocks' rates less that of true time, as fractions, (n,).
 
-        Noise has no rate at an instant; its share is the mean over the `span_s` before: by default that of a preamble,
-        which the carrier integrator follows.
+        White noise has no rate at an instant: its part is the mean over `span_s` before, by default the length of a
+        preamble, over which the carrier integrator averages.
         """
         rate = self.skew[tag] + self.walk_rate[tag, self._step(time)[0]]
         if self.noise is None:
@@ -249,39 +243,36 @@ def profile_of(scenario: Scenario, tag: Tag, key: str) -> Profile | None:
     return found or next(getattr(body, key) for body in scenario.bodies if body.name == tag.body)
 
 
-def own(tag: Tag, devices: Devices, name: str) -> float:
-    """Return what a tag has of a property of all devices: its own, or theirs."""
-    mine = getattr(tag, name)
-    return float(getattr(devices, name) if mine is None else mine)
+def slope_of(tag: Tag, devices: Devices, name: str) -> float:
+    """Return a sensitivity to temperature or voltage: the tag's own, or that of all devices."""
+    value = getattr(tag, name)
+    return float(getattr(devices, name) if value is None else value)
 
 
-def lengthening_m(scenario: Scenario, tag: Tag, time_s: Floats) -> Floats | None:
-    """Return by how much a tag lengthens ranges at times (n,) for its temperature and voltage; None for never."""
-    devices = scenario.devices
-    total: Floats | None = None
-    for profile, slope, reference in (
-        (profile_of(scenario, tag, "temperature_c"), own(tag, devices, "range_mm_per_k") * 1e-3, devices.reference_c),
-        (profile_of(scenario, tag, "supply_v"), own(tag, devices, "range_cm_per_v") * 1e-2, devices.reference_v),
-    ):
-        if profile is not None and slope:
-            part = slope * (profile_at(profile, time_s) - reference)
-            total = part if total is None else total + part
-    return total
+def range_shift_m(scenario: Scenario, tag: Tag, time_s: Floats) -> Floats | None:
+    """Return what a tag's temperature and voltage add to ranges at times (n,); None for a tag without an effect."""
+    d = scenario.devices
+    effects = (
+        (profile_of(scenario, tag, "temperature_c"), slope_of(tag, d, "range_mm_per_k") * 1e-3, d.reference_c),
+        (profile_of(scenario, tag, "supply_v"), slope_of(tag, d, "range_cm_per_v") * 1e-2, d.reference_v),
+    )
+    parts = [slope * (profile_at(profile, time_s) - ref) for profile, slope, ref in effects if profile and slope]
+    return np.sum(parts, axis=0) if parts else None
 
 
 def thermal_rate(scenario: Scenario, tag: Tag, time_s: Floats) -> Floats:
     """Return what temperature and warm-up add to the rate of a tag's clock at times (n,), as a fraction."""
     rate = tag.warm_up_ppm * 1e-6 * np.exp(-time_s / tag.warm_up_s)
-    profile, slope = profile_of(scenario, tag, "temperature_c"), own(tag, scenario.devices, "skew_ppm_per_k")
+    profile, slope = profile_of(scenario, tag, "temperature_c"), slope_of(tag, scenario.devices, "skew_ppm_per_k")
     if profile is not None and slope:
         rate = rate + slope * 1e-6 * (profile_at(profile, time_s) - scenario.devices.reference_c)
     return np.asarray(rate)
 
 
 def readings(scenario: Scenario) -> Columns:
-    """Return what tags read of their temperature and voltage over the run: columns of the recording's `temperature`.
+    """Return the tags' readings of temperature and voltage over the run: columns of the recording's `temperature`.
 
-    NaN where a tag has only one of the two; empty where no tag has either.
+    NaN where a tag has only one of the two; no columns where no tag has either.
     """
     devices, duration_s = scenario.devices, scenario.run.duration_s
     time_s = np.arange(int(duration_s * devices.readings_hz) + 1) / devices.readings_hz

@@ -1,13 +1,13 @@
-"""Responses of pairs of tags from geometry, computed ahead: one every few milliseconds.
+"""Geometric responses of pairs of tags, one every few milliseconds, computed ahead and kept.
 
-Flights, listeners and the workbench ask for many links at once, served boards for one sender at an instant; all have
-the response of the nearest step, so all have the same.
+Flights, listeners and comparisons of protocols ask for many links at once, served boards for one sender at an instant.
+All get the response of the nearest step, so all get the same.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Final, Self
 
 import numpy as np
@@ -23,21 +23,21 @@ from uwbsim.world.geometric_paths import (
     legs_to_scatterers,
     paths_between,
 )
-from uwbsim.world.impulse_response import Detected, Sensing, detect
+from uwbsim.world.impulse_response import Detected, detect
 from uwbsim.world.trajectories import Trajectory
 
 CHUNK: Final = 2048
-"""Links computed at once: fewer take longer each, more do not fit into a core's cache."""
+"""Links computed at once: with fewer each takes longer, more do not fit into a core's cache."""
 
-COLUMNS: Final = ("excess_m", "power_dbm", "total_dbm", "noise_s")
+COLUMNS: Final = tuple(column.name for column in fields(Detected))
 
 
 @dataclass(slots=True)
 class GeometricResponses:
-    """The responses of a scenario's pairs of tags; those asked for once are kept.
+    """The responses of a scenario's pairs of tags; computed ones are kept.
 
-    A pair is the same in both directions, unless a tag sends stronger than others: then what a receiver can tell
-    differs. `keys` are those kept, in order, `columns` (`COLUMNS`, keys) what was read off them.
+    Both directions of a pair have one response, unless the tags' powers differ, which changes detection. `keys` are the
+    sorted keys of kept responses, `columns` (`COLUMNS`, keys) their readings.
     """
 
     around: Surroundings
@@ -48,46 +48,45 @@ class GeometricResponses:
 
     @classmethod
     def of(cls, scenario: Scenario, trajectories: Mapping[str, Trajectory], phases: Floats) -> Self | None:
-        """Return what knows the responses of a scenario's world; None where the scenario does not ask for them."""
+        """Return the responses of a scenario's world; None for a scenario without geometric multipath."""
         model = scenario.radio.multipath
         if not isinstance(model, GeometricMultipath):
             return None
         return cls(Surroundings.of(scenario, phases), trajectories, model)
 
     def at(self, places: tuple[Ints, Ints], time_s: Floats) -> Detected:
-        """Return what is read off the responses between tags at places (n,) at true times (n,)."""
+        """Return the readings of the responses between tags with indices (n,) at true times (n,)."""
         keys = self._key(places, self._step(time_s))
         self._add(self._missing(keys))
-        rows = np.searchsorted(self.keys, keys)
-        return Detected(**dict(zip(COLUMNS, self.columns[:, rows], strict=True)))
+        return Detected(*self.columns[:, np.searchsorted(self.keys, keys)])
 
     def prepare(self, places: tuple[Ints, Ints], time_s: Floats) -> None:
-        """Compute responses that will be asked for; those of many pairs at once share what they have in common."""
+        """Compute responses ahead: those of many pairs at once share the paths to scatterers."""
         keys = self._key(places, self._step(time_s))
         missing = self._missing(keys)
-        # Two million responses' figures are kept at most: 80 MB.
+        # The readings of two million responses are kept at most: 80 MB.
         if len(missing) and len(self.keys) + len(missing) > 2_000_000:
             kept = np.isin(self.keys, keys)
             self.keys, self.columns = self.keys[kept], self.columns[:, kept]
         self._add(missing)
 
     def _missing(self, keys: Ints) -> Ints:
-        """Return those that are not kept, in order, each once."""
+        """Return the keys that are not kept, sorted, each once."""
         if not len(self.keys):
             return np.unique(keys)
         rows = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
         return np.unique(keys[self.keys[rows] != keys])
 
     def _add(self, missing: Ints) -> None:
-        """Compute responses and keep them among the others."""
+        """Compute responses and insert their readings."""
         if len(missing):
             keys = np.concatenate([self.keys, missing])
             order = np.argsort(keys, kind="stable")
             self.keys, self.columns = keys[order], np.hstack([self.columns, self._compute(missing)])[:, order]
 
     def look_ahead(self, sender: int, time_s: float) -> None:
-        """Compute what all tags will hear of a sender in the next few steps, for calls instant by instant."""
-        # Who goes from instant to instant does not come back far: few responses are kept.
+        """Compute the responses from a sender to all tags for the next few steps, for calls in order of time."""
+        # Such callers do not go back far: few responses are kept.
         ahead, most_kept = 16, 5_000
         here = np.arange(len(self.around.scenario.tags))
         origin, first = np.full(len(here), sender), self._step(np.array([time_s]))
@@ -101,7 +100,7 @@ class GeometricResponses:
         )
 
     def paths(self, places: tuple[Ints, Ints], time_s: Floats) -> Paths:
-        """Return the paths between tags at places (n,) at the steps nearest to true times (n,)."""
+        """Return the paths between tags with indices (n,) at the steps nearest to true times (n,)."""
         keys, rows = np.unique(self._key(places, self._step(time_s)), return_inverse=True)
         parts = [self._paths(keys[begin : begin + CHUNK]) for begin in range(0, len(keys), CHUNK)]
         detour_m = np.concatenate([part.detour_m for part in parts])
@@ -111,7 +110,7 @@ class GeometricResponses:
         return np.rint(np.maximum(time_s, 0) / (self.model.step_ms * 1e-3)).astype(np.int64)
 
     def _key(self, places: tuple[Ints, Ints], step: Ints) -> Ints:
-        """One number for step, sender and receiver, in order of time."""
+        """Return one number for step, sender and receiver, increasing with time."""
         a, b = places
         count = len(self.around.scenario.tags)
         if not any(tag.tx_power_db for tag in self.around.scenario.tags):
@@ -120,15 +119,10 @@ class GeometricResponses:
 
     def _compute(self, keys: Ints) -> Floats:
         """Return the columns of responses, (`COLUMNS`, n)."""
-        radio, found = self.around.scenario.radio, []
-        share = 1 / self.model.threshold_to_noise if self.model.stamp_noise else 0.0
-        sensing = Sensing(
-            dynamic_range_db=radio.dynamic_range_db, sensitivity_dbm=radio.sensitivity_dbm, noise_share=share
-        )
-        for begin in range(0, len(keys), CHUNK):
-            seen = detect(self._paths(keys[begin : begin + CHUNK]), sensing)
-            found.append(np.array([getattr(seen, name) for name in COLUMNS]))
-        return np.hstack(found)
+        noise_share = 1 / self.model.threshold_to_noise if self.model.stamp_noise else 0.0
+        chunks = (self._paths(keys[begin : begin + CHUNK]) for begin in range(0, len(keys), CHUNK))
+        read = [detect(paths, self.around.scenario.radio, noise_share) for paths in chunks]
+        return np.array([np.concatenate([getattr(one, name) for one in read]) for name in COLUMNS])
 
     def _paths(self, keys: Ints) -> Paths:
         scenario = self.around.scenario
@@ -148,7 +142,7 @@ class GeometricResponses:
             for body in scenario.bodies
             if body.shadow is not None
         ]
-        # An antenna at an instant has its ways to the scatterers once, however many links it is an end of.
+        # The paths of an antenna to the scatterers at an instant are computed once for all its links.
         ends, which = np.unique(np.concatenate([at * count + a, at * count + b]), return_inverse=True)
         placed, instant = self._placed(ends % count, ends // count, poses), ends // count
         legs = legs_to_scatterers(self.around, placed, bodies, instant)

@@ -1,9 +1,9 @@
-"""Channel impulse responses: as the boards print them, and what a chip reads off one.
+"""Channel impulse responses as boards print them, and detection of the first path in a response.
 
-A printed response has a first path, its echoes, and noise; that of a link whose paths follow from geometry has these
-paths, with their phases, and nothing else. `detect` sums the paths of a link in the accumulator, which has a tap every
-1.0016 ns, and reads first path, powers and noise off it. Pulses are Gaussian; the direct path lies where the chip puts
-a first path, `EDGE_TO_PEAK` after a whole tap.
+A printed response has a first path, its echoes, and noise. With geometric multipath it is the sum of the link's paths
+with their phases, and noise. `detect` sums the paths of a link in the accumulator, which has a tap every 1.0016 ns, and
+returns first path, powers and noise. Pulses are Gaussian; the peak of the direct path is `EDGE_TO_PEAK` after a whole
+tap, where the chip puts a first path.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from scipy.sparse import coo_array
 from uwblink.arrays import Complexes, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.wire.messages import Cir
+from uwbsim.scenario.radio import Radio
 from uwbsim.world.geometric_paths import Paths
 from uwbsim.world.radio import ALPHA_DBM, FPP_OFFSET_DB
 
 PULSE_TAPS: Final = 1.2
-"""Half width of a pulse where it is 1/e of its height: 2 ns from half to half, which is a bandwidth of 440 MHz."""
+"""Half width of a pulse at 1/e of its height: 2 ns full width at half maximum, a bandwidth of 440 MHz."""
 
 EDGE_TO_PEAK: Final = 1.5
 """Taps from the leading edge that the chip reports to the peak of the pulse."""
@@ -39,57 +40,46 @@ LARGEST_TAP: Final = 32_767
 """Taps are 16 bits wide."""
 
 BEFORE: Final = 6
-"""Taps before the direct path's edge; the pulse reaches back no further."""
+"""Taps before the leading edge of the direct path: a pulse is shorter."""
 
 TAPS: Final = 64
-"""Taps in which a first path is looked for: 17 m."""
-
+"""Taps in which a first path is searched: 17 m."""
 
 REACH: Final = 4
-"""Taps on either side of a pulse's peak where it is still there: 1.5e-5 of its height at the fourth."""
+"""Taps on either side of a pulse's peak that are computed: the fourth has 1.5e-5 of its height."""
 
 BLOCK: Final = 2 * REACH
-"""Taps in which a pulse alone is there."""
+"""Taps of a single pulse."""
 
 FRACTIONS: Final = 128
-"""Places in a tap at which pulses are tabulated, 2 mm of path apart."""
+"""Positions within a tap at which pulses are tabulated, 2 mm of path apart."""
 
 CURVATURE: Final = 1 / PULSE_TAPS**2
-"""The logarithm of a pulse is a parabola; this is its coefficient, turned round."""
+"""The logarithm of a pulse is -CURVATURE (taps from its peak)^2."""
 
 OWN_TAPS: Final = np.arange(1, 4)
 """Taps after the edge whose squares are the first path's power (DW1000 User Manual, 4.7.1)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Waves:
-    """All paths of a link from geometry, (p,) each: seconds after the first path, and amplitudes in roots of mW.
-
-    Some come before what the chip takes for the first path.
-    """
-
-    delay_s: Floats
-    amplitude: Complexes
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class PathsHeard:
-    """What an impulse response shows of a link: the power of the first path in dBm, and the paths after it.
+    """The paths of a link for its impulse response: the power of the first path in dBm, and p paths, (p,) each.
 
-    `echoes` are their delays in seconds and amplitudes as shares of the first's. Where `waves` are known, they are all
-    that there is.
+    `delay_s` are relative to the detected first path. Real `amplitude` are those of echoes after it, as fractions of
+    its own. Complex `amplitude` in roots of mW are those of all paths, from geometry, the first among them; some may
+    come before the one that the chip detects.
     """
 
     power_dbm: float
-    echoes: list[tuple[float, float]]
-    waves: Waves | None = None
+    delay_s: Floats
+    amplitude: Floats | Complexes
 
 
 def peak_amplitude(power_dbm: float) -> float:
     """Return the peak of a first path in the chip's counts, from its power (DW1000 User Manual, 4.7.1).
 
-    The power is 10 log10((F1^2 + F2^2 + F3^2)/N^2) - 121.74 of the three taps from the leading edge on; of 128 symbols
-    of the preamble the chip adds up N = 118.
+    The power is 10 log10((F1^2 + F2^2 + F3^2)/N^2) - 121.74 of the three taps after the leading edge; the chip
+    accumulates N = 118 of the 128 symbols of the preamble.
     """
     squares = float(np.sum(np.exp(-2 * ((OWN_TAPS - EDGE_TO_PEAK) / PULSE_TAPS) ** 2)))
     return float(118 * np.sqrt(10 ** ((power_dbm + FPP_OFFSET_DB) / 10) / squares))
@@ -98,10 +88,10 @@ def peak_amplitude(power_dbm: float) -> float:
 def impulse_response(
     rng: np.random.Generator, stamp: int | None = None, paths: PathsHeard | None = None
 ) -> tuple[int, tuple[int, ...]]:
-    """Draw one: index of the first path in thousandths of a tap, and 1016 magnitudes.
+    """Draw a response: index of the first path in thousandths of a tap, and 1016 magnitudes.
 
-    With a receive `stamp` (ticks) the index has its fraction; `paths` are known ones, besides the diffuse, unless
-    `paths.waves` has all. Without them the first path has the power of the boards' usual ones, -82 dBm.
+    The index has the fraction of the receive `stamp` (ticks), or a random one. Diffuse echoes are added to `paths`,
+    unless these are complex. Without `paths` the first path has -82 dBm, as is usual on boards.
     """
     ticks_per_tap = 64
     fraction = rng.uniform() if stamp is None else stamp % ticks_per_tap / ticks_per_tap
@@ -110,10 +100,10 @@ def impulse_response(
     # The chip reports the leading edge; the peak of the pulse follows it.
     peak = index / INDEX_STEPS + EDGE_TO_PEAK
     noise = 45.0
-    if paths and paths.waves:
-        wave = _from_geometry(peak, paths.waves)
-        # Noise of either part: 28 counts of a response that is not turned down, and a share of the strongest tap, as
-        # preambles do not correlate perfectly. By power, 265 responses of MILUV's boards have 0.0090 (at -82 dBm),
+    if paths and np.iscomplexobj(paths.amplitude):
+        wave = _from_geometry(peak, paths)
+        # Noise of real and imaginary part: 28 counts of a response at full gain, and a fraction of the strongest tap,
+        # as preambles do not correlate perfectly. By power, 265 responses of MILUV's boards have 0.0090 (at -82 dBm),
         # 0.0091, 0.0113, 0.0122 and 0.0185 (at -93 dBm) of their strongest taps.
         noise = float(np.hypot(28.0, 0.009 * np.abs(wave).max()))
     else:
@@ -125,7 +115,7 @@ def impulse_response(
 
 
 def _with_diffuse(rng: np.random.Generator, peak: float, paths: PathsHeard | None) -> Complexes:
-    """A first path, known echoes and diffuse ones, all with phases by chance."""
+    """Return a first path, known echoes and diffuse ones, all with random phases."""
     taps = np.arange(Cir.TAPS)
     amplitude = peak_amplitude(paths.power_dbm if paths else ALPHA_DBM)
     wave = amplitude * np.exp(-(((taps - peak) / PULSE_TAPS) ** 2)) + 0j
@@ -133,17 +123,17 @@ def _with_diffuse(rng: np.random.Generator, peak: float, paths: PathsHeard | Non
     later = rng.exponential(decay_taps, count)
     strength = 0.25 * np.exp(-later / decay_taps) * rng.rayleigh(size=count)
     known = [*zip(later.tolist(), strength.tolist(), strict=True)]
-    known += [(delay_s / TAP_S, share) for delay_s, share in paths.echoes] if paths else []
+    known += [*zip((paths.delay_s / TAP_S).tolist(), paths.amplitude.tolist(), strict=True)] if paths else []
     for (place, share), phase in zip(known, rng.uniform(0, 2 * np.pi, len(known)), strict=True):
         wave += amplitude * share * np.exp(1j * phase - ((taps - peak - place) / PULSE_TAPS) ** 2)
     return np.asarray(wave)
 
 
-def _from_geometry(peak: float, waves: Waves) -> Complexes:
-    """The sum of all paths; turned down as a whole, as the chip's gain control does, where it would not fit."""
-    place = peak + waves.delay_s / TAP_S
+def _from_geometry(peak: float, paths: PathsHeard) -> Complexes:
+    """Return the sum of all paths, scaled down where it exceeds the largest tap, as by the chip's gain control."""
+    place = peak + paths.delay_s / TAP_S
     taps = np.floor(place)[:, None] + np.arange(-5, 6)
-    pulses = np.exp(-(((taps - place[:, None]) / PULSE_TAPS) ** 2)) * (peak_amplitude(0.0) * waves.amplitude)[:, None]
+    pulses = np.exp(-(((taps - place[:, None]) / PULSE_TAPS) ** 2)) * (peak_amplitude(0.0) * paths.amplitude)[:, None]
     inside = (taps >= 0) & (taps < Cir.TAPS)
     at, pulses = taps[inside].astype(np.intp), pulses[inside]
     parts = [np.bincount(at, part, minlength=Cir.TAPS) for part in (pulses.real, pulses.imag)]
@@ -152,7 +142,7 @@ def _from_geometry(peak: float, waves: Waves) -> Complexes:
 
 
 def in_transfers(line: bytes) -> list[bytes]:
-    """Cut a printed response into its USB transfers of 50 values, and one for the line end."""
+    """Split a printed response into its USB transfers of 50 values, and one for the line end."""
     body, end = line[:-2], line[-2:]
     parts = body.split(b"|")
     values, header = 50, 5
@@ -162,24 +152,12 @@ def in_transfers(line: bytes) -> list[bytes]:
     return [pieces[0], *(b"|" + piece for piece in pieces[1:]), end]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sensing:
-    """What a chip can tell: how far below the strongest tap, and above which power in dBm, it takes a first path.
-
-    `noise_share` is the noise's standard deviation as a share of that threshold; 0 for none on the stamps.
-    """
-
-    dynamic_range_db: float
-    sensitivity_dbm: float
-    noise_share: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Detected:
-    """What is read off n responses, (n,) each.
+    """Readings of n responses, (n,) each.
 
-    `excess_m` is how much longer than the straight line the first path seems, `power_dbm` its power in the chip's
-    formula, `total_dbm` that of the whole response, `noise_s` what noise does to its edge (standard deviation).
+    `excess_m` is the apparent length of the first path less the straight line, `power_dbm` its power by the chip's
+    formula, `total_dbm` that of the whole response, `noise_s` the standard deviation of its edge by noise.
     """
 
     excess_m: Floats
@@ -188,20 +166,22 @@ class Detected:
     noise_s: Floats
 
 
-def detect(paths: Paths, sensing: Sensing) -> Detected:
-    """Return what a chip makes of paths.
+def detect(paths: Paths, radio: Radio, noise_share: float) -> Detected:
+    """Return the readings of the responses of paths.
 
-    The first path is the first peak from where the response exceeds the threshold; the chip puts it where its leading
-    edge has half its height (so it does in recorded responses: 0.52 in the median of 944 of MILUV's boards). From there
-    to the peak it is as far as in a pulse alone, so a path alone is found where it is, at any power.
+    The threshold is the dynamic range of the radio below the strongest tap, or its sensitivity; `noise_share` is the
+    standard deviation of noise as a fraction of it, 0 for stamps without noise. The first path is the first peak after
+    the response exceeds the threshold. Its arrival is where its leading edge has half its height (0.52 in the median of
+    944 responses of MILUV's boards), plus the time from there to the peak of a single pulse. So the arrival of a single
+    path is exact at any power.
     """
     parts = accumulate(paths)
     squares = parts[0] ** 2
     squares += parts[1] ** 2
     strongest = _height(squares.max(axis=1))
     least = np.log(10) / 20
-    threshold = np.maximum(strongest - sensing.dynamic_range_db * least, sensing.sensitivity_dbm * least)
-    # Who is not heard has a first path all the same.
+    threshold = np.maximum(strongest - radio.dynamic_range_db * least, radio.sensitivity_dbm * least)
+    # A response below the sensitivity has a first path, too.
     threshold = np.minimum(threshold, strongest - 0.5)
     peak, top = _first_peak(squares, np.argmax(squares >= np.exp(2 * threshold)[:, None], axis=1))
     edge, slope = _half_height(squares, peak, top)
@@ -210,12 +190,12 @@ def detect(paths: Paths, sensing: Sensing) -> Detected:
     first = np.floor(arrival - EDGE_TO_PEAK + 1e-6).astype(np.int64)[:, None] + OWN_TAPS
     own = np.take_along_axis(squares, np.clip(first, 0, TAPS - 1), axis=1).sum(axis=1) / _squares(OWN_TAPS)
     total = squares.sum(axis=1) / _squares(np.arange(-8, 9))
-    # Paths that come after the last tap count for the total power alone.
+    # Paths after the last tap count for the total power only.
     late = paths.detour_m >= (TAPS - BEFORE - EDGE_TO_PEAK) * TAP_M
     if np.any(late):
         total += np.sum(np.abs(np.where(late, paths.amplitude, 0)) ** 2, axis=1)
-    noise = sensing.noise_share * np.exp(np.minimum(threshold - top, 0)) * 2
-    # On a flatter edge than 0.2, of the logarithm over a tap, noise does not count for more.
+    noise = noise_share * np.exp(np.minimum(threshold - top, 0)) * 2
+    # The slope is limited to 0.2 of the logarithm per tap, so that noise stays finite on flat edges.
     return Detected(
         excess_m=(arrival - BEFORE - EDGE_TO_PEAK) * TAP_M,
         power_dbm=10 * np.log10(np.maximum(own, 1e-20)),
@@ -227,9 +207,8 @@ def detect(paths: Paths, sensing: Sensing) -> Detected:
 def accumulate(paths: Paths) -> Floats:
     """Return the accumulators of n links around their direct paths: real and imaginary parts in roots of mW.
 
-    Shape (2, n, `TAPS`).
-    A pulse lies in the block of taps where it begins and the next one; so each path adds one row of a table to two
-    blocks at its amplitude, which a sparse matrix does without a list of its taps.
+    Shape (2, n, `TAPS`). A pulse extends over the block of taps where it begins and the next one, so each path adds one
+    row of a table, times its amplitude, to two blocks: a product with a sparse matrix.
     """
     count, blocks = len(paths.amplitude), TAPS // BLOCK
     place = (BEFORE + EDGE_TO_PEAK + paths.detour_m / TAP_M) * FRACTIONS
@@ -256,9 +235,9 @@ def _squares(taps: Ints) -> float:
 
 @cache
 def _pulses() -> Floats:
-    """Pulses on two blocks of taps, by where in the first they peak, in `FRACTIONS` of a tap: (places, two blocks).
+    """Return pulses on two blocks of taps, by the position of the peak in the first, in `FRACTIONS` of a tap.
 
-    The first tap is the one `REACH` - 1 before; so far a pulse reaches back.
+    Shape (positions, taps of two blocks). The first tap is `REACH` - 1 before the position zero.
     """
     step, fraction = np.divmod(np.arange(BLOCK * FRACTIONS), FRACTIONS)
     taps = np.arange(2 * BLOCK) - (REACH - 1) - step[:, None]
@@ -267,12 +246,12 @@ def _pulses() -> Floats:
 
 
 def _height(squares: Floats) -> Floats:
-    """The logarithm of an amplitude, of its square; of 1e-20 roots of mW at least."""
+    """Return the logarithms of amplitudes from their squares; of 1e-20 roots of mW at least."""
     return np.asarray(np.log(np.maximum(squares, 1e-20**2)) / 2)
 
 
 def _first_peak(squares: Floats, begin: Ints) -> tuple[Ints, Floats]:
-    """Return the first peak's tap from the tap `begin` on, and its height, by a parabola through its neighbours."""
+    """Return the tap of the first peak from `begin` on, and its height by a parabola through its neighbours."""
     rows, last = np.arange(len(squares)), squares.shape[1] - 2
     falls = squares[:, :-1] >= squares[:, 1:]
     falls &= np.arange(squares.shape[1] - 1) >= begin[:, None]
@@ -283,13 +262,13 @@ def _first_peak(squares: Floats, begin: Ints) -> tuple[Ints, Floats]:
 
 
 def _half_height(squares: Floats, peak: Ints, top: Floats) -> tuple[Floats, Floats]:
-    """Return where the edge before a peak has half its height, in taps, and its slope there.
+    """Return the position in taps at which the edge before a peak has half its height, and the slope there.
 
-    Between two taps the logarithm is curved as a pulse's is.
+    The logarithm between two taps has the curvature of a pulse.
     """
     rows, half = np.arange(len(squares)), top - np.log(2)
     below = (squares < np.exp(2 * half)[:, None]) & (np.arange(squares.shape[1]) < peak[:, None])
-    # The last tap before the peak that is lower; the first there is where none is.
+    # The last tap before the peak that is lower, or the first tap.
     before = np.where(below.any(axis=1), squares.shape[1] - 1 - np.argmax(below[:, ::-1], axis=1), 0)
     low, high = (_height(squares[rows, before + k]) for k in (0, 1))
     rise = np.maximum(high - low, 1e-9)

@@ -1,7 +1,7 @@
-"""How a frame is received: when it arrives, what its receiver stamps, hears and prints.
+"""Reception of frames: time of arrival, receive stamp, detection, and the readings that boards print.
 
-Flight loop, served boards and passive listeners call `Medium.receive`; the protocol workbench, which needs the
-distribution and no draw of it, calls `arrive`, on which `receive` is built.
+Simulated flights, served boards and passive listeners call `Medium.receive`. Comparisons of protocols need the
+distribution of an arrival instead of a draw: they call `arrive`, which `receive` uses, too.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from uwbsim.scenario.devices import TX_SHARE
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Radio
 from uwbsim.world.channel import Link
-from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks, lengthening_m
+from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks, range_shift_m
 from uwbsim.world.radio import (
     printed_power_dbm,
     printed_skew_ppm,
@@ -30,47 +30,46 @@ from uwbsim.world.world import SampledWorld, World
 
 @dataclass(frozen=True, slots=True)
 class AntennaDelays:
-    """What antennas add to stamps, of tags by their places in the scenario.
+    """Errors of stamps by the antenna delays of tags, by the tags' indices in the scenario.
 
-    `fixed` (tags, 2) is what they add to transmit and to receive stamps at the references, in seconds; the tags in
-    `moving` are longer or shorter with temperature and voltage. A range is longer by x where the tag's aggregate delay,
-    transmit less receive, is shorter by 2 x/c: frames leave later than stamped by 0.44 of that and are stamped later
-    than they come by 0.56 of it.
+    `fixed` (tags, 2) are those of transmit and of receive stamps at the reference temperature and voltage, in seconds;
+    the delays of the tags in `variable` depend on both. A range grows by x where the tag's aggregate delay, transmit
+    less receive, falls by 2 x/c: 0.44 of that delays transmissions relative to their stamps, and 0.56 of it delays
+    receive stamps.
     """
 
     scenario: Scenario
     fixed: Floats
-    moving: tuple[int, ...]
+    variable: tuple[int, ...]
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
         """Return the antenna delays of a scenario's tags."""
-        now = np.zeros(1)
-        moving = [k for k, tag in enumerate(scenario.tags) if lengthening_m(scenario, tag, now) is not None]
-        return cls(scenario, np.array([tag.delays_ns() for tag in scenario.tags]) * 1e-9, tuple(moving))
+        start = np.zeros(1)
+        variable = [k for k, tag in enumerate(scenario.tags) if range_shift_m(scenario, tag, start) is not None]
+        return cls(scenario, np.array([tag.delays_ns() for tag in scenario.tags]) * 1e-9, tuple(variable))
 
     def transmit_s(self, tag: Ints, time: Ints) -> Floats:
-        """Return what is added to the transmit stamps of tags (n,) at true times (n,) in sub-ticks, in seconds."""
-        return np.asarray(self.fixed[tag, 0] - TX_SHARE * self._longer_s(tag, time))
+        """Return the errors of the transmit stamps of tags (n,) at true times (n,) in sub-ticks, in seconds."""
+        return np.asarray(self.fixed[tag, 0] - TX_SHARE * self._variable_s(tag, time))
 
     def receive_s(self, tag: Ints, time: Ints) -> Floats:
-        """Return what is added to the receive stamps of tags (n,) at true times (n,) in sub-ticks, in seconds."""
-        return np.asarray(self.fixed[tag, 1] + (1 - TX_SHARE) * self._longer_s(tag, time))
+        """Return the errors of the receive stamps of tags (n,) at true times (n,) in sub-ticks, in seconds."""
+        return np.asarray(self.fixed[tag, 1] + (1 - TX_SHARE) * self._variable_s(tag, time))
 
-    def _longer_s(self, tag: Ints, time: Ints) -> Floats:
-        """Return by how much the ways through the tags' antennas, transmission and reception together, are longer."""
-        longer = np.zeros(len(tag))
-        for place in self.moving:
+    def _variable_s(self, tag: Ints, time: Ints) -> Floats:
+        """Return the effect of temperature and voltage on a transmission and a reception together, (n,) seconds."""
+        total = np.zeros(len(tag))
+        for place in self.variable:
             rows = np.flatnonzero(tag == place)
-            if len(rows):
-                found = lengthening_m(self.scenario, self.scenario.tags[place], time[rows] / SUBTICKS_PER_SECOND)
-                longer[rows] = 0.0 if found is None else 2 * found / SPEED_OF_LIGHT
-        return longer
+            shift_m = range_shift_m(self.scenario, self.scenario.tags[place], time[rows] / SUBTICKS_PER_SECOND)
+            total[rows] = 0.0 if shift_m is None else 2 * shift_m / SPEED_OF_LIGHT
+        return total
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arrival:
-    """How n frames arrive apart from chance: seconds of flight, and bias and noise of their stamps, (n,) each."""
+    """Arrival of n frames: seconds of flight, bias and standard deviation of their stamps, (n,) each."""
 
     flight_s: Floats
     bias_s: Floats
@@ -78,7 +77,7 @@ class Arrival:
 
 
 def arrive(radio: Radio, link: Link) -> Arrival:
-    """Return what a link does to the stamps of frames that take it."""
+    """Return flight time, stamp bias and stamp noise of frames on a link."""
     seen_dbm = reported_dbm(radio, link.power_dbm)
     std_s = reception_noise_s(radio, seen_dbm)
     return Arrival(
@@ -90,7 +89,7 @@ def arrive(radio: Radio, link: Link) -> Arrival:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frames:
-    """n frames on the air: places of their senders and receivers, and true sub-ticks at which they leave, (n,) each."""
+    """n frames on the air: indices of senders and receivers, and true sub-ticks of departure, (n,) each."""
 
     sender: Ints
     receiver: Ints
@@ -99,7 +98,7 @@ class Frames:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reception:
-    """How n frames are received: stamps in whole ticks of the receivers' clocks, not wrapped, and the links taken."""
+    """Reception of n frames: stamps in whole ticks of the receivers' clocks, not wrapped, and their links."""
 
     stamp: Ints
     link: Link
@@ -107,9 +106,9 @@ class Reception:
 
 @dataclass(frozen=True, slots=True)
 class Medium:
-    """Everything a frame goes through: the links and the clocks of a scenario, and what stamps of it have added.
+    """The links, the clocks and the antenna delays of a scenario.
 
-    `tx_register` and `reply_constant` (tags,) are what is programmed, in ticks.
+    `tx_register` and `reply_constant` (tags,) are the programmed antenna delays, in ticks.
     """
 
     scenario: Scenario
@@ -120,27 +119,26 @@ class Medium:
     reply_constant: Ints = field(init=False)
 
     def __post_init__(self) -> None:
-        """Work out what antennas add to stamps."""
+        """Compute antenna delays and programmed values from the scenario."""
         object.__setattr__(self, "delays", AntennaDelays.of(self.scenario))
         programmed = [tag.antenna_delay for tag in self.scenario.tags]
         object.__setattr__(self, "tx_register", np.array([one.tx for one in programmed], dtype=np.int64))
         object.__setattr__(self, "reply_constant", np.array([one.reply for one in programmed], dtype=np.int64))
 
     def leave(self, sender: Ints, stamp: Ints, noise: Floats) -> Ints:
-        """Return the true sub-ticks (n,) at which frames leave that have transmit stamps of whole ticks (n,).
+        """Return the true sub-ticks (n,) of departure of frames with transmit stamps in whole ticks (n,).
 
-        These are the chip's, which has added its register to the time at which a frame leaves by its own counter.
-        `noise` is standard normal, (n,).
+        A transmit stamp is the chip's counter at departure plus its register. `noise` is standard normal, (n,).
         """
         due = stamp * SUBTICKS
-        # When it is, for the temperature, is known well enough without the delay.
-        now = self.clocks.when(sender, due) if self.delays.moving else due
+        # The antenna delay shifts the instant by less than temperature and voltage change in.
+        now = self.clocks.when(sender, due) if self.delays.variable else due
         delay = self.delays.transmit_s(sender, now)
         early = noise * (self.scenario.radio.tx_noise_ps * 1e-12) * SUBTICKS_PER_SECOND - delay * SUBTICKS_PER_SECOND
         return self.clocks.when(sender, np.rint(early).astype(np.int64) + due)
 
     def receive(self, frames: Frames, noise: Floats, detour_m: Floats | float = 0.0) -> Reception:
-        """Receive frames (n,); `noise` is standard normal, (n,), `detour_m` how much further they travel by chance."""
+        """Receive frames (n,); `noise` is standard normal, (n,), `detour_m` a random additional path length."""
         link = self.links.link(frames.sender, frames.receiver, frames.departure)
         arrival = arrive(self.scenario.radio, link)
         detour = np.asarray(detour_m) / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND
@@ -153,7 +151,7 @@ class Medium:
         return Reception(stamp=(reading + shift + SUBTICKS // 2) // SUBTICKS, link=link)
 
     def heard(self, power_dbm: Floats, fading: Floats | float = 0.0) -> Bools:
-        """Return which frames are strong enough; `fading` is standard normal, and makes the edge soft."""
+        """Return which frames are above the sensitivity, after power noise; `fading` is standard normal."""
         radio = self.scenario.radio
         return np.asarray(power_dbm + fading * radio.power_noise_db >= radio.sensitivity_dbm)
 

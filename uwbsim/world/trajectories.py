@@ -36,10 +36,6 @@ class Trajectory:
         """Return positions (n, 3) and rotations body to world (n, 3, 3)."""
         return self.position_m(time_s), Rotation.from_quat(self.quaternion(time_s)).as_matrix()
 
-    def nearest_m(self, other: Trajectory, time_s: Floats) -> float:
-        """Return how close two bodies come at times (n,)."""
-        return float(np.linalg.norm(self.position_m(time_s) - other.position_m(time_s), axis=1).min())
-
     def point_m(self, time_s: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
         """Return where a point of the body is, shape (n, 3)."""
         return np.asarray(self.position_m(time_s) + Rotation.from_quat(self.quaternion(time_s)).apply(lever_arm_m))

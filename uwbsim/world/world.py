@@ -1,9 +1,9 @@
-"""Where every tag is, and what reaches one from another: exactly, or sampled a second ahead."""
+"""Positions of all tags and the links between them: computed exactly, or interpolated from blocks of a second."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Final, Self
 
@@ -20,7 +20,7 @@ from uwbsim.world.channel import Ends, Link, link_between, paths_heard
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS_PER_SECOND
 from uwbsim.world.diffraction import PlacedShadow
 from uwbsim.world.geometric_responses import GeometricResponses
-from uwbsim.world.impulse_response import PathsHeard, Waves
+from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.pair_states import PairLevels, ReflectedStates
 from uwbsim.world.radio import shadowing_phases
 from uwbsim.world.trajectories import Trajectory, sample
@@ -30,8 +30,8 @@ from uwbsim.world.trajectories import Trajectory, sample
 class World:
     """Bodies on their trajectories, with tags on lever arms.
 
-    `phases` are those of the tags' shadowing, `states` the reflections that last by pair, `levels` the fading and the
-    outages of pairs, `responses` those from geometry.
+    `phases` are those of the tags' shadowing, `states` the lasting reflections of pairs, `levels` fading and outages of
+    pairs, `responses` the geometric responses; None where the scenario has none.
     """
 
     scenario: Scenario
@@ -43,39 +43,34 @@ class World:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
-        """Sample every body's trajectory from the seed; raises `ScenarioError` where they cannot keep apart."""
-        phases = shadowing_phases(scenario)
-        trajectories = _trajectories(scenario)
-        states, levels = ReflectedStates.of(scenario), PairLevels.of(scenario)
+        """Draw all trajectories from the seed; raises `ScenarioError` where bodies cannot keep their distance."""
+        phases, trajectories = shadowing_phases(scenario), _trajectories(scenario)
         responses = GeometricResponses.of(scenario, trajectories, phases)
-        return cls(scenario, trajectories, phases, states, levels, responses)
+        return cls(scenario, trajectories, phases, ReflectedStates.of(scenario), PairLevels.of(scenario), responses)
 
     def link(self, initiator: Ints, target: Ints, time: Ints) -> Link:
-        """Return what reaches the second tag from the first, shape (n,); reciprocal but for the sender's power.
+        """Return the links from the first tags to the second, (n,); reciprocal except for the sender's power.
 
-        Tags are places in the scenario's list, times true sub-ticks.
+        Tags are indices in the scenario's list, times true sub-ticks.
         """
         self.prepare(initiator, target, time)
-        columns = np.empty((5, len(time)))
+        columns = np.zeros((5, len(time)))
         pair = initiator * len(self.scenario.tags) + target
         for key in np.unique(pair):
             rows = np.flatnonzero(pair == key)
-            i, j = divmod(int(key), len(self.scenario.tags))
-            found = self._pair(i, j, time[rows] / SUBTICKS_PER_SECOND)
-            noise_s = 0.0 if found.noise_s is None else found.noise_s
-            columns[:4, rows] = found.distance_m, found.excess_m, found.power_dbm, found.total_dbm
-            columns[4, rows] = noise_s
-        distance_m, excess_m, power_dbm, total_dbm, edge_s = columns
-        link = Link(distance_m, excess_m, power_dbm, total_dbm)
-        return link if self.responses is None else replace(link, noise_s=edge_s)
+            link = self._pair(*divmod(int(key), len(self.scenario.tags)), time[rows] / SUBTICKS_PER_SECOND)
+            columns[:4, rows] = link.distance_m, link.excess_m, link.power_dbm, link.total_dbm
+            if link.noise_s is not None:
+                columns[4, rows] = link.noise_s
+        return Link(*columns[:4], noise_s=None if self.responses is None else columns[4])
 
     def prepare(self, initiator: Ints, target: Ints, time: Ints) -> None:
-        """Work out responses that will be asked for, (n,); quicker for many pairs at once than for one by one."""
+        """Compute the responses of links (n,) ahead: faster for many pairs at once than pair by pair."""
         if self.responses is not None:
             self.responses.prepare((initiator, target), time / SUBTICKS_PER_SECOND)
 
     def paths(self, sender: int, receiver: int, time: int, detour_m: float = 0.0) -> PathsHeard:
-        """Return the paths at one instant as a response shows them; `detour_m` is the range's own by chance."""
+        """Return the paths at one instant as a response shows them; `detour_m` is the random detour of the range."""
         (found,) = self.all_paths(np.array([sender]), np.array([receiver]), np.array([time]), np.array([detour_m]))
         return found
 
@@ -88,17 +83,14 @@ class World:
         link, read = self.link(sender, receiver, time), self.responses.at((sender, receiver), time_s)
         paths = self.responses.paths((sender, receiver), time_s)
         later_s = (paths.detour_m - (read.excess_m + detour_m)[:, None]) / SPEED_OF_LIGHT
-        # What else happens to a link happens to all its paths alike.
+        # Other effects on a link change all its paths alike.
         amplitude = paths.amplitude * 10 ** ((link.power_dbm - read.power_dbm) / 20)[:, None]
-        return [
-            PathsHeard(power_dbm=power, echoes=[], waves=Waves(delay_s=delays, amplitude=amplitudes))
-            for power, delays, amplitudes in zip(link.power_dbm.tolist(), later_s, amplitude, strict=True)
-        ]
+        return [PathsHeard(*path) for path in zip(link.power_dbm.tolist(), later_s, amplitude, strict=True)]
 
     def _pair(self, i: int, j: int, time_s: Floats) -> Link:
         tags = self.scenario.tags
         shadowing = [body.name for body in self.scenario.bodies if body.shadow is not None]
-        # Each body once, whether it carries one of the tags, stands in between, or both.
+        # Each body once, whether it carries a tag, obstructs the link, or both.
         names = dict.fromkeys([tags[i].body, tags[j].body, *shadowing])
         bodies = {name: self.trajectories[name].pose(time_s) for name in names}
         return link_between(
@@ -119,7 +111,7 @@ class World:
         rotations: tuple[Floats, Floats],
         bodies: Mapping[str, tuple[Floats, Floats]],
     ) -> Ends:
-        """Return the ends of n links; `bodies` has position and rotation of those with a shadow, at each instant."""
+        """Return the ends of n links; `bodies` has positions and rotations of the bodies with a shadow, (n,) each."""
         shadows = [
             PlacedShadow(shadow=body.shadow, position_m=bodies[body.name][0], rotation=bodies[body.name][1])
             for body in self.scenario.bodies
@@ -145,9 +137,9 @@ class World:
 
     def motion_capture(self) -> Poses:
         """Return the poses that motion capture writes over the run, with its rate, noise, latency and gaps."""
-        mocap, settings = self.scenario.mocap, self.scenario.run
+        mocap = self.scenario.mocap
         # A little longer than the run, so that the last exchange lies between two poses.
-        count = int(np.ceil((settings.duration_s + 0.05) * mocap.rate_hz)) + 2
+        count = int(np.ceil((self.scenario.run.duration_s + 0.05) * mocap.rate_hz)) + 2
         time_ns = np.rint(np.arange(count) * NS_PER_S / mocap.rate_hz).astype(np.int64)
         shown_ns = time_ns + round((mocap.latency_ms * 1e-3) * NS_PER_S)
         parts = [
@@ -157,7 +149,7 @@ class World:
         return Poses.concatenate(parts).in_time_order()
 
     def _gaps(self, name: str, time_ns: Ints) -> Bools:
-        """Which poses of a body are seen."""
+        """Return which poses of a body are outside of gaps, (n,)."""
         mocap = self.scenario.mocap
         seen = np.ones(len(time_ns), dtype=bool)
         if mocap.gaps_per_min:
@@ -177,17 +169,16 @@ class World:
 
 
 def _trajectories(scenario: Scenario) -> dict[str, Trajectory]:
-    """Sample trajectories one after the other, trying again where a body would come too near an earlier one."""
-    seed, duration = scenario.run.seed, scenario.run.duration_s
-    least = scenario.min_separation_m
-    tries = 60
+    """Draw the trajectories in turn; one that comes too close to an earlier one is drawn again."""
+    seed, duration, least, tries = scenario.run.seed, scenario.run.duration_s, scenario.min_separation_m, 60
     time = np.arange(0, min(duration, 600.0) + 0.05, 0.05)
     found: dict[str, Trajectory] = {}
     for body in scenario.bodies:
         for attempt in range(tries if least else 1):
             names = (body.name, attempt) if attempt else (body.name,)
             path = sample(body.motion, duration, partial(stream, seed, "motion", *names))
-            if not least or all(path.nearest_m(other, time) >= least for other in found.values()):
+            apart = (path.position_m(time) - other.position_m(time) for other in found.values() if least)
+            if all(np.linalg.norm(vectors, axis=1).min() >= least for vectors in apart):
                 break
         else:
             raise ScenarioError(
@@ -200,18 +191,19 @@ def _trajectories(scenario: Scenario) -> dict[str, Trajectory]:
 
 STEP_S: Final = 0.005
 STEPS: Final = 200
-"""Samples of a block. Linear interpolation between them is wrong by 30 um at most at 10 m/s^2, 0.01 ticks."""
+"""Samples of a block, `STEP_S` apart. The error of linear interpolation is a (STEP_S)^2/8: 30 um or 0.01 ticks at
+10 m/s^2."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Samples:
-    """A block: positions (samples, things, 3) and rotations body to world (samples, things, 3, 3)."""
+    """A block of samples: positions (samples, k, 3) and rotations body to world (samples, k, 3, 3) of k objects."""
 
     spots: Floats
     turns: Floats
 
     def at(self, index: int, into: float) -> tuple[Floats, Floats]:
-        """Interpolate between a sample and the next."""
+        """Interpolate between a sample and the next; `into` is the fraction of the step."""
         return (
             self.spots[index] + into * (self.spots[index + 1] - self.spots[index]),
             self.turns[index] + into * (self.turns[index + 1] - self.turns[index]),
@@ -219,34 +211,35 @@ class _Samples:
 
 
 class SampledWorld:
-    """The tags of a world at one instant after another; going back a little is cheap, going back far is not."""
+    """The links of a world for single frames in order of time, interpolated within blocks of `STEPS` samples.
+
+    An instant in another block than the last one computes that block.
+    """
 
     def __init__(self, world: World) -> None:
-        """Begin at time zero."""
+        """Compute the first block."""
         self._world = world
         self._shadowing = [body.name for body in world.scenario.bodies if body.shadow is not None]
         self._prepare(0)
 
     def link(self, initiator: Ints, target: Ints, time: Ints) -> Link:
-        """Return what `World.link` does, for one frame: all rows have the same sender and time."""
+        """Return the links of one frame: all rows must have the same sender and time."""
         return self.from_sender(int(initiator[0]), int(time[0]))[target]
 
     def from_sender(self, sender: int, time: int) -> Link:
-        """Return what reaches every tag from a tag's place, shape (tags,)."""
+        """Return the links from a tag, by its index, to all tags, (tags,)."""
         step, into = divmod(time / SUBTICKS_PER_SECOND / STEP_S, 1)
         block, index = divmod(int(step), STEPS)
         if block != self._block:
             self._prepare(block)
         spots, turns = self._tags.at(index, into)
         count, time_s = len(spots), time / SUBTICKS_PER_SECOND
-        origin = np.full(count, sender)
+        origin, poses = np.full(count, sender), {}
         if self._world.responses is not None:
             self._world.responses.look_ahead(sender, time_s)
-        poses = {}
         if self._shadowing:
-            places, rotations = self._bodies.at(index, into)
-            for k, name in enumerate(self._shadowing):
-                poses[name] = np.broadcast_to(places[k], (count, 3)), np.broadcast_to(rotations[k], (count, 3, 3))
+            for name, at, turn in zip(self._shadowing, *self._bodies.at(index, into), strict=True):
+                poses[name] = np.broadcast_to(at, (count, 3)), np.broadcast_to(turn, (count, 3, 3))
         return link_between(
             self._world.ends(
                 (origin, np.arange(count)),
@@ -258,16 +251,14 @@ class SampledWorld:
         )
 
     def _prepare(self, block: int) -> None:
-        """Sample a block."""
-        world = self._world
+        """Compute the samples of a block."""
+        world, self._block = self._world, block
         time = np.asarray((block * STEPS + np.arange(STEPS + 1)) * STEP_S, dtype=np.float64)
         bodies = {name: path.pose(time) for name, path in world.trajectories.items()}
         tags = world.scenario.tags
-        turned = np.stack([bodies[tag.body][1] for tag in tags], axis=1)
+        position, turned = (np.stack([bodies[tag.body][k] for tag in tags], axis=1) for k in (0, 1))
         arms = np.array([tag.lever_arm_m for tag in tags])
-        middle = np.stack([bodies[tag.body][0] for tag in tags], axis=1)
-        self._tags = _Samples(middle + np.einsum("stij,tj->sti", turned, arms), turned)
+        self._tags = _Samples(position + np.einsum("stij,tj->sti", turned, arms), turned)
         if self._shadowing:
             parts = [bodies[name] for name in self._shadowing]
             self._bodies = _Samples(*(np.stack(column, axis=1) for column in zip(*parts, strict=True)))
-        self._block = block

@@ -6,8 +6,7 @@ import pytest
 import uwbsim
 from uwblink import PROTOCOLS, Board, raw_range
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwbsim.protocols.conditions import conditions_of
-from uwbsim.protocols.monte_carlo import range_errors_m
+from uwbsim.protocols.conditions import conditions_of, range_errors_m
 from uwbsim.protocols.prediction import predict
 
 WHITE = 0.01e-6

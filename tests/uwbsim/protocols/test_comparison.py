@@ -12,8 +12,7 @@ from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim import simulate
 from uwbsim.protocols.comparison import compare, costs, optimum, over_reply, over_skew
-from uwbsim.protocols.conditions import calibrated, conditions_of
-from uwbsim.protocols.monte_carlo import range_errors_m
+from uwbsim.protocols.conditions import calibrated, conditions_of, range_errors_m
 from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.loading import load
 from uwbsim.scenario.ranging import TURNAROUND_S

@@ -11,8 +11,7 @@ from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import COLUMNS, raw_range
 from uwbsim import simulate
-from uwbsim.protocols.conditions import Conditions, conditions_of
-from uwbsim.protocols.monte_carlo import range_errors_m
+from uwbsim.protocols.conditions import Conditions, conditions_of, range_errors_m
 from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.loading import load
 

@@ -3,8 +3,8 @@
 import pytest
 
 from docs.site.schema import UNITS, described, reference, unit_of
+from uwbsim.boards.server import Faults
 from uwbsim.scenario.base import BY_UNIT
-from uwbsim.scenario.faults import Faults
 from uwbsim.scenario.model import Scenario
 from uwbsim.sweep.design import SweepFile
 

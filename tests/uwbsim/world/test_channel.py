@@ -131,7 +131,9 @@ def test_obstacles_weaken_the_response_and_let_its_echoes_stand_out():
     free, blocked = (World.of(scenario(room=ROOM, **more)).paths(0, 1, 0) for more in ({}, {"obstacles": [weak]}))
     assert free.power_dbm - blocked.power_dbm == pytest.approx(10.0, abs=1e-9)
     assert peak_amplitude(free.power_dbm) / peak_amplitude(blocked.power_dbm) == pytest.approx(10**0.5, rel=1e-9)
-    delays, shares = (np.array([world.echoes for world in (free, blocked)])[:, :, k] for k in (0, 1))
+    delays, shares = (
+        np.array([getattr(world, name) for world in (free, blocked)]) for name in ("delay_s", "amplitude")
+    )
     np.testing.assert_allclose(delays[0], delays[1])
     # By the walls behind the two tags the way goes through the obstacle as well.
     np.testing.assert_allclose(np.sort(shares[1] / shares[0]), [1, 1, *[10**0.5] * 4], rtol=1e-6)
@@ -141,7 +143,7 @@ def test_a_ranges_own_detour_brings_its_echoes_nearer():
     """With a detour of the first path, what comes after comes sooner after it."""
     world = World.of(scenario(room=ROOM))
     plain, late = world.paths(0, 1, 0), world.paths(0, 1, 0, detour_m=0.3)
-    assert late.echoes[0][0] == pytest.approx(plain.echoes[0][0] - 0.3 / SPEED_OF_LIGHT)
+    assert late.delay_s[0] == pytest.approx(plain.delay_s[0] - 0.3 / SPEED_OF_LIGHT)
     always = {"probability": 1.0, "mean_excess_m": 0.2}
     room = ROOM | {"max_m": [8.0, 4.0, 40.0], "min_m": [-60.0, -60.0, -0.5], "reflection_loss_db": 0.0}
     flight = uwbsim.simulate(scenario(room=room, radio={"multipath": always}))

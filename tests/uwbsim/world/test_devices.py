@@ -11,8 +11,7 @@ from uwblink import Board, Recording, raw_range
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ScenarioError
-from uwbsim.protocols.conditions import conditions_of
-from uwbsim.protocols.monte_carlo import range_errors_m
+from uwbsim.protocols.conditions import conditions_of, range_errors_m
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.reception import AntennaDelays
 

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from uwbsim.scenario.radio import Radio
 from uwbsim.world.geometric_paths import Paths
-from uwbsim.world.impulse_response import BEFORE, TAP_M, Sensing, accumulate, detect
+from uwbsim.world.impulse_response import BEFORE, TAP_M, accumulate, detect
 
-SENSING = Sensing(dynamic_range_db=15.0, sensitivity_dbm=-105.0, noise_share=1 / 12)
+SENSING = (Radio(dynamic_range_db=15.0, sensitivity_dbm=-105.0), 1 / 12)
 WIDTH_TAPS, EDGE_TAPS = 1.2, 1.5
 
 
@@ -34,7 +35,7 @@ def test_responses_are_sums_of_pulses():
 
 @pytest.mark.parametrize("power_dbm", [-70.0, -85.0, -95.0, -104.0])
 def test_a_path_alone_is_found_where_it_is_with_the_power_that_it_has(power_dbm):
-    found = detect(paths((0.0, power_dbm, 0.3)), SENSING)
+    found = detect(paths((0.0, power_dbm, 0.3)), *SENSING)
     assert found.excess_m[0] == pytest.approx(0.0, abs=1e-12)
     assert found.power_dbm[0] == pytest.approx(power_dbm, abs=1e-9)
     assert found.total_dbm[0] == pytest.approx(power_dbm, abs=1e-9)
@@ -47,7 +48,7 @@ def test_a_direct_path_counts_down_to_the_threshold_and_no_further(below_db, fir
     Taps lie up to half a tap beside a peak, where it has 1.5 dB less: so near to the threshold either may be.
     """
     detour = np.hypot(4.0, 6.0) - 4.0
-    found = detect(paths((0.0, -80.0 - below_db, 0.0), (detour, -80.0, 1.0)), SENSING)
+    found = detect(paths((0.0, -80.0 - below_db, 0.0), (detour, -80.0, 1.0)), *SENSING)
     assert found.excess_m[0] == pytest.approx(0.0 if first else detour, abs=0.003)
     if below_db == 10:
         assert found.power_dbm[0] == pytest.approx(-90.0, abs=0.3)
@@ -56,17 +57,17 @@ def test_a_direct_path_counts_down_to_the_threshold_and_no_further(below_db, fir
 
 def test_what_is_below_sensitivity_is_no_first_path():
     weak = paths((0.0, -106.0, 0.0), (2.0, -98.0, 0.0))
-    assert detect(weak, SENSING).excess_m[0] == pytest.approx(2.0, abs=0.005)
-    keener = Sensing(dynamic_range_db=15.0, sensitivity_dbm=-108.0, noise_share=0.1)
-    assert detect(weak, keener).excess_m[0] == pytest.approx(0.0, abs=0.02)
+    assert detect(weak, *SENSING).excess_m[0] == pytest.approx(2.0, abs=0.005)
+    keener = Radio(dynamic_range_db=15.0, sensitivity_dbm=-108.0)
+    assert detect(weak, keener, 0.1).excess_m[0] == pytest.approx(0.0, abs=0.02)
 
 
 def test_paths_nearer_than_the_pulse_fade_by_their_phase():
     """Half a wavelength apart they cancel, in phase they add; the edge moves by less than the path."""
     near = 0.01
-    powers = [detect(paths((0.0, -80.0, 0.0), (near, -86.02, p)), SENSING).power_dbm[0] for p in (0.0, np.pi)]
+    powers = [detect(paths((0.0, -80.0, 0.0), (near, -86.02, p)), *SENSING).power_dbm[0] for p in (0.0, np.pi)]
     np.testing.assert_allclose(powers, -80 + 20 * np.log10([1.5, 0.5]), atol=0.2)
-    moved = [detect(paths((0.0, -80.0, 0.0), (0.3, -86.0, p)), SENSING).excess_m[0] for p in np.linspace(0, 6, 13)]
+    moved = [detect(paths((0.0, -80.0, 0.0), (0.3, -86.0, p)), *SENSING).excess_m[0] for p in np.linspace(0, 6, 13)]
     assert np.ptp(moved) > 0.02
     assert np.all(np.abs(moved) < 0.3)
 
@@ -75,7 +76,7 @@ def test_noise_of_the_edge_is_that_of_a_crossing_at_half_height():
     """Draw noise on the edge, find the crossing again: its spread is what was said. The peak's height is known."""
     rng = np.random.default_rng(4)
     for power_dbm in (-85.0, -97.0):
-        said = detect(paths((0.0, power_dbm, 0.0)), SENSING).noise_s[0]
+        said = detect(paths((0.0, power_dbm, 0.0)), *SENSING).noise_s[0]
         peak = 10 ** (power_dbm / 20)
         # The strongest taps lie half a tap beside the peak.
         strongest = peak * np.exp(-((0.5 / WIDTH_TAPS) ** 2))
@@ -97,13 +98,12 @@ def test_the_edge_is_at_half_the_height_of_the_first_peak():
     half = taps[np.argmax(height >= height.max() / 2)]
     expected = (half + WIDTH_TAPS * np.sqrt(np.log(2))) * TAP_M
     # The taps sample it a nanosecond apart.
-    assert detect(ways, SENSING).excess_m[0] == pytest.approx(expected, abs=0.02)
+    assert detect(ways, *SENSING).excess_m[0] == pytest.approx(expected, abs=0.02)
     assert 0.05 < expected < 0.35
 
 
 def test_the_weaker_the_first_path_the_noisier_its_edge():
-    noise = [detect(paths((0.0, p, 0.0)), SENSING).noise_s[0] for p in (-80.0, -95.0, -100.0, -104.0)]
+    noise = [detect(paths((0.0, p, 0.0)), *SENSING).noise_s[0] for p in (-80.0, -95.0, -100.0, -104.0)]
     assert np.all(np.diff(noise) >= 0)
     assert noise[-1] > 1.3 * noise[0]
-    still = Sensing(dynamic_range_db=15.0, sensitivity_dbm=-105.0, noise_share=0.0)
-    assert detect(paths((0.0, -90.0, 0.0)), still).noise_s[0] == 0
+    assert detect(paths((0.0, -90.0, 0.0)), SENSING[0], 0.0).noise_s[0] == 0

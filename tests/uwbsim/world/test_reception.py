@@ -9,8 +9,7 @@ import uwbsim
 from tests.uwbsim.world.helpers import served
 from uwblink import PROTOCOLS, raw_range
 from uwblink.ticks import METRES_PER_TICK
-from uwbsim.protocols.conditions import conditions_of
-from uwbsim.protocols.monte_carlo import range_errors_m
+from uwbsim.protocols.conditions import conditions_of, range_errors_m
 from uwbsim.protocols.prediction import predict
 from uwbsim.world.channel import CHANNEL_EFFECTS
 

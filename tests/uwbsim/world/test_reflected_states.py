@@ -122,7 +122,7 @@ def test_reflections_show_in_impulse_responses():
 def test_the_rise_of_a_response_is_the_later_paths():
     world = World.of(scenario(share=1.0))
     paths = world.paths(0, 1, SUBTICKS_PER_SECOND)
-    (delay_s, share) = paths.echoes[-1]
+    delay_s, share = paths.delay_s[-1], paths.amplitude[-1]
     expected = world.states.at((np.array([0]), np.array([1])), np.array([1.0])).rise_s[0]
     assert delay_s == pytest.approx(expected, rel=1e-6)
     later_db = 10 * np.log10(10 ** ((FIRST_DB - TOTAL_DB) / 10) - 1)
