@@ -1,20 +1,24 @@
-"""Robust spread of values, and the factor of 95 % intervals."""
+"""Robust spread of values, all together or by groups, and the factor of 95 % intervals."""
 
 from __future__ import annotations
 
 from typing import Final
 
 import numpy as np
+from scipy import ndimage
 
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, Ints
 
-__all__ = ["SIGMA_OF_MAD", "TWO_SIDED_95", "robust_spread"]
+__all__ = ["SIGMA_OF_MAD", "STD_OF_MEDIAN", "TWO_SIDED_95", "less_medians", "medians", "robust_spread", "spreads"]
 
 TWO_SIDED_95: Final = 1.959963984540054
 """Standard deviations about the mean that contain 95 % of a normal distribution."""
 
 SIGMA_OF_MAD: Final = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
+
+STD_OF_MEDIAN: Final = 1.2533
+"""Standard error of a median over that of a mean, of normal values: the root of pi/2."""
 
 
 def robust_spread(values: Floats, centre: float | None = None) -> float:
@@ -27,3 +31,18 @@ def robust_spread(values: Floats, centre: float | None = None) -> float:
     apart = np.asarray(values - middle)
     np.abs(apart, out=apart)
     return SIGMA_OF_MAD * float(np.median(apart, overwrite_input=True))
+
+
+def medians(values: Floats, group: Ints) -> Floats:
+    """Return the median of the values (n,) of each group (k,), by the numbers of groups (n,), which all have some."""
+    return np.asarray(ndimage.median(values, group, np.arange(group.max() + 1))) if len(values) else np.zeros(0)
+
+
+def less_medians(values: Floats, group: Ints) -> Floats:
+    """Return values (n,) less the median of their group (n,)."""
+    return np.asarray(values - medians(values, group)[group])
+
+
+def spreads(values: Floats, group: Ints) -> Floats:
+    """Return the robust spread of the values (n,) of each group (k,)."""
+    return SIGMA_OF_MAD * medians(np.abs(less_medians(values, group)), group)

@@ -11,7 +11,7 @@ FILES = [path for package in ("uwblink", "uwbsim", "calib") for path in sorted((
 # Numbers that every formula takes from one module: in air, in a vacuum, and what makes a median deviation a sigma.
 HOMES = {
     299_702_547.0: "uwblink/ticks.py",
-    299_792_458.0: "calib/checks/stamps.py",
+    299_792_458.0: "calib/checks/columns.py",
     1.4826: "calib/spread.py",
 }
 

@@ -9,15 +9,13 @@ import numpy as np
 from scipy import sparse
 
 from calib.checks.limits import told
-from calib.checks.quick_fit import quick_fit
-from calib.checks.recording_view import RecordingView, chosen, pair_ids
+from calib.checks.recording_view import RecordingView, quick_fit
 from calib.data.clocks import PPM_TO_METRES, corrected, left_skew
 from calib.estimator.score_tests import Family
 from calib.findings import Candidate, exceeds
-from calib.spread import robust_spread
-from uwblink.arrays import Floats
+from calib.spread import medians, spreads
 from uwblink.protocols.table import single_sided
-from uwblink.recording import clock_skews
+from uwblink.recording import clock_skews, target_faster_ppm
 from uwblink.ticks import TICK_S
 from uwblink.twr import intervals, without_stamps
 
@@ -45,20 +43,19 @@ NORMAL: Final = 1e6
 def skew(view: RecordingView) -> Iterator[Candidate]:
     """Errors that follow the carriers' readings: skew that was not taken out, or was with the wrong sign."""
     e = view.exchanges
-    single = chosen(view, np.isin(e.protocol, single_sided()) & np.isfinite(view.error_m) & ~without_stamps(e))
-    taken = {corrected(name) for name in np.unique(single.exchanges.protocol).tolist()}
-    if len(single.raw_m) < RANGES_OF_A_SLOPE or len(taken) > 1:
+    single = np.isin(e.protocol, single_sided()) & np.isfinite(view.error_m) & ~without_stamps(e)
+    taken = {corrected(name) for name in np.unique(e.protocol[single]).tolist()}
+    if np.count_nonzero(single) < RANGES_OF_A_SLOPE or len(taken) > 1:
         return
-    some = single.exchanges
-    known = np.isfinite(some.skew2_ppm) & (some.skew2_ppm != 0)
+    known = single & np.isfinite(e.skew2_ppm) & (e.skew2_ppm != 0)
     if np.count_nonzero(known) < RANGES_OF_A_SLOPE:
-        yield from _by_direction(single)
+        yield from _by_direction(view.chosen(single))
         return
     # Delays are the same both ways, and do not follow skews, so that pairs that range one way tell of it as well.
-    fit = quick_fit([chosen(single, known)], constants="tag")
+    fit = quick_fit([view.chosen(known)], constants="tag")
     if fit is None:
         return
-    some = some[known][fit.rows]
+    some = e[known][fit.rows]
     # A target's reply lasts longer by the clock of a faster initiator, and so does the range.
     expected = PPM_TO_METRES * some.skew2_ppm * intervals(some).dt32 * TICK_S
     slope, _, std, dof = fit.offsets(Family(kind="skew", names=[LEFT], derivative=sparse.csr_matrix(expected[:, None])))
@@ -80,57 +77,35 @@ def _by_direction(single: RecordingView) -> Iterator[Candidate]:
     e = single.exchanges[fit.rows]
     forth = np.where(e.initiator < e.target, 0.5, -0.5)
     by_pair = sparse.csr_matrix((forth, (np.arange(len(forth)), fit.pair)))
-    names = [fit.named(pair) for pair in range(len(fit.ends))]
-    ways, _, std, dof = fit.offsets(Family(kind="way", names=names, derivative=by_pair))
+    ways, _, std, dof = fit.offsets(Family(kind="way", names=fit.names, derivative=by_pair))
     worst = int(np.argmax((np.abs(ways) - ONE_WAY_M) / std))
-    told = f"ranges of pair {names[worst]} differ by {100 * abs(ways[worst]):.0f} cm by who initiates, the most of all"
+    told = (
+        f"ranges of pair {fit.names[worst]} differ by {100 * abs(ways[worst]):.0f} cm by who initiates, the most of all"
+    )
     p_value = exceeds(float(ways[worst]), float(std[worst]), dof, tolerance=ONE_WAY_M, tried=len(ways))
     remedy = "record the carrier integrator, or use double-sided ranging; until then take the mean of both ways"
     yield Candidate(LEFT, told, p_value, {"more": remedy})
 
 
-def _line(x: Floats, y: Floats, variance: Floats) -> tuple[float, float]:
-    """Return the slope of y (n,) over x (n,) through the origin, and its standard error, by what is left if larger."""
-    square = float(np.sum(x**2 / variance))
-    if square == 0:
-        return 0.0, np.inf
-    slope = float(np.sum(x * y / variance)) / square
-    left = float(np.mean((y - slope * x) ** 2 / variance))
-    return slope, float(np.sqrt(max(left, 1.0) / square))
-
-
 def swapped_roles(view: RecordingView) -> Iterator[Candidate]:
     """The target's clock against the initiator's: from the third leg, and as the carriers say."""
     e = view.exchanges
-    double = (e.protocol == "ds") & (e.tx3 != 0) & np.isfinite(e.skew1_ppm)
-    if np.count_nonzero(double) < 100:
+    e = e[(e.protocol == "ds") & (e.tx3 != 0) & np.isfinite(e.skew1_ppm)]
+    _, link, count = np.unique(e.initiator * 65_536 + e.target, return_inverse=True, return_counts=True)
+    enough = count > RANGES_A_WAY
+    if len(e) < RANGES_OF_A_SLOPE or not enough.any():
         return
-    spans = intervals(e[double])
-    with np.errstate(all="ignore"):
-        target_faster = (spans.dt53 / spans.dt64 - 1) * 1e6
-    told = e.skew1_ppm[double]
-    pairs = pair_ids(e[double])
-    first = e.initiator[double] < e.target[double]
-    groups = [
-        (
-            float(np.median(target_faster[rows])),
-            float(np.median(told[rows])),
-            np.pi / 2 * max(robust_spread(told[rows]), 1e-4) ** 2 / count,
-        )
-        for p in np.unique(pairs)
-        for way in (True, False)
-        if (count := np.count_nonzero(rows := (pairs == p) & (first == way))) > RANGES_A_WAY
-    ]
-    if not groups:
-        return
-    stamps, readings, variance = np.array(groups).T
+    variance = (np.pi / 2 * np.maximum(spreads(e.skew1_ppm, link), 1e-4) ** 2 / count)[enough]
+    stamps, readings = (medians(ppm, link)[enough] for ppm in (target_faster_ppm(e), e.skew1_ppm))
+    square = max(float(np.sum(stamps**2 / variance)), 1e-300)
+    slope = float(np.sum(stamps * readings / variance)) / square
+    left = float(np.mean((readings - slope * stamps) ** 2 / variance))
     # The readings' own offset of a tenth of a ppm, which is no noise, hides no slope of 1.
-    slope, std = _line(stamps, readings, variance)
     if slope < -NEAR:
         yield Candidate(
             "swapped roles",
             "the carriers say that the targets' clocks are slower where the stamps say faster, and the other way round",
-            exceeds(slope, std, NORMAL, tolerance=NEAR),
+            exceeds(slope, float(np.sqrt(max(left, 1.0) / square)), NORMAL, tolerance=NEAR),
         )
 
 
@@ -149,27 +124,25 @@ SLOPES: Final = {
 def unread(view: RecordingView) -> Iterator[Candidate]:
     """Single-sided ranges whose carriers were not read: nothing says what skew left in them."""
     left = left_skew(view.exchanges)
-    if left is None or np.isfinite(left.told_m):
-        return
-    yield Candidate(BLIND, told(left))
+    if left and not np.isfinite(left.told_m):
+        yield Candidate(BLIND, told(left))
 
 
 def carriers(view: RecordingView) -> Iterator[Candidate]:
     """Carriers' readings that do not follow the clocks' ratios by the stamps."""
-    if without_stamps(view.exchanges).all():
-        return
-    found = clock_skews(view.exchanges)
-    known = [
-        (one.residual_ppm, one.count, one.pair) for one in found if one.residual_ppm and one.count >= RANGES_OF_A_SLOPE
-    ]
-    if not known:
-        return
-    # That of most pairs: one board that scatters is not the unit of all.
-    scatter, count, pair = sorted(known)[(len(known) - 1) // 2]
-    # Of the logarithm of a median absolute deviation (efficiency 0.37).
-    std = float(1 / np.sqrt(2 * 0.37 * count))
-    p_value = exceeds(max(np.log(scatter / SCATTER_PPM), 0.0), std, NORMAL)
-    told = (
-        f"they scatter by {scatter:.1f} ppm about their median (pair {pair}), and as much or more in half of the pairs"
+    known = sorted(
+        (one.residual_ppm, one.count, one.pair)
+        for one in clock_skews(view.exchanges)
+        if one.residual_ppm and one.count >= RANGES_OF_A_SLOPE
     )
-    yield Candidate("carrier readings that say little", told, p_value)
+    if known:
+        # That of most pairs: one board that scatters is not the unit of all.
+        scatter, count, pair = known[(len(known) - 1) // 2]
+        # Of the logarithm of a median absolute deviation (efficiency 0.37).
+        p_value = exceeds(max(np.log(scatter / SCATTER_PPM), 0.0), float(1 / np.sqrt(2 * 0.37 * count)), NORMAL)
+        yield Candidate(
+            "carrier readings that say little",
+            f"they scatter by {scatter:.1f} ppm about their median (pair {pair}), and as much or more in half of the "
+            "pairs",
+            p_value,
+        )

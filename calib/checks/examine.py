@@ -13,14 +13,11 @@ from typing import Final
 
 import numpy as np
 
-from calib.checks import clocks, geometry, offsets, pairs, reflected, stamps, surveys, units
-from calib.checks.recording_view import Looked, RecordingView, chosen, looked_at
+from calib.checks import clocks, columns, geometry, offsets, pairs, reflected, surveys
+from calib.checks.recording_view import RecordingView, view_of
 from calib.checks.table import BETWEEN, CHECKS, GEOMETRY, GROSS, LEVEL, RADIO, ROWS, STRUCTURE, SURVEYS
 from calib.data.sources import Data, each, opened
 from calib.findings import Check, Finding
-from uwblink.recording.distances import distances_m
-from uwblink.recording.target_reports import differences, repeated_rows, single_reports
-from uwblink.twr import raw_range
 
 
 def examine(data: Data | Iterable[Data]) -> list[Finding]:
@@ -37,14 +34,14 @@ def examine(data: Data | Iterable[Data]) -> list[Finding]:
     >>> [finding.fault for finding in calib.examine(calib.sample_flight())]
     []
     """
-    views, findings = [], list[Finding]()
-    recordings = each(data)
-    for number, one in enumerate(recordings):
-        found, view = _examined(one)
-        name = f"{view.name if view else number + 1}: " if len(recordings) > 1 else ""
-        findings += [replace(finding, evidence=name + finding.evidence) for finding in found]
-        if view is not None and not {finding.fault for finding in found} & GROSS_FAULTS:
-            views.append(view)
+    recordings, views, findings = each(data), list[RecordingView](), list[Finding]()
+    for one in recordings:
+        with opened(one) as (name, source):
+            whole = view_of(name, source)
+        found, view = _examined(whole)
+        prefix = f"{name}: " if len(recordings) > 1 else ""
+        findings += [replace(finding, evidence=prefix + finding.evidence) for finding in found]
+        views += [view] if view else []
     if len(views) > 1:
         between = BETWEEN.findings(offsets.compared(views, LEVEL), LEVEL)
         # What moved between two recordings is no fault of either one.
@@ -59,23 +56,19 @@ def _run(checks: Sequence[Check], view: RecordingView) -> list[Finding]:
     return [finding for check in checks for finding in check.findings(check.look(view), LEVEL)]
 
 
-def _examined(data: Data) -> tuple[list[Finding], RecordingView | None]:
-    """Return what is wrong with one recording, and the recording without its impossible rows."""
-    with opened(data) as (name, source):
-        looked = looked_at(source)
-        marked = tuple(getattr(source, "arrangements", ()))
-    if not looked.count:
+def _examined(view: RecordingView) -> tuple[list[Finding], RecordingView | None]:
+    """Return what is wrong with one recording, and the recording without its impossible rows, if that can be used."""
+    if not len(view.exchanges):
         return [Finding(EMPTY, "the recording holds no exchanges", "record or import some", 0.0)], None
-    view = replace(_admitted(name, looked), arrangements=marked)
     for check in GROSS:
         if gross := check.findings(check.look(view), LEVEL):
             return gross, None
     findings = _run(ROWS, view)
-    bad = stamps.impossible(view)
+    bad = columns.impossible(view)
     if bad.all():
         return findings, None
-    view = chosen(view, ~bad)
-    if units.POWER in {finding.fault for finding in findings}:
+    view = view.chosen(~bad)
+    if columns.POWER in {finding.fault for finding in findings}:
         unknown = np.full(len(view.exchanges), np.nan)
         view = replace(view, exchanges=replace(view.exchanges, fpp1_dbm=unknown, fpp2_dbm=unknown))
     # Only stamps that make sense can say something about poses, and only right poses something about radios.
@@ -93,42 +86,7 @@ def _best(view: RecordingView) -> list[Finding]:
     return check.findings(best, LEVEL)
 
 
-def _admitted(name: str, looked: Looked) -> RecordingView:
-    both, poses, tags = looked.exchanges, looked.poses, looked.tags
-    again = repeated_rows(both)
-    both = both[~again]
-    reports = single_reports(both)
-    e = reports.exchanges
-    with np.errstate(all="ignore"):
-        raw = raw_range(e)
-    truth, posed = e.truth_m, False
-    if len(poses):
-        by_poses = distances_m(poses, tags, e.initiator, e.target, e.time_ns)
-        given = np.isfinite(truth)
-        # Tables with places of antennas bring both, which are then the same.
-        apart = np.abs(truth - by_poses)[given & np.isfinite(by_poses)]
-        posed = not given.any() or (len(apart) > 0 and float(np.median(apart)) < SAME_M)
-        truth = by_poses if posed else truth
-    told = tuple(", ".join(differences(both, a, b)) for a, b in reports.differing.tolist())
-    return RecordingView(
-        name=name,
-        exchanges=e,
-        poses=poses,
-        tags=tags,
-        faults=looked.faults,
-        raw_m=raw,
-        truth_m=truth,
-        reported_twice=reports.repeated,
-        contradictions=told,
-        posed=posed,
-        doubled=int(np.count_nonzero(again)),
-    )
-
-
 EMPTY: Final = "empty"
-SAME_M: Final = 0.001
-"""Distances that are written down and those of the poses are the same if they differ by rounding."""
-
 ORDER: Final = (EMPTY, *(fault for check in CHECKS for fault in check.remedies))
 CHANGED: Final = {offsets.OPEN, reflected.MANY, reflected.LASTING}
 IMPLIED: Final = (
@@ -140,9 +98,7 @@ IMPLIED: Final = (
     (offsets.ASTRAY, {*CHANGED, offsets.MOVED, offsets.DRIFTED}),
     (clocks.LEFT, {*CHANGED, offsets.ASTRAY}),
     (clocks.WRONG_SIGN, {*CHANGED, offsets.ASTRAY}),
-    (units.POWER, {"no powers"}),
-    (units.REPORTED, {"corrupted exchanges"}),
+    (columns.POWER, {"no powers"}),
+    (columns.REPORTED, {"corrupted exchanges"}),
 )
 """What follows from a fault and is not told beside it."""
-
-GROSS_FAULTS: Final = {fault for check in GROSS for fault in check.remedies}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from heapq import nlargest
 from itertools import combinations
 from typing import Final
 
@@ -11,11 +12,10 @@ import numpy as np
 from scipy import optimize, sparse, special
 
 from calib.checks.pairs import standing_still
-from calib.checks.quick_fit import QuickFit, quick_fit
-from calib.checks.recording_view import RecordingView, chosen, less_pairs, spread_m
+from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
 from calib.estimator.score_tests import Family
 from calib.findings import Candidate, positive, stretches
-from calib.spread import robust_spread
+from calib.spread import less_medians, medians, robust_spread
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.recording.distances import antennas_m, distances_m, find_offset
@@ -28,6 +28,8 @@ SMALLEST_OFFSET_S: Final = 0.03
 LONGEST_ARM_M: Final = 1.0
 """Robots that carry these boards are smaller; longer arms may be in another unit."""
 
+ARM_UNITS: Final = {"mm": 0.001, "cm": 0.01, "in": 0.0254}
+
 
 def pose_clock(view: RecordingView) -> Iterator[Candidate]:
     """Poses whose clock is off by up to a few seconds."""
@@ -37,72 +39,54 @@ def pose_clock(view: RecordingView) -> Iterator[Candidate]:
         found = find_offset(view.exchanges, view.poses, view.tags, within_s=LARGEST_OFFSET_S)
     except ImportTableError:
         return
-    shift_s = found.offset_ns * 1e-9
-    e = view.exchanges
-    moved = distances_m(view.poses, view.tags, e.initiator, e.target, e.time_ns - found.offset_ns)
+    shift_s, e = found.offset_ns * 1e-9, view.exchanges
     if abs(shift_s) > SMALLEST_OFFSET_S:
-        p_value, gain = narrower(view, view.error_m, view.raw_m - moved)
-        told = (
-            f"with the poses {shift_s:+.3f} s later the ranges' spread is {100 * spread_m(view, moved):.1f} cm instead "
-            f"of {100 * spread_m(view):.1f} cm"
-        )
-        yield Candidate("pose time offset", told, p_value, {"shift": f"{shift_s:.3f}"}, gain)
+        moved = distances_m(view.poses, view.tags, e.initiator, e.target, e.time_ns - found.offset_ns)
+        told = f"with the poses {shift_s:+.3f} s later"
+        yield _undone(view, Candidate("pose time offset", told, words={"shift": f"{shift_s:.3f}"}), moved)
 
 
 def _trials(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]:
     """Suspected faults of geometry, each with poses and tags as they would be without it."""
-    bodies = sorted({tag.body for tag in view.tags})
-    for body in bodies:
-        mine = [tag for tag in view.tags if tag.body == body]
-        if any(any(tag.lever_arm_m) for tag in mine):
-            yield (
-                Candidate("lever arm sign", f"of body {body}", words={"body": body}),
-                view.poses,
-                _scaled(view, mine, -1.0),
-            )
-        if any(np.linalg.norm(tag.lever_arm_m) > LONGEST_ARM_M for tag in mine):
-            for unit, length in (("mm", 0.001), ("cm", 0.01), ("in", 0.0254)):
-                seen = Candidate("lever arm unit", f"of body {body} in {unit}", words={"body": body, "length": length})
-                yield seen, view.poses, _scaled(view, mine, length)
-        for a, b in combinations(mine, 2):
-            arms = {a.tag: b.lever_arm_m, b.tag: a.lever_arm_m}
-            swapped = [replace(t, lever_arm_m=arms.get(t.tag, t.lever_arm_m)) for t in view.tags]
-            seen = Candidate("swapped tag ids", f"of tags {a.tag} and {b.tag}", words={"a": a.tag, "b": b.tag})
-            yield seen, view.poses, swapped
-    q = view.poses.quaternion
-    if len(q):
-        yield (
-            Candidate("wxyz quaternion", "of the poses"),
-            replace(view.poses, quaternion=q[:, [1, 2, 3, 0]]),
-            view.tags,
-        )
+    for body in sorted({tag.body for tag in view.tags}):
+        arms = {tag.tag: np.array(tag.lever_arm_m) for tag in view.tags if tag.body == body}
+        longest = max(np.linalg.norm(arm) for arm in arms.values())
+        scales = [("lever arm sign", -1.0, "")] if longest > 0 else []
+        if longest > LONGEST_ARM_M:
+            scales += [("lever arm unit", length, f" in {unit}") for unit, length in ARM_UNITS.items()]
+        for fault, length, unit in scales:
+            seen = Candidate(fault, f"of body {body}{unit}: undone,", words={"body": body, "length": length})
+            yield seen, view.poses, _with_arms(view.tags, {tag: length * arm for tag, arm in arms.items()})
+        for a, b in combinations(arms, 2):
+            seen = Candidate("swapped tag ids", f"of tags {a} and {b}: undone,", words={"a": a, "b": b})
+            yield seen, view.poses, _with_arms(view.tags, {a: arms[b], b: arms[a]})
+    if len(view.poses):
+        turned = replace(view.poses, quaternion=view.poses.quaternion[:, [1, 2, 3, 0]])
+        yield Candidate("wxyz quaternion", "of the poses: undone,"), turned, view.tags
 
 
-def _scaled(view: RecordingView, mine: list[Tag], factor: float) -> list[Tag]:
-    """Return all tags, with the lever arms of some times a factor."""
-    arms = [(t, factor if t in mine else 1.0) for t in view.tags]
-    return [replace(t, lever_arm_m=(f * t.lever_arm_m[0], f * t.lever_arm_m[1], f * t.lever_arm_m[2])) for t, f in arms]
+def _with_arms(tags: list[Tag], arms: dict[int, Floats]) -> list[Tag]:
+    """Return all tags, some with other lever arms (3,)."""
+    return [replace(tag, lever_arm_m=tuple(arms.get(tag.tag, tag.lever_arm_m))) for tag in tags]
 
 
 def geometry(view: RecordingView) -> Iterator[Candidate]:
     """Try every suspected fault of geometry; of those that explain the ranges, the one that does so best."""
-    if not view.posed:
-        return
-    e = view.exchanges
-    before = spread_m(view)
-    best: Candidate | None = None
-    trials = list(_trials(view))
-    for seen, poses, tags in trials:
-        truth = distances_m(poses, tags, e.initiator, e.target, e.time_ns)
-        p_value, gain = narrower(view, view.error_m, view.raw_m - truth, tried=len(trials))
-        if p_value < 1 and (best is None or gain > best.gain):
-            told = (
-                f"{seen.evidence}: undone, the ranges' spread is {100 * spread_m(view, truth):.1f} cm instead of "
-                f"{100 * before:.1f} cm"
-            )
-            best = replace(seen, evidence=told, p_value=p_value, gain=gain)
-    if best:
-        yield best
+    if view.posed:
+        e, trials = view.exchanges, list(_trials(view))
+        found = [
+            _undone(view, seen, distances_m(poses, tags, e.initiator, e.target, e.time_ns), tried=len(trials))
+            for seen, poses, tags in trials
+        ]
+        yield from nlargest(1, (one for one in found if one.p_value < 1), key=lambda one: one.gain)
+
+
+def _undone(view: RecordingView, seen: Candidate, truth_m: Floats, *, tried: int = 1) -> Candidate:
+    """Return a suspected fault with how the spread of ranges changes with the true distances (n,) without it."""
+    p_value, gain = narrower(view, view.error_m, view.raw_m - truth_m, tried=tried)
+    after, before = (100 * view.spread_m(view.raw_m - truth) for truth in (truth_m, view.truth_m))
+    told = f"{seen.evidence} the ranges' spread is {after:.1f} cm instead of {before:.1f} cm"
+    return replace(seen, evidence=told, p_value=p_value, gain=gain)
 
 
 ELSEWHERE: Final = "anchor stands elsewhere"
@@ -128,104 +112,71 @@ HELD: Final = 1e-3
 """Share of a range that holds a place where ranges do not: robots that move in a plane do not see its height."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Displaced:
-    """An anchor that stands elsewhere, by `away_m` (3,), its ranges' spreads in metres, p-value and gain.
-
-    `instead` are the bodies that the recording has at the place, or below or above it.
-    """
-
-    body: str
-    away_m: Floats
-    before_m: float
-    after_m: float
-    p_value: float
-    gain: float
-    instead: tuple[str, ...]
-
-
 def anchors(view: RecordingView) -> Iterator[Candidate]:
-    """Anchors whose ranges ask for another place."""
-    for one in displaced(view):
-        x, y, z = one.away_m
-        there = f"; there the recording has {' and '.join(one.instead)}: are numbers exchanged?" if one.instead else ""
-        yield Candidate(
-            ELSEWHERE,
-            f"ranges with {one.body} fit a place {np.linalg.norm(one.away_m):.2f} m away ({x:+.2f} {y:+.2f} {z:+.2f} m"
-            f"): their spread is {100 * one.after_m:.1f} cm there instead of {100 * one.before_m:.1f} cm{there}",
-            one.p_value,
-            {"body": one.body},
-            one.gain,
-        )
-
-
-def displaced(view: RecordingView) -> list[Displaced]:
-    """Return the anchors that may stand elsewhere."""
+    """Anchors whose ranges ask for another place, which is `away_m` (3,) among the words."""
     # Where nothing moves, each pair has a level that is its own.
-    if not view.posed or standing_still(view) is not None or view.quick_fit is None:
-        return []
-    places = {body: place_m(view, body) for body in standing(view)}
-    found = [_displaced(view, view.quick_fit, body, places) for body in places]
-    return [one for one in found if one is not None and one.p_value < 1]
+    if view.posed and standing_still(view) is None and view.quick_fit is not None:
+        places = places_m(view)
+        for body in places:
+            yield from _displaced(view, view.quick_fit, body, places)
 
 
-def standing(view: RecordingView) -> list[str]:
-    """Return the bodies that carry tags and do not move."""
+def places_m(view: RecordingView) -> dict[str, Floats]:
+    """Return the places (3,) of the bodies that carry tags and do not move."""
     bodies = sorted({tag.body for tag in view.tags} & set(np.unique(view.poses.body).tolist()))
-    spans = {body: np.ptp(view.poses.position_m[view.poses.body == body], axis=0).max() for body in bodies}
-    return [body for body in bodies if spans[body] < ANCHOR_STANDS_M]
+    points = {body: view.poses.position_m[view.poses.body == body] for body in bodies}
+    return {
+        body: np.asarray(np.median(some, axis=0))
+        for body, some in points.items()
+        if np.ptp(some, axis=0).max() < ANCHOR_STANDS_M
+    }
 
 
-def place_m(view: RecordingView, body: str) -> Floats:
-    """Return where a body stands (3,)."""
-    return np.asarray(np.median(view.poses.position_m[view.poses.body == body], axis=0))
-
-
-def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, Floats]) -> Displaced | None:
-    """Return where ranges fit an anchor best, tested by the slopes of its distances at that place."""
+def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, Floats]) -> Iterator[Candidate]:
+    """Yield an anchor whose ranges fit another place, tested by the slopes of its distances at that place."""
     tags = [tag.tag for tag in view.tags if tag.body == body]
     e = view.exchanges[fit.rows]
     mine = np.isin(e.initiator, tags) != np.isin(e.target, tags)
-    e, time_ns = e[mine], e.time_ns[mine]
-    own = np.isin(e.initiator, tags)
-    ids = np.where(own, e.initiator, e.target), np.where(own, e.target, e.initiator)
-    here, there = (antennas_m(view.poses, view.tags, ends, time_ns) for ends in ids)
+    own, e = view.chosen(fit.rows[mine]), e[mine]
+    first = np.isin(e.initiator, tags)
+    ids = np.where(first, e.initiator, e.target), np.where(first, e.target, e.initiator)
+    here, there = (antennas_m(view.poses, view.tags, ends, e.time_ns) for ends in ids)
     apart, pair = here - there, np.unique(fit.pair[mine], return_inverse=True)[1]
     if len(apart) < RANGES_OF_A_PLACE or not np.isfinite(apart).all():
-        return None
+        return
+    here_m = np.linalg.norm(apart, axis=1)
     # Where anchors are metres off, what power does is not known, and small beside that.
     loud = robust_spread(fit.residual[mine]) > ASTRAY_M
-    measured = np.linalg.norm(apart, axis=1) + (view.error_m[fit.rows] if loud else fit.residual)[mine]
+    measured = here_m + (own.error_m if loud else fit.residual[mine])
     tried = [_place(apart, measured, pair, place - places[body]) for place in places.values()]
-    spreads = [robust_spread(_left(apart + away, measured, pair)) for away in tried]
+    before, *spreads = (
+        robust_spread(less_medians(measured - np.linalg.norm(apart + away, axis=1), pair))
+        for away in (np.zeros(3), *tried)
+    )
     away, after = tried[int(np.argmin(spreads))], min(spreads)
-    before, size = robust_spread(_left(apart, measured, pair)), float(np.linalg.norm(away))
     # The ranges of this anchor alone, at its other place: their noise is theirs, whatever else is wrong.
-    rows, there_m = fit.rows[mine], np.linalg.norm(apart + away, axis=1)
-    truth_m, direction = view.truth_m.copy(), np.zeros((len(view.truth_m), 3))
-    truth_m[rows] += there_m - np.linalg.norm(apart, axis=1)
-    direction[rows] = (apart + away) / there_m[:, None]
-    only = np.isin(np.arange(len(truth_m)), rows)
-    moved = quick_fit([chosen(replace(view, truth_m=truth_m), only)])
-    gain = narrower(view, view.error_m, view.raw_m - truth_m)[1]
-    explains = after < min(before, EXPLAINED * robust_spread(fit.residual[~mine])) if (~mine).any() else after < before
-    if size <= TOLERANCE_M or gain <= 0 or not explains or moved is None:
-        return None
-    derivative = sparse.csr_matrix(direction[only][moved.rows])
+    size, there_m = float(np.linalg.norm(away)), np.linalg.norm(apart + away, axis=1)
+    elsewhere = replace(own, truth_m=own.truth_m + (there_m - here_m))
+    moved, gain = quick_fit([elsewhere]), narrower(own, own.error_m, elsewhere.error_m)[1]
+    usual = EXPLAINED * robust_spread(fit.residual[~mine]) if not mine.all() else np.inf
+    if size <= TOLERANCE_M or gain <= 0 or after >= min(before, usual) or moved is None:
+        return
+    derivative = sparse.csr_matrix(((apart + away) / there_m[:, None])[moved.rows])
     tested = moved.slopes.test(Family(kind="place", names="xyz", derivative=derivative))
     slope = tested.information @ away * (1 - TOLERANCE_M / size)
     square = float(slope @ np.linalg.lstsq(tested.covariance, slope, rcond=1e-12)[0])
     p_value = float(special.fdtrc(3, tested.blocks - 3.0, square / 3))
     # Places above and below each other are alike to robots that move in a plane; a displacement is known to a tenth.
     near = {name: float(np.hypot(*(place - places[body] - away)[:2])) for name, place in places.items()}
-    return Displaced(
-        body=body,
-        away_m=away,
-        before_m=before,
-        after_m=after,
-        p_value=min(1.0, p_value * len(places)),
-        gain=gain,
-        instead=tuple(name for name in places if name != body and near[name] < SAME_PLACE_M + 0.1 * size),
+    others = " and ".join(name for name in places if name != body and near[name] < SAME_PLACE_M + 0.1 * size)
+    yield Candidate(
+        ELSEWHERE,
+        f"ranges with {body} fit a place {size:.2f} m away ({away[0]:+.2f} {away[1]:+.2f} {away[2]:+.2f} m): their "
+        f"spread is {100 * after:.1f} cm there instead of {100 * before:.1f} cm"
+        + (f"; there the recording has {others}: are numbers exchanged?" if others else ""),
+        min(1.0, p_value * len(places)),
+        {"body": body, "away_m": away},
+        gain,
     )
 
 
@@ -233,29 +184,14 @@ def _place(apart: Floats, measured: Floats, pair: Ints, start: Floats) -> Floats
     """Return the displacement (3,) that ranges ask for, beside a constant of each pair, by robust least squares."""
     every = slice(None, None, max(len(apart) // 2000, 1))
     apart, measured, pair = apart[every], measured[every], pair[every]
-    count = int(pair.max()) + 1
 
     def residuals(x: Floats) -> Floats:
         rest = measured - np.linalg.norm(apart + x[:3], axis=1) - x[3:][pair]
         return np.append(rest, HELD * len(rest) ** 0.5 * x[:3])
 
-    constants = medians(measured - np.linalg.norm(apart + start, axis=1), pair, count)
+    constants = medians(measured - np.linalg.norm(apart + start, axis=1), pair)
     found = optimize.least_squares(residuals, np.append(start, constants), loss="soft_l1", f_scale=0.1)
     return np.asarray(found.x[:3])
-
-
-def _left(apart: Floats, measured: Floats, pair: Ints) -> Floats:
-    """Return what is left of ranges (n,) at distances (n, 3), each less its pair's median."""
-    rest = measured - np.linalg.norm(apart, axis=1)
-    return np.asarray(rest - medians(rest, pair, int(pair.max()) + 1)[pair])
-
-
-def medians(values: Floats, place: Ints, count: int) -> Floats:
-    """Return the median of values (n,) at each place (count,), which all have some."""
-    order = np.argsort(place, kind="stable")
-    return np.array(
-        [np.median(part) for part in np.split(values[order], np.searchsorted(place[order], range(1, count)))]
-    )
 
 
 def narrower(view: RecordingView, before_m: Floats, after_m: Floats, *, tried: float = 1) -> tuple[float, float]:
@@ -263,7 +199,7 @@ def narrower(view: RecordingView, before_m: Floats, after_m: Floats, *, tried: f
 
     The statistic is the logarithm of how much wider they spread before, by stretches of time, less `MATERIAL`.
     """
-    a, b = less_pairs(view, before_m), less_pairs(view, after_m)
+    a, b = view.less_pairs(before_m), view.less_pairs(after_m)
     rows = np.flatnonzero(np.isfinite(a) & np.isfinite(b) & (np.abs(before_m - after_m) > 1e-3))
     rows = rows[np.argsort(view.exchanges.time_ns[rows], kind="stable")]
     a, b = a[rows], b[rows]

@@ -15,10 +15,9 @@ import numpy as np
 from scipy import sparse, special
 
 from calib.checks.fitted import has_shares, of_pairs, shares_of_pairs, slopes_of
-from calib.checks.geometry import Displaced, displaced, place_m, standing
+from calib.checks.geometry import anchors, places_m
 from calib.checks.pairs import standing_still
-from calib.checks.quick_fit import QuickFit, quick_fit
-from calib.checks.recording_view import RecordingView, chosen
+from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
 from calib.data.ranges import Ranges
 from calib.errors import CalibError
 from calib.estimator.known_distances import FEWEST_RANGES, KnownDistances, Recipe, fit_known_distances
@@ -69,6 +68,12 @@ MIN_RANGES_A_SIDE: Final = 12
 OTHERS: Final = 0.4
 """Share of a tag's shift by which other pairs may shift: an antenna, or a voltage, is one tag's."""
 
+ANCHOR_MOVED_M: Final = 0.08
+"""By how much places that two recordings give an anchor may differ."""
+
+CLIP: Final = 2.5
+"""Spreads beyond which a residual counts no further: a reflection is not to move a mean."""
+
 MOST_NAMED: Final = 3
 """Tags of a recording that are named: faults are few."""
 
@@ -82,19 +87,13 @@ MOSTLY: Final = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shift:
-    """The ranges of a tag from some time on (`late`, n) are longer by `size_m`; `pairs` are how many show it."""
+    """The ranges of a tag from some time on (`late`, n) are longer by `size_m`; `pairs` says in words which show it."""
 
     tag: int
     size_m: float
     late: Bools
     p_value: float
-    pairs: int
-
-    @property
-    def pairs_alike(self) -> str:
-        """The size as a delay, and which ranges of the tag show it."""
-        delay = f"({2e9 * abs(self.size_m) / SPEED_OF_LIGHT:.2f} ns in its delay)"
-        return f"{delay}, {'all its pairs alike' if self.pairs > 1 else 'its only pair'}"
+    pairs: str
 
 
 def closures(view: RecordingView) -> Iterator[Candidate]:
@@ -104,7 +103,7 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
         return
     ranges = Ranges.from_exchanges(view.exchanges[rows], view.truth_m[rows])
     pairs = pairs_of(ranges.initiator, ranges.target, ranges.tags())
-    offset_m, tested, spread_m = np.zeros(len(pairs.ends)), None, 0.0
+    offset_m = np.zeros(len(pairs.ends))
     for _ in range(MOST_REPEATED):
         moved = replace(ranges, truth_m=ranges.truth_m + offset_m[pairs.number])
         try:
@@ -118,8 +117,6 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
         before, offset_m = offset_m, _offsets(found, tested, at, offset_m)
         if np.max(np.abs(offset_m - before)) < SETTLED_M:
             break
-    if tested is None:
-        return
     # Where reflections make all pairs differ, one of them has to stand out among these.
     tolerance = max(PAIR_M, float(special.ndtri(1 - BUDGET / (2 * len(offset_m)))) * spread_m)
     if standing_still(view) is not None:
@@ -152,16 +149,15 @@ def _offsets(found: KnownDistances, tested: Tested, at: Ints, before_m: Floats) 
 
 def astray(view: RecordingView) -> Iterator[Candidate]:
     """Pairs whose ranges and true distances have little to do with each other."""
-    fit = view.quick_fit
+    fit, found = view.quick_fit, list[tuple[float, str]]()
     if fit is None:
         return
-    found = list[tuple[float, str]]()
-    for pair in range(len(fit.ends)):
+    for pair, name in enumerate(fit.names):
         rest = np.minimum(np.abs(fit.residual[fit.pair == pair]), 10 * LOUD_M)
         means = np.array([float(np.mean(rest[s])) for s in stretches(len(rest))])
         p_value = positive(means - LOUD_M, tried=len(fit.ends))
         if p_value < BUDGET:
-            found.append((p_value, f"{fit.named(pair)} by {np.mean(means):.2f} m"))
+            found.append((p_value, f"{name} by {np.mean(means):.2f} m"))
     if found:
         told = ", ".join(name for _, name in found[:6]) + (f" and {len(found) - 6} pairs more" if found[6:] else "")
         yield Candidate(ASTRAY, f"ranges of pairs {told} differ on average, each pair's median aside", min(found)[0])
@@ -172,18 +168,19 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
     fit = view.quick_fit
     if fit is None or fit.time_s[-1] < SHORTEST_S:
         return
-    several = min(CUTS, MOST_COLUMNS // len(fit.ends))
-    cuts = fit.time_s[-1] * np.linspace(MARGIN, 1 - MARGIN, several)
+    cuts = fit.time_s[-1] * np.linspace(MARGIN, 1 - MARGIN, min(CUTS, MOST_COLUMNS // len(fit.ends)))
+    reach, time_ns = CLIP * max(robust_spread(fit.residual), 1e-4), fit.model.ranges.time_ns
     for shift in shifts(fit, fit.time_s[:, None] >= cuts):
         mine = fit.of_tag(shift.tag)
-        time_s, rest, late = fit.time_s[mine], fit.clipped[mine], shift.late[mine]
-        drifts = np.corrcoef(rest, time_s)[0, 1] ** 2 > 1.15 * np.corrcoef(rest, late)[0, 1] ** 2
-        if drifts or _stays(time_s, rest, late):
-            when = "over the recording" if drifts else f"{fit.host_s[np.argmax(shift.late)]:.0f} s after the start"
+        time_s, rest, late = fit.time_s[mine], np.clip(fit.residual[mine], -reach, reach), shift.late[mine]
+        fault, when = MOVED, f"{(time_ns[np.argmax(shift.late)] - time_ns[0]) * 1e-9:.0f} s after the start"
+        if np.corrcoef(rest, time_s)[0, 1] ** 2 > 1.15 * np.corrcoef(rest, late)[0, 1] ** 2:
+            fault, when = DRIFTED, "over the recording"
+        if fault == DRIFTED or _stays(time_s, rest, late):
             yield Candidate(
-                DRIFTED if drifts else MOVED,
-                f"ranges of tag {shift.tag} {'drift' if drifts else 'shift'} by {100 * shift.size_m:+.1f} cm {when} "
-                f"{shift.pairs_alike}, others do not",
+                fault,
+                f"ranges of tag {shift.tag} {'drift' if fault == DRIFTED else 'shift'} by {100 * shift.size_m:+.1f} cm "
+                f"{when} {shift.pairs}, others do not",
                 shift.p_value,
                 {"tag": shift.tag},
             )
@@ -191,12 +188,11 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
 
 def _stays(time_s: Floats, rest: Floats, late: Bools) -> bool:
     """Return whether both parts keep their level: a body in the way goes again."""
-    levels = []
-    for side in (~late, late):
-        middle = np.median(time_s[side])
-        levels += [float(np.mean(rest[side & half])) for half in (time_s < middle, time_s >= middle)]
-    step = abs(levels[2] + levels[3] - levels[0] - levels[1]) / 2
-    return max(abs(levels[1] - levels[0]), abs(levels[3] - levels[2])) < 0.6 * step
+    middle = np.where(late, np.median(time_s[late]), np.median(time_s[~late]))
+    levels = np.array(
+        [[np.mean(rest[side & half]) for half in (time_s < middle, time_s >= middle)] for side in (~late, late)]
+    )
+    return bool(np.ptp(levels, axis=1).max() < 0.6 * abs(np.diff(levels.mean(axis=1))[0]))
 
 
 def shifts(fit: QuickFit, late: Bools) -> Iterator[Shift]:
@@ -232,7 +228,7 @@ def _of_pairs(fit: QuickFit, late: Bools) -> tuple[Floats, Floats, Floats, float
     rows, cut = np.nonzero(late)
     columns = fit.pair[rows] * cuts + cut
     derivative = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(late), count * cuts))
-    names = [fit.named(pair) for pair in range(count) for _ in range(cuts)]
+    names = [name for name in fit.names for _ in range(cuts)]
     *found, dof = fit.offsets(Family(kind="shift", names=names, derivative=derivative))
     size, weight, std = (one.reshape(count, cuts) for one in found)
     return size, weight, std, dof
@@ -277,56 +273,45 @@ def _shift_of(fit: QuickFit, tag: int, late: Bools, size: Floats, mean: float, t
         whole = float(weight[own].sum())
         dof *= whole**2 / float(np.sum(weight[own] ** 2))
         p_value = exceeds(mean, whole**-0.5, dof, tolerance=DELAY_M, tried=tried)
-        yield Shift(tag=tag, size_m=shift, late=late, p_value=p_value, pairs=int(mine.sum()))
+        delay_ns = 2e9 * abs(shift) / SPEED_OF_LIGHT
+        pairs = f"({delay_ns:.2f} ns in its delay), {'all its pairs alike' if mine.sum() > 1 else 'its only pair'}"
+        yield Shift(tag=tag, size_m=shift, late=late, p_value=p_value, pairs=pairs)
 
 
 def compared(views: Sequence[RecordingView], level: float) -> Iterator[Candidate]:
     """What differs between recordings, each compared with the one before it; `level` is that of a check."""
-    moved = {view.name: {one.body: one for one in displaced(view) if one.p_value < level} for view in views}
-    for first, second in pairwise(views):
-        bodies = _moved(first, second, moved)
-        for body, (away, p_value) in bodies.items():
-            yield Candidate(
-                MOVED_ANCHOR,
-                f"{body} stands {np.linalg.norm(away):.2f} m elsewhere ({away[0]:+.2f} {away[1]:+.2f} {away[2]:+.2f} m"
-                f") in {second.name} than in {first.name}, by its ranges and the places that the recordings give it",
-                p_value,
-                {"body": body},
+    displaced = [{one.words["body"]: one for one in anchors(view) if one.p_value < level} for view in views]
+    for (first, second), both in zip(pairwise(views), pairwise(displaced), strict=True):
+        given, bodies = [places_m(view) for view in (first, second)], set().union(*both)
+        for body in sorted(bodies.intersection(*given)):
+            found = [of.get(body) for of in both]
+            here, there = (
+                places[body] + (one.words["away_m"] if one else 0.0) for places, one in zip(given, found, strict=True)
             )
-        known = {*bodies, *moved[first.name], *moved[second.name]}
-        yield from _other_delays(first, second, [tag.tag for tag in (*first.tags, *second.tags) if tag.body in known])
-
-
-def _moved(
-    first: RecordingView, second: RecordingView, moved: dict[str, dict[str, Displaced]]
-) -> dict[str, tuple[Floats, float]]:
-    """Return the anchors of both recordings whose places differ by more than 8 cm, by how much, and the p-value."""
-    found = {}
-    for body in sorted(set(standing(first)) & set(standing(second))):
-        off = [moved[view.name].get(body) for view in (first, second)]
-        places = [
-            place_m(view, body) + (one.away_m if one else 0.0) for view, one in zip((first, second), off, strict=True)
-        ]
-        known = [one.p_value for one in off if one]
-        if known and np.linalg.norm(places[1] - places[0]) > 0.08:
-            found[body] = places[1] - places[0], min(known)
-    return found
+            away = there - here
+            if np.linalg.norm(away) > ANCHOR_MOVED_M:
+                yield Candidate(
+                    MOVED_ANCHOR,
+                    f"{body} stands {np.linalg.norm(away):.2f} m elsewhere ({away[0]:+.2f} {away[1]:+.2f} "
+                    f"{away[2]:+.2f} m) in {second.name} than in {first.name}, by its ranges and the places that the "
+                    "recordings give it",
+                    min(one.p_value for one in found if one),
+                    {"body": body},
+                )
+        yield from _other_delays(first, second, [tag.tag for tag in (*first.tags, *second.tags) if tag.body in bodies])
 
 
 def _other_delays(first: RecordingView, second: RecordingView, but: list[int]) -> Iterator[Candidate]:
     """Yield tags all of whose pairs read otherwise in the second recording, beside other pairs that do not."""
-    views = [
-        chosen(view, ~(np.isin(view.exchanges.initiator, but) | np.isin(view.exchanges.target, but)))
+    fit = quick_fit([
+        view.chosen(~(np.isin(view.exchanges.initiator, but) | np.isin(view.exchanges.target, but)))
         for view in (first, second)
-    ]
-    fit = quick_fit(views)
-    if fit is None:
-        return
-    for shift in shifts(fit, (fit.session == 1)[:, None]):
+    ])  # fmt: skip
+    for shift in shifts(fit, (fit.model.ranges.session == 1)[:, None]) if fit else ():
         yield Candidate(
             OTHER_DELAY,
             f"ranges of tag {shift.tag} are {100 * shift.size_m:+.1f} cm longer in {second.name} than in {first.name} "
-            f"{shift.pairs_alike}, others are not",
+            f"{shift.pairs}, others are not",
             shift.p_value,
             {"tag": shift.tag},
         )

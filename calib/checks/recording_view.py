@@ -1,37 +1,49 @@
-"""A recording as checks see it; of a long one, stretches over all of its time.
+"""A recording as checks see it, and a quick robust fit of it whose residuals are tested for one more unknown.
 
-Shares, medians and what lasts show in some hundred thousand exchanges. Stretches are taken, and not single exchanges,
-because errors that last show in neighbours only.
+Of a long recording stretches over all of its time are examined: shares, medians and what lasts show in some hundred
+thousand exchanges. Stretches are taken, and not single exchanges, because errors that last show in neighbours only.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib.data.sources import RecordedSource, Source, no_poses
-from calib.spread import robust_spread
+from calib.data.ranges import Ranges, concatenate
+from calib.data.sources import RecordedSource, Source
+from calib.estimator.known_distances import FEWEST_RANGES, PILOT, Fitted, Recipe, likeliest, model_of, robust_fit
+from calib.estimator.optimize import maximize
+from calib.estimator.range_model import RangeModel
+from calib.estimator.score_tests import REACHED, Family, Slopes
+from calib.estimator.time_blocks import GAP_S, TimeBlocks, time_blocks
+from calib.estimator.unknowns import Priors
+from calib.range_errors.density import OUTLIERS_OVER_M, error_slopes
+from calib.spread import less_medians, robust_spread
 from uwblink.arrays import Bools, Floats, Ints
+from uwblink.recording.contents import Contents
+from uwblink.recording.distances import distances_m
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, Fault, Poses, Tag
+from uwblink.recording.target_reports import differences, repeated_rows, single_reports
 from uwblink.ticks import TICK_S
-from uwblink.twr import Exchanges
-
-if TYPE_CHECKING:
-    from calib.checks.quick_fit import QuickFit
+from uwblink.twr import Exchanges, raw_range
 
 PLAUSIBLE_M: Final = 1000.0
+SAME_M: Final = 0.001
+"""Distances that are written down and those of the poses are the same if they differ by rounding."""
+
+RANGES_A_MEDIAN: Final = 11
+"""Ranges of a pair from which its median is taken off."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingView:
-    """A recording as the examinations see it; `truth_m` (n,) is NaN where nothing says it.
+    """A recording as the checks see it; `truth_m` (n,) is NaN where nothing says it.
 
     Each exchange is there once; `reported_twice` were reported by both ends, and `contradictions` say how two reports
     of one differ; `doubled` rows repeated another one. It is `posed` where true distances come from poses.
@@ -43,13 +55,13 @@ class RecordingView:
     poses: Poses
     tags: list[Tag]
     faults: list[Fault]
+    arrangements: list[Arrangement]
     raw_m: Floats
     truth_m: Floats
-    reported_twice: int = 0
-    contradictions: tuple[str, ...] = ()
-    doubled: int = 0
-    posed: bool = False
-    arrangements: tuple[Arrangement, ...] = ()
+    reported_twice: int
+    contradictions: list[str]
+    doubled: int
+    posed: bool
 
     @property
     def standing(self) -> bool:
@@ -59,8 +71,6 @@ class RecordingView:
     @cached_property
     def quick_fit(self) -> QuickFit | None:
         """A quick fit with constants of pairs; None where too few ranges have a true distance."""
-        from calib.checks.quick_fit import quick_fit
-
         return quick_fit([self])
 
     @property
@@ -68,41 +78,62 @@ class RecordingView:
         """Range less truth, shape (n,)."""
         return self.raw_m - self.truth_m
 
+    def chosen(self, rows: Bools | Ints) -> RecordingView:
+        """Return a view of some exchanges."""
+        return replace(self, exchanges=self.exchanges[rows], raw_m=self.raw_m[rows], truth_m=self.truth_m[rows])
 
-def chosen(view: RecordingView, rows: Bools) -> RecordingView:
-    """Return a view of some exchanges."""
-    return replace(view, exchanges=view.exchanges[rows], raw_m=view.raw_m[rows], truth_m=view.truth_m[rows])
+    def less_pairs(self, error_m: Floats) -> Floats:
+        """Return errors (n,) less the median of their pair, NaN for pairs with ten or fewer."""
+        good = np.isfinite(error_m)
+        _, pair, count = np.unique(pair_ids(self.exchanges[good]), return_inverse=True, return_counts=True)
+        left = np.full(len(error_m), np.nan)
+        left[good] = less_medians(error_m[good], pair)
+        left[np.flatnonzero(good)[count[pair] < RANGES_A_MEDIAN]] = np.nan
+        return left
+
+    def spread_m(self, error_m: Floats) -> float:
+        """Return the robust spread of errors (n,) after each pair's own median; infinity where nothing is known."""
+        left = self.less_pairs(error_m)
+        good = np.isfinite(left)
+        return robust_spread(left[good], 0.0) if good.any() else float("inf")
 
 
-def spread_m(view: RecordingView, truth_m: Floats | None = None, raw_m: Floats | None = None) -> float:
-    """Robust spread of errors after each pair's own median, metres; infinity where nothing is known."""
-    error = (view.raw_m if raw_m is None else raw_m) - (view.truth_m if truth_m is None else truth_m)
-    left = less_pairs(view, error)
-    good = np.isfinite(left)
-    return robust_spread(left[good], 0.0) if good.any() else float("inf")
-
-
-def less_pairs(view: RecordingView, error_m: Floats) -> Floats:
-    """Return errors (n,) less the median of their pair, NaN for pairs with ten or fewer."""
-    pair = pair_ids(view.exchanges)
-    left = np.full(len(error_m), np.nan)
-    good = np.isfinite(error_m)
-    for p in np.unique(pair[good]):
-        rows = good & (pair == p)
-        if np.count_nonzero(rows) > 10:
-            left[rows] = error_m[rows] - np.median(error_m[rows])
-    return left
+def view_of(name: str, source: Source) -> RecordingView:
+    """Return a source as the checks see it: each exchange once, with its range and its true distance."""
+    looked = looked_at(source)
+    again = repeated_rows(looked.exchanges)
+    both = looked.exchanges[~again]
+    reports = single_reports(both)
+    e = reports.exchanges
+    with np.errstate(all="ignore"):
+        raw = raw_range(e)
+    truth, posed = e.truth_m, False
+    if len(looked.poses):
+        by_poses = distances_m(looked.poses, looked.tags, e.initiator, e.target, e.time_ns)
+        given = np.isfinite(truth)
+        # Tables with places of antennas bring both, which are then the same.
+        apart = np.abs(truth - by_poses)[given & np.isfinite(by_poses)]
+        posed = not given.any() or (len(apart) > 0 and float(np.median(apart)) < SAME_M)
+        truth = by_poses if posed else truth
+    return RecordingView(
+        name=name,
+        exchanges=e,
+        poses=looked.poses,
+        tags=list(looked.tags),
+        faults=list(getattr(looked, "faults", ())),
+        arrangements=list(getattr(source, "arrangements", ())),
+        raw_m=raw,
+        truth_m=truth,
+        reported_twice=reports.repeated,
+        contradictions=[", ".join(differences(both, a, b)) for a, b in reports.differing.tolist()],
+        doubled=int(np.count_nonzero(again)),
+        posed=posed,
+    )
 
 
 def pair_ids(e: Exchanges) -> Ints:
     """Return one number for each pair of tags, whoever initiated, shape (n,)."""
     return np.asarray(np.minimum(e.initiator, e.target) * 65_536 + np.maximum(e.initiator, e.target))
-
-
-def plausible_share(raw_m: Floats) -> float:
-    """Return the share of ranges (n,) that a radio of this kind could measure."""
-    with np.errstate(invalid="ignore"):
-        return float(np.mean(np.abs(raw_m) < PLAUSIBLE_M))
 
 
 EXAMINED_EXCHANGES: Final = 160_000
@@ -113,24 +144,24 @@ MARGIN_NS: Final = 4_000_000_000
 """Poses are needed so far around exchanges: farther than the largest offset of clocks that is looked for."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Looked:
-    """What is looked at of a recording: its exchanges, or some of `count`, and the poses around them."""
-
-    exchanges: Exchanges
-    poses: Poses
-    tags: list[Tag]
-    faults: list[Fault]
-    count: int
-
-
-def looked_at(source: Source) -> Looked:
-    """Return what to look at of a source: everything, of a long recording stretches of it."""
-    if isinstance(source, RecordedSource) and source.recording.count("exchanges") > EXAMINED_EXCHANGES:
-        return _stretches(source.recording)
-    faults = list(getattr(source, "faults", ()))
-    x = source.exchanges
-    return Looked(exchanges=x, poses=source.poses, tags=list(source.tags), faults=faults, count=len(x))
+def looked_at(source: Source) -> Source:
+    """Return what to look at of a source: everything, of a long recording stretches of it with the poses around."""
+    if not isinstance(source, RecordedSource) or source.recording.count("exchanges") <= EXAMINED_EXCHANGES:
+        return source
+    recording = source.recording
+    spans = recording.stretches(EXAMINED_EXCHANGES // EXAMINED_STRETCHES)
+    windows, parts, poses = recording.pose_windows(), list[Exchanges](), list[Poses]()
+    for k in np.unique(np.linspace(0, len(spans) - 1, EXAMINED_STRETCHES).round().astype(int)).tolist():
+        start_ns, end_ns = spans[k]
+        parts.append(recording.exchanges_between(start_ns, end_ns))
+        # A range belongs to the middle of its first two messages, which is after its time, by half a wrap at most.
+        later = int(2 ** parts[-1].bits * TICK_S * 0.5e9) + 1
+        poses.append(windows.around(start_ns - MARGIN_NS, end_ns + later + MARGIN_NS))
+    every = Poses.concatenate(poses)
+    # Poses of two stretches are there once.
+    places = np.column_stack([every.time_ns, np.unique(every.body, return_inverse=True)[1]])
+    every = every[np.unique(places, axis=0, return_index=True)[1]]
+    return Contents(exchanges=Exchanges.concatenate(parts), poses=every, tags=source.tags, faults=source.faults)
 
 
 def examined_part(recording: str | os.PathLike[str]) -> str:
@@ -148,42 +179,120 @@ def examined_part(recording: str | os.PathLike[str]) -> str:
     )
 
 
-def _stretches(recording: Recording) -> Looked:
-    spans = recording.stretches(EXAMINED_EXCHANGES // EXAMINED_STRETCHES)
-    chosen = np.unique(np.linspace(0, len(spans) - 1, EXAMINED_STRETCHES).round().astype(int)).tolist()
-    windows, parts, poses = recording.pose_windows(), list[Exchanges](), list[Poses]()
-    for start_ns, end_ns in (spans[k] for k in chosen):
-        part = recording.exchanges_between(start_ns, end_ns)
-        # A range belongs to the middle of its first two messages, which is after its time, by half a wrap at most.
-        later = int(2**part.bits * TICK_S * 0.5e9) + 1
-        parts.append(part)
-        poses.append(windows.around(start_ns - MARGIN_NS, end_ns + later + MARGIN_NS))
-    return Looked(
-        exchanges=_joined(parts),
-        poses=_once(poses),
-        tags=recording.tags(),
-        faults=recording.faults(),
-        count=recording.count("exchanges"),
+RANGES_A_PAIR: Final = 40
+"""Ranges of a pair, below which its median is not known to a fifth of their spread; it is left out."""
+
+STRETCHES_OF_SCORES: Final = 32
+"""Stretches of time over which scores are summed: variances of sums are then known to a quarter, and errors that last
+for a hundredth of the recording are in one stretch."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class QuickFit:
+    """A robust fit to the ranges (n,) of all pairs with enough of them, by session and time.
+
+    `rows` (n,) are those of each recording, `error` (n,) is measured less true and `residual` (n,) less fitted, metres.
+    `time_s` (n,) counts from the first range, without pauses. `slopes` test for more unknowns.
+    """
+
+    rows: Ints
+    model: RangeModel
+    error: Floats
+    start: Fitted
+    residual: Floats
+    time_s: Floats
+    slopes: Slopes
+
+    @property
+    def pair(self) -> Ints:
+        """The number of each range's pair (n,)."""
+        return self.model.pairs.number
+
+    @property
+    def ends(self) -> Ints:
+        """The tags of each pair (k, 2)."""
+        return self.model.pairs.ends
+
+    @property
+    def names(self) -> list[str]:
+        """The names of pairs (k,)."""
+        return [f"{a}-{b}" for a, b in self.ends.tolist()]
+
+    def less(self, metres: Floats) -> QuickFit:
+        """Return a fit to ranges that are shorter by some metres (n,)."""
+        return _fitted(self.model, self.error - metres, self.rows)
+
+    @cached_property
+    def reflected(self) -> Floats:
+        """The probability (n,) that each range is reflected, by the likeliest error model beside all else."""
+        found = likeliest(self.model, self.error, self.start)
+        values = {name: np.atleast_1d(of) for name, of in found.rows.values(found.optimum.x).items()}
+        return error_slopes(found.residuals, values, span_m=OUTLIERS_OVER_M).reflected
+
+    def of_tag(self, tag: int) -> Bools:
+        """Return which ranges (n,) are a tag's."""
+        return np.asarray((self.ends == tag).any(axis=1)[self.pair])
+
+    def offsets(self, family: Family) -> tuple[Floats, Floats, Floats, float]:
+        """Return offsets (k,), what is known of each in 1/m^2, standard errors (k,), and degrees of freedom.
+
+        Errors that last are in the standard errors, which are infinite for offsets of which nothing is known.
+        """
+        tested = self.slopes.test(family)
+        information = np.diag(tested.information)
+        known = information > REACHED * tested.whole
+        information = np.where(known, information, 1.0)
+        std = np.sqrt(np.maximum(np.diag(tested.covariance), 1e-300)) / information
+        size = np.where(known, -tested.total / information, 0.0)
+        dof = min(tested.lasting.freedom, tested.blocks - 1.0)
+        return size, np.where(known, information, 0.0), np.where(known, std, np.inf), dof
+
+
+def quick_fit(
+    views: Sequence[RecordingView], constants: str = "pair", ranges_a_pair: int = RANGES_A_PAIR
+) -> QuickFit | None:
+    """Fit a curve over power and constants by "pair" or "tag" to recordings, a session each; None if ranges are few."""
+    kept = [_of_common_pairs(view, ranges_a_pair) for view in views]
+    if sum(map(len, kept)) < FEWEST_RANGES or not all(map(len, kept)):
+        return None
+    parts = [
+        Ranges.from_exchanges(view.exchanges[rows], view.truth_m[rows]) for view, rows in zip(views, kept, strict=True)
+    ]
+    ranges = parts[0] if len(parts) == 1 else concatenate(parts)
+    model = model_of(ranges, Recipe(loss="cauchy", fixed_ns={}, groups={}, constants=constants), trimmed=False)
+    error = np.concatenate([view.error_m[rows] for view, rows in zip(views, kept, strict=True)])
+    return _fitted(model, error, np.concatenate(kept))
+
+
+def _fitted(model: RangeModel, error: Floats, rows: Ints) -> QuickFit:
+    kinds = ("delay", *model.curve_kinds())
+    start = robust_fit(model, error, "cauchy", None, kinds, sample=PILOT)
+    layout, whole = model.build(error, start.rows.errors, only=kinds)
+    optimum = maximize([whole, *start.gauge], Priors(layout), start.optimum.x, steps=20, evidence_steps=0)
+    time_ns, session = model.ranges.time_ns, model.ranges.session
+    steps_s = np.diff(time_ns * 1e-9, prepend=time_ns[0] * 1e-9) * (np.diff(session, prepend=0) == 0)
+    return QuickFit(
+        rows=rows,
+        model=model,
+        error=error,
+        start=start,
+        residual=whole.residuals(optimum.x),
+        time_s=np.cumsum(np.minimum(steps_s, GAP_S)),
+        slopes=Slopes(whole, optimum, _long(time_blocks(time_ns, session)), np.zeros((0, layout.size))),
     )
 
 
-def _joined(parts: list[Exchanges]) -> Exchanges:
-    whole: dict[str, Any] = {name: np.concatenate(list(columns)) for name, columns in _columns(parts)}
-    return replace(parts[0], **whole)
+def _long(blocks: TimeBlocks) -> TimeBlocks:
+    """Return long blocks in the place of short ones: sums over them hardly share errors that last."""
+    count = min(STRETCHES_OF_SCORES, blocks.count)
+    number = blocks.number.astype(np.int64) * count // blocks.count
+    bounds = np.unique(np.append(blocks.bounds[:-1] * count // blocks.count, count))
+    return TimeBlocks(number=number.astype(np.int32), bounds=bounds, seconds=blocks.seconds)
 
 
-def _once(parts: list[Poses]) -> Poses:
-    """Return poses in order of time, those that several have once."""
-    every = replace(no_poses(), **{name: np.concatenate(list(columns)) for name, columns in _columns(parts)})
-    body = np.unique(every.body, return_inverse=True)[1]
-    order = np.lexsort((body, every.time_ns))
-    time, who = every.time_ns[order], body[order]
-    first = np.ones(len(order), dtype=bool)
-    first[1:] = (np.diff(time) != 0) | (np.diff(who) != 0)
-    return every[order[first]]
-
-
-def _columns(parts: list[Any]) -> Iterator[tuple[str, Iterator[NDArray[Any]]]]:
-    for field in fields(parts[0]):
-        if isinstance(getattr(parts[0], field.name), np.ndarray):
-            yield field.name, (getattr(part, field.name) for part in parts)
+def _of_common_pairs(view: RecordingView, ranges_a_pair: int) -> Ints:
+    """Return the rows with a true distance of pairs that have enough of them, by time."""
+    rows = np.flatnonzero(np.isfinite(view.error_m))
+    rows = rows[np.argsort(view.exchanges.time_ns[rows], kind="stable")]
+    _, pair, count = np.unique(pair_ids(view.exchanges)[rows], return_inverse=True, return_counts=True)
+    return np.asarray(rows[count[pair] >= ranges_a_pair])

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from calib.checks.quick_fit import QuickFit, quick_fit
-from calib.checks.recording_view import RecordingView
+from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
 from calib.data.ranges import Ranges
 from calib.errors import CalibError
 from calib.estimator.known_distances import Recipe, fit_known_distances
@@ -47,43 +45,27 @@ BETTER: Final = 0.6
 """A loss is recommended if its halves disagree by no more than this share of the other's."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reflected:
-    """A pair's reflected ranges: share, mean detour, how long they stay so on average, and the p-value of that."""
-
-    name: str
-    share: float
-    detour_m: float
-    life_s: float
-    p_value: float
-
-
 def reflections(view: RecordingView) -> Iterator[Candidate]:
     """Pairs whose reflections last, and recordings or tags of whose ranges a large share is reflected."""
     fit = view.quick_fit or quick_fit([view], constants="tag", ranges_a_pair=1)
     if fit is None or len(fit.rows) < RANGES_IN_ALL:
         return
     long = fit.reflected > 0.5
-    share, detour = float(np.mean(long)), _detour_m(fit, long)
-    told = f"about {100 * share:.0f} % of the ranges are reflected, by {100 * detour:.0f} cm on average"
+    share = float(np.mean(long))
+    told = f"about {100 * share:.0f} % of the ranges are reflected, by {100 * _detour_m(fit, long):.0f} cm on average"
     if view.quick_fit is None:
         yield from _of_tags(fit, long, told)
         return
-    pairs = [one for pair in range(len(fit.ends)) if (one := _of_pair(fit, fit.pair == pair, long)) is not None]
-    lasting = sorted((one for one in pairs if one.p_value < BUDGET), key=lambda one: -one.share * one.detour_m)
+    lasting = [one for pair in range(len(fit.ends)) for one in _of_pair(fit, pair, long) if one.p_value < BUDGET]
     if lasting:
-        named = "; ".join(
-            f"pair {one.name}: {100 * one.share:.0f} % of its ranges, by {100 * one.detour_m:.0f} cm, for "
-            f"{one.life_s:.1f} s at a time"
-            for one in lasting[:4]
-        )
+        lasting.sort(key=lambda one: -one.gain)
+        named = "; ".join(one.evidence for one in lasting[:4])
         more = f"; and {len(lasting) - 4} pairs more" if lasting[4:] else ""
         p_value = min(one.p_value for one in lasting)
         yield Candidate(LASTING, named + more, p_value, {"advice": advice_on_loss(view)})
-        return
-    parts = [float(np.mean(long[s])) for s in stretches(len(long))]
-    std = float(np.std(parts, ddof=1) / np.sqrt(len(parts))) if parts else np.inf
-    if share > MANY_SHARE:
+    elif share > MANY_SHARE:
+        parts = [float(np.mean(long[s])) for s in stretches(len(long))]
+        std = float(np.std(parts, ddof=1) / np.sqrt(len(parts))) if parts else np.inf
         p_value = exceeds(share, std, len(parts) - 1, tolerance=MANY_SHARE)
         remedy = f"move antennas away from bodies and walls{advice_on_loss(view) if p_value < BUDGET else ''}"
         yield Candidate(MANY, told, p_value, {"more": remedy})
@@ -94,19 +76,22 @@ def _detour_m(fit: QuickFit, long: Bools) -> float:
     return float(np.mean(fit.residual[long]) - np.median(fit.residual[~long])) if long.any() and not long.all() else 0.0
 
 
-def _of_pair(fit: QuickFit, mine: Bools, every: Bools) -> Reflected | None:
-    """Return what of a pair's ranges is reflected, and the p-value of reflected ranges that follow each other."""
-    long, time_s = every[mine], fit.time_s[mine]
-    share = float(np.mean(long))
+def _of_pair(fit: QuickFit, pair: int, every: Bools) -> Iterator[Candidate]:
+    """Yield a pair whose reflected ranges follow each other, with how much they lengthen its ranges as its gain."""
+    mine = fit.pair == pair
+    long, share = every[mine], float(np.mean(every[mine]))
     if len(long) < RANGES_OF_A_SEQUENCE or not LEAST_SHARE < share < 1:
-        return None
-    after = long[1:][long[:-1]]
-    p_value = more_often(int(after.sum()), len(after), share + STICKY * (1 - share), tried=len(fit.ends))
-    life_s = _life_s(fit.reflected[mine], time_s)
-    name = fit.named(int(fit.pair[mine][0]))
-    detour_m = _detour_m(fit, mine & every)
-    p_value = p_value if life_s > LASTS_S else 1.0
-    return Reflected(name=name, share=share, detour_m=detour_m, life_s=life_s, p_value=p_value)
+        return
+    life_s, detour_m = _life_s(fit.reflected[mine], fit.time_s[mine]), _detour_m(fit, mine & every)
+    if life_s > LASTS_S:
+        after = long[1:][long[:-1]]
+        yield Candidate(
+            LASTING,
+            f"pair {fit.names[pair]}: {100 * share:.0f} % of its ranges, by {100 * detour_m:.0f} cm, for "
+            f"{life_s:.1f} s at a time",
+            more_often(int(after.sum()), len(after), share + STICKY * (1 - share), tried=len(fit.ends)),
+            gain=share * detour_m,
+        )
 
 
 def _life_s(reflected: Floats, time_s: Floats) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from calib.checks import clocks, geometry, offsets, pairs, reflected, stamps, surveys, units
+from calib.checks import clocks, columns, geometry, offsets, pairs, reflected, surveys
 from calib.findings import BUDGET, CERTAIN, OF_A_FIT, Check
 
 ALONE: Final = "Student's t over 16 stretches of time"
@@ -15,24 +15,24 @@ GROSS: Final = (
         "Do double-sided exchanges have a third message?",
         "share without one, above a half", CERTAIN,
         {"single-sided data taken for double-sided": 'import again with protocol = "ss"'},
-        stamps.single_as_double,
+        columns.single_as_double,
     ),
     Check(
         "Does a frame last as long as frames do?",
         "longest leg, shorter than a frame as ticks and not as ns", CERTAIN,
         {"unit slip": 'the stamps are nanoseconds, not ticks: import again with [units] stamps = "ns"'},
-        stamps.ticks,
+        columns.ticks,
     ),
     Check(
         "Are true distances and ranges in one unit?",
         "spread of ranges less true distances, halved by mm, cm, in or ft", CERTAIN,
         {
-            units.POSES: "divide x y z of the poses by {many}, add them again: uwblink poses ... --from FILE; or "
+            columns.POSES: "divide x y z of the poses by {many}, add them again: uwblink poses ... --from FILE; or "
             'import again with [units] distance = "{unit}" where the table has them',
-            units.TRUTH: 'import again with [units] distance = "{unit}", or divide gt_range_m by {many}',
-            units.RANGES: 'import again with [units] distance = "{unit}"',
+            columns.TRUTH: 'import again with [units] distance = "{unit}", or divide gt_range_m by {many}',
+            columns.RANGES: 'import again with [units] distance = "{unit}"',
         },
-        units.lengths,
+        columns.lengths,
     ),
     Check(
         "Do the stamps make ranges as the recording says?",
@@ -41,7 +41,7 @@ GROSS: Final = (
             "another protocol": "import again with {settings}",
             "timestamp width": "import again with bits = {bits}",
         },
-        stamps.another,
+        columns.another,
     ),
 )  # fmt: skip
 
@@ -53,27 +53,27 @@ ROWS: Final = (
             "corrupted exchanges": "a robust fit leaves them out; check cables and USB load, and decode the recording "
             "again if it has bytes"
         },
-        stamps.corrupted,
+        columns.corrupted,
     ),
     Check(
         "Is each exchange there once?",
         "rows with all stamps of another", CERTAIN,
         {"doubled exchanges": "import one log of each exchange; what is said here counts each once"},
-        stamps.doubled,
+        columns.doubled,
     ),
     Check(
         "Do both reports of an exchange agree?",
         "reports that differ", CERTAIN,
         {"contradicting reports": "look at the cables and ports of the two boards; what a damaged line says is not "
          "known"},
-        stamps.contradicting,
+        columns.contradicting,
     ),
     Check(
         "Does a tag range with itself?",
         "exchanges with one tag at both ends", CERTAIN,
         {"a tag with itself": "import again with other columns for from_id and to_id; a fit leaves these exchanges "
          "out"},
-        stamps.with_itself,
+        columns.with_itself,
     ),
     Check(
         "Does a tag fail in more than half of its exchanges, and more than others?",
@@ -84,8 +84,8 @@ ROWS: Final = (
     Check(
         "Are powers dBm at an antenna?",
         "median outside of -140 to -30 dBm", CERTAIN,
-        {units.POWER: "{factor}, and import again"},
-        units.powers,
+        {columns.POWER: "{factor}, and import again"},
+        columns.powers,
     ),
 )  # fmt: skip
 
@@ -172,19 +172,15 @@ STRUCTURE: Final = (
         clocks.swapped_roles,
     ),
     Check(
-        "Are reported ranges those of the stamps?",
+        "Are reported ranges those of the stamps, in metres?",
         "median of their ratio", CERTAIN,
         {
             "speed of light in vacuum": "nothing for a fit, which uses the stamps; multiply reported ranges by 0.9997 "
             "before using them",
+            columns.REPORTED: 'nothing for a fit, which uses stamps; else import again with [units] distance = '
+            '"{unit}"',
         },
-        stamps.speed_of_light,
-    ),
-    Check(
-        "Are reported ranges in metres?",
-        "median of their ratio to those of the stamps", CERTAIN,
-        {units.REPORTED: 'nothing for a fit, which uses stamps; else import again with [units] distance = "{unit}"'},
-        units.reported,
+        columns.reported,
     ),
     Check(
         "Were carriers read where one reply is all that there is?",

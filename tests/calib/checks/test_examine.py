@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib.checks.columns import VACUUM_OVER_AIR
 from calib.checks.examine import examine
-from calib.checks.stamps import VACUUM_OVER_AIR
 from uwblink.recording.schema import Fault
 from uwblink.ticks import TICKS_PER_SECOND
 from uwblink.twr import STAMPS, board_range
