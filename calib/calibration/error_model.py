@@ -54,7 +54,8 @@ class ErrorModel:
     what makes quantiles hold where the shape does not. `scale` does so for the total standard deviation. `detour_m` is
     the mean of both kinds of exponential detour; `long_share` of the reflections are `long_factor` times as long as the
     others. Without one there is one kind, as in calibrations of uwbcal up to 0.2.0. Of the noise `between_m` is what
-    stays in the ranges of a pair for a recording, or a spell of it, and changes by the next.
+    stays in the ranges of a pair for a recording, or a spell of it, and changes by the next; the uncertainty of delays
+    and curve is in the noise, too.
     `lasting` says how long errors within the gate of a filter last; None where that is not known.
     """
 
@@ -74,9 +75,13 @@ class ErrorModel:
     pairs: dict[PairName, PairErrors] = field(default_factory=dict)
     lasting: LastingErrors | None = None
 
-    def between(self, between_m: float) -> ErrorModel:
-        """Return the model for other recordings, in which pairs differ by `between_m`."""
-        noise_m = tuple(np.hypot(self.noise_m, between_m).tolist())
+    def between(self, between_m: float, correction_m: Floats | float = 0.0) -> ErrorModel:
+        """Return the model for other recordings, in which pairs differ by `between_m`.
+
+        `correction_m` (nodes,) are standard deviations of the correction at the powers `lifted`: with few ranges,
+        delays and curve are uncertain, and corrected ranges share that error.
+        """
+        noise_m = tuple(np.hypot(np.hypot(self.noise_m, between_m), correction_m).tolist())
         return replace(self, noise_m=noise_m, between_m=between_m)
 
     @property

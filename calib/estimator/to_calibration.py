@@ -60,7 +60,7 @@ def calibration_of(
         errors = error_model(model, found.residuals, described, found.blocks)
         if between_m is None:
             between_m = between_recordings(model, found.residuals, described, found.blocks, _between_pairs(found))
-        errors = errors.between(between_m)
+        errors = errors.between(between_m, _correction_std(found, delays_ns2, np.array(errors.lifted)))
         sigmas, sigma_m2 = sigma_curves(model, described.values, described.covariances["noise"])
     return Calibration(
         delays_ns={tag: float(found.delays[k]) for k, tag in zip(fitted, tags, strict=not of_pairs)} | dict(fixed),
@@ -143,6 +143,26 @@ def _flat_sigma(model: RangeModel, sigma: float, count: int) -> tuple[dict[str, 
     value = max(sigma, SIGMA_FLOOR_M)
     curve = flat_curve(value, model.span)
     return dict.fromkeys(model.groups or ("",), curve), np.full((DEGREE + 1,) * 2, value**2 / (2 * count))
+
+
+def _correction_std(found: KnownDistances, delays_ns2: Floats, lifted: Floats) -> Floats:
+    """Return the standard deviation of the correction at lifted powers (nodes,), in metres: the root mean square over
+    the fitted pairs.
+
+    The correction of a pair has half of both delays, times the speed of light, and the curve.
+    """
+    model = found.model
+    if model.constants == "pair":
+        of_pairs = METRES_A_NS**2 * np.diag(delays_ns2)
+    else:
+        delays = np.sum(model.pairs.ends[:, :, None] == np.array(model.tags), axis=1) * METRES_A_NS / 2
+        of_pairs = np.sum(delays @ delays_ns2 * delays, axis=1)
+    variance = np.full(len(lifted), float(np.mean(of_pairs)))
+    if model.curve is not None:
+        at = Spline.at(lifted, model.curve.knots)
+        known = _bias_covariance(found)[at.columns[:, :, None], at.columns[:, None, :]]
+        variance += np.einsum("ki,kij,kj->k", at.values, known, at.values)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def _bias_covariance(found: KnownDistances) -> Floats:
