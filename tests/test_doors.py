@@ -15,7 +15,7 @@ BESIDE = {
     "uwblink.exporters.export_recording": "the front door offers no export yet",
     "uwblink.importers.guess.guess_map": "what import suggests where no map is given; read_source takes the map",
     "uwblink.__version__": "what --version prints",
-    "uwblink.cli.starting": "Ctrl-C while a command is being imported, and what must come before",
+    "uwblink.cli.start": "Ctrl-C while a command is being imported, and what must come before",
     "uwblink.settings": "fields of settings that Python and the command line share",
     "calib.settings": "the settings of a fit, of which its options are made",
     "uwblink.cli.guide": "options, panels, examples and completion that the three commands share",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NoReturn
 
-from uwblink.cli.starting import start
+from uwblink.cli import start
 
 
 def main() -> NoReturn:

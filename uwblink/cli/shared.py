@@ -18,10 +18,10 @@ from typing import Annotated, Any, Final, NoReturn
 import typer
 
 from uwblink import __version__
+from uwblink.cli import INTERRUPTED as INTERRUPTED
 from uwblink.cli.guide import AsJson as AsJson
 from uwblink.cli.guide import Force as Force
 from uwblink.cli.guide import Group
-from uwblink.cli.starting import INTERRUPTED as INTERRUPTED
 from uwblink.errors import PluginWarning, UwblinkError
 
 FLAGS: Final = {"map_file": "--map", "tags_from": "--tags", "duration_s": "--duration"}

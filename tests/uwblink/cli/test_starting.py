@@ -8,7 +8,7 @@ import sys
 import pytest
 
 THREADS = """
-from uwblink.cli.starting import start
+from uwblink.cli import start
 
 def command():
     import numpy
@@ -31,7 +31,7 @@ def test_linear_algebra_takes_one_thread_unless_asked_for_more(asked, threads):
 
 INTERRUPTED_AT_THE_END = """
 import atexit, os, signal
-from uwblink.cli.starting import start
+from uwblink.cli import start
 
 def command():
     # Registered first, so called last: when the command has ended and its files are written.
