@@ -240,10 +240,6 @@ def _by_body(option: str, what: str, words: list[str]) -> dict[str, str]:
     return found
 
 
-def _announce(names: dict[str, str]) -> None:
-    typer.echo("\n".join(f"{was} plays at {now}" for was, now in names.items()))
-
-
 def replay(
     recording: Annotated[Path, typer.Argument(help="Recording of boards (.uwb).")],
     output: Annotated[Path | None, output("Recording to write, decoded again (.uwb).")] = None,
@@ -260,8 +256,13 @@ def replay(
         check_output(output, force=force, recording=True)
     with uwblink.Recording.open(recording) as opened:
         if serve:
-            count = play(opened, _announce, speed=speed, link_dir=link_dir)
-            typer.echo(f"{count} pieces played")
+            played = play(
+                opened,
+                lambda names: typer.echo("\n".join(f"{was} plays at {now}" for was, now in names.items())),
+                speed=speed,
+                link_dir=link_dir,
+            )
+            typer.echo(f"{played} pieces played")
             return
         with waiting("decoding"):
             decoded = decode_again(opened)
@@ -269,8 +270,10 @@ def replay(
             if output:
                 rewrite(opened, decoded, output, force=force)
     lines = [f"{summary['messages']} messages, {summary['skipped_bytes']} bytes skipped"]
-    for table in ("exchanges", "overheard", "cirs"):
-        lines.append(f"  {table}: {summary[table]['decoded']} decoded now, {summary[table]['stored']} in the recording")
+    lines += [
+        f"  {table}: {summary[table]['decoded']} decoded now, {summary[table]['stored']} in the recording"
+        for table in ("exchanges", "overheard", "cirs")
+    ]
     print_result(summary, "\n".join(lines), as_json=as_json)
 
 

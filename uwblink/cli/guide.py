@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import Field, fields, is_dataclass
 from functools import wraps
 from inspect import Parameter, Signature, signature
@@ -49,51 +49,40 @@ def count(sentence: str, *, min: int = 1, max: int | None = None) -> Any:  # noq
     return typer.Option("-n", "--count", help=sentence, min=min, max=max)
 
 
-def refuse_old_names(words: Sequence[str], renamed: Mapping[str, str]) -> None:
-    """Raise `ArgumentError` with the new name of an option that is given by its old name."""
-    for word in words:
-        old = word.partition("=")[0]
-        if old in renamed:
-            raise ArgumentError(f"{old} is now {renamed[old]}")
+class _PlainFlags:
+    def get_params(self, ctx: Any) -> Any:
+        """Return the parameters; flags are shown without a value."""
+        parameters = super().get_params(ctx)  # type: ignore[misc]  # that of the class beside it
+        for one in parameters:
+            if getattr(one, "is_flag", False):
+                one.metavar = ""
+        return parameters
 
 
-class Command(TyperCommand):
+class Command(_PlainFlags, TyperCommand):
     """A command that shows no type for flags, and rejects old names of its options with the new ones."""
 
     renamed: Mapping[str, str] = {}
 
-    def get_params(self, ctx: Any) -> Any:
-        """Return the parameters; flags are shown without a value."""
-        return _without_type(super().get_params(ctx))
-
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line; raises `ArgumentError` for an old name."""
-        if not ctx.resilient_parsing:
-            refuse_old_names(args, self.renamed)
+        for word in () if ctx.resilient_parsing else args:
+            old = word.partition("=")[0]
+            if old in self.renamed:
+                raise ArgumentError(f"{old} is now {self.renamed[old]}")
         return super().parse_args(ctx, args)
 
 
-class Group(TyperGroup):
+class Group(_PlainFlags, TyperGroup):
     """A group of commands that shows no type for flags; `moved` is the error for an unknown command."""
 
     moved = ""
-
-    def get_params(self, ctx: Any) -> Any:
-        """Return the parameters; flags are shown without a value."""
-        return _without_type(super().get_params(ctx))
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line; raises `ArgumentError` if the group is called as the command that it was before."""
         if self.moved and not ctx.resilient_parsing and args and args[0] not in (*self.list_commands(ctx), "--help"):
             raise ArgumentError(self.moved)
         return super().parse_args(ctx, args)
-
-
-def _without_type(parameters: Any) -> Any:
-    for one in parameters:
-        if getattr(one, "is_flag", False):
-            one.metavar = ""
-    return parameters
 
 
 WRITTEN: Final = ("output", "pdf", "figures", "report", "tum", "plot")
@@ -192,16 +181,13 @@ def apart(command: Callable[..., None]) -> Callable[..., None]:
         from uwblink.output import check_apart
 
         outputs = {name: given[name] for name in WRITTEN if isinstance(given.get(name), Path)}
-        others = (value for name, value in given.items() if name not in outputs)
-        check_apart(outputs, [path for value in others for path in _paths(value)])
+        others = (
+            value if isinstance(value, list | tuple) else [value] for n, value in given.items() if n not in outputs
+        )
+        check_apart(outputs, [one for values in others for one in values if isinstance(one, Path)])
         command(**given)
 
     return run
-
-
-def _paths(value: Any) -> list[Path]:
-    several = value if isinstance(value, list | tuple) else [value]
-    return [one for one in several if isinstance(one, Path)]
 
 
 def epilog(*examples: str) -> str | None:

@@ -102,7 +102,9 @@ def record(
     chosen = _plan(plan, rate, antenna_delays, pairs="all" if pairs == "all" else ())
     if cir:
         chosen = replace(chosen, get_cir=True)
-    with interrupts() as stop, _watcher() as watch, _page(output, calibration, live_port, live, chosen) as page:
+    with ExitStack() as stack:
+        stop, watch = stack.enter_context(interrupts()), stack.enter_context(_watcher())
+        page = stack.enter_context(_page(output, calibration, live_port, chosen)) if live else None
 
         def watch_all(progress: Progress) -> None:
             watch(progress)
@@ -246,19 +248,13 @@ def _ids(text: str) -> tuple[int, ...]:
     return tuple(map(int, words))
 
 
-@contextmanager
-def _page(
-    path: Path, calibration: Path | None, port: int, live: bool, plan: uwblink.RangingPlan
-) -> Iterator[LivePage | None]:
-    """Serve the live page, if it was asked for."""
-    if not live:
-        yield None
-        return
+def _page(path: Path, calibration: Path | None, port: int, plan: uwblink.RangingPlan) -> LivePage:
+    """Return the served live page."""
     from uwblink.boards import LivePage
 
-    with LivePage(path, correct=_correction(calibration, plan), port=port) as page:
-        typer.echo(f"live page: {page.url}", err=True)
-        yield page
+    page = LivePage(path, correct=_correction(calibration, plan), port=port)
+    typer.echo(f"live page: {page.url}", err=True)
+    return page
 
 
 @contextmanager
