@@ -1,28 +1,34 @@
 """Import of files in other formats; programs and other distributions can register importers of their own.
 
 A registered reader takes a path and returns `Contents`. This module writes the recording, and never overwrites one
-unless it is told to.
+unless it is told to. It also reads back what `uwblink export --to csv` or `parquet` wrote.
 """
 
 from __future__ import annotations
 
+import csv
 import os
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final, Protocol
 
-from uwblink.errors import ArgumentError, ImportTableError
+import duckdb
+
+from uwblink.errors import ArgumentError, ImportTableError, first_line
 from uwblink.importers.bags import BAG_SUFFIXES, open_exchange_bag
 from uwblink.importers.exchange_tables import TABLE_SUFFIXES, open_tables
-from uwblink.importers.exported import read_exported
 from uwblink.importers.miluv import read_miluv
 from uwblink.importers.poses import add_poses
-from uwblink.importers.staging import Watch
+from uwblink.importers.staging import Watch, unwatched
+from uwblink.importers.tables import connect_to
 from uwblink.output import check_output
 from uwblink.plugins import Registry, check_row, is_text
-from uwblink.recording.contents import Contents
+from uwblink.recording.contents import Contents, load
+from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM
+from uwblink.recording.store import Store
 
 __all__ = [
     "IMPORTERS",
@@ -62,7 +68,7 @@ class Importer:
     map_help: str | None = None
     read_all: Callable[[Sequence[Path], Path | None], Contents] | None = None
     _: KW_ONLY
-    open_all: Callable[[Sequence[Path], Path | None, Watch | None], AbstractContextManager[Importing]] | None = None
+    open_all: Callable[[Sequence[Path], Path | None, Watch], AbstractContextManager[Importing]] | None = None
 
 
 def check_importer(row: Any) -> None:
@@ -92,6 +98,53 @@ def read_table(source: Path | Sequence[Path], map_file: Path | None = None) -> C
 def _read_bag(source: Path, map_file: Path | None = None) -> Contents:
     with open_exchange_bag([source], map_file) as found:
         return found.contents()
+
+
+def read_exported(folder: Path, _map_file: Path | None = None) -> Contents:
+    """Read an export to CSV or Parquet, every column of every table; raises `ImportTableError`."""
+    if not folder.is_dir():
+        raise ImportTableError(f"{folder}: no such folder; expected one that 'uwblink export' wrote")
+    places = [(table, folder / f"{table}{suffix}") for table in TABLES for suffix in (".parquet", ".csv")]
+    paths = {table: path for table, path in places if path.is_file()}
+    if "exchanges" not in paths:
+        raise ImportTableError(f"{folder}: holds no exchanges.csv or exchanges.parquet, as 'uwblink export' writes")
+    with TemporaryDirectory() as place:
+        path = Path(place) / "exported.uwb"
+        store = Store.write(path, path)
+        try:
+            for table, source in paths.items():
+                with connect_to([source]) as db:
+                    store.insert(table, dict(db.execute(_query(db, table, source), [str(source)]).fetchnumpy()))
+        except (duckdb.Error, UnicodeDecodeError, csv.Error) as error:
+            raise ImportTableError(f"{source}: not in the form of 'uwblink export' ({first_line(error)})") from error
+        finally:
+            store.close()
+        return load(path)
+
+
+def _query(db: duckdb.DuckDBPyConnection, table: str, source: Path) -> str:
+    """Return the query that reads an exported table; text from the file never becomes part of it."""
+    columns, read = TABLES[table] | {TRUTH_FROM: "VARCHAR"}, "read_parquet(?)"
+    cells = {name: f'"{name}"' for name in TABLES[table]}
+    if source.suffix == ".csv":
+        with source.open(encoding="utf-8-sig", newline="") as file:
+            header = next(csv.reader(file), [])
+        there = [name if name in columns else f"other{k}" for k, name in enumerate(header)]
+        kinds = ", ".join(f"'{name}': 'VARCHAR'" for name in there)
+        read = (
+            f"read_csv(?, auto_detect=false, header=true, delim=',', quote='\"', escape='\"', nullstr='', "
+            f"allow_quoted_nulls=false, columns={{{kinds}}}, max_line_size=64000000, parallel=false)"
+        )
+        for name, kind in TABLES[table].items():
+            cells[name] = f"CAST({f'unhex({cells[name]})' if kind == 'BLOB' else cells[name]} AS {kind})"
+    else:
+        found = db.execute(f"DESCRIBE SELECT * FROM {read}", [str(source)]).fetchall()  # noqa: S608 - nothing of a file
+        there = [str(row[0]) for row in found]
+    if TRUTH_FROM in there and table == "exchanges":
+        # Distances by poses are left out, because the poses are imported, too.
+        cells["truth_m"] = f"CASE WHEN {TRUTH_FROM} = '{BY_POSES}' THEN NULL ELSE {cells['truth_m']} END"
+    listed = ", ".join(f'{cell} AS "{name}"' for name, cell in cells.items())
+    return f"SELECT {listed} FROM {read}"  # noqa: S608 - keys of TABLES
 
 
 IMPORTERS: Final[Registry[Importer]] = Registry(
@@ -189,7 +242,7 @@ def import_file(
     importer: str | None = None,
     map_file: str | os.PathLike[str] | None = None,
     force: bool = False,
-    watch: Watch | None = None,
+    watch: Watch = unwatched,
 ) -> Imported:
     """Do what `import_recording` does; returns what was imported.
 

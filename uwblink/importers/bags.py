@@ -25,7 +25,7 @@ from uwblink.errors import ImportTableError, first_line
 from uwblink.exporters.mcap import RANGE
 from uwblink.importers.column_map import ColumnMap, load_map
 from uwblink.importers.exchange_tables import TableImport, plan
-from uwblink.importers.staging import Watch, staged
+from uwblink.importers.staging import Watch, staged, unwatched
 from uwblink.text_files import require_regular
 
 BAG_SUFFIXES: Final = (".bag", ".mcap", ".db3")
@@ -163,15 +163,14 @@ def _records(path: Path) -> Iterator[McapRecord]:
 
 @contextmanager
 def open_exchange_bag(
-    sources: Sequence[Path], map_file: Path | None = None, watch: Watch | None = None
+    sources: Sequence[Path], map_file: Path | None = None, watch: Watch = unwatched
 ) -> Iterator[TableImport]:
     """Yield the exchanges of one bag; `map_file` says which topics and fields they are in.
 
     Raises `ImportTableError`.
     """
     (source,) = sources
-    if watch:
-        watch("reading", 0.0)
+    watch("reading", 0.0)
     with TemporaryDirectory(prefix="uwblink-") as place:
         table = Path(place) / f"{source.name}.jsonl"
         column_map = _to_json_lines(source, load_map(map_file) if map_file else ColumnMap(), table)

@@ -178,16 +178,6 @@ class ColumnMap:
     each: str | None = None
     topics: dict[str, dict[str, float | str]] = field(default_factory=dict)
 
-    @property
-    def metres_per_unit(self) -> float:
-        """The unit of distances, metres by default."""
-        return DISTANCE_UNITS[self.distance_unit or "m"]
-
-    @property
-    def power_sign(self) -> float:
-        """The factor of powers: -1 if they are written without their sign."""
-        return -1.0 if self.power_unit == "-dBm" else 1.0
-
     def header(self, name: str) -> str:
         """Return the table's name of a column of `NAMES`."""
         return self.columns.get(name, name)

@@ -18,7 +18,7 @@ from uwblink.arrays import Ints
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import IDS
 from uwblink.importers.plausibility import counter_format
-from uwblink.importers.staging import StagedRows, Staging, Watch
+from uwblink.importers.staging import StagedRows, Staging, Watch, unwatched
 from uwblink.importers.tables import Columns
 from uwblink.recording.schema import Fault
 from uwblink.twr import LARGEST_ID, STAMPS
@@ -64,10 +64,6 @@ class Faults:
     def __len__(self) -> int:
         """Return the number of unusable rows, without those with too many cells."""
         return int(self._staging.db.execute("SELECT count(*) FROM faulty").fetchall()[0][0])
-
-    def count_too_long(self) -> int:
-        """Return the number of rows with more cells than the header."""
-        return sum(len(table.rejected()) for table in self._staging.tables)
 
     def check(self, total: int) -> None:
         """Raise `ImportTableError` with the first unusable row if half of all rows or more are unusable."""
@@ -132,7 +128,7 @@ class UsableRows:
 
     def blocks(self) -> Iterator[Columns]:
         """Yield the rows in their order, block by block; empty blocks are left out."""
-        return filter(_some, self.rows.blocks(self.condition))
+        return (columns for columns in self.rows.blocks(self.condition) if len(columns["origin"]))
 
     def sample(self, size: int) -> Columns:
         """Return a pseudo-random sample of the rows, in their order."""
@@ -143,10 +139,6 @@ class UsableRows:
         """Return the ids of all devices, in ascending order."""
         ends = (f"SELECT {name} AS id FROM {self.rows.name} WHERE {self.condition}" for name in IDS)
         return [int(tag) for (tag,) in self.rows.db.execute(f"{' UNION '.join(ends)} ORDER BY id").fetchall()]
-
-
-def _some(columns: Columns) -> bool:
-    return bool(len(columns["origin"]))
 
 
 def usable_ranges(rows: StagedRows, faults: Faults, among: str) -> UsableRows:
@@ -206,7 +198,7 @@ _WHOLE: Final = ("gt_range_m", "range_m")
 
 
 def assemble_exchanges(
-    staging: Staging, layout: str, faults: Faults, watch: Watch | None = None
+    staging: Staging, layout: str, faults: Faults, watch: Watch = unwatched
 ) -> tuple[StagedRows, str, str | None]:
     """Combine rows of "messages", "stamps" or "parts" into exchanges.
 
@@ -218,13 +210,11 @@ def assemble_exchanges(
     for name in needed[layout]:
         if not rows.has(name):
             raise staging.missing(name)
-    if watch:
-        watch("sorting", 0.0)
+    watch("sorting", 0.0)
     good = faults.reject(rows, ENDS)
     if layout == "stamps":
         rows, good = _messages_of_stamps(rows, good, faults, within_s)
-    if watch:
-        watch("grouping", 0.0)
+    watch("grouping", 0.0)
     if layout == "parts":
         return _exchanges_of_parts(rows, good, faults, within_s)
     return _exchanges_of_messages(rows, good, faults, within_s)

@@ -46,7 +46,7 @@ from uwblink.importers.plausibility import (
     to_ticks,
     truth_m,
 )
-from uwblink.importers.staging import ROWS_AT_ONCE, Staging, Watch, staged
+from uwblink.importers.staging import ROWS_AT_ONCE, Staging, Watch, staged, unwatched
 from uwblink.importers.tables import Columns
 from uwblink.recording.antenna_delays import AntennaDelay, delay_of, meta_of_delays
 from uwblink.recording.contents import Contents, load
@@ -62,7 +62,7 @@ ROW_PERIOD_NS: Final = 1_000_000
 
 @contextmanager
 def open_tables(
-    sources: Sequence[Path], map_file: Path | None = None, watch: Watch | None = None
+    sources: Sequence[Path], map_file: Path | None = None, watch: Watch = unwatched
 ) -> Iterator[TableImport]:
     """Open one table, all tables of a folder as one, or several files as one; raises `ImportTableError`.
 
@@ -80,7 +80,7 @@ def open_tables(
         yield plan(staging, "import csv", ", ".join(path.name for path in paths), watch)
 
 
-def plan(staging: Staging, source: str, imported_from: str, watch: Watch | None = None) -> TableImport:
+def plan(staging: Staging, source: str, imported_from: str, watch: Watch = unwatched) -> TableImport:
     """Check staged tables and return the import; raises `ImportTableError` if half of the rows or more are unusable.
 
     `source` and `imported_from` go into the recording's `meta`.
@@ -97,8 +97,7 @@ def plan(staging: Staging, source: str, imported_from: str, watch: Watch | None 
     else:
         good = faults.reject(rows, ENDS)
     total = rows.count(good) + len(faults)
-    if watch:
-        watch("checking", 0.0)
+    watch("checking", 0.0)
     reading = None
     if layout == "ranges":
         if not rows.has("range_m"):
@@ -232,7 +231,7 @@ class TableImport:
     total: int
     source: str
     imported_from: str
-    watch: Watch | None
+    watch: Watch
 
     def write(self, path: str | os.PathLike[str], *, force: bool = False) -> tuple[dict[str, int], list[str]]:
         """Write a recording; returns the number of rows of each table that has any, and the notes.
@@ -240,13 +239,13 @@ class TableImport:
         Raises what `Recording.create` raises.
         """
         notes, faults = self.notes, iter(self.faults)
-        if count := len(self.faults) + self.faults.count_too_long():
+        if count := len(self.faults) + sum(len(table.rejected()) for table in self.staging.tables):
             first = next(faults)
             rest = f"rows cannot be used and are kept as faults; the first: {first[0].detail}"
             notes, faults = [*notes, f"{count} of {self.total} {rest}"], chain([first], faults)
         counts = {"exchanges": 0, "poses": 0, "powers": 0, "faults": 0}
         with Recording.create(path, meta=self._meta(notes), force=force, memory_mb=250) as recording:
-            recording.append_tags(self._tags())
+            recording.append_tags(Tag(tag, self._body(tag), (0.0, 0.0, 0.0)) for tag in self.usable.tags())
             for exchanges, powers in self._exchanges():
                 with recording.transaction():
                     recording.append_exchanges(exchanges)
@@ -272,8 +271,7 @@ class TableImport:
         """Yield blocks of exchanges in the order of their rows, and their columns of the table `powers`."""
         before = 0
         for rows in self.usable.blocks():
-            if self.watch:
-                self.watch("writing", before / self.usable.count)
+            self.watch("writing", before / self.usable.count)
             exchanges = exchanges_of(self.staging.column_map, rows, self.reading, before)
             powers: Columns = {}
             if "rxp1" in rows or "rxp2" in rows:
@@ -281,9 +279,6 @@ class TableImport:
                 powers |= {f"{name}_dbm": optional(rows, name) for name in ("rxp1", "rxp2")}
             yield exchanges, powers
             before += len(exchanges)
-
-    def _tags(self) -> list[Tag]:
-        return [Tag(i, self._body(i), (0.0, 0.0, 0.0)) for i in self.usable.tags()]
 
     def _meta(self, notes: list[str]) -> dict[str, Any]:
         delays, names = self.staging.column_map.antenna_delays, self.staging.names

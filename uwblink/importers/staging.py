@@ -17,7 +17,7 @@ import duckdb
 import numpy as np
 
 from uwblink.errors import ImportTableError, first_line
-from uwblink.importers.column_map import DISTANCES, IDS, NAMES, POWERS, TIME_UNITS, ColumnMap
+from uwblink.importers.column_map import DISTANCE_UNITS, DISTANCES, IDS, NAMES, POWERS, TIME_UNITS, ColumnMap
 from uwblink.importers.tables import Columns, Table, connect_to
 from uwblink.twr import LARGEST_ID, LATEST_NS, STAMPS
 
@@ -26,6 +26,10 @@ ROWS_AT_ONCE: Final = 245_760
 
 Watch = Callable[[str, float], object]
 """Callback for progress: the current step ("reading", "writing" ...) and the share of it that is done."""
+
+
+def unwatched(_step: str, _share: float) -> None:
+    """Take no notice of progress."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +74,7 @@ class StagedRows:
 
 
 @contextmanager
-def staged(paths: Sequence[Path], column_map: ColumnMap, watch: Watch | None = None) -> Iterator[Staging]:
+def staged(paths: Sequence[Path], column_map: ColumnMap, watch: Watch = unwatched) -> Iterator[Staging]:
     """Stage several tables as one for the duration of the block; raises `ImportTableError`, also if the disk is full.
 
     Columns are read if the map names them, or if their names are in `NAMES`.
@@ -93,7 +97,7 @@ class Staging:
     """
 
     def __init__(
-        self, db: duckdb.DuckDBPyConnection, paths: Sequence[Path], column_map: ColumnMap, watch: Watch | None
+        self, db: duckdb.DuckDBPyConnection, paths: Sequence[Path], column_map: ColumnMap, watch: Watch
     ) -> None:
         """See `staged`."""
         self.db, self.paths, self.column_map = db, tuple(paths), column_map
@@ -102,8 +106,7 @@ class Staging:
         self._headers: dict[str, str] = {}
         counts = [0]
         for k, path in enumerate(paths):
-            if watch:
-                watch("reading", k / len(paths))
+            watch("reading", k / len(paths))
             self._add(Table(path, column_map.delimiter, column_map.decimal, db=db, key=k))
             counts.append(self._query_number("count(*)"))
         self.offsets = np.array(counts)
@@ -165,7 +168,8 @@ class Staging:
         # Differences need only the low 40 bits of ticks.
         low = {n: f"CAST({n}_exact & {(1 << 40) - 1} AS DOUBLE)" for n in exact if n in _COUNTED}
         values |= {n: f"CASE WHEN {n} = trunc({n}) THEN {value} ELSE {n} END" for n, value in low.items()}
-        factors = dict.fromkeys(DISTANCES, column_map.metres_per_unit) | dict.fromkeys(POWERS, column_map.power_sign)
+        factors = dict.fromkeys(DISTANCES, DISTANCE_UNITS[column_map.distance_unit or "m"])
+        factors |= dict.fromkeys(POWERS, -1.0 if column_map.power_unit == "-dBm" else 1.0)
         values |= {n: f"{values[n]} * {factor!r}" for n, factor in factors.items() if n in values and factor != 1.0}
         ids = self._ids(values, exact)
         if "time_s" in values:
