@@ -233,20 +233,23 @@ def _explained(name: str, error: Exception) -> PortError:
     def matches(words: str, *codes: int) -> bool:
         return code in codes or words in text
 
-    if matches("No such file", errno.ENOENT):
-        return PortMissingError(f"{name}: no such port; `uwblink ports` lists the boards that are plugged in")
-    if matches("Permission denied", errno.EACCES, errno.EPERM):
-        group = _group(name)
-        return PortPermissionError(
-            f"{name}: permission denied; join the group {group} (sudo usermod -aG {group} $USER) and log in again"
-        )
-    if matches("exclusively lock", errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
-        return PortBusyError(f"{name}: another process has this port open; close it first")
-    if os.path.isdir(name):
-        return PortError(f"{name.rstrip('/')}: is a folder; name the ports in it, as with {name.rstrip('/')}/*")
-    if matches("Inappropriate ioctl", errno.ENOTTY) or "configure port" in text:
-        return PortError(f"{name}: not a serial port")
-    return PortError(f"{name}: cannot be opened ({text})")
+    missing, forbidden = matches("No such file", errno.ENOENT), matches("Permission denied", errno.EACCES, errno.EPERM)
+    busy = matches("exclusively lock", errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK)
+    group, folder = _group(name), name.rstrip("/")
+    reasons: tuple[tuple[bool, type[PortError], str], ...] = (
+        (missing, PortMissingError, "no such port; `uwblink ports` lists the boards that are plugged in"),
+        (
+            forbidden,
+            PortPermissionError,
+            f"permission denied; join the group {group} (sudo usermod -aG {group} $USER) and log in again",
+        ),
+        (busy, PortBusyError, "another process has this port open; close it first"),
+        (os.path.isdir(name), PortError, f"is a folder; name the ports in it, as with {folder}/*"),
+        (matches("Inappropriate ioctl", errno.ENOTTY) or "configure port" in text, PortError, "not a serial port"),
+        (True, PortError, f"cannot be opened ({text})"),
+    )
+    kind, reason = next((kind, reason) for applies, kind, reason in reasons if applies)
+    return kind(f"{folder if os.path.isdir(name) else name}: {reason}")
 
 
 def _group(name: str) -> str:
@@ -321,22 +324,16 @@ class Terminal:
 
     def read(self) -> bytes:
         """Return what the client has written, without waiting."""
-        if not self._ends:
-            return b""
-        try:
-            return os.read(self._ends[0], 65_536)
-        except (BlockingIOError, OSError):
-            return b""
+        with contextlib.suppress(OSError):
+            if self._ends:
+                return os.read(self._ends[0], 65_536)
+        return b""
 
     def write(self, data: bytes) -> None:
         """Send bytes in one piece; bytes that do not fit are lost and counted."""
-        if not self._ends:
-            self.lost_bytes += len(data)
-            return
-        try:
-            sent = os.write(self._ends[0], data)
-        except (BlockingIOError, OSError):
-            sent = 0
+        sent = 0
+        with contextlib.suppress(OSError):
+            sent = os.write(self._ends[0], data) if self._ends else 0
         self.lost_bytes += len(data) - sent
 
 

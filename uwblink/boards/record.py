@@ -13,8 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from uwblink.boards.listeners import DelayCheck, Heard, Listener, Pair, Progress
 from uwblink.boards.ports import Ports, SerialPorts
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.recorder import Recorder
+from uwblink.closing import Closing
 from uwblink.database import log_of
 from uwblink.errors import PlanError, RecordingError
 from uwblink.output import check_output
@@ -220,7 +220,7 @@ class Batch:
         recording.append_faults(self.faults)
 
 
-class RecordingWriter(Listener):
+class RecordingWriter(Closing, Listener):
     """A listener that writes a live recording. A context manager: leaving it writes what is left."""
 
     def __init__(self, recording: Recording) -> None:
@@ -239,18 +239,12 @@ class RecordingWriter(Listener):
         self._thread = threading.Thread(target=self._work, name="uwblink writer", daemon=True)
         self._thread.start()
 
-    def __enter__(self) -> Self:
-        """Return the writer."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Write the rest; raises what `check` raises, unless the block raised already."""
         try:
             self.close()
         except RecordingError:
-            if kind is None:
+            if error[0] is None:
                 raise
 
     def on_bytes(self, time_ns: int, port: str, direction: str, data: bytes) -> None:

@@ -35,25 +35,20 @@ class Station:
         self._ports, self._passive = ports, passive
         self.port: Transport | None = None
         self._todo: deque[Message] = deque()
-        self._retry_s = self._pause_until_s = 0.0
+        self._retry_s = self.pause_until_s = 0.0
         self._damage, self._damaged_s = b"", 0.0
         self._plug(name)
 
     def ready(self, now_s: float) -> bool:
         """Whether the board may be asked to range now."""
         waits = self._todo or self.connection.busy or self.connection.ready_s(now_s)
-        return self.port is not None and not waits and now_s >= self._pause_until_s
+        return self.port is not None and not waits and now_s >= self.pause_until_s
 
     def next_command(self, now_s: float) -> Message | None:
         """Return the next set-up command of the board, None if there is none."""
         if self.port is None or self.connection.busy or not self._todo or self.connection.ready_s(now_s) > 0:
             return None
         return self._todo.popleft()
-
-    def pause_after(self, outcome: CommandOutcome, now_s: float) -> None:
-        """Pause a board for a second if it did not answer a fence."""
-        if isinstance(outcome.error, TimeoutError) and outcome.command is FENCE:
-            self._pause_until_s = now_s + 1.0
 
     def damage(self, events: list[Event], now_s: float) -> str | None:
         """Gather bytes that are no message; returns a description of them when a damaged line is over.
@@ -281,7 +276,8 @@ class Recorder:
             kind = "time-out" if isinstance(outcome.error, TimeoutError) else "failed exchange"
             ranged = outcome.command if isinstance(outcome.command, RangeCommand) else None
             self._fault(station, kind, str(outcome.error), ranged)
-            station.pause_after(outcome, now_s)
+            if kind == "time-out" and outcome.command is FENCE:
+                station.pause_until_s = now_s + 1.0
         if isinstance(outcome.reply, IdReport) and outcome.reply.board != station.board:
             self._fault(station, "wrong board", f"board {outcome.reply.board} where {station.board} was")
             self._unplug(station)

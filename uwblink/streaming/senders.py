@@ -19,6 +19,7 @@ import socket
 import socketserver
 import sys
 import threading
+from functools import cache
 from http.client import HTTPException, parse_headers
 from typing import Any, Final
 from urllib.parse import urlsplit
@@ -198,8 +199,9 @@ class FoxgloveServer(Closing):
             self._server.stop()
             raise PortError(f"foxglove {address}: cannot be served there ({error.strerror or error})") from error
         layout = json.dumps(SCHEMAS[RANGE]).encode()
-        self._schema = foxglove.Schema(name=RANGE, encoding="jsonschema", data=layout)
-        self._channels: dict[tuple[int, int], foxglove.Channel] = {}
+        schema = foxglove.Schema(name=RANGE, encoding="jsonschema", data=layout)
+        settings: dict[str, Any] = {"message_encoding": "json", "schema": schema, "context": self._context}
+        self._channel = cache(lambda pair: foxglove.Channel(f"/ranges/{pair}", **settings))
         self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self._gate.server_address[1]}"
 
     def close(self) -> None:
@@ -211,13 +213,5 @@ class FoxgloveServer(Closing):
         """Send a range to the viewers of its topic, `/ranges/INITIATOR_TARGET`."""
         row = found.to_dict()
         data = json.dumps(stamped(row.pop("time_ns"), row)).encode()
-        self._channel(found.initiator, found.target).log(data, log_time=max(found.time_ns, 0))
-
-    def _channel(self, initiator: int, target: int) -> Any:
-        if (initiator, target) not in self._channels:
-            import foxglove
-
-            self._channels[initiator, target] = foxglove.Channel(
-                f"/ranges/{initiator}_{target}", message_encoding="json", schema=self._schema, context=self._context
-            )
-        return self._channels[initiator, target]
+        channel = self._channel(f"{found.initiator}_{found.target}")
+        channel.log(data, log_time=max(found.time_ns, 0))
