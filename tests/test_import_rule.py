@@ -35,7 +35,7 @@ CONFINED = {
     ),
     "yaml": lambda path: path in {"uwblink/importers/miluv.py", "calib/calibration/formats.py"},
     "mcap": lambda path: path in {"uwblink/importers/bags.py", "uwblink/exporters/mcap.py"},
-    "rosbags": lambda path: path in {"uwblink/importers/bags.py", "uwblink/exporters/rosbag2.py"},
+    "rosbags": lambda path: path in {"uwblink/importers/bags.py", "uwblink/exporters/mcap.py"},
     "foxglove": lambda path: path == "uwblink/streaming/senders.py",
     "distributed": lambda path: path == "uwbsim/sweep/executors.py",
 }

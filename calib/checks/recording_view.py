@@ -29,7 +29,7 @@ from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, Fault, Poses, Tag
-from uwblink.recording.target_reports import differences, repeated_rows, single_reports
+from uwblink.recording.summary import differences, repeated_rows, single_reports
 from uwblink.ticks import TICK_S
 from uwblink.twr import Exchanges, raw_range
 

@@ -40,7 +40,7 @@ from uwblink.recording.antenna_delays import AntennaDelays, delays_in_meta
 from uwblink.recording.distances import Tracks
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, Fault, KnownDistance, Poses, Tag
-from uwblink.recording.target_reports import single_report_blocks, single_reports
+from uwblink.recording.summary import single_report_blocks, single_reports
 from uwblink.twr import Exchanges, names_in
 
 EXCHANGES_AT_ONCE: Final = 131_072

@@ -25,7 +25,7 @@ from calib.evaluation.tracking import nearest_attitude
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import bodies_m
 from uwblink.recording.schema import Poses
-from uwblink.recording.target_reports import single_reports
+from uwblink.recording.summary import single_reports
 
 MODELS: Final = ("imu", "constant-velocity")
 

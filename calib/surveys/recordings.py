@@ -28,7 +28,7 @@ from calib.surveys.result import Contradiction
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.antenna_delays import AntennaDelays
 from uwblink.recording.schema import Arrangement, KnownDistance
-from uwblink.recording.target_reports import single_reports
+from uwblink.recording.summary import single_reports
 
 LIFT = "mean-of-lifted"
 """How the powers of both ends become one, as in `calib.fit`."""

@@ -17,7 +17,7 @@ from calib.trajectories.samples import Heights, Places, Tapes, heights_of, no_he
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.antenna_delays import AntennaDelay
 from uwblink.recording.schema import Poses, Tag
-from uwblink.recording.target_reports import single_reports
+from uwblink.recording.summary import single_reports
 from uwblink.ticks import TICK_S
 from uwblink.twr import Exchanges, intervals
 

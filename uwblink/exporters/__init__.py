@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError, UwblinkError
-from uwblink.exporters.mcap import write_mcap
-from uwblink.exporters.rosbag2 import write_rosbag2
+from uwblink.exporters.mcap import write_mcap, write_rosbag2
 from uwblink.exporters.tables import write_csv, write_parquet, write_tum
 from uwblink.output import place_beside, take_name
 from uwblink.plugins import Registry, check_row

@@ -10,10 +10,10 @@ import pytest
 from calib.data import sources
 from calib.data.ranges import COLUMNS, Ranges
 from calib.data.samples import sample_flight
-from uwblink.recording import AntennaDelay, target_reports
+from uwblink.recording import AntennaDelay, summary
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
-from uwblink.recording.target_reports import single_reports
+from uwblink.recording.summary import single_reports
 from uwblink.twr import Exchanges
 
 ROWS = 300
@@ -127,7 +127,7 @@ def test_of_two_reports_one_counts_wherever_blocks_and_stretches_end(tmp_path, m
             source="it.uwb",
             antenna_delays={None: AntennaDelay()},
         ).usable()
-    monkeypatch.setattr(target_reports, "ROWS_AT_ONCE", 23)
+    monkeypatch.setattr(summary, "ROWS_AT_ONCE", 23)
     monkeypatch.setattr(sources, "EXCHANGES_AT_ONCE", rows)
     found = sources.load_ranges(path)
     assert reports.repeated > ROWS / 3

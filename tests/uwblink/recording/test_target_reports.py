@@ -12,8 +12,7 @@ from calib.checks.examine import examine
 from tests.boards import bench_scenario
 from uwblink.boards.listeners import ReportCheck
 from uwblink.recording.file import Recording
-from uwblink.recording.summary import summarize
-from uwblink.recording.target_reports import differences, single_reports
+from uwblink.recording.summary import differences, single_reports, summarize
 from uwblink.twr import COLUMNS
 from uwblink.wire.messages import RangeReport, TargetRangeReport
 from uwbsim.boards.virtual_port import VirtualPorts
