@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.arrays import Floats, Ints, few_words
+from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError, RecordingExistsError
 from uwblink.importers.bags import open_bag
 from uwblink.importers.plausibility import other_unit
@@ -28,7 +28,7 @@ from uwblink.recording.file import Recording
 from uwblink.recording.schema import POSE, Poses, Tag
 from uwblink.recording.tags import load_places
 from uwblink.text_files import read_text, require_regular
-from uwblink.twr import LATEST_NS, Exchanges, raw_range
+from uwblink.twr import LATEST_NS, Exchanges, names_in, raw_range
 
 MESSAGES: Final = {
     "geometry_msgs/msg/PoseStamped": ("pose.position", "pose.orientation", False),
@@ -276,7 +276,7 @@ def add_poses(
         seats = [tag for tag in (given or opened.tags()) if tag.tag not in anchors] + standing
         if not len(exchanges):
             raise ImportTableError(f"{recording}: holds no exchanges to add truth to")
-        bodies = _bodies(poses)
+        bodies = set(names_in(poses.body))
         sitting = [tag for tag in seats if tag.body in bodies]
         if len(sitting) < 2:
             found = ", ".join(sorted({tag.body for tag in seats})) or "none"
@@ -324,11 +324,6 @@ def _check_units(what: str, exchanges: Exchanges, poses: Poses, tags: Sequence[T
         raise ImportTableError(
             f"{what}: {found[0]} are in {found[1]}, not metres, by comparison of ranges and distances; convert them"
         )
-
-
-def _bodies(poses: Poses) -> set[str]:
-    few = few_words(poses.body)
-    return set((few[0] if few else np.unique(poses.body)).tolist())
 
 
 def _in_order(parts: list[Poses]) -> Poses:

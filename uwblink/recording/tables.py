@@ -223,14 +223,10 @@ class Tables:
     def _readings(self, table: str, start_ns: int | None = None, end_ns: int | None = None) -> Columns:
         """Return a table in the order of its rows; missing values are "", False, NaN or 0."""
         found = self.columns(table, start_ns, end_ns)
+        defaults: dict[str, tuple[Any, type]] = {"VARCHAR": ("", np.str_), "BOOLEAN": (False, bool)}
         for name, column in found.items():
-            kind = TABLES[table][name]
-            if kind == "VARCHAR":
-                found[name] = np.ma.filled(column, "").astype(np.str_)
-            elif kind == "BOOLEAN":
-                found[name] = np.ma.filled(column, False).astype(bool)
-            else:
-                found[name] = filled(column)
+            value, kind = defaults.get(TABLES[table][name], (None, object))
+            found[name] = filled(column) if value is None else np.ma.filled(column, value).astype(kind)
         return found
 
     def _by_time(self, table: str, start_ns: int | None = None, end_ns: int | None = None) -> Columns:
@@ -371,10 +367,8 @@ def _column(kind: str, values: tuple[Any, ...]) -> NDArray[Any]:
 
 def filled(column: NDArray[Any]) -> NDArray[Any]:
     """Return a column of numbers as float64 or int64, in which missing values are NaN or zero."""
-    kind = np.float64 if column.dtype.kind == "f" else np.int64
-    if isinstance(column, np.ma.MaskedArray):
-        column = column.filled(np.nan if column.dtype.kind == "f" else 0)
-    return np.asarray(column, dtype=kind)
+    missing, kind = (np.nan, np.float64) if column.dtype.kind == "f" else (0, np.int64)
+    return np.asarray(np.ma.filled(column, missing), dtype=kind)
 
 
 def known_tables(names: Iterable[str]) -> None:
