@@ -165,7 +165,7 @@ def timed(work: Callable[[], object], count: int) -> np.ndarray:
 
 def decoder() -> None:
     from benchmarks.sources import report
-    from uwblink.wire.bulk import ColumnDecoder
+    from uwblink.wire.codec import ColumnDecoder
 
     data = b"".join(report(k) for k in range(200_000))
     rates = []

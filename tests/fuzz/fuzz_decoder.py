@@ -9,8 +9,7 @@ import sys
 import atheris
 
 with atheris.instrument_imports(include=["uwblink"]):
-    from uwblink.wire.bulk import ColumnDecoder
-    from uwblink.wire.codec import Decoder, encode
+    from uwblink.wire.codec import ColumnDecoder, Decoder, encode
     from uwblink.wire.messages import REPORTS, RangeReport, Skipped, TextLine
 
 

@@ -26,7 +26,7 @@ from uwblink.closing import Closing
 from uwblink.errors import PortError
 from uwblink.pages.blocks import CSS
 from uwblink.recording.schema import Fault
-from uwblink.wire.bulk import exchanges_of
+from uwblink.wire.codec import exchanges_of
 
 IDLE_S: Final = 10.0
 """Connections without a request for this time are closed, because each has a thread."""

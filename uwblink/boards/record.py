@@ -30,7 +30,7 @@ from uwblink.recording.antenna_delays import meta_of_delays
 from uwblink.recording.file import Recording, SnapshotMaker
 from uwblink.recording.schema import SHAPES, Arrangement, CirRow, Fault, FrameRow, Tag
 from uwblink.twr import Exchanges
-from uwblink.wire.bulk import exchanges_of
+from uwblink.wire.codec import exchanges_of
 from uwblink.wire.messages import Cir, Overheard, RangeReport
 
 FILE_MB: Final = 64

@@ -15,7 +15,7 @@ from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import FrameRow
 from uwblink.twr import Exchanges
-from uwblink.wire.bulk import ColumnDecoder
+from uwblink.wire.codec import ColumnDecoder
 from uwblink.wire.messages import TextLine
 
 

@@ -10,8 +10,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from threading import Event, Thread
-from time import monotonic
+from threading import Timer
 from types import FrameType
 from typing import Annotated, Any, Final, NoReturn
 
@@ -203,27 +202,20 @@ def waiting(what: str, *, after_s: float = 1.0) -> Iterator[Callable[[str], obje
     if not sys.stderr.isatty():
         yield lambda _what: None
         return
-    texts, done = [what], Event()
-    line = Thread(target=_show, args=(texts, done, after_s, monotonic()), daemon=True)
-    line.start()
-    try:
-        yield texts.append
-    finally:
-        done.set()
-        line.join()
-
-
-def _show(texts: list[str], done: Event, after_s: float, began_s: float) -> None:
-    """Show the last of the texts until the work is done."""
-    if done.wait(after_s):
-        return
     from rich.console import Console
     from rich.markup import escape
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn("line"), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as line:
-        task = line.add_task(escape(texts[-1]), total=None)
-        line.tasks[task].start_time = began_s
-        while not done.wait(0.1):
-            line.update(task, description=escape(texts[-1]))
+    line = Progress(*columns, console=Console(stderr=True), transient=True)
+    task = line.add_task(escape(what), total=None)
+    begin = Timer(after_s, line.start)
+    begin.daemon = True
+    begin.start()
+    try:
+        yield lambda text: line.update(task, description=escape(text))
+    finally:
+        begin.cancel()
+        begin.join()
+        if line.live.is_started:
+            line.stop()

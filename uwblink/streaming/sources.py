@@ -32,7 +32,7 @@ from uwblink.boards.recorder import Recorder
 from uwblink.errors import ArgumentError
 from uwblink.recording.file import Recording
 from uwblink.twr import Exchanges
-from uwblink.wire.bulk import exchanges_of
+from uwblink.wire.codec import exchanges_of
 from uwblink.wire.messages import RangeReport
 
 Stream = Generator["StreamedRange", None, None]

@@ -17,8 +17,7 @@ from uwblink.recording.file import Recording
 from uwblink.recording.schema import CirRow, Fault, FrameRow, Poses, Tag
 from uwblink.ticks import TICK_S, UUS_TICKS, elapsed
 from uwblink.twr import Exchanges, raw_range
-from uwblink.wire.bulk import ColumnDecoder
-from uwblink.wire.codec import encode
+from uwblink.wire.codec import ColumnDecoder, encode
 from uwblink.wire.messages import RangeReport
 from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from uwblink import Contents, Exchanges, Poses, Recording
-from uwblink.exporters import export_recording, mcap, tables
+from uwblink import Contents, Exchanges, Poses, Recording, exporters
+from uwblink.exporters import export_recording, mcap
 from uwblink.recording.contents import exchanges_with_poses, pieces
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Fault, Tag
@@ -100,7 +100,7 @@ def test_corrections_of_other_exchanges_are_left_out(tmp_path):
         assert all(not held.corrected for held in pieces(recording, 50))
 
 
-@pytest.mark.parametrize(("to", "module"), [("mcap", mcap), ("tum", tables), ("rosbag2", mcap)])
+@pytest.mark.parametrize(("to", "module"), [("mcap", mcap), ("tum", exporters), ("rosbag2", mcap)])
 def test_an_export_does_not_depend_on_the_pieces(path, tmp_path, monkeypatch, to, module):
     as_one = export_recording(path, tmp_path / "one", to=to)
     monkeypatch.setattr(module, "pieces", partial(pieces, rows=120))

@@ -6,8 +6,7 @@ import pytest
 from tests.uwblink.wire.test_codec import decode, understood
 from uwblink.errors import FrameError
 from uwblink.wire import messages as m
-from uwblink.wire.bulk import ColumnDecoder
-from uwblink.wire.codec import LONGEST_LINE, Decoder, encode
+from uwblink.wire.codec import LONGEST_LINE, ColumnDecoder, Decoder, encode
 from uwblink.wire.fields import BOOL, BYTES, ID, INT, STAMP, TEXT, Malformed, write_printed
 
 REPORT = b"R05|2|3.0550|2334148660|1211574983|1233803316|2356378373|1332123700|2454699099|-87.4977|-87.5239|-3.4971|3.5222\r\n"  # noqa: E501 - as captured

@@ -5,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from uwblink.twr import COLUMNS
-from uwblink.wire.bulk import ColumnDecoder, exchanges_of
-from uwblink.wire.codec import Decoder, encode
+from uwblink.wire.codec import ColumnDecoder, Decoder, encode, exchanges_of
 from uwblink.wire.messages import REPORTS, RangeReport, Skipped, TargetRangeReport
 
 NUMBER = st.integers(-(10**8), 10**8).map(lambda n: n / 1e4)
