@@ -139,10 +139,8 @@ def _summary_of(ranges: list[float], failed: int, asked: int, *, as_json: bool) 
     if as_json:
         figures = {"exchanges": len(ranges), "failed": failed, "asked": asked, "mean_m": mean, "std_m": spread}
         return json.dumps({"summary": figures})
-    text = f"{len(ranges)} of {asked} exchanges"
-    if mean is not None:
-        text += f", mean {mean:.4f}" + (f" ± {spread:.4f}" if spread is not None else "") + " m"
-    return text
+    deviation = "" if spread is None else f" ± {spread:.4f}"
+    return f"{len(ranges)} of {asked} exchanges" + ("" if mean is None else f", mean {mean:.4f}{deviation} m")
 
 
 def _line(initiator: int, report: RangeReport) -> str:

@@ -158,10 +158,9 @@ def named_columns(headers: Iterable[str]) -> dict[str, str]:
         whole = f"({pattern}){{end}}".format_map(_WORDS)
         # Each column is used once, but for names of messages, which may repeat those of exchanges at this stage.
         taken = {header for name, header in found.items() if (name in OF_MESSAGES) == (ours in OF_MESSAGES)}
-        for header in listed:
-            if re.fullmatch(whole, called[header]) and listed.count(header) == 1 and header not in taken:
-                found[ours] = header
-                break
+        free = (header for header in listed if listed.count(header) == 1 and header not in taken)
+        if header := next((header for header in free if re.fullmatch(whole, called[header])), None):
+            found[ours] = header
     return found
 
 

@@ -14,10 +14,10 @@ import json
 import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import islice
 from pathlib import Path
-from typing import IO, Any, Final, NamedTuple
+from typing import IO, Any, Final
 
 import duckdb
 import numpy as np
@@ -40,15 +40,6 @@ MAX_CELLS: Final = 4096
 """Cells of a row; an impulse response in cells of its own takes 2,032."""
 
 
-class CsvDialect(NamedTuple):
-    """Dialect of a CSV file; the first row of values follows after `skip` lines."""
-
-    names: tuple[str, ...]
-    delimiter: str
-    decimal_comma: bool
-    skip: int
-
-
 def open_file(path: Path) -> IO[bytes]:
     """Open a file, plain or gzipped."""
     return gzip.open(path) if path.suffix == ".gz" else path.open("rb")  # type: ignore[return-value]  # it reads alike
@@ -69,11 +60,12 @@ def reading(path: Path) -> Iterator[None]:
         raise ImportTableError(f"{path}: not a CSV table ({first_line(error)})") from error
 
 
-def detect(path: Path, delimiter: str | None = None, decimal: str | None = None) -> CsvDialect:
+def detect(path: Path, delimiter: str | None, decimal: str | None) -> tuple[tuple[str, ...], str, bool, int]:
     """Return the dialect of a CSV file by its first 64 KiB; `delimiter` and `decimal` override what is found.
 
-    Lines before the header that are empty or begin with "#" are skipped. Raises `ImportTableError` for a file that is
-    not text with a header.
+    It consists of the names of the columns, the delimiter, whether the decimal mark is a comma, and the number of lines
+    before the first row of values. Lines before the header that are empty or begin with "#" are skipped. Raises
+    `ImportTableError` for a file that is not text with a header.
     """
     require_regular(path, ImportTableError, "table (.csv or .csv.gz)")
     with reading(path), open_file(path) as file:
@@ -94,7 +86,7 @@ def detect(path: Path, delimiter: str | None = None, decimal: str | None = None)
             for digits, mark in (("+", ","), ("*", r"\."))
         )
         decimal = "," if commas > points else "."
-    return CsvDialect(names, mark, decimal == "," and mark != ",", skip)
+    return names, mark, decimal == "," and mark != ",", skip
 
 
 def _delimiter(lines: list[str]) -> str:
@@ -253,12 +245,9 @@ class Table(Closing):
         with reading(self.path), open_file(self.path) as file:
             lines = [line.decode("utf-8-sig") for line in islice(file, 1000)]
         for line in lines:
-            try:
+            with suppress(ValueError, RecursionError):
                 row = json.loads(line)
-            except (ValueError, RecursionError):
-                continue
-            if isinstance(row, dict):
-                fields |= dict(_fields(row, "", ""))
+                fields |= dict(_fields(row, "", "")) if isinstance(row, dict) else {}
         if not fields:
             raise ImportTableError(f"{self.path}: holds no JSON objects, one a line")
         self._check_count(len(fields))

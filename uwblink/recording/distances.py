@@ -153,10 +153,8 @@ def distances_m(poses: Poses | Tracks, tags: Sequence[Tag], initiator: Ints, tar
     # 32768 at once, so that intermediate results stay in the processor's cache.
     for begin in range(0, len(time_ns), 32_768):
         rows = slice(begin, begin + 32_768)
-        (x, y, z), other = (_antennas(tracks, tags, ids[rows], time_ns[rows]) for ids in (target, initiator))
-        x -= other[0]
-        y -= other[1]
-        z -= other[2]
+        here, there = (_antennas(tracks, tags, ids[rows], time_ns[rows]) for ids in (target, initiator))
+        x, y, z = here - there
         found[rows] = np.sqrt(x * x + y * y + z * z)
     return found
 
@@ -179,8 +177,7 @@ def _antennas(tracks: Tracks, tags: Sequence[Tag], ids: Ints, time_ns: Ints) -> 
         rows = np.flatnonzero(ids == tag.tag)
         if len(rows) and tag.body in tracks:
             point = tracks[tag.body].point_m(time_ns[rows], np.array(tag.lever_arm_m, dtype=np.float64))
-            for axis in range(3):
-                found[axis, rows] = point[axis]
+            found[:, rows] = point
     return found
 
 
