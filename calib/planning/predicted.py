@@ -15,12 +15,12 @@ from itertools import combinations
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM
-from calib.information import Unknown, Verdict, judge
+from calib.information import Verdict, reduced
 from calib.planning.settings import SurveyPlanSettings
 from calib.surveys.network import Boards, Case, CurvePrior, Known, Network
-from calib.surveys.outcome import DELAY_SCALE_NS
+from calib.surveys.outcome import verdict_on_delays
 from calib.surveys.recordings import PairMeans
-from uwblink.arrays import Floats
+from uwblink.arrays import Bools, Floats
 
 SIZES_M = {"line": (5.0, 0.0, 0.0), "plane": (3.0, 2.0, 0.0), "space": (6.0, 5.0, 2.5)}
 """Where boards may stand if nobody says: a string across a room, a large table, a room."""
@@ -90,10 +90,11 @@ def on_line(order: tuple[int, ...], length_m: float) -> Layout:
     return Layout(place, 1)
 
 
-def rows_of(inputs: SurveyPlanSettings, layout: Layout, curve: CurvePrior | None = None) -> tuple[Floats, Floats]:
-    """Return the derivatives (n, k) of an arrangement's rows by delays (ns) and curve, and by coordinates, over errors.
+def rows_of(inputs: SurveyPlanSettings, layout: Layout, curve: CurvePrior | None = None) -> tuple[Floats, Bools]:
+    """Return the derivatives (n, k) of an arrangement's rows over their errors, and which are by delays and curve.
 
-    First those of all pairs, as `itertools.combinations` has them, then taped distances and known coordinates.
+    Those come first, the coordinates of places after them. Of rows the first are those of all pairs, as
+    `itertools.combinations` has them, then taped distances and known coordinates.
     """
     boards = len(inputs.tags)
     pairs = np.array(list(combinations(range(boards), 2)))
@@ -126,25 +127,16 @@ def rows_of(inputs: SurveyPlanSettings, layout: Layout, curve: CurvePrior | None
         curve=curve,
     )
     case = Case(marks=none.astype(bool), pair_m=inputs.pair_error_m, curve_m=CURVE_M)
-    rows = network.linear(network.with_positions(network.layout.start(), layout.place_m))[1]
-    rows /= network.std_m(case)[:, None]
-    wanted = np.concatenate([network.columns("delay"), network.columns("curve")])
-    return rows[:, wanted], rows[:, np.setdiff1d(network.free(), wanted)]
+    here = network.at(network.with_positions(network.layout.start(), layout.place_m), case)
+    wanted = network.layout.indices(["delay", "curve"])
+    columns = np.concatenate([wanted, np.setdiff1d(here.free, wanted)])
+    return here.jacobian[:, columns] / here.std[:, None], np.arange(len(columns)) < len(wanted)
 
 
 def delay_information(inputs: SurveyPlanSettings, layout: Layout) -> Floats:
     """Return the information (boards, boards) on delays, 1/ns^2, that an arrangement gives, whatever its places."""
-    return information_beside(*rows_of(inputs, layout))
-
-
-def information_beside(wanted: Floats, others: Floats) -> Floats:
-    """Return the information on the wanted unknowns (n, m) that the others (n, k) cannot take up."""
-    if not len(others):
-        return np.zeros((wanted.shape[1],) * 2)
-    basis, size, _ = np.linalg.svd(others, full_matrices=False)
-    basis = basis[:, size > 1e-9 * size[0]]
-    left = wanted - basis @ (basis.T @ wanted)
-    return left.T @ left
+    rows, wanted = rows_of(inputs, layout)
+    return reduced(rows.T @ rows, wanted)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,30 +158,20 @@ def predict(inputs: SurveyPlanSettings, layouts: Sequence[Layout], *, curve: boo
     for k, layout in enumerate(layouts):
         here = slice(k * len(pairs), (k + 1) * len(pairs))
         own = None if prior is None else replace(prior, design=prior.design[here])
-        wanted, places = rows_of(inputs, layout, own)
-        kept = np.ones((DRAWS if inputs.reflected else 1, len(wanted)), dtype=bool)
+        rows, wanted = rows_of(inputs, layout, own)
+        kept = np.ones((DRAWS if inputs.reflected else 1, len(rows)), dtype=bool)
         if inputs.reflected:
             rng = np.random.default_rng([inputs.seed, k])
             kept[:, : len(pairs)] = rng.uniform(size=(DRAWS, len(pairs))) >= inputs.reflected
-        parts.append(np.array([information_beside(wanted[rows], places[rows]) for rows in kept]))
+        parts.append(np.array([reduced((rows.T * some) @ rows, wanted) for some in kept]))
     before = np.zeros(parts[0].shape[1:])
     if prior is not None:
         before[boards:, boards:] = prior.precision / CURVE_M**2
-    return [_averaged([_verdict(one, inputs.tags) for one in draws + before]) for draws in np.cumsum(parts, axis=0)]
-
-
-def verdict_on_delays(information: Floats, tags: Sequence[int]) -> Verdict:
-    """Return what is determined of delays by their information (tags, tags), 1/ns^2."""
-    return judge(information, [Unknown("delay", str(tag), DELAY_SCALE_NS) for tag in tags])
-
-
-def _verdict(information: Floats, tags: tuple[int, ...]) -> Verdict:
-    """Return what is determined of the delays, whatever the curve is."""
-    boards = len(tags)
-    mixed, curve = information[:boards, boards:], information[boards:, boards:]
-    left = information[:boards, :boards] - mixed @ np.linalg.solve(curve, mixed.T)
-    values, vectors = np.linalg.eigh((left + left.T) / 2)
-    return verdict_on_delays((vectors * np.maximum(values, 0.0)) @ vectors.T, tags)
+    delays = np.arange(len(before)) < boards
+    return [
+        _averaged([verdict_on_delays(reduced(one, delays), inputs.tags) for one in draws + before])
+        for draws in np.cumsum(parts, axis=0)
+    ]
 
 
 def _averaged(verdicts: list[Verdict]) -> Prediction:

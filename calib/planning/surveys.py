@@ -18,12 +18,11 @@ from calib.planning.predicted import (
     delay_information,
     predict,
     random_layouts,
-    verdict_on_delays,
 )
 from calib.planning.result import Halves, NextBest, Plan, PlannedArrangement, mean_std_ns
 from calib.planning.settings import SurveyPlanSettings
 from calib.spread import TWO_SIDED_95
-from calib.surveys.outcome import students_factor
+from calib.surveys.outcome import students_factor, verdict_on_delays
 from uwblink.arrays import Floats
 
 RANGES_A_PAIR = 20

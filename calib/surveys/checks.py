@@ -80,13 +80,10 @@ def worst(
 
 def _of_known(found: Solution) -> tuple[Floats, Floats, Floats]:
     """Return of what is known (k,) what is left, its standard deviation, and the share of its variance that is left."""
-    network, here = found.network, len(found.network.means)
-    left, jacobian = network.linear(found.x)
-    std = network.std_m(found.case)
-    rows = jacobian[here:]
-    covariance = found.covariance() - found.more
-    share = 1 - np.einsum("ij,jk,ik->i", rows, covariance, rows) / std[here:] ** 2
-    return left[here:], std[here:], np.clip(share, 1e-9, 1.0)
+    here, known = found.network.at(found.x, found.case), slice(len(found.network.means), None)
+    rows, std = here.jacobian[known], here.std[known]
+    share = 1 - np.einsum("ij,jk,ik->i", rows, here.covariance(), rows) / std**2
+    return here.left[known], std, np.clip(share, 1e-9, 1.0)
 
 
 def _distances(found: Solution, names: tuple[str, ...]) -> Iterator[Hypothesis]:
@@ -145,11 +142,11 @@ def _exchanged(found: Solution, names: tuple[str, ...]) -> Iterator[Hypothesis]:
     left, std, share = _of_known(found)
     if not (np.abs(left) > ODD * std * np.sqrt(share)).any() and not (len(left) and found.case.marks.any()):
         return
-    number = {point: k for k, point in enumerate(network.points)}
-    involved = {network.points[k][1] for k in [*known.ends.ravel().tolist(), *known.at.tolist()]}
+    points = list(network.points)
+    involved = {points[k][1] for k in [*known.ends.ravel().tolist(), *known.at.tolist()]}
     for one, other in combinations(sorted(involved), 2):
         swap = {one: other, other: one}
-        new = np.array([number.get((a, swap.get(t, t)), k) for k, (a, t) in enumerate(network.points)])
+        new = np.array([network.points.get((a, swap.get(t, t)), k) for k, (a, t) in enumerate(points)])
         changed = replace(network, known=replace(known, ends=new[known.ends], at=new[known.at]))
         text = f"what is known fits if {one} and {other} are exchanged"
         yield Hypothesis(text, changed, first_start(changed, found.delays))

@@ -8,13 +8,14 @@ which is estimated (`calib.surveys.solution`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis
+from calib.estimator.inverse import inverse_of
 from calib.estimator.range_model import METRES_A_NS
 from calib.estimator.rows import Terms, normal_terms
 from calib.estimator.unknowns import Layout, Prior, Priors, Unknown
@@ -104,6 +105,12 @@ class Boards:
     freed: bool = False
 
 
+def numbered(arrangements: Sequence[Boards]) -> dict[tuple[int, int], int]:
+    """Return the number of every point by arrangement and tag, in order."""
+    points = [(k, tag) for k, boards in enumerate(arrangements) for tag in boards.tags]
+    return {point: n for n, point in enumerate(points)}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Known:
     """Distances and positions that are known.
@@ -131,6 +138,32 @@ class Case:
     curve_m: float
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Linear:
+    """A network about unknowns (p,) in a case: what is `left` of each row (n,) beside the detours of reflected means.
+
+    `jacobian` (n, p) has the derivatives of what is predicted, `std` (n,) the standard deviations of rows. `prior`
+    (p, p) is the precision of what is known of the unknowns beforehand, from whose centre they are `away` (p,). `free`
+    are the indices of those that are sought.
+    """
+
+    left: Floats
+    jacobian: Floats
+    std: Floats
+    prior: Floats
+    away: Floats
+    free: Ints
+
+    def information(self) -> Floats:
+        """Return the information (p, p) of the rows."""
+        rows = self.jacobian / self.std[:, None]
+        return rows.T @ rows
+
+    def covariance(self) -> Floats:
+        """Return the covariance (p, p) of the free unknowns by rows and prior, zero elsewhere."""
+        return np.asarray(inverse_of(self.information() + self.prior, self.free))
+
+
 @dataclass(frozen=True)
 class Lengths:
     """Rows of lengths that were measured, in a `case` (`Network.linear`)."""
@@ -140,10 +173,9 @@ class Lengths:
 
     def terms(self, x: Floats) -> Iterator[Terms]:
         """Yield all rows as one block."""
-        left, derivative = self.network.linear(x)
-        left[: len(self.case.marks)] -= DETOUR_M * self.case.marks
-        std = self.network.std_m(self.case)
-        yield replace(normal_terms(left, std, derivative.T, np.arange(len(x))[None]), starts=np.array([0, len(left)]))
+        left, jacobian = self.network.linear(x, self.case.marks)
+        block = normal_terms(left, self.network.std_m(self.case), jacobian.T, np.arange(len(x))[None])
+        yield replace(block, starts=np.array([0, len(left)]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,9 +194,9 @@ class Network:
     curve: CurvePrior | None
 
     @cached_property
-    def points(self) -> list[tuple[int, int]]:
-        """Arrangement and tag of every point."""
-        return [(k, tag) for k, boards in enumerate(self.arrangements) for tag in boards.tags]
+    def points(self) -> dict[tuple[int, int], int]:
+        """The number of every point by arrangement and tag, in order."""
+        return numbered(self.arrangements)
 
     @cached_property
     def owner(self) -> Ints:
@@ -173,30 +205,42 @@ class Network:
 
     @cached_property
     def layout(self) -> Layout:
-        """The unknowns; only places and curve where no delay is free."""
+        """The unknowns, and what is known of them beforehand, with a curve of 1 m."""
         fixed = np.array([tag in self.fixed_ns for tag in self.tags])
         delays = np.array([self.fixed_ns.get(tag, 0.0) for tag in self.tags])
-        dimensions = np.array([boards.dimensions for boards in self.arrangements])[self.owner]
-        beyond = np.arange(3) >= dimensions[:, None]
-        size = 0 if self.curve is None else len(self.curve.precision)
-        places = tuple(str(tag) for _, tag in self.points for _ in range(3))
-        centres = np.zeros((len(self.points), 3))
+        dimensions = np.array([boards.dimensions for boards in self.arrangements])[self.owner, None]
+        freed = np.array([boards.freed for boards in self.arrangements])[self.owner, None]
+        std = np.where(freed & (np.arange(3) == dimensions - 1), BESIDE_M, FAR_M).ravel()
+        centre = np.zeros((len(self.points), 3))
         for k in range(len(self.arrangements)):
             known = self.known.position_m[self.owner[self.known.at] == k]
-            centres[self.owner == k] = known.mean(axis=0) if len(known) else 0.0
-        curve = Unknown(kind="curve", names=("",) * size, start=np.zeros(size))
+            centre[self.owner == k] = known.mean(axis=0) if len(known) else 0.0
+        precision = np.zeros((0, 0)) if self.curve is None else self.curve.precision
+        size = len(precision)
         return Layout(
             (
-                Unknown(kind="place", names=places, start=centres.ravel(), known=beyond.ravel()),
-                Unknown(kind="delay", names=tuple(map(str, self.tags)), start=delays, known=fixed),
-                curve,
+                Unknown(
+                    kind="place",
+                    names=tuple(str(tag) for _, tag in self.points for _ in range(3)),
+                    start=centre.ravel(),
+                    known=(np.arange(3) >= dimensions).ravel(),
+                    priors=(Prior(weight=1.0, structure=np.diag(std**-2), centre=centre.ravel(), rows=centre.size),),
+                ),
+                Unknown(
+                    kind="delay",
+                    names=tuple(map(str, self.tags)),
+                    start=delays,
+                    known=fixed,
+                    priors=(Prior.of_deviation(UNLIKE_NS, delays),),
+                ),
+                Unknown(
+                    kind="curve",
+                    names=("",) * size,
+                    start=np.zeros(size),
+                    priors=(Prior(weight=1.0, structure=precision, rows=size),),
+                ),
             )
         )
-
-    def columns(self, kind: str) -> Ints:
-        """Return the indices of a kind of unknowns."""
-        where = self.layout.where[kind]
-        return np.arange(where.start, where.stop)
 
     def seats(self, arrangement: int) -> Ints:
         """Return the points (rows of `points`) of an arrangement, in the order of its tags."""
@@ -205,9 +249,7 @@ class Network:
     def free(self, only: int | None = None) -> Ints:
         """Return the indices of the free unknowns; of `only` one arrangement's places where that is given."""
         free = self.layout.free()
-        if only is None:
-            return free
-        return np.intersect1d(free, (3 * self.seats(only)[:, None] + np.arange(3)).ravel())
+        return free if only is None else np.intersect1d(free, 3 * self.seats(only)[:, None] + np.arange(3))
 
     def rows_of(self, only: int | None = None) -> Bools:
         """Return which means (n,) belong to an arrangement; all of them for none."""
@@ -227,9 +269,8 @@ class Network:
     @cached_property
     def ends(self) -> Ints:
         """The points between which each length was measured (n, 2): means, then known distances."""
-        number = {point: k for k, point in enumerate(self.points)}
         rows = zip(self.means.arrangement.tolist(), self.means.ends.tolist(), strict=True)
-        of_means = [(number[k, i], number[k, j]) for k, (i, j) in rows]
+        of_means = [(self.points[k, i], self.points[k, j]) for k, (i, j) in rows]
         return np.concatenate([np.array(of_means).reshape(-1, 2), self.known.ends])
 
     @cached_property
@@ -243,14 +284,18 @@ class Network:
             found[: len(rows), self.layout.where["curve"]] = self.curve.design
         return found
 
-    def linear(self, x: Floats) -> tuple[Floats, Floats]:
-        """Return what is left of each row (n,), and derivatives (n, p): means, known distances, coordinates."""
+    def linear(self, x: Floats, marks: Bools | float = 0.0) -> tuple[Floats, Floats]:
+        """Return what is left of each row (n,), and derivatives (n, p): means, known distances, coordinates.
+
+        Of means with `marks` (n,) a detour is taken off.
+        """
         place, known, found = self.positions(x), self.known, self._of_delays_and_curve.copy()
         apart = place[self.ends[:, 0]] - place[self.ends[:, 1]]
         length = np.linalg.norm(apart, axis=1)
         measured = np.concatenate([self.means.range_m, known.distance_m, known.position_m.ravel()])
         told = np.concatenate([length, place[known.at].ravel()])
         left = measured - told - found @ x
+        left[: len(self.means)] -= DETOUR_M * marks
         # Boards on top of each other have no direction: any will do to part them.
         unit = np.where(length[:, None] > 1e-9, apart / np.maximum(length, 1e-9)[:, None], [1.0, 0.0, 0.0])
         rows = np.arange(len(length))[:, None]
@@ -264,26 +309,28 @@ class Network:
         means = np.sqrt(self.means.std_m**2 + case.pair_m**2 + DETOUR_STD_M**2 * case.marks)
         return np.concatenate([means, self.known.distance_std_m, np.repeat(self.known.position_std_m, 3)])
 
-    def prior(self, curve_m: float) -> tuple[Floats, Floats]:
-        """Return what is known of the unknowns beforehand: a precision (p, p), and the unknowns (p,) it is about."""
-        freed = np.array([boards.dimensions - 1 if boards.freed else -1 for boards in self.arrangements])[self.owner]
-        beside = (np.arange(3) == freed[:, None]).ravel()
-        delays = np.full(len(self.tags), UNLIKE_NS**-2)
-        curve = np.zeros((0, 0)) if self.curve is None else self.curve.precision / curve_m**2
-        found = np.zeros((self.layout.size,) * 2)
-        diagonal = np.concatenate([np.where(beside, BESIDE_M**-2, FAR_M**-2), delays, np.zeros(len(curve))])
-        found[np.diag_indices_from(found)] = diagonal
-        found[self.layout.where["curve"], self.layout.where["curve"]] = curve
-        return found, self.layout.start()
-
     def priors(self, curve_m: float, only: int | None = None) -> Priors:
-        """Return the same for a search, in which all but `only` one arrangement's places are known if that is given."""
-        precision, centre = self.prior(curve_m)
-        size = self.layout.size
-        known = np.ones(size, dtype=bool)
-        known[self.free(only)] = False
-        prior = Prior(weight=1.0, structure=precision, centre=centre, rows=size)
-        return Priors(Layout((Unknown(kind="survey", names=("",) * size, start=centre, known=known, priors=(prior,)),)))
+        """Return what is known of the unknowns beforehand, with the spread of the curve.
+
+        All but `only` one arrangement's places are known if that is given.
+        """
+        layout = self.layout
+        if only is not None:
+            known = ~np.isin(np.arange(layout.size), self.free(only))
+            layout = Layout(tuple(replace(one, known=known[layout.where[one.kind]]) for one in layout.blocks))
+        return Priors(layout, [1.0, UNLIKE_NS**-2, curve_m**-2])
+
+    def at(self, x: Floats, case: Case, only: int | None = None) -> Linear:
+        """Return the network about unknowns (p,) in a case; `only` one arrangement's places are free if given."""
+        left, jacobian = self.linear(x, case.marks)
+        return Linear(
+            left=left,
+            jacobian=jacobian,
+            std=self.std_m(case),
+            prior=np.asarray(self.priors(case.curve_m).precision()),
+            away=x - self.layout.start(),
+            free=self.free(only),
+        )
 
 
 @dataclass(frozen=True, slots=True)

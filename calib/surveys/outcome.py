@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +18,7 @@ from calib.errors import UnanswerableError
 from calib.estimator.range_model import METRES_A_NS
 from calib.information import Unknown, Verdict, judge, reduced
 from calib.spread import TWO_SIDED_95
-from calib.surveys.network import Boards, Network, TakenCurve
+from calib.surveys.network import Boards, TakenCurve
 from calib.surveys.recordings import LIFT, SurveyData
 from calib.surveys.result import (
     Contradiction,
@@ -94,22 +95,28 @@ def result_of(
     )
 
 
+def verdict_on_delays(information: Floats, tags: Sequence[int]) -> Verdict:
+    """Return what is determined of delays by their information (tags, tags), 1/ns^2."""
+    return judge(information, [Unknown("delay", str(tag), DELAY_SCALE_NS) for tag in tags])
+
+
 def verdict_of(found: Solution) -> Verdict:
     """Return what is determined of the delays, in nanoseconds, whatever places and curve are."""
     network = found.network
-    free, delays = network.free(), network.columns("delay")
+    free, delays = network.free(), network.layout.indices(["delay"])
     open_delays = np.intersect1d(free, delays)
     information = np.diag(np.where(np.isin(delays, free), 0.0, 1e8))
     mine = np.searchsorted(delays, open_delays)
     of_free = found.information()[np.ix_(free, free)]
     information[np.ix_(mine, mine)] = reduced(of_free, np.isin(free, open_delays))
-    return judge(information, [Unknown("delay", str(tag), DELAY_SCALE_NS) for tag in network.tags])
+    return verdict_on_delays(information, network.tags)
 
 
 def reflected_pairs(found: Solution) -> tuple[ReflectedPair, ...]:
     """Return the pairs that may be reflected, the likeliest first."""
     network = found.network
-    means, names, longer = network.means, [boards.name for boards in network.arrangements], found.residuals_m().tolist()
+    means, names = network.means, [boards.name for boards in network.arrangements]
+    longer = network.linear(found.x)[0].tolist()
     return tuple(
         ReflectedPair(
             names[means.arrangement[k]], int(means.ends[k, 0]), int(means.ends[k, 1]), longer[k], float(found.chance[k])
@@ -181,10 +188,10 @@ def _calibration(
         curve, curve_covariance, span = taken.curve, taken.covariance_m2, taken.curve.range
         gauge = "that of the calibration whose curve was taken over"
     elif network.curve is not None:
-        columns, knots = network.columns("curve"), network.curve.knots
+        where, knots = network.layout.where["curve"], network.curve.knots
         span = (float(knots[0]), float(knots[-1]))
-        curve = Curve(tuple(knots.tolist()), tuple(found.x[columns].tolist()), DEGREE, span)
-        curve_covariance = found.covariance()[np.ix_(columns, columns)] * factor**2
+        curve = Curve(tuple(knots.tolist()), tuple(found.x[where].tolist()), DEGREE, span)
+        curve_covariance = found.covariance()[where, where] * factor**2
     else:
         gauge = "no curve; the delays carry the constant"
     fixed = {"fixed_ns": {str(tag): delay for tag, delay in sorted(network.fixed_ns.items())}}
@@ -298,9 +305,7 @@ def rigid_motions(points: Floats, dimensions: int) -> Floats:
 
 def widened_by(found: Solution, taken: TakenCurve) -> Solution:
     """Return a solution whose covariance has what the errors of a curve that was taken over do to delays and places."""
-    network: Network = found.network
-    count = len(network.means)
-    std = network.std_m(found.case)[:count, None]
-    rows = network.linear(found.x)[1][:count]
-    gain = (found.covariance() - found.more) @ ((rows / std).T @ (taken.design(network.means.lifted) / std))
+    here, count = found.network.at(found.x, found.case), len(found.network.means)
+    weighed = here.jacobian[:count] / here.std[:count, None] ** 2
+    gain = here.covariance() @ (weighed.T @ taken.design(found.network.means.lifted))
     return replace(found, more=found.more + gain @ taken.covariance_m2 @ gain.T)

@@ -45,16 +45,10 @@ class Marks:
     @classmethod
     def at(cls, network: Network, x: Floats, case: Case, only: int | None = None) -> Marks:
         """Return the marks of a case, linear about unknowns (p,); those of `only` one arrangement can change."""
-        free = network.free(only)
-        left, jacobian = network.linear(x)
-        prior, centre = network.prior(case.curve_m)
-        rows = jacobian[:, free]
-        std = network.std_m(case)
-        left = left + rows @ (x - centre)[free]
-        left[: len(case.marks)] -= DETOUR_M * case.marks
-        weighed = rows / std[:, None] ** 2
-        spread = np.linalg.inv(rows.T @ weighed + prior[np.ix_(free, free)])
-        inverse = np.diag(std**-2) - weighed @ spread @ weighed.T
+        here = network.at(x, case, only)
+        left = here.left + here.jacobian[:, here.free] @ here.away[here.free]
+        weighed = here.jacobian / here.std[:, None] ** 2
+        inverse = np.diag(here.std**-2) - weighed @ here.covariance() @ weighed.T
         count = len(case.marks)
         return cls(case.marks, inverse[:count, :count], (inverse @ left)[:count], network.rows_of(only))
 

@@ -11,12 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter, itemgetter
 
 import numpy as np
 from scipy.optimize import minimize
 
 from calib.estimator.optimize import maximize
-from calib.surveys.network import DETOUR_M, Case, Lengths, Network
+from calib.surveys.network import Case, Lengths, Network
 from calib.surveys.reflections import Marks, unlikely
 from calib.surveys.result import SecondBest
 from calib.surveys.starts import first_start, is_in_order, line_coordinates, other_starts, start_in_order
@@ -64,36 +65,18 @@ class Solution:
         """The delays (tags,), ns."""
         return self.x[self.network.layout.where["delay"]]
 
-    def residuals_m(self) -> Floats:
-        """Return what is left of each row; of means with the whole detour."""
-        return self.network.linear(self.x)[0]
-
     def covariance(self) -> Floats:
         """Return the covariance (p, p), with what is known of delays beforehand, so that there is always one."""
-        return _covariance(self.network, self.x, self.case) + self.more
+        return self.network.at(self.x, self.case).covariance() + self.more
 
     def information(self) -> Floats:
         """Return the information (p, p) of what was measured, and of what is known of the curve."""
-        prior = self.network.prior(self.case.curve_m)[0]
-        places_and_delays = self.network.layout.where["curve"].start
-        prior[:places_and_delays, :places_and_delays] = 0.0
-        found = _information(self.network, self.x, self.case) + prior
+        here, curve = self.network.at(self.x, self.case), self.network.layout.where["curve"]
+        found = here.information()
+        found[curve, curve] += here.prior[curve, curve]
         # Of the sum of two covariances, the first of which may be infinite.
         wider = np.linalg.solve(np.eye(len(found)) + found @ self.more, found)
         return np.asarray((wider + wider.T) / 2)
-
-
-def _information(network: Network, x: Floats, case: Case) -> Floats:
-    rows = network.linear(x)[1] / network.std_m(case)[:, None]
-    return rows.T @ rows
-
-
-def _covariance(network: Network, x: Floats, case: Case) -> Floats:
-    free = network.free()
-    found = np.zeros((len(x),) * 2)
-    whole = _information(network, x, case) + network.prior(case.curve_m)[0]
-    found[np.ix_(free, free)] = np.linalg.inv(whole[np.ix_(free, free)])
-    return found
 
 
 def settle(network: Network, x: Floats, case: Case, only: int | None = None) -> tuple[Floats, bool]:
@@ -112,15 +95,12 @@ def settle(network: Network, x: Floats, case: Case, only: int | None = None) -> 
 
 def unlikelihood(network: Network, x: Floats, case: Case, only: int | None = None) -> float:
     """Return -2 log likelihood where a search settled, whatever the unknowns are (of `only` one arrangement)."""
-    free = network.free(only)
-    left, jacobian = network.linear(x)
-    left[: len(case.marks)] -= DETOUR_M * case.marks
-    std = network.std_m(case)
-    prior, centre = network.prior(case.curve_m)
-    rows, own = jacobian[:, free] / std[:, None], prior[np.ix_(free, free)]
-    away = x - centre
-    value = float(np.sum((left / std) ** 2) + away @ prior @ away) + 2 * float(np.log(std).sum())
-    value += float(np.linalg.slogdet(rows.T @ rows + own)[1] - np.linalg.slogdet(own)[1])
+    here = network.at(x, case, only)
+    free = np.ix_(here.free, here.free)
+    value = float(np.sum((here.left / here.std) ** 2) + here.away @ here.prior @ here.away)
+    value += 2 * float(np.log(here.std).sum())
+    value += float(np.linalg.slogdet((here.information() + here.prior)[free])[1])
+    value -= float(np.linalg.slogdet(here.prior[free])[1])
     value += unlikely(int(case.marks.sum()), len(case.marks))
     if case.marks.any():
         value += float(Marks.at(network, x, case, only).penalties()[case.marks].sum())
@@ -137,21 +117,22 @@ def out_of_order(network: Network, x: Floats) -> list[int]:
     ]
 
 
-def adjust(network: Network, x: Floats, *, marks: Bools | None = None, pair_m: float | None = None) -> Solution:
-    """Return the best unknowns from a start, with the spreads and the reflected means estimated along.
+def adjust(
+    network: Network,
+    x: Floats,
+    *,
+    marks: Bools | None = None,
+    pair_m: float | None = None,
+    start_m: float = PAIR_STD_M,
+    rounds: int = 6,
+) -> Solution:
+    """Return the best unknowns from a start, with the spreads and the reflected means estimated along, in turns.
 
-    `pair_m` is the constant error of pairs where that is known; `marks` (n,) are means that are reflected at first.
+    `pair_m` is the constant error of pairs where that is known, `start_m` where its search begins; `marks` (n,) are
+    means that are reflected at first.
     """
     none = np.zeros(len(network.means), dtype=bool)
-    return _alternated(network, x, Case(none if marks is None else marks, pair_m or PAIR_STD_M, CURVE_STD_M), pair_m)
-
-
-def _unlikely(found: Solution) -> float:
-    return found.unlikely
-
-
-def _alternated(network: Network, x: Floats, case: Case, pair_m: float | None, rounds: int = 6) -> Solution:
-    """Return what comes of settling, of searching for reflections, and of estimating spreads, in turns."""
+    case = Case(none if marks is None else marks, pair_m or start_m, CURVE_STD_M)
     for _ in range(rounds):
         before = case
         x, _ = settle(network, x, case)
@@ -161,7 +142,7 @@ def _alternated(network: Network, x: Floats, case: Case, pair_m: float | None, r
         if abs(case.pair_m - before.pair_m) < 0.02 * case.pair_m and np.array_equal(case.marks, before.marks):
             break
     x, settled = settle(network, x, case)
-    covariance = _covariance(network, x, case)
+    here = network.at(x, case)
     # Lengths, and known coordinates that may be free.
     dimensions = np.array([boards.dimensions for boards in network.arrangements])
     rows = len(network.ends) + int(dimensions[network.owner[network.known.at]].sum())
@@ -170,7 +151,7 @@ def _alternated(network: Network, x: Floats, case: Case, pair_m: float | None, r
         x=x,
         case=case,
         unlikely=unlikelihood(network, x, case) + _unlikely_spreads(case.pair_m, case.curve_m),
-        freedom=float(rows - np.sum(covariance * _information(network, x, case))),
+        freedom=float(rows - np.sum(here.covariance() * here.information())),
         settled=settled,
         chance=case.marks.astype(float),
         more=np.zeros((len(x),) * 2),
@@ -188,14 +169,12 @@ def _unlikely_by_spreads(network: Network, x: Floats, case: Case) -> Callable[[f
 
     By error contrasts: combinations of rows in which neither coordinates nor delays are, as many as freedoms are left.
     """
-    left, jacobian = network.linear(x)
-    left[: len(case.marks)] -= DETOUR_M * case.marks
-    curve = network.columns("curve")
-    basis, size, _ = np.linalg.svd(jacobian[:, np.setdiff1d(network.free(), curve)], full_matrices=True)
+    here, curve = network.at(x, replace(case, pair_m=0.0)), network.layout.indices(["curve"])
+    basis, size, _ = np.linalg.svd(here.jacobian[:, np.setdiff1d(here.free, curve)], full_matrices=True)
     contrasts = basis[:, int(np.count_nonzero(size > 1e-9 * size[0])) :].T
-    curves = contrasts @ jacobian[:, curve]
-    seen = contrasts @ left + curves @ x[curve]
-    own = (contrasts * network.std_m(replace(case, pair_m=0.0)) ** 2) @ contrasts.T
+    curves = contrasts @ here.jacobian[:, curve]
+    seen = contrasts @ here.left + curves @ x[curve]
+    own = (contrasts * here.std**2) @ contrasts.T
     shared = contrasts[:, : len(case.marks)] @ contrasts[:, : len(case.marks)].T
     smooth = 0.0 if network.curve is None else curves @ np.linalg.inv(network.curve.precision) @ curves.T
 
@@ -252,45 +231,33 @@ def averaged(found: Solution, *, pair_known: bool) -> Solution:
 
 def _mixed(found: Solution, cases: Sequence[Case], weight: Floats) -> tuple[Floats, Floats]:
     """Return the mean step over cases, linear, and what their covariance is more than that of one case, not below 0."""
-    network, x, free = found.network, found.x, found.network.free()
-    left, jacobian = network.linear(x)
-    rows = jacobian[:, free]
 
     def solved(case: Case) -> tuple[Floats, Floats]:
-        std = network.std_m(case)
-        prior, centre = network.prior(case.curve_m)
-        weighed = rows / std[:, None] ** 2
-        spread = np.asarray(np.linalg.inv(rows.T @ weighed + prior[np.ix_(free, free)]), dtype=np.float64)
-        away = left - DETOUR_M * np.pad(case.marks.astype(float), (0, len(left) - len(case.marks)))
-        return spread @ (weighed.T @ away - (prior @ (x - centre))[free]), spread
+        here = found.network.at(found.x, case)
+        spread = here.covariance()
+        return spread @ (here.jacobian.T @ (here.left / here.std**2) - here.prior @ here.away), spread
 
-    here = solved(found.case)[1]
+    own = solved(found.case)[1]
     every = [solved(case) for case in cases]
     steps = np.array([step for step, _ in every])
     mean = weight @ steps
     around = steps - mean
-    wider = (
-        sum(w * (spread - here) for w, (_, spread) in zip(weight, every, strict=True)) + (around.T * weight) @ around
-    )
+    wider = sum(w * (spread - own) for w, (_, spread) in zip(weight, every, strict=True)) + (around.T * weight) @ around
     values, vectors = np.linalg.eigh((wider + wider.T) / 2)
-    step, more = np.zeros(len(x)), np.zeros((len(x),) * 2)
-    step[free] = mean
-    more[np.ix_(free, free)] = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return step, more
+    return mean, (vectors * np.maximum(values, 0.0)) @ vectors.T
 
 
 def solve(network: Network, *, pair_m: float | None, moves: int = 6) -> tuple[Solution, SecondBest | None]:
     """Return the best solution that any start leads to, and the second-best."""
-    start, none = first_start(network), np.zeros(len(network.means), dtype=bool)
+    start, least = first_start(network), attrgetter("unlikely")
     spreads = PAIR_STARTS_M if pair_m is None else (pair_m,)
-    every = [_alternated(network, start, Case(none, spread, CURVE_STD_M), pair_m) for spread in spreads]
-    found = min(every, key=_unlikely)
+    found = min((adjust(network, start, pair_m=pair_m, start_m=spread) for spread in spreads), key=least)
     # Once more with the delays that came out: the first guess of places was made without any.
-    found = min(found, adjust(network, first_start(network, found.delays), pair_m=pair_m), key=_unlikely)
+    found = min(found, adjust(network, first_start(network, found.delays), pair_m=pair_m), key=least)
     wrong = out_of_order(network, found.x)
     if wrong:
         start = start_in_order(network, found.x, wrong)
-        found = min(found, adjust(network, start, pair_m=pair_m), key=_unlikely)
+        found = min(found, adjust(network, start, pair_m=pair_m), key=least)
     worse: list[tuple[float, tuple[str, tuple[int, ...]]]] = []
     for _ in range(moves):
         here = unlikelihood(network, found.x, found.case)
@@ -299,7 +266,7 @@ def solve(network: Network, *, pair_m: float | None, moves: int = 6) -> tuple[So
         better = [other for other in others if other[0] < here - 1e-3]
         if not better:
             break
-        _, x, case, _ = min(better, key=lambda other: other[0])
+        _, x, case, _ = min(better, key=itemgetter(0))
         moved = adjust(network, x, marks=case.marks, pair_m=pair_m)
         if moved.unlikely > found.unlikely - 1e-3:
             break

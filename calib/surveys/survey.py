@@ -16,7 +16,7 @@ from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.surveys.checks import misplaced, worst
 from calib.surveys.knowledge import Knowledge, check_knowledge, load_knowledge
-from calib.surveys.network import DIMENSIONS, Boards, CurvePrior, Known, Network, TakenCurve
+from calib.surveys.network import DIMENSIONS, Boards, CurvePrior, Known, Network, TakenCurve, numbered
 from calib.surveys.outcome import result_of, widened_by
 from calib.surveys.recordings import LIFT, SurveyData, read_surveys
 from calib.surveys.result import SurveyResult
@@ -178,9 +178,7 @@ def _boards(gathered: SurveyData, knowledge: Knowledge, number: int, tags: tuple
 
 def _known(arrangements: tuple[Boards, ...], knowledge: Knowledge, distances: tuple[KnownDistance, ...]) -> Known:
     """Return what is known as columns. What holds in several arrangements is one reading, not several."""
-    number: dict[tuple[int, int], int] = {}
-    for k, boards in enumerate(arrangements):
-        number |= {(k, tag): len(number) + n for n, tag in enumerate(boards.tags)}
+    number = numbered(arrangements)
     lengths, places = [], []
     for statement, d in enumerate(distances):
         held = [

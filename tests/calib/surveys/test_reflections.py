@@ -28,7 +28,7 @@ def linear():
     x, free = first_start(network), network.free()
     rows = len(network.means)
     left, jacobian = network.linear(x)
-    prior, centre = network.prior(CURVE_M)
+    prior, centre = network.priors(CURVE_M).precision(), network.layout.start()
     spread = jacobian[:, free] @ np.linalg.inv(prior[np.ix_(free, free)]) @ jacobian[:, free].T
     seen = left + jacobian[:, free] @ (x - centre)[free]
 
