@@ -297,6 +297,14 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     return Calibration.from_json(read_text(path, BadInputError, "calibration file (.json)"), str(path))
 
 
+def given_calibration(source: Calibration | str | os.PathLike[str] | None, parameter: str) -> Calibration | None:
+    """Return the calibration that is given as an object or as its path; errors name `parameter`."""
+    known = load_calibration(source) if isinstance(source, str | os.PathLike) else source
+    if known is not None:
+        require_calibration(known, parameter)
+    return known
+
+
 DELAY_HEAD: Final = ("tag", "delay (ns)", "95 % interval")
 PAIR_HEAD: Final = ("pair", "constant (cm)", "95 % interval")
 MAX_ROWS: Final = 40

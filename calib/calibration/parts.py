@@ -22,6 +22,11 @@ Matrix = tuple[tuple[Number, ...], ...]
 """A matrix as a tuple of rows."""
 
 
+def matrix_of(values: Floats) -> Matrix:
+    """Return an array (n, k) as a tuple of rows."""
+    return tuple(map(tuple, values.tolist()))
+
+
 @dataclass(frozen=True, slots=True)
 class TagGroup:
     """Tags of one design, and their curves; a range between groups gets the mean of both groups' curves."""

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from calib.calibration.model import Calibration
-from calib.calibration.parts import Matrix, PairOffset, TagGroup, Uncertainty
+from calib.calibration.parts import PairOffset, TagGroup, Uncertainty, matrix_of
 from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, flat_curve
 from calib.estimator.error_summary import between_recordings, error_model
 from calib.estimator.known_distances import LARGEST_SPREAD_M, KnownDistances, described_errors
@@ -74,9 +74,9 @@ def calibration_of(
         sigma_curve=_average(list(sigmas.values())),
         uncertainty=Uncertainty(
             tuple(tags),
-            () if offsets else _rows(delays_ns2[np.ix_(fitted, fitted)]),
-            _rows(_bias_covariance(found)),
-            _rows(sigma_m2),
+            () if offsets else matrix_of(delays_ns2[np.ix_(fitted, fitted)]),
+            matrix_of(_bias_covariance(found)),
+            matrix_of(sigma_m2),
         ),
         pair_offsets=offsets,
         groups={name: TagGroup(tuple(own), biases[name], sigmas[name]) for name, own in groups.items()},
@@ -178,7 +178,3 @@ def _average(curves: list[Curve]) -> Curve:
     """Return the mean of curves over the same knots."""
     mean = np.mean([curve.coefficients for curve in curves], axis=0)
     return Curve(curves[0].knots, tuple(mean.tolist()), curves[0].degree, curves[0].range)
-
-
-def _rows(matrix: Floats) -> Matrix:
-    return tuple(tuple(row) for row in matrix.tolist())

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 import uwblink
 from calib.calibration.lasting import lasting_errors
-from calib.calibration.model import Calibration
+from calib.calibration.model import Calibration, given_calibration
 from calib.calibration.power_curves import lift as lift_power
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import limits, warnings_of
@@ -24,11 +24,11 @@ from calib.checks.plausibility import implausible, one_way, refuse_impossible, r
 from calib.checks.power_levels import unlike_powers
 from calib.data.ranges import Ranges, held_out
 from calib.data.sources import Data, load_ranges
+from calib.errors import BadInputError
 from calib.estimator.known_distances import KnownDistances, Recipe, fit_known_distances
 from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
-from calib.fitting.known_delays import imported, std_taken_over, taken_over
 from calib.fitting.result import FitResult, HeldOut
 from calib.settings import FitSettings
 from uwblink.arrays import Bools, Floats
@@ -62,9 +62,9 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     pinned, groups, sequential = dict(settings.fixed_ns), dict(settings.groups), settings.sequential
     lift, alpha_dbm, delays_only = settings.lift, settings.alpha_dbm, settings.delays_only
     check_loss(settings.loss)
-    source = imported(settings.delays_from)
+    source = given_calibration(settings.delays_from, "delays_from")
     ranges = load_ranges(data, need_power=not delays_only)
-    fixed = taken_over(source, ranges, curve=not delays_only) | pinned
+    fixed = _taken_over(source, ranges, curve=not delays_only) | pinned
     refuse_impossible(ranges)
     loss = settings.loss or (ROBUST_LOSS if sequential or delays_only else MIXTURE)
     reference = settings.reference_power_dbm
@@ -99,7 +99,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         )
     given = set(fixed) - set(pinned)
     stated = {tag: std for tag, std in calibration.delays_std_ns.items() if tag not in given}
-    calibration = replace(calibration, delays_std_ns=stated | std_taken_over(source, given))
+    calibration = replace(calibration, delays_std_ns=stated | _std_taken_over(source, given))
     held = _held_out(ranges, settings) if settings.hold_out else None
     provenance = {
         **({"undetermined": found.free} if found.free else {}),
@@ -121,6 +121,30 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         more=_stopped(found, settings.loss),
     )
     return replace(result, held_out=held)
+
+
+def _taken_over(known: Calibration | None, ranges: Ranges, *, curve: bool) -> dict[int, float]:
+    """Return the delays that a calibration has for tags of these ranges.
+
+    Raises `BadInputError` where it has none, and where it has all and no `curve` is fitted beside them.
+    """
+    if known is None:
+        return {}
+    found = {tag: known.delays_ns[tag] for tag in ranges.tags() if tag in known.delays_ns}
+    if not found:
+        there, here = (", ".join(map(str, sorted(tags))) for tags in (known.delays_ns, ranges.tags()))
+        raise BadInputError(f"its tags are {there}, those of the ranges {here}", parameter="delays_from")
+    if not curve and len(found) == len(ranges.tags()):
+        raise BadInputError(
+            "it has the delays of all tags, and `delays_only` fits no curve, so nothing is left to fit",
+            parameter="delays_from",
+        )
+    return found
+
+
+def _std_taken_over(known: Calibration | None, tags: Iterable[int]) -> dict[int, float]:
+    """Return the standard errors of delays that were taken from a calibration."""
+    return {} if known is None else {tag: known.delays_std_ns[tag] for tag in tags if tag in known.delays_std_ns}
 
 
 def result_of(

@@ -9,7 +9,7 @@ nothing is wrong. The likeliest hypothesis is taken first, because a wrong tape 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -50,30 +50,15 @@ class Hypothesis:
     beforehand: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Check:
-    """A question to a survey: the hypotheses that answer it, and what to do where one is true."""
-
-    name: str
-    question: str
-    remedy: str
-    hypotheses: Callable[[Solution, tuple[str, ...]], Iterator[Hypothesis]]
-
-
-def worst(
-    found: Solution, names: tuple[str, ...], pair_m: float | None = None
-) -> tuple[Contradiction, Solution] | None:
-    """Return the likeliest hypothesis that chance does not explain, and the solution in which it is true.
-
-    `names` say what each known distance is called.
-    """
+def worst(found: Solution) -> tuple[Contradiction, Solution] | None:
+    """Return the likeliest hypothesis that chance does not explain, and the solution in which it is true."""
     best: tuple[float, Contradiction, Solution] | None = None
-    for check in CHECKS:
-        for one in check.hypotheses(found, names):
-            without = adjust(one.network, one.start, pair_m=pair_m)
+    for name, (hypotheses, remedy) in CHECKS.items():
+        for one in hypotheses(found):
+            without = adjust(one.network, one.start)
             p_value = math.exp(min(0.5 * (without.unlikely + one.beforehand - found.unlikely), 0.0))
             if p_value < FALSE_ALARMS and (best is None or without.unlikely + one.beforehand < best[0]):
-                finding = Contradiction(check.name, f"{one.text}; {check.remedy}", p_value)
+                finding = Contradiction(name, f"{one.text}; {remedy}", p_value)
                 best = without.unlikely + one.beforehand, finding, without
     return None if best is None else best[1:]
 
@@ -86,7 +71,8 @@ def _of_known(found: Solution) -> tuple[Floats, Floats, Floats]:
     return here.left[known], std, np.clip(share, 1e-9, 1.0)
 
 
-def _distances(found: Solution, names: tuple[str, ...]) -> Iterator[Hypothesis]:
+def _distances(found: Solution) -> Iterator[Hypothesis]:
+    """Yield what is known without one of the known distances."""
     network, known = found.network, found.network.known
     left, _, share = _of_known(found)
     for statement in np.unique(known.statement).tolist():
@@ -103,11 +89,12 @@ def _distances(found: Solution, names: tuple[str, ...]) -> Iterator[Hypothesis]:
         # The rows go, and with them what they say of likelihood: as if the tape were wrong by some half a metre.
         std = np.append(known.distance_std_m[rows][1:], WRONG_TAPE_M)
         beforehand = 2 * float(np.log(std).sum()) + (off / WRONG_TAPE_M) ** 2
-        text = f"{names[statement]} is {100 * off:+.0f} cm off what the ranges say"
+        text = f"{known.names[statement]} is {100 * off:+.0f} cm off what the ranges say"
         yield Hypothesis(text, replace(network, known=less), found.x, beforehand)
 
 
-def _shapes(found: Solution, names: tuple[str, ...]) -> Iterator[Hypothesis]:
+def _shapes(found: Solution) -> Iterator[Hypothesis]:
+    """Yield boards that stand beside a line, or a plane, that they are said to be on."""
     network = found.network
     for k, boards in enumerate(network.arrangements):
         if boards.dimensions == 3 or len(boards.tags) < boards.dimensions + 2 or boards.freed:
@@ -136,7 +123,7 @@ def _shapes(found: Solution, names: tuple[str, ...]) -> Iterator[Hypothesis]:
         yield Hypothesis(text, freed, x)
 
 
-def _exchanged(found: Solution, names: tuple[str, ...]) -> Iterator[Hypothesis]:
+def _exchanged(found: Solution) -> Iterator[Hypothesis]:
     """Yield what is known with two tags' names exchanged, where something known is off or reflected."""
     network, known = found.network, found.network.known
     left, std, share = _of_known(found)
@@ -152,11 +139,12 @@ def _exchanged(found: Solution, names: tuple[str, ...]) -> Iterator[Hypothesis]:
         yield Hypothesis(text, changed, first_start(changed, found.delays))
 
 
-CHECKS = (
-    Check("distance", "is a known distance wrong?", "measure it again or leave it out", _distances),
-    Check("shape", "is a line, or a plane, none?", "put the boards as is said, or do not say so", _shapes),
-    Check("labels", "are two boards' labels exchanged?", "look at the labels of these two boards", _exchanged),
-)
+CHECKS = {
+    "distance": (_distances, "measure it again or leave it out"),
+    "shape": (_shapes, "put the boards as is said, or do not say so"),
+    "labels": (_exchanged, "look at the labels of these two boards"),
+}
+"""The checks by what may be wrong: the hypotheses, and what to do where one is true."""
 
 
 def misplaced(found: Solution) -> Iterator[Contradiction]:

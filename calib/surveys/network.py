@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis
+from calib.calibration.power_curves import ALPHA_DBM, DEGREE, basis
 from calib.estimator.inverse import inverse_of
 from calib.estimator.range_model import METRES_A_NS
 from calib.estimator.rows import Terms, normal_terms
@@ -115,9 +115,9 @@ def numbered(arrangements: Sequence[Boards]) -> dict[tuple[int, int], int]:
 class Known:
     """Distances and positions that are known.
 
-    `ends` (k, 2) are points (rows of `Network.points`), `distance_m` and `distance_std_m` (k,) go with them and
-    `statement` says from which statement each comes; `at` (l,) are points at `position_m` (l, 3), known to
-    `position_std_m` (l,).
+    `ends` (k, 2) are points (`Network.points`), `distance_m` and `distance_std_m` (k,) go with them, and `statement`
+    (k,) says which of `names` each comes from; `at` (l,) are points at `position_m` (l, 3), known to `position_std_m`
+    (l,).
     """
 
     ends: Ints
@@ -127,6 +127,7 @@ class Known:
     at: Ints
     position_m: Floats
     position_std_m: Floats
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +137,10 @@ class Case:
     marks: Bools
     pair_m: float
     curve_m: float
+
+    def scaled(self, pair: float, curve: float) -> Case:
+        """Return the case with other spreads, by the logarithms of their factors."""
+        return replace(self, pair_m=self.pair_m * math.exp(pair), curve_m=self.curve_m * math.exp(curve))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -182,8 +187,9 @@ class Lengths:
 class Network:
     """Means of pairs, the boards they belong to, and what is known beside them.
 
-    The unknowns are three coordinates of each point, delays in ns, and coefficients of the curve over power; known are
-    coordinates beyond an arrangement's dimensions, and delays of `fixed_ns`.
+    `pair_m` is the constant error of pairs, None to estimate it. The unknowns are three coordinates of each point,
+    delays in ns, and coefficients of the curve over power; known are coordinates beyond an arrangement's dimensions,
+    and delays of `fixed_ns`.
     """
 
     means: PairMeans
@@ -192,6 +198,7 @@ class Network:
     known: Known
     fixed_ns: dict[int, float]
     curve: CurvePrior | None
+    pair_m: float | None = None
 
     @cached_property
     def points(self) -> dict[tuple[int, int], int]:
@@ -331,15 +338,3 @@ class Network:
             away=x - self.layout.start(),
             free=self.free(only),
         )
-
-
-@dataclass(frozen=True, slots=True)
-class TakenCurve:
-    """A curve that is taken over from another calibration, and the covariance (m, m) of its coefficients, m^2."""
-
-    curve: Curve
-    covariance_m2: Floats
-
-    def design(self, lifted: Floats) -> Floats:
-        """Return the derivatives (n, m) of the curve at lifted powers with respect to its coefficients."""
-        return basis(np.clip(lifted, *self.curve.range), np.array(self.curve.knots))

@@ -12,13 +12,13 @@ from scipy.special import stdtrit
 
 import uwblink
 from calib.calibration.model import Calibration
-from calib.calibration.parts import Matrix, Uncertainty
-from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, flat_curve
+from calib.calibration.parts import Uncertainty, matrix_of
+from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis, flat_curve
 from calib.errors import UnanswerableError
 from calib.estimator.range_model import METRES_A_NS
 from calib.information import Unknown, Verdict, judge, reduced
 from calib.spread import TWO_SIDED_95
-from calib.surveys.network import Boards, TakenCurve
+from calib.surveys.network import Boards
 from calib.surveys.recordings import LIFT, SurveyData
 from calib.surveys.result import (
     Contradiction,
@@ -56,7 +56,7 @@ def result_of(
     found: Solution,
     second: SecondBest | None,
     findings: tuple[Contradiction, ...],
-    taken: TakenCurve | None,
+    taken: Calibration | None,
 ) -> SurveyResult:
     """Return the result of a survey; raises `UnanswerableError` where no delay is determined."""
     verdict = verdict_of(found)
@@ -169,7 +169,7 @@ def _calibration(
     found: Solution,
     verdict: Verdict,
     factor: float,
-    taken: TakenCurve | None,
+    taken: Calibration | None,
     warnings: list[str],
     more: dict[str, Any],
 ) -> Calibration:
@@ -183,17 +183,16 @@ def _calibration(
     lifted = network.means.lifted[np.isfinite(network.means.lifted)]
     span = (float(lifted.min()), float(lifted.max())) if len(lifted) else (1.0, 1.0)
     curve, curve_covariance = flat_curve(0.0, span), np.zeros((DEGREE + 1,) * 2)
-    gauge = f"the bias curve is zero at {ALPHA_DBM:g} dBm; the delays carry the constant"
+    gauge = "no curve; the delays carry the constant"
     if taken is not None:
-        curve, curve_covariance, span = taken.curve, taken.covariance_m2, taken.curve.range
+        curve, curve_covariance, span = taken.bias_curve, _of_curve(taken), taken.bias_curve.range
         gauge = "that of the calibration whose curve was taken over"
     elif network.curve is not None:
         where, knots = network.layout.where["curve"], network.curve.knots
         span = (float(knots[0]), float(knots[-1]))
         curve = Curve(tuple(knots.tolist()), tuple(found.x[where].tolist()), DEGREE, span)
         curve_covariance = found.covariance()[where, where] * factor**2
-    else:
-        gauge = "no curve; the delays carry the constant"
+        gauge = f"the bias curve is zero at {ALPHA_DBM:g} dBm; the delays carry the constant"
     fixed = {"fixed_ns": {str(tag): delay for tag, delay in sorted(network.fixed_ns.items())}}
     freedom = found.freedom
     provenance = (fixed if network.fixed_ns else {}) | {
@@ -232,13 +231,15 @@ def _calibration(
         bias_curve=curve,
         sigma_curve=flat_curve(sigma, span),
         provenance=provenance | more,
-        uncertainty=Uncertainty(tuple(tags), _rows(covariance), _rows(curve_covariance), _rows(of_sigma)),
+        uncertainty=Uncertainty(tuple(tags), *map(matrix_of, (covariance, curve_covariance, of_sigma))),
         antenna_delays=known_delays(data.antenna_delays, tags),
     )
 
 
-def _rows(matrix: Floats) -> Matrix:
-    return tuple(tuple(row) for row in matrix.tolist())
+def _of_curve(taken: Calibration) -> Floats:
+    """Return the covariance (m, m) of a curve that was taken over, m^2; zero where it is not stated."""
+    size = len(taken.bias_curve.coefficients)
+    return np.zeros((size, size)) if taken.uncertainty is None else np.array(taken.uncertainty.bias_m2)
 
 
 def _arrangement(found: Solution, covariance: Floats, number: int) -> SurveyedArrangement:
@@ -303,9 +304,10 @@ def rigid_motions(points: Floats, dimensions: int) -> Floats:
     return np.array([field.ravel() for field in fields]).T
 
 
-def widened_by(found: Solution, taken: TakenCurve) -> Solution:
+def widened_by(found: Solution, curve: Calibration) -> Solution:
     """Return a solution whose covariance has what the errors of a curve that was taken over do to delays and places."""
     here, count = found.network.at(found.x, found.case), len(found.network.means)
     weighed = here.jacobian[:count] / here.std[:count, None] ** 2
-    gain = here.covariance() @ (weighed.T @ taken.design(found.network.means.lifted))
-    return replace(found, more=found.more + gain @ taken.covariance_m2 @ gain.T)
+    lifted = np.clip(found.network.means.lifted, *curve.bias_curve.range)
+    gain = here.covariance() @ (weighed.T @ basis(lifted, np.array(curve.bias_curve.knots)))
+    return replace(found, more=found.more + gain @ _of_curve(curve) @ gain.T)

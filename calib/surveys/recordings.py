@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 from pathlib import PurePath
 
 import numpy as np
+from scipy import ndimage
 
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data, antenna_delays_of, each, opened
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.optimize import maximize
-from calib.estimator.pairs import Pairs
+from calib.estimator.pairs import Pairs, pairs_of
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, Part
 from calib.estimator.unknowns import Prior, Priors, Unknown
@@ -195,11 +196,8 @@ def _moved(one: Arrangement, ranges: Ranges) -> list[Contradiction]:
     return [Contradiction("moved", text)]
 
 
-def pair_numbers(ranges: Ranges) -> tuple[list[tuple[int, int]], Ints]:
-    """Return the pairs of tags in ranges, the smaller first, and the number of the pair of each range (n,)."""
-    ends = np.sort(np.column_stack([ranges.initiator, ranges.target]), axis=1)
-    pairs, number = np.unique(ends, axis=0, return_inverse=True)
-    return [(i, j) for i, j in pairs.tolist()], number.ravel()
+def _pairs(ranges: Ranges) -> Pairs:
+    return pairs_of(ranges.initiator, ranges.target, ranges.tags())
 
 
 def still_stretches(ranges: Ranges, bin_s: float = 1.0) -> list[tuple[int, int]]:
@@ -211,15 +209,12 @@ def still_stretches(ranges: Ranges, bin_s: float = 1.0) -> list[tuple[int, int]]
     if not len(ranges):
         return []
     begin, bin_ns = int(ranges.time_ns.min()), int(bin_s * 1e9)
-    number = pair_numbers(ranges)[1]
+    number = _pairs(ranges).number
     bins, at = np.unique((ranges.time_ns - begin) // bin_ns, return_inverse=True)
     median = np.full((number.max() + 1, len(bins)), np.nan)
     key = number * len(bins) + at
-    order = np.lexsort((ranges.raw_m, key))
-    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
-    ends = np.append(starts[1:], len(key))
-    ordered = ranges.raw_m[order]
-    median.ravel()[key[order][starts]] = (ordered[(starts + ends - 1) // 2] + ordered[(starts + ends) // 2]) / 2
+    there = np.unique(key)
+    median.ravel()[there] = ndimage.median(ranges.raw_m, key, there)
     noise = np.array([_noise(row) for row in median])
     threshold = np.maximum(STEP_M, SIGMAS * noise * np.sqrt(2 / WINDOW))
     moving = (np.abs(_steps(median)) > threshold[:, None]).sum(axis=0) >= min(2, len(median))
@@ -233,11 +228,8 @@ def still_stretches(ranges: Ranges, bin_s: float = 1.0) -> list[tuple[int, int]]
 def _steps(median: Floats) -> Floats:
     """Return the step (p, b + 1) of each pair at each edge of bins: median after less median before, NaN at too few."""
     padded = np.pad(median, ((0, 0), (WINDOW, WINDOW)), constant_values=np.nan)
-    windows = np.sort(np.lib.stride_tricks.sliding_window_view(padded, WINDOW, axis=1), axis=2)
-    count = np.isfinite(windows).sum(axis=2, keepdims=True)
-    # Missing values are sorted to the end, so the middle ones of those that are there are known.
-    middle = [np.take_along_axis(windows, np.maximum((count - 1 + k) // 2, 0), axis=2)[:, :, 0] for k in (0, 1)]
-    medians = (middle[0] + middle[1]) / 2
+    windows = np.ma.masked_invalid(np.lib.stride_tricks.sliding_window_view(padded, WINDOW, axis=1))
+    medians = np.ma.median(windows, axis=2).filled(np.nan)  # type: ignore[no-untyped-call]  # NumPy states none
     return np.asarray(medians[:, WINDOW:] - medians[:, :-WINDOW])
 
 
@@ -254,23 +246,23 @@ def find_motion(ranges: Ranges, splits: int = 20, fewest: int = 8) -> Motion | N
     3 cm: a single pair does so when somebody walks by. The board most of whose pairs change, and most, is named. Either
     side of an instant needs `fewest` ranges.
     """
-    pairs, number = pair_numbers(ranges)
-    tags = sorted({tag for pair in pairs for tag in pair})
-    if len(pairs) < 2:
+    pairs, tags = _pairs(ranges), ranges.tags()
+    if len(pairs.ends) < 2:
         return None
-    series = [(ranges.time_ns[number == k], ranges.raw_m[number == k]) for k in range(len(pairs))]
+    here = [pairs.number == k for k in range(len(pairs.ends))]
+    series = [(ranges.time_ns[rows], ranges.raw_m[rows]) for rows in here]
     noise = [max(_noise(raw), 0.005) for _, raw in series]
     best: tuple[float, Motion | None] = 0.0, None
     for instant in np.linspace(ranges.time_ns.min(), ranges.time_ns.max(), splits + 2)[1:-1].tolist():
         changed: dict[tuple[int, int], tuple[float, float]] = {}
-        for pair, (time, raw), own in zip(pairs, series, noise, strict=True):
+        for (i, j), (time, raw), own in zip(pairs.ends.tolist(), series, noise, strict=True):
             before, after = raw[time < instant], raw[time >= instant]
             if min(len(before), len(after)) < fewest:
                 continue
             step = float(np.median(after) - np.median(before))
             size = abs(step) / (1.25 * own * np.sqrt(1 / len(before) + 1 / len(after)))
             if abs(step) > MOVED_M and size > SIGMAS:
-                changed[pair] = step, min(float(size), 50.0)
+                changed[i, j] = step, min(float(size), 50.0)
         for tag in tags:
             mine = {sum(pair) - tag: found for pair, found in changed.items() if tag in pair}
             total = sum(size for _, size in mine.values())
@@ -285,8 +277,8 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
     Pairs of fewer than five ranges in an arrangement are left out; the second value counts them. Raises
     `UnanswerableError` where none is left.
     """
-    pairs, number = pair_numbers(ranges)
-    key = np.where(arrangement >= 0, arrangement * len(pairs) + number, -1)
+    pairs = _pairs(ranges)
+    key = np.where(arrangement >= 0, arrangement * len(pairs.ends) + pairs.number, -1)
     keys, counts = np.unique(key[key >= 0], return_counts=True)
     kept = keys[counts >= MIN_RANGES]
     if not len(kept):
@@ -294,7 +286,7 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
     rows = np.flatnonzero(np.isin(key, kept))
     rows = rows[np.argsort(ranges.time_ns[rows], kind="stable")]
     group = np.searchsorted(kept, key[rows])
-    ends = np.array(pairs)[kept % len(pairs)]
+    ends = pairs.ends[kept % len(pairs.ends)]
     own = ranges[rows]
     location, std, noise = _locations(own, group, ends)
     from_first = own.initiator == ends[group, 0]
@@ -306,7 +298,7 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
     with np.errstate(invalid="ignore"):
         power = np.bincount(group, np.where(powered, lifted, 0.0)) / np.bincount(group, powered)
     means = PairMeans(
-        arrangement=kept // len(pairs),
+        arrangement=kept // len(pairs.ends),
         ends=ends,
         weights=np.column_stack([np.bincount(group, weight) / count for weight in weights.T]),
         range_m=location,
@@ -324,7 +316,7 @@ def _locations(ranges: Ranges, group: Ints, ends: Ints) -> tuple[Floats, Floats,
     Ranges are in order of time. Slopes of the likelihood are summed over parts of each group's ranges, too: errors that
     last show in these sums.
     """
-    median = np.array([np.median(ranges.raw_m[group == k]) for k in range(len(ends))])
+    median = ndimage.median(ranges.raw_m, group, np.arange(len(ends)))
     model = RangeModel.of(ranges, lift=LIFT, alpha_dbm=ALPHA_DBM, fixed_ns={}, groups={}, curve=False, offsets=False)
     model = replace(model, noise=None, pairs=Pairs(group, ends))
     residual = ranges.raw_m - median[group]
@@ -336,12 +328,10 @@ def _locations(ranges: Ranges, group: Ints, ends: Ints) -> tuple[Floats, Floats,
     found = maximize([rows], Priors(layout), layout.start())
     values = rows.values(found.x)
     slope = errors.slopes(values)[1][RESIDUAL]
-    order = np.argsort(group, kind="stable")
     count = np.bincount(group)
-    place = np.empty(len(group), dtype=np.int64)
-    place[order] = np.arange(len(group)) - np.repeat(np.cumsum(count) - count, count)
-    sums = np.zeros((len(ends), PARTS))
-    np.add.at(sums, (group, place * PARTS // count[group]), slope)
+    order = np.argsort(group, kind="stable")
+    number = np.concatenate([np.arange(n) * PARTS // n for n in count.tolist()])
+    sums = np.bincount(group[order] * PARTS + number, slope[order], len(ends) * PARTS).reshape(-1, PARTS)
     # What a range tells of its mean, as a share of what it would with noise alone, is the same for all.
     inverse = np.exp(-2 * values["noise"])
     told = np.bincount(group, inverse) * float(np.sum(slope**2) / np.sum(inverse))

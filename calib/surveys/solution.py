@@ -122,23 +122,22 @@ def adjust(
     x: Floats,
     *,
     marks: Bools | None = None,
-    pair_m: float | None = None,
     start_m: float = PAIR_STD_M,
     rounds: int = 6,
 ) -> Solution:
     """Return the best unknowns from a start, with the spreads and the reflected means estimated along, in turns.
 
-    `pair_m` is the constant error of pairs where that is known, `start_m` where its search begins; `marks` (n,) are
-    means that are reflected at first.
+    `start_m` is the constant error of pairs at first, where that is not known, and `marks` (n,) are the means that are
+    reflected at first.
     """
     none = np.zeros(len(network.means), dtype=bool)
-    case = Case(none if marks is None else marks, pair_m or start_m, CURVE_STD_M)
+    case = Case(none if marks is None else marks, network.pair_m or start_m, CURVE_STD_M)
     for _ in range(rounds):
         before = case
         x, _ = settle(network, x, case)
         case = replace(case, marks=Marks.at(network, x, case).searched())
         x, _ = settle(network, x, case)
-        case = _spreads(network, x, case, pair_m)
+        case = _spreads(network, x, case)
         if abs(case.pair_m - before.pair_m) < 0.02 * case.pair_m and np.array_equal(case.marks, before.marks):
             break
     x, settled = settle(network, x, case)
@@ -150,7 +149,7 @@ def adjust(
         network=network,
         x=x,
         case=case,
-        unlikely=unlikelihood(network, x, case) + _unlikely_spreads(case.pair_m, case.curve_m),
+        unlikely=unlikelihood(network, x, case) + _unlikely_spreads(case),
         freedom=float(rows - np.sum(here.covariance() * here.information())),
         settled=settled,
         chance=case.marks.astype(float),
@@ -158,14 +157,14 @@ def adjust(
     )
 
 
-def _unlikely_spreads(pair_m: float, curve_m: float) -> float:
+def _unlikely_spreads(case: Case) -> float:
     """Return -2 log of what is known of the spreads beforehand."""
-    known = PAIR_WORTH * (2 * math.log(pair_m) + (PAIR_STD_M / pair_m) ** 2)
-    return known + (math.log(curve_m / CURVE_STD_M) / math.log(CURVE_FACTOR)) ** 2
+    known = PAIR_WORTH * (2 * math.log(case.pair_m) + (PAIR_STD_M / case.pair_m) ** 2)
+    return known + (math.log(case.curve_m / CURVE_STD_M) / math.log(CURVE_FACTOR)) ** 2
 
 
-def _unlikely_by_spreads(network: Network, x: Floats, case: Case) -> Callable[[float, float], float]:
-    """Return -2 log likelihood as a function of the logarithms of the spreads of pairs and curve.
+def _unlikely_by_spreads(network: Network, x: Floats, case: Case) -> Callable[[Case], float]:
+    """Return -2 log likelihood as a function of cases that differ in the spreads of pairs and curve.
 
     By error contrasts: combinations of rows in which neither coordinates nor delays are, as many as freedoms are left.
     """
@@ -178,36 +177,33 @@ def _unlikely_by_spreads(network: Network, x: Floats, case: Case) -> Callable[[f
     shared = contrasts[:, : len(case.marks)] @ contrasts[:, : len(case.marks)].T
     smooth = 0.0 if network.curve is None else curves @ np.linalg.inv(network.curve.precision) @ curves.T
 
-    def value(log_pair: float, log_curve: float) -> float:
-        found = _unlikely_spreads(math.exp(log_pair), math.exp(log_curve))
+    def value(case: Case) -> float:
+        found = _unlikely_spreads(case)
         if len(seen):
-            root = np.linalg.cholesky(own + math.exp(2 * log_pair) * shared + math.exp(2 * log_curve) * smooth)
+            root = np.linalg.cholesky(own + case.pair_m**2 * shared + case.curve_m**2 * smooth)
             found += 2 * float(np.log(np.diag(root)).sum()) + float(np.sum(np.linalg.solve(root, seen) ** 2))
         return found
 
     return value
 
 
-def _spreads(network: Network, x: Floats, case: Case, pair_m: float | None) -> Case:
+def _spreads(network: Network, x: Floats, case: Case) -> Case:
     """Return a case with the spreads of pairs and curve that are likeliest."""
     value = _unlikely_by_spreads(network, x, case)
-    start = np.log([case.pair_m, case.curve_m])
-    free = np.array([pair_m is None, network.curve is not None])
+    free = np.array([network.pair_m is None, network.curve is not None])
 
-    def unlikely_at(steps: Floats) -> float:
-        log_pair, log_curve = start + np.where(free, steps, 0.0)
-        outside = max(abs(log_pair - math.log(0.02)), abs(log_curve - math.log(0.02))) - 3.9
-        return value(float(log_pair), float(log_curve)) if outside < 0 else 1e9 * (1 + outside)
+    def unlikely_by(steps: Floats) -> float:
+        return value(case.scaled(*np.where(free, steps, 0.0).tolist()))
 
+    # What is known of the spreads beforehand bounds them.
     simplex = np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]])
     found = minimize(
-        unlikely_at, np.zeros(2), method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": 0.02}
+        unlikely_by, np.zeros(2), method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": 0.02}
     )
-    pair, curve = np.exp(start + np.where(free, found.x, 0.0)).tolist()
-    return replace(case, pair_m=pair, curve_m=curve)
+    return case.scaled(*np.where(free, found.x, 0.0).tolist())
 
 
-def averaged(found: Solution, *, pair_known: bool) -> Solution:
+def averaged(found: Solution) -> Solution:
     """Return the mean over what is nearly as likely, with the covariance that the other possibilities add.
 
     These are other choices of reflected means and, where there is a curve, other spreads of pairs and curve: few pairs
@@ -219,9 +215,9 @@ def averaged(found: Solution, *, pair_known: bool) -> Solution:
     if network.curve is not None:
         value = _unlikely_by_spreads(network, x, case)
         # Steps of logarithms of about half of what a survey knows of either.
-        steps = [(0.3 * i, 0.4 * k) for i in range(-2, 3) for k in range(-4, 5) if not (pair_known and i)]
-        cases = [replace(case, pair_m=case.pair_m * math.exp(i), curve_m=case.curve_m * math.exp(k)) for i, k in steps]
-        worse = np.array([value(math.log(one.pair_m), math.log(one.curve_m)) for one in cases])
+        steps = [(0.3 * i, 0.4 * k) for i in range(-2, 3) for k in range(-4, 5) if network.pair_m is None or not i]
+        cases = [case.scaled(*step) for step in steps]
+        worse = np.array([value(one) for one in cases])
         likely = np.exp(-0.5 * (worse - worse.min()))
         kept = np.flatnonzero(likely > 1e-3)
         step, wider = _mixed(found, [cases[k] for k in kept.tolist()], likely[kept] / likely[kept].sum())
@@ -247,27 +243,28 @@ def _mixed(found: Solution, cases: Sequence[Case], weight: Floats) -> tuple[Floa
     return mean, (vectors * np.maximum(values, 0.0)) @ vectors.T
 
 
-def solve(network: Network, *, pair_m: float | None, moves: int = 6) -> tuple[Solution, SecondBest | None]:
+def solve(network: Network, *, moves: int = 6) -> tuple[Solution, SecondBest | None]:
     """Return the best solution that any start leads to, and the second-best."""
     start, least = first_start(network), attrgetter("unlikely")
-    spreads = PAIR_STARTS_M if pair_m is None else (pair_m,)
-    found = min((adjust(network, start, pair_m=pair_m, start_m=spread) for spread in spreads), key=least)
+    spreads = PAIR_STARTS_M if network.pair_m is None else (network.pair_m,)
+    found = min((adjust(network, start, start_m=spread) for spread in spreads), key=least)
     # Once more with the delays that came out: the first guess of places was made without any.
-    found = min(found, adjust(network, first_start(network, found.delays), pair_m=pair_m), key=least)
+    found = min(found, adjust(network, first_start(network, found.delays)), key=least)
     wrong = out_of_order(network, found.x)
     if wrong:
         start = start_in_order(network, found.x, wrong)
-        found = min(found, adjust(network, start, pair_m=pair_m), key=least)
+        found = min(found, adjust(network, start), key=least)
     worse: list[tuple[float, tuple[str, tuple[int, ...]]]] = []
     for _ in range(moves):
         here = unlikelihood(network, found.x, found.case)
         others = [other for k in range(len(network.arrangements)) for other in _others(found, k)]
-        worse = [(value - here, who) for value, _, _, who in others if value >= here - 1e-3]
+        # Rounded, so that of mirror images the same one is named on every machine.
+        worse = [(round(value - here, 3), who) for value, _, _, who in others if value >= here - 1e-3]
         better = [other for other in others if other[0] < here - 1e-3]
         if not better:
             break
         _, x, case, _ = min(better, key=itemgetter(0))
-        moved = adjust(network, x, marks=case.marks, pair_m=pair_m)
+        moved = adjust(network, x, marks=case.marks)
         if moved.unlikely > found.unlikely - 1e-3:
             break
         found = moved

@@ -10,13 +10,13 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from calib.calibration.model import Calibration, load_calibration, require_calibration
-from calib.calibration.power_curves import ALPHA_DBM
+from calib.calibration.model import Calibration, given_calibration
+from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.surveys.checks import misplaced, worst
 from calib.surveys.knowledge import Knowledge, check_knowledge, load_knowledge
-from calib.surveys.network import DIMENSIONS, Boards, CurvePrior, Known, Network, TakenCurve, numbered
+from calib.surveys.network import DIMENSIONS, Boards, CurvePrior, Known, Network, numbered
 from calib.surveys.outcome import result_of, widened_by
 from calib.surveys.recordings import LIFT, SurveyData, read_surveys
 from calib.surveys.result import SurveyResult
@@ -63,28 +63,28 @@ def survey(
             raise BadInputError(f"tag {tag} has {delay}, expected a finite number of ns", parameter="fixed_ns")
     if pair_error_m is not None and not (math.isfinite(pair_error_m) and pair_error_m > 0):
         raise BadInputError(f"found {pair_error_m}, expected a positive number of metres", parameter="pair_error_m")
-    taken = _taken_curve(curve_from)
+    taken = _checked_curve(curve_from)
     if taken is not None and delays_only:
         raise BadInputError("a curve is taken over, and `delays_only` asks for none", parameter="curve_from")
     # Small matrices: several threads make them slower, and the last digits another.
     with threadpool_limits(limits=1, user_api="blas"):
         gathered = read_surveys(data, knowledge)
         if taken is not None:
-            gathered = _less_curve(gathered, taken)
-        network, names = network_of(gathered, knowledge, fixed, curve=not delays_only and taken is None)
-        found, second = solve(network, pair_m=pair_error_m)
+            gathered = _less_curve(gathered, taken.bias_curve)
+        network = network_of(gathered, knowledge, fixed, curve=not delays_only and taken is None)
+        found, second = solve(replace(network, pair_m=pair_error_m))
         findings = list(gathered.findings)
         most = len(findings) + max(1, int(MOST_FINDINGS * len(network.means)))
-        while len(findings) < most and (doubted := worst(found, names, pair_error_m)):
+        while len(findings) < most and (doubted := worst(found)):
             finding, found = doubted
             findings.append(finding)
         if len(findings) > len(gathered.findings):
-            found, second = solve(found.network, pair_m=pair_error_m)
+            found, second = solve(found.network)
         findings += misplaced(found)
         if findings and not regardless:
             text = "; ".join(one.text for one in findings)
             raise UnanswerableError(f"{text} (`regardless` surveys all the same)")
-        found = averaged(found, pair_known=pair_error_m is not None)
+        found = averaged(found)
         if taken is not None:
             found = widened_by(found, taken)
         return result_of(gathered, found, second, tuple(findings), taken)
@@ -100,40 +100,33 @@ def _knowledge(known: Knowledge | str | os.PathLike[str]) -> Knowledge:
     raise BadInputError(f"found {known!r:.40}, expected line, plane, a path or a Knowledge", parameter="known")
 
 
-def _taken_curve(curve_from: Calibration | str | os.PathLike[str] | None) -> TakenCurve | None:
-    """Return the curve of a calibration, or of its file.
+def _checked_curve(curve_from: Calibration | str | os.PathLike[str] | None) -> Calibration | None:
+    """Return the calibration whose curve is taken over.
 
     Raises `BadInputError` for one of another lifting, and for one that has no curve.
     """
-    if curve_from is None:
-        return None
-    known = load_calibration(curve_from) if isinstance(curve_from, str | os.PathLike) else curve_from
-    require_calibration(known, "curve_from")
-    if known.lift != LIFT or known.alpha_dbm != ALPHA_DBM:
+    known = given_calibration(curve_from, "curve_from")
+    if known is not None and (known.lift != LIFT or known.alpha_dbm != ALPHA_DBM):
         text = f"it lifts powers by {known.lift} above {known.alpha_dbm:g} dBm, expected {LIFT} above {ALPHA_DBM:g} dBm"
         raise BadInputError(text, parameter="curve_from")
-    if known.bias_curve.flat:
+    if known is not None and known.bias_curve.flat:
         raise BadInputError("it has no curve over power", parameter="curve_from")
-    size = len(known.bias_curve.coefficients)
-    spread = np.zeros((size, size)) if known.uncertainty is None else np.array(known.uncertainty.bias_m2)
-    return TakenCurve(known.bias_curve, spread)
+    return known
 
 
-def _less_curve(gathered: SurveyData, taken: TakenCurve) -> SurveyData:
+def _less_curve(gathered: SurveyData, curve: Curve) -> SurveyData:
     """Return the means less a curve, with a warning of powers that it was not fitted at."""
     means = gathered.means
     if not np.isfinite(means.lifted).all():
         raise UnanswerableError("pairs have no power, so no curve can be taken off (`curve_from`)")
-    beyond = int(np.count_nonzero(~taken.curve.inside(means.lifted)))
+    beyond = int(np.count_nonzero(~curve.inside(means.lifted)))
     more = (f"{beyond} pairs have powers that the curve taken over was not fitted at",) if beyond else ()
-    less = replace(means, range_m=means.range_m - taken.curve(means.lifted))
+    less = replace(means, range_m=means.range_m - curve(means.lifted))
     return replace(gathered, means=less, warnings=(*gathered.warnings, *more))
 
 
-def network_of(
-    gathered: SurveyData, knowledge: Knowledge, fixed_ns: dict[int, float], *, curve: bool
-) -> tuple[Network, tuple[str, ...]]:
-    """Return the network of means and of what is known beside them, and what to call each distance that is known."""
+def network_of(gathered: SurveyData, knowledge: Knowledge, fixed_ns: dict[int, float], *, curve: bool) -> Network:
+    """Return the network of means and of what is known beside them."""
     means = gathered.means
     tags = [sorted(set(means.ends[means.arrangement == k].ravel().tolist())) for k in range(len(gathered.arrangements))]
     there = {one.name: set(own) for one, own in zip(gathered.arrangements, tags, strict=True)}
@@ -144,7 +137,7 @@ def network_of(
     used = [k for k, own in enumerate(tags) if own]
     arrangements = tuple(_boards(gathered, knowledge, k, tuple(tags[k])) for k in used)
     distances = (*gathered.distances, *knowledge.distances)
-    network = Network(
+    return Network(
         means=replace(means, arrangement=np.searchsorted(used, means.arrangement)),
         arrangements=arrangements,
         tags=tuple(means.tags()),
@@ -152,11 +145,6 @@ def network_of(
         fixed_ns=fixed_ns,
         curve=CurvePrior.at(means.lifted) if curve else None,
     )
-    names = tuple(
-        f"the known distance of {d.first} and {d.second}{' in ' + d.arrangement if d.arrangement else ''}"
-        for d in distances
-    )
-    return network, names
 
 
 def _boards(gathered: SurveyData, knowledge: Knowledge, number: int, tags: tuple[int, ...]) -> Boards:
@@ -204,4 +192,8 @@ def _known(arrangements: tuple[Boards, ...], knowledge: Knowledge, distances: tu
         at=at[:, 0].astype(np.int64),
         position_m=at[:, 1:4],
         position_std_m=at[:, 4],
+        names=tuple(
+            f"the known distance of {d.first} and {d.second}{' in ' + d.arrangement if d.arrangement else ''}"
+            for d in distances
+        ),
     )

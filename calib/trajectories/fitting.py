@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from calib.calibration.model import Calibration
+from calib.calibration.model import Calibration, given_calibration
 from calib.calibration.power_curves import lift as lift_power
 from calib.checks.fitted import examine_fit
 from calib.checks.plausibility import refuse_refuted
@@ -25,7 +25,6 @@ from calib.estimator.range_rows import Mixture
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
 from calib.fitting.fitting import result_of
-from calib.fitting.known_delays import imported
 from calib.fitting.result import FitResult
 from calib.settings import FitSettings, FlightSettings
 from calib.trajectories.judging import Judgement, curve_uncertainty, judge_delays
@@ -155,7 +154,7 @@ def _curve_source(curve_from: Calibration | str | os.PathLike[str] | None, other
 
     Raises `BadInputError` if it has more than one curve, or if the setting `other` ("" for none) excludes it.
     """
-    known = imported(curve_from, "curve_from")
+    known = given_calibration(curve_from, "curve_from")
     if known is not None and other:
         raise BadInputError(f"gives the curve of all tags, and does not go with `{other}`", parameter="curve_from")
     if known is not None and (known.groups or known.power_at != "exchange"):

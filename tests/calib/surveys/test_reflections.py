@@ -24,7 +24,7 @@ def linear():
     """Marks of three arrangements on a line, none set, and how unlikely marks are by the likelihood written out."""
     world = standing_boards(11, boards=4, arrangements=3, reflected=0.12)
     knowledge = Knowledge(shape="line")
-    network = network_of(read_surveys(world.ranges, knowledge), knowledge, {}, curve=False)[0]
+    network = network_of(read_surveys(world.ranges, knowledge), knowledge, {}, curve=False)
     x, free = first_start(network), network.free()
     rows = len(network.means)
     left, jacobian = network.linear(x)
