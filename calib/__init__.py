@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from calib.report.campaign import run_campaign
     from calib.report.sections import register_report_section
     from calib.report.writing import write_report
-    from calib.settings import FitSettings, FlightSettings
+    from calib.settings import FitSettings, FlightSettings, SurveySettings
     from calib.surveys.knowledge import Knowledge, KnownPosition
     from calib.surveys.result import SurveyResult
     from calib.surveys.sample import sample_arrangements
@@ -58,6 +58,7 @@ __all__ = [
     "Ranges",
     "SurveyPlanSettings",
     "SurveyResult",
+    "SurveySettings",
     "UnanswerableError",
     "add_tag",
     "apply",
@@ -99,6 +100,7 @@ _HOMES: Final = {
     "Ranges": "calib.data.ranges",
     "SurveyPlanSettings": "calib.planning.settings",
     "SurveyResult": "calib.surveys.result",
+    "SurveySettings": "calib.settings",
     "UnanswerableError": "calib.errors",
     "add_tag": "calib.fitting.new_tag",
     "apply": "calib.calibration.correction",

@@ -28,6 +28,19 @@ FOLDS: Final = ("time", "pair", "session")
 HIGHEST_TAG: Final = 65_535
 """Ids of tags have 16 bits in recordings."""
 
+OBJECTS: Final = {"Calibration": "a calibration", "Knowledge": "known facts"}
+"""What results call settings that were given as objects."""
+
+FIXED: Any = {
+    "flag": "--fix",
+    "kind": list[str] | None,
+    "tags": "{}=",
+    "metavar": "TAG=NS",
+}
+"""The option of known delays."""
+
+FIXED_HELP: Final = "Known delay of a tag, which stays as it is, as in 1=-0.36. May be repeated."
+
 ERRORS_PANEL: Final = "How errors count"
 MODEL_PANEL: Final = "What is fitted"
 FLIGHT_PANEL: Final = "Without known distances (--truth ranges)"
@@ -93,8 +106,38 @@ def read_groups(path: Path) -> dict[str, tuple[int, ...]]:
     return {name: tuple(tags) for name, tags in groups.items()}
 
 
+def _checked_delays(fixed_ns: Mapping[int, float] | None) -> dict[int, float]:
+    """Return known delays by tag; raises `BadInputError` for what is no tag or no number."""
+    for tag, delay in (fixed_ns or {}).items():
+        if not (is_tag(tag) and _is_finite(delay)):
+            raise BadInputError(
+                f"found {tag!r}: {delay!r}, expected a tag id and its delay in ns", parameter="fixed_ns"
+            )
+    return {int(tag): float(delay) for tag, delay in (fixed_ns or {}).items()}
+
+
+@dataclass(frozen=True, slots=True)
+class _Settings:
+    """Settings that results repeat."""
+
+    def changed(self) -> dict[str, Any]:
+        """Return the settings that are not the defaults, as JSON has them: what calibrations and reports repeat."""
+        given = {one.name: getattr(self, one.name) for one in fields(self)}
+        default = type(self)()
+        return {name: _as_json(value) for name, value in given.items() if value != getattr(default, name)}
+
+
+def _as_json(value: object) -> object:
+    """Return the value of a setting as JSON has it; of an object a word."""
+    if isinstance(value, Mapping):
+        return {str(key): _as_json(one) for key, one in value.items()}
+    if isinstance(value, tuple):
+        return list(value)
+    return value if isinstance(value, str | int | float) else OBJECTS.get(type(value).__name__, str(value))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FitSettings:
+class FitSettings(_Settings):
     """The settings of `fit`, which it takes as keyword arguments, too; raises `BadInputError` that names the setting.
 
     `loss` is "mixture", the likelihood of direct ranges, reflections and outliers with a share of reflections by pair,
@@ -151,13 +194,10 @@ class FitSettings:
     alpha_dbm: float = -82.0
     fixed_ns: Mapping[int, float] = setting(
         {},
-        "Known delay of a tag, which stays as it is, as in 1=-0.36. May be repeated.",
-        flag="--fix",
-        kind=list[str] | None,
+        FIXED_HELP,
         parse=read_fixed,
-        tags="{}=",
-        metavar="TAG=NS",
         rich_help_panel=MODEL_PANEL,
+        **FIXED,
     )
     groups: Mapping[str, tuple[int, ...]] = setting(
         {},
@@ -235,11 +275,7 @@ class FitSettings:
             raise BadInputError(
                 "goes with a loss, not with the mixture; leave one of the two away", parameter="sequential"
             )
-        for tag, delay in (self.fixed_ns or {}).items():
-            if not (is_tag(tag) and _is_finite(delay)):
-                raise BadInputError(
-                    f"found {tag!r}: {delay!r}, expected a tag id and its delay in ns", parameter="fixed_ns"
-                )
+        object.__setattr__(self, "fixed_ns", _checked_delays(self.fixed_ns))
         seen: dict[int, str] = {}
         for name, tags in (self.groups or {}).items():
             listed = list(tags) if isinstance(tags, Iterable) and not isinstance(tags, str) else []
@@ -249,25 +285,7 @@ class FitSettings:
                 if tag in seen:
                     raise BadInputError(f"tag {tag} is in {seen[tag]!r} and in {name!r}", parameter="groups")
                 seen[tag] = name
-        fixed = {int(tag): float(delay) for tag, delay in (self.fixed_ns or {}).items()}
-        object.__setattr__(self, "fixed_ns", fixed)
         object.__setattr__(self, "groups", {name: tuple(map(int, tags)) for name, tags in (self.groups or {}).items()})
-
-    def changed(self) -> dict[str, Any]:
-        """Return the settings that are not the defaults, as JSON has them: what calibrations and reports repeat."""
-        plain, found = FitSettings(), dict[str, Any]()
-        for name in (one.name for one in fields(self)):
-            value = getattr(self, name)
-            if value == getattr(plain, name):
-                continue
-            if name == "delays_from":
-                value = value if isinstance(value, str) else str(value) if isinstance(value, Path) else "a calibration"
-            elif name == "fixed_ns":
-                value = {str(tag): delay for tag, delay in value.items()}
-            elif name == "groups":
-                value = {group: list(tags) for group, tags in value.items()}
-            found[name] = value
-        return found
 
 
 def read_distances(texts: Iterable[str]) -> tuple[KnownDistance, ...]:
@@ -362,3 +380,46 @@ class FlightSettings:
             if value is not None and not (_is_finite(value) and value >= 0):
                 raise BadInputError(f"found {value!r}, expected a number of 0 or more", parameter=name)
         object.__setattr__(self, "distances", tuple(self.distances))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SurveySettings(_Settings):
+    """What is known of boards that stand still, and the settings of `survey`, which it takes as keyword arguments, too.
+
+    `known` is "line" or "plane" for all arrangements, the path of a TOML file (`load_knowledge`), or a `Knowledge`:
+    shapes, distances and positions, which stay what they are within their sigmas. `fixed_ns` are delays that are known,
+    `pair_error_m` is the constant error of a pair in an arrangement, estimated by default. `delays_only` looks for no
+    curve over power; `curve_from` is a calibration, or its path, whose curve is taken over. `regardless` surveys also
+    where ranges contradict what is said to be known. Raises `BadInputError` that names the setting.
+
+    >>> import calib
+    >>> string = calib.SurveySettings(known="line", pair_error_m=0.01)
+    >>> sorted(calib.survey(calib.sample_arrangements(), string).calibration.delays_ns)
+    [1, 2, 3, 4]
+    """
+
+    known: Any = setting(  # a word, a path or a Knowledge
+        "",
+        "What is known of the arrangements: all boards on a line or on a plane, or a file that says more (.toml).",
+        kind=str,
+        metavar="line|plane|FILE",
+    )
+    fixed_ns: Mapping[int, float] = setting({}, FIXED_HELP, parse=read_fixed, **FIXED)
+    pair_error_m: float | None = setting(
+        None, "Constant error of a pair in an arrangement (m); by default estimated.", flag="--pair-error"
+    )
+    delays_only: bool = setting(False, "Fit no curve over power.")
+    curve_from: Any = setting(  # a Calibration or its path
+        None, "Calibration whose curve over power is taken over (.json).", kind=Path | None
+    )
+    regardless: bool = setting(False, "Survey even where ranges contradict what is known.")
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        object.__setattr__(self, "fixed_ns", _checked_delays(self.fixed_ns))
+        if self.pair_error_m is not None and not (_is_finite(self.pair_error_m) and self.pair_error_m > 0):
+            raise BadInputError(
+                f"found {self.pair_error_m!r}, expected a positive number of metres", parameter="pair_error_m"
+            )
+        if self.curve_from is not None and self.delays_only:
+            raise BadInputError("a curve is taken over, and `delays_only` asks for none", parameter="curve_from")

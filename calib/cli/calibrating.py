@@ -23,7 +23,7 @@ from calib.cli.shared import (
     with_flags,
 )
 from calib.errors import BadInputError, UnanswerableError
-from calib.settings import FitSettings, FlightSettings, check_choice, read_fixed
+from calib.settings import FitSettings, FlightSettings, SurveySettings, check_choice
 from uwblink.cli.guide import (
     AsJson,
     CalibrationFile,
@@ -200,14 +200,7 @@ def add_tag(
 def survey(
     recordings: Annotated[list[Path], typer.Argument(help="Recordings of boards that stand still (.uwb).")],
     output: NewCalibration,
-    known: Annotated[
-        str,
-        typer.Option(
-            metavar="line|plane|FILE",
-            help="What is known of the arrangements: all boards on a line or on a plane, or a file that says more "
-            "(.toml).",
-        ),
-    ] = "",
+    settings: SurveySettings,
     save_anchors: Annotated[
         str | None,
         typer.Option(
@@ -218,22 +211,6 @@ def survey(
     ] = None,
     plot: Plot = None,
     report: ReportFile = None,
-    fix: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="TAG=NS", help="Known delay of a tag, which stays as it is, as in 1=-0.36. May be repeated."
-        ),
-    ] = None,
-    pair_error: Annotated[
-        float | None, typer.Option(help="Constant error of a pair in an arrangement (m); by default estimated.")
-    ] = None,
-    delays_only: Annotated[bool, typer.Option("--delays-only", help="Fit no curve over power.")] = False,
-    curve_from: Annotated[
-        Path | None, typer.Option(help="Calibration whose curve over power is taken over (.json).")
-    ] = None,
-    regardless: Annotated[
-        bool, typer.Option("--regardless", help="Survey even where ranges contradict what is known.")
-    ] = False,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -245,19 +222,12 @@ def survey(
     written = {"output": output, "save_anchors": anchors, "plot": plot, "report": report}
     for path in filter(None, written.values()):
         check_output(path, force=force)
-    read = [*recordings, *([Path(known)] if known.endswith(".toml") else []), *filter(None, [curve_from])]
+    files = [Path(settings.known)] if settings.known.endswith(".toml") else []
+    read = [*recordings, *files, *filter(None, [settings.curve_from])]
     check_apart(written, read)
     with _undetermined_as_json(as_json):
         with waiting("surveying"):
-            result = calib.survey(
-                recordings,
-                known=known,
-                fixed_ns=read_fixed(fix or ()),
-                pair_error_m=pair_error,
-                delays_only=delays_only,
-                curve_from=curve_from,
-                regardless=regardless,
-            )
+            result = calib.survey(recordings, settings)
         if anchors:
             result.save_anchors(anchors, arrangement=arrangement, force=force)
         if plot:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from calib.settings import FitSettings, FlightSettings
+from calib.settings import FitSettings, FlightSettings, SurveySettings
 from uwblink.cli import shared
 from uwblink.cli.guide import output
 from uwblink.settings import flags_of
@@ -28,10 +28,10 @@ FLAGS: Final = {
     "robots": "COUNT",
     "arrangement": "--save-anchors",
     "base": "--antenna-delays",
-    "pair_error_m": "--pair-error",
     "velocity_std_mps": "--process-noise",
     **flags_of(FitSettings),
     **flags_of(FlightSettings),
+    **flags_of(SurveySettings),
 }
 """The options that stand for parameters of calib, where they are not the parameter's name with dashes."""
 

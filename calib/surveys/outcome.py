@@ -17,6 +17,7 @@ from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis, flat
 from calib.errors import UnanswerableError
 from calib.estimator.range_model import METRES_A_NS
 from calib.information import Unknown, Verdict, judge, reduced
+from calib.settings import SurveySettings
 from calib.spread import TWO_SIDED_95
 from calib.surveys.network import Boards
 from calib.surveys.recordings import LIFT, SurveyData
@@ -57,6 +58,7 @@ def result_of(
     second: SecondBest | None,
     findings: tuple[Contradiction, ...],
     taken: Calibration | None,
+    asked: SurveySettings,
 ) -> SurveyResult:
     """Return the result of a survey; raises `UnanswerableError` where no delay is determined."""
     verdict = verdict_of(found)
@@ -77,7 +79,7 @@ def result_of(
     factor = students_factor(found.freedom)
     covariance = found.covariance() * factor**2
     arrangements = tuple(_arrangement(found, covariance, k) for k in range(len(found.network.arrangements)))
-    more = {
+    more = ({"settings": asked.changed()} if asked.changed() else {}) | {
         "surveyed": [one.to_dict() for one in arrangements],
         "reflected": [one.to_dict() for one in reflected],
         "findings": [one.text for one in findings],

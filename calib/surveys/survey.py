@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -14,6 +15,7 @@ from calib.calibration.model import Calibration, given_calibration
 from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
+from calib.settings import SurveySettings
 from calib.surveys.checks import misplaced, worst
 from calib.surveys.knowledge import Knowledge, check_knowledge, load_knowledge
 from calib.surveys.network import DIMENSIONS, Boards, CurvePrior, Known, Network, numbered
@@ -27,24 +29,13 @@ MOST_FINDINGS = 0.15
 """Share of the means, as a number of findings, after which no more is looked for."""
 
 
-def survey(
-    data: Data | Iterable[Data],
-    *,
-    known: Knowledge | str | os.PathLike[str] = "",
-    fixed_ns: Mapping[int, float] | None = None,
-    pair_error_m: float | None = None,
-    delays_only: bool = False,
-    curve_from: Calibration | str | os.PathLike[str] | None = None,
-    regardless: bool = False,
-) -> SurveyResult:
+def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, **changes: Any) -> SurveyResult:
     """Return the delays, the power curve and the places of boards that stood still, from their ranges alone.
 
     `data` is what `load_ranges` takes; true distances are not needed and not looked at. Arrangements are those that
     recordings mark (`uwblink record --arrangement`), those whose times `known` gives, or stretches in which nothing
-    moves. `known` is "line" or "plane" for all arrangements, the path of a TOML file (`load_knowledge`), or a
-    `Knowledge`: shapes, distances and positions, which stay what they are within their sigmas. `fixed_ns` are delays
-    that are known, `pair_error_m` is the constant error of a pair in an arrangement, estimated by default.
-    `delays_only` looks for no curve over power; `curve_from` is a calibration, or its path, whose curve is taken over.
+    moves. `settings` and keyword arguments named like its fields (`SurveySettings`, which explains them) say what is
+    known and what is fitted.
 
     The result holds only delays that the arrangements determine. Raises `UnanswerableError` where none is, with the
     reason, and where ranges contradict what is said to be known (a line that is none, a board that was moved, exchanged
@@ -56,23 +47,15 @@ def survey(
     >>> abs(delay - planted) < 3 * result.calibration.delays_std_ns[2]
     True
     """
-    knowledge = _knowledge(known)
-    fixed = {int(tag): float(delay) for tag, delay in (fixed_ns or {}).items()}
-    for tag, delay in fixed.items():
-        if not math.isfinite(delay):
-            raise BadInputError(f"tag {tag} has {delay}, expected a finite number of ns", parameter="fixed_ns")
-    if pair_error_m is not None and not (math.isfinite(pair_error_m) and pair_error_m > 0):
-        raise BadInputError(f"found {pair_error_m}, expected a positive number of metres", parameter="pair_error_m")
-    taken = _checked_curve(curve_from)
-    if taken is not None and delays_only:
-        raise BadInputError("a curve is taken over, and `delays_only` asks for none", parameter="curve_from")
+    asked = replace(settings or SurveySettings(), **changes)
+    knowledge, taken = _knowledge(asked.known), _checked_curve(asked.curve_from)
     # Small matrices: several threads make them slower, and the last digits another.
     with threadpool_limits(limits=1, user_api="blas"):
         gathered = read_surveys(data, knowledge)
         if taken is not None:
             gathered = _less_curve(gathered, taken.bias_curve)
-        network = network_of(gathered, knowledge, fixed, curve=not delays_only and taken is None)
-        found, second = solve(replace(network, pair_m=pair_error_m))
+        network = network_of(gathered, knowledge, asked.fixed_ns, curve=not asked.delays_only and taken is None)
+        found, second = solve(replace(network, pair_m=asked.pair_error_m))
         findings = list(gathered.findings)
         most = len(findings) + max(1, int(MOST_FINDINGS * len(network.means)))
         while len(findings) < most and (doubted := worst(found)):
@@ -81,13 +64,13 @@ def survey(
         if len(findings) > len(gathered.findings):
             found, second = solve(found.network)
         findings += misplaced(found)
-        if findings and not regardless:
+        if findings and not asked.regardless:
             text = "; ".join(one.text for one in findings)
             raise UnanswerableError(f"{text} (`regardless` surveys all the same)")
         found = averaged(found)
         if taken is not None:
             found = widened_by(found, taken)
-        return result_of(gathered, found, second, tuple(findings), taken)
+        return result_of(gathered, found, second, tuple(findings), taken, asked)
 
 
 def _knowledge(known: Knowledge | str | os.PathLike[str]) -> Knowledge:
@@ -125,7 +108,7 @@ def _less_curve(gathered: SurveyData, curve: Curve) -> SurveyData:
     return replace(gathered, means=less, warnings=(*gathered.warnings, *more))
 
 
-def network_of(gathered: SurveyData, knowledge: Knowledge, fixed_ns: dict[int, float], *, curve: bool) -> Network:
+def network_of(gathered: SurveyData, knowledge: Knowledge, fixed_ns: Mapping[int, float], *, curve: bool) -> Network:
     """Return the network of means and of what is known beside them."""
     means = gathered.means
     tags = [sorted(set(means.ends[means.arrangement == k].ravel().tolist())) for k in range(len(gathered.arrangements))]
@@ -142,7 +125,7 @@ def network_of(gathered: SurveyData, knowledge: Knowledge, fixed_ns: dict[int, f
         arrangements=arrangements,
         tags=tuple(means.tags()),
         known=_known(arrangements, knowledge, distances),
-        fixed_ns=fixed_ns,
+        fixed_ns=dict(fixed_ns),
         curve=CurvePrior.at(means.lifted) if curve else None,
     )
 
