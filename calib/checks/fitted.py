@@ -7,13 +7,12 @@ fit, so their variance is in the intervals whether one of them stands out or not
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
 
 from calib.calibration.power_curves import basis
-from calib.checks.places import OfPlaces, of_places
+from calib.checks.places import of_places
 from calib.estimator.known_distances import KnownDistances
 from calib.estimator.range_rows import Mixture
 from calib.estimator.score_tests import Family, FoundOffset, Slopes, Tested, search, widening
@@ -51,16 +50,11 @@ SCALE = 0.01
 """Relative error of true distances that a recording may have and not show: a judgement."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Doubts:
-    """The covariance (tags, tags) of the stated delays in ns^2 with what does not fit, and what to say of it."""
+def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
+    """Hold a fit against alternatives.
 
-    covariance_ns2: Floats
-    sentences: list[str]
-
-
-def examine_fit(found: KnownDistances) -> Doubts:
-    """Hold a fit against alternatives, and widen the delays' covariance by what does not fit."""
+    Returns the covariance (tags, tags) of the stated delays in ns^2 with what does not fit, and what to say of it.
+    """
     slopes = slopes_of(found)
     louder, alone = change_per_decibel(found), len(found.searches) > 1
     tested = slopes.tests(list(families(found, louder, beside_curve=not alone)))
@@ -70,12 +64,12 @@ def examine_fit(found: KnownDistances) -> Doubts:
     for one in tested:
         if one.family.kind in ("pair", "session") and not len(one.family.fitted):
             plain = plain + widening(one)
-    places = OfPlaces(widening_ns2=np.zeros_like(plain))
+    places_ns2, said = np.zeros_like(plain), list[str]()
     if not alone and found.model.curve is not None:
-        places = of_places(found, slopes, next(one for one in tested if one.family.kind == "pair"))
-    covariance, sentences = _weighed(plain, findings, places)
-    more = [*_reflected(found), *_short(found), *_confounded(found, slopes)]
-    return Doubts(covariance_ns2=covariance, sentences=sentences + more)
+        pairs = next(one for one in tested if one.family.kind == "pair")
+        places_ns2, said = of_places(found, slopes, pairs, plain)
+    covariance, sentences = _weighed(plain, findings, places_ns2, said)
+    return covariance, [*sentences, *_reflected(found), *_short(found), *_confounded(found, slopes)]
 
 
 def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> Iterator[Family]:
@@ -87,33 +81,33 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
     clock leaves it whose skew is not corrected, and what all ranges share. A fit whose curve comes after its delays is
     not `beside_curve`: the curve is in its errors, and follows distance as power does.
     """
-    model, ranges, tags, count = found.model, found.model.ranges, found.model.tags, len(found.model.ranges)
-    ends = np.searchsorted(tags, model.pairs.ends)[model.pairs.number]
-    names = [f"tag {tag}" for tag in tags]
-    named = [f"pair {a}-{b}" for a, b in model.pairs.ends.tolist()]
-    both = np.ones(2)
+    model, ranges, count = found.model, found.model.ranges, len(found.model.ranges)
+    tags = [f"tag {tag}" for tag in model.tags]
+    ends = np.searchsorted(model.tags, model.pairs.ends)[model.pairs.number]
+
+    def of_tags(kind: str, derivative: Floats) -> Family:
+        return Family(kind=kind, names=tags, derivative=_columns(ends, derivative, len(tags)))
+
     yield of_pairs(found)
     several = int(min(max(found.blocks.seconds / SPAN_S, 2), SEGMENTS))
     span = np.arange(count) * several // count
     yield Family(
         kind="time",
-        names=[name for name in names for _ in range(several)],
-        derivative=_columns(ends * several + span[:, None], both, len(tags) * several),
+        names=[name for name in tags for _ in range(several)],
+        derivative=_columns(ends * several + span[:, None], 1.0, len(tags) * several),
         spans=several,
     )
     if len(found.blocks.bounds) > 2:
-        yield _of_sessions(found, names, named, ends)
+        yield _of_sessions(found, tags, ends)
     if model.curve is not None:
-        rank = np.empty(count)
-        rank[np.argsort(model.lifted, kind="stable")] = np.linspace(-1, 1, count)
-        yield Family(kind="power", names=names, derivative=_columns(ends, rank, len(tags)))
+        rank = np.argsort(np.argsort(model.lifted, kind="stable"))
+        yield of_tags("power", np.linspace(-1, 1, count)[rank][:, None])
     size = _root_mean_square(louder_m)
     if size > 0:
-        yield Family(kind="decibels", names=names, derivative=_columns(ends, louder_m / size, len(tags)))
+        yield of_tags("decibels", louder_m[:, None] / size)
     forth = np.where(ranges.initiator < ranges.target, 1.0, -1.0)
-    yield Family(kind="skew", names=names, derivative=_columns(ends, forth[:, None] * [1.0, -1.0], len(tags)))
-    shared = _shared(found, louder_m)
-    shared = shared if beside_curve else {name: weight for name, weight in shared.items() if name == "late"}
+    yield of_tags("skew", forth[:, None] * [1.0, -1.0])
+    shared = _shared(found, louder_m) if beside_curve else _late(found)
     if shared:
         columns = sparse.csr_matrix(np.column_stack(list(shared.values())))
         yield Family(kind="shared", names=list(shared), derivative=columns)
@@ -121,12 +115,11 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
 
 def of_pairs(found: KnownDistances) -> Family:
     """Return the offsets of pairs."""
-    names = [f"pair {a}-{b}" for a, b in found.model.pairs.ends.tolist()]
-    number = found.model.pairs.number
+    pairs = found.model.pairs
     return Family(
         kind="pair",
-        names=names,
-        derivative=_columns(number[:, None], np.ones(len(number)), len(names)),
+        names=[f"pair {a}-{b}" for a, b in pairs.ends.tolist()],
+        derivative=_columns(pairs.number[:, None], 1.0, len(pairs.ends)),
         fitted=found.searches[0].optimum.layout.indices(["offset of pair"]),
     )
 
@@ -139,46 +132,35 @@ def slopes_of(found: KnownDistances) -> Slopes:
     return Slopes(search.rows, search.optimum, found.blocks, delays)
 
 
-def _columns(columns: Ints, values: Floats, size: int) -> sparse.csr_matrix:
-    """Return a matrix (n, size) whose rows have `values` (n, k), (n,) or (k,) at `columns` (n, k)."""
-    count, several = columns.shape
-    spread = values[:, None] if values.ndim == 1 and len(values) == count and several != count else values
-    filled = np.broadcast_to(spread, columns.shape)
-    bounds = np.arange(count + 1) * several
-    return sparse.csr_matrix((filled.ravel(), columns.ravel(), bounds), shape=(count, size))
+def _columns(columns: Ints, values: Floats | float, size: int) -> sparse.csr_matrix:
+    """Return a matrix (n, size) whose rows have `values` (n, k), (n, 1) or a number at `columns` (n, k)."""
+    bounds = np.arange(len(columns) + 1) * columns.shape[1]
+    return sparse.csr_matrix(
+        (np.broadcast_to(values, columns.shape).ravel(), columns.ravel(), bounds), shape=(len(columns), size)
+    )
 
 
-def _of_sessions(found: KnownDistances, tags: list[str], pairs: list[str], ends: Ints) -> Family:
+def _of_sessions(found: KnownDistances, tags: list[str], ends: Ints) -> Family:
     """Return offsets of tags, and of pairs, in one session; those of tags alone where time is short for both.
 
     Between sessions antennas are taken off and screwed on, and things are moved.
     """
-    model = found.model
-    session = model.ranges.session[:, None].astype(np.int64)
-    sessions = _distinct(list(model.ranges.sessions))
-    count = len(sessions)
-    columns = np.column_stack([ends * count + session, (model.pairs.number[:, None] + len(tags)) * count + session])
+    model, sessions = found.model, found.model.ranges.sessions
+    names, columns = tags, ends
+    kinds, count = ["offset of tag in session", "offset of pair in session"], len(sessions)
     # The covariance of so many slopes must be known from blocks of time.
-    with_pairs = (len(tags) + len(pairs)) * count < found.blocks.count / 2
-    names = tags + pairs if with_pairs else tags
-    chosen = columns if with_pairs else columns[:, :2]
-    layout = found.searches[0].optimum.layout
-    kinds = ["offset of tag in session", "offset of pair in session"]
-    fitted = layout.indices(kinds)
+    if (len(tags) + len(model.pairs.ends)) * count < found.blocks.count / 2:
+        names = [*tags, *of_pairs(found).names]
+        columns = np.column_stack([ends, model.pairs.number + len(tags)])
+    if len(set(sessions)) < count:
+        sessions = tuple(f"{name} ({k} of {count})" for k, name in enumerate(sessions, 1))
     return Family(
         kind="session",
         names=[name for name in names for _ in range(count)],
-        derivative=_columns(chosen, np.ones(chosen.shape[1]), len(names) * count),
-        fitted=fitted if with_pairs else layout.indices(kinds[:1]),
+        derivative=_columns(columns * count + model.ranges.session[:, None].astype(np.int64), 1.0, len(names) * count),
+        fitted=found.searches[0].optimum.layout.indices(kinds if len(names) > len(tags) else kinds[:1]),
         sessions=sessions,
     )
-
-
-def _distinct(names: list[str]) -> tuple[str, ...]:
-    """Return names of sessions, numbered where two have the same."""
-    if len(set(names)) == len(names):
-        return tuple(names)
-    return tuple(f"{name} ({k} of {len(names)})" for k, name in enumerate(names, 1))
 
 
 def _shared(found: KnownDistances, louder_m: Floats) -> dict[str, Floats]:
@@ -193,11 +175,7 @@ def _shared(found: KnownDistances, louder_m: Floats) -> dict[str, Floats]:
     reach = float(np.ptp(truth_m))
     if reach <= 0:
         return {}
-    shared = {"scale": (truth_m - float(np.median(truth_m))) / reach}
-    rate = _speeds(found)
-    size = _root_mean_square(rate)
-    if size > 0:
-        shared["late"] = rate / size
+    shared = {"scale": (truth_m - float(np.median(truth_m))) / reach} | _late(found)
     if np.any(louder_m):
         decibels = 10 * np.log10(np.maximum(found.model.lifted, 1e-4))
         far = np.log(np.maximum(truth_m, 0.1))
@@ -207,8 +185,11 @@ def _shared(found: KnownDistances, louder_m: Floats) -> dict[str, Floats]:
     return shared
 
 
-def _speeds(found: KnownDistances) -> Floats:
-    """Return by how many metres a second the true distance of each range (n,) changes, by its pair's neighbours."""
+def _late(found: KnownDistances) -> dict[str, Floats]:
+    """Return by how many metres a second the true distance of each range (n,) changes, over its root mean square.
+
+    Speeds are those by the neighbours of each pair; nothing is returned where no distance changes.
+    """
     ranges, pair = found.model.ranges, found.model.pairs.number
     order = np.argsort(pair, kind="stable")
     time_s, truth_m = ranges.time_ns[order] * 1e-9, ranges.truth_m[order]
@@ -220,7 +201,8 @@ def _speeds(found: KnownDistances) -> Floats:
     sides = np.add(np.append(usual, False), np.insert(usual, 0, False), dtype=np.float64)
     speeds = np.empty(len(order))
     speeds[order] = (np.append(rate, 0.0) + np.insert(rate, 0, 0.0)) / np.maximum(sides, 1.0)
-    return speeds
+    size = _root_mean_square(speeds)
+    return {"late": speeds / size} if size > 0 else {}
 
 
 def _root_mean_square(values: Floats) -> float:
@@ -268,30 +250,29 @@ def _wrong_decibels(findings: list[FoundOffset], tested: list[Tested]) -> Iterat
             )
 
 
-def _weighed(plain: Floats, findings: list[FoundOffset], places: OfPlaces) -> tuple[Floats, list[str]]:
-    """Return the delays' covariance (tags, tags) with what findings add, and those that matter as sentences."""
-    said = places.sentences(plain)
-    if said:
+def _weighed(
+    plain: Floats, findings: list[FoundOffset], places_ns2: Floats, of_places: list[str]
+) -> tuple[Floats, list[str]]:
+    """Return the delays' covariance (tags, tags) with what findings add, and those that matter as sentences.
+
+    `of_places` says what places do, if that is certain, and `places_ns2` (tags, tags) is the covariance that they add.
+    """
+    if of_places:
         # Offsets of pairs are then draws like the others; one of them is no fault of its own.
         findings = [one for one in findings if one.kind != "pair"]
-    narrower = [one for one in findings if _is_cause(one, plain, certain=bool(said))]
-    if any("late" in one.names for one in narrower):
-        # Ranges of two bodies are wrong together then, too: the narrower cause is named.
-        said = []
-    covariance, matter = plain + places.widening_ns2, []
+    covariance, matter, said = plain + places_ns2, dict[tuple[str, tuple[str, ...]], FoundOffset](), of_places
     for one in findings:
-        moved = _moved(one, plain)
+        moved, cause = _moved(one, plain), _is_cause(one, plain, certain=bool(of_places))
         if moved > MATTERS:
             covariance = covariance + one.spread_ns2
-        large = abs(one.offset_m) > SMALLEST_M
-        if one.names == READINGS:
-            continue
-        given = any(one is other for other in narrower)
-        if given or (moved > MATTERS and (large or (moved > CLEARLY and one.largest_ns > SMALLEST_NS))):
-            matter.append(one)
-    # A tag that was moved stands out in more than one span of time: once is enough.
-    once = {(one.kind, one.names): one for one in reversed(matter)}
-    return covariance, [*said, *(sentence_of(one) for one in matter if once[one.kind, one.names] is one)]
+        if cause and "late" in one.names:
+            # Ranges of two bodies are wrong together then, too: the narrower cause is named.
+            said = []
+        large = abs(one.offset_m) > SMALLEST_M or (moved > CLEARLY and one.largest_ns > SMALLEST_NS)
+        if one.names != READINGS and (cause or (moved > MATTERS and large)):
+            # A tag that was moved stands out in more than one span of time: once is enough.
+            matter.setdefault((one.kind, one.names), one)
+    return covariance, [*said, *map(sentence_of, matter.values())]
 
 
 def _is_cause(finding: FoundOffset, before_ns2: Floats, *, certain: bool) -> bool:
@@ -318,32 +299,38 @@ def _moved(finding: FoundOffset, covariance: Floats) -> float:
     return float(np.max(np.abs(finding.effects_ns) / std, initial=0.0))
 
 
+SENTENCES = {
+    "pair": "{whose}: ranges read {size} too {way} for the other pairs, which moves {worst}; record it anew",
+    "time": "{whose}: ranges are {size} too {way} for a part of the recording, which moves {worst}; touched?",
+    "session": "{whose}: ranges in {own} are {size} {way}er than in {others} (p = {p:.1g}), which moves {worst}; was "
+    "an antenna changed, or something moved, in between? Fit the recordings apart to see",
+    "power": "{whose}: errors change with power by {size} as no other tag's do, which moves {worst}",
+    "decibels": "{whose}: errors are as if its powers were wrong by some decibels, {size} in its ranges, which moves "
+    "{worst}; does it stand at another gain, or have another antenna?",
+    "skew": "{whose}: ranges read {size} too {way} as initiator and as much the other way as target, which moves "
+    "{worst}: clock skew is not corrected, or with the wrong sign",
+    "scale": "ranges grow with the distance by {size} too {way} over the recorded distances, which moves {worst}; see "
+    "to the unit and the lever arms of the true distances",
+    "late": "ranges change by {size} with the speed at which true distances change (root mean square): motion capture "
+    "and ranges are not of the same time; see to the clocks (`calib doctor` says by how much)",
+}
+"""What to say of findings, by their kinds, or by the names of what all ranges share."""
+
+
 def sentence_of(finding: FoundOffset) -> str:
-    """Return a finding as a sentence."""
-    whose = " or ".join(finding.names)
-    size = f"{100 * abs(finding.offset_m):.1f} cm"
-    worst = f"delays by up to {1e3 * finding.largest_ns:.0f} ps"
+    """Return a finding as a sentence; where two causes leave the same trace, both are named."""
     own, others = finding.sessions
-    way = "long" if finding.offset_m > 0 else "short"
-    sentences = {
-        "pair": f"{whose}: ranges read {size} too {way} for the other pairs, which moves {worst}; record it anew",
-        "time": f"{whose}: ranges are {size} too {way} for a part of the recording, which moves {worst}; touched?",
-        "session": f"{whose}: ranges in {own} are {size} {way}er than in {others} (p = {finding.p_value:.1g}), which "
-        f"moves {worst}; was an antenna changed, or something moved, in between? Fit the recordings apart to see",
-        "power": f"{whose}: errors change with power by {size} as no other tag's do, which moves {worst}",
-        "decibels": f"{whose}: errors are as if its powers were wrong by some decibels, {size} in its ranges, which "
-        f"moves {worst}; does it stand at another gain, or have another antenna?",
-        "skew": f"{whose}: ranges read {size} too {way} as initiator and as much the other way as target, which moves "
-        f"{worst}: clock skew is not corrected, or with the wrong sign",
-        "scale": f"ranges grow with the distance by {size} too {way} over the recorded distances, which moves {worst}; "
-        "see to the unit and the lever arms of the true distances",
-        "late": f"ranges change by {size} with the speed at which true distances change (root mean square): motion "
-        "capture and ranges are not of the same time; see to the clocks (`calib doctor` says by how much)",
+    words = {
+        "whose": " or ".join(finding.names),
+        "size": f"{100 * abs(finding.offset_m):.1f} cm",
+        "way": "long" if finding.offset_m > 0 else "short",
+        "worst": f"delays by up to {1e3 * finding.largest_ns:.0f} ps",
+        "p": finding.p_value,
+        "own": own,
+        "others": others,
     }
-    if finding.kind == "shared":
-        # Where two causes leave the same trace, both are named.
-        return "; or ".join(sentences[name] for name in finding.names if name in sentences)
-    return sentences[finding.kind]
+    names = [name for name in finding.names if name in SENTENCES] if finding.kind == "shared" else [finding.kind]
+    return "; or ".join(SENTENCES[name].format(**words) for name in names)
 
 
 def has_shares(found: KnownDistances) -> bool:
@@ -359,43 +346,39 @@ def shares_of_pairs(found: KnownDistances) -> tuple[Floats, Floats]:
     return share, detour
 
 
-def _reflected(found: KnownDistances) -> list[str]:
-    """Name the pairs of which hardly a range is direct, and tags most of whose are not, where that was fitted."""
+def _reflected(found: KnownDistances) -> Iterator[str]:
+    """Name the pairs of which hardly a range is direct, or else tags most of whose are not, where that was fitted."""
     if not has_shares(found):
-        return []
+        return
     share, detour = shares_of_pairs(found)
-    ends = found.model.pairs.ends
-    tags, far = np.unique(ends), detour > FAR_M
-    sentences = []
-    for number in np.flatnonzero((share > MOSTLY) & far).tolist():
+    ends, far = found.model.pairs.ends, detour > FAR_M
+    hidden, tags = np.flatnonzero((share > MOSTLY) & far).tolist(), np.unique(ends).tolist()
+    for number in hidden:
         a, b = ends[number].tolist()
-        others = [tag for tag in tags.tolist() if tag not in (a, b)]
+        others = [tag for tag in tags if tag not in (a, b)]
         either = f" or pair {others[0]}-{others[1]}" if len(tags) == FOUR else ""
-        sentences.append(
+        yield (
             f"pair {a}-{b}{either}: {100 * share[number]:.0f} % of its ranges are reflected, or off by "
             f"{100 * detour[number]:.0f} cm; record it anew, delays rest on the other pairs"
         )
-    for tag in tags.tolist():
-        mean = float(np.where(far, share, 0.0)[np.any(ends == tag, axis=1)].mean())
-        if mean > OFTEN and not sentences:
-            sentences.append(
-                f"tag {tag}: {100 * mean:.0f} % of its ranges are reflected; what stands near its antenna?"
-            )
-    return sentences
+    means = {tag: float(np.where(far, share, 0.0)[np.any(ends == tag, axis=1)].mean()) for tag in tags}
+    often = [tag for tag in tags if means[tag] > OFTEN and not hidden]
+    for tag in often[:1]:
+        yield f"tag {tag}: {100 * means[tag]:.0f} % of its ranges are reflected; what stands near its antenna?"
 
 
-def _short(found: KnownDistances) -> list[str]:
+def _short(found: KnownDistances) -> Iterator[str]:
     """Say where errors last so long that a recording holds few independent stretches of time."""
     lasting = found.lasting.lasting[0]
-    if lasting.stretches >= FEWEST_STRETCHES:
-        return []
-    return [
-        f"errors last for {lasting.stretch_s:.1f} s, so the recording holds only {lasting.stretches:.0f} independent "
-        f"stretches of time; intervals are widened for it, and a guess below {FEWEST_STRETCHES:.0f}: record for longer"
-    ]
+    if lasting.stretches < FEWEST_STRETCHES:
+        yield (
+            f"errors last for {lasting.stretch_s:.1f} s, so the recording holds only {lasting.stretches:.0f} "
+            f"independent stretches of time; intervals are widened for it, and a guess below {FEWEST_STRETCHES:.0f}: "
+            "record for longer"
+        )
 
 
-def _confounded(found: KnownDistances, slopes: Slopes) -> list[str]:
+def _confounded(found: KnownDistances, slopes: Slopes) -> Iterator[str]:
     """Say where a small error that grows with the distance would pass for a curve over power.
 
     The curve is fitted beside such an error, of which `SCALE` is known beforehand. It is named where it adds more to
@@ -403,7 +386,7 @@ def _confounded(found: KnownDistances, slopes: Slopes) -> list[str]:
     """
     model, truth_m = found.model, found.model.ranges.truth_m
     if model.curve is None or len(found.searches) > 1 or not np.ptp(truth_m) > 0:
-        return []
+        return
     far = truth_m - np.median(truth_m)
     link = slopes.link(sparse.csr_matrix(far[:, None]))[0]
     taken = np.asarray(slopes.optimum.covariance @ link)
@@ -417,10 +400,9 @@ def _confounded(found: KnownDistances, slopes: Slopes) -> list[str]:
     more = float(np.sqrt(np.mean((rows @ taken[own_columns] * slope) ** 2)))
     variance = np.einsum("ij,jk,ik->i", rows, found.covariances["curve"], rows)
     band = float(np.sqrt(max(float(np.mean(variance)), 0.0)))
-    if more < band:
-        return []
-    return [
-        f"power and distance are confounded: true distances {100 * SCALE:.0f} % off would pass for {1e3 * more:.0f} mm "
-        f"of the curve, whose band says {1e3 * band:.0f} mm; turn the antennas while recording, or fit with "
-        "`delays_only`"
-    ]
+    if more >= band:
+        yield (
+            f"power and distance are confounded: true distances {100 * SCALE:.0f} % off would pass for "
+            f"{1e3 * more:.0f} mm of the curve, whose band says {1e3 * band:.0f} mm; turn the antennas while "
+            "recording, or fit with `delays_only`"
+        )

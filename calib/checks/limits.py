@@ -1,4 +1,7 @@
-"""What a fit of a kind cannot know from the data that it had, said before anything else."""
+"""What a fit cannot know from the data that it had, and what hardware and arithmetic do not allow.
+
+Data that cannot be what they claim are refused, or named before they are believed.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +13,14 @@ import numpy as np
 from calib.calibration.power_curves import ALPHA_DBM, equal_bins, lifted_power
 from calib.data.clocks import LeftSkew, corrected
 from calib.data.ranges import NO_STAMPS, STATIC, Ranges
+from calib.errors import UnanswerableError
 from calib.estimator.known_distances import KnownDistances
 from calib.estimator.pairs import pairs_of
+from calib.spread import STD_OF_MEDIAN, medians, robust_spread
 from uwblink.arrays import Floats
 from uwblink.protocols.table import is_single_sided
 from uwblink.recording.antenna_delays import known_delays
-from uwblink.ticks import SPEED_OF_LIGHT
+from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import names_in
 
 RANGES_A_MEDIAN: Final = 20
@@ -28,13 +33,44 @@ SPREAD: Final = (5, 95)
 """Percent of the powers between which errors are compared."""
 
 
+MOST_LEFT_OUT: Final = 0.5
+SCALE: Final = (0.75, 1.35)
+"""How many metres a range may grow in a metre of true distance: a foot is 0.305 m, a yard 0.914."""
+
+RANGES_ASKED: Final = 100_000
+"""Of more ranges, only every so many are asked for their scale and their clocks."""
+
+UNITS: Final = {0.001: "millimetres", 0.01: "centimetres", 0.3048: "feet"}
+FEWEST_SPREADS: Final = 3.0
+"""True distances must spread by so much more than errors for their scale to be known."""
+
+SKEW_PPM: Final = 100.0
+"""Clock ratios beyond this are none: crystals of these boards keep 20 ppm each, over temperature and age."""
+
+LONGEST_NS: Final = 2.5
+"""Boards of one kind differ by less in their antenna delays (published ones by 0.6 ns)."""
+
+ONE_WAY_M: Final = 0.05
+WAYS_DIFFER: Final = 8.0
+RANGES_A_WAY: Final = 20
+LOUD_M: Final = 0.5
+"""Errors that spread by more are not those of a UWB range."""
+
+REGISTER_NS: Final = 65_536 * TICK_S * 1e9
+"""Antenna delays are registers of 16 bits, in ticks: up to 1.03 us, twice what a board has that is programmed with none
+(514 ns). A delay beyond is a length in the wrong unit: 154 m of range a tag."""
+
+
 def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Mapping[int, float]) -> Iterator[str]:
     """Yield what cannot be known, in sentences; `residuals_m` (n,) are fully corrected errors of the ranges."""
-    model = found.model
-    of_pairs = model.constants == "pair"
+    model, pairs = found.model, found.model.constants == "pair"
     bare = int(np.count_nonzero(ranges.protocol == NO_STAMPS))
     if bare:
-        yield _without_stamps(bare, len(ranges), "constants" if of_pairs else "delays")
+        yield (
+            f"{'' if bare == len(ranges) else f'{bare} of {len(ranges)} '}ranges without stamps: clock skew, and what "
+            f"the device added or took off itself, are not known and are in the {'constants' if pairs else 'delays'}; "
+            "a damaged range cannot be told from a reflected one"
+        )
     if ranges.left_skew is not None:
         yield told(ranges.left_skew)
     elif any(is_single_sided(name) and not corrected(name) for name in names_in(ranges.protocol)):
@@ -44,24 +80,26 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
         )
     if ranges.clocks_apart is not None:
         yield str(ranges.clocks_apart)
-    if of_pairs:
+    if pairs:
+        count = len(model.pairs.ends)
         yield (
-            f"{_pairs(len(model.pairs.ends))}: antenna delays stay unknown, other pairs cannot be corrected, and "
-            "what else is constant in the ranges of a pair (an obstacle, a wrong lever arm) is in its constant"
+            f"{'the constant of one pair' if count == 1 else f'constants of {count} pairs'}: antenna delays stay "
+            "unknown, other pairs cannot be corrected, and what else is constant in the ranges of a pair (an obstacle, "
+            "a wrong lever arm) is in its constant"
         )
     if model.curve is None and model.looked_for_curve and model.powered.any():
         yield (
-            f"the first-path power never changes ({_middle_dbm(ranges):.1f} dBm): the curve is flat, and delays hold "
-            "at this power only"
+            f"the first-path power never changes ({np.median(_mean_dbm(ranges)):.1f} dBm): the curve is flat, and "
+            "delays hold at this power only"
         )
     elif model.curve is None:
         yield _without_curve(ranges, residuals_m)
     if fixed and set(model.tags) <= set(fixed):
-        yield _pinned(ranges, residuals_m)
-
-
-def _pairs(count: int) -> str:
-    return "the constant of one pair" if count == 1 else f"constants of {count} pairs"
+        own = medians(residuals_m, pairs_of(ranges.initiator, ranges.target, ranges.tags()).number)
+        yield (
+            "curve only: the delays are those that were given; what they have in common that is wrong is in the curve, "
+            f"where they differ it stays in the ranges (medians of pairs lie within {_length(float(np.ptp(own)))})"
+        )
 
 
 def told(left: LeftSkew) -> str:
@@ -87,80 +125,151 @@ def _length(metres: float) -> str:
     return f"{100 * metres:.0f} cm" if metres >= 0.01 else f"{1e3 * metres:.1f} mm"
 
 
-def _without_stamps(bare: int, count: int, where: str) -> str:
-    share = "" if bare == count else f"{bare} of {count} "
-    return (
-        f"{share}ranges without stamps: clock skew, and what the device added or took off itself, are not known and "
-        f"are in the {where}; a damaged range cannot be told from a reflected one"
-    )
-
-
 def _without_curve(ranges: Ranges, residuals_m: Floats) -> str:
-    known = np.isfinite(ranges.fpp1_dbm) | np.isfinite(ranges.fpp2_dbm)
+    lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, "mean-of-lifted", ALPHA_DBM)
+    known = np.isfinite(lifted)
     if not known.any():
         return (
             "delays only, without any power: how ranges change with power cannot be seen, is in delays and errors, and "
             "delays from other distances will differ"
         )
     low, high = np.percentile(_mean_dbm(ranges), SPREAD)
-    reach = _change_with_power(ranges, residuals_m)
-    differ = f"{reach / SPEED_OF_LIGHT * 1e9:.2f} ns"
+    number = equal_bins(lifted[known]).number
+    middle = medians(residuals_m[known], number)[np.bincount(number) >= RANGES_A_MEDIAN]
+    reach = float(np.ptp(np.percentile(middle, SPREAD))) if len(middle) else 0.0
+    differ_ns = reach / SPEED_OF_LIGHT * 1e9
     return (
         f"delays only: errors that change with power stay in the ranges, here {_length(reach)} between {low:.0f} and "
-        f"{high:.0f} dBm; delays hold for the recorded powers, and differ by up to {differ} at others among "
-        "them"
+        f"{high:.0f} dBm; delays hold for the recorded powers, and differ by up to {differ_ns:.2f} ns "
+        "at others among them"
     )
-
-
-def _lifted(ranges: Ranges) -> Floats:
-    return lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, "mean-of-lifted", ALPHA_DBM)
 
 
 def _mean_dbm(ranges: Ranges) -> Floats:
+    """Return the mean powers of the ranges that have any (k,)."""
     both = np.column_stack([ranges.fpp1_dbm, ranges.fpp2_dbm])
-    known = both[np.isfinite(both).any(axis=1)]
-    return np.asarray(np.nanmean(known, axis=1))
+    return np.asarray(np.nanmean(both[np.isfinite(both).any(axis=1)], axis=1))
 
 
-def _middle_dbm(ranges: Ranges) -> float:
-    return float(np.median(_mean_dbm(ranges)))
+def refuse_impossible(ranges: Ranges) -> None:
+    """Raise `UnanswerableError` where ranges cannot be fitted whatever the settings."""
+    for reason in _impossible(ranges):
+        raise UnanswerableError(f"{ranges.source}: {reason}")
 
 
-def _change_with_power(ranges: Ranges, residuals_m: Floats) -> float:
-    """Return by how much the medians of errors differ over power, metres."""
-    lifted = _lifted(ranges)
-    known = np.isfinite(lifted)
-    number, error = equal_bins(lifted[known]).number, residuals_m[known]
-    medians = [
-        np.median(error[number == k]) for k in np.unique(number) if np.count_nonzero(number == k) >= RANGES_A_MEDIAN
-    ]
-    return float(np.ptp(np.percentile(medians, SPREAD))) if medians else 0.0
+def _impossible(ranges: Ranges) -> Iterator[str]:
+    """Yield why ranges cannot be what they claim."""
+    missing = {reason: count for reason, count in ranges.excluded.items() if reason != STATIC}
+    share = sum(missing.values()) / max(len(ranges) + sum(missing.values()), 1)
+    if share > MOST_LEFT_OUT:
+        worst = max(missing, key=lambda reason: missing[reason])
+        yield (
+            f"{100 * share:.0f} % of the exchanges were left out, most for {worst}; more than half is no sample: see "
+            "to the protocol and the columns of the recording"
+        )
+    sessions = np.unique(ranges.session)
+    if len(ranges) > 1 and not any(np.ptp(ranges.time_ns[ranges.session == number]) for number in sessions):
+        yield "all ranges have the same time, so nothing says how long errors last; give their times"
+    some = ranges[:: max(len(ranges) // RANGES_ASKED, 1)]
+    # How ranges and true distances spread: a unit or two columns may be wrong.
+    slope = _robust_slope(some.truth_m, some.raw_m)
+    rest = robust_spread(some.raw_m - slope * some.truth_m)
+    if not SCALE[0] < slope < SCALE[1] and abs(slope) * robust_spread(some.truth_m) >= FEWEST_SPREADS * rest:
+        guess = _looks_like(slope)
+        yield (f"ranges grow by {slope:.3g} m in a metre of true distance; {guess and guess + '; '}give both in metres")
+    # Clock ratios that no crystals have: stamps that wrapped, or columns in the wrong order.
+    weight = some.weight_target[some.protocol == "ds"]
+    skew = 1e6 * float(np.median(np.abs(2 * weight - 1))) if len(weight) else 0.0
+    if skew > SKEW_PPM:
+        yield (
+            f"clocks differ by {skew:.0f} ppm by their third messages, crystals by 40 at most; the third leg is longer "
+            "than stamps count before they wrap, or the columns of stamps are in another order"
+        )
 
 
-def _pinned(ranges: Ranges, residuals_m: Floats) -> str:
-    place = pairs_of(ranges.initiator, ranges.target, ranges.tags()).number
-    medians = [np.median(residuals_m[place == k]) for k in range(int(place.max()) + 1)]
-    return (
-        "curve only: the delays are those that were given; what they have in common that is wrong is in the curve, "
-        f"where they differ it stays in the ranges (medians of pairs lie within {_length(float(np.ptp(medians)))})"
+def _looks_like(ratio: float) -> str:
+    """Return what ranges that are so many times the true distances look like, an empty text where no unit is near."""
+    whose, smaller = ("true distances", ratio) if ratio < 1 else ("ranges", 1 / ratio)
+    near = (f"{whose} look like {unit}" for own, unit in UNITS.items() if abs(np.log(max(smaller, 1e-9) / own)) < 0.2)
+    return next(near, "")
+
+
+def _robust_slope(x: Floats, y: Floats) -> float:
+    """Return how y (n,) grows with x (n,): the median slope between thirds (Tukey's line)."""
+    order = np.argsort(x, kind="stable")
+    third = max(len(x) // 3, 1)
+    low, high = order[:third], order[-third:]
+    run = float(np.median(x[high]) - np.median(x[low]))
+    return float(np.median(y[high]) - np.median(y[low])) / run if run > 0 else 1.0
+
+
+def one_way(ranges: Ranges) -> Iterator[str]:
+    """Name the pair whose ranges depend most on who initiates, as they do where clock skew is left in them."""
+    pairs = pairs_of(ranges.initiator, ranges.target, ranges.tags())
+    error, forth, found = ranges.raw_m - ranges.truth_m, ranges.initiator < ranges.target, list[tuple[float, str]]()
+    rows_of_pairs = np.split(np.argsort(pairs.number, kind="stable"), np.cumsum(np.bincount(pairs.number))[:-1])
+    for (a, b), rows in zip(pairs.ends.tolist(), rows_of_pairs, strict=True):
+        ways = [error[rows[forth[rows] == way]] for way in (True, False)]
+        if min(map(len, ways)) < RANGES_A_WAY:
+            continue
+        differ = float(np.median(ways[0]) - np.median(ways[1]))
+        std = STD_OF_MEDIAN * float(np.hypot(*(robust_spread(some) / np.sqrt(len(some)) for some in ways)))
+        if abs(differ) > max(ONE_WAY_M, WAYS_DIFFER * std):
+            told = f"{100 * abs(differ):.0f} cm {'longer' if differ > 0 else 'shorter'} if tag {a} initiates"
+            found.append((abs(differ), f"pair {a}-{b}: ranges read {told}"))
+    if found:
+        yield f"{max(found)[1]}: clock skew is not corrected, or with the wrong sign of the carrier's reading"
+
+
+def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: Ranges) -> None:
+    """Raise `UnanswerableError` where a fit found what no radio has, so that its calibration is of no use.
+
+    Delays beyond what registers hold, and errors as large as the ranges are: then true distances say nothing of the
+    ranges, as they do in another unit where bodies move so little that how ranges grow with them is not seen.
+    """
+    every = slice(None, None, max(len(ranges) // RANGES_ASKED, 1))
+    typical = float(np.median(np.abs(ranges.raw_m[every])))
+    largest = max(map(abs, delays_ns.values()), default=0.0)
+    spread = robust_spread(residuals_m[every])
+    if largest < REGISTER_NS and spread < max(typical, LOUD_M):
+        return
+    ratio = typical / max(float(np.median(np.abs(ranges.truth_m[every]))), 1e-9)
+    guess = _looks_like(ratio) or "they may be in another unit, or of other tags"
+    raise UnanswerableError(
+        f"{ranges.source}: no radio has a delay of {largest:.0f} ns (registers hold {REGISTER_NS:.0f}) or errors that "
+        f"spread by {spread:.3g} m in ranges of {typical:.3g} m; check the units of the true distances and of the "
+        f"ranges: {guess}"
     )
 
 
-def warnings_of(ranges: Ranges, inliers: float, free: list[list[int]], seconds: float) -> list[str]:
-    """Return sentences, the gravest first.
+def implausible(delays_ns: Mapping[int, float], residuals_m: Floats) -> Iterator[str]:
+    """Yield sentences on fitted values that hardware does not have."""
+    large = {tag: delay for tag, delay in delays_ns.items() if abs(delay) > LONGEST_NS}
+    if large:
+        tag = max(large, key=lambda tag: abs(large[tag]))
+        yield (
+            f"tag {tag}: a delay of {large[tag]:+.1f} ns is more than boards differ by ({LONGEST_NS} ns); see to the "
+            "unit of true distances, the order of stamps, the carrier's sign and the configured antenna delays"
+        )
+    spread = robust_spread(residuals_m)
+    if spread > LOUD_M:
+        yield f"errors spread by {spread:.2f} m after the fit, those of UWB ranges by a decimetre: whose truth is it?"
+
+
+def warnings_of(ranges: Ranges, inliers: float, free: list[list[int]], seconds: float) -> Iterator[str]:
+    """Yield sentences on the data of a fit, the gravest first.
 
     `inliers` is the share of ranges within three sigmas, `seconds` the time that ranges cover.
     """
-    found = []
     if free:
         groups = "; ".join(", ".join(map(str, group)) for group in free)
-        found.append(
+        yield (
             f"the data leave the delays of tags {groups} free; those written are the smallest that agree with the data"
         )
     delays = known_delays(ranges.antenna_delays, ranges.tags())
     apart = [f"{tag} ({one})" for tag, one in delays.items() if tag is not None and one.reply != one.tx]
     if apart:
-        found.append(
+        yield (
             f"the stamps of tag{'s' * (len(apart) > 1)} {', '.join(apart)} carry two antenna delays, the register's "
             "and another constant in those of delayed replies: no delay of a tag fits both; program the firmware's "
             "constants, too (`calib export --to firmware`), and record anew"
@@ -168,9 +277,8 @@ def warnings_of(ranges: Ranges, inliers: float, free: list[list[int]], seconds: 
     everything = len(ranges) + sum(ranges.excluded.values())
     for reason, count in ranges.excluded.items():
         if reason != STATIC and count > MANY_MISSING * everything:
-            found.append(f"{100 * count / everything:.0f} % of the exchanges were left out: {reason}")
+            yield f"{100 * count / everything:.0f} % of the exchanges were left out: {reason}"
     if 1 - inliers > MANY_OUTLIERS:
-        found.append(f"{100 * (1 - inliers):.0f} % of the ranges lie beyond three sigmas of the calibrated errors")
+        yield f"{100 * (1 - inliers):.0f} % of the ranges lie beyond three sigmas of the calibrated errors"
     if seconds < SHORT_S:
-        found.append(f"only {seconds:.0f} s of data: errors that persist are few, so intervals may be too narrow")
-    return found
+        yield f"only {seconds:.0f} s of data: errors that persist are few, so intervals may be too narrow"

@@ -8,10 +8,8 @@ more pairs of bodies than bodies; where there are not, what stays is taken to be
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from scipy.special import ndtr
+from scipy import special
 
 from calib.estimator.known_distances import KnownDistances
 from calib.estimator.score_tests import Slopes, Tested
@@ -41,58 +39,47 @@ SIZES_M = np.geomspace(3e-4, 0.2, 60)
 """Standard deviations of offsets that are thought of; an offset of more is a detour, and among reflections."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OfPlaces:
-    """What places do: covariance (tags, tags) that they add to that of the delays, and whether it is certain."""
+def of_places(found: KnownDistances, slopes: Slopes, pairs: Tested, before_ns2: Floats) -> tuple[Floats, list[str]]:
+    """Return the covariance (tags, tags) that places add to that of the delays, and a sentence where they matter.
 
-    widening_ns2: Floats
-    certain: bool = False
-
-    def sentences(self, before_ns2: Floats) -> list[str]:
-        """Return it as a sentence, where it is certain and matters beside a covariance (tags, tags) without it."""
-        # What all delays have in common hangs on the curve as well, and is less known by far.
-        apart = np.eye(len(before_ns2)) - 1 / max(len(before_ns2), 1)
-        own, more = (np.diag(apart @ one @ apart) for one in (before_ns2, self.widening_ns2))
-        if not self.certain or not np.any(more > np.maximum(own, SMALLEST_NS**2)):
-            return []
-        return [
-            "errors belong to places or directions: ranges between the same two bodies are wrong together, as walls "
-            "and things near them make it, or a wrong lever arm, or an antenna whose delay depends on the direction, "
-            f"which may move differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals are widened for "
-            "it; check the lever arms, then record elsewhere too, or farther from walls: what all ranges are too long "
-            "by in common no range shows"
-        ]
-
-
-def of_places(found: KnownDistances, slopes: Slopes, pairs: Tested) -> OfPlaces:
-    """Return what errors that tags of a body share do to delays; `pairs` are the slopes of offsets by pair.
-
-    Nothing is found where no body is known to carry two tags.
+    `pairs` are the slopes of offsets by pair, `before_ns2` is the covariance without places. Nothing is found where no
+    body is known to carry two tags.
     """
+    nothing = np.zeros_like(before_ns2), list[str]()
     group = _pairs_of_bodies(found)
-    nothing = OfPlaces(widening_ns2=np.zeros((len(found.delays),) * 2))
     if group is None:
         return nothing
     sums = np.eye(int(group.max()) + 1)[:, group]
     values, reach = _staying(pairs, sums)
-    square = float(values @ values)
     variance, deviation = _moving(found, slopes, sums)
+    # How surely something stays, as deviations of one normal value.
+    stays = -float(special.ndtri(special.chdtrc(max(len(values), 1), float(values @ values))))
     moves = deviation > WIDENING_DEVIATION
-    if not moves and square <= _of_chi_square(len(values), WIDENING_DEVIATION):
+    if not moves and stays <= WIDENING_DEVIATION:
         return nothing
     spread = 1 + reach[:, None] * SIZES_M**2
     likely = -0.5 * np.sum(np.log(spread) + values[:, None] ** 2 / spread, axis=0)
     middle, width = (np.sqrt(variance), SIZE_FOLDS) if moves else (WALLS_M, 1.0)
-    likely -= 0.5 * (np.log(SIZES_M / middle) / width) ** 2
-    size, effects = _as_one(likely), pairs.effects @ sums.T
-    certain = deviation > CERTAIN_DEVIATION or square > _of_chi_square(len(values), CERTAIN_DEVIATION)
-    return OfPlaces(widening_ns2=size**2 * effects @ effects.T, certain=certain)
+    effects = _as_one(likely - 0.5 * (np.log(SIZES_M / middle) / width) ** 2) * pairs.effects @ sums.T
+    widening = effects @ effects.T
+    # What all delays have in common hangs on the curve as well, and is less known by far.
+    apart = np.eye(len(before_ns2)) - 1 / max(len(before_ns2), 1)
+    own, more = (np.diag(apart @ one @ apart) for one in (before_ns2, widening))
+    if max(deviation, stays) <= CERTAIN_DEVIATION or not np.any(more > np.maximum(own, SMALLEST_NS**2)):
+        return widening, []
+    return widening, [
+        "errors belong to places or directions: ranges between the same two bodies are wrong together, as walls "
+        "and things near them make it, or a wrong lever arm, or an antenna whose delay depends on the direction, "
+        f"which may move differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals are widened for "
+        "it; check the lever arms, then record elsewhere too, or farther from walls: what all ranges are too long "
+        "by in common no range shows"
+    ]
 
 
 def _as_one(likely: Floats) -> float:
     """Return the standard deviation whose 95 % interval is that of all sizes together, by their log likelihoods."""
     weight = np.exp(likely - likely.max())
-    within = 2 * ndtr(TWO_SIDED_95 * SIZES_M[:, None] / SIZES_M) - 1
+    within = 2 * special.ndtr(TWO_SIDED_95 * SIZES_M[:, None] / SIZES_M) - 1
     return float(np.interp(0.95, within @ (weight / weight.sum()), SIZES_M))
 
 
@@ -124,12 +111,6 @@ def _staying(pairs: Tested, sums: Floats) -> tuple[Floats, Floats]:
     reach = np.maximum(reach, 0.0)
     largest = np.sqrt(1 + reach * (SIZES_M[-1] / 2) ** 2)
     return np.clip(turned.T @ root.T @ total, -largest, largest), reach
-
-
-def _of_chi_square(freedom: int, deviation: float) -> float:
-    """Return the value of chi-square as unlikely as a normal deviation (Wilson and Hilferty 1931)."""
-    part = 2 / (9 * max(freedom, 1))
-    return float(freedom * (1 - part + deviation * np.sqrt(part)) ** 3)
 
 
 def _moving(found: KnownDistances, slopes: Slopes, sums: Floats) -> tuple[float, float]:

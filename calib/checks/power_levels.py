@@ -14,10 +14,9 @@ import numpy as np
 
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import lifted_power
-from calib.checks.plausibility import MEDIAN
 from calib.data.ranges import Ranges
 from calib.findings import SMALLEST_NS
-from calib.spread import TWO_SIDED_95, robust_spread
+from calib.spread import STD_OF_MEDIAN, TWO_SIDED_95, medians, spreads
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -69,24 +68,21 @@ def power_levels_db(ranges: Ranges) -> dict[int, tuple[float, float]]:
     rows = _spread(len(ranges))
     # The initiator reads what the target sent, and the target what the initiator sent.
     apart = ranges.fpp2_dbm[rows] - ranges.fpp1_dbm[rows]
-    known = np.isfinite(apart)
-    rows, apart = rows[known], apart[known]
-    tags, code = np.unique(np.concatenate([ranges.initiator[rows], ranges.target[rows]]), return_inverse=True)
-    first, second = np.split(code, 2)
-    pair, number, count = np.unique(first * len(tags) + second, return_inverse=True, return_counts=True)
-    enough = np.flatnonzero(count >= RANGES_A_LEVEL)
-    if not len(enough):
+    rows, apart = rows[np.isfinite(apart)], apart[np.isfinite(apart)]
+    link = ranges.initiator[rows] * 65_536 + ranges.target[rows]
+    links, number, count = np.unique(link, return_inverse=True, return_counts=True)
+    enough = count >= RANGES_A_LEVEL
+    if not enough.any():
         return {}
-    parts = [apart[number == k] for k in enough]
-    ends = np.divmod(pair[enough], len(tags))
-    told = np.unique(ends)
-    inverse = np.linalg.pinv(np.subtract(*(np.equal.outer(end, told).astype(float) for end in ends)))
-    std = np.array([MEDIAN * robust_spread(part) / np.sqrt(len(part)) for part in parts])
-    levels: Floats = inverse @ np.array([np.median(part) for part in parts])
+    ends = np.divmod(links[enough], 65_536)
+    tags = np.unique(ends)
+    inverse = np.linalg.pinv(np.subtract(*(np.equal.outer(end, tags).astype(float) for end in ends)))
+    middle, spread = (of(apart, number)[enough] for of in (medians, spreads))
+    levels: Floats = inverse @ middle
     near = np.abs(np.subtract.outer(levels, levels)) < SAME_LEVEL_DB
     levels -= levels[near[np.argmax(near.sum(axis=1))]].mean()
-    spreads = np.sqrt(inverse**2 @ std**2)
-    return dict(zip(tags[told].tolist(), zip(levels.tolist(), spreads.tolist(), strict=True), strict=True))
+    std = np.sqrt(inverse**2 @ ((STD_OF_MEDIAN * spread) ** 2 / count[enough]))
+    return dict(zip(tags.tolist(), zip(levels.tolist(), std.tolist(), strict=True), strict=True))
 
 
 def _spread(count: int) -> Ints:

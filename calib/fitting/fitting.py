@@ -19,8 +19,7 @@ from calib.calibration.lasting import lasting_errors
 from calib.calibration.model import Calibration, given_calibration
 from calib.calibration.power_curves import lift as lift_power
 from calib.checks.fitted import examine_fit
-from calib.checks.limits import limits, warnings_of
-from calib.checks.plausibility import implausible, one_way, refuse_impossible, refuse_refuted
+from calib.checks.limits import implausible, limits, one_way, refuse_impossible, refuse_refuted, warnings_of
 from calib.checks.power_levels import unlike_powers
 from calib.data.ranges import Ranges, held_out
 from calib.data.sources import Data, load_ranges
@@ -87,10 +86,10 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         found = fit_known_distances(ranges, recipe)
         fitted = dict(zip(found.model.tags, found.delays.tolist(), strict=False))
         refuse_refuted(fitted, found.residuals, found.model.ranges)
-        doubts = examine_fit(found)
+        covariance_ns2, findings = examine_fit(found)
         calibration = calibration_of(
             found,
-            doubts.covariance_ns2,
+            covariance_ns2,
             lift=lift,
             alpha_dbm=alpha_dbm,
             fixed=fixed,
@@ -115,7 +114,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         found,
         replace(calibration, provenance=provenance),
         ranges,
-        doubts.sentences,
+        findings,
         settings=settings,
         fixed=fixed,
         more=_stopped(found, settings.loss),

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from calib.calibration.model import Calibration, given_calibration
 from calib.calibration.power_curves import lift as lift_power
 from calib.checks.fitted import examine_fit
-from calib.checks.plausibility import refuse_refuted
+from calib.checks.limits import refuse_refuted
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described
@@ -203,8 +203,8 @@ def _result(
     refuse_refuted(
         dict(zip(found.model.tags, found.delays.tolist(), strict=False)), found.residuals, found.model.ranges
     )
-    doubts = examine_fit(found)
-    covariance = judgement.widened(doubts.covariance_ns2)
+    covariance_ns2, findings = examine_fit(found)
+    covariance = judgement.widened(covariance_ns2)
     calibration = calibration_of(
         found,
         covariance,
@@ -225,7 +225,7 @@ def _result(
         found,
         calibration,
         found.model.ranges,
-        doubts.sentences,
+        findings,
         settings=settings,
         fixed=fixed,
         first=[*judgement.undetermined_sentences(covariance), *_of_search(top, rival), *top.scene.tapes.left_out],
