@@ -30,7 +30,6 @@ RANGES_A_WAY: Final = 15
 NEAR: Final = 0.5
 """A slope is that of a fault, of 1 or of 2, or none: halfway lies the edge."""
 
-BLIND: Final = "single-sided without carrier readings"
 LEFT: Final = "skew in single-sided ranges"
 WRONG_SIGN: Final = "carrier readings with the wrong sign"
 SCATTER_PPM: Final = 1.5
@@ -125,7 +124,7 @@ def unread(view: RecordingView) -> Iterator[Candidate]:
     """Single-sided ranges whose carriers were not read: nothing says what skew left in them."""
     left = left_skew(view.exchanges)
     if left and not np.isfinite(left.told_m):
-        yield Candidate(BLIND, told(left))
+        yield Candidate("single-sided without carrier readings", told(left))
 
 
 def carriers(view: RecordingView) -> Iterator[Candidate]:

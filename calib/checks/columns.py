@@ -208,9 +208,6 @@ SPREAD_BY_UNIT: Final = MATERIAL / 2
 ONE_DISTANCE_M: Final = 0.5
 """Ranges that spread by less are of one distance."""
 
-POSES: Final = "unit of the poses"
-TRUTH: Final = "unit of the true distances"
-RANGES: Final = "unit of the ranges"
 REPORTED: Final = "unit of the reported ranges"
 POWER: Final = "unit of the powers"
 
@@ -227,9 +224,9 @@ def lengths(view: RecordingView) -> Iterator[Candidate]:
     if len(raw) < RANGES_OF_A_UNIT:
         if bare and np.nanmedian(np.abs(view.raw_m)) > PLAUSIBLE_M:
             told = f"half of the ranges are longer than {PLAUSIBLE_M:.0f} m, which no UWB radio measures"
-            yield Candidate(RANGES, told, words={"unit": "mm"})
+            yield Candidate("unit of the ranges", told, words={"unit": "mm"})
     elif unit := _unit(raw, truth):
-        name, whose = (POSES, "poses") if view.posed else (TRUTH, "true distances")
+        name, whose = ("unit of the poses", "poses") if view.posed else ("unit of the true distances", "true distances")
         told = (
             f"true distances have a median of {np.median(truth):.6g}, ranges one of {np.median(raw):.6g} m: they agree "
             f"if {whose} are in {unit}"
@@ -237,7 +234,7 @@ def lengths(view: RecordingView) -> Iterator[Candidate]:
         yield Candidate(name, told, words={"unit": unit, "many": f"{LENGTHS[unit]:g}"})
     elif bare and (unit := _unit(truth, raw)):
         told = f"ranges are in {unit} if true distances are in m: half of them are longer than {np.median(raw):.0f}"
-        yield Candidate(RANGES, told, words={"unit": unit})
+        yield Candidate("unit of the ranges", told, words={"unit": unit})
 
 
 def _unit(metres: Floats, others: Floats) -> str | None:

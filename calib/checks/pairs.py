@@ -73,16 +73,6 @@ def still(view: RecordingView) -> Iterator[Candidate]:
         yield Candidate(STATIC, f"no distance changes by more than {100 * span:.0f} cm")
 
 
-def no_truth(view: RecordingView) -> Iterator[Candidate]:
-    """Exchanges without a true distance."""
-    known = float(np.mean(np.isfinite(view.truth_m)))
-    if known < 0.5 and not view.standing:
-        yield Candidate(
-            "no true distances",
-            f"{100 * known:.0f} % of the exchanges have one: poses are missing or do not cover the recording",
-        )
-
-
 CONFOUNDED: Final = "power confounded with distance"
 EXPLAINED: Final = 0.9
 """Share of the power's variance that distance may explain: beyond, what is fitted over power has more than ten times
@@ -101,12 +91,15 @@ LOOKED_AT: Final = 5000
 GROUPS: Final = 40
 
 
-def unpowered(view: RecordingView) -> Iterator[Candidate]:
-    """Exchanges without a first-path power at either end, of which no curve can be fitted."""
-    e = view.exchanges
-    known = float(np.mean(np.isfinite(measured_powers(e.fpp1_dbm)) | np.isfinite(measured_powers(e.fpp2_dbm))))
-    if known < 0.5:
-        yield Candidate("no powers", f"{100 * known:.0f} % of the exchanges have a first-path power")
+def missing(view: RecordingView) -> Iterator[Candidate]:
+    """Exchanges without a first-path power at either end, of which no curve can be fitted, or without true distance."""
+    powers = [np.isfinite(measured_powers(one)) for one in (view.exchanges.fpp1_dbm, view.exchanges.fpp2_dbm)]
+    powered, true = (100 * float(np.mean(known)) for known in (np.any(powers, axis=0), np.isfinite(view.truth_m)))
+    if powered < 50:
+        yield Candidate("no powers", f"{powered:.0f} % of the exchanges have a first-path power")
+    if true < 50 and not view.standing:
+        told = f"{true:.0f} % of the exchanges have one: poses are missing or do not cover the recording"
+        yield Candidate("no true distances", told)
 
 
 def confounded(view: RecordingView) -> Iterator[Candidate]:

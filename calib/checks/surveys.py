@@ -44,50 +44,35 @@ MANY: Final = 0.1
 
 def surveyed(recordings: list[Data]) -> Iterator[Candidate]:
     """Yield what a survey of recordings finds wrong: with what is known, with places, with powers."""
-    yield from _powers(recordings)
+    contradictions: tuple[Contradiction, ...] = ()
+    found: SurveyResult | None = None
     try:
+        given = read_surveys(recordings, Knowledge())
+        contradictions, lifted = given.findings, given.means.lifted
+        if np.isfinite(lifted).all() and (lifted > 0).all() and np.ptp(in_dbm(lifted)) < NARROWEST_DB:
+            yield Candidate(
+                "powers that hardly vary",
+                f"mean powers of pairs lie within {np.ptp(in_dbm(lifted)):.1f} dB, and a curve over power needs "
+                f"{NARROWEST_DB:g}",
+            )
         found = survey(recordings, regardless=True)
     except UnanswerableError as error:
-        yield from _contradicted(read_surveys(recordings, Knowledge()).findings)
         yield Candidate("survey determines nothing", str(error))
-        return
-    yield from _contradicted(found.contradictions)
-    yield from _weak(found)
-
-
-def _contradicted(found: tuple[Contradiction, ...]) -> Iterator[Candidate]:
-    for one in found:
+    for one in found.contradictions if found else contradictions:
         yield Candidate(FAULTS[one.kind], one.text.partition("; ")[0])
+    if found:
+        yield from _weak(found)
 
 
 def _weak(found: SurveyResult) -> Iterator[Candidate]:
-    made = found.calibration.provenance
+    made, second = found.calibration.provenance, found.second_best
     if made["undetermined"]:
         who = ", ".join(map(str, made["undetermined"][0]))
         yield Candidate("delays that a survey leaves open", f"the arrangements do not determine the delays of {who}")
-    likely = [one for one in found.reflected if one.chance > 0.5]
+    likely = [f"{one.first}-{one.second} in {one.arrangement}" for one in found.reflected if one.chance > 0.5]
     if len(likely) > MANY * made["pairs"]:
-        who = ", ".join(f"{one.first}-{one.second} in {one.arrangement}" for one in likely)
-        yield Candidate(
-            "many reflected pairs",
-            f"{len(likely)} of {made['pairs']} pairs are believed to be reflected: {who}",
-        )
-    if found.second_best is not None and found.second_best.ambiguous:
-        who = ", ".join(map(str, found.second_best.tags))
-        yield Candidate(
-            "two solutions of a survey",
-            f"{found.second_best.arrangement}: boards {who} could as well be elsewhere",
-        )
-
-
-def _powers(recordings: list[Data]) -> Iterator[Candidate]:
-    try:
-        lifted = read_surveys(recordings, Knowledge()).means.lifted
-    except UnanswerableError:
-        return
-    if np.isfinite(lifted).all() and (lifted > 0).all() and np.ptp(in_dbm(lifted)) < NARROWEST_DB:
-        yield Candidate(
-            "powers that hardly vary",
-            f"mean powers of pairs lie within {np.ptp(in_dbm(lifted)):.1f} dB, and a curve over power needs "
-            f"{NARROWEST_DB:g}",
-        )
+        told = f"{len(likely)} of {made['pairs']} pairs are believed to be reflected: {', '.join(likely)}"
+        yield Candidate("many reflected pairs", told)
+    if second is not None and second.ambiguous:
+        told = f"{second.arrangement}: boards {', '.join(map(str, second.tags))} could as well be elsewhere"
+        yield Candidate("two solutions of a survey", told)

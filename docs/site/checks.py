@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from calib.checks.table import CHECKS
+from calib.checks.examine import CHECKS
 
 HEAD: Final = "| question | statistic; distribution on sound data | faults, and what to do |\n|---|---|---|"
 

@@ -14,7 +14,7 @@ import calib
 import uwbsim
 from benchmarks import doctor as planted
 from benchmarks.flights import Flight, Plan, fly
-from calib.checks.table import CHECKS, LEVEL
+from calib.checks.examine import CHECKS, LEVEL
 from calib.findings import BUDGET, OF_A_FIT, exceeds
 from docs.site import checks
 from tests import processes
