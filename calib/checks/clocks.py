@@ -6,12 +6,10 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
-from scipy import sparse
 
 from calib.checks.limits import told
 from calib.checks.recording_view import RecordingView, quick_fit
 from calib.data.clocks import PPM_TO_METRES, corrected, left_skew
-from calib.estimator.score_tests import Family
 from calib.findings import Candidate, exceeds
 from calib.spread import medians, spreads
 from uwblink.protocols.table import single_sided
@@ -57,7 +55,7 @@ def skew(view: RecordingView) -> Iterator[Candidate]:
     some = e[known][fit.rows]
     # A target's reply lasts longer by the clock of a faster initiator, and so does the range.
     expected = PPM_TO_METRES * some.skew2_ppm * intervals(some).dt32 * TICK_S
-    slope, _, std, dof = fit.offsets(Family(kind="skew", names=[LEFT], derivative=sparse.csr_matrix(expected[:, None])))
+    slope, _, std, dof = fit.offsets(expected[:, None])
     reach = float(np.ptp(np.percentile(expected, (5, 95))))
     if reach < SPREAD_M:
         return
@@ -74,9 +72,8 @@ def _by_direction(single: RecordingView) -> Iterator[Candidate]:
     if fit is None:
         return
     e = single.exchanges[fit.rows]
-    forth = np.where(e.initiator < e.target, 0.5, -0.5)
-    by_pair = sparse.csr_matrix((forth, (np.arange(len(forth)), fit.pair)))
-    ways, _, std, dof = fit.offsets(Family(kind="way", names=fit.names, derivative=by_pair))
+    size, _, error, dof = fit.offsets_of_pairs(np.where(e.initiator < e.target, 0.5, -0.5)[:, None])
+    ways, std = size[:, 0], error[:, 0]
     worst = int(np.argmax((np.abs(ways) - ONE_WAY_M) / std))
     told = (
         f"ranges of pair {fit.names[worst]} differ by {100 * abs(ways[worst]):.0f} cm by who initiates, the most of all"

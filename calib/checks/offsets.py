@@ -12,7 +12,7 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from scipy import sparse, special
+from scipy import special
 
 from calib.checks.fitted import has_shares, of_pairs, shares_of_pairs, slopes_of
 from calib.checks.geometry import anchors, places_m
@@ -22,7 +22,7 @@ from calib.data.ranges import Ranges
 from calib.errors import CalibError
 from calib.estimator.known_distances import FEWEST_RANGES, KnownDistances, Recipe, fit_known_distances
 from calib.estimator.pairs import pairs_of
-from calib.estimator.score_tests import Family, Tested, findings
+from calib.estimator.score_tests import Tested, findings
 from calib.findings import BUDGET, Candidate, exceeds, positive, stretches
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
@@ -209,9 +209,11 @@ def shifts(fit: QuickFit, late: Bools) -> Iterator[Shift]:
 
 def _likely_shifts(fit: QuickFit, late: Bools) -> Iterator[Shift]:
     """Yield shifts of single tags, at the time that explains most, those first that explain more."""
-    size, weight = _of_pairs(fit, late)[:2]
-    tags, noise = np.unique(fit.ends), _noise(fit)
-    weight = weight / noise[:, None]
+    size, weight, _, _ = fit.offsets_of_pairs(late)
+    # How many times the variance of each pair's mean is that of independent ranges, as errors last.
+    _, known, std, _ = fit.offsets_of_pairs(fit.time_s[:, None] > np.median(fit.time_s))
+    weight = weight / np.where(known > 0, np.maximum(std**2 * known, 1e-9), np.inf)
+    tags = np.unique(fit.ends)
     mine = np.array([(fit.ends == tag).any(axis=1) for tag in tags], dtype=np.float64)
     whole = np.maximum(mine @ weight, 1e-12)
     mean = mine @ (weight * size) / whole
@@ -220,24 +222,6 @@ def _likely_shifts(fit: QuickFit, late: Bools) -> Iterator[Shift]:
         cut = int(np.argmax(explained[k]))
         if explained[k, cut] > 0:
             yield from _shift_of(fit, int(tags[k]), late[:, cut], size[:, cut], float(mean[k, cut]), mean.size)
-
-
-def _of_pairs(fit: QuickFit, late: Bools) -> tuple[Floats, Floats, Floats, float]:
-    """Return for each pair and time (k, cuts) what `QuickFit.offsets` does of a shift at that time."""
-    count, cuts = len(fit.ends), late.shape[1]
-    rows, cut = np.nonzero(late)
-    columns = fit.pair[rows] * cuts + cut
-    derivative = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(late), count * cuts))
-    names = [name for name in fit.names for _ in range(cuts)]
-    *found, dof = fit.offsets(Family(kind="shift", names=names, derivative=derivative))
-    size, weight, std = (one.reshape(count, cuts) for one in found)
-    return size, weight, std, dof
-
-
-def _noise(fit: QuickFit) -> Floats:
-    """Return how many times the variance of each pair's mean (k,) is that of independent ranges, as errors last."""
-    _, weight, std, _ = _of_pairs(fit, fit.time_s[:, None] > np.median(fit.time_s))
-    return np.where(weight[:, 0] > 0, np.maximum(std[:, 0] ** 2 * weight[:, 0], 1e-9), np.inf)
 
 
 def _shift_of(fit: QuickFit, tag: int, late: Bools, size: Floats, mean: float, tried: int) -> Iterator[Shift]:
@@ -257,7 +241,7 @@ def _shift_of(fit: QuickFit, tag: int, late: Bools, size: Floats, mean: float, t
     shift = float(np.average(medians, weights=1 / (1 / sides[:, own]).sum(axis=0)))
     # What the shift itself leaves in residuals is no noise: standard errors are those without it.
     rest = fit.less(np.where(fit.of_tag(tag) & late, shift, 0.0))
-    _, _, errors, dof = _of_pairs(rest, late[:, None])
+    _, _, errors, dof = rest.offsets_of_pairs(late[:, None])
     std = errors[:, 0]
     weight = std**-2.0
     mean = float(np.average(size[own], weights=weight[own]))

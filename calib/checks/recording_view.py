@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
+from scipy import sparse
 
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import RecordedSource, Source
@@ -233,12 +234,13 @@ class QuickFit:
         """Return which ranges (n,) are a tag's."""
         return np.asarray((self.ends == tag).any(axis=1)[self.pair])
 
-    def offsets(self, family: Family) -> tuple[Floats, Floats, Floats, float]:
+    def offsets(self, derivative: Floats | sparse.csr_matrix) -> tuple[Floats, Floats, Floats, float]:
         """Return offsets (k,), what is known of each in 1/m^2, standard errors (k,), and degrees of freedom.
 
-        Errors that last are in the standard errors, which are infinite for offsets of which nothing is known.
+        `derivative` (n, k) is that of each range by each offset. Errors that last are in the standard errors, which are
+        infinite for offsets of which nothing is known.
         """
-        tested = self.slopes.test(family)
+        tested = self.slopes.test(Family(kind="", names=(), derivative=sparse.csr_matrix(derivative)))
         information = np.diag(tested.information)
         known = information > REACHED * tested.whole
         information = np.where(known, information, 1.0)
@@ -246,6 +248,18 @@ class QuickFit:
         size = np.where(known, -tested.total / information, 0.0)
         dof = min(tested.lasting.freedom, tested.blocks - 1.0)
         return size, np.where(known, information, 0.0), np.where(known, std, np.inf), dof
+
+    def offsets_of_pairs(self, derivative: Floats | Bools) -> tuple[Floats, Floats, Floats, float]:
+        """Return the same (k, m) of offsets of each pair, with derivatives (n, m) of its ranges."""
+        shape = len(self.ends), derivative.shape[1]
+        rows, column = np.nonzero(derivative)
+        columns = self.pair[rows] * shape[1] + column
+        values = np.asarray(derivative[rows, column], dtype=np.float64)
+        *found, dof = self.offsets(
+            sparse.csr_matrix((values, (rows, columns)), shape=(len(derivative), shape[0] * shape[1]))
+        )
+        size, information, std = (one.reshape(shape) for one in found)
+        return size, information, std, dof
 
 
 def quick_fit(

@@ -19,8 +19,15 @@ from calib.calibration.lasting import lasting_errors
 from calib.calibration.model import Calibration, given_calibration
 from calib.calibration.power_curves import lift as lift_power
 from calib.checks.fitted import examine_fit
-from calib.checks.limits import implausible, limits, one_way, refuse_impossible, refuse_refuted, warnings_of
-from calib.checks.power_levels import unlike_powers
+from calib.checks.limits import (
+    implausible,
+    limits,
+    one_way,
+    refuse_impossible,
+    refuse_refuted,
+    unlike_powers,
+    warnings_of,
+)
 from calib.data.ranges import Ranges, held_out
 from calib.data.sources import Data, load_ranges
 from calib.errors import BadInputError

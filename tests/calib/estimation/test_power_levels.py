@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import calib
-from calib.checks import power_levels
-from calib.checks.power_levels import power_levels_db, unlike_powers
+from calib.checks import limits
+from calib.checks.limits import power_levels_db, unlike_powers
 from tests.calib.synthetic import DELAYS_NS, ranges
 
 SENT_DB, READ_DB = {2: -3.0}, {3: 2.0}
@@ -78,7 +78,7 @@ def test_tags_alike_are_not_named(monkeypatch):
     sure = calib.fit(world(noise_db=1.0, tail=0.0, noise_m=0.02))
     assert not [warning for warning in sure.warnings if "stand apart" in warning]
     # A curve so flat that nothing of it would matter is not what these are to show.
-    monkeypatch.setattr(power_levels, "SMALLEST_NS", 0.0)
+    monkeypatch.setattr(limits, "SMALLEST_NS", 0.0)
     surest = replace(sure.calibration, delays_std_ns=dict.fromkeys(DELAYS_NS, 1e-4))
     for seed in range(12):
         # Levels that differ by chance, by as much as would matter to delays that are known so well.
