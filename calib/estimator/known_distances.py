@@ -15,7 +15,6 @@ from scipy import sparse
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.covariance import Covariance, Kept, sandwich
-from calib.estimator.identifiability import free_directions, square_of
 from calib.estimator.losses import LOSSES, MIXTURE
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import METRES_A_NS, RangeModel, Spline
@@ -59,8 +58,7 @@ class KnownDistances:
 
     `values` are unknowns by kind, `covariances` those of "delay", of all curves side by side ("curve") and of the noise
     ("noise"). `residuals` (n,) are fitted less true ranges in the order of the model's ranges, metres. `searches` are
-    the one search, or that of the delays and that of the curves. `free` are groups of tags whose delays the data leave
-    free.
+    the one search, or that of the delays and that of the curves.
     """
 
     model: RangeModel
@@ -70,7 +68,11 @@ class KnownDistances:
     lasting: Covariance
     blocks: TimeBlocks
     residuals: Floats
-    free: list[list[int]]
+
+    @property
+    def free(self) -> list[list[int]]:
+        """Return groups of tags whose delays the pairs leave free."""
+        return self.model.free
 
     @property
     def delays(self) -> Floats:
@@ -114,11 +116,11 @@ def fit_known_distances(ranges: Ranges, recipe: Recipe) -> KnownDistances:
     """
     model = model_of(ranges, recipe)
     error = model.ranges.raw_m - model.ranges.truth_m
-    directions, groups = _free_tags(model, recipe)
-    model = replace(model, held=directions)
+    if not recipe.minimum_norm:
+        refuse_free(model, by_pair=True)
     blocks = time_blocks(model.ranges.time_ns, model.ranges.session)
     if recipe.sequential and model.curve is not None and not set(model.tags) <= set(recipe.fixed_ns):
-        return _in_sequence(model, error, recipe, blocks, groups)
+        return _in_sequence(model, error, recipe, blocks)
     robust = recipe.loss if recipe.loss != MIXTURE else "cauchy"
     pilot = robust_fit(model, error, robust, recipe.scale_m, ("delay", *model.curve_kinds()), sample=PILOT)
     if recipe.loss == MIXTURE and LEAST_SCALE_M < robust_spread(pilot.residuals) < LARGEST_SPREAD_M:
@@ -129,7 +131,7 @@ def fit_known_distances(ranges: Ranges, recipe: Recipe) -> KnownDistances:
         fitted = pilot
     if not isinstance(fitted.rows.errors, Mixture):
         fitted = robust_fit(model, error, robust, recipe.scale_m, [u.kind for u in model.unknowns], start=pilot)
-    return described(model, fitted, blocks, groups)
+    return described(model, fitted, blocks)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,28 +175,20 @@ def model_of(ranges: Ranges, recipe: Recipe, *, trimmed: bool = True) -> RangeMo
     return model
 
 
-def _free_tags(model: RangeModel, recipe: Recipe) -> tuple[Floats, list[list[int]]]:
-    """Return the directions of delays (tags, k) that the pairs leave free, and their tags; raises `UnanswerableError`
-    without `minimum_norm`."""
-    ranges, free = model.ranges, [k for k, tag in enumerate(model.tags) if tag not in recipe.fixed_ns]
-    directions = np.zeros((len(model.tags), 0))
-    if recipe.constants == "pair" or not free:
-        return directions, []
-    square, pairs = square_of(
-        model.tags, ranges.initiator, ranges.target, ranges.weight_initiator, ranges.weight_target
-    )
-    own, groups = free_directions(square[np.ix_(free, free)], [model.tags[k] for k in free], pairs)
-    directions = np.zeros((len(model.tags), own.shape[1]))
-    directions[free] = own
-    if groups and not recipe.minimum_norm:
-        named = "; ".join(", ".join(map(str, group)) for group in groups)
+def refuse_free(model: RangeModel, *, by_pair: bool = False) -> None:
+    """Raise `UnanswerableError` if the pairs leave delays free, whatever the distances.
+
+    The message names the constants of pairs as another answer where they can be had (`by_pair`).
+    """
+    if model.free:
+        named = "; ".join(", ".join(map(str, group)) for group in model.free)
         raise UnanswerableError(
             f"the pairs do not determine the antenna delays of tags {named}: some can grow as others shrink without "
             "changing any range; record three tags that all range with each other, or pin a known delay with "
-            "`fixed_ns` (`minimum_norm` fits regardless, and says so; `constants` pair gives each pair its own)",
-            undetermined=groups,
+            "`fixed_ns` (`minimum_norm` fits regardless, and says so"
+            f"{'; `constants` pair gives each pair its own' if by_pair else ''})",
+            undetermined=model.free,
         )
-    return directions, groups
 
 
 def robust_fit(
@@ -215,7 +209,7 @@ def robust_fit(
     weights = LOSSES[loss].weights
     layout, whole = model.build(error, Robust(weights=weights, scale_m=1.0), only=kinds)
     every = whole if weight is None else whole.sample(np.flatnonzero(weight))
-    gauge = tuple(model.gauge_rows(layout))
+    gauge = (*model.gauge_rows(layout), *model.held_rows(layout))
     rows, x = every, _from(layout, start)
     if sample is not None and sample < len(error):
         # A fixed random choice: a regular one could coincide with the schedule of pairs.
@@ -270,7 +264,10 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted) -> Fitted:
     ranges."""
     errors, unknowns, parts = model.error_model(pilot.residuals)
     layout, rows = model.build(error, errors, unknowns, parts)
-    gauge, asked = tuple(model.gauge_rows(layout)), layout.indices([u.kind for u in model.unknowns])
+    gauge, asked = (
+        (*model.gauge_rows(layout), *model.held_rows(layout)),
+        layout.indices([u.kind for u in model.unknowns]),
+    )
     x, priors = _from(layout, pilot), Priors(layout)
     order = np.random.default_rng(0).permutation(len(error))
     size, steps = FIRST_SAMPLE, pilot.steps
@@ -299,7 +296,7 @@ def _from(layout: Layout, start: Fitted | None) -> Floats:
     return x
 
 
-def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks, free: list[list[int]]) -> KnownDistances:
+def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDistances:
     """Return a fit with the covariances of what was fitted."""
     layout = fitted.optimum.layout
     noise = [kind for kind in layout.where if kind.startswith(("noise level", "noise curve"))]
@@ -325,7 +322,6 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks, free: list[
         lasting=lasting,
         blocks=blocks,
         residuals=fitted.residuals,
-        free=free,
     )
 
 
@@ -348,20 +344,18 @@ def _of_another_shape(optimum: Optimum, delays: Ints) -> Floats:
     return np.asarray((moved * (SHAPE * share * noise) ** 2) @ moved.T)
 
 
-def _in_sequence(
-    model: RangeModel, error: Floats, recipe: Recipe, blocks: TimeBlocks, groups: list[list[int]]
-) -> KnownDistances:
+def _in_sequence(model: RangeModel, error: Floats, recipe: Recipe, blocks: TimeBlocks) -> KnownDistances:
     """Fit delays first, then the curves to the residuals, as in ICRA 2023, sections III and IV, with splines.
 
     The curves keep their constants and the delays are those of the first step, unless a reference power is given.
     """
     free = replace(model, gauged=(False,) * len(model.gauged))
-    first = described(free, robust_fit(free, error, recipe.loss, recipe.scale_m, ("delay",)), blocks, groups)
+    first = described(free, robust_fit(free, error, recipe.loss, recipe.scale_m, ("delay",)), blocks)
     kinds = free.curve_kinds()
     # Few ranges have the outer powers, and they would bend the curve: it is fitted to the others.
     inside = (free.lifted >= free.span[0]) & (free.lifted <= free.span[1])
     second = robust_fit(free, first.residuals, recipe.loss, first.searches[0].scale_m, kinds, weight=inside)
-    curves = described(free, second, blocks, groups)
+    curves = described(free, second, blocks)
     values = first.values | {kind: curves.values[kind] for kind in kinds}
     if recipe.reference is not None:
         values = _stated(model, values, recipe)
@@ -373,7 +367,6 @@ def _in_sequence(
         lasting=first.lasting,
         blocks=blocks,
         residuals=second.residuals,
-        free=groups,
     )
 
 

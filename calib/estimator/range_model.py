@@ -7,7 +7,7 @@ and differ only in the source of distances.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -15,6 +15,7 @@ from scipy.interpolate import BSpline
 from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, knots_for, lifted_power, populated
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
+from calib.estimator.identifiability import free_directions, square_of
 from calib.estimator.pairs import Pairs, pairs_of
 from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
 from calib.estimator.rows import NormalRows
@@ -92,7 +93,7 @@ class RangeModel:
 
     `unknowns` are delays, curves and offsets; `error_model` adds those of errors. `gauged` tells for each group whether
     its curve is zero at `reference`; the others keep a constant that pinned delays determine. Delays have no part
-    along the directions `held` (tags, k), which no range determines.
+    along the directions `held` (tags, k), which no range determines and which shift the tags of the groups `free`.
     """
 
     ranges: Ranges
@@ -110,7 +111,8 @@ class RangeModel:
     reference: float | None
     constants: str
     looked_for_curve: bool
-    held: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    held: Floats
+    free: list[list[int]]
 
     @classmethod
     def of(  # noqa: PLR0913 - keyword-only settings of one fit
@@ -148,6 +150,7 @@ class RangeModel:
         tags = ranges.tags()
         _check_tags(ranges, tags, fixed_ns, groups)
         pairs = pairs_of(ranges.initiator, ranges.target, tags)
+        held, free = _free_directions(ranges, tags, fixed_ns, constants)
         unknowns, parts = _constants(ranges, pairs, tags, fixed_ns, constants)
         bias = noise = None
         gauged: list[bool] = []
@@ -186,6 +189,8 @@ class RangeModel:
             reference=reference,
             constants=constants,
             looked_for_curve=looked_for,
+            held=held,
+            free=free,
         )
 
     def curve_kinds(self) -> list[str]:
@@ -203,18 +208,11 @@ class RangeModel:
         return key
 
     def gauge_rows(self, layout: Layout) -> list[NormalRows]:
-        """Return rows that set free directions of delays to zero, and curves at the reference power, where delays can
-        take the constant."""
-        rows = [
-            NormalRows(
-                value=np.zeros(1), std=np.full(1, HELD_NS), entries=one[None], columns=layout.indices(["delay"])[None]
-            )
-            for one in self.held.T
-        ]
+        """Return rows that set curves to zero at the reference power, where delays can take the constant."""
         if self.curve is None or self.reference is None:
-            return rows
+            return []
         at = Spline.at(np.array([self.reference]), self.curve.knots)
-        return rows + [
+        return [
             NormalRows(
                 value=np.zeros(1),
                 std=np.full(1, HELD_M),
@@ -223,6 +221,14 @@ class RangeModel:
             )
             for kind, gauged in zip(self.curve_kinds(), self.gauged, strict=True)
             if gauged
+        ]
+
+    def held_rows(self, layout: Layout) -> list[NormalRows]:
+        """Return rows that set free directions of delays to zero: skews of clocks would pin them to 100 ns."""
+        delays = layout.indices(["delay"])[None]
+        return [
+            NormalRows(value=np.zeros(1), std=np.full(1, HELD_NS), entries=one[None], columns=delays)
+            for one in self.held.T
         ]
 
     def error_model(self, residual: Floats) -> tuple[Mixture, tuple[Unknown, ...], tuple[Part, ...]]:
@@ -283,6 +289,20 @@ def _scalar(kind: str, start: float, prior: Prior) -> Unknown:
 
 def _of_pairs(kind: str, names: tuple[str, ...], spread: tuple[float, float, float]) -> Unknown:
     return Unknown(kind=kind, names=names, start=np.zeros(len(names)), priors=(Prior.of_spread(*spread),))
+
+
+def _free_directions(
+    ranges: Ranges, tags: list[int], fixed_ns: Mapping[int, float], constants: str
+) -> tuple[Floats, list[list[int]]]:
+    """Return the directions of delays (tags, k) that the pairs leave free, and their tags."""
+    own = [k for k, tag in enumerate(tags) if tag not in fixed_ns]
+    held, free = np.zeros((len(tags), 0)), list[list[int]]()
+    if own and constants == "tag":
+        square, ends = square_of(tags, ranges.initiator, ranges.target, ranges.weight_initiator, ranges.weight_target)
+        directions, free = free_directions(square[np.ix_(own, own)], [tags[k] for k in own], ends)
+        held = np.zeros((len(tags), directions.shape[1]))
+        held[own] = directions
+    return held, free
 
 
 def _constants(

@@ -18,7 +18,7 @@ from calib.checks.fitted import examine_fit
 from calib.checks.limits import refuse_refuted
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described
+from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described, refuse_free
 from calib.estimator.losses import MIXTURE
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import Mixture
@@ -90,6 +90,8 @@ def fit_from_ranges(
     import_module("scipy.linalg")
     with threadpool_limits(limits=1, user_api="blas"):
         model, scene = range_model(scene, settings, curve=not settings.delays_only and known is None)
+        if not settings.minimum_norm:
+            refuse_free(model)
         scene, state, rival = begin(scene, lambda share: report(SHARE_OF_START * share))
         error = model.ranges.raw_m if known is None else model.ranges.raw_m - known.bias_curve(model.lifted)
         top = search(scene, model, error, state, lambda share: report(SHARE_OF_START + (1 - SHARE_OF_START) * share))
@@ -182,8 +184,8 @@ def _described(model: RangeModel, top: Found, known: Calibration | None) -> Know
         steps=top.steps,
         beside=tuple(top.known.values()),
     )
-    # Identifiability is judged later, with the uncertainty of trajectories.
-    found = described(model, fitted, time_blocks(model.ranges.time_ns, model.ranges.session), [])
+    # What the pairs leave free is known; the rest is judged later, with the uncertainty of trajectories.
+    found = described(model, fitted, time_blocks(model.ranges.time_ns, model.ranges.session))
     if known is not None:
         more = curve_uncertainty(found, known)
         found = replace(found, covariances=found.covariances | {"delay": found.covariances["delay"] + more})
@@ -274,6 +276,8 @@ def _provenance(
     more: dict[str, Any] = {}
     if judgement.free_tags:
         more = {"undetermined": [judgement.free_tags], "left_open": judgement.undetermined_sentences(covariance)[0]}
+    elif found.free:
+        more = {"undetermined": found.free}
     pinned = set(found.model.tags) <= set(settings.fixed_ns)
     return more | {
         "recordings": [scene.source],

@@ -173,7 +173,7 @@ class _Search:
         parts = [*model.parts, *more[1]]
         self.rows = RangeRows.of(self.error_m, model.key(), parts, errors, self.layout, self.geometry)
         self.known = known_rows(self.motion, self.layout)
-        self.gauge = tuple(model.gauge_rows(self.layout))
+        self.gauge = (*model.gauge_rows(self.layout), *model.held_rows(self.layout))
         self.x = self.layout.start()
         for kind, where in self.layout.where.items():
             if kind in self.values:
