@@ -1,11 +1,14 @@
-"""A recorded flight (MILUV: three robots, six anchors, 317 exchanges), with little or none of its motion capture."""
+"""A recorded flight (MILUV: three robots, six anchors, 317 exchanges), with little or none of its motion capture; and
+a simulated one whose tags range with anchors only."""
 
 import tarfile
+from typing import Any
 
 import numpy as np
 import pytest
 
 import calib
+import uwbsim
 from tests.shared_data import shared
 from uwblink.importers import read_source
 
@@ -45,3 +48,17 @@ def test_anchors_alone_leave_the_delays_open_and_intervals_say_how_far(flown):
     assert "the ranges determine no delay" in found.warnings[0]
     assert np.isinf(list(found.calibration.delays_std_ns.values())).all()
     assert np.abs(joint_scores(found.calibration, flown)).max() < 2.5
+
+
+def test_tags_that_range_with_anchors_only_leave_delays_open_whatever_the_skews_of_clocks():
+    flown = uwbsim.simulate(uwbsim.load("anchors_and_tag/bipartite", {"run.duration_s": 20.0}))
+    given: dict[str, Any] = {"poses_until_s": 8.0, "delays_only": True}
+    with pytest.raises(calib.UnanswerableError, match="`minimum_norm`") as raised:
+        calib.fit_from_ranges(flown, **given)
+    everyone = [[0, 1, 2, 3, 4, 5, 10, 11]]
+    assert raised.value.undetermined == everyone
+    found = calib.fit_from_ranges(flown, minimum_norm=True, **given).calibration
+    assert found.provenance["undetermined"] == everyone
+    assert np.isinf(list(found.delays_std_ns.values())).all()
+    of_tags = found.delays_ns[10] + found.delays_ns[11]
+    assert of_tags == pytest.approx(sum(found.delays_ns.values()) - of_tags, abs=0.01)
