@@ -19,7 +19,7 @@ import uwbsim
 from docs.site.commands import leaves
 from tests.boards import served
 from tests.processes import run
-from uwblink.cli.guide import WRITTEN
+from uwblink.cli.shared import WRITTEN
 from uwblink.exporters import export_recording
 
 ROOT = Path(__file__).parents[1]

@@ -24,7 +24,7 @@ from calib.cli.shared import (
 )
 from calib.errors import BadInputError, UnanswerableError
 from calib.settings import FitSettings, FlightSettings, SurveySettings, check_choice
-from uwblink.cli.guide import (
+from uwblink.cli.shared import (
     AsJson,
     CalibrationFile,
     Force,
@@ -36,8 +36,8 @@ from uwblink.cli.guide import (
     count,
     output,
     tags_of,
+    waiting,
 )
-from uwblink.cli.shared import waiting
 
 if TYPE_CHECKING:
     import calib

@@ -8,8 +8,7 @@ from typing import Annotated, Final
 import typer
 
 from calib.cli.shared import known_calibration, warn
-from uwblink.cli.guide import CalibrationFile, Force, Group, add, choice, epilog, output
-from uwblink.cli.shared import waiting
+from uwblink.cli.shared import CalibrationFile, Force, Group, add, choice, epilog, output, waiting
 
 MILUV: Final = "calib import miluv uwb_calib.json -o calibration.json"
 

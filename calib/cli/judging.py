@@ -12,8 +12,7 @@ import typer
 
 from calib.cli.shared import STOPPED, Recordings, TrimStatic, command_line, known_calibration, warn, with_flags
 from calib.settings import FitSettings
-from uwblink.cli.guide import AsJson, CalibrationFile, Figures, Force, ReportFile, Seeds, add, choice, output
-from uwblink.cli.shared import waiting
+from uwblink.cli.shared import AsJson, CalibrationFile, Figures, Force, ReportFile, Seeds, add, choice, output, waiting
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -11,8 +11,7 @@ import typer
 
 from calib.errors import BadInputError
 from calib.planning import FlightPlanSettings, SurveyPlanSettings, read_whole
-from uwblink.cli.guide import AsJson, Figures, Force, Group, add, epilog, output
-from uwblink.cli.shared import waiting
+from uwblink.cli.shared import AsJson, Figures, Force, Group, add, epilog, output, waiting
 
 if TYPE_CHECKING:
     import calib

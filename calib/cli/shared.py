@@ -13,7 +13,7 @@ import typer
 
 from calib.settings import FitSettings, FlightSettings, SurveySettings
 from uwblink.cli import shared
-from uwblink.cli.guide import output
+from uwblink.cli.shared import output
 from uwblink.settings import flags_of
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import uwblink
-from uwblink.cli import boards, recording
-from uwblink.cli.guide import (
+from uwblink.cli import boards
+from uwblink.cli.shared import (
     AsJson,
     Command,
     Force,
@@ -22,10 +22,13 @@ from uwblink.cli.guide import (
     apart,
     choice,
     epilog,
+    new_app,
     output,
     plain,
+    print_json,
+    print_result,
+    waiting,
 )
-from uwblink.cli.shared import new_app, print_json, print_result, waiting
 from uwblink.display import printable
 from uwblink.errors import ImportTableError
 from uwblink.output import check_output, write_text
@@ -279,7 +282,6 @@ def replay(
 
 app = new_app("Command ranging boards, record and stream their ranges, and import, export and show recordings.")
 boards.add_to(app)
-recording.add_to(app)
 add(app, show, "uwblink show flight.uwb", panel="Recordings")
 app.add_typer(imports, name="import", rich_help_panel="Recordings")
 for _command, *_examples in (

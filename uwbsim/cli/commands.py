@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 import uwbsim
-from uwblink.cli import guide
-from uwblink.cli.guide import (
+from uwblink.cli import shared
+from uwblink.cli.shared import (
+    INTERRUPTED,
     AntennaDelays,
     AsJson,
     CalibrationFile,
@@ -24,10 +25,13 @@ from uwblink.cli.guide import (
     Seeds,
     add,
     choice,
+    interrupts,
+    new_app,
+    print_json,
     several,
     starting,
+    waiting,
 )
-from uwblink.cli.shared import INTERRUPTED, interrupts, new_app, print_json, waiting
 from uwblink.output import check_folder, check_output
 
 if TYPE_CHECKING:
@@ -82,7 +86,7 @@ Protocols = Annotated[
 
 def run(
     scenario: ScenarioFile,
-    output: Annotated[Path, guide.output("Recording to write (.uwb).")],
+    output: Annotated[Path, shared.output("Recording to write (.uwb).")],
     seed: Seed = None,
     overrides: Overrides = None,
     allow_files: AllowFiles = None,
@@ -126,7 +130,7 @@ def scenarios(
         list[str] | None,
         typer.Argument(metavar="[NAME]...", help="Scenarios, or folders of them; else all.", autocompletion=shipped),
     ] = None,
-    output: Annotated[Path | None, guide.output("Folder to copy them into.")] = None,
+    output: Annotated[Path | None, shared.output("Folder to copy them into.")] = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -189,7 +193,7 @@ def serve(
 
 def show(
     scenario: ScenarioFile,
-    output: Annotated[Path, guide.output("Page (.html) or picture (.png, .svg, .pdf).")],
+    output: Annotated[Path, shared.output("Page (.html) or picture (.png, .svg, .pdf).")],
     overrides: Overrides = None,
     allow_files: AllowFiles = None,
     force: Force = False,
@@ -222,7 +226,7 @@ def schema() -> None:
 
 def compare(
     scenario: ScenarioFile,
-    output: Annotated[Path, guide.output("Folder for compare.html, .csv and .parquet.")],
+    output: Annotated[Path, shared.output("Folder for compare.html, .csv and .parquet.")],
     protocols: Protocols = "all",
     count: Annotated[int, typer.Option("-n", "--ranges", help="Ranges with each protocol.")] = 1_000_000,
     overrides: Overrides = None,
@@ -360,7 +364,7 @@ def optimum(
     scenario: ScenarioFile,
     protocols: Protocols = "all",
     overhead_us: Annotated[float, typer.Option(min=0.0, help="Additional time of an exchange, microseconds.")] = 0.0,
-    output: Annotated[Path | None, guide.output("Folder for pictures of the curves (.png).")] = None,
+    output: Annotated[Path | None, shared.output("Folder for pictures of the curves (.png).")] = None,
     overrides: Overrides = None,
     allow_files: AllowFiles = None,
     as_json: AsJson = False,
@@ -390,7 +394,7 @@ def optimum(
 
 def sweep(
     plan: Annotated[Path, typer.Argument(help="Sweep file: what varies (.toml).")],
-    output: Annotated[Path, guide.output("Folder for the results.")],
+    output: Annotated[Path, shared.output("Folder for the results.")],
     workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; by default one per core.")] = None,
     scheduler: Annotated[str | None, typer.Option(help="Address of a running Dask scheduler.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue a sweep that was interrupted.")] = False,
@@ -424,7 +428,7 @@ def sweep(
 def twin(
     recording: Annotated[Path, typer.Argument(help="Recording with poses and first-path powers (.uwb).")],
     calibration: CalibrationFile,
-    output: Annotated[Path, guide.output("Scenario to write (.toml).")],
+    output: Annotated[Path, shared.output("Scenario to write (.toml).")],
     seeds: Seeds = None,
     as_json: AsJson = False,
     force: Force = False,
