@@ -102,13 +102,18 @@ class Board(Closing):
         sent), `NoAnswerError`, `RangingFailedError` with the board's own line, or `PortLostError`. Other reports are
         kept for `reports`.
         """
-        self._settle()
+        self._pass(0.0)
+        while (wait_s := self._connection.ready_s(self._transport.now_s())) > 0:
+            self._pass(wait_s)  # an incoming impulse response delays commands
         if self._connection.doubtful:
             self._exchange(FENCE)
         try:
             return self._exchange(command)
         except NoAnswerError as error:
-            self._revive(error)
+            try:
+                self._exchange(FENCE)  # with a long time-out: firmware that waits for a frame answers late
+            except NoAnswerError as still:
+                raise NoAnswerError(f"{error}; then {str(still).removeprefix(f'{self.name}: ')}") from still
             if isinstance(command, Broadcast | Bootloader):
                 raise  # it may have been executed, and must not be executed twice
         return self._exchange(command)
@@ -170,13 +175,6 @@ class Board(Closing):
             if not self._reports:
                 return
 
-    def _revive(self, error: NoAnswerError) -> None:
-        """Send a fence with a long time-out: firmware that waits for a frame answers late."""
-        try:
-            self._exchange(FENCE)
-        except NoAnswerError as still:
-            raise NoAnswerError(f"{error}; then {str(still).removeprefix(f'{self.name}: ')}") from still
-
     def _ask(self, command: Message, kind: type[Reply]) -> Reply:
         reply = self.request(command)
         if not isinstance(reply, kind):
@@ -200,12 +198,6 @@ class Board(Closing):
 
     def _keep(self, events: list[Event], reply: Message | None) -> None:
         self._reports.extend(e for e in events if e is not reply and not isinstance(e, Skipped))
-
-    def _settle(self) -> None:
-        """Wait until a command may be sent, which an incoming impulse response delays."""
-        self._pass(0.0)
-        while (wait_s := self._connection.ready_s(self._transport.now_s())) > 0:
-            self._pass(wait_s)
 
     def _pass(self, seconds: float, *, until_report: bool = False) -> None:
         """Wait, and keep reports that arrive; with 0 seconds, read what has arrived."""

@@ -24,7 +24,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from uwblink.errors import ImportTableError, first_line
 from uwblink.exporters.mcap import RANGE
 from uwblink.importers.column_map import ColumnMap, load_map
-from uwblink.importers.exchange_tables import TableImport, plan
+from uwblink.importers.exchange_tables import TableImport
 from uwblink.importers.staging import Watch, staged, unwatched
 from uwblink.text_files import require_regular
 
@@ -175,7 +175,7 @@ def open_exchange_bag(
         table = Path(place) / f"{source.name}.jsonl"
         column_map = _to_json_lines(source, load_map(map_file) if map_file else ColumnMap(), table)
         with staged([table], column_map, watch) as staging:
-            yield plan(staging, "import bag", source.name, watch)
+            yield TableImport(staging, "import bag", source.name, watch)
 
 
 def _to_json_lines(source: Path, column_map: ColumnMap, table: Path) -> ColumnMap:

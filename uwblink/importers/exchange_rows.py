@@ -207,9 +207,7 @@ def assemble_exchanges(
     """
     rows, within_s = staging.rows, staging.column_map.within_s
     needed = {"messages": ("tx", "rx"), "stamps": ("stamp", "event", "message"), "parts": ()}
-    for name in needed[layout]:
-        if not rows.has(name):
-            raise staging.missing(name)
+    staging.require(rows, needed[layout])
     watch("sorting", 0.0)
     good = faults.reject(rows, ENDS)
     if layout == "stamps":

@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,7 +26,6 @@ from uwblink.importers.column_map import IDS, POSITIONS, ColumnMap, load_map
 from uwblink.importers.exchange_rows import (
     ENDS,
     Faults,
-    UsableRows,
     assemble_exchanges,
     usable_exchanges,
     usable_ranges,
@@ -77,53 +76,7 @@ def open_tables(
     if column_map.topics or column_map.each:
         raise ImportTableError(f"{map_file}: topics and each are of bags; {paths[0]} is a table")
     with staged(paths, column_map, watch) as staging:
-        yield plan(staging, "import csv", ", ".join(path.name for path in paths), watch)
-
-
-def plan(staging: Staging, source: str, imported_from: str, watch: Watch = unwatched) -> TableImport:
-    """Check staged tables and return the import; raises `ImportTableError` if half of the rows or more are unusable.
-
-    `source` and `imported_from` go into the recording's `meta`.
-    """
-    column_map, rows, faults = staging.column_map, staging.rows, Faults(staging)
-    for name in IDS:
-        if not rows.has(name):
-            raise staging.missing(name)
-    notes = _notes(staging)
-    layout, protocol = column_map.layout or _layout(staging), column_map.protocol
-    if layout in ("messages", "stamps", "parts"):
-        rows, good, found = assemble_exchanges(staging, layout, faults, watch)
-        protocol = protocol or found
-    else:
-        good = faults.reject(rows, ENDS)
-    total = rows.count(good) + len(faults)
-    watch("checking", 0.0)
-    reading = None
-    if layout == "ranges":
-        if not rows.has("range_m"):
-            raise staging.missing("range_m")
-        usable = usable_ranges(rows, faults, good)
-        faults.check(total)
-        check_units(column_map, staging.paths[0], usable.sample(SAMPLE_ROWS), None)
-        notes += filter(None, [note_on_repeats(next(usable.blocks()))])
-    else:
-        protocol = protocol or ("ds" if rows.has("tx3") and rows.has("rx3") else "ss")
-        for name in stamps_of(protocol):
-            if not rows.has(name):
-                raise staging.missing(name)
-        usable, repeats, bits, counter = usable_exchanges(staging, rows, faults, good, stamps_of(protocol))
-        faults.check(total)
-        if repeats:
-            notes.append(
-                f"{repeats} of {total} rows repeat an exchange, with the same devices and stamps, and are left out"
-            )
-        if counter != "wrapped":
-            notes.append(f"stamps are {counter}, and are taken modulo 2^{bits}")
-        sample = usable.sample(SAMPLE_ROWS)
-        reading = _reading(column_map, staging.paths[0], sample, Reading(protocol, bits), notes)
-        raw = raw_range(exchanges_of(column_map, sample, reading))
-        check_units(column_map, staging.paths[0], sample, raw)
-    return TableImport(staging, usable, faults, reading, notes, total, source, imported_from, watch)
+        yield TableImport(staging, "import csv", ", ".join(path.name for path in paths), watch)
 
 
 def _notes(staging: Staging) -> list[str]:
@@ -219,19 +172,52 @@ def exchanges_of(column_map: ColumnMap, rows: Columns, reading: Reading | None, 
     )
 
 
-@dataclass(frozen=True, slots=True)
 class TableImport:
-    """Usable rows of tables, and how to read their stamps (None: ranges without stamps)."""
+    """Usable rows of staged tables, and how to read their stamps.
 
-    staging: Staging
-    usable: UsableRows
-    faults: Faults
-    reading: Reading | None
-    notes: list[str]
-    total: int
-    source: str
-    imported_from: str
-    watch: Watch
+    `reading` is None for ranges without stamps; `notes` are for the user; `total` counts usable and faulty rows.
+    """
+
+    def __init__(self, staging: Staging, source: str, imported_from: str, watch: Watch) -> None:
+        """Check staged tables; raises `ImportTableError` if half of the rows or more are unusable.
+
+        `source` and `imported_from` go into the recording's `meta`.
+        """
+        column_map, rows, faults = staging.column_map, staging.rows, Faults(staging)
+        self.staging, self.faults, self.watch = staging, faults, watch
+        self._source = {"source": source, "imported_from": imported_from}
+        staging.require(rows, IDS)
+        self.notes = _notes(staging)
+        layout, protocol = column_map.layout or _layout(staging), column_map.protocol
+        if layout in ("messages", "stamps", "parts"):
+            rows, good, found = assemble_exchanges(staging, layout, faults, watch)
+            protocol = protocol or found
+        else:
+            good = faults.reject(rows, ENDS)
+        self.total = rows.count(good) + len(faults)
+        watch("checking", 0.0)
+        self.reading: Reading | None = None
+        if layout == "ranges":
+            staging.require(rows, ["range_m"])
+            self.usable = usable_ranges(rows, faults, good)
+            faults.check(self.total)
+            check_units(column_map, staging.paths[0], self.usable.sample(SAMPLE_ROWS), None)
+            self.notes += filter(None, [note_on_repeats(next(self.usable.blocks()))])
+            return
+        protocol = protocol or ("ds" if rows.has("tx3") and rows.has("rx3") else "ss")
+        staging.require(rows, stamps_of(protocol))
+        self.usable, repeats, bits, counter = usable_exchanges(staging, rows, faults, good, stamps_of(protocol))
+        faults.check(self.total)
+        if repeats:
+            self.notes.append(
+                f"{repeats} of {self.total} rows repeat an exchange, with the same devices and stamps, and are left out"
+            )
+        if counter != "wrapped":
+            self.notes.append(f"stamps are {counter}, and are taken modulo 2^{bits}")
+        sample = self.usable.sample(SAMPLE_ROWS)
+        self.reading = _reading(column_map, staging.paths[0], sample, Reading(protocol, bits), self.notes)
+        raw = raw_range(exchanges_of(column_map, sample, self.reading))
+        check_units(column_map, staging.paths[0], sample, raw)
 
     def write(self, path: str | os.PathLike[str], *, force: bool = False) -> tuple[dict[str, int], list[str]]:
         """Write a recording; returns the number of rows of each table that has any, and the notes.
@@ -285,8 +271,7 @@ class TableImport:
         if self.reading and self.reading.undelayed:
             delays = {None: AntennaDelay(0, 0, 0)}
         meta: dict[str, Any] = {
-            "source": self.source,
-            "imported_from": self.imported_from,
+            **self._source,
             "timestamp_bits": self.reading.bits if self.reading else 32,
             "notes": notes,
         }

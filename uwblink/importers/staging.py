@@ -6,7 +6,7 @@ grow with the tables. Whether ids or times are words depends on all rows: such c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,6 +113,12 @@ class Staging:
         if not counts[-1]:
             raise ImportTableError(f"{paths[0]}: a header and no rows")
         self.rows = self._make_rows()
+
+    def require(self, rows: StagedRows, names: Iterable[str]) -> None:
+        """Raise the error for the first column that rows lack."""
+        for name in names:
+            if not rows.has(name):
+                raise self.missing(name)
 
     def missing(self, name: str) -> ImportTableError:
         """Return the error for a missing column."""

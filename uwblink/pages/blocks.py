@@ -60,15 +60,6 @@ def page_html(title: str, parts: Iterable[str]) -> str:
     )
 
 
-def figure_html(drawings: Mapping[str, bytes], caption: str) -> str:
-    """Return a figure: drawings (SVG) by width, "page" and "column", of which a page shows the one that fits."""
-    wide, narrow = (inline(drawings[name], caption) for name in ("page", "column"))
-    return (
-        f"<figure><div class='wide'>{wide}</div><div class='narrow'>{narrow}</div>"
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-    )
-
-
 def inline(svg: bytes, caption: str) -> str:
     """Return a drawing as part of a page: no prologue, no fixed size, the colours and fonts of the page.
 
@@ -261,8 +252,12 @@ def to_html(document: Document, drawings: Drawings | None = None) -> str:
                 opening = "<pre class='table'>" if table else "<pre>"
                 parts.append(f"{opening}{escape(text)}</pre>")
             case Picture(name):
-                svg = {width: files["svg"] for width, files in drawings[name].items()}
-                parts.append(figure_html(svg, captions[name]))
+                # A page shows the drawing that fits.
+                wide, narrow = (inline(drawings[name][width]["svg"], captions[name]) for width in ("page", "column"))
+                parts.append(
+                    f"<figure><div class='wide'>{wide}</div><div class='narrow'>{narrow}</div>"
+                    f"<figcaption>{escape(captions[name])}</figcaption></figure>"
+                )
             case Table(header, rows, above, total, words):
                 parts.append(table_html(header, rows, above, total=total, words=words))
     return page_html(document.title, parts)

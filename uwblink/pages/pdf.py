@@ -249,20 +249,17 @@ def _lines(text: str, width: float, font: FontProperties) -> list[str]:
     return found
 
 
-def _widths(table: Table) -> list[float]:
-    """Return the widths of columns: those of their widest cells."""
-    bold, rows = [table.header, *table.rows[-1:]] if table.total else [table.header], table.rows
-    cells = [(row, _font(bold=strong)) for some, strong in ((bold, True), (rows, False)) for row in some]
-    return [max(_width(row[k], font) for row, font in cells) + 7 for k in range(len(table.header))]
-
-
 def _parts(table: Table) -> list[tuple[list[int], list[float]]]:
     """Return the columns of each part of a table, and their widths; parts have the first column in common.
 
     Where a table of words is wider than the page, its columns above 57 points (20 mm) give way and their lines break.
     Other tables are cut between columns: text stays as large as it is.
     """
-    widths, room = _widths(table), PAPER[0] - 2 * MARGIN
+    # Columns are as wide as their widest cells.
+    bold = [table.header, *(table.rows[-1:] if table.total else [])]
+    cells = [(row, _font(bold=strong)) for rows, strong in ((bold, True), (table.rows, False)) for row in rows]
+    widths = [max(_width(row[k], font) for row, font in cells) + 7 for k in range(len(table.header))]
+    room = PAPER[0] - 2 * MARGIN
     if sum(widths) <= room:
         return [(list(range(len(widths))), widths)]
     if table.words or len(widths) < 3:
