@@ -284,7 +284,7 @@ class Recorder:
         if self._active and self._active[0] is station and isinstance(outcome.command, RangeCommand):
             if self._plan.get_cir:
                 self._keep_quiet(self._active[1], now_s)
-            self._end_turn(outcome.reply if isinstance(outcome.reply, RangeReport) else None)
+            self._end_turn(self._active[1], outcome.reply if isinstance(outcome.reply, RangeReport) else None)
 
     def _keep_quiet(self, pair: Pair, now_s: float) -> None:
         """Send nothing while the two boards of an exchange, and passive ones, print their impulse responses."""
@@ -295,11 +295,8 @@ class Recorder:
             if board in pair or self._passive:
                 station.connection.keep_quiet(until_s)
 
-    def _end_turn(self, report: RangeReport | None) -> None:
-        if self._active is None:
-            return
-        turn = Turn(self._ports.host_ns(), self._active[1], report)
-        self._active = None
+    def _end_turn(self, pair: Pair, report: RangeReport | None) -> None:
+        turn, self._active = Turn(self._ports.host_ns(), pair, report), None
         for listener in self._listeners:
             listener.on_turn(turn)
 
@@ -307,7 +304,7 @@ class Recorder:
         self._fault(station, "unplugged", str(error))
         self._unplug(station)
         if self._active and self._active[0] is station:
-            self._end_turn(None)
+            self._end_turn(self._active[1], None)
 
     def _unplug(self, station: Station) -> None:
         self._by_port.pop(id(station.port), None)

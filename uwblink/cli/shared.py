@@ -140,13 +140,11 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
         return command
     parameters = []
     for name, one in signature(command).parameters.items():
-        if name not in settings:
+        if name in settings:
+            types = get_type_hints(settings[name])
+            parameters += [_parameter(field, types[field.name]) for field in fields(settings[name]) if field.metadata]
+        else:
             parameters.append(one.replace(kind=Parameter.KEYWORD_ONLY, annotation=hints[name]))
-            continue
-        types = get_type_hints(settings[name])
-        for field in fields(settings[name]):
-            if field.metadata:
-                parameters.append(_parameter(field, types[field.name]))
 
     flags = {name: flag for kind in settings.values() for name, flag in flags_of(kind).items()}
 
@@ -154,18 +152,12 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
     def run(**given: Any) -> None:
         try:
             for name, kind in settings.items():
-                values = {}
-                for field in fields(kind):
-                    value = given.pop(field.name) if field.metadata else None
-                    if value not in (None, [], ()):
-                        values[field.name] = _parsed(field, value)
-                given[name] = kind(**values)
+                values = [(field, given.pop(field.name)) for field in fields(kind) if field.metadata]
+                given[name] = kind(**{f.name: _parsed(f, value) for f, value in values if value not in (None, [], ())})
             command(**given)
         except OfParameter as error:
-            text = str(error)
-            for name, flag in flags.items():
-                text = text.replace(f"`{name}`", flag)
-            error.args = (text,)
+            # Other names in backticks are replaced by the caller, which knows their options.
+            error.args = (re.sub(r"`([a-z_]+)`", lambda found: flags.get(found[1], found[0]), str(error)),)
             raise
 
     run.__signature__ = Signature(parameters)  # type: ignore[attr-defined]

@@ -143,10 +143,8 @@ def _plain_names(headers: Iterable[str]) -> dict[str, str]:
     matches = {h: re.fullmatch(forms[0], name) or re.fullmatch(forms[1], name) for h, name in names.items()}
     ends = {match["whose"] for match in matches.values() if match}
     numbers = _AT_DEVICE | _OF_MESSAGE | ({"resp": 1, "response": 1} if ends & {"init", "initiator", "tag"} else {})
-    for header, match in matches.items():
-        if match:
-            names[header] = f"{match['level']}_{numbers[match['whose']]}{match['end']}"
-    return names
+    levels = {h: f"{m['level']}_{numbers[m['whose']]}{m['end']}" for h, m in matches.items() if m}
+    return names | levels
 
 
 def named_columns(headers: Iterable[str]) -> dict[str, str]:

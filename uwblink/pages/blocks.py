@@ -290,10 +290,8 @@ def write_document(
         for path in papers:
             write_bytes(path, data, force=force)
     if figures:
-        files: dict[str, bytes] = {}
-        for name, widths in made.items():
-            for width, drawings in widths.items():
-                files |= {f"{name}-{width}.{kind}": data for kind, data in drawings.items()}
+        drawings = ((f"{name}-{width}", kinds) for name, widths in made.items() for width, kinds in widths.items())
+        files = {f"{name}.{kind}": data for name, kinds in drawings for kind, data in kinds.items()}
         write_files(figures, files, force=force)
     if page:
         progress("writing the page")

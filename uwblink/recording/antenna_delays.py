@@ -81,15 +81,15 @@ def delays_in_meta(meta: Mapping[str, Any]) -> AntennaDelays:
 
     The default of the constant for replies is the transmitter's delay.
     """
-    found: dict[int | None, AntennaDelay] = {}
     rows: dict[int | None, Any] = {None: meta[ALL]} if ALL in meta else {}
     try:
         rows |= {int(tag): row for tag, row in meta.get(BY_TAG, {}).items()}
-        for tag, row in rows.items():
-            found[tag] = AntennaDelay(int(row["tx"]), int(row["rx"]), int(row.get("reply", row["tx"])))
+        return {
+            tag: AntennaDelay(int(row["tx"]), int(row["rx"]), int(row.get("reply", row["tx"])))
+            for tag, row in rows.items()
+        }
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"has no usable antenna delays of its devices ({ALL})") from error
-    return found
 
 
 def meta_of_delays(delays: AntennaDelays) -> dict[str, Any]:
