@@ -1,15 +1,28 @@
-"""Boards on serial ports: driver, plans, recorder, replay, and a picture of an impulse response."""
+"""Boards on serial ports: driver, plans, recorder, replay, and a picture of an impulse response.
 
+Replay is of the stored bytes of a recording: decoded again, or played back on pseudo-terminals.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sized
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from uwblink.boards.listeners import Correction, Progress, delays_warning, load_correction
+from uwblink.boards.listeners import Correction, Heard, Progress, delays_warning, load_correction
 from uwblink.boards.live_page import LivePage
-from uwblink.boards.ports import boards_ports, serial_number
+from uwblink.boards.ports import Terminal, boards_ports, serial_number, wait_until
 from uwblink.boards.ranging_plan import load_plan
-from uwblink.boards.replay import decode_again, play, rewrite, summarize
+from uwblink.boards.record import Batch
+from uwblink.errors import RecordingError
 from uwblink.output import write_bytes
-from uwblink.wire.messages import Cir
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import FrameRow
+from uwblink.twr import Exchanges
+from uwblink.wire.codec import ColumnDecoder
+from uwblink.wire.messages import Cir, TextLine
 
 __all__ = [
     "Correction",
@@ -50,3 +63,102 @@ def plot_cir(cir: Cir, path: Path, *, force: bool = False) -> None:
         return figure
 
     write_bytes(path, picture(draw, path.suffix.removeprefix(".").lower()), force=force)
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """Decoded bytes: exchanges in order of time, overheard exchanges, impulse responses, and counts."""
+
+    exchanges: Exchanges
+    others: Batch
+    texts: int
+    skipped_bytes: int
+    messages: int
+
+
+def decode_again(recording: Recording) -> Decoded:
+    """Decode all bytes from boards; raises `RecordingError` if there are none."""
+    frames = _heard(recording)
+    ids = board_ids(recording)
+    decoders: dict[str, ColumnDecoder] = {}
+    for frame in frames:
+        name = frame.board
+        if name not in decoders:
+            decoders[name] = ColumnDecoder(ids.get(name, len(decoders)))
+        decoders[name].feed(frame.data, frame.time_ns)
+    heard = []
+    for name, decoder in decoders.items():
+        decoder.finish(frames[-1].time_ns)
+        heard += [Heard(time_ns, ids.get(name, 0), event) for time_ns, event in decoder.events]
+    others = Batch()
+    for one in sorted(heard, key=lambda one: one.time_ns):
+        others.add(one)
+    return Decoded(
+        Exchanges.concatenate([d.exchanges() for d in decoders.values()]).in_time_order(),
+        others,
+        sum(isinstance(one.message, TextLine) for one in heard),
+        sum(d.decoder.skipped_bytes for d in decoders.values()),
+        sum(d.decoder.messages for d in decoders.values()),
+    )
+
+
+def board_ids(recording: Recording) -> dict[str, int]:
+    """Return the board at each port at the start of the recording."""
+    ports = recording.meta().get("ports", {})
+    return {str(name): int(board) for board, name in ports.items()} if isinstance(ports, dict) else {}
+
+
+def rewrite(source: Recording, decoded: Decoded, output: Path, *, force: bool = False) -> None:
+    """Write a copy of a recording with decoded exchanges; raises what `Recording.create` raises."""
+    with source.copying(output, without=("exchanges", "overheard", "cirs"), force=force) as written:
+        written.append_exchanges(decoded.exchanges)
+        decoded.others.append_to(written)
+
+
+def play(
+    recording: Recording,
+    ready: Callable[[dict[str, str]], None],
+    *,
+    speed: float = 1.0,
+    link_dir: Path | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> int:
+    """Play the bytes from boards back on one pseudo-terminal each; returns how many frames were played.
+
+    `ready` is called with the new name of each board's port before the first byte. Raises `RecordingError` if the
+    recording has no bytes.
+    """
+    frames = _heard(recording)
+    ids = board_ids(recording)
+    names = sorted({frame.board for frame in frames})
+    terminals = {n: Terminal(link_dir / f"tag{ids.get(n, k)}" if link_dir else None) for k, n in enumerate(names)}
+    try:
+        ready({name: terminal.name for name, terminal in terminals.items()})
+        start_s, first_ns = time.monotonic(), frames[0].time_ns
+        for count, frame in enumerate(frames):
+            if not wait_until(start_s + (frame.time_ns - first_ns) * 1e-9 / speed, stop):
+                return count
+            terminals[frame.board].write(frame.data)
+        return len(frames)
+    finally:
+        for terminal in terminals.values():
+            terminal.unplug()
+
+
+def summarize(recording: Recording, decoded: Decoded) -> dict[str, Any]:
+    """Return the numbers of decoded and of stored rows, for JSON."""
+    totals = {name: getattr(decoded, name) for name in ("messages", "skipped_bytes", "texts")}
+    tables: dict[str, Sized] = {
+        "exchanges": decoded.exchanges,
+        "overheard": decoded.others.overheard,
+        "cirs": decoded.others.cirs,
+    }
+    return totals | {n: {"stored": recording.count(n), "decoded": len(rows)} for n, rows in tables.items()}
+
+
+def _heard(recording: Recording) -> list[FrameRow]:
+    """Return the bytes from boards; raises `RecordingError` when there are none."""
+    frames = [frame for frame in recording.frames() if frame.direction == "in"]
+    if not frames:
+        raise RecordingError(f"{recording.path}: holds no bytes from boards; only recordings of boards can be replayed")
+    return frames

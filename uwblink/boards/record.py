@@ -134,8 +134,9 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
 
 def _check_arrangement(mark: Arrangement) -> None:
     if mark.known not in SHAPES or (mark.known and not mark.name):
-        text = f"found {mark.known!r:.40}, allowed: line, plane, of an `arrangement` that has a name"
-        raise PlanError(text, parameter="known")
+        raise PlanError(
+            f"found {mark.known!r:.40}, allowed: line, plane, of an `arrangement` that has a name", parameter="known"
+        )
     if mark.order and mark.known != "line":
         raise PlanError("is the order of boards that are `known` to be on a line", parameter="order")
 
@@ -144,8 +145,10 @@ def _check_boards(found: Mapping[int, str], plan: RangingPlan, mark: Arrangement
     """Raise `PlanError` if an order or places of tags are for other boards than those at the ports."""
     there, seats = ", ".join(map(str, sorted(found))), {tag.tag for tag in plan.tags}
     if mark.order and sorted(mark.order) != sorted(found):
-        text = f"found {', '.join(map(str, mark.order))}, expected each of the boards at the ports, {there}"
-        raise PlanError(text, parameter="order")
+        raise PlanError(
+            f"found {', '.join(map(str, mark.order))}, expected each of the boards at the ports, {there}",
+            parameter="order",
+        )
     if seats and not seats & found.keys():
         seated = ", ".join(map(str, sorted(seats)))
         raise PlanError(

@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, Final
 
@@ -127,13 +128,8 @@ def _file_names(bodies: Iterable[str]) -> dict[str, str]:
 def _lines(poses: Poses) -> Iterator[str]:
     columns = (poses.time_ns.tolist(), poses.position_m.tolist(), poses.quaternion.tolist())
     for time_ns, place, turn in zip(*columns, strict=True):
-        yield " ".join([_seconds(time_ns), *map(repr, [*place, *turn])]) + "\n"
-
-
-def _seconds(time_ns: int) -> str:
-    """Return nanoseconds as seconds, exactly."""
-    whole, rest = divmod(abs(time_ns), 1_000_000_000)
-    return f"{'-' if time_ns < 0 else ''}{whole}.{rest:09d}"
+        seconds = f"{Decimal(time_ns).scaleb(-9):f}"  # exactly
+        yield " ".join([seconds, *map(repr, [*place, *turn])]) + "\n"
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from tests.boards import bench_scenario, served
+from uwblink.boards import decode_again
 from uwblink.boards.listeners import Listener, Progress
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.record import record
-from uwblink.boards.replay import decode_again
 from uwblink.errors import PlanError, PortMissingError, RecordingError, RecordingExistsError
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, Tag
