@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NoReturn, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -93,8 +93,7 @@ def whole_numbers(name: str, values: ArrayLike, count: int, low: int, high: int,
         bad = ~((found >= low) & (found <= high))
         if found.dtype.kind == "f":
             bad |= found != np.rint(found)
-    if bad.any():
-        _refuse(name, found, bad, f"a whole number from {low} to {high}{hint}")
+    reject(name, found, bad, f"a whole number from {low} to {high}{hint}")
     return found.astype(np.int64)
 
 
@@ -105,9 +104,7 @@ def numbers(name: str, values: ArrayLike | None, count: int) -> Floats:
     found = _rows(name, values, count)
     if found.dtype.kind not in "iuf":
         raise ArgumentError(f"{name}: found {_kind(found)}, expected numbers")
-    endless: Bools = np.isinf(found)
-    if endless.any():
-        _refuse(name, found, endless, "a finite number, or NaN where nothing is known")
+    reject(name, found, np.isinf(found), "a finite number, or NaN where nothing is known")
     return found.astype(np.float64)
 
 
@@ -132,9 +129,7 @@ def vectors(name: str, values: ArrayLike, count: int, size: int) -> Floats:
     if found.shape not in ((size,), (count, size)):
         raise ArgumentError(f"{name}: found an array of shape {found.shape}, expected ({count}, {size}) or ({size},)")
     found = np.array(np.broadcast_to(found, (count, size)))
-    bad = ~np.isfinite(found).all(axis=1)
-    if bad.any():
-        _refuse(name, found, np.asarray(bad), "finite numbers")
+    reject(name, found, np.asarray(~np.isfinite(found).all(axis=1)), "finite numbers")
     return found
 
 
@@ -164,7 +159,8 @@ def few_words(column: NDArray[Any]) -> tuple[NDArray[np.str_], Ints] | None:
 def reject(name: str, values: NDArray[Any], bad: Bools, expected: str) -> None:
     """Raise `ArgumentError` for the first bad row, if there is one."""
     if bad.any():
-        _refuse(name, values, bad, expected)
+        row = int(np.argmax(bad))
+        raise ArgumentError(f"{name}: row {row}: found {str(values[row])[:60]}, expected {expected}")
 
 
 def _rows(name: str, values: ArrayLike, count: int) -> NDArray[Any]:
@@ -177,11 +173,6 @@ def _rows(name: str, values: ArrayLike, count: int) -> NDArray[Any]:
     if length(name, found) != count:
         raise ArgumentError(f"{name}: found {len(found)} rows, expected {count} as in the first column")
     return found
-
-
-def _refuse(name: str, values: NDArray[Any], bad: Bools, expected: str) -> NoReturn:
-    row = int(np.argmax(bad))
-    raise ArgumentError(f"{name}: row {row}: found {str(values[row])[:60]}, expected {expected}")
 
 
 def _kind(values: NDArray[Any]) -> str:

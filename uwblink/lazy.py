@@ -18,7 +18,4 @@ def offer(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any],
         setattr(sys.modules[package], name, value)
         return value
 
-    def listed() -> list[str]:
-        return sorted(homes)
-
-    return get, listed
+    return get, lambda: sorted(homes)

@@ -164,9 +164,7 @@ def check_apart(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = ())
     """
     read = {path.resolve() for path in inputs}
     taken: dict[Path, str] = {}
-    for name, path in outputs.items():
-        if path is None:
-            continue
+    for name, path in ((name, path) for name, path in outputs.items() if path is not None):
         place = path.resolve()
         if place in read:
             raise ArgumentError(f"{path}: is what is read; give another name", parameter=name)

@@ -26,8 +26,10 @@ def setting(
     to which `more` adds some for completion; `tags` is the format ("{}=") in which a shell completes tags of the
     recordings on the command line. `shown` is passed to `typer.Option`: `metavar`, `min`, `max`, `rich_help_panel`.
     """
-    typed = {"flag": flag, "kind": kind, "parse": parse, "names": names, "more": more, "tags": tags, "shown": shown}
-    metadata = {"help": help, **typed}
+    metadata = {
+        "help": help, "flag": flag, "kind": kind, "parse": parse, "names": names, "more": more, "tags": tags,
+        "shown": shown,
+    }  # fmt: skip
     if isinstance(default, dict):
         return field(default_factory=default.copy, metadata=metadata)
     return field(default=default, metadata=metadata)

@@ -65,7 +65,7 @@ class LivePage(Closing, Listener):
         self._faults: deque[Fault] = deque(maxlen=8)
         self._progress = Progress()
         try:
-            self._server = _Server(("127.0.0.1", port), self._handler())
+            self._server = _Server(("127.0.0.1", port), type("Handler", (_Handler,), {"page": self}))
         except OSError as error:
             raise PortError(f"port {port}: the page cannot be served there ({error.strerror})") from error
         threading.Thread(target=self._server.serve_forever, name="uwblink page", daemon=True).start()
@@ -147,28 +147,40 @@ class LivePage(Closing, Listener):
             f"queue: {progress.waiting} pieces, last commit {progress.behind_s:.1f} s ago</p>"
         )
 
-    def _handler(self) -> type[BaseHTTPRequestHandler]:
-        page = self
 
-        class Handler(BaseHTTPRequestHandler):
-            """Answers for one page."""
+class _Handler(BaseHTTPRequestHandler):
+    """Answers for one page."""
 
-            timeout = IDLE_S
+    timeout = IDLE_S
+    page: LivePage
 
-            def do_GET(self) -> None:
-                host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
-                found = {"/": page.html, "/body": page.body}.get(self.path)
-                if host not in ("127.0.0.1", "localhost"):
-                    self.send_error(403)
-                elif found is None:
-                    self.send_error(404)
-                else:
-                    _send(self, found())
+    def do_GET(self) -> None:
+        host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
+        found = {"/": self.page.html, "/body": self.page.body}.get(self.path)
+        if host not in ("127.0.0.1", "localhost"):
+            self.send_error(403)
+        elif found is None:
+            self.send_error(404)
+        else:
+            data = found().encode()
+            script = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()
+            policy = (
+                f"default-src 'none'; style-src 'unsafe-inline'; connect-src 'self'; script-src 'sha256-{script}'; "
+                "frame-ancestors 'none'"
+            )
+            self.send_response(200)
+            for name, value in (
+                ("Content-Type", "text/html; charset=utf-8"),
+                ("Content-Length", str(len(data))),
+                ("Cache-Control", "no-store"),
+                ("Content-Security-Policy", policy),
+            ):
+                self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(data)
 
-            def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the library's name
-                """Print nothing: the recorder uses the terminal."""
-
-        return Handler
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the library's name
+        """Print nothing: the recorder uses the terminal."""
 
 
 class _Server(ThreadingHTTPServer):
@@ -179,25 +191,6 @@ class _Server(ThreadingHTTPServer):
         """Ignore lost connections; the recorder uses the terminal."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
-
-
-def _send(handler: BaseHTTPRequestHandler, text: str) -> None:
-    data = text.encode()
-    script = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()
-    handler.send_response(200)
-    policy = (
-        f"default-src 'none'; style-src 'unsafe-inline'; connect-src 'self'; script-src 'sha256-{script}'; "
-        "frame-ancestors 'none'"
-    )
-    for name, value in (
-        ("Content-Type", "text/html; charset=utf-8"),
-        ("Content-Length", str(len(data))),
-        ("Cache-Control", "no-store"),
-        ("Content-Security-Policy", policy),
-    ):
-        handler.send_header(name, value)
-    handler.end_headers()
-    handler.wfile.write(data)
 
 
 def _table(progress: Progress, series: Mapping[Pair, Sequence[Point]], *, corrected: bool) -> str:
