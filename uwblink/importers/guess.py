@@ -263,7 +263,8 @@ def guess_map(path: Path) -> Guess:
     cells = {name: numbers[header] for name, header in headers.items()}
     if not len(next(iter(cells.values()), np.empty(0))):
         raise ImportTableError(f"{path}: no column whose name is known, or no rows; there are {', '.join(table.names)}")
-    layout = "stamps" if "event" in columns else _layout(cells)
+    fitting = (one for one in ("exchanges", "messages", "ranges") if all(name in cells for name in _LAYOUTS[one][0]))
+    layout = "stamps" if "event" in columns else next(fitting, "nothing")
     if layout == "messages" and _only_words(cells, "message") and columns["message"] != "message":
         del columns["message"], cells["message"]  # without a column of that name messages are told by their order
     unplaced = unusable_positions(columns, cells)
@@ -305,12 +306,6 @@ def guess_map(path: Path) -> Guess:
 
 def _only_words(cells: dict[str, Floats], name: str) -> bool:
     return name in cells and not np.isfinite(cells[name]).any()
-
-
-def _layout(cells: dict[str, Floats]) -> str:
-    return next(
-        (one for one in ("exchanges", "messages", "ranges") if all(n in cells for n in _LAYOUTS[one][0])), "nothing"
-    )
 
 
 def _belongs(name: str, layout: str) -> bool:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape, unescape
 from importlib.resources import files
@@ -39,25 +39,6 @@ CSS: Final = (
     .replace("/* figures by night */", _figure_colours(dark=True))
 )
 """Styles for a screen, a phone, light and dark ground, and paper."""
-
-
-def page_html(title: str, parts: Iterable[str]) -> str:
-    """Return a whole page; `parts` are HTML already, `title` is text and becomes the heading.
-
-    Without its script a page loses only the values under the pointer and the enlarged figures.
-    """
-    return "\n".join(
-        [
-            "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
-            "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-            f"<title>{escape(title)}</title><style>{CSS}</style></head><body>",
-            f"<h1>{escape(title)}</h1>",
-            *parts,
-            "<div id='tip'></div><dialog id='zoom' aria-label='Figure, closer'><form method='dialog'>"
-            "<button>Close</button> wheel: closer · drag: move · double click: all</form>"
-            f"<div style='height:100%'></div></dialog><script>{_part('page.js')}</script></body></html>\n",
-        ]
-    )
 
 
 def inline(svg: bytes, caption: str) -> str:
@@ -260,7 +241,20 @@ def to_html(document: Document, drawings: Drawings | None = None) -> str:
                 )
             case Table(header, rows, above, total, words):
                 parts.append(table_html(header, rows, above, total=total, words=words))
-    return page_html(document.title, parts)
+    title = escape(document.title)
+    # Without its script a page loses only the values under the pointer and the enlarged figures.
+    return "\n".join(
+        [
+            "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
+            "<meta name='viewport' content='width=device-width, initial-scale=1'>",
+            f"<title>{title}</title><style>{CSS}</style></head><body>",
+            f"<h1>{title}</h1>",
+            *parts,
+            "<div id='tip'></div><dialog id='zoom' aria-label='Figure, closer'><form method='dialog'>"
+            "<button>Close</button> wheel: closer · drag: move · double click: all</form>"
+            f"<div style='height:100%'></div></dialog><script>{_part('page.js')}</script></body></html>\n",
+        ]
+    )
 
 
 def write_document(

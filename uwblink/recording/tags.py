@@ -11,12 +11,16 @@ from uwblink.text_files import TomlReader, is_number
 
 
 def load_places(path: Path) -> tuple[tuple[Tag, ...], dict[int, tuple[float, float, float]]]:
-    """Read the `[[tags]]` of a file and the places in metres of its `[[anchors]]`, which stand still, by id.
+    """Read the `[[tags]]` of a plan, a scenario or another file, and the places in metres of its `[[anchors]]`, by id.
 
-    An anchor may have `covariance_m2` (xx xy xz yy yz zz), as `calib survey --anchors` writes it; poses have no place
-    for it. Raises `PlanError` where there are neither, or an id is there twice.
+    Anchors stand still. One may have `covariance_m2` (xx xy xz yy yz zz), as `calib survey --anchors` writes it; poses
+    have no place for it. Raises `PlanError` where there are neither, or an id is there twice.
     """
-    file = _file_of_tags(path)
+    file = TomlReader(path, PlanError, "file of tags (.toml)")
+    if not _is_scenario(file):
+        # A ranging plan says where tags sit, too.
+        plan = ("pairs", "rate_hz", "protocol", "target_reports", "get_cir", "antenna_delays")
+        file.known(file.table, ("tags", "anchors", *plan))
     tags, rows = read_tags(file), file.rows("anchors", ("id", "position_m", "covariance_m2"))
     if not tags and not rows:
         raise PlanError(f"{path}: holds no [[tags]] with id, body and lever_arm_m, and no [[anchors]]")
@@ -54,16 +58,6 @@ def _new_id(file: TomlReader, key: str, row: dict[str, Any], taken: set[int]) ->
     file.check(key, number, is_board_id(number), "a whole number 0 to 254")
     file.check(key, number, number not in taken, "another id than those before")
     return int(number)
-
-
-def _file_of_tags(path: Path) -> TomlReader:
-    """Return a reader of a plan, a scenario, or a file of tags and anchors."""
-    file = TomlReader(path, PlanError, "file of tags (.toml)")
-    if not _is_scenario(file):
-        # A ranging plan says where tags sit, too.
-        plan = ("pairs", "rate_hz", "protocol", "target_reports", "get_cir", "antenna_delays")
-        file.known(file.table, ("tags", "anchors", *plan))
-    return file
 
 
 def _is_scenario(file: TomlReader) -> bool:
