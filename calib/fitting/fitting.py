@@ -65,12 +65,11 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     '0.41 ns, planted 0.40 ns'
     """
     settings = replace(settings or FitSettings(), **changes)
-    pinned, groups, sequential = dict(settings.fixed_ns), dict(settings.groups), settings.sequential
-    lift, alpha_dbm, delays_only = settings.lift, settings.alpha_dbm, settings.delays_only
+    alpha_dbm, delays_only, sequential = settings.alpha_dbm, settings.delays_only, settings.sequential
     check_loss(settings.loss)
     source = given_calibration(settings.delays_from, "delays_from")
     ranges = load_ranges(data, need_power=not delays_only)
-    fixed = _taken_over(source, ranges, curve=not delays_only) | pinned
+    fixed = _taken_over(source, ranges, curve=not delays_only) | dict(settings.fixed_ns)
     refuse_impossible(ranges)
     loss = settings.loss or (ROBUST_LOSS if sequential or delays_only else MIXTURE)
     reference = settings.reference_power_dbm
@@ -78,10 +77,10 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     recipe = Recipe(
         loss=loss,
         scale_m=None if settings.scale_ns is None else settings.scale_ns * 1e-9 * SPEED_OF_LIGHT,
-        lift=lift,
+        lift=settings.lift,
         alpha_dbm=alpha_dbm,
         fixed_ns=fixed,
-        groups=groups,
+        groups=dict(settings.groups),
         minimum_norm=settings.minimum_norm,
         reference=None if reference is None else _lifted(reference, alpha_dbm),
         curve=not delays_only,
@@ -97,13 +96,13 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         calibration = calibration_of(
             found,
             covariance_ns2,
-            lift=lift,
+            lift=settings.lift,
             alpha_dbm=alpha_dbm,
             fixed=fixed,
-            groups=groups,
+            groups=settings.groups,
             between_m=settings.between_m,
         )
-    given = set(fixed) - set(pinned)
+    given = set(fixed) - set(settings.fixed_ns)
     stated = {tag: std for tag, std in calibration.delays_std_ns.items() if tag not in given}
     calibration = replace(calibration, delays_std_ns=stated | _std_taken_over(source, given))
     held = _held_out(ranges, settings) if settings.hold_out else None

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
+from scipy.interpolate import BSpline, make_interp_spline
 
-from calib.data.samples import stamped
+from calib.data.samples import SampleFlight, stamped
 from calib.planning.settings import FlightPlanSettings
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Poses, Tag
-from uwblink.twr import Exchanges
 
 POSES_HZ = 20.0
 IMU_HZ = 50.0
@@ -37,23 +35,17 @@ STARTING_S = 3.0
 """Seconds from standstill to full speed."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReferenceFlight:
-    """A recording of the flight without errors or delays."""
-
-    exchanges: Exchanges
-    poses: Poses
-    tags: list[Tag]
-    imu: Mapping[str, Any] = field(default_factory=dict)
+Motion = tuple[BSpline, BSpline]
+"""Where a body is over time, and its yaw."""
 
 
-def reference_motion(flown: FlightPlanSettings) -> ReferenceFlight:
-    """Return a flight; the same for the same seed."""
+def reference_motion(flown: FlightPlanSettings) -> SampleFlight:
+    """Return a flight without errors or delays; the same for the same seed."""
     rng = np.random.default_rng(flown.seed)
-    bodies = [_Body(flown, number, rng) for number in range(len(flown.robots))]
+    bodies = {f"robot{k + 1}": _motion(flown, k, rng) for k in range(len(flown.robots))}
     tags = [
-        Tag(tag, f"robot{number + 1}", tuple(arm))
-        for number, robot in enumerate(flown.robots)
+        Tag(tag, body, tuple(arm))
+        for body, robot in zip(bodies, flown.robots, strict=True)
         for tag, arm in zip(robot, _arms(len(robot), flown.apart_m).tolist(), strict=True)
     ]
     stands = dict(zip(flown.anchors, _corners(flown), strict=True))
@@ -68,34 +60,31 @@ def reference_motion(flown: FlightPlanSettings) -> ReferenceFlight:
     power = POWER_AT_2_M_DBM - 20 * np.log10(distance / 2) + rng.normal(0, FADING_DB, (2, len(time)))
     exchanges = stamped(np.rint(time * 1e9).astype(np.int64), pair, distance, power)
     imu = _readings(bodies, flown.seconds) if flown.inertial else {}
-    return ReferenceFlight(exchanges, _poses(bodies, stands, flown.seconds), tags, imu)
+    return SampleFlight(exchanges, _poses(bodies, stands, flown.seconds), tags, {}, imu)
 
 
-class _Body:
-    """One body's motion, upright and turning to and fro: two sines an axis about a middle of its own.
+def _motion(flown: FlightPlanSettings, number: int, rng: np.random.Generator) -> Motion:
+    """Return the motion of one body, upright and turning to and fro: two sines an axis about a middle of its own.
 
-    Until it starts it stands; `STARTING_S` later it is as fast as it will be. `place` and `yaw` are splines over time.
+    Until it starts it stands; `STARTING_S` later it is as fast as it will be.
     """
-
-    def __init__(self, flown: FlightPlanSettings, number: int, rng: np.random.Generator) -> None:
-        size, angle = np.array(flown.size_m), 2 * np.pi * number / len(flown.robots) + 0.4
-        self.name = f"robot{number + 1}"
-        middle = size * (0.5 + MIDDLES * np.array([np.cos(angle), np.sin(angle), 0.0]))
-        reach = REACH * size
-        slow = 2 * np.pi * float(np.linalg.norm(reach)) / flown.speed_m_s
-        rate = 2 * np.pi / (slow * rng.uniform(*PERIODS, (3, 2)))
-        phase = rng.uniform(0, 2 * np.pi, (3, 2))
-        turning = 2 * np.pi / rng.uniform(*TURNS_S)
-        heading = float(rng.uniform(-np.pi, np.pi))
-        time = np.arange(-1.5, flown.seconds + 1.5, SAMPLE_S)
-        along = time
-        if flown.still_s:
-            # The pace rises from 0 to 1 by 3 u^2 - 2 u^3, whose integral this is.
-            u = np.clip((time - flown.still_s) / STARTING_S, 0.0, 1.0)
-            along = STARTING_S * (u**3 - u**4 / 2) + np.maximum(time - flown.still_s - STARTING_S, 0.0)
-        waves = np.sin(rate * along[:, None, None] + phase).sum(axis=2)
-        self.place = make_interp_spline(time, middle + reach * waves)
-        self.yaw = make_interp_spline(time, heading + TURN_RAD * np.sin(turning * along))
+    size, angle = np.array(flown.size_m), 2 * np.pi * number / len(flown.robots) + 0.4
+    middle = size * (0.5 + MIDDLES * np.array([np.cos(angle), np.sin(angle), 0.0]))
+    reach = REACH * size
+    slow = 2 * np.pi * float(np.linalg.norm(reach)) / flown.speed_m_s
+    rate = 2 * np.pi / (slow * rng.uniform(*PERIODS, (3, 2)))
+    phase = rng.uniform(0, 2 * np.pi, (3, 2))
+    turning = 2 * np.pi / rng.uniform(*TURNS_S)
+    heading = float(rng.uniform(-np.pi, np.pi))
+    time = np.arange(-1.5, flown.seconds + 1.5, SAMPLE_S)
+    along = time
+    if flown.still_s:
+        # The pace rises from 0 to 1 by 3 u^2 - 2 u^3, whose integral this is.
+        u = np.clip((time - flown.still_s) / STARTING_S, 0.0, 1.0)
+        along = STARTING_S * (u**3 - u**4 / 2) + np.maximum(time - flown.still_s - STARTING_S, 0.0)
+    place = middle + reach * np.sin(rate * along[:, None, None] + phase).sum(axis=2)
+    yaw = heading + TURN_RAD * np.sin(turning * along)
+    return make_interp_spline(time, place), make_interp_spline(time, yaw)
 
 
 def _arms(count: int, apart_m: float) -> Floats:
@@ -122,26 +111,25 @@ def _in_turn(flown: FlightPlanSettings, count: int, rng: np.random.Generator) ->
     return np.concatenate(rounds)[:count].astype(np.int64)
 
 
-def _antennas(bodies: list[_Body], tags: list[Tag], stands: Mapping[int, Floats], time_s: Floats) -> Floats:
+def _antennas(bodies: Mapping[str, Motion], tags: list[Tag], stands: Mapping[int, Floats], time_s: Floats) -> Floats:
     """Return where each tag is at each instant (tags, n, 3)."""
-    by_name = {body.name: body for body in bodies}
     found = np.empty((len(tags), len(time_s), 3))
     for k, tag in enumerate(tags):
         if tag.tag in stands:
             found[k] = stands[tag.tag]
             continue
-        body, (x, y, z) = by_name[tag.body], tag.lever_arm_m
-        c, s = np.cos(body.yaw(time_s)), np.sin(body.yaw(time_s))
-        found[k] = body.place(time_s) + np.column_stack([c * x - s * y, s * x + c * y, np.full(len(c), z)])
+        (place, yaw), (x, y, z) = bodies[tag.body], tag.lever_arm_m
+        c, s = np.cos(yaw(time_s)), np.sin(yaw(time_s))
+        found[k] = place(time_s) + np.column_stack([c * x - s * y, s * x + c * y, np.full(len(c), z)])
     return found
 
 
-def _poses(bodies: list[_Body], stands: Mapping[int, Floats], seconds: float) -> Poses:
+def _poses(bodies: Mapping[str, Motion], stands: Mapping[int, Floats], seconds: float) -> Poses:
     time = np.arange(-1.0, seconds + 1.0, 1 / POSES_HZ)
-    places = [body.place(time) for body in bodies] + [np.tile(place, (2, 1)) for place in stands.values()]
-    yaws = [body.yaw(time) for body in bodies] + [np.zeros(2) for _ in stands]
+    places = [place(time) for place, _ in bodies.values()] + [np.tile(place, (2, 1)) for place in stands.values()]
+    yaws = [yaw(time) for _, yaw in bodies.values()] + [np.zeros(2) for _ in stands]
     times = [time for _ in bodies] + [time[[0, -1]] for _ in stands]
-    names = [body.name for body in bodies] + [f"anchor{tag}" for tag in stands]
+    names = [*bodies, *(f"anchor{tag}" for tag in stands)]
     yaw = np.concatenate(yaws)
     upright = np.column_stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)])
     each = [len(some) for some in times]
@@ -150,16 +138,13 @@ def _poses(bodies: list[_Body], stands: Mapping[int, Floats], seconds: float) ->
     )
 
 
-def _readings(bodies: list[_Body], seconds: float) -> dict[str, Any]:
+def _readings(bodies: Mapping[str, Motion], seconds: float) -> dict[str, Any]:
     """Return the table of inertial readings, without errors."""
-    time = np.arange(0.0, seconds + 0.5, 1 / IMU_HZ)
-    found: dict[str, list[Any]] = {name: [] for name in ("time_ns", "body", "wx", "wy", "wz", "ax", "ay", "az")}
-    for body in bodies:
-        c, s = np.cos(body.yaw(time)), np.sin(body.yaw(time))
-        x, y, z = body.place(time, 2).T
-        columns = (0 * c, 0 * c, body.yaw(time, 1), c * x + s * y, c * y - s * x, z + GRAVITY_M_S2)
-        found["time_ns"].append(np.rint(time * 1e9).astype(np.int64))
-        found["body"].append(np.full(len(time), body.name))
-        for name, column in zip(("wx", "wy", "wz", "ax", "ay", "az"), columns, strict=True):
-            found[name].append(column)
-    return {name: np.concatenate(parts) for name, parts in found.items()}
+    time, rows = np.arange(0.0, seconds + 0.5, 1 / IMU_HZ), []
+    for name, (place, yaw) in bodies.items():
+        c, s = np.cos(yaw(time)), np.sin(yaw(time))
+        x, y, z = place(time, 2).T
+        turns, forces = (0 * c, 0 * c, yaw(time, 1)), (c * x + s * y, c * y - s * x, z + GRAVITY_M_S2)
+        rows.append((np.rint(time * 1e9).astype(np.int64), np.full(len(time), name), *turns, *forces))
+    names = ("time_ns", "body", "wx", "wy", "wz", "ax", "ay", "az")
+    return {name: np.concatenate(parts) for name, parts in zip(names, zip(*rows, strict=True), strict=True)}

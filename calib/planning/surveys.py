@@ -54,26 +54,24 @@ def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None
     if len(tags) < 2:
         raise BadInputError(f"found {boards!r:.60}, expected 2 to 30 boards, each once", parameter="boards")
     inputs = replace(settings or SurveyPlanSettings(), tags=tags, **changes)
-    taped, rate_hz = inputs.taped, inputs.rate_hz
     known = "" if inputs.on == "space" else inputs.on
     candidates = random_layouts(inputs, CANDIDATES)
     if not candidates:
         raise UnanswerableError(f"{len(inputs.tags)} boards find no room: they must stand 0.4 m from each other")
     informations = [delay_information(inputs, layout) for layout in candidates]
     chosen = [candidates[k] for k in _choose(informations, inputs.arrangements)]
-    for _ in range(taped):
+    for _ in range(inputs.taped):
         best = _best_tape(inputs, chosen)
         if best is not None:
             chosen[best[0]] = best[1]
     made = tuple(_named(ascii_uppercase[k], layout, inputs.tags) for k, layout in enumerate(chosen))
-    seconds = max(30.0, math.ceil(RANGES_A_PAIR * math.comb(len(inputs.tags), 2) / rate_hz / 10) * 10.0)
+    seconds = max(30.0, math.ceil(RANGES_A_PAIR * math.comb(len(inputs.tags), 2) / inputs.rate_hz / 10) * 10.0)
     predictions = predict(inputs, chosen)
     after = [
         dict(zip(inputs.tags, (_interval(inputs, chosen[: k + 1]) * one.each).tolist(), strict=True))
         for k, one in enumerate(predictions)
     ]
-    wide = _interval(inputs, chosen)
-    total = _total(inputs, chosen)
+    wide, total = _interval(inputs, chosen), _total(inputs, chosen)
     return Plan(
         on=known,
         tags=inputs.tags,
@@ -83,12 +81,12 @@ def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None
         common_ns=wide * predictions[-1].common,
         with_curve_ns=_halves(predict(inputs, chosen, curve=True)[-1], wide),
         verdict=verdict_on_delays(total, inputs.tags),
-        next_best=tuple(_next_best(inputs, candidates, informations, chosen)),
-        rate_hz=rate_hz,
+        next_best=tuple(_next_best(inputs, candidates, informations, chosen, wide, total)),
+        rate_hz=inputs.rate_hz,
         seconds_each=seconds,
         pair_error_m=inputs.pair_error_m,
         reflected=inputs.reflected,
-        known_beside=bool(inputs.anchors) or taped > 0,
+        known_beside=bool(inputs.anchors or inputs.taped),
         steps=tuple(_steps(inputs, made, seconds)),
     )
 
@@ -145,10 +143,17 @@ def _halves(prediction: Prediction, wide: float) -> Halves:
 
 
 def _next_best(
-    inputs: SurveyPlanSettings, candidates: list[Layout], informations: list[Floats], chosen: list[Layout]
+    inputs: SurveyPlanSettings,
+    candidates: list[Layout],
+    informations: list[Floats],
+    chosen: list[Layout],
+    wide: float,
+    total: Floats,
 ) -> list[NextBest]:
-    """Return the next arrangement and the next taped distance, the one that brings more first."""
-    wide, total = _interval(inputs, chosen), _total(inputs, chosen)
+    """Return the next arrangement and the next taped distance, the one that brings more first.
+
+    `wide` is the factor of intervals, `total` the information of the chosen arrangements.
+    """
     now = wide * mean_std_ns(total)
     k = min(range(len(candidates)), key=lambda k: mean_std_ns(total + informations[k]))
     more = _named(ascii_uppercase[min(len(chosen), len(ascii_uppercase) - 1)], candidates[k], inputs.tags)

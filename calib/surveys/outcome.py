@@ -288,14 +288,10 @@ def _in_frame(points: Floats, covariance: Floats, boards: Boards) -> tuple[Float
     motions = rigid_motions(moved, boards.dimensions)
     hold = np.eye(len(motions)) - motions @ np.linalg.pinv(motions[datum]) @ np.eye(len(motions))[datum]
     # Along its own motions an arrangement is as free as the prior has it: none of that is left in its frame.
-    found = hold @ _without(rigid_motions(moved, boards.dimensions), turns @ covariance @ turns.T) @ hold.T
+    along = np.linalg.qr(motions)[0]
+    clear = hold @ (np.eye(len(motions)) - along @ along.T) @ turns
+    found = clear @ covariance @ clear.T
     return moved, (found + found.T) / 2, words
-
-
-def _without(motions: Floats, covariance: Floats) -> Floats:
-    basis = np.linalg.qr(motions)[0]
-    rest = np.eye(len(covariance)) - basis @ basis.T
-    return np.asarray(rest @ covariance @ rest)
 
 
 def rigid_motions(points: Floats, dimensions: int) -> Floats:

@@ -271,7 +271,7 @@ def solve(network: Network, *, moves: int = 6) -> tuple[Solution, SecondBest | N
     if not worse:
         return found, None
     gap, (name, tags) = min(worse)
-    return found, SecondBest(name, tags, max(gap, 0.0))
+    return found, SecondBest(name, tags, max(0.0, gap))
 
 
 def settle_with_marks(network: Network, x: Floats, case: Case, only: int | None = None) -> tuple[float, Floats, Case]:

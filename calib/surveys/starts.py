@@ -10,6 +10,8 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations, pairwise
 
 import numpy as np
+from scipy.linalg import orthogonal_procrustes
+from scipy.sparse.csgraph import floyd_warshall
 
 from calib.surveys.network import Network
 from uwblink.arrays import Floats, Ints
@@ -124,8 +126,7 @@ def _distances(network: Network, measured: Floats, here: Ints) -> Floats:
     rows = np.flatnonzero(np.isin(network.ends[: len(network.means), 0], here))
     ends = np.searchsorted(here, network.ends[rows])
     apart[ends[:, 0], ends[:, 1]] = apart[ends[:, 1], ends[:, 0]] = np.maximum(measured[rows], 0.01)
-    for via in range(len(here)):
-        apart = np.minimum(apart, apart[:, [via]] + apart[[via], :])
+    apart = floyd_warshall(apart)
     longest = float(apart[np.isfinite(apart)].max(initial=1.0))
     return np.where(np.isfinite(apart), apart, longest)
 
@@ -136,5 +137,5 @@ def _onto_known(network: Network, points: Floats, here: Ints) -> Floats:
     if not len(rows):
         return points
     goal, mine = network.known.position_m[rows], points[np.searchsorted(here, network.known.at[rows])]
-    u, _, v = np.linalg.svd((mine - mine.mean(axis=0)).T @ (goal - goal.mean(axis=0)))
-    return np.asarray((points - mine.mean(axis=0)) @ (u @ v) + goal.mean(axis=0))
+    turn = orthogonal_procrustes(mine - mine.mean(axis=0), goal - goal.mean(axis=0))[0]
+    return np.asarray((points - mine.mean(axis=0)) @ turn + goal.mean(axis=0))
