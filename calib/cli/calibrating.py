@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -132,18 +133,15 @@ def fit(
         raise typer.Exit(STOPPED)
 
 
-class _undetermined_as_json:  # noqa: N801 - a context manager
+@contextmanager
+def _undetermined_as_json(as_json: bool) -> Iterator[None]:
     """Print an `UnanswerableError` as JSON, too, where JSON was asked for."""
-
-    def __init__(self, as_json: bool) -> None:
-        self.as_json = as_json
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if self.as_json and isinstance(error, UnanswerableError):
+    try:
+        yield
+    except UnanswerableError as error:
+        if as_json:
             typer.echo(json.dumps({"error": with_flags(str(error)), "undetermined": error.undetermined}, indent=1))
+        raise
 
 
 def _fit_from_ranges(

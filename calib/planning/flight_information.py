@@ -42,7 +42,7 @@ EVIDENCE_STEPS = 12
 ENDS = 4
 """Control points at either end of a path that planned positions do not determine well."""
 
-STEADIEST_M_S3 = 0.2
+MIN_JERK_M_S3 = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -263,4 +263,4 @@ def _jerk(points: Floats, step_s: float) -> float:
     """Return the jerk that paths by control points (k, bodies, 3) have, root mean square, away from their ends."""
     inner = points[ENDS:-ENDS] if len(points) > 3 * ENDS else points
     jerk = np.diff(inner, n=3, axis=0) / step_s**3
-    return max(float(np.sqrt(np.mean(jerk**2))), STEADIEST_M_S3)
+    return max(float(np.sqrt(np.mean(jerk**2))), MIN_JERK_M_S3)

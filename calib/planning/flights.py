@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -59,8 +58,6 @@ def plan_flight(robots: Robots | Data, settings: FlightPlanSettings | None = Non
     """
     data = None if isinstance(robots, int | Sequence) and not isinstance(robots, str) else robots
     asked = replace(settings or FlightPlanSettings(), robots=robots if data is None else None, **changes)
-    # As in a fit: SciPy has its own linear algebra, which must be loaded to be limited.
-    import_module("scipy.linalg")
     with threadpool_limits(limits=1, user_api="blas"):
         return _plan(asked, data)
 

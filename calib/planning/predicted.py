@@ -29,7 +29,7 @@ NEAREST_M = 0.4
 """Boards stand no nearer to each other; nearer, powers saturate and fields are not yet waves."""
 
 CURVE_M = 0.05
-"""How large a curve over power is, as a standard deviation: that of the published curves (`BEND_DB`) is 0.1 m."""
+"""Standard deviation of a curve over power: that of the published curves (`CURVE_LENGTH_DB`) is 0.1 m."""
 
 POWER_AT_1_M_DBM = -74.0
 """Received power at a metre, as DW1000 boards report it."""

@@ -1,9 +1,9 @@
-"""What contradicts the ranges: known distances, shapes that are none, labels that were exchanged.
+"""What contradicts the ranges: wrong known distances, wrong shapes, exchanged labels.
 
-Each check holds hypotheses of what is wrong against the survey as it was said to be, each with the reflections that fit
-it best: a few reflected pairs can look like a string that is not straight. The statistic is the ratio of likelihoods,
-whatever the unknowns are; by Markov's inequality such a ratio is above 1/p with a probability of at most p where
-nothing is wrong. The likeliest hypothesis is taken first, because a wrong tape makes other things look wrong, too.
+Each check compares hypotheses of a fault with the survey as described, each with the reflections that fit it best: a
+few reflected pairs can look like a string that is not straight. The statistic is the ratio of the likelihoods,
+integrated over the unknowns; by Markov's inequality it exceeds 1/p with a probability of at most p where nothing is
+wrong. The likeliest hypothesis is taken first, because a wrong tape makes other things look wrong, too.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ import numpy as np
 
 from calib.surveys.network import Network
 from calib.surveys.result import Contradiction
-from calib.surveys.solution import Solution, adjust, out_of_order, settle_with_marks, unlikelihood
+from calib.surveys.solution import Solution, adjust, optimize_with_marks, out_of_order, unlikelihood
 from calib.surveys.starts import exchanged_boards, first_start, line_coordinates
 from uwblink.arrays import Floats
 
 FALSE_ALARMS = 0.01
 """Share of sound surveys in which a check may find something."""
 
-WORTH_A_LOOK = 1.0
-"""Fall of -2 log likelihood of an arrangement alone from which its shape is looked at, if there are more than three."""
+MIN_SHAPE_GAIN = 1.0
+"""Fall of -2 log likelihood of one arrangement from which its shape is tested; of up to three, all are tested."""
 
-ODD = 3.0
-"""Standard deviations by which something known must be off for labels to be looked at."""
+MIN_LABEL_SIGMAS = 3.0
+"""Standard deviations by which a known distance or position must be off for labels to be tested."""
 
-WRONG_TAPE_M = 0.5
-"""How wrong a tape is if it is, before any data."""
+TAPE_ERROR_M = 0.5
+"""Standard deviation of the error of a wrong tape, before any data."""
 
-LEAST_SHARE = 0.02
+MIN_VARIANCE_SHARE = 0.02
 """Share of its variance that the fit must leave of a known distance for its error to be seen."""
 
-LIFT_M = 0.15
-"""How far boards are put beside a line, or plane, for a search to begin: on it a derivative would be zero."""
+START_BESIDE_M = 0.15
+"""How far boards are put beside a line, or plane, at the start of a search: on it a derivative would be zero."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """What may be wrong, in words, the network without it, a start, and what is known of its size before (-2 log)."""
+    """A possible fault in words, the network without it, a start, and -2 log of the prior density of its size."""
 
     text: str
     network: Network
@@ -50,8 +50,8 @@ class Hypothesis:
     beforehand: float = 0.0
 
 
-def worst(found: Solution) -> tuple[Contradiction, Solution] | None:
-    """Return the likeliest hypothesis that chance does not explain, and the solution in which it is true."""
+def likeliest_fault(found: Solution) -> tuple[Contradiction, Solution] | None:
+    """Return the likeliest fault that chance does not explain, and the solution without it."""
     best: tuple[float, Contradiction, Solution] | None = None
     for name, (hypotheses, remedy) in CHECKS.items():
         for one in hypotheses(found):
@@ -64,7 +64,8 @@ def worst(found: Solution) -> tuple[Contradiction, Solution] | None:
 
 
 def _of_known(found: Solution) -> tuple[Floats, Floats, Floats]:
-    """Return of what is known (k,) what is left, its standard deviation, and the share of its variance that is left."""
+    """Return residuals (k,) of known distances and positions, their standard deviations, and the shares of variance
+    that the fit leaves of them."""
     here, known = found.network.at(found.x, found.case), slice(len(found.network.means), None)
     rows, std = here.jacobian[known], here.std[known]
     share = 1 - np.einsum("ij,jk,ik->i", rows, here.covariance(), rows) / std**2
@@ -72,12 +73,12 @@ def _of_known(found: Solution) -> tuple[Floats, Floats, Floats]:
 
 
 def _distances(found: Solution) -> Iterator[Hypothesis]:
-    """Yield what is known without one of the known distances."""
+    """Yield the network without each of the known distances."""
     network, known = found.network, found.network.known
     left, _, share = _of_known(found)
     for statement in np.unique(known.statement).tolist():
         rows = np.flatnonzero(known.statement == statement)
-        off = float(np.mean(left[rows] / np.maximum(share[rows], LEAST_SHARE)))
+        off = float(np.mean(left[rows] / np.maximum(share[rows], MIN_VARIANCE_SHARE)))
         keep = known.statement != statement
         less = replace(
             known,
@@ -87,14 +88,14 @@ def _distances(found: Solution) -> Iterator[Hypothesis]:
             statement=known.statement[keep],
         )
         # The rows go, and with them what they say of likelihood: as if the tape were wrong by some half a metre.
-        std = np.append(known.distance_std_m[rows][1:], WRONG_TAPE_M)
-        beforehand = 2 * float(np.log(std).sum()) + (off / WRONG_TAPE_M) ** 2
+        std = np.append(known.distance_std_m[rows][1:], TAPE_ERROR_M)
+        beforehand = 2 * float(np.log(std).sum()) + (off / TAPE_ERROR_M) ** 2
         text = f"{known.names[statement]} is {100 * off:+.0f} cm off what the ranges say"
         yield Hypothesis(text, replace(network, known=less), found.x, beforehand)
 
 
 def _shapes(found: Solution) -> Iterator[Hypothesis]:
-    """Yield boards that stand beside a line, or a plane, that they are said to be on."""
+    """Yield the network with each arrangement beside the line, or plane, that it is said to be on."""
     network = found.network
     for k, boards in enumerate(network.arrangements):
         if boards.dimensions == 3 or len(boards.tags) < boards.dimensions + 2 or boards.freed:
@@ -106,12 +107,12 @@ def _shapes(found: Solution) -> Iterator[Hypothesis]:
         place = network.positions(found.x)
         place[seats] = freed.positions(first_start(freed, found.delays))[seats]
         # Where scaling finds nothing beside the line, a derivative there would be zero.
-        if np.ptp(place[seats, beside]) < LIFT_M:
-            place[seats, beside] += LIFT_M * np.where(np.arange(len(seats)) % 2, 1.0, -1.0)
+        if np.ptp(place[seats, beside]) < START_BESIDE_M:
+            place[seats, beside] += START_BESIDE_M * np.where(np.arange(len(seats)) % 2, 1.0, -1.0)
         mine = replace(found.case, marks=found.case.marks & ~network.rows_of(k))
-        value, x, _ = settle_with_marks(freed, freed.with_positions(found.x, place), mine, k)
+        value, x, _ = optimize_with_marks(freed, freed.with_positions(found.x, place), mine, k)
         alone = unlikelihood(network, found.x, found.case, k)
-        if alone - value < WORTH_A_LOOK and len(network.arrangements) > 3:
+        if alone - value < MIN_SHAPE_GAIN and len(network.arrangements) > 3:
             continue
         away = freed.positions(x)[seats, beside]
         odd = boards.tags[int(np.argmax(np.abs(away - np.median(away))))]
@@ -124,10 +125,12 @@ def _shapes(found: Solution) -> Iterator[Hypothesis]:
 
 
 def _exchanged(found: Solution) -> Iterator[Hypothesis]:
-    """Yield what is known with two tags' names exchanged, where something known is off or reflected."""
+    """Yield the network with two tags exchanged in what is known, where something known is off or reflected."""
     network, known = found.network, found.network.known
     left, std, share = _of_known(found)
-    if not (np.abs(left) > ODD * std * np.sqrt(share)).any() and not (len(left) and found.case.marks.any()):
+    if not (np.abs(left) > MIN_LABEL_SIGMAS * std * np.sqrt(share)).any() and not (
+        len(left) and found.case.marks.any()
+    ):
         return
     points = list(network.points)
     involved = {points[k][1] for k in [*known.ends.ravel().tolist(), *known.at.tolist()]}
@@ -147,10 +150,10 @@ CHECKS = {
 """The checks by what may be wrong: the hypotheses, and what to do where one is true."""
 
 
-def misplaced(found: Solution) -> Iterator[Contradiction]:
-    """Yield what is wrong with orders that were said of boards on a line, once for each mistake.
+def wrong_orders(found: Solution) -> Iterator[Contradiction]:
+    """Yield the contradictions between the stated orders of boards on a line and the ranges.
 
-    What several arrangements have in common is one mistake.
+    What several arrangements have in common is one contradiction.
     """
     network = found.network
     points = network.positions(found.x)

@@ -15,7 +15,7 @@ from uwblink.text_files import TomlReader, is_number
 TAPE_M, PLACE_M = 0.005, 0.01
 """Standard deviations of a distance by tape, and of each coordinate of a position, where none is stated."""
 
-FARTHEST_M, LEAST_SIGMA_M = 1e6, 1e-6
+MAX_LENGTH_M, MIN_SIGMA_M = 1e6, 1e-6
 """From a micrometre to a thousand kilometres, squares and weights are numbers that can be computed with."""
 
 
@@ -168,16 +168,16 @@ def check_knowledge(knowledge: Knowledge, tags: dict[str, set[int]]) -> None:
     for one in known:
         if isinstance(one, KnownDistance):
             who, what = {one.first, one.second}, f"a distance of {one.first} and {one.second}"
-            good = 0 < one.distance_m <= FARTHEST_M
+            good = 0 < one.distance_m <= MAX_LENGTH_M
             value = f"{one.distance_m} ± {one.sigma_m} m, expected more than 0, and"
         else:
             who, what = {one.tag}, f"a position of {one.tag}"
-            good = all(abs(x) <= FARTHEST_M for x in one.position_m)
+            good = all(abs(x) <= MAX_LENGTH_M for x in one.position_m)
             value = f"{one.position_m} ± {one.sigma_m} m, expected numbers"
         where = {one.arrangement: tags[one.arrangement]} if one.arrangement else tags
         if not any(who <= there for there in where.values()):
             place = f"arrangement {one.arrangement}" if one.arrangement else "any arrangement"
             raise BadInputError(f"{what}, which do not range in {place}", parameter="known")
-        if not (good and LEAST_SIGMA_M <= one.sigma_m <= FARTHEST_M):
-            text = f"{what} of {value} up to {FARTHEST_M:g} m ± {LEAST_SIGMA_M:g} m or more"
+        if not (good and MIN_SIGMA_M <= one.sigma_m <= MAX_LENGTH_M):
+            text = f"{what} of {value} up to {MAX_LENGTH_M:g} m ± {MIN_SIGMA_M:g} m or more"
             raise BadInputError(text, parameter="known")

@@ -25,16 +25,16 @@ from uwblink.arrays import Bools, Floats, Ints
 DIMENSIONS = {"line": 1, "plane": 2, "": 3}
 """In how many dimensions boards may stand, by what is known of an arrangement."""
 
-FAR_M = 30.0
+PLACE_STD_M = 30.0
 """Standard deviation of a coordinate about those that are known, before any data: it holds what no range determines."""
 
-BESIDE_M = 0.5
+BESIDE_STD_M = 0.5
 """The same of how far boards stand beside a line, or a plane, that is none."""
 
 DETOUR_M, DETOUR_STD_M = 0.3, 0.25
 """How much longer a reflected way is, before any data: two in three detours within these of each other."""
 
-BEND_DB = 4.0
+CURVE_LENGTH_DB = 4.0
 """Length of the Gaussian process (Matern 5/2 over decibels) that a curve is before any data.
 
 From the three published curves of boards (`icra2023`, `icra2023-july`, `miluv` of `uwbsim`): at 13 powers from -95 to
@@ -49,7 +49,7 @@ CURVE_SEGMENTS = 12
 NARROWEST_DB = 3.0
 """Span of powers below which there is no curve to speak of."""
 
-UNLIKE_NS = 2.0
+DELAY_STD_NS = 2.0
 """How far a delay may be from what was configured: published boards differ by 0.6 ns. Surveys need it: without known
 distances a scale of the places can pass for a delay."""
 
@@ -77,7 +77,7 @@ class CurvePrior:
         back = np.linalg.pinv(basis(10 ** ((dense - ALPHA_DBM) / 10), knots))
         # The process, given that it is zero at the reference power.
         both = np.append(dense, ALPHA_DBM)
-        apart = math.sqrt(5.0) * np.abs(both[:, None] - both) / BEND_DB
+        apart = math.sqrt(5.0) * np.abs(both[:, None] - both) / CURVE_LENGTH_DB
         likeness = (1 + apart + apart**2 / 3) * np.exp(-apart)
         process = likeness[:-1, :-1] - np.outer(likeness[:-1, -1], likeness[-1, :-1])
         covariance = back @ process @ back.T
@@ -217,7 +217,7 @@ class Network:
         delays = np.array([self.fixed_ns.get(tag, 0.0) for tag in self.tags])
         dimensions = np.array([boards.dimensions for boards in self.arrangements])[self.owner, None]
         freed = np.array([boards.freed for boards in self.arrangements])[self.owner, None]
-        std = np.where(freed & (np.arange(3) == dimensions - 1), BESIDE_M, FAR_M).ravel()
+        std = np.where(freed & (np.arange(3) == dimensions - 1), BESIDE_STD_M, PLACE_STD_M).ravel()
         centre = np.zeros((len(self.points), 3))
         for k in range(len(self.arrangements)):
             known = self.known.position_m[self.owner[self.known.at] == k]
@@ -238,7 +238,7 @@ class Network:
                     names=tuple(map(str, self.tags)),
                     start=delays,
                     known=fixed,
-                    priors=(Prior.of_deviation(UNLIKE_NS, delays),),
+                    priors=(Prior.of_deviation(DELAY_STD_NS, delays),),
                 ),
                 Unknown(
                     kind="curve",
@@ -325,7 +325,7 @@ class Network:
         if only is not None:
             known = ~np.isin(np.arange(layout.size), self.free(only))
             layout = Layout(tuple(replace(one, known=known[layout.where[one.kind]]) for one in layout.blocks))
-        return Priors(layout, [1.0, UNLIKE_NS**-2, curve_m**-2])
+        return Priors(layout, [1.0, DELAY_STD_NS**-2, curve_m**-2])
 
     def at(self, x: Floats, case: Case, only: int | None = None) -> Linear:
         """Return the network about unknowns (p,) in a case; `only` one arrangement's places are free if given."""

@@ -29,7 +29,7 @@ from calib.surveys.result import (
     SurveyedBoard,
     SurveyResult,
 )
-from calib.surveys.solution import PAIR_WORTH, Solution
+from calib.surveys.solution import PAIR_PRIOR_FREEDOM, Solution
 from uwblink.arrays import Floats
 from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -37,7 +37,7 @@ from uwblink.ticks import SPEED_OF_LIGHT
 DELAY_SCALE_NS = 0.5
 """How far a delay is known without any data: devices of one design differ by that."""
 
-PROBABLY, PERHAPS = 0.5, 0.1
+MIN_BELIEVED, MIN_MENTIONED = 0.5, 0.1
 """Probabilities from which a pair is believed to be reflected, and from which it is said that it may be."""
 
 SHAPES = {1: "line", 2: "plane", 3: ""}
@@ -49,7 +49,7 @@ def students_factor(freedom: float) -> float:
 
     What is known of that spread beforehand counts as a few degrees of freedom.
     """
-    return float(stdtrit(max(freedom + PAIR_WORTH, 1.0), 0.975)) / TWO_SIDED_95
+    return float(stdtrit(max(freedom + PAIR_PRIOR_FREEDOM, 1.0), 0.975)) / TWO_SIDED_95
 
 
 def result_of(
@@ -124,7 +124,7 @@ def reflected_pairs(found: Solution) -> tuple[ReflectedPair, ...]:
             names[means.arrangement[k]], int(means.ends[k, 0]), int(means.ends[k, 1]), longer[k], float(found.chance[k])
         )
         for k in np.argsort(-found.chance, kind="stable").tolist()
-        if found.chance[k] >= PERHAPS
+        if found.chance[k] >= MIN_MENTIONED
     )
 
 
@@ -134,12 +134,12 @@ def _reflections_in_words(reflected: tuple[ReflectedPair, ...]) -> list[str]:
         f"{one.arrangement}: the range of {one.first} and {one.second} is {100 * one.longer_m:+.0f} cm off what all "
         f"others say: believed to be reflected ({100 * one.chance:.0f} %), and hardly counted"
         for one in reflected
-        if one.chance >= PROBABLY
+        if one.chance >= MIN_BELIEVED
     ]
     perhaps = [
         f"{one.first}-{one.second} in {one.arrangement} ({100 * one.chance:.0f} %)"
         for one in reflected
-        if one.chance < PROBABLY
+        if one.chance < MIN_BELIEVED
     ]
     return [*lines, *([f"may be reflected, too: {', '.join(perhaps)}; intervals are wider by that"] if perhaps else [])]
 

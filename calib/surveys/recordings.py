@@ -40,10 +40,10 @@ MIN_RANGES = 5
 PARTS = 10
 """Stretches of time whose means say how well the mean of all is known, also where errors last."""
 
-LONGEST_M = 1e4
+MAX_RANGE_M = 1e4
 """Ranges beyond are no ranges, but stamps that went wrong."""
 
-WINDOW = 5
+WINDOW_BINS = 5
 """Bins of a second before and after an instant whose medians are compared."""
 
 STEP_M = 0.05
@@ -55,7 +55,7 @@ MOVED_M = 0.03
 SIGMAS = 6.0
 """Standard deviations of noise from which a change is one: one in 5e8 by chance, and there are thousands."""
 
-SHORTEST_S = 15.0
+MIN_STILL_S = 15.0
 """Shorter stretches between two motions are part of the motion."""
 
 
@@ -157,7 +157,7 @@ def _load(data: Data) -> tuple[Ranges, list[Arrangement], list[KnownDistance]]:
             raise UnanswerableError(f"{name}: holds no exchanges")
         unknown = np.full(len(exchanges), np.nan)
         ranges = Ranges.from_exchanges(exchanges, unknown, source=name, antenna_delays=delays)
-    good = np.isfinite(ranges.raw_m) & (np.abs(ranges.raw_m) < LONGEST_M)
+    good = np.isfinite(ranges.raw_m) & (np.abs(ranges.raw_m) < MAX_RANGE_M)
     if not good.any():
         raise UnanswerableError(f"{ranges.source}: none of its {len(ranges)} exchanges has possible stamps")
     return ranges[good], marked, stated
@@ -216,21 +216,21 @@ def still_stretches(ranges: Ranges, bin_s: float = 1.0) -> list[tuple[int, int]]
     there = np.unique(key)
     median.ravel()[there] = ndimage.median(ranges.raw_m, key, there)
     noise = np.array([_noise(row) for row in median])
-    threshold = np.maximum(STEP_M, SIGMAS * noise * np.sqrt(2 / WINDOW))
+    threshold = np.maximum(STEP_M, SIGMAS * noise * np.sqrt(2 / WINDOW_BINS))
     moving = (np.abs(_steps(median)) > threshold[:, None]).sum(axis=0) >= min(2, len(median))
     # An edge that sees a step within its window is not the step itself: only a bin that stands free of all is still.
     still = np.concatenate([[False], ~(moving[:-1] | moving[1:]), [False]]).astype(np.int8)
     first, last = np.flatnonzero(np.diff(still) == 1), np.flatnonzero(np.diff(still) == -1) - 1
     found = zip((begin + bin_ns * bins[first]).tolist(), (begin + bin_ns * (bins[last] + 1)).tolist(), strict=True)
-    return [(a, b) for a, b in found if b - a >= SHORTEST_S * 1e9]
+    return [(a, b) for a, b in found if b - a >= MIN_STILL_S * 1e9]
 
 
 def _steps(median: Floats) -> Floats:
     """Return the step (p, b + 1) of each pair at each edge of bins: median after less median before, NaN at too few."""
-    padded = np.pad(median, ((0, 0), (WINDOW, WINDOW)), constant_values=np.nan)
-    windows = np.ma.masked_invalid(np.lib.stride_tricks.sliding_window_view(padded, WINDOW, axis=1))
+    padded = np.pad(median, ((0, 0), (WINDOW_BINS, WINDOW_BINS)), constant_values=np.nan)
+    windows = np.ma.masked_invalid(np.lib.stride_tricks.sliding_window_view(padded, WINDOW_BINS, axis=1))
     medians = np.ma.median(windows, axis=2).filled(np.nan)  # type: ignore[no-untyped-call]  # NumPy states none
-    return np.asarray(medians[:, WINDOW:] - medians[:, :-WINDOW])
+    return np.asarray(medians[:, WINDOW_BINS:] - medians[:, :-WINDOW_BINS])
 
 
 def _noise(values: Floats) -> float:

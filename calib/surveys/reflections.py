@@ -23,13 +23,13 @@ from uwblink.arrays import Bools, Floats
 REFLECTED, STRAIGHT = 1.0, 30.0
 """Rows with and without a detour that the share of them is worth before any data."""
 
-SHORTER = 0.01
+SHORTER_SHARE = 0.01
 """Share of rows with a gross error that are shorter than the straight way: no detour is."""
 
-WINDOW = 2 * math.log(20.0)
+MAX_WORSE = 2 * math.log(20.0)
 """By how much -2 log likelihood a choice may be worse than the best and still count."""
 
-LOOKED_AT = 24
+MAX_FIRST_CHANGES = 24
 """How many single changes, the best ones, are looked at together with a second one."""
 
 
@@ -74,7 +74,7 @@ class Marks:
         own, pull = own / grown, (self.pull - np.where(self.marked, 0.0, DETOUR_M) * own) / grown
         mean, variance = DETOUR_M + DETOUR_STD_M**2 * pull, DETOUR_STD_M**2 - DETOUR_STD_M**4 * own
         longer = ndtr(mean / np.sqrt(np.maximum(variance, 1e-12)))
-        return np.asarray(-2 * np.log((longer + SHORTER) / (ndtr(DETOUR_M / DETOUR_STD_M) + SHORTER)))
+        return np.asarray(-2 * np.log((longer + SHORTER_SHARE) / (ndtr(DETOUR_M / DETOUR_STD_M) + SHORTER_SHARE)))
 
     def changes(self, *, signed: bool = True) -> Floats:
         """Return what a change of each mark (n,) adds to -2 log likelihood, with the row's penalty if `signed`."""
@@ -96,7 +96,7 @@ class Marks:
             singles = here.changes()
             first = int(np.argmin(singles))
             best, chosen = float(singles[first]), here.flipped(first)
-            for row in np.argsort(singles, kind="stable")[:LOOKED_AT].tolist():
+            for row in np.argsort(singles, kind="stable")[:MAX_FIRST_CHANGES].tolist():
                 if not math.isfinite(singles[row]):
                     break
                 after = here.flipped(row)
@@ -115,13 +115,13 @@ class Marks:
         kept: list[tuple[Bools, float]] = [(self.marked, float(self.penalties()[self.marked].sum()))]
         singles, plain = self.changes(), self.changes(signed=False)
         seen = np.zeros(len(singles), dtype=bool)
-        for row in np.argsort(singles, kind="stable")[:LOOKED_AT].tolist():
+        for row in np.argsort(singles, kind="stable")[:MAX_FIRST_CHANGES].tolist():
             after = self.flipped(row)
-            if singles[row] < WINDOW:
+            if singles[row] < MAX_WORSE:
                 kept.append((after.marked, plain[row] + float(after.penalties()[after.marked].sum())))
             doubles, more = after.changes(), after.changes(signed=False)
             seen[row] = True
-            for second in np.flatnonzero((singles[row] + doubles < WINDOW) & ~seen).tolist():
+            for second in np.flatnonzero((singles[row] + doubles < MAX_WORSE) & ~seen).tolist():
                 last = after.flipped(second)
                 value = plain[row] + more[second] + float(last.penalties()[last.marked].sum())
                 kept.append((last.marked, value))

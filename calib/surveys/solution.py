@@ -1,9 +1,9 @@
-"""The solution of a network: the unknowns that agree best with what was measured, how large errors are, and others.
+"""The solution of a network: the likeliest unknowns, the sizes of errors, and other solutions that fit as well.
 
-For given errors the unknowns come of the one loop (`calib.estimator.optimize`). The constant error of pairs and the
-spread of the curve are those of restricted maximum likelihood (Patterson and Thompson, Biometrika, 1971), with weak
-knowledge beforehand, since a small network says little of either. Likelihoods are those of everything measured,
-whatever the unknowns are (Laplace), so that solutions with other reflections, orders and spreads can be compared.
+For given errors `calib.estimator.optimize` finds the unknowns. The constant error of pairs and the spread of the curve
+are those of restricted maximum likelihood (Patterson and Thompson, Biometrika, 1971) with weak priors, since a small
+network determines neither well. Likelihoods are integrated over the unknowns (Laplace's approximation), so that
+solutions with different reflections, orders and spreads can be compared.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from calib.surveys.result import SecondBest
 from calib.surveys.starts import first_start, is_in_order, line_coordinates, other_starts, start_in_order
 from uwblink.arrays import Bools, Floats, Ints
 
-PAIR_STD_M, PAIR_WORTH = 0.02, 3.0
-"""What a constant error of a pair is like before any data, and worth how many degrees of freedom."""
+PAIR_STD_M, PAIR_PRIOR_FREEDOM = 0.02, 3.0
+"""Standard deviation of the constant error of a pair before any data, and the degrees of freedom that it counts as."""
 
 PAIR_STARTS_M = (0.01, 0.015, 0.02, 0.03, 0.045, 0.07)
 """Errors of pairs from which a search begins: with small ones too much looks reflected, with large ones too little."""
 
 CURVE_STD_M, CURVE_FACTOR = 0.1, 1.7
-"""Standard deviation of a curve before any data, and the factor by which that may be wrong (`BEND_DB`)."""
+"""Standard deviation of a curve before any data, and the factor by which that may be wrong (`CURVE_LENGTH_DB`)."""
 
-WRONG_ORDER = 2 * math.log(100.0)
+WRONG_ORDER_PENALTY = 2 * math.log(100.0)
 """-2 log of the chance that boards stand in another order than somebody said who put them so: one in a hundred."""
 
-APART_M = 0.03
-"""How far a board must be from where it was for a solution to be another one."""
+MIN_DIFFERENCE_M = 0.03
+"""How far a board must move for a solution to count as another one."""
 
-WORTH_A_LOOK = 60.0
-"""By how much another solution of one arrangement alone may be worse for it to be solved with all others."""
+MAX_WORSE_ALONE = 60.0
+"""By how much -2 log likelihood of one arrangement's other solution may be worse for all to be solved with it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,8 +79,8 @@ class Solution:
         return np.asarray((wider + wider.T) / 2)
 
 
-def settle(network: Network, x: Floats, case: Case, only: int | None = None) -> tuple[Floats, bool]:
-    """Return the best unknowns from a start, or those of `only` one arrangement, and whether the search ended."""
+def optimize(network: Network, x: Floats, case: Case, only: int | None = None) -> tuple[Floats, bool]:
+    """Return the likeliest unknowns from a start (of `only` one arrangement), and whether the search converged."""
     places = network.layout.where["place"]
     found = maximize(
         [Lengths(network, case)],
@@ -94,7 +94,7 @@ def settle(network: Network, x: Floats, case: Case, only: int | None = None) -> 
 
 
 def unlikelihood(network: Network, x: Floats, case: Case, only: int | None = None) -> float:
-    """Return -2 log likelihood where a search settled, whatever the unknowns are (of `only` one arrangement)."""
+    """Return -2 log likelihood at an optimum, integrated over the unknowns (those of `only` one arrangement)."""
     here = network.at(x, case, only)
     free = np.ix_(here.free, here.free)
     value = float(np.sum((here.left / here.std) ** 2) + here.away @ here.prior @ here.away)
@@ -104,7 +104,7 @@ def unlikelihood(network: Network, x: Floats, case: Case, only: int | None = Non
     value += unlikely(int(case.marks.sum()), len(case.marks))
     if case.marks.any():
         value += float(Marks.at(network, x, case, only).penalties()[case.marks].sum())
-    return value + WRONG_ORDER * len(out_of_order(network, x))
+    return value + WRONG_ORDER_PENALTY * len(out_of_order(network, x))
 
 
 def out_of_order(network: Network, x: Floats) -> list[int]:
@@ -134,13 +134,13 @@ def adjust(
     case = Case(none if marks is None else marks, network.pair_m or start_m, CURVE_STD_M)
     for _ in range(rounds):
         before = case
-        x, _ = settle(network, x, case)
+        x, _ = optimize(network, x, case)
         case = replace(case, marks=Marks.at(network, x, case).searched())
-        x, _ = settle(network, x, case)
+        x, _ = optimize(network, x, case)
         case = _spreads(network, x, case)
         if abs(case.pair_m - before.pair_m) < 0.02 * case.pair_m and np.array_equal(case.marks, before.marks):
             break
-    x, settled = settle(network, x, case)
+    x, settled = optimize(network, x, case)
     here = network.at(x, case)
     # Lengths, and known coordinates that may be free.
     dimensions = np.array([boards.dimensions for boards in network.arrangements])
@@ -159,7 +159,7 @@ def adjust(
 
 def _unlikely_spreads(case: Case) -> float:
     """Return -2 log of what is known of the spreads beforehand."""
-    known = PAIR_WORTH * (2 * math.log(case.pair_m) + (PAIR_STD_M / case.pair_m) ** 2)
+    known = PAIR_PRIOR_FREEDOM * (2 * math.log(case.pair_m) + (PAIR_STD_M / case.pair_m) ** 2)
     return known + (math.log(case.curve_m / CURVE_STD_M) / math.log(CURVE_FACTOR)) ** 2
 
 
@@ -257,7 +257,7 @@ def solve(network: Network, *, moves: int = 6) -> tuple[Solution, SecondBest | N
     worse: list[tuple[float, tuple[str, tuple[int, ...]]]] = []
     for _ in range(moves):
         here = unlikelihood(network, found.x, found.case)
-        others = [other for k in range(len(network.arrangements)) for other in _others(found, k)]
+        others = [other for k in range(len(network.arrangements)) for other in _other_solutions(found, k)]
         # Rounded, so that of mirror images the same one is named on every machine.
         worse = [(round(value - here, 3), who) for value, _, _, who in others if value >= here - 1e-3]
         better = [other for other in others if other[0] < here - 1e-3]
@@ -274,19 +274,21 @@ def solve(network: Network, *, moves: int = 6) -> tuple[Solution, SecondBest | N
     return found, SecondBest(name, tags, max(0.0, gap))
 
 
-def settle_with_marks(network: Network, x: Floats, case: Case, only: int | None = None) -> tuple[float, Floats, Case]:
+def optimize_with_marks(network: Network, x: Floats, case: Case, only: int | None = None) -> tuple[float, Floats, Case]:
     """Return -2 log likelihood, the unknowns and the case with what is likeliest reflected, from a start."""
     for _ in range(2):
-        x, _ = settle(network, x, case, only)
+        x, _ = optimize(network, x, case, only)
         marks = Marks.at(network, x, case, only).searched()
         if np.array_equal(marks, case.marks):
             break
         case = replace(case, marks=marks)
-        x, _ = settle(network, x, case, only)
+        x, _ = optimize(network, x, case, only)
     return unlikelihood(network, x, case, only), x, case
 
 
-def _others(found: Solution, arrangement: int) -> Iterator[tuple[float, Floats, Case, tuple[str, tuple[int, ...]]]]:
+def _other_solutions(
+    found: Solution, arrangement: int
+) -> Iterator[tuple[float, Floats, Case, tuple[str, tuple[int, ...]]]]:
     """Yield other solutions that differ in one arrangement: how likely, unknowns, errors, and who is elsewhere."""
     network, mine = found.network, found.network.rows_of(arrangement)
     seats = network.seats(arrangement)
@@ -296,15 +298,15 @@ def _others(found: Solution, arrangement: int) -> Iterator[tuple[float, Floats, 
     seen = [_signature(network, found.x, seats)]
     here = unlikelihood(network, found.x, found.case, arrangement)
     for start in other_starts(network, found.x, arrangement):
-        value, x, case = settle_with_marks(network, start, straight, arrangement)
+        value, x, case = optimize_with_marks(network, start, straight, arrangement)
         mark = _signature(network, x, seats)
-        if value > here + WORTH_A_LOOK or any(float(np.abs(mark - one).max()) < APART_M for one in seen):
+        if value > here + MAX_WORSE_ALONE or any(float(np.abs(mark - one).max()) < MIN_DIFFERENCE_M for one in seen):
             continue
         seen.append(mark)
-        value, x, case = settle_with_marks(network, x, case)
+        value, x, case = optimize_with_marks(network, x, case)
         change = np.abs(_signature(network, x, seats) - seen[0]).max(axis=1)
-        if change.max() >= APART_M:
-            tags = np.array(network.arrangements[arrangement].tags)[change > max(APART_M, 0.5 * change.max())]
+        if change.max() >= MIN_DIFFERENCE_M:
+            tags = np.array(network.arrangements[arrangement].tags)[change > max(MIN_DIFFERENCE_M, 0.5 * change.max())]
             yield value, x, case, (network.arrangements[arrangement].name, tuple(tags.tolist()))
 
 

@@ -16,7 +16,7 @@ from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.settings import SurveySettings
-from calib.surveys.checks import misplaced, worst
+from calib.surveys.checks import likeliest_fault, wrong_orders
 from calib.surveys.knowledge import Knowledge, check_knowledge, load_knowledge
 from calib.surveys.network import DIMENSIONS, Boards, CurvePrior, Known, Network, numbered
 from calib.surveys.outcome import result_of, widened_by
@@ -58,12 +58,12 @@ def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, 
         found, second = solve(replace(network, pair_m=asked.pair_error_m))
         findings = list(gathered.findings)
         most = len(findings) + max(1, int(MOST_FINDINGS * len(network.means)))
-        while len(findings) < most and (doubted := worst(found)):
-            finding, found = doubted
+        while len(findings) < most and (fault := likeliest_fault(found)):
+            finding, found = fault
             findings.append(finding)
         if len(findings) > len(gathered.findings):
             found, second = solve(found.network)
-        findings += misplaced(found)
+        findings += wrong_orders(found)
         if findings and not asked.regardless:
             text = "; ".join(one.text for one in findings)
             raise UnanswerableError(f"{text} (`regardless` surveys all the same)")
