@@ -1,8 +1,7 @@
-"""What reaches one antenna from another: the one place where the length and the powers of a link are computed.
+"""Links between antennas: lengths and powers of their paths, by a table of effects.
 
-Simulated flights, served boards, passive listeners and the protocol workbench all call `link_between`, so an effect of
-`CHANNEL_EFFECTS` shows in all of them, by the same decibels and metres. The functions on segments work on n straight
-segments from `a` (n, 3) to `b` (n, 3), metres.
+Simulated flights, served boards, passive listeners and comparisons of protocols all call `link_between`, so each effect
+of `CHANNEL_EFFECTS` applies to all of them alike.
 """
 
 from __future__ import annotations
@@ -23,17 +22,17 @@ from uwbsim.world.diffraction import PlacedShadow, box_loss
 from uwbsim.world.geometric_responses import GeometricResponses
 from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.pair_states import PairLevels, ReflectedStates
-from uwbsim.world.radio import antenna_gain_db, group_delay_m, has_group_delays, path_gain_db
+from uwbsim.world.radio import antenna_gain_db, group_delay_m, path_gain_db
 
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """What reaches one antenna from another, (n,).
+    """n links between two antennas each, (n,).
 
-    `distance_m` is the straight line, `excess_m` how much longer the first detected path is or seems;
-    `power_dbm` that path's power, `total_dbm` that of all paths together. Where there are several paths, `paths_m` and
-    `paths_dbm` are the lengths and powers of all, (n, paths), in any order. `noise_s` is what noise does to the leading
-    edge of the first path, a standard deviation, where a response tells.
+    `distance_m` is the length of the straight line, `excess_m` the apparent additional length of the first detected
+    path; `power_dbm` is that path's power, `total_dbm` that of all paths together. With several paths, `paths_m` and
+    `paths_dbm` are the lengths and powers of all, (n, paths), in any order. With geometric responses, `noise_s` is the
+    standard deviation of the leading edge of the first path by noise.
     """
 
     distance_m: Floats
@@ -51,22 +50,20 @@ class Link:
         return replace(self, **{name: column[rows] for name, column in columns.items() if column is not None})
 
     def weaker(self, loss_db: Floats) -> Link:
-        """Return the link with all of its paths weaker by a loss (n,)."""
+        """Return the links with a loss (n,) on all their paths."""
         paths = None if self.paths_dbm is None else self.paths_dbm - loss_db[:, None]
         return replace(self, power_dbm=self.power_dbm - loss_db, total_dbm=self.total_dbm - loss_db, paths_dbm=paths)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ends:
-    """The two ends of n links at an instant each, in the world's frame.
+    """The two ends of n links, each at one instant, in the world frame; the first end sends.
 
-    `time_s` (n,) is true time; `places` are the tags at the two ends as places in the scenario's list, (n,) each;
-    `antennas_m` where their antennas are, (n, 3) each, and `rotations` how they are turned, body to world, (n, 3, 3)
-    each. `shadows` are the bodies that may stand in between; `phases` (tags, harmonics) those of the tags' shadowing;
-    `states` the reflections that last by pair, `levels` fading and outages of pairs, `responses` those from geometry,
-    where the scenario has them.
-    `distance_m` and `gain_db`, (n,) each, follow from these: the lengths of the straight lines, and what the sender's
-    power and the two antennas together add along them. The first end sends.
+    `time_s` (n,) is true time; `places` are the indices of the two tags in the scenario, (n,) each; `antennas_m` the
+    positions of their antennas, (n, 3) each, and `rotations` their attitudes, body to world, (n, 3, 3) each. `shadows`
+    are the bodies that may obstruct links; `phases` (tags, harmonics) those of the tags' shadowing; `states` lasting
+    reflections of pairs, `levels` fading and outages of pairs, `responses` geometric responses, None where the scenario
+    has none. `distance_m` (n,) is the length of the straight lines.
     """
 
     scenario: Scenario
@@ -82,7 +79,7 @@ class Ends:
     distance_m: Floats = field(init=False)
 
     def __post_init__(self) -> None:
-        """Compute the distances, which all effects need."""
+        """Compute the distances."""
         apart = self.antennas_m[1] - self.antennas_m[0]
         object.__setattr__(self, "distance_m", np.sqrt(np.einsum("ij,ij->i", apart, apart)))
 
@@ -91,17 +88,10 @@ class Ends:
         """Return unit vectors from the sender to the receiver, (n, 3)."""
         return (self.antennas_m[1] - self.antennas_m[0]) / np.maximum(self.distance_m, 1e-10)[:, None]
 
-    @property
-    def gain_db(self) -> Floats:
-        """Return what the sender's power and the antennas add along the straight lines, (n,)."""
-        towards = self.towards
-        return self.gain_towards_db(towards, -towards)
-
     def gain_towards_db(self, leaving: Floats, arriving: Floats) -> Floats:
-        """Return what the sender's power and the antennas add to paths, (n,).
+        """Return the gain of both antennas and the offset of the sender's power on paths, (n,).
 
-        `leaving` are the unit vectors (n, 3) in which they leave the sender, `arriving` those in which the receiver
-        sees them come.
+        `leaving` are unit vectors (n, 3) from the sender along the paths, `arriving` those from the receiver.
         """
         gain = np.zeros(len(leaving))
         for tags, rotation, way in zip(self.places, self.rotations, (leaving, arriving), strict=True):
@@ -129,14 +119,15 @@ def paths_heard(link: Link, detour_m: float = 0.0) -> PathsHeard:
 
 
 ChannelEffect = Callable[[Link, Ends], Link]
-"""Returns what becomes of n links between given ends; what it does not change it keeps (`dataclasses.replace`)."""
+"""Returns n links between given ends after an effect; `dataclasses.replace` keeps what it does not change."""
 
 
 def link_between(ends: Ends) -> Link:
-    """Return the links of tags at known places, (n,), with every effect of `CHANNEL_EFFECTS` in its order."""
-    nothing = np.zeros_like(ends.distance_m)
-    # A response from geometry has the powers, too.
-    power = nothing if ends.responses is not None else path_gain_db(ends.scenario.radio, ends.distance_m) + ends.gain_db
+    """Return the links between known ends, (n,), after all effects of `CHANNEL_EFFECTS` in their order."""
+    power = nothing = np.zeros_like(ends.distance_m)
+    if ends.responses is None:  # geometric responses have the powers, too
+        gain = ends.gain_towards_db(ends.towards, -ends.towards)
+        power = path_gain_db(ends.scenario.radio, ends.distance_m) + gain
     link = Link(ends.distance_m, nothing, power, power)
     for name, effect in CHANNEL_EFFECTS.items():
         link = effect(link, ends)
@@ -146,7 +137,7 @@ def link_between(ends: Ends) -> Link:
 
 
 def _check(name: str, link: Link, ends: Ends) -> None:
-    """Raise `ScenarioError` where the effect of a plug-in returned something else than n finite links."""
+    """Raise `ScenarioError` if the effect of a plug-in did not return n finite links."""
     if not isinstance(link, Link):
         raise ScenarioError(f"channel effect {name!r}: returned {link!r:.60}, expected a Link")
     for column in ("distance_m", "excess_m", "power_dbm", "total_dbm"):
@@ -166,18 +157,18 @@ def _obstacles(link: Link, ends: Ends) -> Link:
 
 
 def _shadows(link: Link, ends: Ends) -> Link:
-    """Weaken the direct path by bodies in its way, before the first path is chosen."""
+    """Apply the loss of bodies on the direct path, before the first path is chosen."""
     for body in ends.shadows if ends.responses is None else ():
         link = link.weaker(body.loss_db(*(spots[:, None] for spots in ends.antennas_m))[:, 0])
     return link
 
 
 def _reflections(link: Link, ends: Ends) -> Link:
-    """Add the paths by the room's surfaces, through obstacles and bodies as the direct one.
+    """Add the reflections by the room's surfaces, with the losses of obstacles and bodies on them.
 
-    The image method: straight to the image of the other end is as long as the path by the surface, which it crosses
-    where that reflects. The detector takes the earliest path that is not weaker than the strongest by more than its
-    dynamic range.
+    The image method: the straight line to the image of the other end has the length of the reflected path, and crosses
+    the surface at the point of reflection. The first detected path is the earliest whose power is within the dynamic
+    range of the strongest.
     """
     room, radio = ends.scenario.room, ends.scenario.radio
     if room is None or room.reflection_loss_db is None:
@@ -188,7 +179,7 @@ def _reflections(link: Link, ends: Ends) -> Link:
     way, back = images[1] - spots[0], images[0] - spots[1]
     length = np.linalg.norm(way, axis=2)
     scale = np.maximum(length, 1e-10)[:, :, None]
-    # How far in front of the surface the two ends are decides where the path meets it.
+    # The distances of the two ends from the surface give the point of reflection.
     near, far = (np.linalg.norm(image - end, axis=2) for image, end in zip(images, spots, strict=True))
     point = spots[0] + (near / np.maximum(near + far, 1e-10))[:, :, None] * way
     leaving, arriving = way / scale, back / scale
@@ -217,7 +208,7 @@ def _reflections(link: Link, ends: Ends) -> Link:
 
 
 def _images(room: Room, spots: Floats) -> Floats:
-    """Return points (n, 6, 3) mirrored at the surface of their column."""
+    """Return the images of points (n, 6, 3) in the surfaces of their columns."""
     image = spots.copy()
     for axis in range(3):
         for side, wall in enumerate((room.min_m[axis], room.max_m[axis])):
@@ -226,7 +217,7 @@ def _images(room: Room, spots: Floats) -> Floats:
 
 
 def _states(link: Link, ends: Ends) -> Link:
-    """Apply reflections that last: a weaker and later first path, and most of the power later still."""
+    """Apply lasting reflections: a weaker and later first path, and a strongest path after it."""
     model = ends.scenario.radio.multipath
     if ends.states is None or not isinstance(model, TwoStateMultipath):
         return link
@@ -234,7 +225,7 @@ def _states(link: Link, ends: Ends) -> Link:
     power = link.power_dbm - first.first_loss_db
     total = link.total_dbm - np.where(first.reflected, model.total_loss_db, 0.0)
     excess = link.excess_m + first.excess_m
-    # The strongest path comes after the first; with a direct path there is none, of 1e-30 mW.
+    # The strongest path comes after the first; after a direct path it has no power (1e-30 mW).
     nothing_mw = 1e-30
     rest = np.maximum(10 ** (total / 10) - 10 ** (power / 10), nothing_mw)
     later = np.where(first.reflected, 10 * np.log10(rest), 10 * np.log10(nothing_mw))
@@ -252,27 +243,25 @@ def _states(link: Link, ends: Ends) -> Link:
 
 
 def _response(link: Link, ends: Ends) -> Link:
-    """Read all that geometry does off one response: the effects above skip links that have one."""
+    """Take excess length, powers and noise from geometric responses; the effects above skip links that have one."""
     if ends.responses is None:
         return link
     read = ends.responses.at(ends.places, ends.time_s)
-    return replace(
-        link, excess_m=read.excess_m, power_dbm=read.power_dbm, total_dbm=read.total_dbm, noise_s=read.noise_s
-    )
+    return replace(link, **{column.name: getattr(read, column.name) for column in fields(read)})
 
 
 def _levels(link: Link, ends: Ends) -> Link:
-    """Apply fading and outages of pairs, to all paths alike."""
+    """Apply fading and outages of pairs to all paths."""
     return link if ends.levels is None else link.weaker(-ends.levels.at_db(ends.places, ends.time_s))
 
 
 def _group_delays(link: Link, ends: Ends) -> Link:
-    """Delay every path of a link by the group delays of the antennas in the directions of the direct one."""
-    if not has_group_delays(ends.scenario):
+    """Delay every path of a link by the group delays of both antennas in the direction of the direct path."""
+    scenario, towards, late = ends.scenario, ends.towards, np.zeros(len(ends.distance_m))
+    if scenario.radio.group_delay is None and all(tag.group_delay is None for tag in scenario.tags):
         return link
-    towards, late = ends.towards, np.zeros(len(ends.distance_m))
     for tags, rotation, way in zip(ends.places, ends.rotations, (towards, -towards), strict=True):
-        late = late + group_delay_m(ends.scenario, tags, np.einsum("ni,nij->nj", way, rotation))
+        late = late + group_delay_m(scenario, tags, np.einsum("ni,nij->nj", way, rotation))
     paths = None if link.paths_m is None else link.paths_m + late[:, None]
     return replace(link, excess_m=link.excess_m + late, paths_m=paths)
 
@@ -286,18 +275,18 @@ CHANNEL_EFFECTS: Final[dict[str, ChannelEffect]] = {
     "fading and outages": _levels,
     "group delays": _group_delays,
 }
-"""What happens to waves on their way, in this order, for every link of every scenario; those of plug-ins come last."""
+"""Effects on every link of every scenario, in this order; those of plug-ins come last."""
 
 OWN_EFFECTS: Final = tuple(CHANNEL_EFFECTS)
-"""Those that follow from the scenario alone."""
+"""Effects that follow from the scenario alone."""
 
 
 def register_channel_effect(name: str, effect: ChannelEffect) -> None:
-    """Add an effect to every link that is simulated from now on; `del CHANNEL_EFFECTS[name]` takes it away again.
+    """Add an effect to every link that is simulated from now on; `del CHANNEL_EFFECTS[name]` removes it.
 
     `effect(link, ends)` is given n links (`Link`: distances and excess lengths in metres, powers in dBm, (n,) each) and
     their two ends (`Ends`), and returns links. It must depend on nothing else, so that the same seed gives the same
-    flight. Flights, served boards, passive listeners, and the predictions and comparisons of protocols all show it.
+    flight. It applies to flights, served boards, passive listeners, and predictions and comparisons of protocols.
     Raises `ParameterError` for a name that is taken.
 
     >>> from dataclasses import replace

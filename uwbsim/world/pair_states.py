@@ -1,7 +1,8 @@
-"""What changes with a pair of tags over time: fading, outages, and reflections that last ("two-state" multipath).
+"""Random states of pairs of tags over time: fading, outages, and lasting reflections ("two-state" multipath).
 
-All three are drawn anew at random instants (`Redraws`), so their autocorrelation is exp(-dt/life). Each property has a
-random stream named after its purpose and the two tags: a longer run continues a shorter one.
+A state is constant between random instants, at which it is drawn again (`Redraws`), so its autocorrelation is
+exp(-dt/life). Each property has a random stream named by its purpose and the two tags: a longer run continues a shorter
+one.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Fading, TwoStateMultipath
 
 Draw = Callable[[str], np.random.Generator]
-"""Returns the random stream of a pair for a purpose."""
+"""Returns the random stream of a pair, or of a body, for a purpose."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Redraws:
-    """The instants at which states of pairs are drawn anew, one pair after the other, each in order of time.
+    """The instants at which the states of pairs are drawn again, ordered by pair and time.
 
-    `begin` has the instants in seconds, moved by `span_s` for each pair before, so that one search finds a state;
-    `pair` gives the pair of two tags by their places, (tags, tags).
+    `begin` are the instants in seconds plus `span_s` times the number of their pair, so that one search finds a state;
+    `pair` is the number of the pair of two tags by their indices, (tags, tags).
     """
 
     pair: Ints
@@ -48,7 +49,7 @@ class Redraws:
         `life_s(ids, draw)` is the mean time between redraws of the pair with these tag ids, and
         `values(ids, draw, count)` draws its states, (..., count).
         """
-        # Links are asked for a minute after the end of a run at most; beyond it the last state lasts.
+        # Links are needed until a minute after the end of a run at most; beyond it the last state stays.
         count, span = len(scenario.tags), scenario.run.duration_s + 60.0
         pair, begins, drawn = np.zeros((count, count), dtype=np.int64), [], []
         for number, (a, b) in enumerate(combinations(range(count), 2)):
@@ -61,13 +62,13 @@ class Redraws:
         return cls(pair=pair, span_s=span, begin=np.concatenate(begins)), np.concatenate(drawn, axis=-1)
 
     def at(self, places: tuple[Ints, Ints], time_s: Floats) -> Ints:
-        """Return the places (n,) of the states between tags (n,) at true times (n,); the same in both directions."""
+        """Return the indices (n,) of the states between tags (n,) at true times (n,); the same in both directions."""
         inside = np.clip(time_s, 0, np.nextafter(self.span_s, 0))
         return np.searchsorted(self.begin, self.pair[places] * self.span_s + inside, side="right") - 1
 
 
 def _instants(rng: np.random.Generator, life_s: float, span_s: float) -> Floats:
-    """Return when states are drawn anew, from zero on."""
+    """Return the instants of redraws from zero to `span_s`, a Poisson process."""
     begin = np.zeros(1)
     while begin[-1] < span_s:
         more = rng.exponential(life_s, int((span_s - begin[-1]) / life_s * 1.1) + 8)
@@ -83,20 +84,16 @@ class PairLevels:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self | None:
-        """Draw fading and outages over a run; None where the scenario asks for neither."""
+        """Draw fading and outages over a run; None for a scenario without either."""
         fading, outages, parts = scenario.radio.fading, scenario.radio.outages, []
         if fading is not None:
             parts.append(_levels(scenario, "fading", fading.life_s, partial(_fades, fading)))
         if outages is not None:
-            share = outages.share
-            # At -80 dB nothing is heard.
-            parts.append(
-                _levels(scenario, "outages", outages.life_s, lambda rng, n: np.where(rng.random(n) < share, -80.0, 0.0))
-            )
+            parts.append(_levels(scenario, "outages", outages.life_s, partial(_outages, outages.share)))
         return cls(tuple(parts)) if parts else None
 
     def at_db(self, places: tuple[Ints, Ints], time_s: Floats) -> Floats:
-        """Return what is added to powers between tags at places (n,) at true times (n,), in dB."""
+        """Return the change of power between tags with indices (n,) at true times (n,), in dB."""
         total = np.asarray(sum(level[redraws.at(places, time_s)] for redraws, level in self.parts))
         return np.where(places[0] != places[1], total, 0.0)
 
@@ -107,6 +104,10 @@ def _levels(
     return Redraws.of(scenario, purpose, lambda ids, draw: life_s, lambda ids, draw, n: levels(draw("levels"), n))
 
 
+def _outages(share: float, rng: np.random.Generator, count: int) -> Floats:
+    return np.where(rng.random(count) < share, -80.0, 0.0)  # -80 dB is below any sensitivity
+
+
 def _fades(fading: Fading, rng: np.random.Generator, count: int) -> Floats:
     if not fading.levels_db:
         return fading.std_db * rng.standard_normal(count)
@@ -115,10 +116,10 @@ def _fades(fading: Fading, rng: np.random.Generator, count: int) -> Floats:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FirstPaths:
-    """The first paths of n links: whether they are reflections, and what tells them from direct ones, (n,) each.
+    """The first paths of n links: whether they are reflections, and their properties, (n,) each.
 
-    `excess_m` is the excess length of the first path; `first_loss_db` how much weaker it is than the direct one would
-    be, and `rise_s` how much later the strongest path comes, zero for direct paths.
+    `excess_m` is the excess length of the first path; `first_loss_db` its loss relative to the direct path, and
+    `rise_s` the delay of the strongest path after it, both zero for direct paths.
     """
 
     reflected: Bools
@@ -129,14 +130,14 @@ class FirstPaths:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReflectedStates:
-    """Reflections that last: the states of all pairs as rows in the order of `FirstPaths`, (4, states)."""
+    """Lasting reflections: the states of all pairs, rows in the order of the fields of `FirstPaths`, (4, states)."""
 
     redraws: Redraws
     states: Floats
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self | None:
-        """Draw the first paths of all pairs over a run; None where the scenario does not ask for any."""
+        """Draw the first paths of all pairs over a run; None for a scenario without two-state multipath."""
         model = scenario.radio.multipath
         if not isinstance(model, TwoStateMultipath):
             return None
@@ -160,7 +161,7 @@ class ReflectedStates:
         return cls(redraws=redraws, states=drawn)
 
     def at(self, places: tuple[Ints, Ints], time_s: Floats) -> FirstPaths:
-        """Return the paths between tags at places (n,) at true times (n,); a tag has no path to itself."""
+        """Return the first paths between tags with indices (n,) at true times (n,); a tag has none to itself."""
         reflected, excess_m, loss_db, rise_s = self.states[:, self.redraws.at(places, time_s)]
         others = places[0] != places[1]
         late = (reflected > 0) & others
@@ -173,7 +174,7 @@ class ReflectedStates:
 
 
 def share_and_life(model: TwoStateMultipath, ids: list[int], rng: np.random.Generator) -> tuple[float, float]:
-    """Return a pair's share of reflections and their life in seconds: known ones, or drawn."""
+    """Return a pair's share of reflections and their life in seconds: from the scenario, or else drawn."""
     share = model.share
     if model.share_std:
         # The beta distribution with the model's mean and standard deviation.

@@ -1,4 +1,4 @@
-"""Antennas over direction (gain, group delay), received power, and what depends on it: bias, noise, printed values."""
+"""Antenna gain and group delay by direction, received power, and bias, noise and printed readings by power."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ FPP_OFFSET_DB: Final = 121.74
 """DW1000 User Manual, section 4.7.1, for a pulse repetition frequency of 64 MHz."""
 
 NEAREST_PATH_M: Final = 0.05
-"""Shorter paths count as this long: path gain has no sense nearer to an antenna."""
+"""Least length of a path in its gain: the far-field formula does not hold closer to an antenna."""
 
 SHADOW_ORDERS: Final = np.arange(1, 4)
-"""Harmonics of azimuth that the shadow of a tag's body is made of: smooth over some 60 degrees."""
+"""Harmonics of azimuth in the shadowing of a tag by its body: smooth over some 60 degrees. Chosen."""
 
 
 def _dipole_db(sine: Floats) -> Floats:
-    """Return the gain of a short dipole; nulls are 20 dB deep."""
+    """Return the gain of a short dipole in dB, with nulls 20 dB below its maximum."""
     return 1.76 + 20 * np.log10(np.maximum(sine, 0.1))
 
 
@@ -44,29 +44,29 @@ ANTENNAS: Final[dict[str, Callable[[Floats], Floats]]] = {"isotropic": np.zeros_
 def harmonics(direction: Floats, degree: int) -> Floats:
     """Return the real spherical harmonics of degree 0 to `degree` at unit vectors (n, 3), (n, (degree + 1)^2).
 
-    In order of degree l, and in each of m from -l to l: the sine of azimuth for negative ones. Their root mean square
+    Ordered by degree l, then by m from -l to l; negative m are those with the sine of azimuth. Their root mean square
     over all directions is one.
     """
     azimuth = np.arctan2(direction[:, 1], direction[:, 0])
     height = np.clip(direction[:, 2], -1, 1)
     columns = []
-    for l in range(degree + 1):  # noqa: E741 - the letter that everybody writes
+    for l in range(degree + 1):  # noqa: E741 - the usual symbol
         for m in range(-l, l + 1):
             scale = sqrt((2 * l + 1) * factorial(l - abs(m)) / factorial(l + abs(m)) * (2 if m else 1))
-            # lpmv has the sign of Condon and Shortley, which is taken out again.
+            # (-1)^m removes the Condon-Shortley sign of lpmv.
             wave = (-1) ** m * (np.sin(-m * azimuth) if m < 0 else np.cos(m * azimuth))
             columns.append(scale * lpmv(abs(m), l, height) * wave)
     return np.column_stack(columns)
 
 
 def shadowing_phases(scenario: Scenario) -> Floats:
-    """Return the phases of the harmonics of each tag's shadow, (tags, harmonics): the same in every run with a seed."""
+    """Return the phases of the harmonics of each tag's shadowing, (tags, harmonics), drawn from the seed."""
     streams = (stream(scenario.run.seed, "shadowing", tag.id) for tag in scenario.tags)
     return np.array([one.uniform(0, 2 * np.pi, len(SHADOW_ORDERS)) for one in streams])
 
 
 def antenna_gain_db(scenario: Scenario, phases: Floats, tags: Ints, direction: Floats) -> Floats:
-    """Return the gains in dB of tags at places (n,) towards unit vectors (n, 3) in their bodies' frames, (n,).
+    """Return the gains in dB of tags with indices (n,) towards unit vectors (n, 3) in their bodies' frames, (n,).
 
     The antenna stands along the body's z axis. Shadowing by the body is a smooth function of azimuth with standard
     deviation `shadowing_db`; `phases` (tags, harmonics) are those of `shadowing_phases`.
@@ -96,15 +96,10 @@ def _interpolator(azimuth_deg: tuple[float, ...], elevation_deg: tuple[float, ..
     return RegularGridInterpolator((azimuth_deg, elevation_deg), np.array(values))
 
 
-def has_group_delays(scenario: Scenario) -> bool:
-    """Return whether any tag has one."""
-    return scenario.radio.group_delay is not None or any(tag.group_delay is not None for tag in scenario.tags)
-
-
 def group_delay_m(scenario: Scenario, tags: Ints, direction: Floats) -> Floats:
-    """Return the group delays of tags at places (n,) towards unit vectors (n, 3) in their bodies' frames.
+    """Return the group delays, in metres of path (n,), of tags with indices (n,) towards unit vectors (n, 3).
 
-    In metres of path, (n,).
+    The vectors are in the frames of the tags' bodies.
     """
     delay = np.zeros(len(tags))
     for place in np.unique(tags).tolist():
@@ -119,7 +114,7 @@ def _group_delay_cm(model: GroupDelay, direction: Floats) -> Floats:
     azimuth = np.arctan2(direction[:, 1], direction[:, 0]) - np.radians(model.turned_deg)
     sine = np.clip(direction[:, 2], -1, 1)
     if isinstance(model, GroupDelayTable):
-        # Turned boards look beyond the table's ends, which are the same direction.
+        # The azimuth of a turned board may lie beyond the ends of the table, which are the same direction.
         around = (np.degrees(azimuth) + 180) % 360 - 180
         table = _interpolator(model.azimuth_deg, model.elevation_deg, model.delay_cm)
         return np.asarray(table(np.column_stack([around, np.degrees(np.arcsin(sine))])))
@@ -146,9 +141,10 @@ SATURATION_SHARPNESS: Final = 1.5
 
 
 def reported_dbm(radio: Radio, power_dbm: Floats) -> Floats:
-    """Return the first-path powers that receivers read: the same, or saturating.
+    """Return the first-path powers that receivers read, saturated if the radio has a saturation.
 
-    The inverses of the lifted powers to the power of `SATURATION_SHARPNESS` add up with that of the highest.
+    With lifted powers x of the path, y of the reading and z of saturation: y^-s = x^-s + z^-s, s being
+    `SATURATION_SHARPNESS`.
     """
     if radio.saturation_dbm is None:
         return power_dbm
@@ -157,15 +153,15 @@ def reported_dbm(radio: Radio, power_dbm: Floats) -> Floats:
 
 
 def before_saturation_dbm(reading_dbm: Floats, saturation_dbm: float) -> tuple[Floats, Floats]:
-    """Return the powers whose readings saturate below `saturation_dbm`, and their slopes by the readings."""
+    """Return the powers of saturated readings, the inverse of `reported_dbm`, and their derivatives by the readings."""
     left = 1 - 10 ** (SATURATION_SHARPNESS / 10 * (reading_dbm - saturation_dbm))
     return np.asarray(reading_dbm - 10 / SATURATION_SHARPNESS * np.log10(left)), 1 / left
 
 
 def reception_bias_s(radio: Radio, power_dbm: Floats, total_dbm: Floats | None = None) -> Floats:
-    """Return what power adds to a receive stamp, in seconds: a spline over first-path, a table over total power.
+    """Return the bias of a receive stamp by power, in seconds: a spline over first-path, a table over total power.
 
-    Each of the two receptions of a range carries it, so a range has the mean of the curve's values.
+    Both receptions of a range have it, so the bias of a range is the mean of the curve's two values.
     """
     if isinstance(radio.bias, BiasTable):
         order = np.argsort(radio.bias.power_dbm)
@@ -185,7 +181,7 @@ def reception_noise_s(radio: Radio, power_dbm: Floats) -> Floats:
 
 
 def printed_power_dbm(radio: Radio, power_dbm: Floats, noise: Floats) -> Floats:
-    """Return first-path power as the boards print it: 10 log10 of a whole number, cut to four decimals.
+    """Return first-path power as the boards print it: 10 log10 of a whole number, truncated to four decimals.
 
     `noise` is standard normal, (n,).
     """
@@ -197,7 +193,7 @@ def printed_power_dbm(radio: Radio, power_dbm: Floats, noise: Floats) -> Floats:
 
 
 def carrier_bias_ppm(radio: Radio, power_dbm: Floats) -> Floats:
-    """Return the bias of the carrier integrator's readings of frames with these first-path powers.
+    """Return the bias of the carrier integrator's readings of frames by first-path power.
 
     It is `skew_bias_ppm` at -90 dBm, in the middle of the boards' powers.
     """
@@ -207,7 +203,7 @@ def carrier_bias_ppm(radio: Radio, power_dbm: Floats) -> Floats:
 def printed_skew_ppm(radio: Radio, skew_ppm: Floats, noise: Floats, power_dbm: Floats) -> Floats:
     """Return relative skew as the boards print it: whole counts of the carrier integrator, with sign, bias and noise.
 
-    `skew_ppm` is by how much the receiver's clock is faster than the sender's.
+    `skew_ppm` is the rate of the receiver's clock relative to the sender's.
     """
     read = radio.carrier_sign * skew_ppm + carrier_bias_ppm(radio, power_dbm) + noise * radio.skew_noise_ppm
     if not radio.quantize:
@@ -225,6 +221,6 @@ def _spline(curve: Spline | SigmaSpline | None, power_dbm: Floats) -> Floats:
 
 @lru_cache(maxsize=16)
 def _bspline(curve: Spline) -> tuple[BSpline, tuple[float, float]]:
-    """Return a curve of a scenario as a spline, and the range in which it is not constant."""
+    """Return a curve of a scenario as a spline, and its domain, beyond which it is constant."""
     knots = np.array(curve.knots)
     return BSpline(knots, np.array(curve.coefficients), curve.degree), (knots[curve.degree], knots[-1 - curve.degree])

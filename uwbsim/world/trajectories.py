@@ -17,9 +17,7 @@ from uwbsim.scenario.devices import Body
 from uwbsim.scenario.model import Scenario
 from uwbsim.tables import Columns, in_time_order
 from uwbsim.world.clocks import NS_PER_S
-
-Draw = Callable[[str], np.random.Generator]
-"""Returns the random stream of a body for a purpose."""
+from uwbsim.world.pair_states import Draw
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,14 +35,14 @@ class Trajectory:
         return self.position_m(time_s), Rotation.from_quat(self.quaternion(time_s)).as_matrix()
 
     def point_m(self, time_s: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
-        """Return where a point of the body is, shape (n, 3)."""
+        """Return the positions of a point of the body, shape (n, 3)."""
         return np.asarray(self.position_m(time_s) + Rotation.from_quat(self.quaternion(time_s)).apply(lever_arm_m))
 
 
 def _quaternions(angles: Floats) -> Floats:
-    """Return yaw, pitch, roll (n, 3) as quaternions x y z w: scipy's `from_euler("ZYX")` in a fifth of its time."""
+    """Return yaw, pitch, roll (n, 3) as quaternions x y z w: SciPy's `from_euler("ZYX")` in a fifth of its time."""
     (cz, cy, cx), (sz, sy, sx) = np.cos(angles / 2).T, np.sin(angles / 2).T
-    # Yaw and pitch first; the product with roll comes after.
+    # The product of yaw and pitch; then that with roll.
     x, y, z, w = -(sz * sy), cz * sy, cy * sz, cz * cy
     return np.stack([w * sx + cx * x, cx * y + z * sx, cx * z - y * sx, w * cx - x * sx], axis=1)
 
@@ -52,7 +50,7 @@ def _quaternions(angles: Floats) -> Floats:
 def sample(
     motion: RandomFlight | Waypoints | Figure | Static | Carried | Recorded, duration_s: float, draw: Draw
 ) -> Trajectory:
-    """Make the trajectory of a body over [0, duration_s]; random ones draw from the streams that `draw` names.
+    """Return the trajectory of a body over [0, duration_s]; `draw` gives the streams of random trajectories.
 
     A longer duration continues the same flight.
     """
@@ -97,7 +95,7 @@ def _waypoints(motion: Waypoints, _duration_s: float, _draw: Draw) -> Trajectory
         return Trajectory(_straight(points, motion.speed_mps or 1.0, motion.acceleration_mps2), _level)
     times = np.array(motion.times_s)
     path = CubicSpline(times, points, bc_type="clamped")
-    # Before the first and after the last point the body hovers there.
+    # Before the first and after the last point the body does not move.
     return Trajectory(lambda t: np.asarray(path(np.clip(t, times[0], times[-1]))), _level)
 
 
@@ -106,7 +104,7 @@ def _level(time_s: Floats) -> Floats:
 
 
 def _straight(points: Floats, speed: float, acceleration: float) -> Callable[[Floats], Floats]:
-    """Straight legs from standstill to standstill: trapezoids of speed, triangles where a leg is short."""
+    """Return positions on straight legs between stops: trapezoids of speed, or triangles on short legs."""
     legs = np.linalg.norm(np.diff(points, axis=0), axis=1)
     top = np.minimum(speed, np.sqrt(legs * acceleration))
     ramp = top / acceleration
@@ -134,7 +132,7 @@ def _figure(motion: Figure, _duration_s: float, _draw: Draw) -> Trajectory:
     def position(time_s: Floats) -> Floats:
         angle = 2 * np.pi * time_s / motion.period_s + np.radians(motion.phase_deg)
         sideways = np.sin(2 * angle) / 2 if motion.shape == "eight" else np.sin(angle)
-        # A helix climbs and sinks once in five rounds, the others once a round.
+        # The height of a helix has a period of five rounds, that of other figures of one.
         slow = angle / 5 if motion.shape == "helix" else angle
         height = 0.5 * motion.climb_m * np.sin(slow)
         return np.asarray(centre + np.column_stack([radius * np.cos(angle), radius * sideways, height]))
@@ -147,7 +145,7 @@ def _figure(motion: Figure, _duration_s: float, _draw: Draw) -> Trajectory:
 
 
 def _recorded(motion: Recorded, _duration_s: float, _draw: Draw) -> Trajectory:
-    """A monotone cubic through recorded positions, and the shortest turns between recorded attitudes."""
+    """Return a monotone cubic through recorded positions, and spherical interpolation of recorded attitudes."""
     times = np.array(motion.times_s)
     path = PchipInterpolator(times, np.array(motion.positions_m))
     turns = Slerp(times, Rotation.from_quat(np.array(motion.quaternions)))
@@ -170,7 +168,7 @@ def _random_flight(motion: RandomFlight, duration_s: float, draw: Draw) -> Traje
     turns = draw("yaw")
     yaw = turns.uniform(-np.pi, np.pi) + np.cumsum(turns.normal(0, 0.8, count))
     angles = BSpline(knots, np.column_stack([yaw, draw("tilt").normal(0, tilt_rad, (count, 2))]), 3)
-    # A little after the end, where the last exchange may still be under way, the body holds its place.
+    # The body stops one leg after the end, when the last exchange is over.
     last_s = duration_s + leg_s
     return Trajectory(
         lambda t: np.asarray(path(np.minimum(t, last_s))),
@@ -206,7 +204,7 @@ def height_readings(scenario: Scenario, trajectories: Mapping[str, Trajectory]) 
 
 
 def _times(scenario: Scenario, body: Body, rate_hz: float) -> tuple[Floats, Columns]:
-    """Return when a sensor reads, in seconds, and the first two columns of its table."""
+    """Return the times of a sensor's readings in seconds, and the first two columns of its table."""
     count = int(np.ceil(scenario.run.duration_s * rate_hz)) + 1
     time_ns = np.rint(np.arange(count) * NS_PER_S / rate_hz).astype(np.int64)
     return time_ns / NS_PER_S, {"time_ns": time_ns, "body": np.full(len(time_ns), body.name)}
@@ -214,17 +212,17 @@ def _times(scenario: Scenario, body: Body, rate_hz: float) -> tuple[Floats, Colu
 
 def true_motion(path: Trajectory, time_s: Floats) -> tuple[Floats, Floats]:
     """Return angular velocity (n, 3) in rad/s and specific force (n, 3) in m/s^2, both in the axes of the body."""
-    # Positions are exact to 1e-16, accelerations over 2 ms so to 1e-9.
+    # The error of positions is 1e-16, so that of accelerations over 2 ms is 1e-9.
     step_s = 1e-3
     before, after = (Rotation.from_quat(path.quaternion(time_s + sign * step_s)) for sign in (-1, 1))
     gyro = (before.inv() * after).as_rotvec() / (2 * step_s)
     early, now, late = (path.position_m(time_s + sign * step_s) for sign in (-1, 0, 1))
-    pull = (late - 2 * now + early) / step_s**2 + (0.0, 0.0, 9.81)
-    return np.asarray(gyro), np.asarray(Rotation.from_quat(path.quaternion(time_s)).inv().apply(pull))
+    force = (late - 2 * now + early) / step_s**2 + (0.0, 0.0, 9.81)
+    return np.asarray(gyro), np.asarray(Rotation.from_quat(path.quaternion(time_s)).inv().apply(force))
 
 
 def _errors(rng: np.random.Generator, imu: Imu, which: str, count: int) -> Floats:
-    """Return a bias that wanders, and white noise (n, 3), in SI units."""
+    """Return the sum of constant bias, random walk of the bias, and white noise, (n, 3), in SI units."""
     found = imu.errors(which)
     root = np.sqrt(imu.rate_hz)
     wander = np.cumsum(rng.normal(0.0, found.wander / root, (count, 3)), axis=0)
