@@ -1,6 +1,6 @@
-"""A scenario's surroundings, and all paths of a wave between two antennas in them: direct, by mirrors, by scatterers.
+"""All paths of waves between antennas in a scenario's surroundings: direct, reflected by faces, and by scatterers.
 
-`paths_between` takes antennas in their `Surroundings` to their paths, many links at once.
+`paths_between` computes the paths of many links at once from `Surroundings` and the ends of the links.
 """
 
 from __future__ import annotations
@@ -19,40 +19,40 @@ from uwbsim.scenario.model import WAVELENGTH_M, Scenario
 from uwbsim.scenario.radio import GeometricMultipath
 from uwbsim.world.diffraction import (
     AXIAL,
-    LIT,
+    LIT_NU,
     WAVENUMBER,
     Mirrors,
     PlacedShadow,
     body_gain,
     box_chords_m,
-    box_cover,
     box_loss,
-    coupling,
-    on_faces,
+    boxes_blocked,
+    face_fraction,
     planes,
+    reflection_gain,
     roughness_factor,
 )
 from uwbsim.world.radio import NEAREST_PATH_M, antenna_gain_db, path_gain_db
 
 CELLS: Final = 128
-"""A side of the table of an antenna's gains: directions are known to a degree."""
+"""Cells along a side of the table of an antenna's gains: a resolution of a degree."""
 
 
 @dataclass(frozen=True, slots=True)
 class Patterns:
-    """Amplitude gains of t different antennas with their bodies, (t, cells), and which each tag has, (tags,).
+    """Amplitude gains of t different antennas with their bodies, (t * cells,), and the index of each tag's, (tags,).
 
-    Directions are folded onto an octahedron and that onto a square, so that a look-up takes no trigonometry. `level`
-    says that all gains are one.
+    Directions are projected onto an octahedron, which is unfolded to a square, so that a look-up needs no trigonometry.
+    `constant` says that all gains are one.
     """
 
     table: Floats
     which: Ints
-    level: bool
+    constant: bool
 
     @classmethod
     def of(cls, scenario: Scenario, phases: Floats) -> Self:
-        """Tabulate those of a scenario's tags; `phases` (tags, harmonics) are those of their shadowing."""
+        """Tabulate the gains of a scenario's tags; `phases` (tags, harmonics) are those of their shadowing."""
         directions, radio = _directions(), scenario.radio
         shadows = {body.name: body.shadow for body in scenario.bodies}
         tables: list[Floats] = []
@@ -72,13 +72,12 @@ class Patterns:
                     gain = gain * body_gain(shadow, arm, arm + 3.0 * directions)
                 tables.append(gain)
             places.append(which[kind])
-        level = all(bool(np.all(table == 1)) for table in tables)
-        return cls(np.array(tables).ravel(), np.array(places), level)
+        return cls(np.array(tables).ravel(), np.array(places), bool(np.all(np.array(tables) == 1)))
 
     def gain(self, tag: Ints, own: Sequence[Floats]) -> Floats:
         """Return the gains of tags (n,) in directions of any length whose three coordinates are (n, k) each, (n, k)."""
         x, y, z = own
-        if self.level:
+        if self.constant:
             return np.ones(x.shape)
         wide = (CELLS / 2) / np.maximum(np.abs(x) + np.abs(y) + np.abs(z), 1e-12)
         u, v = x * wide, y * wide
@@ -102,7 +101,7 @@ def _directions() -> Floats:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scatterers:
-    """Things at places (s, 3) in metres; what each adds to a way, in metres, and its complex gain as a mirror, (s,)."""
+    """s scatterers: positions (s, 3) in metres, additional path length in metres and complex gain, (s,) each."""
 
     place_m: Floats
     extra_m: Floats
@@ -110,26 +109,23 @@ class Scatterers:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
-        """Draw those of a scenario; each property has a stream, so that more of them leave the first where they are."""
+        """Draw the scatterers of a scenario; each property has a stream, so that more of them do not move the first."""
         model, room = scenario.radio.multipath, scenario.room
-        count = model.scatterers if isinstance(model, GeometricMultipath) and room else 0
         if not isinstance(model, GeometricMultipath) or room is None:
             return cls(place_m=np.zeros((0, 3)), extra_m=np.zeros(0), gain=np.zeros(0, dtype=np.complex128))
-        places, extra, field = (
-            stream(scenario.run.seed, "scatterers", what) for what in ("places", "bounces", "fields")
-        )
-        extra_m = extra.exponential(SPEED_OF_LIGHT * (model.decay_ns * 1e-9), count)
+        count, names = model.scatterers, ("places", "bounces", "fields")
+        places, extra, field = (stream(scenario.run.seed, "scatterers", name) for name in names)
         parts = field.normal(size=(count, 2)) @ np.array([1, 1j]) / np.sqrt(2)
         return cls(
             place_m=places.uniform(room.min_m, room.max_m, (count, 3)),
-            extra_m=extra_m,
+            extra_m=extra.exponential(SPEED_OF_LIGHT * (model.decay_ns * 1e-9), count),
             gain=parts * 10 ** (-model.scatter_loss_db / 20),
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Surroundings:
-    """A scenario as waves see it; `phases` (tags, harmonics) are those of the tags' shadowing."""
+    """The parts of a scenario that paths depend on; `phases` (tags, harmonics) are those of the tags' shadowing."""
 
     scenario: Scenario
     mirrors: Mirrors
@@ -139,7 +135,7 @@ class Surroundings:
 
     @classmethod
     def of(cls, scenario: Scenario, phases: Floats) -> Self:
-        """Collect what stands still, and draw the scatterers."""
+        """Collect faces and antenna patterns, and draw the scatterers."""
         return cls(
             scenario=scenario,
             mirrors=Mirrors.of(scenario),
@@ -151,7 +147,7 @@ class Surroundings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Placed:
-    """m antennas at an instant each: the tags' places in the scenario's list, positions (m, 3), rotations (m, 3, 3)."""
+    """m antennas at an instant each: indices of the tags, positions (m, 3), rotations (m, 3, 3)."""
 
     tag: Ints
     antenna_m: Floats
@@ -164,20 +160,20 @@ class Placed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlacedBody(PlacedShadow):
-    """A body with a shadow at m instants: its centre (m, 3) and rotation (m, 3, 3); `carries` (tags,) says whom."""
+    """A body with a shadow at m instants; `carries` (tags,) says which tags it carries."""
 
     carries: Bools
 
-    def past(self, at: Ints, a: Floats, b: Floats) -> Floats:
-        """Return the share of the field past it, of segments (n, 3) to (n, 3) at instants `at` (n,)."""
+    def gain(self, at: Ints, a: Floats, b: Floats) -> Floats:
+        """Return the relative field behind it on segments (n, 3) to (n, 3) at instants `at` (n,)."""
         spots = (self._inside(at, ends) for ends in (a, b))
         return body_gain(self.shadow, *spots)
 
-    def past_fans(self, end: Placed, at: Ints, spots: Floats, length_m: Floats) -> Floats | float:
-        """Return the same of k segments each, of known lengths (n, k), from antennas (n,) to spots (n, k, 3) or (k, 3).
+    def fan_gain(self, end: Placed, at: Ints, spots: Floats, length_m: Floats) -> Floats | float:
+        """Return the same for k segments of lengths (n, k) from each antenna (n,) to spots (n, k, 3) or (k, 3).
 
-        Those that pass further away than a zone at its widest are not looked at any closer, nor is a body's own tag:
-        its pattern has its body.
+        It is 1, without further computation, for segments at more than the largest radius of a Fresnel zone, and for
+        tags on the body, whose antenna patterns include it.
         """
         a, k = end.antenna_m, self.shadow.centre_m
         towards = self.position_m[at] - a
@@ -193,14 +189,14 @@ class PlacedBody(PlacedShadow):
         squared -= 2 * along
         squared *= share
         longest_m = float(length_m.max(initial=0.0))
-        widest = max(self.shadow.semi_axes_m) - LIT * np.sqrt(WAVELENGTH_M / 8 * longest_m)
+        widest = max(self.shadow.semi_axes_m) - LIT_NU * np.sqrt(WAVELENGTH_M / 8 * longest_m)
         allowed = np.where(self.carries[end.tag], -np.inf, widest**2 - (towards**2).sum(axis=1))
         rows, columns = np.nonzero(squared < allowed[:, None])
         if not len(rows):
             return 1.0
         gain = np.ones(length_m.shape)
         there = spots[columns] if spots.ndim == 2 else spots[rows, columns]
-        gain[rows, columns] = self.past(at[rows], a[rows], there)
+        gain[rows, columns] = self.gain(at[rows], a[rows], there)
         return gain
 
     def _inside(self, at: Ints, spots: Floats) -> Floats:
@@ -208,12 +204,12 @@ class PlacedBody(PlacedShadow):
         return np.asarray(np.einsum("nj,njk->nk", away, self.rotation[at]))
 
 
-def in_the_way(
+def obstruction_gain(
     around: Surroundings, end: Placed, bodies: Sequence[PlacedBody], at: Ints, spots: Floats, length: Floats
 ) -> Floats:
-    """What obstacles and others' bodies leave of the field from antennas to spots (n, k, 3) or (k, 3), (n, k).
+    """Return the relative field after obstacles and other bodies from antennas to spots (n, k, 3) or (k, 3), (n, k).
 
-    A tag's own body is part of its pattern.
+    A tag's own body is part of its antenna pattern.
     """
     left = np.ones(length.shape)
     if around.scenario.obstacles:
@@ -221,12 +217,12 @@ def in_the_way(
         loss, _ = box_loss(around.scenario.obstacles, begin, np.broadcast_to(spots, (*length.shape, 3)).reshape(-1, 3))
         left = 10 ** (-loss.reshape(left.shape) / 20)
     for body in bodies:
-        left = left * body.past_fans(end, at, spots, length)
+        left = left * body.fan_gain(end, at, spots, length)
     return left
 
 
-def field_after(scenario: Scenario, length: Floats) -> Floats:
-    """Amplitude after a way without antennas: its square is the power in mW."""
+def free_space_field(scenario: Scenario, length: Floats) -> Floats:
+    """Return the amplitude after a path length without antennas: its square is the power in mW."""
     radio = scenario.radio
     if radio.path_loss_exponent == 2.0:
         return np.asarray(10 ** (radio.first_path_at_1m_dbm / 20) / np.maximum(length, NEAREST_PATH_M))
@@ -234,7 +230,7 @@ def field_after(scenario: Scenario, length: Floats) -> Floats:
 
 
 def antenna_axes(scenario: Scenario, end: Placed) -> Floats:
-    """Directions of the antennas, along which they are polarised: (n, 3)."""
+    """Return the directions of the antennas' axes, along which they are polarised, (n, 3)."""
     if scenario.radio.antenna == "isotropic":
         return np.broadcast_to(np.array([0.0, 0.0, 1.0]), (len(end.tag), 3))
     return end.rotation[:, :, 2]
@@ -242,7 +238,7 @@ def antenna_axes(scenario: Scenario, end: Placed) -> Floats:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Paths:
-    """p paths of n links: how much longer than the straight line each is, in metres, and its complex amplitude.
+    """p paths of n links: length less the straight line, in metres, and complex amplitude.
 
     Shapes (n, p); an amplitude's square is a power in mW, its phase that of the carrier.
     """
@@ -253,25 +249,25 @@ class Paths:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Legs:
-    """From m antennas to s scatterers: lengths in metres, and amplitude gains with what is in the way, (m, s) each."""
+    """Legs from m antennas to s scatterers: lengths in metres, and amplitude gains with obstructions, (m, s) each."""
 
     length_m: Floats
     gain: Floats
 
     def __getitem__(self, rows: Ints) -> Legs:
-        """Return those of the chosen antennas."""
+        """Return the legs of the chosen antennas."""
         return Legs(length_m=self.length_m[rows], gain=self.gain[rows])
 
 
 def legs_to_scatterers(around: Surroundings, ends: Placed, bodies: Sequence[PlacedBody], instant: Ints) -> Legs:
-    """Return the ways between antennas (m,) at their `instant` (m,) of the bodies' and all scatterers."""
+    """Return the legs from antennas (m,) to all scatterers; `instant` (m,) are the indices of the bodies' poses."""
     spots, a = around.scatterers.place_m, ends.antenna_m
     own = [
         ends.rotation[:, :, k] @ spots.T - np.einsum("mj,mj->m", ends.rotation[:, :, k], a)[:, None] for k in range(3)
     ]
     length = np.maximum(np.sqrt(own[0] ** 2 + own[1] ** 2 + own[2] ** 2), NEAREST_PATH_M)
     gain = around.patterns.gain(ends.tag, own)
-    gain = gain * in_the_way(around, ends, bodies, instant, spots, length)
+    gain = gain * obstruction_gain(around, ends, bodies, instant, spots, length)
     return Legs(length_m=length, gain=gain)
 
 
@@ -292,7 +288,7 @@ def paths_between(
 
 
 def _phasors(length: Floats) -> Complexes:
-    """What the carrier turns by on ways of these lengths: to 1e-7, which takes much less than all digits."""
+    """Return the phase factors of the carrier after path lengths, to single precision, which is much faster."""
     turns = length / WAVELENGTH_M
     angle = (-2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
     turned = np.empty(length.shape, dtype=np.complex128)
@@ -303,23 +299,23 @@ def _phasors(length: Floats) -> Complexes:
 def _direct(
     around: Surroundings, ends: tuple[Placed, Placed], distance: Floats, bodies: Sequence[PlacedBody], at: Ints
 ) -> tuple[Floats, Complexes]:
-    """The straight way, as what goes around obstacles and what goes through them and comes later; (n, 2) each."""
+    """Return lengths and fields of the direct path around obstacles, and of that through them; (n, 2) each."""
     scenario = around.scenario
     a, b = (end.antenna_m for end in ends)
     towards = (b - a) / np.maximum(distance, 1e-10)[:, None]
-    field = field_after(scenario, distance) * _matched(scenario, ends, towards)
+    field = free_space_field(scenario, distance) * _polarisation_match(scenario, ends, towards)
     for end, way in zip(ends, (towards, -towards), strict=True):
         own = np.einsum("nj,njk->nk", way, end.rotation)
         field = field * 10 ** (antenna_gain_db(scenario, around.phases, end.tag, own) / 20)
     for body in bodies:
-        field = field * body.past(at, a, b)
+        field = field * body.gain(at, a, b)
     if not scenario.obstacles:
         return distance[:, None], field[:, None].astype(np.complex128)
-    cover, edge = box_cover(scenario.obstacles, a, b)
+    cover, edge = boxes_blocked(scenario.obstacles, a, b)
     loss, late = _inside_boxes(around, a, b)
     past = np.prod(1 - cover, axis=1)
     everything = np.prod(1 - cover * (1 - 10 ** (-loss / 20)), axis=1)
-    # Deep in a shadow waves take the longer way by the edge, nu^2/4 wavelengths; the cover has its phase already.
+    # Deep in a shadow the path by the edge is nu^2/4 wavelengths longer; `cover` already has its phase.
     bent = np.maximum(edge.max(axis=1), 0) ** 2 / 4 * WAVELENGTH_M
     around_edges = field * past * np.exp(1j * WAVENUMBER * bent)
     slowed = np.minimum(np.abs(cover), 1.0) * late
@@ -328,9 +324,9 @@ def _direct(
 
 
 def _inside_boxes(around: Surroundings, a: Floats, b: Floats) -> tuple[Floats, Floats]:
-    """Loss in dB and excess length of what goes through each box, (n, boxes) each.
+    """Return loss in dB and excess length in metres of paths through each box, (n, boxes) each.
 
-    What passes close by an edge goes through the box beside it, at its thinnest.
+    A path close to an edge goes through the least thickness of the box.
     """
     boxes = around.scenario.obstacles
     thinnest = np.array([min(hi - lo for lo, hi in zip(box.min_m, box.max_m, strict=True)) for box in boxes])
@@ -342,7 +338,7 @@ def _inside_boxes(around: Surroundings, a: Floats, b: Floats) -> tuple[Floats, F
 def _mirrored(
     around: Surroundings, ends: tuple[Placed, Placed], bodies: Sequence[PlacedBody], at: Ints
 ) -> tuple[Floats, Complexes]:
-    """The ways by walls and faces, (n, mirrors) each: the image method, once."""
+    """Return lengths and fields of the paths by walls and faces, (n, mirrors) each: single reflections by images."""
     mirrors, scenario = around.mirrors, around.scenario
     count, axis = len(at), mirrors.axis
     if not len(axis):
@@ -350,7 +346,7 @@ def _mirrored(
     a, b = (end.antenna_m for end in ends)
     plane, there = planes(mirrors, a, b)
     columns = np.arange(len(axis))
-    # Straight to the image of the other end; only the coordinate across the mirror is another.
+    # The vector to the image of the other end differs from that to the end in the coordinate across the mirror only.
     way = np.repeat((b - a).T[:, :, None], len(axis), axis=2)
     across = 2 * plane - a[:, axis] - b[:, axis]
     way[axis, :, columns] = across.T
@@ -359,31 +355,31 @@ def _mirrored(
     point = np.moveaxis(a.T[:, :, None] + share * way, 0, 2)
     cosine = across / length
     steep = np.abs(cosine)
-    field = field_after(scenario, length) * roughness_factor(mirrors.roughness_m, steep)
+    field = free_space_field(scenario, length) * roughness_factor(mirrors.roughness_m, steep)
     back = -way
     back[axis, :, columns] *= -1
     for end, leaving, legs in zip(ends, (way, back), (share, 1 - share), strict=True):
         own = [np.einsum("jnm,nj->nm", leaving, end.rotation[:, :, k]) for k in range(3)]
         leg = np.maximum(legs * length, NEAREST_PATH_M)
-        field = field * around.patterns.gain(end.tag, own) * in_the_way(around, end, bodies, at, point, leg)
+        field = field * around.patterns.gain(end.tag, own) * obstruction_gain(around, end, bodies, at, point, leg)
     axes = (antenna_axes(scenario, ends[0]), antenna_axes(scenario, ends[1]))
-    reflected = coupling(mirrors, axes, way / length, cosine)
-    return length, np.where(there, field * reflected * on_faces(mirrors, point, share, length), 0)
+    reflected = reflection_gain(mirrors, axes, way / length, cosine)
+    return length, np.where(there, field * reflected * face_fraction(mirrors, point, share, length), 0)
 
 
 def _scattered(around: Surroundings, legs: tuple[Legs, Legs]) -> tuple[Floats, Complexes]:
-    """The ways by scatterers, (n, scatterers) each."""
+    """Return lengths and fields of the paths by scatterers, (n, scatterers) each."""
     things = around.scatterers
     length = legs[0].length_m + legs[1].length_m + things.extra_m
-    return length, (field_after(around.scenario, length) * legs[0].gain * legs[1].gain) * things.gain
+    return length, (free_space_field(around.scenario, length) * legs[0].gain * legs[1].gain) * things.gain
 
 
-def _matched(scenario: Scenario, ends: tuple[Placed, Placed], towards: Floats) -> Floats:
-    """How well the two antennas' polarisations agree on the straight way, (n,); along their axes perfectly."""
+def _polarisation_match(scenario: Scenario, ends: tuple[Placed, Placed], towards: Floats) -> Floats:
+    """Return the match of the antennas' polarisations on the direct path, (n,); 1 along their axes."""
     one, other = (antenna_axes(scenario, end) for end in ends)
     along = [np.einsum("nj,nj->n", axis, towards) for axis in (one, other)]
     size = np.sqrt(np.maximum((1 - along[0] ** 2) * (1 - along[1] ** 2), 0))
     match = (np.einsum("nj,nj->n", one, other) - along[0] * along[1]) / np.maximum(size, AXIAL)
     match = np.where(size < AXIAL, 1.0, match)
-    # Chosen: across its polarisation an antenna receives a tenth of the field all the same, 20 dB down.
+    # Chosen: cross-polarised antennas are coupled by a tenth of the field, -20 dB.
     return np.copysign(np.maximum(np.abs(match), 0.1), match)

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import quad
 
 from uwbsim.scenario.bodies import Obstacle, Shadow
-from uwbsim.world.diffraction import body_gain, box_cover, covered, edge_gain
+from uwbsim.world.diffraction import blocked_fraction, body_gain, boxes_blocked, edge_gain
 
 WAVELENGTH_M = 299_702_547 / 3993.6e6
 
@@ -24,7 +24,7 @@ def itu_db(nu):
 
 @pytest.mark.parametrize("nu", [-2.0, -0.7, 0.0, 0.4, 1.0, 2.4, 5.0])
 def test_what_a_half_plane_leaves_is_fresnels_integral(nu):
-    left = abs(1 - covered(np.array([nu]))[0])
+    left = abs(1 - blocked_fraction(np.array([nu]))[0])
     assert -20 * np.log10(left) == pytest.approx(knife_edge_db(nu), abs=0.02)
 
 
@@ -38,7 +38,7 @@ def test_the_approximation_for_bodies_is_that_of_the_itu(nu):
 def test_a_long_thin_wall_is_a_knife_edge(above_m):
     """Its upper edge lies this high above the line of sight, 2 m from one end and 3 m from the other."""
     wall = Obstacle(min_m=(1.999, -50, -50), max_m=(2.001, 50, above_m), material="metal")
-    cover, edge = box_cover([wall], np.array([[0.0, 0, 0]]), np.array([[5.0, 0, 0]]))
+    cover, edge = boxes_blocked([wall], np.array([[0.0, 0, 0]]), np.array([[5.0, 0, 0]]))
     nu = above_m * np.sqrt(2 * 5 / (WAVELENGTH_M * 2 * 3))
     assert edge[0, 0] == pytest.approx(nu, rel=1e-3, abs=1e-6)
     assert -20 * np.log10(abs(1 - cover[0, 0])) == pytest.approx(knife_edge_db(nu), abs=0.6)
@@ -58,7 +58,7 @@ def test_edges_are_where_the_line_meets_them_from_any_direction():
     a, b = offset - 4 * towards, offset + 4 * towards
     steps = a[:, None] + np.linspace(0, 1, 801)[:, None] * (b - a)[:, None]
     inside = np.all((steps > box.min_m) & (steps < box.max_m), axis=2).any(axis=1)
-    cover, edge = box_cover([box], a, b)
+    cover, edge = boxes_blocked([box], a, b)
     clear = np.abs(edge[:, 0]) > 0.5
     np.testing.assert_array_equal((edge[:, 0] > 0)[clear], inside[clear])
     assert np.all(np.abs(cover[edge[:, 0] > 3] - 1) < 0.3)
@@ -68,7 +68,7 @@ def test_edges_are_where_the_line_meets_them_from_any_direction():
 def test_boxes_that_are_not_between_the_ends_do_nothing():
     box = Obstacle(min_m=(6, -1, -1), max_m=(7, 1, 1), material="metal")
     a, b = np.zeros((2, 3)), np.array([[5.0, 0, 0], [-5.0, 0, 0]])
-    assert np.all(box_cover([box], a, b)[0] == 0)
+    assert np.all(boxes_blocked([box], a, b)[0] == 0)
 
 
 BODY = Shadow(semi_axes_m=(0.3, 0.3, 0.3), loss_db_per_m=1000.0)
