@@ -19,11 +19,10 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
-from scipy.spatial.transform import Rotation
 
-from uwblink.arrays import Floats
 from uwblink.boards.ports import Terminal
 from uwblink.output import new_file
+from uwblink.recording.schema import Poses
 from uwblink.text_files import read_text
 from uwbsim.boards.frames import NS_PER_MS
 from uwbsim.boards.virtual_board import Bench, VirtualBoard
@@ -120,18 +119,18 @@ def load_faults(path: str | os.PathLike[str], tags: Iterable[int]) -> Faults:
 
 
 def stays_s(scenario: Scenario) -> list[tuple[float, float]]:
-    """Return the stretches, (begin, end) in seconds, in which no body is being carried; none where none ever is.
+    """Return the intervals, (begin, end) in seconds, in which no body is moved; none without `carried` bodies.
 
     The last one has no end.
     """
     carried = [body.motion for body in scenario.bodies if isinstance(body.motion, Carried)]
-    ways = sorted(
+    moves = sorted(
         (turn * (motion.stay_s + motion.carry_s) + motion.stay_s, (turn + 1) * (motion.stay_s + motion.carry_s))
         for motion in carried
         for turn in range(len(motion.places_m) - 1)
     )
     found, since = [], 0.0
-    for begin, end in ways:
+    for begin, end in moves:
         if begin > since:
             found.append((since, begin))
         since = max(since, end)
@@ -139,73 +138,42 @@ def stays_s(scenario: Scenario) -> list[tuple[float, float]]:
 
 
 class LivePoses:
-    """Writes what motion capture sees, with its rate, noise, latency and gaps, as `uwblink poses` reads it.
+    """Writes the poses of motion capture, with its rate, noise, latency and gaps, as `uwblink poses` reads them.
 
-    Rows are written whole, so that a reader of the file finds complete lines meanwhile.
+    Rows are written whole, so that the file has complete lines at any time.
     """
 
     def __init__(self, world: World, path: Path, epoch_ns: int) -> None:
-        """Begin a file; `epoch_ns` is the host time at which the world's time is zero."""
-        self._world, self._epoch_ns = world, epoch_ns
-        self._eyes = {name: _Eye(world, name) for name in world.trajectories}
-        self._next = 0
+        """Create the file; `epoch_ns` is the host time at which the world's time is zero."""
+        seed, mocap = world.scenario.run.seed, world.scenario.mocap
+        self._world, self._epoch_ns, self._next = world, epoch_ns, 0
+        self._noise = {name: stream(seed, "live motion capture", name) for name in world.trajectories}
+        # Half as many again as gaps are expected in the longest run, each after the end of the last.
+        numbers, per_min = np.arange(int(1.5 * mocap.gaps_per_min * LONGEST_RUN_S / 60)), max(mocap.gaps_per_min, 1e-9)
+        draws = {name: stream(seed, "live motion capture gaps", name) for name in world.trajectories}
+        waits = {name: np.cumsum(rng.exponential(60 / per_min, len(numbers))) for name, rng in draws.items()}
+        self._gaps_s = {name: wait + numbers * mocap.gap_s for name, wait in waits.items()}
         self._file = new_file(path, force=True)
         self._file.write("time_ns,body,x,y,z,qx,qy,qz,qw\n")
         self._file.flush()
 
     def write_until(self, time_ns: int) -> None:
-        """Append the poses that motion capture has delivered by a time of the world."""
+        """Append the poses that motion capture has delivered until a time of the world."""
         mocap = self._world.scenario.mocap
-        latency_ns = round(mocap.latency_ms * 1e6)
-        end = math.floor((time_ns - latency_ns) * mocap.rate_hz / NS_PER_S) + 1
+        end = math.floor((time_ns - round(mocap.latency_ms * 1e6)) * mocap.rate_hz / NS_PER_S) + 1
         if end <= self._next:
             return
         taken_ns = np.rint(np.arange(self._next, end) * (NS_PER_S / mocap.rate_hz)).astype(np.int64)
-        rows = [
-            f"{int(at) + latency_ns + self._epoch_ns},{name}," + ",".join(f"{v:.6f}" for v in pose)
-            for name, eye in self._eyes.items()
-            for at, pose in zip(taken_ns, eye.see(taken_ns * 1e-9), strict=True)
-            if pose is not None
-        ]
-        rows.sort(key=lambda row: int(row[: row.index(",")]))
         self._next = end
-        if rows:
-            self._file.write("\n".join(rows) + "\n")
-            self._file.flush()
+        parts = [self._world.seen(name, taken_ns, rng, self._gaps_s[name]) for name, rng in self._noise.items()]
+        poses = Poses.concatenate(parts).in_time_order()
+        for at, body, *pose in zip(poses.time_ns, poses.body, *poses.position_m.T, *poses.quaternion.T, strict=True):
+            self._file.write(f"{at + self._epoch_ns},{body}," + ",".join(f"{v:.6f}" for v in pose) + "\n")
+        self._file.flush()
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-
-class _Eye:
-    """What motion capture sees of one body."""
-
-    def __init__(self, world: World, body: str) -> None:
-        self._mocap, self._path = world.scenario.mocap, world.trajectories[body]
-        self._noise = stream(world.scenario.run.seed, "live motion capture", body)
-        self._gaps = stream(world.scenario.run.seed, "live motion capture gaps", body)
-        self._blind_from_s = self._gap_after(0.0)
-
-    def _gap_after(self, time_s: float) -> float:
-        """Draw when the next gap begins."""
-        per_min = self._mocap.gaps_per_min
-        return time_s + float(self._gaps.exponential(60 / per_min)) if per_min else math.inf
-
-    def see(self, time_s: Floats) -> list[Floats | None]:
-        """Return position and quaternion at times (n,), None in a gap."""
-        spread = self._noise.normal(size=(2, len(time_s), 3))
-        position = self._path.position_m(time_s) + spread[0] * self._mocap.position_noise_m
-        wobble = Rotation.from_rotvec(spread[1] * self._mocap.attitude_noise_rad)
-        turn = (Rotation.from_quat(self._path.quaternion(time_s)) * wobble).as_quat()
-        return [
-            None if self._is_blind(at) else np.concatenate(p) for at, *p in zip(time_s, position, turn, strict=True)
-        ]
-
-    def _is_blind(self, time_s: float) -> bool:
-        while time_s > (end_s := self._blind_from_s + self._mocap.gap_s):
-            self._blind_from_s = self._gap_after(end_s)
-        return time_s >= self._blind_from_s
 
 
 class Server:
@@ -246,9 +214,8 @@ class Server:
     ) -> None:
         """Open one pseudo-terminal a tag; raises `PortError` where a link cannot be made.
 
-        With a `speed` below 1 the boards' time passes that much slower than the wall clock's. `tell` is called with
-        a line about each failure that does not end the serving: a board's own program failed, or poses cannot be
-        written any more.
+        `speed` is the rate of the boards' time relative to the wall clock. `tell` is called with a line about each
+        failure that does not end the server: a board's own program failed, or poses cannot be written any more.
         """
         self._speed, self._tell = speed, tell
         self._faults = faults or Faults()
@@ -276,9 +243,9 @@ class Server:
 
     @staticmethod
     def extended(scenario: Scenario, duration_s: float | None) -> Scenario:
-        """Return a scenario that lasts as long as it is to be served; two hours where no duration is given.
+        """Return a scenario that lasts as long as it is served, two hours if no duration is given.
 
-        Then bodies hold their place.
+        After that, bodies do not move.
         """
         longer = max(scenario.run.duration_s, duration_s or 7200.0)
         return scenario.model_copy(
@@ -287,17 +254,17 @@ class Server:
 
     @property
     def lost_bytes(self) -> int:
-        """Bytes that found no reader."""
+        """Bytes that no client has read."""
         return sum(t.lost_bytes for t in self._terminals.values())
 
     def run(self, stop: Callable[[], bool], duration_s: float = float("inf")) -> None:
-        """Serve until `stop` says so or the time is over."""
+        """Serve until `stop` returns True or the duration is over."""
         end_ns = duration_s * NS_PER_S
         while not stop() and self._now_ns() < end_ns:
             self.step()
 
     def step(self) -> None:
-        """Wait for bytes or for what is due next, and do it."""
+        """Wait for bytes from clients or for the next event, and process them."""
         due = min(self.bench.next_ns(), self._timed[0][0] if self._timed else float("inf"))
         wait_s = min(max((due - self._now_ns()) / NS_PER_S / self._speed, 0.0), 0.1)
         for key, _ in self._selector.select(wait_s):
@@ -312,7 +279,7 @@ class Server:
             heapq.heappop(self._timed)[2]()
 
     def announce(self, tell: Callable[[str], object]) -> None:
-        """Call `tell` with a line when boards that are carried from place to place stand still, and until when."""
+        """Call `tell` with a line at each time from which `carried` boards stand still, and until when."""
         stays = stays_s(self.bench.radios.scenario)
         for number, (begin_s, end_s) in enumerate(stays, start=1):
             until = "stay there" if math.isinf(end_s) else f"stand until {end_s:g} s"
@@ -339,7 +306,7 @@ class Server:
         self._tell(f"board {board.id} hangs: its program failed with {type(error).__name__}: {error}")
 
     def close(self) -> None:
-        """Unplug everything."""
+        """Unplug all boards, and close the file of poses."""
         if self._poses is not None:
             with suppress(OSError):
                 self._poses.close()
@@ -348,7 +315,7 @@ class Server:
         self._selector.close()
 
     def unplug(self, tag: int) -> None:
-        """Pull a board's cable, from any thread: `step` does it, so that nothing closes what it waits on."""
+        """Unplug a board, from any thread: `step` does it, so that no terminal is closed while it is waited on."""
         self._at(self._now_ns(), partial(self._unplug, tag))
 
     def plug(self, tag: int) -> None:
@@ -363,7 +330,6 @@ class Server:
         self.bench.boards[tag].power_off()
 
     def _plug(self, tag: int) -> None:
-        """Plug a board in again: it boots."""
         if self._terminals[tag].fileno is None:
             self._terminals[tag].plug()
             self._watch(tag)
@@ -390,7 +356,7 @@ class Server:
             self._at(int((fault.at_s + fault.for_s) * NS_PER_S), partial(self._plug, fault.tag))
 
     def _printed(self, time_ns: int, tag: int, data: bytes) -> None:
-        """Send what a board prints, in one write, unless a fault says otherwise."""
+        """Send the output of a board in one write, unless a fault changes it."""
         terminal = self._terminals[tag]
         for fault in self._faults.faults:
             if getattr(fault, "tag", tag) not in (tag, None):

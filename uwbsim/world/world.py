@@ -10,7 +10,7 @@ from typing import Final, Self
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Poses
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ScenarioError
@@ -137,35 +137,28 @@ class World:
 
     def motion_capture(self) -> Poses:
         """Return the poses that motion capture writes over the run, with its rate, noise, latency and gaps."""
-        mocap = self.scenario.mocap
+        mocap, seed, parts = self.scenario.mocap, self.scenario.run.seed, []
         # A little longer than the run, so that the last exchange lies between two poses.
         count = int(np.ceil((self.scenario.run.duration_s + 0.05) * mocap.rate_hz)) + 2
         time_ns = np.rint(np.arange(count) * NS_PER_S / mocap.rate_hz).astype(np.int64)
-        shown_ns = time_ns + round((mocap.latency_ms * 1e-3) * NS_PER_S)
-        parts = [
-            Poses(shown_ns, np.full(count, name), *self._seen(name, time_ns))[self._gaps(name, time_ns)]
-            for name in self.trajectories
-        ]
+        duration = float(time_ns[-1]) * 1e-9
+        for name in self.trajectories:
+            rng = stream(seed, "motion capture gaps", name)
+            gaps_s = rng.uniform(0, duration, rng.poisson(mocap.gaps_per_min * duration / 60))
+            parts.append(self.seen(name, time_ns, stream(seed, "motion capture", name), np.sort(gaps_s)))
         return Poses.concatenate(parts).in_time_order()
 
-    def _gaps(self, name: str, time_ns: Ints) -> Bools:
-        """Return which poses of a body are outside of gaps, (n,)."""
-        mocap = self.scenario.mocap
-        seen = np.ones(len(time_ns), dtype=bool)
-        if mocap.gaps_per_min:
-            rng = stream(self.scenario.run.seed, "motion capture gaps", name)
-            duration = float(time_ns[-1]) * 1e-9
-            for begin in rng.uniform(0, duration, rng.poisson(mocap.gaps_per_min * duration / 60)):
-                seen &= (time_ns < begin * NS_PER_S) | (time_ns > (begin + mocap.gap_s) * NS_PER_S)
-        return seen
-
-    def _seen(self, name: str, time_ns: Ints) -> tuple[Floats, Floats]:
+    def seen(self, name: str, time_ns: Ints, rng: np.random.Generator, gaps_s: Floats) -> Poses:
+        """Return the poses of a body that motion capture takes at times (n,), except in gaps with these starts."""
         mocap, body = self.scenario.mocap, self.trajectories[name]
-        rng = stream(self.scenario.run.seed, "motion capture", name)
         time_s = np.asarray(time_ns * 1e-9, dtype=np.float64)
         position = body.position_m(time_s) + rng.normal(0, 1, (len(time_s), 3)) * mocap.position_noise_m
-        wobble = Rotation.from_rotvec(rng.normal(0, 1, (len(time_s), 3)) * mocap.attitude_noise_rad)
-        return position, (Rotation.from_quat(body.quaternion(time_s)) * wobble).as_quat()
+        error = Rotation.from_rotvec(rng.normal(0, 1, (len(time_s), 3)) * mocap.attitude_noise_rad)
+        quaternion = (Rotation.from_quat(body.quaternion(time_s)) * error).as_quat()
+        last = np.append(-np.inf, gaps_s)[np.searchsorted(gaps_s * NS_PER_S, time_ns, side="right")]
+        latency_ns = round((mocap.latency_ms * 1e-3) * NS_PER_S)
+        poses = Poses(time_ns + latency_ns, np.full(len(time_ns), name), position, quaternion)
+        return poses[np.flatnonzero(time_ns > (last + mocap.gap_s) * NS_PER_S)]
 
 
 def _trajectories(scenario: Scenario) -> dict[str, Trajectory]:
