@@ -1,8 +1,8 @@
-"""How virtual boards read their USB buffer, and what they do with each command: one executor each, in a table.
+"""The parser of virtual boards for their USB buffer, and the executors of commands, in a table.
 
-The parser is written from observed behaviour (firmware wire format, section 1.6): any `C` starts a command, numbers are
-read like C's `atoi`, extra fields are ignored, a missing one is complained about, and a command whose end has not come
-when the buffer is read kills the board.
+The parser follows observed behaviour (firmware wire format, section 1.6): any `C` starts a command, numbers are read as
+by C's `atoi`, extra fields are ignored, a missing one gives an error line, and a command that is incomplete when the
+buffer is read hangs the board.
 
 A new command is one message class and one executor:
 
@@ -20,8 +20,8 @@ register_message(Temperature)
 register_command(GetTemperature, lambda board, factor: Temperature(23 * factor))
 ```
 
-From then on every virtual board answers it, in process and served, and `Board.request(GetTemperature(1))` returns the
-answer. Fields are handed to the executor in the order in which they are declared.
+After that every virtual board answers it, in process and served, and `Board.request(GetTemperature(1))` returns the
+answer. Fields are passed to the executor in the order of their declaration.
 """
 
 from __future__ import annotations
@@ -82,8 +82,8 @@ if TYPE_CHECKING:
 def printed_float(value: float) -> bytes:
     """Return a four-byte float as the boards print it.
 
-    They print its whole part as a 32-bit integer and four decimals beside it. A Cortex-M4 turns what does not fit
-    into the nearest integer that does, and what is no number into 0; the fraction of such a value is 0.
+    They print its whole part as a 32-bit integer, and four decimals. A Cortex-M4 converts values beyond the integers to
+    the nearest integer, and NaN to 0, with a fraction of 0.
     """
     single = float(np.float32(value)) if math.isfinite(value) else value
     if math.isnan(single):
@@ -94,9 +94,9 @@ def printed_float(value: float) -> bytes:
 
 
 def atoi(text: bytes) -> int:
-    """Return the number at the start of a text, 0 where there is none, as C's function does; a larger one saturates."""
+    """Return the number at the start of a text, 0 without one, as C's function does; it saturates at 32 bits."""
     found = re.match(rb"\s*([+-]?)0*(\d+)", text)
-    # Eleven digits are beyond the largest number already, and how many more there are does not matter.
+    # Eleven digits are beyond the largest number already.
     return max(-(2**31), min(int(found[1] + found[2][:11]), 2**31 - 1)) if found else 0
 
 
@@ -108,7 +108,7 @@ _UNTIL_BAR: Final[dict[Kind, Callable[[bytes], Any]]] = {INT: atoi, ID: atoi, ST
 
 
 class Command(NamedTuple):
-    """A command as the board understood it: which, and the values of its fields in their order."""
+    """A command as the board reads it: its message class, and the values of its fields in order."""
 
     kind: type[Message]
     values: tuple[Any, ...]
@@ -116,7 +116,7 @@ class Command(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What a look at the buffer gave: commands, complaints, the bytes that stay, and whether the board survives."""
+    """The result of reading the buffer: commands, error lines, remaining bytes, and whether the board is alive."""
 
     commands: tuple[Command, ...]
     complaints: tuple[bytes, ...]
@@ -134,14 +134,14 @@ class _Unended(Exception):  # noqa: N818 - a signal of the parser, not an error 
 
 
 def read_commands(buffer: bytes, known: Container[bytes] = COMMANDS) -> Reading:
-    """Take every command out of a buffer; the board executes only the last of them. `known` are the keys it knows."""
+    """Parse all commands of a buffer, of which the board executes only the last. `known` are the keys it knows."""
     commands: list[Command] = []
     no_end = b"Failed to detect USB command terminator char! Trying my best"
     while (at := buffer.find(b"C")) >= 0:
         try:
             command, end = _command(buffer, at, known)
         except _Missing as missing:
-            # What the firmware does next depends on link addresses; the boards seen survived with an empty buffer.
+            # The next step of the firmware depends on link addresses; observed boards went on with an empty buffer.
             complaints = (*[b"No next key character found."] * missing.fields, no_end)
             return Reading(tuple(commands), complaints, b"", alive=True)
         except _Unended:
@@ -154,7 +154,7 @@ def read_commands(buffer: bytes, known: Container[bytes] = COMMANDS) -> Reading:
 def _command(buffer: bytes, at: int, known: Container[bytes]) -> tuple[Command, int]:
     key = b"C%02d" % atoi(buffer[at + 1 : at + 3])
     if key not in known or key not in COMMANDS:
-        raise _Unended  # an index out of bounds in the firmware; a dead board is the mildest of its ends
+        raise _Unended  # an index out of bounds in the firmware; the board hangs at best
     kind, values, at = COMMANDS[key], [], at + 3
     for k, field in enumerate(kind.FIELDS.values()):
         bar = buffer.find(b"|", at)
@@ -185,21 +185,20 @@ def _value(field: Kind, buffer: bytes, at: int) -> tuple[Any, int]:
 
 
 ANSWER: Final = 195 * NS_PER_US
-"""From the poll of the USB buffer that found a command to its answer on the bus."""
-
+"""From the read of the USB buffer with a command to its answer on the bus."""
 
 Attempt = Generator[simpy.Event, Any, bool]
-"""What takes time: yields SimPy events of the bench, in nanoseconds, and returns whether the command is done."""
+"""An execution that takes time: yields SimPy events of the bench, and returns whether the command is done."""
 
 Executor = Callable[..., "Message | bytes | Attempt"]
-"""Called with the board and the command's values; returns the reply, or does everything itself as an `Attempt`.
+"""Called with the board and the command's values; returns the reply, or an `Attempt` that does everything itself.
 
-A command that is not done is tried again a millisecond later, six times in all.
+A command that is not done is retried a millisecond later, six times in all.
 """
 
 
 def register_command(kind: type[Message], execute: Executor) -> None:
-    """Have virtual boards carry out a command that `uwblink` knows; raises `UwbsimError` for one that they cannot read.
+    """Register the executor of a command that `uwblink` knows; raises `UwbsimError` for one that boards cannot read.
 
     A second registration replaces the first.
     """
@@ -256,7 +255,7 @@ def _broadcast(board: VirtualBoard, data: bytes) -> Attempt:
 
 
 EXECUTORS: Final[dict[bytes, Executor]] = {}
-"""What each command does, by its key; `register_command` adds to it."""
+"""Executors of commands by key; `register_command` adds to it."""
 
 for _kind, _execute in (
     (SetIdle, lambda board: IdleSet()),

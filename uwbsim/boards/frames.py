@@ -1,9 +1,9 @@
-"""Frames between virtual boards: what they carry, when they leave, how each board receives them, what collides.
+"""Frames between virtual boards: payloads, transmission, reception and collisions.
 
-The same clocks, radios and firmware arithmetic as in a batch simulation, for one frame at a time, whose instant is
-known only when a command arrives. The rules of the air are those of the event loop of `uwbsim run`: of two frames that
-overlap at a receiver the first is received where it is stronger by `capture_db`, and a board that waits for an answer
-takes the first frame that comes.
+Clocks, radios and firmware arithmetic are those of a batch simulation, for one frame at a time, whose time is not known
+before a command arrives. The medium has the rules of the event loop of `uwbsim run`: of two frames that overlap at a
+receiver the first is received if it is stronger by `capture_db`, and a board that waits for an answer takes the first
+frame that arrives.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from uwbsim.world.world import SampledWorld, World
 
 @dataclass(frozen=True, slots=True)
 class PollPayload:
-    """Signal 1: what the initiator wants."""
+    """Signal 1: the kind of exchange and the reports that the initiator requests."""
 
     target_reports: bool
     double_sided: bool
@@ -54,7 +54,7 @@ class ResponsePayload:
 
 @dataclass(frozen=True, slots=True)
 class FinalPayload:
-    """The last signal of either side: stamps of its sender as printed, power and skew of the first it received."""
+    """The last signal of either board: stamps of its sender as printed, power and skew of the first signal received."""
 
     stamps: tuple[int, int, int]
     power_dbm: float
@@ -70,7 +70,7 @@ class DataPayload:
 
     @property
     def length(self) -> int:
-        """Return the length of the frame in bytes: 8 besides its payload (firmware wire format, 2.1)."""
+        """Return the length of the frame in bytes: 8 and its payload (firmware wire format, 2.1)."""
         return 8 + len(self.data)
 
 
@@ -79,10 +79,10 @@ Payload = PollPayload | ResponsePayload | FinalPayload | DataPayload
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Receptions:
-    """A frame at all boards, shape (tags,), whether it listens or not.
+    """Reception of a frame at all boards, (tags,), whether or not their receivers are on.
 
-    Power at the antenna, whether it is strong enough and not lost, its stamp (ticks, not wrapped), and what is printed
-    of it.
+    Power at the antenna, whether it is above the sensitivity and not lost, stamp (ticks, not wrapped), printed power
+    and skew.
     """
 
     power_dbm: Floats
@@ -94,11 +94,11 @@ class Receptions:
 
 @dataclass(slots=True, kw_only=True)
 class Frame:
-    """A frame on the air, or about to be.
+    """A frame on the air, or scheduled.
 
-    `stamp` is the sender's transmit stamp (ticks, not wrapped), `departure` the true time (sub-ticks) at which its
-    marker leaves, `start` and `end` when it is on the air (ns). `receiver` is None for a broadcast. `excess_m` is the
-    detour between the two boards of an exchange. A frame that was `cancelled` before its start is never sent.
+    `stamp` is the sender's transmit stamp (ticks, not wrapped), `departure` the true time (sub-ticks) of its marker,
+    `start` and `end` the times between which it is on the air (ns). `receiver` is None for a broadcast. `excess_m` is
+    the detour between the two boards of an exchange. A frame that is `cancelled` before its start is never sent.
     """
 
     sender: int
@@ -127,7 +127,7 @@ class Radios:
     """The radios of a scenario's tags; `lost_share` of all receptions fail besides the weak ones."""
 
     def __init__(self, scenario: Scenario, lost_share: float = 0.0) -> None:
-        """Set up world and clocks; chance comes from the scenario's seed."""
+        """Create world, clocks and random stream from the scenario."""
         self.scenario = scenario
         self.world = World.of(scenario)
         self.sampled_world = SampledWorld(self.world)
@@ -144,21 +144,21 @@ class Radios:
         return next_grid(ready) + self.tx_register(board)
 
     def reply_stamp(self, board: int, received: int) -> int:
-        """Return the transmit stamp of a reply sent at once to what was received at a stamp; its latency is drawn."""
+        """Return the transmit stamp of an immediate reply to a frame received at a stamp, with a random latency."""
         latency = round(float(draw_reply_s(self.scenario, self._chance, 1)[0]) / TICK_S)
         return next_grid(received + latency - ANTENNA_DELAY_TICKS) + self.tx_register(board)
 
     def scheduled_stamps(self, board: int, reference: int, delay_uus: int) -> tuple[int, int]:
-        """Return the transmit stamps of a frame that is to leave some time after the stamp `reference`.
+        """Return the transmit stamps of a frame scheduled a delay after the stamp `reference`.
 
-        The chip's, which ignores the low nine bits of the time at which it is told to send; and the one that the
-        firmware works out and sends, with a constant of its build.
+        The chip's stamp, which ignores the low nine bits of the scheduled time; and the one that the firmware computes
+        and sends, with a constant of its build.
         """
         due = (reference + delay_uus * UUS_TICKS) // DELAYED_TX_GRID * DELAYED_TX_GRID
         return due + self.tx_register(board), due + int(self.medium.reply_constant[self.place[board]])
 
     def tx_register(self, board: int) -> int:
-        """Return what is programmed into a board's register of the transmitter, in ticks."""
+        """Return the antenna delay programmed into a board's transmitter register, in ticks."""
         return int(self.medium.tx_register[self.place[board]])
 
     def excess_m(self) -> float:
@@ -167,7 +167,7 @@ class Radios:
         return float(self._chance.exponential(mean_m)) if share and self._chance.random() < share else 0.0
 
     def frame(self, sender: int, receiver: int | None, payload: Payload, stamp: int, excess_m: float = 0.0) -> Frame:
-        """Return a frame that leaves at a transmit stamp of its sender's clock, and how every board receives it."""
+        """Return a frame with a transmit stamp of its sender's clock, and its reception at all boards."""
         place = self.place[sender]
         departure = int(self.medium.leave(self._one(sender), np.array([stamp]), self._chance.normal(size=1))[0])
         excess = np.zeros(len(self._all))
@@ -184,12 +184,12 @@ class Radios:
         )
 
     def received(self, frame: Frame, board: int) -> Received:
-        """Return what one board has of a frame."""
+        """Return the reception of a frame at one board."""
         at, k = frame.receptions, self.place[board]
         return Received(frame, int(at.stamp[k]), float(at.printed_dbm[k]), float(at.skew_ppm[k]))
 
     def paths(self, frame: Frame, receiver: int) -> PathsHeard:
-        """Return the paths that a frame took to a board, as `World.paths` does."""
+        """Return the paths of a frame to a board, as `World.paths` does."""
         detour = frame.excess_m if frame.receiver == receiver else 0.0
         return self.world.paths(self.place[frame.sender], self.place[receiver], frame.departure, detour)
 
@@ -216,10 +216,10 @@ Wait = Generator[simpy.Event, Any, "Received | None"]
 
 
 class BoardAir:
-    """The medium. Frames are announced when it is decided to send them, and arrive when they end."""
+    """The medium. Frames are announced when they are scheduled, and arrive when they end."""
 
     def __init__(self, env: simpy.Environment, radios: Radios) -> None:
-        """`radios` compute how frames are received."""
+        """`radios` compute the reception of frames."""
         self.env, self.physics = env, radios
         self.radios: dict[int, Radio] = {}
         self._frames: list[Frame] = []
@@ -233,11 +233,11 @@ class BoardAir:
         return (int(self.env.now) + later) * SUBTICKS_PER_SECOND // NS_PER_S
 
     def announce(self, frame: Frame) -> None:
-        """Put a frame on the air at its time."""
+        """Schedule a frame at its departure."""
         marker = frame.departure * NS_PER_S // SUBTICKS_PER_SECOND
         frame.start = marker - self.before_marker
         frame.end = marker + _ns(after_marker_s(frame.payload.length))
-        # A frame that is over for 20 ms matters to none any more.
+        # A frame that ended 20 ms ago collides with no frame and is waited for by no board.
         oldest = int(self.env.now) - 20 * NS_PER_MS
         self._frames = [f for f in self._frames if f.end > oldest and not f.cancelled]
         self._frames.append(frame)
@@ -245,7 +245,7 @@ class BoardAir:
         over.callbacks.append(lambda _: self._arrive(frame))
 
     def arriving(self, board: int, since: int) -> int | None:
-        """Return when the frame ends that a board which listens since `since` is receiving now, None without one."""
+        """Return the end of the frame that a board, whose receiver is on since `since`, receives now; else None."""
         now, place = int(self.env.now), self.physics.place[board]
         ends = [
             f.end
@@ -255,7 +255,7 @@ class BoardAir:
         return min(ends, default=None)
 
     def _in_time(self, frame: Frame, since: int) -> bool:
-        """Whether a receiver that is on since `since` still finds enough of a frame's preamble."""
+        """Return whether a receiver that is on since `since` detects a frame's preamble."""
         return since <= frame.start + self.late_enough and not frame.cancelled
 
     def _arrive(self, frame: Frame) -> None:
@@ -269,7 +269,7 @@ class BoardAir:
                 radio.take(None if self._collides(frame, place) else self.physics.received(frame, board))
 
     def _collides(self, frame: Frame, place: int) -> bool:
-        """Whether another frame spoils one at the board with this place."""
+        """Return whether a frame collides with another one at the board with this index."""
         signal = float(frame.receptions.power_dbm[place])
         for other in self._frames:
             if other is frame or other.cancelled or other.end <= frame.start or other.start >= frame.end:
@@ -283,10 +283,10 @@ class BoardAir:
 
 
 class Radio:
-    """The radio of a board. `since` is when (ns) its receiver was switched on, None while it is off."""
+    """The radio of a board. `since` is the time (ns) at which its receiver was switched on, None while it is off."""
 
     def __init__(self, air: BoardAir, board: int, interrupt: Callable[[Received | None], None]) -> None:
-        """`interrupt` gets what arrives while no task waits for it, None for a damaged frame."""
+        """`interrupt` is called with frames that no task waits for, None for a damaged one."""
         self._air, self._board, self._interrupt = air, board, interrupt
         self.since: int | None = None
         self.masked = False
@@ -296,16 +296,16 @@ class Radio:
 
     @property
     def sending(self) -> bool:
-        """Whether a frame is on its way out, or waits for its time."""
+        """Whether a frame is being sent or scheduled."""
         return self._pending is not None and self._pending.end > self._air.env.now and not self._pending.cancelled
 
     def listen(self) -> None:
-        """Switch the receiver on, at once or when what is being sent has left."""
+        """Switch the receiver on, at once or at the end of the frame that is being sent."""
         now = int(self._air.env.now)
         self.since = self._pending.end if self._pending is not None and self.sending else now
 
     def off(self) -> None:
-        """Switch everything off; a frame that waits for its time is never sent."""
+        """Switch receiver and transmitter off; a scheduled frame is never sent."""
         self.since = None
         if self._pending is not None and self._pending.end > self._air.env.now:
             self._pending.cancelled = True
@@ -320,7 +320,7 @@ class Radio:
         return frame
 
     def first_stamp(self) -> int:
-        """Return the stamp of a frame that is sent now: its marker leaves when its preamble is over."""
+        """Return the stamp of a frame that is sent now: its marker leaves at the end of its preamble."""
         return self._air.physics.next_stamp(self._board, self._air.subticks(self._air.before_marker))
 
     def over(self, frame: Frame) -> simpy.Event:
@@ -328,7 +328,10 @@ class Radio:
         return self._air.env.timeout(max(frame.end - int(self._air.env.now), 0))
 
     def wait(self, timeout: int | None = round(PREAMBLE_TIMEOUT_S * NS_PER_S)) -> Wait:
-        """Wait for a frame; None when it comes damaged, or when no preamble comes in time (None: wait for ever)."""
+        """Wait for a frame and return it; None if it is damaged, or if no preamble is detected within the timeout.
+
+        Without a timeout the wait has no end.
+        """
         env = self._air.env
         if self.since is None:
             self.listen()
@@ -345,7 +348,7 @@ class Radio:
         return received
 
     def take(self, received: Received | None) -> None:
-        """Take a received frame, None if damaged: a waiting task gets it, otherwise it interrupts."""
+        """Pass a received frame, None if damaged, to the waiting task, or else to the interrupt."""
         waiting, self._waiting = self._waiting, None
         self.since = None
         if waiting is not None:

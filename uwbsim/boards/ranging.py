@@ -1,8 +1,8 @@
-"""Ranging as the firmware does it: the initiator in the USB task, target and listeners in the interrupt.
+"""Ranging as in the firmware: the initiator runs in the USB task, target and listeners in the interrupt.
 
-Each waits for a frame as the firmware does, takes whatever comes first, and gives up on anything else than what it
-waits for (firmware wire format, 3.1 and 3.2). Overhearing keeps the processor busy from frame to frame, and waits for
-ever for the initiator's final: a passive board is deaf to USB meanwhile (firmware wire format, 3.3).
+Each takes the first frame that arrives, and stops if it is not the expected one (firmware wire format, 3.1 and 3.2).
+A passive board occupies its processor from frame to frame, and waits for the initiator's final without timeout: it
+reads no USB commands meanwhile (firmware wire format, 3.3).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 TO_AIR: Final = 330 * NS_PER_US
-"""From the poll of the USB buffer that found a command to the time stamp of its frame: set-up and half a preamble."""
+"""From the read of the USB buffer with a command to the marker of its frame: set-up and half a preamble."""
 
 Content = TypeVar("Content", PollPayload, FinalPayload)
 Steps = Generator[simpy.Event, Any, None]
@@ -47,7 +47,7 @@ Answers = Generator[simpy.Event, Any, "tuple[Received, Received] | None"]
 
 
 def is_expected(received: Received | None, payload: type[Payload], sender: int, receiver: int) -> bool:
-    """Whether what came is what was waited for; boards look at type and both ids."""
+    """Return whether a frame is the expected one; boards compare type and both ids."""
     if received is None:
         return False
     frame = received.frame
@@ -55,7 +55,7 @@ def is_expected(received: Received | None, payload: type[Payload], sender: int, 
 
 
 def payload_of(received: Received, kind: type[Content]) -> Content:
-    """Return what a frame carries; raises `TypeError` where it is of another kind."""
+    """Return the payload of a frame; raises `TypeError` for one of another kind."""
     payload = received.frame.payload
     if not isinstance(payload, kind):
         raise TypeError(f"found {payload!r:.60}, expected a {kind.__name__}")
@@ -63,7 +63,7 @@ def payload_of(received: Received, kind: type[Content]) -> Content:
 
 
 def initiate(board: VirtualBoard, target: int, target_reports: bool, double_sided: bool, get_cir: bool) -> Attempt:
-    """Range with a target, one try (C05)."""
+    """Range with a target: one attempt of C05."""
     if target == board.id:
         return (yield from board.answer(b"TWR FAIL: The target ID is the same as the initiator's ID.\r\n"))
     radio = board.radio
@@ -81,7 +81,7 @@ def initiate(board: VirtualBoard, target: int, target_reports: bool, double_side
 
 
 def _answers(board: VirtualBoard, poll: Frame, double_sided: bool) -> Answers:
-    """Wait for the target's frames: its first and its last."""
+    """Wait for the target's frames; return its first and its last one."""
     first = None
     if double_sided:
         first = yield from board.radio.wait()
@@ -94,7 +94,7 @@ def _answers(board: VirtualBoard, poll: Frame, double_sided: bool) -> Answers:
 
 
 def _report(board: VirtualBoard, poll: Frame, wish: PollPayload, first: Received, last: Received) -> Steps:
-    """Print the report; before it send the final if the target reports too, after it print the impulse response."""
+    """Send the final if the target reports too, print the report, and the impulse response if requested."""
     came, target = payload_of(last, FinalPayload), poll.receiver or 0
     mine = poll.stamp & MASK, first.stamp & MASK, last.stamp & MASK if wish.double_sided else 0
     to_final = 136 * NS_PER_US  # from the end of the target's last frame to the start of the final
@@ -112,19 +112,19 @@ def _report(board: VirtualBoard, poll: Frame, wish: PollPayload, first: Received
 
 
 def answer(board: VirtualBoard, received: Received) -> Steps:
-    """Answer a poll: response and delayed final, or the final alone; report if the initiator's final comes."""
+    """Answer a poll: response and delayed final, or the final alone; report if the initiator's final arrives."""
     wish, initiator, radio = payload_of(received, PollPayload), received.frame.sender, board.radio
     excess, radios = received.frame.excess_m, board.bench.radios
     if wish.double_sided:
         first = radios.reply_stamp(board.id, received.stamp)
         yield radio.over(radio.send(initiator, ResponsePayload(), first, excess))
-        # A shorter delayed transmission would start in the past (firmware wire format, 3.6).
+        # A transmission with a shorter delay would start in the past (firmware wire format, 3.6).
         if not 265 <= board.delay_uus <= 32_767:
             return
         last, told = radios.scheduled_stamps(board.id, first, board.delay_uus)
         sent = first, told
     else:
-        # That of a single-sided exchange is not settable on the boards (firmware wire format, 0.5).
+        # The delay of a single-sided exchange cannot be set on the boards (firmware wire format, 0.5).
         last, told = radios.scheduled_stamps(board.id, received.stamp, 1500)
         first, sent = last, (told, told)
     payload = FinalPayload(_of_target(received.stamp, *sent, wish), received.power_dbm, received.skew_ppm)
@@ -134,13 +134,13 @@ def answer(board: VirtualBoard, received: Received) -> Steps:
     came = yield from radio.wait()
     if came is None or not is_expected(came, FinalPayload, initiator, board.id):
         return
-    # Its own report has the chip's stamps, and not those that it sent.
+    # Its own report has the chip's stamps, not those that it sent.
     mine = _of_target(received.stamp, first, last, wish)
     yield from _target_report(board, mine, received, came, get_cir=wish.get_cir)
 
 
 def _of_target(received: int, first: int, last: int, wish: PollPayload) -> tuple[int, int, int]:
-    """Return the stamps of a target as they are printed: rx1, tx2, tx3, without the last in single-sided ranging."""
+    """Return the printed stamps of a target: rx1, tx2, tx3; the last is 0 in single-sided ranging."""
     return received & MASK, first & MASK, last & MASK if wish.double_sided else 0
 
 
@@ -164,7 +164,7 @@ def _in_order(initiator: tuple[int, int, int], target: tuple[int, int, int]) -> 
 
 
 def range_report(neighbour: int, stamps: dict[str, int], powers: tuple[float, float, float, float]) -> RangeReport:
-    """Return the report of an exchange, with the range that the boards compute from the same stamps."""
+    """Return the report of an exchange, with the range that the boards compute from its stamps."""
     fpp1, fpp2, skew1, skew2 = powers
     none = np.zeros(1, dtype=np.int64)
     exchange = Exchanges(
@@ -194,8 +194,8 @@ def range_report(neighbour: int, stamps: dict[str, int], powers: tuple[float, fl
 
 
 def print_cir(board: VirtualBoard, initiator: int, target: int, last: Received) -> Steps:
-    """Print the impulse response of the last frame received, a piece a millisecond; other tasks run between them."""
-    # Read-out over SPI, and 1016 magnitudes.
+    """Print the impulse response of the last frame received, one transfer a millisecond; other tasks run meanwhile."""
+    # Read-out over SPI, and computation of 1016 magnitudes.
     yield board.sleep(int(board.chance.integers(3_800 * NS_PER_US, 6_000 * NS_PER_US)))
     board.release()
     frame = last.frame
@@ -207,15 +207,15 @@ def print_cir(board: VirtualBoard, initiator: int, target: int, last: Received) 
 
 
 Expected = tuple[type[Payload], int, int, int | None]
-"""A frame that a listener waits for: its payload, its two boards, and for how long."""
+"""A frame that a listener waits for: payload, sender, receiver, and timeout in ns."""
 
 
 def received_by(board: VirtualBoard, received: Received | None) -> Steps | None:
-    """Deal with a frame at once, or return the steps that it takes."""
+    """Handle a frame that no task waits for at once, or return the steps of its handling."""
     if received is None:
         return _recover(board)
     payload = received.frame.payload
-    to_line = 90 * NS_PER_US  # from the end of a frame to a line that needs no arithmetic
+    to_line = 90 * NS_PER_US  # from the end of a frame to a line without computation
     if isinstance(payload, PollPayload):
         if received.frame.receiver == board.id:
             return answer(board, received)
@@ -231,13 +231,13 @@ def received_by(board: VirtualBoard, received: Received | None) -> Steps | None:
 
 
 def _recover(board: VirtualBoard) -> Steps:
-    """After a damaged frame the receiver is off, until the USB task looks at it."""
+    """Wait with the receiver off after a damaged frame, until the USB task switches it on."""
     board.release()
     yield board.until_next_poll()
 
 
 def overhear(board: VirtualBoard, poll: Received) -> Steps:
-    """Follow the exchange that a poll begins, and print it; nothing, or zeros, where a frame does not come."""
+    """Receive the exchange after a poll, and print it; without one of its frames print nothing, or zeros."""
     wish, initiator, target = payload_of(poll, PollPayload), poll.frame.sender, poll.frame.receiver or 0
     heard = [poll]
     for payload, sender, receiver, patience in _sequence(wish, initiator, target):
@@ -254,31 +254,26 @@ def overhear(board: VirtualBoard, poll: Received) -> Steps:
 
 
 def _sequence(wish: PollPayload, initiator: int, target: int) -> list[Expected]:
-    """Return the frames that follow a poll; the firmware sets no time-out for the last one."""
-    patience = round(PREAMBLE_TIMEOUT_S * NS_PER_S)
-    frames: list[Expected] = [(FinalPayload, target, initiator, patience)]
-    if wish.double_sided:
-        frames.insert(0, (ResponsePayload, target, initiator, patience))
-    if wish.target_reports:
-        frames.append((FinalPayload, initiator, target, None))
-    return frames
+    """Return the frames after a poll; the firmware sets no timeout for the last one."""
+    timeout = round(PREAMBLE_TIMEOUT_S * NS_PER_S)
+    response: list[Expected] = [(ResponsePayload, target, initiator, timeout)] * wish.double_sided
+    report: list[Expected] = [(FinalPayload, initiator, target, None)] * wish.target_reports
+    return [*response, (FinalPayload, target, initiator, timeout), *report]
 
 
 def _overheard(initiator: int, target: int, wish: PollPayload, heard: list[Received]) -> Overheard:
-    """Return what a listener prints; the initiator's own readings travel only in its final."""
+    """Return the report of a listener; the initiator's own readings are sent only in its final."""
     signals = heard[:3] if wish.double_sided else heard[:2]
-    rx = [*(r.stamp & MASK for r in signals), 0]
-    power: list[float | None] = [*(r.power_dbm for r in signals), None]
-    skew: list[float | None] = [*(r.skew_ppm for r in signals), None]
+    third = signals[2] if wish.double_sided else None
     theirs = payload_of(signals[-1], FinalPayload)
     mine = payload_of(heard[-1], FinalPayload) if wish.target_reports else FinalPayload((0, 0, 0), 0.0, 0.0)
     (tx1, rx2, rx3), (rx1, tx2, tx3) = mine.stamps, theirs.stamps
     return Overheard(
         initiator,
         target,
-        rx1=rx[0],
-        rx2=rx[1],
-        rx3=rx[2],
+        rx1=heard[0].stamp & MASK,
+        rx2=heard[1].stamp & MASK,
+        rx3=third.stamp & MASK if third else 0,
         tx1_n=tx1,
         rx1_n=rx1,
         tx2_n=tx2,
@@ -287,10 +282,10 @@ def _overheard(initiator: int, target: int, wish: PollPayload, heard: list[Recei
         rx3_n=rx3,
         fpp1_dbm=heard[0].power_dbm,
         fpp2_dbm=heard[1].power_dbm,
-        fpp3_dbm=power[2],
+        fpp3_dbm=third.power_dbm if third else None,
         skew1_ppm=heard[0].skew_ppm,
         skew2_ppm=heard[1].skew_ppm,
-        skew3_ppm=skew[2],
+        skew3_ppm=third.skew_ppm if third else None,
         fpp1_n_dbm=theirs.power_dbm,
         fpp2_n_dbm=mine.power_dbm,
         skew1_n_ppm=theirs.skew_ppm,

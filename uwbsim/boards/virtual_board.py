@@ -1,8 +1,8 @@
-"""Virtual boards: command bytes in, report bytes out, with the firmware's tasks, its USB and its quirks.
+"""Virtual boards: command bytes in, report bytes out, with the tasks and the USB interface of the firmware.
 
-All boards of a scenario share one air and one SimPy clock in integer nanoseconds, which tests turn by hand and
-`uwbsim.boards.server` along with the wall clock. Formats, order and timing are those of the firmware wire format,
-sections 1.3 to 1.6 and 3; the times that depend on a processor are fitted to the captured transcripts.
+All boards of a scenario share one medium and one SimPy clock in integer nanoseconds, which tests advance step by step
+and `uwbsim.boards.server` with the wall clock. Formats, order and timing are those of the firmware wire format,
+sections 1.3 to 1.6 and 3; processing times are fitted to the captured transcripts.
 """
 
 from __future__ import annotations
@@ -23,18 +23,22 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 
 PACKET_BYTES: Final = 64
-"""Of full-speed USB; a packet takes 55 us on the bus (fitted to transcripts, as all times here)."""
+"""Length of a packet of full-speed USB."""
 
 PACKET_GAP: Final = 55 * NS_PER_US
+"""Time of a packet on the bus, fitted to transcripts."""
+
 FULL: Final = b"USB Buffer full! Message rejected to prevent overflow."
 
 
 class UsbLink:
-    """One board's USB from power-up to power-off. `arrived` is triggered when a packet comes; `lost` counts transfers
-    that found the bus busy."""
+    """The USB interface of one board from power-up to power-off.
+
+    `arrived` is triggered when a packet comes; `lost` counts transfers that were dropped because the bus was busy.
+    """
 
     def __init__(self, env: simpy.Environment, send: Callable[[bytes], None]) -> None:
-        """`send` takes the bytes of a transfer at its time."""
+        """`send` is called with the bytes of each transfer at its time."""
         self._env, self._send = env, send
         self._packets: list[bytes] = []
         self._busy_until = 0
@@ -48,11 +52,11 @@ class UsbLink:
         return bool(self._packets)
 
     def close(self) -> None:
-        """Be unplugged: what is under way comes nowhere."""
+        """Unplug the board: transfers under way are lost."""
         self._open = False
 
     def write(self, data: bytes) -> None:
-        """Take one write of the host, which USB carries in packets of 64 bytes."""
+        """Receive one write of the host, in packets of 64 bytes."""
         for number, at in enumerate(range(0, len(data), PACKET_BYTES)):
             piece = data[at : at + PACKET_BYTES]
             # The firmware drops packets of one byte; "~" alone is one of them.
@@ -60,7 +64,7 @@ class UsbLink:
                 self._after(100 * NS_PER_US + number * PACKET_GAP, partial(self._arrive, piece))
 
     def read(self) -> bytes:
-        """Return what has come, which empties the queue."""
+        """Return the received bytes and clear the queue."""
         data = b"".join(self._packets)
         self._packets.clear()
         self.arrived = self._env.event()
@@ -101,21 +105,21 @@ Sender = Callable[[int, int, bytes], None]
 
 
 class Bench:
-    """The boards of a scenario, powered and in range of each other; `send` receives what they print."""
+    """The boards of a scenario on one medium; `send` is called with their output."""
 
     def __init__(self, scenario: Scenario, send: Sender, lost_share: float = 0.0) -> None:
-        """Power all boards at time zero; `lost_share` of all receptions fail besides the weak ones."""
+        """Power all boards at time zero; `lost_share` of all receptions fail in addition to weak ones."""
         self.env = simpy.Environment(initial_time=0)
         self.scenario = scenario
         self.send = send
         self.radios = Radios(scenario, lost_share)
         self.air = BoardAir(self.env, self.radios)
         self.crashed: Callable[[VirtualBoard, Exception], None] | None = None
-        """Called when a board's own program raises; the board hangs then. Without it, the exception is raised."""
+        """Called when a board's own program raises, after which the board hangs. If None, the exception is raised."""
         self.boards = {tag.id: VirtualBoard(self, tag.id) for tag in scenario.tags}
 
     def advance(self, time_ns: int) -> None:
-        """Let time pass until `time_ns`."""
+        """Advance time to `time_ns`."""
         if time_ns > self.env.now:
             # Stepping, because `run(until=...)` leaves its own event in the queue, where `next_ns` would find it.
             reached = self.env.timeout(time_ns - int(self.env.now))
@@ -123,22 +127,22 @@ class Bench:
                 self.env.step()
 
     def next_ns(self) -> float:
-        """Return when something happens next, infinity when nothing is due."""
+        """Return the time of the next event, infinity without one."""
         return float(self.env.peek())
 
 
 @dataclass(slots=True)
 class _Task:
-    """The command that the board is busy with; `tries` survives a change of command, as on the boards."""
+    """The command that the board executes; as on the boards, `tries` is kept if another command replaces it."""
 
     command: Command | None = None
     tries: int = 0
 
 
 class VirtualBoard:
-    """One board. `write` takes what the host sends; what the board prints goes to the bench's `send`.
+    """One board. `write` takes bytes from the host; the bench's `send` is called with the board's output.
 
-    `passive` and `delay_uus` are what C04 and C08 set, `powered` and `alive` what unplugging and a hard fault change.
+    C04 sets `passive` and C08 `delay_uus`; unplugging clears `powered`, and a hard fault `alive`.
     """
 
     def __init__(self, bench: Bench, board: int) -> None:
@@ -163,18 +167,18 @@ class VirtualBoard:
         self._processes = [env.process(self._guarded(self._usb_task()))]
 
     def power_cycle(self) -> None:
-        """Take the power away and give it back: everything that was set is forgotten."""
+        """Switch the power off and on, which resets all settings."""
         self.power_off()
         self._power_on()
 
     def power_off(self) -> None:
-        """Take the power away: the board neither prints nor hears."""
+        """Switch the power off: the board neither sends nor receives."""
         self.powered = False
         self.usb.close()
         self.hang()
 
     def hang(self) -> None:
-        """Send the board into the firmware's hard-fault loop, from which only a power cycle helps."""
+        """Put the board into the firmware's hard-fault loop, which only a power cycle ends."""
         self.alive = False
         self.radio.off()
         for process in self._processes:
@@ -182,7 +186,7 @@ class VirtualBoard:
                 process.interrupt()
 
     def write(self, data: bytes) -> None:
-        """Take one write of the host."""
+        """Receive one write of the host."""
         if self.powered:
             self.usb.write(data)
 
@@ -191,7 +195,7 @@ class VirtualBoard:
         self.usb.say(what if isinstance(what, bytes) else encode(what), delay)
 
     def answer(self, reply: Message | bytes) -> Attempt:
-        """Print a reply, which takes the time it takes; the command is done."""
+        """Print a reply after its processing time; the command is done."""
         self.say(reply, ANSWER)
         yield self.bench.env.timeout(ANSWER)
         return True
@@ -201,18 +205,18 @@ class VirtualBoard:
         return self.bench.env.timeout(delay)
 
     def until_next_poll(self) -> simpy.Event:
-        """Return the event of the next look at the USB buffer, one a millisecond (firmware wire format, 1.3)."""
+        """Return the event of the next read of the USB buffer, one a millisecond (firmware wire format, 1.3)."""
         now = int(self.bench.env.now)
         return self.bench.env.timeout(NS_PER_MS - (now - self._phase) % NS_PER_MS)
 
     def release(self) -> None:
-        """Give the processor back to the task that reads the USB buffer, which an interrupt had taken it from."""
+        """Return the processor from an interrupt to the task that reads the USB buffer."""
         released, self._released = self._released, None
         if released is not None:
             released.succeed()
 
     def _interrupted(self, received: Received | None) -> None:
-        """Handle a frame that no task was waiting for; what takes time keeps the processor from the USB task."""
+        """Handle a frame that no task waits for; the USB task is blocked while the handling takes time."""
         steps = received_by(self, received)
         if steps is None:
             return
@@ -229,7 +233,7 @@ class VirtualBoard:
             self.radio.listen()
 
     def _guarded(self, steps: Steps) -> Steps:
-        """Run a task until it ends, the board hangs, or its own program fails, which is a way to hang."""
+        """Run a task until it ends, the board hangs, or its own program fails, after which the board hangs."""
         try:
             yield from steps
         except simpy.Interrupt:
@@ -241,7 +245,7 @@ class VirtualBoard:
             self.bench.crashed(self, error)
 
     def _usb_task(self) -> Steps:
-        """The task that reads the USB buffer every millisecond and does what it says."""
+        """Read the USB buffer every millisecond, and execute its commands."""
         while True:
             if not self.usb.waiting and self._task.command is None:
                 yield self.usb.arrived
@@ -271,7 +275,7 @@ class VirtualBoard:
         if not reading.alive:
             self.hang()
         elif reading.commands:
-            # Only the last one is executed, in place of whatever was being retried, and with its count of tries.
+            # Only the last command is executed; it replaces one that is retried, and continues its count of tries.
             self._task.command = reading.commands[-1]
 
     def _try(self, command: Command) -> Steps:

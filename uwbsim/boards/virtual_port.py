@@ -1,6 +1,6 @@
-"""Virtual boards as ports of the driver, in virtual time: no wall clock, no pseudo-terminal, the same every run.
+"""Virtual boards as ports of the driver, in virtual time: without wall clock and pseudo-terminal, deterministic.
 
-For tests of one's own code: whatever takes a `uwblink.Board` or the ports of a recorder takes these.
+For tests of programs that use `uwblink.Board` or the ports of a recorder.
 
 ```python
 ports = uwbsim.VirtualPorts(scenario)
@@ -8,7 +8,7 @@ print(uwblink.Board(ports.port(10)).range(20).range_m)
 uwblink.record(ports.names.values(), "flight.uwb", uwblink.RangingPlan(), duration_s=60.0, using=ports)
 ```
 
-The minute of the recording passes in the time that its computation takes.
+The minute of the recording takes only the time of its computation.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from uwbsim.world.clocks import NS_PER_S
 class VirtualPorts:
     """The ports of a scenario's boards. Time passes only while a caller reads or waits.
 
-    `names` are what `open` takes, by tag; `lost_share` of all frames on the air are lost besides the weak ones.
+    `names` by tag are the arguments of `open`; `lost_share` of all frames are lost in addition to weak ones.
 
     >>> import uwblink, uwbsim
     >>> near, far = ({"model": "static", "position_m": [x, 0.0, 1.0]} for x in (0.0, 3.0))
@@ -52,8 +52,8 @@ class VirtualPorts:
     def __init__(self, scenario: Scenario | Source, lost_share: float = 0.0, *, epoch_ns: int = 0) -> None:
         """Power all boards at virtual time zero, which is `epoch_ns` in the host times of a recording.
 
-        `scenario` is what `uwbsim.load` takes or gives; of all frames `lost_share` (0 to 1) are lost besides the weak
-        ones. Raises `ScenarioError` and `ParameterError`.
+        `scenario` is an argument or a result of `uwbsim.load`; of all frames `lost_share` (0 to 1) are lost in addition
+        to weak ones. Raises `ScenarioError` and `ParameterError`.
         """
         if not 0 <= lost_share <= 1:
             raise ParameterError(f"found {lost_share}, expected a share from 0 to 1", parameter="lost_share")
@@ -64,7 +64,7 @@ class VirtualPorts:
         self._opened: list[VirtualPort] = []
         self.names = {tag.id: f"virtual board {tag.id}" for tag in scenario.tags}
         self.transfers: deque[tuple[int, int, bytes]] = deque(maxlen=20_000)
-        """The last 20,000, some MB, that boards sent: time (ns), board, bytes of one USB transfer."""
+        """The last 20,000 transfers of boards, some MB: time (ns), board, bytes of one USB transfer."""
 
     def port(self, tag: int) -> VirtualPort:
         """Return the port of a board; raises `PortMissingError` where the scenario has no such tag."""
@@ -88,7 +88,7 @@ class VirtualPorts:
         self._opened = [p for p in self._opened if p is not port]
 
     def wait(self, timeout_s: float) -> Sequence[VirtualPort]:
-        """Let time pass until bytes wait at an open port, or the time is over; returns ports to read from."""
+        """Advance time until bytes wait at an open port, or to the timeout; return the ports to read from."""
         until_ns = self.now_ns() + math.ceil(timeout_s * NS_PER_S)
         while not (ready := [p for p in self._opened if p.waiting or not self.bench.boards[p.tag].powered]):
             if self.bench.next_ns() > until_ns:
@@ -122,13 +122,13 @@ class VirtualPort:
     """One board's port, a `uwblink.boards.ports.Transport`."""
 
     def __init__(self, ports: VirtualPorts, tag: int) -> None:
-        """Belong to a set of ports."""
+        """Create the port of a board."""
         self._ports, self.tag = ports, tag
         self.name = ports.names[tag]
         self.waiting = bytearray()
 
     def read(self, timeout_s: float) -> bytes:
-        """Let time pass until something comes, or the time is over; raises `PortLostError` at an unplugged board."""
+        """Advance time until bytes arrive, or to the timeout; raises `PortLostError` at an unplugged board."""
         bench = self._ports.bench
         until_ns = self._ports.now_ns() + math.ceil(timeout_s * NS_PER_S)
         while not self.waiting and bench.next_ns() <= until_ns:
@@ -150,7 +150,7 @@ class VirtualPort:
         return self._ports.now_s()
 
     def close(self) -> None:
-        """Forget what was not read."""
+        """Discard bytes that were not read."""
         self.waiting.clear()
 
     def _check(self) -> None:
