@@ -11,7 +11,7 @@ from uwblink.lazy import offer
 
 if TYPE_CHECKING:
     from uwbsim.boards.server import Server, load_faults
-    from uwbsim.boards.virtual_port import VirtualPorts
+    from uwbsim.boards.virtual_board import VirtualPorts
     from uwbsim.errors import ParameterError, ScenarioError, UwbsimError
     from uwbsim.pages.documents import show
     from uwbsim.pages.preview import preview
@@ -64,7 +64,7 @@ _HOMES: Final = {
     "State": "uwbsim.protocols.prediction",
     "Twin": "uwbsim.twins.fitting",
     "UwbsimError": "uwbsim.errors",
-    "VirtualPorts": "uwbsim.boards.virtual_port",
+    "VirtualPorts": "uwbsim.boards.virtual_board",
     "compare": "uwbsim.protocols.comparison",
     "load": "uwbsim.scenario.loading",
     "load_design": "uwbsim.sweep.design",

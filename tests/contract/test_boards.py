@@ -15,7 +15,7 @@ from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
 from uwblink.ticks import elapsed
 from uwblink.twr import truncate4
 from uwblink.wire import messages as m
-from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.boards.virtual_board import VirtualPorts
 
 ABSENT = 9
 

@@ -6,7 +6,7 @@ import pytest
 
 from tests.boards import bench_scenario
 from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, FinalPayload, PollPayload, Received
-from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.boards.virtual_board import VirtualPorts
 from uwbsim.scenario.model import Scenario
 
 EVERY = 70 * NS_PER_MS

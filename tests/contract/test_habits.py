@@ -15,7 +15,7 @@ from uwblink.boards.ports import SerialPort
 from uwblink.wire import messages as m
 from uwblink.wire.codec import Decoder
 from uwblink.wire.messages import REPORTS
-from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.boards.virtual_board import VirtualPorts
 
 TIMEOUT_S = 0.1
 LATENCY_S = (0.0002, 0.0015)

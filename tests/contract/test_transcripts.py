@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.boards import bench_scenario
-from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.boards.virtual_board import VirtualPorts
 
 FILE = Path(__file__).parents[1] / "golden" / "board_transcripts.txt"
 LINE = re.compile(r"^ +([\d.]+) ms +board (\d+) +(<-host|->host) +(b\".*\")$")

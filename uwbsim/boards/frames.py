@@ -139,9 +139,8 @@ class Radios:
 
     def next_stamp(self, board: int, time: int) -> int:
         """Return the first transmit stamp that a board's clock allows at or after a true time (sub-ticks)."""
-        me = self._one(board)
-        ready = -(-int(self.medium.clocks.read(me, np.array([time]))[0]) // SUBTICKS)
-        return next_grid(ready) + self.tx_register(board)
+        reading = int(self.medium.clocks.read(self._one(board), np.array([time]))[0])
+        return next_grid(-(-reading // SUBTICKS)) + self.tx_register(board)
 
     def reply_stamp(self, board: int, received: int) -> int:
         """Return the transmit stamp of an immediate reply to a frame received at a stamp, with a random latency."""
@@ -227,10 +226,6 @@ class BoardAir:
         self.before_marker = _ns(before_marker_s(radio.preamble_symbols))
         self.late_enough = _ns(radio.preamble_symbols / 2 * PREAMBLE_SYMBOL_S)
         self._capture_db, self._sensitivity_dbm = radio.capture_db, radio.sensitivity_dbm
-
-    def subticks(self, later: int = 0) -> int:
-        """Return the true time `later` nanoseconds from now, in sub-ticks."""
-        return (int(self.env.now) + later) * SUBTICKS_PER_SECOND // NS_PER_S
 
     def announce(self, frame: Frame) -> None:
         """Schedule a frame at its departure."""
@@ -321,7 +316,8 @@ class Radio:
 
     def first_stamp(self) -> int:
         """Return the stamp of a frame that is sent now: its marker leaves at the end of its preamble."""
-        return self._air.physics.next_stamp(self._board, self._air.subticks(self._air.before_marker))
+        marker_ns = int(self._air.env.now) + self._air.before_marker
+        return self._air.physics.next_stamp(self._board, marker_ns * SUBTICKS_PER_SECOND // NS_PER_S)
 
     def over(self, frame: Frame) -> simpy.Event:
         """Return the event of a frame's end."""

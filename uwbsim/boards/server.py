@@ -25,7 +25,7 @@ from uwblink.output import new_file
 from uwblink.recording.schema import Poses
 from uwblink.text_files import read_text
 from uwbsim.boards.frames import NS_PER_MS
-from uwbsim.boards.virtual_board import Bench, VirtualBoard
+from uwbsim.boards.virtual_board import Bench
 from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.base import NotNegative, Positive, Section, Share, TagId
@@ -220,7 +220,9 @@ class Server:
         self._speed, self._tell = speed, tell
         self._faults = faults or Faults()
         self.bench = Bench(scenario, self._printed, self._faults.lost_share())
-        self.bench.crashed = self._crashed
+        self.bench.crashed = lambda board, error: self._tell(
+            f"board {board.id} hangs: its program failed with {type(error).__name__}: {error}"
+        )
         self._poses: LivePoses | None = None
         self._chance = stream(scenario.run.seed, "serial faults")
         self._terminals: dict[int, Terminal] = {}
@@ -301,9 +303,6 @@ class Server:
             self._tell(f"the poses end here: {error.strerror or error}")
             return
         self._at(now + 100 * NS_PER_MS, self._append_poses)
-
-    def _crashed(self, board: VirtualBoard, error: Exception) -> None:
-        self._tell(f"board {board.id} hangs: its program failed with {type(error).__name__}: {error}")
 
     def close(self) -> None:
         """Unplug all boards, and close the file of poses."""

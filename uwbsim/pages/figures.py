@@ -133,13 +133,9 @@ def room(width_in: float, scenario: Scenario) -> Figure:
             (dots,) = axes.plot(own[:, x], own[:, y], kind.marker, color=kind.colour, ms=4, label=body.name)
             mark(dots, body.name)
         _name_tags(axes, {tag: spot[[x, y]] for tag, spot in tags.items()}, scale, high[x])
-        axes.set_xlim(low[x], high[x])
-        axes.set_ylim(low[y], high[y])
-        axes.set_aspect("equal", adjustable="box")
-        axes.set_xlabel(f"{'xyz'[x]} (m)")
-        axes.set_ylabel(f"{'xyz'[y]} (m)")
+        axes.set(xlim=(low[x], high[x]), ylim=(low[y], high[y]), aspect="equal", axisbelow=True)
+        axes.set(xlabel=f"{'xyz'[x]} (m)", ylabel=f"{'xyz'[y]} (m)")
         axes.grid(True)
-        axes.set_axisbelow(True)
         axes.set_title(name, loc="left")
     legend(figure, panels[0])
     return figure
@@ -206,8 +202,8 @@ def timing(width_in: float, scenario: Scenario, name: str) -> Figure:
     _draw_messages(axes, scenario, protocol, times_us, width_in)
     _draw_spans(axes, protocol, stamped, times_us, width_in)
     axes.set_yticks([0, 1], [f"target {pair[1]}", f"initiator {pair[0]}"], rotation=90 if narrow else 0, va="center")
-    axes.set_ylim(-0.8, 1.8)
-    axes.set_xlabel("time since the poll's marker (µs)" if narrow else "time since the poll's ranging marker (µs)")
+    marker = "marker" if narrow else "ranging marker"
+    axes.set(ylim=(-0.8, 1.8), xlabel=f"time since the poll's {marker} (µs)")
     axes.set_title(protocol.title, loc="left")
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.tick_params(axis="y", length=0)
@@ -374,8 +370,7 @@ def marginals(width_in: float, found: Sequence[Compared]) -> Figure:
         lines = {name: {"lw": 1.2, "color": colour, "label": name} for name, colour in colours.items()}
         outlines(axes, dict(zip(colours, one.drawn, strict=True)), edges, lines, ends=False)
         axes.set_title(one.name, loc="left")
-        axes.set_xlabel(one.unit)
-        axes.set_yticks([])
+        axes.set(xlabel=one.unit, yticks=[])
     legend(figure, panels[0])
     return figure
 
@@ -396,6 +391,6 @@ def by_pair(width_in: float, found: Sequence[Compared], fewest: int = 5) -> Figu
         else:
             axes.text(0.5, 0.5, "too few exchanges a pair", ha="center", va="center", transform=axes.transAxes)
         axes.set_title(f"{one.name}:\n{name}", loc="left")
-        axes.set_xlabel(f"measured ({'autocorrelation' if what == 'lag1' else one.unit})")
-        axes.set_ylabel("simulated")
+        unit = "autocorrelation" if what == "lag1" else one.unit
+        axes.set(xlabel=f"measured ({unit})", ylabel="simulated")
     return figure

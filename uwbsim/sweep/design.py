@@ -17,8 +17,7 @@ from uwblink.protocols.table import PROTOCOLS
 from uwblink.text_files import read_text
 from uwbsim.errors import ScenarioError, UnknownKeyError
 from uwbsim.random_streams import stream
-from uwbsim.scenario.linked_files import Folders, check_linked
-from uwbsim.scenario.loading import load, parse_toml, shipped_scenarios, validated
+from uwbsim.scenario.loading import Folders, check_linked, load, parse_toml, shipped_scenarios, validated
 from uwbsim.scenario.ranging import ProtocolName
 
 MOST_RUNS: Final = 10_000_000

@@ -223,27 +223,28 @@ class Twin:
     def files(self, output: str | os.PathLike[str]) -> tuple[Path, ...]:
         """Return the names of what `save` writes: the scenario, and beside it its poses and its plan where needed."""
         path = Path(output)
-        poses = (path.with_suffix(".poses.uwb"),) if self.paths else ()
-        plan = (path.with_suffix(".plan.csv"),) if isinstance(self.table["ranging"].get("plan"), dict) else ()
+        poses = [path.with_suffix(".poses.uwb")] if self.paths else []
+        plan = [path.with_suffix(".plan.csv")] if "plan" in self.table["ranging"] else []
         return (path, *poses, *plan)
 
     def save(self, output: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write the scenario (.toml) and what it names; raises what `check_output` raises, with nothing written."""
-        path = Path(output)
+        path, table = Path(output), dict(self.table)
         check_name(path)
         for file in self.files(path):
             check_output(file, force=force)
-        table = _linked(self.table, path)
         if self.paths:
-            with Recording.create(
-                path.with_suffix(".poses.uwb"), meta={"source": "uwbsim twin"}, force=force
-            ) as recording:
+            poses = path.with_suffix(".poses.uwb")
+            with Recording.create(poses, meta={"source": "uwbsim twin"}, force=force) as recording:
                 recording.append_tags([Tag(tag.id, tag.body, tag.lever_arm_m) for tag in self.scenario.tags])
                 recording.append_poses(Poses.concatenate(list(self.paths.values())).in_time_order())
-        if isinstance(table["ranging"].get("plan"), dict):
-            slots = self.table["ranging"]["plan"]["slots"]
+            motions = {name: {"model": "recorded", "file": poses.name, "body": name} for name in self.paths}
+            table["bodies"] = [body | {"motion": motions.get(body["name"], body["motion"])} for body in table["bodies"]]
+        if "plan" in table["ranging"]:
+            plan, slots = path.with_suffix(".plan.csv"), table["ranging"]["plan"]["slots"]
             rows = [dict(zip(("time_s", "initiator", "target"), slot, strict=True)) for slot in slots]
-            write_csv(path.with_suffix(".plan.csv"), rows, force=force)
+            write_csv(plan, rows, force=force)
+            table["ranging"] = table["ranging"] | {"plan": {"file": plan.name}}
         head = (
             f"The twin of {Path(self.recording).name} with {Path(self.calibration).name}: fitted to it by "
             "`uwbsim twin`, which also wrote the files that it names. Keys that are left out have their defaults."
@@ -373,17 +374,3 @@ def check_name(path: Path) -> None:
     """Raise `ScenarioError` for an output that is no scenario file."""
     if path.suffix.lower() != ".toml":
         raise ScenarioError(f"{path}: found {path.suffix or 'no suffix'}, expected the name of a scenario file (.toml)")
-
-
-def _linked(table: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return the tables with names of files in the place of what is in them."""
-    bodies = [
-        body | {"motion": {"model": "recorded", "file": path.with_suffix(".poses.uwb").name, "body": body["name"]}}
-        if body["motion"]["model"] == "recorded"
-        else body
-        for body in table["bodies"]
-    ]
-    ranging = dict(table["ranging"])
-    if isinstance(ranging.get("plan"), dict):
-        ranging["plan"] = {"file": path.with_suffix(".plan.csv").name}
-    return table | {"bodies": bodies, "ranging": ranging}

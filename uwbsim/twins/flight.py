@@ -435,8 +435,7 @@ def _turns(first: Ints, second: Ints) -> list[tuple[int, int]]:
 
 def _beat(time: Floats, first: Ints, second: Ints, turns: list[tuple[int, int]]) -> float | None:
     """Return the interval of a round robin in seconds; None unless nine of ten slots keep to it and to their turns."""
-    regular_share = 0.9
-    number = {pair: k for k, pair in enumerate(turns)}
+    regular_share, number = 0.9, {pair: k for k, pair in enumerate(turns)}
     turn = np.array([number[pair] for pair in zip(first.tolist(), second.tolist(), strict=True)])
     step, apart = np.diff(turn) % len(turns), np.diff(time)
     in_turn = step == 1 % len(turns)

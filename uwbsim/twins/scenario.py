@@ -14,7 +14,7 @@ from scipy.special import chdtrc
 from uwblink.arrays import Bools, Floats
 from uwblink.recording.schema import Poses
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwbsim.scenario.linked_files import MOST_POSES
+from uwbsim.scenario.loading import MOST_POSES
 from uwbsim.scenario.radio import Radio, TwoStateMultipath
 from uwbsim.twins.clocks import ClockFit
 from uwbsim.twins.flight import SHORTEST_LIFE_S, Flight, ScheduleFit, attitude, bulk_spread

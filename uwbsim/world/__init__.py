@@ -1,1 +1,1 @@
-"""What is there: clocks, trajectories, propagation, radios."""
+"""Physical models: clocks, trajectories, propagation, radios."""

@@ -99,13 +99,11 @@ class ClockNoise:
         cell = np.clip(time >> GRID_OCTAVE, 0, self.knots.shape[1] - 2)
         into = (time - (cell << GRID_OCTAVE)) * 2.0**-GRID_OCTAVE
         low = self.knots[tag, cell]
-        return np.asarray(low + into * (self.knots[tag, cell + 1] - low) + self._fine(tag, time))
-
-    def _fine(self, tag: Ints, time: Ints) -> Floats:
-        """Sum the octaves below the grid, in pieces."""
-        octaves, piece = slice(0, GRID_OCTAVE + 1 - SHORTEST_OCTAVE), 2048  # which fits into a core's cache
+        # The octaves below the grid, in pieces that fit into a core's cache.
+        octaves, piece = slice(0, GRID_OCTAVE + 1 - SHORTEST_OCTAVE), 2048
         cuts = range(0, max(len(time), 1), piece)
-        return np.concatenate([self._pulses(tag[k : k + piece], time[k : k + piece], octaves) for k in cuts])
+        fine = [self._pulses(tag[k : k + piece], time[k : k + piece], octaves) for k in cuts]
+        return np.asarray(low + into * (self.knots[tag, cell + 1] - low) + np.concatenate(fine))
 
     def _pulses(self, tag: Ints, time: Ints, octaves: slice) -> Floats:
         """Sum the triangular pulses of some octaves, (n,), from the shortest to the longest."""

@@ -166,8 +166,8 @@ class PlacedBody(PlacedShadow):
 
     def gain(self, at: Ints, a: Floats, b: Floats) -> Floats:
         """Return the relative field behind it on segments (n, 3) to (n, 3) at instants `at` (n,)."""
-        spots = (self._inside(at, ends) for ends in (a, b))
-        return body_gain(self.shadow, *spots)
+        ends = (np.einsum("nj,njk->nk", end - self.position_m[at], self.rotation[at]) for end in (a, b))
+        return body_gain(self.shadow, *ends)
 
     def fan_gain(self, end: Placed, at: Ints, spots: Floats, length_m: Floats) -> Floats | float:
         """Return the same for k segments of lengths (n, k) from each antenna (n,) to spots (n, k, 3) or (k, 3).
@@ -198,10 +198,6 @@ class PlacedBody(PlacedShadow):
         there = spots[columns] if spots.ndim == 2 else spots[rows, columns]
         gain[rows, columns] = self.gain(at[rows], a[rows], there)
         return gain
-
-    def _inside(self, at: Ints, spots: Floats) -> Floats:
-        away = spots - self.position_m[at]
-        return np.asarray(np.einsum("nj,njk->nk", away, self.rotation[at]))
 
 
 def obstruction_gain(

@@ -8,7 +8,7 @@ from uwblink.boards.record import identify
 from uwblink.boards.recorder import Recorder
 from uwblink.recording.file import Recording
 from uwblink.wire.messages import RangeReport
-from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.boards.virtual_board import VirtualPorts
 
 
 def recorded(path, ports, *listeners, seconds=5.0, **more):

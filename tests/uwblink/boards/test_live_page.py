@@ -24,7 +24,7 @@ from uwblink.boards.live_page import LivePage
 from uwblink.errors import PlanError, PortError
 from uwblink.recording.schema import Fault
 from uwblink.wire.messages import RangeReport
-from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.boards.virtual_board import VirtualPorts
 
 BIN = Path(sys.executable).parent
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

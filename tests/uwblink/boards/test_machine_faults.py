@@ -17,7 +17,7 @@ from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.record import LONGEST_BACKLOG_S, RecordingWriter, record
 from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
-from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.boards.virtual_board import VirtualPorts
 
 HOUR_NS = 3600 * 10**9
 

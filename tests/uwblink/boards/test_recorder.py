@@ -17,7 +17,7 @@ from uwblink.boards.record import record
 from uwblink.errors import PlanError, PortMissingError, RecordingError, RecordingExistsError
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, Tag
-from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.boards.virtual_board import VirtualPorts
 
 BIN = Path(sys.executable).parent
 

@@ -14,7 +14,7 @@ from tests.boards import bench_scenario
 from uwblink.errors import RecordingError, RecordingInUseError
 from uwblink.recording.file import Recording, SnapshotMaker, open_snapshot
 from uwblink.recording.schema import Fault
-from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.boards.virtual_board import VirtualPorts
 
 BIN = Path(sys.executable).parent
 READ = "import sys, uwblink\nwith uwblink.Recording.open(sys.argv[1]) as r: print(len(r.exchanges()))"

@@ -15,7 +15,7 @@ from uwblink.recording.file import Recording
 from uwblink.recording.summary import differences, single_reports, summarize
 from uwblink.twr import COLUMNS
 from uwblink.wire.messages import RangeReport, TargetRangeReport
-from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.boards.virtual_board import VirtualPorts
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 
 import uwblink
 from tests.boards import bench_scenario
-from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.boards.virtual_board import VirtualPorts
 
 PAGE = Path(__file__).parents[3] / "docs" / "boards.md"
 

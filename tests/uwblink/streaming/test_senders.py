@@ -16,7 +16,7 @@ from tests.boards import bench_scenario, served
 from tests.uwblink.streaming.clients import FoxgloveClient
 from uwblink.errors import PortError
 from uwblink.streaming import FoxgloveServer, StreamedRange, UdpSender
-from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.boards.virtual_board import VirtualPorts
 
 BIN = Path(sys.executable).parent
 LISTENING = Path("/proc/net/tcp")

@@ -18,7 +18,7 @@ from tests.boards import bench_scenario, served
 from uwblink.boards import LivePage, Progress, load_correction
 from uwblink.errors import ArgumentError, PlanError, PortError
 from uwblink.streaming import RangeListener
-from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.boards.virtual_board import VirtualPorts
 
 BIN = Path(sys.executable).parent
 

@@ -11,7 +11,7 @@ from uwblink.wire import messages as m
 from uwblink.wire.fields import INT, PRINTED, TEXT
 from uwbsim.boards.commands import EXECUTORS, atoi, printed_float, read_commands, register_command
 from uwbsim.boards.frames import NS_PER_MS
-from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.boards.virtual_board import VirtualPorts
 from uwbsim.errors import UwbsimError
 
 

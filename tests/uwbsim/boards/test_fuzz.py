@@ -7,7 +7,7 @@ from tests.boards import bench_scenario
 from uwblink.boards.board import Board
 from uwblink.wire import messages as m
 from uwbsim.boards.frames import NS_PER_MS
-from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.boards.virtual_board import VirtualPorts
 
 COMMANDS = 100_000
 NUMBERS = (
