@@ -28,6 +28,8 @@ from uwbsim.world.radio import carrier_bias_ppm
 from uwbsim.world.reception import AntennaDelays, arrive
 from uwbsim.world.world import World
 
+SIDES: Final = ("initiator", "target")
+
 STATES: Final = 16_384
 """States of the world that are sampled; it is also the length of the pieces that fit into a core's cache."""
 
@@ -75,6 +77,10 @@ class Conditions:
     def __len__(self) -> int:
         """Return the number of states."""
         return len(self.flight)
+
+    def by_side(self, name: str) -> dict[str, Floats]:
+        """Return a property of which the two boards have one each, such as `rate`, by `SIDES`."""
+        return {side: getattr(self, f"{name}_{side}") for side in SIDES}
 
     @property
     def distance_m(self) -> Floats:
@@ -210,9 +216,6 @@ def calibrated(conditions: Conditions) -> Conditions:
     return replace(conditions.with_columns(late=0.0, excess=0.0, **delays), multipath=0.0)
 
 
-SIDES: Final = ("initiator", "target")
-
-
 def range_errors_m(
     protocol: RangingProtocol,
     conditions: Conditions,
@@ -243,36 +246,31 @@ class _Ticks:
 
     def __init__(self, c: Conditions) -> None:
         scale = 1 / TICK_S
-        self.flight, self.flight_rate = c.flight * scale, c.flight_rate
-        self.way = (c.flight + c.excess) * scale
-        self.faster = {"initiator": 1 + c.rate_initiator, "target": 1 + c.rate_target}
+        self.conditions, self.moving = c, bool(np.any(c.flight_rate))
+        self.flight, self.way, self.detour = c.flight * scale, (c.flight + c.excess) * scale, c.detour_s * scale
+        self.faster = {side: 1 + rate for side, rate in c.by_side("rate").items()}
         self.slower = {side: 1 / rate for side, rate in self.faster.items()}
-        drifts = {"initiator": c.drift_initiator, "target": c.drift_target}
-        self.half_drift = {s: d * (TICK_S / 2) if np.any(d) else None for s, d in drifts.items()}
-        self.tx_delay = {"initiator": c.tx_delay_initiator * scale, "target": c.tx_delay_target * scale}
-        rx_delay = {"initiator": c.rx_delay_initiator * scale, "target": c.rx_delay_target * scale}
-        self.rx_late = {side: c.late * scale + delay for side, delay in rx_delay.items()}
-        # A stamp shows what a frame left late by and what it was seen late by together, and nothing else shows either:
-        # one draw a frame has the distribution of two. (What that does to a later departure, by motion, drift or a
-        # clock's noise, is below a part in 10^7 of it.)
+        self.half_drift = {s: d * (TICK_S / 2) if np.any(d) else None for s, d in c.by_side("drift").items()}
+        self.tx_delay = {side: delay * scale for side, delay in c.by_side("tx_delay").items()}
+        self.rx_late = {side: c.late * scale + delay * scale for side, delay in c.by_side("rx_delay").items()}
+        # Transmit and receive noise of a frame appear only as a sum in its receive stamp, so one draw with their common
+        # standard deviation replaces two. (The effect on later departures, by motion, drift or clock noise, is below
+        # 10^-7 of it.)
         self.noise_std = {
             sender: np.hypot(c.tx_std * self.slower[sender] * self.faster[receiver], c.rx_std) * scale
             for sender, receiver in (SIDES, SIDES[::-1])
         }
         self.reply = {"at once": c.at_once * scale, "scheduled": c.scheduled * scale}
         self.carrier_ppm = c.carrier_sign * (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
-        self.carrier_sign = c.carrier_sign
-        self.carrier_std_ppm, self.detour = c.carrier_std_ppm, c.detour_s * scale
-        # What a clock's phase gathers in a tick, in ticks.
-        self.white = {"initiator": c.white_initiator * scale**0.5, "target": c.white_target * scale**0.5}
-        self.moving = bool(np.any(c.flight_rate))
+        # The standard deviation of a clock's phase after a tick, in ticks.
+        self.white = {side: white * scale**0.5 for side, white in c.by_side("white").items()}
 
 
 class _Wander:
-    """The phase of a clock whose rate has white noise, in ticks, at one instant after another."""
+    """The phase of a clock with white noise of its rate, in ticks, at instants in order of time."""
 
     def __init__(self, white: Floats, steps: list[Floats]) -> None:
-        """Begin at zero when first asked; `steps` are standard normal, one an instant."""
+        """The phase is zero at the first instant; `steps` are standard normal, one per instant."""
         self._white, self._steps = white, iter(steps)
         self._time: Floats | None = None
         self._phase = np.zeros_like(white)
@@ -287,7 +285,7 @@ class _Wander:
 
 
 class _Noise:
-    """Named streams of random numbers, drawn from in the order of exchanges; none where conditions need none."""
+    """Named streams of random numbers, drawn in the order of exchanges; only those that the conditions need."""
 
     def __init__(self, protocol: RangingProtocol, c: Conditions, seed: int) -> None:
         numbers = range(len(protocol.messages)) if np.any(c.tx_std) or np.any(c.rx_std) else ()
@@ -303,7 +301,7 @@ class _Noise:
         if not self._share:
             return 0.0
         hit = self._hit.random(count)
-        # What is left of a uniform draw below a threshold is uniform again: one draw decides both.
+        # A uniform draw below a threshold, divided by it, is uniform: one draw gives both occurrence and length.
         return np.where(hit < self._share, -np.log(np.maximum(hit / self._share, 1e-300)), 0.0)
 
 
@@ -312,7 +310,7 @@ def _execute(protocol: RangingProtocol, c: _Ticks, noise: _Noise) -> Floats:
     stamps: dict[str, Floats] = {}
     flights: list[Floats] = []
     count, instants = len(c.flight), len(protocol.messages) + 2
-    # A counter shows its phase at the start.
+    # The phases of the counters on the grid of transmissions at the start.
     phases = {side: own.random(count) * DELAYED_TX_GRID for side, own in noise.counters.items()}
     wander = {
         side: _Wander(c.white[side], [own.standard_normal(count) for _ in range(instants)])
@@ -330,9 +328,9 @@ def _execute(protocol: RangingProtocol, c: _Ticks, noise: _Noise) -> Floats:
             departure -= half * departure**2
         if wander:
             if k == 1:
-                carrier = carrier + c.carrier_sign * _carrier_ppm(wander, departure)
+                carrier = carrier + c.conditions.carrier_sign * _carrier_ppm(wander, departure)
             departure = departure - wander[sender].at(departure)
-        moved = c.flight_rate * departure if c.moving else 0.0
+        moved = c.conditions.flight_rate * departure if c.moving else 0.0
         arrival = departure + (path + moved)
         seen = arrival * c.faster[receiver]
         half = c.half_drift[receiver]
@@ -350,18 +348,18 @@ def _execute(protocol: RangingProtocol, c: _Ticks, noise: _Noise) -> Floats:
         stamps[f"tx{k + 1}"], stamps[f"rx{k + 1}"] = printed, seen
         flights.append(c.flight + moved)
     if noise.carrier is not None:
-        carrier = carrier + noise.carrier.standard_normal(count) * c.carrier_std_ppm
+        carrier = carrier + noise.carrier.standard_normal(count) * c.conditions.carrier_std_ppm
     truth = (flights[0] + flights[1]) / 2
     return np.asarray((protocol.flight_ticks(intervals_of(protocol, stamps, carrier)) - truth) * METRES_PER_TICK)
 
 
 def _transmission(message: ProtocolMessage, stamps: dict[str, Floats], c: _Ticks, phases: dict[str, Floats]) -> Floats:
-    """Return the printed transmit stamp, in ticks since the start: the poll's is near nought."""
+    """Return the printed transmit stamp, in ticks since the start: near zero for the poll."""
     due = stamps[message.after] + c.reply[message.timing] if message.after else np.zeros_like(c.flight)
     if not phases:
         return due
-    # Transmissions begin on the grid of the counter; the software's latency runs to the antenna.
-    # Boards round a scheduled transmission down to the grid of their counter, and send others at its next instant.
+    # Transmissions begin on the grid of the counter, and the latency of the software ends at the antenna. Boards round
+    # a scheduled transmission down to the grid, and send others at its next instant.
     due = due + phases[message.sender]
     slot = due // DELAYED_TX_GRID
     if message.timing == "at once":
@@ -370,7 +368,7 @@ def _transmission(message: ProtocolMessage, stamps: dict[str, Floats], c: _Ticks
 
 
 def _carrier_ppm(wander: dict[str, _Wander], departure: Floats) -> Floats:
-    """Return what the clocks' noise adds to the carrier integrator's reading of a frame, over its preamble."""
+    """Return the effect of the clocks' noise over a preamble on the carrier integrator's reading of the frame."""
     span = RATE_SPAN_S / TICK_S
     begun = {side: path.at(departure - span) for side, path in wander.items()}
     gained = {side: path.at(departure) - begun[side] for side, path in wander.items()}

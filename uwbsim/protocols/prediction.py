@@ -16,7 +16,7 @@ from uwblink.arrays import Floats
 from uwblink.protocols.table import RangingProtocol
 from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S
 from uwbsim.errors import ParameterError
-from uwbsim.protocols.conditions import Conditions, chosen, intervals_of
+from uwbsim.protocols.conditions import SIDES, Conditions, chosen, intervals_of
 from uwbsim.scenario.devices import TX_SHARE
 from uwbsim.world.clocks import RATE_SPAN_S
 
@@ -35,7 +35,7 @@ class PredictedErrors:
 
     @property
     def variance_m2(self) -> Floats:
-        """Return the whole variance."""
+        """Return the total variance."""
         radio = self.transmit_m2 + self.receive_m2 + self.quantization_m2 + self.carrier_m2
         return radio + self.clock_m2 + self.multipath_m2
 
@@ -88,22 +88,19 @@ def _noiseless(protocol: RangingProtocol, c: Conditions) -> tuple[dict[str, Floa
     A clock reads 1 + rate times the true time, plus half of drift times its square; what antennas and power add to
     stamps comes on top.
     """
-    sides = ("initiator", "target")
-    tx = {"initiator": c.tx_delay_initiator, "target": c.tx_delay_target}
-    rx = {"initiator": c.rx_delay_initiator + c.late, "target": c.rx_delay_target + c.late}
-    rate = {"initiator": c.rate_initiator, "target": c.rate_target}
-    drift = {"initiator": c.drift_initiator, "target": c.drift_target}
+    tx, rate, drift = (c.by_side(name) for name in ("tx_delay", "rate", "drift"))
+    rx = {side: delay + c.late for side, delay in c.by_side("rx_delay").items()}
     way = c.flight + c.excess
     # True instants at the antennas, from the departure of the poll.
     leave: list[Floats] = []
     arrive: list[Floats] = []
     stamps = {}
     for k, message in enumerate(protocol.messages):
-        side, other = message.sender, sides[1 - sides.index(message.sender)]
+        side, other = message.sender, SIDES[1 - SIDES.index(message.sender)]
         left = np.zeros(len(c))
         if message.after:
             received = message.after.startswith("rx")
-            # The printed reply runs from stamp to stamp; at the antenna it is shorter by what antenna and power add.
+            # The printed reply is between stamps; at the antenna it is shorter by the errors of antenna and power.
             added = tx[side] - (rx if received else tx)[side]
             left = (arrive if received else leave)[k - 1] + (_reply_s(protocol, k, c) - added) / (1 + rate[side])
         leave.append(left)
@@ -132,13 +129,13 @@ def _white_clocks(
     arrive: list[Floats],
     c: Conditions,
 ) -> Floats:
-    """Return the variance of the flight in square seconds that white noise of the clocks' rates leaves.
+    """Return the variance of the flight in square seconds by white noise of the clocks' rates.
 
-    The phase at an instant is what the clock has gathered until then, so a span of time weighs with the sum of the
-    slopes of all that is read after it: h^2 times the integral of its square. The carrier integrator reads the mean
-    rate over the preamble of the second message.
+    The phase at an instant is the integral of the noise until then, so the noise of a time interval has the sum of the
+    slopes of all later readings as its weight: the variance is h^2 times the integral of the squared weight. The
+    carrier integrator reads the mean rate over the preamble of the second message.
     """
-    # How the flight changes with what the phase gains during the preamble.
+    # The derivative of the flight by the phase gained during the preamble.
     gain = c.carrier_sign * slopes["carrier"] * 1e6 * TICK_S / RATE_SPAN_S
     total = np.zeros(len(c))
     for side, white, sign in (("initiator", c.white_initiator, 1), ("target", c.white_target, -1)):
