@@ -97,7 +97,7 @@ def test_a_report_is_lost_while_the_bus_is_busy():
     ports = VirtualPorts(bench_scenario())
     board = ports.bench.boards[1]
     for delay in (1 * NS_PER_US, 50 * NS_PER_US, 200 * NS_PER_US):
-        board.usb.say(b"%d" % delay + bytes(100), delay)
+        board.usb.send(b"%d" % delay + bytes(100), delay)
     ports.bench.advance(NS_PER_MS)
     # Two packets of 64 bytes take 110 us; what comes 50 us after the first finds the bus busy.
     assert [data.rstrip(b"\0") for _, data in said(ports, 1)] == [b"1000", b"200000"]

@@ -119,7 +119,7 @@ class Reading:
     """The result of reading the buffer: commands, error lines, remaining bytes, and whether the board is alive."""
 
     commands: tuple[Command, ...]
-    complaints: tuple[bytes, ...]
+    error_lines: tuple[bytes, ...]
     rest: bytes
     alive: bool
 
@@ -142,8 +142,8 @@ def read_commands(buffer: bytes, known: Container[bytes] = COMMANDS) -> Reading:
             command, end = _command(buffer, at, known)
         except _Missing as missing:
             # The next step of the firmware depends on link addresses; observed boards went on with an empty buffer.
-            complaints = (*[b"No next key character found."] * missing.fields, no_end)
-            return Reading(tuple(commands), complaints, b"", alive=True)
+            error_lines = (*[b"No next key character found."] * missing.fields, no_end)
+            return Reading(tuple(commands), error_lines, b"", alive=True)
         except _Unended:
             return Reading(tuple(commands), (no_end,), b"", alive=False)
         commands.append(command)
@@ -243,14 +243,14 @@ def _bootloader(board: VirtualBoard) -> Attempt:
 
 def _broadcast(board: VirtualBoard, data: bytes) -> Attempt:
     if len(data) > LONGEST_BROADCAST:
-        board.say(b"ERROR: Requested to send message over UWB that is too long.", ANSWER)
+        board.send(b"ERROR: Requested to send message over UWB that is too long.", ANSWER)
         yield board.sleep(NS_PER_MS)
         return False
     board.radio.off()
     yield board.sleep(TO_AIR - board.bench.air.before_marker)
     board.radio.send(None, DataPayload(data), board.radio.first_stamp())
     yield board.sleep(930 * NS_PER_US)
-    board.say(BroadcastSent())
+    board.send(BroadcastSent())
     return True
 
 
@@ -263,7 +263,7 @@ for _kind, _execute in (
     (Reset, _reset),
     (DoTests, _do_tests),
     (SetPassive, _set_passive),
-    (RangeCommand, lambda board, target, *wishes: initiate(board, target % 256, *wishes)),
+    (RangeCommand, lambda board, target, *requests: initiate(board, target % 256, *requests)),
     (Broadcast, _broadcast),
     (GetMaxFrame, lambda board: MaxFrameReport(100)),
     (SetResponseDelay, _set_delay),

@@ -135,7 +135,7 @@ class Radios:
         self.lost_share = lost_share
         self.place = {tag.id: k for k, tag in enumerate(scenario.tags)}
         self._all = np.arange(len(scenario.tags))
-        self._chance = stream(scenario.run.seed, "boards")
+        self._rng = stream(scenario.run.seed, "boards")
 
     def next_stamp(self, board: int, time: int) -> int:
         """Return the first transmit stamp that a board's clock allows at or after a true time (sub-ticks)."""
@@ -144,7 +144,7 @@ class Radios:
 
     def reply_stamp(self, board: int, received: int) -> int:
         """Return the transmit stamp of an immediate reply to a frame received at a stamp, with a random latency."""
-        latency = round(float(draw_reply_s(self.scenario, self._chance, 1)[0]) / TICK_S)
+        latency = round(float(draw_reply_s(self.scenario, self._rng, 1)[0]) / TICK_S)
         return next_grid(received + latency - ANTENNA_DELAY_TICKS) + self.tx_register(board)
 
     def scheduled_stamps(self, board: int, reference: int, delay_uus: int) -> tuple[int, int]:
@@ -163,12 +163,12 @@ class Radios:
     def excess_m(self) -> float:
         """Draw the detour of an exchange's signals."""
         share, mean_m = self.scenario.radio.independent_multipath
-        return float(self._chance.exponential(mean_m)) if share and self._chance.random() < share else 0.0
+        return float(self._rng.exponential(mean_m)) if share and self._rng.random() < share else 0.0
 
     def frame(self, sender: int, receiver: int | None, payload: Payload, stamp: int, excess_m: float = 0.0) -> Frame:
         """Return a frame with a transmit stamp of its sender's clock, and its reception at all boards."""
         place = self.place[sender]
-        departure = int(self.medium.leave(self._one(sender), np.array([stamp]), self._chance.normal(size=1))[0])
+        departure = int(self.medium.leave(self._one(sender), np.array([stamp]), self._rng.normal(size=1))[0])
         excess = np.zeros(len(self._all))
         if receiver in self.place:
             excess[self.place[receiver]] = excess_m
@@ -193,10 +193,10 @@ class Radios:
         return self.world.paths(self.place[frame.sender], self.place[receiver], frame.departure, detour)
 
     def _receptions(self, sender: int, departure: int, excess_m: Floats) -> Receptions:
-        chance, count = self._chance, len(self._all)
+        rng, count = self._rng, len(self._all)
         frames = Frames(sender=np.full(count, sender), receiver=self._all, departure=np.full(count, departure))
-        noise = chance.normal(size=(4, count))
-        arrives = chance.random(count) >= self.lost_share
+        noise = rng.normal(size=(4, count))
+        arrives = rng.random(count) >= self.lost_share
         received = self.medium.receive(frames, noise[1], excess_m)
         power_dbm = received.link.power_dbm
         printed_dbm, skew_ppm = self.medium.readings(frames, power_dbm, noise[2], noise[3])
@@ -332,15 +332,15 @@ class Radio:
         if self.since is None:
             self.listen()
         since = int(env.now) if self.since is None else self.since
-        came = self._waiting = env.event()
+        arrived = self._waiting = env.event()
         if timeout is None:
-            yield came
+            yield arrived
         else:
-            yield came | env.timeout(since + timeout - int(env.now))
-            while not came.triggered and (end := self._air.arriving(self._board, since)) is not None:
-                yield came | env.timeout(end + 1 - int(env.now))
+            yield arrived | env.timeout(since + timeout - int(env.now))
+            while not arrived.triggered and (end := self._air.arriving(self._board, since)) is not None:
+                yield arrived | env.timeout(end + 1 - int(env.now))
         self._waiting, self.since = None, None
-        received: Received | None = came.value if came.triggered else None
+        received: Received | None = arrived.value if arrived.triggered else None
         return received
 
     def take(self, received: Received | None) -> None:

@@ -70,11 +70,11 @@ def initiate(board: VirtualBoard, target: int, target_reports: bool, double_side
     radio.off()
     board.ranging = radio.masked = True
     yield board.sleep(TO_AIR - board.bench.air.before_marker)
-    wish = PollPayload(target_reports, double_sided, get_cir)
-    poll = radio.send(target, wish, radio.first_stamp(), board.bench.radios.excess_m())
+    request = PollPayload(target_reports, double_sided, get_cir)
+    poll = radio.send(target, request, radio.first_stamp(), board.bench.radios.excess_m())
     answers = yield from _answers(board, poll, double_sided)
     if answers is not None:
-        yield from _report(board, poll, wish, *answers)
+        yield from _report(board, poll, request, *answers)
     board.ranging = radio.masked = False
     radio.listen()
     return answers is not None
@@ -93,67 +93,67 @@ def _answers(board: VirtualBoard, poll: Frame, double_sided: bool) -> Answers:
     return first or last, last
 
 
-def _report(board: VirtualBoard, poll: Frame, wish: PollPayload, first: Received, last: Received) -> Steps:
+def _report(board: VirtualBoard, poll: Frame, request: PollPayload, first: Received, last: Received) -> Steps:
     """Send the final if the target reports too, print the report, and the impulse response if requested."""
-    came, target = payload_of(last, FinalPayload), poll.receiver or 0
-    mine = poll.stamp & MASK, first.stamp & MASK, last.stamp & MASK if wish.double_sided else 0
+    theirs, target = payload_of(last, FinalPayload), poll.receiver or 0
+    mine = poll.stamp & MASK, first.stamp & MASK, last.stamp & MASK if request.double_sided else 0
     to_final = 136 * NS_PER_US  # from the end of the target's last frame to the start of the final
-    if wish.target_reports:
+    if request.target_reports:
         yield board.sleep(to_final)
         final = FinalPayload(mine, first.power_dbm, first.skew_ppm)
         board.radio.send(target, final, board.radio.first_stamp(), poll.excess_m)
     # From the end of the last frame to the report on the bus: read-out, arithmetic, printing.
     to_report = 474 * NS_PER_US
-    yield board.sleep(to_report - (to_final if wish.target_reports else 0))
-    powers = came.power_dbm, first.power_dbm, came.skew_ppm, first.skew_ppm
-    board.say(range_report(target, _in_order(mine, came.stamps), powers))
-    if wish.get_cir:
+    yield board.sleep(to_report - (to_final if request.target_reports else 0))
+    powers = theirs.power_dbm, first.power_dbm, theirs.skew_ppm, first.skew_ppm
+    board.send(range_report(target, _in_order(mine, theirs.stamps), powers))
+    if request.get_cir:
         yield from print_cir(board, board.id, target, last)
 
 
 def answer(board: VirtualBoard, received: Received) -> Steps:
     """Answer a poll: response and delayed final, or the final alone; report if the initiator's final arrives."""
-    wish, initiator, radio = payload_of(received, PollPayload), received.frame.sender, board.radio
+    request, initiator, radio = payload_of(received, PollPayload), received.frame.sender, board.radio
     excess, radios = received.frame.excess_m, board.bench.radios
-    if wish.double_sided:
+    if request.double_sided:
         first = radios.reply_stamp(board.id, received.stamp)
         yield radio.over(radio.send(initiator, ResponsePayload(), first, excess))
         # A transmission with a shorter delay would start in the past (firmware wire format, 3.6).
         if not 265 <= board.delay_uus <= 32_767:
             return
-        last, told = radios.scheduled_stamps(board.id, first, board.delay_uus)
-        sent = first, told
+        last, printed = radios.scheduled_stamps(board.id, first, board.delay_uus)
+        sent = first, printed
     else:
         # The delay of a single-sided exchange cannot be set on the boards (firmware wire format, 0.5).
-        last, told = radios.scheduled_stamps(board.id, received.stamp, 1500)
-        first, sent = last, (told, told)
-    payload = FinalPayload(_of_target(received.stamp, *sent, wish), received.power_dbm, received.skew_ppm)
+        last, printed = radios.scheduled_stamps(board.id, received.stamp, 1500)
+        first, sent = last, (printed, printed)
+    payload = FinalPayload(_of_target(received.stamp, *sent, request), received.power_dbm, received.skew_ppm)
     radio.send(initiator, payload, last, excess)
-    if not wish.target_reports:
+    if not request.target_reports:
         return
-    came = yield from radio.wait()
-    if came is None or not is_expected(came, FinalPayload, initiator, board.id):
+    final = yield from radio.wait()
+    if final is None or not is_expected(final, FinalPayload, initiator, board.id):
         return
     # Its own report has the chip's stamps, not those that it sent.
-    mine = _of_target(received.stamp, first, last, wish)
-    yield from _target_report(board, mine, received, came, get_cir=wish.get_cir)
+    mine = _of_target(received.stamp, first, last, request)
+    yield from _target_report(board, mine, received, final, get_cir=request.get_cir)
 
 
-def _of_target(received: int, first: int, last: int, wish: PollPayload) -> tuple[int, int, int]:
+def _of_target(received: int, first: int, last: int, request: PollPayload) -> tuple[int, int, int]:
     """Return the printed stamps of a target: rx1, tx2, tx3; the last is 0 in single-sided ranging."""
-    return received & MASK, first & MASK, last & MASK if wish.double_sided else 0
+    return received & MASK, first & MASK, last & MASK if request.double_sided else 0
 
 
 def _target_report(
-    board: VirtualBoard, mine: tuple[int, int, int], poll: Received, came: Received, *, get_cir: bool
+    board: VirtualBoard, mine: tuple[int, int, int], poll: Received, final: Received, *, get_cir: bool
 ) -> Steps:
-    theirs, initiator = payload_of(came, FinalPayload), poll.frame.sender
+    theirs, initiator = payload_of(final, FinalPayload), poll.frame.sender
     yield board.sleep(474 * NS_PER_US)
     if get_cir:
-        yield from print_cir(board, initiator, board.id, came)
+        yield from print_cir(board, initiator, board.id, final)
     powers = poll.power_dbm, theirs.power_dbm, poll.skew_ppm, theirs.skew_ppm
     report = range_report(initiator, _in_order(theirs.stamps, mine), powers)
-    board.say(TargetRangeReport(*(getattr(report, name) for name in RangeReport.FIELDS)))
+    board.send(TargetRangeReport(*(getattr(report, name) for name in RangeReport.FIELDS)))
 
 
 def _in_order(initiator: tuple[int, int, int], target: tuple[int, int, int]) -> dict[str, int]:
@@ -196,14 +196,14 @@ def range_report(neighbour: int, stamps: dict[str, int], powers: tuple[float, fl
 def print_cir(board: VirtualBoard, initiator: int, target: int, last: Received) -> Steps:
     """Print the impulse response of the last frame received, one transfer a millisecond; other tasks run meanwhile."""
     # Read-out over SPI, and computation of 1016 magnitudes.
-    yield board.sleep(int(board.chance.integers(3_800 * NS_PER_US, 6_000 * NS_PER_US)))
+    yield board.sleep(int(board.rng.integers(3_800 * NS_PER_US, 6_000 * NS_PER_US)))
     board.release()
     frame = last.frame
     paths = board.bench.radios.paths(frame, board.id)
-    index, taps = impulse_response(board.chance, last.stamp & MASK, paths)
+    index, taps = impulse_response(board.rng, last.stamp & MASK, paths)
     for piece in in_transfers(encode(Cir(initiator, target, index, taps))):
-        board.say(piece)
-        yield board.sleep(NS_PER_MS + int(board.chance.integers(0, 120 * NS_PER_US)))
+        board.send(piece)
+        yield board.sleep(NS_PER_MS + int(board.rng.integers(0, 120 * NS_PER_US)))
 
 
 Expected = tuple[type[Payload], int, int, int | None]
@@ -222,10 +222,10 @@ def received_by(board: VirtualBoard, received: Received | None) -> Steps | None:
         if board.passive:
             return overhear(board, received)
     elif isinstance(payload, DataPayload):
-        board.say(BroadcastReceived(payload.data), to_line)
+        board.send(BroadcastReceived(payload.data), to_line)
     else:
         number = b"B" if isinstance(payload, ResponsePayload) else b"C"
-        board.say(b"WARNING 0x" + number + b": TWR message is firing an interrupt when it shouldn't be.\r\n", to_line)
+        board.send(b"WARNING 0x" + number + b": TWR message is firing an interrupt when it shouldn't be.\r\n", to_line)
     board.radio.listen()
     return None
 
@@ -238,35 +238,35 @@ def _recover(board: VirtualBoard) -> Steps:
 
 def overhear(board: VirtualBoard, poll: Received) -> Steps:
     """Receive the exchange after a poll, and print it; without one of its frames print nothing, or zeros."""
-    wish, initiator, target = payload_of(poll, PollPayload), poll.frame.sender, poll.frame.receiver or 0
+    request, initiator, target = payload_of(poll, PollPayload), poll.frame.sender, poll.frame.receiver or 0
     heard = [poll]
-    for payload, sender, receiver, patience in _sequence(wish, initiator, target):
-        came = yield from board.radio.wait(patience)
-        if came is None or not is_expected(came, payload, sender, receiver):
-            if wish.double_sided and len(heard) == 1:
-                board.say(OverheardNothing(initiator, target), 90 * NS_PER_US)
+    for payload, sender, receiver, timeout in _sequence(request, initiator, target):
+        frame = yield from board.radio.wait(timeout)
+        if frame is None or not is_expected(frame, payload, sender, receiver):
+            if request.double_sided and len(heard) == 1:
+                board.send(OverheardNothing(initiator, target), 90 * NS_PER_US)
             return
-        heard.append(came)
+        heard.append(frame)
     yield board.sleep(525 * NS_PER_US)
-    if wish.get_cir:
+    if request.get_cir:
         yield from print_cir(board, initiator, target, heard[-1])
-    board.say(_overheard(initiator, target, wish, heard))
+    board.send(_overheard(initiator, target, request, heard))
 
 
-def _sequence(wish: PollPayload, initiator: int, target: int) -> list[Expected]:
+def _sequence(request: PollPayload, initiator: int, target: int) -> list[Expected]:
     """Return the frames after a poll; the firmware sets no timeout for the last one."""
     timeout = round(PREAMBLE_TIMEOUT_S * NS_PER_S)
-    response: list[Expected] = [(ResponsePayload, target, initiator, timeout)] * wish.double_sided
-    report: list[Expected] = [(FinalPayload, initiator, target, None)] * wish.target_reports
+    response: list[Expected] = [(ResponsePayload, target, initiator, timeout)] * request.double_sided
+    report: list[Expected] = [(FinalPayload, initiator, target, None)] * request.target_reports
     return [*response, (FinalPayload, target, initiator, timeout), *report]
 
 
-def _overheard(initiator: int, target: int, wish: PollPayload, heard: list[Received]) -> Overheard:
+def _overheard(initiator: int, target: int, request: PollPayload, heard: list[Received]) -> Overheard:
     """Return the report of a listener; the initiator's own readings are sent only in its final."""
-    signals = heard[:3] if wish.double_sided else heard[:2]
-    third = signals[2] if wish.double_sided else None
+    signals = heard[:3] if request.double_sided else heard[:2]
+    third = signals[2] if request.double_sided else None
     theirs = payload_of(signals[-1], FinalPayload)
-    mine = payload_of(heard[-1], FinalPayload) if wish.target_reports else FinalPayload((0, 0, 0), 0.0, 0.0)
+    mine = payload_of(heard[-1], FinalPayload) if request.target_reports else FinalPayload((0, 0, 0), 0.0, 0.0)
     (tx1, rx2, rx3), (rx1, tx2, tx3) = mine.stamps, theirs.stamps
     return Overheard(
         initiator,

@@ -224,7 +224,7 @@ class Server:
             f"board {board.id} hangs: its program failed with {type(error).__name__}: {error}"
         )
         self._poses: LivePoses | None = None
-        self._chance = stream(scenario.run.seed, "serial faults")
+        self._rng = stream(scenario.run.seed, "serial faults")
         self._terminals: dict[int, Terminal] = {}
         self._selector = selectors.SelectSelector()
         self._timed: list[tuple[int, int, Callable[[], object]]] = []
@@ -362,18 +362,18 @@ class Server:
                 continue
             if isinstance(fault, Bytes):
                 data = self._damaged(fault, data)
-            elif isinstance(fault, LateReplies) and self._chance.random() < fault.share:
+            elif isinstance(fault, LateReplies) and self._rng.random() < fault.share:
                 self._at(time_ns + int(fault.delay_ms * NS_PER_MS), partial(terminal.write, data))
                 return
-            elif isinstance(fault, SplitWrites) and len(data) > 1 and self._chance.random() < fault.share:
-                cut = int(self._chance.integers(1, len(data)))
+            elif isinstance(fault, SplitWrites) and len(data) > 1 and self._rng.random() < fault.share:
+                cut = int(self._rng.integers(1, len(data)))
                 self._at(time_ns + int(fault.gap_ms * NS_PER_MS), partial(terminal.write, data[cut:]))
                 data = data[:cut]
         terminal.write(data)
 
     def _damaged(self, fault: Bytes, data: bytes) -> bytes:
         values = np.frombuffer(data, dtype=np.uint8)
-        hit = self._chance.random(len(values)) < fault.share
+        hit = self._rng.random(len(values)) < fault.share
         if fault.kind == "drop-bytes":
             return values[~hit].tobytes()
-        return np.where(hit, self._chance.integers(0, 256, len(values)), values).astype(np.uint8).tobytes()
+        return np.where(hit, self._rng.integers(0, 256, len(values)), values).astype(np.uint8).tobytes()

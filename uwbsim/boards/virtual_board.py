@@ -88,7 +88,7 @@ class UsbLink:
         self.arrived = self._env.event()
         return data
 
-    def say(self, data: bytes, delay: int = 0) -> None:
+    def send(self, data: bytes, delay: int = 0) -> None:
         """Send a transfer after a delay (ns)."""
         if delay:
             self._after(delay, partial(self._transfer, data))
@@ -166,8 +166,8 @@ class VirtualBoard:
     def __init__(self, bench: Bench, board: int) -> None:
         """Power the board on."""
         self.bench, self.id = bench, board
-        self.chance = stream(bench.scenario.run.seed, "board", board)
-        self._phase = int(self.chance.integers(0, NS_PER_MS))
+        self.rng = stream(bench.scenario.run.seed, "board", board)
+        self._phase = int(self.rng.integers(0, NS_PER_MS))
         self._power_on()
 
     def _power_on(self) -> None:
@@ -208,13 +208,13 @@ class VirtualBoard:
         if self.powered:
             self.usb.write(data)
 
-    def say(self, what: bytes | Message, delay: int = 0) -> None:
+    def send(self, what: bytes | Message, delay: int = 0) -> None:
         """Print something after a delay (ns)."""
-        self.usb.say(what if isinstance(what, bytes) else encode(what), delay)
+        self.usb.send(what if isinstance(what, bytes) else encode(what), delay)
 
     def answer(self, reply: Message | bytes) -> Attempt:
         """Print a reply after its processing time; the command is done."""
-        self.say(reply, ANSWER)
+        self.send(reply, ANSWER)
         yield self.bench.env.timeout(ANSWER)
         return True
 
@@ -282,14 +282,14 @@ class VirtualBoard:
         self._buffer += self.usb.read()
         longest = 8000
         if len(self._buffer) > longest:
-            self.say(FULL)
+            self.send(FULL)
             self._buffer = self._buffer[:longest]
         reading = read_commands(self._buffer, EXECUTORS)
         self._buffer = reading.rest
-        for number, complaint in enumerate(reading.complaints):
+        for number, line in enumerate(reading.error_lines):
             if number:
                 yield self.sleep(NS_PER_MS)
-            self.say(complaint, 118 * NS_PER_US)
+            self.send(line, 118 * NS_PER_US)
         if not reading.alive:
             self.hang()
         elif reading.commands:
@@ -298,7 +298,7 @@ class VirtualBoard:
 
     def _try(self, command: Command) -> Steps:
         if self._task.tries > 5:
-            self.say(b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n", ANSWER)
+            self.send(b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n", ANSWER)
             self._task = _Task()
             return
         answer = EXECUTORS[command.kind.KEY](self, *command.values)

@@ -365,9 +365,9 @@ def _mirrored(
 
 def _scattered(around: Surroundings, legs: tuple[Legs, Legs]) -> tuple[Floats, Complexes]:
     """Return lengths and fields of the paths by scatterers, (n, scatterers) each."""
-    things = around.scatterers
-    length = legs[0].length_m + legs[1].length_m + things.extra_m
-    return length, (free_space_field(around.scenario, length) * legs[0].gain * legs[1].gain) * things.gain
+    scatterers = around.scatterers
+    length = legs[0].length_m + legs[1].length_m + scatterers.extra_m
+    return length, (free_space_field(around.scenario, length) * legs[0].gain * legs[1].gain) * scatterers.gain
 
 
 def _polarisation_match(scenario: Scenario, ends: tuple[Placed, Placed], towards: Floats) -> Floats:
