@@ -134,26 +134,19 @@ def answer(board: VirtualBoard, received: Received) -> Steps:
     final = yield from radio.wait()
     if final is None or not is_expected(final, FinalPayload, initiator, board.id):
         return
+    yield board.sleep(474 * NS_PER_US)
+    if request.get_cir:
+        yield from print_cir(board, initiator, board.id, final)
     # Its own report has the chip's stamps, not those that it sent.
-    mine = _of_target(received.stamp, first, last, request)
-    yield from _target_report(board, mine, received, final, get_cir=request.get_cir)
+    mine, theirs = _of_target(received.stamp, first, last, request), payload_of(final, FinalPayload)
+    powers = received.power_dbm, theirs.power_dbm, received.skew_ppm, theirs.skew_ppm
+    report = range_report(initiator, _in_order(theirs.stamps, mine), powers)
+    board.send(TargetRangeReport(*(getattr(report, name) for name in RangeReport.FIELDS)))
 
 
 def _of_target(received: int, first: int, last: int, request: PollPayload) -> tuple[int, int, int]:
     """Return the printed stamps of a target: rx1, tx2, tx3; the last is 0 in single-sided ranging."""
     return received & MASK, first & MASK, last & MASK if request.double_sided else 0
-
-
-def _target_report(
-    board: VirtualBoard, mine: tuple[int, int, int], poll: Received, final: Received, *, get_cir: bool
-) -> Steps:
-    theirs, initiator = payload_of(final, FinalPayload), poll.frame.sender
-    yield board.sleep(474 * NS_PER_US)
-    if get_cir:
-        yield from print_cir(board, initiator, board.id, final)
-    powers = poll.power_dbm, theirs.power_dbm, poll.skew_ppm, theirs.skew_ppm
-    report = range_report(initiator, _in_order(theirs.stamps, mine), powers)
-    board.send(TargetRangeReport(*(getattr(report, name) for name in RangeReport.FIELDS)))
 
 
 def _in_order(initiator: tuple[int, int, int], target: tuple[int, int, int]) -> dict[str, int]:

@@ -7,6 +7,7 @@ the boards' output at its time. The models of faults come first: they are the sc
 from __future__ import annotations
 
 import heapq
+import itertools
 import math
 import os
 import selectors
@@ -228,7 +229,7 @@ class Server:
         self._terminals: dict[int, Terminal] = {}
         self._selector = selectors.SelectSelector()
         self._timed: list[tuple[int, int, Callable[[], object]]] = []
-        self._count = 0
+        self._numbers = itertools.count()  # so that events at the same time keep their order
         try:
             for tag in scenario.tags:
                 self._terminals[tag.id] = Terminal(link_dir / f"tag{tag.id}" if link_dir else None)
@@ -249,10 +250,8 @@ class Server:
 
         After that, bodies do not move.
         """
-        longer = max(scenario.run.duration_s, duration_s or 7200.0)
-        return scenario.model_copy(
-            update={"run": scenario.run.model_copy(update={"duration_s": min(longer, LONGEST_RUN_S)})}
-        )
+        longer = min(max(scenario.run.duration_s, duration_s or 7200.0), LONGEST_RUN_S)
+        return scenario.model_copy(update={"run": scenario.run.model_copy(update={"duration_s": longer})})
 
     @property
     def lost_bytes(self) -> int:
@@ -342,14 +341,12 @@ class Server:
     def _now_ns(self) -> int:
         return round((time.monotonic_ns() - self._start_ns) * self._speed)
 
-    def _at(self, time_ns: int, what: Callable[[], object]) -> None:
-        self._count += 1
-        heapq.heappush(self._timed, (time_ns, self._count, what))
+    def _at(self, time_ns: int, action: Callable[[], object]) -> None:
+        heapq.heappush(self._timed, (time_ns, next(self._numbers), action))
 
     def _arrange(self, fault: Fault) -> None:
         if isinstance(fault, Hang):
-            board = self.bench.boards[fault.tag]
-            self._at(int(fault.at_s * NS_PER_S), board.hang)
+            self._at(int(fault.at_s * NS_PER_S), self.bench.boards[fault.tag].hang)
         if isinstance(fault, Unplug):
             self._at(int(fault.at_s * NS_PER_S), partial(self._unplug, fault.tag))
             self._at(int((fault.at_s + fault.for_s) * NS_PER_S), partial(self._plug, fault.tag))
