@@ -176,8 +176,7 @@ class PairState:
     def rate_hz(self, time_s: float) -> float:
         """Return the successes a second over the last two seconds before `time_s`."""
         # Of a copy, made at once: a page asks in a thread of its own, while the recorder goes on.
-        recent = sum(t > time_s - 2.0 for t in [*self.recent_s])
-        return recent / min(2.0, max(time_s, 0.1))
+        return sum(t > time_s - 2.0 for t in [*self.recent_s]) / min(2.0, max(time_s, 0.1))
 
 
 @dataclass(slots=True, kw_only=True)

@@ -19,6 +19,7 @@ from uwblink.recording.distances import distances_m
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, CirRow, Fault, FrameRow, KnownDistance, Poses, Tag
 from uwblink.recording.summary import counted
+from uwblink.ticks import TICK_S
 from uwblink.twr import LATEST_NS, Exchanges, middle_ns
 
 Pairs = Iterable[tuple[int, int]]
@@ -250,5 +251,7 @@ def exchanges_with_poses(recording: Recording) -> Iterator[tuple[Exchanges, Pose
     The poses suffice for distances at the times of exchanges and at the middle between their messages.
     """
     windows = recording.pose_windows()
-    for block in recording.exchange_blocks():
-        yield from windows.beside(block)
+    for block in filter(len, recording.exchange_blocks()):
+        # A range belongs to the middle of its first two messages, which is after its time, by half a wrap at most.
+        later = int(2**block.bits * TICK_S * 0.5e9) + 1
+        yield block, windows.around(int(block.time_ns.min()), int(block.time_ns.max()) + later)

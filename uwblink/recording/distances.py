@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.recording.schema import POSE, Poses, Tag
-from uwblink.ticks import TICK_S
 from uwblink.twr import Exchanges, raw_range
 
 
@@ -114,13 +113,6 @@ class PoseWindows:
         """Yield exchanges and the tracks for their distances; nothing where there are no exchanges."""
         if len(exchanges):
             yield exchanges, self.tracks
-
-    def beside(self, exchanges: Exchanges) -> Iterator[tuple[Exchanges, Poses]]:
-        """Yield exchanges and the poses between which their ranges are; nothing where there are no exchanges."""
-        if len(exchanges):
-            # A range belongs to the middle of its first two messages, which is after its time, by half a wrap at most.
-            later = int(2**exchanges.bits * TICK_S * 0.5e9) + 1
-            yield exchanges, self.around(int(exchanges.time_ns.min()), int(exchanges.time_ns.max()) + later)
 
     def around(self, start_ns: int, end_ns: int) -> Poses:
         """Return the poses from `start_ns` to `end_ns`, and each body's next ones on either side, in order of time.

@@ -52,7 +52,9 @@ class SingleReports:
 
 def single_reports(exchanges: Exchanges) -> SingleReports:
     """Return each exchange once: the initiator's report if there is one, else the target's."""
-    by_target = np.flatnonzero(from_targets(exchanges))
+    # Exchanges of a tag with itself have one report.
+    from_target = (exchanges.reporter == exchanges.target) & (exchanges.initiator != exchanges.target)
+    by_target = np.flatnonzero(from_target)
     if not len(by_target):
         return SingleReports(exchanges, 0, np.empty((0, 2), dtype=np.int64))
     by_initiator = np.flatnonzero(exchanges.reporter == exchanges.initiator)
@@ -86,11 +88,6 @@ def repeated_rows(exchanges: Exchanges) -> Bools:
     again = np.zeros(len(e), dtype=bool)
     again[order[1:][same]] = True
     return again
-
-
-def from_targets(exchanges: Exchanges) -> Bools:
-    """Return which exchanges (n,) were reported by the target; exchanges of a tag with itself are not."""
-    return np.asarray((exchanges.reporter == exchanges.target) & (exchanges.initiator != exchanges.target))
 
 
 def single_report_blocks(recording: Tables, rows: int = ROWS_AT_ONCE) -> Iterator[SingleReports]:
