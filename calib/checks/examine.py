@@ -122,7 +122,10 @@ GEOMETRY: Final = (
     Check(
         "Does an anchor stand more than 5 cm elsewhere?",
         "displacement that ranges ask for", "F(3, 9), variances by stretches of time, for all anchors",
-        {geometry.ELSEWHERE: "measure the place of {body} again, and see whose number it has"},
+        {
+            geometry.ELSEWHERE: "measure the place of {body} again, and see whose number it has; these ranges give "
+            "position_m = {place}"
+        },
         geometry.anchors,
     ),
 )  # fmt: skip

@@ -15,7 +15,7 @@ from calib.checks.pairs import standing_still
 from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
 from calib.estimator.score_tests import Family
 from calib.findings import Candidate, positive, stretches
-from calib.spread import less_medians, medians, robust_spread
+from calib.spread import TWO_SIDED_95, less_medians, medians, robust_spread
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.recording.distances import antennas_m, distances_m, find_offset
@@ -169,13 +169,16 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
     # Places above and below each other are alike to robots that move in a plane; a displacement is known to a tenth.
     near = {name: float(np.hypot(*(place - places[body] - away)[:2])) for name, place in places.items()}
     others = " and ".join(name for name in places if name != body and near[name] < SAME_PLACE_M + 0.1 * size)
+    inverse = np.linalg.pinv(tested.information, rcond=1e-12, hermitian=True)
+    half = TWO_SIDED_95 * np.sqrt(np.diag(inverse @ tested.covariance @ inverse))
+    axes = ", ".join(f"{one:+.2f} ± {far:.2f}" for one, far in zip(away, half, strict=True))
     yield Candidate(
         ELSEWHERE,
-        f"ranges with {body} fit a place {size:.2f} m away ({away[0]:+.2f} {away[1]:+.2f} {away[2]:+.2f} m): their "
+        f"ranges with {body} fit a place {size:.2f} m away (x, y, z: {axes} m, 95 %): their "
         f"spread is {100 * after:.1f} cm there instead of {100 * before:.1f} cm"
         + (f"; there the recording has {others}: are numbers exchanged?" if others else ""),
         min(1.0, p_value * len(places)),
-        {"body": body, "away_m": away},
+        {"body": body, "away_m": away, "place": [round(value, 2) for value in (places[body] + away).tolist()]},
         gain,
     )
 
