@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from calib.checks.limits import told
+from calib.checks.limits import skew_sentence
 from calib.checks.recording_view import RecordingView, quick_fit
 from calib.data.clocks import PPM_TO_METRES, corrected, left_skew
 from calib.findings import Candidate, exceeds
@@ -75,12 +75,12 @@ def _by_direction(single: RecordingView) -> Iterator[Candidate]:
     size, _, error, dof = fit.offsets_of_pairs(np.where(e.initiator < e.target, 0.5, -0.5)[:, None])
     ways, std = size[:, 0], error[:, 0]
     worst = int(np.argmax((np.abs(ways) - ONE_WAY_M) / std))
-    told = (
+    evidence = (
         f"ranges of pair {fit.names[worst]} differ by {100 * abs(ways[worst]):.0f} cm by who initiates, the most of all"
     )
     p_value = exceeds(float(ways[worst]), float(std[worst]), dof, tolerance=ONE_WAY_M, tried=len(ways))
     remedy = "record the carrier integrator, or use double-sided ranging; until then take the mean of both ways"
-    yield Candidate(LEFT, told, p_value, {"more": remedy})
+    yield Candidate(LEFT, evidence, p_value, {"more": remedy})
 
 
 def swapped_roles(view: RecordingView) -> Iterator[Candidate]:
@@ -121,7 +121,7 @@ def unread(view: RecordingView) -> Iterator[Candidate]:
     """Single-sided ranges whose carriers were not read: nothing says what skew left in them."""
     left = left_skew(view.exchanges)
     if left and not np.isfinite(left.told_m):
-        yield Candidate("single-sided without carrier readings", told(left))
+        yield Candidate("single-sided without carrier readings", skew_sentence(left))
 
 
 def carriers(view: RecordingView) -> Iterator[Candidate]:

@@ -49,8 +49,8 @@ def single_as_double(view: RecordingView) -> Iterator[Candidate]:
     e = view.exchanges
     empty = 100 * float(np.mean(~np.isin(e.protocol, single_sided()) & (e.tx3 == 0) & (e.rx3 == 0)))
     if empty > 50:
-        told = f"{empty:.0f} % of the double-sided exchanges have no third message"
-        yield Candidate("single-sided data taken for double-sided", told)
+        evidence = f"{empty:.0f} % of the double-sided exchanges have no third message"
+        yield Candidate("single-sided data taken for double-sided", evidence)
 
 
 def impossible(view: RecordingView) -> Bools:
@@ -75,15 +75,15 @@ def with_itself(view: RecordingView) -> Iterator[Candidate]:
     same = e.initiator == e.target
     if same.any():
         tags = ", ".join(map(str, np.unique(e.initiator[same])[:6].tolist()))
-        told = f"{np.count_nonzero(same)} of {len(e)} exchanges have one tag at both ends ({tags})"
-        yield Candidate("a tag with itself", told)
+        evidence = f"{np.count_nonzero(same)} of {len(e)} exchanges have one tag at both ends ({tags})"
+        yield Candidate("a tag with itself", evidence)
 
 
 def doubled(view: RecordingView) -> Iterator[Candidate]:
     """Rows that repeat another one: two robots log an exchange, and both logs were imported."""
     if view.doubled:
-        told = f"{view.doubled} of {view.doubled + len(view.exchanges)} rows repeat another one"
-        yield Candidate("doubled exchanges", told)
+        evidence = f"{view.doubled} of {view.doubled + len(view.exchanges)} rows repeat another one"
+        yield Candidate("doubled exchanges", evidence)
 
 
 def corrupted(view: RecordingView) -> Iterator[Candidate]:
@@ -121,12 +121,14 @@ def reported(view: RecordingView) -> Iterator[Candidate]:
     ratios = _reported_over_stamps(view)
     ratio = float(np.median(ratios)) if len(ratios) >= RANGES_OF_A_UNIT else 1.0
     if len(ratios) >= RANGES_OF_A_RATIO and abs(ratio / VACUUM_OVER_AIR - 1) < 5e-5:
-        told = f"reported ranges are {ratio:.5f} times those from the stamps: 299 792 458 m/s instead of 299 702 547"
-        yield Candidate("speed of light in vacuum", told)
+        evidence = (
+            f"reported ranges are {ratio:.5f} times those from the stamps: 299 792 458 m/s instead of 299 702 547"
+        )
+        yield Candidate("speed of light in vacuum", evidence)
     for unit, many in LENGTHS.items():
         if abs(ratio / many - 1) < UNIT_OFF:
-            told = f"reported ranges are {ratio:.5g} times those from the stamps"
-            yield Candidate(REPORTED, told, words={"unit": unit})
+            evidence = f"reported ranges are {ratio:.5g} times those from the stamps"
+            yield Candidate(REPORTED, evidence, words={"unit": unit})
 
 
 WIDTHS: Final = (32, 40)
@@ -167,8 +169,8 @@ def another(view: RecordingView) -> Iterator[Candidate]:
         alike = [n for n in PROTOCOLS if tried.get((n, bits), 0.0) > share - 0.01 and n not in (said, name)]
         also = f" (or {' or '.join(alike)})" if alike else ""
         width, setting = (f" with {bits} bits", f", bits = {bits}") if bits != e.bits else ("", "")
-        told = f"read as {name}{also}{width} {numbers} ({said})"
-        yield Candidate("another protocol", told, words={"settings": f'protocol = "{name}"{setting}'})
+        evidence = f"read as {name}{also}{width} {numbers} ({said})"
+        yield Candidate("another protocol", evidence, words={"settings": f'protocol = "{name}"{setting}'})
 
 
 def _possible_share(e: Exchanges) -> float:
@@ -223,18 +225,18 @@ def lengths(view: RecordingView) -> Iterator[Candidate]:
     bare = bool(without_stamps(view.exchanges).mean() > 0.5)
     if len(raw) < RANGES_OF_A_UNIT:
         if bare and np.nanmedian(np.abs(view.raw_m)) > PLAUSIBLE_M:
-            told = f"half of the ranges are longer than {PLAUSIBLE_M:.0f} m, which no UWB radio measures"
-            yield Candidate("unit of the ranges", told, words={"unit": "mm"})
+            evidence = f"half of the ranges are longer than {PLAUSIBLE_M:.0f} m, which no UWB radio measures"
+            yield Candidate("unit of the ranges", evidence, words={"unit": "mm"})
     elif unit := _unit(raw, truth):
         name, whose = ("unit of the poses", "poses") if view.posed else ("unit of the true distances", "true distances")
-        told = (
+        evidence = (
             f"true distances have a median of {np.median(truth):.6g}, ranges one of {np.median(raw):.6g} m: they agree "
             f"if {whose} are in {unit}"
         )
-        yield Candidate(name, told, words={"unit": unit, "many": f"{LENGTHS[unit]:g}"})
+        yield Candidate(name, evidence, words={"unit": unit, "many": f"{LENGTHS[unit]:g}"})
     elif bare and (unit := _unit(truth, raw)):
-        told = f"ranges are in {unit} if true distances are in m: half of them are longer than {np.median(raw):.0f}"
-        yield Candidate("unit of the ranges", told, words={"unit": unit})
+        evidence = f"ranges are in {unit} if true distances are in m: half of them are longer than {np.median(raw):.0f}"
+        yield Candidate("unit of the ranges", evidence, words={"unit": unit})
 
 
 def _unit(metres: Floats, others: Floats) -> str | None:
@@ -262,5 +264,5 @@ def powers(view: RecordingView) -> Iterator[Candidate]:
         if USUAL_DBM[0] < times * middle < USUAL_DBM[1]:
             guess = f"they look like {name}: times {times:g} they would be {times * middle:.0f} dBm"
             factor = f"multiply fpp1 and fpp2 by {times:g}"
-    told = f"the median power is {middle:+.5g} dBm, where these radios receive -115 to -55; {guess}"
-    yield Candidate(POWER, told, words={"factor": factor})
+    evidence = f"the median power is {middle:+.5g} dBm, where these radios receive -115 to -55; {guess}"
+    yield Candidate(POWER, evidence, words={"factor": factor})

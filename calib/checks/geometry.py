@@ -42,8 +42,8 @@ def pose_clock(view: RecordingView) -> Iterator[Candidate]:
     shift_s, e = found.offset_ns * 1e-9, view.exchanges
     if abs(shift_s) > SMALLEST_OFFSET_S:
         moved = distances_m(view.poses, view.tags, e.initiator, e.target, e.time_ns - found.offset_ns)
-        told = f"with the poses {shift_s:+.3f} s later"
-        yield _undone(view, Candidate("pose time offset", told, words={"shift": f"{shift_s:.3f}"}), moved)
+        evidence = f"with the poses {shift_s:+.3f} s later"
+        yield _undone(view, Candidate("pose time offset", evidence, words={"shift": f"{shift_s:.3f}"}), moved)
 
 
 def _trials(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]:
@@ -85,8 +85,8 @@ def _undone(view: RecordingView, seen: Candidate, truth_m: Floats, *, tried: int
     """Return a suspected fault with how the spread of ranges changes with the true distances (n,) without it."""
     p_value, gain = narrower(view, view.error_m, view.raw_m - truth_m, tried=tried)
     after, before = (100 * view.spread_m(view.raw_m - truth) for truth in (truth_m, view.truth_m))
-    told = f"{seen.evidence} the ranges' spread is {after:.1f} cm instead of {before:.1f} cm"
-    return replace(seen, evidence=told, p_value=p_value, gain=gain)
+    evidence = f"{seen.evidence} the ranges' spread is {after:.1f} cm instead of {before:.1f} cm"
+    return replace(seen, evidence=evidence, p_value=p_value, gain=gain)
 
 
 ELSEWHERE: Final = "anchor stands elsewhere"

@@ -74,7 +74,7 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
             "a damaged range cannot be told from a reflected one"
         )
     if ranges.left_skew is not None:
-        yield told(ranges.left_skew)
+        yield skew_sentence(ranges.left_skew)
     elif any(is_single_sided(name) and not corrected(name) for name in names_in(ranges.protocol)):
         yield (
             "single-sided ranges without their reply times and carrier readings: what clock skew has left in them "
@@ -104,7 +104,7 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
         )
 
 
-def told(left: LeftSkew) -> str:
+def skew_sentence(left: LeftSkew) -> str:
     """Return as a sentence what clock skew may have left in single-sided ranges."""
     bound = (
         f"clocks that are 20 ppm off each leave up to {_length(left.bound_m)} "
@@ -217,8 +217,8 @@ def one_way(ranges: Ranges) -> Iterator[str]:
         differ = float(np.median(ways[0]) - np.median(ways[1]))
         std = STD_OF_MEDIAN * float(np.hypot(*(robust_spread(some) / np.sqrt(len(some)) for some in ways)))
         if abs(differ) > max(ONE_WAY_M, WAYS_DIFFER * std):
-            told = f"{100 * abs(differ):.0f} cm {'longer' if differ > 0 else 'shorter'} if tag {a} initiates"
-            found.append((abs(differ), f"pair {a}-{b}: ranges read {told}"))
+            size = f"{100 * abs(differ):.0f} cm {'longer' if differ > 0 else 'shorter'} if tag {a} initiates"
+            found.append((abs(differ), f"pair {a}-{b}: ranges read {size}"))
     if found:
         yield f"{max(found)[1]}: clock skew is not corrected, or with the wrong sign of the carrier's reading"
 

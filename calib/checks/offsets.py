@@ -159,8 +159,8 @@ def astray(view: RecordingView) -> Iterator[Candidate]:
         if p_value < BUDGET:
             found.append((p_value, f"{name} by {np.mean(means):.2f} m"))
     if found:
-        told = ", ".join(name for _, name in found[:6]) + (f" and {len(found) - 6} pairs more" if found[6:] else "")
-        yield Candidate(ASTRAY, f"ranges of pairs {told} differ on average, each pair's median aside", min(found)[0])
+        named = ", ".join(name for _, name in found[:6]) + (f" and {len(found) - 6} pairs more" if found[6:] else "")
+        yield Candidate(ASTRAY, f"ranges of pairs {named} differ on average, each pair's median aside", min(found)[0])
 
 
 def changed_delays(view: RecordingView) -> Iterator[Candidate]:

@@ -54,8 +54,8 @@ def silent(view: RecordingView) -> Iterator[Candidate]:
         if others + others_bad:
             usual = max(MOSTLY, others_bad / (others + others_bad))
             p_value = more_often(bad, bad + done, usual, tried=len(tags))
-            told = f"tag {tag} took part in {done} exchanges, {bad} failed"
-            yield Candidate("dead or deaf tag", told, p_value, {"tag": tag})
+            evidence = f"tag {tag} took part in {done} exchanges, {bad} failed"
+            yield Candidate("dead or deaf tag", evidence, p_value, {"tag": tag})
 
 
 def standing_still(view: RecordingView) -> float | None:
@@ -98,8 +98,8 @@ def missing(view: RecordingView) -> Iterator[Candidate]:
     if powered < 50:
         yield Candidate("no powers", f"{powered:.0f} % of the exchanges have a first-path power")
     if true < 50 and not view.standing:
-        told = f"{true:.0f} % of the exchanges have one: poses are missing or do not cover the recording"
-        yield Candidate("no true distances", told)
+        evidence = f"{true:.0f} % of the exchanges have one: poses are missing or do not cover the recording"
+        yield Candidate("no true distances", evidence)
 
 
 def confounded(view: RecordingView) -> Iterator[Candidate]:

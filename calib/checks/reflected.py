@@ -52,9 +52,11 @@ def reflections(view: RecordingView) -> Iterator[Candidate]:
         return
     long = fit.reflected > 0.5
     share = float(np.mean(long))
-    told = f"about {100 * share:.0f} % of the ranges are reflected, by {100 * _detour_m(fit, long):.0f} cm on average"
+    evidence = (
+        f"about {100 * share:.0f} % of the ranges are reflected, by {100 * _detour_m(fit, long):.0f} cm on average"
+    )
     if view.quick_fit is None:
-        yield from _of_tags(fit, long, told)
+        yield from _of_tags(fit, long, evidence)
         return
     lasting = [one for pair in range(len(fit.ends)) for one in _of_pair(fit, pair, long) if one.p_value < BUDGET]
     if lasting:
@@ -68,7 +70,7 @@ def reflections(view: RecordingView) -> Iterator[Candidate]:
         std = float(np.std(parts, ddof=1) / np.sqrt(len(parts))) if parts else np.inf
         p_value = exceeds(share, std, len(parts) - 1, tolerance=MANY_SHARE)
         remedy = f"move antennas away from bodies and walls{advice_on_loss(view) if p_value < BUDGET else ''}"
-        yield Candidate(MANY, told, p_value, {"more": remedy})
+        yield Candidate(MANY, evidence, p_value, {"more": remedy})
 
 
 def _detour_m(fit: QuickFit, long: Bools) -> float:
@@ -109,7 +111,7 @@ def _life_s(reflected: Floats, time_s: Floats) -> float:
     return float(min(1 / max(rate * (1 - np.mean(reflected)), 1e-9), steps * len(time_s) / 4))
 
 
-def _of_tags(fit: QuickFit, long: Bools, told: str) -> Iterator[Candidate]:
+def _of_tags(fit: QuickFit, long: Bools, evidence: str) -> Iterator[Candidate]:
     """Where pairs have a few ranges each: the tags of whose ranges many more are reflected than of the others'."""
     p_value, tags = more_often(int(long.sum()), len(long), MANY_SHARE), np.unique(fit.ends).tolist()
     for tag in tags:
@@ -119,9 +121,9 @@ def _of_tags(fit: QuickFit, long: Bools, told: str) -> Iterator[Candidate]:
         p_value = min(p_value, p_tag)
         if mine.sum() >= RANGES_OF_A_TAG and p_tag < BUDGET:
             size = f"{100 * np.mean(long[mine]):.0f} % of its ranges, by {100 * _detour_m(fit, mine & long):.0f} cm"
-            told += f"; tag {tag}: {size}"
+            evidence += f"; tag {tag}: {size}"
     remedy = "see what stands near these antennas; pairs have too few ranges to say more: record for longer"
-    yield Candidate(MANY, told, p_value, {"more": remedy})
+    yield Candidate(MANY, evidence, p_value, {"more": remedy})
 
 
 def advice_on_loss(view: RecordingView) -> str:

@@ -71,8 +71,8 @@ def _weak(found: SurveyResult) -> Iterator[Candidate]:
         yield Candidate("delays that a survey leaves open", f"the arrangements do not determine the delays of {who}")
     likely = [f"{one.first}-{one.second} in {one.arrangement}" for one in found.reflected if one.chance > 0.5]
     if len(likely) > MANY * made["pairs"]:
-        told = f"{len(likely)} of {made['pairs']} pairs are believed to be reflected: {', '.join(likely)}"
-        yield Candidate("many reflected pairs", told)
+        evidence = f"{len(likely)} of {made['pairs']} pairs are believed to be reflected: {', '.join(likely)}"
+        yield Candidate("many reflected pairs", evidence)
     if second is not None and second.ambiguous:
-        told = f"{second.arrangement}: boards {', '.join(map(str, second.tags))} could as well be elsewhere"
-        yield Candidate("two solutions of a survey", told)
+        evidence = f"{second.arrangement}: boards {', '.join(map(str, second.tags))} could as well be elsewhere"
+        yield Candidate("two solutions of a survey", evidence)

@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.spread import STD_OF_MEDIAN
 from uwblink.arrays import Bools, Floats
 from uwblink.protocols.table import PROTOCOLS, Intervals, is_single_sided
 from uwblink.recording import IMPOSSIBLE_PPM, target_faster_ppm
@@ -109,12 +110,11 @@ def _apart(pair: tuple[int, int], stamps: Floats, carrier: Floats, reply_s: Floa
     """Return a pair whose two readings of skew differ for certain, None otherwise.
 
     Readings of a carrier may be off by 1 ppm, and by a tenth of the skew, without any fault; and eight standard errors
-    of the median difference are no chance. The standard error of a median is 1.2533 sigma / sqrt(n), with sigma half
-    of the distance between the percentiles 16 and 84.
+    of the median difference are no chance. Sigma is half of the distance between the percentiles 16 and 84.
     """
     differ = stamps - carrier
     middle = float(np.median(differ))
-    std = 1.2533 * float(np.ptp(np.percentile(differ, (16, 84)))) / 2 / np.sqrt(len(differ))
+    std = STD_OF_MEDIAN * float(np.ptp(np.percentile(differ, (16, 84)))) / 2 / np.sqrt(len(differ))
     by_stamps, by_carrier = float(np.median(stamps)), float(np.median(carrier))
     if abs(middle) < max(1.0, 8.0 * std, 0.1 * abs(by_carrier)):
         return None

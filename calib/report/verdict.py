@@ -13,7 +13,7 @@ from scipy.stats import binomtest
 from calib.calibration.model import rests_on
 from calib.evaluation.statistics import Stats
 from calib.report.results import Results
-from calib.spread import TWO_SIDED_95
+from calib.spread import STD_OF_MEDIAN, TWO_SIDED_95
 from uwblink.pages.blocks import Block, Table, Text
 
 GOOD: Final = "good"
@@ -129,11 +129,11 @@ def _bias(results: Results) -> Criterion:
 def _median_bound_m(stats: Stats, pairs: int) -> float:
     """Return the bound of a median error by chance, at 1 % for all pairs together (Bonferroni), in metres.
 
-    The standard error of a median is 1.2533 sigma / sqrt(n), and sigma is known to n - 1 degrees of freedom.
+    Sigma is known to n - 1 degrees of freedom.
     """
     if stats.n < 2:
         return math.inf
-    return float(1.2533 * stats.robust_std_m / math.sqrt(stats.n) * stdtrit(stats.n - 1, 1 - 0.005 / pairs))
+    return float(STD_OF_MEDIAN * stats.robust_std_m / math.sqrt(stats.n) * stdtrit(stats.n - 1, 1 - 0.005 / pairs))
 
 
 def _interval(results: Results) -> Criterion:
