@@ -127,9 +127,8 @@ def of_pairs(found: KnownDistances) -> Family:
 def slopes_of(found: KnownDistances) -> Slopes:
     """Return the slopes of the fit of the delays."""
     search = found.searches[0]
-    delays = np.zeros((len(found.delays), search.optimum.layout.size))
-    delays[:, search.optimum.layout.where["delay"]] = np.eye(len(found.delays))
-    return Slopes(search.rows, search.optimum, found.blocks, delays)
+    layout = search.optimum.layout
+    return Slopes(search.rows, search.optimum, found.blocks, np.eye(layout.size)[layout.where["delay"]])
 
 
 def _columns(columns: Ints, values: Floats | float, size: int) -> sparse.csr_matrix:

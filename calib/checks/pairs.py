@@ -12,7 +12,7 @@ from calib.checks.recording_view import RecordingView, pair_ids
 from calib.data.ranges import measured_powers
 from calib.estimator.identifiability import free_directions, square_of
 from calib.findings import Candidate, more_often
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Floats
 from uwblink.recording.summary import failures_by_pair
 from uwblink.twr import delay_weights
 
@@ -114,16 +114,20 @@ def confounded(view: RecordingView) -> Iterator[Candidate]:
     rows = rows[np.argsort(e.time_ns[rows], kind="stable")]
     if len(rows) < RANGES_OF_A_SHARE or np.ptp(view.truth_m[rows]) < SHORTEST_M:
         return
-    every, shares = rows[:: max(len(rows) // LOOKED_AT, 1)], []
-    seconds = e.time_ns[rows] // round(TURNED_S * 1e9)
-    alone = len(np.unique(np.column_stack([pair_ids(e)[rows], seconds]), axis=0))
+    every, shares = rows[:: max(len(rows) // LOOKED_AT, 1)], [0.0]
+    pair, time_ns = pair_ids(e)[rows], e.time_ns[rows]
+    alone = len(np.unique(np.column_stack([pair, time_ns // round(TURNED_S * 1e9)]), axis=0))
+    # Readings of a pair that follow each other at once differ by their noise.
+    order = np.argsort(pair, kind="stable")
+    together = (np.diff(pair[order]) == 0) & (np.diff(time_ns[order]) < AT_ONCE_S * 1e9)
+    enough = np.count_nonzero(together) >= RANGES_OF_A_SHARE // 3
     # Lifted powers near the antennas outweigh all others, their decibels do not; either way is too much.
     for power in (lifted, np.log(lifted)):
-        noise = _noise(view, power, rows)
+        noise = float(np.mean(np.diff(power[rows][order])[together] ** 2)) / 2 if enough else 0.0
         share = share_by_distance(power[every], view.truth_m[every], noise)
         if share_by_distance(power[every], view.truth_m[every]) > FROM_DISTANCE:
             shares.append(1 - (1 - share) * (alone - 1) / max(alone - GROUPS, 1))
-    if max(shares, default=0.0) > EXPLAINED:
+    if max(shares) > EXPLAINED:
         yield Candidate(CONFOUNDED, f"distance explains {100 * max(shares):.0f} % of the power's variance")
 
 
@@ -133,17 +137,6 @@ def share_by_distance(power: Floats, truth_m: Floats, noise: float = 0.0) -> flo
     within = float(np.mean([np.var(group) for group in groups]))
     between = float(np.var([np.mean(group) for group in groups]))
     return between / max(between + max(within - noise, 0.0), 1e-300)
-
-
-def _noise(view: RecordingView, power: Floats, rows: Ints) -> float:
-    """Return the variance of readings' noise in powers (n,), from readings of a pair that follow each other at once."""
-    e = view.exchanges[rows]
-    pair, time_s = pair_ids(e), e.time_ns * 1e-9
-    order = np.lexsort((time_s, pair))
-    together = (np.diff(pair[order]) == 0) & (np.diff(time_s[order]) < AT_ONCE_S)
-    if np.count_nonzero(together) < RANGES_OF_A_SHARE // 3:
-        return 0.0
-    return float(np.mean(np.diff(power[rows][order])[together] ** 2)) / 2
 
 
 TURNED_S: Final = 2.0

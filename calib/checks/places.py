@@ -88,10 +88,9 @@ def _pairs_of_bodies(found: KnownDistances) -> Ints | None:
     carried = dict(found.model.ranges.bodies)
     if found.model.constants == "pair" or not carried:
         return None
-    names: dict[frozenset[str], int] = {}
     ends = [frozenset(carried.get(tag, f"tag {tag}") for tag in both) for both in found.model.pairs.ends.tolist()]
-    group = np.array([names.setdefault(both, len(names)) for both in ends])
-    return group if len(names) < len(ends) else None
+    groups = list(dict.fromkeys(ends))
+    return np.array([groups.index(both) for both in ends]) if len(groups) < len(ends) else None
 
 
 def _staying(pairs: Tested, sums: Floats) -> tuple[Floats, Floats]:
