@@ -11,6 +11,7 @@ from calib.data import sources
 from calib.data.ranges import COLUMNS, Ranges
 from calib.data.samples import sample_flight
 from uwblink.recording import AntennaDelay, summary
+from uwblink.recording.contents import exchanges_with_poses
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
 from uwblink.recording.summary import single_reports
@@ -96,7 +97,7 @@ def test_bodies_with_one_pose_do_not_split_what_is_read(tmp_path):
         time_ns, names = np.full(100, int(flight.poses.time_ns[0])), np.array([f"anchor{k}" for k in range(100)])
         recording.append_poses(Poses(time_ns, names, np.ones((100, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (100, 1))))
     with Recording.open(path) as recording:
-        parts = [len(part) for part, _ in recording.pose_windows().beside(recording.exchanges())]
+        parts = [len(part) for part, _ in exchanges_with_poses(recording)]
     assert parts == [3000]
 
 
