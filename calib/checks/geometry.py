@@ -171,10 +171,10 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
     others = " and ".join(name for name in places if name != body and near[name] < SAME_PLACE_M + 0.1 * size)
     inverse = np.linalg.pinv(tested.information, rcond=1e-12, hermitian=True)
     half = TWO_SIDED_95 * np.sqrt(np.diag(inverse @ tested.covariance @ inverse))
-    axes = ", ".join(f"{one:+.2f} ± {far:.2f}" for one, far in zip(away, half, strict=True))
+    axes = ", ".join(f"{name} {one:+.2f} ± {far:.2f}" for name, one, far in zip("xyz", away, half, strict=True))
     yield Candidate(
         ELSEWHERE,
-        f"ranges with {body} fit a place {size:.2f} m away (x, y, z: {axes} m, 95 %): their "
+        f"ranges with {body} fit a place {size:.2f} m away ({axes} m, 95 %): their "
         f"spread is {100 * after:.1f} cm there instead of {100 * before:.1f} cm"
         + (f"; there the recording has {others}: are numbers exchanged?" if others else ""),
         min(1.0, p_value * len(places)),
