@@ -41,7 +41,7 @@ docs: setup ## build the documentation site into docs/_build/html; warnings are 
 	$(BIN)/python -m docs.site.narrow
 	@echo "open docs/_build/html/index.html"
 
-coverage: setup ## run the whole test suite and measure what it reaches (10 minutes); fails below 92 %
+coverage: setup ## run the whole test suite and measure what it reaches (15 minutes); fails below 92 %
 	$(BIN)/python $(TESTS) --cov --cov-report=term-missing
 
 rooms: setup ## print which room imports which, floor by floor
