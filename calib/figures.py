@@ -223,13 +223,13 @@ def delays(
     bars = np.where(np.isfinite(std), TWO_SIDED_95 * std, 0.0)
     inside = within_fence(values)
     beside = 0.12 if planted_ns else 0.0
-    told, open_ = inside & (bars > 0), inside & (bars == 0)
+    bounded, unbounded = inside & (bars > 0), inside & (bars == 0)
     dots: dict[str, Any] = {"fmt": "o", "ms": 3.5, "capsize": 2.5, "color": BLUE, "label": "fitted, 95 % interval"}
-    if told.any():
-        axes.errorbar((place - beside)[told], values[told], bars[told], **dots)
-    if open_.any():
+    if bounded.any():
+        axes.errorbar((place - beside)[bounded], values[bounded], bars[bounded], **dots)
+    if unbounded.any():
         name = "without an interval: pinned or undetermined"
-        axes.plot((place - beside)[open_], values[open_], "o", ms=4, mfc="none", mec=BLUE, label=name)
+        axes.plot((place - beside)[unbounded], values[unbounded], "o", ms=4, mfc="none", mec=BLUE, label=name)
     low, high = float(values[inside].min()), float(values[inside].max())
     if planted_ns:
         known = np.array([planted_ns.get(tag, np.nan) + shift_ns for tag in tags])

@@ -123,3 +123,18 @@ def test_many_tags_leave_room_for_their_lines(fitted):
         figure.draw_without_rendering()
         height_in = figure.axes[0].get_window_extent().height / figure.dpi
     assert height_in > 1.3
+
+
+def test_a_delay_that_nothing_determines_is_a_circle_without_an_interval(fitted):
+    known = fitted.calibration
+    tag = min(known.delays_ns)
+    open_one = replace(known, delays_std_ns=known.delays_std_ns | {tag: np.inf})
+    axes = axes_of(lambda axes: delays(open_one, axes=axes))
+    circle = labelled(axes, "without an interval: pinned or undetermined")
+    assert circle.get_ydata() == pytest.approx([known.delays_ns[tag]])
+    (bars,) = axes.containers
+    assert len(bars.lines[0].get_ydata()) == len(known.delays_ns) - 1
+    assert (
+        "without an interval: pinned or undetermined"
+        not in axes_of(lambda axes: delays(known, axes=axes)).get_legend_handles_labels()[1]
+    )
