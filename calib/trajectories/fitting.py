@@ -230,7 +230,7 @@ def _result(
         findings,
         settings=settings,
         fixed=fixed,
-        first=[*judgement.undetermined_sentences(covariance), *_of_search(top, rival), *top.scene.tapes.left_out],
+        first=[*_left_open(found, judgement, covariance), *_of_search(top, rival), *top.scene.tapes.left_out],
         more=judgement.sentences,
     )
 
@@ -243,6 +243,15 @@ def _with_curve(calibration: Calibration, known: Calibration) -> Calibration:
         of_curve = known.uncertainty.bias_m2 if known.uncertainty else tuple((0.0,) * size for _ in range(size))
         uncertainty = replace(uncertainty, bias_m2=of_curve)
     return replace(calibration, bias_curve=known.bias_curve, uncertainty=uncertainty)
+
+
+def _left_open(found: KnownDistances, judgement: Judgement, covariance: Floats) -> list[str]:
+    """Return a sentence on delays that trajectories leave open, beyond those that the pairs leave free.
+
+    The latter are held at the smallest values, so that their covariance says nothing of them.
+    """
+    free = {tag for group in found.free for tag in group}
+    return [] if free.issuperset(judgement.free_tags) else judgement.undetermined_sentences(covariance)
 
 
 def _of_search(top: Found, rival: str) -> Iterator[str]:
@@ -274,8 +283,8 @@ def _provenance(
     """Return the provenance that only fits of trajectories have."""
     scene, places_s, reference_dbm = top.scene, top.scene.places.time_s, _reference_dbm(settings)
     more: dict[str, Any] = {}
-    if judgement.free_tags:
-        more = {"undetermined": [judgement.free_tags], "left_open": judgement.undetermined_sentences(covariance)[0]}
+    if left_open := _left_open(found, judgement, covariance):
+        more = {"undetermined": [judgement.free_tags], "left_open": left_open[0]}
     elif found.free:
         more = {"undetermined": found.free}
     pinned = set(found.model.tags) <= set(settings.fixed_ns)
