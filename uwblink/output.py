@@ -116,13 +116,14 @@ def take_name(partial: Path, path: Path) -> None:
 def new_file(path: Path, *, force: bool) -> TextIO:
     """Create a text file that is written under its own name; links are not followed.
 
-    Raises `OutputError`, and what `check_output` raises.
+    What is written between two flushes, up to a megabyte, reaches the file at once. Raises `OutputError`, and what
+    `check_output` raises.
     """
     check_output(path, force=force)
     try:
         if force:
             path.unlink(missing_ok=True)
-        return path.open("x", encoding="utf-8", newline="\n")
+        return path.open("x", 2**20, encoding="utf-8", newline="\n")
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
 

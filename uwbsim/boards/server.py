@@ -141,7 +141,7 @@ def stays_s(scenario: Scenario) -> list[tuple[float, float]]:
 class LivePoses:
     """Writes the poses of motion capture, with its rate, noise, latency and gaps, as `uwblink poses` reads them.
 
-    Rows are written whole, so that the file has complete lines at any time.
+    Rows are flushed together: a reader sees an incomplete line only while the system copies them.
     """
 
     def __init__(self, world: World, path: Path, epoch_ns: int) -> None:
