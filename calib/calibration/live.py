@@ -7,7 +7,7 @@ from pathlib import Path
 
 from calib.calibration.model import load_calibration
 from calib.calibration.parts import CorrectedColumns
-from calib.data.ranges import Ranges, columns_of
+from calib.data.ranges import Ranges
 from uwblink.arrays import Floats
 from uwblink.twr import Exchanges
 
@@ -22,8 +22,7 @@ def live_correction(path: Path) -> Callable[[Exchanges], dict[str, Floats]]:
     calibration = load_calibration(path)
 
     def correct(exchanges: Exchanges) -> dict[str, Floats]:
-        columns = columns_of(exchanges, exchanges.truth_m, None, ())
-        ranges = Ranges(source=str(path), excluded={}, planted=None, **columns)
+        ranges = Ranges.from_exchanges(exchanges, source=str(path))
         known = CorrectedColumns.of(calibration.apply(ranges))._asdict()
         return {"corrected_m": known.pop("range_m"), **known}
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from calib.spread import STD_OF_MEDIAN
-from uwblink.arrays import Bools, Floats
+from calib.spread import STD_OF_MEDIAN, medians, spreads
+from uwblink.arrays import Ints
 from uwblink.protocols.table import PROTOCOLS, Intervals, is_single_sided
 from uwblink.recording import IMPOSSIBLE_PPM, target_faster_ppm
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
@@ -43,82 +42,38 @@ class ClocksApart:
 def clocks_apart(exchanges: Exchanges) -> ClocksApart | None:
     """Return the pair whose clock ratio by the stamps is farthest from that of the carriers, None where all agree.
 
-    Most pairs settle which sign the readings have: ranges with a third message do not depend on it.
+    Compared are exchanges of three messages with readings, of which 0 is none. Most pairs settle which sign the
+    readings have: ranges with a third message do not depend on it. Readings of a carrier may be off by 1 ppm, and by a
+    tenth of the skew, without any fault; and eight standard errors of the median difference are no chance.
     """
-    sample = ClockSample()
-    sample.add(exchanges)
-    return sample.farthest_pair()
-
-
-class ClockSample:
-    """Exchanges whose clocks are compared: at most `size`, drawn at random from all that are added."""
-
-    def __init__(self, size: int = 10_000) -> None:
-        """Begin empty."""
-        self._size = size
-        self._random, self._count = np.random.default_rng(0), 0
-        self._parts: list[Exchanges] = []
-        self._draws: list[Floats] = []
-
-    def add(self, exchanges: Exchanges) -> None:
-        """Add some more exchanges."""
-        able = _comparable(exchanges)
-        self._count += int(np.count_nonzero(able))
-        draws = self._random.random(len(exchanges))
-        # More are kept than will be compared: the share of those that are kept only falls.
-        kept = able & (draws < self._share())
-        self._parts.append(exchanges[kept])
-        self._draws.append(draws[kept])
-
-    def _share(self) -> float:
-        return self._size / self._count if self._count > self._size else 1.0
-
-    def farthest_pair(self) -> ClocksApart | None:
-        """Return the pair whose clocks are farthest apart, None where all agree."""
-        parts = [part[draws < self._share()] for part, draws in zip(self._parts, self._draws, strict=True)]
-        if not sum(map(len, parts)):
-            return None
-        return _farthest_pair(Exchanges.concatenate(parts))
-
-
-def _comparable(exchanges: Exchanges) -> Bools:
-    """Return which exchanges show skew in both ways: three messages with stamps, and readings, of which 0 is none."""
+    readings = np.abs(exchanges.skew1_ppm) + np.abs(exchanges.skew2_ppm)
     triple = [name for name in names_in(exchanges.protocol) if PROTOCOLS[name].third_sender is not None]
     able = np.isin(exchanges.protocol, triple) & ((exchanges.tx3 | exchanges.rx3) != 0)
-    readings = np.abs(exchanges.skew1_ppm) + np.abs(exchanges.skew2_ppm)
-    return np.asarray(able & np.isfinite(readings) & (readings != 0))
-
-
-def _farthest_pair(some: Exchanges, min_exchanges: int = 20) -> ClocksApart | None:
-    forth = np.where(some.initiator < some.target, 1.0, -1.0)
+    rows = np.flatnonzero(able & np.isfinite(readings) & (readings != 0))
+    # So many are enough; a regular choice could coincide with the schedule of pairs.
+    some = exchanges[np.sort(np.random.default_rng(0).permutation(rows)[:20_000])]
+    some = some[np.abs(target_faster_ppm(some)) < IMPOSSIBLE_PPM]
+    _, first, pair, count = np.unique(pair_ids(some), return_index=True, return_inverse=True, return_counts=True)
+    forth, enough = np.where(some.initiator < some.target, 1.0, -1.0), count >= 20
     stamps, carrier = forth * target_faster_ppm(some), forth * (some.skew1_ppm - some.skew2_ppm) / 2
-    good = np.abs(stamps) < IMPOSSIBLE_PPM
-    low, high = np.minimum(some.initiator, some.target), np.maximum(some.initiator, some.target)
-    rows = {}
-    for a, b in sorted(set(zip(low.tolist(), high.tolist(), strict=True))):
-        mine = good & (low == a) & (high == b)
-        if np.count_nonzero(mine) >= min_exchanges:
-            rows[a, b] = mine
-    medians = [(float(np.median(stamps[mine])), float(np.median(carrier[mine]))) for mine in rows.values()]
-    carrier = carrier if sum(one * other for one, other in medians) >= 0 else -carrier
-    reply_s = intervals(some).dt32 * TICK_S
-    found = [_apart(pair, stamps[mine], carrier[mine], reply_s[mine]) for pair, mine in rows.items()]
-    return max(filter(None, found), key=lambda one: one.moves_m, default=None)
-
-
-def _apart(pair: tuple[int, int], stamps: Floats, carrier: Floats, reply_s: Floats) -> ClocksApart | None:
-    """Return a pair whose two readings of skew differ for certain, None otherwise.
-
-    Readings of a carrier may be off by 1 ppm, and by a tenth of the skew, without any fault; and eight standard errors
-    of the median difference are no chance. Sigma is half of the distance between the percentiles 16 and 84.
-    """
-    differ = stamps - carrier
-    middle = float(np.median(differ))
-    std = STD_OF_MEDIAN * float(np.ptp(np.percentile(differ, (16, 84)))) / 2 / np.sqrt(len(differ))
-    by_stamps, by_carrier = float(np.median(stamps)), float(np.median(carrier))
-    if abs(middle) < max(1.0, 8.0 * std, 0.1 * abs(by_carrier)):
+    by_stamps, by_carrier = medians(stamps, pair), medians(carrier, pair)
+    sign = 1.0 if np.sum((by_stamps * by_carrier)[enough]) >= 0 else -1.0
+    differ, by_carrier = medians(stamps - sign * carrier, pair), sign * by_carrier
+    std = STD_OF_MEDIAN * spreads(stamps - sign * carrier, pair) / np.sqrt(count)
+    apart = np.abs(differ) >= np.maximum.reduce([np.ones(len(count)), 8.0 * std, 0.1 * np.abs(by_carrier)])
+    moves_m = PPM_TO_METRES * np.abs(differ) * medians(intervals(some).dt32 * TICK_S, pair)
+    moves_m = np.where(apart & enough, moves_m, 0.0)
+    if not moves_m.any():
         return None
-    return ClocksApart(pair, by_stamps, by_carrier, PPM_TO_METRES * abs(middle) * float(np.median(reply_s)))
+    k = int(np.argmax(moves_m))
+    low, high = sorted((int(some.initiator[first[k]]), int(some.target[first[k]])))
+    return ClocksApart((low, high), float(by_stamps[k]), float(by_carrier[k]), float(moves_m[k]))
+
+
+def pair_ids(exchanges: Exchanges) -> Ints:
+    """Return one number for each pair of tags, whoever initiated, shape (n,)."""
+    first, second = exchanges.initiator, exchanges.target
+    return np.asarray(np.minimum(first, second) * 65_536 + np.maximum(first, second))
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +88,29 @@ class LeftSkew:
     reply_s: float
     told_m: float
 
+    def __str__(self) -> str:
+        """Return the bound as a sentence."""
+        bound = (
+            f"clocks that are 20 ppm off each leave up to {as_length(self.bound_m)} "
+            f"(c/2 x 40 ppm x {1e6 * self.reply_s:.0f} µs of reply)"
+        )
+        if not np.isfinite(self.told_m):
+            return (
+                f"single-sided ranges without carrier readings: {bound}, which looks like an antenna delay and changes "
+                "its sign with who initiates"
+            )
+        return (
+            f"single-sided ranges with clock skew in them: {bound}, and by the carriers' readings up to "
+            f"{as_length(self.told_m)}; read as protocol ss-cfo they are corrected with those"
+        )
+
+
+def as_length(metres: float) -> str:
+    """Return a length as text, in the unit that suits it."""
+    if metres >= 1:
+        return f"{metres:.1f} m"
+    return f"{100 * metres:.0f} cm" if metres >= 0.01 else f"{1e3 * metres:.1f} mm"
+
 
 def left_skew(exchanges: Exchanges) -> LeftSkew | None:
     """Return what skew may have left in the single-sided ranges that nothing corrected; None where there are none.
@@ -140,36 +118,22 @@ def left_skew(exchanges: Exchanges) -> LeftSkew | None:
     A single-sided time of flight is half of round trip less reply, so a target's clock that is faster by s makes it
     longer by s times half the reply.
     """
-    return left_skew_of([skew_terms(exchanges)])
-
-
-def skew_terms(exchanges: Exchanges) -> tuple[Floats, Floats]:
-    """Return reply times (n,) in s of uncorrected single-sided ranges, and what carriers say of those read, in m."""
     names = [name for name in names_in(exchanges.protocol) if is_single_sided(name) and not corrected(name)]
-    rows = np.isin(exchanges.protocol, names) & ~without_stamps(exchanges)
-    some = exchanges[rows]
-    reply_s = intervals(some).dt32 * TICK_S
-    known = np.isfinite(some.skew2_ppm) & (some.skew2_ppm != 0)
-    return reply_s, np.abs(some.skew2_ppm[known]) * PPM_TO_METRES * reply_s[known]
-
-
-def left_skew_of(terms: Sequence[tuple[Floats, Floats]]) -> LeftSkew | None:
-    """Return what skew may have left in ranges, by `skew_terms` of all of them; None where there are none."""
-    replies = [reply_s for reply_s, _ in terms if len(reply_s)]
-    if not replies:
+    some = exchanges[np.isin(exchanges.protocol, names) & ~without_stamps(exchanges)]
+    if not len(some):
         return None
-    median, told_m = float(np.median(np.concatenate(replies))), np.concatenate([metres for _, metres in terms])
-    told = float(np.quantile(told_m, 0.95)) if len(told_m) else np.nan
+    reply_s = intervals(some).dt32 * TICK_S
+    median_s, known = float(np.median(reply_s)), np.isfinite(some.skew2_ppm) & (some.skew2_ppm != 0)
+    told_m = (np.abs(some.skew2_ppm) * PPM_TO_METRES * reply_s)[known]
     # Each of two crystals may be off its frequency by 20 ppm (IEEE 802.15.4, 15.4.9).
-    return LeftSkew(bound_m=2 * 20.0 * PPM_TO_METRES * median, reply_s=median, told_m=told)
+    bound_m = 2 * 20.0 * PPM_TO_METRES * median_s
+    return LeftSkew(bound_m, median_s, float(np.quantile(told_m, 0.95)) if len(told_m) else np.nan)
 
 
 def corrected(protocol: str) -> bool:
     """Return whether a protocol's formula takes the carriers' readings into account."""
-    reply, third = np.array([1e7]), np.zeros(1)
+    one = np.ones(1)
+    tried = [Intervals(2e7 * one, 1e7 * one, 0 * one, 0 * one, ppm * one) for ppm in (0.0, 10.0)]
     with np.errstate(all="ignore"):
-        found = [
-            float(PROTOCOLS[protocol].flight_ticks(Intervals(2 * reply, reply, third, third, np.array([ppm])))[0])
-            for ppm in (0.0, 10.0)
-        ]
-    return found[0] != found[1]
+        first, second = (PROTOCOLS[protocol].flight_ticks(spans)[0] for spans in tried)
+    return bool(first != second)

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from calib.data.clocks import ClocksApart, LeftSkew, clocks_apart, left_skew
 from calib.errors import BadInputError, UnanswerableError
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, delay_of
-from uwblink.recording.distances import Tracks, distances_m
+from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, known_delays
+from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import Exchanges, delay_weights, middle_ns, raw_range, without_stamps
 
@@ -34,24 +35,9 @@ MAX_RANGE_M: Final = 1e4
 FAINTEST_DBM, LOUDEST_DBM = -140.0, -30.0
 """Received powers lie between these bounds; a board that cannot tell a strong power prints 0."""
 
-COLUMNS: Final = (
-    "time_ns",
-    "initiator",
-    "target",
-    "protocol",
-    "raw_m",
-    "truth_m",
-    "weight_initiator",
-    "weight_target",
-    "fpp1_dbm",
-    "fpp2_dbm",
-    "session",
-)
-"""The fields of `Ranges` that have one value per range."""
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ranges:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Ranges(ColumnTable):
     """Ranges with their true distances as columns of length n; `from_exchanges` and `from_arrays` make them.
 
     `raw_m` is the range recomputed from the stamps, `truth_m` the distance between the antennas; `weight_initiator` and
@@ -89,7 +75,7 @@ class Ranges:
     def __post_init__(self) -> None:
         """Put all ranges into one session where none are given."""
         if len(self.session) != len(self.time_ns):
-            object.__setattr__(self, "session", np.broadcast_to(np.int32(0), len(self.time_ns)))
+            object.__setattr__(self, "session", np.zeros(len(self.time_ns), dtype=np.int32))
 
     @classmethod
     def from_exchanges(
@@ -109,18 +95,34 @@ class Ranges:
         the lever arms of `tags`. A power that cannot have been measured is NaN. Raises `BadInputError` where `truth_m`
         has another length than the exchanges.
         """
-        given = exchanges.truth_m if truth_m is None else np.asarray(truth_m, dtype=np.float64)
-        if given.shape != (len(exchanges),):
-            raise BadInputError(f"has shape {given.shape}, expected ({len(exchanges)},)", parameter="truth_m")
+        truth = exchanges.truth_m if truth_m is None else np.asarray(truth_m, dtype=np.float64)
+        if truth.shape != (len(exchanges),):
+            raise BadInputError(f"has shape {truth.shape}, expected ({len(exchanges)},)", parameter="truth_m")
+        known = np.isfinite(truth)
+        if not known.all() and poses is not None and len(poses):
+            # A range belongs to the middle of its first two messages.
+            ends = exchanges.initiator, exchanges.target, middle_ns(exchanges)
+            truth = np.where(known, truth, distances_m(poses, tags, *ends))
+        of_initiator, of_target = delay_weights(exchanges)
+        bare = without_stamps(exchanges)
         return cls(
             source=source,
+            time_ns=exchanges.time_ns,
+            initiator=exchanges.initiator,
+            target=exchanges.target,
+            protocol=np.where(bare, NO_STAMPS, exchanges.protocol) if bare.any() else exchanges.protocol,
+            raw_m=raw_range(exchanges),
+            truth_m=truth,
+            weight_initiator=of_initiator,
+            weight_target=of_target,
+            fpp1_dbm=measured_powers(exchanges.fpp1_dbm),
+            fpp2_dbm=measured_powers(exchanges.fpp2_dbm),
             excluded={},
             planted=dict(planted) if planted else None,
             left_skew=left_skew(exchanges),
             clocks_apart=clocks_apart(exchanges),
-            bodies=bodies_of(tags),
+            bodies=tuple((tag.tag, tag.body) for tag in tags),
             antenna_delays=antenna_delays or {},
-            **columns_of(exchanges, given, poses, tags),
         )
 
     @classmethod
@@ -178,41 +180,52 @@ class Ranges:
         columns |= {name: measured_powers(columns[name]) for name in ("fpp1_dbm", "fpp2_dbm")}
         return cls(source=source, protocol=np.full(len(rows[0]), protocol), excluded={}, planted=None, **columns)
 
-    def __len__(self) -> int:
-        """Return the number of ranges."""
-        return len(self.time_ns)
-
-    def __getitem__(self, rows: Bools | Ints | slice) -> Ranges:
-        """Return the chosen rows, in their order."""
-        columns: dict[str, Any] = {name: _rows_of(getattr(self, name), rows) for name in COLUMNS}
-        return replace(self, **columns)
+    def _title(self) -> str:
+        left = "".join(f", {count} left out: {reason}" for reason, count in self.excluded.items())
+        return f"Ranges of {self.source}: {len(self)} of tags {', '.join(map(str, self.tags()))}{left}"
 
     def __repr__(self) -> str:
         """Return how many ranges of which tags there are, and what was left out."""
-        left = "".join(f", {count} left out: {reason}" for reason, count in self.excluded.items())
-        return f"<Ranges of {self.source}: {len(self)} of tags {', '.join(map(str, self.tags()))}{left}>"
+        return f"<{self._title()}>"
 
     def tags(self) -> list[int]:
         """Return the ids of the tags that range, in order."""
-        counts = [np.bincount(ids) > 0 for ids in (self.initiator, self.target)]
-        return sorted({*np.flatnonzero(counts[0]).tolist(), *np.flatnonzero(counts[1]).tolist()})
+        return np.flatnonzero(np.bincount(np.append(self.initiator, self.target))).tolist()
 
-    def usable(self, why_no_truth: str = "", why_no_power: str = "", *, need_power: bool = True) -> Ranges:
+    def usable(
+        self, why_no_truth: str = "", why_no_power: str = "", *, need_power: bool = True, need_truth: bool = True
+    ) -> Ranges:
         """Leave out and count ranges of a tag with itself, without true distance, without power, of impossible stamps.
 
-        Without `need_power`, ranges without power stay. Raises `UnanswerableError` where nothing is left, with
-        `why_no_truth` or `why_no_power` where that is the reason.
+        A range counts for the first of these. Without `need_power`, ranges without power stay, and without
+        `need_truth` those without true distance. Raises `UnanswerableError` where nothing is left, with `why_no_truth`
+        or `why_no_power` where that is the reason.
         """
-        found, excluded = usable_rows(self, need_power=need_power)
-        require_some(self.source, len(self), excluded, why_no_truth, why_no_power)
-        return found
-
-
-def _rows_of(column: NDArray[Any], rows: Bools | Ints | slice) -> NDArray[Any]:
-    """Return rows of a column (n,); one value that stands for all rows is not copied."""
-    if column.strides == (0,) and len(column):
-        return np.broadcast_to(column[0], np.empty(len(column), np.bool_)[rows].shape)
-    return np.asarray(column[rows])
+        good = {
+            "a tag with itself": self.initiator != self.target,
+            "no true distance": np.isfinite(self.truth_m) | (not need_truth),
+            "no power": np.isfinite(self.fpp1_dbm) | np.isfinite(self.fpp2_dbm) | (not need_power),
+            "impossible stamps": np.abs(self.raw_m) < MAX_RANGE_M,
+        }
+        keep, excluded = np.ones(len(self), dtype=bool), dict[str, int]()
+        for reason, rows in good.items():
+            excluded[reason] = int(np.count_nonzero(keep & ~rows))
+            keep &= rows
+        if keep.any():
+            left_out = {reason: count for reason, count in excluded.items() if count}
+            return replace(self[keep], excluded=self.excluded | left_out) if left_out else self
+        if not len(self):
+            raise UnanswerableError(f"{self.source}: holds no exchanges")
+        hints = {
+            "no true distance": why_no_truth
+            or "it needs poses and lever arms (`uwblink poses`), or measured distances (gt_range_m of a table); "
+            "without any see `calib survey`, or `calib fit --truth ranges`",
+            "no power": why_no_power or "a calibration without a curve needs none: `calib fit --delays-only` makes one",
+            "a tag with itself": "look at from_id and to_id of what was imported",
+        }
+        most = max(excluded, key=lambda reason: excluded[reason])
+        hint = f"; {hints[most]}" if most in hints else ""
+        raise UnanswerableError(f"{self.source}: none of its {len(self)} exchanges can be used: {most}{hint}")
 
 
 def measured_powers(fpp_dbm: Floats) -> Floats:
@@ -221,117 +234,44 @@ def measured_powers(fpp_dbm: Floats) -> Floats:
         return np.where((fpp_dbm < LOUDEST_DBM) & (fpp_dbm > FAINTEST_DBM), fpp_dbm, np.nan)
 
 
-def columns_of(
-    exchanges: Exchanges, given_m: Floats, poses: Poses | Tracks | None, tags: Sequence[Tag]
-) -> dict[str, Any]:
-    """Return exchanges as the columns of ranges, with true distances `given_m` (n,), from poses where they are NaN.
-
-    The stamps of some exchanges at a time are worked on, so that what leads to ranges stays small beside them.
-    """
-    at_once = 65_536
-    raw, initiator, target = (np.empty(len(exchanges)) for _ in range(3))
-    middle = np.empty(len(exchanges), dtype=np.int64)
-    for begin in range(0, len(exchanges), at_once):
-        rows = slice(begin, begin + at_once)
-        some = exchanges[rows]
-        raw[rows], (initiator[rows], target[rows]) = raw_range(some), delay_weights(some)
-        middle[rows] = middle_ns(some)
-    known, truth = np.isfinite(given_m), given_m
-    if not known.all() and poses is not None and len(poses):
-        # A range belongs to the middle of its first two messages.
-        truth = np.where(known, given_m, distances_m(poses, tags, exchanges.initiator, exchanges.target, middle))
-    bare = without_stamps(exchanges)
-    return {
-        "time_ns": exchanges.time_ns,
-        "initiator": exchanges.initiator,
-        "target": exchanges.target,
-        "protocol": np.where(bare, NO_STAMPS, exchanges.protocol) if bare.any() else exchanges.protocol,
-        "raw_m": raw,
-        "truth_m": truth,
-        "weight_initiator": initiator,
-        "weight_target": target,
-        "fpp1_dbm": measured_powers(exchanges.fpp1_dbm),
-        "fpp2_dbm": measured_powers(exchanges.fpp2_dbm),
-    }
-
-
-def usable_rows(ranges: Ranges, *, need_power: bool) -> tuple[Ranges, dict[str, int]]:
-    """Return the ranges that a fit can use, and how many not for which reason; a range counts for the first one."""
-    raw = ranges.raw_m
-    powers = np.isfinite(ranges.fpp1_dbm) | np.isfinite(ranges.fpp2_dbm)
-    good = {
-        "a tag with itself": ranges.initiator != ranges.target,
-        "no true distance": np.isfinite(ranges.truth_m),
-        "no power": powers | (not need_power),
-        "impossible stamps": np.isfinite(raw) & (np.abs(raw) < MAX_RANGE_M),
-    }
-    keep, excluded = np.ones(len(ranges), dtype=bool), dict[str, int]()
-    for reason, rows in good.items():
-        excluded[reason] = int(np.count_nonzero(keep & ~rows))
-        keep &= rows
-    if keep.all():
-        return ranges, excluded
-    return replace(ranges[keep], excluded=ranges.excluded | {r: n for r, n in excluded.items() if n}), excluded
-
-
-def require_some(
-    source: str, count: int, excluded: Mapping[str, int], why_no_truth: str, why_no_power: str = ""
-) -> None:
-    """Raise `UnanswerableError` that gives the reason where there are no ranges, or all of `count` were left out."""
-    if not count:
-        raise UnanswerableError(f"{source}: holds no exchanges")
-    if sum(excluded.values()) < count:
-        return
-    most = max(excluded, key=lambda reason: excluded[reason])
-    hints = {
-        "no true distance": why_no_truth
-        or "it needs poses and lever arms (`uwblink poses`), or measured "
-        "distances (gt_range_m of a table); without any see `calib survey`, or `calib fit --truth ranges`",
-        "no power": why_no_power or "a calibration without a curve needs none: `calib fit --delays-only` makes one",
-        "a tag with itself": "look at from_id and to_id of what was imported",
-    }
-    hint = f"; {hints[most]}" if most in hints else ""
-    raise UnanswerableError(f"{source}: none of its {count} exchanges can be used: {most}{hint}")
-
-
 def concatenate(parts: Sequence[Ranges]) -> Ranges:
     """Join the ranges of several recordings, in their order.
 
     Raises `BadInputError` where other antenna delays were programmed into a tag in one of them than in another.
     """
-    columns: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in COLUMNS}
-    columns["session"], names = _sessions(parts)
+    session, names = _sessions(parts)
     skews = [part.left_skew for part in parts if part.left_skew]
     apart = [part.clocks_apart for part in parts if part.clocks_apart]
-    return Ranges(
-        source=", ".join(p.source for p in parts),
-        excluded={r: sum(p.excluded.get(r, 0) for p in parts) for r in sorted({r for p in parts for r in p.excluded})},
-        planted=parts[0].planted,
+    bodies = {one for part in parts for one in part.bodies}
+    reasons = sorted({reason for part in parts for reason in part.excluded})
+    return replace(
+        Ranges.concatenate(parts),
+        source=", ".join(part.source for part in parts),
+        excluded={reason: sum(part.excluded.get(reason, 0) for part in parts) for reason in reasons},
         left_skew=max(skews, key=lambda one: one.bound_m, default=None),
         clocks_apart=max(apart, key=lambda one: one.moves_m, default=None),
-        recordings=tuple(one for p in parts for one in p.recordings),
-        bodies=_bodies_of_all(parts),
+        recordings=tuple(one for part in parts for one in part.recordings),
+        # A tag that changes its body belongs to none.
+        bodies=tuple(sorted(bodies)) if len({tag for tag, _ in bodies}) == len(bodies) else (),
+        session=session,
         sessions=names,
         antenna_delays=_antenna_delays_of_all(parts),
-        **columns,
     )
 
 
 def _antenna_delays_of_all(parts: Sequence[Ranges]) -> AntennaDelays:
-    found: dict[int | None, AntennaDelay] = {}
-    where: dict[int, str] = {}
+    found: dict[int, tuple[AntennaDelay, str]] = {}
     for part in parts:
-        for tag in part.tags():
-            delay = delay_of(part.antenna_delays, tag)
-            if delay is None:
+        for tag, delay in known_delays(part.antenna_delays, part.tags()).items():
+            if tag is None:
                 continue
-            if found.setdefault(tag, delay) != delay:
+            known, where = found.setdefault(tag, (delay, part.source))
+            if known != delay:
                 raise BadInputError(
-                    f"{part.source}: tag {tag} had antenna delays of {delay} ticks programmed, and {found[tag]} in "
-                    f"{where[tag]}; take recordings with the same ones"
+                    f"{part.source}: tag {tag} had antenna delays of {delay} ticks programmed, and {known} in {where}; "
+                    "take recordings with the same ones"
                 )
-            where.setdefault(tag, part.source)
-    return found
+    return {tag: delay for tag, (delay, _) in found.items()}
 
 
 def _sessions(parts: Sequence[Ranges]) -> tuple[Ints, tuple[str, ...]]:
@@ -356,32 +296,18 @@ def _sessions(parts: Sequence[Ranges]) -> tuple[Ints, tuple[str, ...]]:
     return np.concatenate(number), tuple(names)
 
 
-def bodies_of(tags: Iterable[Tag]) -> tuple[tuple[int, str], ...]:
-    """Return tags with the body that carries each."""
-    return tuple((tag.tag, tag.body) for tag in tags)
-
-
-def _bodies_of_all(parts: Sequence[Ranges]) -> tuple[tuple[int, str], ...]:
-    """Return the bodies of tags that sit on the same ones in all recordings; none where a tag changes its body."""
-    every = {one for part in parts for one in part.bodies}
-    return tuple(sorted(every)) if len({tag for tag, _ in every}) == len(every) else ()
-
-
 def without_static(ranges: Ranges, *, span_s: float = 2.0, within_m: float = 0.02) -> Ranges:
     """Leave out spans of two seconds in which a pair's distance stays within two centimetres.
 
     A flight that waits on the ground repeats one geometry, and with it one error. Raises `UnanswerableError` where
     nothing ever moves.
     """
-    low, high = np.minimum(ranges.initiator, ranges.target), np.maximum(ranges.initiator, ranges.target)
     span = (ranges.time_ns - ranges.time_ns.min()) // int(span_s * 1e9)
-    order = np.lexsort((span, high, low))
-    keys = np.column_stack([low, high, span])[order]
-    starts = np.flatnonzero(np.any(np.diff(keys, axis=0, prepend=keys[:1] - 1) != 0, axis=1))
-    truth = ranges.truth_m[order]
-    reach = np.maximum.reduceat(truth, starts) - np.minimum.reduceat(truth, starts)
-    moves = np.empty(len(ranges), dtype=bool)
-    moves[order] = np.repeat(reach > within_m, np.diff(starts, append=len(ranges)))
+    low, high = np.minimum(ranges.initiator, ranges.target), np.maximum(ranges.initiator, ranges.target)
+    group = np.unique((span * 65_536 + low) * 65_536 + high, return_inverse=True)[1]
+    every = np.arange(group.max() + 1)
+    reach = ndimage.maximum(ranges.truth_m, group, every) - ndimage.minimum(ranges.truth_m, group, every)
+    moves = reach[group] > within_m
     if not moves.any():
         raise UnanswerableError(f"{ranges.source}: nothing moves, so `trim_static` leaves nothing")
     count = int(np.count_nonzero(~moves))

@@ -1,50 +1,30 @@
-"""Where ranges come from: recordings, open ones, simulations in memory, or several of them.
-
-Recordings are read some exchanges at a time, with only the poses around them in memory; a source in memory is one such
-block. What comes out is what `Ranges.from_exchanges` makes of all exchanges and all poses, without unusable ranges.
-"""
+"""Where ranges come from: recordings, open ones, simulations in memory, or several of them."""
 
 from __future__ import annotations
 
 import os
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from scipy.interpolate import BSpline
 
-from calib.data.clocks import ClockSample, left_skew_of, skew_terms
-from calib.data.ranges import (
-    COLUMNS,
-    FAINTEST_DBM,
-    IN_MEMORY,
-    LOUDEST_DBM,
-    Ranges,
-    bodies_of,
-    columns_of,
-    concatenate,
-    require_some,
-    usable_rows,
-    without_static,
-)
+from calib.data.ranges import FAINTEST_DBM, IN_MEMORY, LOUDEST_DBM, Ranges, concatenate, without_static
 from calib.errors import BadInputError, UnanswerableError
 from uwblink.arrays import Floats
 from uwblink.display import printable
 from uwblink.recording.antenna_delays import AntennaDelays, delays_in_meta
-from uwblink.recording.distances import Tracks
+from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Arrangement, Fault, KnownDistance, Poses, Tag
-from uwblink.recording.summary import single_report_blocks, single_reports
-from uwblink.twr import Exchanges, names_in
-
-EXCHANGES_AT_ONCE: Final = 131_072
-"""Exchanges of a file that are read together: about 30 MB of columns."""
+from uwblink.recording.schema import Poses, Tag
+from uwblink.recording.summary import single_reports
+from uwblink.twr import Exchanges
 
 
 @runtime_checkable
@@ -73,13 +53,20 @@ Data = str | os.PathLike[str] | Recording | Source | Exchanges | Ranges
 """One recording: its path, an open one, a `Source`, exchanges with their distances, or ranges loaded before."""
 
 
-def no_poses() -> Poses:
-    """Return poses of no body."""
-    return Poses(np.zeros(0, np.int64), np.zeros(0, np.str_), np.zeros((0, 3)), np.zeros((0, 4)))
+READERS: Final[dict[str, Callable[[Recording], Any]]] = {
+    "meta": Recording.meta,
+    "faults": Recording.faults,
+    "overheard": Recording.overheard,
+    "imu": Recording.imu,
+    "height": Recording.heights,
+    "arrangements": Recording.arrangements,
+    "known_distances": Recording.known_distances,
+}
+"""What a recording has beside exchanges, poses and tags, and what reads it."""
 
 
 class RecordedSource:
-    """An open recording as a `Source`, which reads each table when it is asked for."""
+    """An open recording as a `Source`, which reads each table when it is asked for: all of `READERS`, too."""
 
     def __init__(self, recording: Recording) -> None:
         """Take a recording, which must stay open."""
@@ -100,56 +87,11 @@ class RecordedSource:
         """Return the tags."""
         return self.recording.tags()
 
-    @cached_property
-    def meta(self) -> Mapping[str, Any]:
-        """Return the recording's metadata."""
-        return self.recording.meta()
-
-    @cached_property
-    def planted(self) -> Mapping[str, Any] | None:
-        """Return what a simulation planted, None in a real recording."""
-        found = self.recording.meta().get("planted")
-        return found if isinstance(found, dict) else None
-
-    @cached_property
-    def faults(self) -> list[Fault]:
-        """Return what went wrong while recording."""
-        return self.recording.faults()
-
-    @cached_property
-    def overheard(self) -> dict[str, NDArray[Any]]:
-        """Return the columns of passively heard exchanges."""
-        return self.recording.overheard()
-
-    @cached_property
-    def imu(self) -> dict[str, NDArray[Any]]:
-        """Return the columns of inertial readings."""
-        return self.recording.imu()
-
-    @cached_property
-    def arrangements(self) -> list[Arrangement]:
-        """Return the stretches of time in which boards stood still."""
-        return self.recording.arrangements()
-
-    @cached_property
-    def known_distances(self) -> list[KnownDistance]:
-        """Return the distances that were measured otherwise."""
-        return self.recording.known_distances()
-
-    @cached_property
-    def height(self) -> dict[str, NDArray[Any]]:
-        """Return the columns of readings of height sensors."""
-        return self.recording.heights()
-
-
-@dataclass(frozen=True, slots=True)
-class _Bare:
-    """Exchanges that carry their true distances, and nothing beside them."""
-
-    exchanges: Exchanges
-    poses: Poses = field(default_factory=no_poses)
-    tags: Sequence[Tag] = ()
-    planted: Mapping[str, Any] | None = None
+    def __getattr__(self, name: str) -> Any:
+        """Return what another table holds."""
+        if name not in READERS:
+            raise AttributeError(name)
+        return READERS[name](self.recording)
 
 
 @contextmanager
@@ -161,10 +103,10 @@ def opened(data: Data) -> Iterator[tuple[str, Source]]:
     if isinstance(data, Recording):
         yield data.path.name, RecordedSource(data)
     elif isinstance(data, str | os.PathLike):
-        with Recording.open(data) as recording:
+        with Recording.open(data, memory_mb=256) as recording:
             yield Path(data).name, RecordedSource(recording)
     elif isinstance(data, Exchanges):
-        yield IN_MEMORY, _Bare(data)
+        yield IN_MEMORY, Contents(exchanges=data)
     elif isinstance(data, Ranges):
         raise BadInputError("ranges do not say where bodies are; give the recording they come from", parameter="data")
     elif isinstance(data, Source):
@@ -229,7 +171,7 @@ def each(data: Data | Iterable[Data]) -> list[Data]:
 def _load(data: Data, need_power: bool) -> Ranges:
     if isinstance(data, Ranges):
         return data.usable(need_power=need_power)
-    with held_open(data) as held, opened(held) as (name, source):
+    with opened(data) as (name, source):
         return _read(name, source, need_power=need_power)
 
 
@@ -239,77 +181,24 @@ def _read(name: str, source: Source, *, need_power: bool) -> Ranges:
     Raises `BadInputError` for planted values or antenna delays that cannot be read, `UnanswerableError` where no range
     can be used.
     """
-    planted, delays, tags = _planted(source, name), antenna_delays_of(source, name), source.tags
-    columns: dict[str, list[Any]] = {column: [] for column in COLUMNS if column != "session"}
-    excluded, count, times, measured_m = Counter[str](), 0, sha256(), list[Floats]()
-    terms, clocks = list[tuple[Floats, Floats]](), ClockSample()
-    for block, with_poses in _blocks(source):
-        for part, poses in with_poses:
-            some = Ranges(source="", excluded={}, planted=None, **columns_of(part, part.truth_m, poses, tags))
-            usable, left_out = usable_rows(some, need_power=need_power)
-            excluded.update(left_out)
-            for column, rows in columns.items():
-                # A copy where all rows are usable: the block itself must not stay in memory.
-                rows.append(_words(usable.protocol) if column == "protocol" else np.array(getattr(usable, column)))
-        count += len(block)
-        times.update(np.ascontiguousarray(block.time_ns).data)
-        measured_m.append(block.range_m)
-        terms.append(skew_terms(block))
-        clocks.add(block)
-    if sum(excluded.values()) == count:
-        require_some(name, count, excluded, _why_no_truth(source), _why_no_power(source.exchanges))
-    for one in measured_m:
-        times.update(np.ascontiguousarray(one).data)
-    protocol = _joined_words(columns.pop("protocol"))
-    joined: dict[str, Any] = {column: np.concatenate(columns.pop(column)) for column in list(columns)}
-    return Ranges(
+    exchanges = single_reports(source.exchanges).exchanges
+    found = Ranges.from_exchanges(
+        exchanges,
+        poses=source.poses,
+        tags=source.tags,
+        planted=planted_of(source, name),
         source=name,
-        excluded={reason: number for reason, number in excluded.items() if number},
-        planted=dict(planted) if planted else None,
-        left_skew=left_skew_of(terms),
-        clocks_apart=clocks.farthest_pair(),
-        bodies=bodies_of(tags),
-        antenna_delays=delays,
-        recordings=((name, times.hexdigest()[:32]),),
-        protocol=protocol,
-        **joined,
+        antenna_delays=antenna_delays_of(source, name),
     )
-
-
-Parts = Iterable[tuple[Exchanges, Poses | Tracks | None]]
-
-
-def _blocks(source: Source) -> Iterator[tuple[Exchanges, Parts]]:
-    """Yield the exchanges of a source block by block, each with its parts and the poses around each part."""
-    if not isinstance(source, RecordedSource):
-        exchanges = single_reports(source.exchanges).exchanges
-        complete = len(exchanges) > 0 and bool(np.isfinite(exchanges.truth_m).all())
-        yield exchanges, [(exchanges, None if complete else source.poses)]
-        return
-    windows = source.recording.pose_windows()
-    for reports in single_report_blocks(source.recording, EXCHANGES_AT_ONCE):
-        if len(block := reports.exchanges):
-            complete = bool(np.isfinite(block.truth_m).all())
-            yield block, [(block, None)] if complete else windows.tracks_beside(block)
-
-
-def _words(protocol: NDArray[np.str_]) -> NDArray[np.str_]:
-    """Return protocols of ranges (n,), without a copy for each where all are the same."""
-    names = names_in(protocol)
-    return np.broadcast_to(np.array(names[0]), len(protocol)) if len(names) == 1 else protocol
-
-
-def _joined_words(parts: list[NDArray[np.str_]]) -> NDArray[np.str_]:
-    parts = [part for part in parts if len(part)]
-    if all(part.strides == (0,) for part in parts) and len({str(part[0]) for part in parts}) == 1:
-        return np.broadcast_to(parts[0][0], sum(map(len, parts)))
-    return np.concatenate(parts)
+    fingerprint = sha256(exchanges.time_ns.tobytes() + exchanges.range_m.tobytes()).hexdigest()[:32]
+    usable = found.usable(_why_no_truth(source), _why_no_power(exchanges), need_power=need_power)
+    return replace(usable, recordings=((name, fingerprint),))
 
 
 def held_open(data: Data) -> AbstractContextManager[Data]:
     """Return a context in which a file is open, for those who read it more than once; raises what opening it raises."""
     if isinstance(data, str | os.PathLike):
-        return Recording.open(data, memory_mb=256)  # more does not read blocks any faster
+        return Recording.open(data, memory_mb=256)
     return nullcontext(data)
 
 
@@ -326,7 +215,8 @@ def antenna_delays_of(source: Source, name: str) -> AntennaDelays:
     return antenna_delays_in(getattr(source, "meta", None) or {}, name)
 
 
-def _planted(source: Source, name: str) -> Mapping[str, Any] | None:
+def planted_of(source: Source, name: str) -> Mapping[str, Any] | None:
+    """Return what a simulation planted, None where nothing was; raises what `check_planted` raises."""
     found = getattr(source, "planted", None) or getattr(source, "meta", {}).get("planted")
     if not isinstance(found, Mapping):
         return None
@@ -366,39 +256,36 @@ def _why_no_truth(source: Source) -> str:
 
 def check_planted(planted: Mapping[str, Any], where: str) -> None:
     """Raise `BadInputError`, beginning with `where`, for delays that are no numbers by tag and curves that are none."""
-    delays = planted.get("delays_ns", {})
-    if not isinstance(delays, Mapping) or not all(str(tag).isdecimal() for tag in delays):
-        raise _wrong(where, "delays_ns", delays, "numbers by tag")
-    if len(_numbers([*delays.values()])) != len(delays):
-        raise _wrong(where, "delays_ns", delays, "numbers by tag")
-    for name in ("bias_curve", "sigma_curve"):
-        curve = planted.get(name)
-        if curve and not _fits(curve):
-            raise _wrong(where, name, curve, "knots, coefficients and degree of a B-spline")
+    for key, (read, form) in FORMS.items():
+        try:
+            if planted.get(key) is not None:
+                read(planted[key])
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError):
+            found = printable(repr(planted[key]))[:60]
+            raise BadInputError(f"{where}: planted: {key}: found {found}, expected {form}") from None
 
 
-def _fits(curve: Any) -> bool:
-    if not isinstance(curve, Mapping):
-        return False
-    degree = curve.get("degree")
-    knots, coefficients = _numbers(curve.get("knots")), _numbers(curve.get("coefficients"))
-    if not isinstance(degree, int) or not 0 <= degree <= 5:
-        return False
-    sizes = len(coefficients) > degree and len(knots) == len(coefficients) + degree + 1
-    return bool(sizes and (np.diff(knots) >= 0).all() and knots[degree] < knots[-1 - degree])
+def _delays(found: Any) -> None:
+    _numbers([*found.values()])
+    if not all(str(tag).isdecimal() for tag in found):
+        raise ValueError("a key is no tag")
 
 
-def _numbers(values: ArrayLike | None) -> Floats:
-    """Return a list of numbers as an array, an empty one where one of them is none or beyond 1e9 ns, m or mW."""
-    try:
-        found = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return np.empty(0)
-    return found if found.ndim == 1 and (np.abs(found) <= 1e9).all() else np.empty(0)
+def _curve(found: Any) -> None:
+    BSpline(_numbers(found["knots"]), _numbers(found["coefficients"]), found["degree"])
 
 
-def _wrong(where: str, key: str, found: object, expected: str) -> BadInputError:
-    return BadInputError(f"{where}: planted: {key}: found {printable(repr(found))[:60]}, expected {expected}")
+def _numbers(values: ArrayLike) -> Floats:
+    """Return a list of numbers as an array (n,); raises an error where one is none or beyond 1e9 ns, m or mW."""
+    found = np.array(values, dtype=np.float64)
+    if found.ndim != 1 or not (np.abs(found) <= 1e9).all():
+        raise ValueError("not a list of usable numbers")
+    return found
+
+
+CURVE: Final = (_curve, "knots, coefficients and degree of a B-spline")
+FORMS: Final = {"delays_ns": (_delays, "numbers by tag"), "bias_curve": CURVE, "sigma_curve": CURVE}
+"""What a simulation may have planted: how it is checked, and what is expected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -427,5 +314,5 @@ def require_times(ranges: Ranges) -> None:
 
 def load_flight(data: Data, *, need_power: bool = True) -> Flight:
     """Return a recording's ranges with its poses; raises what `load_ranges` raises."""
-    with held_open(data) as held, opened(held) as (_, source):
-        return Flight(load_ranges(held, need_power=need_power), source.poses, list(source.tags))
+    with opened(data) as (name, source):
+        return Flight(_read(name, source, need_power=need_power), source.poses, list(source.tags))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib.calibration.model import Calibration, require_calibration
-from calib.data.ranges import MAX_RANGE_M, Ranges, require_some
+from calib.data.ranges import Ranges
 from calib.data.sources import Data, opened, require_times
 from calib.errors import BadInputError, UnanswerableError
 from calib.evaluation.inertial_filter import GRAVITY, InertialFilter, Noise, P
@@ -166,11 +166,7 @@ def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
         poses, tags = source.poses, list(source.tags)
         imu, heights = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))
     ranges = Ranges.from_exchanges(exchanges, source=name)
-    powered = np.isfinite(ranges.fpp1_dbm) | np.isfinite(ranges.fpp2_dbm) | (not calibration.needs_power)
-    possible = np.isfinite(ranges.raw_m) & (np.abs(ranges.raw_m) < MAX_RANGE_M)
-    excluded = {"no power": int(np.sum(~powered)), "impossible stamps": int(np.sum(powered & ~possible))}
-    require_some(name, len(ranges), excluded, "")
-    ranges = ranges[powered & possible]
+    ranges = ranges.usable(need_power=calibration.needs_power, need_truth=False)
     anchors = {}
     for body in sorted(set(poses.body.tolist())):
         place = poses.position_m[poses.body == body]

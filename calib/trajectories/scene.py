@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.data.ranges import Ranges
-from calib.data.sources import Data, antenna_delays_of, opened
+from calib.data.sources import Data, antenna_delays_of, opened, planted_of
 from calib.errors import UnanswerableError
 from calib.settings import FlightSettings
 from calib.trajectories.attitudes import Attitude, Inertial, Readings, integrated, windows
@@ -146,7 +146,7 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     """Return the scene of a recording; raises `UnanswerableError` if it has no ranges or no body moves."""
     with opened(data) as (name, source):
         exchanges = single_reports(source.exchanges).exchanges
-        poses, tags, planted = source.poses, list(source.tags), getattr(source, "planted", None)
+        poses, tags, planted = source.poses, list(source.tags), planted_of(source, name)
         delays = antenna_delays_of(source, name)
         # A source need not have any of these.
         imu, height = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))

@@ -184,7 +184,11 @@ class Tables:
         return list(pairwise(edges))
 
     def poses(self, start_ns: int | None = None, end_ns: int | None = None) -> Poses:
-        """Return all poses in order of time."""
+        """Return all poses in order of time.
+
+        Raises `RecordingError` for a body without a name, and for a pose without a time.
+        """
+        self._check_poses()
         r = self._store.read(f"SELECT * FROM poses {_within(start_ns, end_ns)} ORDER BY time_ns, body")  # noqa: S608 - numbers
         return Poses(
             time_ns=filled(r["time_ns"]),
@@ -198,14 +202,17 @@ class Tables:
 
         Raises `RecordingError` for a body without a name, and for a pose without a time.
         """
-        if self._store.rows("SELECT 1 FROM poses WHERE body IS NULL OR time_ns IS NULL LIMIT 1"):
-            raise RecordingError(f"{self.path}: table poses: a body without a name, or a pose without a time")
+        self._check_poses()
         tracks: dict[str, Columns] = {}
         # By hash, because reading millions of words would take longer than everything else.
         for body, code in self._store.rows("SELECT body, hash(body) FROM poses GROUP BY body ORDER BY body"):
             query = f"SELECT time_ns, {', '.join(POSE)} FROM poses WHERE hash(body) = {code}::UBIGINT ORDER BY rowid"  # noqa: S608 - a number
             tracks[body] = {name: filled(column) for name, column in self._store.read(query).items()}
         return PoseWindows(tracks)
+
+    def _check_poses(self) -> None:
+        if self._store.rows("SELECT 1 FROM poses WHERE body IS NULL OR time_ns IS NULL LIMIT 1"):
+            raise RecordingError(f"{self.path}: table poses: a body without a name, or a pose without a time")
 
     def columns(self, table: str, start_ns: int | None = None, end_ns: int | None = None) -> Columns:
         """Return one of `TABLES` as columns in the order of its rows, masked where a value is missing.

@@ -1,16 +1,15 @@
-"""Ranges read some exchanges at a time are those of all exchanges and all poses, to the last bit."""
+"""Ranges of a recording are those of its exchanges and poses, of two reports of an exchange one."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from hashlib import sha256
 from typing import Any
 
 import numpy as np
-import pytest
 
-from calib.data import sources
-from calib.data.ranges import COLUMNS, Ranges
+from calib.data.ranges import Ranges
 from calib.data.samples import sample_flight
-from uwblink.recording import AntennaDelay, summary
+from calib.data.sources import load_ranges
+from uwblink.recording import AntennaDelay
 from uwblink.recording.contents import exchanges_with_poses
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
@@ -26,27 +25,6 @@ def written(path, exchanges, poses, tags):
         recording.append_poses(poses)
         recording.append_exchanges(exchanges)
     return path
-
-
-def of_all(path):
-    with Recording.open(path) as recording:
-        whole = recording.exchanges()
-        found = Ranges.from_exchanges(
-            whole,
-            poses=recording.poses(),
-            tags=recording.tags(),
-            planted=recording.meta()["planted"],
-            source="it.uwb",
-            antenna_delays={None: AntennaDelay()},
-        )
-    return found.usable()
-
-
-def assert_same(one, other):
-    for name in COLUMNS:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
-    for name in {field.name for field in fields(Ranges)} - {*COLUMNS, "recordings"}:
-        assert repr(getattr(one, name)) == repr(getattr(other, name)), name
 
 
 def awkward():
@@ -78,17 +56,6 @@ def awkward():
     return replace(exchanges, fpp1_dbm=fpp1, fpp2_dbm=fpp2, truth_m=truth, protocol=protocol), poses, tags
 
 
-def test_blocks_of_any_size_make_the_ranges_of_the_whole(tmp_path, monkeypatch):
-    path = written(tmp_path / "it.uwb", *awkward())
-    whole = of_all(path)
-    assert whole.excluded["no true distance"] > 5
-    assert whole.excluded["no power"] > 5
-    assert whole.left_skew is not None
-    for rows in (37, ROWS - 1, 10 * ROWS):
-        monkeypatch.setattr(sources, "EXCHANGES_AT_ONCE", rows)
-        assert_same(sources.load_ranges(path), whole)
-
-
 def test_bodies_with_one_pose_do_not_split_what_is_read(tmp_path):
     """A hundred anchors have a pose each: thousands of exchanges are read in one part, not one by one."""
     flight = sample_flight(3000)
@@ -114,24 +81,20 @@ def both_ends(exchanges, poses, tags):
     return Exchanges(**{name: column[order] for name, column in columns.items()}), poses, tags
 
 
-@pytest.mark.parametrize("rows", [19, 10 * ROWS])
-def test_of_two_reports_one_counts_wherever_blocks_and_stretches_end(tmp_path, monkeypatch, rows):
+def test_of_two_reports_one_counts(tmp_path):
     path = written(tmp_path / "it.uwb", *both_ends(*awkward()))
     with Recording.open(path) as recording:
         reports = single_reports(recording.exchanges())
         alone = reports.exchanges
-        whole = Ranges.from_exchanges(
-            alone,
-            poses=recording.poses(),
-            tags=recording.tags(),
-            planted=recording.meta()["planted"],
-            source="it.uwb",
-            antenna_delays={None: AntennaDelay()},
-        ).usable()
-    monkeypatch.setattr(summary, "ROWS_AT_ONCE", 23)
-    monkeypatch.setattr(sources, "EXCHANGES_AT_ONCE", rows)
-    found = sources.load_ranges(path)
+        whole = Ranges.from_exchanges(alone, poses=recording.poses(), tags=recording.tags()).usable()
+    found = load_ranges(path)
     assert reports.repeated > ROWS / 3
-    assert_same(found, whole)
+    assert found.excluded["no true distance"] > 5
+    assert found.excluded["no power"] > 5
+    assert (found.excluded, found.left_skew) == (whole.excluded, whole.left_skew)
+    for name, column in whole.to_dict().items():
+        np.testing.assert_array_equal(getattr(found, name), column, err_msg=name)
+    assert found.planted == {"delays_ns": {"1": 0.1}}
+    assert found.antenna_delays == {None: AntennaDelay()}
     fingerprint = sha256(alone.time_ns.tobytes() + alone.range_m.tobytes()).hexdigest()[:32]
     assert found.recordings == (("it.uwb", fingerprint),)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import calib
-from calib.data.ranges import COLUMNS, Ranges
+from calib.data.ranges import Ranges
 from calib.data.samples import DELAYS_NS, sample_flight
 from calib.data.sources import load_flight, load_ranges
 from calib.errors import BadInputError, UnanswerableError
@@ -30,8 +30,8 @@ def path(tmp_path_factory):
 
 
 def assert_same(one, other):
-    for name in COLUMNS:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    for name, column in one.to_dict().items():
+        np.testing.assert_array_equal(column, getattr(other, name), err_msg=name)
 
 
 def test_a_file_an_open_recording_and_an_object_are_the_same(path):
