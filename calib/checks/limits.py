@@ -97,7 +97,7 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
     elif model.curve is None:
         yield _without_curve(ranges, residuals_m)
     if fixed and set(model.tags) <= set(fixed):
-        own = medians(residuals_m, pairs_of(ranges.initiator, ranges.target, ranges.tags()).number)
+        own = medians(residuals_m, pairs_of(ranges.initiator, ranges.target).number)
         yield (
             "curve only: the delays are those that were given; what they have in common that is wrong is in the curve, "
             f"where they differ it stays in the ranges (medians of pairs lie within {_length(float(np.ptp(own)))})"
@@ -207,7 +207,7 @@ def _robust_slope(x: Floats, y: Floats) -> float:
 
 def one_way(ranges: Ranges) -> Iterator[str]:
     """Name the pair whose ranges depend most on who initiates, as they do where clock skew is left in them."""
-    pairs = pairs_of(ranges.initiator, ranges.target, ranges.tags())
+    pairs = pairs_of(ranges.initiator, ranges.target)
     error, forth, found = ranges.raw_m - ranges.truth_m, ranges.initiator < ranges.target, list[tuple[float, str]]()
     rows_of_pairs = np.split(np.argsort(pairs.number, kind="stable"), np.cumsum(np.bincount(pairs.number))[:-1])
     for (a, b), rows in zip(pairs.ends.tolist(), rows_of_pairs, strict=True):

@@ -102,7 +102,7 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
     if len(rows) < FEWEST_RANGES:
         return
     ranges = Ranges.from_exchanges(view.exchanges[rows], view.truth_m[rows])
-    pairs = pairs_of(ranges.initiator, ranges.target, ranges.tags())
+    pairs = pairs_of(ranges.initiator, ranges.target)
     offset_m = np.zeros(len(pairs.ends))
     for _ in range(MOST_REPEATED):
         moved = replace(ranges, truth_m=ranges.truth_m + offset_m[pairs.number])

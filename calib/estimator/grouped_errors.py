@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.estimator.error_unknowns import error_unknowns
 from calib.estimator.optimize import maximize
-from calib.estimator.range_model import DETOUR_M, DETOUR_WORTH, LEAST_DETOUR_M, LONG_ODDS, ODDS
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows
 from calib.estimator.unknowns import Layout, Prior, Priors, Unknown
 from calib.range_errors.densities import LONG_FACTOR, LongDetours
@@ -37,35 +37,25 @@ def fit_grouped_errors(groups: Sequence[Floats], most: int = 20_000) -> GroupedE
     """Return the maximum likelihood error model of groups of errors in metres; larger groups are thinned evenly to
     `most`.
 
-    The density is that of `calib.range_errors.density`. Centre and noise belong to a group; shares and detours of
-    groups scatter about common values, as those of pairs do in a fit (`RangeModel.error_model`).
+    The density is that of `calib.range_errors.density`. Each group has a centre and a noise; shares and detours of
+    groups scatter about common values, as those of pairs do in a fit (`error_unknowns`).
     """
     members = [own[:: -(-len(own) // most)] for own in groups]
     count, size = len(members), np.array([len(own) for own in members])
     error_m, group = np.concatenate(members), np.repeat(np.arange(count), size)
     middle = np.array([np.median(own) for own in members])
     spread = np.maximum([robust_spread(own) for own in members], 1e-6)
-    zero = np.zeros(count)
-    # Parameter, kind, start, prior; a parameter is the sum of its kinds.
-    table = (
-        (RESIDUAL, "centre", zero, Prior.of_deviation(100.0)),
-        ("noise", "noise", np.log(spread), Prior.of_deviation(2.0, np.log(spread))),
-        ("odds", "odds level", ODDS, Prior.of_deviation(2.0, ODDS)),
-        ("odds", "odds", zero, Prior.of_spread(0.7, 0.03, 2.0)),
-        ("detour", "detour level", np.log(DETOUR_M), Prior.of_deviation(DETOUR_WORTH**-0.5, np.log(DETOUR_M))),
-        ("detour", "detour", zero, Prior.of_spread(0.2, 0.03, 0.7)),
-        ("outliers", "outliers", -6.0, Prior.of_deviation(3.0, -6.0)),
-        ("least", "least detour", np.log(LEAST_DETOUR_M), Prior.of_deviation(2**0.5, np.log(LEAST_DETOUR_M))),
-        ("long", "long detours", LONG_ODDS, Prior.of_deviation(1.0, LONG_ODDS)),
-    )
-    unknowns, parts = [], []
-    for parameter, kind, start, prior in table:
-        first = np.atleast_1d(start).astype(np.float64)
-        unknowns.append(Unknown(kind=kind, names=("",) * len(first), start=first, priors=(prior,)))
-        columns = group[:, None] if np.ndim(start) else np.zeros((1, 1), dtype=np.int64)
-        weight = np.full((len(group), 1), -1.0) if parameter == RESIDUAL else None
-        parts.append(Part(parameter=parameter, kind=kind, columns=columns, values=weight))
-    layout = Layout(tuple(unknowns))
+    names = tuple(map(str, range(count)))
+    unknowns, parts = error_unknowns(float(np.median(spread)), names, group, "group")
+    # Groups need not be alike in their noise: each has its own, about no common level.
+    unknowns = [unknown for unknown in unknowns if not unknown.kind.startswith("noise")]
+    parts = [part for part in parts if part.kind != "noise level"]
+    log_spread = np.log(spread)
+    wide = (Prior.of_deviation(2.0, log_spread),)
+    unknowns.append(Unknown(kind="noise of group", names=names, start=log_spread, priors=wide))
+    centre = Unknown(kind="centre", names=names, start=np.zeros(count), priors=(Prior.of_deviation(100.0),))
+    parts.append(Part(parameter=RESIDUAL, kind="centre", columns=group[:, None], values=np.full((len(group), 1), -1.0)))
+    layout = Layout((centre, *unknowns))
     rows = RangeRows.of(error_m - middle[group], group, parts, Mixture(), layout)
     found = maximize([rows], Priors(layout), layout.start())
     values = rows.values(found.x)
@@ -75,9 +65,9 @@ def fit_grouped_errors(groups: Sequence[Floats], most: int = 20_000) -> GroupedE
     return GroupedErrors(
         centre_m=middle + found.of("centre"),
         centre_std_m=np.sqrt(np.diag(found.covariance[of_centre, of_centre])),
-        sigma_m=np.exp(found.of("noise")),
+        sigma_m=np.exp(found.of("noise of group")),
         reflected=np.bincount(group, each.reflected) / size,
         detour_m=np.exp(found.of("least detour")[0])
-        + long.mean * np.exp(found.of("detour level") + found.of("detour")),
+        + long.mean * np.exp(found.of("detour level") + found.of("detour of group")),
         outliers=np.bincount(group, 1 - each.inlier) / size,
     )

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from uwblink.arrays import Floats, Ints
 
@@ -20,14 +22,12 @@ def square_of(tags: list[int], initiator: Ints, target: Ints, first: Floats, sec
 
     `first` and `second` are the weights of the delays of initiator and target.
     """
-    count, (one, two) = len(tags), (np.searchsorted(tags, ids) for ids in (initiator, target))
-
-    def summed(row: Ints, column: Ints, weight: Floats) -> Floats:
-        return np.asarray(np.bincount(row * count + column, weight, count * count), np.float64).reshape(count, count)
-
-    across = summed(one, two, first * second)
-    pairs = np.array(tags)[np.argwhere(across + across.T)]
-    return summed(one, one, first**2) + summed(two, two, second**2) + across + across.T, pairs
+    rows = np.arange(len(initiator))
+    columns = [np.searchsorted(tags, ids) for ids in (initiator, target)]
+    place = (np.tile(rows, 2), np.concatenate(columns))
+    design = sparse.csr_matrix((np.concatenate([first, second]), place), shape=(len(rows), len(tags)))
+    square = np.asarray((design.T @ design).toarray())
+    return square, np.array(tags)[np.argwhere(square - np.diag(np.diag(square)))]
 
 
 def free_directions(square: Floats, tags: list[int], pairs: Ints) -> tuple[Floats, list[list[int]]]:
@@ -38,21 +38,9 @@ def free_directions(square: Floats, tags: list[int], pairs: Ints) -> tuple[Float
     robots, a single pair) can shift by +a and -a without a trace in any range.
     """
     values, vectors = np.linalg.eigh(square)
-    loose = values < UNDETERMINED * values[-1]
-    free = {tag for tag, row in zip(tags, vectors[:, loose], strict=True) if np.abs(row).max(initial=0.0) > 1e-3}
-    return np.asarray(vectors[:, loose]), _connected(free, {(low, high) for low, high in pairs.tolist()})
-
-
-def _connected(tags: set[int], pairs: set[tuple[int, int]]) -> list[list[int]]:
-    """Return the connected components of a graph of pairs, among some tags."""
-    left, groups = set(tags), []
-    while left:
-        group, waiting = set(), [min(left)]
-        while waiting:
-            tag = waiting.pop()
-            group.add(tag)
-            linked = {b for a, b in pairs if a == tag} | {a for a, b in pairs if b == tag}
-            waiting += sorted((linked & left) - group)
-        groups.append(sorted(group))
-        left -= group
-    return groups
+    loose = vectors[:, values < UNDETERMINED * values[-1]]
+    free = np.array(tags)[np.abs(loose).max(axis=1, initial=0.0) > 1e-3]
+    ends = np.searchsorted(free, pairs[np.isin(pairs, free).all(axis=1)])
+    graph = sparse.coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(free), len(free)))
+    count, group = connected_components(graph, directed=False)
+    return np.asarray(loose), [free[group == k].tolist() for k in range(count)]

@@ -17,21 +17,8 @@ class Pairs:
     ends: Ints
 
 
-def pairs_of(initiator: Ints, target: Ints, tags: list[int]) -> Pairs:
-    """Number the pairs of ranges (n,) between `tags`, in order of their lower tags, then of their higher ones."""
-    known = np.array(tags)
-
-    first, second = places_of(tags, initiator, target)
-    key = np.minimum(first, second) * len(tags) + np.maximum(first, second)
-    there = np.bincount(key) > 0
-    low, high = np.divmod(np.flatnonzero(there), len(tags))
-    place = np.cumsum(there) - 1
-    number = place[key].astype(np.int32)
-    return Pairs(number, np.column_stack([known[low], known[high]]))
-
-
-def places_of(tags: list[int], *ids: Ints) -> list[Ints]:
-    """Return for each of `ids` (n,) its place among ascending tags."""
-    place = np.zeros(tags[-1] + 1, dtype=np.int64)
-    place[tags] = np.arange(len(tags))
-    return [place[some] for some in ids]
+def pairs_of(initiator: Ints, target: Ints) -> Pairs:
+    """Number the pairs of ranges (n,) in order of their lower tags, then of their higher ones."""
+    low, high = np.minimum(initiator, target).astype(np.int64), np.maximum(initiator, target).astype(np.int64)
+    codes, number = np.unique(low << 32 | high, return_inverse=True)
+    return Pairs(number.astype(np.int32), np.column_stack([codes >> 32, codes & 0xFFFFFFFF]))

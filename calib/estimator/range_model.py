@@ -15,6 +15,7 @@ from scipy.interpolate import BSpline
 from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, knots_for, lifted_power, populated
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
+from calib.estimator.error_unknowns import error_unknowns, scattered
 from calib.estimator.identifiability import free_directions, square_of
 from calib.estimator.pairs import Pairs, pairs_of
 from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
@@ -35,10 +36,6 @@ HELD_NS, HELD_M = 1e-3, 1e-5
 CURVE_M = 0.5
 """Prior standard deviation of the bias over power: published curves reach 0.2 m (DW1000 user manual, APS011)."""
 
-NOISE_M, NOISE_WORTH = 0.06, 20.0
-"""Prior of the noise of a range, and the number of ranges that it counts for. A stamp of a DW1000 has 0.15 ns of noise
-in the open (its user manual, 8.3), which gives 3 to 10 cm."""
-
 SEGMENTS_A_FOLD, SEGMENTS = 4.5, (10, 28)
 """Segments of a bias curve per factor e of lifted power, and their bounds. Roughness is estimated, so more segments
 change nothing (the study of `make accuracy`)."""
@@ -48,16 +45,6 @@ FEWEST_OF_GROUP = 20
 
 SAME_POWER = 1e-6
 """Lifted powers that differ by less count as equal."""
-
-DETOUR_M, DETOUR_WORTH, LEAST_DETOUR_M = 0.2, 5.0, 0.03
-"""Prior of the mean of the shorter kind of exponential detours, the number of reflections that it counts for, and the
-least detour (published detours are 0.1 to 0.5 m: MILUV, STAR-loc)."""
-
-ODDS = -2.2
-"""Prior log odds of a reflection: one range in ten."""
-
-LONG_ODDS = -1.1
-"""Prior log odds that a reflection is of the longer kind: one in four; 11 to 48 % within one standard deviation."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,7 +136,7 @@ class RangeModel:
             ordered = ordered[np.searchsorted(ordered, low) : np.searchsorted(ordered, high, side="right")]
         tags = ranges.tags()
         _check_tags(ranges, tags, fixed_ns, groups)
-        pairs = pairs_of(ranges.initiator, ranges.target, tags)
+        pairs = pairs_of(ranges.initiator, ranges.target)
         held, free = _free_directions(ranges, tags, fixed_ns, constants)
         unknowns, parts = _constants(ranges, pairs, tags, fixed_ns, constants)
         bias = noise = None
@@ -233,27 +220,8 @@ class RangeModel:
 
     def error_model(self, residual: Floats) -> tuple[Mixture, tuple[Unknown, ...], tuple[Part, ...]]:
         """Return the error model with its unknowns and parts, started from robust spreads of residuals (n,)."""
-        spread = max(robust_spread(residual), 1e-3)
         names = tuple(f"{a}-{b}" for a, b in self.pairs.ends.tolist())
-        everyone = np.zeros((1, 1), dtype=np.int64)
-        by_pair = self.pairs.number[:, None]
-        unknowns = [
-            _scalar(
-                "noise level", np.log(0.9 * spread), Prior.of_deviation((2 * NOISE_WORTH) ** -0.5, np.log(NOISE_M))
-            ),
-            _scalar("odds level", ODDS, Prior.of_deviation(2.0, ODDS)),
-            _scalar("detour level", np.log(DETOUR_M), Prior.of_deviation(DETOUR_WORTH**-0.5, np.log(DETOUR_M))),
-            _scalar("least detour", np.log(LEAST_DETOUR_M), Prior.of_deviation(2**0.5, np.log(LEAST_DETOUR_M))),
-            _scalar("outliers", -6.0, Prior.of_deviation(3.0, -6.0)),
-            _scalar("long detours", LONG_ODDS, Prior.of_deviation(1.0, LONG_ODDS)),
-            _of_pairs("noise of pair", names, (0.1, 0.01, 2.0)),
-            _of_pairs("odds of pair", names, (0.7, 0.03, 2.0)),
-            _of_pairs("detour of pair", names, (0.2, 0.03, 0.7)),
-        ]
-        level = (("noise", "noise level"), ("odds", "odds level"), ("detour", "detour level"))
-        alone = (("least", "least detour"), ("outliers", "outliers"), ("long", "long detours"))
-        parts = [Part(parameter=name, kind=kind, columns=everyone) for name, kind in (*level, *alone)]
-        parts += [Part(parameter=name, kind=f"{name} of pair", columns=by_pair) for name, _ in level]
+        unknowns, parts = error_unknowns(max(robust_spread(residual), 1e-3), names, self.pairs.number)
         if self.noise is not None:
             rough = Prior(weight=1.0, structure=curvature(self.noise.knots), bounds=(1e-3, 1e6))
             several = tuple(map(str, range(self.noise.size)))
@@ -281,14 +249,6 @@ class RangeModel:
         layout = Layout((*unknowns, *more))
         used = [*(p for p in self.parts if p.kind in kinds), *parts]
         return layout, RangeRows.of(residual, self.key(), used, errors, layout, geometry)
-
-
-def _scalar(kind: str, start: float, prior: Prior) -> Unknown:
-    return Unknown(kind=kind, names=("",), start=np.array([start]), priors=(prior,))
-
-
-def _of_pairs(kind: str, names: tuple[str, ...], spread: tuple[float, float, float]) -> Unknown:
-    return Unknown(kind=kind, names=names, start=np.zeros(len(names)), priors=(Prior.of_spread(*spread),))
 
 
 def _free_directions(
@@ -351,7 +311,7 @@ def _add_offsets(
     names = tuple(f"{a}-{b}" for a, b in pairs.ends.tolist())
     number = pairs.number[:, None]
     if identifiable:
-        unknowns.append(_of_pairs("offset of pair", names, OFFSETS))
+        unknowns.append(scattered("offset of pair", names, OFFSETS))
         parts.append(Part(parameter=RESIDUAL, kind="offset of pair", columns=number))
     count = len(ranges.sessions)
     if count < 2:
@@ -363,7 +323,7 @@ def _add_offsets(
         ("offset of tag in session", tuple(map(str, tags)), ends * count + session),
     ):
         several = tuple(f"{name} in {where}" for name in whose for where in ranges.sessions)
-        unknowns.append(_of_pairs(kind, several, OFFSETS))
+        unknowns.append(scattered(kind, several, OFFSETS))
         parts.append(Part(parameter=RESIDUAL, kind=kind, columns=columns.astype(np.int32)))
 
 

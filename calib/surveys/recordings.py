@@ -197,7 +197,7 @@ def _moved(one: Arrangement, ranges: Ranges) -> list[Contradiction]:
 
 
 def _pairs(ranges: Ranges) -> Pairs:
-    return pairs_of(ranges.initiator, ranges.target, ranges.tags())
+    return pairs_of(ranges.initiator, ranges.target)
 
 
 def still_stretches(ranges: Ranges, bin_s: float = 1.0) -> list[tuple[int, int]]:

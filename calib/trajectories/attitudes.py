@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from uwblink.arrays import Bools, Floats
 
@@ -39,17 +39,11 @@ class Attitude:
 
     def at(self, time_s: Floats) -> Floats:
         """Return rotation matrices (n, 3, 3) at instants (n,), interpolated between quaternions, constant outside."""
-        time = np.clip(time_s, self.time_s[0], self.time_s[-1])
-        if len(self.time_s) == 1:
-            return np.asarray(Rotation.from_quat(np.tile(self.quaternion[0], (len(time), 1))).as_matrix())
-        after = np.clip(np.searchsorted(self.time_s, time, side="right"), 1, len(self.time_s) - 1)
-        span = self.time_s[after] - self.time_s[after - 1]
-        share = (time - self.time_s[after - 1]) / np.where(span > 0, span, 1.0)
-        first, second = self.quaternion[after - 1], self.quaternion[after]
-        # q and -q are one attitude.
-        sign = np.where(np.einsum("ij,ij->i", first, second) < 0, -1.0, 1.0)
-        mixed = (1 - share)[:, None] * first + (share * sign)[:, None] * second
-        return np.asarray(Rotation.from_quat(mixed).as_matrix())
+        distinct = np.diff(self.time_s, prepend=-np.inf) > 0
+        time, turned = self.time_s[distinct], Rotation.from_quat(self.quaternion[distinct])
+        if len(time) == 1:
+            return np.tile(turned.as_matrix(), (len(time_s), 1, 1))
+        return np.asarray(Slerp(time, turned)(np.clip(time_s, time[0], time[-1])).as_matrix())
 
 
 def _about_vertical(heading_rad: float) -> Rotation:

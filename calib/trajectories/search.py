@@ -14,8 +14,9 @@ from itertools import pairwise
 import numpy as np
 from scipy import sparse
 
+from calib.estimator.error_unknowns import NOISE_M, NOISE_WORTH
 from calib.estimator.optimize import Optimum, maximize
-from calib.estimator.range_model import NOISE_M, NOISE_WORTH, RangeModel
+from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, Errors, Mixture, Part, RangeRows
 from calib.estimator.rows import NormalRows, Rows
 from calib.estimator.unknowns import Layout, Priors, Unknown

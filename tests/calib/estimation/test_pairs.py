@@ -2,18 +2,14 @@
 
 import numpy as np
 
-from calib.estimator.pairs import pairs_of, places_of
+from calib.estimator.pairs import pairs_of
 
 
 def test_pairs_are_numbered_by_their_tags_and_a_single_range_makes_one():
     initiator, target = np.array([9, 2, 5, 2, 5]), np.array([2, 9, 2, 9, 9])
-    found = pairs_of(initiator, target, [2, 5, 9])
+    found = pairs_of(initiator, target)
     assert found.ends.tolist() == [[2, 5], [2, 9], [5, 9]]
     assert found.number.tolist() == [1, 1, 0, 1, 2]
-    rare = pairs_of(np.array([1, 3]), np.array([3, 7]), [1, 3, 7])
+    rare = pairs_of(np.array([1, 3]), np.array([3, 7]))
     assert rare.ends.tolist() == [[1, 3], [3, 7]]
     assert rare.number.tolist() == [0, 1]
-
-
-def test_places_are_those_among_the_tags():
-    assert [some.tolist() for some in places_of([2, 5, 9], np.array([9, 2]), np.array([5, 5]))] == [[2, 0], [1, 1]]
