@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from uwblink.arrays import Bools, Floats
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Attitude:
     """Attitudes at `time_s` (k,) as quaternions x y z w (k, 4), body to world, and their errors.
 
@@ -39,11 +40,14 @@ class Attitude:
 
     def at(self, time_s: Floats) -> Floats:
         """Return rotation matrices (n, 3, 3) at instants (n,), interpolated between quaternions, constant outside."""
-        distinct = np.diff(self.time_s, prepend=-np.inf) > 0
-        time, turned = self.time_s[distinct], Rotation.from_quat(self.quaternion[distinct])
-        if len(time) == 1:
-            return np.tile(turned.as_matrix(), (len(time_s), 1, 1))
-        return np.asarray(Slerp(time, turned)(np.clip(time_s, time[0], time[-1])).as_matrix())
+        time = np.clip(time_s, self.time_s[0], self.time_s[-1])
+        return np.asarray(self._turn(time).as_matrix())
+
+    @cached_property
+    def _turn(self) -> Slerp:
+        # A second instant makes a single attitude last.
+        instants, rows = np.unique(np.append(self.time_s, self.time_s[-1] + 1.0), return_index=True)
+        return Slerp(instants, Rotation.from_quat(self.quaternion[np.minimum(rows, len(self.time_s) - 1)]))
 
 
 def _about_vertical(heading_rad: float) -> Rotation:
@@ -171,16 +175,17 @@ def integrated(readings: Readings, known: Attitude | None, until_s: float) -> At
 def _carried_on(readings: Readings, first: int, turn: Floats, bias: Floats) -> Floats:
     """Return quaternions (n - first, 4) integrated from the attitude `turn` of reading `first`."""
     steps = np.minimum(np.diff(readings.time_s[first:], append=readings.time_s[-1]), 0.1)
-    rates, pulls = readings.gyro[first:] - bias, _smoothed(readings)[first:]
+    turns = Rotation.from_rotvec((readings.gyro[first:] - bias) * steps[:, None]).as_matrix()
+    pulls = _smoothed(readings)[first:]
     sizes = np.linalg.norm(pulls, axis=1)
-    found, attitude = np.empty((len(steps), 3, 3)), turn
-    for k, dt in enumerate(steps.tolist()):
+    pulls /= np.maximum(sizes, 1e-9)[:, None]
+    shares = np.where((sizes > 0.8 * GRAVITY_M_S2) & (sizes < 1.2 * GRAVITY_M_S2), LEVELLING * steps, 0.0)
+    found, attitude, up = np.empty((len(steps), 3, 3)), turn, np.array([0.0, 0.0, 1.0])
+    for k, share in enumerate(shares.tolist()):
         found[k] = attitude
-        rate = rates[k]
-        if 0.8 < sizes[k] / GRAVITY_M_S2 < 1.2:
-            # The last row of the rotation matrix is the world's vertical in the axes of the body.
-            rate = rate + LEVELLING * np.cross(pulls[k] / sizes[k], attitude[2])
-        attitude = attitude @ Rotation.from_rotvec(rate * dt).as_matrix()
+        # A turn by pull x vertical, small enough to be linear: the last row of the matrix is the world's vertical.
+        levelling = np.outer(up, pulls[k]) - np.outer(attitude @ pulls[k], attitude[2])
+        attitude = (attitude + share * levelling) @ turns[k]
     return np.asarray(Rotation.from_matrix(found).as_quat())
 
 
