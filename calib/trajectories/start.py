@@ -33,8 +33,9 @@ SCALES_M = (3.0, 1.0, 0.3)
 WINDOW_JERK_M_S3 = 3.0
 """Standard deviation of jerk in a window; small, because ranges count less under a wide likelihood."""
 
-START_COUNT, SAMPLED_RANGES = 24, 400
-"""Random starts of the first window, and the number of its ranges that are used."""
+START_COUNT, KEPT_STARTS, SAMPLED_RANGES = 24, 8, 400
+"""Random starts of the first window, how many of them go on after the widest likelihood, which is nearly convex, and
+the number of the window's ranges that are used."""
 
 START_SPREAD_M = 2.0
 EQUAL_LIKELIHOOD = 6.0
@@ -186,9 +187,14 @@ def _fit_first_window(scene: Scene) -> tuple[Scene, Trajectories, Floats, str]:
     time = np.arange(float(scene.time_s[0]), float(scene.time_s[0]) + length + SAMPLE_S / 2, SAMPLE_S)
     window = scene.between(float(time[0]), float(time[-1]))
     window = window.only(np.arange(0, len(window.time_s), max(len(window.time_s) // SAMPLED_RANGES, 1)))
-    tried = [
-        (_fit_window(window.turned_by(heading), guess, stand), heading)
+    wide = [
+        (fit_motion(window.turned_by(heading), guess.state(window, stand), SCALES_M[:1], WINDOW_JERK_M_S3), heading)
         for guess, stand, heading in _guesses(window, time, headless)
+    ]
+    wide.sort(key=lambda one: -one[0].value)
+    tried = [
+        (fit_motion(window.turned_by(heading), one.state, SCALES_M[1:], WINDOW_JERK_M_S3), heading)
+        for one, heading in wide[:KEPT_STARTS]
     ]
     best, heading = max(tried, key=lambda one: one[0].value)
     stand = best.state.get("stand", np.zeros((1, 0, 3)))[0]
