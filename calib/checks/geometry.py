@@ -36,12 +36,12 @@ def pose_clock(view: RecordingView) -> Iterator[Candidate]:
     if not len(view.poses):
         return
     try:
-        found = find_offset(view.exchanges, view.poses, view.tags, within_s=LARGEST_OFFSET_S)
+        offset_ns = find_offset(view.exchanges, view.poses, view.tags, within_s=LARGEST_OFFSET_S)
     except ImportTableError:
         return
-    shift_s, e = found.offset_ns * 1e-9, view.exchanges
+    shift_s, e = offset_ns * 1e-9, view.exchanges
     if abs(shift_s) > SMALLEST_OFFSET_S:
-        moved = distances_m(view.poses, view.tags, e.initiator, e.target, e.time_ns - found.offset_ns)
+        moved = distances_m(view.poses, view.tags, e.initiator, e.target, e.time_ns - offset_ns)
         evidence = f"with the poses {shift_s:+.3f} s later"
         yield _undone(view, Candidate("pose time offset", evidence, words={"shift": f"{shift_s:.3f}"}), moved)
 

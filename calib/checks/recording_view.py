@@ -10,6 +10,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -27,7 +28,7 @@ from calib.range_errors.density import OUTLIERS_OVER_M, error_slopes
 from calib.spread import less_medians, robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.contents import Contents
-from uwblink.recording.distances import distances_m
+from uwblink.recording.distances import distances_m, poses_around, tracks_of
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, Fault, Poses, Tag
 from uwblink.recording.summary import differences, repeated_rows, single_reports
@@ -150,14 +151,15 @@ def looked_at(source: Source) -> Source:
     if not isinstance(source, RecordedSource) or source.recording.count("exchanges") <= EXAMINED_EXCHANGES:
         return source
     recording = source.recording
-    spans = recording.stretches(EXAMINED_EXCHANGES // EXAMINED_STRETCHES)
-    windows, parts, poses = recording.pose_windows(), list[Exchanges](), list[Poses]()
+    *edges, last_ns = recording.dividing_times("exchanges", EXAMINED_EXCHANGES // EXAMINED_STRETCHES)
+    spans = list(pairwise([*edges, last_ns + 1]))
+    tracks, parts, poses = tracks_of(source.poses), list[Exchanges](), list[Poses]()
     for k in np.unique(np.linspace(0, len(spans) - 1, EXAMINED_STRETCHES).round().astype(int)).tolist():
         start_ns, end_ns = spans[k]
-        parts.append(recording.exchanges_between(start_ns, end_ns))
+        parts.append(recording.exchanges(start_ns, end_ns))
         # A range belongs to the middle of its first two messages, which is after its time, by half a wrap at most.
         later = int(2 ** parts[-1].bits * TICK_S * 0.5e9) + 1
-        poses.append(windows.around(start_ns - MARGIN_NS, end_ns + later + MARGIN_NS))
+        poses.append(poses_around(tracks, start_ns - MARGIN_NS, end_ns + later + MARGIN_NS))
     every = Poses.concatenate(poses)
     # Poses of two stretches are there once.
     places = np.column_stack([every.time_ns, np.unique(every.body, return_inverse=True)[1]])

@@ -194,7 +194,7 @@ def doctor(
                 skews[str(path)] = clock_skews(recording.exchange_blocks())
     findings = [replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in found]
     if as_json:
-        clocks = {path: [asdict(one) | {"slope": one.slope} for one in some] for path, some in skews.items()}
+        clocks = {path: [asdict(one) for one in some] for path, some in skews.items()}
         found_all = {"findings": [asdict(f) for f in findings], "clock_skews": clocks}
         typer.echo(json.dumps(found_all | ({"examined": parts} if parts else {}), indent=1))
         return

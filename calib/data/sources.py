@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final, Protocol, runtime_checkable
@@ -56,9 +56,7 @@ Data = str | os.PathLike[str] | Recording | Source | Exchanges | Ranges
 READERS: Final[dict[str, Callable[[Recording], Any]]] = {
     "meta": Recording.meta,
     "faults": Recording.faults,
-    "overheard": Recording.overheard,
-    "imu": Recording.imu,
-    "height": Recording.heights,
+    **{table: partial(Recording.columns, table=table) for table in ("overheard", "imu", "height")},
     "arrangements": Recording.arrangements,
     "known_distances": Recording.known_distances,
 }

@@ -125,7 +125,7 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
             if arrangement:
                 first_ns = recorder.progress.start_ns
                 mark = replace(mark, start_ns=first_ns, end_ns=max(using.host_ns(), first_ns + 1))
-                recording.append_arrangements([mark])
+                recording.append("arrangements", [mark])
     except WrongDelayError:
         path.unlink(missing_ok=True)  # its `meta` would say wrong antenna delays
         raise
@@ -212,15 +212,13 @@ class Batch:
 
     def append_to(self, recording: Recording) -> None:
         """Append everything; raises `RecordingError`."""
-        recording.append_frames(self.frames)
+        recording.append("frames", self.frames)
         if self.exchanges:
             recording.append_exchanges(exchanges_of(self.exchanges))
-        recording.append_overheard(overheard_row(*row) for row in self.overheard)
-        recording.append_cirs(
-            CirRow(t, board, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes)
-            for t, board, c in self.cirs
-        )
-        recording.append_faults(self.faults)
+        recording.append("overheard", [overheard_row(*row) for row in self.overheard])
+        cirs = [CirRow(t, b, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes) for t, b, c in self.cirs]
+        recording.append("cirs", cirs)
+        recording.append("faults", self.faults)
 
 
 class RecordingWriter(Closing, Listener):

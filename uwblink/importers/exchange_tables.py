@@ -242,7 +242,7 @@ class TableImport:
                 recording.append_poses(poses)
                 counts["poses"] += len(poses)
             for some in faults:
-                recording.append_faults(some)
+                recording.append("faults", some)
                 counts["faults"] += len(some)
         return {name: n for name, n in counts.items() if n or name == "exchanges"}, notes
 

@@ -286,7 +286,7 @@ def add_poses(
             )
         if shift_ns is None:
             _check_units(what, exchanges, poses, seats, int(exchanges.time_ns.min() - poses.time_ns.min()))
-            shift_ns = find_offset(exchanges, poses, seats).offset_ns
+            shift_ns = find_offset(exchanges, poses, seats)
         moved = replace(poses, time_ns=poses.time_ns + shift_ns)
         truth = distances_m(moved, seats, exchanges.initiator, exchanges.target, exchanges.time_ns)
         covered = int(np.count_nonzero(np.isfinite(truth)))

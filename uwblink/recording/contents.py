@@ -10,17 +10,18 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from uwblink.arrays import Bools, Floats
+from uwblink import arrays
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import as_html, first_few, printable
 from uwblink.errors import ArgumentError
-from uwblink.recording.distances import distances_m
+from uwblink.recording.distances import distances_m, poses_around, tracks_of
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, CirRow, Fault, FrameRow, KnownDistance, Poses, Tag
 from uwblink.recording.summary import counted
 from uwblink.ticks import TICK_S
-from uwblink.twr import LATEST_NS, Exchanges, middle_ns
+from uwblink.twr import LARGEST_ID, LATEST_NS, Exchanges, middle_ns
 
 Pairs = Iterable[tuple[int, int]]
 Row = TypeVar("Row", CirRow, FrameRow, Fault)
@@ -75,34 +76,35 @@ class Contents:
         Raises `ArgumentError`.
         """
         first_ns, end_ns = self._bounds(start_s, stop_s)
-        of_tags, of_pairs = _ids(tags), _pairs(pairs)
+        of_tags = None if tags is None else sorted(_ids("tags", [*tags]).tolist())
+        of_pairs = None if pairs is None else _pairs([*pairs])
+        kept = {"start_s": start_s, "stop_s": stop_s, "tags": of_tags, "pairs": of_pairs}
 
         def chosen(columns: Mapping[str, NDArray[Any]]) -> Bools:
             """Return which rows are in the span, and where they are of two tags, of these tags and pairs."""
             good: Bools = (columns["time_ns"] >= first_ns) & (columns["time_ns"] < end_ns)
             if "initiator" in columns:
-                ends = columns["initiator"], columns["target"]
+                ends = np.column_stack([columns["initiator"], columns["target"]])
                 if of_tags is not None:
-                    good &= np.isin(ends[0], of_tags) & np.isin(ends[1], of_tags)
+                    good &= np.isin(ends, of_tags).all(axis=1)
                 if of_pairs is not None:
-                    hits = [(ends[0] == i) & (ends[1] == j) for i, j in of_pairs]
-                    good &= np.any(hits, axis=0) if hits else False
+                    good &= np.isin(ends @ (1 << 16, 1), [i << 16 | j for i, j in of_pairs])
             return good
 
         def rows(listed: list[Row], *names: str) -> list[Row]:
             columns = {name: np.array([getattr(row, name) for row in listed]) for name in ("time_ns", *names)}
             return [row for row, good in zip(listed, chosen(columns).tolist(), strict=True) if good]
 
-        cut: dict[str, Any] = {}
-        for table in _COLUMNS:
-            if columns := getattr(self, table):
-                good = chosen(columns)
-                cut[table] = {name: column[good] for name, column in columns.items()}
-        kept = {"start_s": start_s, "stop_s": stop_s, "tags": tags and sorted(tags), "pairs": of_pairs}
+        tables = {name: getattr(self, name) for name in _COLUMNS}
+        cut: dict[str, Any] = {
+            name: {word: column[chosen(columns)] for word, column in columns.items()}
+            for name, columns in tables.items()
+            if columns
+        }
         return replace(
             self,
             exchanges=self.exchanges[chosen(self.exchanges.to_dict())],
-            poses=_around(self.poses, first_ns, end_ns),
+            poses=poses_around(tracks_of(self.poses), first_ns, end_ns),
             cirs=rows(self.cirs, "initiator", "target"),
             frames=rows(self.frames),
             faults=rows(self.faults),
@@ -178,40 +180,21 @@ def load(path: str | os.PathLike[str]) -> Contents:
     """
     with Recording.open(Path(path)) as r:
         return Contents(
-            exchanges=r.exchanges(), tags=r.tags(), poses=r.poses(), overheard=r.overheard(), imu=r.imu(),
-            height=r.heights(), powers=r.powers(), temperature=r.temperatures(), corrected=r.corrected(),
-            cirs=r.cirs(), frames=r.frames(), faults=r.faults(), arrangements=r.arrangements(),
-            known_distances=r.known_distances(), meta=r.meta(),
+            exchanges=r.exchanges(), tags=r.tags(), poses=r.poses(), cirs=r.cirs(), frames=r.frames(),
+            faults=r.faults(), arrangements=r.arrangements(), known_distances=r.known_distances(), meta=r.meta(),
+            **{name: r.columns(name) for name in _COLUMNS},
         )  # fmt: skip
 
 
-def _around(poses: Poses, first_ns: int, end_ns: int) -> Poses:
-    """Return each body's poses in a span of time, and the adjacent ones, which interpolation needs."""
-    keep = np.zeros(len(poses), dtype=bool)
-    for body in np.unique(poses.body):
-        rows = np.flatnonzero(poses.body == body)
-        before = int(np.searchsorted(poses.time_ns[rows], first_ns, side="right")) - 1
-        after = int(np.searchsorted(poses.time_ns[rows], end_ns, side="left")) + 1
-        # A body with a single pose does not move.
-        keep[rows[max(before, 0) : after] if len(rows) > 1 else rows] = True
-    return poses[keep]
+def _ids(name: str, values: ArrayLike) -> Ints:
+    return arrays.whole_numbers(name, values, len(np.atleast_1d(values)), 0, LARGEST_ID)
 
 
-def _ids(ids: Collection[int] | None) -> list[int] | None:
-    if ids is None:
-        return None
-    if isinstance(ids, str | bytes) or not all(isinstance(i, int | np.integer) for i in ids):
-        raise ArgumentError(f"tags: found {ids!r:.60}, expected ids of tags, as [1, 2]")
-    return sorted(int(i) for i in ids)
-
-
-def _pairs(pairs: Pairs | None) -> list[tuple[int, int]] | None:
-    if pairs is None:
-        return None
-    listed = [tuple(pair) if isinstance(pair, list | tuple | np.ndarray) else () for pair in pairs]
-    if not all(len(pair) == 2 and all(isinstance(i, int | np.integer) for i in pair) for pair in listed):
-        raise ArgumentError(f"pairs: found {listed!r:.60}, expected pairs of initiator and target, as [(1, 2)]")
-    return [(int(i), int(j)) for i, j in listed]
+def _pairs(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    if pairs and np.shape(pairs) != (len(pairs), 2):
+        raise ArgumentError(f"pairs: found {pairs!r:.60}, expected pairs of initiator and target, as [(1, 2)]")
+    ends = (_ids("pairs", [pair[k] for pair in pairs]).tolist() for k in (0, 1))
+    return list(zip(*ends, strict=True))
 
 
 def pieces(recording: Recording, rows: int = 50_000) -> Iterator[Contents]:
@@ -219,19 +202,17 @@ def pieces(recording: Recording, rows: int = 50_000) -> Iterator[Contents]:
 
     Bytes, impulse responses and total powers are left out, and `corrected` if its rows are not those of the exchanges.
     """
-    fitting = recording.corrected_is_of_exchanges()
+    columns = ("imu", "height", "temperature", *(["corrected"] if recording.corrected_is_of_exchanges() else []))
     edges = {-LATEST_NS, LATEST_NS}
-    for table in ("exchanges", "poses", "imu", "height", "temperature", "corrected", "faults"):
-        edges |= set(recording.times_apart(table, rows))
+    for table in ("exchanges", "poses", "faults", *columns):
+        edges |= set(recording.dividing_times(table, rows)[1:-1])
     for start_ns, end_ns in pairwise(sorted(edges)):
+        some: dict[str, Any] = {name: recording.columns(name, start_ns, end_ns) for name in columns}
         yield Contents(
-            exchanges=recording.exchanges_between(start_ns, end_ns),
+            exchanges=recording.exchanges(start_ns, end_ns),
             poses=recording.poses(start_ns, end_ns),
-            imu=recording.imu(start_ns, end_ns),
-            height=recording.heights(start_ns, end_ns),
-            temperature=recording.temperatures(start_ns, end_ns),
-            corrected=recording.corrected(start_ns, end_ns) if fitting else {},
             faults=recording.faults(start_ns, end_ns),
+            **some,
         )
 
 
@@ -240,7 +221,7 @@ def distances_by_poses_m(recording: Recording, blocks: Iterable[Exchanges]) -> I
 
     They are distances at the middle between the first two messages, which is the time of a range.
     """
-    tracks, tags = recording.pose_windows().tracks, recording.tags()
+    tracks, tags = tracks_of(recording.poses()), recording.tags()
     for some in blocks:
         yield distances_m(tracks, tags, some.initiator, some.target, middle_ns(some))
 
@@ -250,8 +231,8 @@ def exchanges_with_poses(recording: Recording) -> Iterator[tuple[Exchanges, Pose
 
     The poses suffice for distances at the times of exchanges and at the middle between their messages.
     """
-    windows = recording.pose_windows()
+    tracks = tracks_of(recording.poses())
     for block in filter(len, recording.exchange_blocks()):
         # A range belongs to the middle of its first two messages, which is after its time, by half a wrap at most.
         later = int(2**block.bits * TICK_S * 0.5e9) + 1
-        yield block, windows.around(int(block.time_ns.min()), int(block.time_ns.max()) + later)
+        yield block, poses_around(tracks, int(block.time_ns.min()), int(block.time_ns.max()) + later)

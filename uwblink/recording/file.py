@@ -163,7 +163,7 @@ class Recording(Tables):
 
     def _complete(self) -> None:
         """Write everything into the file, close it, and give it its name."""
-        self._store.finish()
+        self._store.shorten_log()
         self._store.close()
         if self._partial:
             log_of(self.path).unlink(missing_ok=True)  # of the file that had the name before

@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from threading import Event, Timer
+from threading import Timer
 from typing import Any, Final
 
 from uwblink.database import duckdb, log_of
@@ -107,19 +107,13 @@ def longest_read_s(size: int) -> float:
 
 
 @contextmanager
-def interrupted_after(seconds: float, interrupt: Callable[[], None]) -> Iterator[Event]:
-    """Call `interrupt` if the block takes longer than that; the event says whether it was called."""
-    late = Event()
-
-    def stop() -> None:
-        late.set()
-        interrupt()
-
-    watch = Timer(seconds, stop)
+def interrupted_after(seconds: float, interrupt: Callable[[], None]) -> Iterator[None]:
+    """Call `interrupt` if the block takes longer than that; DuckDB then raises `InterruptException`."""
+    watch = Timer(seconds, interrupt)
     watch.daemon = True
     watch.start()
     try:
-        yield late
+        yield
     finally:
         watch.cancel()
 

@@ -6,7 +6,6 @@ settings, and are checked (`uwblink.recording.intake`) before anything in them i
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -16,7 +15,6 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.arrays import few_words
 from uwblink.database import connect, duckdb, log_of
 from uwblink.errors import RecordingError, RecordingInUseError, first_line
 from uwblink.recording.intake import (
@@ -48,11 +46,8 @@ class Store:
 
         `writes`: the file is open for writing. `vanishes`: its owner removes it if writing fails.
         """
-        self._db, self._second = connection, connection.cursor()
-        self._second_lock = threading.Lock()
-        self.path, self.writes, self.vanishes = path, writes, vanishes
+        self._db, self.path, self.writes, self.vanishes = connection, path, writes, vanishes
         self._longest_read_s = longest_read_s(size)
-        self._columns: dict[str, set[str]] | None = None
 
     @classmethod
     def write(cls, place: Path, path: Path, memory_mb: int | None = None) -> Self:
@@ -72,7 +67,7 @@ class Store:
                     raise RecordingError(f"{path}: cannot be written ({first_line(error)})") from error
                 time.sleep(0.02)
         store = cls(db, path, writes=True, vanishes=place != path)
-        store._create_missing()
+        store._create()
         return store
 
     @classmethod
@@ -100,9 +95,9 @@ class Store:
         store = cls(connection, path, size, writes=update)
         try:
             check_intake(store.rows, path, size)
-            store.check_columns()
+            store._check_tables()
             if update:
-                store._create_missing()
+                store._create()
         except RecordingError:
             store.close()
             raise
@@ -110,63 +105,53 @@ class Store:
 
     def close(self) -> None:
         """Close the file."""
-        self._second.close()
         self._db.close()
 
-    def finish(self) -> None:
-        """Write everything into the file itself, so that the log beside it is empty; raises `RecordingError`.
+    def shorten_log(self) -> None:
+        """Write the log into the file, also while other threads write; raises `RecordingError`.
 
         Closing does so too, but does not report failures.
         """
-        try:
-            self._db.execute("CHECKPOINT")
-        except duckdb.Error as error:
-            if self.vanishes:
-                raise self._unwritable(error) from error
-            raise RecordingError(
-                f"{self.path}: cannot be completed ({first_line(error)}); everything is kept, "
-                f"some of it in {log_of(self.path).name} beside it: keep the two together"
-            ) from error
-
-    def shorten_log(self) -> None:
-        """Write the log into the file while other threads continue to write; raises `RecordingError`."""
-        try:
-            with self._second_lock:
-                self._second.execute("CHECKPOINT")
-        except duckdb.Error as error:
-            raise self._unwritable(error) from error
+        with self._writing(), self._db.cursor() as db:
+            db.execute("CHECKPOINT")
 
     def copy_to(self, place: Path) -> None:
         """Write what is committed to a new file, on a connection of its own; raises `RecordingError`."""
         target = str(place).replace("'", "''")
         try:
-            with self._second_lock:
-                (source,) = self._second.execute("SELECT current_database()").fetchone() or ("",)
+            with self._db.cursor() as db:
+                (source,) = db.execute("SELECT current_database()").fetchone() or ("",)
                 named = source.replace('"', '""')
-                self._second.execute(f"ATTACH '{target}' AS uwblink_snapshot")
+                db.execute(f"ATTACH '{target}' AS uwblink_snapshot")
                 try:
-                    self._second.execute(f'COPY FROM DATABASE "{named}" TO uwblink_snapshot')
+                    db.execute(f'COPY FROM DATABASE "{named}" TO uwblink_snapshot')
                 finally:
-                    self._second.execute("DETACH uwblink_snapshot")
+                    db.execute("DETACH uwblink_snapshot")
         except duckdb.Error as error:
             place.unlink(missing_ok=True)
             raise RecordingError(f"{place}: cannot be written ({first_line(error)})") from error
 
     def execute(self, statement: str, values: list[Any] | None = None) -> None:
         """Execute a statement of SQL; raises `RecordingError` where the file cannot be written."""
-        try:
+        with self._writing():
             self._db.execute(statement, values)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Raise `RecordingError` for what DuckDB raises where the file cannot be written."""
+        try:
+            yield
         except _UNFIT:
             raise  # `insert` knows of which table
         except duckdb.Error as error:
-            raise self._unwritable(error) from error
-
-    def _unwritable(self, error: duckdb.Error) -> RecordingError:
-        disk = isinstance(error, duckdb.IOException | duckdb.TransactionException | duckdb.FatalException)
-        reason = f"{first_line(error)}){'; is the disk full?' if disk else '.'}"
-        if self.vanishes:
-            return RecordingError(f"{self.path}: cannot be written ({reason} Nothing was written")
-        return RecordingError(f"{self.path}: cannot be written any more ({reason} What was written before is kept")
+            disk = isinstance(error, duckdb.IOException | duckdb.TransactionException | duckdb.FatalException)
+            reason = f"{first_line(error)}){'; is the disk full?' if disk else ';'}"
+            if self.vanishes:
+                raise RecordingError(f"{self.path}: cannot be written ({reason} nothing was written") from error
+            raise RecordingError(
+                f"{self.path}: cannot be written any more ({reason} everything before is kept, perhaps some of it in "
+                f"{log_of(self.path).name} beside it: keep the two together"
+            ) from error
 
     def insert(self, table: str, columns: Mapping[str, NDArray[Any]]) -> None:
         """Add rows from columns with the table's names; masked values are missing in the table.
@@ -192,10 +177,10 @@ class Store:
             ) from error
         self._db.unregister("batch")
 
-    def read(self, query: str) -> dict[str, NDArray[Any]]:
+    def read(self, query: str, values: list[Any] | None = None) -> dict[str, NDArray[Any]]:
         """Return the result of a query as columns, masked where values are missing; raises `RecordingError`."""
         with self._reading():
-            return dict(self._db.execute(query).fetchnumpy())
+            return dict(self._db.execute(query, values).fetchnumpy())
 
     def rows(self, query: str) -> list[tuple[Any, ...]]:
         """Return the result of a query as rows; raises `RecordingError`."""
@@ -204,21 +189,24 @@ class Store:
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
-        with interrupted_after(self._longest_read_s, self._db.interrupt) as late:
-            try:
+        try:
+            with interrupted_after(self._longest_read_s, self._db.interrupt):
                 yield
-            except duckdb.Error as error:
-                why = f"took longer than {self._longest_read_s:.0f} s" if late.is_set() else first_line(error)
-                raise RecordingError(f"{self.path}: cannot be read, truncated or damaged ({why})") from error
+        except duckdb.Error as error:
+            late = isinstance(error, duckdb.InterruptException)
+            why = f"took longer than {self._longest_read_s:.0f} s" if late else first_line(error)
+            raise RecordingError(f"{self.path}: cannot be read, truncated or damaged ({why})") from error
+
+    def blocks(self, table: str, rows: int) -> Iterator[str]:
+        """Yield conditions of queries for all rows of a table in their order, some at a time."""
+        ((last,),) = self.rows(f"SELECT coalesce(max(rowid), -1) FROM {table}")  # noqa: S608 - a key of TABLES
+        for start in range(0, last + 1, rows):
+            yield f"WHERE rowid >= {start} AND rowid < {start + rows}"
 
     def take(self, source: Store, table: str) -> None:
         """Add all rows of another file's table in their order, missing values included, some at a time."""
-        present = source.columns().get(table, set()) & TABLES[table].keys()
-        ((last,),) = source.rows(f"SELECT max(rowid) FROM {table}") if present else [(None,)]  # noqa: S608 - a key of TABLES
-        names = ", ".join(f'"{name}"' for name in present)
-        for start in range(0, 0 if last is None else int(last) + 1, ROWS_AT_A_TIME):
-            piece = f"rowid >= {start} AND rowid < {start + ROWS_AT_A_TIME} ORDER BY rowid"
-            self.insert(table, source.read(f"SELECT {names} FROM {table} WHERE {piece}"))  # noqa: S608 - keys of TABLES
+        for block in source.blocks(table, ROWS_AT_A_TIME):
+            self.insert(table, source.read(f"SELECT {', '.join(TABLES[table])} FROM {table} {block}"))  # noqa: S608 - keys of TABLES
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
@@ -227,47 +215,47 @@ class Store:
             self.execute("BEGIN")
             yield
             self.execute("COMMIT")
-        except (duckdb.Error, RecordingError) as error:
-            with suppress(RecordingError):
+        except BaseException:
+            with suppress(duckdb.Error, RecordingError):
                 self.execute("ROLLBACK")
-            if isinstance(error, RecordingError):
-                raise
-            raise self._unwritable(error) from error
+            raise
 
-    def columns(self) -> dict[str, set[str]]:
-        """Return the names of the columns of each table that the file has."""
-        if self._columns is None or self.writes:
-            self._columns = {}
-            for table, column, _kind in self.rows(COLUMNS):
-                self._columns.setdefault(table, set()).add(column)
-        return self._columns
-
-    def _create_missing(self) -> None:
-        """Create the tables that the file does not have: all in a new one, and later ones in an older one."""
+    def _create(self) -> None:
+        """Create the tables and columns that the file does not have: all in a new one, later ones in an older one."""
         for table, columns in TABLES.items():
-            spec = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
+            spec = ", ".join(f"{name} {kind}" for name, kind in columns.items())
             self.execute(f"CREATE TABLE IF NOT EXISTS {table} ({spec})")
+            for name in ADDED_LATER.get(table, ()):
+                self.execute(f"ALTER TABLE {table} ADD COLUMN IF NOT EXISTS {name} {columns[name]}")
 
-    def check_columns(self) -> None:
-        """Raise `RecordingError` where the file lacks a table or a column that all recordings have."""
-        found = self.columns()
-        if "meta" not in found:
+    def _check_tables(self) -> None:
+        """Raise `RecordingError` where the file lacks a table or column that every recording has.
+
+        Later ones are read as empty ones in memory.
+        """
+        present: dict[str, set[str]] = {table: set() for table in TABLES}
+        for table, column, _kind in self.rows(COLUMNS):
+            present.setdefault(table, set()).add(column)
+        if not present["meta"]:
             raise RecordingError(f"{self.path}: a DuckDB file, but not a {SUFFIX} recording (no table meta)")
         for table, columns in TABLES.items():
-            present, later = found.get(table, set()), ADDED_LATER.get(table, frozenset())
-            came_whole = later == columns.keys()
-            missing = sorted(columns.keys() - present - (later if not (present and came_whole) else set()))
-            if missing:
-                raise RecordingError(f"{self.path}: table {table} lacks {', '.join(missing)}")
+            missing = frozenset(columns.keys() - present[table])
+            if missing and missing != ADDED_LATER.get(table, frozenset()):
+                raise RecordingError(f"{self.path}: table {table} lacks {', '.join(sorted(missing))}")
+            if missing and not self.writes:
+                values = ", ".join(f"NULL::{columns[n]} AS {n}" if n in missing else n for n in columns)
+                rows = f"FROM {table}" if present[table] else "LIMIT 0"
+                self.execute(f"CREATE TEMP TABLE {table} AS SELECT {values} {rows}")
 
 
 def _value(name: str, kind: str, column: NDArray[Any], arrays: dict[str, NDArray[Any]], bound: list[Any]) -> str:
     """Return the SQL of a column's values; adds to `arrays` the arrays to scan, and to `bound` the bound values."""
     arrays[name], value = np.ascontiguousarray(np.ma.getdata(column)), f'"{name}"'
-    if (coded := few_words(column)) is not None:
+    if arrays[name].dtype.kind == "U":
         # DuckDB would sort an array of words, which takes longer than the rest of an insertion.
-        bound.append(coded[0].tolist())
-        arrays[name], value = coded[1] + 1, f'CAST(? AS VARCHAR[])["{name}"]'
+        words, which = np.unique(arrays[name], return_inverse=True)
+        bound.append(words.tolist())
+        arrays[name], value = which + 1, f'CAST(? AS VARCHAR[])["{name}"]'
     if kind == "BLOB":
         # Not every version takes bytes from an array; all take digits.
         arrays[name] = np.array([data.hex() for data in arrays[name].tolist()], dtype=object)

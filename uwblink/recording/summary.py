@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import as_html, cut, first_few, printable
@@ -52,24 +53,20 @@ class SingleReports:
 
 def single_reports(exchanges: Exchanges) -> SingleReports:
     """Return each exchange once: the initiator's report if there is one, else the target's."""
-    # Exchanges of a tag with itself have one report.
-    from_target = (exchanges.reporter == exchanges.target) & (exchanges.initiator != exchanges.target)
-    by_target = np.flatnonzero(from_target)
-    if not len(by_target):
+    e, partner = exchanges, np.full(len(exchanges), -1, dtype=np.int64)
+    for name in ("tx2", "tx1"):  # a stamp of each clock, in case that one is damaged
+        one, other = _neighbours(e, [getattr(e, name), e.target, e.initiator])
+        theirs = np.where(e.reporter[one] == e.target[one], one, other)
+        mine = one + other - theirs
+        pairs = (e.reporter[mine] == e.initiator[mine]) & (e.reporter[theirs] == e.target[theirs])
+        pairs &= (e.reporter[mine] != e.reporter[theirs]) & (np.abs(e.time_ns[mine] - e.time_ns[theirs]) < APART_NS)
+        partner[theirs[pairs]] = mine[pairs]
+    repeated = partner >= 0
+    if not repeated.any():
         return SingleReports(exchanges, 0, np.empty((0, 2), dtype=np.int64))
-    by_initiator = np.flatnonzero(exchanges.reporter == exchanges.initiator)
-    partner = np.full(len(by_target), -1, dtype=np.int64)
-    for name in ("tx1", "tx2"):  # a stamp of each clock, in case that one is damaged
-        alone = partner < 0
-        partner[alone] = _partners(exchanges, name, by_target[alone], by_initiator)
-    known = partner >= 0
-    first, second = partner[known], by_target[known]
-    differs = np.zeros(len(first), dtype=bool)
-    for name in COMPARED:
-        differs |= _unequal(getattr(exchanges, name), first, second)
-    keep = np.ones(len(exchanges), dtype=bool)
-    keep[second] = False
-    return SingleReports(exchanges[keep], int(known.sum()), np.column_stack([first, second])[differs])
+    first, second = partner[repeated], np.flatnonzero(repeated)
+    differs = np.any([_unequal(getattr(e, name), first, second) for name in COMPARED], axis=0)
+    return SingleReports(e[~repeated], len(second), np.column_stack([first, second])[differs])
 
 
 def repeated_rows(exchanges: Exchanges) -> Bools:
@@ -79,15 +76,18 @@ def repeated_rows(exchanges: Exchanges) -> Bools:
     """
     e = exchanges
     columns = [e.initiator, e.target, e.reporter, *(getattr(e, name) for name in COMPARED)]
-    keys = [np.nan_to_num(column, nan=-1e300) if column.dtype.kind == "f" else column for column in columns]
-    order = np.lexsort((e.time_ns, *reversed(keys)))
-    same = np.ones(max(len(e) - 1, 0), dtype=bool)
-    for key in keys:
-        same &= np.diff(key[order]) == 0
-    same &= ~without_stamps(e)[order][1:] | (np.diff(e.time_ns[order]) < APART_NS)
+    before, row = _neighbours(e, [np.nan_to_num(column, nan=-1e300) for column in columns])
+    same = ~without_stamps(e)[row] | (e.time_ns[row] - e.time_ns[before] < APART_NS)
     again = np.zeros(len(e), dtype=bool)
-    again[order[1:][same]] = True
+    again[row[same]] = True
     return again
+
+
+def _neighbours(e: Exchanges, columns: Sequence[NDArray[Any]]) -> tuple[Ints, Ints]:
+    """Return rows that are equal in some columns, each (k,) with the next in time."""
+    order = np.lexsort((e.time_ns, *columns))
+    same = np.all([np.diff(column[order]) == 0 for column in columns], axis=0)
+    return order[:-1][same], order[1:][same]
 
 
 def single_report_blocks(recording: Tables, rows: int = ROWS_AT_ONCE) -> Iterator[SingleReports]:
@@ -112,33 +112,13 @@ def _unequal(column: Ints, first: Ints, second: Ints) -> Bools:
     return np.asarray((a != b) & ~((a != a) & (b != b)))
 
 
-def _partners(e: Exchanges, name: str, wanted: Ints, among: Ints) -> Ints:
-    """Return for each of the rows `wanted` the row of `among` with its pair and stamp, the nearest in time, else -1."""
-    stamps = getattr(e, name)
-    # Ids and the low 32 bits of the stamp as one number; the time resolves ambiguities of the stamp.
-    key = ((e.initiator.astype(np.uint64) << 16 | e.target.astype(np.uint64)) << 32) | (stamps & 0xFFFFFFFF).astype(
-        np.uint64
-    )
-    order = among[np.argsort(key[among], kind="stable")]
-    low, high = (np.searchsorted(key[order], key[wanted], side=side) for side in ("left", "right"))
-    best = np.full(len(wanted), -1, dtype=np.int64)
-    nearest = np.full(len(wanted), APART_NS, dtype=np.int64)
-    for step in range(int((high - low).max(initial=0))):
-        rows = np.flatnonzero(low + step < high)
-        candidate = order[low[rows] + step]
-        apart = np.abs(e.time_ns[candidate] - e.time_ns[wanted[rows]])
-        nearer = apart < nearest[rows]
-        best[rows[nearer]], nearest[rows[nearer]] = candidate[nearer], apart[nearer]
-    return best
-
-
 @dataclass(frozen=True, slots=True)
 class ClockSkew:
     """Relative rate of the clocks of a pair, the smaller id first, in ppm; positive if the second clock is faster.
 
     `stamps_ppm` is that by the third leg of `count` exchanges, `carrier_ppm` by readings of the carriers, None without
-    any; `slope` is the ratio of the second to the first, `residual_ppm` the scatter of readings about their median.
-    `same_sign` is None if the skew is too small.
+    any; `residual_ppm` is the scatter of readings about their median. `slope`, the ratio of the second to the first,
+    and `same_sign` are None if the skew is too small.
     """
 
     pair: str
@@ -146,25 +126,16 @@ class ClockSkew:
     stamps_ppm: float
     carrier_ppm: float | None
     residual_ppm: float | None
+    slope: float | None
     same_sign: bool | None
-
-    @property
-    def slope(self) -> float | None:
-        """Return the skew by carriers over that by stamps, None if the latter is too small."""
-        if self.carrier_ppm is None or abs(self.stamps_ppm) <= CLEAR_PPM:
-            return None
-        return self.carrier_ppm / self.stamps_ppm
 
     def __str__(self) -> str:
         """Return stamps, carriers, slope, residual and sign in one line."""
-        if self.carrier_ppm is None or self.residual_ppm is None:
-            return f"pair {self.pair}: {self.stamps_ppm:+.2f} ppm by the stamps, carriers not read"
-        slope = "" if self.slope is None else f", slope {self.slope:.3f}"
-        sign = f", {SIGNS[self.same_sign]}" if SIGNS[self.same_sign] else ""
-        return (
-            f"pair {self.pair}: {self.stamps_ppm:+.2f} ppm by the stamps, {self.carrier_ppm:+.2f} by the carriers"
-            f"{slope}, residual {self.residual_ppm:.2f}{sign}"
-        )
+        start = f"pair {self.pair}: {self.stamps_ppm:+.2f} ppm by the stamps"
+        if self.carrier_ppm is None:
+            return f"{start}, carriers not read"
+        slope, sign = ("", "") if self.slope is None else (f", slope {self.slope:.3f}", f", {SIGNS[self.same_sign]}")
+        return f"{start}, {self.carrier_ppm:+.2f} by the carriers{slope}, residual {self.residual_ppm:.2f}{sign}"
 
 
 def target_faster_ppm(exchanges: Exchanges) -> Floats:
@@ -186,21 +157,17 @@ def clock_skews(exchanges: Exchanges | Iterable[Exchanges]) -> list[ClockSkew]:
 
     `exchanges` are all of them, or blocks as from `Recording.exchange_blocks`.
     """
-    pairs, stamps, carriers = [np.empty(0, np.uint32)], [np.empty(0)], [np.empty(0)]
+    found = [np.empty((3, 0))]
     for some in [exchanges] if isinstance(exchanges, Exchanges) else exchanges:
         double = [name for name in names_in(some.protocol) if PROTOCOLS[name].third_sender is not None]
         e = some[np.isin(some.protocol, double) & ((some.tx3 | some.rx3) != 0)]
-        forth = np.where(e.initiator < e.target, 1.0, -1.0)
-        by_stamps = forth * target_faster_ppm(e)
-        good = np.isfinite(by_stamps) & (np.abs(by_stamps) < IMPOSSIBLE_PPM)
-        pair = np.minimum(e.initiator, e.target) << 16 | np.maximum(e.initiator, e.target)
-        pairs.append(pair[good].astype(np.uint32))
-        stamps.append(by_stamps[good])
-        carriers.append((forth * (e.skew1_ppm - e.skew2_ppm) / 2)[good])
-    all_pairs, all_stamps, all_carriers = np.concatenate(pairs), np.concatenate(stamps), np.concatenate(carriers)
-    ids, counts = np.unique(all_pairs, return_counts=True)
-    mine = ((int(one), all_pairs == one) for one in ids[counts >= 5])
-    return [_skew(one, all_stamps[rows], all_carriers[rows]) for one, rows in mine]
+        low, high = np.sort([e.initiator, e.target], axis=0)
+        sign = np.where(e.initiator == low, 1.0, -1.0)
+        readings = sign * target_faster_ppm(e), sign * (e.skew1_ppm - e.skew2_ppm) / 2
+        found.append(np.array([low * 65_536 + high, *readings])[:, np.abs(readings[0]) < IMPOSSIBLE_PPM])
+    pair, by_stamps, by_carriers = np.concatenate(found, axis=1)
+    ids, counts = np.unique(pair, return_counts=True)
+    return [_skew(int(one), by_stamps[pair == one], by_carriers[pair == one]) for one in ids[counts >= 5]]
 
 
 def _skew(pair: int, by_stamps: Floats, by_carriers: Floats) -> ClockSkew:
@@ -208,21 +175,20 @@ def _skew(pair: int, by_stamps: Floats, by_carriers: Floats) -> ClockSkew:
     carrier = float(np.median(known)) if len(known) else None
     # Between 16 and 84 percent lies one standard deviation to either side.
     spread = float(np.ptp(np.percentile(known, (16, 84)))) / 2 if len(known) else None
-    alike = None
-    if carrier is not None and abs(stamps) > CLEAR_PPM:
-        alike = bool(np.sign(stamps) == np.sign(carrier))
-    return ClockSkew(f"{pair >> 16}-{pair & 0xFFFF}", len(by_stamps), stamps, carrier, spread, alike)
+    slope = None if carrier is None or abs(stamps) <= CLEAR_PPM else carrier / stamps
+    sign = None if slope is None else slope > 0
+    return ClockSkew(f"{pair >> 16}-{pair & 0xFFFF}", len(by_stamps), stamps, carrier, spread, slope, sign)
 
 
 def skew_summary(skews: Sequence[ClockSkew]) -> str:
     """Return pairs' skews in one line: how well carriers agree with stamps, and how many pairs have the other sign."""
     slopes = [one.slope for one in skews if one.slope is not None]
-    residuals = [one.residual_ppm for one in skews if one.residual_ppm is not None]
-    if not slopes or not residuals:
+    if not slopes:
         return f"{len(skews)} pairs by the stamps, no carriers to compare with"
+    residual = np.median([one.residual_ppm for one in skews if one.residual_ppm is not None])
     other = sum(one.same_sign is False for one in skews)
     sign = "same sign" if not other else f"OTHER SIGN in {other} of {len(skews)} pairs"
-    return f"carriers over stamps {np.median(slopes):.3f}, residual {np.median(residuals):.2f} ppm, {sign}"
+    return f"carriers over stamps {np.median(slopes):.3f}, residual {residual:.2f} ppm, {sign}"
 
 
 @dataclass(frozen=True, slots=True)

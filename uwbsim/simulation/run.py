@@ -105,11 +105,11 @@ class Simulated:
             recording.append_tags(self.tags)
             recording.append_poses(self.poses)
             recording.append_exchanges(self.exchanges)
-            recording.append_faults(self.faults)
+            recording.append("faults", self.faults)
             for table in ("overheard", "temperature", "imu", "height"):
                 recording.append(table, getattr(self, table))
-            recording.append_cirs(self.cirs)
-            recording.append_frames(frames)
+            recording.append("cirs", self.cirs)
+            recording.append("frames", frames)
 
     def __repr__(self) -> str:
         """Return a few lines: what was simulated, how the raw ranges err, and what failed."""

@@ -23,10 +23,10 @@ def full_recording(path):
         recording.append_tags(flight.tags)
         recording.append_poses(flight.poses)
         recording.append_exchanges(exchanges)
-        recording.append_faults([Fault(5, "1", "time-out", "no answer")])
-        recording.append_frames([FrameRow(7, "1", "in", b"\x00\xff raw"), FrameRow(8, "1", "out", b"C05")])
-        recording.append_cirs([CirRow(9, 1, 1, 2, 741.25, tuple(range(1016)))])
-        recording.append_overheard([{name: float(k) for k, name in enumerate(TABLES["overheard"])}])
+        recording.append("faults", [Fault(5, "1", "time-out", "no answer")])
+        recording.append("frames", [FrameRow(7, "1", "in", b"\x00\xff raw"), FrameRow(8, "1", "out", b"C05")])
+        recording.append("cirs", [CirRow(9, 1, 1, 2, 741.25, tuple(range(1016)))])
+        recording.append("overheard", [{name: float(k) for k, name in enumerate(TABLES["overheard"])}])
         # And not "corrected", which is what is made.
         for table in ("imu", "height", "powers", "temperature", "arrangements", "distances"):
             kinds = {"BIGINT": np.array([11]), "VARCHAR": np.array(["b1"]), "DOUBLE": np.array([0.5])}

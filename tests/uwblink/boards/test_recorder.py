@@ -70,7 +70,7 @@ def test_a_plan_that_seats_other_boards_is_refused_before_anything_is_recorded(t
 @pytest.mark.parametrize("known", ["line 1 1", "plane 1 2", "line 1 b", "line  1"])
 def test_an_order_that_is_none_is_one_line(tmp_path, known):
     with Recording.create(tmp_path / "a.uwb", meta={}) as recording:
-        recording.append_arrangements([Arrangement("A", 0, 1, known)])
+        recording.append("arrangements", [Arrangement("A", 0, 1, known)])
         with pytest.raises(RecordingError, match="known: found"):
             recording.arrangements()
 
@@ -151,7 +151,7 @@ def test_an_unplugged_board_leaves_the_others_running_and_resumes(tmp_path):
     with_3 = exchanges.time_ns[(exchanges.initiator == 3) | (exchanges.target == 3)]
     assert np.any(with_3 > back)
     with Recording.open(path) as recording:
-        heard = recording.overheard()
+        heard = recording.columns("overheard")
         heard = heard["time_ns"][heard["listener"] == 3]
     assert np.any(heard > back), "passive listening was lost with the power and is restored"
 

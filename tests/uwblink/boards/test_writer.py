@@ -118,10 +118,10 @@ def test_a_log_stays_short_and_everything_is_in_the_file(live, monkeypatch):
 def test_whatever_ends_the_writing_is_told_within_a_second(live, monkeypatch, error):
     writer = RecordingWriter(live)
 
-    def failing(_recording, _rows):
+    def failing(_recording, _table, _rows):
         raise error
 
-    monkeypatch.setattr(Recording, "append_frames", failing)
+    monkeypatch.setattr(Recording, "append", failing)
     writer.on_bytes(5, "port", "in", b"x")
     begun = time.monotonic()
     with pytest.raises(RecordingError, match=str(error)):

@@ -28,7 +28,7 @@ def whole(full):  # noqa: F811
         db.execute("DELETE FROM cirs WHERE magnitudes IS NULL")
         db.execute("DELETE FROM faults WHERE board IS NULL")
     with Recording.open(full, update=True) as recording:
-        recording.append_faults([Fault(3, "", 'odd, "quoted"', "two\nlines; nan")])
+        recording.append("faults", [Fault(3, "", 'odd, "quoted"', "two\nlines; nan")])
     return full
 
 

@@ -42,7 +42,7 @@ def made():
 def test_what_is_loaded_and_saved_is_the_same(full, tmp_path):  # noqa: F811
     load(full).save(tmp_path / "again.uwb")
     before, after = rows(full), rows(tmp_path / "again.uwb")
-    for table in set(TABLES) - {"exchanges", "faults", "cirs"}:  # in those the fixture leaves values out
+    for table in set(TABLES) - {"exchanges"}:  # in which the fixture leaves values out
         assert sorted(after[table]) == sorted(before[table]), table
     assert {table: len(found) for table, found in after.items()} == {
         table: len(found) for table, found in before.items()
@@ -110,8 +110,8 @@ def test_it_prints_itself_on_a_screen():
         ({"start_s": 5, "stop_s": 2}, "stop_s: found 2, expected no less than start_s, 5"),
         ({"start_s": float("nan")}, "start_s: found nan, expected seconds"),
         ({"stop_s": 1e30}, r"stop_s: found 1e\+30, expected seconds"),
-        ({"tags": ["a"]}, r"tags: found \['a'\], expected ids of tags"),
-        ({"tags": "12"}, "tags: found '12', expected ids of tags"),
+        ({"tags": ["a"]}, "tags: found 'a' .*, expected whole numbers"),
+        ({"tags": "12"}, "tags: found '1' .*, expected whole numbers"),
         ({"pairs": [(1, 2, 3)]}, "pairs: found .*, expected pairs of initiator and target"),
         ({"pairs": [1, 2]}, "pairs: found .*, expected pairs of initiator and target"),
     ],

@@ -32,7 +32,7 @@ def written(tmp_path_factory):
         r.append_exchanges(random_exchanges())
         r.append_tags([Tag(3, "b", (0.1, 0.2, 0.3)), Tag(1, "a", (0, 0, 0))])
         r.append_poses(Poses(np.array([5, 6]), np.array(["a", "b"]), np.ones((2, 3)), np.zeros((2, 4))))
-        r.append_faults([Fault(9, "1", "time-out", "no answer")])
+        r.append("faults", [Fault(9, "1", "time-out", "no answer")])
     return path
 
 
@@ -186,7 +186,7 @@ def text(e):
         (lambda r: r.append_exchanges(text(random_exchanges())), "table exchanges: values that do not fit"),
         (lambda r: r.append_exchanges(short(random_exchanges())), "table exchanges: columns of different lengths"),
         (lambda r: r.append_tags([Tag(-1, "a", (0, 0, 0))]), "table tags: values that do not fit"),
-        (lambda r: r.append_cirs([CirRow(1, 1, 1, 2, 0.0, (70_000,))]), "table cirs: values that do not fit"),
+        (lambda r: r.append("cirs", [CirRow(1, 1, 1, 2, 0.0, (70_000,))]), "table cirs: values that do not fit"),
         (lambda r: r.append_meta({"bad": float("nan")}), "meta 'bad': cannot be stored as JSON"),
         (lambda r: r.append_meta({"bad": {1, 2}}), "meta 'bad': cannot be stored as JSON"),
     ],

@@ -169,10 +169,14 @@ def test_meta_that_is_no_json(file, value, expected):
     assert len(str(caught.value)) < 300
 
 
-def test_tags_with_nothing_in_them(file):
-    change(file, "INSERT INTO tags VALUES (2, NULL, 0, 0, 0)")
-    with Recording.open(file) as recording, pytest.raises(RecordingError, match="table tags: a row with nothing"):
-        recording.tags()
+@pytest.mark.parametrize(
+    ("table", "row"),
+    [("tags", "2, NULL, 0, 0, 0"), ("cirs", "9, 1, 1, 2, NULL, NULL"), ("faults", "9, NULL, 'power', '', NULL, 3")],
+)
+def test_rows_with_nothing_in_them(file, table, row):
+    change(file, f"INSERT INTO {table} VALUES ({row})")
+    with Recording.open(file) as recording, pytest.raises(RecordingError, match=f"table {table}: a row with nothing"):
+        getattr(recording, table)()
 
 
 @pytest.mark.parametrize("bits", [0, -1, 33, 64, 10**30, True, None, "32", [32], 32.5])

@@ -90,6 +90,6 @@ def test_clocks_of_pairs_are_the_same_from_blocks(written):
 
 def test_a_recording_without_exchanges_has_no_stretches(tmp_path):
     with Recording.create(tmp_path / "empty.uwb") as recording:
-        assert recording.stretches(50) == []
+        assert recording.dividing_times("exchanges", 50) == []
     with Recording.open(tmp_path / "empty.uwb") as recording:
         assert recording.show().span_s == 0.0

@@ -74,7 +74,7 @@ def path(tmp_path):
 def test_each_row_is_in_one_piece_and_later_ones_are_in_later_pieces(path, rows):
     with Recording.open(path) as recording:
         found = list(pieces(recording, rows))
-        tables = {"poses": recording.poses().time_ns, "imu": recording.imu()["time_ns"]}
+        tables = {"poses": recording.poses().time_ns, "imu": recording.columns("imu")["time_ns"]}
         tables |= {"exchanges": np.sort(recording.exchanges().time_ns)}
     assert (len(found) == 1) == (rows > 1000)
     times = [

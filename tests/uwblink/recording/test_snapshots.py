@@ -65,9 +65,9 @@ def test_rows_are_the_same_and_in_their_order(tmp_path):
     with Recording.create(tmp_path / "f.uwb", live=True) as recording:
         for k in range(50):
             with recording.transaction():
-                recording.append_faults([Fault(50 - k, "1", "kind", f"row {k}")])
+                recording.append("faults", [Fault(50 - k, "1", "kind", f"row {k}")])
         recording.snapshot(tmp_path / "s.uwb")
-        recording.append_faults([Fault(99, "1", "kind", "later")])
+        recording.append("faults", [Fault(99, "1", "kind", "later")])
     with Recording.open(tmp_path / "s.uwb") as copy:
         assert {f.detail for f in copy.faults()} == {f"row {k}" for k in range(50)}
         with Recording.open(tmp_path / "f.uwb") as whole:

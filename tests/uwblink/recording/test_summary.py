@@ -17,7 +17,7 @@ def summary(tmp_path):
     with Recording.create(tmp_path / "f.uwb", meta={"note": "[bold]x[/] \x1b[31m", "scenario": "long"}) as r:
         r.append_exchanges(random_exchanges(50))
         r.append_tags([Tag(3, "b", (0.1, 0.2, 0.3))])
-        r.append_faults([Fault(9, "1", "time-out", "no answer"), Fault(10, "1", "time-out", "")])
+        r.append("faults", [Fault(9, "1", "time-out", "no answer"), Fault(10, "1", "time-out", "")])
     with Recording.open(tmp_path / "f.uwb") as r:
         return r.show()
 
@@ -40,7 +40,7 @@ def test_a_summary_fits_on_a_screen_and_cannot_steer_it(tmp_path):
     with Recording.create(tmp_path / "\x1b[2J.uwb") as r:
         r.append_exchanges(random_exchanges(500))
         r.append_tags([Tag(k, "\x1b[31m" + "b" * 200, (0.0, 0.0, 0.0)) for k in range(40)])
-        r.append_faults([Fault(k, "1", f"kind {k}" * 10, "", 1, 2) for k in range(40)])
+        r.append("faults", [Fault(k, "1", f"kind {k}" * 10, "", 1, 2) for k in range(40)])
     with Recording.open(tmp_path / "\x1b[2J.uwb") as r:
         summary = r.show()
     lines = str(summary).splitlines()

@@ -113,7 +113,7 @@ def test_a_profile_from_a_file_and_what_the_recording_tells(tmp_path):
     flight = uwbsim.simulate(tmp_path / "s.toml")
     flight.save(tmp_path / "f.uwb")
     with Recording.open(tmp_path / "f.uwb") as recording:
-        told = recording.temperatures()
+        told = recording.columns("temperature")
         assert "temperature 21" in str(recording.show())
     assert set(told["tag"].tolist()) == {1}
     np.testing.assert_allclose(told["temperature_c"], 20 + 2 * told["time_ns"] * 1e-9, atol=1e-9)

@@ -85,8 +85,8 @@ def test_heights_and_the_recording(tmp_path):
     from uwblink import Recording
 
     with Recording.open(tmp_path / "f.uwb") as recording:
-        assert np.array_equal(recording.imu()["ax"], found.imu["ax"])
-        assert np.array_equal(recording.heights()["height_m"], found.height["height_m"])
+        assert np.array_equal(recording.columns("imu")["ax"], found.imu["ax"])
+        assert np.array_equal(recording.columns("height")["height_m"], found.height["height_m"])
 
 
 def test_no_sensor_no_table():
