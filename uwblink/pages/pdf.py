@@ -1,5 +1,6 @@
-"""A document as PDF on A4: Matplotlib sets text and tables, pypdf inserts the figures, links and the outline.
+"""A document as PDF on A4: Matplotlib sets text and tables, pypdf inserts the figures and the outline.
 
+A document becomes strips, such as a line of text, a row of a table or a figure, which fill one page after the other.
 Lengths are points (1/72 inch) from the upper left corner of a page.
 """
 
@@ -8,8 +9,9 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
@@ -18,17 +20,17 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.textpath import text_to_path
 from pypdf import PdfReader, PdfWriter
-from pypdf.annotations import Link
-from pypdf.generic import NameObject, TextStringObject
 
-from uwblink.pages.blocks import Document, Heading, Listing, Picture, Table, Text
+from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text
 from uwblink.pages.figures import WIDTHS, style
 
 PAPER: Final = (595.28, 841.89)
 """Width and height of A4."""
 
-MARGIN: Final = (PAPER[0] - 72 * WIDTHS["page"]) / 2
-"""Figures of a page's width are printed as large as they are drawn."""
+ROOM: Final = 72 * WIDTHS["page"]
+"""Width of text; figures of a page's width are printed as large as they are drawn."""
+
+MARGIN: Final = (PAPER[0] - ROOM) / 2
 
 SIZE: Final = 9.5
 SMALL: Final = 8.0
@@ -47,182 +49,158 @@ FILLS: Final = {
 """Grounds of paragraphs, as in page.css."""
 
 
+class Words(NamedTuple):
+    """One line of text: its place (`y` below the upper edge of its strip, of the base line), alignment and font."""
+
+    text: str
+    x: float
+    y: float
+    align: str
+    font: FontProperties
+
+
+@dataclass(frozen=True, slots=True)
+class Strip:
+    """A piece of a page as wide as the text, which is not parted.
+
+    It begins a new page where less height than `room` is left; `heads` are then repeated above it. `figure` is the name
+    of a figure that stands on it, `section` the entry of the outline that leads to it.
+    """
+
+    height: float
+    words: tuple[Words, ...] = ()
+    room: float = 0.0
+    heads: tuple[Strip, ...] = ()
+    figure: str = ""
+    section: str = ""
+    fill: str = ""
+    ruled: bool = False
+
+
 def to_pdf(document: Document, figures: Mapping[str, bytes]) -> bytes:
     """Return the document as PDF; `figures` are the PDFs of its figures by name, as wide as the page's text."""
     drawings = {name: PdfReader(io.BytesIO(data)).pages[0] for name, data in figures.items()}
+    pages: list[Figure] = []
+    placed: list[tuple[Strip, int, float]] = []
+    y = PAPER[1]
     with style():
-        pages = _Pages(document, {name: float(page.mediabox.height) for name, page in drawings.items()})
+        for strip in _strips(document, {name: float(page.mediabox.height) for name, page in drawings.items()}):
+            heads: tuple[Strip, ...] = ()
+            if y + max(strip.height, strip.room) > PAPER[1] - 45:
+                pages.append(Figure(figsize=(PAPER[0] / 72, PAPER[1] / 72)))
+                y, heads = MARGIN, strip.heads
+            for one in (*heads, strip):
+                _draw(pages[-1], one, y)
+                y += one.height
+            placed.append((strip, len(pages) - 1, y))
+        for number, page in enumerate(pages, 1):
+            text = Words(f"{number} / {len(pages)}", PAPER[0] / 2, PAPER[1] - 20, "center", _font(SMALL))
+            _draw(page, Strip(0.0, (text,)), 0.0)
         data = io.BytesIO()
         # No date in the file: the same data give the same bytes; the subtitle says when it was made.
         with PdfPages(data, metadata={"Title": document.title, "CreationDate": None}) as file:
-            for figure in pages.pages:
-                file.savefig(figure)
+            for page in pages:
+                file.savefig(page)
     writer = PdfWriter(clone_from=data)
-    for name, on, y in pages.placed:
-        writer.pages[on].merge_translated_page(drawings[name], MARGIN, PAPER[1] - y)
-    for text, begins in pages.sections:
-        writer.add_outline_item(title=text, page_number=begins)
-    for (_, begins), (on, y) in zip(pages.sections, pages.contents, strict=bool(pages.contents)):
-        box = (MARGIN, PAPER[1] - y - 1.45 * SIZE, PAPER[0] - MARGIN, PAPER[1] - y)
-        writer.add_annotation(on, Link(rect=box, target_page_index=begins, border=[0, 0, 0]))
-    writer.root_object[NameObject("/Lang")] = TextStringObject("en")
-    for page in writer.pages:
-        page.compress_content_streams()
+    for strip, on, y in placed:
+        if strip.figure:
+            writer.pages[on].merge_translated_page(drawings[strip.figure], MARGIN, PAPER[1] - y)
+        if strip.section:
+            writer.add_outline_item(title=strip.section, page_number=on)
+    for done in writer.pages:
+        done.compress_content_streams()
     writer.compress_identical_objects()  # each figure brings the same fonts
     data = io.BytesIO()
     writer.write(data)
     return data.getvalue()
 
 
-class _Pages:
-    """The pages of a document with room for figures of given heights, and the places of figures and links.
-
-    `placed` are name, page and lower edge of each figure, `sections` headings with their pages, `contents` page and
-    upper edge of the lines that list them.
-    """
-
-    def __init__(self, document: Document, heights: Mapping[str, float]) -> None:
-        self.pages: list[Figure] = []
-        self.placed: list[tuple[str, int, float]] = []
-        self.sections: list[tuple[str, int]] = []
-        self.contents: list[tuple[int, float]] = []
-        self.y = 0.0
-        self._new_page()
-        self._write(document.title, 18, bold=True)
-        self._write(document.subtitle, SMALL)
-        captions, contents = document.captions(), document.contents()
-        for block, following in zip(document.blocks, [*document.blocks[1:], None], strict=True):
-            match block:
-                case Heading(text):
-                    if not self.sections and len(contents) > 2:
-                        self._list(contents)
-                    # A heading stays with the figure or the short table that follows, or with some lines.
-                    room = heights[following.name] if isinstance(following, Picture) else 70.0
-                    room = max(room, self._whole(following)) if isinstance(following, Table) else room
-                    self._need(min(room + 55, PAPER[1] - 2 * MARGIN - 30))
-                    self.sections.append((text, len(self.pages) - 1))
-                    self.y += 9
-                    self._write(text, 13, bold=True)
-                    self._rule(MARGIN, PAPER[0] - MARGIN)
-                    self.y += 6
-                case Text(_, kind):
-                    large, rest = block.parts()
-                    self._write(large, 13, bold=True, fill=FILLS.get(kind), below=0.0)
-                    self._write(rest, SMALL if kind == "note" else SIZE + 1 if large else SIZE, fill=FILLS.get(kind))
-                    self.y += 4
-                case Listing(text):
-                    self._write(text, SMALL, fill=FILLS["lead"], family="DejaVu Sans Mono")
-                case Picture(name):
-                    self._need(heights[name] + 30)
-                    self.y += heights[name]
-                    self.placed.append((name, len(self.pages) - 1, self.y))
-                    self._write(captions[name], SMALL)
-                    self.y += 4
-                case Table():
-                    for columns, widths in _parts(block):
-                        self._table(block, columns, widths)
-        for (on, y), (_, begins) in zip(self.contents, self.sections, strict=bool(self.contents)):
-            self._text(str(begins + 1), PAPER[0] - MARGIN, y, SIZE, align="right", page=on)
-        for k in range(len(self.pages)):
-            self._text(f"{k + 1} / {len(self.pages)}", PAPER[0] / 2, PAPER[1] - 30, SMALL, align="center", page=k)
-
-    def _new_page(self) -> None:
-        self.pages.append(Figure(figsize=(PAPER[0] / 72, PAPER[1] / 72)))
-        self.y = MARGIN
-
-    def _need(self, height: float) -> bool:
-        """Begin a new page if the height does not fit on this one; returns whether it did."""
-        full = self.y + height > PAPER[1] - 45
-        if full:
-            self._new_page()
-        return full
-
-    def _text(
-        self, text: str, x: float, y: float, size: float, *, align: str = "left", page: int = -1, **font: Any
-    ) -> None:
-        place = (x / PAPER[0], 1 - (y + 1.1 * size) / PAPER[1])
-        self.pages[page].text(*place, text, fontsize=size, ha=align, va="baseline", parse_math=False, **font)
-
-    def _rule(self, left: float, right: float) -> None:
-        height = 1 - self.y / PAPER[1]
-        line = Line2D([left / PAPER[0], right / PAPER[0]], [height, height], color="#000000", lw=0.3)
-        self.pages[-1].add_artist(line)
-
-    def _write(
-        self,
-        text: str,
-        size: float,
-        *,
-        bold: bool = False,
-        fill: str | None = None,
-        family: str = "DejaVu Sans",
-        below: float = 4.0,
-    ) -> None:
-        """Write a paragraph over the width of the page, on a filled ground if `fill` is given."""
-        if not text:
-            return
-        font = FontProperties(family=family, weight="bold" if bold else "normal", size=size)
-        step, edge = 1.45 * size, 6.0 if fill else 0.0
-        for line in _lines(text, PAPER[0] - 2 * MARGIN - 2 * edge, font):
-            self._need(step)
-            if fill:
-                # A little higher than the line, so that no gap shows between two.
-                corner = (MARGIN / PAPER[0], 1 - (self.y + step + 2) / PAPER[1])
-                size_of = (1 - 2 * MARGIN / PAPER[0], (step + 3) / PAPER[1])
-                self.pages[-1].add_artist(Rectangle(corner, *size_of, fc=fill, lw=0, zorder=0))
-            self._text(line, MARGIN + edge, self.y, size, family=family, weight="bold" if bold else "normal")
-            self.y += step
-        self.y += below
-
-    def _list(self, contents: list[str]) -> None:
-        self.y += 6
-        for text in contents:
-            self._need(1.45 * SIZE)
-            self.contents.append((len(self.pages) - 1, self.y))
-            self._text(text, MARGIN, self.y, SIZE)
-            self.y += 1.45 * SIZE
-
-    def _whole(self, table: Table) -> float:
-        """Return the height of a table that is kept on one page: up to half of it, no line broken; 0 of others."""
-        height = (ROW + 2.4) * (len(table.rows) + (2 if table.above else 1))
-        return height if not table.words and height < (PAPER[1] - 2 * MARGIN) / 2 else 0.0
-
-    def _table(self, table: Table, columns: list[int], widths: list[float]) -> None:
-        """Set some columns of a table; its headings are repeated on every page."""
-        over = [name for name, span in table.above for _ in range(span)]
-        edges = [MARGIN + sum(widths[:k]) for k in range(len(widths) + 1)]
-        self._need(self._whole(table))
-
-        def cells_of(texts: list[str], *, bold: bool) -> list[list[str]]:
-            return [_lines(texts[c], w - 4, _font(bold=bold)) for c, w in zip(columns, widths, strict=True)]
-
-        head = cells_of(table.header, bold=True)
-        for k, row in enumerate(table.rows):
-            bold = table.total and k == len(table.rows) - 1
-            cells = cells_of(row, bold=bold)
-            if self._need(ROW * max(map(len, cells)) + 2.4) or k == 0:
-                if over:
-                    for name, group in groupby(range(len(columns)), key=lambda place: over[columns[place]]):
-                        places = list(group)
-                        middle = (edges[places[0]] + edges[places[-1] + 1]) / 2
-                        self._text(name, middle, self.y, SMALL, align="center", weight="bold")
-                    self.y += ROW + 2.4
-                self._row(head, edges, left=table.words, bold=True)
-            self._row(cells, edges, left=table.words, bold=bold)
-        self.y += 8
-
-    def _row(self, cells: list[list[str]], edges: list[float], *, left: bool, bold: bool) -> None:
-        for k, lines in enumerate(cells):
-            align = "left" if left or k == 0 else "right"
-            x = edges[k] + 2 if align == "left" else edges[k + 1] - 2
-            for n, line in enumerate(lines):
-                self._text(line, x, self.y + n * ROW + 1.2, SMALL, align=align, weight="bold" if bold else "normal")
-        self.y += ROW * max(map(len, cells)) + 2.4
-        self._rule(edges[0], edges[-1])
+def _draw(page: Figure, strip: Strip, y: float) -> None:
+    """Draw a strip without its figure below a height."""
+    left, right, lower = MARGIN / PAPER[0], 1 - MARGIN / PAPER[0], 1 - (y + strip.height) / PAPER[1]
+    if strip.fill:
+        # A little higher than the strip, so that no gap shows between two.
+        height = (strip.height + 1) / PAPER[1]
+        page.add_artist(Rectangle((left, lower), right - left, height, fc=strip.fill, lw=0, zorder=0))
+    for words in strip.words:
+        place = (words.x / PAPER[0], 1 - (y + words.y) / PAPER[1])
+        page.text(*place, words.text, font=words.font, ha=words.align, va="baseline", parse_math=False)
+    if strip.ruled:
+        page.add_artist(Line2D([left, right], [lower, lower], color="#000000", lw=0.3))
 
 
-def _font(*, bold: bool) -> FontProperties:
-    return FontProperties(family="DejaVu Sans", weight="bold" if bold else "normal", size=SMALL)
+def _strips(document: Document, heights: Mapping[str, float]) -> list[Strip]:
+    """Return the strips of a document with figures of given heights."""
+    captions = document.captions()
+    parts = [_of_block(block, captions, heights) for block in document.blocks]
+    for k, block in enumerate(document.blocks[:-1]):
+        if isinstance(block, Heading):
+            # A heading stays with the figure or the short table that follows, or with some lines.
+            room = sum(strip.height for strip in parts[k]) + max(70.0, parts[k + 1][0].room)
+            parts[k][0] = replace(parts[k][0], room=room)
+    title = [*_paragraph(document.title, 18, weight="bold"), *_paragraph(document.subtitle, SMALL)]
+    return [*title, *(strip for part in parts for strip in part)]
+
+
+def _of_block(block: Block, captions: Mapping[str, str], heights: Mapping[str, float]) -> list[Strip]:
+    match block:
+        case Heading(text):
+            *lines, gap = _paragraph(text, 13, weight="bold")
+            lines[-1] = replace(lines[-1], ruled=True, section=text)
+            return [Strip(9.0), *lines, gap]
+        case Text(_, kind):
+            large, rest = block.parts()
+            fill = FILLS.get(kind, "")
+            size = SMALL if kind == "note" else SIZE
+            return [*_paragraph(large, 13, fill, weight="bold")[:-1], *_paragraph(rest, size, fill)]
+        case Listing(text):
+            return _paragraph(text, SMALL, FILLS["lead"], family="DejaVu Sans Mono")
+        case Picture(name):
+            return [Strip(heights[name], figure=name, room=heights[name] + 30), *_paragraph(captions[name], SMALL)]
+        case Table():
+            return [strip for columns, widths in _parts(block) for strip in _table(block, columns, widths)]
+
+
+def _paragraph(text: str, size: float, fill: str = "", **font: Any) -> list[Strip]:
+    """Return the lines of a text and the gap below; no lines of an empty text."""
+    set_in, edge = _font(size, **font), 6.0 if fill else 0.0
+    lines = _lines(text, ROOM - 2 * edge, set_in) if text else []
+    strips = [
+        Strip(1.45 * size, (Words(line, MARGIN + edge, 1.1 * size, "left", set_in),), fill=fill) for line in lines
+    ]
+    return [*strips, Strip(8.0)]
+
+
+def _table(table: Table, columns: list[int], widths: list[float]) -> list[Strip]:
+    """Return some columns of a table as strips; a table of up to half a page is not parted."""
+    edges = [MARGIN + sum(widths[:k]) for k in range(len(widths) + 1)]
+
+    def row(texts: list[str], weight: str = "normal") -> Strip:
+        font, words, most = _font(SMALL, weight=weight), [], 1
+        for k, column in enumerate(columns):
+            left = table.words or k == 0
+            x, align = (edges[k] + 2, "left") if left else (edges[k + 1] - 2, "right")
+            lines = _lines(texts[column], widths[k] - 4, font)
+            words += [Words(line, x, n * ROW + 1.1 * SMALL + 1.2, align, font) for n, line in enumerate(lines)]
+            most = max(most, len(lines))
+        return Strip(ROW * most + 2.4, tuple(words), ruled=True)
+
+    over = [name for name, span in table.above for _ in range(span)]
+    above = []
+    for name, group in groupby(range(len(columns)) if over else (), key=lambda place: over[columns[place]]):
+        places = list(group)
+        middle = (edges[places[0]] + edges[places[-1] + 1]) / 2
+        above.append(Words(name, middle, 1.1 * SMALL, "center", _font(SMALL, weight="bold")))
+    heads = (Strip(ROW + 2.4 if above else 0.0, tuple(above)), row(table.header, "bold"))
+    last = len(table.rows) - 1 if table.total else None
+    rows = [replace(row(texts, "bold" if k == last else "normal"), heads=heads) for k, texts in enumerate(table.rows)]
+    whole = sum(strip.height for strip in (*heads, *rows))
+    room = whole if whole < PAPER[1] / 2 else sum(strip.height for strip in (*heads, *rows[:1]))
+    return [replace(heads[0], room=room), heads[1], *rows, Strip(8.0)]
+
+
+def _font(size: float, weight: str = "normal", family: str = "DejaVu Sans") -> FontProperties:
+    return FontProperties(family=family, weight=weight, size=size)
 
 
 def _width(text: str, font: FontProperties) -> float:
@@ -230,21 +208,16 @@ def _width(text: str, font: FontProperties) -> float:
 
 
 def _lines(text: str, width: float, font: FontProperties) -> list[str]:
-    """Break a text into lines of a width: between words, and a word that is longer than a line inside."""
-    if "\n" not in text and _width(text, font) <= width:
-        return [text]
+    """Break a text into lines of a width: between words, and a word that is longer than a line anywhere."""
     found = []
     for paragraph in text.split("\n"):
         line = ""
         for word in re.findall(r"\S+\s*|\s+", paragraph):
-            if line.strip() and _width(line + word.rstrip(), font) > width:
-                found.append(line.rstrip())
-                line = ""
-            while _width(line + word.rstrip(), font) > width and len(word) > 1:
-                fits = next((k for k in range(len(word), 1, -1) if _width(line + word[:k], font) <= width), 1)
-                found.append(line + word[:fits])
-                line, word = "", word[fits:]
-            line += word
+            for piece in [word] if _width(word.rstrip(), font) <= width else word:
+                if line.strip() and _width(line + piece.rstrip(), font) > width:
+                    found.append(line.rstrip())
+                    line = ""
+                line += piece
         found.append(line.rstrip())
     return found
 
@@ -255,23 +228,15 @@ def _parts(table: Table) -> list[tuple[list[int], list[float]]]:
     Where a table of words is wider than the page, its columns above 57 points (20 mm) give way and their lines break.
     Other tables are cut between columns: text stays as large as it is.
     """
-    # Columns are as wide as their widest cells.
-    bold = [table.header, *(table.rows[-1:] if table.total else [])]
-    cells = [(row, _font(bold=strong)) for rows, strong in ((bold, True), (table.rows, False)) for row in rows]
-    widths = [max(_width(row[k], font) for row, font in cells) + 7 for k in range(len(table.header))]
-    room = PAPER[0] - 2 * MARGIN
-    if sum(widths) <= room:
-        return [(list(range(len(widths))), widths)]
-    if table.words or len(widths) < 3:
+    rows = [table.header, *table.rows]
+    widths = [max(_width(row[k], _font(SMALL, "bold")) for row in rows) + 7 for k in range(len(table.header))]
+    if sum(widths) > ROOM and (table.words or len(widths) < 3):
         wide = sum(w for w in widths if w > 57)
-        left = max(room - (sum(widths) - wide), 57.0)
-        return [(list(range(len(widths))), [w * left / wide if w > 57 else w for w in widths])]
-    groups: list[list[int]] = []
-    used = room
+        left = max(ROOM - (sum(widths) - wide), 57.0)
+        widths = [w * left / wide if w > 57 else w for w in widths]
+    parts = [[0]]
     for k in range(1, len(widths)):
-        used += widths[k]
-        if used > room:
-            groups.append([0])
-            used = widths[0] + widths[k]
-        groups[-1].append(k)
-    return [(columns, [widths[k] for k in columns]) for columns in groups]
+        if len(parts[-1]) > 1 and sum(widths[c] for c in parts[-1]) + widths[k] > ROOM + 0.1:
+            parts.append([0])
+        parts[-1].append(k)
+    return [(columns, [widths[k] for k in columns]) for columns in parts]
