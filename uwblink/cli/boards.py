@@ -9,7 +9,7 @@ import statistics
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -100,9 +100,15 @@ def ports(
     """
     from uwblink.boards import boards_ports
 
-    known: dict[str, dict[str, Any]] = {port.device: asdict(port) for port in boards_ports()}
-    unknown = {"description": "", "serial_number": None}
-    rows = [known.get(name, {"device": name, **unknown}) for name in names or known]
+    plugged = {port.device: port for port in boards_ports()}
+    rows: list[dict[str, Any]] = [
+        {
+            "device": name,
+            "description": getattr(plugged.get(name), "description", ""),
+            "serial_number": getattr(plugged.get(name), "serial_number", None),
+        }
+        for name in names or plugged
+    ]
     for row in rows if probe else ():
         try:
             with uwblink.Board.open(str(row["device"])) as board:

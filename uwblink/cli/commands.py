@@ -13,13 +13,11 @@ import uwblink
 from uwblink.cli import boards
 from uwblink.cli.shared import (
     AsJson,
-    Command,
     Force,
     Group,
     LinkDir,
     PlaybackSpeed,
     add,
-    apart,
     choice,
     epilog,
     new_app,
@@ -57,21 +55,16 @@ class ImportGroup(Group):
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the names of the importers, and `guess`."""
-        return [*_importers(), "guess"]
+        return [*_importers(), *super().list_commands(ctx)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a command by its name, None if there is none."""
-        text = "Propose the map of a table."
-        if cmd_name == "guess":
-            run, example = guess, "uwblink import guess ranges.csv -o map.toml"
-        elif cmd_name in _importers():
-            row: Importer = _importers()[cmd_name]
-            source = f"measured{row.suffixes[0]}" if row.suffixes else "folder"
-            run, text, example = _importing(row), row.help, f"uwblink import {row.name} {source} -o measured.uwb"
-        else:
-            return None
+        if cmd_name not in _importers():
+            return super().get_command(ctx, cmd_name)
+        row: Importer = _importers()[cmd_name]
+        source = f"measured{row.suffixes[0]}" if row.suffixes else "folder"
         app = typer.Typer(add_completion=False)
-        app.command(cmd_name, cls=Command, help=plain(text), epilog=epilog(example))(apart(run))
+        add(app, _importing(row), f"uwblink import {row.name} {source} -o measured.uwb", name=cmd_name)
         return typer.main.get_command(app)
 
 
@@ -86,11 +79,6 @@ imports = typer.Typer(
     ),
     no_args_is_help=True,
 )
-
-
-@imports.callback()
-def _imports() -> None:
-    """Do nothing: a group of typer needs a callback."""
 
 
 def guess(
@@ -140,6 +128,7 @@ def _importing(row: Importer) -> Callable[..., None]:
     several = typer.Argument(help=f"{what} Several are one table.")
     one = typer.Argument(help=what)
     command = run if row.map_help else without_map
+    command.__doc__ = plain(row.help)
     command.__annotations__ |= {
         "table": Annotated[Path, one] if row.read_all is None else Annotated[list[Path], several],
         "output": Annotated[Path, output("Recording to write (.uwb).")],
@@ -282,6 +271,7 @@ def replay(
 
 app = new_app("Command ranging boards, record and stream their ranges, and import, export and show recordings.")
 boards.add_to(app)
+add(imports, guess, "uwblink import guess ranges.csv -o map.toml")
 add(app, show, "uwblink show flight.uwb", panel="Recordings")
 app.add_typer(imports, name="import", rich_help_panel="Recordings")
 for _command, *_examples in (

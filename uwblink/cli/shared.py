@@ -18,7 +18,7 @@ from dataclasses import Field, fields, is_dataclass
 from functools import wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
-from threading import Timer
+from traceback import walk_stack
 from types import FrameType
 from typing import Annotated, Any, Final, NoReturn, get_type_hints
 
@@ -394,11 +394,11 @@ def interrupts(*, at_once: bool = False) -> Iterator[Callable[[], bool]]:
             leave(number, frame)
 
     def leave(_number: int, frame: FrameType | None) -> None:
-        if hasattr(signal, "setitimer") and _is_importing(frame):
-            signal.signal(signal.SIGALRM, leave)
-            signal.setitimer(signal.ITIMER_REAL, IMPORT_POLL_S)
-        else:
+        importing = any(one.f_globals.get("__name__") == "importlib._bootstrap" for one, _ in walk_stack(frame))
+        if not importing or not hasattr(signal, "setitimer"):
             raise KeyboardInterrupt
+        signal.signal(signal.SIGALRM, leave)
+        signal.setitimer(signal.ITIMER_REAL, IMPORT_POLL_S)
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -408,15 +408,6 @@ def interrupts(*, at_once: bool = False) -> Iterator[Callable[[], bool]]:
             signal.setitimer(signal.ITIMER_REAL, 0)
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _is_importing(frame: FrameType | None) -> bool:
-    """Return whether a frame was called by Python's import system."""
-    while frame is not None:
-        if frame.f_globals.get("__name__") == "importlib._bootstrap":
-            return True
-        frame = frame.f_back
-    return False
 
 
 @contextmanager
@@ -437,29 +428,26 @@ def _plain_warnings() -> Iterator[None]:
 
 
 @contextmanager
-def waiting(what: str, *, after_s: float = 1.0) -> Iterator[Callable[[str], object]]:
-    """Show on a terminal what the block does, as in "fitting", if it takes longer than `after_s` seconds.
+def waiting(what: str) -> Iterator[Callable[[str | float], None]]:
+    """Show on a terminal what the block does, as in "fitting"; the line is gone after the block, which must not print.
 
-    Nothing is shown elsewhere, and the line is gone after the block, which must not print. Yields a function that
-    replaces the text.
+    Yields a function that takes another text, or the share that is done (0 to 1). Nothing is shown elsewhere.
     """
     if not sys.stderr.isatty():
-        yield lambda _what: None
+        yield lambda _: None
         return
     from rich.console import Console
     from rich.markup import escape
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-    columns = (SpinnerColumn("line"), TextColumn("{task.description}"), TimeElapsedColumn())
-    line = Progress(*columns, console=Console(stderr=True), transient=True)
-    task = line.add_task(escape(what), total=None)
-    begin = Timer(after_s, line.start)
-    begin.daemon = True
-    begin.start()
-    try:
-        yield lambda text: line.update(task, description=escape(text))
-    finally:
-        begin.cancel()
-        begin.join()
-        if line.live.is_started:
-            line.stop()
+    columns = (SpinnerColumn("line"), TextColumn("{task.description}"), TaskProgressColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as line:
+        task = line.add_task(escape(what), total=None)
+
+        def update(found: str | float) -> None:
+            if isinstance(found, str):
+                line.update(task, description=escape(found))
+            else:
+                line.update(task, total=1.0, completed=found)
+
+        yield update

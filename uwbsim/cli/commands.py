@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -28,6 +26,7 @@ from uwblink.cli.shared import (
     interrupts,
     new_app,
     print_json,
+    print_result,
     several,
     starting,
     waiting,
@@ -37,11 +36,7 @@ from uwblink.output import check_folder, check_output
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rich.console import Console
-    from rich.table import Table
-
     from uwblink import RangingProtocol
-    from uwbsim.twins import Compared
 
 
 def shipped(incomplete: str) -> list[str]:
@@ -59,18 +54,6 @@ AllowFiles = Annotated[
     list[Path] | None,
     typer.Option(metavar="DIR", help="Further folder in which files that the scenario names may lie; repeatable."),
 ]
-
-
-@contextmanager
-def progress(name: str, *, eta: bool = False) -> Iterator[Callable[[float], None]]:
-    """Show on a terminal how far work has come, and nothing elsewhere; yields a function of the done fraction."""
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), transient=not eta, disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task(escape(name), total=1.0)
-        yield lambda fraction: bar.update(task, completed=fraction)
 
 
 def _protocols() -> list[str]:
@@ -103,7 +86,7 @@ def run(
     """Simulate a scenario and write what its boards and motion capture record."""
     check_output(output, force=force, recording=True)
     loaded = _programmed(uwbsim.load(scenario, overrides or (), seed, allow_files=allow_files or ()), antenna_delays)
-    with progress(loaded.run.name) as report:
+    with waiting(loaded.run.name) as report:
         simulated = uwbsim.simulate(loaded, report, contention=contention)
     frames: list[Any] = []
     if wire:
@@ -142,17 +125,7 @@ def scenarios(
             typer.echo(path)
         return
     found = listed(names or ())
-    if as_json:
-        print_json(found)
-        return
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table.grid("name", "what it is", padding=(0, 2, 0, 0))
-    for row in found.items():
-        table.add_row(*map(escape, row))
-    Console(highlight=False).print(table)
+    print_result(found, "\n".join(f"{name}\n    {title}" for name, title in found.items()), as_json=as_json)
 
 
 def serve(
@@ -213,10 +186,7 @@ def validate(
 ) -> None:
     """Summarise what a scenario will do, without running it."""
     found = uwbsim.preview(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()))
-    if as_json:
-        print_json(found.to_dict())
-    else:
-        typer.echo(found)
+    print_result(found.to_dict(), str(found), as_json=as_json)
 
 
 def schema() -> None:
@@ -235,18 +205,19 @@ def compare(
     force: Force = False,
 ) -> None:
     """Simulate ranges of every protocol in the same random world, and compare their errors and costs."""
-    from uwbsim.pages import FILES, write_comparison
+    from uwbsim.pages import COLUMNS, FILES, write_comparison
 
     rows = _rows(protocols)
     loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
     check_folder(output, FILES, force=force)
-    with progress(loaded.run.name) as report:
+    with waiting(loaded.run.name) as report:
         found = uwbsim.compare(loaded, rows, count, report)
     write_comparison(found, output, force=force)
     if as_json:
         print_json(found.to_dict())
         return
-    _print_outcomes(found)
+    # On its side, because it has few protocols and many quantities.
+    _print_table([[name.strip(), *map(show, found.outcomes)] for name, show in COLUMNS.items()])
     typer.echo(f"{output / FILES[0]}, {', '.join(FILES[1:])}")
 
 
@@ -257,37 +228,20 @@ def _rows(protocols: str) -> list[RangingProtocol]:
     return chosen(None if protocols == "all" else [name.strip() for name in protocols.split(",") if name.strip()])
 
 
-def _print_outcomes(found: uwbsim.Comparison) -> None:
-    from uwbsim.pages import COLUMNS
-
-    cells = [[show(outcome) for show in COLUMNS.values()] for outcome in found.outcomes]
-    heads = [name.strip().replace(" (", "\n(").replace("95 % of errors", "95 % of\nerrors") for name in COLUMNS]
-    console = _console(140)
-    narrow = console.width < 116  # what all columns of the table take
-    if narrow:
-        # A narrow terminal has no room for all columns: then each protocol is one.
-        heads, *cells = ([name, *row] for name, row in zip(COLUMNS, zip(*cells, strict=True), strict=True))
-    console.print(_table(heads, cells, 1))
-
-
-def _console(width: int) -> Console:
-    """Return a console as wide as the terminal, or of a width elsewhere."""
-    from rich.console import Console
-
-    return Console(width=None if sys.stdout.isatty() else width)
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], gap: int, title: str | None = None) -> Table:
-    """Return a table of texts, the first column left-aligned; cells that are too wide go on in a second line."""
+def _print_table(rows: Sequence[Sequence[str]], title: str | None = None) -> None:
+    """Print a table of texts whose first row has the headings, and whose first column is left-aligned."""
     from rich.box import SIMPLE_HEAD
+    from rich.console import Console
     from rich.table import Table
 
+    console = Console(width=None if sys.stdout.isatty() else 150)
+    gap = 1 if console.width > 80 else 0
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, gap, 0, 0), title=title, title_justify="left")
-    for k, head in enumerate(heads):
+    for k, head in enumerate(rows[0]):
         table.add_column(head, justify="right" if k else "left", overflow="fold")
-    for row in rows:
+    for row in rows[1:]:
         table.add_row(*row)
-    return table
+    console.print(table)
 
 
 def predict(
@@ -354,10 +308,7 @@ def predict(
             whole_ticks=whole_ticks,
         )
     )
-    if as_json:
-        print_json(found.to_dict())
-    else:
-        typer.echo(found)
+    print_result(found.to_dict(), str(found), as_json=as_json)
 
 
 def optimum(
@@ -402,7 +353,7 @@ def sweep(
 ) -> None:
     """Run a scenario many times with varied settings and seeds; an interrupted sweep can be resumed."""
     loaded = uwbsim.load_design(plan, allow_files=allow_files or ())
-    with interrupts() as stop, progress(loaded.name, eta=True) as report:
+    with interrupts() as stop, waiting(loaded.name) as report:
 
         def go_on(share: float) -> None:
             report(share)
@@ -434,7 +385,7 @@ def twin(
     force: Force = False,
 ) -> None:
     """Fit a scenario to a recording, and compare its simulation with the measurements on a page."""
-    from uwbsim.pages import write_twin
+    from uwbsim.pages import TWIN_COLUMNS, write_twin
     from uwbsim.twins import check_name
 
     check_name(output)
@@ -446,7 +397,7 @@ def twin(
     files = found.files(output)
     for path in files:
         check_output(path, force=force)
-    with progress(output.name) as report:
+    with waiting(output.name) as report:
         compared = found.compare(seeds, report)
     found.save(output, force=force)
     write_twin(found, compared, page, force=force)
@@ -454,15 +405,9 @@ def twin(
         rows = [one.to_dict() for one in compared]
         print_json({"found": found.found, "unknown": found.unknown, "compared": rows})
         return
-    _print(compared, _console(150))
+    rows_of_text = [[show(one) for show in TWIN_COLUMNS.values()] for one in compared]
+    _print_table([[*TWIN_COLUMNS], *rows_of_text], "measured / simulated")
     typer.echo(", ".join(map(str, (*files, page))))
-
-
-def _print(compared: Sequence[Compared], console: Console) -> None:
-    from uwbsim.pages import TWIN_COLUMNS
-
-    rows = [[show(one) for show in TWIN_COLUMNS.values()] for one in compared]
-    console.print(_table(list(TWIN_COLUMNS), rows, 1 if console.width > 80 else 0, "measured / simulated"))
 
 
 app = new_app("Simulate tags that range with ultra-wideband radios.")
