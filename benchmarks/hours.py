@@ -164,22 +164,23 @@ class AnsweringPorts:
         return name
 
 
-class TimedBatch(writer.Batch):
-    """A batch that notes how long its commit took, and when it ended."""
+COMMITS: Final[list[tuple[float, float]]] = []
+"""When each commit of the recorder began, and when it ended."""
 
-    __slots__ = ()
-    commits: Final[list[tuple[float, float]]] = []
 
-    def write(self, recording: Recording) -> None:
-        """Append everything in one transaction."""
-        begin = time.monotonic()
-        super().write(recording)
-        self.commits.append((begin, time.monotonic()))
+class TimedWriter(writer.RecordingWriter):
+    """A writer that notes how long its commits took."""
+
+    def _write(self) -> None:
+        begin, rows = time.monotonic(), self.waiting
+        super()._write()
+        if rows:
+            COMMITS.append((begin, time.monotonic()))
 
 
 def recording(hours: float, path: Path) -> None:
     """Record in virtual time; prints a line for each half hour of it. *: by processor time."""
-    writer.Batch = TimedBatch  # type: ignore[misc]
+    writer.RecordingWriter = TimedWriter  # type: ignore[misc]
     ports = AnsweringPorts(a_round=MANY_A_ROUND)
     print("| hour | exchanges | file | memory | commit, median (99 %) | message to row, 99 % | times real time* |")
     print("|---|---|---|---|---|---|---|", flush=True)
@@ -201,8 +202,8 @@ class _Lines:
     def watch(self, progress: Progress) -> None:
         if progress.time_s < self._next_s:
             return
-        commits = np.array(TimedBatch.commits)
-        TimedBatch.commits.clear()
+        commits = np.array(COMMITS)
+        COMMITS.clear()
         taken = np.diff(commits, axis=1)[:, 0]
         # What came right after a batch was taken waits until the next one is committed.
         late = commits[1:, 1] - commits[:-1, 0]
@@ -229,24 +230,25 @@ def growth(path: Path) -> None:
         print(f"| {long.count('exchanges')} | {_commits(long, second)} |", flush=True)
 
 
-def _a_second() -> writer.Batch:
+def _a_second() -> list[writer.Row]:
     """Return what a recorder writes in a second: reports and their bytes."""
-    ports, batch, decoder = AnsweringPorts(), writer.Batch(), Decoder(REPORTS)
+    ports, decoder = AnsweringPorts(), Decoder(REPORTS)
+    rows: list[writer.Row] = []
     for k in range(int(RATE_HZ)):
         board, target = ports.pairs[k % len(ports.pairs)]
         command = encode(RangeCommand(target))
         answer = ports.answer(board, command)
-        batch.frames += [FrameRow(k, str(board), "out", command), FrameRow(k, str(board), "in", answer)]
-        for event in decoder.feed(answer):
-            batch.add(Heard(k, board, event))
-    return batch
+        rows += [FrameRow(k, str(board), "out", command), FrameRow(k, str(board), "in", answer)]
+        rows += [Heard(k, board, event) for event in decoder.feed(answer)]
+    return rows
 
 
-def _commits(recording: Recording, batch: writer.Batch) -> str:
+def _commits(recording: Recording, rows: list[writer.Row]) -> str:
     taken = []
     for _ in range(200):
         begin = time.thread_time()
-        batch.write(recording)
+        with recording.transaction():
+            writer.append_rows(recording, rows)
         taken.append(time.thread_time() - begin)
     return f"{1e3 * np.median(taken):.1f} ms ({1e3 * np.percentile(taken, 99):.1f})"
 

@@ -6,7 +6,7 @@ Replay is of the stored bytes of a recording: decoded again, or played back on p
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sized
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,14 +15,14 @@ from uwblink.boards.listeners import Correction, Heard, Progress, delays_warning
 from uwblink.boards.live_page import LivePage
 from uwblink.boards.ports import Terminal, boards_ports, serial_number, wait_until
 from uwblink.boards.ranging_plan import load_plan
-from uwblink.boards.record import Batch
+from uwblink.boards.record import append_rows
 from uwblink.errors import RecordingError
 from uwblink.output import write_bytes
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import FrameRow
 from uwblink.twr import Exchanges
-from uwblink.wire.codec import ColumnDecoder
-from uwblink.wire.messages import Cir, TextLine
+from uwblink.wire.codec import ColumnDecoder, Event
+from uwblink.wire.messages import Cir, Overheard, TextLine
 
 __all__ = [
     "Correction",
@@ -67,13 +67,16 @@ def plot_cir(cir: Cir, path: Path, *, force: bool = False) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """Decoded bytes: exchanges in order of time, overheard exchanges, impulse responses, and counts."""
+    """Decoded bytes: exchanges and all other messages, both in order of time, and counts."""
 
     exchanges: Exchanges
-    others: Batch
-    texts: int
+    others: list[Heard]
     skipped_bytes: int
     messages: int
+
+    def count(self, kind: type[Event]) -> int:
+        """Return the number of other messages of a kind."""
+        return sum(isinstance(one.message, kind) for one in self.others)
 
 
 def decode_again(recording: Recording) -> Decoded:
@@ -86,17 +89,13 @@ def decode_again(recording: Recording) -> Decoded:
         if name not in decoders:
             decoders[name] = ColumnDecoder(ids.get(name, len(decoders)))
         decoders[name].feed(frame.data, frame.time_ns)
-    heard = []
+    others = []
     for name, decoder in decoders.items():
         decoder.finish(frames[-1].time_ns)
-        heard += [Heard(time_ns, ids.get(name, 0), event) for time_ns, event in decoder.events]
-    others = Batch()
-    for one in sorted(heard, key=lambda one: one.time_ns):
-        others.add(one)
+        others += [Heard(time_ns, ids.get(name, 0), event) for time_ns, event in decoder.events]
     return Decoded(
         Exchanges.concatenate([d.exchanges() for d in decoders.values()]).in_time_order(),
-        others,
-        sum(isinstance(one.message, TextLine) for one in heard),
+        sorted(others, key=lambda one: one.time_ns),
         sum(d.decoder.skipped_bytes for d in decoders.values()),
         sum(d.decoder.messages for d in decoders.values()),
     )
@@ -112,7 +111,7 @@ def rewrite(source: Recording, decoded: Decoded, output: Path, *, force: bool = 
     """Write a copy of a recording with decoded exchanges; raises what `Recording.create` raises."""
     with source.copying(output, without=("exchanges", "overheard", "cirs"), force=force) as written:
         written.append_exchanges(decoded.exchanges)
-        decoded.others.append_to(written)
+        append_rows(written, decoded.others)
 
 
 def play(
@@ -147,13 +146,13 @@ def play(
 
 def summarize(recording: Recording, decoded: Decoded) -> dict[str, Any]:
     """Return the numbers of decoded and of stored rows, for JSON."""
-    totals = {name: getattr(decoded, name) for name in ("messages", "skipped_bytes", "texts")}
-    tables: dict[str, Sized] = {
-        "exchanges": decoded.exchanges,
-        "overheard": decoded.others.overheard,
-        "cirs": decoded.others.cirs,
+    rows = {"exchanges": len(decoded.exchanges), "overheard": decoded.count(Overheard), "cirs": decoded.count(Cir)}
+    return {
+        "messages": decoded.messages,
+        "skipped_bytes": decoded.skipped_bytes,
+        "texts": decoded.count(TextLine),
+        **{table: {"stored": recording.count(table), "decoded": count} for table, count in rows.items()},
     }
-    return totals | {n: {"stored": recording.count(n), "decoded": len(rows)} for n, rows in tables.items()}
 
 
 def _heard(recording: Recording) -> list[FrameRow]:

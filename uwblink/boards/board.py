@@ -187,9 +187,7 @@ class Board(Closing):
         while True:
             until_s = connection.deadline_s() or 0.0
             data = transport.read(max(until_s - transport.now_s(), 0.0))
-            now_s = transport.now_s()
-            events, outcome = connection.receive(data, now_s)
-            outcome = outcome or connection.expire(now_s)
+            events, outcome = connection.receive(data, transport.now_s())
             self._keep(events, outcome.reply if outcome else None)
             if outcome and outcome.error:
                 raise outcome.error

@@ -74,11 +74,9 @@ class Connection:
         self.decoder = Decoder(REPORTS)
         self.doubtful = False
         """Whether a late reply may still come, so that a fence must be sent before the next command."""
-        self.late = 0
-        """Replies that came after their time."""
         self._answer_s = answer_s
         self._pending: _Pending | None = None
-        self._quiet_until_s = self._heard_s = 0.0
+        self._quiet_until_s = 0.0
 
     @property
     def busy(self) -> bool:
@@ -87,9 +85,6 @@ class Connection:
 
     def ready_s(self, now_s: float) -> float:
         """Return how long to wait until the board may be asked again."""
-        if self.decoder.begun == Cir.KEY:  # an impulse response that another command requested
-            # Its pieces come a millisecond apart; after five without one it is incomplete.
-            return max(self._quiet_until_s, self._heard_s + 0.005) - now_s
         return max(self._quiet_until_s - now_s, 0.0)
 
     def keep_quiet(self, until_s: float) -> None:
@@ -110,26 +105,21 @@ class Connection:
         return data
 
     def receive(self, data: bytes, now_s: float) -> tuple[list[Event], CommandOutcome | None]:
-        """Take in bytes; returns everything they hold, and the outcome of the command if it ended."""
-        events = self.decoder.feed(data)
-        self._heard_s = now_s if data else self._heard_s
-        outcome = None
+        """Take in bytes, or none; returns everything they hold, and the outcome of the command if it ended."""
+        events, outcome = self.decoder.feed(data), None
+        # The pieces of an impulse response come a millisecond apart, and a target's report 3 ms after it.
+        if data and (self.decoder.begun == Cir.KEY or any(isinstance(event, Cir) for event in events)):
+            self.keep_quiet(now_s + 0.005)
         if self._pending:
             self._pending.heard = (self._pending.heard + data)[-60:]
         for event in events:
-            if isinstance(event, Cir):
-                self._quiet_until_s = now_s + 0.003  # a target prints its report after its impulse response
             if outcome is None and self._pending is not None:
                 outcome = self._ended_by(self._pending, event, now_s)
-            elif isinstance(event, RangeReport) and event.KEY == b"R05":
-                self.late += 1
+        if self._pending and now_s >= self._pending.until_s:
+            outcome = self._expired(self._pending)
         return events, outcome
 
-    def expire(self, now_s: float) -> CommandOutcome | None:
-        """Return the outcome of a command whose time is over."""
-        pending = self._pending
-        if pending is None or now_s < pending.until_s:
-            return None
+    def _expired(self, pending: _Pending) -> CommandOutcome:
         self._pending, self.doubtful = None, True
         heard = repr(pending.heard)[1:] if pending.heard else "nothing"
         sent = encode(pending.command)
@@ -158,10 +148,9 @@ class Connection:
             return None
         if isinstance(event, RangeReport) and isinstance(command, RangeCommand):
             if event.neighbour != command.target or (command.double_sided and event.tx3 == 0):
-                self.late += 1
-                return None
+                return None  # a late report of another command
             if command.get_cir:
-                self._quiet_until_s = now_s + QUIET_AFTER_CIR_S
+                self.keep_quiet(now_s + QUIET_AFTER_CIR_S)
         self._pending = None
         if isinstance(event, IdleSet):
             self.doubtful = False

@@ -21,7 +21,7 @@ corrects exchanges.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -165,18 +165,11 @@ def as_listeners(listeners: Iterable[Listener | Callable[[Heard], object]]) -> l
 
 @dataclass(slots=True)
 class PairState:
-    """Statistics of a pair; `recent_s` are the times of its last successes since the start."""
+    """Counts of a pair, and the last reports of its exchanges, each with its host time (ns) and initiator."""
 
     tried: int = 0
     good: int = 0
-    range_m: float = float("nan")
-    fpp_dbm: float = float("nan")
-    recent_s: deque[float] = field(default_factory=lambda: deque(maxlen=1000))
-
-    def rate_hz(self, time_s: float) -> float:
-        """Return the successes a second over the last two seconds before `time_s`."""
-        # Of a copy, made at once: a page asks in a thread of its own, while the recorder goes on.
-        return sum(t > time_s - 2.0 for t in [*self.recent_s]) / min(2.0, max(time_s, 0.1))
+    reports: deque[tuple[int, int, RangeReport]] = field(default_factory=lambda: deque(maxlen=1000))
 
 
 @dataclass(slots=True, kw_only=True)
@@ -189,8 +182,8 @@ class Progress(Listener):
     start_ns: int = 0
     time_s: float = 0.0
     pairs: dict[Pair, PairState] = field(default_factory=dict)
-    faults: dict[str, int] = field(default_factory=dict)
-    last_fault: str = ""
+    faults: Counter[str] = field(default_factory=Counter)
+    last_faults: deque[Fault] = field(default_factory=lambda: deque(maxlen=8))
     overheard: int = 0
     cirs: int = 0
     waiting: int = 0
@@ -206,20 +199,22 @@ class Progress(Listener):
         """Exchanges that were begun and ended."""
         return sum(p.tried for p in self.pairs.values())
 
+    @property
+    def last_fault(self) -> str:
+        """Kind and detail of the last fault, "" without one."""
+        return "".join(f"{fault.kind}: {fault.detail}" for fault in [*self.last_faults][-1:])
+
     def rows(self) -> list[tuple[Pair, list[str]]]:
-        """Return each pair's rate (Hz), success, last range (m) and its first-path power (dBm) as texts."""
-        return [
-            (
-                pair,
-                [
-                    f"{state.rate_hz(self.time_s):.1f}",
-                    f"{100 * state.good / state.tried:.0f} %" if state.tried else "",
-                    f"{state.range_m:.3f}" if state.good else "",
-                    f"{state.fpp_dbm:.1f}" if state.good else "",
-                ],
-            )
-            for pair, state in list(self.pairs.items())
-        ]
+        """Return each pair's rate (Hz, over 2 s), success, last range (m) and its first-path power (dBm) as texts."""
+        since_ns, over_s = self.start_ns + (self.time_s - 2.0) * 1e9, min(2.0, max(self.time_s, 0.1))
+        rows = []
+        for pair, state in [*self.pairs.items()]:
+            reports = [*state.reports]  # copied at once: a page asks in a thread of its own, while the recorder goes on
+            rate_hz = sum(time_ns > since_ns for time_ns, *_ in reports) / over_s
+            success = f"{100 * state.good / state.tried:.0f} %" if state.tried else ""
+            last = [(f"{report.range_m:.3f}", f"{report.fpp1_dbm:.1f}") for *_, report in reports[-1:]]
+            rows.append((pair, [f"{rate_hz:.1f}", success, *(last or [("", "")])[0]]))
+        return rows
 
     def __str__(self) -> str:
         """Return the counts as one line."""
@@ -244,13 +239,12 @@ class Progress(Listener):
         state.tried += 1
         if turn.report is not None:
             state.good += 1
-            state.range_m, state.fpp_dbm = turn.report.range_m, turn.report.fpp1_dbm
-            state.recent_s.append((turn.time_ns - self.start_ns) * 1e-9)
+            state.reports.append((turn.time_ns, turn.pair[0], turn.report))
 
     def on_fault(self, fault: Fault) -> None:
         """Count a fault."""
-        self.faults[fault.kind] = self.faults.get(fault.kind, 0) + 1
-        self.last_fault = f"{fault.kind}: {fault.detail}"
+        self.faults[fault.kind] += 1
+        self.last_faults.append(fault)
 
 
 class WrongDelayError(PlanError):

@@ -13,19 +13,18 @@ import math
 import shutil
 import sys
 import threading
-from collections import deque
 from collections.abc import Mapping, Sequence
 from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
-from uwblink.boards.listeners import Correction, Listener, Pair, Progress, Turn, check_pairs
+from uwblink.boards.listeners import Correction, Listener, Pair, Progress, check_pairs
 from uwblink.closing import Closing
+from uwblink.database import log_of
 from uwblink.errors import PortError
 from uwblink.pages.blocks import CSS
-from uwblink.recording.schema import Fault
 from uwblink.wire.codec import exchanges_of
 
 IDLE_S: Final = 10.0
@@ -43,14 +42,6 @@ m.querySelector('p').textContent='This recording has ended; below is the last th
 """
 
 
-class Point(NamedTuple):
-    """A range of a pair: host time (ns), range and corrected range (m), the latter NaN without a calibration."""
-
-    time_ns: int
-    range_m: float
-    corrected_m: float
-
-
 class LivePage(Closing, Listener):
     """A page that shows the progress of a recording. A context manager: leaving it ends the server."""
 
@@ -60,9 +51,6 @@ class LivePage(Closing, Listener):
         With `correct` each range is shown corrected, too.
         """
         self._path, self._correct = path, correct
-        self._lock = threading.Lock()
-        self._series: dict[Pair, deque[Point]] = {}
-        self._faults: deque[Fault] = deque(maxlen=8)
         self._progress = Progress()
         try:
             self._server = _Server(("127.0.0.1", port), type("Handler", (_Handler,), {"page": self}))
@@ -79,25 +67,8 @@ class LivePage(Closing, Listener):
         """Raise the error of the correction if it cannot correct ranges of a pair."""
         check_pairs(self._correct, pairs)
 
-    def on_turn(self, turn: Turn) -> None:
-        """Keep the range of a turn."""
-        if turn.report is None:
-            return
-        corrected_m = math.nan
-        if self._correct:
-            known = self._correct(exchanges_of([(turn.time_ns, turn.pair[0], turn.report)]))
-            corrected_m = float(known["corrected_m"][0])
-        point = Point(turn.time_ns, turn.report.range_m, corrected_m)
-        with self._lock:
-            self._series.setdefault(turn.pair, deque(maxlen=600)).append(point)
-
-    def on_fault(self, fault: Fault) -> None:
-        """Keep a fault."""
-        with self._lock:
-            self._faults.append(fault)
-
     def watch(self, progress: Progress) -> None:
-        """Show the counts of a recorder."""
+        """Show this progress from now on."""
         self._progress = progress
 
     def close(self) -> None:
@@ -119,24 +90,42 @@ class LivePage(Closing, Listener):
 
     def body(self) -> str:
         """Return the part that changes: name, counts, pairs, faults, disk. The next recorder may have the same port."""
-        with self._lock:
-            series = {pair: list(points) for pair, points in self._series.items()}
-            faults = list(reversed(self._faults))
         progress = self._progress
+        faults = reversed([*progress.last_faults])
         items = "".join(f"<li>board {escape(f.board)}: {escape(f.kind)}: {escape(f.detail)}</li>" for f in faults)
         parts = (
             f"<h1>recording {escape(self._path.name)}</h1>",
             f"<p>{escape(str(progress))}</p>",
-            _table(progress, series, corrected=self._correct is not None),
+            self._table(progress),
             f"<ul>{items}</ul>" if items else "",
             self._disk(),
         )
         return "".join(parts)
 
+    def _table(self, progress: Progress) -> str:
+        """Return a table with one row for each pair; pairs without ranges for two seconds are highlighted."""
+        kinds = ("range", "corrected") if self._correct else ("range",)
+        drawn = ", ".join(f"<b class='{kind}'>{kind}</b>" for kind in kinds)
+        names = ("pair", "rate (Hz)", "success", "FPP (dBm)", *(f"{k} (m)" for k in kinds), f"last minute: {drawn}")
+        rows = ""
+        for pair, (rate, success, _, power) in progress.rows():
+            shown = [*progress.pairs[pair].reports]
+            shown = [one for one in shown if shown[-1][0] - one[0] <= 60e9]
+            series = {"range": [report.range_m for *_, report in shown]}
+            if self._correct and shown:
+                series["corrected"] = self._correct(exchanges_of(shown))["corrected_m"].tolist()
+            last = (f"{series[k][-1]:.3f}" if shown else "" for k in kinds)
+            image = picture([time_ns for time_ns, *_ in shown], series)
+            cells = (f"{pair[0]}&nbsp;&rarr;&nbsp;{pair[1]}", rate, success, power, *last, image)
+            silent = " class='silent'" if success and rate == "0.0" else ""
+            rows += f"<tr{silent}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+        head = "".join(f"<th>{name}</th>" for name in names)
+        return f"<div class='wide live'><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>"
+
     def _disk(self) -> str:
         """Return the size of the file, the free space, and the number of rows that wait to be written."""
         try:
-            size = sum(p.stat().st_size for p in (self._path, Path(f"{self._path}.wal")) if p.exists())
+            size = sum(p.stat().st_size for p in (self._path, log_of(self._path)) if p.exists())
             free = shutil.disk_usage(self._path.parent).free
         except OSError:
             return ""
@@ -144,7 +133,7 @@ class LivePage(Closing, Listener):
         behind = ' class="bad"' if progress.behind_s > 1 else ""
         return (
             f"<p{behind}>file {size / 2**20:.1f} MB, disk {free / 2**30:.1f} GB free; "
-            f"queue: {progress.waiting} pieces, last commit {progress.behind_s:.1f} s ago</p>"
+            f"queue: {progress.waiting} rows, last commit {progress.behind_s:.1f} s ago</p>"
         )
 
 
@@ -193,43 +182,21 @@ class _Server(ThreadingHTTPServer):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 
 
-def _table(progress: Progress, series: Mapping[Pair, Sequence[Point]], *, corrected: bool) -> str:
-    """Return a table with one row for each pair; pairs without ranges for two seconds are highlighted."""
-    names = ["pair", "rate (Hz)", "success", "range (m)", *(["corrected (m)"] if corrected else []), "FPP (dBm)"]
-    head = "".join(f"<th>{name}</th>" for name in names)
-    drawn = "<b class='range'>range</b>" + (", <b class='corrected'>corrected</b>" if corrected else "")
-    rows = ""
-    for pair, cells in progress.rows():
-        points = series.get(pair, ())
-        corrected_m = f"{points[-1].corrected_m:.3f}" if points and math.isfinite(points[-1].corrected_m) else ""
-        cells[3:3] = [corrected_m] if corrected else []
-        cells = [f"{pair[0]}&nbsp;&rarr;&nbsp;{pair[1]}", *cells, picture(points)]
-        state = progress.pairs[pair]
-        silent = " class='silent'" if state.tried and state.rate_hz(progress.time_s) == 0 else ""
-        rows += f"<tr{silent}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
-    return (
-        f"<div class='wide live'><table><thead><tr>{head}<th>last minute: {drawn}</th></tr></thead>"
-        f"<tbody>{rows}</tbody></table></div>"
-    )
-
-
-def picture(points: Sequence[Point]) -> str:
-    """Draw range and corrected range over the last minute as SVG; the scale is that of the ranges shown."""
-    if len(points) < 2:
+def picture(time_ns: Sequence[int], series: Mapping[str, Sequence[float]]) -> str:
+    """Draw series of ranges over time as SVG; the scale is that of the ranges."""
+    if len(time_ns) < 2:
         return ""
-    shown = [p for p in points if points[-1].time_ns - p.time_ns <= 60e9]
-    values = [v for p in shown for v in (p.range_m, p.corrected_m) if math.isfinite(v)]
-    low, high, began = min(values), max(values), shown[0].time_ns
-    lasted_ns, spread_m = max(shown[-1].time_ns - began, 1), max(high - low, 1e-3)
+    known = [value for values in series.values() for value in values if math.isfinite(value)]
+    low, high, first, last = min(known), max(known), time_ns[0], time_ns[-1]
+    across, up = (WIDTH - 2 * MARGIN) / max(last - first, 1), (HEIGHT - 2 * MARGIN) / max(high - low, 1e-3)
     lines = ""
-    for kind in ("range", "corrected"):
-        places = [
-            f"{MARGIN + (WIDTH - 2 * MARGIN) * (p.time_ns - began) / lasted_ns:.1f},"
-            f"{HEIGHT - MARGIN - (HEIGHT - 2 * MARGIN) * (value - low) / spread_m:.1f}"
-            for p in shown
-            if math.isfinite(value := p.range_m if kind == "range" else p.corrected_m)
-        ]
-        lines += f'<polyline class="{kind}" points="{" ".join(places)}"/>' if places else ""
+    for kind, values in series.items():
+        points = " ".join(
+            f"{MARGIN + across * (t - first):.1f},{HEIGHT - MARGIN - up * (value - low):.1f}"
+            for t, value in zip(time_ns, values, strict=True)
+            if math.isfinite(value)
+        )
+        lines += f'<polyline class="{kind}" points="{points}"/>'
     label = f"range from {low:.3f} to {high:.3f} m"
     return (
         f'<svg role="img" aria-label="{label}" viewBox="0 0 {WIDTH} {HEIGHT}" preserveAspectRatio="none">'

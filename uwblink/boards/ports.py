@@ -12,13 +12,13 @@ import os
 import select
 import selectors
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import serial
 from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 
 from uwblink.errors import PortBusyError, PortError, PortLostError, PortMissingError, PortPermissionError
 
@@ -27,6 +27,10 @@ try:
     import tty
 except ImportError:  # pragma: no cover - Windows has no pseudo-terminals
     pty = None  # type: ignore[assignment]
+
+
+POLL_S: Final = 0.002
+"""How long a port without a descriptor is waited for before others are asked; an exchange takes 4 ms."""
 
 
 class Transport(Protocol):
@@ -69,22 +73,10 @@ class Ports(Protocol):
         """Return the present name of a port by its USB serial number `number`, None while it is unplugged."""
 
 
-@dataclass(frozen=True, slots=True)
-class PortInfo:
-    """A serial device of this computer that has the boards' USB identity."""
-
-    device: str
-    description: str
-    serial_number: str | None
-
-
-def boards_ports() -> list[PortInfo]:
+def boards_ports() -> list[ListPortInfo]:
     """Return the serial devices with the boards' USB identity, without opening any."""
-    return [
-        PortInfo(p.device, p.description or "", p.serial_number)
-        for p in sorted(list_ports.comports())
-        if (p.vid, p.pid) == (0x0483, 0x5740)  # "STM32 Virtual ComPort" (firmware wire format, 1.1)
-    ]
+    # "STM32 Virtual ComPort" (firmware wire format, 1.1)
+    return [port for port in sorted(list_ports.comports()) if (port.vid, port.pid) == (0x0483, 0x5740)]
 
 
 def serial_number(device: str) -> str | None:
@@ -104,37 +96,22 @@ class SerialPort:
             self.fileno: int | None = self._serial.fileno()
         except (OSError, AttributeError, NotImplementedError):
             self.fileno = None  # rfc2217 has no descriptor to wait on
-        if self.fileno is not None:
-            os.set_blocking(self.fileno, False)
+            self._serial.timeout = POLL_S
 
     def read(self, timeout_s: float) -> bytes:
-        """Return received bytes as soon as there are any; empty after the time-out. Raises `PortLostError`."""
-        if self.fileno is None:
-            return self._read_pyserial(timeout_s)
-        if not select.select([self.fileno], [], [], max(timeout_s, 0.0))[0]:
+        """Return received bytes as soon as there are any; raises `PortLostError`.
+
+        Empty after the time-out, and after `POLL_S` where a port has no descriptor.
+        """
+        if self.fileno is not None and not select.select([self.fileno], [], [], max(timeout_s, 0.0))[0]:
             return b""
-        try:
-            data = os.read(self.fileno, 65_536)
-        except BlockingIOError:
-            return b""
-        except OSError as error:
-            raise self._lost(error) from error
-        if not data:  # readable and yet empty: the other end has hung up
-            raise self._lost(OSError(errno.ENODEV, "unplugged"))
-        return data
+        with self._reporting_loss():
+            return bytes(self._serial.read(65_536))
 
     def write(self, data: bytes) -> None:
         """Send bytes in one write; raises `PortLostError`."""
-        try:
-            if self.fileno is None:
-                self._serial.write(data)
-                return
-            sent = os.write(self.fileno, data)
-            while sent < len(data):  # a full buffer: what is left must still follow
-                select.select([], [self.fileno], [], 1.0)
-                sent += os.write(self.fileno, data[sent:])
-        except (OSError, serial.SerialException) as error:
-            raise self._lost(error) from error
+        with self._reporting_loss():
+            self._serial.write(data)
 
     def now_s(self) -> float:
         """Return the monotonic clock in seconds."""
@@ -145,17 +122,12 @@ class SerialPort:
         with contextlib.suppress(OSError, serial.SerialException, TypeError):
             self._serial.close()
 
-    def _read_pyserial(self, timeout_s: float) -> bytes:
+    @contextlib.contextmanager
+    def _reporting_loss(self) -> Iterator[None]:
         try:
-            self._serial.timeout = timeout_s
-            first: bytes = self._serial.read(1)
-            return first + self._serial.read(self._serial.in_waiting) if first else first
-        except (OSError, serial.SerialException) as error:
-            raise self._lost(error) from error
-
-    def _lost(self, error: Exception) -> PortLostError:
-        reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
-        return PortLostError(f"{self.name}: the port is gone ({reason}); plug the board in again")
+            yield
+        except (OSError, serial.SerialException, TypeError) as error:  # TypeError: another thread closed the port
+            raise PortLostError(f"{self.name}: the port is gone ({error}); plug the board in again") from error
 
 
 def _since_boot_ns() -> int:
@@ -193,7 +165,7 @@ class SerialPorts:
     def wait(self, timeout_s: float) -> Sequence[SerialPort]:
         """Return ports at which bytes may be waiting; those without a descriptor must be asked again and again."""
         if self._pyserial:
-            timeout_s = min(timeout_s, 0.002)
+            timeout_s = min(timeout_s, POLL_S)
         return [key.data for key, _ in self._selector.select(max(timeout_s, 0.0))] + self._pyserial
 
     def now_s(self) -> float:
@@ -213,7 +185,8 @@ class SerialPorts:
 
 def _opened(name: str) -> Any:
     try:
-        port = serial.serial_for_url(name, do_not_open=True, timeout=0, baudrate=19_200)  # the boards ignore the rate
+        port = serial.serial_for_url(name, do_not_open=True, baudrate=19_200)  # the boards ignore the rate
+        port.timeout, port.write_timeout = 0, 1.0
         if "://" not in name:
             port.exclusive = True
         port.open()
@@ -255,10 +228,8 @@ def _explained(name: str, error: Exception) -> PortError:
 def _group(name: str) -> str:
     """The group that owns a device, "dialout" where that cannot be found out."""
     try:
-        import grp
-
-        return grp.getgrgid(os.stat(name).st_gid).gr_name
-    except (OSError, KeyError, ImportError):
+        return Path(name).group()
+    except (OSError, KeyError, NotImplementedError):
         return "dialout"
 
 

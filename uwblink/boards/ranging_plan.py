@@ -25,7 +25,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from itertools import combinations
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from uwblink.errors import PlanError
 from uwblink.protocols.table import ON_BOARDS
@@ -77,13 +77,16 @@ class RangingPlan:
 
     def __post_init__(self) -> None:
         """Check what was given."""
-        if self.rate_hz is not None and not (is_number(self.rate_hz) and self.rate_hz > 0):
-            raise PlanError(f"rate_hz: found {self.rate_hz!r}, expected a positive number")
-        if self.protocol not in ON_BOARDS:
-            raise PlanError(f"protocol: found {self.protocol!r}, allowed: {', '.join(ON_BOARDS)}")
-        for pair in () if self.pairs == "all" else self.pairs:
-            if not (isinstance(pair, tuple) and len(pair) == 2 and all(map(is_board_id, pair)) and pair[0] != pair[1]):
-                raise PlanError(f'pairs: found {pair!r:.60}, expected "all" or pairs of two different ids')
+        pairs, rate_hz = self.pairs, self.rate_hz
+        for name, good, expected in (
+            ("pairs", pairs == "all" or all(map(_is_pair, pairs)), '"all" or pairs of two different ids'),
+            ("rate_hz", rate_hz is None or (is_number(rate_hz) and rate_hz > 0), "a positive number"),
+            ("protocol", self.protocol in ON_BOARDS, " or ".join(ON_BOARDS)),
+            ("target_reports", isinstance(self.target_reports, bool), "true or false"),
+            ("get_cir", isinstance(self.get_cir, bool), "true or false"),
+        ):
+            if not good:
+                raise PlanError(f"{name}: found {getattr(self, name)!r:.60}, expected {expected}")
 
     def delays(self) -> AntennaDelays:
         """Return the programmed antenna delays; by default the 16436 ticks of the firmware for all boards."""
@@ -125,24 +128,20 @@ def load_plan(path: Path) -> RangingPlan:
     file = TomlReader(path, PlanError)
     table = file.table
     file.known(table, (name.removesuffix("[]") for name in heads(FILE_KEYS)))
-    flags = {name: table.get(name, False) for name in ("target_reports", "get_cir")}
-    for name, value in flags.items():
-        file.check(name, value, isinstance(value, bool), "true or false")
+    given = {name: value for name, value in table.items() if name not in ("tags", "antenna_delays")}
     pairs = table.get("pairs", "all")
     listed = isinstance(pairs, list) and pairs and all(isinstance(pair, list) for pair in pairs)
     file.check("pairs", pairs, pairs == "all" or bool(listed), '"all" or [[initiator, target], ...] of ids')
+    given["pairs"] = tuple(map(tuple, pairs)) if listed else "all"
     tags, delays = read_tags(file), read_antenna_delays(file)
     try:
-        return RangingPlan(
-            tuple(map(tuple, pairs)) if listed else "all",
-            rate_hz=table.get("rate_hz"),
-            protocol=table.get("protocol", "ds"),
-            tags=tags,
-            antenna_delays=delays,
-            **flags,
-        )
+        return RangingPlan(**given, tags=tags, antenna_delays=delays)
     except PlanError as error:
         raise PlanError(f"{path}: {error}") from error
+
+
+def _is_pair(pair: Any) -> bool:
+    return isinstance(pair, tuple) and len(pair) == 2 and all(map(is_board_id, pair)) and pair[0] != pair[1]
 
 
 def _listed(tags: Iterable[int]) -> str:

@@ -1,8 +1,4 @@
-"""Recording from boards into a file: identification of boards, metadata, and the thread that writes the file.
-
-The recorder's loop collects messages and a separate thread commits them every `FLUSH_S` seconds, so that a slow disk
-does not make the loop miss bytes.
-"""
+"""Recording from boards into a file: identification of boards, metadata, and the thread that writes the file."""
 
 from __future__ import annotations
 
@@ -10,9 +6,11 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, Final
 
 import numpy as np
@@ -31,7 +29,7 @@ from uwblink.recording.file import Recording, SnapshotMaker
 from uwblink.recording.schema import SHAPES, Arrangement, CirRow, Fault, FrameRow, Tag
 from uwblink.twr import Exchanges
 from uwblink.wire.codec import exchanges_of
-from uwblink.wire.messages import Cir, Overheard, RangeReport
+from uwblink.wire.messages import Cir, Message, Overheard, RangeReport
 
 FILE_MB: Final = 64
 """Memory limit for the file; by default DuckDB would cache all of it."""
@@ -181,97 +179,65 @@ def identify(names: Iterable[str], ports: Ports | None = None) -> dict[int, str]
     return found
 
 
-@dataclass(slots=True)
-class Batch:
-    """Rows that wait to be written, in the order in which they came."""
+Row = FrameRow | Fault | Heard
+"""What a recording stores of what its boards send."""
 
-    frames: list[FrameRow] = field(default_factory=list)
-    exchanges: list[tuple[int, int, RangeReport]] = field(default_factory=list)
-    overheard: list[tuple[int, int, Overheard]] = field(default_factory=list)
-    cirs: list[tuple[int, int, Cir]] = field(default_factory=list)
-    faults: list[Fault] = field(default_factory=list)
 
-    def __bool__(self) -> bool:
-        """Whether there is anything to write."""
-        return bool(self.frames or self.exchanges or self.overheard or self.cirs or self.faults)
+def append_rows(recording: Recording, rows: Sequence[Row]) -> None:
+    """Append rows to their tables; raises `RecordingError`.
 
-    def add(self, heard: Heard) -> None:
-        """Add a message to the list of its table; other messages are stored as bytes only."""
-        row = heard.time_ns, heard.board
-        if isinstance(heard.message, RangeReport):
-            self.exchanges.append((*row, heard.message))
-        elif isinstance(heard.message, Overheard):
-            self.overheard.append((*row, heard.message))
-        elif isinstance(heard.message, Cir):
-            self.cirs.append((*row, heard.message))
+    Messages other than reports of exchanges, overheard exchanges and impulse responses are stored as bytes only.
+    """
 
-    def write(self, recording: Recording) -> None:
-        """Append everything in one transaction; raises `RecordingError`."""
-        with recording.transaction():
-            self.append_to(recording)
+    def heard(kind: type[Message]) -> list[tuple[int, int, Any]]:
+        found = (row for row in rows if isinstance(row, Heard))
+        return [(one.time_ns, one.board, one.message) for one in found if isinstance(one.message, kind)]
 
-    def append_to(self, recording: Recording) -> None:
-        """Append everything; raises `RecordingError`."""
-        recording.append("frames", self.frames)
-        if self.exchanges:
-            recording.append_exchanges(exchanges_of(self.exchanges))
-        recording.append("overheard", [overheard_row(*row) for row in self.overheard])
-        cirs = [CirRow(t, b, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes) for t, b, c in self.cirs]
-        recording.append("cirs", cirs)
-        recording.append("faults", self.faults)
+    recording.append("frames", [row for row in rows if isinstance(row, FrameRow)])
+    recording.append("faults", [row for row in rows if isinstance(row, Fault)])
+    if ranges := heard(RangeReport):
+        recording.append_exchanges(exchanges_of(ranges))
+    recording.append("overheard", [overheard_row(*row) for row in heard(Overheard)])
+    cirs = [(t, board, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes) for t, board, c in heard(Cir)]
+    recording.append("cirs", [CirRow(*row) for row in cirs])
 
 
 class RecordingWriter(Closing, Listener):
-    """A listener that writes a live recording. A context manager: leaving it writes what is left."""
+    """A listener that writes a live recording. A context manager: leaving it writes what is left.
+
+    A thread commits every `FLUSH_S` seconds, so that a slow disk does not make the recorder miss bytes. `behind_s` is
+    the time since the last commit, without the time for which this process was stopped.
+    """
 
     def __init__(self, recording: Recording) -> None:
         """Start writing; raises `RecordingError` if rows cannot be read back as they were written."""
         check_writing(recording)
         self._recording = recording
-        self._batch = Batch()
-        self._lock = threading.Lock()
+        self._rows: SimpleQueue[Row] = SimpleQueue()
         self._ended = threading.Event()
-        self._written_s = self._checked_s = time.monotonic()
-        self._stopped_s = 0.0
-        self._file = _identity(recording.path)
+        self.behind_s, self._checked_s = 0.0, time.monotonic()
+        self._file = recording.path.stat()
         self._error: RecordingError | None = None
         self._snapshots = SnapshotMaker(recording.path, recording.snapshot)
-        self._shortening: threading.Thread | None = None
         self._thread = threading.Thread(target=self._work, name="uwblink writer", daemon=True)
         self._thread.start()
 
-    def __exit__(self, *error: object) -> None:
-        """Write the rest; raises what `check` raises, unless the block raised already."""
-        try:
-            self.close()
-        except RecordingError:
-            if error[0] is None:
-                raise
-
     def on_bytes(self, time_ns: int, port: str, direction: str, data: bytes) -> None:
         """Keep bytes."""
-        with self._lock:
-            self._batch.frames.append(FrameRow(time_ns, port, direction, data))
+        self._rows.put(FrameRow(time_ns, port, direction, data))
 
     def on_message(self, heard: Heard) -> None:
-        """Keep a message in the table of its kind."""
-        with self._lock:
-            self._batch.add(heard)
+        """Keep a message."""
+        self._rows.put(heard)
 
     def on_fault(self, fault: Fault) -> None:
         """Keep a fault."""
-        with self._lock:
-            self._batch.faults.append(fault)
+        self._rows.put(fault)
 
     @property
     def waiting(self) -> int:
-        """Number of pieces of bytes that wait to be written."""
-        return len(self._batch.frames)
-
-    @property
-    def behind_s(self) -> float:
-        """Time since the last commit in seconds, without the time for which this process was stopped."""
-        return time.monotonic() - self._written_s - self._stopped_s
+        """Number of rows that wait to be written."""
+        return self._rows.qsize()
 
     def check(self) -> None:
         """Raise `RecordingError` when nothing can be written any more, or the disk cannot keep up."""
@@ -279,8 +245,7 @@ class RecordingWriter(Closing, Listener):
             raise self._error
         now_s = time.monotonic()
         # If the loop did not check for two seconds, the process was stopped (Ctrl-Z, a suspended computer).
-        if now_s - self._checked_s > 2.0:
-            self._stopped_s += now_s - self._checked_s
+        self.behind_s += min(now_s - self._checked_s, 2.0)
         self._checked_s = now_s
         if self.behind_s > LONGEST_BACKLOG_S:
             raise RecordingError(
@@ -295,61 +260,40 @@ class RecordingWriter(Closing, Listener):
         self.check()
 
     def _work(self) -> None:
-        last = False
-        while not last and not self._error:
-            last = self._ended.wait(FLUSH_S)
-            with self._lock:
-                batch, self._batch = self._batch, Batch()
-            try:
-                if batch:
-                    batch.write(self._recording)
-                self._check_file()
-            except RecordingError as error:
-                self._error = error
-            except Exception as error:  # it would end the thread unnoticed
-                self._error = RecordingError(
-                    f"{self._recording.path}: cannot be written any more ({type(error).__name__}: {error}). "
-                    "What was written before is kept"
-                )
-            self._written_s, self._stopped_s = time.monotonic(), 0.0
-            if not self._error:
-                self._snapshots.look()
-                self._shorten_log()
-        self._snapshots.close()
-        if self._shortening:
-            self._shortening.join()
-
-    def _shorten_log(self) -> None:
-        """Checkpoint a long log in another thread, while this one continues to commit."""
-        if self._shortening and self._shortening.is_alive():
-            return
-        try:
-            long = log_of(self._recording.path).stat().st_size > LONG_LOG
-        except OSError:
-            return
-
-        def checkpoint() -> None:
-            with suppress(RecordingError):  # the next commit reports problems of the disk
-                self._recording.shorten_log()
-
-        if long:
-            self._shortening = threading.Thread(target=checkpoint, name="uwblink log", daemon=True)
-            self._shortening.start()
-
-    def _check_file(self) -> None:
-        """Raise `RecordingError` if the file was removed or replaced."""
         path = self._recording.path
-        if _identity(path) != self._file:
-            raise RecordingError(f"{path}: was removed or replaced while it was being recorded; what it held is lost")
+        shortening: Future[None] | None = None
+        # Another thread checkpoints a long log, while this one continues to commit.
+        with ThreadPoolExecutor(1, "uwblink log") as other:
+            while not self._error:
+                last = self._ended.wait(FLUSH_S)
+                try:
+                    self._write()
+                    with suppress(OSError):  # there is no log
+                        if log_of(path).stat().st_size > LONG_LOG and (shortening is None or shortening.done()):
+                            shortening = other.submit(self._recording.shorten_log)
+                    self._snapshots.look()
+                except RecordingError as error:
+                    self._error = error
+                except Exception as error:  # it would end the thread unnoticed
+                    self._error = RecordingError(
+                        f"{path}: cannot be written any more ({type(error).__name__}: {error}). "
+                        "What was written before is kept"
+                    )
+                if last:
+                    break
+        self._snapshots.close()
 
-
-def _identity(path: Path) -> tuple[int, int] | None:
-    """Return device and inode of a file, None if there is none."""
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_dev, found.st_ino
+    def _write(self) -> None:
+        """Commit the rows that wait; raises `RecordingError` if the file was removed or replaced."""
+        path = self._recording.path
+        if rows := [self._rows.get() for _ in range(self._rows.qsize())]:
+            with self._recording.transaction():
+                append_rows(self._recording, rows)
+        self.behind_s = 0.0
+        with suppress(OSError):
+            if os.path.samestat(path.stat(), self._file):
+                return
+        raise RecordingError(f"{path}: was removed or replaced while it was being recorded; what it held is lost")
 
 
 class _Withdrawn(RecordingError):  # noqa: N818 - nothing is wrong
@@ -361,23 +305,19 @@ def check_writing(recording: Recording) -> None:
 
     `recording` is new and empty. This detects incompatible versions of libraries before a long recording.
     """
-    probe = Batch(
-        frames=[FrameRow(1, "probe", "in", bytes(range(256)))],
-        exchanges=[(2, 1, RangeReport(2, 1.25, 3, 4, 5, 6, 7, 8, -80.5, -81.5, 0.25, -0.25))],
-        cirs=[(3, 1, Cir(1, 2, 3500, (0, 65535, 7)))],
-        faults=[Fault(4, "probe", "kind", "a 'detail'", 1, 2)],
-    )
+    frame, fault = FrameRow(1, "probe", "in", bytes(range(256))), Fault(4, "probe", "kind", "a 'detail'", 1, 2)
 
-    def values(exchanges: Exchanges) -> dict[str, Any]:
+    def values(exchanges: Exchanges) -> dict[str, str]:
         return {name: str(column.tolist()) for name, column in exchanges.to_dict().items()}
 
+    report, cir = RangeReport(2, 1.25, 3, 4, 5, 6, 7, 8, -80.5, -81.5, 0.25, -0.25), Cir(1, 2, 3500, (0, 65535, 7))
     with suppress(_Withdrawn), recording.transaction():
-        probe.append_to(recording)
+        append_rows(recording, [frame, fault, Heard(2, 1, report), Heard(3, 1, cir)])
         same = {
-            "frames": recording.frames() == probe.frames,
-            "exchanges": values(recording.exchanges()) == values(exchanges_of(probe.exchanges)),
-            "cirs": recording.cirs() == [CirRow(3, 1, 1, 2, 3.5, (0, 65535, 7))],
-            "faults": recording.faults() == probe.faults,
+            "frames": recording.frames() == [frame],
+            "exchanges": values(recording.exchanges()) == values(exchanges_of([(2, 1, report)])),
+            "cirs": recording.cirs() == [CirRow(3, 1, 1, 2, 3.5, cir.magnitudes)],
+            "faults": recording.faults() == [fault],
         }
         if not all(same.values()):
             wrong = ", ".join(table for table, good in same.items() if not good)

@@ -36,36 +36,31 @@ class Station:
         self.port: Transport | None = None
         self._todo: deque[Message] = deque()
         self._retry_s = self.pause_until_s = 0.0
-        self._damage, self._damaged_s = b"", 0.0
+        self._damage = b""
         self._plug(name)
 
-    def ready(self, now_s: float) -> bool:
-        """Whether the board may be asked to range now."""
-        waits = self._todo or self.connection.busy or self.connection.ready_s(now_s)
-        return self.port is not None and not waits and now_s >= self.pause_until_s
+    def next_command(self, now_s: float, ranging: RangeCommand | None = None) -> Message | None:
+        """Return the command that is due, None if the board cannot take one now.
 
-    def next_command(self, now_s: float) -> Message | None:
-        """Return the next set-up command of the board, None if there is none."""
-        if self.port is None or self.connection.busy or not self._todo or self.connection.ready_s(now_s) > 0:
+        A fence comes first if a late answer is possible, then the board is set up, and only then it may range.
+        """
+        idle = self.port is not None and not self.connection.busy and self.connection.ready_s(now_s) <= 0
+        if not idle or now_s < self.pause_until_s:
             return None
-        return self._todo.popleft()
+        if self.connection.doubtful:
+            return FENCE
+        return self._todo.popleft() if self._todo else ranging
 
-    def damage(self, events: list[Event], now_s: float) -> str | None:
+    def gather_damage(self, event: Event) -> str | None:
         """Gather bytes that are no message; returns a description of them when a damaged line is over.
 
-        The decoder skips a damaged line in several pieces. The line ends with a message, a line end, too many bytes, or
-        after 50 ms of silence.
+        The decoder skips a damaged line in several pieces. The line ends with a message, a line end, or too many bytes.
         """
-        text = None
-        for event in [*events, None]:
-            if isinstance(event, Skipped):
-                self._damage, self._damaged_s = self._damage + event.data, now_s
-                continue
-            late = now_s - self._damaged_s > 0.05
-            over = event or late or self._damage.endswith(b"\r\n") or len(self._damage) > LONGEST_LINE
-            if self._damage and over:
-                text = f"{len(self._damage)} bytes: {self._damage[:60]!r}"
-                self._damage = b""
+        skipped = isinstance(event, Skipped)
+        self._damage += event.data if isinstance(event, Skipped) else b""
+        if not self._damage or (skipped and not self._damage.endswith(b"\r\n") and len(self._damage) <= LONGEST_LINE):
+            return None
+        text, self._damage = f"{len(self._damage)} bytes: {self._damage[:60]!r}", b""
         return text
 
     def unplug(self, now_s: float) -> None:
@@ -89,11 +84,8 @@ class Station:
         """Open the port and repeat the set-up commands, because the board may have lost power."""
         self.port = self._ports.open(name)
         self.name, self.connection = name, Connection(name)
-        self._todo.clear()
-        if self._retry_s:
-            self._todo.append(GetId())
-        if self._passive:
-            self._todo.append(SetPassive(True))
+        again: list[Message] = [GetId()] if self._retry_s else []
+        self._todo = deque([*again, SetPassive(True)] if self._passive else again)
 
 
 class Recorder:
@@ -113,7 +105,7 @@ class Recorder:
         self._ports = ports or SerialPorts()
         self._plan, self._turns, self._passive = plan, tuple(turns), passive
         self._start_s = self._ports.now_s()
-        self._turn, self._next_s = 0, self._start_s
+        self._turn, self._next_s, self._quiet_until_s = 0, self._start_s, 0.0
         self._active: tuple[Station, Pair] | None = None
         self._check = ReportCheck()
         self.progress = Progress(start_ns=self._ports.host_ns(), pairs={pair: PairState() for pair in self._turns})
@@ -125,7 +117,6 @@ class Recorder:
         except PortError:
             self.close()
             raise
-        self._by_port = {id(s.port): s for s in self._stations.values()}
 
     def run(
         self,
@@ -173,57 +164,43 @@ class Recorder:
         for listener in self._listeners:
             listener.check()
         self._begin()
-        for port in self._ports.wait(self._wait_s(end_s)):
-            self._receive(self._by_port[id(port)])
-        now_s = self._ports.now_s()
+        ready = self._ports.wait(self._wait_s(end_s))
         for station in self._stations.values():
-            if station.plug_again(now_s):
-                self._by_port[id(station.port)] = station
+            if station.plug_again(self._ports.now_s()):
                 self._fault(station, "replugged", f"{station.name}: board {station.board} is back")
-            if station.port is None:
-                continue
-            if outcome := station.connection.expire(now_s):
-                self._finish_command(station, outcome)
-            if damage := station.damage([], now_s):
-                self._fault(station, "garbage", damage)
+            if station.port is not None:
+                self._receive(station, station.port, waiting=station.port in ready)
 
     def _wait_s(self, end_s: float) -> float:
         now_s = self._ports.now_s()
         ends = [now_s + LONGEST_WAIT_S, end_s]
         if self._active is None and self._turns:
-            ends.append(self._next_s)
+            ends.append(max(self._next_s, self._quiet_until_s))
         ends += [s.connection.deadline_s() or now_s + LONGEST_WAIT_S for s in self._stations.values()]
         return max(min(ends) - now_s, 0.0)
 
     def _begin(self) -> None:
-        """Send due commands: set-up commands first, then the next turn of the plan."""
-        now_s = self._ports.now_s()
+        """Send due commands: fences and set-up commands first, then the next turn of the plan."""
+        now_s, plan = self._ports.now_s(), self._plan
+        if now_s < self._quiet_until_s:
+            return
         for station in self._stations.values():
             if command := station.next_command(now_s):
                 self._send(station, command)
         if self._active or not self._turns or now_s < self._next_s:
             return
-        found = self._next_turn(now_s)
-        if found is None:
-            self._next_s = now_s + 0.005
-        elif found[0].connection.doubtful:
-            self._turn -= 1
-            self._send(found[0], FENCE)
-        else:
-            # A late turn is not followed by a burst.
-            self._next_s = max(self._next_s + (1 / self._plan.rate_hz if self._plan.rate_hz else 0.0), now_s)
-            self._active = station, pair = found
-            plan = self._plan
-            self._send(station, RangeCommand(pair[1], plan.target_reports, plan.protocol == "ds", plan.get_cir))
-
-    def _next_turn(self, now_s: float) -> tuple[Station, Pair] | None:
-        """Return the next pair of the plan that can range; pairs with a busy or missing board are skipped."""
-        for _ in range(len(self._turns)):
+        for _ in self._turns:  # pairs with a busy or missing board are skipped
             pair = self._turns[self._turn % len(self._turns)]
             self._turn += 1
-            if self._stations[pair[0]].ready(now_s) and self._stations[pair[1]].port is not None:
-                return self._stations[pair[0]], pair
-        return None
+            station = self._stations[pair[0]]
+            wanted = RangeCommand(pair[1], plan.target_reports, plan.protocol == "ds", plan.get_cir)
+            if self._stations[pair[1]].port is not None and station.next_command(now_s, wanted):
+                # A late turn is not followed by a burst.
+                self._next_s = max(self._next_s + (1 / plan.rate_hz if plan.rate_hz else 0.0), now_s)
+                self._active = station, pair
+                self._send(station, wanted)
+                return
+        self._next_s = now_s + 0.005
 
     def _send(self, station: Station, command: Message) -> None:
         data = station.connection.send(command, self._ports.now_s())
@@ -234,18 +211,15 @@ class Recorder:
         except PortLostError as error:
             self._report_lost(station, error)
 
-    def _receive(self, station: Station) -> None:
+    def _receive(self, station: Station, port: Transport, *, waiting: bool) -> None:
+        """Read bytes that are waiting, and end the board's command if they or the time ended it."""
         try:
-            data = station.port.read(0.0) if station.port is not None else b""
+            data = port.read(0.0) if waiting else b""
         except PortLostError as error:
             self._report_lost(station, error)
             return
-        if not data:
-            return
-        time_ns, now_s = self._notify_of_bytes(station, "in", data), self._ports.now_s()
-        events, outcome = station.connection.receive(data, now_s)
-        if damage := station.damage(events, now_s):
-            self._fault(station, "garbage", damage)
+        time_ns = self._notify_of_bytes(station, "in", data) if data else 0
+        events, outcome = station.connection.receive(data, self._ports.now_s())
         for event in events:
             self._notify(station, time_ns, event)
         if outcome:
@@ -258,6 +232,8 @@ class Recorder:
         return time_ns
 
     def _notify(self, station: Station, time_ns: int, event: Event) -> None:
+        if damage := station.gather_damage(event):
+            self._fault(station, "garbage", damage)
         if isinstance(event, Skipped):
             return
         # Lines that accompany failed exchanges are expected; all others are faults.
@@ -280,20 +256,13 @@ class Recorder:
                 station.pause_until_s = now_s + 1.0
         if isinstance(outcome.reply, IdReport) and outcome.reply.board != station.board:
             self._fault(station, "wrong board", f"board {outcome.reply.board} where {station.board} was")
-            self._unplug(station)
+            station.unplug(now_s)
         if self._active and self._active[0] is station and isinstance(outcome.command, RangeCommand):
             if self._plan.get_cir:
-                self._keep_quiet(self._active[1], now_s)
+                # The two boards of the exchange, and passive ones, print their impulse responses.
+                both = self._plan.target_reports or self._passive
+                self._quiet_until_s = now_s + (QUIET_TARGET_S if both else QUIET_AFTER_CIR_S)
             self._end_turn(self._active[1], outcome.reply if isinstance(outcome.reply, RangeReport) else None)
-
-    def _keep_quiet(self, pair: Pair, now_s: float) -> None:
-        """Send nothing while the two boards of an exchange, and passive ones, print their impulse responses."""
-        both = self._plan.target_reports or self._passive
-        until_s = now_s + (QUIET_TARGET_S if both else QUIET_AFTER_CIR_S)
-        self._next_s = max(self._next_s, until_s)
-        for board, station in self._stations.items():
-            if board in pair or self._passive:
-                station.connection.keep_quiet(until_s)
 
     def _end_turn(self, pair: Pair, report: RangeReport | None) -> None:
         turn, self._active = Turn(self._ports.host_ns(), pair, report), None
@@ -302,13 +271,9 @@ class Recorder:
 
     def _report_lost(self, station: Station, error: PortLostError) -> None:
         self._fault(station, "unplugged", str(error))
-        self._unplug(station)
+        station.unplug(self._ports.now_s())
         if self._active and self._active[0] is station:
             self._end_turn(self._active[1], None)
-
-    def _unplug(self, station: Station) -> None:
-        self._by_port.pop(id(station.port), None)
-        station.unplug(self._ports.now_s())
 
     def _fault(self, station: Station, kind: str, detail: str, failed: RangeCommand | None = None) -> None:
         ends = (station.board, failed.target) if failed else (None, None)

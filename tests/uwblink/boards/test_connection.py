@@ -53,8 +53,8 @@ def test_a_line_of_failure_does_not_end_a_command_that_cannot_fail():
 def test_time_runs_out_once_and_leaves_a_doubt_that_a_fence_settles():
     connection = asked()
     connection.receive(b"junk", 0.01)
-    assert connection.expire(0.1499) is None
-    outcome = connection.expire(0.15)
+    assert connection.receive(b"", 0.1499)[1] is None
+    outcome = connection.receive(b"", 0.15)[1]
     assert isinstance(outcome.error, NoAnswerError)
     assert "b'C05|2|0|1|0\\r'" in str(outcome.error)
     assert "'junk'" in str(outcome.error)

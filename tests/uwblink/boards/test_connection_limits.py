@@ -39,24 +39,24 @@ def test_a_command_is_waited_for_150_ms_and_a_fence_in_doubt_a_second():
     assert (connection.busy, connection.deadline_s()) == (False, None)
     connection.send(FENCE, 5.0)
     assert (connection.busy, connection.deadline_s()) == (True, 5.0 + ANSWER_S)
-    assert connection.expire(5.0 + ANSWER_S - 1e-9) is None
-    assert connection.expire(5.0 + ANSWER_S).reply is None
+    assert connection.receive(b"", 5.0 + ANSWER_S - 1e-9)[1] is None
+    assert connection.receive(b"", 5.0 + ANSWER_S)[1].reply is None
     assert connection.doubtful
-    assert connection.expire(9.0) is None
+    assert connection.receive(b"", 9.0)[1] is None
     connection.send(FENCE, 10.0)
     assert connection.deadline_s() == 10.0 + PATIENT_S
-    silent = connection.expire(11.0)
+    silent = connection.receive(b"", 11.0)[1]
     assert str(silent.error).endswith(f"within 1000 ms; heard nothing; {NO_ANSWER_HINT}")
     connection.send(m.GetId(), 12.0)
     assert connection.deadline_s() == 12.0 + ANSWER_S
-    assert NO_ANSWER_HINT not in str(connection.expire(13.0).error)
+    assert NO_ANSWER_HINT not in str(connection.receive(b"", 13.0)[1].error)
 
 
 def test_a_patient_connection_stays_patient():
     connection = Connection("port", answer_s=2.0)
     connection.send(FENCE, 0.0)
     assert connection.deadline_s() == 2.0
-    connection.expire(2.0)
+    connection.receive(b"", 2.0)
     connection.send(FENCE, 3.0)
     assert connection.deadline_s() == 5.0
     connection.receive(b"R00\r\n", 3.1)
@@ -67,18 +67,9 @@ def test_the_last_60_bytes_are_quoted():
     connection = asked()
     connection.receive(b"\xff" + b"a" * 40, 0.01)
     connection.receive(b"b" * 21, 0.02)
-    error = connection.expire(1.0).error
+    error = connection.receive(b"", 1.0)[1].error
     assert isinstance(error, NoAnswerError)
     assert str(error).endswith("heard '" + "a" * 39 + "b" * 21 + "'")
-
-
-def test_reports_after_the_outcome_or_without_a_command_are_late():
-    connection = asked()
-    _, outcome = connection.receive(REPORT + OTHER, 0.1)
-    assert outcome.reply.neighbour == 2
-    assert connection.late == 1
-    connection.receive(REPORT + REPORT.replace(b"R05", b"S05"), 0.2)
-    assert connection.late == 2, "the target's own report answers nobody, and is late for nobody"
 
 
 def test_the_first_of_two_replies_is_the_outcome():
@@ -96,9 +87,9 @@ def test_only_an_impulse_response_that_was_asked_for_keeps_the_board_quiet():
     assert with_cir.ready_s(1.0) == pytest.approx(0.030)
     assert with_cir.ready_s(1.02) == pytest.approx(0.010)
     # Once it is there, the report of a target may follow within 3 ms.
-    with_cir.receive(CIR, 1.01)
-    assert with_cir.ready_s(1.01) == pytest.approx(0.003)
-    assert with_cir.ready_s(1.02) == 0.0
+    with_cir.receive(CIR, 1.028)
+    assert with_cir.ready_s(1.03) == pytest.approx(0.003)
+    assert with_cir.ready_s(1.04) == 0.0
 
 
 def test_an_impulse_response_of_others_is_waited_out_piece_by_piece():
@@ -113,7 +104,7 @@ def test_an_impulse_response_of_others_is_waited_out_piece_by_piece():
     connection.keep_quiet(2.5)
     assert connection.ready_s(2.4) == pytest.approx(0.1)
     connection.receive(CIR[800:], 2.41)
-    assert connection.ready_s(2.41) == pytest.approx(0.003)
+    assert connection.ready_s(2.5) == 0.0
 
 
 def test_being_left_alone_is_never_cut_short():
@@ -147,8 +138,6 @@ def test_a_report_answers_only_who_asked_for_that_target_and_that_protocol():
     assert connection.receive(single, 0.02)[1].reply.tx3 == 0
     both = asked(m.RangeCommand(2))
     assert both.receive(single, 0.01)[1] is None
-    assert both.late == 1
     assert both.receive(REPORT, 0.02)[1].reply.tx3 != 0
     other = asked(m.GetId())
     assert other.receive(REPORT, 0.01)[1] is None
-    assert other.late == 0, "nobody's report while another command is out is no reply to it"

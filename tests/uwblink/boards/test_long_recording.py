@@ -10,9 +10,10 @@ import pytest
 from benchmarks.hours import RATE_HZ, AnsweringPorts
 from uwblink.boards.listeners import Listener
 from uwblink.boards.ranging_plan import RangingPlan
-from uwblink.boards.record import FILE_MB, FLUSH_S, Batch, identify, record
+from uwblink.boards.record import FILE_MB, FLUSH_S, append_rows, identify, record
 from uwblink.boards.recorder import Recorder
 from uwblink.recording.file import Recording
+from uwblink.recording.schema import FrameRow
 
 WARM, LATER, LONG = 1_200, 3_600, 3_700
 EVERY, FAST = 100, 50
@@ -26,16 +27,14 @@ class Committing(Listener):
     """Commits after every so many exchanges, in the loop itself, and notes what each commit asked of the database."""
 
     def __init__(self, recording, every=EVERY):
-        self.recording, self.every, self.batch, self.exchanges = recording, every, Batch(), 0
+        self.recording, self.every, self.batch, self.exchanges = recording, every, [], 0
         self.asked, self.rows = [], []
 
     def on_bytes(self, time_ns, port, direction, data):
-        from uwblink.recording.schema import FrameRow
-
-        self.batch.frames.append(FrameRow(time_ns, port, direction, data))
+        self.batch.append(FrameRow(time_ns, port, direction, data))
 
     def on_message(self, heard):
-        self.batch.add(heard)
+        self.batch.append(heard)
 
     def on_turn(self, turn):
         self.exchanges += 1
@@ -44,10 +43,11 @@ class Committing(Listener):
 
     def commit(self):
         before = len(STATEMENTS)
-        self.rows.append((len(self.batch.exchanges), len(self.batch.frames)))
-        self.batch.write(self.recording)
+        self.rows.append(len(self.batch))
+        with self.recording.transaction():
+            append_rows(self.recording, self.batch)
         self.asked.append(STATEMENTS[before:])
-        self.batch = Batch()
+        self.batch = []
 
 
 STATEMENTS: list[str] = []
