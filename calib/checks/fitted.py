@@ -15,7 +15,7 @@ from calib.calibration.power_curves import basis
 from calib.checks.places import of_places
 from calib.estimator.known_distances import KnownDistances
 from calib.estimator.range_rows import Mixture
-from calib.estimator.score_tests import Family, FoundOffset, Slopes, Tested, search, widening
+from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes, Tested, search, widening
 from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.estimator.to_calibration import bias_curves
 from calib.findings import OF_A_FIT, SMALLEST_NS
@@ -45,6 +45,9 @@ READINGS = ("readings",)
 FAR_M, MOSTLY, OFTEN, FOUR = 0.12, 0.8, 0.45, 4
 """Detours of less may as well be an error that wanders. A pair, or all pairs of a tag, with such shares of reflected
 ranges are named; over four tags a pair's offset and that of the two others leave the same trace."""
+
+UNIT = np.ones((1, 1))
+"""The derivative of a range by an offset of it."""
 
 SCALE = 0.01
 """Relative error of true distances that a recording may have and not show: a judgement."""
@@ -86,7 +89,7 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
     ends = np.searchsorted(model.tags, model.pairs.ends)[model.pairs.number]
 
     def of_tags(kind: str, derivative: Floats) -> Family:
-        return Family(kind=kind, names=tags, derivative=_columns(ends, derivative, len(tags)))
+        return Family(kind=kind, names=tags, derivative=Derivative(ends, derivative, len(tags)))
 
     yield of_pairs(found)
     several = int(min(max(found.blocks.seconds / SPAN_S, 2), SEGMENTS))
@@ -94,7 +97,7 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
     yield Family(
         kind="time",
         names=[name for name in tags for _ in range(several)],
-        derivative=_columns(ends * several + span[:, None], 1.0, len(tags) * several),
+        derivative=Derivative(ends * several + span[:, None], UNIT, len(tags) * several),
         spans=several,
     )
     if len(found.blocks.bounds) > 2:
@@ -109,8 +112,9 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
     yield of_tags("skew", forth[:, None] * [1.0, -1.0])
     shared = _shared(found, louder_m) if beside_curve else _late(found)
     if shared:
-        columns = sparse.csr_matrix(np.column_stack(list(shared.values())))
-        yield Family(kind="shared", names=list(shared), derivative=columns)
+        everyone = np.broadcast_to(np.arange(len(shared)), (count, len(shared)))
+        values = np.column_stack(list(shared.values()))
+        yield Family(kind="shared", names=list(shared), derivative=Derivative(everyone, values, len(shared)))
 
 
 def of_pairs(found: KnownDistances) -> Family:
@@ -119,7 +123,7 @@ def of_pairs(found: KnownDistances) -> Family:
     return Family(
         kind="pair",
         names=[f"pair {a}-{b}" for a, b in pairs.ends.tolist()],
-        derivative=_columns(pairs.number[:, None], 1.0, len(pairs.ends)),
+        derivative=Derivative(pairs.number[:, None], UNIT, len(pairs.ends)),
         fitted=found.searches[0].optimum.layout.indices(["offset of pair"]),
     )
 
@@ -129,14 +133,6 @@ def slopes_of(found: KnownDistances) -> Slopes:
     search = found.searches[0]
     layout = search.optimum.layout
     return Slopes(search.rows, search.optimum, found.blocks, np.eye(layout.size)[layout.where["delay"]])
-
-
-def _columns(columns: Ints, values: Floats | float, size: int) -> sparse.csr_matrix:
-    """Return a matrix (n, size) whose rows have `values` (n, k), (n, 1) or a number at `columns` (n, k)."""
-    bounds = np.arange(len(columns) + 1) * columns.shape[1]
-    return sparse.csr_matrix(
-        (np.broadcast_to(values, columns.shape).ravel(), columns.ravel(), bounds), shape=(len(columns), size)
-    )
 
 
 def _of_sessions(found: KnownDistances, tags: list[str], ends: Ints) -> Family:
@@ -156,7 +152,7 @@ def _of_sessions(found: KnownDistances, tags: list[str], ends: Ints) -> Family:
     return Family(
         kind="session",
         names=[name for name in names for _ in range(count)],
-        derivative=_columns(columns * count + model.ranges.session[:, None].astype(np.int64), 1.0, len(names) * count),
+        derivative=Derivative(columns * count + model.ranges.session[:, None], UNIT, len(names) * count),
         fitted=found.searches[0].optimum.layout.indices(kinds if len(names) > len(tags) else kinds[:1]),
         sessions=sessions,
     )

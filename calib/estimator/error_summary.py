@@ -18,7 +18,6 @@ from calib.estimator.range_model import OFFSETS, TYPICAL_OFFSET_M, RangeModel, S
 from calib.estimator.range_rows import RESIDUAL
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
 from calib.range_errors.densities import LONG_FACTOR, LongDetours
-from calib.range_errors.density import error_slopes
 from uwblink.arrays import Floats
 
 if TYPE_CHECKING:
@@ -53,7 +52,7 @@ SPELLS = 8
 def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, blocks: TimeBlocks) -> ErrorModel:
     """Return the error model of residuals (n,), in the order of the model's ranges."""
     values, number = errors.values, model.pairs.number
-    found = error_slopes(residual - errors.location_m, errors.parameters, span_m=errors.span_m)
+    found = errors.slopes
     lasting = lasting_in_pairs(found.by["odds"], number, blocks)
     pairs = len(model.pairs.ends)
     told = np.bincount(number, found.by["odds"] ** 2, pairs)
@@ -98,17 +97,14 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
     return _put_right(stated, model, residual)
 
 
-def between_recordings(
-    model: RangeModel, residual: Floats, errors: DescribedErrors, blocks: TimeBlocks, pairs_m: float | None
-) -> float:
+def between_recordings(model: RangeModel, errors: DescribedErrors, blocks: TimeBlocks, pairs_m: float | None) -> float:
     """Return the standard deviation, in metres, of the difference of a pair's offset between this and another
     recording.
 
     One recording shows offsets of pairs (`pairs_m`, None if they are not determined) and of pairs in spells. Both are
     as large as the differences between days (public flights: 3 to 4 cm).
     """
-    found = error_slopes(residual - errors.location_m, errors.parameters, span_m=errors.span_m)
-    pair, score = model.pairs.number, found.by[RESIDUAL]
+    pair, score = model.pairs.number, errors.slopes.by[RESIDUAL]
     pairs, cell = len(model.pairs.ends), pair * SPELLS + np.arange(len(pair)) * SPELLS // len(pair)
     lasting = lasting_in_pairs(score, pair, blocks, SPELLS)
     slope, known = (

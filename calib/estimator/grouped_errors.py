@@ -12,7 +12,6 @@ from calib.estimator.optimize import maximize
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows
 from calib.estimator.unknowns import Layout, Prior, Priors, Unknown
 from calib.range_errors.densities import LONG_FACTOR, LongDetours
-from calib.range_errors.density import OUTLIERS_OVER_M, error_slopes
 from calib.spread import robust_spread
 from uwblink.arrays import Floats
 
@@ -58,8 +57,7 @@ def fit_grouped_errors(groups: Sequence[Floats], most: int = 20_000) -> GroupedE
     layout = Layout((centre, *unknowns))
     rows = RangeRows.of(error_m - middle[group], group, parts, Mixture(), layout)
     found = maximize([rows], Priors(layout), layout.start())
-    values = rows.values(found.x)
-    each = error_slopes(values.pop(RESIDUAL), values, span_m=OUTLIERS_OVER_M)
+    each = rows.error_slopes(found.x, ())
     long = LongDetours(share=float(1 / (1 + np.exp(-found.of("long detours")[0]))), factor=LONG_FACTOR)
     of_centre = layout.where["centre"]
     return GroupedErrors(

@@ -22,6 +22,7 @@ from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows, Robus
 from calib.estimator.rows import NormalRows, Rows
 from calib.estimator.time_blocks import TimeBlocks, in_order, time_blocks
 from calib.estimator.unknowns import Layout, Priors, Unknown
+from calib.range_errors.density import ErrorSlopes
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 
@@ -389,21 +390,16 @@ def _stated(model: RangeModel, values: dict[str, Floats], recipe: Recipe) -> dic
 
 @dataclass(frozen=True, kw_only=True)
 class DescribedErrors:
-    """The error model of a fit: unknowns by kind, the covariance of the noise, and the parameters of each range.
+    """The error model of a fit: unknowns by kind, the covariance of the noise, and how each range looks.
 
-    `parameters` are those of every range (n,), in the order of the model's ranges, for errors less `location_m`.
+    `slopes` are those of every range (n,) by the residual and the odds, in the order of the model's ranges, for errors
+    less `location_m`.
     """
 
     values: dict[str, Floats]
     covariances: dict[str, Floats]
-    parameters: dict[str, Floats]
+    slopes: ErrorSlopes
     location_m: float
-    span_m: float
-
-
-DESCRIBED = 400_000
-"""Ranges from which the error model is estimated after a robust fit: all of 800,000 change shares by half a percentage
-point."""
 
 
 def described_errors(found: KnownDistances) -> DescribedErrors:
@@ -411,26 +407,15 @@ def described_errors(found: KnownDistances) -> DescribedErrors:
     search, model, location = found.searches[-1], found.model, 0.0
     values, covariances = found.values, found.covariances
     rows, x = search.rows, search.optimum.x
-    mixture = rows.errors
-    if not isinstance(mixture, Mixture):
+    if not isinstance(rows.errors, Mixture):
         mixture, unknowns, parts = model.error_model(found.residuals)
         centre = Unknown(kind="centre", names=("",), start=np.array([-float(np.median(found.residuals))]))
         everyone = Part(parameter=RESIDUAL, kind="centre", columns=np.zeros((1, 1), dtype=np.int64))
-        layout, every = model.build(found.residuals, mixture, [centre, *unknowns], [everyone, *parts], only=())
-        rows = every
-        if len(every) > DESCRIBED:
-            some = every.sample(np.sort(np.random.default_rng(0).permutation(len(every))[:DESCRIBED]))
-            x = maximize([some], Priors(layout), layout.start()).x
-        optimum = maximize([rows], Priors(layout), x if len(x) == layout.size else layout.start())
+        layout, rows = model.build(found.residuals, mixture, [centre, *unknowns], [everyone, *parts], only=())
+        optimum = maximize([rows], Priors(layout), layout.start())
         x, location = optimum.x, -float(optimum.of("centre")[0])
         values = {kind: x[where] for kind, where in layout.where.items()}
         noise = layout.indices([kind for kind in values if kind.startswith(("noise level", "noise curve"))])
         covariances = {"noise": optimum.covariance[:, noise][noise]}
-    parameters = rows.values(x)
-    return DescribedErrors(
-        values=values,
-        covariances=covariances,
-        parameters=parameters,
-        location_m=location,
-        span_m=mixture.span_m,
-    )
+    slopes = rows.error_slopes(x, (RESIDUAL, "odds"))
+    return DescribedErrors(values=values, covariances=covariances, slopes=slopes, location_m=location)

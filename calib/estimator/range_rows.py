@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.estimator.rows import ROWS_AT_ONCE, Terms
 from calib.estimator.unknowns import Layout
-from calib.range_errors.density import OUTLIERS_OVER_M, error_slopes
+from calib.range_errors.density import OUTLIERS_OVER_M, ErrorSlopes, error_slopes
 from uwblink.arrays import Floats, Ints
 
 RESIDUAL = "residual"
@@ -242,6 +242,22 @@ class RangeRows:
             for name, column in found.items():
                 column[self.order[rows]] = values[name]
         return found
+
+    def error_slopes(self, x: Floats, names: Sequence[str]) -> ErrorSlopes:
+        """Return the densities of all ranges (n,) with their slopes by some parameters, in the order given.
+
+        Raises `TypeError` where the ranges have a robust loss instead of a `Mixture`.
+        """
+        if not isinstance(self.errors, Mixture):
+            raise TypeError("a robust loss has no parts")
+        log_density, reflected, inlier = np.empty((3, len(self)))
+        by = {name: np.empty(len(self)) for name in names}
+        for _, rows, values, _ in self._pieces(x):
+            found, given = error_slopes(values[RESIDUAL], values, span_m=self.errors.span_m), self.order[rows]
+            log_density[given], reflected[given], inlier[given] = found.log_density, found.reflected, found.inlier
+            for name, column in by.items():
+                column[given] = found.by[name]
+        return ErrorSlopes(log_density=log_density, by=by, reflected=reflected, inlier=inlier)
 
     def _pieces(self, x: Floats, only: tuple[str, ...] = ()) -> Iterator[tuple[slice, slice, dict[str, Floats], Any]]:
         """Yield blocks, rows, parameters and derivatives of distances, for as many rows as are worked on at once."""

@@ -33,6 +33,27 @@ MOST_NAMED = 3
 """Alternatives of a family that are looked for one after the other: faults are few."""
 
 
+@dataclass(frozen=True, slots=True)
+class Derivative:
+    """A sparse matrix (n, k), made a few rows at a time: rows have `values` (n, m) or (n, 1) at `columns` (n, m)."""
+
+    columns: Ints
+    values: Floats
+    size: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Return the numbers of rows and columns."""
+        return len(self.columns), self.size
+
+    def __getitem__(self, rows: Ints) -> sparse.csr_matrix:
+        """Return some rows."""
+        columns = self.columns[rows]
+        values = np.broadcast_to(self.values if len(self.values) == 1 else self.values[rows], columns.shape)
+        bounds = np.arange(len(columns) + 1) * columns.shape[1]
+        return sparse.csr_matrix((values.ravel(), columns.ravel(), bounds), shape=(len(columns), self.size))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Family:
     """Alternatives of one kind: `derivative` (n, k) is that of the residual of each given range by each offset.
@@ -44,7 +65,7 @@ class Family:
 
     kind: str
     names: Sequence[str]
-    derivative: sparse.csr_matrix
+    derivative: Derivative | sparse.csr_matrix
     spans: int = SPANS
     fitted: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     sessions: tuple[str, ...] = ("",)
@@ -160,7 +181,7 @@ class Slopes:
         place = (number, np.arange(len(number)))
         return sparse.csr_matrix((np.ones(len(number)), place), shape=(self.blocks.count, len(number)))
 
-    def link(self, derivative: sparse.csr_matrix) -> Floats:
+    def link(self, derivative: Derivative | sparse.csr_matrix) -> Floats:
         """Return what links offsets, as derivatives (n, k) of given ranges, to all unknowns (k, p)."""
         return self._sums([derivative])[0].link
 
@@ -173,7 +194,7 @@ class Slopes:
         sums = self._sums([family.derivative for family in families])
         return [self._tested(family, own) for family, own in zip(families, sums, strict=True)]
 
-    def _sums(self, derivatives: Sequence[sparse.csr_matrix]) -> list[_Sums]:
+    def _sums(self, derivatives: Sequence[Derivative | sparse.csr_matrix]) -> list[_Sums]:
         """Return sums over all ranges for offsets with derivatives (n, k) of given ranges."""
         sums = [_Sums.empty(each.shape[1], *self.own.shape) for each in derivatives]
         for which, terms, by in self._pieces():

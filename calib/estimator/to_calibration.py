@@ -59,7 +59,7 @@ def calibration_of(
         described = described_errors(found)
         errors = error_model(model, found.residuals, described, found.blocks)
         if between_m is None:
-            between_m = between_recordings(model, found.residuals, described, found.blocks, _between_pairs(found))
+            between_m = between_recordings(model, described, found.blocks, _between_pairs(found))
         errors = errors.between(between_m, _correction_std(found, delays_ns2, np.array(errors.lifted)))
         sigmas, sigma_m2 = sigma_curves(model, described.values, described.covariances["noise"])
     return Calibration(
