@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from scipy.special import chdtrc
 
+from calib.calibration.document import for_json
 from calib.calibration.model import Calibration, require_calibration
 from calib.errors import UnanswerableError
 from calib.spread import TWO_SIDED_95
@@ -75,26 +76,12 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `calib compare --json` prints."""
-        return {
-            "difference_ns": {str(t): d for t, d in self.difference_ns.items()},
-            "std_ns": {str(t): _or_none(d) for t, d in self.std_ns.items()},
-            "offset_m": self.offset_m,
-            "curve_rms_m": self.curve_rms_m,
-            "chi_square": _or_none(self.chi_square),
-            "probability": _or_none(self.probability),
-            "verdict": self.verdict,
-            "only_first": list(self.only_first),
-            "only_second": list(self.only_second),
-        }
+        table: dict[str, Any] = for_json(asdict(self) | {"verdict": self.verdict})
+        return table
 
 
 def _interval(std_ns: float) -> str:
     return f"± {TWO_SIDED_95 * std_ns:.4f} (95 %)" if np.isfinite(std_ns) else "standard error not stated"
-
-
-def _or_none(value: float) -> float | None:
-    """Return a number for JSON, None if it is not finite."""
-    return value if np.isfinite(value) else None
 
 
 def compare(first: Calibration, second: Calibration) -> Comparison:

@@ -257,6 +257,13 @@ def _explained(errors: list[ErrorDetails]) -> str:
     return f"{where}: {found}{message}"
 
 
+def for_json(value: Any) -> Any:
+    """Return a value of numbers and tables as JSON has it, with None for what is not finite."""
+    if isinstance(value, dict):
+        return {str(key): for_json(inner) for key, inner in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def finite(text: str) -> float:
     """Return a number of JSON; raises `ValueError` for infinities and NaN, which could not be written again."""
     value = float(text)

@@ -15,10 +15,8 @@ from calib.settings import FitSettings
 from uwblink.cli.shared import AsJson, CalibrationFile, Figures, Force, ReportFile, Seeds, add, choice, output, waiting
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from calib import Calibration
-    from calib.evaluation import ErrorStatistics, Evaluation
+    from calib.evaluation import Evaluation
 
 
 def add_to(app: typer.Typer) -> None:
@@ -74,10 +72,9 @@ def evaluate(
     if as_json:
         typer.echo(json.dumps(evaluation.to_dict(), indent=1))
         return
-    from rich.console import Console
-
-    # The largest width of the table: in a file no number may be cut.
-    print_table(evaluation, Console(width=None if sys.stdout.isatty() else 110))
+    typer.echo(repr(evaluation))
+    for line in _remarks(evaluation):
+        typer.echo(line)
     for path in filter(None, (report, figures)):
         typer.echo(f"report: {path}")
 
@@ -296,40 +293,6 @@ def report(
         raise typer.Exit(STOPPED)
 
 
-def print_table(evaluation: Evaluation, console: Console) -> None:
-    """Print errors in centimetres, a row per pair and one for all.
-
-    The last columns are the share in % that chi-square rejects, the spread of errors over the total sigma, and how many
-    of them lie between the quantiles for 95 %.
-    """
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    from calib.evaluation import CORRECTION_STAGES
-
-    # From 92 columns on there is room for two blanks between figures; a terminal of 80 has room for one.
-    gap = 1 if console.width >= 92 else 0
-    short = {"raw": "raw", "delays": "delay", "full": "full"}
-    table = Table(
-        title="Range error in cm", title_justify="left", box=SIMPLE_HEAD, padding=(0, gap, 0, 0), pad_edge=False
-    )
-    table.add_column("pair", no_wrap=True)
-    table.add_column("n", justify="right", no_wrap=True)
-    for stage in CORRECTION_STAGES:
-        for what in ("mean", "med.", "rob."):
-            table.add_column(f"{short[stage]}\n{what}", justify="right", no_wrap=True)
-    table.add_column("chi2\nout%", justify="right", no_wrap=True)
-    for what in ("total\nz std", "in\n95%"):
-        table.add_column(what, justify="right", no_wrap=True)
-    for name, group in evaluation.pairs.items():
-        table.add_row(name, *_cells(group))
-    table.add_section()
-    table.add_row("all", *_cells(evaluation.overall), style="bold")
-    console.print(table)
-    for line in _remarks(evaluation):
-        console.print(line, highlight=False, soft_wrap=True)
-
-
 def _remarks(evaluation: Evaluation) -> Iterator[str]:
     """Yield lines below the table: quantiles, coverage, errors against planted values."""
     group = evaluation.overall
@@ -358,18 +321,3 @@ def _remarks(evaluation: Evaluation) -> Iterator[str]:
             f"from what was planted: delays {rms:.4f} ns rms, bias curve {100 * planted.curve_rms_m:.2f} cm, "
             f"whole correction {100 * planted.correction_rms_m:.2f} cm rms"
         )
-
-
-def _cells(group: ErrorStatistics) -> list[str]:
-    from calib.evaluation import CORRECTION_STAGES
-
-    cells = [str(group.raw.n)]
-    for stage in CORRECTION_STAGES:
-        stats = getattr(group, stage)
-        figures = (stats.mean_m, stats.median_m, stats.robust_std_m)
-        cells += [f"{100 * figure:.1f}" for figure in figures]
-    return [*cells, f"{100 * group.rejected:.1f}", _known(group.total_std, "{:.2f}"), _known(100 * group.inside_95)]
-
-
-def _known(value: float, form: str = "{:.1f}") -> str:
-    return form.format(value) if value == value else "-"

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib.evaluation.range_updates import Fix, RangeErrors, RangeUpdate, mixture_update
 from uwblink.arrays import Floats
@@ -179,17 +180,9 @@ class InertialFilter:
 
 def _cross(vectors: Floats) -> Floats:
     """Return the cross-product matrices (n, 3, 3) of vectors (n, 3)."""
-    found = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    found[:, 0, 1], found[:, 0, 2], found[:, 1, 2] = -z, y, -x
-    found[:, 1, 0], found[:, 2, 0], found[:, 2, 1] = z, -y, x
-    return found
+    return np.asarray(np.cross(np.eye(3), vectors[:, None, :]))
 
 
 def _rotation(vectors: Floats) -> Floats:
-    """Return rotations (n, 3, 3) by vectors (n, 3) in radians (Rodrigues)."""
-    angle = np.linalg.norm(vectors, axis=1)
-    small = np.maximum(angle, 1e-12)
-    skew = _cross(vectors)
-    one, two = np.sinc(angle / np.pi), 0.5 * np.sinc(small / (2 * np.pi)) ** 2
-    return np.asarray(np.eye(3) + one[:, None, None] * skew + two[:, None, None] * (skew @ skew))
+    """Return rotations (n, 3, 3) by vectors (n, 3) in radians."""
+    return np.asarray(Rotation.from_rotvec(vectors).as_matrix())

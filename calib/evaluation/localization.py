@@ -14,10 +14,11 @@ import numpy as np
 from scipy.stats import chi2
 
 from calib.calibration.model import Calibration, require_calibration
+from calib.data.ranges import Ranges
 from calib.data.sources import Data, Flight, load_flight, require_times
 from calib.errors import UnanswerableError
 from calib.evaluation.range_updates import range_errors
-from calib.evaluation.tracking import FILTERS, FilterRanges, Run, Settings, Track, problems, run_filters
+from calib.evaluation.tracking import FILTERS, FilterRanges, Settings, Track, problems, run_filters
 from uwblink.arrays import Floats
 
 PAPER_RMSE_M: Final = {"raw": 0.804, "calibrated": 0.500, "variance": 0.431}
@@ -25,6 +26,9 @@ PAPER_RMSE_M: Final = {"raw": 0.804, "calibrated": 0.500, "variance": 0.431}
 
 TUNED_OVER: Final = (0.04, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.6, 1.0)
 """Candidates for fixed standard deviations on a training flight, in metres, about two per octave."""
+
+TUNED_RANGES: Final = 7500
+"""Ranges of a training flight that are used, about a minute of three bodies: neighbouring candidates differ little."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,55 +86,54 @@ def localize(
     flight = data if isinstance(data, Flight) else load_flight(data, need_power=calibration.needs_power)
     fixed = fixed_std(calibration, chosen, training)
     require_times(flight.ranges)
-    runs = filter_runs(flight, calibration, fixed)
-    if not runs:
+    bodies = problems(flight)
+    if not bodies:
         raise UnanswerableError(
             f"{flight.ranges.source}: no body moves among poses and ranges, so there is nothing to localize"
         )
-    return [
-        Localization(
-            source=flight.ranges.source,
-            body=run.problem.body,
-            tracks={name: own[0] for name, own in tracks.items()},
-            rmse_m={name: np.array([track.rmse_m for track in own]) for name, own in tracks.items()},
-            fixed=fixed,
-            simulated=flight.ranges.planted is not None,
+    found = []
+    for problem in bodies:
+        tracks = run_filters(problem, filter_ranges(flight.ranges[problem.rows], calibration, fixed), chosen)
+        found.append(
+            Localization(
+                source=flight.ranges.source,
+                body=problem.body,
+                tracks={name: own[0] for name, own in tracks.items()},
+                rmse_m={name: np.array([track.rmse_m for track in own]) for name, own in tracks.items()},
+                fixed=fixed,
+                simulated=flight.ranges.planted is not None,
+            )
         )
-        for run, tracks in zip(runs, run_filters(runs, chosen), strict=True)
-    ]
+    return found
 
 
-def filter_runs(flight: Flight, calibration: Calibration, fixed: FixedStd) -> list[Run]:
-    """Return the inputs of each of `FILTERS` for each body; the robust filter needs an error model."""
-    applied, runs = calibration.apply(flight.ranges), []
-    for problem in problems(flight):
-        rows = problem.rows
-        raw, corrected, sigma = applied.raw_m[rows], applied.corrected_m[rows], applied.sigma_m[rows]
-        ranges = {
-            "raw": FilterRanges(raw, np.full(len(rows), fixed.std_m["raw"])),
-            "calibrated": FilterRanges(corrected, np.full(len(rows), fixed.std_m["calibrated"])),
-            "variance": FilterRanges(corrected, sigma),
-        }
-        if calibration.errors is not None:
-            noise, errors = range_errors(calibration, flight.ranges[rows])
-            ranges["robust"] = FilterRanges(corrected - calibration.errors.location_m, noise, errors)
-            if lasting := calibration.errors.lasting:
-                own = np.sqrt(lasting.own_variance)
-                ranges["variance"] = FilterRanges(
-                    corrected - lasting.mean * sigma, own * sigma, lasting=lasting, sigma_m=sigma
-                )
-                # The mixture contains reflections within the gate, so the total variance is that of the noise.
-                unit = noise / np.sqrt(lasting.own_variance + lasting.lasting_variance)
-                ranges["robust"] = replace(ranges["robust"], std_m=own * unit, lasting=lasting, sigma_m=unit)
-        runs.append(Run(problem, ranges))
-    return runs
+def filter_ranges(ranges: Ranges, calibration: Calibration, fixed: FixedStd) -> dict[str, FilterRanges]:
+    """Return what each of `FILTERS` measures of a body; the robust filter needs an error model."""
+    applied = calibration.apply(ranges)
+    corrected, sigma, model = applied.corrected_m, applied.sigma_m, calibration.errors
+    found = {
+        "raw": FilterRanges(applied.raw_m, fixed.std_m["raw"]),
+        "calibrated": FilterRanges(corrected, fixed.std_m["calibrated"]),
+        "variance": FilterRanges(corrected, sigma),
+    }
+    if model is None:
+        return found
+    noise, errors = range_errors(calibration, ranges)
+    found["robust"] = FilterRanges(corrected - model.location_m, noise, errors)
+    if lasting := model.lasting:
+        own, shared, time_s = np.sqrt(lasting.own_variance), np.sqrt(lasting.lasting_variance), lasting.time_s
+        # The mixture contains reflections within the gate, so the total variance is that of the noise.
+        unit = noise / np.hypot(own, shared)
+        found["variance"] = FilterRanges(corrected - lasting.mean * sigma, own * sigma, None, shared * sigma, time_s)
+        found["robust"] = FilterRanges(corrected - model.location_m, own * unit, errors, shared * unit, time_s)
+    return found
 
 
 def fixed_std(calibration: Calibration, settings: Settings, training: Data | Flight | None = None) -> FixedStd:
     """Return the fixed standard deviations of raw and calibrated ranges, from what is known before the flight.
 
-    In this order: the given one; those with the smallest RMSE on a training flight (the first 2500 ranges of each
-    body); those of the errors that the calibration was fitted to; for old calibrations its sigma at the median power.
+    In this order: the given one; those with the smallest RMSE on a training flight; those of the errors that the
+    calibration was fitted to; for old calibrations its sigma at the median power.
     """
     if settings.fixed_std_m is not None:
         return FixedStd(dict.fromkeys(("raw", "calibrated"), settings.fixed_std_m), "given")
@@ -142,17 +145,14 @@ def fixed_std(calibration: Calibration, settings: Settings, training: Data | Fli
         middle = float(calibration.sigma_curve(np.array([np.mean(calibration.sigma_curve.range)]))[0])
         return FixedStd(dict.fromkeys(("raw", "calibrated"), middle), "the sigma curve's middle")
     flight = training if isinstance(training, Flight) else load_flight(training)
-    applied, runs = calibration.apply(flight.ranges), []
-    for problem in (whole.first(2500) for whole in problems(flight)):
-        measured = {"raw": applied.raw_m[problem.rows], "calibrated": applied.corrected_m[problem.rows]}
-        each = [(name, own, std) for name, own in measured.items() for std in TUNED_OVER]
-        runs.append(
-            Run(problem, {f"{name}, {std}": FilterRanges(own, np.full(len(own), std)) for name, own, std in each})
-        )
+    flight = replace(flight, ranges=flight.ranges[:TUNED_RANGES])
+    applied = calibration.apply(flight.ranges)
     squares = np.zeros((2, len(TUNED_OVER)))
-    for tracks in run_filters(runs, settings):
-        errors = [[track.rmse_m for track in own] for own in tracks.values()]
-        squares += np.sum(np.array(errors) ** 2, axis=1).reshape(squares.shape)
+    for problem in problems(flight):
+        measured = [column[problem.rows] for column in (applied.raw_m, applied.corrected_m)]
+        ranges = {f"{k}, {std}": FilterRanges(own, std) for k, own in enumerate(measured) for std in TUNED_OVER}
+        errors = [[track.rmse_m for track in own] for own in run_filters(problem, ranges, settings).values()]
+        squares += np.sum(np.square(errors), axis=1).reshape(squares.shape)
     raw, calibrated = (TUNED_OVER[k] for k in np.argmin(squares, axis=1))
     return FixedStd({"raw": raw, "calibrated": calibrated}, f"tuned on {flight.ranges.source}")
 

@@ -1,7 +1,7 @@
 """Localization without motion capture: ranges to fixed anchors, optionally an IMU and a height sensor.
 
 The first ranges give the start (`multilaterate`), gravity gives the tilt, and several headings are tried in parallel;
-the likeliest is reported. If half of the latest ranges are inconsistent, the filter restarts from them. Poses of the
+the likeliest is reported. If it does not explain its ranges, the filter restarts from them. Poses of the
 body are only used as truth for evaluation.
 """
 
@@ -13,8 +13,10 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
+from calib.calibration.lasting import GATE
 from calib.calibration.model import Calibration, require_calibration
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, opened, require_times
@@ -232,19 +234,19 @@ def _corrected(ranges: Ranges, calibration: Calibration) -> tuple[Floats, Floats
 def _table(
     table: Mapping[str, NDArray[Any]], body: str, names: tuple[str, ...], began_ns: int
 ) -> tuple[Floats, Floats]:
-    """Return times in seconds and columns (n, names) of a body's rows, in order of time."""
+    """Return times in seconds and columns (n, names) of a body's rows, in order of time, one for each time."""
     if not table:
         return np.zeros(0), np.zeros((0, len(names)))
-    rows = np.flatnonzero(table["body"] == body)
-    rows = rows[np.argsort(table["time_ns"][rows], kind="stable")]
-    columns = np.column_stack([np.asarray(table[name][rows], dtype=np.float64) for name in names])
-    return np.asarray((table["time_ns"][rows] - began_ns) * 1e-9), columns
+    mine = np.flatnonzero(table["body"] == body)
+    time_ns, first = np.unique(table["time_ns"][mine], return_index=True)
+    columns = np.column_stack([np.asarray(table[name][mine[first]], dtype=np.float64) for name in names])
+    return np.asarray((time_ns - began_ns) * 1e-9), columns
 
 
 def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilter]:
     """Return the index of the range at which the filter starts, and the filter."""
     inertial, first = settings.model == "imu", 0
-    if inertial and not len(one.imu_s):
+    if inertial and len(one.imu_s) < 2:
         raise UnanswerableError(f"{one.source}: no inertial readings of {one.body}; choose the model constant-velocity")
     if settings.start_m is not None:
         fix = Fix(np.array(settings.start_m, dtype=np.float64), np.eye(3) * settings.start_std_m**2)
@@ -307,17 +309,15 @@ def _events(one: _Readings, settings: OnboardSettings, begin_s: float) -> Iterat
 
 
 def _means(one: _Readings, edges: Floats) -> Floats:
-    """Return the means of inertial readings between edges (n + 1,), straight between two readings: (n, 6)."""
-    if not len(one.imu_s):
+    """Return the means of inertial readings between edges (n + 1,), linear between two readings: (n, 6)."""
+    if len(one.imu_s) < 2:
         return np.zeros((len(edges) - 1, 6))
-    steps = np.diff(one.imu_s)[:, None] * (one.imu[1:] + one.imu[:-1]) / 2
-    gathered = np.vstack([np.zeros(6), np.cumsum(steps, axis=0)])
+    readings = make_interp_spline(one.imu_s, one.imu, k=1)
     inside = np.clip(edges, one.imu_s[0], one.imu_s[-1])
-    at = np.column_stack([np.interp(inside, one.imu_s, column) for column in gathered.T])
     span = np.diff(inside)[:, None]
-    now = np.column_stack([np.interp(inside[1:], one.imu_s, column) for column in one.imu.T])
-    # Linear interpolation of the sum has an error below its last term.
-    return np.asarray(np.where(span > 1e-9, np.diff(at, axis=0) / np.maximum(span, 1e-9), now))
+    sums = np.diff(readings.antiderivative()(inside), axis=0)
+    # The rounding of a sum is divided by the span.
+    return np.asarray(np.where(span > 1e-9, sums / np.maximum(span, 1e-9), readings(inside[1:])))
 
 
 def _still_spans(one: _Readings) -> set[int]:
@@ -339,12 +339,12 @@ def _still_spans(one: _Readings) -> set[int]:
 def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
     """Process ranges, steps and heights in order of time, and return the states of the likeliest heading."""
     first, running = _begin(one, settings)
-    now = float(one.time_s[first])
+    now = heard = float(one.time_s[first])
     calm = _still_spans(one) if running.inertial else set()
     states: list[tuple[float, Floats, Floats, Floats]] = []
     updates: list[tuple[float, float, bool]] = []
     restarts: list[float] = []
-    window: list[tuple[int, float]] = []
+    unexplained_s = 0.0
     # The speed limit counts once a second: velocities are independent after a second.
     slow_every = max(round(settings.rate_hz), 1)
     for time_s, kind, number, inertial in _events(one, settings, now):
@@ -365,30 +365,24 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
                 measured, noise_m, one.errors.at(number), one.arm_m[number], one.anchor_m[number]
             )
             updates.append((now, float(update.nis[best]), bool(update.believed[best])))
-            window.append((number, float(np.sqrt(update.nis[best]))))
-            if _diverged(one, window, settings):
-                running.restart(_fix(one, np.array([row for row, _ in window]), settings), settings.speed_m_s)
+            # As in `tracking.run_filters`, but explained ranges earn no trust: this filter drifts.
+            lasted_s = min(now - heard, settings.reopen_s / 2 / MIN_RANGES_PER_FIX)
+            unexplained_s = max(unexplained_s + (lasted_s if update.nis[best] > GATE else -lasted_s / 3), 0.0)
+            heard, rows = now, _latest(one, number, settings)
+            if unexplained_s > settings.reopen_s / 2 and len(np.unique(one.anchor_m[rows], axis=0)) > MIN_ANCHORS:
+                running.restart(_fix(one, rows, settings), settings.speed_m_s)
                 restarts.append(now)
-                window = []
+                unexplained_s = 0.0
         best = int(np.argmax(running.likelihood))
         covariance = running.covariance[best][P, P]
         states.append((now, running.place[best].copy(), running.attitude[best].copy(), covariance.copy()))
     return _told(one, settings, states, updates, restarts)
 
 
-def _diverged(one: _Readings, window: list[tuple[int, float]], settings: OnboardSettings) -> bool:
-    """Return whether half of the latest ranges are off by more than three standard deviations; drop older ones.
-
-    The window has `reopen_s` seconds, or as many ranges as a fix needs.
-    """
-    now = float(one.time_s[window[-1][0]])
-    while len(window) > MIN_RANGES_PER_FIX and now - one.time_s[window[1][0]] > settings.reopen_s:
-        window.pop(0)
-    rows = [row for row, _ in window]
-    if len(window) < MIN_RANGES_PER_FIX or now - one.time_s[rows[0]] < settings.reopen_s:
-        return False
-    enough = len(np.unique(one.anchor_m[rows], axis=0)) > MIN_ANCHORS
-    return enough and float(np.median([score for _, score in window])) > 3.0
+def _latest(one: _Readings, last: int, settings: OnboardSettings) -> Ints:
+    """Return the ranges of the last `reopen_s`, or as many as a fix needs."""
+    first = int(np.searchsorted(one.time_s, one.time_s[last] - settings.reopen_s))
+    return np.arange(max(min(first, last + 1 - MIN_RANGES_PER_FIX), 0), last + 1)
 
 
 def _told(

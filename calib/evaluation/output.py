@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.calibration.document import for_json
 from calib.evaluation.localization import PAPER_RMSE_M, Localization, Summary, summarize
 from calib.evaluation.onboard import OnboardSettings, OnboardTrack
 from calib.evaluation.tracking import Settings, Track
@@ -63,9 +64,7 @@ def localization_json(found: list[Localization]) -> dict[str, Any]:
         }
         for one in found
     ]
-    summary = asdict(summarize(found))
-    summary["spread_m"] = {k: None if v != v else v for k, v in summary["spread_m"].items()}
-    return {"scenarios": rows, "summary": summary}
+    return {"scenarios": rows, "summary": for_json(asdict(summarize(found)))}
 
 
 def write_tum(found: list[Localization], folder: Path, *, force: bool = False) -> None:
@@ -115,7 +114,7 @@ def onboard_json(found: list[OnboardTrack]) -> list[dict[str, Any]]:
             "body": one.body,
             "model": one.model,
             "used": one.used,
-            "rmse_m": None if one.rmse_m != one.rmse_m else one.rmse_m,
+            "rmse_m": for_json(one.rmse_m),
             "std_m": float(np.sqrt(np.mean(one.std_m**2))),
             "nis": float(np.mean(one.nis)),
             "believed": float(np.mean(one.believed)),

@@ -10,26 +10,26 @@ from typing import Any, Final
 import numpy as np
 from scipy.interpolate import BSpline
 
+from calib.calibration.document import for_json
 from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, load_ranges
-from calib.spread import robust_spread
+from calib.spread import TWO_SIDED_95, robust_spread
 from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
 CORRECTION_STAGES: Final = {"raw": "raw_m", "delays": "delay_corrected_m", "full": "corrected_m"}
 """Names of the stages of correction in `CorrectedRanges`."""
 
-NOMINAL: Final = {"50": 0.6744897501960817, "68": 1.0, "90": 1.6448536269514722, "95": 1.959963984540054,
+NOMINAL: Final = {"50": 0.6744897501960817, "68": 1.0, "90": 1.6448536269514722, "95": TWO_SIDED_95,
                   "99": 2.5758293035489004}  # fmt: skip
 """Two-sided bounds of a standard normal distribution, by per cent."""
 
-CHI_SQUARE_95: Final = 3.841458820694124
-"""95 % quantile of the chi-square distribution with one degree of freedom."""
-
-
-TITLE: Final = "Range errors in cm: mean and robust standard deviation, raw, with delays and fully corrected"
+TITLE: Final = (
+    "Range errors in cm: mean, median and robust standard deviation, raw, with delays and fully corrected; per cent "
+    "that chi-square rejects at 95 %; standard deviation over the total sigma; per cent within their 95 % interval"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,7 +122,9 @@ class Evaluation:
 
     def __repr__(self) -> str:
         """Return a table of errors in cm, a row a pair."""
-        lines = ["".join(f"{cell:>8s}" for cell in row[:-1]) + f"  {row[-1]}" for row in self._rows()]
+        rows = self._rows()
+        widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+        lines = [" ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows]
         return "\n".join([TITLE, *lines])
 
     def _repr_html_(self) -> str:
@@ -130,38 +132,38 @@ class Evaluation:
         rows = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in self._rows())
         return f"<p>{escape(TITLE)}</p><table>{rows}</table>"
 
-    def _rows(self, most: int = 40) -> list[list[str]]:
-        groups = [*list(self.pairs.items())[:most], ("all", self.overall)]
-        rows = [[name, *_cells(group)] for name, group in groups]
-        if len(self.pairs) > most:
-            rows.insert(-1, ["...", *[""] * 8, f"{len(self.pairs) - most} more"])
-        return [["pair", "n", "raw", "std", "delays", "std", "full", "std", "total z", "95 % holds"], *rows]
+    def _rows(self) -> list[list[str]]:
+        above = ["", "", "raw", "", "", "delay", "", "", "full", "", "", "chi2", "total", "in"]
+        head = ["pair", "n", *3 * ["mean", "med.", "rob."], "out%", "z std", "95%"]
+        return [
+            above,
+            head,
+            *([name, *_cells(group)] for name, group in self.pairs.items()),
+            ["all", *_cells(self.overall)],
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `calib evaluate --json` prints; `planted` only where a simulation planted something."""
         document: dict[str, Any] = {
             "seen_by_fit": list(self.seen),
-            "overall": _plain(asdict(self.overall)),
-            "pairs": {name: _plain(asdict(group)) for name, group in self.pairs.items()},
-            "split": _plain(asdict(self.split)),
+            "overall": for_json(asdict(self.overall)),
+            "pairs": {name: for_json(asdict(group)) for name, group in self.pairs.items()},
+            "split": for_json(asdict(self.split)),
         }
-        return document | ({"planted": _plain(asdict(self.planted))} if self.planted else {})
+        return document | ({"planted": for_json(asdict(self.planted))} if self.planted else {})
 
 
 def _cells(group: ErrorStatistics) -> list[str]:
-    cells = [str(group.raw.n)]
-    for stats in (group.raw, group.delays, group.full):
-        cells += [f"{100 * stats.mean_m:+.1f}", f"{100 * stats.robust_std_m:.1f}"]
-    if group.total_std != group.total_std:
-        return [*cells, "-", f"{100 * group.coverage['95']:.0f} %"]
-    return [*cells, f"{group.total_std:.2f}", f"{100 * group.inside_95:.0f} %"]
-
-
-def _plain(value: Any) -> Any:
-    """Return a value for JSON, with None in place of NaN."""
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    return None if isinstance(value, float) and value != value else value
+    errors = [
+        100 * value
+        for stats in (group.raw, group.delays, group.full)
+        for value in (stats.mean_m, stats.median_m, stats.robust_std_m)
+    ]
+    figures = [*(f"{value:.1f}" for value in (*errors, 100 * group.rejected)), f"{group.total_std:.2f}"]
+    return [
+        str(group.raw.n),
+        *(("-" if "nan" in cell else cell) for cell in (*figures, f"{100 * group.inside_95:.1f}")),
+    ]
 
 
 def evaluate(data: Data | Iterable[Data], calibration: Calibration) -> Evaluation:
@@ -302,12 +304,12 @@ def _group(ranges: Ranges, applied: CorrectedRanges, rows: Bools, inside: Floats
     truth = ranges.truth_m[rows]
     errors = {name: getattr(applied, field)[rows] - truth for name, field in CORRECTION_STAGES.items()}
     z = np.abs(errors["full"]) / applied.sigma_m[rows]
-    outside = z**2 > CHI_SQUARE_95
+    outside = z > TWO_SIDED_95
     variance = float(np.var(applied.raw_m - ranges.truth_m))
     total = (errors["full"] - applied.mean_error_m[rows]) / applied.sigma_total_m[rows]
     return ErrorStatistics(
         **{name: statistics(error) for name, error in errors.items()},
-        rejected_raw=float(np.mean(errors["raw"] ** 2 > CHI_SQUARE_95 * variance)),
+        rejected_raw=float(np.mean(errors["raw"] ** 2 > TWO_SIDED_95**2 * variance)),
         rejected=float(np.mean(outside)),
         accepted=statistics(errors["full"][~outside]),
         coverage={name: float(np.mean(z <= bound)) for name, bound in NOMINAL.items()},

@@ -15,6 +15,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import uwblink
+from calib.calibration.document import for_json
 from calib.calibration.lasting import lasting_errors
 from calib.calibration.model import Calibration, given_calibration
 from calib.calibration.power_curves import lift as lift_power
@@ -217,7 +218,7 @@ def _held_out(ranges: Ranges, settings: FitSettings) -> HeldOut:
 def _judged(held: HeldOut, settings: FitSettings) -> dict[str, Any]:
     """Return how a fit to a part of the ranges does on those that are held out, for the provenance."""
     found = evaluate(held.ranges, held.calibration).overall
-    return {
+    judged: dict[str, Any] = {
         "share": settings.hold_out,
         "fold": settings.fold,
         "ranges": found.full.n,
@@ -225,8 +226,9 @@ def _judged(held: HeldOut, settings: FitSettings) -> dict[str, Any]:
         "median_m": found.full.median_m,
         "raw_robust_std_m": found.raw.robust_std_m,
         "robust_std_m": found.full.robust_std_m,
-        "inside_95": None if np.isnan(found.inside_95) else found.inside_95,
+        "inside_95": found.inside_95,
     }
+    return {name: for_json(value) for name, value in judged.items()}
 
 
 def _left(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Bools, Floats]:

@@ -12,9 +12,9 @@ from calib.calibration.power_curves import Curve
 from calib.data.samples import sample_flight
 from calib.data.sources import Flight, load_flight
 from calib.errors import BadInputError, UnanswerableError
-from calib.evaluation.localization import FixedStd, filter_runs, fixed_std, localize, summarize
+from calib.evaluation.localization import fixed_std, localize, summarize
 from calib.evaluation.output import as_tum, localization_json, localization_text, write_tum
-from calib.evaluation.tracking import FilterRanges, Run, Settings, run_filters
+from calib.evaluation.tracking import Settings
 from calib.fitting.fitting import fit
 from calib.report.figures import rmse_bars
 from uwblink.pages.figures import style
@@ -30,6 +30,15 @@ def flights(tmp_path_factory):
     for name in ("train", "test1", "test2"):
         simulate(load(SCENARIOS / f"{name}.toml")).save(folder / f"{name}.uwb")
     return {name: load_flight(folder / f"{name}.uwb") for name in ("train", "test1", "test2")}
+
+
+@pytest.fixture(scope="module")
+def fitted(flights):
+    return fit(flights["train"].ranges).calibration
+
+
+def beginning(flight, count):
+    return replace(flight, ranges=flight.ranges[:count])
 
 
 def flat(value):
@@ -83,7 +92,7 @@ def test_a_filter_that_trusts_its_ranges_too_much_is_found_out(flights):
 
 
 def test_what_cannot_be_localized_or_summed_up(flights):
-    flight, calibration = clean(flights["test1"])
+    flight, calibration = clean(beginning(flights["test1"], 500))
     with pytest.raises(UnanswerableError, match="ifo001"):
         summarize(localize(flight, calibration, Settings(gate=1e-12, seeds=1)))
     still = replace(flight, poses=replace(flight.poses, position_m=flight.poses.position_m * 0))
@@ -91,8 +100,8 @@ def test_what_cannot_be_localized_or_summed_up(flights):
         localize(still, calibration)
 
 
-def test_a_calibration_is_worth_at_least_a_third_of_the_error(flights):
-    calibration = fit(flights["train"].ranges).calibration
+def test_a_calibration_is_worth_at_least_a_third_of_the_error(flights, fitted):
+    calibration = fitted
     found = [one for name in ("test1", "test2") for one in localize(flights[name], calibration, Settings(seeds=2))]
     assert len(found) == 6
     summary = summarize(found)
@@ -114,24 +123,23 @@ def test_a_calibration_is_worth_at_least_a_third_of_the_error(flights):
     assert all(spread < 0.02 for spread in summary.spread_m.values())
 
 
-def test_fixed_variances_are_those_of_the_training_flight(flights):
+def test_fixed_variances_are_those_of_the_training_flight(flights, fitted):
     """Of noise of 8 cm values of the grid near it err least."""
     flight, calibration = clean(flights["test1"])
     found = fixed_std(calibration, Settings(), flight)
     assert found.std_m["calibrated"] in (0.07, 0.1, 0.14)
     assert "tuned on" in found.source
-    fitted = fit(flights["train"].ranges).calibration
     known = fixed_std(fitted, Settings())
     errors = flights["train"].ranges.raw_m - flights["train"].ranges.truth_m
     assert known.std_m["raw"] == pytest.approx(np.std(errors))
     assert known.std_m["calibrated"] < known.std_m["raw"]
     assert fixed_std(fitted, Settings(fixed_std_m=0.3)).std_m == {"raw": 0.3, "calibrated": 0.3}
     # Ranges whose truth nobody knows give the same: the flight itself has no say.
-    assert localize(flight, fitted, Settings(seeds=1))[0].fixed == known
+    assert localize(beginning(flight, 500), fitted, Settings(seeds=1))[0].fixed == known
 
 
 def test_each_body_and_flight_has_noise_of_its_own(flights):
-    flight, calibration = clean(flights["test1"])
+    flight, calibration = clean(beginning(flights["test1"], 1000))
     one, two = localize(flight, calibration, Settings(seeds=2, gate=1e9))[:2]
     errors = [t.estimate_m - t.truth_m for t in (one.tracks["raw"], one.tracks["variance"], two.tracks["raw"])]
     *first, second = (np.diff(error[:200], axis=0) for error in errors)
@@ -142,41 +150,12 @@ def test_each_body_and_flight_has_noise_of_its_own(flights):
     assert again.rmse_m["raw"][0] == one.rmse_m["raw"][1]
 
 
-def test_bodies_side_by_side_are_tracked_as_each_alone(flights):
-    # They begin anew, each in its own time, for none is where it thinks to be.
-    calibration = fit(flights["train"].ranges).calibration
-    settings = Settings(seed=3, seeds=2, initial_offset_m=(3.0, 0.0, 0.0))
-    fixed = FixedStd({"raw": 0.2, "calibrated": 0.1}, "given")
-    runs = []
-    for whole, count in zip(filter_runs(flights["test1"], calibration, fixed), (1200, 700, 40), strict=True):
-        some = np.arange(count)
-        ranges = {
-            name: FilterRanges(own.measured_m[:count], own.std_m[:count], own.errors and own.errors.at(some))
-            for name, own in whole.ranges.items()
-        }
-        runs.append(Run(whole.problem.first(count), ranges))
-    together = run_filters(runs, settings)
-    for run, found in zip(runs, together, strict=True):
-        (alone,) = run_filters([run], settings)
-        assert list(found) == list(alone) == ["raw", "calibrated", "variance", "robust"]
-        for name, tracks in alone.items():
-            for track, other in zip(tracks, found[name], strict=True):
-                for column in ("estimate_m", "std_m", "nis", "nees", "accepted"):
-                    np.testing.assert_array_equal(getattr(track, column), getattr(other, column))
-    for found in together[:2]:
-        track = found["variance"][1]
-        wrong = np.linalg.norm(track.estimate_m - track.truth_m, axis=1)
-        assert wrong[0] > 2
-        assert wrong[-100:].max() < 1, "it began anew"
-
-
 @pytest.mark.parametrize("offset", [(5.0, 0.0, 0.0), (0.0, -10.0, 0.0), (-7.0, 7.0, 0.0), (0.0, 0.0, 5.0)])
-def test_a_wrong_start_is_left_within_two_seconds(flights, offset):
-    calibration = fit(flights["train"].ranges[:12_000]).calibration
+def test_a_wrong_start_is_left_within_two_seconds(flights, fitted, offset):
     flight = flights["test1"]
     early = flight.ranges.time_ns < flight.ranges.time_ns.min() + 8_000_000_000
     short = replace(flight, ranges=flight.ranges[early])
-    for one in localize(short, calibration, Settings(seeds=1, initial_offset_m=offset)):
+    for one in localize(short, fitted, Settings(seeds=1, initial_offset_m=offset)):
         for track in one.tracks.values():
             wrong = np.linalg.norm(track.estimate_m - track.truth_m, axis=1)
             assert wrong[0] > 2
@@ -210,7 +189,7 @@ def test_settings_that_no_filter_can_run_with(name, value):
 
 
 def test_it_says_what_it_rests_on(flights):
-    flight, calibration = clean(flights["test1"])
+    flight, calibration = clean(beginning(flights["test1"], 500))
     settings = Settings(seeds=2, velocity_std_mps=0.2)
     found = localize(flight, calibration, settings)
     found = [replace(one, source="a recording with a name that is long.uwb") for one in found]
@@ -226,7 +205,7 @@ def test_it_says_what_it_rests_on(flights):
 
 
 def test_trajectories_are_written_in_tum_form_with_their_attitudes(flights, tmp_path):
-    flight, calibration = clean(flights["test1"])
+    flight, calibration = clean(beginning(flights["test1"], 1000))
     found = localize(flight, calibration, Settings(seeds=1))
     track = found[0].tracks["raw"]
     lines = as_tum(track).splitlines()
@@ -244,17 +223,17 @@ def test_trajectories_are_written_in_tum_form_with_their_attitudes(flights, tmp_
 
 
 def test_recordings_of_one_name_keep_their_own_trajectories(tmp_path):
-    flights = [sample_flight(60, seed=seed) for seed in (1, 2)]
+    samples = [sample_flight(60, seed=seed) for seed in (1, 2)]
     known = fit(sample_flight()).calibration
-    found = [one for flight in flights for one in localize(flight, known)]
+    found = [one for flight in samples for one in localize(flight, known)]
     write_tum(found, tmp_path)
     raw = sorted(path.name for path in tmp_path.glob("*-raw.tum"))
     assert raw == sorted(f"memory-robot{k}{end}-raw.tum" for k in (1, 2, 3) for end in ("", "_2"))
     assert (tmp_path / raw[0]).read_text() != (tmp_path / raw[1]).read_text()
 
 
-def test_bars_say_where_they_leave_bodies_out(flights):
-    found = localize(flights["test1"], fit(flights["train"].ranges).calibration, Settings(seeds=1))
+def test_bars_say_where_they_leave_bodies_out(flights, fitted):
+    found = localize(beginning(flights["test1"], 500), fitted, Settings(seeds=1))
     with style():
         (few,), (most,) = (rmse_bars(3.5, some).axes for some in (found, 2 * found))
     assert few.get_xlabel() == ""
