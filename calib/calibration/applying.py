@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from scipy.interpolate import PPoly
 
-from calib.calibration.error_model import ErrorsAtOnce
+from calib.calibration.error_model import ErrorShapes
 from calib.calibration.parts import CorrectedRange, CorrectedRanges, offset_of, offsets_m
 from calib.calibration.power_curves import Curve, ends, lift
 from calib.data.ranges import FAINTEST_DBM, LOUDEST_DBM, Ranges
@@ -137,20 +136,20 @@ class RangeCorrector:
     """Corrects single ranges by a calibration; make one object and call it for every range."""
 
     def __init__(self, calibration: Calibration) -> None:
-        """Prepare the curves of every group of tags."""
+        """Prepare the curves of every tag, and those of the error model."""
+        self._calibration, self._flat = calibration, not calibration.needs_power
         self._metres = {tag: d * 1e-9 * calibration.speed_of_light for tag, d in calibration.delays_ns.items()}
-        self._offsets = calibration.pair_offsets
-        self._flat = not calibration.needs_power
-        self._alpha = calibration.alpha_dbm
-        self._of_mean = calibration.lift == "lift-of-mean"
-        self._at_receptions = calibration.power_at == "reception"
         self._plain = PiecewiseCurve(calibration.bias_curve), PiecewiseCurve(calibration.sigma_curve)
-        groups = {
-            name: (PiecewiseCurve(group.bias_curve), PiecewiseCurve(group.sigma_curve))
-            for name, group in calibration.groups.items()
-        }
-        self._errors = calibration.errors and ErrorsAtOnce(calibration.errors, calibration.bias_curve)
-        self._member = {tag: groups[name] for name, group in calibration.groups.items() for tag in group.tags}
+        self._curves = {} if calibration.groups else dict.fromkeys(calibration.delays_ns, self._plain)
+        for group in calibration.groups.values():
+            curves = PiecewiseCurve(group.bias_curve), PiecewiseCurve(group.sigma_curve)
+            self._curves |= dict.fromkeys(group.tags, curves)
+        if model := calibration.errors:
+            low, high = model.lifted[0], model.lifted[-1]
+            self._noise, self._odds = (
+                PiecewiseCurve(Curve((low, *model.lifted, high), tuple(values.tolist()), 1, (low, high)))
+                for values in model.logarithms
+            )
 
     def __call__(
         self,
@@ -160,51 +159,49 @@ class RangeCorrector:
         initiator: int,
         target: int,
         weights: tuple[float, float],
-    ) -> CorrectedRange:
-        """Return what `Calibration.correct` returns for one range."""
-        try:
-            corrected = range_m + weights[0] * self._metres[initiator] + weights[1] * self._metres[target]
-        except KeyError as error:
-            known = ", ".join(map(str, sorted(self._metres)))
-            raise BadInputError(f"no delay for tag {error.args[0]} in the calibration, which knows {known}") from None
-        if self._offsets:
-            corrected -= offset_of(self._offsets, initiator, target).offset_m
+    ) -> CorrectedRange[float]:
+        """Return what `Calibration.correct` returns for one range; raises `KeyError` for a tag that is not known."""
+        known = self._calibration
+        corrected = range_m + weights[0] * self._metres[initiator] + weights[1] * self._metres[target]
+        first, second = self._curves[initiator], self._curves[target]
+        if known.pair_offsets:
+            corrected -= offset_of(known.pair_offsets, initiator, target).offset_m
         lifted = self._lifted(fpp1_dbm, fpp2_dbm)
         if lifted != lifted:
             if not self._flat:
                 return CorrectedRange(corrected, math.nan, True, math.nan, math.nan)
             lifted = self._plain[0].low
-        bias, sigma = self._plain
-        clamped = not (self._flat or bias.low <= lifted <= bias.high)
-        errors = self._errors(lifted, initiator, target) if self._errors else (math.nan, math.nan)
-        if not self._member:
-            return CorrectedRange(
-                corrected - self._bias(bias, lifted, fpp1_dbm, fpp2_dbm), sigma(lifted), clamped, *errors
-            )
-        try:
-            first, second = self._member[initiator], self._member[target]
-        except KeyError as error:
-            raise BadInputError(f"tag {error.args[0]} is in none of the calibration's groups of tags") from None
-        mean = 0.5 * sum(self._bias(curves[0], lifted, fpp1_dbm, fpp2_dbm) for curves in (first, second))
-        both = 0.5 * first[1](lifted) + 0.5 * second[1](lifted)
-        return CorrectedRange(corrected - mean, both, clamped, *errors)
+        powers = [lifted]
+        if known.power_at == "reception":
+            ends = [self._lifted(power, power) for power in (fpp1_dbm, fpp2_dbm)]
+            powers = [power for power in ends if power == power] or powers
+        bias = sum(first[0](power) + second[0](power) for power in powers) / (2 * len(powers))
+        sigma = (first[1](lifted) + second[1](lifted)) / 2
+        clamped = not (self._flat or self._plain[0].low <= lifted <= self._plain[0].high)
+        errors = self._errors(lifted, initiator, target, clamped=clamped)
+        return CorrectedRange(corrected - bias, sigma, clamped, *errors)
 
-    def _bias(self, curve: PiecewiseCurve, lifted: float, first: float, second: float) -> float:
-        """Return the bias at the power of the exchange, or the mean of those at its two receptions'."""
-        if not self._at_receptions:
-            return curve(lifted)
-        one, two = self._lifted(first, first), self._lifted(second, second)
-        return (curve(one if one == one else two) + curve(two if two == two else one)) / 2
+    def _errors(self, lifted: float, initiator: int, target: int, *, clamped: bool) -> tuple[float, float]:
+        """Return the total standard deviation in metres, and the share of reflections; NaN without an error model."""
+        model = self._calibration.errors
+        if model is None:
+            return math.nan, math.nan
+        pair = (initiator, target) if initiator < target else (target, initiator)
+        noise, odds, detour = model.factors.get(pair, (0.0, 0.0, 0.0))
+        shape = ErrorShapes(
+            noise_m=math.exp(noise + self._noise(lifted)),
+            tail_share=1 / (1 + math.exp(-odds - self._odds(lifted))),
+            detour_m=model.detour_m * math.exp(detour),
+        )
+        beyond = float(self._calibration.bias_curve.beyond(lifted)) if clamped else 0.0
+        return math.hypot(model.total_m(shape), beyond), shape.tail_share
 
     def _lifted(self, first: float, second: float) -> float:
         """Return the lifted power; if one of both powers is missing, the other replaces it."""
-        if not FAINTEST_DBM < first < LOUDEST_DBM:
-            first = second
-            if not FAINTEST_DBM < first < LOUDEST_DBM:
-                return math.nan
-        if not FAINTEST_DBM < second < LOUDEST_DBM:
-            second = first
-        if self._of_mean:
-            return math.exp(((first + second) / 2 - self._alpha) * NEPERS_PER_DB)
-        exp: Callable[[float], float] = math.exp
-        return (exp((first - self._alpha) * NEPERS_PER_DB) + exp((second - self._alpha) * NEPERS_PER_DB)) / 2
+        known = [power for power in (first, second) if FAINTEST_DBM < power < LOUDEST_DBM]
+        if not known:
+            return math.nan
+        alpha, count = self._calibration.alpha_dbm, len(known)
+        if self._calibration.lift == "lift-of-mean":
+            return math.exp((sum(known) / count - alpha) * NEPERS_PER_DB)
+        return sum(math.exp((power - alpha) * NEPERS_PER_DB) for power in known) / count

@@ -157,7 +157,7 @@ def c_header(calibration: Calibration) -> str:
 
 def _error_tables(model: ErrorModel, bias: PowerCurve) -> list[str]:
     slopes = bias.beyond(np.array([bias.range[0] - 1, bias.range[1] + 1]))
-    odds = np.array(model.tail_share) / (1 - np.array(model.tail_share))
+    log_noise, log_odds = model.logarithms
     numbers = {
         "LEAST_M": model.least_m,
         "DETOUR_SQUARE": 2 * model.long.square,
@@ -170,8 +170,8 @@ def _error_tables(model: ErrorModel, bias: PowerCurve) -> list[str]:
     }
     rows = {
         "lifted": model.lifted,
-        "log_noise": np.log(model.noise_m).tolist(),
-        "log_odds": np.log(odds).tolist(),
+        "log_noise": log_noise.tolist(),
+        "log_odds": log_odds.tolist(),
     }
     ends = [name.split("-") for name in model.pairs] + [["-1", "-1"]]
     factors = [(np.log(p.noise), np.log(p.odds), p.detour * model.detour_m) for p in model.pairs.values()]

@@ -9,7 +9,6 @@ pair has the common values.
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,11 +16,12 @@ from itertools import pairwise
 from typing import Annotated, Any
 
 import numpy as np
+from scipy.optimize.elementwise import find_root
 from scipy.special import log_ndtr, ndtr
 
 from calib.calibration.document import Metres, Number, OpenShare, PairName, Positive, Share, StdM, joint
 from calib.calibration.lasting import LastingErrors
-from calib.calibration.power_curves import Curve
+from calib.calibration.parts import pairs_of
 from calib.errors import BadInputError
 from calib.range_errors.densities import ROOT_2PI, LongDetours, densities
 from uwblink.arrays import Floats, Ints
@@ -38,11 +38,11 @@ class PairErrors:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorShapes:
-    """Parameters of each range (n,): noise, share of reflections, mean of their exponential detour, in metres."""
+    """Parameters of each range (n,), or of one: noise, share of reflections, mean of their exponential detour, m."""
 
-    noise_m: Floats
-    tail_share: Floats
-    detour_m: Floats
+    noise_m: Any
+    tail_share: Any
+    detour_m: Any
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,17 +95,36 @@ class ErrorModel:
 
     def shapes(self, lifted: Floats, initiator: Ints, target: Ints) -> ErrorShapes:
         """Return the shape of the errors of ranges (n,) at lifted powers between two tags, in either direction."""
-        return self._shapes(lifted, self._factors[self._rows(initiator, target)])
+        pairs, number = pairs_of(initiator, target)
+        return self._shapes(lifted, self._factors_of(pairs)[number])
 
     def _shapes(self, lifted: Floats, factors: Floats) -> ErrorShapes:
-        """Return shapes at lifted powers (n,), from logarithms of factors (n, 3)."""
-        nodes, share = np.array(self.lifted), np.array(self.tail_share)
-        log_odds = np.interp(lifted, nodes, np.log(share / (1 - share))) + factors[:, 1]
+        """Return shapes at lifted powers (...), from logarithms of factors (..., 3)."""
+        log_noise, log_odds = self.logarithms
+        odds = np.interp(lifted, self.lifted, log_odds) + factors[..., 1]
         return ErrorShapes(
-            noise_m=np.exp(np.interp(lifted, nodes, np.log(self.noise_m)) + factors[:, 0]),
-            tail_share=np.asarray(1 / (1 + np.exp(-log_odds))),
-            detour_m=self.detour_m * np.exp(factors[:, 2]),
+            noise_m=np.exp(np.interp(lifted, self.lifted, log_noise) + factors[..., 0]),
+            tail_share=np.asarray(1 / (1 + np.exp(-odds))),
+            detour_m=self.detour_m * np.exp(factors[..., 2]),
         )
+
+    @cached_property
+    def logarithms(self) -> tuple[Floats, Floats]:
+        """Logarithms of the noise in metres, and of the odds of a reflection, at the powers `lifted` (nodes,)."""
+        share = np.array(self.tail_share)
+        return np.log(self.noise_m), np.log(share / (1 - share))
+
+    @cached_property
+    def factors(self) -> dict[tuple[int, ...], tuple[float, ...]]:
+        """Logarithms of the factors on noise, odds and detour, by pair with the smaller id first."""
+        return {
+            tuple(sorted(map(int, name.split("-")))): (math.log(one.noise), math.log(one.odds), math.log(one.detour))
+            for name, one in self.pairs.items()
+        }
+
+    def _factors_of(self, pairs: Sequence[tuple[int, ...]]) -> Floats:
+        """Return logarithms of the factors of pairs (pairs, 3); an unknown pair has none."""
+        return np.array([self.factors.get(pair, (0.0, 0.0, 0.0)) for pair in pairs]).reshape(-1, 3)
 
     def mean_m(self, shapes: ErrorShapes) -> Floats:
         """Return the mean of the errors (n,)."""
@@ -142,16 +161,13 @@ class ErrorModel:
         given = np.asarray(probabilities, dtype=np.float64)
         if given.ndim != 1 or not len(given) or not np.all((given > 0) & (given < 1)):
             raise BadInputError(f"found {probabilities!r:.60}, expected shares between 0 and 1", parameter="shares")
-        place, count = self._rows(initiator, target), len(self.pairs) + 1
-        nodes = np.tile(self.lifted, count)
-        tables = self._table(self._own_levels(given), nodes, np.repeat(np.arange(count), len(self.lifted)))
-        tables = tables.reshape(count, len(self.lifted), len(given))
-        found = np.empty((len(lifted), len(given)))
-        for pair in np.unique(place):
-            rows = place == pair
-            for k in range(len(given)):
-                found[rows, k] = np.interp(lifted[rows], self.lifted, tables[pair, :, k])
-        found[~np.isfinite(lifted)] = np.nan
+        pairs, number = pairs_of(initiator, target)
+        tables = self._table(self._own_levels(given), self._factors_of(pairs))
+        found = np.full((len(lifted), len(given)), np.nan)
+        for pair, table in enumerate(tables):
+            rows = np.flatnonzero((number == pair) & np.isfinite(lifted))
+            for k, column in enumerate(table.T):
+                found[rows, k] = np.interp(lifted[rows], self.lifted, column)
         return found
 
     def tail_given(self, error_m: Floats, shapes: ErrorShapes) -> tuple[Floats, Floats]:
@@ -168,22 +184,20 @@ class ErrorModel:
         total = np.where(nothing, 1.0, total)
         return np.asarray(tail / total), np.where(nothing, 1.0, wild / total)
 
-    def _table(self, levels: Floats, lifted: Floats, pair: Ints) -> Floats:
-        """Return quantiles (m, k) of the uncorrected model at lifted powers of numbered pairs (m,), by bisection."""
-        flat = self._shapes(lifted, self._factors[pair])
-        shapes = ErrorShapes(
-            noise_m=flat.noise_m[:, None], tail_share=flat.tail_share[:, None], detour_m=flat.detour_m[:, None]
-        )
-        # Quantiles lie within 12 sigmas of noise or outliers and 25 means of the longest detour; 50 halvings of that
-        # leave nothing of it.
-        reach = 12.0 * (shapes.noise_m + self.outlier_m)
-        low = np.broadcast_to(self.location_m - reach, (len(pair), len(levels))).copy()
-        high = low + 2 * reach + self.least_m + 25.0 * self.long.longest * shapes.detour_m
-        for _ in range(50):
-            middle = (low + high) / 2
-            above = self.below(middle, shapes) > levels
-            high, low = np.where(above, middle, high), np.where(above, low, middle)
-        return np.asarray((low + high) / 2)
+    def _table(self, levels: Floats, factors: Floats) -> Floats:
+        """Return quantiles (pairs, nodes, k) of the uncorrected model at its powers, for logarithms of factors."""
+        shapes = self._shapes(np.array(self.lifted), factors[:, None, :])
+        noise, share, detour = (x[..., None] for x in (shapes.noise_m, shapes.tail_share, shapes.detour_m))
+
+        def difference(error_m: Floats, noise: Floats, share: Floats, detour: Floats, level: Floats) -> Floats:
+            return self.below(error_m, ErrorShapes(noise_m=noise, tail_share=share, detour_m=detour)) - level
+
+        # Quantiles lie within 12 sigmas of noise or outliers and 25 means of the longest detour.
+        reach = 12.0 * (noise + self.outlier_m)
+        high = self.location_m + reach + self.least_m + 25.0 * self.long.longest * detour
+        bounds = self.location_m - reach, high
+        found = find_root(difference, bounds, args=(noise, share, np.broadcast_to(detour, noise.shape), levels))
+        return np.asarray(found.x)
 
     def _own_levels(self, probabilities: Floats) -> Floats:
         """Return the levels of the uncorrected model for shares of errors."""
@@ -191,31 +205,6 @@ class ErrorModel:
             return probabilities
         found, own = np.array(self.levels).T
         return np.asarray(np.interp(probabilities, [0.0, *found, 1.0], [0.0, *own, 1.0]))
-
-    @cached_property
-    def _factors(self) -> Floats:
-        """Logarithms of each pair's factors (pairs + 1, 3); the last row is that of an unknown pair."""
-        rows = [[pair.noise, pair.odds, pair.detour] for pair in self.pairs.values()]
-        return np.log([*rows, [1.0, 1.0, 1.0]])
-
-    @cached_property
-    def _codes(self) -> tuple[Ints, Ints]:
-        """Return pairs as sorted numbers, and the row of the factors of each."""
-        ends = np.array([[int(end) for end in name.split("-")] for name in self.pairs], dtype=np.int64).reshape(-1, 2)
-        codes = ends.min(axis=1, initial=2**31) << 32 | ends.max(axis=1, initial=0)
-        order = np.argsort(codes)
-        return codes[order], order
-
-    def _rows(self, initiator: Ints, target: Ints) -> Ints:
-        """Return the row of `_factors` of ranges (n,)."""
-        codes, order = self._codes
-        asked = np.minimum(initiator, target).astype(np.int64) << 32 | np.maximum(initiator, target).astype(np.int64)
-        place = np.searchsorted(codes, asked)
-        known = place < len(codes)
-        known[known] = codes[place[known]] == asked[known]
-        found = np.full(len(asked), len(codes), dtype=np.int64)
-        found[known] = order[place[known]]
-        return found
 
 
 def _mistake(model: ErrorModel) -> str:
@@ -225,48 +214,3 @@ def _mistake(model: ErrorModel) -> str:
 
 
 CheckedErrors = Annotated[ErrorModel, joint(_mistake)]
-
-
-class ErrorsAtOnce:
-    """Total standard deviation and share of reflections of single ranges, in plain Python; equal to `ErrorModel`.
-
-    Between powers the total is computed from interpolated noise and odds.
-    """
-
-    def __init__(self, model: ErrorModel, bias_curve: Curve) -> None:
-        """Prepare the tables; outside the range of the bias curve the total increases."""
-        self._model, self._low, self._high = model, *bias_curve.range
-        slopes = bias_curve.beyond(np.array([self._low - 1, self._high + 1]))
-        self._below, self._above = slopes.tolist()
-        share = np.array(model.tail_share)
-        self._square_m2 = model.square_m2
-        self._nodes = list(model.lifted)
-        self._rows = list(zip(np.log(model.noise_m).tolist(), np.log(share / (1 - share)).tolist(), strict=True))
-        self._pairs = {}
-        for name, pair in model.pairs.items():
-            one, two = (int(end) for end in name.split("-"))
-            logs = (math.log(pair.noise), math.log(pair.odds), model.detour_m * pair.detour)
-            self._pairs[one, two] = self._pairs[two, one] = logs
-
-    def __call__(self, lifted: float, initiator: int, target: int) -> tuple[float, float]:
-        """Return the total standard deviation in metres, and the share of reflections."""
-        model = self._model
-        noise, odds, detour = self._pairs.get((initiator, target), (0.0, 0.0, model.detour_m))
-        one, two = self._at(lifted)
-        noise, share = math.exp(noise + one), 1 / (1 + math.exp(-odds - two))
-        inside = 1 - model.outlier_share
-        square = noise * noise + share * self._square_m2(detour)
-        mean = inside * share * (model.least_m + detour)
-        total = model.scale**2 * (inside * square + model.outlier_share * model.outlier_m**2 - mean * mean)
-        away = self._below * max(self._low - lifted, 0.0) + self._above * max(lifted - self._high, 0.0)
-        return math.sqrt(total + away * away), share
-
-    def _at(self, lifted: float) -> tuple[float, float]:
-        """Return logarithm of noise and log odds at a lifted power, straight between the model's."""
-        nodes = self._nodes
-        k = bisect_right(nodes, lifted)
-        if k in (0, len(nodes)):
-            return self._rows[max(k - 1, 0)]
-        part = (lifted - nodes[k - 1]) / (nodes[k] - nodes[k - 1])
-        (a, b), (c, d) = self._rows[k - 1 : k + 1]
-        return a + part * (c - a), b + part * (d - b)

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.document import Metres, Positive
+from calib.calibration.parts import pairs_of
 from calib.data.ranges import Ranges
 from uwblink.arrays import Floats
 
@@ -40,8 +41,8 @@ def lasting_errors(ranges: Ranges, z: Floats) -> LastingErrors | None:
     The autocovariance is averaged in bins of the logarithm of the lag; bins with few products are left out.
     """
     inside = np.flatnonzero(z**2 < GATE)
-    low, high = (np.sort([ranges.initiator[inside], ranges.target[inside]], axis=0)).astype(np.int64)
-    pair = (ranges.session[inside].astype(np.int64) << 32) + (low << 16) + high
+    pairs, number = pairs_of(ranges.initiator[inside], ranges.target[inside])
+    pair = ranges.session[inside] * len(pairs) + number
     order = np.lexsort((ranges.time_ns[inside], pair))
     pair, time_s = pair[order], ranges.time_ns[inside][order] * 1e-9
     mean, total = float(np.mean(z[inside])), float(np.var(z[inside]))

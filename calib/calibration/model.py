@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -32,12 +33,12 @@ from calib.calibration.document import (
 )
 from calib.calibration.error_model import CheckedErrors
 from calib.calibration.parts import (
-    CorrectedColumns,
     CorrectedRange,
     CorrectedRanges,
     PairOffset,
     TagGroup,
     Uncertainty,
+    columns_of,
 )
 from calib.calibration.power_curves import LIFTS, BiasCurve, SigmaCurve, basis, lifted_power
 from calib.data.ranges import Ranges
@@ -184,7 +185,7 @@ class Calibration:
         target: int,
         *,
         weights: tuple[float, float] = ...,
-    ) -> CorrectedRange: ...
+    ) -> CorrectedRange[float]: ...
 
     @overload
     def correct(
@@ -196,7 +197,7 @@ class Calibration:
         target: ArrayLike,
         *,
         weights: tuple[ArrayLike, ArrayLike] = ...,
-    ) -> CorrectedColumns: ...
+    ) -> CorrectedRange[Floats]: ...
 
     def correct(
         self,
@@ -207,7 +208,7 @@ class Calibration:
         target: Any,
         *,
         weights: tuple[Any, Any] = (0.5, 0.5),
-    ) -> CorrectedRange | CorrectedColumns:
+    ) -> CorrectedRange[Any]:
         """Correct one range, or arrays of them (n,): the corrected range and its standard deviations, in metres.
 
         `range_m` is as the board gives it, powers are in dBm, NaN or 0 where a board has none. One range takes a few
@@ -225,11 +226,12 @@ class Calibration:
         if all([isinstance(value, float | int | np.generic) for value in given]):  # noqa: C419 - a list takes half the time of a generator
             corrector = self._corrector or RangeCorrector(self)
             object.__setattr__(self, "_corrector", corrector)
-            return corrector(range_m, fpp1_dbm, fpp2_dbm, initiator, target, weights)
+            with suppress(KeyError):  # an unknown tag is named below
+                return corrector(range_m, fpp1_dbm, fpp2_dbm, initiator, target, weights)
         ranges = Ranges.from_arrays(
             range_m, initiator=initiator, target=target, fpp1_dbm=fpp1_dbm, fpp2_dbm=fpp2_dbm, weights=weights
         )
-        return CorrectedColumns.of(self.apply(ranges))
+        return columns_of(self.apply(ranges))
 
     def band(self, lifted: Floats, which: Literal["bias", "sigma"]) -> Floats | None:
         """Return the standard error of a curve at lifted powers (n,), in metres; None where it is not known."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -12,11 +12,13 @@ from calib.calibration.document import Metres, Number, StdM, number, pair_name
 from calib.calibration.power_curves import BiasCurve, SigmaCurve
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError
-from uwblink.arrays import Bools, Floats
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import as_text, excerpt
 from uwblink.twr import LARGEST_ID
 
 Tags = tuple[Annotated[int, number(0, LARGEST_ID, "the id of a tag", int)], ...]
+
+T = TypeVar("T")
 
 Matrix = tuple[tuple[Number, ...], ...]
 """A matrix as a tuple of rows."""
@@ -57,6 +59,13 @@ class PairOffset:
     std_m: StdM
 
 
+def pairs_of(initiator: Ints, target: Ints) -> tuple[list[tuple[int, int]], Ints]:
+    """Return the pairs among ranges (n,), in order and with the smaller id first, and the number of each one's pair."""
+    low, high = np.sort([initiator, target], axis=0).astype(np.int64)
+    codes, number = np.unique(low << 32 | high, return_inverse=True)
+    return list(zip((codes >> 32).tolist(), (codes % 2**32).tolist(), strict=True)), number
+
+
 def offset_of(offsets: Mapping[tuple[int, int], PairOffset], first: int, second: int) -> PairOffset:
     """Return the constant of a pair, in either direction; raises `BadInputError` for a pair that has none."""
     try:
@@ -73,10 +82,8 @@ def offsets_m(offsets: Mapping[tuple[int, int], PairOffset], ranges: Ranges) -> 
     """Return the constant of each range's pair (n,), zeros where there are none; raises what `offset_of` raises."""
     if not offsets or not len(ranges):
         return np.zeros(len(ranges))
-    ends = np.sort(np.column_stack([ranges.initiator, ranges.target]), axis=1)
-    pairs, place = np.unique(ends, axis=0, return_inverse=True)
-    values = [offset_of(offsets, *pair).offset_m for pair in pairs.tolist()]
-    return np.asarray(np.array(values)[place.ravel()])
+    pairs, number = pairs_of(ranges.initiator, ranges.target)
+    return np.array([offset_of(offsets, *pair).offset_m for pair in pairs])[number]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,42 +123,28 @@ class CorrectedRanges:
         return as_text(f"{len(self.raw_m)} corrected ranges", excerpt(columns))
 
 
-class CorrectedRange(NamedTuple):
+class CorrectedRange(NamedTuple, Generic[T]):
     """A corrected range and its standard deviation, metres; `clamped` where its power is beyond the curves'.
 
     `sigma_m` is the noise of a direct range; `sigma_total_m` includes reflections, which are the share `tail_share` of
     the ranges of this pair at this power; both are NaN without an error model. Without a power at either end the range
-    has the delays' part only, and its standard deviations are NaN.
+    has the delays' part only, and its standard deviations are NaN. Each is a number, or an array (n,).
     """
 
-    range_m: float
-    sigma_m: float
-    clamped: bool
-    sigma_total_m: float
-    tail_share: float
+    range_m: T
+    sigma_m: T
+    clamped: Any
+    sigma_total_m: T
+    tail_share: T
 
 
-class CorrectedColumns(NamedTuple):
-    """What `CorrectedRange` holds, for arrays of ranges (n,)."""
-
-    range_m: Floats
-    sigma_m: Floats
-    clamped: Bools
-    sigma_total_m: Floats
-    tail_share: Floats
-
-    @classmethod
-    def of(cls, applied: CorrectedRanges) -> CorrectedColumns:
-        """Return corrected ranges as columns; those without a power have the delays' part only."""
-        powered = np.isfinite(applied.lifted)
-        return cls(
-            np.where(powered, applied.corrected_m, applied.delay_corrected_m),
-            np.where(powered, applied.sigma_m, np.nan),
-            applied.clamped,
-            applied.sigma_total_m,
-            applied.tail_share,
-        )
-
-    def __repr__(self) -> str:
-        """Return a headline and the first rows, in lines of 79 characters."""
-        return as_text(f"{len(self.range_m)} corrected ranges", excerpt(self._asdict()))
+def columns_of(applied: CorrectedRanges) -> CorrectedRange[Floats]:
+    """Return corrected ranges as columns; those without a power have the delays' part only."""
+    powered = np.isfinite(applied.lifted)
+    return CorrectedRange(
+        np.where(powered, applied.corrected_m, applied.delay_corrected_m),
+        np.where(powered, applied.sigma_m, np.nan),
+        applied.clamped,
+        applied.sigma_total_m,
+        applied.tail_share,
+    )

@@ -80,7 +80,7 @@ class Curve:
             return np.ones(np.shape(lifted), dtype=bool)
         return (lifted >= self.range[0]) & (lifted <= self.range[1])
 
-    def beyond(self, lifted: Floats) -> Floats:
+    def beyond(self, lifted: Floats | float) -> Floats:
         """Return by how much the curve would go on (n,) where it is held constant, straight on from its ends, metres.
 
         Zero at powers that it was fitted at. It is what a range there may be off by.
@@ -118,8 +118,8 @@ def flat_curve(value_m: float, span: tuple[float, float]) -> Curve:
 
 def populated(ordered: Floats) -> tuple[float, float]:
     """Return the range of lifted power, sorted (n,), in which a curve is fitted: all but half a percent at each end."""
-    low, high = _quantiles(ordered, np.array([0.005, 0.995]))
-    return float(low), float(high)
+    low, high = np.quantile(ordered, [0.005, 0.995]).tolist()
+    return low, high
 
 
 def knots_for(ordered: Floats, segments: int, span: tuple[float, float] | None = None) -> Floats:
@@ -129,15 +129,10 @@ def knots_for(ordered: Floats, segments: int, span: tuple[float, float] | None =
     segment, equal lengths the sparse ones without data.
     """
     low, high = span or populated(ordered)
-    quantiles = np.clip(_quantiles(ordered, np.linspace(0, 1, segments + 1)), low, high)
+    quantiles = np.clip(np.quantile(ordered, np.linspace(0, 1, segments + 1)), low, high)
     inner = (quantiles + np.linspace(low, high, segments + 1)) / 2
     inner[[0, -1]] = low, high
     return np.concatenate([[low] * DEGREE, inner, [high] * DEGREE])
-
-
-def _quantiles(ordered: Floats, shares: Floats) -> Floats:
-    """Interpolate linearly between sorted values, as `numpy.quantile` does with unsorted ones."""
-    return np.asarray(np.interp(shares * (len(ordered) - 1), np.arange(len(ordered)), ordered))
 
 
 def basis(lifted: Floats, knots: Floats) -> Floats:

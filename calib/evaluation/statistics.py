@@ -10,9 +10,9 @@ from typing import Any, Final
 import numpy as np
 from scipy.interpolate import BSpline
 
-from calib.calibration.document import for_json
+from calib.calibration.document import for_json, pair_name
 from calib.calibration.model import Calibration, require_calibration
-from calib.calibration.parts import CorrectedRanges
+from calib.calibration.parts import CorrectedRanges, pairs_of
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, load_ranges
 from calib.spread import TWO_SIDED_95, robust_spread
@@ -234,10 +234,8 @@ def planted_curve(ranges: Ranges, which: str, lifted: Floats) -> Floats | None:
 
 def pair_rows(ranges: Ranges) -> dict[str, Bools]:
     """Return which ranges belong to each pair of tags, whoever initiated."""
-    low = np.minimum(ranges.initiator, ranges.target)
-    high = np.maximum(ranges.initiator, ranges.target)
-    found = sorted(set(zip(low.tolist(), high.tolist(), strict=True)))
-    return {f"{a}-{b}": (low == a) & (high == b) for a, b in found}
+    pairs, number = pairs_of(ranges.initiator, ranges.target)
+    return {pair_name(pair): number == k for k, pair in enumerate(pairs)}
 
 
 def split_error(ranges: Ranges, error_m: Floats) -> ErrorSplit:
