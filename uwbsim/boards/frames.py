@@ -29,7 +29,7 @@ from uwbsim.scenario.ranging import (
     before_marker_s,
 )
 from uwbsim.simulation.timestamps import draw_reply_s, next_grid
-from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.reception import Frames, Medium
 from uwbsim.world.world import SampledWorld, World
@@ -129,9 +129,8 @@ class Radios:
     def __init__(self, scenario: Scenario, lost_share: float = 0.0) -> None:
         """Create world, clocks and random stream from the scenario."""
         self.scenario = scenario
-        self.world = World.of(scenario)
-        self.sampled_world = SampledWorld(self.world)
-        self.medium = Medium(scenario, self.sampled_world, Clocks.of(scenario))
+        self.world = World(scenario)
+        self.medium = Medium(scenario, SampledWorld(self.world))
         self.lost_share = lost_share
         self.place = {tag.id: k for k, tag in enumerate(scenario.tags)}
         self._all = np.arange(len(scenario.tags))
@@ -189,21 +188,20 @@ class Radios:
 
     def paths(self, frame: Frame, receiver: int) -> PathsHeard:
         """Return the paths of a frame to a board, as `World.paths` does."""
-        detour = frame.excess_m if frame.receiver == receiver else 0.0
-        return self.world.paths(self.place[frame.sender], self.place[receiver], frame.departure, detour)
+        detour = np.array([frame.excess_m if frame.receiver == receiver else 0.0])
+        (found,) = self.world.paths(self._one(frame.sender), self._one(receiver), np.array([frame.departure]), detour)
+        return found
 
     def _receptions(self, sender: int, departure: int, excess_m: Floats) -> Receptions:
         rng, count = self._rng, len(self._all)
         frames = Frames(sender=np.full(count, sender), receiver=self._all, departure=np.full(count, departure))
         noise = rng.normal(size=(4, count))
         arrives = rng.random(count) >= self.lost_share
-        received = self.medium.receive(frames, noise[1], excess_m)
-        power_dbm = received.link.power_dbm
+        stamp, link = self.medium.receive(frames, noise[1], excess_m)
+        power_dbm = link.power_dbm
         printed_dbm, skew_ppm = self.medium.readings(frames, power_dbm, noise[2], noise[3])
         heard = self.medium.heard(power_dbm, noise[0]) & arrives
-        return Receptions(
-            power_dbm=power_dbm, heard=heard, stamp=received.stamp, printed_dbm=printed_dbm, skew_ppm=skew_ppm
-        )
+        return Receptions(power_dbm=power_dbm, heard=heard, stamp=stamp, printed_dbm=printed_dbm, skew_ppm=skew_ppm)
 
     def _one(self, board: int) -> Ints:
         return np.array([self.place[board]])

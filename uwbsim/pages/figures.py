@@ -25,9 +25,10 @@ from uwbsim.protocols.conditions import interval_stamps
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.ranging import after_marker_s, before_marker_s, message_bytes
-from uwbsim.simulation.timestamps import Begun, Draws, Stamped, draw_reply_s, stamp
+from uwbsim.simulation.air import Schedule
+from uwbsim.simulation.timestamps import Draws, Stamped, draw_reply_s, stamp
 from uwbsim.twins import Compared
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 from uwbsim.world.reception import Medium
 from uwbsim.world.world import World
 
@@ -112,10 +113,11 @@ def optimum_curve(width_in: float, found: Optimum) -> Figure:
 
 def room(width_in: float, scenario: Scenario) -> Figure:
     """Draw bodies' paths, tags at the start, obstacles and the room's walls, from above and from the side, to scale."""
-    world = World.of(scenario)
+    world = World(scenario)
     time = np.linspace(0, min(scenario.run.duration_s, 120.0), 1200)
     paths = {body.name: world.trajectories[body.name].position_m(time) for body in scenario.bodies}
-    tags = {tag.id: world.trajectories[tag.body].point_m(np.zeros(1), tag.lever_arm_m)[0] for tag in scenario.tags}
+    spots, _ = world.antennas(np.arange(len(scenario.tags)), np.zeros(len(scenario.tags)))
+    tags = {tag.id: spot for tag, spot in zip(scenario.tags, spots, strict=True)}
     corners = [corner for box in scenario.obstacles for corner in (box.min_m, box.max_m)]
     corners += [scenario.room.min_m, scenario.room.max_m] if scenario.room else []
     points = np.concatenate([*paths.values(), np.array(list(tags.values())), np.array(corners).reshape(-1, 3)])
@@ -264,9 +266,8 @@ def _one_exchange(scenario: Scenario, protocol: RangingProtocol) -> tuple[Stampe
     reply = stream(scenario.run.seed, "timing diagram")
     draws = Draws(zeros, zeros, draw_reply_s(scenario, reply, 1), np.zeros(1))
     start = np.array([SUBTICKS_PER_SECOND // 100])
-    begun = Begun(start=start, initiator=np.array([place[first]]), target=np.array([place[second]]))
-    medium = Medium(scenario, World.of(scenario), Clocks.of(scenario))
-    return stamp(medium, protocol, begun, draws), (first, second)
+    begun = Schedule(start, np.array([place[first]]), np.array([place[second]]), np.zeros(1, dtype=np.int64))
+    return stamp(Medium(scenario, World(scenario)), protocol, begun, draws), (first, second)
 
 
 @dataclass(frozen=True, slots=True)

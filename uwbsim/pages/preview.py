@@ -104,7 +104,7 @@ def preview(scenario: Scenario | Source) -> Preview:
     two: DS-TWR, third message from the target, plan round-robin, 2 s
     """
     scenario = as_scenario(scenario)
-    plan, world = schedule(scenario), World.of(scenario)
+    plan, world = schedule(scenario), World(scenario)
     duration, radio, samples = scenario.run.duration_s, scenario.radio, 200
     time = (np.linspace(0, duration, samples) * SUBTICKS_PER_SECOND).astype(np.int64)
     reply_s = scenario.ranging.response_delay_uus * UUS_S

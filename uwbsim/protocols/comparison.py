@@ -267,20 +267,23 @@ def over_state(
     protocol: RangingProtocol, conditions: Conditions, values: Floats, errors: Floats, groups: int = 14
 ) -> ErrorCurve:
     """Return the error over a property of the states, `values` (states,), from `errors` of ranges in these in turn."""
-    used = np.resize(np.arange(len(conditions)), len(errors))
-    prediction = predict(protocol, conditions)
-    parts = np.array_split(np.argsort(values), groups)
-    place = np.empty(len(conditions), dtype=np.int64)
-    for k, rows in enumerate(parts):
+    # Range k has the state k modulo their number: of few ranges some states have none.
+    values = values[: len(errors)]
+    groups = min(groups, len(values))
+    prediction, place = predict(protocol, conditions), np.empty(len(values), dtype=np.int64)
+    states = np.array_split(np.argsort(values), groups)
+    for k, rows in enumerate(states):
         place[rows] = k
-    group = place[used]
-    counts = np.maximum(np.bincount(group, minlength=groups), 1)
-    mean = np.bincount(group, errors, groups) / counts
-    std = np.sqrt(np.maximum(np.bincount(group, errors**2, groups) / counts - mean**2, 0))
-    means = np.array([prediction.mean_m[rows].mean() for rows in parts])
-    spreads = np.array([prediction.variance_m2[rows].mean() + prediction.mean_m[rows].var() for rows in parts])
-    middles = np.array([np.median(values[rows]) for rows in parts])
-    return ErrorCurve(middles, mean, std, means, np.sqrt(spreads))
+    group = np.resize(place, len(errors))
+    ranges = [errors[group == k] for k in range(groups)]
+    means = [prediction.mean_m[rows].mean() for rows in states]
+    variances = [prediction.variance_m2[rows].mean() + prediction.mean_m[rows].var() for rows in states]
+    columns = (
+        [np.median(values[rows]) for rows in states],
+        [part.mean() for part in ranges],
+        [part.std() for part in ranges],
+    )
+    return ErrorCurve(*(np.array(column) for column in (*columns, means, np.sqrt(variances))))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -1,8 +1,9 @@
 """Conditions of exchanges, sampled from a scenario as columns, and the Monte Carlo simulation of ranges under them.
 
-The Monte Carlo is the same model as the event loop with its integer stamps (`uwbsim.simulation.timestamps`), in floats
-relative to the start of an exchange, for exchanges that do not interfere. It runs in pieces that fit into the cache.
-Noise comes from named streams, one a frame, so that all protocols have the same noise.
+`exchange` is the same model as the event loop with its integer stamps (`uwbsim.simulation.timestamps`), in floats
+relative to the start of an exchange, for exchanges that do not interfere. With noise it is the Monte Carlo, in pieces
+that fit into the cache; without it is the mean that `predict` needs. Noise comes from named streams, one a frame, so
+that all protocols have the same noise.
 """
 
 from __future__ import annotations
@@ -169,7 +170,7 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
     rows = np.unique(np.linspace(0, len(plan.start) - 1, min(count, len(plan.start))).astype(np.int64))
     marker = round(before_marker_s(scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)
     start, i, j = plan.start[rows] + marker, plan.initiator[rows], plan.target[rows]
-    world, clocks, radio = World.of(scenario), Clocks.of(scenario), scenario.radio
+    world, clocks, radio = World(scenario), Clocks.of(scenario), scenario.radio
     link = world.link(i, j, start)
     step_s = 1e-3  # over which the speed along the line between two tags is measured
     later = world.link(i, j, start + round(step_s * SUBTICKS_PER_SECOND))
@@ -223,17 +224,17 @@ def range_errors_m(
     count: int,
     progress: Callable[[float], None] | None = None,
 ) -> Floats:
-    """Return the errors of `count` ranges in metres, (count,); range k meets the state k modulo their number.
+    """Return the errors of `count` ranges in metres, (count,); range k has the state k modulo their number.
 
     An error is the range by the protocol's formula less the mean distance at its first two messages, before any
     calibration. `progress` is called with the done fraction.
     """
-    noise = _Noise(protocol, conditions, seed)
-    length = min(len(conditions), STATES)
-    pieces = cycle([_Ticks(conditions[k : k + length]) for k in range(0, len(conditions), length)])
-    errors, done = np.empty(count), 0
+    noise, errors, done = Noise(protocol, conditions, seed), np.empty(count), 0
+    pieces = cycle([conditions[k : k + STATES] for k in range(0, len(conditions), STATES)])
     while done < count:
-        part = _execute(protocol, next(pieces), noise)[: count - done]
+        found = exchange(protocol, next(pieces), noise)
+        flight = protocol.flight_ticks(intervals_of(protocol, found.stamps, found.carrier_ppm))
+        part = ((flight - found.truth) * METRES_PER_TICK)[: count - done]
         errors[done : done + len(part)] = part
         done += len(part)
         if progress:
@@ -241,135 +242,123 @@ def range_errors_m(
     return errors
 
 
-class _Ticks:
-    """Conditions with times in device ticks."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stamps:
+    """Exchanges, one for each of n states: stamps by name, times of departure and of arrival, and the true flight.
 
-    def __init__(self, c: Conditions) -> None:
-        scale = 1 / TICK_S
-        self.conditions, self.moving = c, bool(np.any(c.flight_rate))
-        self.flight, self.way, self.detour = c.flight * scale, (c.flight + c.excess) * scale, c.detour_s * scale
-        self.faster = {side: 1 + rate for side, rate in c.by_side("rate").items()}
-        self.slower = {side: 1 / rate for side, rate in self.faster.items()}
-        self.half_drift = {s: d * (TICK_S / 2) if np.any(d) else None for s, d in c.by_side("drift").items()}
-        self.tx_delay = {side: delay * scale for side, delay in c.by_side("tx_delay").items()}
-        self.rx_late = {side: c.late * scale + delay * scale for side, delay in c.by_side("rx_delay").items()}
-        # Transmit and receive noise of a frame appear only as a sum in its receive stamp, so one draw with their common
-        # standard deviation replaces two. (The effect on later departures, by motion, drift or clock noise, is below
-        # 10^-7 of it.)
-        self.noise_std = {
-            sender: np.hypot(c.tx_std * self.slower[sender] * self.faster[receiver], c.rx_std) * scale
-            for sender, receiver in (SIDES, SIDES[::-1])
-        }
-        self.reply = {"at once": c.at_once * scale, "scheduled": c.scheduled * scale}
-        self.carrier_ppm = c.carrier_sign * (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
-        # The standard deviation of a clock's phase after a tick, in ticks.
-        self.white = {side: white * scale**0.5 for side, white in c.by_side("white").items()}
+    All are in ticks, (n,) each, the times by message. `carrier_ppm` are the readings of the carrier integrator.
+    """
+
+    stamps: dict[str, Floats]
+    leave: list[Floats]
+    arrive: list[Floats]
+    truth: Floats
+    carrier_ppm: Floats
 
 
-class _Wander:
-    """The phase of a clock with white noise of its rate, in ticks, at instants in order of time."""
+def exchange(protocol: RangingProtocol, c: Conditions, noise: Noise | None = None) -> Stamps:
+    """Return exchanges under n conditions, with noise, or at the mean of all noise but that of multipath.
 
-    def __init__(self, white: Floats, steps: list[Floats]) -> None:
-        """The phase is zero at the first instant; `steps` are standard normal, one per instant."""
-        self._white, self._steps = white, iter(steps)
-        self._time: Floats | None = None
-        self._phase = np.zeros_like(white)
-
-    def at(self, time: Floats) -> Floats:
-        """Return the phase at times (n,) in ticks, none earlier than the last."""
-        if self._time is not None:
-            gap = np.maximum(time - self._time, 0)
-            self._phase = self._phase + self._white * np.sqrt(gap) * next(self._steps)
-        self._time = time
-        return self._phase
-
-
-class _Noise:
-    """Named streams of random numbers, drawn in the order of exchanges; only those that the conditions need."""
-
-    def __init__(self, protocol: RangingProtocol, c: Conditions, seed: int) -> None:
-        numbers = range(len(protocol.messages)) if np.any(c.tx_std) or np.any(c.rx_std) else ()
-        white = np.any(c.white_initiator) or np.any(c.white_target)
-        self.frames = [stream(seed, "frame noise", k) for k in numbers]
-        self.carrier = stream(seed, "skew reading", 2) if c.carrier_std_ppm else None
-        self.counters = {side: stream(seed, "counter phase", side) for side in SIDES} if c.quantize else {}
-        self.clocks = {side: stream(seed, "clock noise", side) for side in SIDES} if white else {}
-        self._hit, self._share = stream(seed, "multipath"), c.multipath
-
-    def detours(self, count: int) -> Floats | float:
-        """Return the detours of the next exchanges, (count,), in units of their mean."""
-        if not self._share:
-            return 0.0
-        hit = self._hit.random(count)
-        # A uniform draw below a threshold, divided by it, is uniform: one draw gives both occurrence and length.
-        return np.where(hit < self._share, -np.log(np.maximum(hit / self._share, 1e-300)), 0.0)
-
-
-def _execute(protocol: RangingProtocol, c: _Ticks, noise: _Noise) -> Floats:
-    """Return range errors in metres of one piece."""
+    A clock reads 1 + rate times the true time, plus half of drift times its square, plus the phase of its noise.
+    Antenna delays and power add to stamps.
+    """
+    rate, drift, tx, rx = (c.by_side(name) for name in ("rate", "drift", "tx_delay", "rx_delay"))
     stamps: dict[str, Floats] = {}
-    flights: list[Floats] = []
-    count, instants = len(c.flight), len(protocol.messages) + 2
-    # The phases of the counters on the grid of transmissions at the start.
-    phases = {side: own.random(count) * DELAYED_TX_GRID for side, own in noise.counters.items()}
-    wander = {
-        side: _Wander(c.white[side], [own.standard_normal(count) for _ in range(instants)])
-        for side, own in noise.clocks.items()
-    }
-    carrier = c.carrier_ppm
-    path = c.way + noise.detours(count) * c.detour
+    leave, arrive = [], []
+    carrier = c.carrier_sign * (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
+    way = (c.flight + c.excess) / TICK_S
+    if noise:
+        noise.begin(c)
+        way = way + noise.detours(c) / TICK_S
     for k, message in enumerate(protocol.messages):
-        sender = message.sender
-        receiver = SIDES[1 - SIDES.index(sender)]
-        printed = _transmission(message, stamps, c, phases)
-        departure = (printed - c.tx_delay[sender]) * c.slower[sender]
-        half = c.half_drift[sender]
-        if half is not None:
-            departure -= half * departure**2
-        if wander:
+        sender, receiver = SIDES if message.sender == "initiator" else SIDES[::-1]
+        sent = _transmit_stamp(message, stamps, c, noise)
+        left = (sent - tx[sender] / TICK_S) / (1 + rate[sender])
+        left = left - drift[sender] * (TICK_S / 2) * left**2
+        if noise:
             if k == 1:
-                carrier = carrier + c.conditions.carrier_sign * _carrier_ppm(wander, departure)
-            departure = departure - wander[sender].at(departure)
-        moved = c.conditions.flight_rate * departure if c.moving else 0.0
-        arrival = departure + (path + moved)
-        seen = arrival * c.faster[receiver]
-        half = c.half_drift[receiver]
-        if half is not None:
-            seen += half * arrival**2
-        if wander:
-            seen += wander[receiver].at(arrival)
-        seen += c.rx_late[receiver]
-        if noise.frames:
-            seen += noise.frames[k].standard_normal(count) * c.noise_std[sender]
-        if phases:
-            seen += phases[receiver]
-            np.rint(seen, out=seen)
-            seen -= phases[receiver]
-        stamps[f"tx{k + 1}"], stamps[f"rx{k + 1}"] = printed, seen
-        flights.append(c.flight + moved)
-    if noise.carrier is not None:
-        carrier = carrier + noise.carrier.standard_normal(count) * c.conditions.carrier_std_ppm
-    truth = (flights[0] + flights[1]) / 2
-    return np.asarray((protocol.flight_ticks(intervals_of(protocol, stamps, carrier)) - truth) * METRES_PER_TICK)
+                carrier = carrier + noise.carrier_ppm(c, left)
+            left = left - noise.phase(sender, left)
+        came = left + way + c.flight_rate * left
+        seen = (1 + rate[receiver]) * came + drift[receiver] * (TICK_S / 2) * came**2 + (c.late + rx[receiver]) / TICK_S
+        if noise:
+            seen = noise.received(c, k, receiver, seen + noise.phase(receiver, came))
+        stamps[f"tx{k + 1}"], stamps[f"rx{k + 1}"] = sent, seen
+        leave.append(left)
+        arrive.append(came)
+    truth = c.flight / TICK_S + c.flight_rate * (leave[0] + leave[1]) / 2
+    return Stamps(stamps=stamps, leave=leave, arrive=arrive, truth=truth, carrier_ppm=carrier)
 
 
-def _transmission(message: ProtocolMessage, stamps: dict[str, Floats], c: _Ticks, phases: dict[str, Floats]) -> Floats:
+def _transmit_stamp(message: ProtocolMessage, stamps: dict[str, Floats], c: Conditions, noise: Noise | None) -> Floats:
     """Return the printed transmit stamp, in ticks since the start: near zero for the poll."""
-    due = stamps[message.after] + c.reply[message.timing] if message.after else np.zeros_like(c.flight)
-    if not phases:
+    reply, scheduled = (c.scheduled if message.timing == "scheduled" else c.at_once), message.timing == "scheduled"
+    due = stamps[message.after] + reply / TICK_S if message.after else np.zeros(len(c))
+    if not c.quantize:
         return due
     # Transmissions begin on the grid of the counter, and the latency of the software ends at the antenna. Boards round
     # a scheduled transmission down to the grid, and send others at its next instant.
-    due = due + phases[message.sender]
+    if noise is None:
+        half = DELAYED_TX_GRID / 2
+        return due + (ANTENNA_DELAY_TICKS - half if scheduled else half) if message.after else due
+    due = due + noise.grid[message.sender]
     slot = due // DELAYED_TX_GRID
     if message.timing == "at once":
         slot = np.ceil((due - ANTENNA_DELAY_TICKS) / DELAYED_TX_GRID)
-    return np.asarray(slot * DELAYED_TX_GRID + ANTENNA_DELAY_TICKS - phases[message.sender])
+    return np.asarray(slot * DELAYED_TX_GRID + ANTENNA_DELAY_TICKS - noise.grid[message.sender])
 
 
-def _carrier_ppm(wander: dict[str, _Wander], departure: Floats) -> Floats:
-    """Return the effect of the clocks' noise over a preamble on the carrier integrator's reading of the frame."""
-    span = RATE_SPAN_S / TICK_S
-    begun = {side: path.at(departure - span) for side, path in wander.items()}
-    gained = {side: path.at(departure) - begun[side] for side, path in wander.items()}
-    return np.asarray((gained["initiator"] - gained["target"]) / span * 1e6)
+class Noise:
+    """The noise of exchanges, from named streams; `grid` are the phases of the counters at the start, by side."""
+
+    def __init__(self, protocol: RangingProtocol, c: Conditions, seed: int) -> None:
+        """Open the streams; those that the conditions do not need are not drawn from."""
+        self._frames = [stream(seed, "frame noise", k) for k in range(len(protocol.messages))]
+        self._multipath, self._carrier = stream(seed, "multipath"), stream(seed, "skew reading", 2)
+        self._counters = {side: stream(seed, "counter phase", side) for side in SIDES}
+        self._clocks = {side: stream(seed, "clock noise", side) for side in SIDES}
+        self._radio = bool(np.any(c.tx_std) or np.any(c.rx_std))
+        self._white = bool(np.any(c.white_initiator) or np.any(c.white_target))
+
+    def begin(self, c: Conditions) -> None:
+        """Begin exchanges: draw the phases of the counters; the phases of the clocks' noise are zero."""
+        if c.quantize:
+            self.grid = {side: own.random(len(c)) * DELAYED_TX_GRID for side, own in self._counters.items()}
+        self._walks: dict[str, tuple[Floats, Floats]] = {}
+        # The standard deviation of a clock's phase after a tick, in ticks.
+        self._wander = {side: white * TICK_S**-0.5 for side, white in c.by_side("white").items()}
+
+    def detours(self, c: Conditions) -> Floats | float:
+        """Return the detours of the exchanges in seconds."""
+        if not c.multipath:
+            return 0.0
+        hit = self._multipath.random(len(c))
+        # A uniform draw below a threshold, divided by it, is uniform: one draw gives both occurrence and length.
+        units = np.where(hit < c.multipath, -np.log(np.maximum(hit / c.multipath, 1e-300)), 0.0)
+        return units * c.detour_s
+
+    def phase(self, side: str, time: Floats) -> Floats | float:
+        """Return the phase of a clock by the white noise of its rate at times in ticks, none earlier than the last."""
+        if not self._white:
+            return 0.0
+        last, phase = self._walks.get(side, (time, np.zeros_like(time)))
+        step = np.sqrt(np.maximum(time - last, 0)) * self._clocks[side].standard_normal(len(time))
+        self._walks[side] = time, phase + self._wander[side] * step
+        return self._walks[side][1]
+
+    def carrier_ppm(self, c: Conditions, departure: Floats) -> Floats | float:
+        """Return the noise of the carrier integrator, with that of the clocks over the preamble before a departure."""
+        noise = self._carrier.standard_normal(len(c)) * c.carrier_std_ppm if c.carrier_std_ppm else 0.0
+        span = RATE_SPAN_S / TICK_S
+        before = [self.phase(side, departure - span) for side in SIDES]
+        mine, other = (self.phase(side, departure) - phase for side, phase in zip(SIDES, before, strict=True))
+        return noise + c.carrier_sign * (mine - other) / span * 1e6
+
+    def received(self, c: Conditions, k: int, side: str, seen: Floats) -> Floats:
+        """Return receive stamps of message k with the noise of both radios, in whole ticks of the receiver's counter.
+
+        Transmit noise is added here, too: its effect on later departures is below 1e-7 of it.
+        """
+        if self._radio:
+            seen = seen + self._frames[k].standard_normal(len(c)) * (np.hypot(c.tx_std, c.rx_std) / TICK_S)
+        return np.rint(seen + self.grid[side]) - self.grid[side] if c.quantize else seen

@@ -7,16 +7,17 @@ at once as there are; `predict_state` describes a single one.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Final
 
 import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.protocols.table import RangingProtocol
-from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S
+from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S
 from uwbsim.errors import ParameterError
-from uwbsim.protocols.conditions import SIDES, Conditions, chosen, intervals_of
+from uwbsim.protocols.conditions import Conditions, Stamps, chosen, exchange, intervals_of
 from uwbsim.scenario.devices import TX_SHARE
 from uwbsim.world.clocks import RATE_SPAN_S
 
@@ -54,9 +55,8 @@ class PredictedErrors:
 
 def predict(protocol: RangingProtocol, c: Conditions) -> PredictedErrors:
     """Predict the error of a protocol under conditions (n,)."""
-    stamps, leave, arrive = _noiseless(protocol, c)
-    carrier = c.carrier_sign * (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
-    readings = stamps | {"carrier": carrier}
+    mean = exchange(protocol, c)
+    readings = mean.stamps | {"carrier": mean.carrier_ppm}
 
     def flight(**errors: float) -> Floats:
         """Return the flight in ticks where readings have some errors, by their names."""
@@ -66,69 +66,22 @@ def predict(protocol: RangingProtocol, c: Conditions) -> PredictedErrors:
     # The formulas are smooth over thousands of ticks, and over ppm.
     steps = {name: 1.0 if name == "carrier" else 16.0 for name in readings}
     slopes = {name: (flight(**{name: h}) - flight(**{name: -h})) / (2 * h) for name, h in steps.items()}
-    squares = {end: sum(slopes[name] ** 2 for name in stamps if name.startswith(end)) for end in ("tx", "rx")}
-    truth = ((arrive[0] - leave[0] + arrive[1] - leave[1]) / 2 - c.excess) / TICK_S
+    squares = {end: sum(slopes[name] ** 2 for name in mean.stamps if name.startswith(end)) for end in ("tx", "rx")}
     # A detour of all messages lengthens the two flights of the first round trip; the formulas hold it to the same
     # precision as the flight itself.
     p, detour = c.multipath, c.detour_s * SPEED_OF_LIGHT
     return PredictedErrors(
-        mean_m=np.asarray((flight() - truth) * METRES_PER_TICK + p * detour),
+        mean_m=np.asarray((flight() - mean.truth) * METRES_PER_TICK + p * detour),
         transmit_m2=np.asarray(squares["tx"] * (c.tx_std * SPEED_OF_LIGHT) ** 2),
         receive_m2=np.asarray(squares["rx"] * (c.rx_std * SPEED_OF_LIGHT) ** 2),
         quantization_m2=np.asarray(squares["rx"] * METRES_PER_TICK**2 / 12 * c.quantize),
         carrier_m2=np.asarray((slopes["carrier"] * c.carrier_std_ppm * METRES_PER_TICK) ** 2),
-        clock_m2=_white_clocks(protocol, slopes, leave, arrive, c) * SPEED_OF_LIGHT**2,
+        clock_m2=_white_clocks(protocol, slopes, mean, c) * SPEED_OF_LIGHT**2,
         multipath_m2=np.full(len(c), p * (2 - p) * detour**2),
     )
 
 
-def _noiseless(protocol: RangingProtocol, c: Conditions) -> tuple[dict[str, Floats], list[Floats], list[Floats]]:
-    """Return stamps of exchanges without noise in ticks, and true seconds at which messages leave and arrive.
-
-    A clock reads 1 + rate times the true time, plus half of drift times its square; what antennas and power add to
-    stamps comes on top.
-    """
-    tx, rate, drift = (c.by_side(name) for name in ("tx_delay", "rate", "drift"))
-    rx = {side: delay + c.late for side, delay in c.by_side("rx_delay").items()}
-    way = c.flight + c.excess
-    # True instants at the antennas, from the departure of the poll.
-    leave: list[Floats] = []
-    arrive: list[Floats] = []
-    stamps = {}
-    for k, message in enumerate(protocol.messages):
-        side, other = message.sender, SIDES[1 - SIDES.index(message.sender)]
-        left = np.zeros(len(c))
-        if message.after:
-            received = message.after.startswith("rx")
-            # The printed reply is between stamps; at the antenna it is shorter by the errors of antenna and power.
-            added = tx[side] - (rx if received else tx)[side]
-            left = (arrive if received else leave)[k - 1] + (_reply_s(protocol, k, c) - added) / (1 + rate[side])
-        leave.append(left)
-        arrive.append(left + way + c.flight_rate * left)
-        for name, owner, time, late in (("tx", side, left, tx[side]), ("rx", other, arrive[k], rx[other])):
-            shown = (1 + rate[owner]) * time + drift[owner] / 2 * time**2 + late
-            stamps[f"{name}{k + 1}"] = shown / TICK_S
-    return stamps, leave, arrive
-
-
-def _reply_s(protocol: RangingProtocol, k: int, c: Conditions) -> Floats:
-    """Return the reply before message k, as printed, on average over where the counter's grid happens to lie."""
-    scheduled = protocol.messages[k].timing == "scheduled"
-    reply = c.scheduled if scheduled else c.at_once
-    if not c.quantize:
-        return reply
-    # A grid that is rounded down, and the boards' antenna delay on top; or rounded up, to where they want to be.
-    half = DELAYED_TX_GRID / 2 * TICK_S
-    return reply - half + ANTENNA_DELAY_TICKS * TICK_S if scheduled else reply + half
-
-
-def _white_clocks(
-    protocol: RangingProtocol,
-    slopes: dict[str, Floats],
-    leave: list[Floats],
-    arrive: list[Floats],
-    c: Conditions,
-) -> Floats:
+def _white_clocks(protocol: RangingProtocol, slopes: dict[str, Floats], mean: Stamps, c: Conditions) -> Floats:
     """Return the variance of the flight in square seconds by white noise of the clocks' rates.
 
     The phase at an instant is the integral of the noise until then, so the noise of a time interval has the sum of the
@@ -136,16 +89,19 @@ def _white_clocks(
     carrier integrator reads the mean rate over the preamble of the second message.
     """
     # The derivative of the flight by the phase gained during the preamble.
-    gain = c.carrier_sign * slopes["carrier"] * 1e6 * TICK_S / RATE_SPAN_S
+    gain, preamble = (
+        c.carrier_sign * slopes["carrier"] * 1e6 * TICK_S / RATE_SPAN_S,
+        mean.leave[1] - RATE_SPAN_S / TICK_S,
+    )
     total = np.zeros(len(c))
     for side, white, sign in (("initiator", c.white_initiator, 1), ("target", c.white_target, -1)):
-        read = [(leave[1] - RATE_SPAN_S, -sign * gain), (leave[1], sign * gain)]
+        read = [(preamble, -sign * gain), (mean.leave[1], sign * gain)]
         for k, message in enumerate(protocol.messages):
-            name, time = ("tx", leave[k]) if message.sender == side else ("rx", arrive[k])
+            name, time = ("tx", mean.leave[k]) if message.sender == side else ("rx", mean.arrive[k])
             read.append((time, slopes[f"{name}{k + 1}"]))
         read.sort(key=lambda pair: float(pair[0][0]))
         after = np.cumsum([slope for _, slope in reversed(read)], axis=0)[::-1]
-        gaps = np.diff([time for time, _ in read], axis=0)
+        gaps = np.diff([time for time, _ in read], axis=0) * TICK_S
         total += white**2 * np.sum(after[1:] ** 2 * np.maximum(gaps, 0), axis=0)
     return total
 
@@ -180,19 +136,22 @@ class State:
     whole_ticks: bool = False
 
 
+LEAST: Final = {
+    **dict.fromkeys(("reply_delay_us", "distance_m", "tx_noise_ps", "rx_noise_ps", "carrier_noise_ppm"), 0.0),
+    "final_delay_us": 1.0,
+}
+"""Least values of a state; a third message that follows at once would not tell the clocks' rates."""
+
+
 def _check(q: State) -> None:
-    not_negative = ("reply_delay_us", "distance_m", "tx_noise_ps", "rx_noise_ps", "carrier_noise_ppm")
-    for field in fields(q):
-        value = getattr(q, field.name)
-        if field.name in ("protocol", "whole_ticks") or value is None:
+    for name, value in asdict(q).items():
+        if name in ("protocol", "whole_ticks") or value is None:
             continue
         if not isinstance(value, int | float) or not abs(value) < 1e9:
-            raise ParameterError(f"found {value}, expected a number below 1e+09", parameter=field.name)
-        if field.name in not_negative and value < 0:
-            raise ParameterError(f"found {value:g}, expected 0 or more", parameter=field.name)
-    # A third message that follows at once leaves nothing to tell the clocks' rates from.
-    if q.final_delay_us is not None and q.final_delay_us < 1.0:
-        raise ParameterError(f"found {q.final_delay_us:g}, expected at least 1", parameter="final_delay_us")
+            raise ParameterError(f"found {value}, expected a number below 1e+09", parameter=name)
+        least = LEAST.get(name, -math.inf)
+        if value < least:
+            raise ParameterError(f"found {value:g}, expected {least:g} or more", parameter=name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -1,19 +1,20 @@
-"""The plans of a scenario, and the discrete-event loop that executes them: transmissions, collisions, failures.
+"""The plan of a scenario, and its execution by discrete events: transmissions, collisions, lost messages.
 
-A host commands boards one after the other. In a round robin one host commands all; otherwise every initiator has its
-own, and only the plan keeps two from sending at once.
+A host commands its boards one after the other. With the plan "round-robin" one host commands all boards; with any other
+plan each initiator has a host of its own, and only the plan keeps two boards from transmitting at the same time.
 
-The loop decides what happens and in which order. It runs on nominal delays, within a few tens of nanoseconds of the
-exact instants, on which nothing in it depends; those are computed afterwards in batches (`timestamps`).
+The event loop decides which messages are received, and when. It uses nominal delays, which differ from the exact ones
+by a few tens of nanoseconds; no decision depends on that. `timestamps` computes the exact instants afterwards.
 
-A frame is noted when it is decided to send it and judged when it has ended, so that every frame which overlaps it is
-known by then: one event a message. An exchange whose messages are all heard, and which is over before any other host
-can begin, is one event.
+A frame is registered before it is sent, and its reception is decided when it ends: by then all frames that overlap it
+are registered. Each message is one event. An exchange whose messages are all above the sensitivity, and which ends
+before any other host can begin one, is a single event.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+import itertools
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,88 +39,80 @@ from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """Planned exchanges as columns (n,): true start in sub-ticks, places of the tags, and the host that plays each."""
+    """Planned exchanges (n,): true start in sub-ticks, indices of the tags, and the host that commands each."""
 
     start: Ints
     initiator: Ints
     target: Ints
     host: Ints
 
-    def hosts(self) -> list[list[int]]:
-        """Return the numbers of the exchanges that each host plays, in order."""
-        return [np.flatnonzero(self.host == host).tolist() for host in np.unique(self.host)]
+    def __getitem__(self, rows: Ints) -> Schedule:
+        """Return the chosen exchanges."""
+        return Schedule(self.start[rows], self.initiator[rows], self.target[rows], self.host[rows])
 
 
 def schedule(scenario: Scenario) -> Schedule:
-    """Return the exchanges that a scenario plans."""
+    """Return the exchanges that a scenario plans, in order of time."""
     place = {tag.id: k for k, tag in enumerate(scenario.tags)}
-    if not isinstance(scenario.ranging.plan, str):
-        rows = [slot for slot in scenario.ranging.plan.slots if slot[0] <= scenario.run.duration_s]
-        start, ids = np.array([r[0] for r in rows]), [(int(r[1]), int(r[2])) for r in rows]
-        pairs = np.array([[place[a], place[b]] for a, b in ids], dtype=np.int64)
-        return _schedule(start, pairs, pairs[:, 0])
+    plan, rate_hz, duration_s = scenario.ranging.plan, scenario.ranging.rate_hz, scenario.run.duration_s
+    if not isinstance(plan, str):
+        slots = [slot for slot in plan.slots if slot[0] <= duration_s]
+        turns = np.array([[place[a], place[b]] for _, a, b in slots], dtype=np.int64)
+        return _in_order(np.array([time_s for time_s, _, _ in slots]), turns, turns[:, 0])
     pairs = np.array([[place[a], place[b]] for a, b in scenario.pairs()], dtype=np.int64)
-    if scenario.ranging.plan == "aloha":
-        return _aloha(scenario, pairs)
-    # In turns, at the rate. One host plays them; with tdma each initiator has its own, whose clock is off by
-    # `sync_error_ms`. With a common list each robot begins when it has heard the exchange before its own, which keeps
-    # the order; who is too far away to hear it waits for `list_timeout_ms` more (`Slots.pause`).
-    count = int(scenario.run.duration_s * scenario.ranging.rate_hz)
-    start, turn = np.arange(count) / scenario.ranging.rate_hz, pairs[np.arange(count) % len(pairs)]
-    if scenario.ranging.plan != "tdma":
-        return _schedule(start, turn, np.zeros(count, dtype=np.int64))
+    if plan == "aloha":
+        # Every initiator ranges at random times with random targets; their rates add up to the plan's.
+        initiators, parts = np.unique(pairs[:, 0]), []
+        for initiator in initiators:
+            rng = stream(scenario.run.seed, "aloha", scenario.tags[initiator].id)
+            times = np.sort(rng.uniform(0, duration_s, rng.poisson(rate_hz / len(initiators) * duration_s)))
+            mine = pairs[pairs[:, 0] == initiator]
+            parts.append((times, mine[rng.integers(0, len(mine), len(times))]))
+        start, turns = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        return _in_order(start, turns, turns[:, 0])
+    # The pairs range in turn. With "tdma" each initiator has a host of its own, whose clock has an error of
+    # `sync_error_ms`. With "common-list" each robot begins after the exchange before its own, which keeps the order; if
+    # it cannot hear that exchange, it waits for `list_timeout_ms` in addition (`Slots.pause`).
+    count = int(duration_s * rate_hz)
+    start, turns = np.arange(count) / rate_hz, pairs[np.arange(count) % len(pairs)]
+    if plan != "tdma":
+        return _in_order(start, turns, np.zeros(count, dtype=np.int64))
     error_s = stream(scenario.run.seed, "sync error").normal(size=len(scenario.tags))
     late = error_s * (scenario.ranging.sync_error_ms * 1e-3)
-    return _schedule(np.maximum(start + late[turn[:, 0]], 0), turn, turn[:, 0])
+    return _in_order(np.maximum(start + late[turns[:, 0]], 0), turns, turns[:, 0])
 
 
-def _aloha(scenario: Scenario, pairs: Ints) -> Schedule:
-    """Return exchanges of every initiator at random times with random targets; their rates add up to the plan's."""
-    initiators = np.unique(pairs[:, 0])
-    duration, rate = scenario.run.duration_s, scenario.ranging.rate_hz / len(initiators)
-    parts = []
-    for number in initiators:
-        rng = stream(scenario.run.seed, "aloha", scenario.tags[number].id)
-        times = np.sort(rng.uniform(0, duration, rng.poisson(rate * duration)))
-        mine = pairs[pairs[:, 0] == number]
-        parts.append((times, mine[rng.integers(0, len(mine), len(times))]))
-    start = np.concatenate([times for times, _ in parts])
-    turn = np.concatenate([chosen for _, chosen in parts])
-    return _schedule(start, turn, turn[:, 0])
-
-
-def _schedule(start_s: Floats, pairs: Ints, host: Ints) -> Schedule:
+def _in_order(start_s: Floats, pairs: Ints, host: Ints) -> Schedule:
     order = np.argsort(start_s, kind="stable")
-    start = (start_s[order] * SUBTICKS_PER_SECOND).astype(np.int64)
-    return Schedule(start, pairs[order, 0], pairs[order, 1], host[order])
+    start = (start_s * SUBTICKS_PER_SECOND).astype(np.int64)
+    return Schedule(start, pairs[:, 0], pairs[:, 1], host)[order]
 
 
 WEAK, COLLIDED, BUSY, FOREIGN, LATE = "below sensitivity", "collision", "receiver busy", "another's frame", "too late"
 
 Steps = Generator[simpy.Event, Any, None]
 Powers = Callable[[int, int], Floats]
-"""Returns the power (dBm) at every tag from a sender, at a true time in sub-ticks."""
+"""Returns the power in dBm at every tag from a sender, at a true time in sub-ticks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Slots:
-    """A plan of n exchanges as columns: when, who, and what the radios will make of each message.
+    """A plan of n exchanges, and the nominal outcome of each message.
 
-    `pause` is what the initiator waits first, in sub-ticks; `heard` (messages, n) says whether a message is above the
-    receiver's sensitivity, `delay` (messages, n) is the sub-ticks from the stamp it waits for until it leaves.
+    `pause` (n,) are sub-ticks for which the initiator waits first; `heard` (messages, n) says whether a message is
+    above the receiver's sensitivity; `delay` (messages, n) are the sub-ticks from the stamp that a message waits for
+    until its departure.
     """
 
-    start: list[int]
-    initiator: list[int]
-    target: list[int]
-    pause: list[int]
+    plan: Schedule
+    pause: Ints
     heard: Bools
     delay: Ints
 
 
 @dataclass(slots=True)
 class Outcomes:
-    """The outcome of each slot: when its poll left (-1: never), the lost message (-1: none), and the reason."""
+    """Outcomes of n exchanges: departure of the poll, index of the lost message (-1: none), and the reason."""
 
     start: list[int]
     lost: list[int]
@@ -135,143 +128,133 @@ class _Frame:
 
 
 class Air:
-    """The medium and the radios on it, while the slots of a plan are played."""
+    """The medium and the radios that use it while a plan is executed."""
 
-    def __init__(
-        self, protocol: RangingProtocol, slots: Slots, tags: int, hosts: int, powers: Powers, radio: Radio
-    ) -> None:
-        """Begin at time zero with no frame on the air.
-
-        `tags` is the number of radios and `hosts` that of those who command them; `powers` gives what each radio hears
-        of a sender.
-        """
+    def __init__(self, protocol: RangingProtocol, slots: Slots, powers: Powers, radio: Radio) -> None:
+        """Begin at time zero with no frame on the medium."""
         self.env = simpy.Environment()
-        self._messages, self._slots = protocol.messages, slots
-        self._powers, self._radio = powers, radio
+        self._messages, self._slots, self._powers, self._radio = protocol.messages, slots, powers, radio
+        self._start, self._pause = slots.plan.start.tolist(), slots.pause.tolist()
+        self._ends: list[list[int]] = np.column_stack([slots.plan.initiator, slots.plan.target]).tolist()
         self._before = _subticks(before_marker_s(radio.preamble_symbols))
         self._after = [_subticks(after_marker_s(n)) for n in message_bytes(protocol)]
-        self._patience = _subticks(PREAMBLE_TIMEOUT_S + RECEIVER_ON_S)
+        self._timeout = _subticks(PREAMBLE_TIMEOUT_S + RECEIVER_ON_S)
         self._turnaround = _subticks(TURNAROUND_S)
         self._frames: list[_Frame] = []
-        self._busy_until = [0] * tags
-        self._soonest = [0] * hosts
-        self._played = 0
-        self._lengths = self._undisturbed()
-        self.outcomes = Outcomes([-1] * len(slots.start), [-1] * len(slots.start), [""] * len(slots.start))
+        self._busy_until = dict.fromkeys(itertools.chain(*self._ends), 0)
+        self._next_begin: dict[int, int] = {}
+        self._lengths = self._undisturbed_lengths()
+        self._completed, count = itertools.count(1), len(self._start)
+        self.outcomes = Outcomes([-1] * count, [-1] * count, [""] * count)
 
-    def play(self, host: int, numbers: Sequence[int], progress: Callable[[float], None] | None = None) -> Steps:
-        """Play the slots of one host, one after the other; `progress` is called with the done share of all slots."""
-        env, slots, soonest, never = self.env, self._slots, self._soonest, 1 << 62
+    def execute(self, progress: Callable[[float], None] | None) -> None:
+        """Execute the plans of all hosts; `progress` is called with the completed share of all exchanges."""
+        hosts = self._slots.plan.host
+        self._next_begin = dict.fromkeys(np.unique(hosts).tolist(), 0)
+        processes = [
+            self.env.process(self._host(host, np.flatnonzero(hosts == host).tolist(), progress))
+            for host in self._next_begin
+        ]
+        self.env.run(until=self.env.all_of(processes))
+
+    def _host(self, host: int, numbers: list[int], progress: Callable[[float], None] | None) -> Steps:
+        """Execute the exchanges of one host, one after the other."""
+        env, next_begin, never = self.env, self._next_begin, 1 << 62
         for number in numbers:
-            begin = max(soonest[host], slots.start[number])
-            soonest[host] = begin
+            begin = max(next_begin[host], self._start[number])
+            next_begin[host] = begin
             if begin > env.now:
                 yield env.timeout(begin - int(env.now))
-            soonest[host] = never
+            next_begin[host] = never
             if self._alone(number, begin):
-                end = self._succeed(number, begin)
+                self.outcomes.start[number] = begin + self._before
+                end = begin + self._lengths[number]
+                self._busy_until.update(dict.fromkeys(self._ends[number], end))
             else:
-                soonest[host] = 0
-                if slots.pause[number]:
-                    yield env.timeout(slots.pause[number])
+                next_begin[host] = 0
+                if self._pause[number]:
+                    yield env.timeout(self._pause[number])
                 yield from self._exchange(number)
                 end = int(env.now)
-            soonest[host] = end + self._turnaround
-            self._played += 1
-            if progress and not self._played % 500:
-                progress(self._played / len(slots.start))
-        soonest[host] = never
+            next_begin[host] = end + self._turnaround
+            completed = next(self._completed)
+            if progress and not completed % 500:
+                progress(completed / len(self._start))
+        next_begin[host] = never
 
-    def _undisturbed(self) -> list[int]:
-        """Return how long each exchange takes if nothing disturbs it, n; -1 for those that are to be looked at."""
+    def _undisturbed_lengths(self) -> list[int]:
+        """Return the duration of each exchange without disturbance, (n,); -1 if that must be found step by step."""
         slots, after = self._slots, np.array(self._after)[:, None]
         waits = slots.delay[1:] - self._before - after[:-1]
-        plain = slots.heard.all(axis=0) & (np.array(slots.pause) == 0) & (waits <= self._patience).all(axis=0)
+        plain = slots.heard.all(axis=0) & (slots.pause == 0) & (waits <= self._timeout).all(axis=0)
         length = self._before + slots.delay[1:].sum(axis=0) + self._after[-1]
         lengths: list[int] = np.where(plain, length, -1).tolist()
         return lengths
 
     def _alone(self, number: int, begin: int) -> bool:
         """Return whether an exchange that begins now ends before any other event."""
-        length, busy = self._lengths[number], self._busy_until
+        length, (initiator, target) = self._lengths[number], self._ends[number]
         return (
             length >= 0
-            and min(self._soonest) > begin + length
-            and busy[self._slots.initiator[number]] <= begin
-            and busy[self._slots.target[number]] <= begin
+            and min(self._next_begin.values()) > begin + length
+            and self._busy_until[initiator] <= begin
+            and self._busy_until[target] <= begin
         )
 
-    def _succeed(self, number: int, begin: int) -> int:
-        """Record an undisturbed exchange; return the end of its last frame."""
-        self.outcomes.start[number] = begin + self._before
-        end = begin + self._lengths[number]
-        self._busy_until[self._slots.initiator[number]] = self._busy_until[self._slots.target[number]] = end
-        return end
-
     def _exchange(self, number: int) -> Steps:
-        """Send the messages of an exchange in turn; stop, after the wait for it, at one that is not received."""
+        """Send the messages of an exchange in turn; stop at a lost one, after the wait for it."""
         env, outcomes, delays = self.env, self.outcomes, self._slots.delay[:, number].tolist()
-        busy, me, other = self._busy_until, self._slots.initiator[number], self._slots.target[number]
-        if busy[me] > env.now:  # a board that answers somebody takes its own command when it is done
-            yield env.timeout(busy[me] - int(env.now))
+        busy, (initiator, target) = self._busy_until, self._ends[number]
+        if busy[initiator] > env.now:  # a board that answers another board executes its own command afterwards
+            yield env.timeout(busy[initiator] - int(env.now))
         marker = int(env.now) + self._before
-        outcomes.start[number] = marker
-        listening_since = marker
+        outcomes.start[number] = listening_since = marker
         for k, message in enumerate(self._messages):
             if k:
                 marker += delays[k]
-            sender, receiver = (me, other) if message.sender == "initiator" else (other, me)
+            sender, receiver = (initiator, target) if message.sender == "initiator" else (target, initiator)
             frame = _Frame(marker - self._before, marker + self._after[k], sender, number)
             self._frames.append(frame)
             yield env.timeout(frame.end - int(env.now))
-            reason = self._fate(k, frame, receiver, listening_since, marker)
+            reason = self._loss(k, frame, receiver, listening_since)
             if reason:
                 outcomes.lost[number], outcomes.reason[number] = k, reason
-                # Whoever waits for the missing message gives up when its preamble does not come.
-                until = listening_since + self._patience
-                busy[me] = max(until, int(env.now))
-                yield env.timeout(max(until - int(env.now), 0))
+                # The board that waits for the lost message gives up at the preamble timeout.
+                busy[initiator] = max(listening_since + self._timeout, int(env.now))
+                yield env.timeout(busy[initiator] - int(env.now))
                 return
             listening_since = frame.end
             if not k:
-                # From now on both are in this exchange; the target will send its last frame whatever becomes of others.
-                busy[me] = busy[other] = marker + sum(delays[1:]) + self._after[-1]
+                # Both boards are in this exchange now; the target sends its last frame even if others are lost.
+                busy[initiator] = busy[target] = marker + sum(delays[1:]) + self._after[-1]
 
-    def _fate(self, k: int, frame: _Frame, receiver: int, since: int, marker: int) -> str:
-        """Return why a frame that has just ended was not received, empty if it was."""
+    def _loss(self, k: int, frame: _Frame, receiver: int, since: int) -> str:
+        """Return why the receiver, which listens since an instant, lost a frame that has just ended; empty if not."""
         if not self._slots.heard[k, frame.exchange]:
             return WEAK
-        if k and frame.start - since > self._patience:
+        if k and frame.start - since > self._timeout:
             return LATE
         if not k and self._busy_until[receiver] > frame.start:
             return BUSY
-        if len(self._frames) > 1:
-            return self._interference(k, frame, receiver, since)
-        self._frames.clear()
-        return ""
-
-    def _interference(self, k: int, frame: _Frame, receiver: int, since: int) -> str:
-        """Return whether another frame on the air collides with one, or is received in its place; empty if not."""
-        now = int(self.env.now)
-        oldest = now - 2 * self._patience
-        self._frames = [f for f in self._frames if f.end > oldest]
+        self._frames = [other for other in self._frames if other.end > int(self.env.now) - 2 * self._timeout]
         earliest = min(since, frame.start) if k else frame.start
-        others = [f for f in self._frames if f.exchange != frame.exchange and f.end > earliest and f.start < frame.end]
-        if not others:
-            return ""
-        signal = float(self._powers(frame.sender, frame.start)[receiver])
-        for f in others:
-            if f.sender == receiver:
+        others = [
+            other
+            for other in self._frames
+            if other.exchange != frame.exchange and other.end > earliest and other.start < frame.end
+        ]
+        for other in others:
+            if other.sender == receiver:
                 return BUSY
-            power = float(self._powers(f.sender, f.start)[receiver])
+            power = float(self._powers(other.sender, other.start)[receiver])
             if power < self._radio.sensitivity_dbm:
                 continue
-            if f.end <= frame.start:
-                if k and f.start >= since:
-                    return FOREIGN  # a board that waits for an answer takes the first frame that comes
+            if other.end <= frame.start:
+                if k and other.start >= since:
+                    return FOREIGN  # a board that waits for an answer receives the first frame that arrives
                 continue
-            captured = signal >= power + self._radio.capture_db and frame.start <= f.start
-            if not captured:
+            signal = float(self._powers(frame.sender, frame.start)[receiver])
+            if signal < power + self._radio.capture_db or frame.start > other.start:
                 return COLLIDED
         return ""
 
@@ -279,16 +262,13 @@ class Air:
 def run(
     protocol: RangingProtocol,
     slots: Slots,
-    hosts: Sequence[Sequence[int]],
-    tags: int,
     powers: Powers,
     radio: Radio,
     progress: Callable[[float], None] | None = None,
 ) -> Outcomes:
-    """Play a plan; `hosts` are the numbers of each host's slots, in order. Returns what became of every slot."""
-    air = Air(protocol, slots, tags, len(hosts), powers, radio)
-    processes = [air.env.process(air.play(host, numbers, progress)) for host, numbers in enumerate(hosts)]
-    air.env.run(until=air.env.all_of(processes))
+    """Execute a plan; return the outcome of every exchange."""
+    air = Air(protocol, slots, powers, radio)
+    air.execute(progress)
     return air.outcomes
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import Floats
 from uwblink.protocols.table import ON_BOARDS, PROTOCOLS
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import CirRow, Fault, FrameRow, Poses, Tag
@@ -27,7 +27,6 @@ from uwbsim.scenario.ranging import before_marker_s
 from uwbsim.simulation import air
 from uwbsim.simulation.air import Schedule, schedule
 from uwbsim.simulation.timestamps import (
-    Begun,
     Draws,
     draw,
     overhear,
@@ -37,7 +36,7 @@ from uwbsim.simulation.timestamps import (
     responses,
     stamp,
 )
-from uwbsim.world.clocks import LONGEST_RUN_S, NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks, readings
+from uwbsim.world.clocks import LONGEST_RUN_S, NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND, readings
 from uwbsim.world.reception import Medium
 from uwbsim.world.trajectories import height_readings, inertial_readings
 from uwbsim.world.world import SampledWorld, World
@@ -158,35 +157,33 @@ def simulate(
     scenario = as_scenario(scenario)
     if scenario.run.duration_s > LONGEST_RUN_S:
         raise ScenarioError(f"run.duration_s: at most {LONGEST_RUN_S:g} (36 h)")
-    protocol = PROTOCOLS[scenario.ranging.protocol]
-    world = World.of(scenario)
-    medium = Medium(scenario, world, Clocks.of(scenario))
-    plan = schedule(scenario)
+    protocol, world, plan = PROTOCOLS[scenario.ranging.protocol], World(scenario), schedule(scenario)
+    medium = Medium(scenario, world)
     draws = draw(scenario, len(plan.start), len(protocol.messages))
+    slots = _slots(medium, world, plan, draws)
     if contention:
-        ahead, radio = SampledWorld(world), scenario.radio
+        sampled = SampledWorld(world)
 
         def powers(sender: int, time: int) -> Floats:
-            return ahead.from_sender(sender, max(time, 0)).power_dbm
+            return sampled.from_sender(sender, max(time, 0)).power_dbm
 
-        slots = _slots(medium, world, plan, draws)
-        outcomes = air.run(protocol, slots, plan.hosts(), len(scenario.tags), powers, radio, progress)
+        outcomes = air.run(protocol, slots, powers, scenario.radio, progress)
     else:
-        outcomes = _undisturbed(medium, world, plan, draws)
-    lost, begun = np.array(outcomes.lost), np.array(outcomes.start, dtype=np.int64)
+        outcomes = _undisturbed(scenario, slots)
+    begun, lost = np.array(outcomes.start, dtype=np.int64), np.array(outcomes.lost)
     kept = np.flatnonzero(lost < 0)
     kept = kept[np.argsort(begun[kept], kind="stable")]
-    rows = Begun(start=begun[kept], initiator=plan.initiator[kept], target=plan.target[kept])
+    rows = replace(plan[kept], start=begun[kept])
     stamped = stamp(medium, protocol, rows, draws[kept])
     exchanges = reported_exchanges(medium, kept, len(plan.start), rows, stamped)
     return Simulated(
         exchanges=exchanges,
         poses=world.motion_capture(),
         tags=[Tag(t.id, t.body, t.lever_arm_m) for t in scenario.tags],
-        faults=reported_faults(scenario, begun, plan, outcomes),
+        faults=reported_faults(scenario, plan, outcomes),
         overheard=overhear(medium, stamped, exchanges),
         cirs=responses(scenario, world, protocol, exchanges, stamped) if scenario.ranging.get_cir else [],
-        truth_m=(stamped.distance_m[0] + stamped.distance_m[1]) / 2,
+        truth_m=(stamped.links[0].distance_m + stamped.links[1].distance_m) / 2,
         meta=provenance(scenario),
         temperature=readings(scenario),
         imu=inertial_readings(scenario, world.trajectories),
@@ -194,63 +191,41 @@ def simulate(
     )
 
 
-def _delays(scenario: Scenario, draws: Draws) -> dict[str, Ints]:
-    """Return by the timing of a message how long after the stamp that it waits for it leaves, in sub-ticks, (n,)."""
-    at_once = np.rint(draws.reply_s * SUBTICKS_PER_SECOND).astype(np.int64)
-    scheduled = scenario.ranging.response_delay_uus * UUS_TICKS * SUBTICKS
-    return {"at once": at_once, "scheduled": np.full_like(at_once, scheduled)}
-
-
 def _slots(medium: Medium, world: World, plan: Schedule, draws: Draws) -> air.Slots:
-    """Return the plan as the event loop takes it: integers, and which messages are strong enough."""
-    scenario, delays = medium.scenario, _delays(medium.scenario, draws)
-    none = np.zeros(len(plan.start), dtype=np.int64)
-    if scenario.ranging.plan == "common-list" and len(none) > 1:
-        # In a common list the initiator waits for what it does not hear of the exchange before.
+    """Return the plan with the nominal delays of its messages, and whether each is strong enough.
+
+    Power noise makes the limit soft. In a common list an initiator waits longer for an exchange that it cannot hear.
+    """
+    scenario, ranging, radio = medium.scenario, medium.scenario.ranging, medium.scenario.radio
+    messages, ends, pause = PROTOCOLS[ranging.protocol].messages, (plan.initiator, plan.target), plan.start * 0
+    at_once = np.rint(draws.reply_s * SUBTICKS_PER_SECOND).astype(np.int64)
+    delays = {"at once": at_once, "scheduled": at_once * 0 + ranging.response_delay_uus * UUS_TICKS * SUBTICKS}
+    delay = np.array([delays[message.timing] for message in messages])
+    if ranging.plan == "common-list":
         before, mine = plan.target[:-1], plan.initiator[1:]
         others = np.flatnonzero(before != mine)
         power = world.link(before[others], mine[others], plan.start[others + 1]).power_dbm
-        none[others[power < scenario.radio.sensitivity_dbm] + 1] = round(
-            (scenario.ranging.list_timeout_ms * 1e-3) * SUBTICKS_PER_SECOND
-        )
-    return air.Slots(
-        plan.start.tolist(),
-        plan.initiator.tolist(),
-        plan.target.tolist(),
-        none.tolist(),
-        _heard(medium, world, plan, draws),
-        np.array([delays[message.timing] for message in PROTOCOLS[scenario.ranging.protocol].messages]),
-    )
+        timeout = round((ranging.list_timeout_ms * 1e-3) * SUBTICKS_PER_SECOND)
+        pause[others[power < radio.sensitivity_dbm] + 1] = timeout
+    # All messages of an exchange have the power of its first, unless powers change within it.
+    changing, powers = bool(world.levels) or any(tag.tx_power_db for tag in scenario.tags), []
+    time = plan.start + (round(before_marker_s(radio.preamble_symbols) * SUBTICKS_PER_SECOND) if world.levels else 0)
+    for k, message in enumerate(messages):
+        if k and world.levels:
+            time = time + delay[k]
+        if not k or changing:
+            power = world.link(*(ends if message.sender == "initiator" else ends[::-1]), time).power_dbm
+        powers.append(power)
+    noise = stream(scenario.run.seed, "fading").normal(size=(len(messages), len(time)))
+    return air.Slots(plan, pause, medium.heard(np.array(powers), noise), delay)
 
 
-def _undisturbed(medium: Medium, world: World, plan: Schedule, draws: Draws) -> air.Outcomes:
-    """Return the outcomes of exchanges without contention: only messages too weak to be heard are lost."""
-    heard = _heard(medium, world, plan, draws)
-    lost = np.where(heard.all(axis=0), -1, np.argmin(heard, axis=0))
-    marker = round(before_marker_s(medium.scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)
+def _undisturbed(scenario: Scenario, slots: air.Slots) -> air.Outcomes:
+    """Return the outcomes of exchanges without contention: only messages below the sensitivity are lost."""
+    lost = np.where(slots.heard.all(axis=0), -1, np.argmin(slots.heard, axis=0))
+    marker = round(before_marker_s(scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)
     reasons = [air.WEAK if k >= 0 else "" for k in lost.tolist()]
-    return air.Outcomes((plan.start + marker).tolist(), lost.tolist(), reasons)
-
-
-def _heard(medium: Medium, world: World, plan: Schedule, draws: Draws) -> Bools:
-    """Return whether each message (messages, n) is received; a little fading makes the edge soft."""
-    scenario, time = medium.scenario, plan.start
-    messages = PROTOCOLS[scenario.ranging.protocol].messages
-    delays = None
-    if world.levels is not None:
-        # An outage may begin within an exchange, so powers are those at the messages' own instants.
-        delays = _delays(scenario, draws)
-        time = time + round(before_marker_s(scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)
-    powers: list[Floats] = []
-    for message in messages:
-        if delays is not None and message.after:
-            time = time + delays[message.timing]
-        ends = (plan.initiator, plan.target) if message.sender == "initiator" else (plan.target, plan.initiator)
-        # Without levels and unequal powers all messages of an exchange have the power of its first.
-        same = powers and delays is None and not any(tag.tx_power_db for tag in scenario.tags)
-        powers.append(powers[0] if same else world.link(*ends, time).power_dbm)
-    fading = stream(scenario.run.seed, "fading").normal(size=(len(messages), len(time)))
-    return medium.heard(np.array(powers), fading)
+    return air.Outcomes((slots.plan.start + marker).tolist(), lost.tolist(), reasons)
 
 
 def through_wire(simulated: Simulated) -> tuple[Simulated, list[FrameRow]]:

@@ -32,6 +32,7 @@ from uwbsim.tables import in_time_order
 from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.impulse_response import INDEX_STEPS, impulse_response
+from uwbsim.world.links import Link
 from uwbsim.world.reception import Frames, Medium
 from uwbsim.world.world import World
 
@@ -59,27 +60,16 @@ class Draws:
         return Draws(self.transmit[:, rows], self.receive[:, rows], self.reply_s[rows], self.excess_m[rows])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Begun:
-    """Exchanges that begin: true times in sub-ticks, and the places of the tags, (n,) each."""
-
-    start: Ints
-    initiator: Ints
-    target: Ints
-
-
 @dataclass(slots=True)
 class Stamped:
-    """Stamps in whole ticks, not wrapped, and links of the messages, (n,) each; one list item per message.
+    """Stamps in whole ticks, not wrapped, and frames and links of the messages, (n,) each; one list item per message.
 
-    `frames` are the messages with their senders, receivers and departures; `detour_m` (n,) the random detour of all
-    messages.
+    `detour_m` (n,) is the random detour of all messages of an exchange.
     """
 
     stamps: dict[str, Ints]
     frames: list[Frames]
-    distance_m: list[Floats]
-    power_dbm: list[Floats]
+    links: list[Link]
     detour_m: Floats
 
 
@@ -118,9 +108,9 @@ def draw_reply_s(scenario: Scenario, rng: np.random.Generator, count: int) -> Fl
     return np.asarray((303.5 + np.maximum(microseconds, -0.1)) * 1e-6)
 
 
-def stamp(medium: Medium, protocol: RangingProtocol, begun: Begun, draws: Draws) -> Stamped:
-    """Execute exchanges (n,), message after message."""
-    result = Stamped({}, [], [], [], draws.excess_m)
+def stamp(medium: Medium, protocol: RangingProtocol, begun: Schedule, draws: Draws) -> Stamped:
+    """Return the stamps of exchanges that begin at known instants, message after message."""
+    result = Stamped({}, [], [], draws.excess_m)
     ends = (begun.initiator, begun.target)
     for k, message in enumerate(protocol.messages):
         sender, receiver = ends if message.sender == "initiator" else ends[::-1]
@@ -131,13 +121,12 @@ def stamp(medium: Medium, protocol: RangingProtocol, begun: Begun, draws: Draws)
             counter = next_grid(-(-medium.clocks.read(begun.initiator, begun.start) // SUBTICKS))
         left = medium.leave(sender, counter + medium.tx_register[sender], draws.transmit[k])
         frames = Frames(sender=sender, receiver=receiver, departure=left)
-        received = medium.receive(frames, draws.receive[k], draws.excess_m)
+        received, link = medium.receive(frames, draws.receive[k], draws.excess_m)
         added = medium.reply_constant if message.timing == "scheduled" else medium.tx_register
         result.stamps[f"tx{k + 1}"] = counter + added[sender]
-        result.stamps[f"rx{k + 1}"] = received.stamp
+        result.stamps[f"rx{k + 1}"] = received
         result.frames.append(frames)
-        result.distance_m.append(received.link.distance_m)
-        result.power_dbm.append(received.link.power_dbm)
+        result.links.append(link)
     return result
 
 
@@ -156,7 +145,7 @@ def next_grid(ticks: Ticks) -> Ticks:
     return -(-ticks // DELAYED_TX_GRID) * DELAYED_TX_GRID
 
 
-def reported_exchanges(medium: Medium, kept: Ints, planned: int, rows: Begun, stamped: Stamped) -> Exchanges:
+def reported_exchanges(medium: Medium, kept: Ints, planned: int, rows: Schedule, stamped: Stamped) -> Exchanges:
     """Return the reports of the `kept` exchanges (n,), of all `planned`: stamps wrapped, ranges as printed."""
     ids = np.array([tag.id for tag in medium.scenario.tags], dtype=np.int64)
     none = np.zeros(len(kept), dtype=np.int64)
@@ -188,10 +177,10 @@ def _readings(medium: Medium, number: int, kept: Ints, planned: int, stamped: St
     seed = medium.scenario.run.seed
     power_noise = stream(seed, "power reading", number).normal(size=planned)[kept]
     skew_noise = stream(seed, "skew reading", number).normal(size=planned)[kept]
-    return medium.readings(stamped.frames[number - 1], stamped.power_dbm[number - 1], power_noise, skew_noise)
+    return medium.readings(stamped.frames[number - 1], stamped.links[number - 1].power_dbm, power_noise, skew_noise)
 
 
-def reported_faults(scenario: Scenario, begun: Ints, plan: Schedule, outcomes: air.Outcomes) -> list[Fault]:
+def reported_faults(scenario: Scenario, plan: Schedule, outcomes: air.Outcomes) -> list[Fault]:
     """Return the failed exchanges, with their reasons and initiators."""
     ids = [tag.id for tag in scenario.tags]
     found = []
@@ -199,7 +188,7 @@ def reported_faults(scenario: Scenario, begun: Ints, plan: Schedule, outcomes: a
         a, b, reason = ids[plan.initiator[k]], ids[plan.target[k]], outcomes.reason[k]
         found.append(
             Fault(
-                round(int(begun[k]) * (NS_PER_S / SUBTICKS_PER_SECOND)),
+                round(outcomes.start[k] * (NS_PER_S / SUBTICKS_PER_SECOND)),
                 str(a),
                 "lost frame" if reason == air.WEAK else reason,
                 f"{a} ranged with {b}: message {outcomes.lost[k] + 1} {reason}",
@@ -234,13 +223,6 @@ def overhear(medium: Medium, stamped: Stamped, exchanges: Exchanges) -> dict[str
     """
     poll = stamped.frames[0]
     listeners = np.array([k for k, tag in enumerate(medium.scenario.tags) if tag.passive], dtype=np.int64)
-    if len(listeners) and isinstance(medium.links, World):
-        # The responses of all listeners are computed at once, in half the time.
-        columns = (np.concatenate([getattr(f, name) for f in stamped.frames]) for name in ("sender", "departure"))
-        sender, departure = (np.tile(column, len(listeners)) for column in columns)
-        receiver = np.repeat(listeners, len(sender) // len(listeners))
-        others = sender != receiver
-        medium.links.prepare(sender[others], receiver[others], departure[others])
     rows = {k: np.flatnonzero((poll.sender != k) & (poll.receiver != k)) for k in listeners.tolist()}
     return in_time_order([_heard_by(medium, k, r, stamped, exchanges) for k, r in rows.items() if len(r)])
 
@@ -259,11 +241,12 @@ def _heard_by(medium: Medium, me: int, rows: Ints, stamped: Stamped, exchanges: 
         frames = Frames(sender=sent.sender[rows], receiver=np.full(count, me), departure=sent.departure[rows])
         # One stream a listener and message: another listener, or another noise, changes nothing else.
         noise = stream(medium.scenario.run.seed, "overheard", tag.id, k).normal(size=(4, planned))[:, rows]
-        received = medium.receive(frames, noise[1])
-        power = received.link.power_dbm
-        heard &= medium.heard(power, noise[0])
-        columns[f"rx{name}"] = received.stamp & MASK
-        columns[f"fpp{name}_dbm"], columns[f"skew{name}_ppm"] = medium.readings(frames, power, noise[2], noise[3])
+        received, link = medium.receive(frames, noise[1])
+        heard &= medium.heard(link.power_dbm, noise[0])
+        columns[f"rx{name}"] = received & MASK
+        columns[f"fpp{name}_dbm"], columns[f"skew{name}_ppm"] = medium.readings(
+            frames, link.power_dbm, noise[2], noise[3]
+        )
     columns |= {"time_ns": exchanges.time_ns[rows], "listener": np.full(count, tag.id)}
     columns |= {name: getattr(exchanges, name)[rows] for name in ("initiator", "target")}
     columns |= {f"{name}_n": getattr(exchanges, name)[rows] for name in STAMPS}
@@ -281,7 +264,7 @@ def responses(
     """
     last = max(k for k, message in enumerate(protocol.messages) if message.sender == "target")
     sent = stamped.frames[last]
-    heard = world.all_paths(sent.sender, sent.receiver, sent.departure, stamped.detour_m)
+    heard = world.paths(sent.sender, sent.receiver, sent.departure, stamped.detour_m)
     columns = (exchanges.initiator, exchanges.target, getattr(exchanges, f"rx{last + 1}"), exchanges.time_ns)
     rng, rows = stream(scenario.run.seed, "impulse responses"), []
     for initiator, target, rx, time_ns, paths in zip(*(c.tolist() for c in columns), heard, strict=True):

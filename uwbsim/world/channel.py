@@ -6,116 +6,42 @@ of `CHANNEL_EFFECTS` applies to all of them alike.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass, field, fields, replace
+from collections.abc import Callable
+from dataclasses import fields, replace
 from typing import Final
 
 import numpy as np
 
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.scenario.bodies import Room
-from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import TwoStateMultipath
-from uwbsim.world.diffraction import PlacedShadow, box_loss
-from uwbsim.world.geometric_responses import GeometricResponses
+from uwbsim.world.diffraction import box_loss
 from uwbsim.world.impulse_response import PathsHeard
-from uwbsim.world.pair_states import PairLevels, ReflectedStates
-from uwbsim.world.radio import antenna_gain_db, group_delay_m, path_gain_db
+from uwbsim.world.links import Ends, Link
+from uwbsim.world.radio import group_delay_m, path_gain_db
 
 
-@dataclass(frozen=True, slots=True)
-class Link:
-    """n links between two antennas each, (n,).
-
-    `distance_m` is the length of the straight line, `excess_m` the apparent additional length of the first detected
-    path; `power_dbm` is that path's power, `total_dbm` that of all paths together. With several paths, `paths_m` and
-    `paths_dbm` are the lengths and powers of all, (n, paths), in any order. With geometric responses, `noise_s` is the
-    standard deviation of the leading edge of the first path by noise.
-    """
-
-    distance_m: Floats
-    excess_m: Floats
-    power_dbm: Floats
-    total_dbm: Floats
-    _: KW_ONLY
-    paths_m: Floats | None = None
-    paths_dbm: Floats | None = None
-    noise_s: Floats | None = None
-
-    def __getitem__(self, rows: Ints) -> Link:
-        """Return the chosen links."""
-        columns = {column.name: getattr(self, column.name) for column in fields(self)}
-        return replace(self, **{name: column[rows] for name, column in columns.items() if column is not None})
-
-    def weaker(self, loss_db: Floats) -> Link:
-        """Return the links with a loss (n,) on all their paths."""
-        paths = None if self.paths_dbm is None else self.paths_dbm - loss_db[:, None]
-        return replace(self, power_dbm=self.power_dbm - loss_db, total_dbm=self.total_dbm - loss_db, paths_dbm=paths)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ends:
-    """The two ends of n links, each at one instant, in the world frame; the first end sends.
-
-    `time_s` (n,) is true time; `places` are the indices of the two tags in the scenario, (n,) each; `antennas_m` the
-    positions of their antennas, (n, 3) each, and `rotations` their attitudes, body to world, (n, 3, 3) each. `shadows`
-    are the bodies that may obstruct links; `phases` (tags, harmonics) those of the tags' shadowing; `states` lasting
-    reflections of pairs, `levels` fading and outages of pairs, `responses` geometric responses, None where the scenario
-    has none. `distance_m` (n,) is the length of the straight lines.
-    """
-
-    scenario: Scenario
-    phases: Floats
-    time_s: Floats
-    places: tuple[Ints, Ints]
-    antennas_m: tuple[Floats, Floats]
-    rotations: tuple[Floats, Floats]
-    shadows: Sequence[PlacedShadow]
-    states: ReflectedStates | None = None
-    levels: PairLevels | None = None
-    responses: GeometricResponses | None = None
-    distance_m: Floats = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Compute the distances."""
-        apart = self.antennas_m[1] - self.antennas_m[0]
-        object.__setattr__(self, "distance_m", np.sqrt(np.einsum("ij,ij->i", apart, apart)))
-
-    @property
-    def towards(self) -> Floats:
-        """Return unit vectors from the sender to the receiver, (n, 3)."""
-        return (self.antennas_m[1] - self.antennas_m[0]) / np.maximum(self.distance_m, 1e-10)[:, None]
-
-    def gain_towards_db(self, leaving: Floats, arriving: Floats) -> Floats:
-        """Return the gain of both antennas and the offset of the sender's power on paths, (n,).
-
-        `leaving` are unit vectors (n, 3) from the sender along the paths, `arriving` those from the receiver.
-        """
-        gain = np.zeros(len(leaving))
-        for tags, rotation, way in zip(self.places, self.rotations, (leaving, arriving), strict=True):
-            gain = gain + antenna_gain_db(self.scenario, self.phases, tags, np.einsum("ni,nij->nj", way, rotation))
-        if any(tag.tx_power_db for tag in self.scenario.tags):
-            gain = gain + np.array([tag.tx_power_db for tag in self.scenario.tags])[self.places[0]]
-        return gain
-
-    def tags(self) -> tuple[Ints, Ints]:
-        """Return the ids of the tags at the two ends, (n,) each."""
-        ids = np.array([tag.id for tag in self.scenario.tags], dtype=np.int64)
-        return ids[self.places[0]], ids[self.places[1]]
-
-
-def paths_heard(link: Link, detour_m: float = 0.0) -> PathsHeard:
-    """Return the paths of a single link for its response; its first path has a random detour of `detour_m`."""
-    power = float(link.power_dbm[0])
+def paths_heard(link: Link, ends: Ends, detour_m: Floats) -> list[PathsHeard]:
+    """Return the paths of n links as impulse responses show them; first paths have random detours (n,)."""
+    first_m, responses = link.distance_m + link.excess_m, ends.world.responses
+    if responses is not None:
+        paths, read = responses.paths(ends.places, ends.time_s), responses.at(ends.places, ends.time_s)
+        later_s = (paths.detour_m - (read.excess_m + detour_m)[:, None]) / SPEED_OF_LIGHT
+        # Other effects on a link change all its paths alike.
+        amplitude = paths.amplitude * 10 ** ((link.power_dbm - read.power_dbm) / 20)[:, None]
+        return [PathsHeard(*path) for path in zip(link.power_dbm.tolist(), later_s, amplitude, strict=True)]
     if link.paths_m is None or link.paths_dbm is None:
-        return PathsHeard(power, np.zeros(0), np.zeros(0))
-    later_m = link.paths_m[0] - float(link.distance_m[0] + link.excess_m[0]) - detour_m
-    shares = 10 ** ((link.paths_dbm[0] - power) / 20)
+        return [PathsHeard(power, np.zeros(0), np.zeros(0)) for power in link.power_dbm.tolist()]
+    later_m = link.paths_m - first_m[:, None] - detour_m[:, None]
+    shares = 10 ** ((link.paths_dbm - link.power_dbm[:, None]) / 20)
     # Echoes within 1 cm of the first path, or 80 dB weaker, change no tap.
     kept = (later_m > 0.01) & (shares > 1e-4)
-    return PathsHeard(power, later_m[kept] / SPEED_OF_LIGHT, shares[kept])
+    return [
+        PathsHeard(power, late[there] / SPEED_OF_LIGHT, share[there])
+        for power, late, share, there in zip(link.power_dbm.tolist(), later_m, shares, kept, strict=True)
+    ]
 
 
 ChannelEffect = Callable[[Link, Ends], Link]
@@ -125,7 +51,7 @@ ChannelEffect = Callable[[Link, Ends], Link]
 def link_between(ends: Ends) -> Link:
     """Return the links between known ends, (n,), after all effects of `CHANNEL_EFFECTS` in their order."""
     power = nothing = np.zeros_like(ends.distance_m)
-    if ends.responses is None:  # geometric responses have the powers, too
+    if ends.world.responses is None:  # geometric responses have the powers, too
         gain = ends.gain_towards_db(ends.towards, -ends.towards)
         power = path_gain_db(ends.scenario.radio, ends.distance_m) + gain
     link = Link(ends.distance_m, nothing, power, power)
@@ -150,7 +76,7 @@ def _check(name: str, link: Link, ends: Ends) -> None:
 
 
 def _obstacles(link: Link, ends: Ends) -> Link:
-    if not ends.scenario.obstacles or ends.responses is not None:
+    if not ends.scenario.obstacles or ends.world.responses is not None:
         return link
     loss, excess = box_loss(ends.scenario.obstacles, *ends.antennas_m)
     return replace(link.weaker(loss), excess_m=excess)
@@ -158,7 +84,7 @@ def _obstacles(link: Link, ends: Ends) -> Link:
 
 def _shadows(link: Link, ends: Ends) -> Link:
     """Apply the loss of bodies on the direct path, before the first path is chosen."""
-    for body in ends.shadows if ends.responses is None else ():
+    for body in ends.shadows if ends.world.responses is None else ():
         link = link.weaker(body.loss_db(*(spots[:, None] for spots in ends.antennas_m))[:, 0])
     return link
 
@@ -218,41 +144,45 @@ def _images(room: Room, spots: Floats) -> Floats:
 
 def _states(link: Link, ends: Ends) -> Link:
     """Apply lasting reflections: a weaker and later first path, and a strongest path after it."""
-    model = ends.scenario.radio.multipath
-    if ends.states is None or not isinstance(model, TwoStateMultipath):
+    model, states = ends.scenario.radio.multipath, ends.world.states
+    if states is None or not isinstance(model, TwoStateMultipath):
         return link
-    first = ends.states.at(ends.places, ends.time_s)
-    power = link.power_dbm - first.first_loss_db
-    total = link.total_dbm - np.where(first.reflected, model.total_loss_db, 0.0)
-    excess = link.excess_m + first.excess_m
+    reflection, late_m, loss_db, rise_s = states.at(ends.places, ends.time_s)
+    reflected = reflection > 0
+    power = link.power_dbm - np.where(reflected, loss_db, 0.0)
+    total = link.total_dbm - np.where(reflected, model.total_loss_db, 0.0)
+    excess = link.excess_m + late_m
     # The strongest path comes after the first; after a direct path it has no power (1e-30 mW).
     nothing_mw = 1e-30
     rest = np.maximum(10 ** (total / 10) - 10 ** (power / 10), nothing_mw)
-    later = np.where(first.reflected, 10 * np.log10(rest), 10 * np.log10(nothing_mw))
+    later = np.where(reflected, 10 * np.log10(rest), 10 * np.log10(nothing_mw))
     lengths, powers = link.paths_m, link.paths_dbm
     if lengths is None or powers is None:
         lengths, powers = (link.distance_m + link.excess_m)[:, None], link.power_dbm[:, None]
+    last_m = link.distance_m + excess + np.where(reflected, rise_s, 0.0) * SPEED_OF_LIGHT
     return replace(
         link,
         excess_m=excess,
         power_dbm=power,
         total_dbm=total,
-        paths_m=np.column_stack([lengths, link.distance_m + excess + first.rise_s * SPEED_OF_LIGHT]),
+        paths_m=np.column_stack([lengths, last_m]),
         paths_dbm=np.column_stack([powers, later]),
     )
 
 
 def _response(link: Link, ends: Ends) -> Link:
     """Take excess length, powers and noise from geometric responses; the effects above skip links that have one."""
-    if ends.responses is None:
+    if ends.world.responses is None:
         return link
-    read = ends.responses.at(ends.places, ends.time_s)
+    read = ends.world.responses.at(ends.places, ends.time_s)
     return replace(link, **{column.name: getattr(read, column.name) for column in fields(read)})
 
 
 def _levels(link: Link, ends: Ends) -> Link:
     """Apply fading and outages of pairs to all paths."""
-    return link if ends.levels is None else link.weaker(-ends.levels.at_db(ends.places, ends.time_s))
+    if not ends.world.levels:
+        return link
+    return link.weaker(-sum(levels.at(ends.places, ends.time_s)[0] for levels in ends.world.levels))
 
 
 def _group_delays(link: Link, ends: Ends) -> Link:

@@ -42,29 +42,22 @@ WAVENUMBER: Final = 2 * np.pi / WAVELENGTH_M
 
 def box_chords_m(obstacles: Sequence[Obstacle], a: Floats, b: Floats) -> Floats:
     """Return the length of each segment inside each box, (n, boxes): the slab method (Kay and Kajiya 1986)."""
-    way, start = b - a, np.ascontiguousarray(a.T)
-    length, along = np.linalg.norm(way, axis=1), np.ascontiguousarray(way.T)
-    chords = np.zeros((len(a), len(obstacles)))
+    start, way = np.ascontiguousarray(a.T), np.ascontiguousarray((b - a).T)
+    length, chords = np.linalg.norm(b - a, axis=1), np.zeros((len(a), len(obstacles)))
     for k, box in enumerate(obstacles):
-        enter, leave = np.zeros(len(a)), np.ones(len(a))
-        for axis in range(3):
-            first, last = _slab(box.min_m[axis] - start[axis], box.max_m[axis] - start[axis], along[axis])
-            np.maximum(enter, first, out=enter)
-            np.minimum(leave, last, out=leave)
-        chords[:, k] = np.maximum(leave - enter, 0) * length
+        enter, leave = _slabs(np.array(box.min_m)[:, None] - start, np.array(box.max_m)[:, None] - start, way)
+        chords[:, k] = np.maximum(np.minimum(leave.min(axis=0), 1) - np.maximum(enter.max(axis=0), 0), 0) * length
     return chords
 
 
-def _slab(low: Floats, high: Floats, along: Floats) -> tuple[Floats, Floats]:
-    """Return the fractions of segments at which they enter and leave a slab; `low` and `high` are from their starts."""
+def _slabs(low: Floats, high: Floats, way: Floats) -> tuple[Floats, Floats]:
+    """Return the fractions of segments at which they enter and leave slabs; `low` and `high` are from their starts."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        near, far = low / along, high / along
-    enter, leave = np.minimum(near, far), np.maximum(near, far)
+        near, far = low / way, high / way
     # A segment parallel to a slab (0/0) is inside it or outside over its whole length.
-    (beside,) = np.nonzero(along == 0)
-    inside = (low[beside] <= 0) & (high[beside] >= 0)
-    enter[beside], leave[beside] = np.where(inside, -np.inf, np.inf), np.where(inside, np.inf, -np.inf)
-    return enter, leave
+    parallel, inside = way == 0, (low <= 0) & (high >= 0)
+    enter = np.where(parallel, np.where(inside, -np.inf, np.inf), np.minimum(near, far))
+    return enter, np.where(parallel, -enter, np.maximum(near, far))
 
 
 def ellipsoid_chord_m(shadow: Shadow, a: Floats, b: Floats) -> Floats:
@@ -76,15 +69,9 @@ def ellipsoid_chord_m(shadow: Shadow, a: Floats, b: Floats) -> Floats:
     p = np.maximum(np.einsum("...j,...j->...", along, along), 1e-30)
     q = np.einsum("...j,...j->...", start, along)
     r = np.einsum("...j,...j->...", start, start) - 1
-    square = q**2 - p * r
-    chord = np.zeros(square.shape)
-    # Most segments miss the ellipsoid.
-    hit = square > 0
-    if np.any(hit):
-        p, q, root = p[hit], q[hit], np.sqrt(square[hit])
-        low, high = np.clip((-q - root) / p, 0, 1), np.clip((-q + root) / p, 0, 1)
-        chord[hit] = (high - low) * np.linalg.norm(way[hit], axis=-1)
-    return chord
+    root = np.sqrt(np.maximum(q**2 - p * r, 0))
+    low, high = np.clip((-q - root) / p, 0, 1), np.clip((-q + root) / p, 0, 1)
+    return np.asarray((high - low) * np.linalg.norm(way, axis=-1))
 
 
 def box_loss(obstacles: Sequence[Obstacle], a: Floats, b: Floats) -> tuple[Floats, Floats]:
@@ -176,27 +163,26 @@ def _nearer(one: tuple[Floats, Floats], other: tuple[Floats, Floats]) -> tuple[F
     return np.where(first, one[0], other[0]), np.where(first, one[1], other[1])
 
 
+def near_body(shadow: Shadow, start: Floats, way: Floats) -> Ints:
+    """Return the indices of segments that an ellipsoid may shade; `start` (n, 3) are their starts from its centre.
+
+    Others, most of them, pass at more than the largest radius of a Fresnel zone.
+    """
+    squared = np.maximum(_dot(way, way), NEAREST_M**2)
+    share = np.clip(-_dot(start, way) / squared, 0, 1)
+    nearest = start + share[:, None] * way
+    reach = max(shadow.semi_axes_m) - LIT_NU * np.sqrt(WAVELENGTH_M * np.sqrt(squared) / 8)
+    return np.flatnonzero(_dot(nearest, nearest) < reach**2)
+
+
 def body_gain(shadow: Shadow, a: Floats, b: Floats) -> Floats:
     """Return the relative field around and through an ellipsoid on segments (n, 3) to (n, 3) in its frame.
 
     It blocks the product of two strips, one between its near and its far edge, one across. The blocked part of the
     field goes through with the loss per metre of the ellipsoid.
     """
-    axes, centre = np.array(shadow.semi_axes_m), np.array(shadow.centre_m)
-    start, way = a - centre, b - a
-    gain = np.ones(len(way))
-    squared = np.maximum(_dot(way, way), NEAREST_M**2)
-    share = np.clip(-_dot(start, way) / squared, 0, 1)
-    nearest = start + share[:, None] * way
-    # Most segments pass at more than the largest radius of a Fresnel zone.
-    reach = float(axes.max()) - LIT_NU * np.sqrt(WAVELENGTH_M * np.sqrt(squared) / 8)
-    (rows,) = np.nonzero(_dot(nearest, nearest) < reach**2)
-    if len(rows):
-        gain[rows] = _gain_near(shadow, start[rows], way[rows], np.sqrt(squared[rows]))
-    return gain
-
-
-def _gain_near(shadow: Shadow, start: Floats, way: Floats, length_m: Floats) -> Floats:
+    start, way = a - np.array(shadow.centre_m), b - a
+    length_m = np.sqrt(np.maximum(_dot(way, way), NEAREST_M**2))
     axes = np.array(shadow.semi_axes_m)
     # In coordinates in which the ellipsoid is a unit sphere, the nearest point gives the depth.
     begin, along = start / axes, way / axes
@@ -206,31 +192,20 @@ def _gain_near(shadow: Shadow, start: Floats, way: Floats, length_m: Floats) -> 
     radius = np.sqrt(_dot(point, point))
     aside = _offset_direction(point * axes, way, int(np.argmin(axes)))
     unit = fresnel_number(np.ones(len(way)), line, length_m)
-    out = _extent_m(axes, aside) * unit
-    gain = np.ones(len(way))
-    # Bodies are flat: many segments pass above or below them, outside of the shadow.
-    (rows,) = np.nonzero(out * (1 - radius) > LIT_NU)
-    if not len(rows):
-        return gain
-    begin, way, aside, unit = begin[rows], way[rows], aside[rows], unit[rows]
-    p, q, out, radius = p[rows], q[rows], out[rows], radius[rows]
-    wide = _extent_m(axes, _cross(way, aside)) * unit
+    out, wide = _extent_m(axes, aside) * unit, _extent_m(axes, np.cross(way, aside)) * unit
     near, opposite, across = edge_gain(np.stack([out * (1 - radius), out * (1 + radius), wide]))
     covered_share = (1 - np.minimum(near + opposite, 1.0)) * (1 - np.minimum(2 * across, 1.0))
     root = np.sqrt(np.maximum(q**2 - p * (_dot(begin, begin) - 1), 0))
     inside = np.clip((-q + root) / p, 0, 1) - np.clip((-q - root) / p, 0, 1)
-    through = np.where(inside > 0, 10 ** (-inside * length_m[rows] * shadow.loss_db_per_m / 20), 0.0)
-    gain[rows] = 1 - covered_share * (1 - through)
-    return gain
+    through = np.where(inside > 0, 10 ** (-inside * length_m * shadow.loss_db_per_m / 20), 0.0)
+    return np.asarray(1 - covered_share * (1 - through))
 
 
 def _offset_direction(point: Floats, way: Floats, flattest: int) -> Floats:
     """Return the direction of a path's offset from the centre; for one through it, a normal on the flattest axis."""
-    centred = _dot(point, point) < 1e-4**2  # metres
-    if not np.any(centred):
-        return point
-    across = _cross(way, np.broadcast_to(np.eye(3)[flattest], way.shape))
+    across = np.cross(way, np.eye(3)[flattest])
     across[_dot(across, across) < PARALLEL] = np.eye(3)[flattest - 1]
+    centred = _dot(point, point) < 1e-4**2  # metres
     return np.where(centred[:, None], across, point)
 
 
@@ -242,12 +217,6 @@ def _extent_m(axes: Floats, direction: Floats) -> Floats:
 
 def _dot(a: Floats, b: Floats) -> Floats:
     return np.asarray(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2])
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    """Return the vector product of rows: for few rows faster than NumPy's, which checks its arguments."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
 
 
 def permittivity(material: str | Material) -> complex:
@@ -361,17 +330,3 @@ def reflection_gain(mirrors: Mirrors, axes: tuple[Floats, Floats], way: Floats, 
     # At normal incidence there is no plane of incidence, and both coefficients are equal.
     straight = s * ((one * other).sum(axis=0) - parts[0][2] * parts[1][2]) / (parts[0][3] * parts[1][3])
     return np.asarray(np.where(sine2 > AXIAL**2, split, straight))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlacedShadow:
-    """A body with a shadow at n instants: centre (n, 3) in metres, rotation body to world (n, 3, 3)."""
-
-    shadow: Shadow
-    position_m: Floats
-    rotation: Floats
-
-    def loss_db(self, one: Floats, other: Floats) -> Floats:
-        """Return the loss by the body on segments (n, k or 1, 3) to (n, k, 3), in dB, (n, k)."""
-        a, b = ((spots - self.position_m[:, None]) @ self.rotation for spots in (one, other))
-        return ellipsoid_chord_m(self.shadow, a, b) * self.shadow.loss_db_per_m

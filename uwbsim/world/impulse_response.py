@@ -20,7 +20,6 @@ from uwblink.arrays import Complexes, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.wire.messages import Cir
 from uwbsim.scenario.radio import Radio
-from uwbsim.world.geometric_paths import Paths
 from uwbsim.world.radio import ALPHA_DBM, FPP_OFFSET_DB
 
 PULSE_TAPS: Final = 1.2
@@ -59,6 +58,17 @@ CURVATURE: Final = 1 / PULSE_TAPS**2
 
 OWN_TAPS: Final = np.arange(1, 4)
 """Taps after the edge whose squares are the first path's power (DW1000 User Manual, 4.7.1)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Paths:
+    """p paths of n links: length less the straight line, in metres, and complex amplitude.
+
+    Shapes (n, p); an amplitude's square is a power in mW, its phase that of the carrier.
+    """
+
+    detour_m: Floats
+    amplitude: Complexes
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ distribution of an arrival instead of a draw: they call `arrive`, which `receive
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -16,8 +16,8 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.devices import TX_SHARE
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Radio
-from uwbsim.world.channel import Link
 from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks, range_shift_m
+from uwbsim.world.links import Link
 from uwbsim.world.radio import (
     printed_power_dbm,
     printed_skew_ppm,
@@ -96,34 +96,19 @@ class Frames:
     departure: Ints
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reception:
-    """Reception of n frames: stamps in whole ticks of the receivers' clocks, not wrapped, and their links."""
-
-    stamp: Ints
-    link: Link
-
-
-@dataclass(frozen=True, slots=True)
 class Medium:
     """The links, the clocks and the antenna delays of a scenario.
 
     `tx_register` and `reply_constant` (tags,) are the programmed antenna delays, in ticks.
     """
 
-    scenario: Scenario
-    links: World | SampledWorld
-    clocks: Clocks
-    delays: AntennaDelays = field(init=False)
-    tx_register: Ints = field(init=False)
-    reply_constant: Ints = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Compute antenna delays and programmed values from the scenario."""
-        object.__setattr__(self, "delays", AntennaDelays.of(self.scenario))
-        programmed = [tag.antenna_delay for tag in self.scenario.tags]
-        object.__setattr__(self, "tx_register", np.array([one.tx for one in programmed], dtype=np.int64))
-        object.__setattr__(self, "reply_constant", np.array([one.reply for one in programmed], dtype=np.int64))
+    def __init__(self, scenario: Scenario, links: World | SampledWorld) -> None:
+        """Draw the clocks."""
+        self.scenario, self.links = scenario, links
+        self.clocks, self.delays = Clocks.of(scenario), AntennaDelays.of(scenario)
+        programmed = [tag.antenna_delay for tag in scenario.tags]
+        self.tx_register = np.array([one.tx for one in programmed], dtype=np.int64)
+        self.reply_constant = np.array([one.reply for one in programmed], dtype=np.int64)
 
     def leave(self, sender: Ints, stamp: Ints, noise: Floats) -> Ints:
         """Return the true sub-ticks (n,) of departure of frames with transmit stamps in whole ticks (n,).
@@ -137,8 +122,11 @@ class Medium:
         early = noise * (self.scenario.radio.tx_noise_ps * 1e-12) * SUBTICKS_PER_SECOND - delay * SUBTICKS_PER_SECOND
         return self.clocks.when(sender, np.rint(early).astype(np.int64) + due)
 
-    def receive(self, frames: Frames, noise: Floats, detour_m: Floats | float = 0.0) -> Reception:
-        """Receive frames (n,); `noise` is standard normal, (n,), `detour_m` a random additional path length."""
+    def receive(self, frames: Frames, noise: Floats, detour_m: Floats | float = 0.0) -> tuple[Ints, Link]:
+        """Return the receive stamps of frames (n,), whole ticks of their clocks, not wrapped; and the links.
+
+        `noise` is standard normal, (n,), `detour_m` a random additional path length.
+        """
         link = self.links.link(frames.sender, frames.receiver, frames.departure)
         arrival = arrive(self.scenario.radio, link)
         detour = np.asarray(detour_m) / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND
@@ -148,7 +136,7 @@ class Medium:
         delay = self.delays.receive_s(frames.receiver, arrives) * SUBTICKS_PER_SECOND
         shift = np.rint(late_s * SUBTICKS_PER_SECOND + delay).astype(np.int64)
         reading = self.clocks.read(frames.receiver, arrives)
-        return Reception(stamp=(reading + shift + SUBTICKS // 2) // SUBTICKS, link=link)
+        return (reading + shift + SUBTICKS // 2) // SUBTICKS, link
 
     def heard(self, power_dbm: Floats, fading: Floats | float = 0.0) -> Bools:
         """Return which frames are above the sensitivity, after power noise; `fading` is standard normal."""

@@ -34,10 +34,6 @@ class Trajectory:
         """Return positions (n, 3) and rotations body to world (n, 3, 3)."""
         return self.position_m(time_s), Rotation.from_quat(self.quaternion(time_s)).as_matrix()
 
-    def point_m(self, time_s: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
-        """Return the positions of a point of the body, shape (n, 3)."""
-        return np.asarray(self.position_m(time_s) + Rotation.from_quat(self.quaternion(time_s)).apply(lever_arm_m))
-
 
 def _quaternions(angles: Floats) -> Floats:
     """Return yaw, pitch, roll (n, 3) as quaternions x y z w: SciPy's `from_euler("ZYX")` in a fifth of its time."""

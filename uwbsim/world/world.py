@@ -2,138 +2,93 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from functools import partial
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Poses
-from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
-from uwbsim.world.channel import Ends, Link, link_between, paths_heard
+from uwbsim.scenario.radio import GeometricMultipath, TwoStateMultipath
+from uwbsim.world.channel import link_between, paths_heard
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS_PER_SECOND
-from uwbsim.world.diffraction import PlacedShadow
-from uwbsim.world.geometric_responses import GeometricResponses
+from uwbsim.world.geometric import GeometricResponses
 from uwbsim.world.impulse_response import PathsHeard
-from uwbsim.world.pair_states import PairLevels, ReflectedStates
+from uwbsim.world.links import Ends, Link, PlacedBody
+from uwbsim.world.pair_states import pair_levels, reflected_states
 from uwbsim.world.radio import shadowing_phases
 from uwbsim.world.trajectories import Trajectory, sample
 
+PIECE: Final = 4096
+"""Links computed at once: more do not fit into a core's cache."""
 
-@dataclass(frozen=True, slots=True)
+
 class World:
     """Bodies on their trajectories, with tags on lever arms.
 
-    `phases` are those of the tags' shadowing, `states` the lasting reflections of pairs, `levels` fading and outages of
-    pairs, `responses` the geometric responses; None where the scenario has none.
+    `phases` are those of the tags' shadowing, `states` the lasting reflections of pairs, `levels` their fading and
+    outages, `responses` the geometric responses; None or none where the scenario has none.
     """
 
-    scenario: Scenario
-    trajectories: dict[str, Trajectory]
-    phases: Floats
-    states: ReflectedStates | None
-    levels: PairLevels | None = None
-    responses: GeometricResponses | None = None
-
-    @classmethod
-    def of(cls, scenario: Scenario) -> Self:
-        """Draw all trajectories from the seed; raises `ScenarioError` where bodies cannot keep their distance."""
-        phases, trajectories = shadowing_phases(scenario), _trajectories(scenario)
-        responses = GeometricResponses.of(scenario, trajectories, phases)
-        return cls(scenario, trajectories, phases, ReflectedStates.of(scenario), PairLevels.of(scenario), responses)
+    def __init__(self, scenario: Scenario) -> None:
+        """Draw all that is random; raises `ScenarioError` where bodies cannot keep their distance."""
+        model = scenario.radio.multipath
+        self.scenario, self.trajectories = scenario, _trajectories(scenario)
+        self.phases = shadowing_phases(scenario)
+        self.states = reflected_states(scenario, model) if isinstance(model, TwoStateMultipath) else None
+        self.levels = pair_levels(scenario)
+        self.obstructing = [(body, body.shadow) for body in scenario.bodies if body.shadow is not None]
+        self.responses = GeometricResponses(self, model) if isinstance(model, GeometricMultipath) else None
 
     def link(self, initiator: Ints, target: Ints, time: Ints) -> Link:
         """Return the links from the first tags to the second, (n,); reciprocal except for the sender's power.
 
         Tags are indices in the scenario's list, times true sub-ticks.
         """
-        self.prepare(initiator, target, time)
-        columns = np.zeros((5, len(time)))
-        pair = initiator * len(self.scenario.tags) + target
-        for key in np.unique(pair):
-            rows = np.flatnonzero(pair == key)
-            link = self._pair(*divmod(int(key), len(self.scenario.tags)), time[rows] / SUBTICKS_PER_SECOND)
-            columns[:4, rows] = link.distance_m, link.excess_m, link.power_dbm, link.total_dbm
-            if link.noise_s is not None:
-                columns[4, rows] = link.noise_s
-        return Link(*columns[:4], noise_s=None if self.responses is None else columns[4])
+        return Link.concatenate([link_between(ends) for ends in self._pieces(initiator, target, time)])
 
-    def prepare(self, initiator: Ints, target: Ints, time: Ints) -> None:
-        """Compute the responses of links (n,) ahead: faster for many pairs at once than pair by pair."""
-        if self.responses is not None:
-            self.responses.prepare((initiator, target), time / SUBTICKS_PER_SECOND)
-
-    def paths(self, sender: int, receiver: int, time: int, detour_m: float = 0.0) -> PathsHeard:
-        """Return the paths at one instant as a response shows them; `detour_m` is the random detour of the range."""
-        (found,) = self.all_paths(np.array([sender]), np.array([receiver]), np.array([time]), np.array([detour_m]))
+    def paths(self, sender: Ints, receiver: Ints, time: Ints, detour_m: Floats) -> list[PathsHeard]:
+        """Return the paths of n links as impulse responses show them; `detour_m` are random detours of first paths."""
+        found: list[PathsHeard] = []
+        for ends in self._pieces(sender, receiver, time):
+            found += paths_heard(link_between(ends), ends, detour_m[len(found) : len(found) + PIECE])
         return found
 
-    def all_paths(self, sender: Ints, receiver: Ints, time: Ints, detour_m: Floats) -> list[PathsHeard]:
-        """Return the paths of n links as responses show them."""
-        time_s = time / SUBTICKS_PER_SECOND
-        if self.responses is None:
-            columns = zip(sender.tolist(), receiver.tolist(), time_s[:, None], detour_m.tolist(), strict=True)
-            return [paths_heard(self._pair(i, j, now), detour) for i, j, now, detour in columns]
-        link, read = self.link(sender, receiver, time), self.responses.at((sender, receiver), time_s)
-        paths = self.responses.paths((sender, receiver), time_s)
-        later_s = (paths.detour_m - (read.excess_m + detour_m)[:, None]) / SPEED_OF_LIGHT
-        # Other effects on a link change all its paths alike.
-        amplitude = paths.amplitude * 10 ** ((link.power_dbm - read.power_dbm) / 20)[:, None]
-        return [PathsHeard(*path) for path in zip(link.power_dbm.tolist(), later_s, amplitude, strict=True)]
+    def _pieces(self, sender: Ints, receiver: Ints, time: Ints) -> Iterator[Ends]:
+        for begin in range(0, max(len(time), 1), PIECE):
+            rows = slice(begin, begin + PIECE)
+            yield self.ends((sender[rows], receiver[rows]), time[rows] / SUBTICKS_PER_SECOND)
 
-    def _pair(self, i: int, j: int, time_s: Floats) -> Link:
-        tags = self.scenario.tags
-        shadowing = [body.name for body in self.scenario.bodies if body.shadow is not None]
-        # Each body once, whether it carries a tag, obstructs the link, or both.
-        names = dict.fromkeys([tags[i].body, tags[j].body, *shadowing])
-        bodies = {name: self.trajectories[name].pose(time_s) for name in names}
-        return link_between(
-            self.ends(
-                (np.full(len(time_s), i), np.full(len(time_s), j)),
-                time_s,
-                (self._antenna_m(i, bodies), self._antenna_m(j, bodies)),
-                (bodies[tags[i].body][1], bodies[tags[j].body][1]),
-                bodies,
-            )
-        )
-
-    def ends(
-        self,
-        places: tuple[Ints, Ints],
-        time_s: Floats,
-        antennas_m: tuple[Floats, Floats],
-        rotations: tuple[Floats, Floats],
-        bodies: Mapping[str, tuple[Floats, Floats]],
-    ) -> Ends:
-        """Return the ends of n links; `bodies` has positions and rotations of the bodies with a shadow, (n,) each."""
-        shadows = [
-            PlacedShadow(shadow=body.shadow, position_m=bodies[body.name][0], rotation=bodies[body.name][1])
-            for body in self.scenario.bodies
-            if body.shadow is not None
-        ]
+    def ends(self, places: tuple[Ints, Ints], time_s: Floats) -> Ends:
+        """Return the ends of links between tags with indices (n,) at true times (n,)."""
+        one, other = (self.antennas(tags, time_s) for tags in places)
+        poses = [self.trajectories[body.name].pose(time_s) for body, _ in self.obstructing]
         return Ends(
-            scenario=self.scenario,
-            phases=self.phases,
+            world=self,
             time_s=time_s,
             places=places,
-            antennas_m=antennas_m,
-            rotations=rotations,
-            shadows=shadows,
-            states=self.states,
-            levels=self.levels,
-            responses=self.responses,
+            antennas_m=(one[0], other[0]),
+            rotations=(one[1], other[1]),
+            shadows=self.shadows(poses),
         )
 
-    def _antenna_m(self, index: int, bodies: dict[str, tuple[Floats, Floats]]) -> Floats:
-        tag = self.scenario.tags[index]
-        position, turn = bodies[tag.body]
-        return np.asarray(position + turn @ np.array(tag.lever_arm_m))
+    def shadows(self, poses: Iterable[tuple[Floats, Floats]]) -> list[PlacedBody]:
+        """Return the bodies with a shadow at their poses: positions (n, 3) and rotations (n, 3, 3) of each."""
+        return [PlacedBody(*body, *pose) for body, pose in zip(self.obstructing, poses, strict=True)]
+
+    def antennas(self, tags: Ints, time_s: Floats) -> tuple[Floats, Floats]:
+        """Return positions (n, 3) and rotations (n, 3, 3) of the antennas of tags (n,) at true times (n,)."""
+        position, rotation = np.empty((len(tags), 3)), np.empty((len(tags), 3, 3))
+        for place in np.unique(tags).tolist():
+            tag, rows = self.scenario.tags[place], np.flatnonzero(tags == place)
+            at, rotation[rows] = self.trajectories[tag.body].pose(time_s[rows])
+            position[rows] = at + rotation[rows] @ np.array(tag.lever_arm_m)
+        return position, rotation
 
     def motion_capture(self) -> Poses:
         """Return the poses that motion capture writes over the run, with its rate, noise, latency and gaps."""
@@ -188,21 +143,6 @@ STEPS: Final = 200
 10 m/s^2."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Samples:
-    """A block of samples: positions (samples, k, 3) and rotations body to world (samples, k, 3, 3) of k objects."""
-
-    spots: Floats
-    turns: Floats
-
-    def at(self, index: int, into: float) -> tuple[Floats, Floats]:
-        """Interpolate between a sample and the next; `into` is the fraction of the step."""
-        return (
-            self.spots[index] + into * (self.spots[index + 1] - self.spots[index]),
-            self.turns[index] + into * (self.turns[index + 1] - self.turns[index]),
-        )
-
-
 class SampledWorld:
     """The links of a world for single frames in order of time, interpolated within blocks of `STEPS` samples.
 
@@ -212,8 +152,7 @@ class SampledWorld:
     def __init__(self, world: World) -> None:
         """Compute the first block."""
         self._world = world
-        self._shadowing = [body.name for body in world.scenario.bodies if body.shadow is not None]
-        self._prepare(0)
+        self._block, self._samples = 0, self._sample(0)
 
     def link(self, initiator: Ints, target: Ints, time: Ints) -> Link:
         """Return the links of one frame: all rows must have the same sender and time."""
@@ -221,37 +160,32 @@ class SampledWorld:
 
     def from_sender(self, sender: int, time: int) -> Link:
         """Return the links from a tag, by its index, to all tags, (tags,)."""
-        step, into = divmod(time / SUBTICKS_PER_SECOND / STEP_S, 1)
+        time_s, count = time / SUBTICKS_PER_SECOND, len(self._world.scenario.tags)
+        step, into = divmod(time_s / STEP_S, 1)
         block, index = divmod(int(step), STEPS)
         if block != self._block:
-            self._prepare(block)
-        spots, turns = self._tags.at(index, into)
-        count, time_s = len(spots), time / SUBTICKS_PER_SECOND
-        origin, poses = np.full(count, sender), {}
-        if self._world.responses is not None:
-            self._world.responses.look_ahead(sender, time_s)
-        if self._shadowing:
-            for name, at, turn in zip(self._shadowing, *self._bodies.at(index, into), strict=True):
-                poses[name] = np.broadcast_to(at, (count, 3)), np.broadcast_to(turn, (count, 3, 3))
-        return link_between(
-            self._world.ends(
-                (origin, np.arange(count)),
-                np.full(count, time_s),
-                (spots[origin], spots),
-                (turns[origin], turns),
-                poses,
-            )
+            self._block, self._samples = block, self._sample(block)
+        spots, turns = (column[index] + into * (column[index + 1] - column[index]) for column in self._samples)
+        origin = np.full(count, sender)
+        ends = Ends(
+            world=self._world,
+            time_s=np.full(count, time_s),
+            places=(origin, np.arange(count)),
+            antennas_m=(spots[origin], spots[:count]),
+            rotations=(turns[origin], turns[:count]),
+            shadows=self._world.shadows(
+                (np.broadcast_to(spot, (count, 3)), np.broadcast_to(turn, (count, 3, 3)))
+                for spot, turn in zip(spots[count:], turns[count:], strict=True)
+            ),
         )
+        return link_between(ends)
 
-    def _prepare(self, block: int) -> None:
-        """Compute the samples of a block."""
-        world, self._block = self._world, block
-        time = np.asarray((block * STEPS + np.arange(STEPS + 1)) * STEP_S, dtype=np.float64)
-        bodies = {name: path.pose(time) for name, path in world.trajectories.items()}
-        tags = world.scenario.tags
-        position, turned = (np.stack([bodies[tag.body][k] for tag in tags], axis=1) for k in (0, 1))
-        arms = np.array([tag.lever_arm_m for tag in tags])
-        self._tags = _Samples(position + np.einsum("stij,tj->sti", turned, arms), turned)
-        if self._shadowing:
-            parts = [bodies[name] for name in self._shadowing]
-            self._bodies = _Samples(*(np.stack(column, axis=1) for column in zip(*parts, strict=True)))
+    def _sample(self, block: int) -> tuple[Floats, Floats]:
+        """Return positions (steps, k, 3) and rotations (steps, k, 3, 3) of antennas, then of bodies with a shadow."""
+        world, time = self._world, np.asarray((block * STEPS + np.arange(STEPS + 1)) * STEP_S, dtype=np.float64)
+        poses = {name: path.pose(time) for name, path in world.trajectories.items()}
+        names = [tag.body for tag in world.scenario.tags] + [body.name for body, _ in world.obstructing]
+        arms = np.zeros((len(names), 3))
+        arms[: len(world.scenario.tags)] = [tag.lever_arm_m for tag in world.scenario.tags]
+        position, turned = (np.stack([poses[name][k] for name in names], axis=1) for k in (0, 1))
+        return position + np.einsum("stij,tj->sti", turned, arms), turned

@@ -91,7 +91,7 @@ def flight(tmp_path_factory):
     moved.save(folder / "f.uwb")
     from uwbsim.world.world import World
 
-    poses = LivePoses(World.of(scenario), folder / "p.csv", SHIFT_NS + 3_210_000_000)
+    poses = LivePoses(World(scenario), folder / "p.csv", SHIFT_NS + 3_210_000_000)
     poses.write_until(int(scenario.run.duration_s * 1e9))
     poses.close()
     return folder

@@ -36,7 +36,7 @@ def written(world, path, steps):
 
 
 def test_the_file_holds_every_pose_up_to_now_and_none_after(tmp_path):
-    world = World.of(flight(latency_ms=20.0))
+    world = World(flight(latency_ms=20.0))
     poses = LivePoses(world, tmp_path / "p.csv", EPOCH_NS)
     for now_s in (0.5, 0.5, 0.7031, 7.0):
         poses.write_until(round(now_s * 1e9))
@@ -49,7 +49,7 @@ def test_the_file_holds_every_pose_up_to_now_and_none_after(tmp_path):
 
 
 def test_poses_are_those_of_the_world_and_do_not_depend_on_the_pieces(tmp_path):
-    world = World.of(flight(position_noise_m=0.001, attitude_noise_rad=0.01, gaps_per_min=20.0))
+    world = World(flight(position_noise_m=0.001, attitude_noise_rad=0.01, gaps_per_min=20.0))
     one = written(world, tmp_path / "one.csv", [30.0])
     many = written(world, tmp_path / "many.csv", np.arange(0.1, 30.01, 0.1))
     np.testing.assert_array_equal(one.time_ns, many.time_ns)

@@ -151,7 +151,7 @@ def test_compare_writes_a_page_and_tables(tmp_path):
     again = run("compare", TEST1, "-o", out, "--protocols", "ss", "-n", "100")
     assert (again.returncode, again.stderr.count("\n")) == (2, 1)
     assert "--force" in again.stderr
-    assert run("compare", TEST1, "-o", out, "--protocols", "ss", "-n", "1000", "--force").returncode == 0
+    assert run("compare", TEST1, "-o", out, "--protocols", "ss", "-n", "10", "--force").returncode == 0
 
 
 def test_predict_and_optimum_answer_in_words_and_json(tmp_path):
@@ -172,7 +172,7 @@ def test_predict_and_optimum_answer_in_words_and_json(tmp_path):
         (["compare", TEST1, "-o", "no/out"], ["does not exist"]),
         (["predict", "--protocol", "aloha"], ["aloha", "allowed"]),
         (["predict", "--skew-ppm", "nan"], ["--skew-ppm", "nan"]),
-        (["predict", "--final-delay-us", "0"], ["--final-delay-us", "at least"]),
+        (["predict", "--final-delay-us", "0"], ["--final-delay-us", "1 or more"]),
         (["optimum", "no.toml"], ["no such"]),
         (["sweep", "no.toml", "-o", "out"], ["no such"]),
         (["run", TEST1, "-o", "o.uwb", "--through-wire", "--set", "ranging.protocol=ds-sym"], ["ds-sym", "boards"]),

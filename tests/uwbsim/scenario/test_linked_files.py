@@ -95,7 +95,7 @@ def trajectory(tmp_path, seconds):
 
 
 def test_a_recorded_trajectory_is_flown(tmp_path):
-    world = World.of(load(trajectory(tmp_path, 12)))
+    world = World(load(trajectory(tmp_path, 12)))
     path = next(iter(world.trajectories.values()))
     np.testing.assert_allclose(path.position_m(np.array([3.0]))[0], [np.sin(1.0), 0.6, 1.0], atol=1e-6)
 

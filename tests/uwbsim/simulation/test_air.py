@@ -37,20 +37,14 @@ def slot(number, at_us, initiator, target, heard=(True, True, True), reply_us=30
     return number, at_us * US, initiator, target, pause_us * US, heard, (0, reply_us * US, final_us * US)
 
 
-def columns(hosts):
-    """Return the slots of hosts as the event loop takes them, and the numbers of each host's."""
-    rows = sorted(row for host in hosts for row in host)
-    assert [row[0] for row in rows] == list(range(len(rows)))
-    _, start, initiator, target, pause, heard, delay = zip(*rows, strict=True)
-    slots = air.Slots([*start], [*initiator], [*target], [*pause], np.array(heard).T, np.array(delay).T)
-    return slots, [[row[0] for row in host] for host in hosts]
-
-
-def played(hosts, powers=None, capture_db=6.0):
+def played(hosts, powers=None, progress=None):
     table = np.full((8, 8), -80.0) if powers is None else powers
-    rules = Radio(sensitivity_dbm=-100.0, capture_db=capture_db, preamble_symbols=128)
-    slots, numbers = columns(hosts)
-    return air.run(DS, slots, numbers, 8, lambda sender, _time: table[sender], rules)
+    rules = Radio(sensitivity_dbm=-100.0, capture_db=6.0, preamble_symbols=128)
+    rows = sorted((*row, number) for number, host in enumerate(hosts) for row in host)
+    assert [row[0] for row in rows] == list(range(len(rows)))
+    _, start, initiator, target, pause, heard, delay, number = map(np.array, zip(*rows, strict=True))
+    slots = air.Slots(air.Schedule(start, initiator, target, number), pause, heard.T, delay.T)
+    return air.run(DS, slots, lambda sender, _time: table[sender], rules, progress)
 
 
 def with_powers(*changes, everywhere=-80.0):
@@ -148,9 +142,7 @@ def test_progress_is_told_for_every_500th_slot_as_a_share_of_all_hosts():
     hosts = [[slot(k, 3000 * k, 0, 1) for k in range(501)], [slot(501, 0, 4, 5)]]
     powers = np.full((8, 8), -120.0)
     powers[:2, :2] = powers[4:6, 4:6] = -80.0
-    rules = Radio(sensitivity_dbm=-100.0, capture_db=6.0, preamble_symbols=128)
-    slots, numbers = columns(hosts)
-    outcome = air.run(DS, slots, numbers, 8, lambda sender, _: powers[sender], rules, told.append)
+    outcome = played(hosts, powers, told.append)
     assert set(outcome.lost) == {-1}
     assert told == [500 / 502]
 

@@ -28,12 +28,18 @@ def scenario(places=((0.0, 0.0, 1.0), (4.0, 0.0, 1.0)), tags=({}, {}), **more):
 
 
 def link(world, now=5_000_000):
-    return World.of(world).link(ZERO, ONE, np.array([now]))
+    return World(world).link(ZERO, ONE, np.array([now]))
 
 
 def sampled(world, now=5_000_000):
     """The same link with all its paths."""
-    return SampledWorld(World.of(world)).from_sender(0, now)[ONE]
+    return SampledWorld(World(world)).from_sender(0, now)[ONE]
+
+
+def paths(world, detour_m=0.0):
+    """The paths of the first link at the start, as a response shows them."""
+    (found,) = World(world).paths(ZERO, ONE, ZERO, np.array([detour_m]))
+    return found
 
 
 def post(loss_db_per_m):
@@ -128,7 +134,7 @@ def test_impulse_responses_follow_the_power_of_the_link(at_1m_dbm):
 
 def test_obstacles_weaken_the_response_and_let_its_echoes_stand_out():
     weak = BOX | {"material": {"loss_db_per_m": 10.0 / 0.6}}
-    free, blocked = (World.of(scenario(room=ROOM, **more)).paths(0, 1, 0) for more in ({}, {"obstacles": [weak]}))
+    free, blocked = (paths(scenario(room=ROOM, **more)) for more in ({}, {"obstacles": [weak]}))
     assert free.power_dbm - blocked.power_dbm == pytest.approx(10.0, abs=1e-9)
     assert peak_amplitude(free.power_dbm) / peak_amplitude(blocked.power_dbm) == pytest.approx(10**0.5, rel=1e-9)
     delays, shares = (
@@ -141,8 +147,7 @@ def test_obstacles_weaken_the_response_and_let_its_echoes_stand_out():
 
 def test_a_ranges_own_detour_brings_its_echoes_nearer():
     """With a detour of the first path, what comes after comes sooner after it."""
-    world = World.of(scenario(room=ROOM))
-    plain, late = world.paths(0, 1, 0), world.paths(0, 1, 0, detour_m=0.3)
+    plain, late = (paths(scenario(room=ROOM), detour_m) for detour_m in (0.0, 0.3))
     assert late.delay_s[0] == pytest.approx(plain.delay_s[0] - 0.3 / SPEED_OF_LIGHT)
     always = {"probability": 1.0, "mean_excess_m": 0.2}
     room = ROOM | {"max_m": [8.0, 4.0, 40.0], "min_m": [-60.0, -60.0, -0.5], "reflection_loss_db": 0.0}

@@ -34,7 +34,7 @@ def scenario(*, places=(A, B), motion=None, scatterers=0, stamp_noise=False, **m
 
 def world_paths(world, time_s=0.5):
     """Lengths in metres and complex amplitudes of all paths there are, in order of length."""
-    found = World.of(world).responses.paths((ZERO, ONE), np.array([time_s]))
+    found = World(world).responses.paths((ZERO, ONE), np.array([time_s]))
     there = np.abs(found.amplitude[0]) > 1e-12
     length = found.detour_m[0][there] + np.linalg.norm(np.subtract(A, B))
     order = np.argsort(length)
@@ -43,7 +43,7 @@ def world_paths(world, time_s=0.5):
 
 def link(world, time_s=0.5):
     now = np.array([round(time_s * SUBTICKS_PER_SECOND)])
-    return World.of(world).link(ZERO, ONE, now)
+    return World(world).link(ZERO, ONE, now)
 
 
 def test_noiseless_stays_exact():
@@ -109,7 +109,7 @@ def test_a_mirror_on_an_obstacle_is_as_large_as_its_face():
     for end in (8.0, 3.0, 1.0):
         plate = {"min_m": [-3.0, 4.0, -3.0], "max_m": [end, 4.1, 6.0], "material": "metal", "roughness_mm": 0.0}
         found = scenario(places=((1.0, 2.0, 1.5), (5.0, 2.0, 1.5)), obstacles=[plate])
-        paths = World.of(found).responses.paths((ZERO, ONE), np.zeros(1))
+        paths = World(found).responses.paths((ZERO, ONE), np.zeros(1))
         later = np.argmin(np.abs(paths.detour_m[0] - (np.hypot(4, 4) - 4)))
         strength.append(abs(paths.amplitude[0][later]) * np.hypot(4, 4) / 10 ** (-72 / 20))
     assert strength[0] == pytest.approx(1.0, abs=0.1)
@@ -211,7 +211,7 @@ def test_responses_have_the_first_path_where_the_stamp_is_with_its_power(slow_fl
 
 
 def test_scatterers_stay_where_they_are_and_more_of_them_leave_the_first_there():
-    few, many = (World.of(scenario(room=ROOM, scatterers=n)).responses.around.scatterers for n in (5, 40))
+    few, many = (World(scenario(room=ROOM, scatterers=n)).responses.around.scatterers for n in (5, 40))
     for name in ("place_m", "extra_m", "gain"):
         np.testing.assert_array_equal(getattr(few, name), getattr(many, name)[:5])
     assert np.all((many.place_m >= 0) & (many.place_m <= np.array([8.0, 6.0, 3.0])))
@@ -219,9 +219,9 @@ def test_scatterers_stay_where_they_are_and_more_of_them_leave_the_first_there()
 
 def test_what_is_asked_one_at_a_time_and_all_at_once_is_the_same_draw_for_draw():
     """While a tag moves: flights ask for many links, served boards for one sender at an instant."""
-    world = World.of(scenario(places=(A, B, (6.5, 1.0, 0.8)), motion=SLOW, **CLUTTER))
+    world = World(scenario(places=(A, B, (6.5, 1.0, 0.8)), motion=SLOW, **CLUTTER))
     time = (np.linspace(0.0, 0.9, 37) * SUBTICKS_PER_SECOND).astype(np.int64)
-    sampled = SampledWorld(World.of(world.scenario))
+    sampled = SampledWorld(World(world.scenario))
     for target in (1, 2):
         many = world.link(np.zeros(37, dtype=np.int64), np.full(37, target), time)
         for name in ("excess_m", "power_dbm", "total_dbm", "noise_s"):
@@ -232,14 +232,14 @@ def test_what_is_asked_one_at_a_time_and_all_at_once_is_the_same_draw_for_draw()
 
 def test_links_are_the_same_both_ways_but_for_who_sends_stronger():
     thin = {"min_m": [2.0, 2.4, 0.0], "max_m": [2.2, 4.0, 2.5], "material": "drywall"}
-    world = World.of(scenario(obstacles=[thin], radio={"antenna": "dipole"}, **CLUTTER))
+    world = World(scenario(obstacles=[thin], radio={"antenna": "dipole"}, **CLUTTER))
     now = np.array([SUBTICKS_PER_SECOND // 2])
     there, back = world.link(ZERO, ONE, now), world.link(ONE, ZERO, now)
     assert there.power_dbm[0] == back.power_dbm[0]
     loud = world.scenario.model_copy(
         update={"tags": (world.scenario.tags[0].model_copy(update={"tx_power_db": 3.0}), *world.scenario.tags[1:])}
     )
-    there, back = World.of(loud).link(ZERO, ONE, now), World.of(loud).link(ONE, ZERO, now)
+    there, back = World(loud).link(ZERO, ONE, now), World(loud).link(ONE, ZERO, now)
     assert there.power_dbm[0] - back.power_dbm[0] == pytest.approx(3.0, abs=0.2)
     assert there.total_dbm[0] - back.total_dbm[0] == pytest.approx(3.0, abs=1e-9)
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from uwbsim.scenario.radio import Radio
-from uwbsim.world.geometric_paths import Paths
-from uwbsim.world.impulse_response import BEFORE, TAP_M, accumulate, detect
+from uwbsim.world.impulse_response import BEFORE, TAP_M, Paths, accumulate, detect
 
 SENSING = (Radio(dynamic_range_db=15.0, sensitivity_dbm=-105.0), 1 / 12)
 WIDTH_TAPS, EDGE_TAPS = 1.2, 1.5

@@ -10,7 +10,6 @@ from uwbsim.protocols.conditions import conditions_of
 from uwbsim.protocols.prediction import predict
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 from uwbsim.world.impulse_response import EDGE_TO_PEAK, TAP_S
-from uwbsim.world.pair_states import ReflectedStates
 from uwbsim.world.world import World
 
 PLACES = {"a": (0.0, 0.0, 1.0), "b": (4.0, 0.5, 1.2), "c": (1.5, 3.0, 0.8)}
@@ -96,7 +95,7 @@ def test_excess_is_that_of_the_scenario(long_flight):
 
 
 def test_reflections_show_in_total_less_first_path_power():
-    world = World.of(scenario(300.0))
+    world = World(scenario(300.0))
     time = (np.linspace(0, 300, 2000) * SUBTICKS_PER_SECOND).astype(np.int64)
     link = world.link(np.zeros(2000, dtype=np.int64), np.ones(2000, dtype=np.int64), time)
     reflected = link.excess_m > 0
@@ -120,10 +119,11 @@ def test_reflections_show_in_impulse_responses():
 
 
 def test_the_rise_of_a_response_is_the_later_paths():
-    world = World.of(scenario(share=1.0))
-    paths = world.paths(0, 1, SUBTICKS_PER_SECOND)
+    world = World(scenario(share=1.0))
+    ends = np.array([0]), np.array([1])
+    (paths,) = world.paths(*ends, np.array([SUBTICKS_PER_SECOND]), np.zeros(1))
     delay_s, share = paths.delay_s[-1], paths.amplitude[-1]
-    expected = world.states.at((np.array([0]), np.array([1])), np.array([1.0])).rise_s[0]
+    (expected,) = world.states.at(ends, np.array([1.0]))[3]
     assert delay_s == pytest.approx(expected, rel=1e-6)
     later_db = 10 * np.log10(10 ** ((FIRST_DB - TOTAL_DB) / 10) - 1)
     assert 20 * np.log10(share) == pytest.approx(later_db, abs=1e-6)
@@ -134,7 +134,7 @@ def test_served_boards_and_listeners_meet_the_same_paths_as_flights():
     """One path for the whole run: what differs from a world without is the same wherever one looks."""
     always, never = (scenario(1.0, 20.0, who=((1, 2),), passive=(3,), share=s, life_s=1e4) for s in (1.0, 0.0))
     flights = [uwbsim.simulate(world) for world in (always, never)]
-    excess = World.of(always).states.at((np.array([0]), np.array([1])), np.array([0.5])).excess_m[0]
+    (excess,) = World(always).states.at((np.array([0]), np.array([1])), np.array([0.5]))[1]
     lengths = [np.mean(raw_range(flight.exchanges)) for flight in flights]
     assert lengths[0] - lengths[1] == pytest.approx(excess, abs=0.005)
     heard = [flight.overheard for flight in flights]
@@ -167,9 +167,9 @@ def test_pairs_shares_and_lives_spread_as_asked_for():
             "tags": tags,
         }
     )
-    states = ReflectedStates.of(world)
-    which = np.searchsorted(np.arange(1, 780) * states.redraws.span_s, states.redraws.begin, side="right")
-    shares = np.bincount(which, weights=states.states[0]) / np.bincount(which)
+    states = World(world).states
+    which = np.searchsorted(np.arange(1, 780) * states.span_s, states.begin, side="right")
+    shares = np.bincount(which, weights=states.values[0]) / np.bincount(which)
     # 780 pairs with 1400 paths each.
     assert shares.mean() == pytest.approx(0.2, abs=0.015)
     assert shares.std() == pytest.approx(0.1, rel=0.12)
@@ -177,9 +177,8 @@ def test_pairs_shares_and_lives_spread_as_asked_for():
 
 def test_a_longer_run_continues_the_same_reflections():
     places, time = (np.zeros(100, dtype=np.int64), np.ones(100, dtype=np.int64)), np.linspace(0, 9, 100)
-    short, long = (ReflectedStates.of(scenario(duration)).at(places, time) for duration in (10.0, 1000.0))
-    np.testing.assert_array_equal(short.excess_m, long.excess_m)
-    np.testing.assert_array_equal(short.rise_s, long.rise_s)
+    short, long = (World(scenario(duration)).states.at(places, time) for duration in (10.0, 1000.0))
+    np.testing.assert_array_equal(short, long)
 
 
 @pytest.mark.parametrize(

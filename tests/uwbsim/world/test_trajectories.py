@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 
 import uwbsim
 from uwbsim.random_streams import stream
-from uwbsim.scenario.bodies import Carried, RandomFlight, Static, Waypoints
+from uwbsim.scenario.bodies import Carried, RandomFlight, Waypoints
 from uwbsim.world.trajectories import _quaternions, sample
+from uwbsim.world.world import World
 
 
 def test_random_flight_stays_in_its_box_at_about_its_speed():
@@ -41,9 +42,12 @@ def test_a_carried_body_stands_still_and_goes_on_smoothly():
 
 
 def test_lever_arm_turns_with_the_body():
-    post = sample(Static(model="static", position_m=(1, 2, 3), yaw_deg=90.0), 1.0, partial(stream, 1, "a"))
-    point = post.point_m(np.array([0.0]), (1.0, 0.0, 0.0))
-    assert point[0] == pytest.approx((1, 3, 3))
+    turned = {"model": "static", "position_m": [1.0, 2.0, 3.0], "yaw_deg": 90.0}
+    bodies = [{"name": "a", "motion": turned}, {"name": "b", "motion": turned | {"position_m": [5.0, 2.0, 3.0]}}]
+    tags = [{"id": k, "body": "ab"[k], "lever_arm_m": [1.0, 0.0, 0.0]} for k in (0, 1)]
+    scenario = {"run": {"duration_s": 1.0}, "ranging": {"rate_hz": 1}, "bodies": bodies, "tags": tags}
+    spots, _ = World(uwbsim.load(scenario)).antennas(np.array([0, 1]), np.zeros(2))
+    np.testing.assert_allclose(spots, [(1, 3, 3), (5, 3, 3)], atol=1e-12)
 
 
 def test_quaternions_are_unit():
