@@ -21,7 +21,7 @@ from calib.estimator.range_model import METRES_A_NS, RangeModel, Spline
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows, Robust
 from calib.estimator.rows import NormalRows, Rows
 from calib.estimator.time_blocks import TimeBlocks, in_order, time_blocks
-from calib.estimator.unknowns import Layout, Priors, Unknown
+from calib.estimator.unknowns import Priors, Unknown
 from calib.range_errors.density import ErrorSlopes
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
@@ -151,6 +151,11 @@ class Fitted:
     steps: int
     beside: tuple[Rows, ...] = ()
 
+    @property
+    def values(self) -> dict[str, Floats]:
+        """Return the unknowns by kind."""
+        return {kind: self.optimum.x[where] for kind, where in self.optimum.layout.where.items()}
+
 
 def model_of(ranges: Ranges, recipe: Recipe, *, trimmed: bool = True) -> RangeModel:
     """Return the model of ranges in order of time; raises what `fit_known_distances` raises."""
@@ -211,7 +216,7 @@ def robust_fit(
     layout, whole = model.build(error, Robust(weights=weights, scale_m=1.0), only=kinds)
     every = whole if weight is None else whole.sample(np.flatnonzero(weight))
     gauge = (*model.gauge_rows(layout), *model.held_rows(layout))
-    rows, x = every, _from(layout, start)
+    rows, x = every, layout.start(start.values if start is not None else None)
     if sample is not None and sample < len(error):
         # A fixed random choice: a regular one could coincide with the schedule of pairs.
         rows = every.sample(np.sort(np.random.default_rng(0).permutation(len(error))[:sample]))
@@ -269,7 +274,7 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted) -> Fitted:
         (*model.gauge_rows(layout), *model.held_rows(layout)),
         layout.indices([u.kind for u in model.unknowns]),
     )
-    x, priors = _from(layout, pilot), Priors(layout)
+    x, priors = layout.start(pilot.values), Priors(layout)
     order = np.random.default_rng(0).permutation(len(error))
     size, steps = FIRST_SAMPLE, pilot.steps
     while 2 * size < len(error):
@@ -285,16 +290,6 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted) -> Fitted:
         scale_m=pilot.scale_m,
         steps=steps + found.steps,
     )
-
-
-def _from(layout: Layout, start: Fitted | None) -> Floats:
-    """Return the initial values: those of another search for the unknowns that both have."""
-    x = layout.start()
-    if start is not None:
-        for kind, where in start.optimum.layout.where.items():
-            if kind in layout.where:
-                x[layout.where[kind]] = start.optimum.x[where]
-    return x
 
 
 def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDistances:
@@ -317,7 +312,7 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDis
         covariances["delay"] = covariances["delay"] + wider
     return KnownDistances(
         model=model,
-        values={kind: fitted.optimum.x[where] for kind, where in layout.where.items()},
+        values=fitted.values,
         covariances=covariances,
         searches=(fitted,),
         lasting=lasting,

@@ -8,7 +8,7 @@ variance of offsets between pairs and between sessions, and the spread of error 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -97,9 +97,10 @@ class Layout:
         """Return the number of unknowns."""
         return sum(len(block.start) for block in self.blocks)
 
-    def start(self) -> Floats:
-        """Return where a search begins (p,)."""
-        return np.concatenate([np.asarray(block.start, dtype=np.float64) for block in self.blocks])
+    def start(self, given: Mapping[str, Floats] | None = None) -> Floats:
+        """Return where a search begins (p,): at the values of the kinds that are `given`, else at the blocks' start."""
+        values = [(given or {}).get(block.kind, block.start) for block in self.blocks]
+        return np.concatenate([np.asarray(own, dtype=np.float64).ravel() for own in values])
 
     def free(self) -> Ints:
         """Return the indices of the unknowns that are not known already."""
@@ -128,7 +129,16 @@ class Priors:
         self.layout = layout
         self.all = [(layout.where[block.kind], prior) for block in layout.blocks for prior in block.priors]
         self.weights = [prior.weight for _, prior in self.all] if weights is None else list(weights)
+        self.keys = [(block.kind, k) for block in layout.blocks for k in range(len(block.priors))]
         self.ranks = [where.stop - where.start if prior.rank is None else prior.rank for where, prior in self.all]
+
+    def by_key(self) -> dict[tuple[str, int], float]:
+        """Return the present weights by kind and number of the prior."""
+        return dict(zip(self.keys, self.weights, strict=True))
+
+    def recall(self, known: Mapping[tuple[str, int], float]) -> None:
+        """Take the weights of an earlier search, where it had them."""
+        self.weights = [known.get(key, weight) for key, weight in self.by_key().items()]
 
     def precision(self) -> Matrix:
         """Return the precision of all priors (p, p); a sparse one for many unknowns."""

@@ -29,7 +29,7 @@ from calib.fitting.result import FitResult
 from calib.settings import FitSettings, FlightSettings
 from calib.trajectories.judging import Judgement, curve_uncertainty, judge_delays
 from calib.trajectories.scene import Scene, scene_from
-from calib.trajectories.search import Cauchy, Found, search
+from calib.trajectories.search import Cauchy, Search, search
 from calib.trajectories.start import begin
 from uwblink.arrays import Floats
 
@@ -165,7 +165,7 @@ def _curve_source(curve_from: Calibration | str | os.PathLike[str] | None, other
     return known
 
 
-def _described(model: RangeModel, top: Found, known: Calibration | None) -> KnownDistances:
+def _described(model: RangeModel, top: Search, known: Calibration | None) -> KnownDistances:
     """Return the fit as one to the estimated distances, whose uncertainty is in its covariance."""
     distances = top.geometry.distances(top.optimum.x)[0]
     model = replace(model, ranges=replace(model.ranges, truth_m=distances))
@@ -194,7 +194,7 @@ def _described(model: RangeModel, top: Found, known: Calibration | None) -> Know
 
 def _result(
     found: KnownDistances,
-    top: Found,
+    top: Search,
     judgement: Judgement,
     flight: FlightSettings,
     settings: FitSettings,
@@ -230,7 +230,7 @@ def _result(
         findings,
         settings=settings,
         fixed=fixed,
-        first=[*_left_open(found, judgement, covariance), *_of_search(top, rival), *top.scene.tapes.left_out],
+        first=[*_left_open(found, judgement, covariance), *_of_search(top, rival), *top.motion.scene.tapes.left_out],
         more=judgement.sentences,
     )
 
@@ -254,8 +254,8 @@ def _left_open(found: KnownDistances, judgement: Judgement, covariance: Floats) 
     return [] if free.issuperset(judgement.free_tags) else judgement.undetermined_sentences(covariance)
 
 
-def _of_search(top: Found, rival: str) -> Iterator[str]:
-    if not top.success:
+def _of_search(top: Search, rival: str) -> Iterator[str]:
+    if not top.optimum.success:
         yield f"the fit stopped after {top.steps} steps before it settled: delays are not final"
     if rival:
         yield rival
@@ -274,14 +274,14 @@ def _refuse_undetermined(judgement: Judgement, model: RangeModel, scene: Scene) 
 
 def _provenance(
     found: KnownDistances,
-    top: Found,
+    top: Search,
     judgement: Judgement,
     flight: FlightSettings,
     settings: FitSettings,
     covariance: Floats,
 ) -> dict[str, Any]:
     """Return the provenance that only fits of trajectories have."""
-    scene, places_s, reference_dbm = top.scene, top.scene.places.time_s, _reference_dbm(settings)
+    scene, places_s, reference_dbm = top.motion.scene, top.motion.scene.places.time_s, _reference_dbm(settings)
     more: dict[str, Any] = {}
     if left_open := _left_open(found, judgement, covariance):
         more = {"undetermined": [judgement.free_tags], "left_open": left_open[0]}

@@ -18,7 +18,7 @@ from calib.estimator.unknowns import Layout
 from calib.information import Unknown, Verdict, judge
 from calib.spread import TWO_SIDED_95
 from calib.trajectories.motion import TapeRows
-from calib.trajectories.search import MOTION, Found
+from calib.trajectories.search import MOTION, Search
 from uwblink.arrays import Floats, Ints
 
 PRIOR_NS = 2.0
@@ -97,14 +97,14 @@ class Judgement:
         ]
 
 
-def judge_delays(found: KnownDistances, top: Found) -> Judgement:
+def judge_delays(found: KnownDistances, top: Search) -> Judgement:
     """Return the verdict on the delays of a fit, and contradictions to its trajectories."""
     layout, optimum = top.optimum.layout, top.optimum
     where = layout.where["delay"]
     own = np.intersect1d(np.arange(where.start, where.stop), layout.free())
     tags = tuple(int(layout.blocks[0].names[k - where.start]) for k in own)
     some = np.ix_(own - where.start, own - where.start)
-    by_geometry_alone = top.scene.by_geometry_alone
+    by_geometry_alone = top.motion.scene.by_geometry_alone
     covariance = found.covariances["delay"][some] * (GEOMETRY_ALONE_FACTOR**2 if by_geometry_alone else 1.0)
     information = sum_rows([top.rows, *top.gauge], optimum.x).information + optimum.priors.precision()
     with_truth = with_known_distances(information, layout, own)
@@ -151,7 +151,7 @@ def _absorbed(covariance: Floats, with_truth: Floats) -> float:
     return float(np.linalg.eigvalsh(root.T @ covariance @ root)[-1])
 
 
-def _distance_std(top: Found) -> float:
+def _distance_std(top: Search) -> float:
     """Return the root mean square of the standard errors of some distances."""
     some = np.unique(np.linspace(0, len(top.rows) - 1, SAMPLED_RANGES).astype(np.int64))
     moved, columns = top.geometry.distances(top.optimum.x, some)[1], top.geometry.columns[some]
@@ -160,23 +160,24 @@ def _distance_std(top: Found) -> float:
     return float(np.sqrt(np.mean(np.einsum("kp,pk->k", rows, top.optimum.covariance @ rows.T))))
 
 
-def _of_motion(top: Found) -> Iterator[str]:
-    if top.coarseness.shows:
+def _of_motion(top: Search) -> Iterator[str]:
+    missed = top.coarseness()
+    if missed.shows:
         yield (
             f"bodies move faster than control points every {top.motion.places.step_s:.1f} s follow: about "
-            f"{100 * top.coarseness.motion_m:.0f} cm of their motion is not in the trajectories, and distances are off "
+            f"{100 * missed.motion_m:.0f} cm of their motion is not in the trajectories, and distances are off "
             "by it; fly more calmly"
         )
 
 
-def _of_tapes(top: Found) -> Iterator[str]:
+def _of_tapes(top: Search) -> Iterator[str]:
     """Yield a sentence for each tape that the ranges contradict, by deleted residuals (Cook and Weisberg 1982)."""
     rows = top.known.get("tape")
     if not isinstance(rows, TapeRows):
         return
     left, moved = rows.residuals(top.optimum.x), rows.geometry.distances(top.optimum.x)[1]
-    for number, one in enumerate(top.scene.tapes.stated):
-        mine = np.flatnonzero(top.scene.tapes.number == number)
+    for number, one in enumerate(top.motion.scene.tapes.stated):
+        mine = np.flatnonzero(top.motion.scene.tapes.number == number)
         row = np.zeros(top.optimum.layout.size)
         np.add.at(row, rows.geometry.columns[mine], moved[mine] / len(mine))
         share = min(float(row @ (top.optimum.covariance @ row)) / one.sigma_m**2, 1.0)

@@ -21,7 +21,7 @@ from calib.estimator.range_rows import RESIDUAL, Errors, Mixture, Part, RangeRow
 from calib.estimator.rows import NormalRows, Rows
 from calib.estimator.unknowns import Layout, Priors, Unknown
 from calib.spread import robust_spread
-from calib.trajectories.motion import Distances, Motion, TapeRows, known_rows
+from calib.trajectories.motion import Distances, Motion, known_rows
 from calib.trajectories.scene import Scene
 from uwblink.arrays import Floats, Ints
 
@@ -116,43 +116,29 @@ def fit_motion(
     return MotionFit(motion=motion, state=motion.state(layout, x), residuals=rows.residuals(x), value=value)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Found:
-    """The optimum: all unknowns, and what the verdict needs.
-
-    `used` is the share of the ranges that the unknowns use up, `coarseness` the motion that the paths miss.
-    """
-
-    scene: Scene
-    motion: Motion
-    rows: RangeRows
-    gauge: tuple[NormalRows, ...]
-    known: Mapping[str, NormalRows | TapeRows]
-    optimum: Optimum
-    geometry: Distances
-    used: float
-    coarseness: Coarseness
-    jerk_m_s3: float
-    steps: int
-    success: bool
-
-
-def search(scene: Scene, model: RangeModel, error_m: Floats, start: State, done: Callable[[float], None]) -> Found:
+def search(scene: Scene, model: RangeModel, error_m: Floats, start: State, done: Callable[[float], None]) -> Search:
     """Return the likeliest unknowns; `error_m` (n,) are the ranges of the scene, less a known curve."""
-    state = _Search(scene, model, error_m, start, done)
+    state = Search(scene, model, error_m, start, done)
     state.fit_robustly()
     while state.coarseness().shows and state.motion.places.step_s > MIN_POINT_S:
         state.refine()
         state.fit_robustly()
-    return state.fit_likelihood()
+    state.fit_likelihood()
+    return state
 
 
-class _Search:
-    """The state of a search; each method changes one part of it."""
+class Search:
+    """The state of a search; each method changes one part of it.
+
+    At its end `optimum` has all unknowns of `motion` and ranges (`rows`), beside what else is `known` of the motion.
+    """
+
+    optimum: Optimum
 
     def __init__(
         self, scene: Scene, model: RangeModel, error_m: Floats, start: State, done: Callable[[float], None]
     ) -> None:
+        """Begin at a start of the motion; `error_m` (n,) are ranges, `done` is told the share that is done."""
         self.model, self.error_m, self.done = model, error_m, done
         self.motion, self.origin, self.steps = Motion.of(scene), start, 0
         self.leverage: Floats = np.zeros(len(error_m))
@@ -175,17 +161,8 @@ class _Search:
         self.rows = RangeRows.of(self.error_m, model.key(), parts, errors, self.layout, self.geometry)
         self.known = known_rows(self.motion, self.layout)
         self.gauge = (*model.gauge_rows(self.layout), *model.held_rows(self.layout))
-        self.x = self.layout.start()
-        for kind, where in self.layout.where.items():
-            if kind in self.values:
-                self.x[where] = self.values[kind].ravel()
-        self.priors.weights = [
-            self.weights.get(key, w) for key, w in zip(self._keys(), self.priors.weights, strict=True)
-        ]
-
-    def _keys(self) -> list[tuple[str, int]]:
-        """Return kind and number of each prior."""
-        return [(block.kind, k) for block in self.layout.blocks for k in range(len(block.priors))]
+        self.x = self.layout.start(self.values)
+        self.priors.recall(self.weights)
 
     def optimize(self, *, evidence_steps: int = 12, tolerance: float = 0.1, steps: int = 60) -> Optimum:
         """Maximise the likelihood, and update values and leverages."""
@@ -197,7 +174,7 @@ class _Search:
         self.x, self.steps = found.x, self.steps + found.steps
         self.rows = replace(self.rows, errors=self.errors)
         self.values = {kind: found.x[where] for kind, where in self.layout.where.items()}
-        self.weights = dict(zip(self._keys(), self.priors.weights, strict=True))
+        self.weights = self.priors.by_key()
         self.leverage = leverages(self.rows, found)
         self.done(1 - 0.97**self.steps)
         return found
@@ -260,7 +237,7 @@ class _Search:
         self.build(self.errors, jerk=QUICK_M_S3)
         self.optimize(evidence_steps=0)
 
-    def fit_likelihood(self) -> Found:
+    def fit_likelihood(self) -> None:
         """Maximise the likelihood of direct, reflected and outlying ranges.
 
         Motion and errors are fitted in turn: the joint likelihood is unbounded where a path goes exactly through some
@@ -290,37 +267,21 @@ class _Search:
             self.errors = replace(mixture, used=self.used)
             self.optimize(evidence_steps=0, tolerance=0.03, steps=20)
         self.errors = replace(errors, used=self.used)
-        return self.found(replace(self.optimize(evidence_steps=0, tolerance=np.inf), success=settled))
+        self.optimum = replace(self.optimize(evidence_steps=0, tolerance=np.inf), success=settled)
 
     def fit_errors(self, errors: Mixture, unknowns: tuple[Unknown, ...], parts: tuple[Part, ...]) -> None:
         """Fit the parameters of the error model to the residuals."""
         layout, rows = self.model.build(self.residuals(), errors, unknowns, parts, only=())
-        x, priors = layout.start(), Priors(layout)
-        for kind, where in layout.where.items():
-            x[where] = self.values.get(kind, x[where])
-        keys = [(block.kind, k) for block in layout.blocks for k in range(len(block.priors))]
-        priors.weights = [self.weights.get(key, w) for key, w in zip(keys, priors.weights, strict=True)]
-        found = maximize([rows.sample(self.informative_rows())], priors, x, tolerance=0.1)
+        priors = Priors(layout)
+        priors.recall(self.weights)
+        found = maximize([rows.sample(self.informative_rows())], priors, layout.start(self.values), tolerance=0.1)
         self.values |= {kind: found.x[where] for kind, where in layout.where.items()}
-        self.weights |= dict(zip(keys, priors.weights, strict=True))
+        self.weights |= priors.by_key()
 
-    def found(self, found: Optimum) -> Found:
-        """Return the optimum."""
-        path = next(k for k, key in enumerate(self._keys()) if key == ("path", 0))
-        return Found(
-            scene=self.motion.scene,
-            motion=self.motion,
-            rows=self.rows,
-            gauge=self.gauge,
-            known=self.known,
-            optimum=found,
-            geometry=self.geometry,
-            used=self.used,
-            coarseness=self.coarseness(),
-            jerk_m_s3=float(self.priors.weights[path] ** -0.5),
-            steps=self.steps,
-            success=found.success,
-        )
+    @property
+    def jerk_m_s3(self) -> float:
+        """Return the standard deviation of the jerk of the bodies."""
+        return float(self.weights["path", 0] ** -0.5)
 
 
 def _as_known(unknown: Unknown, values: Floats) -> Unknown:
