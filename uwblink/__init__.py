@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from uwblink.twr import Exchanges, raw_range
     from uwblink.wire.messages import register_message
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 __all__ = [
     "PROTOCOLS",
