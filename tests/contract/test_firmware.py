@@ -5,7 +5,8 @@ from collections import Counter
 import pytest
 
 from tests.boards import bench_scenario
-from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, FinalPayload, PollPayload, Received
+from uwblink.wire.messages import RangeCommand
+from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, FinalPayload, Received
 from uwbsim.boards.virtual_board import VirtualPorts
 from uwbsim.scenario.model import Scenario
 
@@ -144,7 +145,7 @@ def test_a_listener_that_misses_the_last_frame_is_deaf_until_another_comes():
     def losing(frame):
         announce(frame)
         if isinstance(frame.payload, FinalPayload) and frame.sender == 1:
-            frame.receptions.heard[bench.radios.place[3]] = False
+            frame.received[3].heard = False
 
     setattr(bench.air, "announce", losing)  # noqa: B010 - mypy minds an assignment
     bench.boards[3].write(b"C04|1\r")
@@ -222,9 +223,8 @@ def test_of_two_frames_at_once_the_first_is_received_where_it_is_stronger_by_the
     bench.advance(NS_PER_MS)
     for board in sorted(starts, key=lambda b: starts[b]):
         bench.advance(2 * NS_PER_MS + starts[board])
-        bench.boards[board].radio.send(
-            board + 1, PollPayload(False, True, False), bench.boards[board].radio.first_stamp()
-        )
+        radio = bench.boards[board].radio
+        radio.send(board + 1, RangeCommand(board + 1), radio.first_stamp())
     bench.advance(3 * NS_PER_MS)
     assert next(r.frame.sender if r else None for r in came) == received
 
@@ -240,6 +240,6 @@ def test_two_exchanges_at_once_disturb_each_other_near_by_and_not_far_away():
                 bench.boards[board].write(b"C05|%d|0|1|0\r" % (board + 1))
         bench.advance(10 * NS_PER_MS + 50 * EVERY)
         good = sum(len(said(ports, board, b"R05")) for board in (1, 3))
-        shares[distance_m] = good / sum(isinstance(f.payload, PollPayload) for f in frames)
+        shares[distance_m] = good / sum(isinstance(f.payload, RangeCommand) for f in frames)
     assert shares[900.0] == 1
     assert shares[3.0] < 0.5

@@ -53,7 +53,7 @@ class Bench:
     def __init__(self, scenario, link_dir):
         self.ports = uwbsim.VirtualPorts(uwbsim.load(scenario))
         self.ports.names = {tag: f"{link_dir}/tag{tag}" for tag in self.ports.names}
-        self.stays = iter(stays_s(self.ports.bench.radios.scenario))
+        self.stays = iter(stays_s(self.ports.bench.scenario))
 
     def record(self, words):
         """Run `uwblink record` when the boards stand in their next place; patterns of names are spelt out."""

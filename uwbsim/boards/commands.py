@@ -33,7 +33,6 @@ from collections.abc import Callable, Container, Generator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-import numpy as np
 import simpy
 
 from uwblink.wire.fields import (
@@ -71,7 +70,7 @@ from uwblink.wire.messages import (
     SetPassive,
     SetResponseDelay,
 )
-from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, DataPayload
+from uwbsim.boards.frames import NS_PER_MS, NS_PER_US
 from uwbsim.boards.ranging import TO_AIR, initiate
 from uwbsim.errors import UwbsimError
 
@@ -85,12 +84,10 @@ def printed_float(value: float) -> bytes:
     They print its whole part as a 32-bit integer, and four decimals. A Cortex-M4 converts values beyond the integers to
     the nearest integer, and NaN to 0, with a fraction of 0.
     """
-    single = float(np.float32(value)) if math.isfinite(value) else value
-    if math.isnan(single):
-        return b"0.0000"
-    if abs(single) > 2**31 - 1:
-        return b"%d.0000" % (2**31 - 1 if single > 0 else -(2**31))
-    return write_printed(single)
+    largest = 2**31 - 1
+    if math.isnan(value) or abs(value) <= largest:
+        return b"0.0000" if math.isnan(value) else write_printed(value)
+    return b"%d.0000" % (largest if value > 0 else -largest - 1)
 
 
 def atoi(text: bytes) -> int:
@@ -124,28 +121,26 @@ class Reading:
     alive: bool
 
 
-class _Missing(Exception):  # noqa: N818 - a signal of the parser, not an error for users
-    def __init__(self, fields: int) -> None:
-        self.fields = fields
+class _Incomplete(Exception):  # noqa: N818 - a signal of the parser, not an error for users
+    """A command ends too early: the lines that the board prints, and whether it is alive afterwards."""
+
+    def __init__(self, missing_fields: int, *, alive: bool) -> None:
+        self.lines = (*[b"No next key character found."] * missing_fields, NO_END)
+        self.alive = alive
 
 
-class _Unended(Exception):  # noqa: N818 - a signal of the parser, not an error for users
-    pass
+NO_END: Final = b"Failed to detect USB command terminator char! Trying my best"
 
 
 def read_commands(buffer: bytes, known: Container[bytes] = COMMANDS) -> Reading:
     """Parse all commands of a buffer, of which the board executes only the last. `known` are the keys it knows."""
     commands: list[Command] = []
-    no_end = b"Failed to detect USB command terminator char! Trying my best"
     while (at := buffer.find(b"C")) >= 0:
         try:
             command, end = _command(buffer, at, known)
-        except _Missing as missing:
+        except _Incomplete as problem:
             # The next step of the firmware depends on link addresses; observed boards went on with an empty buffer.
-            error_lines = (*[b"No next key character found."] * missing.fields, no_end)
-            return Reading(tuple(commands), error_lines, b"", alive=True)
-        except _Unended:
-            return Reading(tuple(commands), (no_end,), b"", alive=False)
+            return Reading(tuple(commands), problem.lines, b"", problem.alive)
         commands.append(command)
         buffer = buffer[end:]
     return Reading(tuple(commands), (), buffer, alive=True)
@@ -154,34 +149,30 @@ def read_commands(buffer: bytes, known: Container[bytes] = COMMANDS) -> Reading:
 def _command(buffer: bytes, at: int, known: Container[bytes]) -> tuple[Command, int]:
     key = b"C%02d" % atoi(buffer[at + 1 : at + 3])
     if key not in known or key not in COMMANDS:
-        raise _Unended  # an index out of bounds in the firmware; the board hangs at best
-    kind, values, at = COMMANDS[key], [], at + 3
-    for k, field in enumerate(kind.FIELDS.values()):
+        raise _Incomplete(0, alive=False)  # an index out of bounds in the firmware; the board hangs at best
+    kind, values, at = COMMANDS[key], list[Any](), at + 3
+    for field in kind.FIELDS.values():
         bar = buffer.find(b"|", at)
         if bar < 0:
-            raise _Missing(len(kind.FIELDS) - k)
+            raise _Incomplete(len(kind.FIELDS) - len(values), alive=True)
         value, at = _value(field, buffer, bar + 1)
         values.append(value)
     end = buffer.find(b"\r", at)
     if end < 0:
-        raise _Unended
+        raise _Incomplete(0, alive=False)
     return Command(kind, tuple(values)), end + 1
 
 
 def _value(field: Kind, buffer: bytes, at: int) -> tuple[Any, int]:
-    if field == RAW_FLOAT:
-        raw = buffer[at : at + 4]
-        if len(raw) < 4:
-            raise _Unended
-        return struct.unpack("<f", raw)[0], at + 4
-    if field in (BYTES, BROADCAST):
-        length = int.from_bytes(buffer[at : at + 2], "little")
-        if at + 2 + length > len(buffer):
-            raise _Unended
-        return buffer[at + 2 : at + 2 + length], at + 2 + length
-    ends = [end for end in (buffer.find(b"|", at), buffer.find(b"\r", at)) if end >= 0]
-    end = min(ends, default=len(buffer))
-    return _UNTIL_BAR[field](buffer[at:end]), end
+    if field in _UNTIL_BAR:
+        ends = [end for end in (buffer.find(b"|", at), buffer.find(b"\r", at)) if end >= 0]
+        end = min(ends, default=len(buffer))
+        return _UNTIL_BAR[field](buffer[at:end]), end
+    start = at if field == RAW_FLOAT else at + 2
+    end = at + 4 if field == RAW_FLOAT else start + int.from_bytes(buffer[at:start], "little")
+    if end > len(buffer):
+        raise _Incomplete(0, alive=False)
+    return struct.unpack("<f", buffer[start:end])[0] if field == RAW_FLOAT else buffer[start:end], end
 
 
 ANSWER: Final = 195 * NS_PER_US
@@ -248,25 +239,22 @@ def _broadcast(board: VirtualBoard, data: bytes) -> Attempt:
         return False
     board.radio.off()
     yield board.sleep(TO_AIR - board.bench.air.before_marker)
-    board.radio.send(None, DataPayload(data), board.radio.first_stamp())
+    board.radio.send(None, Broadcast(data), board.radio.first_stamp())
     yield board.sleep(930 * NS_PER_US)
     board.send(BroadcastSent())
     return True
 
 
-EXECUTORS: Final[dict[bytes, Executor]] = {}
+EXECUTORS: Final[dict[bytes, Executor]] = {
+    SetIdle.KEY: lambda board: IdleSet(),
+    GetId.KEY: lambda board: IdReport(board.id),
+    Reset.KEY: _reset,
+    DoTests.KEY: _do_tests,
+    SetPassive.KEY: _set_passive,
+    RangeCommand.KEY: lambda board, target, *requests: initiate(board, RangeCommand(target % 256, *requests)),
+    Broadcast.KEY: _broadcast,
+    GetMaxFrame.KEY: lambda board: MaxFrameReport(100),
+    SetResponseDelay.KEY: _set_delay,
+    Bootloader.KEY: _bootloader,
+}
 """Executors of commands by key; `register_command` adds to it."""
-
-for _kind, _execute in (
-    (SetIdle, lambda board: IdleSet()),
-    (GetId, lambda board: IdReport(board.id)),
-    (Reset, _reset),
-    (DoTests, _do_tests),
-    (SetPassive, _set_passive),
-    (RangeCommand, lambda board, target, *requests: initiate(board, target % 256, *requests)),
-    (Broadcast, _broadcast),
-    (GetMaxFrame, lambda board: MaxFrameReport(100)),
-    (SetResponseDelay, _set_delay),
-    (Bootloader, _bootloader),
-):
-    register_command(_kind, _execute)

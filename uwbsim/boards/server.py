@@ -6,10 +6,9 @@ the boards' output at its time. The models of faults come first: they are the sc
 
 from __future__ import annotations
 
-import heapq
-import itertools
 import math
 import os
+import sched
 import selectors
 import time
 from collections.abc import Callable, Iterable
@@ -228,8 +227,10 @@ class Server:
         self._rng = stream(scenario.run.seed, "serial faults")
         self._terminals: dict[int, Terminal] = {}
         self._selector = selectors.SelectSelector()
-        self._timed: list[tuple[int, int, Callable[[], object]]] = []
-        self._numbers = itertools.count()  # so that events at the same time keep their order
+        self._start_ns = time.monotonic_ns()
+        self.epoch_ns = time.time_ns()
+        """Host time (Unix epoch) at which the scenario's time is zero."""
+        self._timed = sched.scheduler(self._now_ns)
         try:
             for tag in scenario.tags:
                 self._terminals[tag.id] = Terminal(link_dir / f"tag{tag.id}" if link_dir else None)
@@ -238,9 +239,6 @@ class Server:
             self.close()
             raise
         self.names = {tag: terminal.name for tag, terminal in self._terminals.items()}
-        self._start_ns = time.monotonic_ns()
-        self.epoch_ns = time.time_ns()
-        """Host time (Unix epoch) at which the scenario's time is zero."""
         for fault in self._faults.faults:
             self._arrange(fault)
 
@@ -266,7 +264,7 @@ class Server:
 
     def step(self) -> None:
         """Wait for bytes from clients or for the next event, and process them."""
-        due = min(self.bench.next_ns(), self._timed[0][0] if self._timed else float("inf"))
+        due = min(self.bench.next_ns(), *(event.time for event in self._timed.queue[:1]), math.inf)
         wait_s = min(max((due - self._now_ns()) / NS_PER_S / self._speed, 0.0), 0.1)
         for key, _ in self._selector.select(wait_s):
             tag: int = key.data
@@ -274,14 +272,12 @@ class Server:
             if data:
                 self.bench.advance(self._now_ns())
                 self.bench.boards[tag].write(data)
-        now = self._now_ns()
-        self.bench.advance(now)
-        while self._timed and self._timed[0][0] <= now:
-            heapq.heappop(self._timed)[2]()
+        self.bench.advance(self._now_ns())
+        self._timed.run(blocking=False)
 
     def announce(self, tell: Callable[[str], object]) -> None:
         """Call `tell` with a line at each time from which `carried` boards stand still, and until when."""
-        stays = stays_s(self.bench.radios.scenario)
+        stays = stays_s(self.bench.scenario)
         for number, (begin_s, end_s) in enumerate(stays, start=1):
             until = "stay there" if math.isinf(end_s) else f"stand until {end_s:g} s"
             text = f"{begin_s:5g} s  place {number} of {len(stays)}: boards {until}"
@@ -289,7 +285,7 @@ class Server:
 
     def write_poses(self, path: Path) -> None:
         """Write motion capture to a file from now on, in host time, as `uwblink poses` reads it."""
-        self._poses = LivePoses(self.bench.radios.world, path, self.epoch_ns)
+        self._poses = LivePoses(self.bench.air.world, path, self.epoch_ns)
         self._append_poses()
 
     def _append_poses(self) -> None:
@@ -342,7 +338,7 @@ class Server:
         return round((time.monotonic_ns() - self._start_ns) * self._speed)
 
     def _at(self, time_ns: int, action: Callable[[], object]) -> None:
-        heapq.heappush(self._timed, (time_ns, next(self._numbers), action))
+        self._timed.enterabs(time_ns, 0, action)
 
     def _arrange(self, fault: Fault) -> None:
         if isinstance(fault, Hang):

@@ -21,7 +21,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
@@ -32,7 +31,7 @@ from uwblink.errors import PortLostError, PortMissingError
 from uwblink.wire.codec import encode
 from uwblink.wire.messages import Message
 from uwbsim.boards.commands import ANSWER, EXECUTORS, Attempt, Command, read_commands
-from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, BoardAir, Radio, Radios, Received
+from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, BoardAir, Radio, Received
 from uwbsim.boards.ranging import received_by
 from uwbsim.errors import ParameterError
 from uwbsim.random_streams import stream
@@ -130,8 +129,7 @@ class Bench:
         self.env = simpy.Environment(initial_time=0)
         self.scenario = scenario
         self.send = send
-        self.radios = Radios(scenario, lost_share)
-        self.air = BoardAir(self.env, self.radios)
+        self.air = BoardAir(self.env, scenario, lost_share)
         self.crashed: Callable[[VirtualBoard, Exception], object] | None = None
         """Called when a board's own program raises, after which the board hangs. If None, the exception is raised."""
         self.boards = {tag.id: VirtualBoard(self, tag.id) for tag in scenario.tags}
@@ -148,13 +146,13 @@ class Bench:
         """Return the time of the next event, infinity without one."""
         return float(self.env.peek())
 
-
-@dataclass(slots=True)
-class _Task:
-    """The command that the board executes; as on the boards, `tries` is kept if another command replaces it."""
-
-    command: Command | None = None
-    tries: int = 0
+    def advance_until(self, happened: Callable[[], object], timeout_s: float) -> None:
+        """Advance time until something happened, or to the timeout."""
+        end_ns = int(self.env.now) + math.ceil(timeout_s * NS_PER_S)
+        while not happened() and self.next_ns() <= end_ns:
+            self.advance(int(self.next_ns()) + 1)
+        if not happened():
+            self.advance(end_ns)
 
 
 class VirtualBoard:
@@ -177,7 +175,8 @@ class VirtualBoard:
         self.delay_uus = 1500  # UWB microseconds, until C08 sets it
         self.ranging = False
         self._buffer = b""
-        self._task = _Task()
+        self._command: Command | None = None
+        self._tries = 0  # as on the boards, kept if another command replaces one that is retried
         self._released: simpy.Event | None = None
         self.usb = UsbLink(env, lambda data: self.bench.send(int(env.now), self.id, data))
         self.radio = Radio(self.bench.air, self.id, self._interrupted)
@@ -265,7 +264,7 @@ class VirtualBoard:
     def _usb_task(self) -> Steps:
         """Read the USB buffer every millisecond, and execute its commands."""
         while True:
-            if not self.usb.waiting and self._task.command is None:
+            if not self.usb.waiting and self._command is None:
                 yield self.usb.arrived
             yield self.until_next_poll()
             while self._released is not None:
@@ -273,8 +272,8 @@ class VirtualBoard:
             yield from self._read_usb()
             if not self.alive:
                 return
-            if self._task.command is not None:
-                yield from self._try(self._task.command)
+            if self._command is not None:
+                yield from self._try(self._command)
 
     def _read_usb(self) -> Steps:
         if not self.usb.waiting:
@@ -294,19 +293,16 @@ class VirtualBoard:
             self.hang()
         elif reading.commands:
             # Only the last command is executed; it replaces one that is retried, and continues its count of tries.
-            self._task.command = reading.commands[-1]
+            self._command = reading.commands[-1]
 
     def _try(self, command: Command) -> Steps:
-        if self._task.tries > 5:
-            self.send(b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n", ANSWER)
-            self._task = _Task()
-            return
-        answer = EXECUTORS[command.kind.KEY](self, *command.values)
-        done = yield from self.answer(answer) if isinstance(answer, Message | bytes) else answer
+        done = self._tries > 5
         if done:
-            self._task = _Task()
+            self.send(b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n", ANSWER)
         else:
-            self._task.tries += 1
+            answer = EXECUTORS[command.kind.KEY](self, *command.values)
+            done = yield from self.answer(answer) if isinstance(answer, Message | bytes) else answer
+        self._command, self._tries = (None, 0) if done else (self._command, self._tries + 1)
 
 
 class VirtualPorts:
@@ -372,13 +368,12 @@ class VirtualPorts:
 
     def wait(self, timeout_s: float) -> Sequence[VirtualPort]:
         """Advance time until bytes wait at an open port, or to the timeout; return the ports to read from."""
-        until_ns = self.now_ns() + math.ceil(timeout_s * NS_PER_S)
-        while not (ready := [p for p in self._opened if p.waiting or not self.bench.boards[p.tag].powered]):
-            if self.bench.next_ns() > until_ns:
-                self.bench.advance(until_ns)
-                break
-            self.bench.advance(int(self.bench.next_ns()) + 1)
-        return ready
+
+        def ready() -> list[VirtualPort]:
+            return [p for p in self._opened if p.waiting or not self.bench.boards[p.tag].powered]
+
+        self.bench.advance_until(ready, timeout_s)
+        return ready()
 
     def now_ns(self) -> int:
         """Return the virtual time in nanoseconds."""
@@ -412,13 +407,9 @@ class VirtualPort:
 
     def read(self, timeout_s: float) -> bytes:
         """Advance time until bytes arrive, or to the timeout; raises `PortLostError` at an unplugged board."""
-        bench = self._ports.bench
-        until_ns = self._ports.now_ns() + math.ceil(timeout_s * NS_PER_S)
-        while not self.waiting and bench.next_ns() <= until_ns:
-            bench.advance(int(bench.next_ns()) + 1)
+        self._ports.bench.advance_until(lambda: self.waiting, timeout_s)
         if not self.waiting:
             self._check()
-            bench.advance(until_ns)
         data = bytes(self.waiting)
         self.waiting.clear()
         return data
