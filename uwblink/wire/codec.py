@@ -21,12 +21,11 @@ from uwblink.arrays import Floats, Ints
 from uwblink.errors import FrameError
 from uwblink.ticks import REPORT_BITS, TICK_S, elapsed
 from uwblink.twr import STAMPS, Exchanges
-from uwblink.wire.fields import ID, INT, LONGEST_TEXT, Kind, Malformed, NeedMore
+from uwblink.wire.fields import LONGEST_TEXT, Kind, Malformed, NeedMore
 from uwblink.wire.messages import (
     COMMANDS,
     REPORTS,
     TEXTS,
-    Cir,
     Message,
     Overheard,
     OverheardNothing,
@@ -51,9 +50,6 @@ def encode(message: Message) -> bytes:
             raise FrameError(f"{message.KEY.decode()} {name}: {error}") from error
     if isinstance(message, OverheardNothing):
         parts += [b"0"] * message.ZEROS
-    if isinstance(message, Cir):
-        parts += [b"%d" % part for part in divmod(message.first_path_milli, 1000)]
-        parts += [b"%d" % tap for tap in message.magnitudes]
     return b"|".join(parts) + _terminator(message.KEY)
 
 
@@ -194,42 +190,25 @@ def _from_parts(kind: type[Message], parts: list[bytes]) -> Message:
     """Build a message from its fields; `parts[0]` is the text between key and first bar."""
     if parts[0]:
         raise Malformed
-    del parts[0]
-    if kind is Cir:
-        return _cir(parts)
-    if kind is Overheard and len(parts) == 2 + OverheardNothing.ZEROS:
-        if parts[2:] != [b"0"] * OverheardNothing.ZEROS:
+    if kind is Overheard and len(parts) == 3 + OverheardNothing.ZEROS:
+        if parts[3:] != [b"0"] * OverheardNothing.ZEROS:
             raise Malformed
-        return OverheardNothing(ID.read(parts[0]), ID.read(parts[1]))
-    if len(parts) != len(kind.FIELDS):
+        kind, parts = OverheardNothing, parts[:3]
+    values, at = list[Any](), 1
+    for field in kind.FIELDS.values():
+        values.append(field.read(b"|".join(parts[at : at + field.parts])))
+        at += field.parts
+    if at != len(parts):
         raise Malformed
-    values: list[Any] = [f.read(part) for f, part in zip(kind.FIELDS.values(), parts, strict=True)]
     return kind(*values)
 
 
-def _cir(parts: list[bytes]) -> Cir:
-    if len(parts) != 4 + Cir.TAPS:
-        raise Malformed
-    whole, milli = INT.read(parts[2]), INT.read(parts[3])
-    taps = parts[4:]
-    tap = re.compile(rb"0|[1-9][0-9]{0,4}")
-    if not 0 <= milli < 1000 or not 0 <= whole < Cir.TAPS + 8 or not all(map(tap.fullmatch, taps)):
-        raise Malformed
-    return Cir(ID.read(parts[0]), ID.read(parts[1]), 1000 * whole + milli, tuple(map(int, taps)))
-
-
-def _run_of_reports() -> re.Pattern[bytes]:
-    board, stamp = rb"(?:25[0-5]|2[0-4][0-9]|1[0-9][0-9]|[1-9]?[0-9])", rb"(?:0|[1-9][0-9]{0,9}+)"
-    number = rb"-?(?:0|[1-9][0-9]{0,9}+)\.[0-9]{4}"
-    line = rb"[RS]05\|" + rb"\|".join([board, number, *[stamp] * 6, *[number] * 4]) + rb"\r\n"
-    return re.compile(rb"(?:" + line + rb")++")
-
-
-RUN: Final = _run_of_reports()
-"""Well-formed reports one after the other; stamps may still have more than 32 bits."""
-
 FIELDS: Final = tuple(RangeReport.FIELDS)
 """The fields of R05, in their order."""
+
+_REPORT: Final = rb"\|".join(b"(?:%s)" % kind.pattern for kind in RangeReport.FIELDS.values())
+RUN: Final = re.compile(rb"(?:[RS]05\|" + _REPORT + rb"\r\n)++")
+"""Reports one after the other; whole numbers may still be larger than a board's."""
 
 
 class ColumnDecoder:
@@ -267,10 +246,11 @@ class ColumnDecoder:
         return _exchanges(times, np.full(len(times), self._board, dtype=np.int64), values)
 
     def _take(self, lines: bytes, time_ns: int) -> bool:
-        """Convert a run of lines; False where a stamp has more than 32 bits, which the expression cannot see."""
+        """Convert a run of lines; False where an id or a stamp is too large, which the expression cannot see."""
         numbers = lines.replace(b"R05|", b"1|").replace(b"S05|", b"0|").replace(b"\r\n", b"|")
         values = np.fromstring(numbers[:-1].decode("ascii"), sep="|").reshape(-1, 1 + len(FIELDS))
-        if values[:, 3:9].max() >= 1 << REPORT_BITS:
+        ids, stamps = values[:, 1], values[:, 3:9]
+        if ids.min() < 0 or ids.max() > 255 or stamps.min() < 0 or stamps.max() >= 1 << REPORT_BITS:
             return False
         self.decoder.messages += len(values)
         self._values.append(values)

@@ -18,6 +18,9 @@ from uwblink.errors import FrameError
 LONGEST_TEXT: Final = 199
 """Bytes of a text that the boards' buffer takes (firmware wire format, 1.2)."""
 
+TAPS: Final = 1016
+"""Taps of an impulse response (DW1000 User Manual 2.10, accumulator at 64 MHz PRF)."""
+
 LONGEST_BROADCAST: Final = 92
 """Bytes of a frame of the radio, without header and checksum (firmware wire format, 1.3)."""
 
@@ -32,72 +35,77 @@ class NeedMore(Exception):  # noqa: N818 - a signal inside the codec, not an err
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of field. `size` is None for text up to the next bar, else how many raw bytes.
+    """A kind of field. `size` is None for text between bars, `parts` pieces of it, else how many raw bytes.
 
-    `size(data, at)` returns the length at a place, or raises `NeedMore` or `Malformed`.
+    `read` raises `Malformed`, `write` raises `FrameError`. Text that is read matches `pattern`. `size(data, at)`
+    returns the length at a place, or raises `NeedMore` or `Malformed`.
     """
 
     name: str
     read: Callable[[bytes], Any]
     write: Callable[[Any], bytes]
     size: Callable[[bytes, int], int] | None = None
+    parts: int = 1
+    pattern: bytes = b""
+
+
+def _text(
+    name: str,
+    pattern: bytes,
+    parse: Callable[[bytes], Any],
+    show: Callable[[Any], bytes],
+    fits: Callable[[Any], bool],
+    expected: str,
+    parts: int = 1,
+) -> Kind:
+    """Return a kind of field that is text: of a `pattern`, with values that fit, which are written as `show` does."""
+    whole = re.compile(pattern, re.DOTALL)
+
+    def read(text: bytes) -> Any:
+        try:
+            if whole.fullmatch(text) and fits(value := parse(text)):
+                return value
+        except UnicodeDecodeError as error:
+            raise Malformed from error
+        raise Malformed
+
+    def write(value: Any) -> bytes:
+        if not fits(value):
+            raise FrameError(f"found {value!r:.60}, expected {expected}")
+        return show(value)
+
+    return Kind(name, read, write, None, parts, pattern)
 
 
 def _integer(low: int, high: int) -> Kind:
-    def read(text: bytes) -> int:
-        if not re.fullmatch(rb"0|-?[1-9][0-9]{0,9}", text) or not low <= int(text) <= high:
-            raise Malformed
-        return int(text)
+    def fits(value: Any) -> bool:
+        return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
 
-    def write(value: int) -> bytes:
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise FrameError(f"found {value!r}, expected a whole number from {low} to {high}")
-        return b"%d" % value
-
-    return Kind(f"integer {low}..{high}", read, write)
+    expected = f"a whole number from {low} to {high}"
+    return _text(f"integer {low}..{high}", b"0|-?[1-9][0-9]{0,9}+", int, b"%d".__mod__, fits, expected)
 
 
-def _read_bool(text: bytes) -> bool:
-    if text not in (b"0", b"1"):
-        raise Malformed
-    return text == b"1"
+def _fits_buffer(value: Any) -> bool:
+    return len(value.encode()) <= LONGEST_TEXT and not any(mark in value for mark in "|\r\0")
 
 
-def _write_bool(value: bool) -> bytes:
-    if not isinstance(value, bool):
-        raise FrameError(f"found {value!r}, expected True or False")
-    return b"1" if value else b"0"
+def _is_printable(value: Any) -> bool:
+    return math.isfinite(value) and abs(value) < 1e10
 
 
-def _read_text(text: bytes) -> str:
-    try:
-        found = text.decode()
-    except UnicodeDecodeError as error:
-        raise Malformed from error
-    if len(text) > LONGEST_TEXT or "\r" in found or "\0" in found:
-        raise Malformed
-    return found
+def _read_first_path(text: bytes) -> int:
+    whole, milli = text.split(b"|")
+    return 1000 * int(whole) + int(milli)
 
 
-def _write_text(value: str) -> bytes:
-    if any(mark in value for mark in "|\r\0"):
-        raise FrameError(f"found {value[:40]!r}, text on the wire cannot hold '|', a carriage return or a NUL")
-    data = value.encode()
-    if len(data) > LONGEST_TEXT:
-        raise FrameError(f"found {len(data)} bytes of text, at most {LONGEST_TEXT} fit")
-    return data
-
-
-def _read_printed(text: bytes) -> float:
-    if not re.fullmatch(rb"-?(0|[1-9][0-9]{0,9})\.[0-9]{4}", text):
-        raise Malformed
-    return float(text)
+def _are_taps(values: Any) -> bool:
+    return len(values) == TAPS and min(values) >= 0 and max(values) < 100_000
 
 
 def write_printed(value: float) -> bytes:
     """Print a number as the boards do: four decimals, cut toward zero, `-0.0000` included."""
-    if not math.isfinite(value) or abs(value) >= 1e10:
-        raise FrameError(f"found {value!r}, expected a finite number below 1e10")
+    if not _is_printable(value):
+        raise FrameError(f"found {value!r}, expected {NUMBER}")
     # What already has four decimals must not lose its last one to binary rounding.
     whole = math.floor(abs(value) * 1e4 + 1e-6)
     sign = b"-" if math.copysign(1, value) < 0 else b""
@@ -131,13 +139,41 @@ def _bytes(longest: int) -> Kind:
 ID: Final = _integer(0, 255)
 STAMP: Final = _integer(0, 2**32 - 1)
 INT: Final = _integer(-(2**31), 2**31 - 1)
-BOOL: Final = Kind("bool", _read_bool, _write_bool)
-TEXT: Final = Kind("text", _read_text, _write_text)
-PRINTED: Final = Kind("printed number", _read_printed, write_printed)
+BOOL: Final = _text("bool", b"[01]", b"1".__eq__, b"%d".__mod__, lambda value: isinstance(value, bool), "True or False")
+TEXT: Final = _text(
+    "text",
+    b".*",
+    bytes.decode,
+    str.encode,
+    _fits_buffer,
+    f"at most {LONGEST_TEXT} bytes of text without '|', a carriage return or a NUL",
+)
+NUMBER: Final = "a finite number below 1e10"
+PRINTED: Final = _text(
+    "printed number", rb"-?(?:0|[1-9][0-9]{0,9}+)\.[0-9]{4}", float, write_printed, _is_printable, NUMBER
+)
 PRINTED_OR_ZERO: Final = Kind(
     "printed number or 0",
-    lambda text: None if text == b"0" else _read_printed(text),
+    lambda text: None if text == b"0" else PRINTED.read(text),
     lambda value: b"0" if value is None else write_printed(value),
+)
+FIRST_PATH: Final = _text(
+    "index of a first path, times 1000",
+    rb"(?:0|[1-9][0-9]{0,3})\|(?:0|[1-9][0-9]{0,2})",
+    _read_first_path,
+    lambda milli: b"%d|%d" % divmod(milli, 1000),
+    lambda milli: 0 <= milli < 1000 * (TAPS + 8),
+    f"thousandths of an index up to {TAPS + 8}",
+    parts=2,
+)
+MAGNITUDES: Final = _text(
+    "taps",
+    rb"(?:(?:0|[1-9][0-9]{0,4})(?:\||$))+",
+    lambda text: tuple(map(int, text.split(b"|"))),
+    lambda taps: b"|".join(b"%d" % tap for tap in taps),
+    _are_taps,
+    f"{TAPS} whole numbers from 0 to 99999",
+    parts=TAPS,
 )
 RAW_FLOAT: Final = Kind(
     "four-byte float", lambda data: struct.unpack("<f", data)[0], _write_raw_float, lambda _data, _at: 4

@@ -25,12 +25,15 @@ from uwblink.wire.fields import (
     BOOL,
     BROADCAST,
     BYTES,
+    FIRST_PATH,
     ID,
     INT,
+    MAGNITUDES,
     PRINTED,
     PRINTED_OR_ZERO,
     RAW_FLOAT,
     STAMP,
+    TAPS,
     TEXT,
     Kind,
 )
@@ -277,11 +280,11 @@ class Cir(Message):
     `first_path_milli` is the first path's index times 1000; `magnitudes` has 1016 taps, 1.0016 ns apart.
     """
 
-    TAPS: ClassVar = 1016
+    TAPS: ClassVar = TAPS
     initiator: int = wire(ID)
     target: int = wire(ID)
-    first_path_milli: int
-    magnitudes: tuple[int, ...]
+    first_path_milli: int = wire(FIRST_PATH)
+    magnitudes: tuple[int, ...] = wire(MAGNITUDES)
 
     def __repr__(self) -> str:
         """Return it without its taps."""
