@@ -146,9 +146,9 @@ class BoardAir:
     def paths(self, received: Received, board: int) -> PathsHeard:
         """Return the paths of a frame to a board, as `World.paths` does."""
         frame = received.frame
-        ends = ([self.place[frame.sender]], [self.place[board]], [frame.departure])
+        sender, receiver = np.array([[self.place[frame.sender]], [self.place[board]]])
         detour = np.array([frame.excess_m if frame.receiver == board else 0.0])
-        (found,) = self.world.paths(*map(np.array, ends), detour)
+        (found,) = self.world.paths(sender, receiver, np.array([frame.departure]), detour)
         return found
 
     def frame(self, sender: int, receiver: int | None, payload: Payload, stamp: int, excess_m: float = 0.0) -> Frame:
