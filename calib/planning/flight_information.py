@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 
 from calib.data.sources import Data
 from calib.errors import UnanswerableError
-from calib.estimator.inverse import Inverse, inverse_of
+from calib.estimator.inverse import inverse_of
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, RangeRows
 from calib.estimator.rows import sum_rows
@@ -26,7 +25,7 @@ from calib.settings import FitSettings, FlightSettings
 from calib.trajectories.fitting import range_model
 from calib.trajectories.judging import GEOMETRY_ALONE_FACTOR, verdict_on, with_known_distances
 from calib.trajectories.motion import Distances, Motion, known_rows
-from calib.trajectories.samples import Places, tapes_of
+from calib.trajectories.samples import tapes_of
 from calib.trajectories.scene import Scene, scene_from
 from calib.trajectories.start import SAMPLE_S, Trajectories, interpolated
 from uwblink.arrays import Floats
@@ -95,14 +94,12 @@ class Predicted:
 class Flight:
     """A planned flight: the inputs of a fit (`scene`), true positions, and the model of ranges.
 
-    `path` has the positions of moving bodies, `stands` those of standing bodies; `known` are positions of moving bodies
-    over the whole flight, of which the scene has the first part.
+    `path` has the positions of moving bodies, `stands` those of standing bodies.
     """
 
     scene: Scene
     model: RangeModel
     errors: Errors
-    known: Places
     path: Trajectories
     stands: Mapping[str, Floats]
 
@@ -110,14 +107,6 @@ class Flight:
     def tapes(self) -> list[tuple[int, int]]:
         """The pairs of tags whose distance is taped."""
         return [(one.first, one.second) for one in self.scene.tapes.stated]
-
-    def known_until(self, seconds: float) -> Flight:
-        """Return the flight with positions known for the first seconds."""
-        return replace(self, scene=replace(self.scene, places=self.known[self.known.time_s < seconds]))
-
-    def with_anchors_given(self) -> Flight:
-        """Return the flight with the places of all anchors known."""
-        return replace(self, scene=replace(self.scene, still=dict(self.stands)))
 
     def taped(self, pairs: Sequence[tuple[int, int]], still_s: float, sigma_m: float) -> Flight:
         """Return the flight with taped distances, of bodies that stand at first or of anchors."""
@@ -133,14 +122,6 @@ class Flight:
         body = {tag: one for tag, (one, _) in self.scene.arms.items() if one in stand}
         return [(a, b) for a, b in combinations(sorted(body), 2) if body[a] != body[b]]
 
-    def with_headings(self, std_rad: float) -> Flight:
-        """Return the flight with this standard deviation of headings."""
-        better = {
-            body: replace(known, std_rad=np.array([*known.std_rad[:2], std_rad]))
-            for body, known in self.scene.attitudes.items()
-        }
-        return replace(self, scene=replace(self.scene, attitudes=better))
-
     def predicted(self) -> Predicted:
         """Return the prediction for a fit of the flight."""
         return Information(self).predicted()
@@ -150,9 +131,7 @@ class Flight:
         pairs = [pair for pair in self.pairs_to_tape(still_s) if pair not in self.tapes]
         if not pairs:
             return None
-        near = Information(self)
-        means = [near.mean_variance_with(near.tape(pair, still_s), sigma_m) for pair in pairs]
-        return pairs[int(np.argmin(np.round(means, 9)))]
+        return Information(self).best_tape(pairs, still_s, sigma_m)
 
 
 def flight_of(
@@ -182,7 +161,6 @@ def flight_of(
         scene=replace(scene, attitudes=attitudes, inertial=inertial),
         model=model,
         errors=errors,
-        known=truth.places,
         path=interpolated(
             truth.places, np.arange(times.min(), times.max() + SAMPLE_S / 2, SAMPLE_S), len(truth.moving)
         ),
@@ -211,52 +189,35 @@ class Information:
         geometry = Distances.of(self.motion, self.layout, (model.ranges.initiator, model.ranges.target), scene.time_s)
         raw = np.zeros(len(scene.time_s))
         ranges = RangeRows.of(raw, model.key(), model.parts, flight.errors, self.layout, geometry)
-        self.of_ranges = sum_rows([ranges, *model.gauge_rows(self.layout)], self.x).information
-        self.whole = self.of_ranges + sum_rows(list(known_rows(self.motion, self.layout).values()), self.x).information
-        self.priors = Priors(self.layout)
+        of_ranges = sum_rows([ranges, *model.gauge_rows(self.layout)], self.x).information
+        beside = sum_rows(list(known_rows(self.motion, self.layout).values()), self.x).information
+        priors, self.delays = Priors(self.layout), self.layout.indices(["delay"])
         for _ in range(EVIDENCE_STEPS):
-            self.priors.update(self.x, self._inverse())
-
-    def _inverse(self) -> Inverse:
-        return inverse_of(self.whole + self.priors.precision(), self.layout.free(), self.layout.local())
-
-    @cached_property
-    def delays(self) -> tuple[Floats, Floats]:
-        """Return columns (p, tags) of the covariance of all unknowns that are delays, and their own (tags, tags)."""
-        own = self.layout.indices(["delay"])
-        columns = self.inverse[:, own]
-        return columns, columns[own]
-
-    @cached_property
-    def inverse(self) -> Inverse:
-        """Return the covariance of all unknowns."""
-        return self._inverse()
+            known = of_ranges + beside + priors.precision()
+            self.covariance = inverse_of(known, self.layout.free(), self.layout.local())
+            priors.update(self.x, self.covariance)
+        self.without_motion = of_ranges + priors.precision()
 
     def predicted(self) -> Predicted:
         """Return the prediction."""
         tags = tuple(self.flight.model.tags)
-        known = self.of_ranges + self.priors.precision()
-        with_truth = with_known_distances(known, self.layout, self.layout.indices(["delay"]))
-        covariance = self.delays[1] * (GEOMETRY_ALONE_FACTOR**2 if self.flight.scene.by_geometry_alone else 1.0)
+        with_truth = with_known_distances(self.without_motion, self.layout, self.delays)
+        factor = GEOMETRY_ALONE_FACTOR if self.flight.scene.by_geometry_alone else 1.0
+        covariance = self.covariance[:, self.delays][self.delays] * factor**2
         return Predicted(tags=tags, covariance_ns2=covariance, verdict=verdict_on(covariance, with_truth, tags))
 
-    def tape(self, pair: tuple[int, int], still_s: float) -> Floats:
-        """Return the derivatives (p,) of the distance of two tags, in the middle of their standstill."""
-        tapes = self.flight.taped([pair], still_s, 1.0).scene.tapes
-        time = np.where(np.isnan(tapes.time_s), self.flight.scene.time_s[0], tapes.time_s)
-        middle = [len(time) // 2]
-        ends = tapes.first[middle], tapes.second[middle]
-        geometry = Distances.of(self.motion, self.layout, ends, time[middle])
-        found = np.zeros(self.layout.size)
-        np.add.at(found, geometry.columns[0], geometry.distances(self.x)[1][0])
-        return found
-
-    def mean_variance_with(self, row: Floats, sigma_m: float) -> float:
-        """Return the mean variance of the delays, ns^2, after a measurement of standard error `sigma_m` with
-        derivatives `row` (p,)."""
-        columns, covariance = self.delays
-        own = float(row @ (self.inverse @ row))
-        return float(np.mean(np.diag(covariance) - (row @ columns) ** 2 / (own + sigma_m**2)))
+    def best_tape(self, pairs: Sequence[tuple[int, int]], still_s: float, sigma_m: float) -> tuple[int, int]:
+        """Return the pair of tags whose taped distance reduces the variance of the delays most."""
+        rows = np.zeros((len(pairs), self.layout.size))
+        for row, pair in zip(rows, pairs, strict=True):
+            tapes = self.flight.taped([pair], still_s, sigma_m).scene.tapes
+            time_s = np.nan_to_num(tapes.time_s, nan=self.flight.scene.time_s[0])
+            geometry = Distances.of(self.motion, self.layout, (tapes.first, tapes.second), time_s)
+            moved = geometry.distances(self.x)[1]
+            np.add.at(row, geometry.columns, moved / len(moved))
+        reach = self.covariance @ rows.T
+        gain = np.sum(reach[self.delays] ** 2, axis=0) / (np.einsum("kp,pk->k", rows, reach) + sigma_m**2)
+        return pairs[int(np.argmax(np.round(gain, 9)))]
 
 
 def _jerk(points: Floats, step_s: float) -> float:

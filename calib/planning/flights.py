@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -59,7 +58,31 @@ def plan_flight(robots: Robots | Data, settings: FlightPlanSettings | None = Non
     data = None if isinstance(robots, int | Sequence) and not isinstance(robots, str) else robots
     asked = replace(settings or FlightPlanSettings(), robots=robots if data is None else None, **changes)
     with threadpool_limits(limits=1, user_api="blas"):
-        return _plan(asked, data)
+        flight = _flight(asked, data)
+        found = flight.predicted()
+        next_best = sorted(_more(asked, data, flight, found), key=lambda one: one.mean_ns)
+    std, count = found.verdict.std, len(found.tags)
+    which = np.isfinite(std) if np.isfinite(std).any() else np.ones(count, dtype=bool)
+    covariance = found.covariance_ns2[np.ix_(which, which)]
+    common = covariance.mean()
+    every = TWO_SIDED_95 * np.sqrt(np.diag(found.covariance_ns2))
+    return FlightPlan(
+        settings=asked,
+        reflected=asked.reflected,
+        ranges=len(flight.scene.time_s),
+        seconds=float(np.ptp(flight.scene.time_s)),
+        source=flight.scene.source,
+        half_ns=dict(zip(found.tags, (TWO_SIDED_95 * std).tolist(), strict=True)),
+        open_ns=dict(zip(found.tags, every.tolist(), strict=True)),
+        common_ns=TWO_SIDED_95 * math.sqrt(common),
+        apart_ns=TWO_SIDED_95 * math.sqrt(np.trace(covariance) / len(covariance) - common),
+        verdict=found.verdict,
+        next_best=tuple(next_best),
+        taped=tuple(flight.tapes),
+        path_m=flight.path.position_m,
+        stands=dict(flight.stands),
+        bodies=flight.scene.moving,
+    )
 
 
 def _flight(asked: FlightPlanSettings, data: Data | None) -> Flight:
@@ -79,51 +102,16 @@ def _flight(asked: FlightPlanSettings, data: Data | None) -> Flight:
         curve=not asked.delays_only,
         force_std_m_s2=force,
     )
-    for _ in range(asked.taped):
-        flight = _with_tape(asked, flight) or flight
-    if len(flight.tapes) < asked.taped:
-        raise BadInputError(
-            f"only {len(flight.tapes)} can be measured: of robots while they stand (`still_s`), and of anchors "
-            "whose places are sought",
-            parameter="taped",
-        )
+    for count in range(asked.taped):
+        best = flight.best_tape(asked.still_s, asked.tape_sigma_m)
+        if best is None:
+            raise BadInputError(
+                f"only {count} can be measured: of robots while they stand (`still_s`), and of anchors whose places "
+                "are sought",
+                parameter="taped",
+            )
+        flight = flight.taped([*flight.tapes, best], asked.still_s, asked.tape_sigma_m)
     return flight
-
-
-def _with_tape(asked: FlightPlanSettings, flight: Flight) -> Flight | None:
-    """Return the flight with the best further taped distance; None if there is none."""
-    best = flight.best_tape(asked.still_s, asked.tape_sigma_m)
-    return best and flight.taped([*flight.tapes, best], asked.still_s, asked.tape_sigma_m)
-
-
-def _plan(asked: FlightPlanSettings, data: Data | None) -> FlightPlan:
-    flight = _flight(asked, data)
-    found = flight.predicted()
-    std = found.verdict.std
-    known = np.isfinite(std)
-    which = known if known.any() else np.ones(len(std), dtype=bool)
-    covariance = found.covariance_ns2[np.ix_(which, which)]
-    count = len(covariance)
-    common = np.full(count, 1 / count)
-    apart = np.eye(count) - 1 / count
-    every = TWO_SIDED_95 * np.sqrt(np.diag(found.covariance_ns2))
-    return FlightPlan(
-        settings=asked,
-        reflected=asked.reflected,
-        ranges=len(flight.scene.time_s),
-        seconds=float(np.ptp(flight.scene.time_s)),
-        source=flight.scene.source,
-        half_ns=dict(zip(found.tags, (TWO_SIDED_95 * std).tolist(), strict=True)),
-        open_ns=dict(zip(found.tags, every.tolist(), strict=True)),
-        common_ns=TWO_SIDED_95 * math.sqrt(float(common @ covariance @ common)),
-        apart_ns=TWO_SIDED_95 * math.sqrt(float(np.trace(apart @ covariance @ apart)) / count),
-        verdict=found.verdict,
-        next_best=tuple(sorted(_more(asked, flight, found), key=lambda one: one.mean_ns)),
-        taped=tuple(flight.tapes),
-        path_m=flight.path.position_m,
-        stands=dict(flight.stands),
-        bodies=flight.scene.moving,
-    )
 
 
 def _mean_ns(covariance: Floats) -> float:
@@ -131,69 +119,60 @@ def _mean_ns(covariance: Floats) -> float:
     return TWO_SIDED_95 * mean_std_ns(np.asarray(np.linalg.pinv(covariance, hermitian=True), np.float64))
 
 
-def _more(asked: FlightPlanSettings, flight: Flight, found: Predicted) -> Iterator[NextBest]:
+def _more(asked: FlightPlanSettings, data: Data | None, flight: Flight, found: Predicted) -> Iterator[NextBest]:
     """Yield the gain of single further measurements, for the same tags."""
     now = _mean_ns(found.covariance_ns2)
-    for what, changed in (*_better_known(asked, flight), *_flown_otherwise(asked)):
-        with_it = changed().predicted()
-        same = [with_it.tags.index(tag) for tag in found.tags]
-        mean = _mean_ns(with_it.covariance_ns2[np.ix_(same, same)])
-        if mean < now:
-            yield NextBest(what, mean, now)
-    tag, mean = _one_delay(found)
-    yield NextBest(f"the delay of tag {tag} from elsewhere, to {DELAY_STD_NS:g} ns", mean, now)
-
-
-Change = tuple[str, Callable[[], Flight]]
-
-
-def _better_known(asked: FlightPlanSettings, flight: Flight) -> Iterator[Change]:
-    """Yield changes of what is known of the same flight."""
-    longer = (asked.poses_until_s or 0.0) + MORE_KNOWN_S
-    if longer < float(flight.scene.time_s[-1]):
-        yield f"positions known for the first {longer:g} s", lambda: flight.known_until(longer)
-    taped = _with_tape(asked, flight)
-    if taped:
-        first, second = taped.tapes[-1]
-        yield f"the distance of tags {first} and {second} by tape", lambda: taped
-    if flight.scene.sought:
-        yield "the places of the anchors, measured", flight.with_anchors_given
-    if asked.attitudes == "poses" and asked.heading_std_deg > HEADING_DEG:
-        better = math.radians(HEADING_DEG)
-        yield f"headings good to {HEADING_DEG:g} degrees", lambda: flight.with_headings(better)
-
-
-def _flown_otherwise(asked: FlightPlanSettings) -> Iterator[Change]:
-    """Yield changes of the flight."""
-    if asked.robots is None:
-        return
-    others: dict[str, dict[str, Any]] = {}
-    if not asked.still_s:
-        text = f"robots that stand for the first {STANDS_S:g} s, and the distance of two of their tags by tape"
-        others[text] = {"still_s": STANDS_S, "taped": asked.taped + 1}
-    others[f"a flight of {2 * asked.seconds:g} s"] = {"seconds": 2 * asked.seconds}
-    if not asked.anchors:
-        four = {"anchors": _more_anchors(asked, MORE_ANCHORS), "anchor_places": "given"}
-        others[f"{MORE_ANCHORS} anchors at known places"] = four
-    elif asked.anchor_places == "given":
-        others["one anchor more at a known place"] = {"anchors": _more_anchors(asked, 1)}
-    if asked.imu is None and asked.attitudes == "poses":
-        others["inertial readings"] = {"imu": "consumer"}
-    for text, changes in others.items():
+    for what, changes in _changes(asked, flight):
         # Invalid changes are not proposed.
         with suppress(BadInputError):
-            yield text, partial(_flight, replace(asked, **changes), None)
-
-
-def _more_anchors(asked: FlightPlanSettings, count: int) -> tuple[int, ...]:
-    last = max(*(tag for robot in asked.robots for tag in robot), *asked.anchors, 0)
-    return (*asked.anchors, *range(last + 1, last + 1 + count))
-
-
-def _one_delay(found: Predicted) -> tuple[int, float]:
-    """Return the tag whose delay is most useful to know from elsewhere, and the mean half interval with it."""
+            changed = _flight(replace(asked, **changes), data)
+            with_it = changed.predicted()
+            same = [with_it.tags.index(tag) for tag in found.tags]
+            mean = _mean_ns(with_it.covariance_ns2[np.ix_(same, same)])
+            if mean < now:
+                pair = changed.tapes[-1] if changed.tapes else ()
+                yield NextBest(what.format(*pair), mean, now)
     c = found.covariance_ns2
-    after = [c - np.outer(c[k], c[k]) / (c[k, k] + DELAY_STD_NS**2) for k in range(len(c))]
-    means = [_mean_ns(one) for one in after]
+    means = [_mean_ns(c - np.outer(c[k], c[k]) / (c[k, k] + DELAY_STD_NS**2)) for k in range(len(c))]
     best = int(np.argmin(np.round(means, 6)))
-    return found.tags[best], means[best]
+    yield NextBest(f"the delay of tag {found.tags[best]} from elsewhere, to {DELAY_STD_NS:g} ns", means[best], now)
+
+
+def _changes(asked: FlightPlanSettings, flight: Flight) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield further measurements in words, with the changes of the settings that they are.
+
+    The words have places for the two tags of the last taped distance.
+    """
+    longer, poses = (asked.poses_until_s or 0.0) + MORE_KNOWN_S, asked.attitudes == "poses"
+    free, given = asked.robots is not None, {"anchor_places": "given"}
+    tags = [*(tag for robot in asked.robots or () for tag in robot), *asked.anchors]
+    one, four = (
+        given | {"anchors": (*asked.anchors, *range(max(tags, default=0) + 1, max(tags, default=0) + 1 + more))}
+        for more in (1, MORE_ANCHORS)
+    )
+    standing = f"robots that stand for the first {STANDS_S:g} s, and the distance of two of their tags by tape"
+    tape = {"taped": asked.taped + 1}
+    rows: list[tuple[bool, str, dict[str, Any]]] = [
+        (
+            longer < float(flight.scene.time_s[-1]),
+            f"positions known for the first {longer:g} s",
+            {"poses_until_s": longer},
+        ),
+        (True, "the distance of tags {} and {} by tape", tape),
+        (bool(flight.scene.sought), "the places of the anchors, measured", given),
+        (
+            poses and asked.heading_std_deg > HEADING_DEG,
+            f"headings good to {HEADING_DEG:g} degrees",
+            {"heading_std_deg": HEADING_DEG},
+        ),
+        (free and not asked.still_s, standing, tape | {"still_s": STANDS_S}),
+        (free, f"a flight of {2 * asked.seconds:g} s", {"seconds": 2 * asked.seconds}),
+        (free and not asked.anchors, f"{MORE_ANCHORS} anchors at known places", four),
+        (
+            free and bool(asked.anchors) and asked.anchor_places == "given",
+            "one anchor more at a known place",
+            one,
+        ),
+        (free and poses and asked.imu is None, "inertial readings", {"imu": "consumer"}),
+    ]
+    yield from ((what, changes) for useful, what, changes in rows if useful)

@@ -1,8 +1,8 @@
 """What arrangements of boards would say of their delays: Fisher's information of a survey's own rows, without data.
 
 Places are unknown. With reflections, which pairs are reflected is drawn, and what is promised is the root mean square
-over the draws: a reflected pair says nothing of the delays. A curve over power is what a survey takes it for, a smooth
-function of the power, which falls with distance as in free space, of 5 cm.
+over the draws: a reflected pair says nearly nothing of the delays. A curve over power is what a survey takes it for, a
+smooth function of the power, which falls with distance as in free space, of 5 cm.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ import numpy as np
 from calib.calibration.power_curves import ALPHA_DBM
 from calib.information import Verdict, reduced
 from calib.planning.settings import SurveyPlanSettings
-from calib.surveys.network import Boards, Case, CurvePrior, Known, Network
+from calib.surveys.knowledge import KnownPosition
+from calib.surveys.network import Boards, Case, CurvePrior, Network
 from calib.surveys.outcome import verdict_on_delays
 from calib.surveys.recordings import PairMeans
 from uwblink.arrays import Bools, Floats
+from uwblink.recording.schema import KnownDistance
 
 SIZES_M = {"line": (5.0, 0.0, 0.0), "plane": (3.0, 2.0, 0.0), "space": (6.0, 5.0, 2.5)}
 """Where boards may stand if nobody says: a string across a room, a large table, a room."""
@@ -46,13 +48,10 @@ class Layout:
     dimensions: int
     taped: tuple[tuple[int, int], ...] = ()
 
-
-def lengths_m(settings: SurveyPlanSettings) -> Floats:
-    """Return how large the line, table or room is (3,)."""
-    if settings.size_m is None:
-        x, y, z = SIZES_M[settings.on]
-        return np.array([max(x, 0.8 * (len(settings.tags) - 1)) if settings.on == "line" else x, y, z])
-    return np.pad(np.array(settings.size_m, dtype=float), (0, 3 - len(settings.size_m)))
+    def powers_dbm(self) -> Floats:
+        """Return the received powers of all pairs, which fall with distance as in free space."""
+        length = [float(np.linalg.norm(one - other)) for one, other in combinations(self.place_m, 2)]
+        return np.asarray(POWER_AT_1_M_DBM - 20 * np.log10(length))
 
 
 def random_layouts(inputs: SurveyPlanSettings, count: int, tries: int = 400) -> list[Layout]:
@@ -61,26 +60,25 @@ def random_layouts(inputs: SurveyPlanSettings, count: int, tries: int = 400) -> 
     Fewer than `count` where a line has fewer orders, or a room too little space. Anchors stay where the first one has
     them: the corners of a room are as good a guess as any.
     """
-    rng, boards, size = np.random.default_rng(inputs.seed), len(inputs.tags), lengths_m(inputs)
+    rng, boards, dimensions = np.random.default_rng(inputs.seed), len(inputs.tags), inputs.dimensions
+    size = np.array(SIZES_M[inputs.on] if inputs.size_m is None else inputs.size_m, dtype=float)[:dimensions]
+    if inputs.on == "line" and inputs.size_m is None:
+        size = np.maximum(size, 0.8 * (boards - 1))
     anchors = [inputs.tags.index(tag) for tag in inputs.anchors]
-    found: list[Layout] = []
-    seen: set[tuple[int, ...]] = set()
-    for _ in range(tries):
+    found: dict[tuple[int, ...] | int, Layout] = {}
+    for number in range(tries):
         if len(found) == count:
             break
         if inputs.on == "line":
             order = tuple(rng.permutation(boards).tolist())
-            if order not in seen:
-                seen |= {order, order[::-1]}
-                found.append(on_line(order, float(size[0])))
+            found.setdefault(min(order, order[::-1]), on_line(order, float(size[0])))
             continue
         place = np.zeros((boards, 3))
-        dimensions = inputs.dimensions
-        place[:, :dimensions] = np.round(rng.uniform(0, size[:dimensions], (boards, dimensions)), 1)
-        if min(np.linalg.norm(place[i] - place[j]) for i, j in combinations(range(boards), 2)) >= NEAREST_M:
-            place[anchors] = found[0].place_m[anchors] if found else place[anchors]
-            found.append(Layout(place, dimensions))
-    return found
+        place[:, :dimensions] = np.round(rng.uniform(0, size, (boards, dimensions)), 1)
+        if min(np.linalg.norm(one - other) for one, other in combinations(place, 2)) >= NEAREST_M:
+            place[anchors] = next(iter(found.values())).place_m[anchors] if found else place[anchors]
+            found[number] = Layout(place, dimensions)
+    return list(found.values())
 
 
 def on_line(order: tuple[int, ...], length_m: float) -> Layout:
@@ -90,53 +88,39 @@ def on_line(order: tuple[int, ...], length_m: float) -> Layout:
     return Layout(place, 1)
 
 
-def rows_of(inputs: SurveyPlanSettings, layout: Layout, curve: CurvePrior | None = None) -> tuple[Floats, Bools]:
-    """Return the derivatives (n, k) of an arrangement's rows over their errors, and which are by delays and curve.
+def delay_information(
+    inputs: SurveyPlanSettings, layout: Layout, curve: CurvePrior | None = None, reflected: Bools | None = None
+) -> Floats:
+    """Return the information on delays, 1/ns^2, and on a curve, that an arrangement gives, whatever its places.
 
-    Those come first, the coordinates of places after them. Of rows the first are those of all pairs, as
-    `itertools.combinations` has them, then taped distances and known coordinates.
+    `reflected` (pairs,) tells which pairs are. Boards are numbered.
     """
-    boards = len(inputs.tags)
-    pairs = np.array(list(combinations(range(boards), 2)))
-    none, ids = np.zeros(len(pairs)), np.zeros(len(pairs), dtype=np.int64)
-    taped = np.array(layout.taped, dtype=np.int64).reshape(-1, 2)
-    anchors = np.array([inputs.tags.index(tag) for tag in inputs.anchors], dtype=np.int64)
+    boards = range(len(inputs.tags))
+    pairs = np.array(list(combinations(boards, 2)))
+    none, number = np.zeros(len(pairs)), np.zeros(len(pairs), dtype=np.int64)
+    means = PairMeans(
+        arrangement=number,
+        ends=pairs,
+        weights=np.full((len(pairs), 2), 0.5),
+        range_m=none,
+        std_m=none,
+        noise_m=none,
+        count=number,
+        lifted=none,
+    )
+    anchors = [(inputs.tags.index(tag), inputs.anchor_sigma_m) for tag in inputs.anchors]
     network = Network(
-        means=PairMeans(
-            arrangement=ids,
-            ends=pairs,
-            weights=np.full((len(pairs), 2), 0.5),
-            range_m=none,
-            std_m=none,
-            noise_m=none,
-            count=ids,
-            lifted=none,
-        ),
-        arrangements=(Boards("", layout.dimensions, tuple(range(boards))),),
-        tags=tuple(range(boards)),
-        known=Known(
-            ends=taped,
-            distance_m=np.zeros(len(taped)),
-            distance_std_m=np.full(len(taped), inputs.tape_sigma_m),
-            statement=np.arange(len(taped)),
-            at=anchors,
-            position_m=layout.place_m[anchors],
-            position_std_m=np.full(len(anchors), inputs.anchor_sigma_m),
-        ),
+        means=means,
+        arrangements=(Boards("", layout.dimensions, tuple(boards)),),
+        tags=tuple(boards),
+        distances=tuple(KnownDistance(i, j, 1.0, inputs.tape_sigma_m) for i, j in layout.taped),
+        positions=tuple(KnownPosition(k, tuple(layout.place_m[k].tolist()), sigma) for k, sigma in anchors),
         fixed_ns={},
         curve=curve,
     )
-    case = Case(marks=none.astype(bool), pair_m=inputs.pair_error_m, curve_m=CURVE_M)
-    here = network.at(network.with_positions(network.layout.start(), layout.place_m), case)
-    wanted = network.layout.indices(["delay", "curve"])
-    columns = np.concatenate([wanted, np.setdiff1d(here.free, wanted)])
-    return here.jacobian[:, columns] / here.std[:, None], np.arange(len(columns)) < len(wanted)
-
-
-def delay_information(inputs: SurveyPlanSettings, layout: Layout) -> Floats:
-    """Return the information (boards, boards) on delays, 1/ns^2, that an arrangement gives, whatever its places."""
-    rows, wanted = rows_of(inputs, layout)
-    return reduced(rows.T @ rows, wanted)
+    case = Case(none > 0 if reflected is None else reflected, inputs.pair_error_m, CURVE_M)
+    x, free = network.with_positions(network.layout.start(), layout.place_m), network.layout.free()
+    return reduced(network.at(x, case).known[np.ix_(free, free)], free >= layout.place_m.size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,28 +134,22 @@ class Prediction:
 
 def predict(inputs: SurveyPlanSettings, layouts: Sequence[Layout], *, curve: bool = False) -> list[Prediction]:
     """Return what is predicted of the first of the arrangements, of the first two, and so on."""
-    boards, pairs = len(inputs.tags), np.array(list(combinations(range(len(inputs.tags)), 2)))
-    lengths = [np.linalg.norm(one.place_m[pairs[:, 0]] - one.place_m[pairs[:, 1]], axis=1) for one in layouts]
-    powers = POWER_AT_1_M_DBM - 20 * np.log10(np.concatenate(lengths))
-    prior = CurvePrior.at(10 ** ((powers - ALPHA_DBM) / 10)) if curve else None
-    parts = []
+    powers = np.array([one.powers_dbm() for one in layouts])
+    prior = CurvePrior.at(10 ** ((powers.ravel() - ALPHA_DBM) / 10)) if curve else None
+    boards, own, parts = len(inputs.tags), None, []
     for k, layout in enumerate(layouts):
-        here = slice(k * len(pairs), (k + 1) * len(pairs))
-        own = None if prior is None else replace(prior, design=prior.design[here])
-        rows, wanted = rows_of(inputs, layout, own)
-        kept = np.ones((DRAWS if inputs.reflected else 1, len(rows)), dtype=bool)
-        if inputs.reflected:
-            rng = np.random.default_rng([inputs.seed, k])
-            kept[:, : len(pairs)] = rng.uniform(size=(DRAWS, len(pairs))) >= inputs.reflected
-        parts.append(np.array([reduced((rows.T * some) @ rows, wanted) for some in kept]))
-    before = np.zeros(parts[0].shape[1:])
+        if prior is not None:
+            rows = slice(k * powers.shape[1], (k + 1) * powers.shape[1])
+            # The prior counts once, below.
+            own = replace(prior, design=prior.design[rows], precision=np.zeros_like(prior.precision))
+        shape = (DRAWS if inputs.reflected else 1, powers.shape[1])
+        drawn = np.random.default_rng([inputs.seed, k]).uniform(size=shape) < inputs.reflected
+        parts.append([delay_information(inputs, layout, own, marks) for marks in drawn])
+    totals = np.cumsum(parts, axis=0)
     if prior is not None:
-        before[boards:, boards:] = prior.precision / CURVE_M**2
-    delays = np.arange(len(before)) < boards
-    return [
-        _averaged([verdict_on_delays(reduced(one, delays), inputs.tags) for one in draws + before])
-        for draws in np.cumsum(parts, axis=0)
-    ]
+        totals[:, :, boards:, boards:] += prior.precision / CURVE_M**2
+    delays = np.arange(totals.shape[-1]) < boards
+    return [_averaged([verdict_on_delays(reduced(one, delays), inputs.tags) for one in draws]) for draws in totals]
 
 
 def _averaged(verdicts: list[Verdict]) -> Prediction:

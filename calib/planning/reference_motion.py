@@ -12,6 +12,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 from calib.data.samples import SampleFlight, stamped
 from calib.planning.settings import FlightPlanSettings
 from uwblink.arrays import Floats, Ints
+from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
 
 POSES_HZ = 20.0
@@ -35,10 +36,6 @@ STARTING_S = 3.0
 """Seconds from standstill to full speed."""
 
 
-Motion = tuple[BSpline, BSpline]
-"""Where a body is over time, and its yaw."""
-
-
 def reference_motion(flown: FlightPlanSettings) -> SampleFlight:
     """Return a flight without errors or delays; the same for the same seed."""
     rng = np.random.default_rng(flown.seed)
@@ -48,23 +45,19 @@ def reference_motion(flown: FlightPlanSettings) -> SampleFlight:
         for body, robot in zip(bodies, flown.robots, strict=True)
         for tag, arm in zip(robot, _arms(len(robot), flown.apart_m).tolist(), strict=True)
     ]
-    stands = dict(zip(flown.anchors, _corners(flown), strict=True))
-    tags += [Tag(tag, f"anchor{tag}", (0.0, 0.0, 0.0)) for tag in stands]
-    time = np.arange(int(flown.seconds * flown.rate_hz)) / flown.rate_hz
-    pair = _in_turn(flown, len(time), rng)
-    where = _antennas(bodies, tags, stands, time)
-    number = {tag.tag: k for k, tag in enumerate(tags)}
-    ends = np.vectorize(number.__getitem__)(pair)
-    rows = np.arange(len(time))
-    distance = np.linalg.norm(where[ends[:, 0], rows] - where[ends[:, 1], rows], axis=1)
-    power = POWER_AT_2_M_DBM - 20 * np.log10(distance / 2) + rng.normal(0, FADING_DB, (2, len(time)))
-    exchanges = stamped(np.rint(time * 1e9).astype(np.int64), pair, distance, power)
+    tags += [Tag(tag, f"anchor{tag}", (0.0, 0.0, 0.0)) for tag in flown.anchors]
+    poses = _poses(flown, bodies)
+    time_ns = np.rint(np.arange(int(flown.seconds * flown.rate_hz)) / flown.rate_hz * 1e9).astype(np.int64)
+    pair = _in_turn(flown, len(time_ns), rng)
+    distance = distances_m(poses, tags, pair[:, 0], pair[:, 1], time_ns)
+    power = POWER_AT_2_M_DBM - 20 * np.log10(distance / 2) + rng.normal(0, FADING_DB, (2, len(time_ns)))
     imu = _readings(bodies, flown.seconds) if flown.inertial else {}
-    return SampleFlight(exchanges, _poses(bodies, stands, flown.seconds), tags, {}, imu)
+    return SampleFlight(stamped(time_ns, pair, distance, power), poses, tags, {}, imu)
 
 
-def _motion(flown: FlightPlanSettings, number: int, rng: np.random.Generator) -> Motion:
-    """Return the motion of one body, upright and turning to and fro: two sines an axis about a middle of its own.
+def _motion(flown: FlightPlanSettings, number: int, rng: np.random.Generator) -> BSpline:
+    """Return position and yaw (4,) of a body over time: two sines an axis about a middle of its own, upright, turning
+    to and fro.
 
     Until it starts it stands; `STARTING_S` later it is as fast as it will be.
     """
@@ -83,8 +76,7 @@ def _motion(flown: FlightPlanSettings, number: int, rng: np.random.Generator) ->
         u = np.clip((time - flown.still_s) / STARTING_S, 0.0, 1.0)
         along = STARTING_S * (u**3 - u**4 / 2) + np.maximum(time - flown.still_s - STARTING_S, 0.0)
     place = middle + reach * np.sin(rate * along[:, None, None] + phase).sum(axis=2)
-    yaw = heading + TURN_RAD * np.sin(turning * along)
-    return make_interp_spline(time, place), make_interp_spline(time, yaw)
+    return make_interp_spline(time, np.column_stack([place, heading + TURN_RAD * np.sin(turning * along)]))
 
 
 def _arms(count: int, apart_m: float) -> Floats:
@@ -92,14 +84,13 @@ def _arms(count: int, apart_m: float) -> Floats:
     return np.column_stack([apart_m / 2 * np.cos(angle), apart_m / 2 * np.sin(angle), np.full(count, -HANGING_M)])
 
 
-def _corners(flown: FlightPlanSettings) -> list[Floats]:
-    """Return places of anchors around the room, high and low in turn."""
-    x, y, z = flown.size_m
-    count = len(flown.anchors)
-    angle = 2 * np.pi * np.arange(count) / max(count, 1) + np.pi / 4
-    reach = 0.5 / np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle)))
-    high = np.where(np.arange(count) % 2, 1 - EDGE, EDGE)
-    return list(np.column_stack([x * (0.5 + reach * np.cos(angle)), y * (0.5 + reach * np.sin(angle)), z * high]))
+def _corners(flown: FlightPlanSettings) -> Floats:
+    """Return places of anchors (n, 3) around the room, high and low in turn."""
+    number = np.arange(len(flown.anchors))
+    angle = 2 * np.pi * number / max(len(number), 1) + np.pi / 4
+    around = np.column_stack([np.cos(angle), np.sin(angle)])
+    around = 0.5 + 0.5 * around / np.abs(around).max(axis=1, keepdims=True)
+    return np.asarray(flown.size_m * np.column_stack([around, np.where(number % 2, 1 - EDGE, EDGE)]))
 
 
 def _in_turn(flown: FlightPlanSettings, count: int, rng: np.random.Generator) -> Ints:
@@ -111,40 +102,29 @@ def _in_turn(flown: FlightPlanSettings, count: int, rng: np.random.Generator) ->
     return np.concatenate(rounds)[:count].astype(np.int64)
 
 
-def _antennas(bodies: Mapping[str, Motion], tags: list[Tag], stands: Mapping[int, Floats], time_s: Floats) -> Floats:
-    """Return where each tag is at each instant (tags, n, 3)."""
-    found = np.empty((len(tags), len(time_s), 3))
-    for k, tag in enumerate(tags):
-        if tag.tag in stands:
-            found[k] = stands[tag.tag]
-            continue
-        (place, yaw), (x, y, z) = bodies[tag.body], tag.lever_arm_m
-        c, s = np.cos(yaw(time_s)), np.sin(yaw(time_s))
-        found[k] = place(time_s) + np.column_stack([c * x - s * y, s * x + c * y, np.full(len(c), z)])
-    return found
-
-
-def _poses(bodies: Mapping[str, Motion], stands: Mapping[int, Floats], seconds: float) -> Poses:
-    time = np.arange(-1.0, seconds + 1.0, 1 / POSES_HZ)
-    places = [place(time) for place, _ in bodies.values()] + [np.tile(place, (2, 1)) for place in stands.values()]
-    yaws = [yaw(time) for _, yaw in bodies.values()] + [np.zeros(2) for _ in stands]
-    times = [time for _ in bodies] + [time[[0, -1]] for _ in stands]
-    names = [*bodies, *(f"anchor{tag}" for tag in stands)]
-    yaw = np.concatenate(yaws)
+def _poses(flown: FlightPlanSettings, bodies: Mapping[str, BSpline]) -> Poses:
+    """Return the poses of all bodies, those of anchors at the first and the last instant."""
+    time = np.arange(-1.0, flown.seconds + 1.0, 1 / POSES_HZ)
+    ends = np.rint(time[[0, -1]] * 1e9).astype(np.int64)
+    rows = [(name, np.rint(time * 1e9).astype(np.int64), motion(time)) for name, motion in bodies.items()]
+    rows += [
+        (f"anchor{tag}", ends, np.tile([*place, 0.0], (2, 1)))
+        for tag, place in zip(flown.anchors, _corners(flown), strict=True)
+    ]
+    names, times, where = zip(*rows, strict=True)
+    x, y, z, yaw = np.concatenate(where).T
     upright = np.column_stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)])
-    each = [len(some) for some in times]
-    return Poses.from_arrays(
-        np.rint(np.concatenate(times) * 1e9).astype(np.int64), np.repeat(names, each), np.concatenate(places), upright
-    )
+    places = np.column_stack([x, y, z])
+    return Poses.from_arrays(np.concatenate(times), np.repeat(names, [len(one) for one in times]), places, upright)
 
 
-def _readings(bodies: Mapping[str, Motion], seconds: float) -> dict[str, Any]:
+def _readings(bodies: Mapping[str, BSpline], seconds: float) -> dict[str, Any]:
     """Return the table of inertial readings, without errors."""
     time, rows = np.arange(0.0, seconds + 0.5, 1 / IMU_HZ), []
-    for name, (place, yaw) in bodies.items():
-        c, s = np.cos(yaw(time)), np.sin(yaw(time))
-        x, y, z = place(time, 2).T
-        turns, forces = (0 * c, 0 * c, yaw(time, 1)), (c * x + s * y, c * y - s * x, z + GRAVITY_M_S2)
+    for name, motion in bodies.items():
+        yaw, rate, (x, y, z, _) = motion(time)[:, 3], motion(time, 1)[:, 3], motion(time, 2).T
+        c, s, zero = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)
+        turns, forces = (zero, zero, rate), (c * x + s * y, c * y - s * x, z + GRAVITY_M_S2)
         rows.append((np.rint(time * 1e9).astype(np.int64), np.full(len(time), name), *turns, *forces))
     names = ("time_ns", "body", "wx", "wy", "wz", "ax", "ay", "az")
     return {name: np.concatenate(parts) for name, parts in zip(names, zip(*rows, strict=True), strict=True)}

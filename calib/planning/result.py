@@ -31,7 +31,7 @@ class PlannedArrangement:
     """One arrangement: its name, where about the boards stand (metres, by tag), and distances to tape, by pairs."""
 
     name: str
-    place_m: Mapping[int, tuple[float, float, float]]
+    place_m: Mapping[int, tuple[float, ...]]
     taped: tuple[tuple[int, int], ...]
 
     def order(self) -> tuple[int, ...]:
@@ -90,28 +90,44 @@ class _Plan:
         """The tags whose delay stays open."""
         return tuple(int(tag) for tag in self.verdict.named("delay"))
 
-    def _delay_lines(self, otherwise: Mapping[int, str]) -> Iterator[str]:
-        """Yield a line a tag; `otherwise` is what is said of one that stays open."""
+    @property
+    def steps(self) -> tuple[str, ...]:
+        """What to do, a line each."""
+        return tuple(f"{k}. {step}" for k, step in enumerate(self._steps(), start=1))
+
+    def _steps(self) -> Iterator[str]:
+        raise NotImplementedError
+
+    def _promise(self) -> tuple[str, list[str]]:
+        """Return what errors are assumed, and lines on what delays share."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        """Return the steps and the intervals."""
+        assumed, shared = self._promise()
+        lines = [*self.steps, "", f"Promised, if {assumed}:"]
         for tag, half in self.half_ns.items():
-            yield f"  tag {tag:3d}  " + (f"± {half:.3f} ns (95 %)" if math.isfinite(half) else otherwise[tag])
-
-    def _open_lines(self) -> Iterator[str]:
-        if self.undetermined:
-            yield from (f"not determined: {direction.words}" for direction in self.verdict.free)
-
-    def _next_lines(self) -> Iterator[str]:
+            lines.append(f"  tag {tag:3d}  " + (f"± {half:.3f} ns (95 %)" if math.isfinite(half) else self._open(tag)))
+        lines += shared
+        lines += [f"not determined: {direction.words}" for direction in self.verdict.free if self.undetermined]
         for k, best in enumerate(self.next_best):
             first = "or" if k else "next best"
-            yield f"{first}: {best.what}: ± {best.mean_ns:.3f} ns on average, not {best.instead_of_ns:.3f}"
+            lines.append(f"{first}: {best.what}: ± {best.mean_ns:.3f} ns on average, not {best.instead_of_ns:.3f}")
+        return "\n".join(lines)
 
-    def _common_dict(self) -> dict[str, Any]:
-        """Return what plans of both kinds have, as JSON takes it; null where nothing is determined."""
+    def _open(self, tag: int) -> str:
+        """Return what is said of a delay that stays open."""
+        return "undetermined"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as JSON takes it; null where nothing is determined."""
         return {
             "half_interval_ns": {str(tag): _number(half) for tag, half in self.half_ns.items()},
             "common_ns": _number(self.common_ns),
             "undetermined": list(self.undetermined),
             "reflected": self.reflected,
             "next_best": [asdict(best) for best in self.next_best],
+            "steps": list(self.steps),
         }
 
 
@@ -141,29 +157,29 @@ class Plan(_Plan):
     seconds_each: float
     pair_error_m: float
     known_beside: bool
-    steps: tuple[str, ...]
 
-    def __str__(self) -> str:
-        """Return the steps, the pictures and the intervals."""
-        return "\n".join([*self.steps, "", *self._intervals()])
+    def _steps(self) -> Iterator[str]:
+        held = {"line": "Stretch a string and keep it straight", "plane": "Take a flat table or floor"}
+        yield f"{held.get(self.on, 'Use the room')}. Places are guides: only what is taped is measured, orders matter."
+        for one in self.arrangements:
+            tapes = "".join(f" Tape the distance of {i} and {j}, antenna to antenna." for i, j in one.taped)
+            where = f"Arrangement {one.name}: boards {one.where(self.on)}."
+            yield f"{where}{tapes} Record all pairs as arrangement {one.name} for {self.seconds_each:.0f} s."
+        shape = f", known to be on a {self.on}" if self.on else ""
+        beside = " A file says what is known beside: the taped distances, the anchors' places."
+        yield f"Survey all recordings together{shape}.{beside if self.known_beside else ''}"
 
-    def _intervals(self) -> Iterator[str]:
+    def _promise(self) -> tuple[str, list[str]]:
         share = f", and {100 * self.reflected:g} % of the pairs are reflected" if self.reflected else ""
-        yield f"Promised, if the constant error of a pair is {100 * self.pair_error_m:.1f} cm{share}:"
-        yield from self._delay_lines(dict.fromkeys(self.tags, "undetermined"))
-        if math.isfinite(self.common_ns):
-            yield f"  what all share ± {self.common_ns:.3f} ns"
-        yield from self._open_lines()
-        curved = ", ".join(
-            f"{what} ± {half:.3f} ns" if math.isfinite(half) else f"{what} undetermined"
-            for what, half in zip(
-                ("a delay", "one against their mean", "what all share"),
-                asdict(self.with_curve_ns).values(),
-                strict=True,
-            )
+        shared = [f"  what all share ± {self.common_ns:.3f} ns"] if math.isfinite(self.common_ns) else []
+        halves = zip(
+            ("a delay", "one against their mean", "what all share"), asdict(self.with_curve_ns).values(), strict=True
         )
-        yield f"With a curve over power fitted along, as surveys do where powers vary: {curved}."
-        yield from self._next_lines()
+        curved = ", ".join(
+            f"{what} ± {half:.3f} ns" if math.isfinite(half) else f"{what} undetermined" for what, half in halves
+        )
+        shared.append(f"With a curve over power fitted along, as surveys do where powers vary: {curved}.")
+        return f"the constant error of a pair is {100 * self.pair_error_m:.1f} cm{share}", shared
 
     def commands(self, ports: str) -> Iterator[str]:
         """Yield the commands that carry it out; `ports` names the boards' serial ports."""
@@ -177,7 +193,7 @@ class Plan(_Plan):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as JSON takes it; null where nothing is determined."""
-        return self._common_dict() | {
+        return _Plan.to_dict(self) | {
             "on": self.on,
             "rate_hz": self.rate_hz,
             "seconds_each": self.seconds_each,
@@ -187,7 +203,6 @@ class Plan(_Plan):
                 {"name": a.name, "place_m": {str(t): list(p) for t, p in a.place_m.items()}, "taped": list(a.taped)}
                 for a in self.arrangements
             ],
-            "steps": list(self.steps),
         }
 
 
@@ -216,15 +231,6 @@ class FlightPlan(_Plan):
     stands: Mapping[str, Floats]
     bodies: tuple[str, ...]
 
-    @property
-    def steps(self) -> tuple[str, ...]:
-        """What to do, a line each."""
-        return tuple(f"{k}. {step}" for k, step in enumerate(self._steps(), start=1))
-
-    def __str__(self) -> str:
-        """Return the steps and the intervals."""
-        return "\n".join([*self.steps, "", *self._intervals()])
-
     def _steps(self) -> Iterator[str]:
         flown = self.settings
         if flown.robots is None:
@@ -241,53 +247,53 @@ class FlightPlan(_Plan):
                 f"Fly for {self.seconds:.0f} s about a room of {room} m at about {flown.speed_m_s:g} m/s, turning to "
                 f"and fro; every pair of different robots ranges in turn, {flown.rate_hz:g} exchanges a second in all."
             )
-        yield from self._known()
+        if flown.poses_until_s:
+            yield f"Let all positions be known for the first {flown.poses_until_s:g} s, to about 2 cm."
+        if self.stands:
+            given = flown.anchor_places == "given"
+            yield f"Places of the {len(self.stands)} anchors {'are measured' if given else 'are found along'}."
+        standing = f", while robots stand for the first {flown.still_s:g} s" if flown.still_s else ""
+        for first, second in self.taped:
+            yield f"Tape the distance of tags {first} and {second}, antenna to antenna{standing}."
+        sources = {
+            "imu": "Attitudes come from gyroscopes and accelerometers.",
+            "poses": f"Attitudes come all along, with headings good to {flown.heading_std_deg:g} degrees.",
+        }
+        if flown.attitudes in sources:
+            yield sources[flown.attitudes]
         yield "Fit delays, curve and trajectories together."
 
-    def _known(self) -> Iterator[str]:
-        if self.settings.poses_until_s:
-            yield f"Let all positions be known for the first {self.settings.poses_until_s:g} s, to about 2 cm."
-        if self.stands:
-            given = self.settings.anchor_places == "given"
-            yield f"Places of the {len(self.stands)} anchors {'are measured' if given else 'are found along'}."
-        for first, second in self.taped:
-            yield f"Tape the distance of tags {first} and {second}, antenna to antenna{self._while()}."
-        if self.settings.attitudes == "imu":
-            yield "Attitudes come from gyroscopes and accelerometers."
-        elif self.settings.attitudes == "poses":
-            yield f"Attitudes come all along, with headings good to {self.settings.heading_std_deg:g} degrees."
+    def _open(self, tag: int) -> str:
+        return f"undetermined (± {self.open_ns[tag]:.2f} ns)"
 
-    def _while(self) -> str:
-        return f", while robots stand for the first {self.settings.still_s:g} s" if self.settings.still_s else ""
-
-    def _intervals(self) -> Iterator[str]:
-        noise, percent = 100 * self.settings.noise_m, 100 * self.reflected
-        yield f"Promised, if ranges have {noise:.1f} cm of noise and {percent:.0f} % are reflected:"
-        yield from self._delay_lines({tag: f"undetermined (± {half:.2f} ns)" for tag, half in self.open_ns.items()})
+    def _promise(self) -> tuple[str, list[str]]:
         which = "" if len(self.undetermined) in (0, len(self.half_ns)) else " of those that are determined"
-        yield f"  what all share{which} ± {self.common_ns:.3f} ns, each against the mean ± {self.apart_ns:.3f} ns"
-        yield from self._open_lines()
-        yield from self._next_lines()
+        assumed = f"ranges have {100 * self.settings.noise_m:.1f} cm of noise and {100 * self.reflected:.0f} % are"
+        shared = f"  what all share{which} ± {self.common_ns:.3f} ns, each against the mean ± {self.apart_ns:.3f} ns"
+        return f"{assumed} reflected", [shared]
 
     def commands(self, ports: str, recording: str = "") -> Iterator[str]:
         """Yield the commands that carry it out; a `recording` that it was planned from is not recorded again."""
-        name = recording or self.source
-        if self.settings.robots is not None:
+        name, flown = recording or self.source, self.settings
+        if flown.robots is not None:
             name = "flight.uwb"
             yield f"uwblink record {ports} --pairs all --duration {self.seconds:.0f} -o {name}"
             yield f"uwblink poses {name} --from poses.csv --tags robots.toml"
-        flown, still_s = self.settings, self.settings.still_s
-        words = [f"--poses-until {flown.poses_until_s:g}"] if flown.poses_until_s is not None else []
-        words += [f"--attitudes {flown.attitudes}"] if flown.attitudes != "poses" else []
-        words += [f"--heading-std {flown.heading_std_deg:g}"] if flown.heading_std_deg != 3 else []
-        words += [f"--anchors {flown.anchor_places}"] if self.stands else []
-        when = f"@0..{still_s:g}" if still_s else ""
+        until = flown.poses_until_s
+        options = [
+            ("" if until is None else f"--poses-until {until:g}", until is not None),
+            (f"--attitudes {flown.attitudes}", flown.attitudes != "poses"),
+            (f"--heading-std {flown.heading_std_deg:g}", flown.heading_std_deg != 3),
+            (f"--anchors {flown.anchor_places}", bool(self.stands)),
+        ]
+        when = f"@0..{flown.still_s:g}" if flown.still_s else ""
+        words = [option for option, needed in options if needed]
         words += [f"--distance {first}-{second}=METRES{when}" for first, second in self.taped]
         yield f"calib fit {name} --truth ranges {' '.join(words)} -o calibration.json"
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything but the path as JSON takes it; null where nothing is determined."""
-        return self._common_dict() | {
+        return _Plan.to_dict(self) | {
             "on": "flight",
             "ranges": self.ranges,
             "seconds": self.seconds,
@@ -295,7 +301,6 @@ class FlightPlan(_Plan):
             "taped": [list(pair) for pair in self.taped],
             "half_interval_all_ns": {str(tag): half for tag, half in self.open_ns.items()},
             "apart_ns": self.apart_ns,
-            "steps": list(self.steps),
         }
 
 

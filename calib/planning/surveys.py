@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 from string import ascii_uppercase
@@ -12,13 +12,7 @@ from typing import Any
 import numpy as np
 
 from calib.errors import BadInputError, UnanswerableError
-from calib.planning.predicted import (
-    Layout,
-    Prediction,
-    delay_information,
-    predict,
-    random_layouts,
-)
+from calib.planning.predicted import Layout, delay_information, predict, random_layouts
 from calib.planning.result import Halves, NextBest, Plan, PlannedArrangement, mean_std_ns
 from calib.planning.settings import SurveyPlanSettings
 from calib.spread import TWO_SIDED_95
@@ -54,40 +48,46 @@ def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None
     if len(tags) < 2:
         raise BadInputError(f"found {boards!r:.60}, expected 2 to 30 boards, each once", parameter="boards")
     inputs = replace(settings or SurveyPlanSettings(), tags=tags, **changes)
-    known = "" if inputs.on == "space" else inputs.on
     candidates = random_layouts(inputs, CANDIDATES)
     if not candidates:
-        raise UnanswerableError(f"{len(inputs.tags)} boards find no room: they must stand 0.4 m from each other")
+        raise UnanswerableError(f"{len(tags)} boards find no room: they must stand 0.4 m from each other")
     informations = [delay_information(inputs, layout) for layout in candidates]
     chosen = [candidates[k] for k in _choose(informations, inputs.arrangements)]
     for _ in range(inputs.taped):
-        best = _best_tape(inputs, chosen)
-        if best is not None:
-            chosen[best[0]] = best[1]
-    made = tuple(_named(ascii_uppercase[k], layout, inputs.tags) for k, layout in enumerate(chosen))
-    seconds = max(30.0, math.ceil(RANGES_A_PAIR * math.comb(len(inputs.tags), 2) / inputs.rate_hz / 10) * 10.0)
-    predictions = predict(inputs, chosen)
-    after = [
-        dict(zip(inputs.tags, (_interval(inputs, chosen[: k + 1]) * one.each).tolist(), strict=True))
-        for k, one in enumerate(predictions)
+        chosen, _ = min(_taped(inputs, chosen), key=_mean_of_second, default=(chosen, None))
+    names = [*ascii_uppercase, ascii_uppercase[-1]]
+    total = np.sum([delay_information(inputs, layout) for layout in chosen], axis=0)
+    wide, predictions = _interval(inputs, chosen), predict(inputs, chosen)
+    curved = predict(inputs, chosen, curve=True)[-1]
+    each, apart = (wide * float(np.sqrt(np.mean(std**2))) for std in (curved.each, curved.apart))
+    now = wide * mean_std_ns(total)
+    k = min(range(len(candidates)), key=lambda k: mean_std_ns(total + informations[k]))
+    where = _named(names[len(chosen)], candidates[k], tags).where(inputs.on)
+    more = [(f"an arrangement {where}", total + informations[k])]
+    for after, information in sorted(_taped(inputs, chosen), key=_mean_of_second)[:1]:
+        number = next(n for n, (old, new) in enumerate(zip(chosen, after, strict=True)) if old is not new)
+        i, j = after[number].taped[-1]
+        more.append((f"the distance of {tags[i]} and {tags[j]} in {names[number]} by tape", information))
+    next_best = [NextBest(what, wide * mean_std_ns(information), now) for what, information in more]
+    after_ns = [
+        dict(zip(tags, (_interval(inputs, chosen[: n + 1]) * one.each).tolist(), strict=True))
+        for n, one in enumerate(predictions)
     ]
-    wide, total = _interval(inputs, chosen), _total(inputs, chosen)
     return Plan(
-        on=known,
-        tags=inputs.tags,
-        arrangements=made,
-        half_ns=after[-1],
-        after_ns=tuple(after),
+        on="" if inputs.on == "space" else inputs.on,
+        tags=tags,
+        arrangements=tuple(_named(name, layout, tags) for name, layout in zip(names, chosen, strict=False)),
+        half_ns=after_ns[-1],
+        after_ns=tuple(after_ns),
         common_ns=wide * predictions[-1].common,
-        with_curve_ns=_halves(predict(inputs, chosen, curve=True)[-1], wide),
-        verdict=verdict_on_delays(total, inputs.tags),
-        next_best=tuple(_next_best(inputs, candidates, informations, chosen, wide, total)),
+        with_curve_ns=Halves(each, apart, wide * curved.common),
+        verdict=verdict_on_delays(total, tags),
+        next_best=tuple(sorted((one for one in next_best if one.mean_ns < now), key=lambda one: one.mean_ns)),
         rate_hz=inputs.rate_hz,
-        seconds_each=seconds,
+        seconds_each=max(30.0, math.ceil(RANGES_A_PAIR * math.comb(len(tags), 2) / inputs.rate_hz / 10) * 10.0),
         pair_error_m=inputs.pair_error_m,
         reflected=inputs.reflected,
         known_beside=bool(inputs.anchors or inputs.taped),
-        steps=tuple(_steps(inputs, made, seconds)),
     )
 
 
@@ -107,24 +107,18 @@ def _choose(informations: list[Floats], count: int | None) -> list[int]:
     return found
 
 
-def _best_tape(inputs: SurveyPlanSettings, chosen: list[Layout]) -> tuple[int, Layout, tuple[int, int], Floats] | None:
-    """Return which arrangement is best taped, that with its tape, between whom, and what all then say, if any."""
+def _taped(inputs: SurveyPlanSettings, chosen: list[Layout]) -> Iterator[tuple[list[Layout], Floats]]:
+    """Yield the arrangements with each further distance that may be taped, and what all then say."""
     each = [delay_information(inputs, layout) for layout in chosen]
     total = np.sum(each, axis=0)
-    best: tuple[float, int, Layout, tuple[int, int], Floats] | None = None
     for k, layout in enumerate(chosen):
-        for pair in combinations(range(len(inputs.tags)), 2):
-            if pair in layout.taped:
-                continue
+        for pair in set(combinations(range(len(inputs.tags)), 2)) - set(layout.taped):
             taped = replace(layout, taped=(*layout.taped, pair))
-            after = total - each[k] + delay_information(inputs, taped)
-            if best is None or mean_std_ns(after) < best[0]:
-                best = mean_std_ns(after), k, taped, pair, after
-    return None if best is None else best[1:]
+            yield [*chosen[:k], taped, *chosen[k + 1 :]], total - each[k] + delay_information(inputs, taped)
 
 
-def _total(inputs: SurveyPlanSettings, chosen: Sequence[Layout]) -> Floats:
-    return np.asarray(np.sum([delay_information(inputs, layout) for layout in chosen], axis=0))
+def _mean_of_second(one: tuple[list[Layout], Floats]) -> float:
+    return mean_std_ns(one[1])
 
 
 def _interval(inputs: SurveyPlanSettings, chosen: Sequence[Layout]) -> float:
@@ -137,70 +131,7 @@ def _interval(inputs: SurveyPlanSettings, chosen: Sequence[Layout]) -> float:
     return TWO_SIDED_95 * students_factor(max(left - boards, 0.0))
 
 
-def _halves(prediction: Prediction, wide: float) -> Halves:
-    each, apart = (wide * float(np.sqrt(np.mean(std**2))) for std in (prediction.each, prediction.apart))
-    return Halves(each, apart, wide * prediction.common)
-
-
-def _next_best(
-    inputs: SurveyPlanSettings,
-    candidates: list[Layout],
-    informations: list[Floats],
-    chosen: list[Layout],
-    wide: float,
-    total: Floats,
-) -> list[NextBest]:
-    """Return the next arrangement and the next taped distance, the one that brings more first.
-
-    `wide` is the factor of intervals, `total` the information of the chosen arrangements.
-    """
-    now = wide * mean_std_ns(total)
-    k = min(range(len(candidates)), key=lambda k: mean_std_ns(total + informations[k]))
-    more = _named(ascii_uppercase[min(len(chosen), len(ascii_uppercase) - 1)], candidates[k], inputs.tags)
-    found = [NextBest(f"an arrangement {more.where(inputs.on)}", wide * mean_std_ns(total + informations[k]), now)]
-    best = _best_tape(inputs, chosen)
-    if best is not None:
-        number, _, (i, j), after = best
-        what = f"the distance of {inputs.tags[i]} and {inputs.tags[j]} in {ascii_uppercase[number]} by tape"
-        found.append(NextBest(what, wide * mean_std_ns(after), now))
-    return sorted((one for one in found if one.mean_ns < now), key=lambda one: one.mean_ns)
-
-
 def _named(name: str, layout: Layout, tags: tuple[int, ...]) -> PlannedArrangement:
     """Return an arrangement under a name, with boards by their ids."""
-    place = {tag: (float(p[0]), float(p[1]), float(p[2])) for tag, p in zip(tags, layout.place_m, strict=True)}
+    place = {tag: tuple(p.tolist()) for tag, p in zip(tags, layout.place_m, strict=True)}
     return PlannedArrangement(name, place, tuple((tags[i], tags[j]) for i, j in layout.taped))
-
-
-def _steps(inputs: SurveyPlanSettings, made: tuple[PlannedArrangement, ...], seconds: float) -> list[str]:
-    """Return what to do, a line each, pictures between."""
-    held = {
-        "line": "Stretch a string and keep it straight",
-        "plane": "Take a flat table or floor",
-        "space": "Use the room",
-    }
-    lines = [f"1. {held[inputs.on]}. Places are guides: nothing but what is taped is measured, orders matter."]
-    for k, one in enumerate(made, start=2):
-        lines.append(f"{k}. Arrangement {one.name}: boards {one.where(inputs.on)}.")
-        lines += _picture(inputs.on, one)
-        for i, j in one.taped:
-            lines.append(f"   Tape the distance of {i} and {j}, antenna to antenna.")
-        lines.append(f"   Record all pairs as arrangement {one.name} for {seconds:.0f} s.")
-    shape = f", known to be on a {inputs.on}" if inputs.on != "space" else ""
-    lines.append(f"{len(made) + 2}. Survey all recordings together{shape}.")
-    if inputs.taped or inputs.anchors:
-        lines.append("   A file says what is known beside: the taped distances, the anchors' places.")
-    return lines
-
-
-def _picture(on: str, one: PlannedArrangement, width: int = 56, height: int = 9) -> list[str]:
-    """Return the arrangement drawn with letters, seen from above: a line of text for a line, a box for others."""
-    place = np.array(list(one.place_m.values()))[:, :2]
-    rows = 1 if on == "line" else height
-    share = (place - place.min(axis=0)) / np.maximum(np.ptp(place, axis=0), 1e-6)
-    cells = [["-" if on == "line" else " "] * width for _ in range(rows)]
-    for tag, (x, y) in zip(one.place_m, share.tolist(), strict=True):
-        column, row = round(x * (width - 3)), rows - 1 - round(y * (rows - 1))
-        for k, letter in enumerate(str(tag)):
-            cells[row][min(column + k, width - 1)] = letter
-    return ["     " + "".join(line).rstrip() for line in cells]

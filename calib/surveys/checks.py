@@ -9,93 +9,59 @@ wrong. The likeliest hypothesis is taken first, because a wrong tape makes other
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
-from calib.surveys.network import Network
 from calib.surveys.result import Contradiction
-from calib.surveys.solution import Solution, adjust, optimize_with_marks, out_of_order, unlikelihood
-from calib.surveys.starts import exchanged_boards, first_start, line_coordinates
-from uwblink.arrays import Floats
+from calib.surveys.solution import Solution, adjust, out_of_order
+from calib.surveys.starts import exchanged_boards, first_start
 
 FALSE_ALARMS = 0.01
 """Share of sound surveys in which a check may find something."""
-
-MIN_SHAPE_GAIN = 1.0
-"""Fall of -2 log likelihood of one arrangement from which its shape is tested; of up to three, all are tested."""
 
 MIN_LABEL_SIGMAS = 3.0
 """Standard deviations by which a known distance or position must be off for labels to be tested."""
 
 TAPE_ERROR_M = 0.5
-"""Standard deviation of the error of a wrong tape, before any data."""
-
-MIN_VARIANCE_SHARE = 0.02
-"""Share of its variance that the fit must leave of a known distance for its error to be seen."""
+"""Prior standard deviation of the error of a wrong tape."""
 
 START_BESIDE_M = 0.15
 """How far boards are put beside a line, or plane, at the start of a search: on it a derivative would be zero."""
 
 
-@dataclass(frozen=True, slots=True)
-class Hypothesis:
-    """A possible fault in words, the network without it, a start, and -2 log of the prior density of its size."""
-
-    text: str
-    network: Network
-    start: Floats
-    beforehand: float = 0.0
-
-
 def likeliest_fault(found: Solution) -> tuple[Contradiction, Solution] | None:
     """Return the likeliest fault that chance does not explain, and the solution without it."""
-    best: tuple[float, Contradiction, Solution] | None = None
+    best: tuple[Contradiction, Solution] | None = None
     for name, (hypotheses, remedy) in CHECKS.items():
-        for one in hypotheses(found):
-            without = adjust(one.network, one.start)
-            p_value = math.exp(min(0.5 * (without.unlikely + one.beforehand - found.unlikely), 0.0))
-            if p_value < FALSE_ALARMS and (best is None or without.unlikely + one.beforehand < best[0]):
-                finding = Contradiction(name, f"{one.text}; {remedy}", p_value)
-                best = without.unlikely + one.beforehand, finding, without
-    return None if best is None else best[1:]
+        for text, without in hypotheses(found):
+            p_value = math.exp(min(0.5 * (without.unlikely - found.unlikely), 0.0))
+            if p_value < FALSE_ALARMS and (best is None or without.unlikely < best[1].unlikely):
+                best = Contradiction(name, f"{text}; {remedy}", p_value), without
+    return best
 
 
-def _of_known(found: Solution) -> tuple[Floats, Floats, Floats]:
-    """Return residuals (k,) of known distances and positions, their standard deviations, and the shares of variance
-    that the fit leaves of them."""
-    here, known = found.network.at(found.x, found.case), slice(len(found.network.means), None)
-    rows, std = here.jacobian[known], here.std[known]
-    share = 1 - np.einsum("ij,jk,ik->i", rows, here.covariance(), rows) / std**2
-    return here.left[known], std, np.clip(share, 1e-9, 1.0)
-
-
-def _distances(found: Solution) -> Iterator[Hypothesis]:
-    """Yield the network without each of the known distances."""
-    network, known = found.network, found.network.known
-    left, _, share = _of_known(found)
-    for statement in np.unique(known.statement).tolist():
-        rows = np.flatnonzero(known.statement == statement)
-        off = float(np.mean(left[rows] / np.maximum(share[rows], MIN_VARIANCE_SHARE)))
-        keep = known.statement != statement
-        less = replace(
-            known,
-            ends=known.ends[keep],
-            distance_m=known.distance_m[keep],
-            distance_std_m=known.distance_std_m[keep],
-            statement=known.statement[keep],
+def _distances(found: Solution) -> Iterator[tuple[str, Solution]]:
+    """Yield the solution with each of the known distances wrong by about half a metre."""
+    network = found.network
+    for k, one in enumerate(network.distances):
+        loose = list(network.distances)
+        loose[k] = replace(one, sigma_m=math.hypot(one.sigma_m, TAPE_ERROR_M))
+        without = adjust(replace(network, distances=tuple(loose)), found.x, start_m=found.case.pair_m)
+        left, rows = without.linear.left[len(network.means.range_m) :], network.tapes[1][:, 2] == k
+        where = f" in {one.arrangement}" if one.arrangement else ""
+        off = 100 * float(np.mean(left[rows]))
+        yield (
+            f"the known distance of {one.first} and {one.second}{where} is {off:+.0f} cm off what the ranges say",
+            without,
         )
-        # The rows go, and with them what they say of likelihood: as if the tape were wrong by some half a metre.
-        std = np.append(known.distance_std_m[rows][1:], TAPE_ERROR_M)
-        beforehand = 2 * float(np.log(std).sum()) + (off / TAPE_ERROR_M) ** 2
-        text = f"{known.names[statement]} is {100 * off:+.0f} cm off what the ranges say"
-        yield Hypothesis(text, replace(network, known=less), found.x, beforehand)
 
 
-def _shapes(found: Solution) -> Iterator[Hypothesis]:
-    """Yield the network with each arrangement beside the line, or plane, that it is said to be on."""
+def _shapes(found: Solution) -> Iterator[tuple[str, Solution]]:
+    """Yield the solution with each arrangement beside the line, or plane, that it is said to be on."""
     network = found.network
     for k, boards in enumerate(network.arrangements):
         if boards.dimensions == 3 or len(boards.tags) < boards.dimensions + 2 or boards.freed:
@@ -104,42 +70,42 @@ def _shapes(found: Solution) -> Iterator[Hypothesis]:
         arrangements[k] = replace(boards, dimensions=boards.dimensions + 1, freed=True)
         freed = replace(network, arrangements=tuple(arrangements))
         seats, beside = network.seats(k), boards.dimensions
-        place = network.positions(found.x)
-        place[seats] = freed.positions(first_start(freed, found.delays))[seats]
+        place = freed.positions_m(first_start(freed, found.delays))[seats]
         # Where scaling finds nothing beside the line, a derivative there would be zero.
-        if np.ptp(place[seats, beside]) < START_BESIDE_M:
-            place[seats, beside] += START_BESIDE_M * np.where(np.arange(len(seats)) % 2, 1.0, -1.0)
-        mine = replace(found.case, marks=found.case.marks & ~network.rows_of(k))
-        value, x, _ = optimize_with_marks(freed, freed.with_positions(found.x, place), mine, k)
-        alone = unlikelihood(network, found.x, found.case, k)
-        if alone - value < MIN_SHAPE_GAIN and len(network.arrangements) > 3:
-            continue
-        away = freed.positions(x)[seats, beside]
+        if np.ptp(place[:, beside]) < START_BESIDE_M:
+            place[:, beside] += START_BESIDE_M * np.where(np.arange(len(seats)) % 2, 1.0, -1.0)
+        marks = found.case.marks & (network.means.arrangement != k)
+        without = adjust(freed, freed.with_positions(found.x, place, seats), marks=marks, start_m=found.case.pair_m)
+        away = freed.positions_m(without.x)[seats, beside]
         odd = boards.tags[int(np.argmax(np.abs(away - np.median(away))))]
-        shape = "line" if boards.dimensions == 1 else "plane"
         text = (
-            f"{boards.name} is said to be a {shape} and is none: its ranges fit if boards, {odd} first of all, stand "
-            f"up to {100 * np.ptp(away):.0f} cm beside it"
+            f"{boards.name} is said to be a {'line' if beside == 1 else 'plane'} and is none: its ranges fit if "
+            f"boards, {odd} first of all, stand up to {100 * np.ptp(away):.0f} cm beside it"
         )
-        yield Hypothesis(text, freed, x)
+        yield text, without
 
 
-def _exchanged(found: Solution) -> Iterator[Hypothesis]:
-    """Yield the network with two tags exchanged in what is known, where something known is off or reflected."""
-    network, known = found.network, found.network.known
-    left, std, share = _of_known(found)
-    if not (np.abs(left) > MIN_LABEL_SIGMAS * std * np.sqrt(share)).any() and not (
-        len(left) and found.case.marks.any()
-    ):
+def _exchanged(found: Solution) -> Iterator[tuple[str, Solution]]:
+    """Yield the solution with two tags exchanged in what is known, where something known is off or reflected."""
+    network, here, count = found.network, found.linear, len(found.network.means.range_m)
+    rows, std = here.jacobian[count:], here.std[count:]
+    # Residuals of what is known vary less than it does by what the fit makes of it.
+    off = list(here.left[count:] / np.sqrt(np.maximum(std**2 - np.diag(rows @ here.covariance @ rows.T), 1e-12)))
+    for point, (place, sigma) in network.known_places.items():
+        own = np.arange(3 * point, 3 * point + 3)
+        off += list((found.x[own] - place) / np.sqrt(np.maximum(sigma**2 - here.covariance[own, own], 1e-12)))
+    if not off or not (np.abs(off).max() > MIN_LABEL_SIGMAS or found.case.marks.any()):
         return
-    points = list(network.points)
-    involved = {points[k][1] for k in [*known.ends.ravel().tolist(), *known.at.tolist()]}
-    for one, other in combinations(sorted(involved), 2):
+    involved = {tag for one in network.distances for tag in (one.first, one.second)}
+    for one, other in combinations(sorted(involved | {place.tag for place in network.positions}), 2):
         swap = {one: other, other: one}
-        new = np.array([network.points.get((a, swap.get(t, t)), k) for k, (a, t) in enumerate(points)])
-        changed = replace(network, known=replace(known, ends=new[known.ends], at=new[known.at]))
+        distances = tuple(
+            replace(d, first=swap.get(d.first, d.first), second=swap.get(d.second, d.second)) for d in network.distances
+        )
+        positions = tuple(replace(p, tag=swap.get(p.tag, p.tag)) for p in network.positions)
+        changed = replace(network, distances=distances, positions=positions)
         text = f"what is known fits if {one} and {other} are exchanged"
-        yield Hypothesis(text, changed, first_start(changed, found.delays))
+        yield text, adjust(changed, first_start(changed, found.delays))
 
 
 CHECKS = {
@@ -155,28 +121,25 @@ def wrong_orders(found: Solution) -> Iterator[Contradiction]:
 
     What several arrangements have in common is one contradiction.
     """
-    network = found.network
-    points = network.positions(found.x)
-    mistakes: list[tuple[set[tuple[int, int]], list[int], Floats]] = []
+    network, points = found.network, found.network.positions_m(found.x)
+    spots = {}
     for k in out_of_order(network, found.x):
-        boards = network.arrangements[k]
-        spot = line_coordinates(points[network.seats(k)], boards.tags, boards.order)
-        pairs = exchanged_boards(boards.order, spot)
-        same = next((n for n, (known, _, _) in enumerate(mistakes) if known & pairs), None)
-        if same is None:
-            mistakes.append((pairs, [k], spot))
-        else:
-            known, rows, first = mistakes[same]
-            mistakes[same] = known & pairs, [*rows, k], first
-    for pairs, rows, spot in mistakes:
-        wrong = [network.arrangements[k] for k in rows]
-        said = wrong[0].order
-        forward = np.corrcoef(np.arange(len(spot)), spot)[0, 1] > 0
-        way = [said[k] for k in np.argsort(spot if forward else -spot).tolist()]
-        words = ", or ".join(f"{i} and {j}" for i, j in sorted(pairs))
-        where = ", ".join(boards.name for boards in wrong)
-        orders = f"said was {'-'.join(map(str, said))}, the ranges of {wrong[0].name} say {'-'.join(map(str, way))}"
-        text = f"{where}: boards {words} stand in each other's place: {orders}; look at the labels of these two"
-        if not pairs:
-            text = f"{where}: boards stand in another order than said: {orders}; look at their labels"
+        order = network.arrangements[k].order
+        along = points[[network.points[k, tag] for tag in order], 0]
+        spots[k] = along if np.corrcoef(np.arange(len(along)), along)[0, 1] > 0 else -along
+    pairs = {k: exchanged_boards(network.arrangements[k].order, along) for k, along in spots.items()}
+    while pairs:
+        common = Counter(pair for some in pairs.values() for pair in sorted(some))
+        pair = max(common, key=common.__getitem__, default=None)
+        same = [k for k, some in pairs.items() if pair in some] or list(pairs)[:1]
+        both = set.intersection(*(pairs.pop(k) for k in same))
+        said = network.arrangements[same[0]].order
+        seen = [said[n] for n in np.argsort(spots[same[0]]).tolist()]
+        where = ", ".join(network.arrangements[k].name for k in same)
+        words = ", or ".join(f"{i} and {j}" for i, j in sorted(both))
+        what = f"boards {words} stand in each other's place" if both else "boards stand in another order than said"
+        text = (
+            f"{where}: {what}: said was {'-'.join(map(str, said))}, the ranges of "
+            f"{network.arrangements[same[0]].name} say {'-'.join(map(str, seen))}; look at their labels"
+        )
         yield Contradiction("labels", text, FALSE_ALARMS)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from calib.errors import BadInputError
 from uwblink.recording.schema import SHAPES, Arrangement, KnownDistance
@@ -66,6 +66,51 @@ class Knowledge:
         return tuple(order) if self.shape_of(arrangement) == "line" else ()
 
 
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and bool(value) and value.isprintable()
+
+
+def _are_tags(value: Any, count: int | None = None) -> bool:
+    good = isinstance(value, list) and all(type(one) is int and 0 <= one <= 254 for one in value)
+    return good and len(set(value)) == len(value) and (len(value) == count if count else len(value) > 1)
+
+
+def _is_length(value: Any) -> bool:
+    return is_number(value) and value > 0
+
+
+LENGTH: Final = (_is_length, "a number above 0 (metres)")
+NAME: Final = (_is_name, "a name")
+SECONDS: Final = (lambda value: is_number(value) and abs(value) <= 1e9, "a number of seconds")  # thirty years
+KEYS: Final[dict[str, dict[str, tuple[Callable[[Any], bool], str]]]] = {
+    "arrangements": {
+        "name": NAME,
+        "known": (SHAPES.__contains__, "line or plane"),
+        "order": (_are_tags, "two tags or more, each once, as in [3, 1, 2]"),
+        "start_s": SECONDS,
+        "end_s": SECONDS,
+    },
+    "distances": {
+        "between": (lambda value: _are_tags(value, 2), "two different tags, as in [1, 2]"),
+        "distance_m": LENGTH,
+        "sigma_m": LENGTH,
+        "arrangement": NAME,
+    },
+    "positions": {
+        "tag": (lambda value: _are_tags([value], 1), "a whole number 0 to 254"),
+        "position_m": (
+            lambda value: isinstance(value, list) and len(value) == 3 and all(map(is_number, value)),
+            "three numbers (metres)",
+        ),
+        "sigma_m": LENGTH,
+        "arrangement": NAME,
+    },
+}
+"""The keys of the tables of a file of what is known: which values are good, and what is expected."""
+
+OPTIONAL: Final = {"known", "order", "start_s", "end_s", "sigma_m", "arrangement"}
+
+
 def load_knowledge(path: str | os.PathLike[str]) -> Knowledge:
     """Read a TOML file of `[[arrangements]]`, `[[distances]]` and `[[positions]]`; raises `BadInputError`, one line.
 
@@ -75,82 +120,50 @@ def load_knowledge(path: str | os.PathLike[str]) -> Knowledge:
     the same two.
     """
     file = TomlReader(Path(path), BadInputError, "file of what is known")
-    file.known(file.table, ("known", "arrangements", "distances", "positions"))
-    shapes: dict[str, str] = {}
-    spans: dict[str, tuple[float, float]] = {}
-    orders: dict[str, tuple[int, ...]] = {}
-    names: list[str] = []
-    for k, row in enumerate(file.rows("arrangements", ("name", "known", "order", "start_s", "end_s"))):
-        where = f"arrangements[{k}]."
-        name = _word(file, f"{where}name", row.get("name"))
-        file.check(f"{where}name", name, name not in names, "each name once")
-        names.append(name)
-        if "order" in row:
-            orders[name] = _tags(file, f"{where}order", row["order"], "two tags or more, each once, as in [3, 1, 2]")
-            good = row.get("known", "line") == "line"
-            file.check(f"{where}order", row["order"], good, 'an order of boards on a line, known = "line"')
-        if "known" in row:
-            shapes[name] = str(file.choice(f"{where}known", row["known"], SHAPES))
-        good = ("start_s" in row) == ("end_s" in row)
-        file.check(where[:-1], row, good, "start_s and end_s, both or neither")
-        if "start_s" in row:
-            start, end = row["start_s"], row["end_s"]
-            # Thirty years either way.
-            file.check(f"{where}start_s", start, is_number(start) and abs(start) <= 1e9, "a number of seconds")
-            good = is_number(end) and start < end <= 1e9
-            file.check(f"{where}end_s", end, good, f"a number above start_s, {start}")
-            spans[name] = (float(start), float(end))
+    file.known(file.table, ("known", *KEYS))
+    arrangements = list(_rows(file, "arrangements"))
+    names = [row["name"] for row in arrangements]
+    for k, row in enumerate(arrangements):
+        where = f"arrangements[{k}]"
+        file.check(f"{where}.name", row["name"], names.count(row["name"]) == 1, "each name once")
+        good = "order" not in row or row.get("known", "line") == "line"
+        file.check(f"{where}.order", row.get("order"), good, 'an order of boards on a line, known = "line"')
+        file.check(where, row, ("start_s" in row) == ("end_s" in row), "start_s and end_s, both or neither")
+        good = "end_s" not in row or row["start_s"] < row["end_s"]
+        file.check(f"{where}.end_s", row.get("end_s"), good, f"a number above start_s, {row.get('start_s')}")
     return Knowledge(
         shape=str(file.choice("known", file.table.get("known", ""), SHAPES)),
-        shapes=shapes,
-        spans_s=spans,
-        orders=orders,
+        shapes={row["name"]: row["known"] for row in arrangements if "known" in row},
+        spans_s={row["name"]: (float(row["start_s"]), float(row["end_s"])) for row in arrangements if "end_s" in row},
+        orders={row["name"]: tuple(row["order"]) for row in arrangements if "order" in row},
         distances=tuple(
-            _distance(file, f"distances[{k}].", row)
-            for k, row in enumerate(file.rows("distances", ("between", "distance_m", "sigma_m", "arrangement")))
+            KnownDistance(
+                min(row["between"]), max(row["between"]), float(row["distance_m"]), *_how_and_where(row, TAPE_M)
+            )
+            for row in _rows(file, "distances")
         ),
         positions=tuple(
-            _position(file, f"positions[{k}].", row)
-            for k, row in enumerate(file.rows("positions", ("tag", "position_m", "sigma_m", "arrangement")))
+            KnownPosition(row["tag"], (float(x), float(y), float(z)), *_how_and_where(row, PLACE_M))
+            for row in _rows(file, "positions")
+            for x, y, z in (row["position_m"],)
         ),
     )
 
 
-def _distance(file: TomlReader, where: str, row: dict[str, Any]) -> KnownDistance:
-    ends = _tags(file, f"{where}between", row.get("between"), "two different tags, as in [1, 2]", count=2)
-    length: Any = row.get("distance_m")
-    file.check(f"{where}distance_m", length, is_number(length) and length > 0, "a number above 0 (metres)")
-    return KnownDistance(min(ends), max(ends), float(length), *_sigma_and_arrangement(file, where, row, TAPE_M))
+def _rows(file: TomlReader, name: str) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a table of a file, checked key by key."""
+    for k, row in enumerate(file.rows(name, KEYS[name])):
+        for key, (is_good, expected) in KEYS[name].items():
+            if key in row or key not in OPTIONAL:
+                file.check(f"{name}[{k}].{key}", row.get(key), is_good(row.get(key)), expected)
+        yield row
 
 
-def _position(file: TomlReader, where: str, row: dict[str, Any]) -> KnownPosition:
-    tag, place = row.get("tag"), row.get("position_m")
-    (tag,) = _tags(file, f"{where}tag", [tag], "a whole number 0 to 254", count=1)
-    good = isinstance(place, list) and len(place) == 3 and all(map(is_number, place))
-    file.check(f"{where}position_m", place, good, "three numbers (metres)")
-    x, y, z = map(float, place or ())
-    return KnownPosition(tag, (x, y, z), *_sigma_and_arrangement(file, where, row, PLACE_M))
+def _how_and_where(row: Mapping[str, Any], default: float) -> tuple[float, str]:
+    return float(row.get("sigma_m", default)), row.get("arrangement", "")
 
 
-def _tags(file: TomlReader, key: str, value: Any, expected: str, count: int | None = None) -> tuple[int, ...]:
-    good = isinstance(value, list) and all(type(one) is int and 0 <= one <= 254 for one in value)
-    good = good and len(set(value)) == len(value) and (len(value) == count if count else len(value) > 1)
-    file.check(key, value, good, expected)
-    return tuple(value)
-
-
-def _sigma_and_arrangement(file: TomlReader, where: str, row: dict[str, Any], default: float) -> tuple[float, str]:
-    sigma = row.get("sigma_m", default)
-    file.check(f"{where}sigma_m", sigma, is_number(sigma) and sigma > 0, "a number above 0 (metres)")
-    return float(sigma), _word(file, f"{where}arrangement", row["arrangement"]) if "arrangement" in row else ""
-
-
-def _word(file: TomlReader, key: str, value: Any) -> str:
-    file.check(key, value, isinstance(value, str) and bool(value) and value.isprintable(), "a name")
-    return str(value)
-
-
-def check_knowledge(knowledge: Knowledge, tags: dict[str, set[int]]) -> None:
+def check_knowledge(knowledge: Knowledge, tags: Mapping[str, set[int]]) -> None:
     """Raise `BadInputError` for what names an arrangement or tags that are not there; `tags` are those by arrangement.
 
     Lengths that come from Python are checked here, too.
@@ -167,17 +180,13 @@ def check_knowledge(knowledge: Knowledge, tags: dict[str, set[int]]) -> None:
         raise BadInputError(f"found {bad[0]!r:.40}, allowed: line, plane", parameter="known")
     for one in known:
         if isinstance(one, KnownDistance):
-            who, what = {one.first, one.second}, f"a distance of {one.first} and {one.second}"
-            good = 0 < one.distance_m <= MAX_LENGTH_M
-            value = f"{one.distance_m} ± {one.sigma_m} m, expected more than 0, and"
+            who, what, good = {one.first, one.second}, "distance", 0 < one.distance_m <= MAX_LENGTH_M
         else:
-            who, what = {one.tag}, f"a position of {one.tag}"
-            good = all(abs(x) <= MAX_LENGTH_M for x in one.position_m)
-            value = f"{one.position_m} ± {one.sigma_m} m, expected numbers"
-        where = {one.arrangement: tags[one.arrangement]} if one.arrangement else tags
-        if not any(who <= there for there in where.values()):
+            who, what, good = {one.tag}, "position", all(abs(x) <= MAX_LENGTH_M for x in one.position_m)
+        where = [tags[one.arrangement]] if one.arrangement else tags.values()
+        if not any(who <= there for there in where):
             place = f"arrangement {one.arrangement}" if one.arrangement else "any arrangement"
-            raise BadInputError(f"{what}, which do not range in {place}", parameter="known")
+            raise BadInputError(f"{one}: its tags do not range in {place}", parameter="known")
         if not (good and MIN_SIGMA_M <= one.sigma_m <= MAX_LENGTH_M):
-            text = f"{what} of {value} up to {MAX_LENGTH_M:g} m ± {MIN_SIGMA_M:g} m or more"
+            text = f"{one}: expected a {what} of more than 0 and up to {MAX_LENGTH_M:g} m ± {MIN_SIGMA_M:g} m or more"
             raise BadInputError(text, parameter="known")

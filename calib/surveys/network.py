@@ -2,40 +2,43 @@
 
 A mean of raw ranges of a pair is distance - w_i d_i - w_j d_j + curve(power) + error, with delays d (docs/theory.md).
 Its error is constant for a pair and an arrangement, so more ranges do not shrink it: it has a variance of its own,
-which is estimated (`calib.surveys.solution`).
+which is estimated (`calib.surveys.solution`). Known positions and delays are priors of the unknowns.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy import sparse
 
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, basis
 from calib.estimator.inverse import inverse_of
 from calib.estimator.range_model import METRES_A_NS
 from calib.estimator.rows import Terms, normal_terms
 from calib.estimator.unknowns import Layout, Prior, Priors, Unknown
+from calib.surveys.knowledge import KnownPosition
 from calib.surveys.recordings import PairMeans
 from uwblink.arrays import Bools, Floats, Ints
+from uwblink.recording.schema import KnownDistance
 
 DIMENSIONS = {"line": 1, "plane": 2, "": 3}
 """In how many dimensions boards may stand, by what is known of an arrangement."""
 
 PLACE_STD_M = 30.0
-"""Standard deviation of a coordinate about those that are known, before any data: it holds what no range determines."""
+"""Prior standard deviation of a coordinate that is not known: it holds what no range determines."""
 
 BESIDE_STD_M = 0.5
 """The same of how far boards stand beside a line, or a plane, that is none."""
 
 DETOUR_M, DETOUR_STD_M = 0.3, 0.25
-"""How much longer a reflected way is, before any data: two in three detours within these of each other."""
+"""Prior mean and standard deviation of how much longer a reflected path is (published detours are 0.1 to 0.5 m)."""
 
 CURVE_LENGTH_DB = 4.0
-"""Length of the Gaussian process (Matern 5/2 over decibels) that a curve is before any data.
+"""Length of the Gaussian process (Matern 5/2 over decibels) that is the prior of a curve.
 
 From the three published curves of boards (`icra2023`, `icra2023-july`, `miluv` of `uwbsim`): at 13 powers from -95 to
 -77 dBm, with errors of 5 mm, the likeliest lengths are 4, 6 and 4 dB, the mean standard deviations 0.11, 0.14 and
@@ -47,11 +50,11 @@ CURVE_SEGMENTS = 12
 """Enough that splines follow a process of this length over 25 dB; the prior, not their number, makes them smooth."""
 
 NARROWEST_DB = 3.0
-"""Span of powers below which there is no curve to speak of."""
+"""Span of powers below which no curve is fitted."""
 
-DELAY_STD_NS = 2.0
-"""How far a delay may be from what was configured: published boards differ by 0.6 ns. Surveys need it: without known
-distances a scale of the places can pass for a delay."""
+DELAY_STD_NS, FIXED_STD_NS = 2.0, 1e-4
+"""Prior standard deviations of delays: published boards differ by 0.6 ns. Surveys need it: without known distances a
+scale of the places can pass for a delay. The second is that of known delays: 0.03 mm, far below any result."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +68,10 @@ class CurvePrior:
     @classmethod
     def at(cls, lifted: Floats) -> CurvePrior | None:
         """Return that of a curve at lifted powers (n,); None where powers lack, or hardly vary."""
-        if not len(lifted) or not np.isfinite(lifted).all() or not (lifted > 0).all():
-            return None
         power = in_dbm(lifted)
-        low, high = float(power.min()), float(power.max())
-        if high - low < NARROWEST_DB:
+        if not np.isfinite(power).all() or np.ptp(power) < NARROWEST_DB:
             return None
+        low, high = float(power.min()), float(power.max())
         inner = 10 ** ((np.linspace(low, high, CURVE_SEGMENTS + 1) - ALPHA_DBM) / 10)
         knots = np.concatenate([[inner[0]] * DEGREE, inner, [inner[-1]] * DEGREE])
         dense = np.linspace(low, high, 60)
@@ -80,14 +81,13 @@ class CurvePrior:
         apart = math.sqrt(5.0) * np.abs(both[:, None] - both) / CURVE_LENGTH_DB
         likeness = (1 + apart + apart**2 / 3) * np.exp(-apart)
         process = likeness[:-1, :-1] - np.outer(likeness[:-1, -1], likeness[-1, :-1])
-        covariance = back @ process @ back.T
-        precision: Floats = np.asarray(np.linalg.inv(covariance + 1e-4 * np.eye(len(covariance))), dtype=np.float64)
-        return cls(knots, basis(lifted, knots), precision)
+        precision = np.linalg.inv(back @ process @ back.T + 1e-4 * np.eye(len(back)))
+        return cls(knots, basis(lifted, knots), np.asarray(precision, dtype=np.float64))
 
 
 def in_dbm(lifted: Floats) -> Floats:
-    """Return the powers that lifted ones stand for."""
-    return np.asarray(ALPHA_DBM + 10 * np.log10(lifted))
+    """Return the powers that lifted ones stand for, NaN for none."""
+    return np.asarray(ALPHA_DBM + 10 * np.log10(np.where(lifted > 0, lifted, np.nan)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,31 +105,6 @@ class Boards:
     freed: bool = False
 
 
-def numbered(arrangements: Sequence[Boards]) -> dict[tuple[int, int], int]:
-    """Return the number of every point by arrangement and tag, in order."""
-    points = [(k, tag) for k, boards in enumerate(arrangements) for tag in boards.tags]
-    return {point: n for n, point in enumerate(points)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Known:
-    """Distances and positions that are known.
-
-    `ends` (k, 2) are points (`Network.points`), `distance_m` and `distance_std_m` (k,) go with them, and `statement`
-    (k,) says which of `names` each comes from; `at` (l,) are points at `position_m` (l, 3), known to `position_std_m`
-    (l,).
-    """
-
-    ends: Ints
-    distance_m: Floats
-    distance_std_m: Floats
-    statement: Ints
-    at: Ints
-    position_m: Floats
-    position_std_m: Floats
-    names: tuple[str, ...] = ()
-
-
 @dataclass(frozen=True, slots=True)
 class Case:
     """What a network's errors may be: which means are reflected (n,), the spread of pairs and that of the curve, m."""
@@ -143,30 +118,59 @@ class Case:
         return replace(self, pair_m=self.pair_m * math.exp(pair), curve_m=self.curve_m * math.exp(curve))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Linear:
-    """A network about unknowns (p,) in a case: what is `left` of each row (n,) beside the detours of reflected means.
+    """A network that is linear about unknowns (p,) in a case: all errors are normal.
 
-    `jacobian` (n, p) has the derivatives of what is predicted, `std` (n,) the standard deviations of rows. `prior`
-    (p, p) is the precision of what is known of the unknowns beforehand, from whose centre they are `away` (p,). `free`
-    are the indices of those that are sought.
+    `left` (n,) is measured less predicted, `jacobian` (n, p) the derivative of what is predicted, `std` (n,) the
+    standard deviation of each row. `prior` (p, p) is the precision of the priors, whose slope is `pull` (p,) and value
+    -2 log density `prior_value`. `free` are the indices of the unknowns that are sought, `guessed` those whose prior is
+    no knowledge but the usual size.
     """
 
     left: Floats
     jacobian: Floats
     std: Floats
     prior: Floats
-    away: Floats
+    pull: Floats
+    prior_value: float
     free: Ints
+    guessed: Ints
 
+    @property
+    def known(self) -> Floats:
+        """The information (p, p) of the rows and of what is known, without guesses."""
+        found = self.information + self.prior
+        found[self.guessed, self.guessed] -= self.prior[self.guessed, self.guessed]
+        return found
+
+    @cached_property
     def information(self) -> Floats:
-        """Return the information (p, p) of the rows."""
+        """The information (p, p) of the rows."""
         rows = self.jacobian / self.std[:, None]
         return rows.T @ rows
 
+    @cached_property
     def covariance(self) -> Floats:
-        """Return the covariance (p, p) of the free unknowns by rows and prior, zero elsewhere."""
-        return np.asarray(inverse_of(self.information() + self.prior, self.free))
+        """The covariance (p, p) of the free unknowns by rows and prior, zero elsewhere."""
+        return np.asarray(inverse_of(self.information + self.prior, self.free))
+
+    @cached_property
+    def slope(self) -> Floats:
+        """The slope (p,) of the log likelihood by the unknowns."""
+        return np.asarray(self.jacobian.T @ (self.left / self.std**2) + self.pull)
+
+    @cached_property
+    def step(self) -> Floats:
+        """The step (p,) to the likeliest unknowns."""
+        return np.asarray(self.covariance @ self.slope)
+
+    def unlikely(self) -> float:
+        """Return -2 log likelihood of the rows, integrated over the unknowns (Laplace's approximation)."""
+        own = np.ix_(self.free, self.free)
+        value = float(np.sum((self.left / self.std) ** 2)) + self.prior_value - float(self.slope @ self.step)
+        value += 2 * float(np.log(self.std).sum()) + float(np.linalg.slogdet((self.information + self.prior)[own])[1])
+        return value - float(np.linalg.slogdet(self.prior[own])[1])
 
 
 @dataclass(frozen=True)
@@ -187,90 +191,118 @@ class Lengths:
 class Network:
     """Means of pairs, the boards they belong to, and what is known beside them.
 
-    `pair_m` is the constant error of pairs, None to estimate it. The unknowns are three coordinates of each point,
-    delays in ns, and coefficients of the curve over power; known are coordinates beyond an arrangement's dimensions,
-    and delays of `fixed_ns`.
+    `pair_m` is the constant error of pairs, None to estimate it. The unknowns are three coordinates of each point
+    (a tag in an arrangement), delays in ns, and coefficients of the curve over power. Coordinates beyond an
+    arrangement's dimensions are zero, as are those of the indices `held`, which fix the frame of an arrangement.
     """
 
     means: PairMeans
     arrangements: tuple[Boards, ...]
     tags: tuple[int, ...]
-    known: Known
+    distances: tuple[KnownDistance, ...] = ()
+    positions: tuple[KnownPosition, ...] = ()
     fixed_ns: dict[int, float]
-    curve: CurvePrior | None
+    curve: CurvePrior | None = None
     pair_m: float | None = None
+    held: tuple[int, ...] = ()
 
     @cached_property
     def points(self) -> dict[tuple[int, int], int]:
         """The number of every point by arrangement and tag, in order."""
-        return numbered(self.arrangements)
+        every = [(k, tag) for k, boards in enumerate(self.arrangements) for tag in boards.tags]
+        return {point: number for number, point in enumerate(every)}
 
     @cached_property
     def owner(self) -> Ints:
         """The arrangement of every point (points,)."""
         return np.array([k for k, _ in self.points])
 
+    def holding(self, known: KnownDistance | KnownPosition) -> list[int]:
+        """Return the arrangements in which a distance or a position is known."""
+        who = {known.first, known.second} if isinstance(known, KnownDistance) else {known.tag}
+        return [
+            k
+            for k, boards in enumerate(self.arrangements)
+            if known.arrangement in ("", boards.name) and who <= set(boards.tags)
+        ]
+
+    @cached_property
+    def tapes(self) -> tuple[Ints, Floats]:
+        """The two points of each known distance (k, 2); distance, standard deviation, number of the statement (k, 3).
+
+        What holds in several arrangements is one reading, not several.
+        """
+        ends, rows = [], []
+        for number, one in enumerate(self.distances):
+            where = self.holding(one)
+            ends += [(self.points[k, one.first], self.points[k, one.second]) for k in where]
+            rows += [(one.distance_m, one.sigma_m * math.sqrt(len(where)), number)] * len(where)
+        return np.array(ends, dtype=np.int64).reshape(-1, 2), np.array(rows).reshape(-1, 3)
+
+    @cached_property
+    def known_places(self) -> dict[int, tuple[Floats, float]]:
+        """Known positions (3,) and their standard deviations by point; on a plane x and y count."""
+        found = {}
+        for one in self.positions:
+            for k in (where := self.holding(one)):
+                place = np.where(np.arange(3) < self.arrangements[k].dimensions, one.position_m, 0.0)
+                found[self.points[k, one.tag]] = (place, one.sigma_m * math.sqrt(len(where)))
+        return found
+
     @cached_property
     def layout(self) -> Layout:
-        """The unknowns, and what is known of them beforehand, with a curve of 1 m."""
-        fixed = np.array([tag in self.fixed_ns for tag in self.tags])
+        """The unknowns and their priors, with a curve of 1 m."""
+        centre, std = np.zeros((len(self.points), 3)), np.full((len(self.points), 3), PLACE_STD_M)
+        known = np.zeros((len(self.points), 3), dtype=bool)
+        for k, boards in enumerate(self.arrangements):
+            mine = self.seats(k)
+            known[mine] = np.arange(3) >= boards.dimensions
+            if boards.freed:
+                std[mine, boards.dimensions - 1] = BESIDE_STD_M
+            if there := [self.known_places[point][0] for point in mine.tolist() if point in self.known_places]:
+                centre[mine] = np.mean(there, axis=0)
+        for point, (place, sigma) in self.known_places.items():
+            centre[point], std[point] = place, sigma
+        known.ravel()[list(self.held)] = True
         delays = np.array([self.fixed_ns.get(tag, 0.0) for tag in self.tags])
-        dimensions = np.array([boards.dimensions for boards in self.arrangements])[self.owner, None]
-        freed = np.array([boards.freed for boards in self.arrangements])[self.owner, None]
-        std = np.where(freed & (np.arange(3) == dimensions - 1), BESIDE_STD_M, PLACE_STD_M).ravel()
-        centre = np.zeros((len(self.points), 3))
-        for k in range(len(self.arrangements)):
-            known = self.known.position_m[self.owner[self.known.at] == k]
-            centre[self.owner == k] = known.mean(axis=0) if len(known) else 0.0
-        precision = np.zeros((0, 0)) if self.curve is None else self.curve.precision
-        size = len(precision)
+        certain = np.array([FIXED_STD_NS if tag in self.fixed_ns else DELAY_STD_NS for tag in self.tags])
+        blocks = [("place", centre.ravel(), np.diag(std.ravel() ** -2)), ("delay", delays, np.diag(certain**-2))]
+        if self.curve is not None:
+            blocks.append(("curve", np.zeros(len(self.curve.precision)), self.curve.precision))
         return Layout(
-            (
+            tuple(
                 Unknown(
-                    kind="place",
-                    names=tuple(str(tag) for _, tag in self.points for _ in range(3)),
-                    start=centre.ravel(),
-                    known=(np.arange(3) >= dimensions).ravel(),
-                    priors=(Prior(weight=1.0, structure=np.diag(std**-2), centre=centre.ravel(), rows=centre.size),),
-                ),
-                Unknown(
-                    kind="delay",
-                    names=tuple(map(str, self.tags)),
-                    start=delays,
-                    known=fixed,
-                    priors=(Prior.of_deviation(DELAY_STD_NS, delays),),
-                ),
-                Unknown(
-                    kind="curve",
-                    names=("",) * size,
-                    start=np.zeros(size),
-                    priors=(Prior(weight=1.0, structure=precision, rows=size),),
-                ),
+                    kind=kind,
+                    names=("",) * len(start),
+                    start=start,
+                    known=known.ravel() if kind == "place" else None,
+                    priors=(Prior(weight=1.0, structure=structure, centre=start, rows=len(start)),),
+                )
+                for kind, start, structure in blocks
             )
         )
+
+    @cached_property
+    def guessed(self) -> Ints:
+        """The unknowns whose prior is no knowledge: places and delays that nobody stated."""
+        places = [3 * k + axis for k in self.points.values() if k not in self.known_places for axis in range(3)]
+        delays = [k for k, tag in enumerate(self.tags, start=3 * len(self.points)) if tag not in self.fixed_ns]
+        return np.array([*places, *delays], dtype=np.int64)
 
     def seats(self, arrangement: int) -> Ints:
         """Return the points (rows of `points`) of an arrangement, in the order of its tags."""
         return np.flatnonzero(self.owner == arrangement)
 
-    def free(self, only: int | None = None) -> Ints:
-        """Return the indices of the free unknowns; of `only` one arrangement's places where that is given."""
-        free = self.layout.free()
-        return free if only is None else np.intersect1d(free, 3 * self.seats(only)[:, None] + np.arange(3))
-
-    def rows_of(self, only: int | None = None) -> Bools:
-        """Return which means (n,) belong to an arrangement; all of them for none."""
-        return np.asarray(self.means.arrangement == (self.means.arrangement if only is None else only))
-
-    def positions(self, x: Floats) -> Floats:
+    def positions_m(self, x: Floats) -> Floats:
         """Return the points (points, 3) that a vector of unknowns stands for."""
         return x[self.layout.where["place"]].reshape(-1, 3).copy()
 
-    def with_positions(self, x: Floats, positions: Floats) -> Floats:
-        """Return a vector of unknowns with other points (points, 3)."""
-        found = x.copy()
-        mine = np.setdiff1d(self.free(), np.arange(3 * len(self.points), len(x)))
-        found[mine] = positions.ravel()[mine]
+    def with_positions(self, x: Floats, positions: Floats, seats: Ints | slice = slice(None)) -> Floats:
+        """Return a vector of unknowns with other points (points, 3), or others of some `seats`, where they are free."""
+        place, found, free = self.positions_m(x), x.copy(), self.layout.free()
+        place[seats] = positions
+        mine = free[free < place.size]
+        found[mine] = place.ravel()[mine]
         return found
 
     @cached_property
@@ -278,63 +310,79 @@ class Network:
         """The points between which each length was measured (n, 2): means, then known distances."""
         rows = zip(self.means.arrangement.tolist(), self.means.ends.tolist(), strict=True)
         of_means = [(self.points[k, i], self.points[k, j]) for k, (i, j) in rows]
-        return np.concatenate([np.array(of_means).reshape(-1, 2), self.known.ends])
+        return np.concatenate([np.array(of_means).reshape(-1, 2), self.tapes[0]])
 
     @cached_property
     def _of_delays_and_curve(self) -> Floats:
         """The derivatives of all rows (n, p) by delays and curve, which do not depend on places."""
-        found = np.zeros((len(self.ends) + 3 * len(self.known.at), self.layout.size))
+        found = np.zeros((len(self.ends), self.layout.size))
         number = np.searchsorted(self.tags, self.means.ends) + self.layout.where["delay"].start
-        rows = np.arange(len(self.means))
+        rows = np.arange(len(self.means.range_m))
         found[rows[:, None], number] = -METRES_A_NS * self.means.weights
         if self.curve is not None:
             found[: len(rows), self.layout.where["curve"]] = self.curve.design
         return found
 
+    @cached_property
+    def curve_root(self) -> Floats:
+        """What independent unknowns of unit variance do to means (n, m) as a curve of 1 m; zero without a curve."""
+        if self.curve is None:
+            return np.zeros((len(self.means.range_m), 1))
+        return np.asarray(self.curve.design @ np.linalg.cholesky(np.linalg.inv(self.curve.precision)))
+
     def linear(self, x: Floats, marks: Bools | float = 0.0) -> tuple[Floats, Floats]:
-        """Return what is left of each row (n,), and derivatives (n, p): means, known distances, coordinates.
+        """Return what is left of each row (n,), and derivatives (n, p): means, known distances.
 
         Of means with `marks` (n,) a detour is taken off.
         """
-        place, known, found = self.positions(x), self.known, self._of_delays_and_curve.copy()
+        place, found = self.positions_m(x), self._of_delays_and_curve.copy()
         apart = place[self.ends[:, 0]] - place[self.ends[:, 1]]
         length = np.linalg.norm(apart, axis=1)
-        measured = np.concatenate([self.means.range_m, known.distance_m, known.position_m.ravel()])
-        told = np.concatenate([length, place[known.at].ravel()])
-        left = measured - told - found @ x
-        left[: len(self.means)] -= DETOUR_M * marks
+        measured = np.concatenate([self.means.range_m - DETOUR_M * marks, self.tapes[1][:, 0]])
+        left = measured - length - found @ x
         # Boards on top of each other have no direction: any will do to part them.
         unit = np.where(length[:, None] > 1e-9, apart / np.maximum(length, 1e-9)[:, None], [1.0, 0.0, 0.0])
         rows = np.arange(len(length))[:, None]
         for end, sign in ((0, 1.0), (1, -1.0)):
             found[rows, 3 * self.ends[:, [end]] + np.arange(3)] = sign * unit
-        found[np.arange(len(length), len(left)), (3 * known.at[:, None] + np.arange(3)).ravel()] = 1.0
         return left, found
 
     def std_m(self, case: Case) -> Floats:
         """Return the standard deviation of each row, with the constant errors of pairs."""
         means = np.sqrt(self.means.std_m**2 + case.pair_m**2 + DETOUR_STD_M**2 * case.marks)
-        return np.concatenate([means, self.known.distance_std_m, np.repeat(self.known.position_std_m, 3)])
+        return np.concatenate([means, self.tapes[1][:, 1]])
 
-    def priors(self, curve_m: float, only: int | None = None) -> Priors:
-        """Return what is known of the unknowns beforehand, with the spread of the curve.
+    def priors(self, curve_m: float) -> Priors:
+        """Return the priors of the unknowns, with the spread of the curve."""
+        return Priors(self.layout, [1.0, 1.0, curve_m**-2][: len(self.layout.blocks)])
 
-        All but `only` one arrangement's places are known if that is given.
-        """
-        layout = self.layout
-        if only is not None:
-            known = ~np.isin(np.arange(layout.size), self.free(only))
-            layout = Layout(tuple(replace(one, known=known[layout.where[one.kind]]) for one in layout.blocks))
-        return Priors(layout, [1.0, DELAY_STD_NS**-2, curve_m**-2])
-
-    def at(self, x: Floats, case: Case, only: int | None = None) -> Linear:
-        """Return the network about unknowns (p,) in a case; `only` one arrangement's places are free if given."""
-        left, jacobian = self.linear(x, case.marks)
+    def at(self, x: Floats, case: Case) -> Linear:
+        """Return the network about unknowns (p,) in a case."""
+        (left, jacobian), priors = self.linear(x, case.marks), self.priors(case.curve_m)
+        precision = priors.precision()
         return Linear(
             left=left,
             jacobian=jacobian,
             std=self.std_m(case),
-            prior=np.asarray(self.priors(case.curve_m).precision()),
-            away=x - self.layout.start(),
-            free=self.free(only),
+            prior=precision.toarray() if sparse.issparse(precision) else precision,
+            pull=priors.pull(x),
+            prior_value=-2 * priors.value(x),
+            free=self.layout.free(),
+            guessed=self.guessed,
         )
+
+    def alone(self, arrangement: int, x: Floats) -> tuple[Network, Floats]:
+        """Return one arrangement as a network whose delays and curve are known, and its unknowns."""
+        rows = self.means.arrangement == arrangement
+        means = self.means[rows]
+        if self.curve is not None:
+            bias = self.curve.design[rows] @ x[self.layout.where["curve"]]
+            means = replace(means, range_m=means.range_m - bias)
+        found = replace(
+            self,
+            means=replace(means, arrangement=np.zeros_like(means.arrangement)),
+            arrangements=(self.arrangements[arrangement],),
+            fixed_ns=dict(zip(self.tags, x[self.layout.where["delay"]].tolist(), strict=True)),
+            curve=None,
+        )
+        return found, found.with_positions(found.layout.start(), self.positions_m(x)[self.seats(arrangement)])

@@ -47,9 +47,14 @@ SHAPES = {1: "line", 2: "plane", 3: ""}
 def students_factor(freedom: float) -> float:
     """Return by how much Student's 95 % quantile is more than the normal one: the spread of errors is estimated.
 
-    What is known of that spread beforehand counts as a few degrees of freedom.
+    Its prior counts as a few degrees of freedom.
     """
     return float(stdtrit(max(freedom + PAIR_PRIOR_FREEDOM, 1.0), 0.975)) / TWO_SIDED_95
+
+
+def verdict_on_delays(information: Floats, tags: Sequence[int]) -> Verdict:
+    """Return what is determined of delays by their information (tags, tags), 1/ns^2."""
+    return judge(information, [Unknown("delay", str(tag), DELAY_SCALE_NS) for tag in tags])
 
 
 def result_of(
@@ -61,76 +66,55 @@ def result_of(
     asked: SurveySettings,
 ) -> SurveyResult:
     """Return the result of a survey; raises `UnanswerableError` where no delay is determined."""
-    verdict = verdict_of(found)
+    network = found.network
+    verdict = verdict_on_delays(
+        reduced(found.information(), np.isin(np.arange(len(found.x)), network.layout.indices(["delay"]))), network.tags
+    )
     free = verdict.named("delay")
-    if len(free) == len(verdict.unknowns) - len(found.network.fixed_ns):
+    if len(free) == len(network.tags) - len(network.fixed_ns):
         raise UnanswerableError(
             f"the arrangements determine no delay: {'; '.join(d.words for d in verdict.free)} can change without "
             "changing any range; `calib plan` says which arrangements or distances would tell",
             undetermined=[[int(tag) for tag in free]],
         )
-    reflected = reflected_pairs(found)
-    warnings = [
-        *data.warnings,
-        *(one.text for one in findings),
-        *_reflections_in_words(reflected),
-        *_notes(found, second, verdict),
-    ]
-    factor = students_factor(found.freedom)
-    covariance = found.covariance() * factor**2
-    arrangements = tuple(_arrangement(found, covariance, k) for k in range(len(found.network.arrangements)))
+    reflected = tuple(_reflected_pairs(found))
+    warnings = (*data.warnings, *(one.text for one in findings), *_notes(found, second, verdict, reflected))
+    arrangements = tuple(_arrangement(found, k) for k in range(len(network.arrangements)))
     more = ({"settings": asked.changed()} if asked.changed() else {}) | {
         "surveyed": [one.to_dict() for one in arrangements],
         "reflected": [one.to_dict() for one in reflected],
         "findings": [one.text for one in findings],
         "second_best": None if second is None else round(second.worse, 2),
+        "warnings": list(warnings),
     }
     return SurveyResult(
-        calibration=_calibration(data, found, verdict, factor, taken, warnings, more),
+        calibration=_calibration(data, found, verdict, taken, more),
         arrangements=arrangements,
         verdict=verdict,
         pair_error_m=found.case.pair_m,
         second_best=second,
         contradictions=findings,
-        warnings=tuple(warnings),
+        warnings=warnings,
         reflected=reflected,
     )
 
 
-def verdict_on_delays(information: Floats, tags: Sequence[int]) -> Verdict:
-    """Return what is determined of delays by their information (tags, tags), 1/ns^2."""
-    return judge(information, [Unknown("delay", str(tag), DELAY_SCALE_NS) for tag in tags])
-
-
-def verdict_of(found: Solution) -> Verdict:
-    """Return what is determined of the delays, in nanoseconds, whatever places and curve are."""
-    network = found.network
-    free, delays = network.free(), network.layout.indices(["delay"])
-    open_delays = np.intersect1d(free, delays)
-    information = np.diag(np.where(np.isin(delays, free), 0.0, 1e8))
-    mine = np.searchsorted(delays, open_delays)
-    of_free = found.information()[np.ix_(free, free)]
-    information[np.ix_(mine, mine)] = reduced(of_free, np.isin(free, open_delays))
-    return verdict_on_delays(information, network.tags)
-
-
-def reflected_pairs(found: Solution) -> tuple[ReflectedPair, ...]:
+def _reflected_pairs(found: Solution) -> list[ReflectedPair]:
     """Return the pairs that may be reflected, the likeliest first."""
-    network = found.network
-    means, names = network.means, [boards.name for boards in network.arrangements]
-    longer = network.linear(found.x)[0].tolist()
-    return tuple(
-        ReflectedPair(
-            names[means.arrangement[k]], int(means.ends[k, 0]), int(means.ends[k, 1]), longer[k], float(found.chance[k])
-        )
+    means, longer = found.network.means, found.network.linear(found.x)[0].tolist()
+    names = [found.network.arrangements[k].name for k in means.arrangement.tolist()]
+    return [
+        ReflectedPair(names[k], int(means.ends[k, 0]), int(means.ends[k, 1]), longer[k], float(found.chance[k]))
         for k in np.argsort(-found.chance, kind="stable").tolist()
         if found.chance[k] >= MIN_MENTIONED
-    )
+    ]
 
 
-def _reflections_in_words(reflected: tuple[ReflectedPair, ...]) -> list[str]:
-    """Return a line for each pair that is believed to be reflected, and one for those that may be."""
-    lines = [
+def _notes(
+    found: Solution, second: SecondBest | None, verdict: Verdict, reflected: Sequence[ReflectedPair]
+) -> list[str]:
+    """Return what a user should know, a line each."""
+    notes = [
         f"{one.arrangement}: the range of {one.first} and {one.second} is {100 * one.longer_m:+.0f} cm off what all "
         f"others say: believed to be reflected ({100 * one.chance:.0f} %), and hardly counted"
         for one in reflected
@@ -141,12 +125,8 @@ def _reflections_in_words(reflected: tuple[ReflectedPair, ...]) -> list[str]:
         for one in reflected
         if one.chance < MIN_BELIEVED
     ]
-    return [*lines, *([f"may be reflected, too: {', '.join(perhaps)}; intervals are wider by that"] if perhaps else [])]
-
-
-def _notes(found: Solution, second: SecondBest | None, verdict: Verdict) -> list[str]:
-    """Return what a user should know beside reflections, a line each."""
-    notes = []
+    if perhaps:
+        notes.append(f"may be reflected, too: {', '.join(perhaps)}; intervals are wider by that")
     if not found.settled:
         notes.append("the search stopped before it settled: delays and places are not final")
     if not verdict.determined.all():
@@ -167,19 +147,14 @@ def _notes(found: Solution, second: SecondBest | None, verdict: Verdict) -> list
 
 
 def _calibration(
-    data: SurveyData,
-    found: Solution,
-    verdict: Verdict,
-    factor: float,
-    taken: Calibration | None,
-    warnings: list[str],
-    more: dict[str, Any],
+    data: SurveyData, found: Solution, verdict: Verdict, taken: Calibration | None, more: dict[str, Any]
 ) -> Calibration:
     """Return the calibration: delays that are determined, the curve, how well both are known and what they rest on."""
-    network, known = found.network, verdict.determined
-    tags = [tag for tag, good in zip(network.tags, known.tolist(), strict=True) if good]
+    network, known, freedom = found.network, verdict.determined, found.freedom
+    factor = students_factor(freedom)
     std = dict(zip(network.tags, (verdict.std * factor).tolist(), strict=True)) | dict.fromkeys(network.fixed_ns, 0.0)
-    delays = dict(zip(network.tags, found.delays.tolist(), strict=True))
+    delays = dict(zip(network.tags, found.delays.tolist(), strict=True)) | network.fixed_ns
+    tags = [tag for tag, good in zip(network.tags, known.tolist(), strict=True) if good]
     noise = float(np.sqrt(np.average(network.means.noise_m**2, weights=network.means.count)))
     sigma = math.hypot(noise, found.case.pair_m)
     lifted = network.means.lifted[np.isfinite(network.means.lifted)]
@@ -196,20 +171,19 @@ def _calibration(
         curve_covariance = found.covariance()[where, where] * factor**2
         gauge = f"the bias curve is zero at {ALPHA_DBM:g} dBm; the delays carry the constant"
     fixed = {"fixed_ns": {str(tag): delay for tag, delay in sorted(network.fixed_ns.items())}}
-    freedom = found.freedom
     provenance = (fixed if network.fixed_ns else {}) | {
         "writer": f"uwbcal {uwblink.__version__}",
         "recordings": list(data.sources),
         "exchanges": int(network.means.count.sum()),
-        "pairs": len(network.means),
+        "pairs": len(network.means.range_m),
         "recipe": "survey",
         "rests_on": {
             "arrangements": [
                 {"name": boards.name, "known": SHAPES[boards.dimensions], "tags": list(boards.tags)}
                 for boards in network.arrangements
             ],
-            "known_distances": len(set(network.known.statement.tolist())),
-            "known_positions": len(network.known.at),
+            "known_distances": len(network.distances),
+            "known_positions": len(network.known_places),
             "pair_error_m": found.case.pair_m,
             "freedom": freedom,
         },
@@ -217,7 +191,6 @@ def _calibration(
         "converged": found.settled,
         "standard_errors": f"constant errors of pairs, {freedom:.0f} degrees of freedom",
         "undetermined": [[int(tag) for tag in verdict.named("delay")]] if verdict.free else [],
-        "warnings": warnings,
         "gauge": gauge,
     }
     covariance = verdict.covariance[np.ix_(known, known)] * factor**2
@@ -244,68 +217,59 @@ def _of_curve(taken: Calibration) -> Floats:
     return np.zeros((size, size)) if taken.uncertainty is None else np.array(taken.uncertainty.bias_m2)
 
 
-def _arrangement(found: Solution, covariance: Floats, number: int) -> SurveyedArrangement:
-    """Return where boards stood in an arrangement, in the frame of known positions or that of its first boards."""
-    network, boards, seats = found.network, found.network.arrangements[number], found.network.seats(number)
-    points = network.positions(found.x)[seats]
-    columns = (3 * seats[:, None] + np.arange(3)).ravel()
-    spread, frame = covariance[np.ix_(columns, columns)], "that of the known positions"
-    if not np.isin(network.known.at, seats).any():
-        points, spread, frame = _in_frame(points, spread, boards)
-    surveyed = []
-    for n, (tag, (x, y, z)) in enumerate(zip(boards.tags, points.tolist(), strict=True)):
-        own = spread[3 * n : 3 * n + 3, 3 * n : 3 * n + 3]
-        surveyed.append(SurveyedBoard(tag, (x, y, z), own, bool(np.trace(own) < 1.0)))
-    return SurveyedArrangement(boards.name, SHAPES[boards.dimensions], tuple(surveyed), frame)
+def widened_by(found: Solution, curve: Calibration) -> Solution:
+    """Return a solution whose covariance has what the errors of a curve that was taken over do to delays and places."""
+    here, means = found.linear, found.network.means
+    weighed = here.jacobian / here.std[:, None] ** 2
+    splines = basis(np.clip(means.lifted, *curve.bias_curve.range), np.array(curve.bias_curve.knots))
+    gain = here.covariance @ (weighed[: len(splines)].T @ splines)
+    return replace(found, more=found.more + gain @ _of_curve(curve) @ gain.T)
 
 
-def _in_frame(points: Floats, covariance: Floats, boards: Boards) -> tuple[Floats, Floats, str]:
-    """Return points (n, 3) and their covariance (3n, 3n) in the frame of the first boards, and that in words.
+def in_frames(found: Solution) -> Solution:
+    """Return a solution with every arrangement without known positions in the frame of its first boards."""
+    network, x, held = found.network, found.x.copy(), list[int]()
+    place = x[network.layout.where["place"]].reshape(-1, 3)
+    for k, boards in enumerate(network.arrangements):
+        seats = network.seats(k)
+        if not network.known_places.keys() & set(seats.tolist()):
+            turn, own, _ = _frame(place[seats], boards)
+            place[seats] = (place[seats] - place[seats[0]]) @ turn.T
+            held += [3 * int(seats[0]) + n for n in own]
+    x[held] = 0.0
+    return replace(found, network=replace(network, held=tuple(held)), x=x)
 
-    The first is the origin, x points to the second, y to the side of the next beside it. The covariance is that in
-    which the coordinates that make the frame have none (Baarda's transformation of the datum).
+
+def _frame(points: Floats, boards: Boards) -> tuple[Floats, list[int], str]:
+    """Return the axes (3, 3) of the frame of the first boards, which coordinates make it, and it in words.
+
+    The first is the origin, x points to the second, y to the side of the next beside it.
     """
     away = points - points[0]
     x = away[1] / max(float(np.linalg.norm(away[1])), 1e-9)
-    first, second = boards.tags[:2]
+    words = f"{boards.tags[0]} at the origin, x towards {boards.tags[1]}"
     if boards.dimensions == 1:
-        turn, datum = np.diag([np.sign(x[0]) or 1.0, 1.0, 1.0]), np.array([0])
-        words = f"{first} at the origin, x towards {second}"
-    else:
-        beside = away - np.outer(away @ x, x)
-        reach = np.linalg.norm(beside, axis=1)
-        third = int(np.argmax(reach > 0.2 * reach.max())) if reach.max() > 0 else 0
-        y = beside[third] / max(float(reach[third]), 1e-9)
-        tag = boards.tags[third]
-        if boards.dimensions == 2:
-            turn, datum = np.array([x, y, [0.0, 0.0, 1.0]]), np.array([0, 1, 4])
-            words = f"{first} at the origin, x towards {second}, y towards {tag}"
-        else:
-            turn, datum = np.array([x, y, np.cross(x, y)]), np.array([0, 1, 2, 4, 5, 3 * third + 2])
-            words = f"{first} at the origin, x towards {second}, {tag} in the plane of x and y, z right-handed"
-    moved = away @ turn.T
-    turns = np.kron(np.eye(len(points)), turn)
-    motions = rigid_motions(moved, boards.dimensions)
-    hold = np.eye(len(motions)) - motions @ np.linalg.pinv(motions[datum]) @ np.eye(len(motions))[datum]
-    # Along its own motions an arrangement is as free as the prior has it: none of that is left in its frame.
-    along = np.linalg.qr(motions)[0]
-    clear = hold @ (np.eye(len(motions)) - along @ along.T) @ turns
-    found = clear @ covariance @ clear.T
-    return moved, (found + found.T) / 2, words
+        return np.diag([np.sign(x[0]) or 1.0, 1.0, 1.0]), [0], words
+    beside = away - np.outer(away @ x, x)
+    reach = np.linalg.norm(beside, axis=1)
+    third = int(np.argmax(reach > 0.2 * reach.max())) if reach.max() > 0 else 0
+    y = beside[third] / max(float(reach[third]), 1e-9)
+    turn = np.array([x, y, np.cross(x, y)])
+    if boards.dimensions == 2:
+        return turn, [0, 1, 4], f"{words}, y towards {boards.tags[third]}"
+    words += f", {boards.tags[third]} in the plane of x and y, z right-handed"
+    return turn, [0, 1, 2, 4, 5, 3 * third + 2], words
 
 
-def rigid_motions(points: Floats, dimensions: int) -> Floats:
-    """Return the motions (3n, k) of points (n, 3) that change no distance: shifts and turns in so many dimensions."""
-    fields = [np.tile(np.eye(3)[axis], (len(points), 1)) for axis in range(dimensions)]
-    turns: dict[int, tuple[int, ...]] = {1: (), 2: (2,), 3: (0, 1, 2)}
-    fields += [np.cross(np.eye(3)[axis], points) for axis in turns[dimensions]]
-    return np.array([field.ravel() for field in fields]).T
-
-
-def widened_by(found: Solution, curve: Calibration) -> Solution:
-    """Return a solution whose covariance has what the errors of a curve that was taken over do to delays and places."""
-    here, count = found.network.at(found.x, found.case), len(found.network.means)
-    weighed = here.jacobian[:count] / here.std[:count, None] ** 2
-    lifted = np.clip(found.network.means.lifted, *curve.bias_curve.range)
-    gain = here.covariance() @ (weighed.T @ basis(lifted, np.array(curve.bias_curve.knots)))
-    return replace(found, more=found.more + gain @ _of_curve(curve) @ gain.T)
+def _arrangement(found: Solution, number: int) -> SurveyedArrangement:
+    """Return where boards stood in an arrangement, in the frame of known positions or that of its first boards."""
+    network, boards, seats = found.network, found.network.arrangements[number], found.network.seats(number)
+    points, covariance = network.positions_m(found.x), found.covariance() * students_factor(found.freedom) ** 2
+    surveyed = []
+    for tag, seat in zip(boards.tags, seats.tolist(), strict=True):
+        own, (x, y, z) = slice(3 * seat, 3 * seat + 3), points[seat].tolist()
+        spread = covariance[own, own]
+        surveyed.append(SurveyedBoard(tag, (x, y, z), spread, bool(np.trace(spread) < 1.0)))
+    known = network.known_places.keys() & set(seats.tolist())
+    frame = "that of the known positions" if known else _frame(points[seats], boards)[2]
+    return SurveyedArrangement(boards.name, SHAPES[boards.dimensions], tuple(surveyed), frame)

@@ -1,36 +1,36 @@
 """The solution of a network: the likeliest unknowns, the sizes of errors, and other solutions that fit as well.
 
 For given errors `calib.estimator.optimize` finds the unknowns. The constant error of pairs and the spread of the curve
-are those of restricted maximum likelihood (Patterson and Thompson, Biometrika, 1971) with weak priors, since a small
-network determines neither well. Likelihoods are integrated over the unknowns (Laplace's approximation), so that
-solutions with different reflections, orders and spreads can be compared.
+maximise the likelihood integrated over the unknowns (restricted maximum likelihood: Patterson and Thompson, Biometrika,
+1971) with weak priors, since a small network determines neither well. By the same likelihood solutions with different
+reflections, orders and spreads are compared.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from operator import attrgetter, itemgetter
 
 import numpy as np
-from scipy.optimize import minimize
 
 from calib.estimator.optimize import maximize
-from calib.surveys.network import Case, Lengths, Network
+from calib.surveys.network import Case, Lengths, Linear, Network
 from calib.surveys.reflections import Marks, unlikely
 from calib.surveys.result import SecondBest
-from calib.surveys.starts import first_start, is_in_order, line_coordinates, other_starts, start_in_order
-from uwblink.arrays import Bools, Floats, Ints
+from calib.surveys.starts import first_start, is_in_order, other_starts
+from uwblink.arrays import Bools, Floats
 
 PAIR_STD_M, PAIR_PRIOR_FREEDOM = 0.02, 3.0
-"""Standard deviation of the constant error of a pair before any data, and the degrees of freedom that it counts as."""
+"""Prior standard deviation of the constant error of a pair, and the degrees of freedom that it counts as."""
 
 PAIR_STARTS_M = (0.01, 0.015, 0.02, 0.03, 0.045, 0.07)
 """Errors of pairs from which a search begins: with small ones too much looks reflected, with large ones too little."""
 
 CURVE_STD_M, CURVE_FACTOR = 0.1, 1.7
-"""Standard deviation of a curve before any data, and the factor by which that may be wrong (`CURVE_LENGTH_DB`)."""
+"""Prior standard deviation of a curve, and the factor by which that may be wrong (`CURVE_LENGTH_DB`)."""
 
 WRONG_ORDER_PENALTY = 2 * math.log(100.0)
 """-2 log of the chance that boards stand in another order than somebody said who put them so: one in a hundred."""
@@ -42,20 +42,19 @@ MAX_WORSE_ALONE = 60.0
 """By how much -2 log likelihood of one arrangement's other solution may be worse for all to be solved with it."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Solution:
     """The best unknowns `x` (p,) of a network, and the errors that go with them.
 
-    `unlikely` is -2 log of the likelihood of everything, up to a constant that all solutions of one set of means share;
-    `freedom` the degrees of freedom that are left. `chance` (n,) is how probable it is of each mean that it is
-    reflected, and `more` (p, p) what it adds to the covariance that others may be reflected, or spreads be others.
+    `unlikely` is -2 log of the likelihood of everything, up to a constant that all solutions of one set of means share.
+    `chance` (n,) is how probable it is of each mean that it is reflected, and `more` (p, p) what it adds to the
+    covariance that others may be reflected, or spreads be others.
     """
 
     network: Network
     x: Floats
     case: Case
     unlikely: float
-    freedom: float
     settled: bool
     chance: Floats
     more: Floats
@@ -65,26 +64,33 @@ class Solution:
         """The delays (tags,), ns."""
         return self.x[self.network.layout.where["delay"]]
 
+    @cached_property
+    def linear(self) -> Linear:
+        """The network about the unknowns."""
+        return self.network.at(self.x, self.case)
+
+    @property
+    def freedom(self) -> float:
+        """The degrees of freedom that are left: rows less those that unknowns use up."""
+        return float(len(self.linear.left) - np.sum(self.linear.covariance * self.linear.information))
+
     def covariance(self) -> Floats:
-        """Return the covariance (p, p), with what is known of delays beforehand, so that there is always one."""
-        return self.network.at(self.x, self.case).covariance() + self.more
+        """Return the covariance (p, p), with the priors of delays, so that there is always one."""
+        return np.asarray(self.linear.covariance + self.more)
 
     def information(self) -> Floats:
-        """Return the information (p, p) of what was measured, and of what is known of the curve."""
-        here, curve = self.network.at(self.x, self.case), self.network.layout.where["curve"]
-        found = here.information()
-        found[curve, curve] += here.prior[curve, curve]
+        """Return the information (p, p) of what was measured and of what is known."""
         # Of the sum of two covariances, the first of which may be infinite.
-        wider = np.linalg.solve(np.eye(len(found)) + found @ self.more, found)
+        wider = np.linalg.solve(np.eye(len(self.x)) + self.linear.known @ self.more, self.linear.known)
         return np.asarray((wider + wider.T) / 2)
 
 
-def optimize(network: Network, x: Floats, case: Case, only: int | None = None) -> tuple[Floats, bool]:
-    """Return the likeliest unknowns from a start (of `only` one arrangement), and whether the search converged."""
+def optimize(network: Network, x: Floats, case: Case) -> tuple[Floats, bool]:
+    """Return the likeliest unknowns from a start, and whether the search converged."""
     places = network.layout.where["place"]
     found = maximize(
         [Lengths(network, case)],
-        network.priors(case.curve_m, only),
+        network.priors(case.curve_m),
         x,
         evidence_steps=0,
         tolerance=1e-6,
@@ -93,44 +99,45 @@ def optimize(network: Network, x: Floats, case: Case, only: int | None = None) -
     return found.x, found.success
 
 
-def unlikelihood(network: Network, x: Floats, case: Case, only: int | None = None) -> float:
-    """Return -2 log likelihood at an optimum, integrated over the unknowns (those of `only` one arrangement)."""
-    here = network.at(x, case, only)
-    free = np.ix_(here.free, here.free)
-    value = float(np.sum((here.left / here.std) ** 2) + here.away @ here.prior @ here.away)
-    value += 2 * float(np.log(here.std).sum())
-    value += float(np.linalg.slogdet((here.information() + here.prior)[free])[1])
-    value -= float(np.linalg.slogdet(here.prior[free])[1])
-    value += unlikely(int(case.marks.sum()), len(case.marks))
+def unlikelihood(network: Network, x: Floats, case: Case) -> float:
+    """Return -2 log likelihood at an optimum, integrated over the unknowns."""
+    value = network.at(x, case).unlikely() + unlikely(int(case.marks.sum()), len(case.marks))
     if case.marks.any():
-        value += float(Marks.at(network, x, case, only).penalties()[case.marks].sum())
+        value += float(Marks.at(network, x, case).penalties()[case.marks].sum())
     return value + WRONG_ORDER_PENALTY * len(out_of_order(network, x))
 
 
 def out_of_order(network: Network, x: Floats) -> list[int]:
     """Return the arrangements in which boards do not stand in the order that is said."""
-    points = network.positions(x)
+    points = network.positions_m(x)
     return [
         k
         for k, boards in enumerate(network.arrangements)
-        if boards.order and not is_in_order(line_coordinates(points[network.seats(k)], boards.tags, boards.order))
+        if boards.order and not is_in_order(points[[network.points[k, tag] for tag in boards.order], 0])
     ]
 
 
+def settle(network: Network, x: Floats, case: Case) -> tuple[Floats, Case]:
+    """Return the unknowns from a start, and the case with the means that are likeliest reflected."""
+    for _ in range(2):
+        x, _ = optimize(network, x, case)
+        marks = Marks.at(network, x, case).searched()
+        if np.array_equal(marks, case.marks):
+            break
+        case = replace(case, marks=marks)
+        x, _ = optimize(network, x, case)
+    return x, case
+
+
 def adjust(
-    network: Network,
-    x: Floats,
-    *,
-    marks: Bools | None = None,
-    start_m: float = PAIR_STD_M,
-    rounds: int = 6,
+    network: Network, x: Floats, *, marks: Bools | None = None, start_m: float = PAIR_STD_M, rounds: int = 6
 ) -> Solution:
     """Return the best unknowns from a start, with the spreads and the reflected means estimated along, in turns.
 
     `start_m` is the constant error of pairs at first, where that is not known, and `marks` (n,) are the means that are
     reflected at first.
     """
-    none = np.zeros(len(network.means), dtype=bool)
+    none = np.zeros(len(network.means.range_m), dtype=bool)
     case = Case(none if marks is None else marks, network.pair_m or start_m, CURVE_STD_M)
     for _ in range(rounds):
         before = case
@@ -141,16 +148,11 @@ def adjust(
         if abs(case.pair_m - before.pair_m) < 0.02 * case.pair_m and np.array_equal(case.marks, before.marks):
             break
     x, settled = optimize(network, x, case)
-    here = network.at(x, case)
-    # Lengths, and known coordinates that may be free.
-    dimensions = np.array([boards.dimensions for boards in network.arrangements])
-    rows = len(network.ends) + int(dimensions[network.owner[network.known.at]].sum())
     return Solution(
         network=network,
         x=x,
         case=case,
         unlikely=unlikelihood(network, x, case) + _unlikely_spreads(case),
-        freedom=float(rows - np.sum(here.covariance() * here.information())),
         settled=settled,
         chance=case.marks.astype(float),
         more=np.zeros((len(x),) * 2),
@@ -158,49 +160,31 @@ def adjust(
 
 
 def _unlikely_spreads(case: Case) -> float:
-    """Return -2 log of what is known of the spreads beforehand."""
-    known = PAIR_PRIOR_FREEDOM * (2 * math.log(case.pair_m) + (PAIR_STD_M / case.pair_m) ** 2)
-    return known + (math.log(case.curve_m / CURVE_STD_M) / math.log(CURVE_FACTOR)) ** 2
+    """Return -2 log of the prior density of the spreads."""
+    pairs = PAIR_PRIOR_FREEDOM * (2 * math.log(case.pair_m) + (PAIR_STD_M / case.pair_m) ** 2)
+    return pairs + (math.log(case.curve_m / CURVE_STD_M) / math.log(CURVE_FACTOR)) ** 2
 
 
-def _unlikely_by_spreads(network: Network, x: Floats, case: Case) -> Callable[[Case], float]:
-    """Return -2 log likelihood as a function of cases that differ in the spreads of pairs and curve.
+def _spreads(network: Network, x: Floats, case: Case, steps: int = 20) -> Case:
+    """Return a case with the likeliest spreads of pairs and curve, by Fisher's scoring of their logarithms.
 
-    By error contrasts: combinations of rows in which neither coordinates nor delays are, as many as freedoms are left.
+    With the inverse covariance P of rows y, of which each spread adds R R', -2 log likelihood has the slopes
+    2 tr(R' P R) - 2 |R' P y|^2 and the expected curvatures 4 |R_i' P R_j|^2 (Patterson and Thompson).
     """
-    here, curve = network.at(x, replace(case, pair_m=0.0)), network.layout.indices(["curve"])
-    basis, size, _ = np.linalg.svd(here.jacobian[:, np.setdiff1d(here.free, curve)], full_matrices=True)
-    contrasts = basis[:, int(np.count_nonzero(size > 1e-9 * size[0])) :].T
-    curves = contrasts @ here.jacobian[:, curve]
-    seen = contrasts @ here.left + curves @ x[curve]
-    own = (contrasts * here.std**2) @ contrasts.T
-    shared = contrasts[:, : len(case.marks)] @ contrasts[:, : len(case.marks)].T
-    smooth = 0.0 if network.curve is None else curves @ np.linalg.inv(network.curve.precision) @ curves.T
-
-    def value(case: Case) -> float:
-        found = _unlikely_spreads(case)
-        if len(seen):
-            root = np.linalg.cholesky(own + case.pair_m**2 * shared + case.curve_m**2 * smooth)
-            found += 2 * float(np.log(np.diag(root)).sum()) + float(np.sum(np.linalg.solve(root, seen) ** 2))
-        return found
-
-    return value
-
-
-def _spreads(network: Network, x: Floats, case: Case) -> Case:
-    """Return a case with the spreads of pairs and curve that are likeliest."""
-    value = _unlikely_by_spreads(network, x, case)
-    free = np.array([network.pair_m is None, network.curve is not None])
-
-    def unlikely_by(steps: Floats) -> float:
-        return value(case.scaled(*np.where(free, steps, 0.0).tolist()))
-
-    # What is known of the spreads beforehand bounds them.
-    simplex = np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]])
-    found = minimize(
-        unlikely_by, np.zeros(2), method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": 0.02}
-    )
-    return case.scaled(*np.where(free, found.x, 0.0).tolist())
+    free, width = [network.pair_m is None, True], math.log(CURVE_FACTOR) ** 2
+    for _ in range(steps):
+        marks, ratio = Marks.at(network, x, case), (PAIR_STD_M / case.pair_m) ** 2
+        roots = [case.pair_m * np.eye(len(case.marks)), case.curve_m * network.curve_root]
+        slope = [2 * np.sum(root * (marks.inverse @ root)) - 2 * np.sum((root.T @ marks.pull) ** 2) for root in roots]
+        slope[0] += 2 * PAIR_PRIOR_FREEDOM * (1 - ratio)
+        slope[1] += 2 * math.log(case.curve_m / CURVE_STD_M) / width
+        bend = 4 * np.array([[np.sum((one.T @ marks.inverse @ other) ** 2) for other in roots] for one in roots])
+        bend += np.diag([4 * PAIR_PRIOR_FREEDOM * max(ratio, 1.0), 2 / width])
+        step = np.clip(-np.linalg.solve(bend, slope * np.array(free)), -1.0, 1.0) * free
+        case = case.scaled(*step.tolist())
+        if np.abs(step).max() < 0.01:
+            break
+    return case
 
 
 def averaged(found: Solution) -> Solution:
@@ -213,33 +197,24 @@ def averaged(found: Solution) -> Solution:
     marks, weight = Marks.at(network, x, case).window()
     mean, more = _mixed(found, [replace(case, marks=one) for one in marks], weight)
     if network.curve is not None:
-        value = _unlikely_by_spreads(network, x, case)
         # Steps of logarithms of about half of what a survey knows of either.
         steps = [(0.3 * i, 0.4 * k) for i in range(-2, 3) for k in range(-4, 5) if network.pair_m is None or not i]
         cases = [case.scaled(*step) for step in steps]
-        worse = np.array([value(one) for one in cases])
+        worse = np.array([network.at(x, one).unlikely() + _unlikely_spreads(one) for one in cases])
         likely = np.exp(-0.5 * (worse - worse.min()))
-        kept = np.flatnonzero(likely > 1e-3)
-        step, wider = _mixed(found, [cases[k] for k in kept.tolist()], likely[kept] / likely[kept].sum())
+        step, wider = _mixed(found, cases, likely / likely.sum())
         mean, more = mean + step, more + wider
     return replace(found, x=x + mean, chance=weight @ np.array(marks), more=more)
 
 
 def _mixed(found: Solution, cases: Sequence[Case], weight: Floats) -> tuple[Floats, Floats]:
     """Return the mean step over cases, linear, and what their covariance is more than that of one case, not below 0."""
-
-    def solved(case: Case) -> tuple[Floats, Floats]:
-        here = found.network.at(found.x, case)
-        spread = here.covariance()
-        return spread @ (here.jacobian.T @ (here.left / here.std**2) - here.prior @ here.away), spread
-
-    own = solved(found.case)[1]
-    every = [solved(case) for case in cases]
-    steps = np.array([step for step, _ in every])
+    every = [found.network.at(found.x, case) for case in cases]
+    steps = np.array([one.step for one in every])
     mean = weight @ steps
     around = steps - mean
-    wider = sum(w * (spread - own) for w, (_, spread) in zip(weight, every, strict=True)) + (around.T * weight) @ around
-    values, vectors = np.linalg.eigh((wider + wider.T) / 2)
+    wider = sum(w * one.covariance for w, one in zip(weight, every, strict=True)) - found.linear.covariance
+    values, vectors = np.linalg.eigh(wider + (around.T * weight) @ around)
     return mean, (vectors * np.maximum(values, 0.0)) @ vectors.T
 
 
@@ -250,10 +225,6 @@ def solve(network: Network, *, moves: int = 6) -> tuple[Solution, SecondBest | N
     found = min((adjust(network, start, start_m=spread) for spread in spreads), key=least)
     # Once more with the delays that came out: the first guess of places was made without any.
     found = min(found, adjust(network, first_start(network, found.delays)), key=least)
-    wrong = out_of_order(network, found.x)
-    if wrong:
-        start = start_in_order(network, found.x, wrong)
-        found = min(found, adjust(network, start), key=least)
     worse: list[tuple[float, tuple[str, tuple[int, ...]]]] = []
     for _ in range(moves):
         here = unlikelihood(network, found.x, found.case)
@@ -274,44 +245,33 @@ def solve(network: Network, *, moves: int = 6) -> tuple[Solution, SecondBest | N
     return found, SecondBest(name, tags, max(0.0, gap))
 
 
-def optimize_with_marks(network: Network, x: Floats, case: Case, only: int | None = None) -> tuple[float, Floats, Case]:
-    """Return -2 log likelihood, the unknowns and the case with what is likeliest reflected, from a start."""
-    for _ in range(2):
-        x, _ = optimize(network, x, case, only)
-        marks = Marks.at(network, x, case, only).searched()
-        if np.array_equal(marks, case.marks):
-            break
-        case = replace(case, marks=marks)
-        x, _ = optimize(network, x, case, only)
-    return unlikelihood(network, x, case, only), x, case
-
-
 def _other_solutions(
     found: Solution, arrangement: int
 ) -> Iterator[tuple[float, Floats, Case, tuple[str, tuple[int, ...]]]]:
     """Yield other solutions that differ in one arrangement: how likely, unknowns, errors, and who is elsewhere."""
-    network, mine = found.network, found.network.rows_of(arrangement)
-    seats = network.seats(arrangement)
-    if not mine.any():
-        return
-    straight = replace(found.case, marks=found.case.marks & ~mine)
-    seen = [_signature(network, found.x, seats)]
-    here = unlikelihood(network, found.x, found.case, arrangement)
-    for start in other_starts(network, found.x, arrangement):
-        value, x, case = optimize_with_marks(network, start, straight, arrangement)
-        mark = _signature(network, x, seats)
-        if value > here + MAX_WORSE_ALONE or any(float(np.abs(mark - one).max()) < MIN_DIFFERENCE_M for one in seen):
+    network, boards, seats = found.network, found.network.arrangements[arrangement], found.network.seats(arrangement)
+    alone, start = network.alone(arrangement, found.x)
+    mine = network.means.arrangement == arrangement
+    case = replace(found.case, marks=found.case.marks[mine])
+    most, seen = unlikelihood(alone, start, case) + MAX_WORSE_ALONE, [_signature(alone, start)]
+    for points in other_starts(alone.positions_m(start), boards, seed=arrangement):
+        x, own = settle(alone, alone.with_positions(start, points), replace(case, marks=np.zeros_like(case.marks)))
+        mark = _signature(alone, x)
+        if unlikelihood(alone, x, own) > most or any(np.abs(mark - one).max() < MIN_DIFFERENCE_M for one in seen):
             continue
         seen.append(mark)
-        value, x, case = optimize_with_marks(network, x, case)
-        change = np.abs(_signature(network, x, seats) - seen[0]).max(axis=1)
+        marks = found.case.marks.copy()
+        marks[mine] = own.marks
+        moved = network.with_positions(found.x, alone.positions_m(x), seats)
+        x, whole = settle(network, moved, replace(found.case, marks=marks))
+        change = np.abs(_signature(*network.alone(arrangement, x)) - seen[0]).max(axis=1)
         if change.max() >= MIN_DIFFERENCE_M:
-            tags = np.array(network.arrangements[arrangement].tags)[change > max(MIN_DIFFERENCE_M, 0.5 * change.max())]
-            yield value, x, case, (network.arrangements[arrangement].name, tuple(tags.tolist()))
+            tags = np.array(boards.tags)[change > max(MIN_DIFFERENCE_M, 0.5 * change.max())]
+            yield unlikelihood(network, x, whole), x, whole, (boards.name, tuple(tags.tolist()))
 
 
-def _signature(network: Network, x: Floats, seats: Ints) -> Floats:
-    """Return what tells two solutions apart (points, k): distances to all others, and places where a frame is known."""
-    place = network.positions(x)[seats]
+def _signature(alone: Network, x: Floats) -> Floats:
+    """Return what tells solutions of an arrangement apart (points, k): distances, and places where a frame is known."""
+    place = alone.positions_m(x)
     apart = np.linalg.norm(place[:, None] - place, axis=2)
-    return np.hstack([apart, place]) if len(network.known.at) else apart
+    return np.hstack([apart, place]) if alone.known_places else apart

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -18,12 +17,12 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.settings import SurveySettings
 from calib.surveys.checks import likeliest_fault, wrong_orders
 from calib.surveys.knowledge import Knowledge, check_knowledge, load_knowledge
-from calib.surveys.network import DIMENSIONS, Boards, CurvePrior, Known, Network, numbered
-from calib.surveys.outcome import result_of, widened_by
+from calib.surveys.network import DIMENSIONS, Boards, CurvePrior, Network
+from calib.surveys.outcome import in_frames, result_of, widened_by
 from calib.surveys.recordings import LIFT, SurveyData, read_surveys
 from calib.surveys.result import SurveyResult
 from calib.surveys.solution import averaged, solve
-from uwblink.recording.schema import SHAPES, KnownDistance
+from uwblink.recording.schema import SHAPES
 
 MOST_FINDINGS = 0.15
 """Share of the means, as a number of findings, after which no more is looked for."""
@@ -57,7 +56,7 @@ def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, 
         network = network_of(gathered, knowledge, asked.fixed_ns, curve=not asked.delays_only and taken is None)
         found, second = solve(replace(network, pair_m=asked.pair_error_m))
         findings = list(gathered.findings)
-        most = len(findings) + max(1, int(MOST_FINDINGS * len(network.means)))
+        most = len(findings) + max(1, int(MOST_FINDINGS * len(network.means.range_m)))
         while len(findings) < most and (fault := likeliest_fault(found)):
             finding, found = fault
             findings.append(finding)
@@ -67,7 +66,7 @@ def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, 
         if findings and not asked.regardless:
             text = "; ".join(one.text for one in findings)
             raise UnanswerableError(f"{text} (`regardless` surveys all the same)")
-        found = averaged(found)
+        found = averaged(in_frames(found))
         if taken is not None:
             found = widened_by(found, taken)
         return result_of(gathered, found, second, tuple(findings), taken, asked)
@@ -110,73 +109,35 @@ def _less_curve(gathered: SurveyData, curve: Curve) -> SurveyData:
 
 def network_of(gathered: SurveyData, knowledge: Knowledge, fixed_ns: Mapping[int, float], *, curve: bool) -> Network:
     """Return the network of means and of what is known beside them."""
-    means = gathered.means
-    tags = [sorted(set(means.ends[means.arrangement == k].ravel().tolist())) for k in range(len(gathered.arrangements))]
-    there = {one.name: set(own) for one, own in zip(gathered.arrangements, tags, strict=True)}
-    check_knowledge(knowledge, there)
-    missing = sorted(set(fixed_ns) - set(means.tags()))
+    means, arrangements = gathered.means, list[Boards]()
+    tags = [tuple(np.unique(means.ends[means.arrangement == k]).tolist()) for k in range(len(gathered.arrangements))]
+    check_knowledge(knowledge, {one.name: set(own) for one, own in zip(gathered.arrangements, tags, strict=True)})
+    everyone = tuple(np.unique(means.ends).tolist())
+    missing = sorted(set(fixed_ns) - set(everyone))
     if missing:
         raise BadInputError(f"tag {missing[0]} is not in the recordings", parameter="fixed_ns")
     used = [k for k, own in enumerate(tags) if own]
-    arrangements = tuple(_boards(gathered, knowledge, k, tuple(tags[k])) for k in used)
-    distances = (*gathered.distances, *knowledge.distances)
+    for k in used:
+        one, order = gathered.arrangements[k], knowledge.order_of(gathered.arrangements[k])
+        boards = Boards(one.name, DIMENSIONS[knowledge.shape_of(one)], tags[k], order)
+        heights = {
+            p.position_m[2] for p in knowledge.positions if p.arrangement in ("", one.name) and p.tag in boards.tags
+        }
+        for wrong, text in (
+            (heights and boards.dimensions == 1, "positions are for a plane or for space; on a line give distances"),
+            (len(heights) > 1 and boards.dimensions == 2, "a plane is that of x and y; its positions differ in z"),
+            (set(order) - set(tags[k]), "its order of boards has a tag that does not range there"),
+            (len(set(order)) < len(order), "its order of boards has a tag twice"),
+        ):
+            if wrong:
+                raise BadInputError(f"{one.name}: {text}", parameter="known")
+        arrangements.append(boards)
     return Network(
         means=replace(means, arrangement=np.searchsorted(used, means.arrangement)),
-        arrangements=arrangements,
-        tags=tuple(means.tags()),
-        known=_known(arrangements, knowledge, distances),
+        arrangements=tuple(arrangements),
+        tags=everyone,
+        distances=(*gathered.distances, *knowledge.distances),
+        positions=knowledge.positions,
         fixed_ns=dict(fixed_ns),
         curve=CurvePrior.at(means.lifted) if curve else None,
-    )
-
-
-def _boards(gathered: SurveyData, knowledge: Knowledge, number: int, tags: tuple[int, ...]) -> Boards:
-    one = gathered.arrangements[number]
-    shape, order = knowledge.shape_of(one), knowledge.order_of(one)
-    heights = {p.position_m[2] for p in knowledge.positions if p.arrangement in ("", one.name) and p.tag in tags}
-    if heights and shape == "line":
-        raise BadInputError(
-            f"{one.name}: positions are for a plane or for space; on a line give distances", parameter="known"
-        )
-    if shape == "plane" and len(heights) > 1:
-        raise BadInputError(f"{one.name}: a plane is that of x and y; its positions differ in z", parameter="known")
-    strangers = sorted(set(order) - set(tags))
-    if strangers or len(set(order)) < len(order):
-        who = f"tag {strangers[0]}, which does not range there" if strangers else "a tag twice"
-        raise BadInputError(f"{one.name}: its order of boards has {who}", parameter="known")
-    return Boards(one.name, DIMENSIONS[shape], tags, order)
-
-
-def _known(arrangements: tuple[Boards, ...], knowledge: Knowledge, distances: tuple[KnownDistance, ...]) -> Known:
-    """Return what is known as columns. What holds in several arrangements is one reading, not several."""
-    number = numbered(arrangements)
-    lengths, places = [], []
-    for statement, d in enumerate(distances):
-        held = [
-            k
-            for k, boards in enumerate(arrangements)
-            if d.arrangement in ("", boards.name) and {d.first, d.second} <= set(boards.tags)
-        ]
-        sigma = d.sigma_m * math.sqrt(len(held))
-        lengths += [(number[k, d.first], number[k, d.second], d.distance_m, sigma, statement) for k in held]
-    for p in knowledge.positions:
-        held = [
-            k for k, boards in enumerate(arrangements) if p.arrangement in ("", boards.name) and p.tag in boards.tags
-        ]
-        for k in held:
-            height = 0.0 if arrangements[k].dimensions == 2 else p.position_m[2]
-            places.append((number[k, p.tag], *p.position_m[:2], height, p.sigma_m * math.sqrt(len(held))))
-    ends, at = np.array(lengths).reshape(-1, 5), np.array(places).reshape(-1, 5)
-    return Known(
-        ends=ends[:, :2].astype(np.int64),
-        distance_m=ends[:, 2],
-        distance_std_m=ends[:, 3],
-        statement=ends[:, 4].astype(np.int64),
-        at=at[:, 0].astype(np.int64),
-        position_m=at[:, 1:4],
-        position_std_m=at[:, 4],
-        names=tuple(
-            f"the known distance of {d.first} and {d.second}{' in ' + d.arrangement if d.arrangement else ''}"
-            for d in distances
-        ),
     )

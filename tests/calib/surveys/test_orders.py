@@ -9,7 +9,7 @@ import calib
 from benchmarks.standing import standing_boards
 from benchmarks.surveys import orders_of
 from calib.errors import BadInputError, UnanswerableError
-from calib.surveys.starts import exchanged_boards, in_said_order, is_in_order, line_coordinates
+from calib.surveys.starts import exchanged_boards, is_in_order
 
 FIVE = standing_boards(4, boards=5, arrangements=5, reflected=0.05, each=20)
 
@@ -68,14 +68,6 @@ def test_an_exchange_that_is_another_one_from_the_other_end_names_both():
 )
 def test_boards_side_by_side_stand_in_either_order(coordinates, in_order):
     assert is_in_order(np.array(coordinates)) is in_order
-
-
-def test_points_are_put_in_the_order_that_is_said():
-    points = np.array([[0.0, 0, 0], [3.0, 0, 0], [1.0, 0, 0]])
-    near, far = in_said_order(points, (4, 7, 9), (4, 7, 9))
-    assert near[:, 0].tolist() == [0.0, 1.0, 3.0]
-    assert far[:, 0].tolist() == [3.0, 1.0, 0.0]
-    assert is_in_order(line_coordinates(near, (4, 7, 9), (4, 7, 9)))
 
 
 @pytest.mark.parametrize("orders", [{"1": (1, 2, 9)}, {"1": (1, 2, 2)}, {"Z": (1, 2)}])

@@ -25,8 +25,8 @@ def linear():
     world = standing_boards(11, boards=4, arrangements=3, reflected=0.12)
     knowledge = Knowledge(shape="line")
     network = network_of(read_surveys(world.ranges, knowledge), knowledge, {}, curve=False)
-    x, free = first_start(network), network.free()
-    rows = len(network.means)
+    x, free = first_start(network), network.layout.free()
+    rows = len(network.means.range_m)
     left, jacobian = network.linear(x)
     prior, centre = network.priors(CURVE_M).precision(), network.layout.start()
     spread = jacobian[:, free] @ np.linalg.inv(prior[np.ix_(free, free)]) @ jacobian[:, free].T

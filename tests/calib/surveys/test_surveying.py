@@ -361,7 +361,7 @@ def test_mistakes_in_the_file_of_what_is_known_are_one_line(tmp_path, text, mess
         ({"known": calib.Knowledge(shape="ring")}, "ring"),
         ({"known": calib.Knowledge(shapes={"9": "line"})}, "names an arrangement '9'"),
         ({"known": calib.Knowledge(distances=(KnownDistance(1, 9, 1.0, 0.1),))}, "do not range"),
-        ({"known": calib.Knowledge(distances=(KnownDistance(1, 2, math.nan, 0.1),))}, "expected more than 0"),
+        ({"known": calib.Knowledge(distances=(KnownDistance(1, 2, math.nan, 0.1),))}, "more than 0"),
         ({"known": calib.Knowledge(distances=(KnownDistance(1, 2, 1.0, 1e300),))}, "or more"),
         ({"known": calib.Knowledge(distances=(KnownDistance(1, 2, 1.0, 1e-300),))}, "or more"),
         ({"known": calib.Knowledge(distances=(KnownDistance(1, 2, 1e200, 0.1),))}, r"up to 1e\+06 m"),
