@@ -10,7 +10,6 @@ import calib
 from benchmarks.worlds import CLEAN, Recipe, make
 from calib.calibration.power_curves import ALPHA_DBM
 from calib.errors import BadInputError
-from tests.shared_data import shared
 
 
 def halves(ranges):
@@ -93,28 +92,6 @@ def test_a_power_beyond_the_curve_widens_the_total():
     np.testing.assert_allclose(total**2 - total[0] ** 2, (slope * np.array([0, 0.5, 2.0]) * high) ** 2, atol=1e-9)
     width = np.ptp(known.quantiles(ranges), axis=1)
     assert width[2] / width[0] == pytest.approx(total[2] / total[0], rel=1e-9)
-
-
-@pytest.mark.parametrize("held", [0, 1])
-def test_halves_of_the_samples_of_the_paper(held):
-    """Half of them predicts the errors of the other half: z-scores, intervals, and a mean of nothing."""
-    samples = np.loadtxt(shared("icra2023_bias_fpp.csv"), delimiter=",", skiprows=1)
-    # The file is sorted by power and has no times.
-    time = np.random.default_rng(3).permutation(len(samples)) * 5_000_000
-    ranges = calib.Ranges.from_arrays(
-        10 + samples[:, 1],
-        initiator=1,
-        target=2,
-        fpp1_dbm=ALPHA_DBM + 10 * np.log10(samples[:, 0]),
-        truth_m=10.0,
-        time_ns=time,
-    )
-    every_second = np.arange(len(samples)) % 2 == held
-    known = calib.fit(ranges[~every_second], fixed_ns={1: 0.0}).calibration
-    found = calib.evaluate(ranges[every_second], known).overall
-    assert 0.95 < found.total_std < 1.08
-    assert 0.94 < found.inside_95 < 0.96
-    assert abs(found.total_mean) < 0.03
 
 
 @pytest.mark.parametrize("seed", [20_002, 20_003])

@@ -87,14 +87,6 @@ def test_groups_that_do_not_fit_the_data_are_refused():
         lonely.apply(r)
 
 
-def test_a_group_with_too_few_ranges_for_a_curve_is_named():
-    r = ranges(3000)
-    rare = (r.initiator != 7) & (r.target != 7)
-    rare[np.flatnonzero(~rare)[:15]] = True
-    with pytest.raises(UnanswerableError, match="group 'b' has too few ranges"):
-        fit(r[rare], groups={"a": (1, 2, 3), "b": (7,)})
-
-
 def test_the_smallest_delays_only_when_asked():
     r = ranges(3000)
     pair = r[(r.initiator == 1) & (r.target == 2)]
