@@ -304,9 +304,6 @@ def _provenance(
             "heights": sorted({scene.moving[body] for body in scene.heights.body.tolist()}),
         },
         "distance_std_m": judgement.distance_std_m,
-        "absorbed": judgement.absorbed,
-        "used": top.used,
-        "jerk_m_s3": top.jerk_m_s3,
         "reference_power_dbm": reference_dbm,
         "gauge": f"the bias curve{' was kept, and' if flight.curve_from else ''} is zero at {reference_dbm:g} dBm; the "
         "delays carry the constant",

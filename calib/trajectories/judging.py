@@ -49,14 +49,12 @@ residual exceeds so many standard errors and so many metres."""
 class Judgement:
     """The verdict on the delays of `tags` that are not pinned; `covariance_ns2` (tags, tags) is their covariance.
 
-    `absorbed` is the largest factor, over all directions of delays, by which unknown distances increase the variance.
     `distance_std_m` is the root mean square standard error of the distances. `sentences` name contradictions.
     """
 
     tags: tuple[int, ...]
     verdict: Verdict
     covariance_ns2: Floats
-    absorbed: float
     distance_std_m: float
     by_geometry_alone: bool
     sentences: tuple[str, ...]
@@ -112,7 +110,6 @@ def judge_delays(found: KnownDistances, top: Search) -> Judgement:
         tags=tags,
         verdict=verdict_on(covariance, with_truth, tags),
         covariance_ns2=covariance,
-        absorbed=_absorbed(optimum.covariance[:, own][own], with_truth),
         distance_std_m=_distance_std(top),
         by_geometry_alone=by_geometry_alone,
         sentences=(*_of_motion(top), *_of_tapes(top)),
@@ -139,16 +136,6 @@ def verdict_on(covariance: Floats, with_truth: Floats, tags: Sequence[int]) -> V
     information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) + np.eye(len(covariance)) / PRIOR_NS**2
     unknowns = [Unknown("delay", str(tag), scale) for tag, scale in zip(tags, guess.tolist(), strict=True)]
     return judge((information + information.T) / 2, unknowns, loosest=LOOSEST)
-
-
-def _absorbed(covariance: Floats, with_truth: Floats) -> float:
-    """Return the largest ratio of two covariances over all directions."""
-    if not len(with_truth):
-        return 1.0
-    values, vectors = np.linalg.eigh(with_truth)
-    kept = values > 1e-9 * values[-1]
-    root = vectors[:, kept] / np.sqrt(values[kept])
-    return float(np.linalg.eigvalsh(root.T @ covariance @ root)[-1])
 
 
 def _distance_std(top: Search) -> float:

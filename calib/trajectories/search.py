@@ -278,11 +278,6 @@ class Search:
         self.values |= {kind: found.x[where] for kind, where in layout.where.items()}
         self.weights |= priors.by_key()
 
-    @property
-    def jerk_m_s3(self) -> float:
-        """Return the standard deviation of the jerk of the bodies."""
-        return float(self.weights["path", 0] ** -0.5)
-
 
 def _as_known(unknown: Unknown, values: Floats) -> Unknown:
     """Return a block of unknowns with fixed values and prior weights."""
