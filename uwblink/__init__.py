@@ -11,6 +11,12 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
+    from uwblink import boards as boards
+    from uwblink import exporters as exporters
+    from uwblink import importers as importers
+    from uwblink import recording as recording
+    from uwblink import streaming as streaming
+    from uwblink import wire as wire
     from uwblink.boards.board import Board
     from uwblink.boards.listeners import Heard, Listener
     from uwblink.boards.ranging_plan import RangingPlan

@@ -10,6 +10,10 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
+    from uwbsim import pages as pages
+    from uwbsim import protocols as protocols
+    from uwbsim import scenario as scenario
+    from uwbsim import twins as twins
     from uwbsim.boards.server import Server, load_faults
     from uwbsim.boards.virtual_board import VirtualPorts
     from uwbsim.errors import ParameterError, ScenarioError, UwbsimError

@@ -10,7 +10,6 @@ import contextlib
 import errno
 import os
 import select
-import selectors
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -141,32 +140,27 @@ class SerialPorts:
 
     def __init__(self) -> None:
         """Start the clock; no port is open."""
-        self._selector = selectors.SelectSelector()
-        self._pyserial: list[SerialPort] = []
+        self._open: list[SerialPort] = []
         # No change of the wall clock moves the times of a recording.
         self._epoch_ns = time.time_ns() - _since_boot_ns()
 
     def open(self, name: str) -> SerialPort:
         """Open a port and watch it; raises one of the `PortError`s."""
         port = SerialPort(name)
-        if port.fileno is None:
-            self._pyserial.append(port)
-        else:
-            self._selector.register(port.fileno, selectors.EVENT_READ, port)
+        self._open.append(port)
         return port
 
     def close(self, port: Transport) -> None:
         """Close a port that was opened here."""
-        if isinstance(port, SerialPort) and port.fileno is not None:
-            self._selector.unregister(port.fileno)
-        self._pyserial = [p for p in self._pyserial if p is not port]
+        self._open = [one for one in self._open if one is not port]
         port.close()
 
     def wait(self, timeout_s: float) -> Sequence[SerialPort]:
         """Return ports at which bytes may be waiting; those without a descriptor must be asked again and again."""
-        if self._pyserial:
-            timeout_s = min(timeout_s, POLL_S)
-        return [key.data for key, _ in self._selector.select(max(timeout_s, 0.0))] + self._pyserial
+        polled = [port for port in self._open if port.fileno is None]
+        watched = {port.fileno: port for port in self._open if port.fileno is not None}
+        timeout_s = min(timeout_s, POLL_S) if polled else timeout_s
+        return [watched[fileno] for fileno in select.select(watched, [], [], max(timeout_s, 0.0))[0]] + polled
 
     def now_s(self) -> float:
         """Return the monotonic clock in seconds."""
@@ -200,37 +194,27 @@ def _opened(name: str) -> Any:
 
 
 def _explained(name: str, error: Exception) -> PortError:
-    """Return the error of a port that cannot be opened, by the number of the error or by its text."""
-    code, text = getattr(error, "errno", None), str(error)
-
-    def matches(words: str, *codes: int) -> bool:
-        return code in codes or words in text
-
-    missing, forbidden = matches("No such file", errno.ENOENT), matches("Permission denied", errno.EACCES, errno.EPERM)
-    busy = matches("exclusively lock", errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK)
-    group, folder = _group(name), name.rstrip("/")
-    reasons: tuple[tuple[bool, type[PortError], str], ...] = (
-        (missing, PortMissingError, "no such port; `uwblink ports` lists the boards that are plugged in"),
-        (
-            forbidden,
-            PortPermissionError,
-            f"permission denied; join the group {group} (sudo usermod -aG {group} $USER) and log in again",
-        ),
-        (busy, PortBusyError, "another process has this port open; close it first"),
-        (os.path.isdir(name), PortError, f"is a folder; name the ports in it, as with {folder}/*"),
-        (matches("Inappropriate ioctl", errno.ENOTTY) or "configure port" in text, PortError, "not a serial port"),
-        (True, PortError, f"cannot be opened ({text})"),
-    )
-    kind, reason = next((kind, reason) for applies, kind, reason in reasons if applies)
-    return kind(f"{folder if os.path.isdir(name) else name}: {reason}")
-
-
-def _group(name: str) -> str:
-    """The group that owns a device, "dialout" where that cannot be found out."""
+    """Return the error of a port that cannot be opened."""
+    code = errno.EISDIR if os.path.isdir(name) else getattr(error, "errno", None)
+    if "configure port" in str(error):
+        code = errno.ENOTTY
     try:
-        return Path(name).group()
+        group = Path(name).group()
     except (OSError, KeyError, NotImplementedError):
-        return "dialout"
+        group = "dialout"
+    denied = f"permission denied; join the group {group} (sudo usermod -aG {group} $USER) and log in again"
+    busy = "another process has this port open; close it first"
+    reasons: dict[int | None, tuple[type[PortError], str]] = {
+        errno.ENOENT: (PortMissingError, "no such port; `uwblink ports` lists the boards that are plugged in"),
+        errno.EACCES: (PortPermissionError, denied),
+        errno.EPERM: (PortPermissionError, denied),
+        errno.EBUSY: (PortBusyError, busy),
+        errno.EAGAIN: (PortBusyError, busy),
+        errno.EISDIR: (PortError, f"is a folder; name the ports in it, as with {name.rstrip('/')}/*"),
+        errno.ENOTTY: (PortError, "not a serial port"),
+    }
+    kind, reason = reasons.get(code, (PortError, f"cannot be opened ({error})"))
+    return kind(f"{name.rstrip('/')}: {reason}")
 
 
 def wait_until(due_s: float, stop: Callable[[], bool]) -> bool:

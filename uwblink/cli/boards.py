@@ -14,6 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
+from rich.live import Live
+from rich.markup import escape
+from rich.table import Table
 
 import uwblink
 from uwblink.cli.shared import (
@@ -40,16 +44,12 @@ from uwblink.errors import PlanError, RangingFailedError, RecordingError, Refuse
 from uwblink.output import check_output
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from uwblink.boards import Correction, LivePage, Progress
     from uwblink.wire import RangeReport
 
 
 def _plugged(incomplete: str) -> list[str]:
-    from uwblink.boards import boards_ports
-
-    return starting(incomplete, (port.device for port in boards_ports()))
+    return starting(incomplete, (port.device for port in uwblink.boards.boards_ports()))
 
 
 Port = Annotated[str, typer.Argument(help="Serial port, link to one, or pyserial URL.", autocompletion=_plugged)]
@@ -98,14 +98,12 @@ def ports(
 
     Nothing is written to a port without --probe.
     """
-    from uwblink.boards import boards_ports
-
-    plugged = {port.device: port for port in boards_ports()}
+    plugged = {port.device: port for port in uwblink.boards.boards_ports()}
     rows: list[dict[str, Any]] = [
         {
             "device": name,
             "description": getattr(plugged.get(name), "description", ""),
-            "serial_number": getattr(plugged.get(name), "serial_number", None),
+            "uwblink.boards.serial_number": getattr(plugged.get(name), "uwblink.boards.serial_number", None),
         }
         for name in names or plugged
     ]
@@ -128,16 +126,13 @@ def ports(
 
 def info(port: Port, as_json: AsJson = False) -> None:
     """Print a board's id and longest frame."""
-    from uwblink.boards import serial_number
-    from uwblink.wire import GetMaxFrame, MaxFrameReport
-
     with uwblink.Board.open(port) as board:
-        longest = board.request(GetMaxFrame())
+        longest = board.request(uwblink.wire.GetMaxFrame())
         facts = {
             "port": port,
             "board": board.id,
-            "longest_frame_bytes": longest.length if isinstance(longest, MaxFrameReport) else None,
-            "usb_serial_number": serial_number(port),
+            "longest_frame_bytes": longest.length if isinstance(longest, uwblink.wire.MaxFrameReport) else None,
+            "usb_serial_number": uwblink.boards.serial_number(port),
         }
     text = (
         f"{port}: board {facts['board']}, frames of up to {facts['longest_frame_bytes']} bytes, "
@@ -164,15 +159,13 @@ def twr(
                 report = board.range(target, protocol=protocol)
             except RangingFailedError as error:
                 failures.append(error)
-                if not ranges and len(failures) >= 3:
+                if not ranges and len(failures) >= min(3, exchanges):
                     raise
                 continue
             ranges.append(report.range_m)
             row = {"initiator": initiator, "target": target, **_fields(report)}
             typer.echo(json.dumps(row) if as_json else _line(initiator, report))
         interrupted = stop()
-    if failures and not ranges and not interrupted:
-        raise failures[-1]
     if as_json or exchanges > 1:
         typer.echo(_summary_of(ranges, len(failures), exchanges, as_json=as_json))
     if interrupted:
@@ -258,9 +251,7 @@ def cir(
         report, response = board.cir(target, protocol=protocol)
         initiator = board.id
     if plot:
-        from uwblink.boards import plot_cir
-
-        plot_cir(response, Path(plot), force=force)
+        uwblink.boards.plot_cir(response, Path(plot), force=force)
     index = response.first_path_milli / 1000
     if as_json:
         typer.echo(json.dumps({"first_path_index": index, "magnitudes": list(response.magnitudes), **_fields(report)}))
@@ -370,15 +361,12 @@ def stream(
     Without --plan, every two boards range. Ends after --duration, else with the recording or Ctrl-C. Without
     --antenna-delays, and without those of a plan, 16436 ticks in each board are assumed.
     """
-    from uwblink.boards import Progress
-    from uwblink.streaming import FoxgloveServer, RangeListener, UdpSender
-
     of_boards = not (len(source) == 1 and source[0].endswith(".uwb"))
     if not of_boards and (plan or rate or output or antenna_delays):
         raise PlanError(
             f"{source[0]}: a recording takes no --plan, --rate, --antenna-delays and --output; they are for boards"
         )
-    seen, count = Progress(), 0
+    seen, count = uwblink.boards.Progress(), 0
     senders: list[Callable[[uwblink.StreamedRange], object]] = (
         [] if quiet else [lambda found: typer.echo(found.to_json())]
     )
@@ -392,9 +380,9 @@ def stream(
     with ExitStack() as stack:
         stop = stack.enter_context(interrupts())
         if udp is not None:
-            senders.append(stack.enter_context(UdpSender(udp)).send)
+            senders.append(stack.enter_context(uwblink.streaming.UdpSender(udp)).send)
         if foxglove is not None:
-            server = stack.enter_context(FoxgloveServer(foxglove))
+            server = stack.enter_context(uwblink.streaming.FoxgloveServer(foxglove))
             typer.echo(f"foxglove: {server.url}", err=True)
             senders.append(server.send)
         chosen = _plan(plan, rate, antenna_delays) if of_boards else None
@@ -402,7 +390,7 @@ def stream(
         duration_s = duration or math.inf
         try:
             if output and chosen:
-                told = [seen, RangeListener(send_on, correct)]
+                told = [seen, uwblink.streaming.RangeListener(send_on, correct)]
                 uwblink.record(source, output, chosen, duration_s=duration_s, stop=stop, listeners=told, force=force)
             else:
                 ranges = uwblink.stream(
@@ -427,32 +415,27 @@ def _plan(
     path: Path | None, rate: float | None, antenna_delays: Path | None, pairs: str | tuple[()] = "all"
 ) -> uwblink.RangingPlan:
     """Return the plan of a file, or one for `pairs`; raises `PlanError` if antenna delays are given twice."""
-    from uwblink.boards import load_plan
-    from uwblink.recording import load_antenna_delays
-
-    chosen = load_plan(path) if path else uwblink.RangingPlan("all" if pairs == "all" else ())
+    chosen = uwblink.boards.load_plan(path) if path else uwblink.RangingPlan("all" if pairs == "all" else ())
     if antenna_delays and chosen.antenna_delays:
         raise PlanError(
             f"{antenna_delays}: the plan has [antenna_delays], too; leave one of them out", parameter="antenna_delays"
         )
     if antenna_delays:
-        chosen = replace(chosen, antenna_delays=load_antenna_delays(antenna_delays))
+        chosen = replace(chosen, antenna_delays=uwblink.recording.load_antenna_delays(antenna_delays))
     return replace(chosen, rate_hz=rate) if rate else chosen
 
 
 def _correction(path: Path | None, plan: uwblink.RangingPlan | None, recording: str | None = None) -> Correction | None:
     """Return the correction of a calibration, and warn if its antenna delays differ from those of the ranges."""
-    from uwblink.boards import delays_warning, load_correction
-    from uwblink.recording import delays_in_meta
-
     if path is None:
         return None
-    correct = load_correction(path)
+    correct = uwblink.boards.load_correction(path)
     if plan is not None:
-        warning = delays_warning(correct, plan.delays())
+        warning = uwblink.boards.delays_warning(correct, plan.delays())
     else:
         with uwblink.Recording.open(recording or "") as opened:
-            warning = delays_warning(correct, delays_in_meta(opened.meta()), [t.tag for t in opened.tags()])
+            delays, tags = uwblink.recording.delays_in_meta(opened.meta()), [one.tag for one in opened.tags()]
+        warning = uwblink.boards.delays_warning(correct, delays, tags)
     if warning:
         typer.echo(f"warning: {path}: {warning}", err=True)
     return correct
@@ -468,9 +451,7 @@ def _ids(text: str) -> tuple[int, ...]:
 
 def _page(path: Path, calibration: Path | None, port: int, plan: uwblink.RangingPlan) -> LivePage:
     """Return the served live page."""
-    from uwblink.boards import LivePage
-
-    page = LivePage(path, correct=_correction(calibration, plan), port=port)
+    page = uwblink.boards.LivePage(path, correct=_correction(calibration, plan), port=port)
     typer.echo(f"live page: {page.url}", err=True)
     return page
 
@@ -479,9 +460,6 @@ def _page(path: Path, calibration: Path | None, port: int, plan: uwblink.Ranging
 def _watcher() -> Iterator[Callable[[Progress], None]]:
     """Show a live table on a terminal, and a line every two seconds elsewhere."""
     if sys.stderr.isatty():
-        from rich.console import Console
-        from rich.live import Live
-
         with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live:
             yield lambda progress: live.update(_progress_table(progress), refresh=True)
         return
@@ -501,9 +479,6 @@ def _watcher() -> Iterator[Callable[[Progress], None]]:
 
 def _progress_table(progress: Progress) -> Table:
     """Return a recorder's progress as a table: rate and success of each pair, last range and power, faults."""
-    from rich.markup import escape
-    from rich.table import Table
-
     table = Table(title=str(progress))
     for name in ("pair", "rate (Hz)", "success", "range (m)", "FPP (dBm)"):
         table.add_column(name, justify="right")

@@ -8,6 +8,9 @@ from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 import uwblink
 from uwblink.cli import boards
@@ -22,7 +25,6 @@ from uwblink.cli.shared import (
     epilog,
     new_app,
     output,
-    plain,
     print_json,
     print_result,
     waiting,
@@ -32,22 +34,12 @@ from uwblink.errors import ImportTableError
 from uwblink.output import check_output, write_text
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from uwblink.importers import Importer
     from uwblink.recording import Summary
 
 
-def _importers() -> Any:
-    from uwblink.importers import IMPORTERS
-
-    return IMPORTERS
-
-
 def _exporters() -> list[str]:
-    from uwblink.exporters import EXPORTERS
-
-    return list(EXPORTERS)
+    return list(uwblink.exporters.EXPORTERS)
 
 
 class ImportGroup(Group):
@@ -55,13 +47,13 @@ class ImportGroup(Group):
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the names of the importers, and `guess`."""
-        return [*_importers(), *super().list_commands(ctx)]
+        return [*uwblink.importers.IMPORTERS, *super().list_commands(ctx)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a command by its name, None if there is none."""
-        if cmd_name not in _importers():
+        if cmd_name not in uwblink.importers.IMPORTERS:
             return super().get_command(ctx, cmd_name)
-        row: Importer = _importers()[cmd_name]
+        row: Importer = uwblink.importers.IMPORTERS[cmd_name]
         source = f"measured{row.suffixes[0]}" if row.suffixes else "folder"
         app = typer.Typer(add_completion=False)
         add(app, _importing(row), f"uwblink import {row.name} {source} -o measured.uwb", name=cmd_name)
@@ -106,10 +98,8 @@ def _importing(row: Importer) -> Callable[..., None]:
     """Return the command of an importer. Typer reads its parameters from the annotations, which depend on the row."""
 
     def run(table: Any, output: Path, map_file: Path | None = None, force: bool = False) -> None:
-        from uwblink.importers import import_file
-
         with waiting("importing") as say:
-            done = import_file(
+            done = uwblink.importers.import_file(
                 table,
                 output,
                 importer=row.name,
@@ -128,7 +118,7 @@ def _importing(row: Importer) -> Callable[..., None]:
     several = typer.Argument(help=f"{what} Several are one table.")
     one = typer.Argument(help=what)
     command = run if row.map_help else without_map
-    command.__doc__ = plain(row.help)
+    command.__doc__ = escape(row.help)
     command.__annotations__ |= {
         "table": Annotated[Path, one] if row.read_all is None else Annotated[list[Path], several],
         "output": Annotated[Path, output("Recording to write (.uwb).")],
@@ -150,16 +140,11 @@ def show(
     if as_json:
         print_json(summary.to_dict())
         return
-    from rich.console import Console
-
     print_summary(summary, Console(highlight=False))
 
 
 def print_summary(summary: Summary, console: Console) -> None:
     """Print a summary; text from files and boards is escaped, because it can have markup and control characters."""
-    from rich.markup import escape
-    from rich.table import Table
-
     console.print(escape(summary.headline()))
     for header, *rows in summary.tables():
         table = Table(*header)
@@ -185,10 +170,8 @@ def export(
     force: Force = False,
 ) -> None:
     """Write a recording in a format that other programs read."""
-    from uwblink.exporters import export_recording
-
     with waiting("exporting"):
-        written = export_recording(recording, output, to=to, force=force)
+        written = uwblink.exporters.export_recording(recording, output, to=to, force=force)
     for name, rows in written.items():
         typer.echo(f"{output / name}: {rows} rows")
 
@@ -207,14 +190,14 @@ def poses(
     force: Force = False,
 ) -> None:
     """Add poses of motion capture to a recording; --force replaces its poses."""
-    from uwblink.importers import add_poses
-
     sources: Any = Path(source[0])
     if len(source) > 1 or ("=" in source[0] and not sources.exists()):
         sources = {name: Path(file) for name, file in _by_body("from", "FILE", source).items()}
     topics = _by_body("topic", "TOPIC", topic) if topic else None
     with waiting("adding poses"):
-        found = add_poses(recording, sources, offset=offset, tags_from=tags, body=body, topics=topics, force=force)
+        found = uwblink.importers.add_poses(
+            recording, sources, offset=offset, tags_from=tags, body=body, topics=topics, force=force
+        )
     typer.echo(
         f"{recording}: {found.poses} poses of {', '.join(found.bodies)}, offset {found.offset_s:+.4f} s; "
         f"{found.covered} of {found.exchanges} exchanges have a true distance"
@@ -242,13 +225,11 @@ def replay(
     force: Force = False,
 ) -> None:
     """Decode the stored bytes of boards again, or play them back on pseudo-terminals."""
-    from uwblink.boards import decode_again, play, rewrite, summarize
-
     if output:
         check_output(output, force=force, recording=True)
     with uwblink.Recording.open(recording) as opened:
         if serve:
-            played = play(
+            played = uwblink.boards.play(
                 opened,
                 lambda names: typer.echo("\n".join(f"{was} plays at {now}" for was, now in names.items())),
                 speed=speed,
@@ -257,10 +238,10 @@ def replay(
             typer.echo(f"{played} pieces played")
             return
         with waiting("decoding"):
-            decoded = decode_again(opened)
-            summary = summarize(opened, decoded)
+            decoded = uwblink.boards.decode_again(opened)
+            summary = uwblink.boards.summarize(opened, decoded)
             if output:
-                rewrite(opened, decoded, output, force=force)
+                uwblink.boards.rewrite(opened, decoded, output, force=force)
     lines = [f"{summary['messages']} messages, {summary['skipped_bytes']} bytes skipped"]
     lines += [
         f"  {table}: {summary[table]['decoded']} decoded now, {summary[table]['stored']} in the recording"

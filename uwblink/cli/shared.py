@@ -23,6 +23,9 @@ from types import FrameType
 from typing import Annotated, Any, Final, NoReturn, get_type_hints
 
 import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from typer.core import TyperCommand, TyperGroup
 
 from uwblink import __version__
@@ -209,16 +212,7 @@ def apart(command: Callable[..., None]) -> Callable[..., None]:
 def epilog(*examples: str) -> str | None:
     """Return examples as an epilog, a line each; None without any."""
     heads = ["Example:" if len(examples) == 1 else "Examples:"]
-    return "\n".join([*heads, *(f"  {plain(one)}" for one in examples)]) if examples else None
-
-
-def plain(text: str) -> str:
-    """Return a text with its markup escaped; rich is loaded only if there is a bracket."""
-    if "[" not in text:
-        return text
-    from rich.markup import escape
-
-    return escape(text)
+    return "\n".join([*heads, *(f"  {escape(one)}" for one in examples)]) if examples else None
 
 
 def choice(*names: str, more: Callable[[], Iterable[str]] | None = None) -> dict[str, Any]:
@@ -436,10 +430,6 @@ def waiting(what: str) -> Iterator[Callable[[str | float], None]]:
     if not sys.stderr.isatty():
         yield lambda _: None
         return
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.progress import Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
-
     columns = (SpinnerColumn("line"), TextColumn("{task.description}"), TaskProgressColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as line:
         task = line.add_task(escape(what), total=None)

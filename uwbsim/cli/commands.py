@@ -8,6 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
 
 import uwbsim
 from uwblink.cli import shared
@@ -101,11 +104,9 @@ def run(
 
 def _programmed(scenario: uwbsim.Scenario, path: Path | None) -> uwbsim.Scenario:
     """Return a scenario with the antenna delays of a file programmed into its tags."""
-    from uwbsim.scenario import with_antenna_delays
-
     if path is None:
         return scenario
-    return scenario.model_copy(update={"tags": with_antenna_delays(scenario.tags, path)})
+    return scenario.model_copy(update={"tags": uwbsim.scenario.with_antenna_delays(scenario.tags, path)})
 
 
 def scenarios(
@@ -118,13 +119,11 @@ def scenarios(
     force: Force = False,
 ) -> None:
     """List the shipped scenarios, or copy them."""
-    from uwbsim.scenario import copy_scenarios, listed
-
     if output is not None:
-        for path in copy_scenarios(names or (), output, force=force):
+        for path in uwbsim.scenario.copy_scenarios(names or (), output, force=force):
             typer.echo(path)
         return
-    found = listed(names or ())
+    found = uwbsim.scenario.listed(names or ())
     print_result(found, "\n".join(f"{name}\n    {title}" for name, title in found.items()), as_json=as_json)
 
 
@@ -205,35 +204,29 @@ def compare(
     force: Force = False,
 ) -> None:
     """Simulate ranges of every protocol in the same random world, and compare their errors and costs."""
-    from uwbsim.pages import COLUMNS, FILES, write_comparison
-
     rows = _rows(protocols)
     loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
-    check_folder(output, FILES, force=force)
+    check_folder(output, uwbsim.pages.FILES, force=force)
     with waiting(loaded.run.name) as report:
         found = uwbsim.compare(loaded, rows, count, report)
-    write_comparison(found, output, force=force)
+    uwbsim.pages.write_comparison(found, output, force=force)
     if as_json:
         print_json(found.to_dict())
         return
     # On its side, because it has few protocols and many quantities.
-    _print_table([[name.strip(), *map(show, found.outcomes)] for name, show in COLUMNS.items()])
-    typer.echo(f"{output / FILES[0]}, {', '.join(FILES[1:])}")
+    _print_table([[name.strip(), *map(show, found.outcomes)] for name, show in uwbsim.pages.COLUMNS.items()])
+    typer.echo(f"{output / uwbsim.pages.FILES[0]}, {', '.join(uwbsim.pages.FILES[1:])}")
 
 
 def _rows(protocols: str) -> list[RangingProtocol]:
     """Return the protocols of these names, separated by commas, or all."""
-    from uwbsim.protocols import chosen
-
-    return chosen(None if protocols == "all" else [name.strip() for name in protocols.split(",") if name.strip()])
+    return uwbsim.protocols.chosen(
+        None if protocols == "all" else [name.strip() for name in protocols.split(",") if name.strip()]
+    )
 
 
 def _print_table(rows: Sequence[Sequence[str]], title: str | None = None) -> None:
     """Print a table of texts whose first row has the headings, and whose first column is left-aligned."""
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table
-
     console = Console(width=None if sys.stdout.isatty() else 150)
     gap = 1 if console.width > 80 else 0
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, gap, 0, 0), title=title, title_justify="left")
@@ -325,13 +318,11 @@ def optimum(
     rows = _rows(protocols)
     loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
     if output:
-        from uwbsim.pages import optimum_file, write_optima
-
-        check_folder(output, [optimum_file(row.name) for row in rows], force=force)
+        check_folder(output, [uwbsim.pages.optimum_file(row.name) for row in rows], force=force)
     with waiting("searching"):
         found = [uwbsim.optimum(loaded, row, overhead_us * 1e-6) for row in rows]
     if output:
-        write_optima(found, output, force=force)
+        uwbsim.pages.write_optima(found, output, force=force)
     if as_json:
         print_json([one.to_dict() for one in found])
         return
@@ -367,9 +358,7 @@ def sweep(
         except KeyboardInterrupt:
             typer.echo(f"{output}: interrupted; what was done is kept, and --resume goes on with it")
             raise typer.Exit(INTERRUPTED) from None
-    from uwbsim.pages import write_sweep_page
-
-    page = write_sweep_page(loaded, output)
+    page = uwbsim.pages.write_sweep_page(loaded, output)
     typer.echo(
         f"{output}: {summary.done} runs of {loaded.total}, {summary.failed} failed, {summary.skipped} were there "
         f"already; results.csv, results.parquet, {page.name}"
@@ -385,10 +374,7 @@ def twin(
     force: Force = False,
 ) -> None:
     """Fit a scenario to a recording, and compare its simulation with the measurements on a page."""
-    from uwbsim.pages import TWIN_COLUMNS, write_twin
-    from uwbsim.twins import check_name
-
-    check_name(output)
+    uwbsim.twins.check_name(output)
     page = output.with_suffix(".html")
     for path in (output, page):
         check_output(path, force=force)
@@ -400,13 +386,13 @@ def twin(
     with waiting(output.name) as report:
         compared = found.compare(seeds, report)
     found.save(output, force=force)
-    write_twin(found, compared, page, force=force)
+    uwbsim.pages.write_twin(found, compared, page, force=force)
     if as_json:
         rows = [one.to_dict() for one in compared]
         print_json({"found": found.found, "unknown": found.unknown, "compared": rows})
         return
-    rows_of_text = [[show(one) for show in TWIN_COLUMNS.values()] for one in compared]
-    _print_table([[*TWIN_COLUMNS], *rows_of_text], "measured / simulated")
+    rows_of_text = [[show(one) for show in uwbsim.pages.TWIN_COLUMNS.values()] for one in compared]
+    _print_table([[*uwbsim.pages.TWIN_COLUMNS], *rows_of_text], "measured / simulated")
     typer.echo(", ".join(map(str, (*files, page))))
 
 
