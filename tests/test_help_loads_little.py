@@ -1,6 +1,6 @@
 """Help is printed before anything heavy is imported: commands import what they work with when they run.
 
-`uwblink import` lists the table of importers, plug-ins included, so its commands may import NumPy and DuckDB.
+`uwblink import` lists the table of importers, plug-ins included, so its commands may import NumPy, SciPy and DuckDB.
 """
 
 import importlib
@@ -39,4 +39,6 @@ def test_help_loads_nothing_heavy(package):
     seen = json.loads(subprocess.run(script, capture_output=True, text=True, check=True).stdout)
     for words, (length, loaded) in zip(commands, seen, strict=True):
         assert length > 100, words
-        assert set(loaded) <= ({"numpy", "duckdb"} if words[1:2] == ("import",) else set()), f"{words} imports {loaded}"
+        assert set(loaded) <= ({"numpy", "scipy", "duckdb"} if words[1:2] == ("import",) else set()), (
+            f"{words} imports {loaded}"
+        )

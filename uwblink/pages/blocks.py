@@ -189,30 +189,25 @@ class Document:
         return [block.text for block in self.blocks if isinstance(block, Heading)]
 
 
-Drawings = Mapping[str, Mapping[str, Mapping[str, bytes]]]
-"""Files of figures by name, width ("page" or "column") and kind ("svg" or "pdf")."""
-
-
-def draw_figures(
-    document: Document, kinds: Mapping[str, list[str]], progress: Callable[[str], None] = lambda _: None
-) -> Drawings:
-    """Draw each figure of a document once at each width that has `kinds` of files."""
+def draw_figures(document: Document, *kinds: str, progress: Callable[[str], None] = lambda _: None) -> dict[str, bytes]:
+    """Draw each figure of a document once at each width; returns files of these kinds, such as "errors-page.svg"."""
     from uwblink.pages.figures import WIDTHS, drawn
 
-    found = {}
+    files: dict[str, bytes] = {}
     for one in document.pictures():
         progress(f"drawing {one.name}")
-        found[one.name] = {
-            width: drawn(one.draw, WIDTHS[width], wanted, salt=f"{one.name} {width}")
-            for width, wanted in kinds.items()
-            if wanted
-        }
-    return found
+        for width, width_in in WIDTHS.items():
+            made = drawn(one.draw, width_in, kinds, salt=f"{one.name} {width}")
+            files |= {f"{one.name}-{width}.{kind}": data for kind, data in made.items()}
+    return files
 
 
-def to_html(document: Document, drawings: Drawings | None = None) -> str:
-    """Return a document as one page of HTML that needs no other file; all text is escaped."""
-    drawings = draw_figures(document, {"page": ["svg"], "column": ["svg"]}) if drawings is None else drawings
+def to_html(document: Document, drawings: Mapping[str, bytes] | None = None) -> str:
+    """Return a document as one page of HTML that needs no other file; all text is escaped.
+
+    `drawings` are its figures as `draw_figures` returns them; without, they are drawn.
+    """
+    drawings = draw_figures(document, "svg") if drawings is None else drawings
     captions, number = document.captions(), 0
     parts = [f"<p class='note'>{escape(document.subtitle)}</p>"] if document.subtitle else []
     for block in document.blocks:
@@ -234,7 +229,7 @@ def to_html(document: Document, drawings: Drawings | None = None) -> str:
                 parts.append(f"{opening}{escape(text)}</pre>")
             case Picture(name):
                 # A page shows the drawing that fits.
-                wide, narrow = (inline(drawings[name][width]["svg"], captions[name]) for width in ("page", "column"))
+                wide, narrow = (inline(drawings[f"{name}-{width}.svg"], captions[name]) for width in ("page", "column"))
                 parts.append(
                     f"<figure><div class='wide'>{wide}</div><div class='narrow'>{narrow}</div>"
                     f"<figcaption>{escape(captions[name])}</figcaption></figure>"
@@ -273,20 +268,16 @@ def write_document(
     """
     page = output if output is not None and output.suffix.lower() != ".pdf" else None
     papers = [path for path in (output if page is None else None, pdf) if path is not None]
-    screen, paper = ["svg"] if page or figures else [], ["pdf"] if figures else []
-    kinds = {"page": screen + (paper or ["pdf"] * bool(papers)), "column": screen + paper}
-    made = draw_figures(document, kinds, progress)
+    made = draw_figures(document, "svg", *(["pdf"] if papers or figures else []), progress=progress)
     if papers:
         from uwblink.pages.pdf import to_pdf
 
         progress("setting the PDF")
-        data = to_pdf(document, {name: widths["page"]["pdf"] for name, widths in made.items()})
+        data = to_pdf(document, {one.name: made[f"{one.name}-page.pdf"] for one in document.pictures()})
         for path in papers:
             write_bytes(path, data, force=force)
     if figures:
-        drawings = ((f"{name}-{width}", kinds) for name, widths in made.items() for width, kinds in widths.items())
-        files = {f"{name}.{kind}": data for name, kinds in drawings for kind, data in kinds.items()}
-        write_files(figures, files, force=force)
+        write_files(figures, made, force=force)
     if page:
         progress("writing the page")
         write_text(page, to_html(document, made), force=force)
