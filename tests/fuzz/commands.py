@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import functools
 import importlib
 import io
 import multiprocessing
@@ -19,6 +18,7 @@ import random
 import resource
 import shlex
 import shutil
+import signal
 import sys
 import tempfile
 import time
@@ -26,9 +26,7 @@ import traceback
 from collections import Counter
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Final, NamedTuple
-
-import typer
+from typing import Final, NamedTuple
 
 import calib
 import calib.cli
@@ -41,9 +39,9 @@ from tests.fuzz.options import another_option
 from tests.fuzz.seeds import ALONE, KINDS, SELDOM, Kind, write_seeds
 
 MAINS: Final = {"uwblink": uwblink.cli.main, "uwbsim": uwbsim.cli.main, "calib": calib.cli.main}
-LONGEST_S: Final = 20.0
+CONTEXT: Final = multiprocessing.get_context("forkserver")
+LONGEST_S: Final = 20
 LONGEST_WAIT_S: Final = 300.0
-CASES_A_PROCESS: Final = 1000
 TOLD_EVERY: Final = 1000
 MOST_BYTES: Final = 2_000_000_000
 USAGE: Final = ("Usage:", "─ Error ─")
@@ -152,72 +150,33 @@ def judge(outcome: Outcome, written: list[Path]) -> str:
     return ""
 
 
-def _work(connection: Connection, seeds: Path, folder: Path) -> None:
-    """Take numbers of cases and return what is wrong with each."""
+def _try(number: int, seeds: Path, place: Path, pipe: Connection) -> None:
+    """Try a case in this process; sends what is wrong with it, the status, and the words of the command."""
     resource.setrlimit(resource.RLIMIT_DATA, (MOST_BYTES, MOST_BYTES))
-    typer.main.get_command = functools.cache(typer.main.get_command)  # a third of the time of most cases
-    while True:
-        number = connection.recv()
-        place = folder / str(number)
-        place.mkdir()
-        os.chdir(place)  # a hostile word may be the name of an output
-        words = prepare(number, seeds, place)
-        outcome = execute(words)
-        wrong = judge(outcome, [*place.glob("out*")])
-        connection.send((wrong, outcome.status, words))
-        if not wrong:
-            os.chdir(folder)
-            shutil.rmtree(place)
+    resource.setrlimit(resource.RLIMIT_CPU, (LONGEST_S, LONGEST_S))
+    place.mkdir()
+    os.chdir(place)  # a hostile word may be the name of an output
+    words = prepare(number, seeds, place)
+    outcome = execute(words)
+    pipe.send((judge(outcome, [*place.glob("out*")]), outcome.status, words))
 
 
-class Runner:
-    """A process that tries cases, and is replaced when it hangs or dies."""
-
-    def __init__(self, seeds: Path, folder: Path) -> None:
-        """Begin with nothing running."""
-        self._seeds, self._folder = seeds, folder
-        self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["__main__", *everything()])
-        self.statuses: Counter[int | None] = Counter()
-        self._process: Any = None
-        self._pipe: Any = None
-        self._tried = 0
-
-    def run(self, number: int) -> str:
-        """Try a case; returns what is wrong, or nothing."""
-        if self._process is None or not self._process.is_alive() or self._tried == CASES_A_PROCESS:
-            self.close()
-            self._start()
-        self._tried += 1
-        self._pipe.send(number)
-        begun, busy = time.monotonic(), _busy_s(self._process.pid)
-        while not self._pipe.poll(0.5):
-            if not self._process.is_alive():
-                return f"died with {self._process.exitcode}"
-            worked = _busy_s(self._process.pid) - busy
-            if worked > LONGEST_S or time.monotonic() > begun + LONGEST_WAIT_S:
-                self.close()
-                return f"more than {LONGEST_S:.0f} s of work" if worked > LONGEST_S else "waits for ever"
-        try:
-            wrong, status, words = self._pipe.recv()
-        except EOFError:  # it ended between two looks
-            self._process.join()
-            return f"died with {self._process.exitcode}"
-        self.statuses[status] += 1
-        return f"{wrong}   [{' '.join(words)[:150]}]" if wrong else ""
-
-    def close(self) -> None:
-        """End the process."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.join()
-            self._process = None
-
-    def _start(self) -> None:
-        self._tried = 0
-        self._pipe, theirs = self._context.Pipe()
-        self._process = self._context.Process(target=_work, args=(theirs, self._seeds, self._folder), daemon=True)
-        self._process.start()
+def run_case(number: int, seeds: Path, folder: Path) -> tuple[str, int | None]:
+    """Try a case in a process of its own; returns what is wrong, or nothing, and the command's status."""
+    place = folder / str(number)
+    mine, theirs = CONTEXT.Pipe()
+    process = CONTEXT.Process(target=_try, args=(number, seeds, place, theirs), daemon=True)
+    process.start()
+    process.join(LONGEST_WAIT_S)
+    if process.exitcode is None:
+        process.kill()
+        return "waits for ever", None
+    if not mine.poll():
+        return f"died with {process.exitcode} (-{signal.SIGXCPU}: after {LONGEST_S} s of work)", None
+    wrong, status, words = mine.recv()
+    if not wrong:
+        shutil.rmtree(place)
+    return f"{wrong}   [{' '.join(words)[:150]}]" if wrong else "", status
 
 
 def everything() -> list[str]:
@@ -231,14 +190,6 @@ def everything() -> list[str]:
     return found
 
 
-def _busy_s(process: int) -> float:
-    """Return the processor time of a process so far; a busy machine makes nothing hang."""
-    with contextlib.suppress(OSError):
-        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-    return 0.0
-
-
 def main() -> int:
     """Try cases and print what is wrong; status 1 where anything is."""
     parser = argparse.ArgumentParser(description="Run commands on damaged files.")
@@ -248,26 +199,27 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, help="folder for the damaged files of cases that went wrong")
     options = parser.parse_args()
     found: Counter[str] = Counter()
+    statuses: Counter[int | None] = Counter()
     begun = time.monotonic()
     with tempfile.TemporaryDirectory() as scratch:
         seeds, folder = Path(scratch) / "seeds", (options.keep or Path(scratch) / "cases").absolute()
         write_seeds(seeds)
         folder.mkdir(parents=True, exist_ok=True)
-        runner = Runner(seeds, folder)
+        CONTEXT.set_forkserver_preload(["__main__", *everything()])
         for number in range(options.first, options.first + options.cases):
             if options.only and not kind_of(random.Random(number)).file.startswith(options.only):
                 continue
-            wrong = runner.run(number)
+            wrong, status = run_case(number, seeds, folder)
+            statuses[status] += 1
             if wrong:
                 found[wrong.partition("   [")[0]] += 1
                 print(f"case {number}: {wrong}", flush=True)
             if (number + 1 - options.first) % TOLD_EVERY == 0:
                 said = f"up to {number}: {sum(found.values())} wrong, {time.monotonic() - begun:.0f} s"
                 print(said, file=sys.stderr, flush=True)
-        runner.close()
     print(
         f"{options.cases} cases, {sum(found.values())} wrong, {time.monotonic() - begun:.0f} s; ended with",
-        dict(runner.statuses),
+        dict(statuses),
     )
     for wrong, count in found.most_common():
         print(f"{count:6d}  {wrong}")

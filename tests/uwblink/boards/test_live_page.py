@@ -2,7 +2,6 @@
 
 import contextlib
 import re
-import shutil
 import signal
 import socket
 import struct
@@ -18,6 +17,7 @@ import pytest
 
 import uwblink
 from tests.boards import bench_scenario, served
+from tests.browser import chromium
 from uwblink.boards import live_page
 from uwblink.boards.listeners import PairState, Progress, Turn, load_correction
 from uwblink.boards.live_page import LivePage
@@ -27,19 +27,6 @@ from uwblink.wire.messages import RangeReport
 from uwbsim.boards.virtual_board import VirtualPorts
 
 BIN = Path(sys.executable).parent
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--virtual-time-budget=3000",
-    "--dump-dom",
-)
 
 
 def fetch(page, path="", **headers):
@@ -201,13 +188,11 @@ def test_what_a_page_fetches_names_the_recording_of_whoever_serves_it_now(tmp_pa
     assert "old.uwb" not in outside, "what is not fetched again says nothing of a recording"
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: nothing to open the page with")
 def test_a_browser_shows_it_and_keeps_it_fresh(tmp_path):
     """Headless Chromium runs the script under the page's own policy, and fetches the body again."""
 
     def look():
-        words = [str(CHROMIUM), *FLAGS, f"--user-data-dir={tmp_path / 'profile'}", page.url]
-        return subprocess.run(words, capture_output=True, text=True, timeout=120)
+        return chromium("--virtual-time-budget=3000", "--dump-dom", page.url, profile=tmp_path / "profile")
 
     with LivePage(tmp_path / "f.uwb") as page:
         bodies = []
@@ -219,9 +204,8 @@ def test_a_browser_shows_it_and_keeps_it_fresh(tmp_path):
 
         page.body = counted  # type: ignore[method-assign]
         _, done = recorded(tmp_path, page, look)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("<polyline") >= 3
-    assert "recording f.uwb" in done.stdout
+    assert done.count("<polyline") >= 3
+    assert "recording f.uwb" in done
     assert len(bodies) >= 2, "the script fetches the body again"
 
 
