@@ -24,21 +24,15 @@ from uwbsim.world.clocks import RATE_SPAN_S
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictedErrors:
-    """Errors of ranges, (n,) each: their mean in metres, and the parts of their variance in square metres."""
+    """Errors of ranges, (n,) each: their mean in metres, and the parts of their variance in square metres by cause."""
 
     mean_m: Floats
-    transmit_m2: Floats
-    receive_m2: Floats
-    quantization_m2: Floats
-    carrier_m2: Floats
-    clock_m2: Floats
-    multipath_m2: Floats
+    parts_m2: dict[str, Floats]
 
     @property
     def variance_m2(self) -> Floats:
         """Return the total variance."""
-        radio = self.transmit_m2 + self.receive_m2 + self.quantization_m2 + self.carrier_m2
-        return radio + self.clock_m2 + self.multipath_m2
+        return np.asarray(np.sum([*self.parts_m2.values()], axis=0))
 
     def pooled(self) -> tuple[float, float]:
         """Return mean and variance over all states together: the variance has the spread of the means in it."""
@@ -72,12 +66,14 @@ def predict(protocol: RangingProtocol, c: Conditions) -> PredictedErrors:
     p, detour = c.multipath, c.detour_s * SPEED_OF_LIGHT
     return PredictedErrors(
         mean_m=np.asarray((flight() - mean.truth) * METRES_PER_TICK + p * detour),
-        transmit_m2=np.asarray(squares["tx"] * (c.tx_std * SPEED_OF_LIGHT) ** 2),
-        receive_m2=np.asarray(squares["rx"] * (c.rx_std * SPEED_OF_LIGHT) ** 2),
-        quantization_m2=np.asarray(squares["rx"] * METRES_PER_TICK**2 / 12 * c.quantize),
-        carrier_m2=np.asarray((slopes["carrier"] * c.carrier_std_ppm * METRES_PER_TICK) ** 2),
-        clock_m2=_white_clocks(protocol, slopes, mean, c) * SPEED_OF_LIGHT**2,
-        multipath_m2=np.full(len(c), p * (2 - p) * detour**2),
+        parts_m2={
+            "transmit noise": squares["tx"] * (c.tx_std * SPEED_OF_LIGHT) ** 2,
+            "receive noise": squares["rx"] * (c.rx_std * SPEED_OF_LIGHT) ** 2,
+            "whole ticks": np.asarray(squares["rx"] * METRES_PER_TICK**2 / 12 * c.quantize),
+            "carrier integrator": (slopes["carrier"] * c.carrier_std_ppm * METRES_PER_TICK) ** 2,
+            "clocks": _white_clocks(protocol, slopes, mean, c) * SPEED_OF_LIGHT**2,
+            "multipath": np.full(len(c), p * (2 - p) * detour**2),
+        },
     )
 
 
@@ -239,12 +235,8 @@ def predict_state(q: State) -> Prediction:
     )
     found = predict(protocol, conditions)
     bias, variance = found.pooled()
-    parts = {
-        "transmit noise": found.transmit_m2,
-        "receive noise": found.receive_m2,
-        "whole ticks": found.quantization_m2,
-        "carrier integrator": found.carrier_m2,
-    }
+    # A state has neither noise of clocks nor multipath.
+    parts = {name: part for name, part in found.parts_m2.items() if name not in ("clocks", "multipath")}
     return Prediction(
         protocol=protocol.name,
         title=protocol.title,

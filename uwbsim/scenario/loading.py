@@ -13,21 +13,22 @@ import math
 import os
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from copy import deepcopy
 from itertools import islice, product, takewhile
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final, TypeVar, get_args
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from uwblink.errors import UwblinkError
 from uwblink.output import made_folder, whole
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import SUFFIX, Poses
+from uwblink.recording.schema import SUFFIX
 from uwblink.text_files import read_text
 from uwbsim.errors import ParameterError, ScenarioError, UnknownKeyError
 from uwbsim.scenario.model import Scenario
@@ -45,46 +46,25 @@ def shipped_scenarios() -> Mapping[str, Path]:
     240.0
     """
     folder = _folder()
-    named = {path.relative_to(folder).with_suffix("").as_posix(): path for path in folder.rglob("*.toml")}
-    return MappingProxyType(dict(sorted(named.items())))
+    return {path.relative_to(folder).with_suffix("").as_posix(): path for path in sorted(folder.rglob("*.toml"))}
 
 
 def _folder() -> Path:
     """Return the folder beside the package's modules, where a wheel puts it, or at the top of a checkout."""
-    package = Path(__file__).parents[1]
-    inside = package / "scenarios"
-    return inside if inside.is_dir() else package.parent / "scenarios"
-
-
-def found(path: Path) -> Path:
-    """Return the file of a shipped scenario by its name, as in icra2023/train; another path as it is.
-
-    An existing file takes precedence over a name.
-    """
-    if os.path.exists(path) or path.is_absolute():  # False, where Path.exists raises: for want of permission
-        return path
-    return shipped_scenarios().get(path.as_posix().removesuffix(".toml"), path)
-
-
-def nearest(path: Path) -> str:
-    """Return `, did you mean ...?` with shipped scenarios of similar names; empty without any."""
-    plain, known = path.as_posix().removesuffix(".toml"), list(shipped_scenarios())
-    parts = [name for name in known if plain in name.split("/")]
-    near = [] if os.path.lexists(path) else parts or difflib.get_close_matches(plain, known, 2)
-    return f", did you mean {' or '.join(near)}?" if near else ""
+    inside = Path(__file__).parents[1] / "scenarios"
+    return inside if inside.is_dir() else Path(__file__).parents[2] / "scenarios"
 
 
 def listed(names: Iterable[str] = ()) -> dict[str, str]:
     """Return titles of shipped scenarios by name; raises what `copy_scenarios` raises for `names`.
 
-    A title is the first sentence of the comment at the head of the file, else the name of its run.
+    A title is the first sentence of the comment at the head of the file.
     """
     found = {}
     for name, path in _chosen(list(names)).items():
-        text = path.read_text(encoding="utf-8")
-        head = [line.lstrip("# ") for line in takewhile(lambda line: line.startswith("#"), text.splitlines())]
-        sentence = re.split(r"(?<=[.:])\s", " ".join(head))[0].rstrip(".:")
-        found[name] = sentence or str(tomllib.loads(text)["run"].get("name", ""))
+        lines = path.read_text(encoding="utf-8").splitlines()
+        head = " ".join(line.lstrip("# ") for line in takewhile(lambda line: line.startswith("#"), lines))
+        found[name] = re.split(r"(?<=[.:])\s", head)[0].rstrip(".:")
     return found
 
 
@@ -94,12 +74,10 @@ def copy_scenarios(names: Iterable[str], folder: Path, *, force: bool = False) -
     `names` are those of `shipped_scenarios`, or of their folders; none are all. Returns what was written. Raises
     `ScenarioError` for a name that is not there, with nothing written, and what `whole` raises.
     """
-    top = _folder().resolve()
-    chosen = _chosen(list(names)).values()
-    files = dict.fromkeys(path.resolve() for path in chosen)
-    for path in chosen:
+    top, files = _folder(), dict[Path, None]()
+    for path in _chosen(list(names)).values():
         linked = re.findall(r'file\s*=\s*"([^"\n]+)"', path.read_text(encoding="utf-8"))
-        files |= dict.fromkeys((path.parent / name).resolve() for name in linked)
+        files |= dict.fromkeys([path, *(path.parent / name for name in linked)])
     places = {path: folder / path.relative_to(top) for path in files}
     with ExitStack() as every:
         for path, place in places.items():
@@ -113,7 +91,7 @@ def _chosen(names: list[str]) -> Mapping[str, Path]:
     chosen: dict[str, Path] = {}
     for name in names:
         plain = name.removesuffix(".toml").rstrip("/")
-        some = {other: path for other, path in known.items() if other == plain or other.startswith(f"{plain}/")}
+        some = {other: path for other, path in known.items() if f"{other}/".startswith(f"{plain}/")}
         if not some:
             raise ScenarioError(f"{name}: no such scenario; known are {', '.join(known)}")
         chosen |= some
@@ -180,9 +158,13 @@ def _table(source: Source) -> tuple[dict[str, Any], Path]:
         raise ParameterError(
             f"found {seen}, expected a path, a name, TOML text, tables or a Scenario", parameter="source"
         )
-    path = found(Path(source))
-    what = f"scenario file (.toml) or name{nearest(path)} (see uwbsim scenarios)"
-    return parse_toml(read_text(path, ScenarioError, what), path), path
+    path, known = Path(source), shipped_scenarios()
+    what, plain = "scenario file (.toml) or name", path.as_posix().removesuffix(".toml")
+    if not os.path.lexists(path) and not path.is_absolute():  # an existing file takes precedence over a name
+        near = [name for name in known if plain in name.split("/")] or difflib.get_close_matches(plain, known, 2)
+        what += f", did you mean {' or '.join(near)}?" if near else ""
+        path = known.get(plain, path)
+    return parse_toml(read_text(path, ScenarioError, f"{what} (see uwbsim scenarios)"), path), path
 
 
 def parse_toml(text: str, path: Path) -> dict[str, Any]:
@@ -238,9 +220,18 @@ def validated(model: type[Model], table: Mapping[str, Any], path: str | Path) ->
     try:
         return model.model_validate(table)
     except ValidationError as error:
-        # An unknown key explains a missing one better than the other way round.
-        first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-        where, known = _key_path(model, first)
+        # Of alternatives that are tables the one with the fewest mistakes is meant, of words and tables the table. An
+        # unknown key explains a missing one better than the other way round.
+        errors = error.errors()
+        among = Counter(one["loc"][:-1] for one in errors)
+
+        def rank(one: ErrorDetails) -> tuple[bool, int, bool]:
+            kind, table = one["type"], isinstance(one["input"], dict)
+            word = table and kind in ("string_type", "literal_error")
+            return word, among[one["loc"][:-1]], kind != "extra_forbidden"
+
+        first = min(errors, key=rank)
+        where, known = _key_path(model, first["loc"], first["type"] == "extra_forbidden")
         if first["type"] == "extra_forbidden":
             near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
             hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
@@ -251,32 +242,39 @@ def validated(model: type[Model], table: Mapping[str, Any], path: str | Path) ->
 def _explain(where: str, first: Mapping[str, Any]) -> str:
     if first["type"] == "missing":
         return f"{where}: missing, and it must be given"
-    message = str(first["msg"]).removeprefix("Value error, ")
+    message, found = str(first["msg"]).removeprefix("Value error, "), repr(first["input"])
     if first["type"] == "value_error":
         # A table's own check begins with the key it is about; that of a single value begins with what was found.
         joint = ": " if message.startswith("found") else "."
         return f"{where}{joint}{message}" if where else message
-    found = repr(first["input"])
     found = found if len(found) <= 60 else found[:57] + "..."
     return f"{where}: found {found}, {message[0].lower()}{message[1:]}"
 
 
-def _key_path(root: type[BaseModel], first: Mapping[str, Any]) -> tuple[str, list[str]]:
-    """Return the path of a mistake as a user writes it, without the names of union members that pydantic adds.
+def _key_path(root: type[BaseModel], parts: Sequence[str | int], unknown: bool) -> tuple[str, list[str]]:
+    """Return the path of a mistake as a user writes it, and the keys that are known beside the last one.
 
-    With it come the keys that are known beside the last one.
+    Pydantic's path also has the names of the alternatives that a value was compared with; `unknown` says that its last
+    part is an unknown key.
     """
-    path, unknown, known = "", first["type"] == "extra_forbidden", list[str]()
-    models: list[type[BaseModel]] = [root]
-    for k, part in enumerate(first["loc"]):
-        known = sorted({name for m in models for name in m.model_fields})
-        children = [f.annotation for m in models if (f := m.model_fields.get(str(part)))]
-        models = [m for child in children for m in _models_in(child)] or models
+    path, models, known = "", [root], list[str]()
+    for k, part in enumerate(parts):
+        nested = [field.annotation for m in models if (field := m.model_fields.get(str(part)))]
         if isinstance(part, int):
             path += f"[{part}]"
-        elif children or (unknown and k == len(first["loc"]) - 1):
+        elif nested or (unknown and k == len(parts) - 1):
             path += f".{part}"
+        else:
+            models = [m for m in models if part == m.__name__ or part in _kinds(m)] or models
+        known = sorted({name for m in models for name in m.model_fields})
+        models = [m for annotation in nested for m in _models_in(annotation)] or models
     return path.lstrip("."), known
+
+
+def _kinds(model: type[BaseModel]) -> tuple[Any, ...]:
+    """Return the values of the key `model` that mean this one of several tables."""
+    field = model.model_fields.get("model")
+    return get_args(field.annotation) if field else ()
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:
@@ -287,6 +285,9 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 
 MOST_POSES: Final = 200_000
 
+MOST_ROWS: Final = 1_000_000
+"""Nearly three hours of slots at 100 Hz; in memory they take 0.2 GB."""
+
 Folders = Iterable[str | os.PathLike[str]]
 
 
@@ -295,25 +296,21 @@ def fill_in(table: dict[str, Any], scenario: Path, folders: Folders = ()) -> Non
 
     Files lie in the scenario's folder, in one of `folders`, or below one of these.
     """
-    folders = tuple(folders)
-    for name in ("radio", "ranging", "bodies", "tags"):
-        section = table.get(name)
-        tables: list[tuple[str, Any]] = [(name, section)]
-        if isinstance(section, list):
-            tables = [(f"{name}[{k}]", one) for k, one in enumerate(section)]
-        for place, one in tables:
-            for key, named in [*one.items()] if isinstance(one, dict) else ():
-                model, read = READERS.get(key, (None, None))
-                if read is None or not isinstance(named, dict) or "file" not in named or named.get("model") != model:
-                    continue
+    sections: dict[str, Any] = {name: table.get(name) for name in ("radio", "ranging")}
+    for name in ("bodies", "tags"):
+        rows = table.get(name)
+        sections |= {f"{name}[{k}]": row for k, row in enumerate(rows if isinstance(rows, list) else ())}
+    for place, section in sections.items():
+        for key, (model, read) in READERS.items():
+            named = section.get(key) if isinstance(section, dict) else None
+            if isinstance(named, dict) and "file" in named and named.get("model") == model:
                 where = f"{scenario}: {place}.{key}.file"
                 if not isinstance(named["file"], str):
                     raise ScenarioError(f"{where}: found {named['file']!r}, expected the name of a file")
                 path = scenario.parent / named["file"]
-                path = check_linked(path, f"{where}: found {named['file']!r}", scenario.parent, folders)
-                held = read(path, key, named)
+                check_linked(path, f"{where}: found {named['file']!r}", scenario.parent, tuple(folders))
                 # A table of antenna gains has no key of its own for its file.
-                one[key] = held if key == "antenna" else named | held
+                section[key] = ({} if key == "antenna" else named) | read(path, key, named)
 
 
 def check_linked(path: Path, where: str, beside: Path, folders: Folders) -> Path:
@@ -340,34 +337,36 @@ def check_linked(path: Path, where: str, beside: Path, folders: Folders) -> Path
     return path
 
 
-def _rows(path: Path, columns: tuple[str, ...]) -> list[list[float]]:
+def _rows(path: Path, *columns: str) -> list[list[float]]:
+    """Return the rows of a CSV file, with these columns; lines that begin with # are comments."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            lines = (line for line in file if not line.startswith("#"))
-            reader = csv.DictReader(lines)
+            reader = csv.DictReader(line for line in file if not line.startswith("#"))
             missing = [c for c in columns if c not in (reader.fieldnames or [])]
             if missing:
                 raise ScenarioError(f"{path}: column {missing[0]!r} is missing; expected {', '.join(columns)}")
-            most = 1_000_000  # nearly three hours of slots at 100 Hz; in memory they take 0.2 GB
-            rows = [[_number(path, reader.line_num, c, row[c]) for c in columns] for row in islice(reader, most)]
-            if next(reader, None) is not None:
-                raise ScenarioError(f"{path}: more than {most} rows, which is the most that is read")
-            return rows
+            some = islice(reader, MOST_ROWS + 1)
+            rows = [[_number(path, reader.line_num, c, row[c]) for c in columns] for row in some]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ScenarioError(f"{path}: cannot be read as a table ({error})") from error
+    if not 0 < len(rows) <= MOST_ROWS:
+        raise ScenarioError(f"{path}: found {'more' if rows else 'no'} rows, expected 1 to {MOST_ROWS}")
+    return rows
 
 
 def _number(path: Path, line: int, column: str, cell: str | None) -> float:
-    with suppress(ValueError):
+    try:
         value = float(cell or "")
-        if math.isfinite(value):
-            return value
-    raise ScenarioError(f"{path}: row {line}: column {column!r}: found {cell!r}, expected a number")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ScenarioError(f"{path}: row {line}: column {column!r}: found {cell!r}, expected a number")
+    return value
 
 
 def _grid(path: Path, name: str) -> dict[str, Any]:
     """Read rows of azimuth_deg, elevation_deg and a value into a full grid."""
-    rows = _rows(path, ("azimuth_deg", "elevation_deg", name))
+    rows = _rows(path, "azimuth_deg", "elevation_deg", name)
     azimuth, elevation = (sorted({row[k] for row in rows}) for k in (0, 1))
     found = {(row[0], row[1]): row[2] for row in rows}
     if len(found) != len(rows):
@@ -375,54 +374,42 @@ def _grid(path: Path, name: str) -> dict[str, Any]:
     for a, e in product(azimuth, elevation):
         if (a, e) not in found:
             raise ScenarioError(f"{path}: a hole in the table: no {name} at azimuth {a:g}, elevation {e:g} degrees")
-    return {
-        "azimuth_deg": azimuth,
-        "elevation_deg": elevation,
-        name: [[found[a, e] for e in elevation] for a in azimuth],
-    }
+    values = [[found[a, e] for e in elevation] for a in azimuth]
+    return {"azimuth_deg": azimuth, "elevation_deg": elevation, name: values}
 
 
 def _plan(path: Path, *_: Any) -> dict[str, Any]:
-    rows = _rows(path, ("time_s", "initiator", "target"))
-    if not rows:
-        raise ScenarioError(f"{path}: a plan without slots")
-    return {"slots": [(row[0], int(row[1]), int(row[2])) for row in rows]}
+    return {"slots": [(time_s, int(a), int(b)) for time_s, a, b in _rows(path, "time_s", "initiator", "target")]}
 
 
 def _profile(path: Path, key: str, *_: Any) -> dict[str, Any]:
-    rows = _rows(path, ("time_s", key))
-    return {"times_s": [row[0] for row in rows], "values": [row[1] for row in rows]}
+    times_s, values = zip(*_rows(path, "time_s", key), strict=True)
+    return {"times_s": times_s, "values": values}
 
 
 def _trajectory(path: Path, _key: str, named: Mapping[str, Any]) -> dict[str, Any]:
+    # With it come all importers, which few scenarios need.
+    from uwblink.importers.poses import read_poses
+
     body = named.get("body")
     try:
-        if path.suffix == ".uwb":
+        if path.suffix == SUFFIX:
             with Recording.open(path) as recording:
                 poses = recording.poses()
         else:
-            # With it come all importers, which few scenarios need.
-            from uwblink.importers.poses import read_poses
-
             poses = read_poses(path, body if path.suffix in (".tum", ".txt") else None)
     except UwblinkError as error:
         raise ScenarioError(str(error)) from error
-    one = _of_body(path, poses, body)
+    names = sorted(set(poses.body.tolist()))
+    body = names[0] if body is None and len(names) == 1 else body
+    if body not in names:
+        raise ScenarioError(f"{path}: found body {body!r}, the file has {', '.join(names) or 'none'}")
+    one = poses[np.flatnonzero(poses.body == body)[:MOST_POSES]]
     return {
         "times_s": ((one.time_ns - one.time_ns[0]) * 1e-9).tolist(),
         "positions_m": one.position_m.tolist(),
         "quaternions": one.quaternion.tolist(),
     }
-
-
-def _of_body(path: Path, poses: Poses, body: str | None) -> Poses:
-    names = sorted(set(poses.body.tolist()))
-    if body is None and len(names) == 1:
-        body = names[0]
-    if body not in names:
-        raise ScenarioError(f"{path}: found body {body!r}, the file has {', '.join(names) or 'none'}")
-    rows = np.flatnonzero(poses.body == body)[:MOST_POSES]
-    return Poses(poses.time_ns[rows], poses.body[rows], poses.position_m[rows], poses.quaternion[rows])
 
 
 READERS: Final[dict[str, tuple[str | None, Callable[[Path, str, Mapping[str, Any]], dict[str, Any]]]]] = {

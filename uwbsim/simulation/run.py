@@ -1,4 +1,4 @@
-"""Simulation of a scenario: plan, event loop, stamps and reports of boards, and the flight that comes of them."""
+"""Simulation of a scenario: plan, event loop, stamps and reports of the boards, and the resulting flight."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ from uwbsim.world.world import SampledWorld, World
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Simulated:
-    """A simulated flight in memory: what a recording of it holds, and the truth, which none does.
+    """A simulated flight in memory: the contents of its recording, and the true distances, which are not recorded.
 
     `exchanges` are n exchanges in order of time and `truth_m` (n,) their true distances in metres, each the mean over
-    the first two messages; `poses` are those of motion capture; `tags` say which body carries which tag, and where;
-    `faults` are the exchanges that failed. `overheard` are the columns of what passive tags heard, `cirs` impulse
+    the first two messages; `poses` are those of motion capture; `tags` are the tags with their bodies and lever arms;
+    `faults` are the exchanges that failed. `overheard` are the columns of what passive tags received, `cirs` impulse
     responses (time_ns, board, initiator, target, first path in taps, 1016 magnitudes). `meta` is the recording's
-    provenance. `temperature` are the columns of what tags with a temperature or a supply voltage read of them, `imu`
-    and `height` those of bodies' inertial and height sensors.
+    provenance. `temperature` are the columns of the tags' readings of temperature and supply voltage, `imu` and
+    `height` those of the bodies' inertial and height sensors.
 
     >>> import uwbsim
     >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
@@ -85,7 +85,7 @@ class Simulated:
 
     @property
     def planted(self) -> dict[str, Any]:
-        """Return what a calibration should find: `delays_ns` by tag, `bias_curve`, `sigma_curve`, `alpha_dbm`."""
+        """Return the planted values: `delays_ns` by tag, `bias_curve`, `sigma_curve`, `alpha_dbm`."""
         planted: dict[str, Any] = self.meta["planted"]
         return planted
 
@@ -96,9 +96,9 @@ class Simulated:
         frames: Sequence[FrameRow] = (),
         force: bool = False,
     ) -> None:
-        """Write a recording (.uwb), with the bytes of boards where there are any (`through_wire`).
+        """Write a recording (.uwb); `frames` are the bytes of the boards, from `through_wire`.
 
-        Raises `RecordingExistsError` where the file is there already, unless `force` says to replace it.
+        Raises `RecordingExistsError` if the file exists, unless `force` is set.
         """
         with Recording.create(path, meta=self.meta, force=force) as recording:
             recording.append_tags(self.tags)
@@ -111,7 +111,7 @@ class Simulated:
             recording.append("frames", frames)
 
     def __repr__(self) -> str:
-        """Return a few lines: what was simulated, how the raw ranges err, and what failed."""
+        """Return a few lines: counts, errors of the raw ranges, and failures."""
         run, ranging = (self.meta["scenario"][name] for name in ("run", "ranging"))
         error = raw_range(self.exchanges) - self.truth_m
         reasons = Counter(fault.kind for fault in self.faults)

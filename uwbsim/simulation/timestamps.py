@@ -228,16 +228,12 @@ def overhear(medium: Medium, stamped: Stamped, exchanges: Exchanges) -> dict[str
 
 
 def _heard_by(medium: Medium, me: int, rows: Ints, stamped: Stamped, exchanges: Exchanges) -> dict[str, NDArray[Any]]:
+    """Return what one listener reports of exchanges with indices `rows`."""
     tag, count, planned = medium.scenario.tags[me], len(rows), len(exchanges)
-    heard = np.ones(count, dtype=bool)
-    columns: dict[str, NDArray[Any]] = {}
-    for k in range(3):
+    heard, nothing = np.ones(count, dtype=bool), np.full(count, np.nan)
+    columns: dict[str, NDArray[Any]] = {"rx3": np.zeros(count, np.int64), "fpp3_dbm": nothing, "skew3_ppm": nothing}
+    for k, sent in enumerate(stamped.frames):
         name = str(k + 1)
-        if k >= len(stamped.frames):
-            nothing = np.full(count, np.nan)
-            columns |= {f"rx{name}": np.zeros(count, np.int64), f"fpp{name}_dbm": nothing, f"skew{name}_ppm": nothing}
-            continue
-        sent = stamped.frames[k]
         frames = Frames(sender=sent.sender[rows], receiver=np.full(count, me), departure=sent.departure[rows])
         # One stream a listener and message: another listener, or another noise, changes nothing else.
         noise = stream(medium.scenario.run.seed, "overheard", tag.id, k).normal(size=(4, planned))[:, rows]

@@ -68,13 +68,13 @@ def test_prediction_monte_carlo_and_flight_agree(protocol):
 @pytest.mark.parametrize("protocol", ["ds", "ss"])
 def test_prediction_has_the_closed_form(protocol):
     found = predict(PROTOCOLS[protocol], conditions_of(scenario(protocol)))
-    np.testing.assert_allclose(np.sqrt(found.clock_m2), closed_form_m(protocol), rtol=2e-3)
+    np.testing.assert_allclose(np.sqrt(found.parts_m2["clocks"]), closed_form_m(protocol), rtol=2e-3)
 
 
 def test_flights_without_noise_stay_exact():
     noiseless = errors_m(scenario(white_ppm=0.0))
     assert np.abs(noiseless).max() < 6e-3, "stamps are whole ticks of 4.7 mm"
-    assert predict(PROTOCOLS["ds"], conditions_of(scenario(white_ppm=0.0))).clock_m2.max() == 0
+    assert predict(PROTOCOLS["ds"], conditions_of(scenario(white_ppm=0.0))).parts_m2["clocks"].max() == 0
 
 
 def test_served_boards_lose_as_much():

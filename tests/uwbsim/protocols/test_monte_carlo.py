@@ -131,9 +131,11 @@ def test_the_alternative_is_neiryncks():
 def test_carrier_noise_adds_half_the_reply_times_it():
     c = world(1, carrier_std_ppm=0.2)
     expected = 0.5 * SPEED_OF_LIGHT * 1538.7e-6 * 0.2e-6
-    assert np.sqrt(predict(PROTOCOLS["ss-cfo"], c).carrier_m2[0]) == pytest.approx(expected, rel=1e-6)
+    assert np.sqrt(predict(PROTOCOLS["ss-cfo"], c).parts_m2["carrier integrator"][0]) == pytest.approx(
+        expected, rel=1e-6
+    )
     assert abs(predict(PROTOCOLS["ss-cfo"], c).mean_m[0]) < 1e-4
-    assert predict(PROTOCOLS["ss"], c).carrier_m2[0] == 0
+    assert predict(PROTOCOLS["ss"], c).parts_m2["carrier integrator"][0] == 0
 
 
 def test_pieces_do_not_depend_on_how_many_are_asked_for():

@@ -18,7 +18,7 @@ NOISELESS = (Path(__file__).parents[3] / "scenarios" / "noiseless.toml").read_te
         ("duration_s = 60.0", "duration_s = 1e16", "run.duration_s: found 1e+16, at most 1e+07"),
         ("lever_arm_m = [", "tx_power_db = 1e16\nlever_arm_m = [", "tags[0].tx_power_db: found 1e+16, at most 500"),
         ("lever_arm_m = [", "lever_arm_m = [1e200, 0, 0] #", "tags[0].lever_arm_m: found 1e+200, at most 1e+06"),
-        ("lever_arm_m = [", "ramp_ppm_per_s = -1e9\nlever_arm_m = [", "tags[0].ramp_ppm_per_s: found 1e+09"),
+        ("lever_arm_m = [", "ramp_ppm_per_s = -1e9\nlever_arm_m = [", "tags[0].ramp_ppm_per_s: found -1e+09"),
         ("speed_mps = 0.5", "speed_mps = 1e16", "motion.speed_mps: found 1e+16, at most 10000 is allowed ("),
     ],
 )
@@ -37,7 +37,7 @@ def test_the_longest_unit_counts():
     assert limit_of("acceleration_mps2").most > limit_of("speed_mps").most
 
 
-@pytest.mark.parametrize("value", [True, "1e99", None, (), ((), ()), ("a", 1e99), 10**5, (1.0, 2.0)])
+@pytest.mark.parametrize("value", [True, "1e99", None, (), ((), ()), 10**5, (1.0, 2.0)])
 def test_what_is_no_number_or_within_passes(value):
     check_limits("length_m", value)
 

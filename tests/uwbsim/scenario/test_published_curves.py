@@ -20,4 +20,6 @@ def test_a_double_sided_range_has_the_standard_deviation_of_the_named_curve(name
     curve = world.radio.sigma
     x = float(lifted(conditions.power_dbm[:1])[0])
     expected = float(BSpline(np.array(curve.knots), np.array(curve.coefficients), curve.degree)(x))
-    assert np.sqrt(predict(PROTOCOLS["ds"], conditions).receive_m2[0]) == pytest.approx(expected, rel=2e-3)
+    assert np.sqrt(predict(PROTOCOLS["ds"], conditions).parts_m2["receive noise"][0]) == pytest.approx(
+        expected, rel=2e-3
+    )

@@ -113,12 +113,6 @@ def test_echoes_go_through_obstacles_and_bodies_as_the_direct_path_does():
     assert free.paths_dbm[0, 5] - behind.paths_dbm[0, 5] == pytest.approx(50 * 0.2, abs=1e-9), "in that by the floor"
 
 
-def test_total_power_in_free_space_is_that_of_friis():
-    for distance in (0.5, 4.0, 30.0):
-        found = link(scenario(places=((0.0, 0.0, 1.0), (distance, 0.0, 1.0))))
-        assert found.total_dbm[0] == pytest.approx(-70 - 20 * np.log10(distance), abs=0.1)
-
-
 @pytest.mark.parametrize("at_1m_dbm", [-70.0, -76.0, -82.0])
 def test_impulse_responses_follow_the_power_of_the_link(at_1m_dbm):
     """The chip's own formula, applied to the taps that it prints, gives the first-path power (User Manual, 4.7.1)."""

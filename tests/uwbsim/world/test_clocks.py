@@ -6,12 +6,18 @@ import pytest
 from tests.uwbsim.simulation.test_protocols import bench
 from uwbsim.world.clocks import LONGEST_RUN_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 
+NOISY = {"white_ppm_sqrt_s": 0.01, "flicker_ppm": 0.01, "drift_ppm_per_sqrt_s": 0.01}
 
-def clocks(skews=(12.0, -7.0), drift=0.01, duration=100.0):
+
+def clocks(skews=(12.0, -7.0), drift=0.01, duration=100.0, **more):
     scenario = bench(skews=skews)
-    tags = tuple(t.model_copy(update={"drift_ppm_per_sqrt_s": drift}) for t in scenario.tags)
+    tags = tuple(t.model_copy(update={"drift_ppm_per_sqrt_s": drift} | more) for t in scenario.tags)
     settings = scenario.run.model_copy(update={"duration_s": duration})
     return Clocks.of(scenario.model_copy(update={"tags": tags, "run": settings}))
+
+
+def noisy_clocks(duration=10.0, **more):
+    return clocks(duration=duration, **(NOISY | more))
 
 
 def test_skew_is_the_rate():
@@ -32,16 +38,6 @@ def test_drift_is_a_continuous_random_walk():
     assert np.std(steps) == pytest.approx(0.1 * np.sqrt(0.1), rel=0.03)
     fine = time[500] + np.arange(-50, 50)
     assert np.abs(np.diff(c.read(np.zeros(100, dtype=np.int64), fine)) - 1).max() <= 1
-
-
-NOISY = {"white_ppm_sqrt_s": 0.01, "flicker_ppm": 0.01, "drift_ppm_per_sqrt_s": 0.01}
-
-
-def noisy_clocks(duration=10.0, **more):
-    scenario = bench(skews=(12.0, -7.0))
-    tags = tuple(t.model_copy(update=NOISY | more) for t in scenario.tags)
-    settings = scenario.run.model_copy(update={"duration_s": duration})
-    return Clocks.of(scenario.model_copy(update={"tags": tags, "run": settings}))
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,11 @@ import uwbsim
 FLIGHT = {"model": "random-flight", "box_min_m": [-2, -2, 0.5], "box_max_m": [2, 2, 2.5]}
 
 
-def flown(imu, height=None, motion=None, seconds=20.0):
+def flown(imu, height=None, motion=None, seconds=20.0, seed=4):
     drone = {"name": "drone", "motion": motion or FLIGHT, "imu": imu} | ({"height": height} if height else {})
     return uwbsim.simulate(
         {
-            "run": {"duration_s": seconds, "seed": 4},
+            "run": {"duration_s": seconds, "seed": seed},
             "ranging": {"rate_hz": 20.0},
             "mocap": {"rate_hz": 200.0},
             "bodies": [drone, {"name": "mast", "motion": {"model": "static", "position_m": [4.0, 0, 2]}}],
@@ -63,16 +63,8 @@ def test_biases_differ_between_seeds_and_are_as_large_as_said():
     still = {"model": "static", "position_m": [0, 0, 1.0]}
     means = []
     for seed in range(30):
-        scenario = {
-            "run": {"duration_s": 1.0, "seed": seed},
-            "ranging": {"rate_hz": 5.0},
-            "bodies": [
-                {"name": "drone", "motion": still, "imu": {"accel_bias_mps2": 0.2, "rate_hz": 50}},
-                {"name": "mast", "motion": {"model": "static", "position_m": [4.0, 0, 2]}},
-            ],
-            "tags": [{"id": 1, "body": "drone"}, {"id": 2, "body": "mast"}],
-        }
-        means.append(columns(uwbsim.simulate(scenario).imu, "a").mean(axis=0) - (0, 0, 9.81))
+        found = flown({"accel_bias_mps2": 0.2, "rate_hz": 50}, motion=still, seconds=1.0, seed=seed)
+        means.append(columns(found.imu, "a").mean(axis=0) - (0, 0, 9.81))
     assert np.std(means) == pytest.approx(0.2, rel=0.25)
 
 
@@ -90,17 +82,7 @@ def test_heights_and_the_recording(tmp_path):
 
 
 def test_no_sensor_no_table():
-    found = uwbsim.simulate(
-        {
-            "run": {"duration_s": 1.0},
-            "ranging": {"rate_hz": 5.0},
-            "bodies": [
-                {"name": name, "motion": {"model": "static", "position_m": [x, 0, 1]}}
-                for name, x in (("a", 0), ("b", 3))
-            ],
-            "tags": [{"id": 1, "body": "a"}, {"id": 2, "body": "b"}],
-        }
-    )
+    found = flown(None, seconds=1.0)
     assert found.imu == {}
     assert found.height == {}
 

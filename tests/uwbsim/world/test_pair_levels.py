@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import uwbsim
+from tests.uwbsim.world.helpers import autocorrelation
 from uwblink import raw_range
 
 PLAIN = {
@@ -29,16 +30,11 @@ def flight(radio, second=None, duration_s=400.0, **ranging):
     )
 
 
-def lag(values, steps):
-    centred = values - values.mean()
-    return np.mean(centred[steps:] * centred[:-steps]) / np.mean(centred**2)
-
-
 def test_fading_has_the_spread_and_the_life_that_were_asked_for():
     x = flight({"fading": {"std_db": 2.0, "life_s": 0.1}}).exchanges
     # 4000 draws: the standard error of the spread is 1.1 %, that of an autocorrelation 0.02.
     assert np.std(x.fpp1_dbm) == pytest.approx(2.0, rel=0.05)
-    assert lag(x.fpp1_dbm, 5) == pytest.approx(np.exp(-1), abs=0.06)
+    assert autocorrelation(x.fpp1_dbm, 5) == pytest.approx(np.exp(-1), abs=0.06)
     assert np.mean(np.isclose(x.fpp1_dbm, x.fpp2_dbm)) > 0.95
 
 
@@ -47,7 +43,7 @@ def test_outages_lose_a_share_of_exchanges_in_bursts_and_change_no_power():
     lost = np.zeros(20_000, dtype=bool)
     lost[[round(fault.time_ns * 50e-9) for fault in run.faults]] = True
     assert np.mean(lost) == pytest.approx(0.2, abs=0.03)
-    assert lag(lost.astype(float), 5) == pytest.approx(np.exp(-0.5), abs=0.06)
+    assert autocorrelation(lost.astype(float), 5) == pytest.approx(np.exp(-0.5), abs=0.06)
     assert np.ptp(run.exchanges.fpp2_dbm) < 1e-9
 
 

@@ -46,46 +46,40 @@ def scenario(**more):
     )
 
 
-@pytest.fixture
-def louder():
-    """A stranger's effect: what reaches or leaves one tag is weaker, and late by a whole step of the boards' grid."""
-
-    def effect(link, ends):
-        hit = (np.array(ends.tags()) == TAG_OF_LOSS).any(axis=0)
-        loss, way = LOSS_DB * hit, TICKS * METRES_PER_TICK * hit
-        return replace(
-            link,
-            excess_m=link.excess_m + way,
-            power_dbm=link.power_dbm - loss,
-            total_dbm=link.total_dbm - loss,
-        )
-
-    uwbsim.register_channel_effect("louder", effect)
-    yield
-    del CHANNEL_EFFECTS["louder"]
+def weaken_tag(link, ends):
+    """A plug-in's effect: links of one tag are weaker, and longer by a whole step of the boards' grid."""
+    hit = (np.array(ends.tags()) == TAG_OF_LOSS).any(axis=0)
+    loss, way = LOSS_DB * hit, TICKS * METRES_PER_TICK * hit
+    powers = {"power_dbm": link.power_dbm - loss, "total_dbm": link.total_dbm - loss}
+    return replace(link, excess_m=link.excess_m + way, **powers)
 
 
-@pytest.fixture
-def without():
-    """The same world without the effect, by all four ways."""
-    world = scenario()
-    return uwbsim.simulate(world), served(world), conditions_of(world)
+@pytest.fixture(scope="module")
+def both():
+    """The same world without the effect and with it: a flight, served boards, and conditions of the workbench."""
+    found = []
+    for _ in range(2):
+        found.append((uwbsim.simulate(scenario()), served(scenario()), conditions_of(scenario())))
+        if not found[1:]:
+            uwbsim.register_channel_effect("weaken", weaken_tag)
+    del CHANNEL_EFFECTS["weaken"]
+    return found
 
 
-def test_a_strangers_effect_shows_in_flights_draw_for_draw(without, louder):
-    before, after = without[0], uwbsim.simulate(scenario())
+def test_a_plug_ins_effect_shows_in_flights_draw_for_draw(both):
+    before, after = (found[0] for found in both)
     for name in ("fpp1_dbm", "fpp2_dbm"):
         drop = getattr(before.exchanges, name) - getattr(after.exchanges, name)
         np.testing.assert_allclose(drop, LOSS_DB, atol=1e-9)
     # Stamps are whole ticks, and the flight is rounded to sub-ticks: the same draws give the same range, but for one.
     longer = raw_range(after.exchanges) - raw_range(before.exchanges)
     np.testing.assert_allclose(longer, TICKS * METRES_PER_TICK, atol=1.01 * METRES_PER_TICK)
-    assert after.meta["channel_effects"] == ["louder"]
+    assert after.meta["channel_effects"] == ["weaken"]
     assert "channel_effects" not in before.meta
 
 
-def test_it_shows_in_what_listeners_overhear(without, louder):
-    before, after = without[0].overheard, uwbsim.simulate(scenario()).overheard
+def test_it_shows_in_what_listeners_overhear(both):
+    before, after = (found[0].overheard for found in both)
     np.testing.assert_allclose(before["fpp1_dbm"], after["fpp1_dbm"], atol=1e-9)
     np.testing.assert_allclose(before["fpp2_dbm"] - after["fpp2_dbm"], LOSS_DB, atol=1e-9)
     # The response leaves later by the poll's way more, and is on its way longer by as much.
@@ -93,8 +87,8 @@ def test_it_shows_in_what_listeners_overhear(without, louder):
     np.testing.assert_allclose(shift, 2 * TICKS, atol=1)
 
 
-def test_it_shows_in_served_boards_and_their_listeners(without, louder):
-    (before, heard_before), (after, heard_after) = without[1], served(scenario())
+def test_it_shows_in_served_boards_and_their_listeners(both):
+    (before, heard_before), (after, heard_after) = (found[1] for found in both)
     for name in ("fpp1_dbm", "fpp2_dbm"):
         assert getattr(before, name) - getattr(after, name) == pytest.approx(LOSS_DB, abs=2e-4), "four decimals"
     assert after.range_m - before.range_m == pytest.approx(TICKS * METRES_PER_TICK, abs=2 * METRES_PER_TICK)
@@ -102,15 +96,12 @@ def test_it_shows_in_served_boards_and_their_listeners(without, louder):
     assert heard_before.fpp2_dbm - heard_after.fpp2_dbm == pytest.approx(LOSS_DB, abs=2e-4)
 
 
-def test_it_shows_in_the_workbench_draw_for_draw(without, louder):
-    before, after = without[2], conditions_of(scenario())
+def test_it_shows_in_the_workbench_draw_for_draw(both):
+    before, after = (found[2] for found in both)
     np.testing.assert_allclose(before.power_dbm - after.power_dbm, LOSS_DB, atol=1e-9)
-    ranged, predicted = [], []
-    for conditions in (before, after):
-        ranged.append(range_errors_m(PROTOCOLS["ds"], conditions, 1, 500) + conditions.distance_m[0])
-        predicted.append(predict(PROTOCOLS["ds"], conditions).mean_m[0] + conditions.distance_m[0])
-    np.testing.assert_allclose(ranged[1] - ranged[0], TICKS * METRES_PER_TICK, atol=1e-6)
-    assert predicted[1] - predicted[0] == pytest.approx(TICKS * METRES_PER_TICK, abs=1e-6)
+    for errors in (lambda c: range_errors_m(PROTOCOLS["ds"], c, 1, 500), lambda c: predict(PROTOCOLS["ds"], c).mean_m):
+        longer = errors(after)[0] - errors(before)[0]
+        assert longer == pytest.approx(TICKS * METRES_PER_TICK, abs=1e-6)
 
 
 @pytest.mark.parametrize(

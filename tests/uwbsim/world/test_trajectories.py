@@ -50,12 +50,6 @@ def test_lever_arm_turns_with_the_body():
     np.testing.assert_allclose(spots, [(1, 3, 3), (5, 3, 3)], atol=1e-12)
 
 
-def test_quaternions_are_unit():
-    box = RandomFlight(model="random-flight", box_min_m=(0, 0, 0), box_max_m=(1, 1, 1))
-    q = sample(box, 10.0, partial(stream, 1, "b")).quaternion(np.linspace(0, 10, 50))
-    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1, atol=1e-12)
-
-
 def test_a_longer_run_continues_the_same_flight():
     box = RandomFlight(model="random-flight", box_min_m=(0, 0, 0), box_max_m=(1, 1, 1))
     short, long = (sample(box, duration, partial(stream, 1, "a")) for duration in (20.0, 500.0))
