@@ -120,7 +120,7 @@ def _importing(row: Importer) -> Callable[..., None]:
     command = run if row.map_help else without_map
     command.__doc__ = escape(row.help)
     command.__annotations__ |= {
-        "table": Annotated[Path, one] if row.read_all is None else Annotated[list[Path], several],
+        "table": Annotated[list[Path], several] if row.takes_several else Annotated[Path, one],
         "output": Annotated[Path, output("Recording to write (.uwb).")],
         "force": Force,
     }

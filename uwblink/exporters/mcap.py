@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import cache
 from heapq import merge
 from pathlib import Path
 from typing import Any, Final
@@ -108,42 +109,62 @@ def fits_exchanges(held: Contents) -> bool:
     )
 
 
+Message = tuple[int, str, str, Any]
+"""Time in nanoseconds, topic, type, and content."""
+
+
+def _write(
+    recording: Path,
+    form: str,
+    encode: Callable[[Recording, Contents], Iterable[Message]],
+    publish: Callable[[int, str, str, Any], object],
+) -> int:
+    """Publish all messages of a recording in order of time; returns their number.
+
+    Raises `RecordingError` for times before 1970 and for values that the form cannot represent.
+    """
+    count = 0
+    with Recording.open(recording, memory_mb=READING_MB) as opened:
+        for time_ns, topic, kind, content in (row for held in pieces(opened) for row in encode(opened, held)):
+            if time_ns < 0:
+                raise RecordingError(f"{recording}: has times before 1970, which {form} cannot hold")
+            try:
+                publish(time_ns, topic, kind, content)
+            except (ValueError, OverflowError) as error:
+                raise RecordingError(
+                    f"{recording}: {topic}: has a number that is not finite or too large, which {form} cannot represent"
+                ) from error
+            count += 1
+    return count
+
+
 def write_mcap(recording: Path, folder: Path) -> dict[str, int]:
     """Write `recording.mcap`; returns its messages. Times before 1970 cannot be written and raise `RecordingError`."""
-    count = 0
-    with Recording.open(recording, memory_mb=READING_MB) as opened, (folder / "recording.mcap").open("wb") as file:
+    with (folder / "recording.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start(library="uwbcal")
         schemas = {
             name: writer.register_schema(name, "jsonschema", json.dumps(layout).encode())
             for name, layout in SCHEMAS.items()
         }
-        channels: dict[str, int] = {}
-        for time_ns, topic, schema, content in _messages(opened):
-            if time_ns < 0:
-                raise RecordingError(f"{recording}: has times before 1970, which MCAP cannot hold")
-            if topic not in channels:
-                channels[topic] = writer.register_channel(topic, "json", schemas[schema])
-            try:
-                data = json.dumps(stamped(time_ns, content), allow_nan=False).encode()
-            except ValueError as error:
-                raise RecordingError(
-                    f"{recording}: {topic}: has a number that is not finite, which JSON cannot represent"
-                ) from error
-            writer.add_message(channels[topic], time_ns, data, time_ns, count & 0xFFFFFFFF)
-            count += 1
+        channel = cache(lambda topic, schema: writer.register_channel(topic, "json", schemas[schema]))
+
+        def publish(time_ns: int, topic: str, schema: str, content: dict[str, Any]) -> None:
+            data = json.dumps(stamped(time_ns, content), allow_nan=False).encode()
+            writer.add_message(channel(topic, schema), time_ns, data, time_ns)
+
+        count = _write(recording, "JSON in MCAP", _messages, publish)
         writer.finish()  # type: ignore[no-untyped-call]  # the library does not say what it returns
     return {"recording.mcap": count}
 
 
-def _messages(recording: Recording) -> Iterator[tuple[int, str, str, dict[str, Any]]]:
-    """Yield time in nanoseconds, topic, schema, and content."""
-    for held in pieces(recording):
-        (by_poses,) = distances_by_poses_m(recording, [held.exchanges])
-        ranges = _ranges(held, by_poses)
-        for time_ns, table, whose, values in timed_rows(held):
-            for message in _ENCODERS[table](whose, ranges(values) if table == "ranges" else values):
-                yield time_ns, *message
+def _messages(recording: Recording, held: Contents) -> Iterator[Message]:
+    """Yield the JSON messages of a piece of a recording; their types are names of `SCHEMAS`."""
+    (by_poses,) = distances_by_poses_m(recording, [held.exchanges])
+    ranges = _ranges(held, by_poses)
+    for time_ns, table, whose, values in timed_rows(held):
+        for message in _ENCODERS[table](whose, ranges(values) if table == "ranges" else values):
+            yield time_ns, *message
 
 
 def _ranges(held: Contents, by_poses: Floats) -> Callable[[int], dict[str, Any]]:
@@ -208,23 +229,14 @@ def write_rosbag2(recording: Path, folder: Path) -> dict[str, int]:
     except ImportError as error:
         raise RecordingError("writing bags needs rosbags; pip install 'uwbcal[bags]'") from error
     store = get_typestore(Stores.ROS2_JAZZY)
-    made = _RosMessages(store.types)
-    count, known = 0, dict[str, Any]()
-    with (
-        Recording.open(recording, memory_mb=READING_MB) as opened,
-        Writer(folder / "rosbag2", version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as bag,
-    ):
-        for time_ns, topic, kind, message in (row for held in pieces(opened) for row in made.all(held)):
-            if time_ns < 0:
-                raise RecordingError(f"{recording}: has times before 1970, which bags cannot hold")
-            if topic not in known:
-                known[topic] = bag.add_connection(topic, kind, typestore=store)
-            try:
-                bag.write(known[topic], time_ns, store.serialize_cdr(message, kind))
-            except OverflowError as error:
-                raise RecordingError(f"{recording}: {topic} has a value that is too large for {kind}") from error
-            count += 1
-    return {"rosbag2": count}
+    place = folder / "rosbag2"
+    with Writer(place, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as bag:
+        connection = cache(lambda topic, kind: bag.add_connection(topic, kind, typestore=store))
+
+        def publish(time_ns: int, topic: str, kind: str, message: Any) -> None:
+            bag.write(connection(topic, kind), time_ns, store.serialize_cdr(message, kind))
+
+        return {"rosbag2": _write(recording, "bags", _RosMessages(store.types).all, publish)}
 
 
 def topic_name(text: str) -> str:
@@ -239,66 +251,66 @@ class _RosMessages:
     def __init__(self, types: Any) -> None:
         self._types = types
 
-    def all(self, held: Contents) -> Iterator[tuple[int, str, str, Any]]:
-        """Yield time in nanoseconds, topic, type and message of a piece of a recording, in order of time."""
+    def all(self, _recording: Recording, held: Contents) -> Iterator[Message]:
+        """Yield the messages of a piece of a recording, in order of time."""
         ranges, variances = held.exchanges.range_m, _variances(held)
-        for time_ns, table, whose, values in timed_rows(held):
-            if table == "poses":
-                yield from self._poses(time_ns, whose, *values)
-            elif table == "ranges":
-                message = self._range(time_ns, f"uwb_{whose[0]}", float(ranges[values]), float(variances[values]))
-                yield time_ns, f"/uwb/range_{whose[0]}_{whose[1]}", "sensor_msgs/msg/Range", message
-            elif table == "imu":
-                yield time_ns, f"/imu/{topic_name(whose)}", "sensor_msgs/msg/Imu", self._imu(time_ns, whose, values)
-            elif table == "height":
-                message = self._range(time_ns, whose, values[0], 0.0)
-                yield time_ns, f"/height/{topic_name(whose)}", "sensor_msgs/msg/Range", message
-            elif table == "temperature":
-                message = self._new("sensor_msgs/Temperature", self._header(time_ns, f"uwb_{whose}"), values[0], 0.0)
-                yield time_ns, f"/temperature/uwb_{whose}", "sensor_msgs/msg/Temperature", message
-            else:
-                warning = (30, whose, f"{values.kind}: {values.detail}", "", "", 0)
-                yield (
-                    time_ns,
-                    "/faults",
-                    "rcl_interfaces/msg/Log",
-                    self._new("rcl_interfaces/Log", self._stamp(time_ns), *warning),
+        encoders: dict[str, Callable[[Any, Any, Any], list[tuple[str, Any]]]] = {
+            "poses": self._poses,
+            "ranges": lambda stamp, ends, k: [
+                (f"/uwb/range_{ends[0]}_{ends[1]}", self._range(stamp, f"uwb_{ends[0]}", ranges[k], variances[k]))
+            ],
+            "imu": self._imu,
+            "height": lambda stamp, body, values: [
+                (f"/height/{topic_name(body)}", self._range(stamp, body, values[0], 0.0))
+            ],
+            "temperature": lambda stamp, tag, values: [
+                (
+                    f"/temperature/uwb_{tag}",
+                    self._new("sensor_msgs/Temperature", self._header(stamp, f"uwb_{tag}"), values[0], 0.0),
                 )
+            ],
+            "faults": lambda stamp, board, fault: [
+                (
+                    "/faults",
+                    self._new("rcl_interfaces/Log", stamp, 30, board, f"{fault.kind}: {fault.detail}", "", "", 0),
+                )
+            ],
+        }
+        for time_ns, table, whose, values in timed_rows(held):
+            stamp = self._new("builtin_interfaces/Time", *divmod(time_ns, 1_000_000_000))
+            for topic, message in encoders[table](stamp, whose, values):
+                yield time_ns, topic, message.__msgtype__, message
 
     def _new(self, kind: str, *values: Any) -> Any:
         package, name = kind.split("/")
         return self._types[f"{package}/msg/{name}"](*values)
 
-    def _header(self, time_ns: int, frame: str) -> Any:
-        return self._new("std_msgs/Header", self._stamp(time_ns), frame)
+    def _header(self, stamp: Any, frame: str) -> Any:
+        return self._new("std_msgs/Header", stamp, frame)
 
-    def _stamp(self, time_ns: int) -> Any:
-        return self._new("builtin_interfaces/Time", *divmod(time_ns, 1_000_000_000))
-
-    def _poses(
-        self, time_ns: int, body: str, place: list[float], turn: list[float]
-    ) -> Iterator[tuple[int, str, str, Any]]:
-        attitude, header = self._new("geometry_msgs/Quaternion", *turn), self._header(time_ns, WORLD)
-        pose = self._new("geometry_msgs/Pose", self._new("geometry_msgs/Point", *place), attitude)
-        stamped = self._new("geometry_msgs/PoseStamped", header, pose)
-        yield time_ns, f"/poses/{topic_name(body)}", "geometry_msgs/msg/PoseStamped", stamped
+    def _poses(self, stamp: Any, body: str, pose: list[list[float]]) -> list[tuple[str, Any]]:
+        place, turn = pose
+        attitude, header = self._new("geometry_msgs/Quaternion", *turn), self._header(stamp, WORLD)
+        posed = self._new("geometry_msgs/Pose", self._new("geometry_msgs/Point", *place), attitude)
         moved = self._new("geometry_msgs/Transform", self._new("geometry_msgs/Vector3", *place), attitude)
         transform = self._new("geometry_msgs/TransformStamped", header, body, moved)
-        yield time_ns, "/tf", "tf2_msgs/msg/TFMessage", self._new("tf2_msgs/TFMessage", [transform])
+        return [
+            (f"/poses/{topic_name(body)}", self._new("geometry_msgs/PoseStamped", header, posed)),
+            ("/tf", self._new("tf2_msgs/TFMessage", [transform])),
+        ]
 
-    def _range(self, time_ns: int, frame: str, range_m: float, variance: float) -> Any:
+    def _range(self, stamp: Any, frame: str, range_m: float, variance: float) -> Any:
         # A field of view all round, and the 300 m that DW1000 boards reach in the open.
-        header = self._header(time_ns, frame)
-        return self._new("sensor_msgs/Range", header, 0, 2 * np.pi, 0.0, 300.0, range_m, variance)
+        limits, header = (2 * np.pi, 0.0, 300.0), self._header(stamp, frame)
+        return self._new("sensor_msgs/Range", header, 0, *limits, float(range_m), float(variance))
 
-    def _imu(self, time_ns: int, body: str, values: list[float]) -> Any:
+    def _imu(self, stamp: Any, body: str, values: list[float]) -> list[tuple[str, Any]]:
         turn, pull = (self._new("geometry_msgs/Vector3", *part) for part in (values[:3], values[3:]))
         level, unknown = self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0), np.zeros(9)
         # -1 stands first in the covariance of what an Imu does not measure, by the definition of the message.
         unmeasured = np.array([-1.0] + [0.0] * 8)
-        return self._new(
-            "sensor_msgs/Imu", self._header(time_ns, body), level, unmeasured, turn, unknown, pull, unknown
-        )
+        readings = (level, unmeasured, turn, unknown, pull, unknown)
+        return [(f"/imu/{topic_name(body)}", self._new("sensor_msgs/Imu", self._header(stamp, body), *readings))]
 
 
 def _variances(held: Contents) -> Floats:

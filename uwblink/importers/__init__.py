@@ -6,24 +6,23 @@ unless it is told to. It also reads back what `uwblink export --to csv` or `parq
 
 from __future__ import annotations
 
-import csv
 import os
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import duckdb
 
 from uwblink.errors import ArgumentError, ImportTableError, first_line
-from uwblink.importers.bags import BAG_SUFFIXES, open_exchange_bag
-from uwblink.importers.exchange_tables import TABLE_SUFFIXES, open_tables
+from uwblink.importers.bags import BAG_SUFFIXES, bag_to_table
+from uwblink.importers.column_map import ColumnMap
+from uwblink.importers.exchange_tables import TABLE_SUFFIXES, Imported, find_tables, import_tables
 from uwblink.importers.miluv import read_miluv
 from uwblink.importers.poses import add_poses
 from uwblink.importers.staging import Watch, unwatched
-from uwblink.importers.tables import connect_to
+from uwblink.importers.tables import connected
 from uwblink.output import check_output
 from uwblink.plugins import Registry, check_row, is_text
 from uwblink.recording.contents import Contents, load
@@ -42,33 +41,34 @@ __all__ = [
 ]
 
 
-class Importing(Protocol):
-    """The contents of files, which do not need to be in memory at once."""
-
-    def write(self, path: str | os.PathLike[str], *, force: bool = False) -> tuple[dict[str, int], list[str]]:
-        """Write a recording; returns the number of rows by table, and notes for the user."""
-
-
 @dataclass(frozen=True, slots=True)
 class Importer:
-    """A kind of file that can become a recording.
+    """A kind of file that can become a recording; it has a function `read` or `tables`.
 
     `read(source, map)` returns what the file at `source` holds and raises `ImportTableError`; `map` is the path of a
     file that explains it, for kinds with a `map_help`, else None. `suffixes` are what names of such files end with, in
     small letters, none for a kind of folder; `name` is that of the command `uwblink import NAME`, and `help` its line.
-    `read_all` takes a list of paths instead of one; formats without it take one file. `open_all` is for formats whose
-    files do not need to be in memory at once: it takes a list of paths, the path of the map and a callback for
-    progress, and yields an object with a method `write`.
+    `read_all` takes a list of paths instead of one; formats without it take one file.
+
+    `tables(sources, map, folder)` returns paths of tables of exchanges, messages or ranges, and their `ColumnMap`.
+    Files that are no tables are written as such into `folder`, for example as JSON lines. Tables do not need to be
+    in memory at once. `several` says that they can be several files.
     """
 
     name: str
     suffixes: tuple[str, ...]
-    read: Callable[[Path, Path | None], Contents]
+    read: Callable[[Path, Path | None], Contents] | None
     help: str
     map_help: str | None = None
     read_all: Callable[[Sequence[Path], Path | None], Contents] | None = None
     _: KW_ONLY
-    open_all: Callable[[Sequence[Path], Path | None, Watch], AbstractContextManager[Importing]] | None = None
+    tables: Callable[[Sequence[Path], Path | None, Path], tuple[Sequence[Path], ColumnMap]] | None = None
+    several: bool = False
+
+    @property
+    def takes_several(self) -> bool:
+        """Whether several files can be one recording."""
+        return self.several or self.read_all is not None
 
 
 def check_importer(row: Any) -> None:
@@ -82,22 +82,19 @@ def check_importer(row: Any) -> None:
                 lambda found: isinstance(found, tuple) and all(isinstance(s, str) and s[:1] == "." for s in found),
                 "a tuple such as ('.csv', '.csv.gz')",
             ),
-            "read": (callable, "a function of a path and a map's path"),
+            "read": (
+                lambda found: callable(found) or callable(getattr(row, "tables", None)),
+                "a function of a path and a map's path",
+            ),
             "help": (is_text, "a line of text"),
             "map_help": (lambda found: found is None or is_text(found), "a line of text"),
         },
     )
 
 
-def read_table(source: Path | Sequence[Path], map_file: Path | None = None) -> Contents:
+def read_table(source: Source, map_file: Path | None = None) -> Contents:
     """Return the exchanges of one table, all tables of a folder, or several tables; raises `ImportTableError`."""
-    with open_tables([source] if isinstance(source, Path) else source, map_file) as found:
-        return found.contents()
-
-
-def _read_bag(source: Path, map_file: Path | None = None) -> Contents:
-    with open_exchange_bag([source], map_file) as found:
-        return found.contents()
+    return read_source(source, importer="csv", map_file=map_file)
 
 
 def read_exported(folder: Path, _map_file: Path | None = None) -> Contents:
@@ -113,9 +110,9 @@ def read_exported(folder: Path, _map_file: Path | None = None) -> Contents:
         store = Store.write(path, path)
         try:
             for table, source in paths.items():
-                with connect_to([source]) as db:
+                with connected([source]) as db:
                     store.insert(table, dict(db.execute(_query(db, table, source), [str(source)]).fetchnumpy()))
-        except (duckdb.Error, UnicodeDecodeError, csv.Error) as error:
+        except duckdb.Error as error:
             raise ImportTableError(f"{source}: not in the form of 'uwblink export' ({first_line(error)})") from error
         finally:
             store.close()
@@ -124,23 +121,18 @@ def read_exported(folder: Path, _map_file: Path | None = None) -> Contents:
 
 def _query(db: duckdb.DuckDBPyConnection, table: str, source: Path) -> str:
     """Return the query that reads an exported table; text from the file never becomes part of it."""
-    columns, read = TABLES[table] | {TRUTH_FROM: "VARCHAR"}, "read_parquet(?)"
-    cells = {name: f'"{name}"' for name in TABLES[table]}
-    if source.suffix == ".csv":
-        with source.open(encoding="utf-8-sig", newline="") as file:
-            header = next(csv.reader(file), [])
-        there = [name if name in columns else f"other{k}" for k, name in enumerate(header)]
-        kinds = ", ".join(f"'{name}': 'VARCHAR'" for name in there)
-        read = (
-            f"read_csv(?, auto_detect=false, header=true, delim=',', quote='\"', escape='\"', nullstr='', "
-            f"allow_quoted_nulls=false, columns={{{kinds}}}, max_line_size=64000000, parallel=false)"
-        )
-        for name, kind in TABLES[table].items():
-            cells[name] = f"CAST({f'unhex({cells[name]})' if kind == 'BLOB' else cells[name]} AS {kind})"
-    else:
-        found = db.execute(f"DESCRIBE SELECT * FROM {read}", [str(source)]).fetchall()  # noqa: S608 - nothing of a file
-        there = [str(row[0]) for row in found]
-    if TRUTH_FROM in there and table == "exchanges":
+    is_csv = source.suffix == ".csv"
+    read = (
+        "read_csv(?, auto_detect=true, all_varchar=true, header=true, delim=',', quote='\"', escape='\"', nullstr='', "
+        "allow_quoted_nulls=false, max_line_size=64000000, parallel=false)"
+        if is_csv
+        else "read_parquet(?)"
+    )
+    cells = {name: f'CAST("{name}" AS {kind})' for name, kind in TABLES[table].items()}
+    if is_csv:
+        cells |= {name: f'unhex("{name}")' for name, kind in TABLES[table].items() if kind == "BLOB"}
+    found = db.execute(f"DESCRIBE SELECT * FROM {read}", [str(source)]).fetchall()  # noqa: S608 - nothing of a file
+    if table == "exchanges" and TRUTH_FROM in {row[0] for row in found}:
         # Distances by poses are left out, because the poses are imported, too.
         cells["truth_m"] = f"CASE WHEN {TRUTH_FROM} = '{BY_POSES}' THEN NULL ELSE {cells['truth_m']} END"
     listed = ", ".join(f'{cell} AS "{name}"' for name, cell in cells.items())
@@ -154,19 +146,19 @@ IMPORTERS: Final[Registry[Importer]] = Registry(
         Importer(
             "csv",
             TABLE_SUFFIXES,
-            read_table,
+            None,
             "Import exchanges, messages or ranges from a table: CSV, Parquet or JSON lines.",
             map_help="Names, units and constants (.toml).",
-            read_all=read_table,
-            open_all=open_tables,
+            tables=find_tables,
+            several=True,
         ),
         Importer(
             "bag",
             BAG_SUFFIXES,
-            _read_bag,
+            None,
             "Import exchanges from messages in a bag of ROS 1, ROS 2 or MCAP.",
             map_help="Topics, names of fields, units and constants (.toml).",
-            open_all=open_exchange_bag,
+            tables=bag_to_table,
         ),
         Importer("exported", (), read_exported, "Import a folder that 'uwblink export' wrote as CSV or Parquet."),
         Importer(
@@ -227,14 +219,6 @@ def import_recording(
     return import_file(source, output, importer=importer, map_file=map_file, force=force).counts["exchanges"]
 
 
-@dataclass(frozen=True, slots=True)
-class Imported:
-    """What was imported: the number of rows by table, exchanges first, and notes for the user."""
-
-    counts: dict[str, int]
-    notes: list[str]
-
-
 def import_file(
     source: Source,
     output: str | os.PathLike[str],
@@ -250,13 +234,18 @@ def import_file(
     "grouping" where an exchange has several rows) and which share of it is done, by importers that say so.
     """
     check_output(Path(output), force=force, recording=True)
-    sources, row, explained = _chosen(source, importer, map_file)
-    if row.open_all is not None:
-        with IMPORTERS.calling(row.name, ImportTableError), row.open_all(sources, explained, watch) as found:
-            return Imported(*found.write(output, force=force))
-    contents = _read(sources, row, explained)
-    contents.save(output, force=force)
-    return Imported(contents.counts(), list(contents.meta.get("notes", ())))
+    sources, row, explained = _choose(source, importer, map_file)
+    with IMPORTERS.calling(row.name, ImportTableError):
+        if row.tables is None:
+            contents = _read(sources, row, explained)
+            contents.save(output, force=force)
+            return Imported(contents.counts(), list(contents.meta.get("notes", ())))
+        with TemporaryDirectory(prefix="uwblink-") as folder:
+            watch("reading", 0.0)
+            paths, column_map = row.tables(sources, explained, Path(folder))
+            names = ", ".join(path.name for path in sources)
+            meta = {"source": f"import {row.name}", "imported_from": names}
+            return import_tables(paths, column_map, Path(output), meta, watch, force=force)
 
 
 def read_source(
@@ -266,10 +255,16 @@ def read_source(
 
     Importers put notes for the user into `meta["notes"]`, a list of lines.
     """
-    return _read(*_chosen(source, importer, map_file))
+    sources, row, explained = _choose(source, importer, map_file)
+    if row.tables is None:
+        with IMPORTERS.calling(row.name, ImportTableError):
+            return _read(sources, row, explained)
+    with TemporaryDirectory(prefix="uwblink-") as folder:
+        import_file(sources, Path(folder) / "imported.uwb", importer=row.name, map_file=explained)
+        return load(Path(folder) / "imported.uwb")
 
 
-def _chosen(
+def _choose(
     source: Source, importer: str | None, map_file: str | os.PathLike[str] | None
 ) -> tuple[list[Path], Importer, Path | None]:
     """Return the files, their importer, and the map."""
@@ -279,15 +274,17 @@ def _chosen(
     row = _importer(sources[0], importer)
     if map_file is not None and row.map_help is None:
         raise ArgumentError(f"map_file: importer {row.name!r} takes none")
-    if len(sources) > 1 and row.read_all is None:
+    if len(sources) > 1 and not row.takes_several:
         raise ArgumentError(f"importer {row.name!r} takes one file, found {len(sources)}", parameter="source")
     return sources, row, None if map_file is None else Path(map_file)
 
 
 def _read(sources: list[Path], row: Importer, map_file: Path | None) -> Contents:
-    several = row.read_all if len(sources) > 1 else None
-    with IMPORTERS.calling(row.name, ImportTableError):
-        contents = several(sources, map_file) if several else row.read(sources[0], map_file)
+    if len(sources) > 1 and row.read_all:
+        contents = row.read_all(sources, map_file)
+    else:
+        read: Any = row.read
+        contents = read(sources[0], map_file)
     if not isinstance(contents, Contents):
         raise ArgumentError(f"importer {row.name!r}: returned {contents!r:.60}, expected Contents")
     return contents

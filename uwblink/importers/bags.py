@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -24,8 +23,6 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from uwblink.errors import ImportTableError, first_line
 from uwblink.exporters.mcap import RANGE
 from uwblink.importers.column_map import ColumnMap, load_map
-from uwblink.importers.exchange_tables import TableImport
-from uwblink.importers.staging import Watch, staged, unwatched
 from uwblink.text_files import require_regular
 
 BAG_SUFFIXES: Final = (".bag", ".mcap", ".db3")
@@ -161,25 +158,13 @@ def _records(path: Path) -> Iterator[McapRecord]:
             ) from error
 
 
-@contextmanager
-def open_exchange_bag(
-    sources: Sequence[Path], map_file: Path | None = None, watch: Watch = unwatched
-) -> Iterator[TableImport]:
-    """Yield the exchanges of one bag; `map_file` says which topics and fields they are in.
+def bag_to_table(sources: Sequence[Path], map_file: Path | None, folder: Path) -> tuple[list[Path], ColumnMap]:
+    """Write the messages of a bag as JSON lines into a folder; returns their path, and the map of them.
 
-    Raises `ImportTableError`.
+    `map_file` names topics and fields. Raises `ImportTableError`.
     """
-    (source,) = sources
-    watch("reading", 0.0)
-    with TemporaryDirectory(prefix="uwblink-") as place:
-        table = Path(place) / f"{source.name}.jsonl"
-        column_map = _to_json_lines(source, load_map(map_file) if map_file else ColumnMap(), table)
-        with staged([table], column_map, watch) as staging:
-            yield TableImport(staging, "import bag", source.name, watch)
-
-
-def _to_json_lines(source: Path, column_map: ColumnMap, table: Path) -> ColumnMap:
-    """Write the messages of a bag as JSON lines; returns the map of these."""
+    (source,), column_map = sources, load_map(map_file) if map_file else ColumnMap()
+    table = folder / f"{source.name}.jsonl"
     first: dict[str, Any] | None = None
     with open_bag(source) as bag:
         column_map = _with_topics(bag, column_map)
@@ -188,10 +173,8 @@ def _to_json_lines(source: Path, column_map: ColumnMap, table: Path) -> ColumnMa
                 for row in _rows(bag, column_map):
                     first = first or row
                     file.write(json.dumps(row, allow_nan=False) + "\n")
-        except RecursionError as error:
-            raise ImportTableError(f"{source}: a message is nested too deeply") from error
-        except OSError as error:
-            reason = error.strerror or error
+        except (OSError, RecursionError) as error:
+            reason = getattr(error, "strerror", None) or error
             raise ImportTableError(
                 f"{source.name}: cannot be turned into a table in {table.parent} ({reason})"
             ) from error
@@ -200,9 +183,10 @@ def _to_json_lines(source: Path, column_map: ColumnMap, table: Path) -> ColumnMa
     # Times are in nanoseconds unless the map says otherwise.
     column_map = replace(column_map, time_unit=column_map.time_unit or "ns")
     if "time_s" in column_map.columns or "time_s" in column_map.constants:
-        return column_map
+        return [table], column_map
     stamped = isinstance(first.get("header"), dict) and "stamp" in first["header"]
-    return replace(column_map, columns=column_map.columns | {"time_s": "header.stamp" if stamped else "log_time"})
+    columns = column_map.columns | {"time_s": "header.stamp" if stamped else "log_time"}
+    return [table], replace(column_map, columns=columns)
 
 
 def _with_topics(bag: Bag, column_map: ColumnMap) -> ColumnMap:
@@ -214,15 +198,12 @@ def _with_topics(bag: Bag, column_map: ColumnMap) -> ColumnMap:
             raise ImportTableError(f"{bag.path}: no topic {topic[:80]!r}; there are {listed}")
     if column_map.topics:
         return column_map
-    if not own and len(bag.kinds) != 1:
-        raise ImportTableError(
-            f'{bag.path}: a `map_file` must name the topics, as [topics."/name"]; there are {listed}'
-        )
-    topics: dict[str, dict[str, float | str]] = {topic: {} for topic in own or bag.kinds}
-    if not own:
-        return replace(column_map, topics=topics)
-    columns, unit = OWN_COLUMNS | column_map.columns, column_map.distance_unit or "m"
-    return replace(column_map, topics=topics, columns=columns, distance_unit=unit)
+    if own:
+        columns, unit = OWN_COLUMNS | column_map.columns, column_map.distance_unit or "m"
+        return replace(column_map, topics={topic: {} for topic in own}, columns=columns, distance_unit=unit)
+    if len(bag.kinds) == 1:
+        return replace(column_map, topics={topic: {} for topic in bag.kinds})
+    raise ImportTableError(f'{bag.path}: a `map_file` must name the topics, as [topics."/name"]; there are {listed}')
 
 
 def _rows(bag: Bag, column_map: ColumnMap) -> Iterator[dict[str, Any]]:

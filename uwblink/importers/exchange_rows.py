@@ -8,20 +8,17 @@ by these keys, so that each group is contiguous. Only DuckDB's sort holds many r
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple
 
-import numpy as np
-
-from uwblink.arrays import Ints
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import IDS
 from uwblink.importers.plausibility import counter_format
-from uwblink.importers.staging import StagedRows, Staging, Watch, unwatched
-from uwblink.importers.tables import Columns
+from uwblink.importers.staging import Rows, Staging, Watch
+from uwblink.importers.tables import Table
 from uwblink.recording.schema import Fault
-from uwblink.twr import LARGEST_ID, STAMPS
+from uwblink.twr import LARGEST_ID, LATEST_NS, STAMPS
 
 FAULTS_AT_ONCE: Final = 100_000
 
@@ -40,8 +37,6 @@ ENDS: Final = (
 )
 """Conditions on the ids of the two devices."""
 
-_TIME: Final = Condition("time_s", "a time", "time_ns IS NULL")
-
 
 class Faults:
     """Unusable rows, with the first reason of each."""
@@ -52,276 +47,188 @@ class Faults:
         self._reasons: list[Condition] = []
         staging.db.execute("CREATE TABLE faulty (origin BIGINT, reason INTEGER)")
 
-    def reject(self, rows: StagedRows, conditions: Sequence[Condition], among: str = "true") -> str:
-        """Record the rows that fulfil a condition as unusable; returns SQL that is true for the others."""
-        first = len(self._reasons)
+    def reject(self, rows: Rows, conditions: Sequence[Condition]) -> Rows:
+        """Record the rows that fulfil a condition as unusable; returns the others."""
+        cases = " ".join(f"WHEN {one.wrong} THEN {k}" for k, one in enumerate(conditions, start=len(self._reasons)))
         self._reasons += conditions
-        cases = " ".join(f"WHEN {one.wrong} THEN {first + k}" for k, one in enumerate(conditions))
-        query = f"SELECT origin, CASE {cases} END AS reason FROM {rows.name} WHERE {among}"
+        query = f"SELECT origin, CASE {cases} END AS reason FROM {rows.name} WHERE {rows.condition}"
         rows.db.execute(f"INSERT INTO faulty SELECT * FROM ({query}) WHERE reason IS NOT NULL")
-        return f"{among} AND CASE {cases} END IS NULL"
+        return rows.where(f"CASE {cases} END IS NULL")
 
     def __len__(self) -> int:
         """Return the number of unusable rows, without those with too many cells."""
         return int(self._staging.db.execute("SELECT count(*) FROM faulty").fetchall()[0][0])
 
+    def __iter__(self) -> Iterator[list[Fault]]:
+        """Yield blocks of faults, those of each file in the order of their rows, then rows with too many cells."""
+        staging, timed = self._staging, self._staging.rows.has("time_s")
+        query = (
+            f"SELECT origin, reason, {'coalesce(time_ns, 0)' if timed else '0'} FROM faulty JOIN rows USING (origin) "
+            f"WHERE origin >= ? AND origin < ? ORDER BY origin, reason LIMIT {FAULTS_AT_ONCE} OFFSET ?"
+        )
+        for table, first, last in zip(staging.tables, staging.offsets, staging.offsets[1:], strict=False):
+            done = 0
+            while found := staging.db.execute(query, [first, last, done]).fetchall():
+                done += len(found)
+                yield self._describe(table, [(row - first, reason, time_ns) for row, reason, time_ns in found])
+            if lines := table.rejected():
+                details = (f"row {line}: more cells than the header has" for line in lines)
+                yield [Fault(0, table.path.name, "unusable row", detail) for detail in details]
+
     def check(self, total: int) -> None:
         """Raise `ImportTableError` with the first unusable row if half of all rows or more are unusable."""
         if len(self) and 2 * len(self) >= total:
-            order = "ORDER BY origin, reason LIMIT 1"
-            ((origin, reason),) = self._staging.db.execute(f"SELECT origin, reason FROM faulty {order}").fetchall()
-            path = self._staging.paths[int(self._files(np.array([origin]))[0])]
-            (fault,) = self._described(np.array([origin]), np.array([reason]), np.array([0]))
+            ((fault, *_), *_) = self
+            path = next(path for path in self._staging.paths if path.name == fault.board)
             raise ImportTableError(f"{path}: {fault.detail}")
 
-    def __iter__(self) -> Iterator[list[Fault]]:
-        """Yield blocks of faults in the order of their rows; rows with too many cells come last."""
-        db, timed = self._staging.db, self._staging.rows.has("time_s")
-        time = "coalesce(time_ns, 0)" if timed else "0"
-        joined = f"SELECT f.*, {time} AS time_ns FROM faulty f JOIN rows USING (origin) ORDER BY origin, reason"
-        db.execute(f"CREATE OR REPLACE TABLE faults AS {joined}")
-        for start in range(0, len(self), FAULTS_AT_ONCE):
-            place = f"rowid >= {start} AND rowid < {start + FAULTS_AT_ONCE}"
-            found = db.execute(f"SELECT * FROM faults WHERE {place}").fetchnumpy()
-            yield self._described(*(np.ma.getdata(found[name]) for name in ("origin", "reason", "time_ns")))
-        for table in self._staging.tables:
-            lines = table.rejected().tolist()
-            for start in range(0, len(lines), FAULTS_AT_ONCE):
-                details = [f"row {n}: more cells than the header has" for n in lines[start : start + FAULTS_AT_ONCE]]
-                yield [Fault(0, table.path.name, "unusable row", detail) for detail in details]
-
-    def _files(self, origin: Ints) -> Ints:
-        return np.searchsorted(self._staging.offsets, origin, side="right") - 1
-
-    def _described(self, origin: Ints, reason: Ints, time_ns: Ints) -> list[Fault]:
-        """Return faults of rows in ascending order; the arguments are arrays (n,)."""
-        column_map, found = self._staging.column_map, []
-        files = self._files(origin)
-        for k in np.unique(files).tolist():
-            table, mine = self._staging.tables[k], files == k
-            rows = origin[mine] - self._staging.offsets[k]
-            reasons = [self._reasons[number] for number in reason[mine].tolist()]
-            headers = {one.column: column_map.header(one.column) for one in reasons}
-            there = [name for name, header in headers.items() if header in table.names]
-            words = table.words_at([headers[name] for name in there], rows)
-            for row, line, when, why in zip(
-                rows.tolist(), table.lines(rows).tolist(), time_ns[mine].tolist(), reasons, strict=True
-            ):
-                place = f"column {headers[why.column][:60]!r}"
-                if why.column in column_map.constants:
-                    place = f"constant {why.column!r}: found {str(column_map.constants[why.column])[:40]!r}"
-                elif why.column in there and row in words:
-                    place += f": found {words[row][headers[why.column]][:40]!r}"
-                found.append(
-                    Fault(when, table.path.name, "unusable row", f"row {line}, {place}, expected {why.expected}")
-                )
-        return found
+    def _describe(self, table: Table, found: Sequence[tuple[int, int, int]]) -> list[Fault]:
+        """Return faults of a table: its rows, reasons and times."""
+        column_map, faults = self._staging.column_map, []
+        headers = {column_map.header(self._reasons[reason].column) for _, reason, _ in found}
+        words = table.words_at([name for name in table.names if name in headers], [row for row, *_ in found])
+        for row, reason, time_ns in found:
+            column, expected, _ = self._reasons[reason]
+            header = column_map.header(column)
+            place = f"column {header[:60]!r}"
+            if column in column_map.constants:
+                place = f"constant {column!r}: found {str(column_map.constants[column])[:40]!r}"
+            elif header in words.get(row, ()):
+                place += f": found {words[row][header][:40]!r}"
+            detail = f"row {table.line(row)}, {place}, expected {expected}"
+            faults.append(Fault(time_ns, table.path.name, "unusable row", detail))
+        return faults
 
 
-@dataclass(frozen=True, slots=True)
-class UsableRows:
-    """The rows for which an SQL condition is true, and their number."""
-
-    rows: StagedRows
-    condition: str
-    count: int
-
-    def blocks(self) -> Iterator[Columns]:
-        """Yield the rows in their order, block by block; empty blocks are left out."""
-        return (columns for columns in self.rows.blocks(self.condition) if len(columns["origin"]))
-
-    def sample(self, size: int) -> Columns:
-        """Return a pseudo-random sample of the rows, in their order."""
-        chosen = f"SELECT row FROM {self.rows.name} WHERE {self.condition} ORDER BY hash(row) LIMIT {size}"
-        return self.rows.read(f"WHERE row IN ({chosen}) ORDER BY row")
-
-    def tags(self) -> list[int]:
-        """Return the ids of all devices, in ascending order."""
-        ends = (f"SELECT {name} AS id FROM {self.rows.name} WHERE {self.condition}" for name in IDS)
-        return [int(tag) for (tag,) in self.rows.db.execute(f"{' UNION '.join(ends)} ORDER BY id").fetchall()]
-
-
-def usable_ranges(rows: StagedRows, faults: Faults, among: str) -> UsableRows:
+def usable_ranges(rows: Rows, faults: Faults) -> Rows:
     """Return the rows that have a range without stamps."""
-    timed = [_TIME] if rows.has("time_s") else []
-    return _usable(
-        rows, faults.reject(rows, [*timed, Condition("range_m", "a finite number", "range_m IS NULL")], among)
-    )
+    return faults.reject(rows, [*_times(rows), Condition("range_m", "a finite number", "range_m IS NULL")])
+
+
+def _times(rows: Rows) -> list[Condition]:
+    in_reach = f"coalesce(time_ns BETWEEN -{LATEST_NS} AND {LATEST_NS}, false)"
+    return [Condition("time_s", "a time", f"NOT {in_reach}")] if rows.has("time_s") else []
 
 
 def usable_exchanges(
-    staging: Staging, rows: StagedRows, faults: Faults, among: str, stamps: Iterable[str]
-) -> tuple[UsableRows, int, int, str]:
+    staging: Staging, rows: Rows, faults: Faults, stamps: Sequence[str], sample_size: int
+) -> tuple[Rows, int, int, str]:
     """Return the rows that have all stamps, without repetitions of an exchange.
 
     Also returns the number of repetitions, and width and format of the counter.
     """
-    scale, names = staging.column_map.ticks_per_unit, list(stamps)
-    ticks = {name: name if scale == 1.0 else f"{name} * {scale!r}" for name in names}
-
-    def count(low: float, high: float) -> int:
-        span = f">= CAST('{low!r}' AS DOUBLE)", f"< CAST('{high!r}' AS DOUBLE)"
-        parts = (f"count(*) FILTER ({value} {span[0]} AND {value} {span[1]})" for value in ticks.values())
-        return int(rows.db.execute(f"SELECT {' + '.join(parts)} FROM {rows.name}").fetchall()[0][0])
-
-    bits, counter = counter_format(count, staging.column_map.bits, staging.column_map.counter)
-    largest = (1 << bits) - 1
+    column_map, sample = staging.column_map, rows.sample(sample_size)
+    scale = column_map.ticks_per_unit
+    ticks = [sample[name] * scale for name in stamps]
+    bits, counter = counter_format(ticks, column_map.bits, column_map.counter)
     low = 0 if counter == "wrapped" else -(1 << (bits - 1))
-    expected = f"{'a whole number' if scale == 1.0 else 'a stamp in ticks'} from {low} to {largest}"
-    conditions = [_TIME] if rows.has("time_s") else []
-    for name, value in ticks.items():
-        wrong = [] if counter == "unwrapped" else [f"{value} < {low} OR {value} >= {low + largest + 1}"]
-        wrong += [f"{value} <> trunc({value})"] if scale == 1.0 else []
-        conditions.append(Condition(name, "a finite number", f"{name} IS NULL"))
-        conditions += [Condition(name, expected, " OR ".join(wrong))] if wrong else []
-    good = faults.reject(rows, conditions, among)
+    number = "a whole number" if scale == 1.0 else "a stamp in ticks"
+    conditions = _times(rows)
+    for name in stamps:
+        conditions.append(Condition(name, "a whole number" if scale == 1.0 else "a finite number", f"{name} IS NULL"))
+        if counter != "unwrapped":
+            value, high = f"{name} * CAST('{scale!r}' AS DOUBLE)" if scale != 1.0 else name, low + (1 << bits)
+            wrong = f"{value} < {low} OR {value} >= {high}"
+            conditions.append(Condition(name, f"{number} from {low} to {high - 1}", wrong))
+    good = faults.reject(rows, conditions)
     # Two of 10 million different exchanges have the same hash of 64 bits once in 400,000 tables.
-    code = f"hash({', '.join([*IDS, *names])})"
-    some = f"({good}) AND ({' OR '.join(f'{name} <> 0' for name in names)})"
-    twice = f"SELECT {code} AS code, min(row) AS first FROM {rows.name} WHERE {some} GROUP BY code HAVING count(*) > 1"
-    later = f"SELECT row FROM {rows.name} JOIN ({twice}) ON {code} = code WHERE {some} AND row > first"
-    rows.db.execute(f"CREATE TABLE repeats AS {later}")
-    repeats = int(rows.db.execute("SELECT count(*) FROM repeats").fetchall()[0][0])
-    if repeats:
-        good += " AND row NOT IN (SELECT row FROM repeats)"
-    return _usable(rows, good), repeats, bits, counter
-
-
-def _usable(rows: StagedRows, condition: str) -> UsableRows:
-    return UsableRows(rows, condition, rows.count(condition))
+    code, some = f"hash({', '.join([*IDS, *stamps])})", good.where(" OR ".join(f"{name} <> 0" for name in stamps))
+    within = f"FROM {rows.name} WHERE {some.condition}"
+    twice = f"SELECT {code} AS code, min(rowid) AS first {within} GROUP BY code HAVING count(*) > 1"
+    later = (
+        f"SELECT r.rowid FROM {rows.name} r JOIN ({twice}) ON {code} = code WHERE {some.condition} AND r.rowid > first"
+    )
+    staging.db.execute(f"CREATE TABLE repeats AS {later}")
+    (repeats,) = Rows(staging.db, "repeats", ()).values("count(*)")
+    return good.where("rowid NOT IN (SELECT rowid FROM repeats)") if repeats else good, repeats, bits, counter
 
 
 _PAIR: Final = "CAST(least(from_id, to_id) AS UINTEGER) * 65536 + greatest(from_id, to_id)"
-_POWERS: Final = ("fpp", "rxp", "skew")
 _WHOLE: Final = ("gt_range_m", "range_m")
 """Columns that belong to the whole exchange."""
 
 
-def assemble_exchanges(
-    staging: Staging, layout: str, faults: Faults, watch: Watch = unwatched
-) -> tuple[StagedRows, str, str | None]:
+def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Watch) -> tuple[Rows, str | None]:
     """Combine rows of "messages", "stamps" or "parts" into exchanges.
 
-    Returns the rows, an SQL condition that holds for complete exchanges, and the protocol, if the rows determine it.
-    Incomplete exchanges are faults. Raises `ImportTableError`.
+    Returns complete exchanges, and the protocol, if the rows determine it. Incomplete exchanges are faults. Messages
+    are numbered 1, 2 and 3 (or 0, 1 and 2) by a column, or by their order. The sender of the first is the initiator;
+    the sender of the third distinguishes "ds" from "ds-alt". Raises `ImportTableError`.
     """
-    rows, within_s = staging.rows, staging.column_map.within_s
-    needed = {"messages": ("tx", "rx"), "stamps": ("stamp", "event", "message"), "parts": ()}
-    staging.require(rows, needed[layout])
+    rows, of_messages = staging.rows, layout != "parts"
+    staging.require(rows, {"messages": ("tx", "rx"), "stamps": ("stamp", "event", "message")}.get(layout, ()))
     watch("sorting", 0.0)
-    good = faults.reject(rows, ENDS)
-    if layout == "stamps":
-        rows, good = _messages_of_stamps(rows, good, faults, within_s)
+    rows = faults.reject(rows, ENDS)
+    number, follows = "place", ""
+    if of_messages and rows.has("message"):
+        some, zeros, largest = rows.values("count(message), count(*) FILTER (message = 0), max(message)")
+        # Numbers begin at 0 if many are 0; a few zeros are damaged cells.
+        number = "message + 1" if some and largest <= 2 and 4 * zeros > some else "message"
+        # A group ends where a message does not follow the one before. Stamps of one message have any order; those of a
+        # sequence are told by its number, because the devices' logs may be out of step.
+        follows = "message > lag(message) OVER ()" if layout == "messages" else ""
+        follows = "message >= lag(message) OVER ()" if layout == "stamps" and not rows.has("sequence") else follows
+    first, cells = f"{number} = 1", dict[str, tuple[str, str]]()
+    if of_messages:
+        theirs = {name: name for name in ("tx", "rx", "fpp", "rxp", "skew") if rows.has(name)} | {"sender": "from_id"}
+        if layout == "stamps":
+            theirs |= {name: f"CASE WHEN event = {k} THEN stamp END" for k, name in ((1.0, "tx"), (2.0, "rx"))}
+        for n in (1, 2, 3):
+            cells |= {f"{name}{n}": (cell, f"{number} = {n}") for name, cell in theirs.items()}
+        cells |= {name: (name, "true") for name in _WHOLE if rows.has(name)}
+    else:
+        # The initiator is whoever the row with its first stamp names first.
+        first = "tx1 IS NOT NULL" if rows.has("tx1") else "false"
+        cells = {name: (name, "true") for name in rows.columns if name not in ("origin", *IDS, "time_ns")}
+    # The rows of messages are told apart by their numbers.
+    told_apart = STAMPS if layout != "messages" else ()
+    twice = [f"count({cell}) FILTER ({where}) > 1" for n, (cell, where) in cells.items() if n in told_apart]
+    values: dict[str, str] = {
+        name: f"any_value({name}) FILTER (first)" for name in ("origin", "time_ns") if name in rows.columns
+    }
+    values |= {n: f"coalesce(arg_min({n}, serial) FILTER ({first}), any_value({n}) FILTER (first))" for n in IDS}
+    values |= {name: f"max({cell}) FILTER ({where})" for name, (cell, where) in cells.items()}
+    values |= {"conflict": " OR ".join(twice) or "false"}
     watch("grouping", 0.0)
-    if layout == "parts":
-        return _exchanges_of_parts(rows, good, faults, within_s)
-    return _exchanges_of_messages(rows, good, faults, within_s)
+    groups = _group(rows, values, follows, staging.column_map.within_s)
+    conflict = Condition("event" if layout == "stamps" else "sequence", "one value of each stamp", "conflict")
+    columns = tuple(name for name in values if name != "conflict" and not name.startswith("sender"))
+    if not of_messages:
+        return replace(faults.reject(groups, [conflict]), columns=columns), None
+    second, third, by_initiator = groups.values("count(sender2), count(sender3), count(*) FILTER (sender3 = from_id)")
+    protocol = "ss" if 2 * third <= second else "ds-alt" if 2 * by_initiator > third else "ds"
+    senders = ["from_id", "to_id", *({"ds": ["to_id"], "ds-alt": ["from_id"]}.get(protocol, []))]
+    whole = " AND ".join(f"coalesce(sender{n} = {sender}, false)" for n, sender in enumerate(senders, start=1))
+    incomplete = Condition("message", "messages 1, 2 (and 3) of one exchange", f"NOT ({whole})")
+    columns = tuple(name for name in columns if protocol != "ss" or name not in ("tx3", "rx3"))
+    return replace(faults.reject(groups, [incomplete, conflict]), columns=columns), protocol
 
 
-def _grouped(
-    rows: StagedRows,
-    good: str,
-    name: str,
-    link: str,
-    numbers: Sequence[str],
-    within_s: float,
-    values: Mapping[str, str],
-    *,
-    ascending: bool = False,
-) -> StagedRows:
+def _group(rows: Rows, values: Mapping[str, str], follows: str, within_s: float) -> Rows:
     """Return a table with one row for each group; `values` are its columns as SQL aggregates over the group's rows.
 
     In these `first` is true for the first row of a group, and `place` counts its rows from 1. Rows are sorted by keys,
-    time and original order. With `ascending` a group ends where the number of the message does not increase.
+    time and original order. A group also ends where the condition `follows` is not true.
     """
     # DuckDB sorts in half the time if the keys have 32 bytes or less, including one for each column.
-    cells = {name: name for name in rows.columns} | {"origin": "CAST(origin AS UINTEGER)"}
+    cells = {name: name for name in rows.columns}
     kinds = {"sequence": "BIGINT", "message": "TINYINT"}
     cells |= {name: f"TRY_CAST(trunc({name}) AS {kind})" for name, kind in kinds.items() if name in cells}
-    cells |= {"link": f"CAST({link} AS UINTEGER)", "turn": "CAST(row AS UINTEGER)"}
+    cells["link"] = f"CAST({_PAIR} AS UINTEGER)"
     listed = ", ".join(f"{cell} AS {column}" for column, cell in cells.items())
-    timed = ["time_ns"] if rows.has("time_s") else []
-    keys = ["link", *(name for name in numbers if name in cells)]
-    order = ", ".join([*keys, *timed, "turn"])
-    rows.db.execute(f"CREATE TABLE sorted AS SELECT {listed} FROM {rows.name} WHERE {good} ORDER BY {order}")
+    keys = ["link", *(name for name in ("sequence",) if name in cells)]
+    order = ", ".join([*keys, *(name for name in ("time_ns",) if name in cells), "origin"])
+    rows.db.execute(f"CREATE TABLE sorted AS SELECT {listed} FROM {rows.name} WHERE {rows.condition} ORDER BY {order}")
     same = [f"{key} IS NOT DISTINCT FROM lag({key}) OVER ()" for key in keys]
-    if timed:
+    if "time_ns" in cells:
         gap = "CAST(time_ns AS DOUBLE) - CAST(lag(time_ns) OVER () AS DOUBLE)"
         same.append(f"coalesce({gap} <= {within_s * 1e9!r}, time_ns IS NULL AND lag(time_ns) OVER () IS NULL)")
-    if ascending:
-        same.append("coalesce(message > lag(message) OVER (), false)")
+    same += [f"coalesce({follows}, false)"] if follows else []
     marked = f"SELECT *, rowid AS serial, NOT ({' AND '.join(same)}) AS first FROM sorted"
     # Windows without ORDER BY stream through the rows.
     start = "max(CASE WHEN first THEN serial END) OVER (ROWS UNBOUNDED PRECEDING)"
     placed = f"SELECT *, {start} AS start, serial - {start} + 1 AS place FROM ({marked})"
     listed = ", ".join(f"{value} AS {column}" for column, value in values.items())
-    rows.db.execute(f"CREATE TABLE {name}_groups AS SELECT {listed} FROM ({placed}) GROUP BY start ORDER BY start")
+    rows.db.execute(f"CREATE TABLE exchanges AS SELECT {listed} FROM ({placed}) GROUP BY start ORDER BY start")
     rows.db.execute("DROP TABLE sorted")
-    rows.db.execute(f"CREATE VIEW {name} AS SELECT rowid AS row, * FROM {name}_groups")
-    return StagedRows(rows.db, name, tuple(values))
-
-
-def _of_first(rows: StagedRows, *more: str) -> dict[str, str]:
-    """Return aggregates that take columns from the first row of a group."""
-    names = ("origin", "from_id", "to_id", "time_ns", *more)
-    return {name: f"any_value({name}) FILTER (first)" for name in names if name in rows.columns}
-
-
-def _exchanges_of_messages(rows: StagedRows, good: str, faults: Faults, within_s: float) -> tuple[StagedRows, str, str]:
-    """Combine messages into exchanges; returns rows, the condition for complete exchanges, and the protocol of most.
-
-    Messages are numbered 1, 2 and 3 (or 0, 1 and 2) by a column, or by their order. The sender of the first is the
-    initiator; the sender of the third distinguishes "ds" from "ds-alt".
-    """
-    number = "place"
-    if rows.has("message"):
-        numbers = "count(message), count(*) FILTER (message = 0), max(message)"
-        ((some, zeros, largest),) = rows.db.execute(f"SELECT {numbers} FROM {rows.name} WHERE {good}").fetchall()
-        # Numbers begin at 0 if many are 0; a few zeros are damaged cells.
-        number = "message + 1" if some and largest <= 2 and 4 * zeros > some else "message"
-    values = _of_first(rows, *_WHOLE)
-    for n in (1, 2, 3):
-        taken = {f"sender{n}": "from_id", f"tx{n}": "tx", f"rx{n}": "rx"}
-        taken |= {f"{level}{n}": level for level in _POWERS if n < 3}
-        values |= {o: f"max({theirs}) FILTER ({number} = {n})" for o, theirs in taken.items() if theirs in rows.columns}
-    groups = _grouped(rows, good, "exchanges", _PAIR, ("sequence",), within_s, values, ascending=rows.has("message"))
-    votes = "count(sender2), count(sender3), count(*) FILTER (sender3 = from_id)"
-    ((second, third, by_initiator),) = rows.db.execute(f"SELECT {votes} FROM exchanges").fetchall()
-    protocol = "ss" if 2 * third <= second else "ds-alt" if 2 * by_initiator > third else "ds"
-    senders = ["from_id", "to_id", *({"ds": ["to_id"], "ds-alt": ["from_id"]}.get(protocol, []))]
-    whole = " AND ".join(f"coalesce(sender{n} = {sender}, false)" for n, sender in enumerate(senders, start=1))
-    condition = Condition("message", "messages 1, 2 (and 3) of one exchange", f"NOT ({whole})")
-    columns = tuple(n for n in values if not n.startswith("sender") and (protocol != "ss" or n not in ("tx3", "rx3")))
-    return StagedRows(rows.db, "exchanges", columns), faults.reject(groups, [condition]), protocol
-
-
-def _messages_of_stamps(rows: StagedRows, good: str, faults: Faults, within_s: float) -> tuple[StagedRows, str]:
-    """Combine stamps into messages; returns rows and the condition that both stamps are there once."""
-    cells = [n for n in ("sequence", "message", *_POWERS, *_WHOLE) if n in rows.columns]
-    values = _of_first(rows) | {name: f"max({name})" for name in cells}
-    for name, event in (("tx", 1), ("rx", 2)):
-        values |= {name: f"max(stamp) FILTER (event = {event})", f"{name}_count": f"count(*) FILTER (event = {event})"}
-    messages = _grouped(
-        rows, good, "messages", "CAST(from_id AS UINTEGER) * 65536 + to_id", ("sequence", "message"), within_s, values
-    )
-    wrong = Condition("event", "one tx and one rx of a message", "tx_count <> 1 OR rx_count <> 1")
-    return messages, faults.reject(messages, [wrong])
-
-
-def _exchanges_of_parts(rows: StagedRows, good: str, faults: Faults, within_s: float) -> tuple[StagedRows, str, None]:
-    """Combine rows with some of the columns into exchanges; the condition is that no stamp has two values."""
-    # The initiator is whoever the row with its first stamp names first.
-    values = _of_first(rows)
-    if rows.has("tx1"):
-        values = {
-            name: f"coalesce(arg_min({name}, serial) FILTER (tx1 IS NOT NULL), {value})"
-            for name, value in values.items()
-        }
-    cells = [name for name in rows.columns if name not in values]
-    counted = [name for name in STAMPS if name in cells]
-    values |= {name: f"max({name})" for name in cells} | {f"{name}_count": f"count({name})" for name in counted}
-    groups = _grouped(rows, good, "exchanges", _PAIR, ("sequence",), within_s, values)
-    twice = " OR ".join(f"{name}_count > 1" for name in counted) or "false"
-    wrong = Condition("sequence", "one value of each column an exchange", twice)
-    columns = tuple(name for name in values if not name.endswith("_count"))
-    return StagedRows(rows.db, "exchanges", columns), faults.reject(groups, [wrong]), None
+    return Rows(rows.db, "exchanges", tuple(values))

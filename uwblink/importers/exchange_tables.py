@@ -1,72 +1,56 @@
-"""Tables of exchanges, of messages or of plain ranges, as CSV, Parquet or JSON lines, one file or several.
+"""Tables of exchanges, of messages or of plain ranges, one file or several, written to a recording.
 
-The steps: stage the table (`staging`), combine the rows of each exchange (`exchange_rows`), record unusable rows as
-faults (`exchange_rows`), write the exchanges in blocks. A table is refused if half of its rows or more are unusable.
-`range_m` is the range that the device reported, or else the range by the stamps. `gt_range_m`, or the distance between
-the two antenna positions (`from_x_m` ... `to_z_m`), is stored as the true distance of the exchange; antennas with
-positions become bodies with poses.
+The steps: stage the tables (`staging`), combine the rows of each exchange and record unusable rows as faults
+(`exchange_rows`), find out how stamps are to be read (`plausibility`), write the exchanges in blocks. A table is
+refused if half of its rows or more are unusable. `range_m` is the range that the device reported, or else the range by
+the stamps. `gt_range_m`, or the distance between the two antenna positions (`from_x_m` ... `to_z_m`), is stored as the
+true distance of the exchange; antennas with positions become bodies with poses.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
 
-from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import IDS, POSITIONS, ColumnMap, load_map
-from uwblink.importers.exchange_rows import (
-    ENDS,
-    Faults,
-    assemble_exchanges,
-    usable_exchanges,
-    usable_ranges,
-)
+from uwblink.importers.exchange_rows import ENDS, Faults, assemble_exchanges, usable_exchanges, usable_ranges
 from uwblink.importers.plausibility import (
-    ACCEPTED_SHARE,
     MIN_ROWS,
+    ROW_PERIOD_NS,
     SAMPLE_ROWS,
     Reading,
-    Sample,
-    Trial,
     check_units,
-    clocks,
-    find_other_reading,
+    exchanges_of,
     optional,
+    settle_reading,
     stamps_of,
-    to_ticks,
-    truth_m,
 )
-from uwblink.importers.staging import ROWS_AT_ONCE, Staging, Watch, staged, unwatched
-from uwblink.importers.tables import Columns
-from uwblink.recording.antenna_delays import AntennaDelay, delay_of, meta_of_delays
-from uwblink.recording.contents import Contents, load
+from uwblink.importers.staging import Rows, Staging, Watch
+from uwblink.importers.tables import connected
+from uwblink.recording.antenna_delays import AntennaDelay, meta_of_delays
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
-from uwblink.ticks import ANTENNA_DELAY_TICKS, METRES_PER_TICK
-from uwblink.twr import LARGEST_ID, STAMPS, Exchanges, raw_range
+from uwblink.twr import STAMPS, raw_range
 
 TABLE_SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".parquet", ".jsonl", ".ndjson", ".jsonl.gz")
-ROW_PERIOD_NS: Final = 1_000_000
-"""Time between the rows of a table without times."""
 
 
-@contextmanager
-def open_tables(
-    sources: Sequence[Path], map_file: Path | None = None, watch: Watch = unwatched
-) -> Iterator[TableImport]:
-    """Open one table, all tables of a folder as one, or several files as one; raises `ImportTableError`.
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """What was imported: the number of rows by table, exchanges first, and notes for the user."""
 
-    `map_file` has names and units of the columns.
-    """
+    counts: dict[str, int]
+    notes: list[str]
+
+
+def find_tables(sources: Sequence[Path], map_file: Path | None, _folder: Path) -> tuple[list[Path], ColumnMap]:
+    """Return the tables of a folder, or several files, and the map of their columns; raises `ImportTableError`."""
     paths = list(sources)
     if len(paths) == 1 and paths[0].is_dir():
         paths = sorted(path for path in paths[0].iterdir() if path.name.lower().endswith(TABLE_SUFFIXES))
@@ -75,8 +59,72 @@ def open_tables(
     column_map = load_map(map_file) if map_file else ColumnMap()
     if column_map.topics or column_map.each:
         raise ImportTableError(f"{map_file}: topics and each are of bags; {paths[0]} is a table")
-    with staged(paths, column_map, watch) as staging:
-        yield TableImport(staging, "import csv", ", ".join(path.name for path in paths), watch)
+    return paths, column_map
+
+
+def import_tables(
+    paths: Sequence[Path],
+    column_map: ColumnMap,
+    output: Path,
+    meta: Mapping[str, Any],
+    watch: Watch,
+    *,
+    force: bool = False,
+) -> Imported:
+    """Write the exchanges of tables to a recording, whose `meta` is added to.
+
+    Raises `ImportTableError`, and what `Recording.create` raises.
+    """
+    with connected(paths) as db:
+        staging = Staging(db, paths, column_map, watch)
+        faults, notes = Faults(staging), _notes(staging)
+        rows, reading = _usable(staging, faults, notes, watch)
+        total = rows.count()
+        blocks = iter(faults)
+        if count := len(faults) + sum(len(table.rejected()) for table in staging.tables):
+            first = next(blocks)
+            rest = f"rows cannot be used and are kept as faults; the first: {first[0].detail}"
+            notes.append(f"{count} of {total + count} {rest}")
+            blocks = chain([first], blocks)
+        delays = column_map.antenna_delays
+        if reading and reading.undelayed:
+            delays = {None: AntennaDelay(0, 0, 0)}
+        tags = {str(number): name for number, name in sorted(staging.names.items())}
+        meta = {
+            **meta,
+            "timestamp_bits": reading.bits if reading else 32,
+            "notes": notes,
+            **({"tag_names": tags} if tags else {}),
+            **meta_of_delays(delays),
+        }
+        counts = {"exchanges": 0, "poses": 0, "powers": 0, "faults": 0}
+        with Recording.create(output, meta=meta, force=force, memory_mb=250) as recording:
+            ends = " UNION ".join(f"SELECT {name} AS id FROM {rows.name} WHERE {rows.condition}" for name in IDS)
+            bodies = {
+                tag: staging.names.get(tag, f"tag{tag}") for (tag,) in db.execute(f"{ends} ORDER BY id").fetchall()
+            }
+            recording.append_tags(Tag(tag, body, (0.0, 0.0, 0.0)) for tag, body in bodies.items())
+            for block in rows.blocks():
+                watch("writing", counts["exchanges"] / total)
+                exchanges = exchanges_of(column_map, block, reading, counts["exchanges"])
+                known = np.isfinite(exchanges.range_m)
+                if not known.all():
+                    raw = raw_range(exchanges)
+                    exchanges = replace(exchanges, range_m=np.where(known, exchanges.range_m, raw))
+                recording.append_exchanges(exchanges)
+                counts["exchanges"] += len(exchanges)
+                if "rxp1" in block or "rxp2" in block:
+                    powers = {name: getattr(exchanges, name) for name in ("time_ns", "initiator", "target")}
+                    powers |= {f"{name}_dbm": optional(block, name) for name in ("rxp1", "rxp2")}
+                    recording.append("powers", powers)
+                    counts["powers"] += len(exchanges)
+            for poses in _poses(rows, bodies):
+                recording.append_poses(poses)
+                counts["poses"] += len(poses)
+            for some in blocks:
+                recording.append("faults", some)
+                counts["faults"] += len(some)
+        return Imported({name: n for name, n in counts.items() if n or name == "exchanges"}, notes)
 
 
 def _notes(staging: Staging) -> list[str]:
@@ -91,6 +139,44 @@ def _notes(staging: Staging) -> list[str]:
     return notes
 
 
+def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) -> tuple[Rows, Reading | None]:
+    """Return the usable exchanges and how to read their stamps, None for ranges without stamps; adds to the notes.
+
+    Raises `ImportTableError` if half of the rows or more are unusable.
+    """
+    column_map, path = staging.column_map, staging.paths[0]
+    layout, protocol = column_map.layout or _layout(staging), column_map.protocol
+    if layout in ("messages", "stamps", "parts"):
+        rows, found = assemble_exchanges(staging, layout, faults, watch)
+        protocol = protocol or found
+    else:
+        rows = faults.reject(staging.rows, ENDS)
+    total = rows.count() + len(faults)
+    watch("checking", 0.0)
+    if layout == "ranges":
+        staging.require(rows, ["range_m"])
+        rows = usable_ranges(rows, faults)
+        faults.check(total)
+        check_units(column_map, path, rows.sample(SAMPLE_ROWS), None)
+        notes += filter(None, [_note_on_repeats(rows)])
+        return rows, None
+    protocol = protocol or ("ds" if rows.has("tx3") and rows.has("rx3") else "ss")
+    staging.require(rows, stamps_of(protocol))
+    rows, repeats, bits, counter = usable_exchanges(staging, rows, faults, stamps_of(protocol), SAMPLE_ROWS)
+    faults.check(total)
+    if repeats:
+        notes.append(
+            f"{repeats} of {total} rows repeat an exchange, with the same devices and stamps, and are left out"
+        )
+    if counter != "wrapped":
+        notes.append(f"stamps are {counter}, and are taken modulo 2^{bits}")
+    sample = rows.sample(SAMPLE_ROWS)
+    reading, note = settle_reading(path, column_map, sample, Reading(protocol, bits))
+    notes += filter(None, [note])
+    check_units(column_map, path, sample, raw_range(exchanges_of(column_map, sample, reading)))
+    return rows, reading
+
+
 def _layout(staging: Staging) -> str:
     """Return the layout that the columns suggest."""
     has = staging.rows.has
@@ -102,243 +188,53 @@ def _layout(staging: Staging) -> str:
     raise staging.missing(next(name for name in STAMPS if not has(name)))
 
 
-def _reading(column_map: ColumnMap, path: Path, rows: Columns, reading: Reading, notes: list[str]) -> Reading:
-    """Return how to read the stamps: as the map says, or otherwise if only that makes plausible ranges."""
-    pair = rows["from_id"] * (LARGEST_ID + 1) + rows["to_id"]
-    # In the unit of the table; stamps that only other protocols have may be missing.
-    cells: dict[str, Floats] = {name: rows[name] for name in STAMPS if name in rows}
-    longer_m = _longer_m(column_map, rows)
-    truth_m, skew2 = optional(rows, "gt_range_m"), optional(rows, "skew2")
-    first, other = find_other_reading(Sample(cells, pair, truth_m, skew2, longer_m, column_map.ticks_per_unit), reading)
-    if other is None:
-        if first.plausible < ACCEPTED_SHARE and len(pair) >= MIN_ROWS:
-            notes.append(
-                f"the ranges are not plausible ({_span(first)}), and no other protocol, width or order of the columns "
-                "makes better ones; check the map"
-            )
-        return reading
-    difference = other.reading.difference(reading)
-    contradicted = (
-        other.reading.swapped
-        or (column_map.protocol and other.reading.protocol != reading.protocol)
-        or (column_map.bits and other.reading.bits != reading.bits)
-        or (column_map.antenna_delays and other.reading.undelayed)
+def _poses(rows: Rows, bodies: Mapping[int, str]) -> Iterator[Poses]:
+    """Yield the poses of antennas in order of time; antennas that never move have a single one."""
+    if not all(map(rows.has, POSITIONS)):
+        return
+    time = "time_ns" if rows.has("time_s") else f"(row_number() OVER () - 1) * {ROW_PERIOD_NS} AS time_ns"
+    located = f"SELECT {time}, rowid AS row, {', '.join((*IDS, *POSITIONS))} FROM {rows.name} WHERE {rows.condition}"
+    ends = (
+        f"SELECT time_ns, {name} AS tag, {rank} AS rank, row, "
+        f"{', '.join(f'{end}_{axis}_m AS {axis}' for axis in 'xyz')} FROM located"
+        for rank, (end, name) in enumerate(zip(("from", "to"), IDS, strict=True))
     )
-    if contradicted:
-        raise ImportTableError(
-            f'{path}: by protocol "{reading.protocol}" its ranges are {_span(first)}; '
-            f"with {difference} they are {_span(other)}: state that in the map"
-        )
-    notes.append(f'read with {difference}: by protocol "{reading.protocol}" the ranges would be {_span(first)}')
-    return other.reading
-
-
-def _longer_m(column_map: ColumnMap, rows: Columns) -> Floats:
-    """Return the lengths (n,) that missing antenna delays add to ranges, by the map."""
-    lacking, delays = np.zeros(len(rows["origin"])), column_map.antenna_delays
-    for name in IDS if delays else ():
-        ids, back = np.unique(rows[name], return_inverse=True)
-        programmed = [delay_of(delays, int(tag)) or AntennaDelay() for tag in ids]
-        lacking += (2 * ANTENNA_DELAY_TICKS - np.array([one.tx + one.rx for one in programmed], np.float64))[back]
-    return lacking / 2 * METRES_PER_TICK
-
-
-def _span(trial: Trial) -> str:
-    return f"{trial.low_m:.4g} to {trial.high_m:.4g} m"
-
-
-def exchanges_of(column_map: ColumnMap, rows: Columns, reading: Reading | None, before: int = 0) -> Exchanges:
-    """Return rows as exchanges with the reported ranges, or else those by the stamps; `before` counts earlier rows.
-
-    Without a reading the rows are ranges without stamps: single-sided exchanges whose stamps are 0.
-    """
-    count = len(rows["origin"])
-    stamps: dict[str, Any] = dict.fromkeys(STAMPS, np.zeros(count, dtype=np.int64))
-    protocol, bits = (reading.protocol, reading.bits) if reading else ("ss", 32)
-    if reading:
-        stamps |= to_ticks(rows, clocks(protocol), column_map.ticks_per_unit, bits)
-    exchanges = Exchanges(
-        time_ns=rows.get("time_ns", np.arange(before, before + count) * ROW_PERIOD_NS),
-        initiator=rows["from_id"], target=rows["to_id"], reporter=rows["from_id"], protocol=np.full(count, protocol),
-        range_m=optional(rows, "range_m"), fpp1_dbm=optional(rows, "fpp1"), fpp2_dbm=optional(rows, "fpp2"),
-        skew1_ppm=optional(rows, "skew1"), skew2_ppm=optional(rows, "skew2"), truth_m=truth_m(rows), bits=bits,
-        **stamps,
-    )  # fmt: skip
-    known = np.isfinite(exchanges.range_m)
-    return (
-        exchanges
-        if known.all()
-        else replace(exchanges, range_m=np.where(known, exchanges.range_m, raw_range(exchanges)))
+    # The first of several positions at one time counts; initiators come before targets.
+    one = ", ".join(f"arg_min({axis}, (rank, row)) AS {axis}" for axis in "xyz")
+    moves = " OR ".join(f"min({axis}) OVER tags <> max({axis}) OVER tags" for axis in "xyz")
+    rows.db.execute(
+        f"CREATE TABLE posed AS WITH located AS MATERIALIZED ({located}), places AS (SELECT time_ns, tag, {one} "
+        f"FROM ({' UNION ALL '.join(ends)}) WHERE x + y + z IS NOT NULL GROUP BY ALL) "
+        f"SELECT time_ns AS origin, tag, x, y, z FROM places WINDOW tags AS (PARTITION BY tag) "
+        f"QUALIFY {moves} OR time_ns = min(time_ns) OVER tags ORDER BY time_ns, tag"
     )
+    level = np.array([0.0, 0.0, 0.0, 1.0])
+    for found in Rows(rows.db, "posed", ("origin", "tag", "x", "y", "z")).blocks():
+        tags, which = np.unique(found["tag"], return_inverse=True)
+        position = np.column_stack([found[axis] for axis in "xyz"])
+        names = np.array([bodies[int(tag)] for tag in tags])[which]
+        yield Poses(found["origin"], names, position, np.tile(level, (len(which), 1)))
 
 
-class TableImport:
-    """Usable rows of staged tables, and how to read their stamps.
-
-    `reading` is None for ranges without stamps; `notes` are for the user; `total` counts usable and faulty rows.
-    """
-
-    def __init__(self, staging: Staging, source: str, imported_from: str, watch: Watch) -> None:
-        """Check staged tables; raises `ImportTableError` if half of the rows or more are unusable.
-
-        `source` and `imported_from` go into the recording's `meta`.
-        """
-        column_map, rows, faults = staging.column_map, staging.rows, Faults(staging)
-        self.staging, self.faults, self.watch = staging, faults, watch
-        self._source = {"source": source, "imported_from": imported_from}
-        staging.require(rows, IDS)
-        self.notes = _notes(staging)
-        layout, protocol = column_map.layout or _layout(staging), column_map.protocol
-        if layout in ("messages", "stamps", "parts"):
-            rows, good, found = assemble_exchanges(staging, layout, faults, watch)
-            protocol = protocol or found
-        else:
-            good = faults.reject(rows, ENDS)
-        self.total = rows.count(good) + len(faults)
-        watch("checking", 0.0)
-        self.reading: Reading | None = None
-        if layout == "ranges":
-            staging.require(rows, ["range_m"])
-            self.usable = usable_ranges(rows, faults, good)
-            faults.check(self.total)
-            check_units(column_map, staging.paths[0], self.usable.sample(SAMPLE_ROWS), None)
-            self.notes += filter(None, [note_on_repeats(next(self.usable.blocks()))])
-            return
-        protocol = protocol or ("ds" if rows.has("tx3") and rows.has("rx3") else "ss")
-        staging.require(rows, stamps_of(protocol))
-        self.usable, repeats, bits, counter = usable_exchanges(staging, rows, faults, good, stamps_of(protocol))
-        faults.check(self.total)
-        if repeats:
-            self.notes.append(
-                f"{repeats} of {self.total} rows repeat an exchange, with the same devices and stamps, and are left out"
-            )
-        if counter != "wrapped":
-            self.notes.append(f"stamps are {counter}, and are taken modulo 2^{bits}")
-        sample = self.usable.sample(SAMPLE_ROWS)
-        self.reading = _reading(column_map, staging.paths[0], sample, Reading(protocol, bits), self.notes)
-        raw = raw_range(exchanges_of(column_map, sample, self.reading))
-        check_units(column_map, staging.paths[0], sample, raw)
-
-    def write(self, path: str | os.PathLike[str], *, force: bool = False) -> tuple[dict[str, int], list[str]]:
-        """Write a recording; returns the number of rows of each table that has any, and the notes.
-
-        Raises what `Recording.create` raises.
-        """
-        notes, faults = self.notes, iter(self.faults)
-        if count := len(self.faults) + sum(len(table.rejected()) for table in self.staging.tables):
-            first = next(faults)
-            rest = f"rows cannot be used and are kept as faults; the first: {first[0].detail}"
-            notes, faults = [*notes, f"{count} of {self.total} {rest}"], chain([first], faults)
-        counts = {"exchanges": 0, "poses": 0, "powers": 0, "faults": 0}
-        with Recording.create(path, meta=self._meta(notes), force=force, memory_mb=250) as recording:
-            recording.append_tags(Tag(tag, self._body(tag), (0.0, 0.0, 0.0)) for tag in self.usable.tags())
-            for exchanges, powers in self._exchanges():
-                with recording.transaction():
-                    recording.append_exchanges(exchanges)
-                    recording.append("powers", powers)
-                counts["exchanges"] += len(exchanges)
-                counts["powers"] += len(exchanges) if powers else 0
-            for poses in self._poses():
-                recording.append_poses(poses)
-                counts["poses"] += len(poses)
-            for some in faults:
-                recording.append("faults", some)
-                counts["faults"] += len(some)
-        return {name: n for name, n in counts.items() if n or name == "exchanges"}, notes
-
-    def contents(self) -> Contents:
-        """Return the same in memory."""
-        with TemporaryDirectory(prefix="uwblink-") as folder:
-            path = Path(folder) / "imported.uwb"
-            _, notes = self.write(path)
-            return replace(load(path), meta=self._meta(notes))
-
-    def _exchanges(self) -> Iterator[tuple[Exchanges, Columns]]:
-        """Yield blocks of exchanges in the order of their rows, and their columns of the table `powers`."""
-        before = 0
-        for rows in self.usable.blocks():
-            self.watch("writing", before / self.usable.count)
-            exchanges = exchanges_of(self.staging.column_map, rows, self.reading, before)
-            powers: Columns = {}
-            if "rxp1" in rows or "rxp2" in rows:
-                powers = {name: getattr(exchanges, name) for name in ("time_ns", "initiator", "target")}
-                powers |= {f"{name}_dbm": optional(rows, name) for name in ("rxp1", "rxp2")}
-            yield exchanges, powers
-            before += len(exchanges)
-
-    def _meta(self, notes: list[str]) -> dict[str, Any]:
-        delays, names = self.staging.column_map.antenna_delays, self.staging.names
-        if self.reading and self.reading.undelayed:
-            delays = {None: AntennaDelay(0, 0, 0)}
-        meta: dict[str, Any] = {
-            **self._source,
-            "timestamp_bits": self.reading.bits if self.reading else 32,
-            "notes": notes,
-        }
-        if names:
-            meta["tag_names"] = {str(number): name for number, name in sorted(names.items())}
-        return meta | meta_of_delays(delays)
-
-    def _body(self, tag: int) -> str:
-        return self.staging.names.get(tag, f"tag{tag}")
-
-    def _poses(self) -> Iterator[Poses]:
-        """Yield the poses of antennas in order of time; antennas that never move have a single one."""
-        rows, db = self.usable.rows, self.staging.db
-        if not all(map(rows.has, POSITIONS)):
-            return
-        time = "time_ns" if rows.has("time_s") else f"(row_number() OVER () - 1) * {ROW_PERIOD_NS} AS time_ns"
-        db.execute(
-            f"CREATE TABLE located AS SELECT row, {time}, {', '.join(IDS)}, {', '.join(POSITIONS)} "
-            f"FROM {rows.name} WHERE {self.usable.condition}"
-        )
-        ends = []
-        for rank, (end, name) in enumerate(zip(("from", "to"), IDS, strict=True)):
-            axes = ", ".join(f"{end}_{axis}_m AS {axis}" for axis in "xyz")
-            known = " AND ".join(f"{end}_{axis}_m IS NOT NULL" for axis in "xyz")
-            ends.append(f"SELECT time_ns, {name} AS tag, {rank} AS rank, row, {axes} FROM located WHERE {known}")
-        # The first of several positions at one time counts; initiators come before targets.
-        one = ", ".join(f"arg_min({axis}, (rank, row)) AS {axis}" for axis in "xyz")
-        db.execute(f"CREATE TABLE places AS SELECT time_ns, tag, {one} FROM ({' UNION ALL '.join(ends)}) GROUP BY ALL")
-        moves = " OR ".join(f"min({axis}) <> max({axis})" for axis in "xyz")
-        db.execute(
-            f"CREATE TABLE posed AS SELECT p.* FROM places p JOIN (SELECT tag, min(time_ns) AS first, {moves} AS moves "
-            "FROM places GROUP BY tag) t ON p.tag = t.tag AND (t.moves OR p.time_ns = t.first) "
-            "ORDER BY p.time_ns, p.tag"
-        )
-        for start in range(0, db.execute("SELECT count(*) FROM posed").fetchall()[0][0], ROWS_AT_ONCE):
-            place = f"rowid >= {start} AND rowid < {start + ROWS_AT_ONCE}"
-            found = db.execute(f"SELECT * FROM posed WHERE {place}").fetchnumpy()
-            tags, which = np.unique(found["tag"], return_inverse=True)
-            names = np.array([self._body(int(tag)) for tag in tags])
-            level = np.tile([0.0, 0.0, 0.0, 1.0], (len(which), 1))
-            position = np.column_stack([np.ma.getdata(found[axis]) for axis in "xyz"])
-            yield Poses(np.ma.getdata(found["time_ns"]), names[which], position, level)
-
-
-def note_on_repeats(rows: Columns) -> str:
+def _note_on_repeats(rows: Rows) -> str:
     """Return a note if ranges without stamps are probably recorded twice; empty text otherwise.
 
     A range may equal the previous one of the same two devices by chance, or because it repeats it. In the first case
-    the times since the previous range are distributed as those of other ranges: rank test of Mann and Whitney.
+    the times since the previous range are those of other ranges; a repetition follows sooner.
     """
-    if "time_ns" not in rows:
+    if not rows.has("time_s"):
         return ""
-    one, other = (rows[name] for name in IDS)
-    pair = np.minimum(one, other) * (LARGEST_ID + 1) + np.maximum(one, other)
-    order = np.lexsort((rows["time_ns"], pair))
-    same = np.diff(pair[order]) == 0
-    gap = np.diff(rows["time_ns"][order])[same] * 1e-9
-    equal = (np.diff(rows["range_m"][order]) == 0)[same]
-    if equal.all() or not equal.any():
+    pair = "PARTITION BY least(from_id, to_id), greatest(from_id, to_id) ORDER BY time_ns, rowid"
+    gaps = (
+        "SELECT (time_ns - lag(time_ns) OVER pair) * 1e-6 AS gap_ms, range_m = lag(range_m) OVER pair AS equal "
+        f"FROM {rows.name} WHERE {rows.condition} WINDOW pair AS ({pair})"
+    )
+    medians = (f"coalesce(median(gap_ms) FILTER ({which}), 0)" for which in ("equal", "NOT equal"))
+    found = rows.db.execute(f"SELECT count(*) FILTER (equal), {', '.join(medians)} FROM ({gaps})").fetchall()
+    ((count, after, others),) = found
+    if count < MIN_ROWS or after >= others / 2:
         return ""
-    from scipy.stats import mannwhitneyu
-
-    # False alarm for one in a million sound tables.
-    if not mannwhitneyu(gap[equal], gap[~equal], alternative="less", method="asymptotic").pvalue < 1e-6:
-        return ""
-    after, others = (f"{1e3 * np.median(some):.3g} ms" for some in (gap[equal], gap[~equal]))
     return (
-        f"{np.count_nonzero(equal)} of {len(pair)} ranges are exactly the one before of the same two devices, {after} "
-        f"after it, and others after {others}: the table may hold exchanges twice, from the logs of both; all are kept"
+        f"{count} of {rows.count()} ranges are exactly the one before of the same two devices, {after:.3g} ms after "
+        f"it, and others after {others:.3g} ms: the table may hold exchanges twice, from the logs of both; all are kept"
     )

@@ -11,7 +11,7 @@ import json
 import re
 import unicodedata
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Final
@@ -29,6 +29,7 @@ from uwblink.importers.column_map import (
     POWERS,
     STAMP_UNITS,
     TIME_UNITS,
+    ColumnMap,
 )
 from uwblink.importers.plausibility import (
     ACCEPTED_SHARE,
@@ -36,14 +37,14 @@ from uwblink.importers.plausibility import (
     MIN_ROWS,
     SAMPLE_ROWS,
     Reading,
-    Sample,
-    Trial,
-    counter_format_of,
+    counter_format,
     reason_against_dbm,
     reason_against_metres,
     stamps_of,
+    truth_m,
+    try_reading,
 )
-from uwblink.importers.tables import Table
+from uwblink.importers.tables import Columns, Table, open_table
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.twr import STAMPS
 
@@ -204,31 +205,14 @@ def stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str] | N
 
 def _is_event(table: Table, name: str) -> bool:
     """Return whether a column has words for transmission and reception, about equally often."""
-    words = np.char.lower(table.read(words=[name])[1][name])
-    sent = np.isin(words, ("tx", "t", "sent", "send", "transmit", "transmitted"))
-    received = np.isin(words, ("rx", "r", "received", "receive", "recv"))
-    return bool(np.mean(sent | received) > 0.9 and 0.25 < np.mean(sent) < 0.75) if len(sent) else False
+    word = f"lower(trim({table.text(name)}))"
+    sent = f"{word} IN ('tx', 't', 'sent', 'send', 'transmit', 'transmitted')"
+    received = f"{word} IN ('rx', 'r', 'received', 'receive', 'recv')"
+    shares = table.read({"sent": f"avg(({sent})::INT)", "received": f"avg(({received})::INT)"})
+    sending, receiving = (float(np.ma.filled(share, 0.0)[0]) for share in shares.values())
+    return sending + receiving > 0.9 and 0.25 < sending < 0.75
 
 
-def unusable_positions(columns: dict[str, str], cells: dict[str, Floats]) -> str:
-    """Return why the positions of a table cannot be used; empty text if they can, or if there are none."""
-    lacking = [name for name in POSITIONS if name not in columns]
-    if len(lacking) == len(POSITIONS):
-        return ""
-    if lacking:
-        return f"positions are used where all six columns are there; missing: {', '.join(lacking)}"
-    if "range_m" not in columns:
-        return ""
-    ends = np.array([cells[name] for name in POSITIONS])
-    apart = np.sqrt(((ends[3:] - ends[:3]) ** 2).sum(axis=0))
-    used = np.isfinite(apart) & (apart > 0) & np.isfinite(cells["range_m"])
-    ratio = float(np.median(cells["range_m"][used] / apart[used])) if used.any() else 1.0
-    if 0.5 < ratio < 2.0:
-        return ""
-    return f"positions are left out: ranges are {ratio:.3g} of their distance; distances have one unit"
-
-
-_ANY_UNIT: Final = f"unit unknown: write {', '.join(STAMP_UNITS)}"
 _LAYOUTS: Final = {
     "exchanges": (STAMPS[:4], "a row has the stamps of a whole exchange"),
     "messages": (("tx", "rx"), "a row has one stamp of a sender and one of a receiver"),
@@ -237,6 +221,9 @@ _LAYOUTS: Final = {
     "nothing": ((), "neither stamps nor ranges were recognised: rename columns below"),
 }
 """The layouts that are recognised: the columns that each needs, and how it was recognised."""
+
+Entries = dict[str, tuple[str | int, str]]
+"""Values of a map by key, each with its reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,57 +242,59 @@ def guess_map(path: Path) -> Guess:
     """Return the proposed map of a table; raises `ImportTableError`."""
     if path.suffix.lower() == ".uwb":
         raise ImportTableError(f"{path}: is a recording already and needs no map; 'uwblink show' prints its contents")
-    with Table(path) as table:
+    with open_table(path) as table:
         columns = named_columns(table.names)
         columns = stamp_and_event(table, columns) or columns
-        headers = {name: header for name, header in columns.items() if name != "event"}
-        numbers = table.read(numbers=headers.values(), limit=100_000)[0]
-    cells = {name: numbers[header] for name, header in headers.items()}
+        numbers = table.numbers({header for name, header in columns.items() if name != "event"}, limit=100_000)
+    cells = {name: numbers[header] for name, header in columns.items() if name != "event"}
     if not len(next(iter(cells.values()), np.empty(0))):
         raise ImportTableError(f"{path}: no column whose name is known, or no rows; there are {', '.join(table.names)}")
+    words = {name for name, column in cells.items() if not np.isfinite(column).any()}
     fitting = (one for one in ("exchanges", "messages", "ranges") if all(name in cells for name in _LAYOUTS[one][0]))
     layout = "stamps" if "event" in columns else next(fitting, "nothing")
-    if layout == "messages" and _only_words(cells, "message") and columns["message"] != "message":
-        del columns["message"], cells["message"]  # without a column of that name messages are told by their order
-    unplaced = unusable_positions(columns, cells)
-    for name in POSITIONS if unplaced else ():
-        columns.pop(name, None)
-        cells.pop(name, None)
     needed, why = _LAYOUTS[layout]
-    top = [f"# {why}" if layout == "nothing" else f'layout = "{layout}"  # {why}']
-    units, delays = _unit_lines(columns, cells), list[str]()
+    if layout == "messages" and "message" in words and columns["message"] != "message":
+        del columns["message"], cells["message"]  # without a column of that name messages are told by their order
+    top: Entries = {} if layout == "nothing" else {"layout": (layout, why)}
+    units, undelayed = _units(columns, cells), False
     if layout in ("exchanges", "messages", "stamps"):
-        counter, unit, delays = _stamp_lines(columns, cells, layout)
-        top, units = top + counter, [unit, *units]
-    missing = [name for name in IDS if name not in columns]
-    asked = [*missing, *(line.split()[0] for line in [*top, *units] if f'= "{ASKED}"' in line)]
-    left = [name for name in table.names if name not in columns.values()]
-    lacking = [name for name in needed if name not in cells or _only_words(cells, name)]
-    lacking += ["message"] if layout == "messages" and _only_words(cells, "message") else []
-    mixed = _distance_units(columns)
+        counter, unit, undelayed = (_exchange_stamps if layout == "exchanges" else _message_stamps)(columns, cells)
+        top, units = top | counter, {"stamps": unit, **units}
+    constants: Entries = {
+        name: (
+            ASKED,
+            f"no column was recognised as {IDS[name]}: write a number or a word for all rows, or the column above",
+        )
+        for name in IDS
+        if name not in columns
+    }
+    lacking = [name for name in needed if name not in cells or name in words]
+    lacking += ["message"] if layout == "messages" and "message" in words & cells.keys() else []
+    unplaced = [name for name in POSITIONS if name not in columns]
+    left = [json.dumps(name) for name in table.names if name not in columns.values()]
+    mixed = sorted(_distance_units(columns))
+    remarks = {
+        why: layout == "nothing",
+        "without antenna delays that were programmed into the devices: give them in [antenna_delays]": not undelayed,
+        f"positions are used where all six columns are there; missing: {', '.join(unplaced)}": 0 < len(unplaced) < 6,
+        f"not used: {', '.join(left)[:300]}": left,
+        f"a column of numbers is still needed: {', '.join(lacking)}": lacking,
+        f"distances have one unit for all, here they have {', '.join(mixed)}: convert some": len(mixed) > 1,
+    }
+    named: Entries = {name: (header, "") for name, header in columns.items() if _belongs(name, layout)}
+    none: Entries = {"tx": (0, "by the true distances none were programmed into the devices"), "rx": (0, "")}
+    sections = {"columns": named, "units": units, "constants": constants, "antenna_delays": none if undelayed else {}}
     # Names of files can have line breaks, which would end the comment.
-    lines = [f"# {json.dumps(path.name)}, as it would be read; every line can be changed", *top, "", "[columns]"]
-    lines += [f"{name} = {json.dumps(header)}" for name, header in columns.items() if _belongs(name, layout)]
-    lines += ["", "[units]", *units] if units else []
-    lines += ["", "[constants]"] if missing else []
-    lines += [
-        f'{name} = "{ASKED}"  # no column was recognised as {IDS[name]}: write a number or a word for all rows, or the '
-        "column above"
-        for name in missing
-    ]
-    lines += ["", f"# {unplaced}"] if unplaced else []
-    lines += ["", f"# not used: {', '.join(map(json.dumps, left))[:300]}"] if left else []
-    lines += [f"# a column of numbers is still needed: {', '.join(lacking)}"] if lacking else []
-    if len(mixed) > 1:
-        lines.append(f"# distances have one unit for all, here they have {', '.join(sorted(mixed))}: convert some")
-    lines += delays or [
-        "# the table has no antenna delays that were programmed into the devices: give them in [antenna_delays]"
-    ]
+    lines = [f"# {json.dumps(path.name)}, as it would be read; every line can be changed", *_lines(top)]
+    for title, entries in sections.items():
+        lines += ["", f"[{title}]", *_lines(entries)] if entries else []
+    lines += ["", *(f"# {text}" for text, is_due in remarks.items() if is_due)]
+    asked = [key for entries in (constants, top, units) for key, (value, _) in entries.items() if value == ASKED]
     return Guess("\n".join(lines) + "\n", layout != "nothing" and not lacking and len(mixed) < 2, tuple(asked))
 
 
-def _only_words(cells: dict[str, Floats], name: str) -> bool:
-    return name in cells and not np.isfinite(cells[name]).any()
+def _lines(entries: Entries) -> list[str]:
+    return [f"{key} = {json.dumps(value)}" + (f"  # {why}" if why else "") for key, (value, why) in entries.items()]
 
 
 def _belongs(name: str, layout: str) -> bool:
@@ -314,88 +303,83 @@ def _belongs(name: str, layout: str) -> bool:
     return name not in OF_MESSAGES and not (layout == "ranges" and name in STAMPS)
 
 
-def _stamp_lines(columns: dict[str, str], cells: dict[str, Floats], layout: str) -> tuple[list[str], str, list[str]]:
-    """Return the map's lines on protocol and counter, on the unit of stamps, and on antenna delays, with reasons."""
-    names = [name for name in (STAMPS if layout == "exchanges" else ("tx", "rx", "stamp")) if name in cells]
-    stamps: dict[str, Floats] = {name: cells[name] for name in names}
-    whole = all(np.array_equal(column, np.rint(column), equal_nan=True) for column in stamps.values())
-    ended = {_suffix(columns[name], STAMP_UNITS) for name in names} - {None}
-    if layout != "exchanges":
-        named = next(iter(ended), None)
-        scale = STAMP_UNITS[named or "ticks"]
-        bits, kind = counter_format_of(column * scale for column in stamps.values())
-        largest = max(float(np.nanmax(column, initial=0.0)) for column in stamps.values())
-        # Of 22 stamps in ticks one at least is in the last tenth of the counter in nine tables of ten.
-        full = whole and 0.9 * 2.0**bits < largest < 2.0**bits
-        unit = named or ("ticks" if full else ASKED)
-        why = "by the columns' names" if named else f"whole numbers up to 2^{bits}" if full else _ANY_UNIT
-        return [f"bits = {bits}", f'counter = "{kind}"'], f'stamps = "{unit}"  # {why}', []
-    units = sorted(filter(None, ended)) or (
-        ["ticks", "ns", "us", "s", "ps"] if whole else ["ns", "us", "s", "ps", "ticks"]
-    )
-    metres = DISTANCE_UNITS[min(_distance_units(columns), default="m")]
-    trials = [trial for unit in units for trial in _trials(stamps, cells, unit, metres)]
-    unit, kind, best = max(trials, key=lambda found: round(found[2].plausible, 2))
-    known = best.plausible >= ACCEPTED_SHARE
-    check = "" if best.plausible >= FITTING_SHARE else "; check columns and units"
-    share = f"{100 * best.plausible:.0f} % of its ranges are plausible, {best.low_m:.3g} to {best.high_m:.3g} m{check}"
-    lines = [
-        f'protocol = "{best.reading.protocol if known else ASKED}"  # {share}',
-        f"bits = {best.reading.bits}  # the stamps fit",
-        f'counter = "{kind}"',
-    ]
-    why = "by the columns' names" if ended else "whole numbers" if whole else "as ranges are plausible"
-    if not known and not ended:
-        unit, why = ASKED, _ANY_UNIT
-    delays = [
-        "",
-        "[antenna_delays]  # by the true distances none were programmed into the devices",
-        "tx = 0",
-        "rx = 0",
-    ]
-    return lines, f'stamps = "{unit}"  # {why}', delays if best.reading.undelayed else []
+StampEntries = tuple[Entries, tuple[str, str], bool]
+"""Protocol and counter, the unit of stamps with its reason, and whether no antenna delays were programmed."""
+
+_ANY_UNIT: Final = f"unit unknown: write {', '.join(STAMP_UNITS)}"
 
 
-def _trials(
-    stamps: dict[str, Floats], cells: dict[str, Floats], unit: str, metres: float
-) -> list[tuple[str, str, Trial]]:
-    """Try stamps in a unit with each protocol; returns unit, format of the counter, and trial."""
+def _message_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> StampEntries:
+    """Return how to read the stamps of a table of messages or of single stamps."""
+    stamps: dict[str, Floats] = {name: cells[name] for name in ("tx", "rx", "stamp") if name in cells}
+    named = next(iter(_ended(columns, stamps, STAMP_UNITS)), None)
+    bits, kind = counter_format(column * STAMP_UNITS[named or "ticks"] for column in stamps.values())
+    largest = max(float(np.nanmax(column, initial=0.0)) for column in stamps.values())
+    # Of 22 stamps in ticks one at least is in the last tenth of the counter in nine tables of ten.
+    full = _are_whole(stamps) and 0.9 * 2.0**bits < largest < 2.0**bits
+    counter: Entries = {"bits": (bits, ""), "counter": (kind, "")}
+    if named:
+        return counter, (named, "by the columns' names"), False
+    return counter, ("ticks", f"whole numbers up to 2^{bits}") if full else (ASKED, _ANY_UNIT), False
+
+
+def _exchange_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> StampEntries:
+    """Return how to read the stamps of a table of exchanges: by which protocol and unit their ranges are plausible."""
+    stamps: dict[str, Floats] = {name: cells[name] for name in STAMPS if name in cells}
+    whole, named = _are_whole(stamps), _ended(columns, stamps, STAMP_UNITS)
     chosen = np.flatnonzero(np.all([np.isfinite(column) for column in stamps.values()], axis=0))[:SAMPLE_ROWS]
     if not len(chosen):
         raise ImportTableError("its stamps are no numbers in any row")
-    sampled, scale, count = {name: column[chosen] for name, column in stamps.items()}, STAMP_UNITS[unit], len(chosen)
-    bits, counter = counter_format_of(column * scale for column in sampled.values())
-    truth = cells["gt_range_m"][chosen] * metres if "gt_range_m" in cells else np.full(count, np.nan)
-    pair, unknown = np.zeros(count, dtype=np.int64), np.full(count, np.nan)
-    sample = Sample(sampled, pair, truth, unknown, np.zeros(count), scale)
-    names = [row.name for row in PROTOCOLS.known() if set(stamps_of(row.name)) == set(stamps)]
-    names = [name for name in names if name not in ("ss-cfo", "ds-sym")] or ["ss"]
-    readings = [Reading(name, bits) for name in names]
-    if np.isfinite(truth).any():
-        readings += [replace(reading, undelayed=True) for reading in readings]
-    return [(unit, counter, sample.try_reading(reading)) for reading in readings]
+    rows: Columns = {name: column[chosen] for name, column in stamps.items()}
+    rows |= dict.fromkeys(("origin", *IDS), np.zeros(len(chosen), np.int64))
+    if "gt_range_m" in cells:
+        rows["gt_range_m"] = cells["gt_range_m"][chosen] * DISTANCE_UNITS[min(_distance_units(columns), default="m")]
+    protocols = [row.name for row in PROTOCOLS.known() if set(stamps_of(row.name)) == set(stamps)]
+    protocols = [name for name in protocols if name not in ("ss-cfo", "ds-sym")] or ["ss"]
+    undelayed = (False, True) if np.isfinite(truth_m(rows)).any() else (False,)
+    trials = []
+    for unit in sorted(named) or (["ticks", "ns", "us", "s", "ps"] if whole else ["ns", "us", "s", "ps"]):
+        scale = STAMP_UNITS[unit]
+        bits, kind = counter_format(rows[name] * scale for name in stamps)
+        for without, name in product(undelayed, protocols):
+            reading = Reading(name, bits, undelayed=without)
+            trials.append((unit, kind, try_reading(rows, ColumnMap(ticks_per_unit=scale), reading)))
+    unit, kind, best = max(trials, key=lambda found: round(found[2].plausible, 2))
+    known = best.plausible >= ACCEPTED_SHARE
+    check = "" if best.plausible >= FITTING_SHARE else "; check columns and units"
+    share = f"{100 * best.plausible:.0f} % of its ranges are plausible, {best}{check}"
+    counter: Entries = {
+        "protocol": (best.reading.protocol if known else ASKED, share),
+        "bits": (best.reading.bits, "the stamps fit"),
+        "counter": (kind, ""),
+    }
+    why = "by the columns' names" if named else "whole numbers" if whole else "as ranges are plausible"
+    return counter, (unit, why) if known or named else (ASKED, _ANY_UNIT), best.reading.undelayed
 
 
-def _unit_lines(columns: dict[str, str], cells: dict[str, Floats]) -> list[str]:
-    lines = []
+def _are_whole(stamps: dict[str, Floats]) -> bool:
+    return all(np.array_equal(column, np.rint(column), equal_nan=True) for column in stamps.values())
+
+
+def _units(columns: dict[str, str], cells: dict[str, Floats]) -> Entries:
+    """Return the units of times, distances and powers, each with its reason, as far as they are not the default."""
+    found: Entries = {}
     if "time_s" in columns:
-        unit, why = _time_unit(columns["time_s"], cells["time_s"])
-        lines.append(f'time = "{unit}"  # {why}')
+        found["time"] = _time_unit(columns["time_s"], cells["time_s"])
     units = _distance_units(columns)
     if len(units) == 1:
-        lines += [f'distance = "{unit}"  # by the columns\' names' for unit in units]
+        found["distance"] = min(units), "by the columns' names"
     elif not units and "range_m" in cells and (why := reason_against_metres(cells["range_m"])):
-        lines.append(f'distance = "{ASKED}"  # {why}: write {", ".join(DISTANCE_UNITS)}')
+        found["distance"] = ASKED, f"{why}: write {', '.join(DISTANCE_UNITS)}"
     reasons = [reason_against_dbm(cells[name]) for name in POWERS if name in cells]
     if why := next(filter(None, reasons), ""):
-        lines.append(f'power = "{ASKED}"  # {why}: write -dBm if they lack their sign')
-    return lines
+        found["power"] = ASKED, f"{why}: write -dBm if they lack their sign"
+    return found
 
 
 def _distance_units(columns: dict[str, str]) -> set[str]:
     """Return the units in the names of columns of ranges, true distances and positions."""
-    ended = (_suffix(columns[name], DISTANCE_UNITS) for name in DISTANCES if name in columns)
-    return {unit for unit in ended if unit}
+    return _ended(columns, DISTANCES, DISTANCE_UNITS)
 
 
 def _time_unit(header: str, values: Floats) -> tuple[str, str]:
@@ -410,6 +394,12 @@ def _time_unit(header: str, values: Floats) -> tuple[str, str]:
     if len(values) < MIN_ROWS or not np.array_equal(values, np.rint(values), equal_nan=True):
         return "s", f"numbers up to {largest:.6g}"
     return ASKED, f"whole numbers up to {largest:.6g}, unit unknown: write {', '.join(TIME_UNITS)}"
+
+
+def _ended(columns: dict[str, str], names: Iterable[str], units: Iterable[str]) -> set[str]:
+    """Return the units at the ends of the headers of some columns."""
+    found = (_suffix(columns[name], units) for name in names if name in columns)
+    return {unit for unit in found if unit}
 
 
 def _suffix(header: str, units: Iterable[str]) -> str | None:

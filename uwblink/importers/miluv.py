@@ -19,8 +19,8 @@ import yaml
 
 from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError, first_line
-from uwblink.importers.plausibility import MISSING, clocks, to_ticks, whole
-from uwblink.importers.tables import Columns, Table
+from uwblink.importers.plausibility import clocks, to_ticks
+from uwblink.importers.tables import Columns, number, open_table, time_ns, whole_number
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import CirRow, Fault, Poses, Tag
@@ -32,6 +32,7 @@ Vectors = dict[str, dict[int, tuple[float, float, float]]]
 """Vectors by name and number: lever arms by robot and tag, or places in metres by constellation and anchor."""
 
 _ENDS: Final = {"initiator": "from_id", "target": "to_id"}
+_IDS: Final = (*_ENDS, "listener", "board")
 
 
 @dataclass(slots=True)
@@ -72,10 +73,10 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
     ranging = {*exchanges.initiator.tolist(), *exchanges.target.tolist()} - {tag.tag for tag in tags}
     tags += [Tag(number, f"tag{number}", (0.0, 0.0, 0.0)) for number in ranging]
     heard = _read_overheard(flight)
-    cirs = _read(flight, "uwb_cir.csv", {"board": "my_id", **_ENDS}, {"first_path_index": "idx"}, taps="cir")
+    cirs = _read_cirs(flight)
     sensed = {f"w{axis}": f"angular_velocity.{axis}" for axis in "xyz"}
     sensed |= {f"a{axis}": f"linear_acceleration.{axis}" for axis in "xyz"}
-    imu, height = _read(flight, "imu_px4.csv", {}, sensed), _read(flight, "height.csv", {}, {"height_m": "range"})
+    imu, height = _read(flight, "imu_px4.csv", sensed), _read(flight, "height.csv", {"height_m": "range"})
     for columns in (heard, cirs, imu, height):
         if columns:
             columns["time_ns"] += start_ns
@@ -121,47 +122,35 @@ def _meta(flight: Flight, start_ns: int, constellation: str | None, off_m: float
 def _read(
     flight: Flight,
     name: str,
-    ids: Mapping[str, str],
-    numbers: Mapping[str, str],
+    needed: Mapping[str, str],
     optional: Mapping[str, str] = {},
-    stamps: Mapping[str, str] = {},
     by_clock: tuple[tuple[str, ...], ...] = (),
-    taps: str = "",
 ) -> Columns:
     """Return the rows of all robots' files of one name in order of time; an empty dictionary if there are none.
 
-    `ids`, `numbers` and so on map names of columns to those of the files; `{raw}` is replaced by `_raw` if a file has
-    such columns. `taps` is the column of a list. Duplicates of rows with ids are dropped; rows without ids belong to
+    `needed` and `optional` map names of columns to those of the files; `{raw}` is replaced by `_raw` if a file has such
+    columns. `by_clock` are those that are stamps. Duplicates of rows with ids are dropped; rows without ids belong to
     the robot's body. Rows that lack a number that is not optional are faults.
     """
     parts: list[Columns] = []
+    ids = [n for n in needed if n in _IDS]
     for robot in flight.robots:
         if not (robot / name).exists():
             continue
-        with Table(robot / name) as table:
+        with open_table(robot / name) as table:
             raw = "_raw" if any("_raw" in header for header in table.names) else ""
-            headers = {n: h.format(raw=raw) for n, h in {**ids, **numbers, **stamps, "time_s": "timestamp"}.items()}
-            headers |= {n: header for n, header in optional.items() if header in table.names}
-            found = table.read(headers.values())[0]
-            lists = table.query({"taps": f"TRY_CAST({table.word(taps)} AS USMALLINT[])"})["taps"] if taps else None
-        values = {n: found[header] for n, header in headers.items()}
-        count, all_ids = len(values["time_s"]), range(LARGEST_ID + 1)
-        columns: Columns = {"time_ns": whole(values["time_s"] * 1e9)}
-        columns |= {n: whole(np.where(np.isin(values[n], all_ids), values[n], np.nan)) for n in ids}
-        columns |= to_ticks(values, by_clock, TICKS_PER_SECOND * 1e-9, REPORT_BITS)
-        good = np.all([column != MISSING for column in columns.values()], axis=0)
-        good &= np.all([np.ones(count), *(np.isfinite(values[n]) for n in numbers)], axis=0)
-        columns |= {n: values.get(n, np.full(count, np.nan)) for n in (*numbers, *optional)}
-        if not ids:
-            columns["body"] = np.full(count, robot.name)
-        if lists is not None:
-            good &= ~np.ma.getmaskarray(lists)
-            columns["taps"] = np.ma.getdata(lists)
+            headers = {n: header.format(raw=raw) for n, header in {"time_ns": "timestamp", **needed}.items()}
+            there = headers | {n: header for n, header in optional.items() if header in table.names}
+            found = table.read({n: _cell(n, table.text(header)) for n, header in there.items()})
+        bad = np.any([np.ma.getmaskarray(found[n]) for n in headers], axis=0)
         flight.faults += [
             Fault(0, name, "unusable row", f"{robot.name}/{name}: row {row + 2}: a number is missing or none")
-            for row in np.flatnonzero(~good).tolist()
+            for row in np.flatnonzero(bad).tolist()
         ]
-        parts.append({n: column[good] for n, column in columns.items()})
+        columns = {n: np.full(len(bad), np.nan) for n in optional} | {"body": np.full(len(bad), robot.name)}
+        columns |= {n: np.ma.getdata(found[n]) if n in headers else np.ma.filled(found[n], np.nan) for n in there}
+        columns |= to_ticks(columns, by_clock, TICKS_PER_SECOND * 1e-9, REPORT_BITS)
+        parts.append({n: column[~bad] for n, column in columns.items() if n != "body" or not ids})
     if not sum(len(part["time_ns"]) for part in parts):
         return {}
     joined = {n: np.concatenate([part[n] for part in parts]) for n in parts[0]}
@@ -175,14 +164,22 @@ def _read(
     return {n: column[order] for n, column in joined.items()}
 
 
+def _cell(name: str, text: str) -> str:
+    """Return SQL of a cell of a column, from its text."""
+    if name == "taps":
+        return f"TRY_CAST({text} AS USMALLINT[])"
+    if name == "time_ns":
+        return time_ns(text, "s", 1e9)
+    whole = whole_number(text)
+    return f"CASE WHEN {whole} BETWEEN 0 AND {LARGEST_ID} THEN {whole} END" if name in _IDS else number(text)
+
+
 def _read_exchanges(flight: Flight) -> tuple[Exchanges, Floats]:
     """Return all exchanges in order of time, without truth, and the distances that the authors measured (n,)."""
-    stamps = {name: f"{name}{{raw}}" for name in STAMPS}
+    needed = _ENDS | {"range_m": "range{raw}"} | {name: f"{name}{{raw}}" for name in STAMPS}
     optional = {"measured_m": "gt_range"} | {f"fpp{k}_dbm": f"fpp{k}" for k in (1, 2)}
     optional |= {f"skew{k}_ppm": f"skew{k}" for k in (1, 2)}
-    columns: dict[str, Any] = _read(
-        flight, "uwb_range.csv", _ENDS, {"range_m": "range{raw}"}, optional, stamps, clocks("ds")
-    )
+    columns: dict[str, Any] = _read(flight, "uwb_range.csv", needed, optional, clocks("ds"))
     if not columns:
         raise ImportTableError(f"{flight.folder}: its uwb_range.csv hold no row that can be used")
     measured = columns.pop("measured_m")
@@ -197,22 +194,24 @@ def _read_overheard(flight: Flight) -> Columns:
     by_clock = (tuple(own), *(tuple(f"{name}_n" for name in clock) for clock in clocks("ds")))
     ends = ("1", "2", "3", "1_n", "2_n")
     optional = {f"fpp{end}_dbm": f"fpp{end}" for end in ends} | {f"skew{end}_ppm": f"skew{end}" for end in ends}
-    ids = {"listener": "my_id", **_ENDS}
-    return _read(flight, "uwb_passive.csv", ids, {}, optional, own | neighbours, by_clock)
+    needed = {"listener": "my_id"} | _ENDS | own | neighbours
+    return _read(flight, "uwb_passive.csv", needed, optional, by_clock)
+
+
+def _read_cirs(flight: Flight) -> Columns:
+    return _read(flight, "uwb_cir.csv", {"board": "my_id"} | _ENDS | {"first_path_index": "idx", "taps": "cir"})
 
 
 def _cir_rows(columns: Columns) -> list[CirRow]:
-    if not columns:
-        return []
-    plain = [columns[name].tolist() for name in ("time_ns", "board", "initiator", "target", "first_path_index")]
-    taps = [tuple(row.tolist()) for row in columns["taps"]]
-    return [CirRow(*row) for row in zip(*plain, taps, strict=True)]
+    names = ("time_ns", "board", *_ENDS, "first_path_index", "taps")
+    cells = [columns[name].tolist() for name in names] if columns else []
+    return [CirRow(*plain, tuple(taps.tolist())) for *plain, taps in zip(*cells, strict=True)]  # type: ignore[call-arg]
 
 
 def _read_poses(flight: Flight) -> Poses:
     """Return the poses of the robots; none without motion capture."""
     names = [*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw")]
-    columns = _read(flight, "mocap.csv", {}, {name: name for name in names})
+    columns = _read(flight, "mocap.csv", {name: name for name in names})
     if not columns:
         return Poses.from_arrays([], "", (0.0, 0.0, 0.0))
     values = np.column_stack([columns[name] for name in names])
@@ -310,12 +309,12 @@ def _read_vectors(path: Path) -> Vectors:
         if not isinstance(group, dict):
             raise ImportTableError(f"{path}: {name[:40]}: expected numbers, each with [x, y, z]")
         found[name] = {}
-        for number, value in group.items():
+        for tag, value in group.items():
             try:
                 x, y, z = (float(cell) for cell in (value.strip("[] ").split(",") if isinstance(value, str) else value))
-                found[name][int(number)] = (x, y, z)
+                found[name][int(tag)] = (x, y, z)
             except (TypeError, ValueError) as error:
                 raise ImportTableError(
-                    f"{path}: {name[:40]}: {str(number)[:20]}: found {reprlib.repr(value)[:40]}, expected [x, y, z]"
+                    f"{path}: {name[:40]}: {str(tag)[:20]}: found {reprlib.repr(value)[:40]}, expected [x, y, z]"
                 ) from error
     return found

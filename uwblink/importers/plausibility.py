@@ -15,18 +15,16 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import DISTANCE_UNITS, POSITIONS, POWERS, ColumnMap
+from uwblink.importers.column_map import DISTANCE_UNITS, IDS, POSITIONS, POWERS, ColumnMap
 from uwblink.importers.tables import Columns
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.recording.antenna_delays import REGISTER_MAX
+from uwblink.recording.antenna_delays import REGISTER_MAX, AntennaDelay, delay_of
 from uwblink.ticks import ANTENNA_DELAY_TICKS, METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import STAMPS, Exchanges, intervals, raw_range
-
-MISSING: Final = np.iinfo(np.int64).min
-"""Stands for a missing integer."""
 
 MIN_ROWS: Final = 20
 """Fewer rows can agree with any assumption by chance."""
@@ -39,13 +37,6 @@ ACCEPTED_SHARE: Final = 0.5
 
 FITTING_SHARE: Final = 0.9
 """From this share of plausible ranges on, another reading fits."""
-
-
-def whole(values: Floats) -> Ints:
-    """Return numbers (n,) rounded to integers, `MISSING` for NaN and for those that do not fit."""
-    with np.errstate(invalid="ignore"):
-        good = np.abs(values) < 2.0**62
-    return np.where(good, np.rint(np.where(good, values, 0.0)), MISSING).astype(np.int64)
 
 
 def clocks(protocol: str) -> tuple[tuple[str, ...], ...]:
@@ -63,53 +54,45 @@ def stamps_of(protocol: str) -> tuple[str, ...]:
 
 
 def to_ticks(
-    cells: Mapping[str, Floats], by_clock: Iterable[tuple[str, ...]], ticks_per_unit: float, bits: int
+    cells: Mapping[str, NDArray[Any]], by_clock: Iterable[tuple[str, ...]], ticks_per_unit: float, bits: int
 ) -> dict[str, Ints]:
-    """Return stamps in any unit as ticks of a counter of `bits` bits; missing ones are `MISSING`.
+    """Return stamps in any unit as ticks of a counter of `bits` bits; missing ones become any number.
 
     Stamps in other units were scaled and written as floats, with an error that grows with the length of the record;
     differences of stamps of one clock are accurate. So the first stamp of each clock is rounded, and the difference of
     each other one from it.
     """
+
+    def whole(values: NDArray[Any]) -> Ints:
+        if ticks_per_unit == 1.0 and values.dtype == np.int64:
+            return values
+        ticks = np.clip(np.nan_to_num(values * ticks_per_unit), -(2.0**62), 2.0**62)
+        return np.rint(ticks).astype(np.int64)
+
     found: dict[str, Ints] = {}
-    mask = np.int64((1 << bits) - 1)
-    for names in by_clock:
-        first = whole(cells[names[0]] * ticks_per_unit)
-        for name in names:
-            if ticks_per_unit == 1.0:
-                ticks = whole(cells[name])
-                found[name] = np.where(ticks == MISSING, MISSING, ticks & mask)
-            else:
-                since = whole((cells[name] - cells[names[0]]) * ticks_per_unit)
-                missing = (first == MISSING) | (since == MISSING)
-                found[name] = np.where(missing, MISSING, (first + since) & mask)
-    return found
+    for first, *others in by_clock:
+        start = whole(cells[first])
+        since = {name: whole(cells[name] - cells[first]) for name in others}
+        found |= {first: start} | {name: start + ticks for name, ticks in since.items()}
+    return {name: ticks & np.int64((1 << bits) - 1) for name, ticks in found.items()}
 
 
-def counter_format(count: Callable[[float, float], int], bits: int | None, counter: str | None) -> tuple[int, str]:
+def counter_format(
+    ticks: Iterable[NDArray[Any]], bits: int | None = None, counter: str | None = None
+) -> tuple[int, str]:
     """Return the width of a counter in bits and its format ("wrapped", "signed", "unwrapped"), unless they are given.
 
-    `count(low, high)` returns the number of stamps in ticks from `low` to below `high`. The first of 32 and 40 bits is
-    chosen into which 99 % of the stamps fit, wrapped or signed; the others are faults. If none fits, stamps are
-    unwrapped.
+    The first of 32 and 40 bits is chosen into which 99 % of the stamps fit, wrapped or signed; the others are faults.
+    If none fits, stamps are unwrapped.
     """
-    stamps = count(-np.inf, np.inf)
+    stamps = np.concatenate([column[np.isfinite(column)] for column in ticks])
+    enough = len(stamps) >= MIN_ROWS
     for width, kind in ((32, "wrapped"), (32, "signed"), (40, "wrapped"), (40, "signed")):
         low = -(2.0 ** (width - 1)) if kind == "signed" else 0.0
-        asked = stamps >= MIN_ROWS and bits in (None, width) and counter in (None, kind)
-        if asked and stamps - count(low, low + 2.0**width) <= 0.01 * stamps:
+        asked = enough and bits in (None, width) and counter in (None, kind)
+        if asked and np.mean((stamps >= low) & (stamps < low + 2.0**width)) >= 0.99:
             return width, kind
-    return bits or 32, counter or ("unwrapped" if stamps >= MIN_ROWS else "wrapped")
-
-
-def counter_format_of(ticks: Iterable[Floats], bits: int | None = None) -> tuple[int, str]:
-    """Return width and format of the counter of stamps in ticks, (n,) each; see `counter_format`."""
-    columns = [column[np.isfinite(column)] for column in ticks]
-
-    def count(low: float, high: float) -> int:
-        return sum(int(np.count_nonzero((column >= low) & (column < high))) for column in columns)
-
-    return counter_format(count, bits, None)
+    return bits or 32, counter or ("unwrapped" if enough else "wrapped")
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,97 +116,141 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Result of a reading: share of plausible ranges, limits of the middle 90 % of ranges, scatter within pairs."""
+    """Result of a reading: the share of plausible ranges, and limits of the middle 90 % of ranges and of errors."""
 
     reading: Reading
     plausible: float
-    low_m: float
-    high_m: float
-    scatter_m: float
+    range_m: tuple[float, float]
+    error_m: tuple[float, float]
+
+    def __str__(self) -> str:
+        """Return the limits of ranges."""
+        return f"{self.range_m[0]:.4g} to {self.range_m[1]:.4g} m"
+
+    def rank(self) -> tuple[float, float]:
+        """Return what is least for the best of several readings: the larger share, then the smaller spread."""
+        return -round(self.plausible, 2), self.error_m[1] - self.error_m[0]
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """Rows on which readings are tried: stamps in their own unit, and pairs.
+def try_reading(rows: Columns, column_map: ColumnMap, reading: Reading) -> Trial:
+    """Return the result of a reading on a sample of rows, whose ranges are beside true distances if there are any."""
+    columns = dict(rows)
+    for one, two in reading.swapped:
+        columns[one], columns[two] = columns[two], columns[one]
+    exchanges = exchanges_of(column_map, columns, reading)
+    # Half of both devices' missing delays, of transmission and reception.
+    longer_m = 2 * ANTENNA_DELAY_TICKS * METRES_PER_TICK if reading.undelayed else _longer_m(column_map, rows)
+    raw = raw_range(exchanges) - longer_m
+    ranges = np.where(np.isfinite(raw), raw, np.nan)  # no time between the last two messages makes them infinite
+    true = exchanges.truth_m
+    spans, half = intervals(exchanges), 2.0 ** (reading.bits - 1)
+    single = PROTOCOLS[reading.protocol].third_sender is None
+    allowance = 50e-6 * spans.dt32 * TICK_S * SPEED_OF_LIGHT / 2 if single else 0.0
+    with np.errstate(invalid="ignore"):
+        good = (ranges > -2.0 - allowance) & (ranges < 2000.0 + allowance)
+        good &= (spans.dt41 < half) & (spans.dt32 < half)
+        if not single:
+            good &= (spans.dt53 < half) & (spans.dt64 < half) & (spans.dt53 > 0)
+        good &= ~np.isfinite(true) | (np.abs(ranges - true) < 50.0 + allowance)
+    limits = [
+        np.percentile(some, [5, 95]) if len(some := values[np.isfinite(values)]) else (np.nan, np.nan)
+        for values in (ranges, ranges - np.nan_to_num(true))
+    ]
+    return Trial(reading, float(np.mean(good)), *((float(low), float(high)) for low, high in limits))
 
-    Unknown true distances and skews of the second message are NaN. `longer_m` (n,) are the lengths that missing antenna
-    delays add to the ranges, by the map.
+
+def _longer_m(column_map: ColumnMap, rows: Columns) -> Floats:
+    """Return the lengths (n,) that missing antenna delays add to ranges, by the map."""
+    lacking, delays = np.zeros(len(rows["origin"])), column_map.antenna_delays
+    for name in IDS if delays else ():
+        ids, back = np.unique(rows[name], return_inverse=True)
+        programmed = [delay_of(delays, int(tag)) or AntennaDelay() for tag in ids]
+        lacking += (2 * ANTENNA_DELAY_TICKS - np.array([one.tx + one.rx for one in programmed], np.float64))[back]
+    return lacking / 2 * METRES_PER_TICK
+
+
+def settle_reading(path: Path, column_map: ColumnMap, rows: Columns, reading: Reading) -> tuple[Reading, str]:
+    """Return how to read the stamps, and a note: as the map says, or otherwise if only that makes plausible ranges.
+
+    Raises `ImportTableError` if that contradicts the map.
     """
-
-    cells: Mapping[str, Floats]
-    pair: Ints
-    truth_m: Floats
-    skew2_ppm: Floats
-    longer_m: Floats
-    ticks_per_unit: float
-
-    def try_reading(self, reading: Reading) -> Trial:
-        """Return the result of a reading on these rows."""
-        columns = dict(self.cells)
-        for one, two in reading.swapped:
-            columns[one], columns[two] = columns[two], columns[one]
-        ticks = to_ticks(columns, clocks(reading.protocol), self.ticks_per_unit, reading.bits)
-        count = len(self.pair)
-        none, unknown = np.zeros(count, dtype=np.int64), np.full(count, np.nan)
-        stamps: dict[str, Any] = {name: np.maximum(ticks[name], 0) if name in ticks else none for name in STAMPS}
-        exchanges = Exchanges(
-            time_ns=none, initiator=none, target=none + 1, reporter=none, bits=reading.bits,
-            protocol=np.full(count, reading.protocol), skew2_ppm=self.skew2_ppm, **stamps,
-            **dict.fromkeys(("range_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "truth_m"), unknown),
-        )  # fmt: skip
-        # Half of both devices' missing delays, of transmission and reception.
-        undelayed_m = 2 * ANTENNA_DELAY_TICKS * METRES_PER_TICK
-        raw = raw_range(exchanges) - (undelayed_m if reading.undelayed else self.longer_m)
-        ranges = np.where(np.isfinite(raw), raw, np.nan)  # no time between the last two messages makes them infinite
-        good = self._plausible(ranges, exchanges)
-        low, high = np.nanpercentile(ranges, [5, 95]) if np.isfinite(ranges).any() else (np.nan, np.nan)
-        return Trial(reading, float(np.mean(good)), float(low), float(high), self._scatter_m(ranges))
-
-    def _plausible(self, ranges: Floats, exchanges: Exchanges) -> Bools:
-        spans, half = intervals(exchanges), 2.0 ** (exchanges.bits - 1)
-        single = PROTOCOLS[str(exchanges.protocol[0])].third_sender is None
-        allowance = 50e-6 * spans.dt32 * TICK_S * SPEED_OF_LIGHT / 2 if single else np.zeros(len(ranges))
-        with np.errstate(invalid="ignore"):
-            good = (ranges > -2.0 - allowance) & (ranges < 2000.0 + allowance)
-            good &= (spans.dt41 < half) & (spans.dt32 < half)
-            if not single:
-                good &= (spans.dt53 < half) & (spans.dt64 < half) & (spans.dt53 > 0)
-            good &= ~np.isfinite(self.truth_m) | (np.abs(ranges - self.truth_m) < 50.0 + allowance)
-        return np.asarray(good)
-
-    def _scatter_m(self, ranges: Floats) -> float:
-        rest = ranges - np.where(np.isfinite(self.truth_m), self.truth_m, 0)
-        if not np.isfinite(rest).all():
-            return float("inf")
-        spreads = [np.ptp(np.percentile(rest[self.pair == p], [25, 75])) for p in np.unique(self.pair)]
-        return float(np.median(spreads))
+    first = try_reading(rows, column_map, reading)
+    if first.plausible >= ACCEPTED_SHARE or len(rows["origin"]) < MIN_ROWS:
+        return reading, ""
+    for others in _others(rows, reading):
+        trials = [try_reading(rows, column_map, other) for other in others]
+        if fitting := [trial for trial in trials if trial.plausible >= FITTING_SHARE]:
+            break
+    else:
+        return reading, (
+            f"the ranges are not plausible ({first}), and no other protocol, width or order of the columns makes "
+            "better ones; check the map"
+        )
+    best = min(fitting, key=Trial.rank)
+    found, difference = best.reading, best.reading.difference(reading)
+    contradicted = (
+        found.swapped
+        or (column_map.protocol and found.protocol != reading.protocol)
+        or (column_map.bits and found.bits != reading.bits)
+        or (column_map.antenna_delays and found.undelayed)
+    )
+    if contradicted:
+        raise ImportTableError(
+            f'{path}: by protocol "{reading.protocol}" its ranges are {first}; with {difference} they are {best}: '
+            "state that in the map"
+        )
+    return found, f'read with {difference}: by protocol "{reading.protocol}" the ranges would be {first}'
 
 
-def find_other_reading(sample: Sample, reading: Reading) -> tuple[Trial, Trial | None]:
-    """Try a reading; if it does not fit, also return another reading that does, None if none does."""
-    first = sample.try_reading(reading)
-    if first.plausible >= ACCEPTED_SHARE or len(sample.pair) < MIN_ROWS:
-        return first, None
-    for readings in _others(sample, reading):
-        fitting = [trial for trial in map(sample.try_reading, readings) if trial.plausible >= FITTING_SHARE]
-        if fitting:
-            return first, min(fitting, key=lambda trial: (-round(trial.plausible, 2), trial.scatter_m))
-    return first, None
-
-
-def _others(sample: Sample, reading: Reading) -> Iterator[list[Reading]]:
+def _others(rows: Columns, reading: Reading) -> Iterator[list[Reading]]:
     """Yield alternative readings, simple ones first: another protocol or width, exchanged columns, or both."""
-    names = [row.name for row in PROTOCOLS.known() if set(stamps_of(row.name)) <= set(sample.cells)]
+    names = [row.name for row in PROTOCOLS.known() if set(stamps_of(row.name)) <= set(rows)]
     names = [name for name in names if name != "ss-cfo" and (name != "ds-sym" or reading.protocol == name)]
     plain = [Reading(name, bits) for name in names for bits in (reading.bits, 72 - reading.bits)]
     used = stamps_of(reading.protocol)
     # Without true distances, ranges of devices without antenna delays are as plausible as those with them.
-    yield [replace(reading, undelayed=True)] if np.isfinite(sample.truth_m).any() else []
+    yield [replace(reading, undelayed=True)] if np.isfinite(truth_m(rows)).any() else []
     yield [other for other in plain if other != reading and stamps_of(other.protocol) == used]
     swaps = [*((pair,) for pair in combinations(used, 2)), (("tx1", "rx1"), ("tx2", "rx2"))]
     yield [Reading(reading.protocol, reading.bits, swap) for swap in swaps]
     yield [other for other in plain if stamps_of(other.protocol) != used]
     yield [Reading(other.protocol, other.bits, swap) for other in plain for swap in swaps]
+
+
+ROW_PERIOD_NS: Final = 1_000_000
+"""Time between the rows of a table without times."""
+
+
+def exchanges_of(column_map: ColumnMap, rows: Columns, reading: Reading | None, before: int = 0) -> Exchanges:
+    """Return rows as exchanges with the reported ranges, NaN where there are none; `before` counts earlier rows.
+
+    Without a reading the rows are ranges without stamps: single-sided exchanges whose stamps are 0.
+    """
+    count = len(rows["origin"])
+    stamps: dict[str, Any] = dict.fromkeys(STAMPS, np.zeros(count, dtype=np.int64))
+    protocol, bits = (reading.protocol, reading.bits) if reading else ("ss", 32)
+    if reading:
+        stamps |= to_ticks(rows, clocks(protocol), column_map.ticks_per_unit, bits)
+    return Exchanges(
+        time_ns=rows.get("time_ns", np.arange(before, before + count) * ROW_PERIOD_NS),
+        initiator=rows["from_id"], target=rows["to_id"], reporter=rows["from_id"], protocol=np.full(count, protocol),
+        range_m=optional(rows, "range_m"), fpp1_dbm=optional(rows, "fpp1"), fpp2_dbm=optional(rows, "fpp2"),
+        skew1_ppm=optional(rows, "skew1"), skew2_ppm=optional(rows, "skew2"), truth_m=truth_m(rows), bits=bits,
+        **stamps,
+    )  # fmt: skip
+
+
+def truth_m(rows: Columns) -> Floats:
+    """Return measured distances (n,), or else those between the antenna positions; NaN if unknown."""
+    if "gt_range_m" in rows or not all(name in rows for name in POSITIONS):
+        return optional(rows, "gt_range_m")
+    ends = np.array([rows[name] for name in POSITIONS])
+    return np.asarray(np.sqrt(((ends[3:] - ends[:3]) ** 2).sum(axis=0)))
+
+
+def optional(rows: Columns, name: str) -> Floats:
+    """Return a column (n,), or NaN if there is no such column."""
+    return rows[name] if name in rows else np.full(len(rows["origin"]), np.nan)
 
 
 Errors = Callable[[float], Floats]
@@ -233,22 +260,20 @@ In this unit noise does not depend on the factor; otherwise ranges of boards at 
 """
 
 
-def other_unit(errors: Mapping[str, Errors]) -> tuple[str, str] | None:
-    """Return the name and unit of lengths that are evidently not in metres; None if all are in metres.
+def other_unit(errors: Mapping[str, Errors]) -> str:
+    """Return which lengths are evidently in which other unit, such as "ranges are in mm"; "" if all are in metres.
 
     `errors` are by the name of the lengths that are multiplied. The residuals of the errors from a constant (antenna
     delays) are compared: a unit is found if they are smaller by more than the square root of its factor. Residuals of
     distances that are unrelated to the ranges shrink to the spread of the ranges, by at most the square root of two.
     """
-    best, found = 0.0, None
+    best, found = 0.0, ""
     for name, of in errors.items():
         plain = _remaining(of(1.0))
         for unit, factor in DISTANCE_UNITS.items():
-            if factor == 1.0 or not plain > 0:
-                continue
-            gain = np.log(plain / max(_remaining(of(factor)), METRES_PER_TICK))
-            if gain > max(best, -np.log(factor) / 2):
-                best, found = gain, (name, unit)
+            gain = np.log(plain / max(_remaining(of(factor)), METRES_PER_TICK)) if plain > 0 else 0.0
+            if factor != 1.0 and gain > max(best, -np.log(factor) / 2):
+                best, found = gain, f"{name} are in {unit}"
     return found
 
 
@@ -265,13 +290,11 @@ def _remaining(errors_m: Floats) -> float:
 def reason_against_metres(ranges: Floats) -> str:
     """Return why numbers (n,) cannot be ranges in metres; empty text if they can."""
     finite = ranges[np.isfinite(ranges)]
-    if len(finite) < MIN_ROWS:
-        return ""
-    middle = float(np.median(np.abs(finite)))
+    middle = float(np.median(np.abs(finite))) if len(finite) >= MIN_ROWS else 0.0
     if middle > 300.0:  # DW1000 devices reach 290 m in the open by their data sheet
         return f"the median range is {middle:.6g}, farther than devices reach in metres"
     # With noise of centimetres, ranges are not all integers, unless one number repeats.
-    if len(np.unique(finite)) > MIN_ROWS // 4 and np.array_equal(finite, np.rint(finite)):
+    if len(np.unique(finite)) > MIN_ROWS // 4 and np.array_equal(finite, np.rint(finite)) and middle:
         return "all ranges are whole numbers, which measured metres are not"
     return ""
 
@@ -284,36 +307,22 @@ def reason_against_dbm(powers: Floats) -> str:
     return f"the median power is {middle:+.4g}, and received powers are below 0 dBm" if middle > 0 else ""
 
 
-def truth_m(rows: Columns) -> Floats:
-    """Return measured distances (n,), or else those between the antenna positions; NaN if unknown."""
-    if "gt_range_m" in rows or not all(name in rows for name in POSITIONS):
-        return optional(rows, "gt_range_m")
-    ends = np.array([rows[name] for name in POSITIONS])
-    return np.asarray(np.sqrt(((ends[3:] - ends[:3]) ** 2).sum(axis=0)))
-
-
-def optional(rows: Columns, name: str) -> Floats:
-    """Return a column (n,), or NaN if there is no such column."""
-    return rows[name] if name in rows else np.full(len(rows["origin"]), np.nan)
-
-
 def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats | None) -> None:
     """Raise `ImportTableError` if a sample of rows shows that lengths or powers are in another unit.
 
     Implausible numbers are refused unless the map states their unit; lengths that contradict each other always are.
     `raw_m` are the ranges by the stamps (n,), if there are any.
     """
-    for name in POWERS:
-        if column_map.power_unit is None and (why := reason_against_dbm(optional(rows, name))):
-            raise ImportTableError(
-                f"{path}: column {column_map.header(name)!r}: {why}; state units.power in the map: "
-                '"-dBm" if they lack their sign'
-            )
     ranges, true = optional(rows, "range_m"), truth_m(rows)
-    if column_map.distance_unit is None and (why := reason_against_metres(ranges)):
-        raise ImportTableError(
-            f"{path}: column {column_map.header('range_m')!r}: {why}; state units.distance in the map"
-        )
+    reasons = {}
+    if column_map.power_unit is None:
+        remedy = 'units.power in the map: "-dBm" if they lack their sign'
+        reasons = {name: (reason_against_dbm(optional(rows, name)), remedy) for name in POWERS}
+    if column_map.distance_unit is None:
+        reasons["range_m"] = reason_against_metres(ranges), "units.distance in the map"
+    for name, (why, remedy) in reasons.items():
+        if why:
+            raise ImportTableError(f"{path}: column {column_map.header(name)!r}: {why}; state {remedy}")
     if raw_m is None:
         found = other_unit({"ranges": lambda f: ranges - true / f, "true distances": lambda f: ranges - f * true})
     else:
@@ -321,6 +330,6 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
     if found:
         beside = "the others" if raw_m is None else "its stamps"
         raise ImportTableError(
-            f"{path}: {found[0]} are in {found[1]} by {beside}, and in {column_map.distance_unit or 'm'} by the map; "
+            f"{path}: {found} by {beside}, and in {column_map.distance_unit or 'm'} by the map; "
             "units.distance is one unit for all ranges, true distances and positions"
         )

@@ -7,13 +7,14 @@ begins with `#timestamp`, one body a file. Bags (ROS 1, ROS 2, MCAP) need the ex
 
 from __future__ import annotations
 
+import csv
 import math
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +23,12 @@ from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError, RecordingExistsError
 from uwblink.importers.bags import open_bag
 from uwblink.importers.plausibility import other_unit
-from uwblink.importers.tables import Table
+from uwblink.importers.tables import reading
 from uwblink.recording.distances import distances_m, find_offset
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import POSE, Poses, Tag
 from uwblink.recording.tags import load_places
-from uwblink.text_files import read_text, require_regular
+from uwblink.text_files import require_regular
 from uwblink.twr import LATEST_NS, Exchanges, names_in, raw_range
 
 MESSAGES: Final = {
@@ -64,93 +65,77 @@ def read_poses(path: Path, body: str | None = None, topics: Mapping[str, str] | 
         raise ImportTableError(
             f"{path}: found {f'.{kind}' if kind else 'no suffix'}, expected one of .{', .'.join(known)}"
         )
-    is_bag = kind in ("bag", "mcap", "db3")
-    if topics and not is_bag:
-        raise ImportTableError(f"{path}: has no topics; only bags have")
-    if is_bag:
+    if kind in ("bag", "mcap", "db3"):
         poses = _from_bag(path, topics)
-    elif kind == "csv" and not _is_euroc(path):
-        poses = _from_table(path, body)
+    elif topics:
+        raise ImportTableError(f"{path}: has no topics; only bags have")
     else:
-        poses = _from_lines(path, body, euroc=kind == "csv")
+        with reading(path), path.open(encoding="utf-8-sig", newline="") as file:
+            poses = _from_text(path, file, body)
     if not len(poses):
         raise ImportTableError(f"{path}: holds no poses")
     return poses
 
 
-def _is_euroc(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.readline().removeprefix(b"\xef\xbb\xbf").lower().startswith(b"#timestamp")
+@dataclass(frozen=True, slots=True)
+class Form:
+    """A form of text files without a header: its name, its columns, and their delimiter (None: blanks)."""
+
+    title: str
+    names: tuple[str, ...]
+    delimiter: str | None
+    more: bool = False
+    """Whether other columns may follow."""
 
 
-def _from_table(path: Path, body: str | None) -> Poses:
-    """Return the poses of a CSV file with a header."""
-    with Table(path, ",", ".") as table:
-        time = next((name for name in ("time_ns", "time_s") if name in table.names), "")
-        missing = [name for name in (*POSE, *(() if body else ("body",))) if name not in table.names]
-        if not time or missing:
-            raise ImportTableError(
-                f"{path}: column {[*missing, 'time_s'][0]!r} is missing; there are {', '.join(table.names)[:400]}; "
-                "expected a first line of time_s or time_ns, body (or `body` for all rows), x, y, z, qx, qy, qz, qw, "
-                "in metres and between commas"
-            )
-        seconds = f"{table.number(time)} * {1.0 if time == 'time_ns' else 1e9!r}"
-        in_reach = f"{seconds} BETWEEN -{LATEST_NS} AND {LATEST_NS}"
-        # Floats are not exact for nanoseconds since 1970.
-        exact = f"coalesce({table.whole_number(time)}, CAST({seconds} AS BIGINT))" if time == "time_ns" else seconds
-        # One query only: a file that is still being written would be longer the second time.
-        cells = {name: table.number(name) for name in POSE} | {
-            time: f"CASE WHEN {in_reach} THEN CAST({exact} AS BIGINT) END"
-        }
-        found = table.query(cells | ({} if body else {"body": f"nullif({table.word('body')}, '')"}))
-        if len(lines := table.rejected()):
-            raise ImportTableError(f"{path}: row {lines[0]}: more cells than the header has")
-        for name, column in found.items():
-            if np.ma.is_masked(column):
-                row = np.flatnonzero(np.ma.getmaskarray(column))[:1]
-                (cell,) = table.words_at([name], row)[int(row[0])].values()
-                expected = {time: "a time", "body": "a name"}.get(name, "a number")
-                raise ImportTableError(
-                    f"{path}: row {table.lines(row)[0]}: column {name!r}: found {cell!r}, expected {expected}"
-                )
-        bodies = np.full(len(found["x"]), body) if body else np.asarray(found["body"], np.str_)
-        values = np.column_stack([np.ma.getdata(found[name]) for name in POSE])
-        return _poses(path, np.ma.getdata(found[time]), bodies, values)
+TUM: Final = Form("TUM", ("time_s", *POSE), None)
+EUROC: Final = Form("EuRoC", ("time_ns", "x", "y", "z", "qw", "qx", "qy", "qz"), ",", more=True)
 
 
-def _from_lines(path: Path, body: str | None, *, euroc: bool) -> Poses:
-    """Return the poses of a TUM or a EuRoC file."""
-    kind, delimiter, time, names = "TUM", None, "time_s", POSE
-    if euroc:
-        kind, delimiter, time, names = "EuRoC", ",", "time_ns", ("x", "y", "z", "qw", "qx", "qy", "qz")
-    if body is None:
-        raise ImportTableError(f"{path}: a {kind} file has no names of bodies; name its body with `body`")
-    time_ns, values, scale = array("q"), array("d"), 1 if euroc else 10**9
-    text = read_text(path, ImportTableError, f"{kind} file").removeprefix("\ufeff").splitlines()
-    for row, line in enumerate(text, start=1):
-        cells = line.split(delimiter)
-        if not line.strip() or line.lstrip().startswith("#"):
+def _from_text(path: Path, file: TextIO, body: str | None) -> Poses:
+    """Return the poses of a CSV file with a header, or of a form without one."""
+    form: Form | None = TUM
+    if path.suffix.lower() == ".csv":
+        form = EUROC if file.readline().lower().startswith("#timestamp") else None
+        file.seek(0)
+    lines = csv.reader(file) if form is None or form.delimiter else (line.split() for line in file)
+    names = form.names if form else tuple(name.strip() for name in next(lines, ()))
+    time = next((name for name in ("time_ns", "time_s") if name in names), "time_s")
+    missing = [name for name in (time, *POSE, "body") if name not in names and not (name == "body" and body)]
+    if form and missing:
+        raise ImportTableError(f"{path}: a {form.title} file has no names of bodies; name its body with `body`")
+    if missing:
+        raise ImportTableError(
+            f"{path}: column {missing[0]!r} is missing; there are {', '.join(names)[:400]}; "
+            "expected a first line of time_s or time_ns, body (or `body` for all rows), x, y, z, qx, qy, qz, qw, "
+            "in metres and between commas"
+        )
+    times, bodies, values = array("q"), list[str](), array("d")
+    scale, places = 1 if time == "time_ns" else 10**9, {name: names.index(name) for name in (time, *POSE)}
+    for row, cells in enumerate(lines, start=1 if form else 2):
+        if not cells or (form and cells[0].startswith("#")):
             continue
-        if len(cells) < 8 or (len(cells) > 8 and not euroc):
-            expected = (delimiter or " ").join((time, *names))
-            raise ImportTableError(f"{path}: row {row}: found {len(cells)} cells, {kind} has 8: {expected}")
-        numbers = dict(zip((time, *names), map(_number, cells), strict=False))
-        for name, cell in zip(numbers, cells, strict=False):
-            if not numbers[name].is_finite() or (name == time and abs(numbers[name]) * scale > LATEST_NS):
-                expected = "a time" if name == time else "a number"
-                raise ImportTableError(f"{path}: row {row}: column {name!r}: found {cell!r}, expected {expected}")
-        time_ns.append(round(numbers[time] * scale))
-        values.extend(float(numbers[name]) for name in POSE)
-    return _poses(path, np.array(time_ns), np.full(len(time_ns), body), np.array(values).reshape(-1, 7))
+        if len(cells) < len(names) or (len(cells) > len(names) and not (form and form.more)):
+            raise ImportTableError(f"{path}: row {row}: found {len(cells)} cells, expected {' '.join(names)}")
+        found = {name: _number(cells[place]) for name, place in places.items()}
+        wrong = {name: "a number" for name, value in found.items() if not math.isfinite(value)}
+        wrong |= {time: "a time"} if not abs(found[time]) * scale <= LATEST_NS else {}
+        bodies.append(body or cells[names.index("body")].strip())
+        wrong |= {} if bodies[-1] else {"body": "a name"}
+        for name, expected in wrong.items():
+            cell = cells[names.index(name)]
+            raise ImportTableError(f"{path}: row {row}: column {name!r}: found {cell!r}, expected {expected}")
+        times.append(round(Decimal(cells[places[time]].strip()) * scale))
+        values.extend(found[name] for name in POSE)
+    return _poses(path, np.array(times), np.array(bodies, np.str_), np.array(values).reshape(-1, 7))
 
 
-def _number(cell: str) -> Decimal:
-    """Return a cell as a decimal number, infinity if it is none; floats are not exact for nanoseconds since 1970."""
+def _number(cell: str) -> float:
+    """Return a cell as a number, NaN if it is none."""
     try:
-        number = Decimal(cell.strip())
-    except InvalidOperation:
-        return Decimal("inf")
-    return number if number.is_finite() and math.isfinite(number) else Decimal("inf")
+        return float(cell)
+    except ValueError:
+        return math.nan
 
 
 def _poses(path: Path, time_ns: Ints, body: NDArray[np.str_], values: Floats) -> Poses:
@@ -194,22 +179,21 @@ def _body_in(name: str) -> str:
 
 def _chosen_topics(path: Path, kinds: Mapping[str, str], topics: Mapping[str, str] | None) -> dict[str, str | None]:
     """Return the topics to read and their bodies; None if message or topic name the body."""
+    known = {topic: kind for topic, kind in kinds.items() if kind in MESSAGES}
     for topic in (topics or {}).values():
-        if kinds.get(topic) not in MESSAGES:
-            known = ", ".join(sorted(name for name, kind in kinds.items() if kind in MESSAGES)) or "none"
-            raise ImportTableError(
-                f"{path}: topic {topic[:80]!r} is {kinds.get(topic, 'not there')}; topics with poses are {known}"
-            )
+        if topic not in known:
+            listed = ", ".join(sorted(known)) or "none"
+            there = kinds.get(topic, "not there")
+            raise ImportTableError(f"{path}: topic {topic[:80]!r} is {there}; topics with poses are {listed}")
     if topics:
         return {topic: body for body, topic in topics.items()}
-    for kind in MESSAGES:
-        found = [topic for topic, its in kinds.items() if its == kind]
-        if found:
-            return dict.fromkeys(found)
-    raise ImportTableError(
-        f"{path}: no topic of {', '.join(name.replace('/msg', '') for name in MESSAGES)}; "
-        f"found {', '.join(sorted(set(kinds.values()))) or 'nothing'}"
-    )
+    if not known:
+        raise ImportTableError(
+            f"{path}: no topic of {', '.join(name.replace('/msg', '') for name in MESSAGES)}; "
+            f"found {', '.join(sorted(set(kinds.values()))) or 'nothing'}"
+        )
+    first = min(known.values(), key=list(MESSAGES).index)
+    return {topic: None for topic, kind in known.items() if kind == first}
 
 
 def _of_message(kind: str, message: dict[str, Any]) -> Iterator[tuple[int, str, list[float]]]:
@@ -319,11 +303,8 @@ def _check_units(what: str, exchanges: Exchanges, poses: Poses, tags: Sequence[T
         "its positions and the lever arms": lambda factor: ranges - distances(factor, factor),
         "the ranges": lambda factor: ranges - distances(1.0, 1.0) / factor,
     }
-    found = other_unit(errors)
-    if found:
-        raise ImportTableError(
-            f"{what}: {found[0]} are in {found[1]}, not metres, by comparison of ranges and distances; convert them"
-        )
+    if found := other_unit(errors):
+        raise ImportTableError(f"{what}: {found}, not metres, by comparison of ranges and distances; convert them")
 
 
 def _in_order(parts: list[Poses]) -> Poses:
@@ -336,10 +317,9 @@ def _in_order(parts: list[Poses]) -> Poses:
 
 
 def _offset_ns(text: str) -> int:
-    value = _number(text)
-    if not abs(value) <= 4e9:
+    if not abs(_number(text)) <= 4e9:
         raise ImportTableError(f"`offset`: found {text!r}, expected seconds or auto")
-    return round(value * 10**9)
+    return round(Decimal(text.strip()) * 10**9)
 
 
 def _apart(exchanges_ns: np.ndarray, poses_ns: np.ndarray) -> str:

@@ -51,14 +51,14 @@ def is_viewer(host: str, origin: str | None, own: str) -> bool:
         page = site.hostname or ""
     except ValueError:
         return False
-    if not (_is_address(name) or name == own.lower() or name.endswith(".local") or (name and "." not in name)):
-        return False
-    if origin is None:  # of a program that is no browser
-        return True
-    if site.scheme not in ("http", "https"):  # a viewer on the desktop; a page without an origin sends "null"
-        return bool(site.scheme)
-    own_page = page in (name, "localhost", LOOPBACK, "::1")
-    return own_page or (site.scheme == "https" and (page == VIEWERS or page.endswith(f".{VIEWERS}")))
+    # Names without a dot and in .local are of this network, so no site can let one of them point here.
+    is_own = name == own.lower() or name.endswith(".local") or "." not in name or _is_address(name)
+    is_page = site.scheme in ("http", "https")  # a viewer on the desktop has another scheme
+    is_trusted = page in (name, "localhost", LOOPBACK, "::1") or (
+        site.scheme == "https" and (page == VIEWERS or page.endswith(f".{VIEWERS}"))
+    )
+    # Programs that are no browsers send no origin; pages without an origin send "null".
+    return bool(name) and is_own and (origin is None or (is_trusted if is_page else bool(site.scheme)))
 
 
 def _is_address(name: str) -> bool:

@@ -49,7 +49,8 @@ def test_a_guess_says_that_nothing_was_programmed(tmp_path):
     assert done.returncode == 0
     assert read_table(path, tmp_path / "map.toml").meta["configured_antenna_delay_ticks"] == {"tx": 0, "rx": 0}
     done = processes.run("uwblink", "import", "guess", table(tmp_path, flights()), "-o", tmp_path / "m2.toml")
-    assert "configured_antenna_delay_ticks" not in read_table(tmp_path / "t.csv", tmp_path / "m2.toml").meta
+    found = read_table(tmp_path / "t.csv", tmp_path / "m2.toml")
+    assert found.meta["configured_antenna_delay_ticks"] == {"tx": PROGRAMMED, "rx": PROGRAMMED}
 
 
 def test_one_device_without_antenna_delays(tmp_path):

@@ -13,7 +13,7 @@ import uwblink
 from tests.uwblink.importers.test_planted_delays import messages_of
 from tests.uwblink.importers.test_table_forms import as_messages, flights, mapped, repeated, stamps, wrapped, write
 from uwblink.errors import ImportTableError
-from uwblink.importers import bags, exchange_rows, exchange_tables, import_file, read_table, staging
+from uwblink.importers import bags, exchange_rows, import_file, read_table, staging
 
 SPOILT = ("", "nan", "x", "-1", "7.5", "99999999999999999999")
 
@@ -36,8 +36,7 @@ def told(contents):
 
 
 def few_at_once(monkeypatch, count=20):
-    for room in (staging, exchange_tables):
-        monkeypatch.setattr(room, "ROWS_AT_ONCE", count)
+    monkeypatch.setattr(staging, "ROWS_AT_ONCE", count)
     monkeypatch.setattr(exchange_rows, "FAULTS_AT_ONCE", 5)
 
 

@@ -421,11 +421,11 @@ def test_no_text_of_a_map_is_a_program(tmp_path, place, monkeypatch):
 
 
 def test_duckdb_may_open_the_named_file_only(tmp_path):
-    from uwblink.importers.tables import Table
+    from uwblink.importers.tables import open_table
 
     write(tmp_path / "t.csv", wrapped(flights()))
     (tmp_path / "secret.csv").write_text("a\n1\n")
-    with Table(tmp_path / "t.csv") as table:
+    with open_table(tmp_path / "t.csv") as table:
         for query in (f"SELECT * FROM read_csv('{tmp_path}/secret.csv')", f"COPY (SELECT 1) TO '{tmp_path}/x.csv'"):
             with pytest.raises(duckdb.Error):
                 table.db.execute(query)
