@@ -9,10 +9,10 @@ ticks again. All files of a folder have one clock; `timeshift.yaml` has its star
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import yaml
@@ -28,10 +28,13 @@ from uwblink.text_files import TomlReader, read_text
 from uwblink.ticks import REPORT_BITS, TICKS_PER_SECOND
 from uwblink.twr import LARGEST_ID, STAMPS, Exchanges
 
+Found = TypeVar("Found")
+
 Vectors = dict[str, dict[int, tuple[float, float, float]]]
 """Vectors by name and number: lever arms by robot and tag, or places in metres by constellation and anchor."""
 
 _ENDS: Final = {"initiator": "from_id", "target": "to_id"}
+_XYZ: Final = "groups of tags, each with [x, y, z] in metres"
 _IDS: Final = (*_ENDS, "listener", "board")
 
 
@@ -62,7 +65,8 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
     flight = Flight(folder, tuple(sorted(path.parent for path in folder.glob("*/uwb_range.csv"))))
     if not flight.robots:
         raise ImportTableError(f"{folder}: no folder in it holds uwb_range.csv, as those of MILUV's robots do")
-    start_ns = _start_ns(folder)
+    clock, shift = folder / "timeshift.yaml", "whole numbers timeshift_s and timeshift_ns"
+    start_ns = _read_yaml(clock, _start_ns, shift) if clock.exists() else 0
     exchanges, measured_m = _read_exchanges(flight)
     poses, tags = _read_poses(flight), _read_tags(flight)
     constellation, off_m, places = _find_anchors(flight, exchanges, measured_m, poses, tags, wanted)
@@ -73,7 +77,8 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
     ranging = {*exchanges.initiator.tolist(), *exchanges.target.tolist()} - {tag.tag for tag in tags}
     tags += [Tag(number, f"tag{number}", (0.0, 0.0, 0.0)) for number in ranging]
     heard = _read_overheard(flight)
-    cirs = _read_cirs(flight)
+    taps = {"board": "my_id"} | _ENDS | {"first_path_index": "idx", "taps": "cir"}
+    cirs = _read(flight, "uwb_cir.csv", taps)
     sensed = {f"w{axis}": f"angular_velocity.{axis}" for axis in "xyz"}
     sensed |= {f"a{axis}": f"linear_acceleration.{axis}" for axis in "xyz"}
     imu, height = _read(flight, "imu_px4.csv", sensed), _read(flight, "height.csv", {"height_m": "range"})
@@ -198,10 +203,6 @@ def _read_overheard(flight: Flight) -> Columns:
     return _read(flight, "uwb_passive.csv", needed, optional, by_clock)
 
 
-def _read_cirs(flight: Flight) -> Columns:
-    return _read(flight, "uwb_cir.csv", {"board": "my_id"} | _ENDS | {"first_path_index": "idx", "taps": "cir"})
-
-
 def _cir_rows(columns: Columns) -> list[CirRow]:
     names = ("time_ns", "board", *_ENDS, "first_path_index", "taps")
     cells = [columns[name].tolist() for name in names] if columns else []
@@ -226,7 +227,7 @@ def _read_poses(flight: Flight) -> Poses:
 def _read_tags(flight: Flight) -> list[Tag]:
     """Return the robots' tags and lever arms from tags.yaml; none without such a file."""
     path = flight.folder / "tags.yaml"
-    arms, names = _read_vectors(path) if path.exists() else {}, {robot.name for robot in flight.robots}
+    arms, names = _read_yaml(path, _vectors, _XYZ) if path.exists() else {}, {robot.name for robot in flight.robots}
     return [Tag(number, body, arm) for body, tags in arms.items() if body in names for number, arm in tags.items()]
 
 
@@ -240,16 +241,13 @@ def _find_anchors(
     constellation fits.
     """
     path = flight.folder / "anchors.yaml"
-    if not path.exists():
-        if wanted is not None:
-            raise ImportTableError(f"{path}: no such file, so there is no constellation {wanted[:40]!r}")
-        return None, float("nan"), {}
-    known = _read_vectors(path)
+    known = _read_yaml(path, _vectors, _XYZ) if path.exists() else {}
     if wanted is not None and wanted not in known:
-        raise ImportTableError(f"{path}: no constellation {wanted[:40]!r}; there are {', '.join(known)}")
+        listed = ", ".join(known) or "none"
+        raise ImportTableError(f"{path}: no constellation {wanted[:40]!r}; there are {listed}")
     ends = exchanges.initiator, exchanges.target
     ranging = {*ends[0].tolist(), *ends[1].tolist()} - {tag.tag for tag in tags}
-    if not ranging and wanted is None:
+    if not known or not (ranging or wanted):
         return None, float("nan"), {}
     found = []
     for name, all_places in known.items():
@@ -280,41 +278,28 @@ def _with_anchors(
     return Poses.concatenate([poses, standing]).in_time_order(), [*tags, *anchors]
 
 
-def _start_ns(folder: Path) -> int:
-    path = folder / "timeshift.yaml"
-    if not path.exists():
-        return 0
-    table = _read_mapping(path)
-    try:
-        return int(table["timeshift_s"]) * 1_000_000_000 + int(table["timeshift_ns"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ImportTableError(f"{path}: expected whole numbers timeshift_s and timeshift_ns") from error
+def _start_ns(table: Any) -> int:
+    """Return the start of the clock by timeshift.yaml."""
+    return int(table["timeshift_s"]) * 1_000_000_000 + int(table["timeshift_ns"])
 
 
-def _read_mapping(path: Path) -> dict[str, Any]:
-    """Return a YAML file whose top level is a mapping; raises `ImportTableError`."""
-    try:
-        table = yaml.safe_load(read_text(path, ImportTableError))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ImportTableError(f"{path}: not YAML ({first_line(error)})") from error
-    if not isinstance(table, dict):
-        raise ImportTableError(f"{path}: expected names and values, as in `name: value`")
-    return {str(name): value for name, value in table.items()}
-
-
-def _read_vectors(path: Path) -> Vectors:
-    """Return vectors of three numbers; each is a list, or text such as "[1.0, 2.0, 3.0]". Raises `ImportTableError`."""
+def _vectors(table: Any) -> Vectors:
+    """Return vectors of tags.yaml and anchors.yaml; each is a list, or text such as "[1.0, 2.0, 3.0]"."""
     found: Vectors = {}
-    for name, group in _read_mapping(path).items():
-        if not isinstance(group, dict):
-            raise ImportTableError(f"{path}: {name[:40]}: expected numbers, each with [x, y, z]")
-        found[name] = {}
+    for name, group in table.items():
         for tag, value in group.items():
-            try:
-                x, y, z = (float(cell) for cell in (value.strip("[] ").split(",") if isinstance(value, str) else value))
-                found[name][int(tag)] = (x, y, z)
-            except (TypeError, ValueError) as error:
-                raise ImportTableError(
-                    f"{path}: {name[:40]}: {str(tag)[:20]}: found {reprlib.repr(value)[:40]}, expected [x, y, z]"
-                ) from error
+            cells = value.strip("[] ").split(",") if isinstance(value, str) else value
+            if len(cells) != 3:
+                raise ValueError(f"{name}: {tag}: found {reprlib.repr(value)[:40]}")
+            found.setdefault(str(name), {})[int(tag)] = (float(cells[0]), float(cells[1]), float(cells[2]))
     return found
+
+
+def _read_yaml(path: Path, convert: Callable[[Any], Found], expected: str) -> Found:
+    """Return a YAML file as `convert` makes it; raises `ImportTableError` if it fails."""
+    try:
+        return convert(yaml.safe_load(read_text(path, ImportTableError)))
+    except ImportTableError:
+        raise
+    except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise ImportTableError(f"{path}: {first_line(error)}; expected {expected}") from error

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from tests import processes
 from tests.uwblink.importers.test_table_forms import AIR, HEADER, TICKS, flights, mapped, wrapped, write
 from uwblink.errors import ImportTableError
 from uwblink.importers import read_table
-from uwblink.recording.contents import load
+from uwblink.importers.guess import guess_map
 
 PROGRAMMED = 16_436
 """Ticks of each direction, as the boards have them; a device without them stamps its transmissions so much earlier."""
@@ -45,11 +44,9 @@ def test_devices_without_antenna_delays_are_read_beside_true_distances(tmp_path,
 
 def test_a_guess_says_that_nothing_was_programmed(tmp_path):
     path = table(tmp_path, undelayed(flights()))
-    done = processes.run("uwblink", "import", "guess", path, "-o", tmp_path / "map.toml")
-    assert done.returncode == 0
+    mapped(tmp_path, guess_map(path).text)
     assert read_table(path, tmp_path / "map.toml").meta["configured_antenna_delay_ticks"] == {"tx": 0, "rx": 0}
-    done = processes.run("uwblink", "import", "guess", table(tmp_path, flights()), "-o", tmp_path / "m2.toml")
-    found = read_table(tmp_path / "t.csv", tmp_path / "m2.toml")
+    found = read_table(path, mapped(tmp_path, guess_map(table(tmp_path, flights())).text))
     assert found.meta["configured_antenna_delay_ticks"] == {"tx": PROGRAMMED, "rx": PROGRAMMED}
 
 
@@ -80,9 +77,6 @@ def test_single_sided_ranges_with_the_carriers_skew(tmp_path):
         ends = {name: row[name] for name in HEADER[:3]}
         table.append({**ends, **short, "skew2": skew, "gt_range_m": row["truth"]})
     path = write(tmp_path / "t.csv", table)
-    (tmp_path / "map.toml").write_text('protocol = "ss-cfo"\n')
-    done = processes.run("uwblink", "import", "csv", path, "--map", tmp_path / "map.toml", "-o", tmp_path / "o.uwb")
-    assert done.returncode == 0, done.stderr
-    found = load(tmp_path / "o.uwb").exchanges
+    found = read_table(path, mapped(tmp_path, 'protocol = "ss-cfo"\n')).exchanges
     assert set(found.protocol) == {"ss-cfo"}
     assert found.range_m == pytest.approx(found.truth_m, abs=0.01)

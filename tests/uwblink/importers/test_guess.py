@@ -8,6 +8,7 @@ import pytest
 from tests import processes
 from tests.shared_data import shared
 from tests.uwblink.importers.test_table_forms import HEADER, as_messages, flights, same, wrapped, write
+from uwblink.errors import ImportTableError
 from uwblink.importers import import_recording, read_table
 from uwblink.importers.column_map import load_map
 from uwblink.importers.guess import guess_map
@@ -134,20 +135,11 @@ def test_places_beside_ranges(tmp_path, mine, other):
     assert (len(found.poses), found.poses.position_m.max()) == (31, 29)
 
 
-def test_places_that_cannot_be_used_are_left_out_and_it_is_said(tmp_path):
-    rows = [
-        {"t_s": k, "src": 1, "dst": 2, "dist_mm": 1000 * (9 + k * k) ** 0.5}
-        | dict(zip(("tag_x", "tag_y", "tag_z", "anchor_x", "anchor_y", "anchor_z"), (k, 0, 1, 0, 3, 1), strict=True))
-        for k in range(30)
-    ]
-    for drop, said in ((None, "ranges are 1e+03 of their distance"), ("anchor_z", "missing: to_z_m")):
-        path = write(tmp_path / "t.csv", [{n: v for n, v in row.items() if n != drop} for row in rows])
-        guess = guess_map(path)
-        assert said in guess.text
-        (tmp_path / "map.toml").write_text(guess.text)
-        found = read_table(path, tmp_path / "map.toml")
-        assert found.exchanges.range_m[0] == pytest.approx(3.0)
-        assert not len(found.poses)
+def test_places_of_which_some_are_missing_are_not_used_and_it_is_said(tmp_path):
+    places = dict.fromkeys(("tag_x", "tag_y", "tag_z", "anchor_x", "anchor_y"), 1.5)
+    path = write(tmp_path / "t.csv", [{"t_s": k, "src": 1, "dst": 2, "range_m": 3.25, **places} for k in range(30)])
+    assert "missing: to_z_m" in guess_map(path).text
+    assert not len(guessed(tmp_path, path).poses)
 
 
 def test_a_table_without_time_between_the_last_messages_is_guessed_in_peace(tmp_path):
@@ -247,10 +239,6 @@ def test_ends_that_are_called_alike(tmp_path, ends):
     assert list(zip(e.initiator.tolist(), e.target.tolist(), strict=True)) == pairs * 5
 
 
-def command(*words):
-    return processes.run("uwblink", "import", *words)
-
-
 @pytest.mark.parametrize(
     ("row", "asked", "answer"),
     [
@@ -265,22 +253,21 @@ def test_what_a_table_does_not_tell_is_asked_for(tmp_path, row, asked, answer):
     """The map as it was guessed imports nothing, and nor does one without the line; one with an answer does."""
     rows = [{n: v + k if n in ("t", "range", "t_s") else v for n, v in row.items()} for k in range(40)]
     path, map_file = write(tmp_path / "t.csv", rows), tmp_path / "map.toml"
-    assert command("guess", path, "-o", map_file).returncode == 0
-    text = map_file.read_text()
+
+    def imported(text):
+        map_file.write_text(text)
+        return read_table(path, map_file)
+
+    text = guess_map(path).text
     assert f'{asked} = "?"' in text
-    done = command("csv", path, "--map", map_file, "-o", tmp_path / "o.uwb")
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert asked in done.stderr
-    assert not (tmp_path / "o.uwb").exists()
+    with pytest.raises(ImportTableError, match=asked):
+        imported(text)
     if answer == '"?"':
         return
     if asked != "time":
-        map_file.write_text(text.replace(f'{asked} = "?"', "#"))
-        assert f"units.{asked}" in command("csv", path, "--map", map_file, "-o", tmp_path / "o.uwb").stderr
-    map_file.write_text(text.replace(f'{asked} = "?"', f'{asked} = "{answer}"'))
-    assert command("csv", path, "--map", map_file, "-o", tmp_path / "o.uwb").returncode == 0
-    found = load(tmp_path / "o.uwb")
+        with pytest.raises(ImportTableError, match=f"units.{asked}"):
+            imported(text.replace(f'{asked} = "?"', "#"))
+    found = imported(text.replace(f'{asked} = "?"', f'{asked} = "{answer}"'))
     assert found.exchanges.time_ns[1] - found.exchanges.time_ns[0] == (10**6 if asked == "time" else 10**9)
     if asked == "distance":
         assert found.exchanges.range_m[0] == pytest.approx(1.5, abs=0.001)

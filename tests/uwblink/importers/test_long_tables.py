@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import uwblink
-from tests.uwblink.importers.test_planted_delays import messages_of
 from tests.uwblink.importers.test_table_forms import as_messages, flights, mapped, repeated, stamps, wrapped, write
 from uwblink.errors import ImportTableError
 from uwblink.importers import bags, exchange_rows, import_file, read_table, staging
@@ -82,9 +81,8 @@ def lines_of(layout):
         lines = as_messages(plain)
     elif layout == "stamps":
         lines = [
-            common | {"event": kind, "stamp": both[kind], "fpp": power}
-            for k, row in enumerate(plain)
-            for common, both, power in messages_of(row | {"fpp3": ""}, k)
+            {n: v for n, v in line.items() if n not in ("tx", "rx")} | {"event": kind, "stamp": line[kind]}
+            for line in as_messages(plain)
             for kind in ("tx", "rx")
         ]
     else:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests import processes
-from uwblink.errors import ImportTableError
+from uwblink.errors import ImportTableError, PlanError, RecordingExistsError
 from uwblink.importers import add_poses
 from uwblink.importers.poses import read_poses
 from uwblink.recording.contents import Contents
@@ -112,21 +112,17 @@ def test_auto_finds_the_offset_from_the_ranges(flight, copied):
 
 
 def test_the_command_says_what_it_did_and_refuses_what_cannot_be(flight, copied, tmp_path):
-
-    def run(*words):
-        return processes.run("uwblink", "poses", copied, *words)
-
-    assert "3320 of 3320 exchanges have a true distance" in run("--from", flight / "p.csv", "--offset", "-3.21").stdout
-    for words, fragment in (
-        (("--from", tmp_path / "no.csv"), "no such file"),
-        (("--from", flight / "p.csv", "--offset", "soon"), "--offset"),
-        (("--from", flight / "p.csv", "--offset", "500000"), "no exchange lies within"),
-        (("--from", flight / "p.csv", "--tags", tmp_path / "no.toml"), "no such file"),
+    said = processes.run("uwblink", "poses", copied, "--from", flight / "p.csv", "--offset", "-3.21").stdout
+    assert "3320 of 3320 exchanges have a true distance" in said
+    done = processes.run("uwblink", "poses", copied, "--from", flight / "p.csv", "--offset", "soon", "--force")
+    assert (done.returncode, done.stderr.count("\n"), "--offset" in done.stderr) == (2, 1, True)
+    for more, error, fragment in (
+        ({"source": tmp_path / "no.csv"}, ImportTableError, "no such file"),
+        ({"offset": "500000"}, ImportTableError, "no exchange lies within"),
+        ({"tags_from": tmp_path / "no.toml"}, PlanError, "no such file"),
     ):
-        done = run(*words, "--force")
-        assert done.returncode == 2
-        assert fragment in done.stderr
-        assert done.stderr.count("\n") == 1
+        with pytest.raises(error, match=fragment):
+            add_poses(copied, **{"source": flight / "p.csv", "force": True} | more)
 
 
 def scaled(path, factor, output):
@@ -142,30 +138,24 @@ def scaled(path, factor, output):
 
 
 def test_poses_that_are_there_stay_unless_they_are_to_be_replaced(flight, copied):
-    def run(*words):
-        return processes.run("uwblink", "poses", copied, "--from", flight / "p.csv", *words)
-
-    assert run("--offset", "-3.21").returncode == 0
-    done = run("--offset", "-3.1")
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert "--force" in done.stderr
-    with Recording.open(copied) as recording:
-        assert recording.meta()["poses_offset_s"] == pytest.approx(-3.21)
-    assert run("--offset", "-3.1", "--force").returncode == 0
-    with Recording.open(copied) as recording:
-        assert recording.meta()["poses_offset_s"] == pytest.approx(-3.1)
+    for offset, force in (("-3.21", False), ("-3.1", True)):
+        add_poses(copied, flight / "p.csv", offset=offset, force=force)
+        with Recording.open(copied) as recording:
+            assert recording.meta()["poses_offset_s"] == pytest.approx(float(offset))
+        with pytest.raises(RecordingExistsError, match="`force` replaces them"):
+            add_poses(copied, flight / "p.csv", offset="-3")
 
 
-@pytest.mark.parametrize("offset", ["-3.21", "auto"])
-@pytest.mark.parametrize(("unit", "factor"), [("mm", 1000.0), ("cm", 100.0), ("ft", 1 / 0.3048)])
+@pytest.mark.parametrize(
+    ("unit", "factor", "offset"),
+    [("mm", 1000.0, "-3.21"), ("cm", 100.0, "auto"), ("ft", 1 / 0.3048, "-3.21"), ("ft", 1 / 0.3048, "auto")],
+)
 def test_poses_in_other_units_are_refused(flight, copied, tmp_path, unit, factor, offset):
     other = scaled(flight / "p.csv", factor, tmp_path / "p.csv")
     before = copied.read_bytes()
-    done = processes.run("uwblink", "poses", copied, "--from", other, "--offset", offset)
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     # The wrong time leaves only what is far beyond all delays to tell the unit by.
-    assert "p.csv" in done.stderr
-    assert offset == "auto" or f"positions are in {unit}" in done.stderr
+    with pytest.raises(ImportTableError, match="p.csv" if offset == "auto" else f"positions are in {unit}"):
+        add_poses(copied, other, offset=offset)
     assert copied.read_bytes() == before
 
 
@@ -176,16 +166,13 @@ def test_lever_arms_and_ranges_in_other_units_are_refused(flight, copied, tmp_pa
     heads = [f'[[tags]]\nid = {tag.tag}\nbody = "{tag.body}"' for tag in tags]
     tables = [f"{head}\nlever_arm_m = {arm}" for head, arm in zip(heads, arms, strict=True)]
     (tmp_path / "tags.toml").write_text("\n".join(tables) + "\n")
-    words = ("--from", flight / "p.csv", "--offset", "-3.21")
-    done = processes.run("uwblink", "poses", copied, *words, "--tags", tmp_path / "tags.toml")
-    assert done.returncode == 2
-    assert "lever arms are in mm" in done.stderr
+    with pytest.raises(ImportTableError, match="lever arms are in mm"):
+        add_poses(copied, flight / "p.csv", offset="-3.21", tags_from=tmp_path / "tags.toml")
     none: dict[str, Any] = dict.fromkeys(STAMPS, np.zeros(len(held), dtype=np.int64))
     bare = replace(held, range_m=1000 * held.range_m, **none)
     Contents(exchanges=bare, tags=tags).save(tmp_path / "mm.uwb")
-    done = processes.run("uwblink", "poses", tmp_path / "mm.uwb", *words)
-    assert done.returncode == 2
-    assert "ranges are in mm" in done.stderr
+    with pytest.raises(ImportTableError, match="ranges are in mm"):
+        add_poses(tmp_path / "mm.uwb", flight / "p.csv", offset="-3.21")
 
 
 def test_boards_that_stand_still_are_not_taken_for_ranges_in_another_unit(tmp_path):
@@ -201,5 +188,4 @@ def test_boards_that_stand_still_are_not_taken_for_ranges_in_another_unit(tmp_pa
     Contents(exchanges=exchanges, tags=seats).save(tmp_path / "still.uwb")
     rows = [f"{t},{body},{x},0,0,0,0,0,1" for t in (-1, 3) for body, x in (("left", 0.0), ("right", 3.0))]
     (tmp_path / "p.csv").write_text("time_s,body,x,y,z,qx,qy,qz,qw\n" + "\n".join(rows) + "\n")
-    done = processes.run("uwblink", "poses", tmp_path / "still.uwb", "--from", tmp_path / "p.csv")
-    assert done.returncode == 0, done.stderr
+    assert add_poses(tmp_path / "still.uwb", tmp_path / "p.csv").covered == count

@@ -3,12 +3,12 @@
 import csv
 import gzip
 import json
+from itertools import cycle
 
 import duckdb
 import numpy as np
 import pytest
 
-from tests import processes
 from uwblink.errors import ArgumentError, ImportTableError
 from uwblink.importers import import_recording, read_source, read_table
 from uwblink.recording.contents import load
@@ -81,7 +81,7 @@ def test_poses_are_told_from_exchanges(tmp_path):
         read_table(path)
 
 
-@pytest.mark.parametrize("delimiter", [",", ";", "\t", "|"])
+@pytest.mark.parametrize("delimiter", [";", "\t", "|"])
 def test_any_delimiter(tmp_path, delimiter):
     rows = flights()
     same(read_table(write(tmp_path / "t.csv", wrapped(rows), delimiter)), rows)
@@ -125,8 +125,6 @@ def test_several_files_are_one_table(tmp_path):
     same(read_table(paths), rows[0::2] + rows[1::2])
     same(read_source(paths), rows[0::2] + rows[1::2])
     assert len(read_table(tmp_path).exchanges) == len(rows)
-    done = processes.run("uwblink", "import", "csv", *paths, "-o", tmp_path / "o.uwb")
-    assert (done.returncode, done.stdout.splitlines()[0].split(": ")[1]) == (0, f"{len(rows)} exchanges")
     with pytest.raises(ArgumentError, match="found no files"):
         read_source([])
     write(tmp_path / "2.csv", [{"time_s": 1, "from_id": 1, "to_id": 2, "range_m": 3}])
@@ -188,6 +186,25 @@ def test_swapped_columns_are_named(tmp_path):
     ]
     with pytest.raises(ImportTableError, match="tx1 and rx1 exchanged and the columns of tx2 and rx2"):
         read_table(write(tmp_path / "r.csv", reversed_roles))
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".csv.gz", ".jsonl"])
+def test_lines_are_counted_past_empty_ones_and_rows_with_too_many_cells(tmp_path, suffix):
+    rows = wrapped(flights())
+    rows[20]["tx2"] = ""
+    lines = [json.dumps(row) for row in rows]
+    if suffix != ".jsonl":
+        lines = ["\ufeff# a comment", ",".join(HEADER), *(",".join(str(row[n]) for n in HEADER) for row in rows)]
+    expected = 22 if suffix == ".jsonl" else 25
+    lines.insert(10, "")
+    if suffix != ".jsonl":
+        lines[5] += ",7"
+        lines.insert(12, " ")
+    data = "\r\n".join(lines).encode()
+    (tmp_path / f"t{suffix}").write_bytes(gzip.compress(data) if suffix.endswith("gz") else data)
+    details = [fault.detail for fault in read_table(tmp_path / f"t{suffix}").faults]
+    assert f"row {expected}, column 'tx2': found '', expected a whole number" in details
+    assert ("row 6: more cells than the header has" in details) == (suffix != ".jsonl")
 
 
 def test_corrupt_rows_are_faults_with_their_place(tmp_path):
@@ -322,8 +339,13 @@ def as_messages(rows, third="target", words=None):
     return found
 
 
-@pytest.mark.parametrize("third", ["target", "initiator"])
-@pytest.mark.parametrize("without", [(), ("seq",), ("message",), ("seq", "message"), ("time_s",)])
+@pytest.mark.parametrize(
+    ("third", "without"),
+    [
+        ("target", ()), ("initiator", ("seq",)), ("target", ("message",)), ("initiator", ("seq", "message")),
+        ("initiator", ("time_s",)),
+    ],
+)  # fmt: skip
 def test_a_row_a_message(tmp_path, third, without):
     rows = flights(third=third)
     lines = [{n: v for n, v in line.items() if n not in without} for line in as_messages(wrapped(rows), third)]
@@ -365,9 +387,7 @@ def test_two_rows_an_exchange(tmp_path):
     assert [stamps(found.exchanges)[k] for k in order] == [[row[n] % 2**32 for n in HEADER[3:9]] for row in rows]
 
 
-@pytest.mark.parametrize(
-    "name", ['a"; DROP TABLE x; --', "c0'); ATTACH 'evil.db'; --", "{0}", "?", "a' OR 1=1 --", "$(touch evil)", "\\"]
-)
+@pytest.mark.parametrize("name", ['a"; DROP TABLE x; --', "c0'); ATTACH 'evil.db'; --", "{0}?\\"])
 def test_a_hostile_name_of_a_column_is_a_name(tmp_path, name, monkeypatch):
     monkeypatch.chdir(tmp_path)
     rows = flights()
@@ -405,12 +425,11 @@ def outcome(table, map_file):
         return str(error)
 
 
-@pytest.mark.parametrize("place", PLACES)
-def test_no_text_of_a_map_is_a_program(tmp_path, place, monkeypatch):
+def test_no_text_of_a_map_is_a_program(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     rows = flights()
     write(tmp_path / "t.csv", wrapped(rows))
-    for text in HOSTILE:
+    for place, text in zip(PLACES, cycle(HOSTILE), strict=False):
         found = outcome(tmp_path / "t.csv", mapped(tmp_path, place.format(json.dumps(text))))
         if isinstance(found, str):
             assert "\n" not in found
