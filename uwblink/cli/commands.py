@@ -120,7 +120,7 @@ def _importing(row: Importer) -> Callable[..., None]:
     command = run if row.map_help else without_map
     command.__doc__ = escape(row.help)
     command.__annotations__ |= {
-        "table": Annotated[list[Path], several] if row.takes_several else Annotated[Path, one],
+        "table": Annotated[list[Path], several] if row.several else Annotated[Path, one],
         "output": Annotated[Path, output("Recording to write (.uwb).")],
         "force": Force,
     }

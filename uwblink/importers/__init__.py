@@ -48,11 +48,10 @@ class Importer:
     `read(source, map)` returns what the file at `source` holds and raises `ImportTableError`; `map` is the path of a
     file that explains it, for kinds with a `map_help`, else None. `suffixes` are what names of such files end with, in
     small letters, none for a kind of folder; `name` is that of the command `uwblink import NAME`, and `help` its line.
-    `read_all` takes a list of paths instead of one; formats without it take one file.
 
     `tables(sources, map, folder)` returns paths of tables of exchanges, messages or ranges, and their `ColumnMap`.
-    Files that are no tables are written as such into `folder`, for example as JSON lines. Tables do not need to be
-    in memory at once. `several` says that they can be several files.
+    Files that are no tables are written as such into `folder`, for example as JSON lines; none needs to be in memory
+    as a whole. With `several` it takes several files as one recording, otherwise one.
     """
 
     name: str
@@ -60,15 +59,9 @@ class Importer:
     read: Callable[[Path, Path | None], Contents] | None
     help: str
     map_help: str | None = None
-    read_all: Callable[[Sequence[Path], Path | None], Contents] | None = None
     _: KW_ONLY
     tables: Callable[[Sequence[Path], Path | None, Path], tuple[Sequence[Path], ColumnMap]] | None = None
     several: bool = False
-
-    @property
-    def takes_several(self) -> bool:
-        """Whether several files can be one recording."""
-        return self.several or self.read_all is not None
 
 
 def check_importer(row: Any) -> None:
@@ -274,17 +267,14 @@ def _choose(
     row = _importer(sources[0], importer)
     if map_file is not None and row.map_help is None:
         raise ArgumentError(f"map_file: importer {row.name!r} takes none")
-    if len(sources) > 1 and not row.takes_several:
+    if len(sources) > 1 and not row.several:
         raise ArgumentError(f"importer {row.name!r} takes one file, found {len(sources)}", parameter="source")
     return sources, row, None if map_file is None else Path(map_file)
 
 
 def _read(sources: list[Path], row: Importer, map_file: Path | None) -> Contents:
-    if len(sources) > 1 and row.read_all:
-        contents = row.read_all(sources, map_file)
-    else:
-        read: Any = row.read
-        contents = read(sources[0], map_file)
+    read: Any = row.read
+    contents = read(sources[0], map_file)
     if not isinstance(contents, Contents):
         raise ArgumentError(f"importer {row.name!r}: returned {contents!r:.60}, expected Contents")
     return contents

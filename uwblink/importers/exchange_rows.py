@@ -18,7 +18,7 @@ from uwblink.importers.plausibility import counter_format
 from uwblink.importers.staging import Rows, Staging, Watch
 from uwblink.importers.tables import Table
 from uwblink.recording.schema import Fault
-from uwblink.twr import LARGEST_ID, LATEST_NS, STAMPS
+from uwblink.twr import LARGEST_ID, STAMPS
 
 FAULTS_AT_ONCE: Final = 100_000
 
@@ -71,14 +71,15 @@ class Faults:
             while found := staging.db.execute(query, [first, last, done]).fetchall():
                 done += len(found)
                 yield self._describe(table, [(row - first, reason, time_ns) for row, reason, time_ns in found])
-            if lines := table.rejected():
-                details = (f"row {line}: more cells than the header has" for line in lines)
+            lines = table.rejected()
+            for start in range(0, len(lines), FAULTS_AT_ONCE):
+                details = (f"row {n}: more cells than the header has" for n in lines[start : start + FAULTS_AT_ONCE])
                 yield [Fault(0, table.path.name, "unusable row", detail) for detail in details]
 
     def check(self, total: int) -> None:
         """Raise `ImportTableError` with the first unusable row if half of all rows or more are unusable."""
         if len(self) and 2 * len(self) >= total:
-            ((fault, *_), *_) = self
+            fault, *_ = next(iter(self))
             path = next(path for path in self._staging.paths if path.name == fault.board)
             raise ImportTableError(f"{path}: {fault.detail}")
 
@@ -106,8 +107,7 @@ def usable_ranges(rows: Rows, faults: Faults) -> Rows:
 
 
 def _times(rows: Rows) -> list[Condition]:
-    in_reach = f"coalesce(time_ns BETWEEN -{LATEST_NS} AND {LATEST_NS}, false)"
-    return [Condition("time_s", "a time", f"NOT {in_reach}")] if rows.has("time_s") else []
+    return [Condition("time_s", "a time", "time_ns IS NULL")] if rows.has("time_s") else []
 
 
 def usable_exchanges(

@@ -175,13 +175,13 @@ def _ends(called: dict[str, str]) -> dict[str, str]:
     return {}
 
 
-def stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str] | None:
-    """Return the columns of a table with one stamp in each row; None without a column of transmissions and receptions.
+def with_stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str]:
+    """Return the columns of a table with a stamp and its event in each row; the same columns for another table.
 
     If several columns are times, the stamp is the one whose name mentions a device, or else does not mention the host.
     """
     if all(name in columns for name in STAMPS[:4]) or ("tx" in columns and "rx" in columns):
-        return None
+        return columns
     single = {name: _plain(name) for name in table.names if table.names.count(name) == 1}
     kinds = r"(event|direction|dir|kind|type|action|edge|what|tx_?or_?rx|tx_?rx)"
     clock = rf"((device|dw|dw1000|raw|chip|uwb)_?)?(stamp|timestamp|time|ticks?|counter|t){_WORDS['end']}"
@@ -190,7 +190,7 @@ def stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str] | N
     )
     times = [name for name, plain in single.items() if re.fullmatch(clock, plain)]
     if event is None or not times:
-        return None
+        return columns
 
     def unlikely(name: str) -> tuple[bool, bool]:
         of_device = re.search(r"device|dw|tick|dtu|raw|chip|counter|^stamp", single[name])
@@ -243,8 +243,7 @@ def guess_map(path: Path) -> Guess:
     if path.suffix.lower() == ".uwb":
         raise ImportTableError(f"{path}: is a recording already and needs no map; 'uwblink show' prints its contents")
     with open_table(path) as table:
-        columns = named_columns(table.names)
-        columns = stamp_and_event(table, columns) or columns
+        columns = with_stamp_and_event(table, named_columns(table.names))
         numbers = table.numbers({header for name, header in columns.items() if name != "event"}, limit=100_000)
     cells = {name: numbers[header] for name, header in columns.items() if name != "event"}
     if not len(next(iter(cells.values()), np.empty(0))):

@@ -30,6 +30,7 @@ from uwblink.database import connect
 from uwblink.errors import ImportTableError, first_line
 from uwblink.output import is_utf8
 from uwblink.text_files import require_regular
+from uwblink.twr import LATEST_NS
 
 MAX_LINE_BYTES: Final = 4_000_000
 """An impulse response in one cell takes 6,000."""
@@ -166,7 +167,8 @@ def time_ns(text: str, unit: str | None, ns_per_unit: float) -> str:
         f"CASE WHEN {zone} THEN epoch_ns(TRY_CAST({text} AS TIMESTAMPTZ)) "
         f"ELSE epoch_ns(TRY_CAST({text} AS TIMESTAMP_NS)) END"
     )
-    return {None: f"coalesce({scaled}, {iso})", "iso": iso}.get(unit, scaled)
+    found = {None: f"coalesce({scaled}, {iso})", "iso": iso}.get(unit, scaled)
+    return f"CASE WHEN {found} BETWEEN -{LATEST_NS} AND {LATEST_NS} THEN {found} END"
 
 
 class Table:

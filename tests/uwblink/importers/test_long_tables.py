@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import uwblink
-from tests.uwblink.importers.test_table_forms import as_messages, flights, mapped, repeated, stamps, wrapped, write
+from tests.uwblink.importers.test_table_forms import as_messages, flights, mapped, repeated, wrapped, write
 from uwblink.errors import ImportTableError
 from uwblink.importers import bags, exchange_rows, import_file, read_table, staging
 
@@ -55,24 +55,6 @@ def test_a_table_is_the_same_a_few_rows_at_a_time(tmp_path, monkeypatch, more):
     np.testing.assert_array_equal(written.exchanges.rx3, whole.exchanges.rx3)
 
 
-def test_a_table_that_is_half_useless_is_refused_alike_and_leaves_nothing(tmp_path, monkeypatch):
-    table = write(tmp_path / "t.csv", [row | {"rx2": "" if k % 2 else row["rx2"]} for k, row in enumerate(spoilt(0))])
-    with pytest.raises(ImportTableError) as whole:
-        read_table(table)
-    few_at_once(monkeypatch)
-    with pytest.raises(ImportTableError) as few:
-        import_file(table, tmp_path / "t.uwb")
-    assert str(few.value) == str(whole.value)
-    assert [path.name for path in tmp_path.iterdir()] == ["t.csv"]
-
-
-def test_times_of_the_calendar_come_from_json_lines_too(tmp_path):
-    rows = [row | {"time_s": f"2024-05-06T07:08:{k % 60:02d}+02:00"} for k, row in enumerate(wrapped(flights()))]
-    (tmp_path / "t.jsonl").write_text("\n".join(map(json.dumps, rows)))
-    found = read_table(tmp_path / "t.jsonl")
-    assert found.exchanges.time_ns[1] - found.exchanges.time_ns[0] == 1_000_000_000
-
-
 def lines_of(layout):
     """Exchanges as rows in any order, some lost and some that nobody can use."""
     rows = flights(80)
@@ -110,49 +92,6 @@ def test_a_long_table_is_the_same_a_few_rows_at_a_time(tmp_path, monkeypatch, la
     assert done.counts == whole.counts()
     assert list(dict.fromkeys(what for what, _ in said)) == ["reading", "sorting", "grouping", "checking", "writing"]
     assert all(0 <= share <= 1 for _, share in said)
-
-
-def test_all_rows_and_not_the_first_ones_tell_the_protocol(tmp_path, monkeypatch):
-    # The pair that is looked at first lost its third messages; of all exchanges it is a third.
-    lines = [
-        line
-        for line in as_messages(wrapped(flights(90)))
-        if line["message"] < 3 or 3 in (line["from_id"], line["to_id"])
-    ]
-    table = write(tmp_path / "t.csv", lines)
-    text = mapped(tmp_path, 'within_s = 0.1\n[columns]\nsequence = "seq"\n')
-    few_at_once(monkeypatch, 40)
-    found = read_table(table, text)
-    assert set(found.exchanges.protocol) == {"ds"}
-    assert (len(found.exchanges), len(found.faults)) == (60, 30)
-
-
-def test_messages_are_counted_from_zero_where_all_of_them_are(tmp_path, monkeypatch):
-    # The pair that is looked at first has a message 0 in each exchange by damage.
-    lines = [line | {"message": line["message"] - 1} for line in as_messages(wrapped(flights(90)))]
-    text = mapped(tmp_path, 'within_s = 0.1\n[columns]\nsequence = "seq"\n')
-    few_at_once(monkeypatch, 40)
-    assert len(read_table(write(tmp_path / "0.csv", lines), text).exchanges) == 90
-    first = [line | {"message": line["message"] + (3 in (line["from_id"], line["to_id"]))} for line in lines]
-    found = read_table(write(tmp_path / "1.csv", first), text)
-    assert (len(found.exchanges), len(found.faults)) == (60, 30)
-
-
-def test_a_group_that_is_longer_than_many_blocks(tmp_path, monkeypatch):
-    rows = flights(12)
-    ends, names = ("time_s", "from_id", "to_id"), ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
-    lines = []
-    for k, row in enumerate(wrapped(rows)):
-        plain = {n: row[n] for n in ends} | {"sequence": k} | dict.fromkeys(names, "")
-        lines += [plain | {n: row[n]} for n in names]
-        # One of the exchanges comes with a hundred rows that say nothing.
-        lines += [plain] * (100 if k == 4 else 0)
-    np.random.default_rng(6).shuffle(lines)
-    table, text = write(tmp_path / "t.csv", lines), mapped(tmp_path, 'layout = "parts"')
-    few_at_once(monkeypatch, 10)
-    found = read_table(table, text).exchanges
-    order = np.argsort(found.time_ns)
-    assert [stamps(found)[k] for k in order] == [[row[n] for n in names] for row in wrapped(rows)]
 
 
 @pytest.mark.parametrize("layout", ["messages", "stamps", "parts"])

@@ -6,28 +6,12 @@ import pytest
 from uwblink.errors import ImportTableError, PlanError
 from uwblink.exporters import export_recording
 from uwblink.importers import add_poses
-from uwblink.importers.poses import body_of, read_poses
+from uwblink.importers.poses import read_poses
 from uwblink.recording.contents import Contents, load
 from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import Exchanges
 
 TURNED = [0.0, 0.0, 0.6, 0.8]
-
-
-@pytest.mark.parametrize(
-    ("topic", "body"),
-    [
-        ("/vrpn_mocap/drone/pose", "drone"),
-        ("/vrpn_client_node/drone/pose", "drone"),
-        ("/vicon/drone/drone", "drone"),
-        ("/natnet_ros/drone/pose", "drone"),
-        ("/qualisys/drone/odom", "drone"),
-        ("/mocap/rigid_bodies/drone/pose", "drone"),
-        ("/pose", "/pose"),
-    ],
-)
-def test_a_topic_is_called_after_its_body(topic, body):
-    assert body_of(topic) == body
 
 
 def bag(path, messages):
@@ -64,7 +48,7 @@ def bag(path, messages):
     ("topic", "kind", "frame"),
     [
         ("/vrpn_mocap/drone/pose", "geometry_msgs/msg/PoseStamped", ""),
-        ("/natnet_ros/drone/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", ""),
+        ("/mocap/rigid_bodies/drone/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", ""),
         ("/qualisys/drone/odom", "nav_msgs/msg/Odometry", "base"),
         ("/vicon/anything", "geometry_msgs/msg/TransformStamped", "vicon/drone/drone"),
         ("/tf", "tf2_msgs/msg/TFMessage", "drone"),
@@ -91,21 +75,6 @@ def test_topics_by_body(tmp_path):
     (tmp_path / "t.tum").write_text("0 1 2 3 0 0 0 1\n")
     with pytest.raises(ImportTableError, match="has no topics"):
         read_poses(tmp_path / "t.tum", topics={"drone": "/d"})
-
-
-def test_euroc(tmp_path):
-    head = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v\n"
-    path = tmp_path / "data.csv"
-    path.write_text(head + "1403636579758555393,1,2,3,0.8,0,0,0.6,9,9\n")
-    poses = read_poses(path, "drone")
-    assert poses.time_ns.tolist() == [1403636579758555393]
-    assert poses.position_m.tolist() == [[1.0, 2.0, 3.0]]
-    np.testing.assert_allclose(poses.quaternion, [TURNED])
-    with pytest.raises(ImportTableError, match="name its body with `body`"):
-        read_poses(path)
-    path.write_text(head + "1,2,3\n")
-    with pytest.raises(ImportTableError, match="row 2: found 3 cells"):
-        read_poses(path, "drone")
 
 
 @pytest.fixture

@@ -65,6 +65,7 @@ def test_every_number_of_every_form_in_order_of_time(tmp_path, name, head, order
         ("a.csv", HEADER, "holds no poses"),
         ("a.csv", HEADER + "0,b,1,2,3,0,0,0,0\n", "quaternion has length 0"),
         ("a.tum", "0 1 2 3\n", "name its body with `body`"),
+        ("a.csv", "#timestamp [ns], x\n1,2,3\n", "name its body with `body`"),
         ("a.xyz", "", "expected one of"),
     ],
 )
@@ -75,6 +76,9 @@ def test_files_that_hold_no_poses(tmp_path, name, text, fragment):
     assert fragment in str(caught.value)
     with pytest.raises(ImportTableError, match="no such file"):
         read_poses(tmp_path / "none.csv")
+    (tmp_path / "a.csv").write_text("#timestamp [ns], x\n1,2,3\n")
+    with pytest.raises(ImportTableError, match="row 2: found 3 cells"):
+        read_poses(tmp_path / "a.csv", "drone")
 
 
 @pytest.fixture(scope="module")
