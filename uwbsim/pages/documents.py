@@ -299,7 +299,7 @@ TWIN_COLUMNS: Final[dict[str, Callable[[Compared], str]]] = {
     "median": lambda c: _both(c.measured.median, c.simulated.median),
     "10 %": lambda c: _both(c.measured.low, c.simulated.low),
     "90 %": lambda c: _both(c.measured.high, c.simulated.high),
-    "lag-1 corr.": lambda c: _both(c.measured.lag1, c.simulated.lag1, ".2f"),
+    "lag-1 corr., detect.": lambda c: f"{_both(c.measured.lag1, c.simulated.lag1, '.2f')}, {c.lag1_detectable:.2f}",
     "effective n": lambda c: f"{c.measured.worth:.0f} of {c.measured.count}",
     "D, detect.": lambda c: f"{c.distance:.2f}, {c.detectable:.2f}",
     "p": lambda c: f"{np.nanmin([c.probability, c.lag1_probability]):.2g}",
@@ -331,10 +331,11 @@ def _twin(found: Twin, compared: Sequence[Compared]) -> Document:
         Text(
             "Each cell has the measured value, then the simulated one. The lag-1 correlation is that of consecutive "
             "exchanges of a pair. The effective n is the number of independent values with the same information "
-            "as the measured ones. D is the largest difference of the cumulative distributions, followed by the one "
-            "that is detected in nine of ten such recordings. p is the smaller p-value of two tests: of D (Kolmogorov "
-            "and Smirnov, with effective n) and of the difference of the lag-1 correlations. Below "
-            f"{LEVEL / 2:g} the quantities differ; there are too few values where a D of 0.2 would not be detected. "
+            "as the measured ones. D is the largest difference of the cumulative distributions. Correlations and D are "
+            "followed by the difference that is detected in nine of ten such recordings. p is the smaller p-value of "
+            "two tests: of D (Kolmogorov and Smirnov, with effective n) and of the difference of the lag-1 "
+            f"correlations. Below {LEVEL / 2:g} the quantities differ; there are too few values where a D of 0.2 or a "
+            "difference of correlations of 0.4 would not be detected. "
             "The scenario was fitted to the same exchanges, so this tests its form, not its predictions."
         ),
         Table(list(TWIN_COLUMNS), [[show(one) for show in TWIN_COLUMNS.values()] for one in compared]),

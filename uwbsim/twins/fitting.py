@@ -85,12 +85,12 @@ class Compared:
     def verdict(self) -> str:
         """Return "differ" for a significant difference, else "alike", or "too few" if a large one were not detected.
 
-        A large difference is 0.2, that of two normal distributions whose means are half a standard deviation apart.
-        Each of the two tests has half of `LEVEL`.
+        A large difference of distributions is 0.2, that of two normal ones whose means are half a standard deviation
+        apart; of autocorrelations 0.4. Each of the two tests has half of `LEVEL`.
         """
         if min(self.probability, np.nan_to_num(self.lag1_probability, nan=1.0)) < LEVEL / 2:
             return "differ"
-        return "alike" if self.detectable <= 0.2 else "too few"
+        return "alike" if self.detectable <= 0.2 and self.lag1_detectable <= 0.4 else "too few"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures, JSON-ready, without the values; NaN is None."""
@@ -290,7 +290,7 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
         # More than 50,000 exchanges would only take longer for clocks and powers.
         rows = flight.some(50_000)
         clocks = fit_clocks(flight[rows])
-        noise = receive_noise(flight[rows], clocks)
+        noise = receive_noise(clocks.receive_noise_s, flight.exchanges.fpp2_dbm[rows])
         std = np.sqrt(np.mean([noise.at(power) ** 2 for power in flight.power_dbm], axis=0))
         errors = fit_range_errors(flight, std)
         powers = fit_powers(flight[rows], errors.reflected[rows])
@@ -325,23 +325,23 @@ def summary(flight: Flight, fitted: Fitted) -> dict[str, Any]:
         "exchanges": len(flight),
         "duration_s": float(flight.time_s[-1]),
         "rate_hz": schedule.rate_hz,
-        "round_robin": schedule.regular,
+        "round_robin": schedule.turns is not None,
         "lost_share": schedule.lost_share,
         "receive_noise_ps": float(np.mean(noise)) * 1e12 if len(noise) else None,
-        "carrier_noise_ppm": clocks.carrier_std_ppm,
-        "carrier_bias_ppm": clocks.carrier_bias_ppm,
+        "carrier_noise_ppm": float(clocks.noise_ppm[1]),
+        "carrier_bias_ppm": float(clocks.bias_ppm[1]),
         "warm_up_s": clocks.warm_up_s,
-        "ratio_bias_ppm": clocks.ratio_bias_ppm,
+        "ratio_bias_ppm": float(clocks.bias_ppm[0]),
         "saturation_dbm": powers.saturation_dbm,
         "first_path_at_1m_dbm": powers.at_1m_dbm,
         "path_loss_exponent": powers.exponent,
         "power_noise_db": powers.noise_db,
         "fading_db": powers.fading_db,
         "fading_life_s": powers.fading_life_s,
-        "mean_delay_ns": errors.mean_ns,
+        "mean_delay_ns": float(np.mean(list(errors.delays_ns.values()))),
         "direct_std_m": errors.direct_std_m,
         "reflected_share": errors.share,
-        "reflected_share_between_pairs": errors.share_std,
+        "reflected_share_between_pairs": float(np.std(errors.pair_share)),
         "mean_excess_m": errors.mean_excess_m,
         "excess_shape": errors.excess_shape,
         "reflection_life_s": errors.life_s,
@@ -363,7 +363,6 @@ def summary(flight: Flight, fitted: Fitted) -> dict[str, Any]:
                 "exchanges": int(np.count_nonzero(flight.pair == k)),
                 "reflected_share": float(errors.pair_share[k]),
                 "mean_excess_m": float(errors.pair_excess_m[k]),
-                "life_s": None if errors.life_s is None else float(errors.pair_life_s[k]),
             }
             for k, (a, b) in enumerate(flight.pairs)
         },

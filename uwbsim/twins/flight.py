@@ -7,18 +7,15 @@ The schedule is who ranged when, how soon boards replied, and which exchanges we
 from __future__ import annotations
 
 import os
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
-from scipy.optimize import least_squares
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import Floats, Ints
 from uwblink.protocols.table import PROTOCOLS, RangingProtocol
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import antennas_m
@@ -34,69 +31,54 @@ if TYPE_CHECKING:
     from uwbsim.twins.range_errors import KnownDevices
 
 
-def lasting(time_s: Floats, pair: Ints, value: Floats, span_s: float) -> tuple[float, float | None]:
+def lasting(time_s: Floats, pair: Ints, value: Floats) -> tuple[float, float | None]:
     """Return variance and time constant in seconds of the persistent part of values (n,), about the means of pairs.
 
     An exponential is fitted to the autocovariance over all pairs. Subtracting means over a flight of finite length
-    (`span_s`) lowers the autocovariance at every lag, which the fit takes into account. The time constant is None, and
-    the variance 0, where the lags do not determine them.
+    lowers the autocovariance at every lag, which the fit takes into account. The time constant is None, and the
+    variance 0, where the lags do not determine them.
     """
     centred = value - (np.bincount(pair, value) / np.maximum(np.bincount(pair), 1))[pair]
-    variance = float(np.mean(centred**2))
+    variance, span_s = float(np.mean(centred**2)), float(time_s[-1] - time_s[0])
     lag_s, covariance, count = _autocovariance(time_s, pair, centred, span_s)
     if len(lag_s) < 3 or variance <= 0:
         return 0.0, None
     error = variance / np.sqrt(count)
-    if np.max(covariance / error) < 4:  # standard errors
-        return 0.0, None
-
-    def misfit(at: Floats) -> Floats:
-        life = np.exp(at[1])
-        # The share of a variance that the mean over a span has, where the autocovariance is exponential.
-        ratio = life / span_s
-        taken = 2 * ratio * (1 - ratio * (1 - np.exp(-1 / ratio)))
-        return np.asarray((np.exp(at[0]) * (np.exp(-lag_s / life) - taken) - covariance) / error)
-
-    peak = max(covariance.max(), 1e-3 * variance)
-    low, high = np.log([1e-4 * variance, lag_s[0] / 20]), np.log([4 * variance, span_s / 2])
-    starts = [np.clip(np.log([peak, life]), low + 1e-6, high - 1e-6) for life in np.geomspace(lag_s[0], span_s / 8, 4)]
-    tries = [least_squares(misfit, start, bounds=(low, high)) for start in starts]
-    found, life = np.exp(min(tries, key=lambda one: float(one.cost)).x)
-    if life < lag_s[0] / 3 or found > 1.5 * variance:
-        return 0.0, None
-    return float(found), float(life)
+    # Time constants in steps of 2 to 3 %; each has its likeliest variance.
+    life = np.geomspace(lag_s[0] / 20, span_s / 2, 400)[:, None]
+    # The share of a variance that the mean over a span has, where the autocovariance is exponential.
+    ratio = life / span_s
+    taken = 2 * ratio * (1 - ratio * (1 - np.exp(-1 / ratio)))
+    shape, asked = (np.exp(-lag_s / life) - taken) / error, covariance / error
+    found = np.maximum(shape @ asked / np.sum(shape**2, axis=1), 0.0)
+    best = int(np.argmin(np.sum((found[:, None] * shape - asked) ** 2, axis=1)))
+    unclear = np.max(asked) < 4 or life[best] < lag_s[0] / 3 or found[best] > 1.5 * variance  # 4 standard errors
+    return (0.0, None) if unclear else (float(found[best]), float(life[best, 0]))
 
 
-def _autocovariance(time_s: Floats, pair: Ints, centred: Floats, span_s: float) -> tuple[Floats, Floats, Ints]:
+def _autocovariance(time_s: Floats, pair: Ints, centred: Floats, span_s: float) -> tuple[Floats, Floats, Floats]:
     """Return mean products of values of a pair that lie some time apart: lags in seconds, covariances, counts.
 
     Lags reach a quarter of the span: longer ones have few independent products.
     """
-    lags, products = [], []
-    for key in np.unique(pair):
-        rows = np.flatnonzero(pair == key)
-        if len(rows) < 8:
-            continue
-        time, values = time_s[rows], centred[rows]
-        # Products lie 1, 2, ... values of the pair apart, denser where they are few; 4 million of them are enough.
-        most = int(np.clip(4_000_000 // len(centred), 12, 80))
-        steps = np.rint(np.geomspace(1, max(len(rows) // 4, 2), most)).astype(np.int64)
-        for step in np.unique(steps).tolist():
-            apart = time[step:] - time[:-step]
-            if apart.min() > span_s / 4:
-                break
-            lags.append(apart)
-            products.append(values[step:] * values[:-step])
-    lag, product = (np.concatenate(parts) if parts else np.zeros(0) for parts in (lags, products))
-    near = (lag >= 1e-3) & (lag <= span_s / 4)
-    lag, product = lag[near], product[near]
+    order = np.lexsort((time_s, pair))
+    time, values, group = time_s[order], centred[order], pair[order]
+    longest = int(np.bincount(pair).max()) // 4
+    lags, products = [np.zeros(0)], [np.zeros(0)]
+    # Products lie 1, 2, ... values of the pair apart, denser where they are few.
+    for step in np.unique(np.geomspace(1, max(longest, 2), 40).astype(np.int64)).tolist():
+        apart = time[step:] - time[:-step]
+        near = (group[step:] == group[:-step]) & (apart >= 1e-3) & (apart <= span_s / 4)
+        lags.append(apart[near])
+        products.append((values[step:] * values[:-step])[near])
+    lag, product = np.concatenate(lags), np.concatenate(products)
     if not len(lag):
-        return lag, product, np.zeros(0, dtype=np.int64)
-    bins = 24
-    which = np.digitize(lag, np.geomspace(lag.min() * 0.999, lag.max() * 1.001, bins + 1)) - 1
-    count, total, where = (np.bincount(which, v, minlength=bins)[:bins] for v in (None, product, lag))
+        return lag, lag, lag
+    edges = np.geomspace(lag.min() * 0.999, lag.max() * 1.001, 25)
+    count = np.histogram(lag, edges)[0]
     some = count > 20
-    return where[some] / count[some], total[some] / count[some], count[some]
+    lag_s, covariance = (np.histogram(lag, edges, weights=v)[0][some] / count[some] for v in (lag, product))
+    return lag_s, covariance, count[some]
 
 
 def effective_size(value: Floats, group: Ints) -> float:
@@ -243,79 +225,68 @@ class Flight:
         That is with less than `fewest` exchanges: of 100, the quantiles of residuals are wrong by a tenth of their
         spread.
         """
+
+        def require(met: object, text: str) -> None:
+            if not met:
+                raise UnanswerableError(f"{where}: {text}")
+
+        require(len(flown.exchanges), "holds no exchanges; record or import some first")
         names, counts = np.unique(flown.exchanges.protocol, return_counts=True)
-        if not len(names):
-            raise UnanswerableError(f"{where}: holds no exchanges; record or import some first")
         row = PROTOCOLS[str(names[np.argmax(counts)])]
-        exchanges = flown.exchanges[np.flatnonzero(flown.exchanges.protocol == row.name)]
-        if len(exchanges) < fewest:
-            raise UnanswerableError(
-                f"{where}: holds {len(exchanges)} exchanges, a twin needs {fewest} or more; record longer"
-            )
-        if not len(flown.poses):
-            raise UnanswerableError(f"{where}: holds no poses; add motion capture with `uwblink poses`")
-        if not np.any(_powered(exchanges)):
-            raise UnanswerableError(f"{where}: no exchange has both first-path powers, and a twin is made from powers")
-        ids = set(np.unique([exchanges.initiator, exchanges.target]).tolist())
-        lacking = sorted(ids - {tag.tag for tag in flown.tags})
-        if lacking:
-            raise UnanswerableError(
-                f"{where}: does not say on which body tag {', '.join(map(str, lacking))} sits; give tags with "
-                "'uwblink poses --tags'"
-            )
-        tags = tuple(tag for tag in flown.tags if tag.tag in ids)
-        known.require([tag.tag for tag in tags])
-        exchanges = exchanges[np.argsort(exchanges.time_ns, kind="stable")]
-        ends = np.array([exchanges.initiator, exchanges.target], dtype=np.int64)
-        spots = np.array([antennas_m(flown.poses, list(tags), end, exchanges.time_ns) for end in ends])
-        good = np.isfinite(spots).all(axis=(0, 2)) & _powered(exchanges) & ~without_stamps(exchanges)
-        good &= ends[0] != ends[1]
-        if np.count_nonzero(good) < fewest:
-            raise UnanswerableError(
-                f"{where}: {np.count_nonzero(good)} of {len(good)} exchanges have stamps, both powers and poses around "
-                f"them, a twin needs {fewest} or more; record longer, and with motion capture all the time"
-            )
-        exchanges, spots, ends = exchanges[good], spots[:, good], ends[:, good]
-        distance = np.linalg.norm(spots[1] - spots[0], axis=1)
-        unit = (spots[1] - spots[0]) / np.maximum(distance, 1e-9)[:, None]
-        names, pair = np.unique(np.sort(ends, axis=0), axis=1, return_inverse=True)
-        places = np.array([tag.tag for tag in tags])
-        order = np.argsort(places)
-        ends = order[np.searchsorted(places[order], ends)]
-        towards = [
-            _into_body(flown.poses, tags, end, exchanges.time_ns, way)
-            for end, way in zip(ends, (unit, -unit), strict=True)
-        ]
+        x = flown.exchanges[np.flatnonzero(flown.exchanges.protocol == row.name)]
+        require(len(x) >= fewest, f"holds {len(x)} exchanges, a twin needs {fewest} or more; record longer")
+        require(len(flown.poses), "holds no poses; add motion capture with `uwblink poses`")
+        x = x[np.argsort(x.time_ns, kind="stable")]
+        powers = np.array([x.fpp1_dbm, x.fpp2_dbm])
+        good = np.all(np.isfinite(powers) & (powers < 0), axis=0)
+        require(good.any(), "no exchange has both first-path powers, and a twin is made from powers")
+        ids = np.unique([x.initiator, x.target]).tolist()
+        lacking = ", ".join(str(tag) for tag in ids if tag not in {tag.tag for tag in flown.tags})
+        require(not lacking, f"does not say on which body tag {lacking} sits; give tags with 'uwblink poses --tags'")
+        known.require(ids)
+        spots = np.array([antennas_m(flown.poses, list(flown.tags), end, x.time_ns) for end in (x.initiator, x.target)])
+        good &= np.isfinite(spots).all(axis=(0, 2)) & ~without_stamps(x) & (x.initiator != x.target)
+        require(
+            np.count_nonzero(good) >= fewest,
+            f"{np.count_nonzero(good)} of {len(good)} exchanges have stamps, both powers and poses around them, a twin "
+            f"needs {fewest} or more; record longer, and with motion capture all the time",
+        )
+        x, way = x[good], spots[1, good] - spots[0, good]
+        # In order of their numbers, so that places in it can be searched.
+        tags = tuple(sorted((tag for tag in flown.tags if tag.tag in ids), key=lambda tag: tag.tag))
+        ends = np.searchsorted([tag.tag for tag in tags], [x.initiator, x.target])
+        distance = np.linalg.norm(way, axis=1)
+        unit = way / np.maximum(distance, 1e-9)[:, None]
+        pairs, pair = np.unique(np.sort(ends, axis=0), axis=1, return_inverse=True)
+        bodies = np.array([tag.body for tag in tags])
         return cls(
             where=where,
             tags=tags,
             row=row,
-            exchanges=exchanges,
-            origin_ns=int(exchanges.time_ns[0]),
-            time_s=np.asarray((exchanges.time_ns - exchanges.time_ns[0]) * 1e-9, dtype=np.float64),
+            exchanges=x,
+            origin_ns=int(x.time_ns[0]),
+            time_s=np.asarray((x.time_ns - x.time_ns[0]) * 1e-9, dtype=np.float64),
             ends=ends,
             pair=pair.ravel(),
-            pairs=tuple((int(a), int(b)) for a, b in names.T),
+            pairs=tuple((tags[a].tag, tags[b].tag) for a, b in pairs.T),
             distance_m=distance,
-            towards=np.array(towards),
-            residual_m=known.corrected_m(exchanges) - distance,
-            ratio_ppm=_ratio_ppm(exchanges, row),
+            towards=np.array(
+                [
+                    _into_body(flown.poses, bodies[end], x.time_ns, sign * unit)
+                    for end, sign in zip(ends, (1, -1), strict=True)
+                ]
+            ),
+            residual_m=known.corrected_m(x) - distance,
+            ratio_ppm=_ratio_ppm(x, row),
         )
 
 
-def _powered(exchanges: Exchanges) -> Bools:
-    powers = np.array([exchanges.fpp1_dbm, exchanges.fpp2_dbm])
-    return np.asarray(np.all(np.isfinite(powers) & (powers < 0), axis=0))
-
-
-def _into_body(poses: Poses, tags: Sequence[Tag], end: Ints, time_ns: Ints, way: Floats) -> Floats:
-    """Return vectors (n, 3) of the world in the frames of the bodies that carry tags at places `end` (n,)."""
+def _into_body(poses: Poses, body: NDArray[np.str_], time_ns: Ints, way: Floats) -> Floats:
+    """Return vectors (n, 3) of the world in the frames of bodies (n,)."""
     turned = way.copy()
-    for body in sorted({tag.body for tag in tags}):
-        mine = [k for k, tag in enumerate(tags) if tag.body == body]
-        rows = np.flatnonzero(np.isin(end, mine))
-        if len(rows):
-            turned[rows] = attitude(poses, body, time_ns[rows]).apply(way[rows], inverse=True)
+    for name in np.unique(body).tolist():
+        rows = np.flatnonzero(body == name)
+        turned[rows] = attitude(poses, name, time_ns[rows]).apply(way[rows], inverse=True)
     return turned
 
 
@@ -344,107 +315,69 @@ SHORTEST_LIFE_S: Final = 0.01
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScheduleFit:
-    """When exchanges began, of whom, and which were lost: columns (slots,) in order of time, tags by their places.
+    """When exchanges began, of whom, and which were lost: columns (slots,) in order of time, `ends` (2, slots).
 
-    `rate_hz` counts all; `regular` says whether they went round robin, and `turns` in which order. `delay_uus` is the
-    scheduled delay, `replies_us` quantiles of replies at once; None where the protocol has none.
+    `rate_hz` counts all; `turns` is the order of a round robin, None where exchanges went by another plan. Outages of a
+    pair last `outage_life_s`. `delay_uus` is the scheduled delay, `replies_us` quantiles of replies at once; None where
+    the protocol has none.
     """
 
     time_s: Floats
-    initiator: Ints
-    target: Ints
-    lost: Bools
-    regular: bool
-    turns: tuple[tuple[int, int], ...]
+    ends: Ints
+    lost_share: float
+    outage_life_s: float
+    turns: Ints | None
     rate_hz: float
     delay_uus: int | None
     replies_us: tuple[float, ...] | None
 
-    @property
-    def lost_share(self) -> float:
-        """Return the share of exchanges that were lost."""
-        return float(np.mean(self.lost))
-
-    def outage_life_s(self) -> float:
-        """Return the mean duration of a pair's outages, from the autocorrelation of its losses."""
-        pair = np.minimum(self.initiator, self.target) * 1000 + np.maximum(self.initiator, self.target)
-        again, _ = lag_one(self.lost.astype(np.float64), pair)
-        if not again > 0.02:
-            return SHORTEST_LIFE_S
-        order = np.argsort(pair, kind="stable")
-        same = pair[order][1:] == pair[order][:-1]
-        apart = float(np.median(np.diff(self.time_s[order])[same]))
-        return max(-apart / float(np.log(min(again, 0.98))), SHORTEST_LIFE_S)
-
 
 def fit_schedule(flight: Flight, faults: list[Fault]) -> ScheduleFit:
     """Return the schedule of a flight, with the exchanges that failed meanwhile."""
-    time, first, second, lost = _slots(flight, faults)
-    turns, rate = _turns(first, second), (len(time) - 1) / max(float(time[-1]), 1e-3)
-    beat = _beat(time, first, second, turns) if turns else None
-    if beat:
-        # Slots of a round robin that left nothing at all are lost, too.
-        rate, slot = 1 / beat, np.rint(time / beat).astype(np.int64)
+    place: dict[int | None, int] = {tag.tag: k for k, tag in enumerate(flight.tags)}
+    known = [fault for fault in faults if fault.initiator in place and fault.target in place]
+    times = np.array([fault.time_ns for fault in known], dtype=np.int64)
+    failed = np.array([[place[fault.initiator], place[fault.target]] for fault in known], dtype=np.int64).reshape(-1, 2)
+    within = (times >= flight.origin_ns) & (times <= flight.exchanges.time_ns[-1])
+    time = np.concatenate([flight.time_s, (times[within] - flight.origin_ns) * 1e-9])
+    ends = np.concatenate([flight.ends, failed[within].T], axis=1)
+    order = np.argsort(time, kind="stable")
+    time, ends, lost = time[order], ends[:, order], order >= len(flight)
+    rate, turns = (len(time) - 1) / max(float(time[-1]), 1e-3), None
+    round_robin = _round_robin(time, ends)
+    if round_robin:
+        beat, slot, turns = round_robin
+        # Slots that left nothing at all are lost, too.
         every = np.arange(slot[-1] + 1)
-        time, lost = every * beat, ~np.isin(every, slot[~lost])
-        first, second = np.array(turns)[every % len(turns)].T
-    else:
-        turns = sorted(set(zip(first.tolist(), second.tolist(), strict=True)))
+        rate, time, ends = 1 / beat, every * beat, turns[:, every % turns.shape[1]]
+        lost = ~np.isin(every, slot[~lost])
+    pair = ends.min(axis=0) * len(flight.tags) + ends.max(axis=0)
     return ScheduleFit(
         time_s=time,
-        initiator=first,
-        target=second,
-        lost=lost,
-        regular=beat is not None,
-        turns=tuple(turns),
+        ends=ends,
+        lost_share=float(np.mean(lost)),
+        outage_life_s=lasting(time, pair, lost.astype(np.float64))[1] or SHORTEST_LIFE_S,
+        turns=turns,
         rate_hz=rate,
         delay_uus=_scheduled_uus(flight),
         replies_us=_replies_us(flight),
     )
 
 
-def _slots(flight: Flight, faults: list[Fault]) -> tuple[Floats, Ints, Ints, Bools]:
-    place = {tag.tag: k for k, tag in enumerate(flight.tags)}
-    end_ns = int(flight.exchanges.time_ns[-1])
-    failed = [
-        ((fault.time_ns - flight.origin_ns) * 1e-9, place[fault.initiator], place[fault.target])
-        for fault in faults
-        if flight.origin_ns <= fault.time_ns <= end_ns and fault.initiator in place and fault.target in place
-    ]
-    time = np.concatenate([flight.time_s, [row[0] for row in failed]])
-    ends = np.concatenate([flight.ends, np.array([row[1:] for row in failed], dtype=np.int64).reshape(-1, 2).T], axis=1)
-    lost = np.arange(len(time)) >= len(flight)
-    order = np.argsort(time, kind="stable")
-    return time[order], ends[0][order], ends[1][order], lost[order]
-
-
-def _turns(first: Ints, second: Ints) -> list[tuple[int, int]]:
-    """Return the order of a round robin, empty where exchanges have none."""
-    names = list(zip(first.tolist(), second.tolist(), strict=True))
-    followers: dict[tuple[int, int], Counter[tuple[int, int]]] = {}
-    for one, other in pairwise(names):
-        followers.setdefault(one, Counter())[other] += 1
-    turns = [names[0]]
-    while len(turns) < len(set(names)):
-        after = followers.get(turns[-1], Counter()).most_common(1)
-        if not after or after[0][0] in turns:
-            return []
-        turns.append(after[0][0])
-    return turns
-
-
-def _beat(time: Floats, first: Ints, second: Ints, turns: list[tuple[int, int]]) -> float | None:
-    """Return the interval of a round robin in seconds; None unless nine of ten slots keep to it and to their turns."""
-    regular_share, number = 0.9, {pair: k for k, pair in enumerate(turns)}
-    turn = np.array([number[pair] for pair in zip(first.tolist(), second.tolist(), strict=True)])
-    step, apart = np.diff(turn) % len(turns), np.diff(time)
-    in_turn = step == 1 % len(turns)
-    if not len(apart) or np.mean(in_turn) < regular_share / 2 or np.median(apart[in_turn]) <= 0:
+def _round_robin(time: Floats, ends: Ints) -> tuple[float, Ints, Ints] | None:
+    """Return interval, slots (n,) and turns (2, pairs) of a round robin, to which nine of ten exchanges keep, or None."""
+    turns, pair = np.unique(ends, axis=1, return_inverse=True)
+    count, apart = turns.shape[1], np.diff(time)
+    usual = np.median(apart) if len(apart) else 0.0
+    if not usual > 0:
         return None
-    beat = float(np.sum(apart) / max(np.sum(np.rint(apart / np.median(apart[in_turn]))), 1))
-    slots = np.rint(apart / beat)
-    fits = (np.abs(apart / beat - slots) < 0.25) & (slots % len(turns) == step)
-    return beat if np.mean(fits) >= regular_share else None
+    beat = float(time[-1] / max(np.sum(np.rint(apart / usual)), 1))
+    slot = np.append(0, np.cumsum(np.rint(apart / beat))).astype(np.int64)
+    seen = np.zeros((count, count), dtype=np.int64)
+    np.add.at(seen, (slot % count, pair.ravel()), 1)
+    order = seen.argmax(axis=1)
+    kept = (order[slot % count] == pair.ravel()) & (np.abs(time / beat - slot) < 0.25)
+    return (beat, slot, turns[:, order]) if np.mean(kept) >= 0.9 and len(set(order.tolist())) == count else None
 
 
 def _scheduled_uus(flight: Flight) -> int | None:

@@ -80,7 +80,7 @@ def fit_powers(flight: Flight, reflected: Floats) -> PowerFit:
     level, own, tx, offset = _split(*(solved.tags_db + seen))
     fading, loss_std = _common(solved, reflected)
     both = solved.left_db.mean(axis=0)
-    _, life = lasting(flight.time_s, flight.pair, both, float(flight.time_s[-1])) if fading > 0 else (0.0, None)
+    _, life = lasting(flight.time_s, flight.pair, both) if fading > 0 else (0.0, None)
     return PowerFit(
         saturation_dbm=saturation,
         at_1m_dbm=solved.at_1m_dbm + level,
@@ -139,23 +139,14 @@ def _solve(
     tags, each = len(flight.tags), 4 * len(flight) / len(flight.tags)
     degree = next((degree for least, degree in ((800, 3), (250, 2), (80, 1)) if each >= least), 0)
     size = (degree + 1) ** 2 - 1  # all of a tag's readings know of its mean, which the offsets have
-    apart = -10 * np.log10(flight.distance_m)
     gain = sum(ANTENNAS[antenna](np.hypot(way[:, 0], way[:, 1])) for way in flight.towards)
-    blocks, readings = [], []
-    waves = [harmonics(way, degree)[:, 1:] for way in flight.towards]
-    for receiver in (1, 0):
-        columns = np.zeros((len(flight), 3 + 2 * tags + tags * size))
-        columns[:, 0], columns[:, 1], columns[:, 2] = 1, apart, -reflected
-        rows = np.arange(len(flight))
-        columns[rows, 3 + flight.ends[1 - receiver]] = 1
-        columns[rows, 3 + tags + flight.ends[receiver]] = 1
-        for end, wave in zip(flight.ends, waves, strict=True):
-            first = 3 + 2 * tags + end * size
-            for k in range(size):
-                columns[rows, first + k] += wave[:, k]
-        blocks.append(columns)
-        readings.append(power_dbm[1 - receiver] - gain)
-    design, value = np.vstack(blocks), np.concatenate(readings)
+    first, second = is_tag = np.eye(tags)[flight.ends]
+    waves = np.array([harmonics(way, degree)[:, 1:] for way in flight.towards])
+    pattern = np.einsum("ent,enk->ntk", is_tag, waves).reshape(len(flight), -1)
+    common = np.column_stack([np.ones(len(flight)), -10 * np.log10(flight.distance_m), -reflected])
+    # Readings at the target, then at the initiator: what they have in common, sender, receiver, both antennas.
+    design = np.block([[common, first, second, pattern], [common, second, first, pattern]])
+    value = (power_dbm - gain).ravel()
     exponent = 0.0 if _tells_path_loss(flight) else 1e9
     fine = [scale_db2 * (k / 2.0) ** 2 for k in range(1, degree + 1) for _ in range(2 * k + 1)]
     penalty = np.array([0.0, exponent, 1e-6] + [scale_db2 / 4.0**2] * (2 * tags) + fine * tags)

@@ -38,10 +38,9 @@ class KnownDevices:
     bias: Spline
 
     def corrected_m(self, exchanges: Exchanges) -> Floats:
-        """Return calibrated ranges in metres (n,); raises `ScenarioError` for tags that the calibration lacks."""
+        """Return calibrated ranges in metres (n,)."""
         from calib import Ranges
 
-        self.require(np.unique([exchanges.initiator, exchanges.target]).tolist())
         return self.calibration.apply(Ranges.from_exchanges(exchanges)).corrected_m
 
     def require(self, tags: list[int]) -> None:
@@ -95,29 +94,20 @@ class RangeErrors:
 
     `delays_ns` is what the flight adds to the delays of tags, by id. `direct_std_m` is the spread of direct ranges
     beyond the noise of receive stamps; `share` that of reflected ranges; `mean_excess_m` the mean of their detours and
-    `excess_shape` the shape of a gamma distribution with their mean and variance. `pair_share`, `pair_excess_m` and
-    `pair_life_s` are those of pairs (pairs,), drawn towards all by how little each tells; `share_std` and
-    `life_spread` their spread between pairs. `life_s` is None where the recording does not tell it. `reflected` (n,)
-    is the probability that a range was reflected.
+    `excess_shape` the shape of a gamma distribution with their mean and variance. `pair_share` and `pair_excess_m` are
+    those of pairs (pairs,), drawn towards all by how little each tells. `life_s` is None where the recording does not
+    tell it. `reflected` (n,) is the probability that a range was reflected.
     """
 
     delays_ns: dict[int, float]
     direct_std_m: float
     share: float
-    share_std: float
     mean_excess_m: float
     excess_shape: float
     life_s: float | None
-    life_spread: float
     pair_share: Floats
     pair_excess_m: Floats
-    pair_life_s: Floats
     reflected: Floats
-
-    @property
-    def mean_ns(self) -> float:
-        """Return the mean of what the flight adds to delays."""
-        return float(np.mean(list(self.delays_ns.values())))
 
 
 def fit_range_errors(flight: Flight, receive_noise_s: Floats) -> RangeErrors:
@@ -147,10 +137,8 @@ def fit_range_errors(flight: Flight, receive_noise_s: Floats) -> RangeErrors:
     applied = found.apply(ranges)
     shapes = found.errors.shapes(applied.lifted, x.initiator, x.target)
     excess, reflected = found.errors.least_m + shapes.detour_m, applied.tail_probability
-    white = range_noise_m(flight, receive_noise_s)
-    direct = float(np.sqrt(np.maximum(np.mean(shapes.noise_m**2 - white**2), 0.0)))
     mean, shape, share = TwoStateMultipath(model="two-state").mean_excess_m, 1.0, np.zeros(count)
-    pair_excess, life, lives = np.full(count, mean), None, (np.full(count, np.nan), 0.0)
+    pair_excess, life = np.full(count, mean), None
     # Fewer than five ranges that are rather reflected than direct are no tail.
     if np.count_nonzero(reflected > 0.5) < 5:
         reflected = np.zeros(len(x))
@@ -160,22 +148,19 @@ def fit_range_errors(flight: Flight, receive_noise_s: Floats) -> RangeErrors:
         shape = mean**2 / (square - mean**2)
         number = np.bincount(pair, minlength=count)
         share, pair_excess = (np.bincount(pair, v, count) / number for v in (shapes.tail_share, excess))
-        _, life = lasting(flight.time_s, pair, reflected, float(flight.time_s[-1]))
-        lives = lives if life is None else _lives(flight, reflected, life, share)
+        _, life = lasting(flight.time_s, pair, reflected)
+    white = range_noise_m(flight, receive_noise_s)
     # Ranges of two messages err by the skew of the clocks, which the fit takes for delays and the twin simulates.
     from_delays = len(flight.row.messages) > 2
     return RangeErrors(
         delays_ns={tag: delay if from_delays else 0.0 for tag, delay in found.delays_ns.items()},
-        direct_std_m=direct,
+        direct_std_m=float(np.sqrt(np.maximum(np.mean(shapes.noise_m**2 - white**2), 0.0))),
         share=float(reflected.mean()),
-        share_std=float(np.std(share)),
         mean_excess_m=mean,
         excess_shape=shape,
         life_s=life,
-        life_spread=lives[1],
         pair_share=share,
         pair_excess_m=pair_excess,
-        pair_life_s=lives[0],
         reflected=reflected,
     )
 
@@ -186,28 +171,3 @@ def range_noise_m(flight: Flight, receive_noise_s: Floats) -> Floats:
     if len(flight.row.messages) > 2:
         ratio = spans.dt32 / np.maximum(spans.dt53, 1.0)
     return np.asarray(SPEED_OF_LIGHT * receive_noise_s * np.sqrt((1 + ratio + ratio**2) / 2))
-
-
-def _lives(flight: Flight, reflected: Floats, life_s: float, share: Floats) -> tuple[Floats, float]:
-    """Return the lives of pairs, drawn towards that of all, and their spread in logarithms.
-
-    The logarithm of a life has the variance 2/spells. That between pairs is estimated by moments (DerSimonian and
-    Laird 1986).
-    """
-    span = float(flight.time_s[-1])
-    value, noise = np.full(len(share), np.log(life_s)), np.full(len(share), np.inf)
-    for k, spells in enumerate(2 * share * (1 - share) * span / life_s):
-        rows = np.flatnonzero(flight.pair == k)
-        if len(rows) < 30 or spells < 6:
-            continue
-        _, mine = lasting(flight.time_s[rows], np.zeros(len(rows), np.int64), reflected[rows], span)
-        if mine is not None:
-            value[k], noise[k] = float(np.log(mine)), 2 / spells + 0.01
-    weight, told = 1 / noise, np.count_nonzero(np.isfinite(noise))
-    if told < 3:
-        return np.full(len(share), life_s), 0.0
-    total, mean = weight.sum(), np.average(value, weights=weight)
-    excess = np.sum(weight * (value - mean) ** 2) - (told - 1)
-    between = float(max(excess / (total - np.sum(weight**2) / total), 0.0))
-    kept = between * weight / (between * weight + 1)
-    return np.exp(np.log(life_s) + kept * (value - np.log(life_s))), float(np.sqrt(between))

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
+from scipy.stats import circmean
 
-from uwblink.arrays import Bools, Floats
+from uwblink.arrays import Floats
 from uwblink.recording.schema import Poses
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.loading import MOST_POSES
@@ -30,42 +32,33 @@ AFTER_S: Final = 0.2
 """Time that a scenario lasts beyond the start of its last exchange, which takes less."""
 
 
-def scenario_text(table: Mapping[str, Any], head: str) -> str:
-    """Return the text of a scenario file: a comment and its tables; long values have a table of their own."""
+def scenario_text(tables: Mapping[str, Any], head: str) -> str:
+    """Return the text of a scenario file: a comment, and tables within tables by their dotted names."""
     parts = ["\n".join(f"# {line}" for line in textwrap.wrap(head, WIDTH - 2))]
-    for name, section in table.items():
-        if isinstance(section, list):
-            parts += [f"[[{name}]]\n{_lines(one)}" for one in section]
-            continue
-        long = {k: v for k, v in section.items() if isinstance(v, Mapping) and len(_toml(v)) > WIDTH // 2}
-        parts.append(f"[{name}]\n{_lines({k: v for k, v in section.items() if k not in long})}")
-        parts += [f"[{name}.{key}]\n{_lines(value)}" for key, value in long.items()]
+    for name, table in tables.items():
+        rows = table if isinstance(table, list) else [table]
+        parts += [_text(f"[[{name}]]" if isinstance(table, list) else f"[{name}]", name, row) for row in rows]
     return "\n\n".join(parts) + "\n"
 
 
-def _lines(section: Mapping[str, Any]) -> str:
-    return "\n".join(f"{key} = {_toml(value)}" for key, value in section.items())
+def _text(header: str, name: str, table: Mapping[str, Any]) -> str:
+    inner = {key: value for key, value in table.items() if isinstance(value, Mapping)}
+    lines = [header, *(f"{key} = {_toml(value)}" for key, value in table.items() if key not in inner)]
+    return "\n".join(lines) + "".join(f"\n\n{_text(f'[{name}.{k}]', f'{name}.{k}', v)}" for k, v in inner.items())
 
 
 def _toml(value: Any) -> str:
-    """Return a value as TOML: numbers with eight digits, lists wrapped; what is long in a list has its own line."""
+    """Return a value as TOML: numbers with eight digits, tables in lists on lines of their own."""
     if isinstance(value, float):
-        text = f"{value:.8g}"
-        return text if "." in text or "e" in text else f"{text}.0"
+        return repr(float(f"{value:.8g}"))
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {_toml(one)}" for key, one in value.items()) + " }"
     if not isinstance(value, list | tuple):
         return json.dumps(value)
     items = [_toml(one) for one in value]
-    line = f"[{', '.join(items)}]"
-    if len(line) <= WIDTH:
-        return line
-    lines = [""]
-    for item in items:
-        if len(lines[-1]) + len(item) + 2 > WIDTH - 2 and lines[-1]:
-            lines.append("")
-        lines[-1] += f"{item}, "
-    return "[\n" + textwrap.indent("\n".join(one.rstrip() for one in lines), "  ") + "\n]"
+    if value and isinstance(value[0], Mapping):
+        return "[\n  " + ",\n  ".join(items) + ",\n]"
+    return textwrap.fill(f"[{', '.join(items)}]", WIDTH, subsequent_indent="  ", break_on_hyphens=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,43 +86,38 @@ class ReceiveNoise:
         return np.asarray(np.interp(lifted(power_dbm), lifted(self.power_dbm), self.std_s))
 
 
-def receive_noise(flight: Flight, clocks: ClockFit) -> ReceiveNoise:
-    """Return the noise of receive stamps from ratios, by the power at their receiver, the initiator."""
-    noise, power = clocks.receive_noise_s(flight), flight.exchanges.fpp2_dbm
-    good = np.isfinite(noise)
-    if not good.any():
+def receive_noise(noise_s: Floats, power_dbm: Floats) -> ReceiveNoise:
+    """Return the noise of receive stamps from values of it (n,), NaN where unknown, by the power at the receiver."""
+    rows = np.flatnonzero(np.isfinite(noise_s))
+    if not len(rows):
         return ReceiveNoise(power_dbm=np.zeros(0), std_s=np.zeros(0))
-    noise, power = noise[good], power[good]
-    keep = np.abs(noise) < 5 * bulk_spread(noise)
-    noise, power = noise[keep], power[keep]
+    rows = rows[np.abs(noise_s[rows]) < 5 * bulk_spread(noise_s[rows])]
+    rows = rows[np.argsort(power_dbm[rows], kind="stable")]
     # Six bins at most, of 200 values or more each: their spreads are known to 5 %.
-    count = int(np.clip(len(noise) // 200, 1, 6))
-    parts = np.array_split(np.argsort(power, kind="stable"), count)
-    std = np.array([np.sqrt(np.mean(noise[rows] ** 2)) for rows in parts])
-    size = np.array([len(rows) for rows in parts])
-    together = float(np.sqrt(np.mean(noise**2)))
+    parts = np.array_split(rows, int(np.clip(len(rows) // 200, 1, 6)))
+    std, together = (np.array([np.sqrt(np.mean(noise_s[own] ** 2)) for own in some]) for some in (parts, [rows]))
     # The logarithm of a spread has the standard error 1/sqrt(2n).
-    misfit = float(np.sum(2 * size * np.log(std / together) ** 2))
-    if count == 1 or chdtrc(count - 1, misfit) > 0.01:
-        return ReceiveNoise(power_dbm=np.array([np.median(power)]), std_s=np.array([together]))
-    middle = np.array([np.median(power[rows]) for rows in parts])
-    distinct = np.append(True, np.diff(middle) > 1e-3)
-    return ReceiveNoise(power_dbm=middle[distinct], std_s=std[distinct])
+    misfit = np.sum([2 * len(own) for own in parts] * np.log(std / together) ** 2)
+    if chdtrc(len(parts) - 1, misfit) > 0.01:
+        parts, std = [rows], together
+    middle, first = np.unique([np.round(np.median(power_dbm[own]), 3) for own in parts], return_index=True)
+    return ReceiveNoise(power_dbm=middle, std_s=std[first])
 
 
 def tables(
     flight: Flight, known: KnownDevices, poses: Poses, fitted: Fitted, name: str
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the scenario's tables, and the poses by body that its `recorded` motions stand for."""
-    duration = float(fitted.schedule.time_s[-1]) + AFTER_S
-    if fitted.schedule.regular:
-        duration = (len(fitted.schedule.time_s) + 0.3) / fitted.schedule.rate_hz
+    schedule = fitted.schedule
+    duration = float(schedule.time_s[-1]) + AFTER_S
+    if schedule.turns is not None:
+        duration = (len(schedule.time_s) + 0.3) / schedule.rate_hz
     bodies, paths = _bodies(flight, poses, duration)
     steps = [np.diff(poses.time_ns[poses.body == tag.body]) for tag in flight.tags]
     rates = [round(NS_PER_S / float(np.median(step)), 3) for step in steps if len(step) > 1]
     table = {
         "run": {"name": name, "seed": 1, "duration_s": duration},
-        "ranging": _ranging(flight, fitted.schedule),
+        "ranging": _ranging(flight, schedule),
         "radio": _radio(flight, known, fitted),
         "mocap": {"rate_hz": rates[0] if rates else 100.0},
         "bodies": bodies,
@@ -144,15 +132,16 @@ def _given(**table: Any) -> dict[str, Any]:
 
 
 def _ranging(flight: Flight, schedule: ScheduleFit) -> dict[str, Any]:
-    ids, plan = [tag.tag for tag in flight.tags], None
-    if not schedule.regular:
-        columns = zip(schedule.time_s.tolist(), schedule.initiator.tolist(), schedule.target.tolist(), strict=True)
-        plan = {"file": "", "slots": [(round(t, 6), ids[i], ids[j]) for t, i, j in columns]}
+    ids, plan = np.array([tag.tag for tag in flight.tags]), None
+    turns = np.unique(schedule.ends, axis=1) if schedule.turns is None else schedule.turns
+    if schedule.turns is None:
+        columns = zip(schedule.time_s.tolist(), *ids[schedule.ends].tolist(), strict=True)
+        plan = {"file": "", "slots": [(round(time_s, 6), i, j) for time_s, i, j in columns]}
     replies = schedule.replies_us
     return _given(
         protocol=flight.row.name,
         rate_hz=schedule.rate_hz,
-        pairs=[[ids[i], ids[j]] for i, j in schedule.turns],
+        pairs=ids[turns.T].tolist(),
         response_delay_uus=schedule.delay_uus,
         reply=None if replies is None else {"model": "quantiles", "delays_us": list(replies)},
         plan=plan,
@@ -172,7 +161,7 @@ def _radio(flight: Flight, known: KnownDevices, fitted: Fitted) -> dict[str, Any
         life_s = None if powers.fading_life_s is None else max(powers.fading_life_s, SHORTEST_LIFE_S)
         fading = _given(levels_db=powers.fading_levels_db.tolist(), life_s=life_s)
     if schedule.lost_share > 0:
-        outages = {"share": schedule.lost_share, "life_s": schedule.outage_life_s()}
+        outages = {"share": schedule.lost_share, "life_s": max(schedule.outage_life_s, SHORTEST_LIFE_S)}
     return _given(
         first_path_at_1m_dbm=powers.at_1m_dbm,
         path_loss_exponent=None if powers.exponent is None else max(powers.exponent, 0.0),
@@ -180,8 +169,8 @@ def _radio(flight: Flight, known: KnownDevices, fitted: Fitted) -> dict[str, Any
         power_noise_db=powers.noise_db,
         saturation_dbm=powers.saturation_dbm,
         sensitivity_dbm=min(Radio().sensitivity_dbm, float(flight.power_dbm.min()) - 1),
-        skew_noise_ppm=clocks.carrier_std_ppm,
-        skew_bias_ppm=clocks.carrier_bias_ppm,
+        skew_noise_ppm=float(clocks.noise_ppm[1]),
+        skew_bias_ppm=float(clocks.bias_ppm[1]),
         bias=known.bias.model_dump(mode="json"),
         rx_noise_ps=float(noise.std_s[0]) * 1e12 if len(noise.std_s) == 1 else 0.0,
         sigma=sigma,
@@ -196,31 +185,20 @@ def _multipath(flight: Flight, fitted: Fitted) -> dict[str, Any] | None:
     if found.share < 0.002 and found.direct_std_m == 0:
         return None
     default = TwoStateMultipath(model="two-state")
-    life_s, shortest = found.life_s, flight.interval_s
-    if life_s is None:
-        life_s = min(shortest / 3, default.life_s) if shortest < default.life_s else default.life_s
-    pairs = [
-        {"tags": list(pair)}
-        | _given(
-            share=float(np.clip(found.pair_share[k], 0, 1)) if found.share_std > 0 else None,
-            life_s=max(float(found.pair_life_s[k]), SHORTEST_LIFE_S) if found.life_spread > 0.1 else None,
-            mean_excess_m=float(found.pair_excess_m[k]) if np.ptp(found.pair_excess_m) > 0 else None,
-        )
-        for k, pair in enumerate(flight.pairs)
-    ]
+    # Where consecutive ranges show no correlation, paths change faster than a pair ranges.
+    life_s = min(default.life_s, flight.interval_s / 3) if found.life_s is None else found.life_s
+    own = zip(flight.pairs, np.clip(found.pair_share, 0, 1).tolist(), found.pair_excess_m.tolist(), strict=True)
     return _given(
         model="two-state",
         share=found.share,
-        share_std=min(found.share_std, 0.9 * float(np.sqrt(found.share * (1 - found.share)))),
         mean_excess_m=found.mean_excess_m,
         excess_shape=found.excess_shape,
         direct_std_m=found.direct_std_m,
         life_s=max(life_s, SHORTEST_LIFE_S),
-        life_spread=min(found.life_spread, 2.0),
         first_path_loss_db=loss,
         loss_std_db=None if loss is None else fitted.powers.reflection_loss_std_db,
         total_loss_db=None if loss is None else min(default.total_loss_db, loss),
-        pairs=[pair for pair in pairs if len(pair) > 1] or None,
+        pairs=[{"tags": list(pair), "share": share, "mean_excess_m": excess} for pair, share, excess in own],
     )
 
 
@@ -268,31 +246,23 @@ def _bodies(flight: Flight, poses: Poses, duration_s: float) -> tuple[list[dict[
 def _still(mine: Poses) -> dict[str, Any] | None:
     """Return position and heading of a body that does not move and stands level; None for any other."""
     middle = np.median(mine.position_m, axis=0)
-    if np.max(np.linalg.norm(mine.position_m - middle, axis=1)) > 0.01:
-        return None
     turns = attitude(mine, str(mine.body[0]), mine.time_ns)
-    yaw, pitch, roll = turns.as_euler("ZYX").T
-    heading = float(np.arctan2(np.sin(yaw).mean(), np.cos(yaw).mean()))
-    turning = np.abs(np.angle(np.exp(1j * (yaw - heading))))
-    if max(np.abs(pitch).max(), np.abs(roll).max(), turning.max()) > 0.01:
+    heading = circmean(turns.as_euler("ZYX")[:, 0], high=np.pi, low=-np.pi)
+    off = (Rotation.from_euler("Z", heading).inv() * turns).magnitude()
+    if np.max(np.linalg.norm(mine.position_m - middle, axis=1)) > 0.01 or off.max() > 0.01:
         return None
     return {"position_m": [float(v) for v in middle], "yaw_deg": float(np.degrees(heading))}
 
 
 def _cut(mine: Poses, origin_ns: int, duration_s: float) -> Poses:
-    """Return poses from the origin on, as long as needed, with poses at both ends."""
-    first, last = origin_ns, origin_ns + int((duration_s + AFTER_S) * NS_PER_S)
+    """Return poses from the origin on, as long as needed, evenly as many as there were, held beyond the ends."""
     times, rows = np.unique(mine.time_ns, return_index=True)
-    mine = mine[rows]
-    inside: Bools = (times > first) & (times < last)
-    wanted = np.concatenate([[first], times[inside], [last]])
-    wanted = wanted[:: max(len(wanted) // MOST_POSES + 1, 1)] if len(wanted) > MOST_POSES else wanted
-    if wanted[-1] != last:
-        wanted = np.append(wanted, last)
-    at = np.clip(wanted, times[0], times[-1]).astype(np.float64)
-    position = np.column_stack([np.interp(at, times.astype(np.float64), mine.position_m[:, k]) for k in range(3)])
-    turns = attitude(mine, str(mine.body[0]), wanted)
-    return Poses(wanted, np.full(len(wanted), str(mine.body[0])), position, turns.as_quat())
+    last = origin_ns + int((duration_s + AFTER_S) * NS_PER_S)
+    count = int(np.clip(np.count_nonzero((times > origin_ns) & (times < last)) + 2, 2, MOST_POSES))
+    wanted = np.linspace(origin_ns, last, count).astype(np.int64)
+    position = np.column_stack([np.interp(wanted, times, column) for column in mine.position_m[rows].T])
+    body = str(mine.body[0])
+    return Poses(wanted, np.full(count, body), position, attitude(mine, body, wanted).as_quat())
 
 
 NOT_DETERMINED: Final = (
@@ -318,7 +288,7 @@ NOT_DETERMINED_IF: Final[tuple[tuple[Callable[[Flight, Fitted], bool], str], ...
         "is assigned to direct_std_m, which is constant between redraws of a path.",
     ),
     (
-        lambda flight, fitted: abs(fitted.clocks.ratio_bias_ppm) > 0.02,
+        lambda flight, fitted: abs(fitted.clocks.bias_ppm[0]) > 0.02,
         "The difference of {ratio_bias:+.2g} ppm between dt64/dt53 and the carrier readings: a scenario has no key "
         "for it.",
     ),
@@ -355,5 +325,5 @@ def unknowns(flight: Flight, fitted: Fitted) -> Iterator[str]:
     interval = flight.interval_s
     for applies, text in NOT_DETERMINED_IF:
         if applies(flight, fitted):
-            yield text.format(interval=interval, ratio_bias=fitted.clocks.ratio_bias_ppm)
+            yield text.format(interval=interval, ratio_bias=fitted.clocks.bias_ppm[0])
     yield from NOT_DETERMINED

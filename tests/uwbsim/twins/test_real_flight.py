@@ -22,7 +22,7 @@ def compared(tmp_path_factory):
         archive.extractall(folder, filter="data")
     flight = read_source(next(folder.iterdir()), importer="miluv")
     twin = uwbsim.twin(flight, read_miluv(shared("miluv_published_calibration.json")))
-    return twin, {one.name: one for one in twin.compare(seeds=12)}
+    return twin, {one.name: one for one in twin.compare(seeds=5)}
 
 
 def test_replies_are_those_measured(compared):
