@@ -15,7 +15,6 @@ from calib.checks.examine import examine
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data, each, held_open, load_each, opened
 from calib.errors import UnanswerableError
-from calib.estimator.losses import MIXTURE
 from calib.evaluation.localization import Localization, localize, summarize
 from calib.findings import Finding
 from calib.fitting.fitting import fit
@@ -29,9 +28,6 @@ from uwblink.pages.blocks import write_document
 
 HELD_OUT_SHARE: Final = 0.3
 """Share of the recordings that judges a report without tests: three of the tenths of `FitSettings.fold`."""
-
-SCALES: Final = (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0)
-"""Factors on the scale of the loss, for which a campaign is fitted again."""
 
 Progress = Callable[[str], None]
 
@@ -127,11 +123,6 @@ def run_campaign(
         found = fit(ranges, settings) if testing else _fit_and_hold_out(ranges, settings)
         held = None if testing else found.held_out
         known = found.calibration
-        refits: dict[float, Calibration] = {}
-        # The mixture and least squares have no scale.
-        for factor in SCALES if known.loss not in (MIXTURE, "l2") else ():
-            scale_ns = factor * known.scale_ns
-            refits[scale_ns] = fit(ranges, replace(settings, scale_ns=scale_ns, hold_out=0.0)).calibration
         progress("examining")
         findings = [finding for one in (*recordings, *judged) for finding in _findings(one)]
         progress("localizing")
@@ -142,7 +133,6 @@ def run_campaign(
             tests=testing if held is None else [held.ranges],
             part=None if held is None else held.calibration,
             fit=found,
-            refits=refits,
             # From the first recording that has passive listeners.
             heard=next(filter(None, (heard_delays(data, known) for data in whole)), {}),
             findings=findings,

@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from calib.evaluation.localization import Localization, summarize
 from calib.evaluation.onboard import OnboardTrack
 from calib.planning.result import FlightPlan, NextBest, Plan, PlannedArrangement
+from uwblink.arrays import Floats
 from uwblink.pages.colours import BLUE, GREY, INK, MUTED, VERMILION, WINE, look
-from uwblink.pages.figures import NARROW_IN, label, legend, mark, sheet
+from uwblink.pages.figures import NARROW_IN, label, legend, mark, series, sheet
 
 FILTER_NAMES: Final = {
     "raw": "raw",
@@ -37,21 +38,20 @@ SAMPLES: Final = 700
 
 def rmse_bars(width_in: float, found: list[Localization]) -> Figure:
     """Draw the RMSE of each body in each recording over seeds, and their mean."""
-    most = 5 if width_in < NARROW_IN else 9
+    most, mean = 5 if width_in < NARROW_IN else 9, summarize(found).rmse_m
     shown = sorted(found, key=lambda one: -float(one.rmse_m["raw"].mean()))[:most] if len(found) > most else found
     figure, (axes,) = sheet(width_in, height_in=2.7)
     names = [f"{one.source.removesuffix('.uwb')}\n{one.body}" for one in shown] + ["mean"]
-    mean = summarize(found).rmse_m
-    for k, stage in enumerate(mean):
+    heights = {stage: [float(one.rmse_m[stage].mean()) for one in shown] + [mean[stage]] for stage in mean}
+    for k, (stage, own) in enumerate(heights.items()):
         colour, _, hatch = FILTER_LINES[stage]
-        heights = [float(one.rmse_m[stage].mean()) for one in shown] + [mean[stage]]
         place = np.arange(len(names)) + 0.21 * (k - (len(mean) - 1) / 2)
-        axes.bar(place, heights, 0.19, color=colour, hatch=hatch, ec="white", lw=0, label=FILTER_NAMES[stage])
-    highest = np.sort([float(one.rmse_m[stage].mean()) for one in shown for stage in mean])
-    usual = float(np.quantile(highest, 0.9))
-    if highest[-1] > 4 * usual:
-        axes.set_ylim(0, 2.5 * usual)
-        axes.text(0.99, 0.97, f"highest bar: {highest[-1]:.2f} m", transform=axes.transAxes, ha="right", va="top")
+        axes.bar(place, own, 0.19, color=colour, hatch=hatch, ec="white", lw=0, label=FILTER_NAMES[stage])
+    every = np.concatenate(list(heights.values()))
+    # A filter that diverged leaves the picture.
+    if every.max() > 4 * np.quantile(every, 0.9):
+        axes.set_ylim(0, 2.5 * np.quantile(every, 0.9))
+        axes.text(0.99, 0.97, f"highest bar: {every.max():.2f} m", transform=axes.transAxes, ha="right", va="top")
     axes.set_xticks(np.arange(len(names)), names)
     left = f"{len(shown)} of {len(found)} bodies, those with the largest errors"
     label(axes, left if len(shown) < len(found) else "", "RMSE of the position (m)")
@@ -60,55 +60,59 @@ def rmse_bars(width_in: float, found: list[Localization]) -> Figure:
     return figure
 
 
+def _draw_path(above: Axes, height: Axes, time: Floats, path_m: Floats, **line: Any) -> None:
+    """Draw a path (n, 3) from above, and its height over time."""
+    (path,) = above.plot(path_m[:, 0], path_m[:, 1], **line)
+    height.plot(time, path_m[:, 2], **line)
+    if "label" in line:
+        mark(path, line["label"])
+
+
+def _label_paths(above: Axes, height: Axes) -> None:
+    above.set_aspect("equal", adjustable="datalim")
+    label(above, "east (m)", "north (m)")
+    label(height, "time (s)", "up (m)")
+
+
 def track(width_in: float, one: Localization) -> Figure:
     """Draw true and estimated paths from above, their heights, and the size of the error over time, by filter."""
     last, narrow = one.tracks["variance"], width_in < NARROW_IN
     every = slice(None, None, max(1, len(last.time_ns) // SAMPLES))
-    time, truth = (last.time_ns - last.time_ns[0])[every] * 1e-9, last.truth_m[every]
+    time = (last.time_ns - last.time_ns[0])[every] * 1e-9
     figure = Figure(figsize=(width_in, 6.0 if narrow else 3.8), layout="constrained")
     places: Any = [["path"], ["height"], ["error"]] if narrow else [["path", "height"], ["error", "error"]]
     panels = figure.subplot_mosaic(places, height_ratios=[2.2, 1, 1.2] if narrow else [1.4, 1])
-    for stage, of_stage in one.tracks.items():
+    above, height, error = panels["path"], panels["height"], panels["error"]
+    usual = []
+    for stage, own in one.tracks.items():
         colour, dashes, _ = FILTER_LINES[stage]
-        line: dict[str, Any] = {"color": colour, "ls": dashes, "lw": 0.9}
-        estimate = of_stage.estimate_m[every]
-        off = np.linalg.norm(estimate - of_stage.truth_m[every], axis=1)
-        mark(panels["error"].plot(time, off, label=FILTER_NAMES[stage], **line)[0], FILTER_NAMES[stage])
+        line: dict[str, Any] = {"color": colour, "ls": dashes, "lw": 0.9, "label": FILTER_NAMES[stage]}
+        off = np.linalg.norm(own.estimate_m - own.truth_m, axis=1)
+        usual.append(float(np.quantile(off, 0.995)))
+        series(error, time, off[every], **line)
         if stage in ("raw", "variance"):
-            panels["path"].plot(estimate[:, 0], estimate[:, 1], **line)
-            panels["height"].plot(time, estimate[:, 2], **line)
-    panels["path"].plot(truth[:, 0], truth[:, 1], lw=0.9, color=INK)
-    panels["height"].plot(time, truth[:, 2], lw=0.9, color=INK)
-    panels["error"].plot([], [], color=INK, lw=0.9, label="true")
-    panels["error"].plot(time, 3 * last.std_m[every], color=MUTED, lw=0.8, ls="--", label="3 σ, by the filter itself")
+            _draw_path(above, height, time, own.estimate_m[every], **line)
+    _draw_path(above, height, time, last.truth_m[every], color=INK, lw=0.9)
+    error.plot([], [], color=INK, lw=0.9, label="true")
+    error.plot(time, 3 * last.std_m[every], color=MUTED, lw=0.8, ls="--", label="3 σ, by the filter itself")
     # The axis leaves out the few errors at the start and those of a diverged filter.
-    usual = [np.quantile(np.linalg.norm(t.estimate_m - t.truth_m, axis=1), 0.995) for t in one.tracks.values()]
-    middle, sigmas = float(np.median(usual)), float(np.quantile(3 * last.std_m, 0.9))
-    panels["error"].set_ylim(0, 1.15 * max(1.5 * middle, *(float(u) for u in usual if u < 5 * middle), sigmas))
-    panels["path"].set_aspect("equal", adjustable="datalim")
-    label(panels["path"], "east (m)", "north (m)")
-    label(panels["height"], "time (s)", "up (m)")
-    label(panels["error"], "time (s)", "position error (m)")
-    legend(figure, panels["error"])
+    error.set_ylim(0, 1.15 * max(3 * np.quantile(last.std_m, 0.9), min(max(usual), 3 * np.median(usual))))
+    _label_paths(above, height)
+    label(error, "time (s)", "position error (m)")
+    legend(figure, error)
     return figure
 
 
 def onboard(width_in: float, one: OnboardTrack) -> Figure:
     """Draw the path from above and the height over time, with the truth if poses give it."""
-    figure, (path, height) = sheet(width_in, 2, height_in=2.8)
+    figure, (above, height) = sheet(width_in, 2, height_in=2.8)
     every = slice(None, None, max(1, len(one.time_ns) // SAMPLES))
     time = (one.time_ns - one.time_ns[0])[every] * 1e-9
-    for place, colour, dashes, name in (
-        (one.truth_m, INK, "-", "true"),
-        (one.estimate_m, BLUE, (0, (5, 1.5)), one.used),
-    ):
-        if np.isfinite(place).any():
-            mark(path.plot(place[every, 0], place[every, 1], color=colour, ls=dashes, lw=1, label=name)[0], name)
-            height.plot(time, place[every, 2], color=colour, ls=dashes, lw=1)
-    path.set_aspect("equal", adjustable="datalim")
-    label(path, "east (m)", "north (m)")
-    label(height, "time (s)", "up (m)")
-    legend(figure, path)
+    if np.isfinite(one.truth_m).any():
+        _draw_path(above, height, time, one.truth_m[every], color=INK, lw=1, label="true")
+    _draw_path(above, height, time, one.estimate_m[every], color=BLUE, ls=(0, (5, 1.5)), lw=1, label=one.used)
+    _label_paths(above, height)
+    legend(figure, above)
     return figure
 
 
@@ -131,28 +135,24 @@ def arrangement(width_in: float, plan: Plan, number: int) -> Figure:
 
 def _boards(axes: Axes, one: PlannedArrangement, height: int, *, on_line: bool) -> None:
     """Draw boards by x and by their coordinate `height` (y from above, z from the side), and tapes between them."""
-    for tag, place in one.place_m.items():
-        axes.plot(place[0], place[height], "o", ms=12, color="white", mec=BLUE, mew=1.2, zorder=3)
-        axes.annotate(str(tag), (place[0], place[height]), ha="center", va="center", color=INK, zorder=4)
-    label(axes, "x (m)", "y (m)" if height == 1 else "height (m)")
-    axes.margins(0.14)
-    axes.set_aspect("equal", adjustable="datalim")
+    spots = {tag: (place[0], place[height]) for tag, place in one.place_m.items()}
+    for tag, spot in spots.items():
+        axes.plot(*spot, "o", ms=12, color="white", mec=BLUE, mew=1.2, zorder=3)
+        axes.annotate(str(tag), spot, ha="center", va="center", color=INK, zorder=4)
     for i, j in one.taped:
         # From left to right, so that all tapes bow upwards.
-        first, second = sorted((one.place_m[tag][0], one.place_m[tag][height]) for tag in (i, j))
+        first, second = sorted((spots[i], spots[j]))
         bow = f"arc3,rad={-0.25 if on_line else 0}"
         style: dict[str, Any] = {"arrowstyle": "<->", "color": VERMILION, "ls": "--", "shrinkA": 7, "shrinkB": 7}
         axes.annotate("", second, xytext=first, arrowprops=style | {"connectionstyle": bow}, zorder=2)
+    axes.margins(0.14)
     if on_line:
-        xs = sorted(place[0] for place in one.place_m.values())
-        axes.set_aspect("auto")
-        axes.plot([xs[0], xs[-1]], [0, 0], color=MUTED, lw=1.0, zorder=1)
-        axes.set_ylim(-0.6, 0.9)
-        axes.set_yticks([])
-        axes.set_xticks(xs)
-        axes.spines["left"].set_visible(False)
+        axes.axhline(0, color=MUTED, lw=1.0, zorder=1)
+        axes.set(ylim=(-0.6, 0.9), yticks=[], xticks=sorted(x for x, _ in spots.values()))
         label(axes, "along the string (m)", "")
-        axes.grid(visible=False)
+    else:
+        axes.set_aspect("equal", adjustable="datalim")
+        label(axes, "x (m)", "y (m)" if height == 1 else "height (m)")
 
 
 def _intervals(
@@ -162,22 +162,18 @@ def _intervals(
     names: tuple[str, str] = ("after this arrangement", "before it"),
 ) -> None:
     """Draw half intervals by tag as bars, and others as outlines; undetermined ones are marked as open."""
-    tags = list(after)
-    rows = np.arange(len(tags))
-    top = max((value for value in [*after.values(), *before.values()] if math.isfinite(value)), default=1.0)
+    rows = np.arange(len(after))
     bars: Any = ((before, names[1], 0.8, "none", MUTED), (after, names[0], 0.5, BLUE, BLUE))
     for values, text, width, face, edge in bars:
-        shown = np.array([values.get(tag, math.nan) for tag in tags])
-        shown[~np.isfinite(shown)] = np.nan
-        if not np.isnan(shown).all():
-            axes.bar(rows, shown, width, label=text, facecolor=face, edgecolor=edge, lw=0.8)
-    for row, tag in zip(rows.tolist(), tags, strict=True):
-        if not math.isfinite(after[tag]):
-            turned = 90 if len(tags) > 5 else 0
-            axes.annotate("open", (row, 0.02 * top), ha="center", va="bottom", color=VERMILION, rotation=turned)
-    axes.set_xticks(rows, [str(tag) for tag in tags])
-    axes.set_xlim(-0.6, len(tags) - 0.4)
-    axes.set_ylim(0, 1.08 * top)
+        shown = np.array([values.get(tag, math.inf) for tag in after])
+        known = np.isfinite(shown)
+        if known.any():
+            axes.bar(rows[known], shown[known], width, label=text, facecolor=face, edgecolor=edge, lw=0.8)
+    for row, value in zip(rows.tolist(), after.values(), strict=True):
+        if not math.isfinite(value):
+            axes.annotate("open", (row, 0), ha="center", va="bottom", color=VERMILION, rotation=90)
+    axes.set_xticks(rows, [str(tag) for tag in after])
+    axes.set_xlim(-0.6, len(after) - 0.4)
     label(axes, "tag", "± ns (95 %)")
     axes.grid(visible=False, axis="x")
 
@@ -185,18 +181,14 @@ def _intervals(
 def more(width_in: float, next_best: tuple[NextBest, ...]) -> Figure:
     """Draw the mean interval of the plan, and with each further measurement."""
     letters = 26 if width_in < NARROW_IN else 60
-    texts = ["as planned", *("+ " + textwrap.shorten(best.what, 3 * letters) for best in next_best)]
-    texts = [textwrap.fill(text, letters) for text in texts]
+    texts = ["as planned", *(textwrap.fill("+ " + best.what, letters) for best in next_best)]
     values = [next_best[0].instead_of_ns, *(best.mean_ns for best in next_best)]
     lines = sum(text.count("\n") + 1 for text in texts)
-    figure, (axes,) = sheet(width_in, height_in=0.7 + max(0.34 * len(texts), 0.16 * lines + 0.1 * len(texts)))
-    rows = np.arange(len(texts))
-    axes.barh(rows, values, 0.6, color=[MUTED, *[BLUE] * len(next_best)])
-    for row, value in zip(rows.tolist(), values, strict=True):
-        axes.annotate(f"{value:.3f}", (value, row), xytext=(4, 0), textcoords="offset points", va="center")
-    axes.set_yticks(rows, texts)
+    figure, (axes,) = sheet(width_in, height_in=0.7 + 0.2 * lines + 0.1 * len(texts))
+    bars = axes.barh(texts, values, 0.6, color=[MUTED, *[BLUE] * len(next_best)])
+    axes.bar_label(bars, fmt="%.3f", padding=4)
     axes.invert_yaxis()
-    axes.set_xlim(0, (1.18 if width_in > NARROW_IN else 1.35) * max(values))
+    axes.margins(x=0.35 if width_in < NARROW_IN else 0.18)
     label(axes, "± ns (95 %), mean", "")
     axes.grid(visible=False, axis="y")
     return figure
@@ -205,7 +197,7 @@ def more(width_in: float, next_best: tuple[NextBest, ...]) -> Figure:
 def planned_delays(width_in: float, plan: FlightPlan) -> Figure:
     """Draw the interval of each delay, and the prior interval of undetermined ones."""
     figure, (axes,) = sheet(width_in, height_in=2.2)
-    left_open = {tag: math.nan if math.isfinite(half) else plan.open_ns[tag] for tag, half in plan.half_ns.items()}
+    left_open = {tag: plan.open_ns[tag] for tag, half in plan.half_ns.items() if not math.isfinite(half)}
     _intervals(axes, plan.half_ns, left_open, ("determined", "stays open"))
     legend(figure)
     return figure
@@ -217,18 +209,13 @@ def flight(width_in: float, plan: FlightPlan) -> Figure:
     time = np.linspace(0, plan.seconds, len(plan.path_m))
     early = time <= (plan.seconds if plan.settings.poses_until_s is None else plan.settings.poses_until_s)
     for k, body in enumerate(plan.bodies):
-        own = look(k)
-        x, y, z = plan.path_m[:, k].T
-        above.plot(x, y, color=own.colour, lw=0.8, label=body, ls=own.dashes)
-        above.plot(x[early], y[early], color=own.colour, lw=2.6)
-        height.plot(time, z, color=own.colour, lw=0.8, ls=own.dashes)
-        height.plot(time[early], z[early], color=own.colour, lw=2.6)
+        path, line = plan.path_m[:, k], {"color": look(k).colour, "ls": look(k).dashes}
+        _draw_path(above, height, time, path, lw=0.8, label=body, **line)
+        _draw_path(above, height, time[early], path[early], lw=2.6, **line)
     for name, (x, y, _) in plan.stands.items():
         above.plot(x, y, "s", ms=5, color=INK)
         above.annotate(name, (x, y), xytext=(0, 6), textcoords="offset points", ha="center", color=MUTED)
-    above.set_aspect("equal", adjustable="datalim")
     above.margins(0.08)
-    label(above, "x (m)", "y (m)")
-    label(height, "time (s)", "height (m)")
+    _label_paths(above, height)
     legend(figure, above)
     return figure

@@ -63,9 +63,9 @@ class Results:
 
     `training` are the ranges it was fitted to, `tests` others that judge it; an `evaluated` one of the judged ranges
     is not made again. `part` is a calibration fitted without the tests where those were held out from the recordings
-    that `calibration` was fitted to; it is the one that is judged. `refits` are calibrations for other scales of the
-    loss, by scale in ns; `heard` delays as passive listeners see them; `findings` the doctor's, by recording; `tracks`
-    the bodies that were localized; `origin` says when the report was made, and from what files.
+    that `calibration` was fitted to; it is the one that is judged. `heard` are delays as passive listeners see them;
+    `findings` the doctor's, by recording; `tracks` the bodies that were localized; `origin` says when the report was
+    made, and from what files.
     """
 
     calibration: Calibration
@@ -74,7 +74,6 @@ class Results:
     evaluated: Evaluation | None = None
     fit: FitResult | None = None
     part: Calibration | None = None
-    refits: dict[float, Calibration] = field(default_factory=dict)
     heard: dict[int, OverheardDelay] = field(default_factory=dict)
     findings: list[tuple[str, Finding]] = field(default_factory=list)
     tracks: list[Localization] = field(default_factory=list)

@@ -224,8 +224,7 @@ def _delays(results: Results) -> list[Block]:
     calibration, heard = results.calibration, results.heard
     if calibration.pair_offsets:
         rows = [list(row) for row in offset_rows(calibration)]
-        table = Table(["pair", "ranges too long by (cm)", "95 %"], rows)
-        return [Heading("Antenna delays"), table, *_sensitivity(results)]
+        return [Heading("Antenna delays"), Table(["pair", "ranges too long by (cm)", "95 %"], rows)]
     planted = results.planted if results.recordings else None
     truth: dict[str, Any] = (results.trained.planted or {}).get("delays_ns", {}) if planted else {}
     known = {int(tag): float(delay) for tag, delay in truth.items()}
@@ -261,20 +260,7 @@ def _delays(results: Results) -> list[Block]:
                 f"ranges, the whole correction of a range by {1e3 * planted.correction_rms_m:.1f} mm."
             )
         blocks.append(Text(text, "note"))
-    return [*blocks, *_sensitivity(results)]
-
-
-def _sensitivity(results: Results) -> list[Block]:
-    if not results.refits:
-        return []
-    draw = partial(
-        figures.scale_sensitivity,
-        scales_ns=list(results.refits),
-        fits=list(results.refits.values()),
-        chosen_ns=results.calibration.scale_ns,
-    )
-    caption = "What another scale of the loss would have done to the delays, mean removed."
-    return [Picture("scale-sensitivity", draw, caption)]
+    return blocks
 
 
 def _provenance(results: Results) -> list[Block]:

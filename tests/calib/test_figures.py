@@ -11,7 +11,6 @@ from calib.figures import (
     cumulative,
     delays,
     histogram,
-    scale_sensitivity,
     within_fence,
 )
 from calib.fitting.fitting import fit
@@ -112,17 +111,6 @@ def test_the_distribution_says_how_many_errors_are_smaller(fitted):
     size = 100 * np.abs(applied.corrected_m - some.truth_m)
     for x, y in zip(line.get_xdata()[::20], line.get_ydata()[::20], strict=True):
         assert 100 * np.mean(size <= x) == pytest.approx(y, abs=0.1)
-
-
-def test_many_tags_leave_room_for_their_lines(fitted):
-    known = replace(fitted.calibration, delays_ns={tag: 0.01 * tag for tag in range(40)})
-    moved = [replace(known, delays_ns={tag: 0.01 * tag + 1e-3 * k * tag for tag in range(40)}) for k in range(5)]
-    scales = [0.05, 0.07, 0.1, 0.14, 0.2]
-    with style():
-        figure = scale_sensitivity(3.5, scales, moved, 0.1)
-        figure.draw_without_rendering()
-        height_in = figure.axes[0].get_window_extent().height / figure.dpi
-    assert height_in > 1.3
 
 
 def test_a_delay_that_nothing_determines_is_a_circle_without_an_interval(fitted):

@@ -140,6 +140,15 @@ def outlines(
         axes.set_xticks([low, *inner, high], [name.replace("-", "−") for name in names])
 
 
+def series(
+    axes: Axes, x: Floats, y: Floats, between: tuple[Floats, Floats] | None = None, *, band: str = "", **line: Any
+) -> None:
+    """Draw a line, named by its label on a page, and a band between two others; `band` is the band's label."""
+    if between is not None and np.any(between[1] > between[0]):
+        axes.fill_between(x, *between, color=line["color"], alpha=0.25, lw=0, label=band)
+    mark(axes.plot(x, y, **line)[0], line["label"])
+
+
 def mark(artist: Any, text: str) -> None:
     """Give a line or points a name that a page shows under the pointer."""
     artist.set_gid(f"series-{text}")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -265,13 +264,14 @@ def _swept(plan: SweepDesign, rows: Sequence[Mapping[str, Any]]) -> Document:
     if not found:
         blocks.append(Text("Nothing to draw: no result of a run is a number that changes.", "warning"))
     protocols = [str(row.get("protocol", "")) for row in good]
-    swept = figures.Swept({key: [row.get(key) for row in good] for key in varied}, protocols, np.zeros(0))
+    columns = {key: [row.get(key) for row in good] for key in varied}
     for name in list(found)[:most]:
         stem, _, unit = name.replace("_", " ").rpartition(" ")
         unit, scale = ("cm", 100.0) if unit == "m" else (unit, 1.0)
         shown = f"{stem} ({unit})" if unit in ("cm", "ns", "s", "hz", "ps", "ppm", "dbm") else f"{stem} {unit}".strip()
         described = f": {RESULTS[name]}" if RESULTS.get(name) else ""
-        draw = partial(figures.result_over_keys, swept=replace(swept, result=scale * found[name]), name=shown)
+        known = {"keys": columns, "protocol": protocols, "result": scale * found[name]}
+        draw = partial(figures.result_over_keys, name=shown, **known)
         blocks.append(Picture(name, draw, f"{shown}{described}."))
     if len(found) > most:
         blocks.append(Text(f"Not drawn: {', '.join(list(found)[most:])}.", "note"))

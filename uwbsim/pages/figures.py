@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.stats import binned_statistic_2d
 
 from uwblink.arrays import Bools, Floats
-from uwblink.pages.colours import BLUE, GRID, INK, MUTED, PALE, SERIES, VERMILION, look
-from uwblink.pages.figures import NARROW_IN, label, legend, mark, outlines, sheet
+from uwblink.pages.colours import BLUE, GRID, INK, MUTED, PALE, SERIES, VERMILION, Look, look
+from uwblink.pages.figures import NARROW_IN, label, legend, mark, outlines, series, sheet
 from uwblink.protocols.table import PROTOCOLS, RangingProtocol
 from uwblink.ticks import TICK_S
 from uwbsim.protocols.comparison import ErrorCurve, Optimum
@@ -47,9 +46,8 @@ def histograms(width_in: float, samples: Mapping[str, Floats]) -> Figure:
     best = min((np.quantile(e, (0.005, 0.995)) for e in samples.values()), key=np.ptp)
     margin = 0.25 * np.ptp(best) + 1e-4
     edges = 100 * np.linspace(best[0] - margin, best[1] + margin, 81)
-    looks = {name: look(k) for k, name in enumerate(samples)}
-    lines = {name: {"lw": 1.2, "color": own.colour, "ls": own.dashes, "label": name} for name, own in looks.items()}
-    outlines(axes, {name: 100 * errors for name, errors in samples.items()}, edges, lines)
+    looks = {name: look(k).line(marker=False) | {"label": name} for k, name in enumerate(samples)}
+    outlines(axes, {name: 100 * errors for name, errors in samples.items()}, edges, looks)
     label(axes, "range error (cm)", "ranges (%)")
     legend(figure)
     return figure
@@ -59,25 +57,21 @@ def error_over(width_in: float, curves: Mapping[str, ErrorCurve], x: str, *, log
     """Draw bias and standard deviation over something: simulated as points, predicted as lines."""
     figure, (left, right) = sheet(width_in, 2)
     for k, (name, c) in enumerate(curves.items()):
-        own = look(k)
-        line: dict[str, Any] = {"color": own.colour, "ls": own.dashes, "lw": 1.1}
-        dots: dict[str, Any] = {"color": own.colour, "ls": "", "marker": own.marker, "ms": 3}
-        left.plot(c.x, 100 * c.predicted_bias_m, **line)
-        left.plot(c.x, 100 * c.bias_m, **dots)
-        right.plot(c.x, 100 * c.predicted_std_m, **line)
-        mark(right.plot(c.x, 100 * c.std_m, **dots)[0], name)
-        left.plot([], [], **(line | dots | {"ls": own.dashes}), label=name)
-    most = max(float(np.abs(100 * bias).max()) for c in curves.values() for bias in (c.bias_m, c.predicted_bias_m))
+        line = look(k).line()
+        for axes, simulated, predicted in ((left, c.bias_m, c.predicted_bias_m), (right, c.std_m, c.predicted_std_m)):
+            axes.plot(c.x, 100 * predicted, **line | {"marker": ""})
+            mark(axes.plot(c.x, 100 * simulated, **line | {"ls": ""})[0], name)
+        left.plot([], [], label=name, **line)
+    biases = 100 * np.concatenate([bias for c in curves.values() for bias in (c.bias_m, c.predicted_bias_m)])
     spreads = 100 * np.concatenate([c.std_m for c in curves.values()])
-    label(left, x, "bias (cm)")
-    label(right, x, "standard deviation (cm)")
-    if most > 20:
+    wide, steep = np.abs(biases).max() > 20, spreads.max() > 10 * spreads.min()
+    label(left, x, "bias (cm), log axis" if wide else "bias (cm)")
+    label(right, x, "std (cm), log axis" if steep else "standard deviation (cm)")
+    if wide:
         # Biases have a sign: to scale about zero, logarithmic beyond a centimetre.
-        left.set_ylabel("bias (cm), log axis")
         left.set_yscale("symlog", linthresh=1.0)
         _plain_ticks(left.yaxis)
-    if spreads.max() > 10 * spreads.min():
-        right.set_ylabel("std (cm), log axis")
+    if steep:
         right.set_yscale("log")
         _plain_ticks(right.yaxis)
     else:
@@ -118,23 +112,25 @@ def room(width_in: float, scenario: Scenario) -> Figure:
     paths = {body.name: world.trajectories[body.name].position_m(time) for body in scenario.bodies}
     spots, _ = world.antennas(np.arange(len(scenario.tags)), np.zeros(len(scenario.tags)))
     tags = {tag.id: spot for tag, spot in zip(scenario.tags, spots, strict=True)}
-    corners = [corner for box in scenario.obstacles for corner in (box.min_m, box.max_m)]
-    corners += [scenario.room.min_m, scenario.room.max_m] if scenario.room else []
-    points = np.concatenate([*paths.values(), np.array(list(tags.values())), np.array(corners).reshape(-1, 3)])
+    boxes = {box.name: np.array([box.min_m, box.max_m]) for box in scenario.obstacles}
+    walls = [np.array([scenario.room.min_m, scenario.room.max_m])] if scenario.room else []
+    points = np.concatenate([*paths.values(), spots, *boxes.values(), *walls])
     # What is drawn is at least a metre large, with a margin.
     middle, half = (points.max(axis=0) + points.min(axis=0)) / 2, np.maximum(np.ptp(points, axis=0) / 2, 0.5)
     half = half + (0.04 if scenario.room else 0.12) * float(half.max())
     low, high = middle - half, middle + half
-    figure, panels, scale = _to_scale(width_in, 2 * half)
+    figure, panels = _to_scale(width_in, 2 * half)
     for axes, (x, y), name in zip(panels, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
-        _draw_walls(axes, scenario, x, y, scale)
+        for text, corners in boxes.items():
+            size = _draw_box(axes, corners[:, [x, y]], fc=GRID, ec=MUTED, lw=0.6)
+            if size.min() > 0.1 * half[0]:
+                spot, turned = corners[:, [x, y]].mean(axis=0), 90 if size[1] > size[0] else 0
+                axes.text(spot[0], spot[1], text, ha="center", va="center", rotation=turned, color=INK)
+        for corners in walls:
+            _draw_box(axes, corners[:, [x, y]], fill=False, ec=INK, lw=1.2, zorder=1)
         for k, body in enumerate(scenario.bodies):
-            own = np.array([tags[tag.id] for tag in scenario.tags if tag.body == body.name]).reshape(-1, 3)
-            path, kind = paths[body.name], look(k)
-            axes.plot(path[:, x], path[:, y], color=kind.colour, lw=0.6, alpha=0.6)
-            (dots,) = axes.plot(own[:, x], own[:, y], kind.marker, color=kind.colour, ms=4, label=body.name)
-            mark(dots, body.name)
-        _name_tags(axes, {tag: spot[[x, y]] for tag, spot in tags.items()}, scale, high[x])
+            own = {tag.id: tags[tag.id][[x, y]] for tag in scenario.tags if tag.body == body.name}
+            _draw_body(axes, body.name, paths[body.name][:, [x, y]], own, look(k), middle[x])
         axes.set(xlim=(low[x], high[x]), ylim=(low[y], high[y]), aspect="equal", axisbelow=True)
         axes.set(xlabel=f"{'xyz'[x]} (m)", ylabel=f"{'xyz'[y]} (m)")
         axes.grid(True)
@@ -143,50 +139,33 @@ def room(width_in: float, scenario: Scenario) -> Figure:
     return figure
 
 
-def _to_scale(width_in: float, size_m: Floats) -> tuple[Figure, list[Axes], float]:
-    """Return a figure whose two panels have the same scale, and inches of a metre; on a phone above each other."""
+def _draw_box(axes: Axes, corners: Floats, **line: Any) -> Floats:
+    """Draw a rectangle between two corners, (2, 2), and return its size."""
+    size = np.asarray(corners[1] - corners[0])
+    axes.add_patch(Rectangle((corners[0, 0], corners[0, 1]), size[0], size[1], **line))
+    return size
+
+
+def _draw_body(axes: Axes, name: str, path: Floats, tags: Mapping[int, Floats], own: Look, middle: float) -> None:
+    """Draw a path (n, 2), and tags with their numbers at the first, on the side of `middle`."""
+    axes.plot(*path.T, color=own.colour, lw=0.6, alpha=0.6)
+    spots = np.array(list(tags.values())).reshape(-1, 2)
+    mark(axes.plot(*spots.T, own.marker, color=own.colour, ms=4, label=name)[0], name)
+    if tags:
+        side = -1 if spots[0, 0] > middle else 1
+        place: dict[str, Any] = {"ha": "right" if side < 0 else "left", "textcoords": "offset points"}
+        axes.annotate(", ".join(map(str, tags)), (spots[0, 0], spots[0, 1]), (4 * side, 4), color=INK, **place)
+
+
+def _to_scale(width_in: float, size_m: Floats) -> tuple[Figure, list[Axes]]:
+    """Return a figure whose two panels have the same scale; on a phone above each other."""
     narrow = width_in < NARROW_IN
     across = size_m[0] if narrow else 2 * size_m[0]
     scale = min((width_in - (0.7 if narrow else 1.4)) / across, (3.6 if narrow else 4.2) / max(size_m[1], size_m[2]))
     heights = [size_m[1] * scale, size_m[2] * scale]
     figure, panels = sheet(width_in, 2, height_ratios=heights if narrow else None)
     figure.set_figheight(sum(heights) + 1.9 if narrow else max(heights) + 1.2)
-    return figure, panels, float(scale)
-
-
-def _draw_walls(axes: Axes, scenario: Scenario, x: int, y: int, scale: float) -> None:
-    if scenario.room:
-        low, high = np.array(scenario.room.min_m), np.array(scenario.room.max_m)
-        axes.add_patch(Rectangle((low[x], low[y]), *(high - low)[[x, y]], fill=False, ec=INK, lw=1.2, zorder=1))
-    for box in scenario.obstacles:
-        low, high = np.array(box.min_m), np.array(box.max_m)
-        width, height = (high - low)[[x, y]]
-        axes.add_patch(Rectangle((low[x], low[y]), width, height, fc=GRID, ec=MUTED, lw=0.6))
-        # A name is written into what it names, along or up, or not at all.
-        length = 0.062 * len(box.name) + 0.05  # inches of letters of 8 pt
-        for angle, along, aside in ((0, width, height), (90, height, width)):
-            if along * scale > length and aside * scale > 0.13:
-                place = (float((low + high)[x] / 2), float((low + high)[y] / 2))
-                middle: dict[str, Any] = {"ha": "center", "va": "center", "clip_on": True}
-                axes.text(*place, box.name, rotation=angle, color=INK, **middle)
-                break
-
-
-def _name_tags(axes: Axes, spots: dict[int, Floats], scale: float, right: float) -> None:
-    """Write numbers beside tags; those that would cover each other are written together, at the first of them."""
-    groups: list[tuple[Floats, list[int]]] = []
-    for tag, spot in spots.items():
-        near = next((names for place, names in groups if np.abs(place - spot).max() * scale < 0.3), None)
-        if near is None:
-            groups.append((spot, [tag]))
-        else:
-            near.append(tag)
-    for spot, names in groups:
-        text = ", ".join(map(str, names)) if len(names) < 5 else f"{names[0]} … {names[-1]}"
-        # Beside the edge to the left, so that no name runs out of the picture.
-        left = (right - spot[0]) * scale < 0.062 * len(text) + 0.1
-        place, side = (float(spot[0]), float(spot[1])), "right" if left else "left"
-        axes.annotate(text, place, (-4 if left else 4, 4), textcoords="offset points", color=INK, ha=side)
+    return figure, panels
 
 
 def timing(width_in: float, scenario: Scenario, name: str) -> Figure:
@@ -270,81 +249,63 @@ def _one_exchange(scenario: Scenario, protocol: RangingProtocol) -> tuple[Stampe
     return stamp(Medium(scenario, World(scenario)), protocol, begun, draws), (first, second)
 
 
-@dataclass(frozen=True, slots=True)
-class Swept:
-    """Rows of a sweep as columns: `values` (rows,) by key, `protocol` (rows,), and one result (rows,), NaN if none."""
+def result_over_keys(
+    width_in: float, keys: Mapping[str, Sequence[Any]], protocol: Sequence[str], result: Floats, name: str
+) -> Figure:
+    """Draw a result (rows,), NaN where there is none, over the values of keys (rows,) and for each protocol.
 
-    values: dict[str, Sequence[Any]]
-    protocol: Sequence[str]
-    result: Floats
-
-    def protocols(self) -> dict[str, Bools]:
-        """Return the rows (rows,) of each protocol that have the result, in the order of the rows."""
-        found = np.isfinite(self.result)
-        return {name: found & (np.array(self.protocol) == name) for name in dict.fromkeys(self.protocol)}
-
-
-def result_over_keys(width_in: float, swept: Swept, name: str) -> Figure:
-    """Draw a result: as heat map over two keys of numbers that form a grid, else over each key, as medians in bands.
-
-    A band holds all seeds and all values of the other keys.
+    Over two keys of numbers that form a grid it is a map, else a line over each key: medians in bands that hold all
+    seeds and all values of the other keys.
     """
-    columns = {key: np.array(values) for key, values in swept.values.items()}
-    grid = [column for column in columns.values() if column.dtype.kind in "iuf"]
-    if len(columns) == len(grid) == 2:
-        sizes = [len(np.unique(column)) for column in grid]
+    found = np.isfinite(result)
+    rows = {one: found & (np.array(protocol) == one) for one in dict.fromkeys(protocol)}
+    columns = {key: np.array(values) for key, values in keys.items()}
+    if len(columns) == 2 and all(column.dtype.kind in "iuf" for column in columns.values()):
+        (x, across), (y, up) = (np.unique(column, return_inverse=True) for column in columns.values())
         # Unless all combinations are there, a map would be mostly holes.
-        if len(np.unique(grid, axis=1).T) == sizes[0] * sizes[1] and sizes[0] > 1:
-            return _heat_maps(width_in, swept, name)
+        if len(np.unique([across, up], axis=1).T) == len(x) * len(y) and len(x) > 1:
+            return _maps(width_in, columns, rows, result, name)
     figure, panels = sheet(width_in, max(len(columns), 1), height_in=2.6)
     for axes, (key, column) in zip(panels, columns.items(), strict=False):
-        _lines(axes, swept, column)
+        _lines(axes, column, rows, result)
         label(axes, key.replace(".", ".\N{ZERO WIDTH SPACE}"), name)
     legend(figure, panels[0])
     return figure
 
 
-def _lines(axes: Axes, swept: Swept, column: NDArray[Any]) -> None:
+def _lines(axes: Axes, column: NDArray[Any], rows: Mapping[str, Bools], result: Floats) -> None:
     """Draw medians over the values of a key (rows,), a line a protocol, in bands from the least to the largest."""
     numeric = column.dtype.kind in "iuf"
     names, places = np.unique(column, return_inverse=True)
     at = np.asarray(column if numeric else places, dtype=np.float64)
-    for k, (protocol, rows) in enumerate(swept.protocols().items()):
-        if not rows.any():
-            continue
-        x, group = _grouped(at[rows])
-        y = swept.result[rows]
-        low, middle, high = np.array([np.quantile(y[group == g], (0, 0.5, 1)) for g in range(len(x))]).T
-        if np.any(high > low):
-            axes.fill_between(x, low, high, color=look(k).colour, alpha=0.18, lw=0)
-        mark(axes.plot(x, middle, label=protocol, **look(k).line())[0], protocol)
+    for k, (protocol, own) in enumerate(rows.items()):
+        values = np.unique(at[own])
+        # Many values are drawn in groups of equal size.
+        groups = [np.flatnonzero(own & (at == value)) for value in values]
+        if len(groups) > 12:
+            groups = np.array_split(np.flatnonzero(own)[np.argsort(at[own], kind="stable")], 12)
+        if groups:
+            x = np.array([np.median(at[group]) for group in groups])
+            low, middle, high = np.array([np.quantile(result[group], (0, 0.5, 1)) for group in groups]).T
+            series(axes, x, middle, (low, high), label=protocol, **look(k).line())
     if not numeric:
         axes.set_xticks(np.arange(len(names)), list(names))
     elif at.min() > 0 and at.max() > 30 * at.min():
         axes.set_xscale("log")
 
 
-def _grouped(places: Floats, most: int = 12) -> tuple[Floats, Any]:
-    """Return where values (rows,) are drawn, and each one's group: single values if few, else groups of equal size."""
-    alone, group = np.unique(places, return_inverse=True)
-    if len(alone) <= most:
-        return alone, group
-    edges = np.quantile(places, np.linspace(0, 1, most + 1))
-    group = np.clip(np.searchsorted(edges, places, side="right") - 1, 0, most - 1)
-    kept, group = np.unique(group, return_inverse=True)
-    return np.array([np.median(places[group == g]) for g in range(len(kept))]), group
-
-
-def _heat_maps(width_in: float, swept: Swept, name: str) -> Figure:
+def _maps(
+    width_in: float, keys: Mapping[str, NDArray[Any]], rows: Mapping[str, Bools], result: Floats, name: str
+) -> Figure:
     """Draw medians over seeds as colours over two keys, a panel a protocol, four at most."""
-    protocols = dict(list(swept.protocols().items())[:4])
+    protocols = list(rows)[:4]
     across = 1 if width_in < NARROW_IN else min(2, len(protocols))
     figure, panels = sheet(width_in, len(protocols), height_in=2.6, across=across, sharex=True, sharey=True)
-    (x, column), (y, row) = (np.unique(values, return_inverse=True) for values in swept.values.values())
-    cells = [np.arange(len(y) + 1), np.arange(len(x) + 1)]
+    (x, column), (y, row) = (np.unique(values, return_inverse=True) for values in keys.values())
+    cells = [np.arange(len(y) + 1) - 0.5, np.arange(len(x) + 1) - 0.5]
     shown = [
-        binned_statistic_2d(row[rows], column[rows], swept.result[rows], "median", cells).statistic
-        for rows in protocols.values()
+        binned_statistic_2d(row[rows[one]], column[rows[one]], result[rows[one]], "median", cells).statistic
+        for one in protocols
     ]
     # "cividis" grows lighter evenly, and alike for all eyes.
     colours: dict[str, Any] = {"cmap": "cividis", "vmin": np.nanmin(shown), "vmax": np.nanmax(shown)}
@@ -352,10 +313,10 @@ def _heat_maps(width_in: float, swept: Swept, name: str) -> Figure:
         image = axes.pcolormesh(cells[1], cells[0], values, **colours)
         for axis, own in ((axes.xaxis, x), (axes.yaxis, y)):
             kept = np.arange(len(own))[:: max(1, len(own) // 6)]
-            axis.set_ticks(kept + 0.5, labels=[f"{own[k]:g}" for k in kept])
+            axis.set_ticks(kept, labels=[f"{value:g}" for value in own[kept]])
         axes.set_title(protocol, loc="left")
     figure.colorbar(image, ax=panels, label=name)
-    first, second = swept.values
+    first, second = keys
     figure.supxlabel(first, fontsize="medium")
     figure.supylabel(second, fontsize="medium")
     return figure
@@ -365,10 +326,10 @@ def marginals(width_in: float, found: Sequence[Compared]) -> Figure:
     """Draw the distributions of both sides, one panel a quantity; the outermost bins hold what lies beyond them."""
     figure, panels = sheet(width_in, len(found), height_in=1.7, across=1 if width_in < NARROW_IN else 3)
     colours = {"measured": BLUE, "simulated": VERMILION}
+    lines = {name: {"lw": 1.2, "color": colour, "label": name} for name, colour in colours.items()}
     for axes, one in zip(panels, found, strict=True):
         low, high = np.quantile(np.concatenate(one.drawn), [0.005, 0.995])
         edges = np.linspace(low, high if high > low else low + 1, 41)
-        lines = {name: {"lw": 1.2, "color": colour, "label": name} for name, colour in colours.items()}
         outlines(axes, dict(zip(colours, one.drawn, strict=True)), edges, lines, ends=False)
         axes.set_title(one.name, loc="left")
         axes.set(xlabel=one.unit, yticks=[])
@@ -384,11 +345,10 @@ def by_pair(width_in: float, found: Sequence[Compared], fewest: int = 5) -> Figu
     for axes, (one, what, name) in zip(panels, drawn, strict=True):
         pairs = [pair for pair in one.pairs.values() if pair[0].count >= fewest]
         points = np.array([[getattr(side, what) for side in pair] for pair in pairs]).reshape(-1, 2)
-        points = points[np.isfinite(points).all(axis=1)]
-        if len(points):
-            ends = [float(points.min()), float(points.max())]
+        if np.isfinite(points).all(axis=1).any():
+            ends = [np.nanmin(points), np.nanmax(points)]
             axes.plot(ends, ends, color=PALE, linewidth=1)
-            axes.plot(points[:, 0], points[:, 1], "o", color=BLUE, markersize=3.5, alpha=0.7)
+            axes.plot(*points.T, "o", color=BLUE, markersize=3.5, alpha=0.7)
         else:
             axes.text(0.5, 0.5, "too few exchanges a pair", ha="center", va="center", transform=axes.transAxes)
         axes.set_title(f"{one.name}:\n{name}", loc="left")

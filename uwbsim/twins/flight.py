@@ -365,7 +365,7 @@ def fit_schedule(flight: Flight, faults: list[Fault]) -> ScheduleFit:
 
 
 def _round_robin(time: Floats, ends: Ints) -> tuple[float, Ints, Ints] | None:
-    """Return interval, slots (n,) and turns (2, pairs) of a round robin, to which nine of ten exchanges keep, or None."""
+    """Return interval, slots (n,) and turns (2, pairs) of a round robin that nine of ten exchanges keep to, or None."""
     turns, pair = np.unique(ends, axis=1, return_inverse=True)
     count, apart = turns.shape[1], np.diff(time)
     usual = np.median(apart) if len(apart) else 0.0

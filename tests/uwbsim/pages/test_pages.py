@@ -14,7 +14,7 @@ from uwblink.pages.blocks import to_html
 from uwblink.pages.figures import picture, style
 from uwbsim.pages import write_sweep_page
 from uwbsim.pages.documents import comparison, scene
-from uwbsim.pages.figures import Swept, error_over, result_over_keys, room, timing
+from uwbsim.pages.figures import error_over, result_over_keys, room, timing
 from uwbsim.protocols.comparison import ErrorCurve
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
@@ -127,8 +127,8 @@ def test_a_sweep_says_what_its_figures_are(tmp_path):
 
 def test_bands_over_seeds_reach_from_the_least_to_the_largest():
     values = [1.0] * 3 + [2.0] * 3
-    swept = Swept({"key": values}, ["ds"] * 6, np.array([1.0, 2.0, 9.0, 4.0, 5.0, 6.0]))
-    figure = result_over_keys(7.16, swept, "figure")
+    result = np.array([1.0, 2.0, 9.0, 4.0, 5.0, 6.0])
+    figure = result_over_keys(7.16, {"key": values}, ["ds"] * 6, result, "figure")
     band = figure.axes[0].collections[0].get_paths()[0].vertices
     assert {(x, y) for x, y in band.tolist()} >= {(1.0, 1.0), (1.0, 9.0), (2.0, 4.0), (2.0, 6.0)}
     assert figure.axes[0].lines[0].get_ydata().tolist() == [2.0, 5.0]
@@ -136,15 +136,15 @@ def test_bands_over_seeds_reach_from_the_least_to_the_largest():
 
 def test_two_keys_make_a_map_of_medians_over_seeds():
     keys: dict[str, list[object]] = {"a": [1.0, 1.0, 2.0, 2.0] * 2, "b": [10.0, 20.0] * 4}
-    swept = Swept({**keys}, ["ds"] * 8, np.array([1.0, 2.0, 3.0, 4.0, 3.0, 4.0, 5.0, 6.0]))
-    figure = result_over_keys(7.16, swept, "figure")
+    result = np.array([1.0, 2.0, 3.0, 4.0, 3.0, 4.0, 5.0, 6.0])
+    figure = result_over_keys(7.16, keys, ["ds"] * 8, result, "figure")
     (mesh,) = figure.axes[0].collections
     assert mesh.get_array().tolist() == [[2.0, 4.0], [3.0, 5.0]]
 
 
 def test_words_and_many_keys_are_drawn_key_by_key():
     keys: dict[str, list[object]] = {"a": [1.0, 2.0] * 4, "b": ["x", "y", "y", "x"] * 2, "c": list(range(8))}
-    figure = result_over_keys(3.5, Swept({**keys}, ["ds", "ss"] * 4, np.arange(8.0)), "figure")
+    figure = result_over_keys(3.5, keys, ["ds", "ss"] * 4, np.arange(8.0), "figure")
     assert len(figure.axes) == 3
     assert [t.get_text() for t in figure.axes[1].get_xticklabels()] == ["x", "y"]
 
