@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Final, NamedTuple
+from collections.abc import Iterator
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
@@ -19,6 +19,9 @@ from uwblink.pages.blocks import Block, Table, Text
 GOOD: Final = "good"
 DOUBT: Final = "doubt"
 BAD: Final = "bad"
+
+MOST_NS: Final = 0.1
+"""Half of an interval of a delay, 3 cm of range: as much as DW1000s of one kind differ by chance."""
 
 
 class Criterion(NamedTuple):
@@ -51,43 +54,59 @@ def verdict(results: Results) -> list[Block]:
 def criteria(results: Results) -> list[Criterion]:
     """Return the criteria that apply to a calibration and its recordings."""
     made = results.calibration.provenance
-    without_truth: Sequence[Ask] = [_distances_found] if rests_on(made) else []
+    judged = list(_of_recordings(results)) if results.recordings else []
+    if not judged and not made.get("converged", True):
+        judged = [Criterion("Did the search settle?", "yes", "no", BAD, "the search stopped before it settled")]
+    delays = _settled(results)
+    found = [*judged[:4], *([delays] if delays else []), *judged[4:]]
     if made.get("recipe") == "survey":
-        without_truth = [_contradicted, _redundant, _pair_error, _reflected, _only_one, _shared]
-    asked: Sequence[Ask] = [_converged, _settled, *without_truth]
-    if results.recordings:
-        asked = [_held_out, _gain, _bias, _interval, _settled, _powers, _positions, *without_truth, _warned]
-    return [found for ask in asked if (found := ask(results)) is not None]
-
-
-Ask = Callable[[Results], Criterion | None]
-"""Returns a criterion, None if it does not apply."""
+        found += _of_survey(results)
+    elif rests_on(made):
+        found += _of_distances(made.get("distance_std_m"))
+    return [*found, _warned(results)] if results.recordings else found
 
 
 def _graded(good: bool, tolerable: bool) -> str:
     return GOOD if good else DOUBT if tolerable else BAD
 
 
+def _of_recordings(results: Results) -> Iterator[Criterion]:
+    """Yield what the recordings that judge a calibration say of it."""
+    yield _held_out(results)
+    yield _gain(results)
+    yield _bias(results)
+    yield _interval(results)
+    most, share = 0.05, results.evaluation.overall.clamped
+    yield Criterion(
+        "Was the curve fitted at such powers?",
+        f"at most {100 * most:.0f} % of the ranges beyond them",
+        f"{100 * share:.1f} % beyond",
+        _graded(share <= most, share <= 0.25),
+        f"{100 * share:.1f} % of the ranges have powers that the fit has not seen",
+    )
+    if results.tracks:
+        raw, best = (np.mean([one.rmse_m[name].mean() for one in results.tracks]) for name in ("raw", "variance"))
+        yield Criterion(
+            "Do positions become better?",
+            "RMSE of the position not larger than with raw ranges",
+            f"from {raw:.3f} to {best:.3f} m over {len(results.tracks)} tracks",
+            _graded(bool(best < raw), False),
+            f"positions go from {100 * raw:.0f} to {100 * best:.0f} cm RMSE",
+        )
+
+
 def _held_out(results: Results) -> Criterion:
-    held, judged = results.held_out, results.judged
+    judged, asked = results.judged, ("Was it judged on recordings that the fit has not seen?", "yes")
     if results.part is not None:
         share = len(judged) / (len(judged) + int(results.part.provenance["exchanges"]))
-        return Criterion(
-            "Was it judged on recordings that the fit has not seen?",
-            "yes",
-            f"in part: a second fit was judged on {100 * share:.0f} % of the same recordings, held out from it",
-            DOUBT,
-            "it was judged on held-out parts of the recordings it was fitted to, not on another recording",
-        )
-    return Criterion(
-        "Was it judged on recordings that the fit has not seen?",
-        "yes",
-        f"{judged.source}: {len(judged)} ranges" if held else "no: on those it was fitted to",
-        _graded(held, True),
-        "it was judged on recordings that the fit has not seen"
-        if held
-        else "it was not judged on recordings that the fit has not seen, so what follows is too good",
-    )
+        found = f"in part: a second fit was judged on {100 * share:.0f} % of the same recordings, held out from it"
+        told = "it was judged on held-out parts of the recordings it was fitted to, not on another recording"
+        return Criterion(*asked, found, DOUBT, told)
+    if not results.held_out:
+        told = "it was not judged on recordings that the fit has not seen, so what follows is too good"
+        return Criterion(*asked, "no: on those it was fitted to", DOUBT, told)
+    told = "it was judged on recordings that the fit has not seen"
+    return Criterion(*asked, f"{judged.source}: {len(judged)} ranges", GOOD, told)
 
 
 def _gain(results: Results) -> Criterion:
@@ -155,25 +174,25 @@ def _interval(results: Results) -> Criterion:
 
 
 def _settled(results: Results) -> Criterion | None:
-    known, most_ns = results.calibration, 0.1  # 3 cm of range: as much as DW1000s of one kind differ by chance
+    known = results.calibration
     if known.pair_offsets:
         return None
     free = known.provenance.get("undetermined", [])
     half = {t: TWO_SIDED_95 * known.delays_std_ns.get(t, math.nan) for t in known.delays_ns}
     measured = {tag: h for tag, h in half.items() if np.isfinite(h)}
-    asked = f"95 % interval of each within ± {most_ns:g} ns (3 cm)"
+    asked = f"95 % interval of each within ± {MOST_NS:g} ns (3 cm)"
     question = "Are the antenna delays known well enough?"
     if free:
         return Criterion(question, asked, left_open(results), BAD, left_open(results))
     if not measured:
         return Criterion(question, asked, "the calibration states no intervals", DOUBT, "delays have no intervals")
     tag = max(measured, key=lambda t: measured[t])
-    fine = measured[tag] <= most_ns
+    fine = measured[tag] <= MOST_NS
     return Criterion(
         question,
         asked,
         f"widest: tag {tag}, ± {measured[tag]:.3f} ns",
-        _graded(fine, measured[tag] <= 3 * most_ns),
+        _graded(fine, measured[tag] <= 3 * MOST_NS),
         f"delays are known to ± {measured[tag]:.3f} ns or better"
         if fine
         else f"the delay of tag {tag} is known to ± {measured[tag]:.2f} ns only",
@@ -188,31 +207,6 @@ def left_open(results: Results) -> str:
     return str(made.get("left_open", trace))
 
 
-def _powers(results: Results) -> Criterion:
-    most = 0.05
-    share = results.evaluation.overall.clamped
-    return Criterion(
-        "Was the curve fitted at such powers?",
-        f"at most {100 * most:.0f} % of the ranges beyond them",
-        f"{100 * share:.1f} % beyond",
-        _graded(share <= most, share <= 0.25),
-        f"{100 * share:.1f} % of the ranges have powers that the fit has not seen",
-    )
-
-
-def _positions(results: Results) -> Criterion | None:
-    if not results.tracks:
-        return None
-    raw, best = (float(np.mean([one.rmse_m[name].mean() for one in results.tracks])) for name in ("raw", "variance"))
-    return Criterion(
-        "Do positions become better?",
-        "RMSE of the position not larger than with raw ranges",
-        f"from {raw:.3f} to {best:.3f} m over {len(results.tracks)} tracks",
-        _graded(best < raw, False),
-        f"positions go from {100 * raw:.0f} to {100 * best:.0f} cm RMSE",
-    )
-
-
 def _warned(results: Results) -> Criterion:
     found = [*results.warnings, *(f"{name}: {finding.fault}" for name, finding in results.findings)]
     return Criterion(
@@ -224,97 +218,77 @@ def _warned(results: Results) -> Criterion:
     )
 
 
-def _converged(results: Results) -> Criterion | None:
-    if results.calibration.provenance.get("converged", True):
-        return None
-    return Criterion("Did the search settle?", "yes", "no", BAD, "the search stopped before it settled")
-
-
-def _contradicted(results: Results) -> Criterion:
-    found = list(map(str, results.calibration.provenance.get("findings", [])))
-    return Criterion(
+def _of_survey(results: Results) -> Iterator[Criterion]:
+    """Yield what a survey of standing boards says of itself."""
+    made = results.calibration.provenance
+    rests, pairs = made["rests_on"], int(made["pairs"])
+    against = list(map(str, made.get("findings", [])))
+    yield Criterion(
         "Do the ranges agree with what is said to be known?",
         "no line that is none, no wrong tape, no exchanged labels, no board that was moved",
-        "; ".join(found) or "they do",
-        _graded(not found, False),
-        f"{len(found)} contradiction{'s' * (len(found) > 1)} to what is known" if found else "nothing contradicts",
+        "; ".join(against) or "they do",
+        _graded(not against, False),
+        f"{len(against)} contradiction{'s' * (len(against) > 1)} to what is known"
+        if against
+        else "nothing contradicts",
     )
-
-
-def _redundant(results: Results) -> Criterion:
-    least = 10.0  # with few, a wrong range is not seen, and the spread of errors is a guess
-    made = results.calibration.provenance
-    freedom, pairs = float(made["rests_on"]["freedom"]), int(made["pairs"])
-    return Criterion(
+    # With few, a wrong range is not seen, and the spread of errors is a guess.
+    freedom, least = float(rests["freedom"]), 10.0
+    yield Criterion(
         "Do the arrangements check each other?",
         f"at least {least:g} ranges of pairs more than the unknowns take",
         f"{freedom:.0f} more, of {pairs}",
         _graded(freedom >= least, freedom >= 4.0),
         f"{freedom:.0f} of {pairs} ranges of pairs are left to check the rest",
     )
-
-
-def _pair_error(results: Results) -> Criterion:
-    most_m = 0.03
-    error = float(results.calibration.provenance["rests_on"]["pair_error_m"])
-    return Criterion(
+    error, most_m = float(rests["pair_error_m"]), 0.03
+    yield Criterion(
         "Are the constant errors of pairs those of such boards?",
         f"at most {100 * most_m:g} cm, beside reflections",
         f"{100 * error:.1f} cm",
         _graded(error <= most_m, error <= 2 * most_m),
         f"a pair has a constant error of {100 * error:.1f} cm in an arrangement",
     )
-
-
-def _reflected(results: Results) -> Criterion:
-    most = 0.05  # of the pairs: where more are reflected, some of it hides in the places of boards
-    made = results.calibration.provenance
-    count, pairs = sum(float(row["chance"]) for row in made.get("reflected", [])), int(made["pairs"])
+    # Where more pairs are reflected, some of it hides in the places of boards.
+    count, most = sum(float(row["chance"]) for row in made.get("reflected", [])), 0.05
     share = count / max(pairs, 1)
-    return Criterion(
+    yield Criterion(
         "Are few pairs reflected?",
         f"at most {100 * most:g} % of them",
         f"{count:.1f} of {pairs} ({100 * share:.0f} %)",
         _graded(share <= most, share <= 0.2),
         f"{100 * share:.0f} % of the pairs are believed to be reflected",
     )
-
-
-def _only_one(results: Results) -> Criterion:
-    clear = 9.0  # three standard deviations of a single unknown
-    worse = results.calibration.provenance.get("second_best")
-    alone = worse is None or float(worse) >= clear
-    return Criterion(
+    # Three standard deviations of a single unknown.
+    second, clear = made.get("second_best"), 9.0
+    worse = math.inf if second is None else float(second)
+    yield Criterion(
         "Is there no other solution?",
         f"the second-best worse by at least {clear:g} in -2 log likelihood: three standard deviations",
-        "none was found" if worse is None else f"{float(worse):.0f} worse",
-        _graded(alone, True),
-        "no other places of boards agree with the ranges" if alone else "other places of boards agree as well",
+        f"{worse:.0f} worse" if math.isfinite(worse) else "none was found",
+        _graded(worse >= clear, True),
+        "no other places of boards agree with the ranges" if worse >= clear else "other places of boards agree as well",
     )
+    known = results.calibration.uncertainty
+    if known is not None and known.tags:
+        half = TWO_SIDED_95 * math.sqrt(max(float(np.mean(np.array(known.delays_ns2))), 0.0))
+        yield Criterion(
+            "Is what all delays share known?",
+            f"95 % interval of their mean within ± {MOST_NS:g} ns; a taped distance or a known delay tells it",
+            f"± {half:.3f} ns",
+            _graded(half <= MOST_NS, half <= 3 * MOST_NS),
+            f"what all delays share is known to ± {half:.2f} ns",
+        )
 
 
-def _shared(results: Results) -> Criterion | None:
-    known, most_ns = results.calibration.uncertainty, 0.1  # 3 cm of every range
-    if known is None or not known.tags:
-        return None
-    half = TWO_SIDED_95 * math.sqrt(max(float(np.mean(np.array(known.delays_ns2))), 0.0))
-    return Criterion(
-        "Is what all delays share known?",
-        f"95 % interval of their mean within ± {most_ns:g} ns; a taped distance or a known delay tells it",
-        f"± {half:.3f} ns",
-        _graded(half <= most_ns, half <= 3 * most_ns),
-        f"what all delays share is known to ± {half:.2f} ns",
-    )
-
-
-def _distances_found(results: Results) -> Criterion | None:
-    off, most_m = results.calibration.provenance.get("distance_std_m"), 0.02
-    if not isinstance(off, int | float):
-        return None
-    return Criterion(
-        "Are the distances that stand for the true ones known well enough?",
-        f"standard error at most {100 * most_m:g} cm",
-        f"{100 * off:.1f} cm",
-        _graded(off <= most_m, off <= 0.05),
-        f"distances were found to {100 * off:.1f} cm",
-    )
+def _of_distances(std_m: Any) -> Iterator[Criterion]:
+    """Yield how well distances are known that were found together with the delays."""
+    if isinstance(std_m, int | float):
+        most_m = 0.02
+        yield Criterion(
+            "Are the distances that stand for the true ones known well enough?",
+            f"standard error at most {100 * most_m:g} cm",
+            f"{100 * std_m:.1f} cm",
+            _graded(std_m <= most_m, std_m <= 0.05),
+            f"distances were found to {100 * std_m:.1f} cm",
+        )
