@@ -81,12 +81,9 @@ class Work:
     def check(self) -> None:
         """Raise `ParameterError` for a function that another process cannot import by its name."""
         named: dict[str, object] = {f"channel effect {name!r}": effect for name, effect in self.effects}
-        for row in self.protocols:
-            named |= {
-                f"{part} of protocol {row.name!r}": getattr(row, part) for part in ("flight_ticks", "delay_weights")
-            }
-        if self.evaluate is not None:
-            named["evaluate"] = self.evaluate
+        parts = ("flight_ticks", "delay_weights")
+        named |= {f"{part} of protocol {row.name!r}": getattr(row, part) for row in self.protocols for part in parts}
+        named |= {} if self.evaluate is None else {"evaluate": self.evaluate}
         for what, function in named.items():
             module = sys.modules.get(getattr(function, "__module__", None) or "")
             if getattr(module, getattr(function, "__qualname__", ""), None) is not function:
@@ -102,7 +99,10 @@ class Work:
             if run.error:
                 raise UwbsimError(run.error)
             scenario = Scenario.model_validate_json(run.scenario)
-            rows = self._compared(scenario) if self.evaluate is None else self._evaluated(scenario, self.evaluate)
+            if self.evaluate is None:
+                rows = [one.to_dict() for one in compare(scenario, self.protocols, self.ranges).outcomes]
+            else:
+                rows = [self._evaluated(scenario, row.name, self.evaluate) for row in self.protocols]
         except (UwbsimError, UwblinkError, ArithmeticError, ValueError, MemoryError) as error:
             return self.failed(run, str(error) or type(error).__name__)
         return run.number, [self._head(run) | {"status": "ok", "error": None} | row for row in rows]
@@ -117,22 +117,16 @@ class Work:
         values = {k: v if isinstance(v, int | float | str | bool) else json.dumps(v) for k, v in run.values.items()}
         return {"scenario": self.name, "number": run.number, "seed": run.seed} | versions | values
 
-    def _compared(self, scenario: Scenario) -> list[Row]:
-        return [outcome.to_dict() for outcome in compare(scenario, self.protocols, self.ranges).outcomes]
-
-    def _evaluated(self, scenario: Scenario, evaluate: Evaluate) -> list[Row]:
-        """Simulate a flight with each protocol, and have it evaluated."""
-        found = []
-        for row in self.protocols:
-            ranging = scenario.ranging.model_copy(update={"protocol": row.name})
-            simulated = simulate(scenario.model_copy(update={"ranging": ranging}))
-            try:
-                figures = dict(evaluate(simulated))
-            except Exception as error:
-                # A plug-in's function: whatever it raises is the failure of this run, and of no other.
-                raise UwbsimError(str(error) or type(error).__name__) from error
-            found.append({"protocol": row.name} | figures | {"failed_exchanges": len(simulated.faults)})
-        return found
+    def _evaluated(self, scenario: Scenario, protocol: str, evaluate: Evaluate) -> Row:
+        """Simulate a flight with a protocol, and have it evaluated."""
+        ranging = scenario.ranging.model_copy(update={"protocol": protocol})
+        simulated = simulate(scenario.model_copy(update={"ranging": ranging}))
+        try:
+            figures = dict(evaluate(simulated))
+        except Exception as error:
+            # A plug-in's function: whatever it raises is the failure of this run, and of no other.
+            raise UwbsimError(str(error) or type(error).__name__) from error
+        return {"protocol": protocol} | figures | {"failed_exchanges": len(simulated.faults)}
 
 
 def run_chunk(runs: Sequence[Run], work: Work) -> tuple[list[Result], float]:

@@ -23,7 +23,7 @@ import uwblink
 from uwblink.database import connect
 from uwblink.errors import UwblinkError, first_line
 from uwblink.output import check_folder, is_utf8
-from uwblink.recording.intake import check_tables, interrupted_after, longest_read_s
+from uwblink.recording.intake import check_tables
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.sweep.design import SweepDesign
 from uwbsim.sweep.executors import Chunk, Evaluate, Result, Work, Workers, evaluator, workers_for
@@ -94,8 +94,7 @@ def run_sweep(
     team = workers_for(workers, scheduler, work)
     try:
         folder.mkdir(exist_ok=True)
-        path = folder / STORE
-        with Store.open(path) if Store.begun(path) else Store.create(path, _identity(plan)) as store:
+        with Store.open(folder / STORE, _identity(plan)) as store:
             known = store.done()
             done, failed = _do(plan, store, team, work, known, progress)
             write_tables(folder / "results.csv", folder / "results.parquet", store, force=True)
@@ -109,24 +108,23 @@ def _identity(plan: SweepDesign) -> dict[str, Any]:
 
 
 def _check(plan: SweepDesign, folder: Path, *, resume: bool) -> None:
-    path = folder / STORE
-    if not Store.begun(path):
-        if resume and not path.exists():
-            raise ParameterError(f"{folder} holds no sweep to go on with", parameter="resume")
-        if folder.is_dir() and any(item.name != STORE for item in folder.iterdir()):
-            raise ScenarioError(f"{folder}: holds other files; give an empty folder or a new one")
-        return
-    with Store.open(path) as store:
-        known = store.identity()
+    path, own, known, begun = folder / STORE, _identity(plan), {}, False
+    if path.exists():
+        with Store.open(path, own) as store:
+            known, begun = store.identity(), bool(store.done())
+    elif resume:
+        raise ParameterError(f"{folder} holds no sweep to go on with", parameter="resume")
+    elif folder.is_dir() and any(folder.iterdir()):
+        raise ScenarioError(f"{folder}: holds other files; give an empty folder or a new one")
     told = {
         "plan": f"holds the results of another sweep, {known.get('plan')}",
         "fingerprint": f"{plan.path.name} or its scenario has changed since its results were made",
         "uwbcal": f"its results are of uwbcal {known.get('uwbcal')}, this is {uwblink.__version__}",
     }
     for key, text in told.items():
-        if known.get(key) != _identity(plan)[key]:
+        if known and known.get(key) != own[key]:
             raise ScenarioError(f"{folder}: {text}; give another folder")
-    if not resume:
+    if begun and not resume:
         raise ParameterError(
             f"{folder} holds results of this sweep; go on with it, or give another folder", parameter="resume"
         )
@@ -195,48 +193,35 @@ class Store:
     """Results by number of run, committed as they come: a killed sweep loses only results not yet committed."""
 
     def __init__(self, connection: Any, path: Path) -> None:
-        """Wrap an open database; use `create` or `open`."""
+        """Wrap an open database; use `open`."""
         self._db, self._path = connection, path
 
     @classmethod
-    def create(cls, path: Path, identity: Mapping[str, Any]) -> Self:
-        """Make a new store; `identity` identifies the sweep whose results it holds."""
-        db = _connect(path)
-        with _writing(path):
-            db.execute("BEGIN")
-            for table, columns in TABLES.items():
-                db.execute(f"CREATE TABLE {table} ({', '.join(f'{name} {kind}' for name, kind in columns.items())})")
-            db.executemany("INSERT INTO identity VALUES (?, ?)", [[k, json.dumps(v)] for k, v in identity.items()])
-            db.execute("COMMIT")
-        return cls(db, path)
-
-    @staticmethod
-    def begun(path: Path) -> bool:
-        """Return whether a file exists and has tables: a sweep killed at its start leaves an empty one."""
-        if not path.exists():
-            return False
-        with _connect(path) as db, _reading(path):
-            return bool(db.execute("SELECT 1 FROM system.main.duckdb_tables() WHERE NOT internal").fetchall())
-
-    @classmethod
-    def open(cls, path: Path) -> Self:
-        """Open a store from an untrusted file; raises `TableError` if it is not a store, or its rows are too long."""
+    def open(cls, path: Path, identity: Mapping[str, Any] | None = None) -> Self:
+        """Open a store, or make one for the sweep with this identity; raises `TableError` if it is no store."""
         db = _connect(path)
         try:
-            with _reading(path), interrupted_after(longest_read_s(path.stat().st_size), db.interrupt):
+            with _reading(path):
                 check_tables(lambda query: db.execute(query).fetchall(), path, path.stat().st_size, TABLES)
                 found = set(db.execute("SELECT table_name, column_name FROM system.main.duckdb_columns()").fetchall())
-                if not {(table, column) for table, columns in TABLES.items() for column in columns} <= found:
-                    raise TableError(f"{path}: not a store of results")
-                ((longest,),) = db.execute("SELECT coalesce(max(strlen(document)), 0) FROM results").fetchall()
-                # Fifty times what a run has with a hundred figures; 5000 rows are read at a time, 0.5 GB.
-                most = 100_000
-                if longest > most:
-                    raise TableError(f"{path}: a row of {longest} letters, and results have at most {most}")
+            # A sweep killed at its start leaves a file without tables.
+            if identity is not None and not found:
+                with _writing(path):
+                    cls._make(db, identity)
+            elif not {(table, column) for table, columns in TABLES.items() for column in columns} <= found:
+                raise TableError(f"{path}: not a store of results")
         except UwblinkError:
             db.close()
             raise
         return cls(db, path)
+
+    @staticmethod
+    def _make(db: Any, identity: Mapping[str, Any]) -> None:
+        db.execute("BEGIN")
+        for table, columns in TABLES.items():
+            db.execute(f"CREATE TABLE {table} ({', '.join(f'{name} {kind}' for name, kind in columns.items())})")
+        db.executemany("INSERT INTO identity VALUES (?, ?)", [[k, json.dumps(v)] for k, v in identity.items()])
+        db.execute("COMMIT")
 
     def __enter__(self) -> Self:
         """Return itself."""
@@ -259,11 +244,9 @@ class Store:
 
     def append(self, results: Sequence[tuple[int, Sequence[Mapping[str, Any]]]]) -> None:
         """Commit results, each a number and its rows, all or none; raises `TableError`."""
-        rows = [(n, k, json.dumps(row)) for n, some in results for k, row in enumerate(some)]
-        if not rows:
-            return
+        rows = [(number, part, json.dumps(row)) for number, some in results for part, row in enumerate(some)]
         # One statement and one commit, however many rows: a statement a row took most of a sweep's own time.
-        columns = [list(column) for column in zip(*rows, strict=True)]
+        columns = [list(column) for column in zip(*rows, strict=True)] or [[], [], []]
         with _writing(self._path):
             self._db.execute("INSERT INTO results SELECT unnest(?), unnest(?), unnest(?)", columns)
 
@@ -285,10 +268,10 @@ def _connect(path: Path) -> Any:
     try:
         return connect(path)
     except duckdb.Error as error:
-        reason = str(error).splitlines()[0]
+        reason = f"cannot be opened ({first_line(error)})"
         if "lock" in reason:
-            raise TableError(f"{path}: another sweep writes its results there; give another folder") from error
-        raise TableError(f"{path}: cannot be opened ({reason[:120]})") from error
+            reason = "another sweep writes its results there; give another folder"
+        raise TableError(f"{path}: {reason}") from error
 
 
 @contextmanager
