@@ -203,7 +203,8 @@ class Store:
         try:
             with _reading(path):
                 check_tables(lambda query: db.execute(query).fetchall(), path, path.stat().st_size, TABLES)
-                found = set(db.execute("SELECT table_name, column_name FROM system.main.duckdb_columns()").fetchall())
+                asked = "SELECT table_name, column_name FROM system.main.duckdb_columns() WHERE NOT internal"
+                found = set(db.execute(asked).fetchall())
             # A sweep killed at its start leaves a file without tables.
             if identity is not None and not found:
                 with _writing(path):
