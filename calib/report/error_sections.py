@@ -127,7 +127,7 @@ def outliers(results: Results) -> list[Block]:
     """Return the error model of calibrated ranges by pair."""
     if not results.recordings:
         return []
-    ranges, applied, rows = results.judged, results.corrected, []
+    ranges, applied = results.judged, results.corrected
     error = applied.corrected_m - ranges.truth_m
     z = error / applied.sigma_m
     groups = {**pair_rows(ranges), "all": np.ones(len(ranges), dtype=bool)}
@@ -135,18 +135,17 @@ def outliers(results: Results) -> list[Block]:
     if not told:
         return []
     parts = fit_grouped_errors([error[mine] for mine in told.values()])
-    for k, (name, mine) in enumerate(told.items()):
-        shares = (100 * float(np.mean(side)) for side in (z[mine] > 3, z[mine] < -3))
-        rows.append(
-            [
-                name,
-                *(f"{share:.1f} %" for share in shares),
-                f"{100 * parts.sigma_m[k]:.1f}",
-                f"{100 * parts.reflected[k]:.1f} %",
-                f"{100 * parts.detour_m[k]:.0f}",
-                f"{100 * parts.outliers[k]:.2f} %",
-            ]
-        )
+    rows = [
+        [
+            name,
+            *(f"{100 * np.mean(side[mine]):.1f} %" for side in (z > 3, z < -3)),
+            f"{100 * parts.sigma_m[k]:.1f}",
+            f"{100 * parts.reflected[k]:.1f} %",
+            f"{100 * parts.detour_m[k]:.0f}",
+            f"{100 * parts.outliers[k]:.2f} %",
+        ]
+        for k, (name, mine) in enumerate(told.items())
+    ]
     return [
         Heading("Outliers"),
         Table(
@@ -169,23 +168,33 @@ def localization(results: Results) -> list[Block]:
         return []
     total = summarize(found)
     names = list(total.rmse_m)
-    rows = [[f"{one.source} {one.body}", *(f"{one.rmse_m[name].mean():.3f}" for name in names)] for one in found]
-    rows.append(["mean", *(f"{total.rmse_m[name]:.3f}" for name in names)])
-    rows.append(["its spread over seeds", *(f"{total.spread_m[name]:.3f}" for name in names)])
-    rows.append(["against raw", "", *(f"{-100 * less:+.0f} %" for less in total.reduction.values())])
-    paper = [f"{PAPER_RMSE_M[name]:.3f}" if name in PAPER_RMSE_M else "" for name in names]
-    rows.append(["ICRA 2023, its own flights", *paper])
+    rows = [
+        *([f"{one.source} {one.body}", *(f"{one.rmse_m[name].mean():.3f}" for name in names)] for one in found),
+        ["mean", *(f"{total.rmse_m[name]:.3f}" for name in names)],
+        ["its spread over seeds", *(f"{total.spread_m[name]:.3f}" for name in names)],
+        ["against raw", "", *(f"{-100 * less:+.0f} %" for less in total.reduction.values())],
+        ["ICRA 2023, its own flights", *(f"{PAPER_RMSE_M[n]:.3f}" if n in PAPER_RMSE_M else "" for n in names)],
+    ]
     (nis_low, nis_high), (nees_low, nees_high) = total.nis_bounds, total.nees_bounds
+    meaning = "Both lie within: the filter knows how good it is."
     if total.nis > nis_high or total.nees > nees_high:
         meaning = (
             "Above their bounds: the filter is surer than it should be, as with reflections, which sigma leaves out."
         )
     elif total.nis < nis_low or total.nees < nees_low:
         meaning = "Below their bounds: the filter is less sure than it could be, as where a gate refuses the tail."
-    else:
-        meaning = "Both lie within: the filter knows how good it is."
     heads = [FILTER_NAMES[name].removeprefix("calibrated, ") for name in names]
-    blocks: list[Block] = [
+    shown = [
+        Picture(
+            track_name(one.source, one.body),
+            partial(track, one=one),
+            f"{one.source}, {one.body}: path from above, height, and position error over time, with three sigmas of "
+            "the filter with variance.",
+        )
+        for one in found[:drawn]
+    ]
+    left = f"The first {drawn} of {len(found)} tracks are drawn; the table has all."
+    return [
         Heading("Localization"),
         Table(["body", *heads], rows, [("", 1), ("RMSE (m)", len(names))]),
         Text(_filters(found), "note"),
@@ -197,16 +206,9 @@ def localization(results: Results) -> list[Block]:
             "note",
         ),
         Picture("rmse", partial(rmse_bars, found=found), "RMSE of the position of each body, and the mean."),
+        *shown,
+        *([Text(left, "note")] if len(found) > drawn else []),
     ]
-    for one in found[:drawn]:
-        caption = (
-            f"{one.source}, {one.body}: path from above, height, and position error over time, with three sigmas of "
-            "the filter with variance."
-        )
-        blocks.append(Picture(track_name(one.source, one.body), partial(track, one=one), caption))
-    if len(found) > drawn:
-        blocks.append(Text(f"The first {drawn} of {len(found)} tracks are drawn; the table has all.", "note"))
-    return blocks
 
 
 def _filters(found: list[Localization]) -> str:
@@ -234,14 +236,10 @@ def over_time(results: Results) -> list[Block]:
     """Return a figure of the calibrated errors over time for each recording."""
     blocks: list[Block] = [Heading("Over time")] if results.recordings else []
     for k, recording in enumerate(results.recordings):
+        caption = f"{recording.source}: calibrated errors, and lines between which 95 % should lie without reflections."
         pairs, most = len(pair_rows(recording)), figures.MOST_PAIRS
-        left_out = (
-            f" Of {pairs} pairs the {most} whose errors spread most; others are left out." if pairs > most else ""
-        )
-        caption = (
-            f"{recording.source}: calibrated errors, and lines between which 95 % should lie without reflections."
-            f"{left_out}"
-        )
+        if pairs > most:
+            caption += f" Of {pairs} pairs the {most} whose errors spread most; others are left out."
         draw = partial(figures.over_time, ranges=recording, applied=results.judged_calibration.apply(recording))
         blocks.append(Picture(f"over-time-{k + 1}", draw, caption))
     return blocks

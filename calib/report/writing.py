@@ -20,7 +20,7 @@ from calib.report.error_sections import track_name
 from calib.report.figures import onboard, rmse_bars, track
 from calib.report.results import Origin, Results, origin_of
 from calib.report.sections import document
-from uwblink.output import check_output
+from uwblink.output import check_folder, check_output
 from uwblink.pages.blocks import Block, Document, Picture, to_html, write_document
 
 EVALUATION: Final = "Calibration report"
@@ -30,24 +30,18 @@ EVALUATION: Final = "Calibration report"
 def check_places(output: Path | None, pdf: Path | None, figures: Path | None, *, force: bool) -> None:
     """Check the output files of a report before anything is computed.
 
-    Raises what `check_output` raises, and `BadInputError` for a `pdf` that is the `output`, and for a folder of
-    `figures` that is a file, that holds figures already, or whose parent does not exist.
+    Raises what `check_output` and, for a folder of `figures`, `check_folder` raise, and `BadInputError` for a `pdf`
+    that is the `output` and for a folder that holds figures already.
     """
     for path in filter(None, (output, pdf)):
         check_output(path, force=force)
     if pdf is not None and output is not None and output.resolve() == pdf.resolve():
         raise BadInputError(f"{output} is the page already; give the PDF another name", parameter="pdf")
-    if figures is None:
-        return
-    wrong = ""
-    if figures.exists() and not figures.is_dir():
-        wrong = "is a file, expected a folder"
-    elif not force and any(path.suffix in (".pdf", ".svg") for path in figures.glob("*.*")):
-        wrong = "holds figures already; give another folder, or `force` to replace them"
-    elif not figures.parent.is_dir():
-        raise BadInputError(f"{figures.parent} does not exist", parameter="figures")
-    if wrong:
-        raise BadInputError(f"{figures} {wrong}", parameter="figures")
+    if figures is not None:
+        check_folder(figures)
+        if not force and any(path.suffix in (".pdf", ".svg") for path in figures.glob("*.*")):
+            text = "holds figures already; give another folder, or `force` to replace them"
+            raise BadInputError(f"{figures} {text}", parameter="figures")
 
 
 def render(data: Data | Iterable[Data], calibration: Calibration) -> str:

@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 from uwblink.arrays import Floats
 from uwblink.ticks import TICK_S
 from uwblink.twr import intervals
-from uwbsim.twins.flight import Flight, bulk_spread
+from uwbsim.twins.flight import Flight
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +68,7 @@ class _Search:
         self.knots = int(np.clip(min(300 // self.tags, span / 0.5), 2, 400))
         self.step_s = span / (self.knots - 1)
         self._read()
-        self.noise, self.walk = _initial_noise(flight), np.full(self.tags, 3e-3)
+        self.noise, self.walk = np.array([0.2, 0.2]), np.full(self.tags, 3e-3)
         self.left = np.zeros(len(self.value))
         for _ in range(40):
             before = np.append(self.noise, self.walk)
@@ -162,11 +162,3 @@ class _Search:
             bias_ppm=self.found[-2:],
             receive_noise_s=np.asarray(ratio * 1e-6 * span_s / np.sqrt(2)),
         )
-
-
-def _initial_noise(flight: Flight) -> Floats:
-    """Return rough noises of ratios and of carriers, from values that do not depend on rates."""
-    x = flight.exchanges
-    both, apart = x.skew1_ppm + x.skew2_ppm, flight.ratio_ppm - (x.skew2_ppm - x.skew1_ppm) / 2
-    spreads = [bulk_spread(v[np.isfinite(v)]) if np.isfinite(v).any() else 0.2 for v in (apart, both)]
-    return np.maximum(spreads, 1e-6)

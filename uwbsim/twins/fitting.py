@@ -29,6 +29,7 @@ from uwbsim.twins.flight import Flight, RecordingSource, effective_size, fit_sch
 from uwbsim.twins.powers import fit_powers
 from uwbsim.twins.range_errors import CalibrationSource, KnownDevices, fit_range_errors, read_calibration
 from uwbsim.twins.scenario import Fitted, receive_noise, scenario_text, tables, unknowns
+from uwbsim.world.radio import lifted
 
 LEVEL: Final = 0.01
 """Significance level of the comparison of a quantity."""
@@ -95,9 +96,10 @@ class Compared:
     def to_dict(self) -> dict[str, Any]:
         """Return the figures, JSON-ready, without the values; NaN is None."""
         own = ("name", "unit", "distance", "probability", "detectable", "lag1_probability", "lag1_detectable")
-        found = {name: getattr(self, name) for name in own} | _both_sides(self.measured, self.simulated)
-        pairs = {name: _both_sides(*sides) for name, sides in self.pairs.items()}
-        return {k: _finite_or_none(v) for k, v in found.items()} | {"verdict": self.verdict, "pairs": pairs}
+        found = {name: _finite_or_none(getattr(self, name)) for name in own} | _both_sides(
+            self.measured, self.simulated
+        )
+        return found | {"verdict": self.verdict, "pairs": {k: _both_sides(*sides) for k, sides in self.pairs.items()}}
 
 
 def _both_sides(measured: Side, simulated: Side) -> dict[str, Any]:
@@ -106,7 +108,7 @@ def _both_sides(measured: Side, simulated: Side) -> dict[str, Any]:
 
 
 def _finite_or_none(value: Any) -> Any:
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    return None if value != value else value
 
 
 Column = Callable[[Flight], Floats]
@@ -291,8 +293,10 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
         rows = flight.some(50_000)
         clocks = fit_clocks(flight[rows])
         noise = receive_noise(clocks.receive_noise_s, flight.exchanges.fpp2_dbm[rows])
-        std = np.sqrt(np.mean([noise.at(power) ** 2 for power in flight.power_dbm], axis=0))
-        errors = fit_range_errors(flight, std)
+        std_s = np.zeros_like(flight.power_dbm)
+        if len(noise.std_s):
+            std_s = np.interp(lifted(flight.power_dbm), lifted(noise.power_dbm), noise.std_s)
+        errors = fit_range_errors(flight, np.sqrt(np.mean(std_s**2, axis=0)))
         powers = fit_powers(flight[rows], errors.reflected[rows])
         schedule = fit_schedule(flight, flown.faults)
     fitted = Fitted(clocks=clocks, noise=noise, errors=errors, powers=powers, schedule=schedule)

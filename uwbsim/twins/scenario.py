@@ -79,12 +79,6 @@ class ReceiveNoise:
     power_dbm: Floats
     std_s: Floats
 
-    def at(self, power_dbm: Floats) -> Floats:
-        """Return the noise at powers, linear in lifted power between those that are known."""
-        if not len(self.std_s):
-            return np.zeros_like(power_dbm)
-        return np.asarray(np.interp(lifted(power_dbm), lifted(self.power_dbm), self.std_s))
-
 
 def receive_noise(noise_s: Floats, power_dbm: Floats) -> ReceiveNoise:
     """Return the noise of receive stamps from values of it (n,), NaN where unknown, by the power at the receiver."""
