@@ -180,7 +180,7 @@ def timing(width_in: float, scenario: Scenario, name: str) -> Figure:
     figure, (axes,) = sheet(width_in, height_in=2.3)
     for level in (0, 1):
         axes.axhline(level, color=MUTED, lw=0.8)
-    _draw_messages(axes, scenario, protocol, times_us, width_in)
+    _draw_messages(axes, scenario, protocol, times_us)
     _draw_spans(axes, protocol, stamped, times_us, width_in)
     axes.set_yticks([0, 1], [f"target {pair[1]}", f"initiator {pair[0]}"], rotation=90 if narrow else 0, va="center")
     marker = "marker" if narrow else "ranging marker"
@@ -192,13 +192,9 @@ def timing(width_in: float, scenario: Scenario, name: str) -> Figure:
     return figure
 
 
-def _draw_messages(
-    axes: Axes, scenario: Scenario, protocol: RangingProtocol, times_us: list[float], width_in: float
-) -> None:
+def _draw_messages(axes: Axes, scenario: Scenario, protocol: RangingProtocol, times_us: list[float]) -> None:
     """Draw each message on the lane of who sends it (initiator 1, target 0), and its stamps on both lanes."""
     before = before_marker_s(scenario.radio.preamble_symbols) * 1e6
-    whole = max(times_us) - min(times_us) + 2 * before
-    placed: dict[float, float] = {}
     for k, (message, size, at_us) in enumerate(zip(protocol.messages, message_bytes(protocol), times_us, strict=True)):
         y = 1.0 if message.sender == "initiator" else 0.0
         axes.add_patch(Rectangle((at_us - before, y - 0.09), before, 0.18, fc=SERIES[k], alpha=0.35))
@@ -206,10 +202,8 @@ def _draw_messages(
         arrow: dict[str, Any] = {"arrowstyle": "->", "color": SERIES[k], "lw": 1.2}
         axes.annotate("", (at_us, 1.0 - y), (at_us, y), arrowprops=arrow)
         for level, text in ((y, f"tx{k + 1} (t{2 * k + 1})"), (1.0 - y, f"rx{k + 1} (t{2 * k + 2})")):
-            # Stamps that are closer than their names are written in the next line.
-            close = level in placed and (at_us - placed[level]) / whole * (width_in - 1.2) < 0.62
-            placed[level] = at_us
-            away = (22 if close else 9) * (1 if level else -1)
+            # In two lines by turns: neighbours may be closer than their names are long.
+            away = (22 if k % 2 else 9) * (1 if level else -1)
             upright: dict[str, Any] = {"ha": "center", "va": "bottom" if level else "top"}
             axes.annotate(text, (at_us, level), (0, away), textcoords="offset points", **upright)
 

@@ -381,21 +381,19 @@ def _round_robin(time: Floats, ends: Ints) -> tuple[float, Ints, Ints] | None:
 
 
 def _scheduled_uus(flight: Flight) -> int | None:
+    """Return the delay of the first scheduled message, within what a scenario takes."""
     spans = intervals(flight.exchanges)
-    shortest, longest = 280, 6500  # what a scenario takes
-    for k, message in enumerate(flight.row.messages[1:], start=1):
+    for message, ticks in zip(flight.row.messages[1:], (spans.dt32, spans.dt53), strict=False):
         if message.timing == "scheduled":
-            ticks = float(np.median(spans.dt32 if k == 1 else spans.dt53))
             # A delay is cut to the grid of transmissions, after which the antenna's comes on top.
-            nearest = round((ticks - ANTENNA_DELAY_TICKS) / UUS_TICKS)
-            return int(np.clip(nearest, shortest, longest))
+            return int(np.clip(round((np.median(ticks) - ANTENNA_DELAY_TICKS) / UUS_TICKS), 280, 6500))
     return None
 
 
 def _replies_us(flight: Flight) -> tuple[float, ...] | None:
+    """Return quantiles of replies at once, within what a scenario takes."""
     if flight.row.messages[1].timing != "at once":
         return None
     delays = intervals(flight.exchanges).dt32 * TICK_S * 1e6
-    levels = np.linspace(0, 1, min(201, len(delays)))
-    found = np.clip(np.quantile(delays, levels), 180.0, 6000.0)  # what a scenario takes
-    return tuple(round(float(value), 4) for value in np.maximum.accumulate(found))
+    found = np.quantile(delays, np.linspace(0, 1, min(201, len(delays))))
+    return tuple(np.clip(found, 180.0, 6000.0).round(4).tolist())
