@@ -19,6 +19,7 @@ from calib.report import Heading, Picture, Table, Text, check_places
 from calib.report.figures import arrangement
 from calib.report.sections import SECTIONS
 from tests import processes
+from uwblink.errors import UwblinkError
 from uwblink.pages.blocks import Document, write_document
 from uwblink.pages.figures import picture, sheet
 from uwblink.pages.pdf import to_pdf
@@ -93,7 +94,7 @@ def test_ranges_alone_are_fitted_and_judged(campaign, tmp_path):
     (tmp_path / "mine.html").write_text("mine")
     with pytest.raises(FileExistsError):
         campaign.write(tmp_path / "r.html", tmp_path / "mine.html")
-    with pytest.raises(calib.BadInputError, match="`figures`"):
+    with pytest.raises(UwblinkError, match="is a file"):
         campaign.write(tmp_path / "r.html", figures=tmp_path / "mine.html")
     assert [path.name for path in tmp_path.iterdir()] == ["mine.html"]
 
