@@ -95,7 +95,7 @@ class _Plan:
         """What to do, a line each."""
         return tuple(f"{k}. {step}" for k, step in enumerate(self._steps(), start=1))
 
-    def _steps(self) -> Iterator[str]:
+    def _steps(self) -> list[str]:
         raise NotImplementedError
 
     def _promise(self) -> tuple[str, list[str]]:
@@ -158,16 +158,20 @@ class Plan(_Plan):
     pair_error_m: float
     known_beside: bool
 
-    def _steps(self) -> Iterator[str]:
+    def _steps(self) -> list[str]:
         held = {"line": "Stretch a string and keep it straight", "plane": "Take a flat table or floor"}
-        yield f"{held.get(self.on, 'Use the room')}. Places are guides: only what is taped is measured, orders matter."
-        for one in self.arrangements:
-            tapes = "".join(f" Tape the distance of {i} and {j}, antenna to antenna." for i, j in one.taped)
-            where = f"Arrangement {one.name}: boards {one.where(self.on)}."
-            yield f"{where}{tapes} Record all pairs as arrangement {one.name} for {self.seconds_each:.0f} s."
+        first = (
+            f"{held.get(self.on, 'Use the room')}. Places are guides: only what is taped is measured, orders matter."
+        )
         shape = f", known to be on a {self.on}" if self.on else ""
         beside = " A file says what is known beside: the taped distances, the anchors' places."
-        yield f"Survey all recordings together{shape}.{beside if self.known_beside else ''}"
+        made = [
+            f"Arrangement {one.name}: boards {one.where(self.on)}."
+            + "".join(f" Tape the distance of {i} and {j}, antenna to antenna." for i, j in one.taped)
+            + f" Record all pairs as arrangement {one.name} for {self.seconds_each:.0f} s."
+            for one in self.arrangements
+        ]
+        return [first, *made, f"Survey all recordings together{shape}.{beside if self.known_beside else ''}"]
 
     def _promise(self) -> tuple[str, list[str]]:
         share = f", and {100 * self.reflected:g} % of the pairs are reflected" if self.reflected else ""
@@ -231,37 +235,35 @@ class FlightPlan(_Plan):
     stands: Mapping[str, Floats]
     bodies: tuple[str, ...]
 
-    def _steps(self) -> Iterator[str]:
-        flown = self.settings
-        if flown.robots is None:
-            yield f"Fly as {self.source} does: {self.ranges} ranges in {self.seconds:.0f} s."
-        else:
-            robots = ", ".join(
-                f"{' and '.join(map(str, tags))} on robot {k}" for k, tags in enumerate(flown.robots, start=1)
-            )
-            yield f"Note where on its body each tag sits, to a centimetre: tags {robots}."
-            if flown.anchors:
-                yield f"Fix anchors {', '.join(map(str, flown.anchors))} around the room, high and low in turn."
-            room = " x ".join(f"{v:g}" for v in flown.size_m)
-            yield (
-                f"Fly for {self.seconds:.0f} s about a room of {room} m at about {flown.speed_m_s:g} m/s, turning to "
-                f"and fro; every pair of different robots ranges in turn, {flown.rate_hz:g} exchanges a second in all."
-            )
-        if flown.poses_until_s:
-            yield f"Let all positions be known for the first {flown.poses_until_s:g} s, to about 2 cm."
-        if self.stands:
-            given = flown.anchor_places == "given"
-            yield f"Places of the {len(self.stands)} anchors {'are measured' if given else 'are found along'}."
+    def _steps(self) -> list[str]:
+        flown, robots = self.settings, self.settings.robots or ()
+        bodies = ", ".join(f"{' and '.join(map(str, tags))} on robot {k}" for k, tags in enumerate(robots, start=1))
+        room = " x ".join(f"{v:g}" for v in flown.size_m)
+        known = "are measured" if flown.anchor_places == "given" else "are found along"
         standing = f", while robots stand for the first {flown.still_s:g} s" if flown.still_s else ""
-        for first, second in self.taped:
-            yield f"Tape the distance of tags {first} and {second}, antenna to antenna{standing}."
-        sources = {
-            "imu": "Attitudes come from gyroscopes and accelerometers.",
-            "poses": f"Attitudes come all along, with headings good to {flown.heading_std_deg:g} degrees.",
-        }
-        if flown.attitudes in sources:
-            yield sources[flown.attitudes]
-        yield "Fit delays, curve and trajectories together."
+        steps = [
+            (not robots, f"Fly as {self.source} does: {self.ranges} ranges in {self.seconds:.0f} s."),
+            (robots, f"Note where on its body each tag sits, to a centimetre: tags {bodies}."),
+            (flown.anchors, f"Fix anchors {', '.join(map(str, flown.anchors))} around the room, high and low in turn."),
+            (
+                robots,
+                f"Fly for {self.seconds:.0f} s about a room of {room} m at about {flown.speed_m_s:g} m/s, turning to "
+                f"and fro; every pair of different robots ranges in turn, {flown.rate_hz:g} exchanges a second in all.",
+            ),
+            (
+                flown.poses_until_s,
+                f"Let all positions be known for the first {flown.poses_until_s or 0:g} s, to about 2 cm.",
+            ),
+            (self.stands, f"Places of the {len(self.stands)} anchors {known}."),
+            *((True, f"Tape the distance of tags {a} and {b}, antenna to antenna{standing}.") for a, b in self.taped),
+            (flown.attitudes == "imu", "Attitudes come from gyroscopes and accelerometers."),
+            (
+                flown.attitudes == "poses",
+                f"Attitudes come all along, with headings good to {flown.heading_std_deg:g} degrees.",
+            ),
+            (True, "Fit delays, curve and trajectories together."),
+        ]
+        return [text for needed, text in steps if needed]
 
     def _open(self, tag: int) -> str:
         return f"undetermined (± {self.open_ns[tag]:.2f} ns)"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -37,19 +37,22 @@ def read_whole(text: str) -> list[int]:
     return [int(value) for value in found]
 
 
-def _check_bounds(settings: object, bounds: Mapping[str, tuple[float, float]]) -> None:
-    """Raise `BadInputError` for a setting that is not within its bounds."""
+def _check(settings: Any, bounds: Mapping[str, tuple[float, float]], refused: Iterable[tuple[str, Any, str]]) -> None:
+    """Raise `BadInputError` for a setting that is not within its bounds, and for the first that is refused.
+
+    `refused` has the name of a setting, whether (or what of it) is wrong, and a text, which may name that.
+    """
     for name, (least, most) in bounds.items():
         value = getattr(settings, name)
         if not (math.isfinite(value) and least <= value <= most):
             raise BadInputError(f"found {value}, expected {least:g} to {most:g}", parameter=name)
+    for name, wrong, text in refused:
+        if wrong:
+            raise BadInputError(text.format(getattr(settings, name, ""), wrong), parameter=name)
 
 
-def _lengths(size_m: Sequence[float], dimensions: int) -> None:
-    if len(size_m) != dimensions or not all(math.isfinite(v) and 0 < v <= 1000 for v in size_m):
-        raise BadInputError(
-            f"found {list(size_m)}, expected as many lengths in metres as dimensions, {dimensions}", parameter="size_m"
-        )
+def _are_lengths(size_m: Sequence[float], dimensions: int) -> bool:
+    return len(size_m) == dimensions and all(math.isfinite(v) and 0 < v <= 1000 for v in size_m)
 
 
 _SIZE: Any = {"flag": "--size", "kind": str | None, "parse": read_numbers, "metavar": "M,M,M"}
@@ -96,32 +99,28 @@ class SurveyPlanSettings:
     def __post_init__(self) -> None:
         """Check all values."""
         check_choice("on", self.on, DIMENSIONS)
-        sigma = (1e-9, 100.0)
-        _check_bounds(
-            self,
-            {
-                "taped": (0, 1000),
-                "tape_sigma_m": sigma,
-                "anchor_sigma_m": sigma,
-                "pair_error_m": sigma,
-                # Of more pairs nobody could tell which are reflected.
-                "reflected": (0.0, 0.3),
-                "rate_hz": (1e-3, 1e5),
-            },
-        )
-        if self.arrangements is not None and not 1 <= self.arrangements <= 26:
-            raise BadInputError(f"found {self.arrangements}, expected 1 to 26", parameter="arrangements")
-        if self.tags and not (2 <= len(self.tags) <= 30 and len(set(self.tags)) == len(self.tags)):
-            raise BadInputError(f"found {self.tags!r:.60}, expected 2 to 30 boards, each once", parameter="boards")
-        strangers = sorted(set(self.anchors) - set(self.tags)) if self.tags else []
-        if strangers:
-            raise BadInputError(f"{strangers[0]} is none of the boards", parameter="anchors")
-        if self.anchors and self.on == "line":
-            raise BadInputError(
-                "stand in a plane or in space; on a line say how many distances are taped", parameter="anchors"
-            )
-        if self.size_m is not None:
-            _lengths(self.size_m, self.dimensions)
+        sigma, count, tags = (1e-9, 100.0), self.arrangements, self.tags
+        bounds = {
+            "taped": (0, 1000),
+            "tape_sigma_m": sigma,
+            "anchor_sigma_m": sigma,
+            "pair_error_m": sigma,
+            # Of more pairs nobody could tell which are reflected.
+            "reflected": (0.0, 0.3),
+            "rate_hz": (1e-3, 1e5),
+        }
+        on_line = "stand in a plane or in space; on a line say how many distances are taped"
+        wrong_size = self.size_m is not None and not _are_lengths(self.size_m, self.dimensions)
+        several = 2 <= len(tags) <= 30 and len(set(tags)) == len(tags)
+        strangers = [tag for tag in sorted(self.anchors) if tags and tag not in tags]
+        refused = [
+            ("arrangements", count is not None and not 1 <= count <= 26, "found {}, expected 1 to 26"),
+            ("boards", tags and not several, f"found {tags!r:.60}, expected 2 to 30 boards, each once"),
+            ("anchors", strangers, "{1[0]} is none of the boards"),
+            ("anchors", self.anchors and self.on == "line", on_line),
+            ("size_m", wrong_size, f"found {{}}, expected as many lengths in metres as dimensions, {self.dimensions}"),
+        ]
+        _check(self, bounds, refused)
 
     @property
     def dimensions(self) -> int:
@@ -186,52 +185,52 @@ class FlightPlanSettings:
         check_choice("anchor_places", self.anchor_places, ("given", "sought"))
         if self.imu is not None:
             check_choice("imu", self.imu, IMU_GRADES)
-        _check_bounds(
-            self,
-            {
-                "seconds": (5.0, 3600.0),
-                "rate_hz": (0.5, 2000.0),
-                "speed_m_s": (0.05, 10.0),
-                "apart_m": (0.0, 3.0),
-                "noise_m": (1e-4, 10.0),
-                "reflected": (0.0, 0.9),
-                "still_s": (0.0, 600.0),
-                "taped": (0, 10),
-                "tape_sigma_m": (1e-4, 1.0),
-            },
+        bounds = {
+            "seconds": (5.0, 3600.0),
+            "rate_hz": (0.5, 2000.0),
+            "speed_m_s": (0.05, 10.0),
+            "apart_m": (0.0, 3.0),
+            "noise_m": (1e-4, 10.0),
+            "reflected": (0.0, 0.9),
+            "still_s": (0.0, 600.0),
+            "taped": (0, 10),
+            "tape_sigma_m": (1e-4, 1.0),
+        }
+        _check(
+            self, bounds, [("size_m", not _are_lengths(self.size_m, 3), "found {}, expected three lengths in metres")]
         )
-        _lengths(self.size_m, 3)
         if self.robots is None:
             return
-        if self.seconds * self.rate_hz > MAX_RANGES:
-            text = f"{self.seconds * self.rate_hz:.0f} ranges are more than a plan takes, {MAX_RANGES}"
-            raise BadInputError(text, parameter="seconds")
-        if self.still_s > self.seconds / 2:
-            text = f"found {self.still_s:g}, expected at most half of the {self.seconds:g} s"
-            raise BadInputError(text, parameter="still_s")
-        object.__setattr__(self, "robots", _tags_by_robot(self.robots, self.anchors))
+        robots = self.robots
+        if isinstance(robots, int):
+            robots = [(2 * k + 1, 2 * k + 2) for k in range(robots)]
+        robots = tuple(tuple(map(int, tags)) for tags in robots)
+        tags, anchors, ranges = [tag for robot in robots for tag in robot], self.anchors, self.seconds * self.rate_hz
+        once = len(set(tags)) == len(tags) and len(tags) + len(anchors) <= MAX_TAGS
+        among = (
+            f"found {self.robots!r:.60}, expected robots with a tag or more each, every tag once, at most {MAX_TAGS}"
+        )
+        others = len(set(anchors)) == len(anchors) and not set(anchors) & set(tags)
+        refused = [
+            ("seconds", ranges > MAX_RANGES, f"{ranges:.0f} ranges are more than a plan takes, {MAX_RANGES}"),
+            (
+                "still_s",
+                self.still_s > self.seconds / 2,
+                f"found {{}}, expected at most half of the {self.seconds:g} s",
+            ),
+            ("robots", not (robots and all(robots) and once), among),
+            ("anchors", not others, "found {}, expected other tags than those of robots"),
+            ("robots", len(robots) == 1 and not anchors, "a single robot without anchors ranges with nobody"),
+            (
+                "robots",
+                not all(0 < tag < 65536 for tag in (*tags, *anchors)),
+                "found a tag that is none, expected ids of 1 or more",
+            ),
+        ]
+        _check(self, {}, refused)
+        object.__setattr__(self, "robots", robots)
 
     @property
     def inertial(self) -> bool:
         """Whether robots have an IMU."""
         return self.imu is not None or self.attitudes == "imu"
-
-
-def _tags_by_robot(robots: int | Sequence[Sequence[int]], anchors: Sequence[int]) -> tuple[tuple[int, ...], ...]:
-    """Return the tags of each robot, two each where only their number is given; raises `BadInputError`."""
-    found = (
-        tuple((2 * k + 1, 2 * k + 2) for k in range(robots))
-        if isinstance(robots, int)
-        else tuple(tuple(map(int, tags)) for tags in robots)
-    )
-    tags = [tag for robot in found for tag in robot]
-    if not found or not all(found) or len(set(tags)) < len(tags) or len(tags) + len(anchors) > MAX_TAGS:
-        text = f"found {robots!r:.60}, expected robots with a tag or more each, every tag once, at most {MAX_TAGS}"
-        raise BadInputError(text, parameter="robots")
-    if len(set(anchors)) < len(anchors) or set(anchors) & set(tags):
-        raise BadInputError(f"found {list(anchors)}, expected other tags than those of robots", parameter="anchors")
-    if len(found) == 1 and not anchors:
-        raise BadInputError("a single robot without anchors ranges with nobody", parameter="robots")
-    if any(not 0 < tag < 65536 for tag in (*tags, *anchors)):
-        raise BadInputError("found a tag that is none, expected ids of 1 or more", parameter="robots")
-    return found

@@ -171,22 +171,17 @@ def check_knowledge(knowledge: Knowledge, tags: Mapping[str, set[int]]) -> None:
     known: list[KnownDistance | KnownPosition] = [*knowledge.distances, *knowledge.positions]
     named = {*knowledge.shapes, *knowledge.orders, *(one.arrangement for one in known)}
     strangers = sorted(named - {"", *tags})
-    if strangers:
-        raise BadInputError(
-            f"names an arrangement {strangers[0]!r:.40}; there are {', '.join(sorted(tags))}", parameter="known"
-        )
     bad = sorted({shape for shape in (knowledge.shape, *knowledge.shapes.values()) if shape not in SHAPES})
-    if bad:
-        raise BadInputError(f"found {bad[0]!r:.40}, allowed: line, plane", parameter="known")
+    wrong = [f"names an arrangement {name!r:.40}; there are {', '.join(sorted(tags))}" for name in strangers]
+    wrong += [f"found {shape!r:.40}, allowed: line, plane" for shape in bad]
     for one in known:
         if isinstance(one, KnownDistance):
-            who, what, good = {one.first, one.second}, "distance", 0 < one.distance_m <= MAX_LENGTH_M
+            who, good = {one.first, one.second}, 0 < one.distance_m <= MAX_LENGTH_M
         else:
-            who, what, good = {one.tag}, "position", all(abs(x) <= MAX_LENGTH_M for x in one.position_m)
-        where = [tags[one.arrangement]] if one.arrangement else tags.values()
-        if not any(who <= there for there in where):
-            place = f"arrangement {one.arrangement}" if one.arrangement else "any arrangement"
-            raise BadInputError(f"{one}: its tags do not range in {place}", parameter="known")
+            who, good = {one.tag}, all(abs(x) <= MAX_LENGTH_M for x in one.position_m)
+        if not any(who <= there for name, there in tags.items() if one.arrangement in ("", name)):
+            wrong.append(f"{one}: its tags do not range in {one.arrangement or 'any arrangement'}")
         if not (good and MIN_SIGMA_M <= one.sigma_m <= MAX_LENGTH_M):
-            text = f"{one}: expected a {what} of more than 0 and up to {MAX_LENGTH_M:g} m ± {MIN_SIGMA_M:g} m or more"
-            raise BadInputError(text, parameter="known")
+            wrong.append(f"{one}: expected more than 0 and up to {MAX_LENGTH_M:g} m ± {MIN_SIGMA_M:g} m or more")
+    if wrong:
+        raise BadInputError(wrong[0], parameter="known")

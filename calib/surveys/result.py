@@ -20,6 +20,17 @@ from uwblink.output import write_bytes, write_text
 AMBIGUOUS = 9.0
 """By how much -2 log likelihood of a second solution may be worse for it to be as good: three standard deviations."""
 
+YAML = (
+    "# covariance: xx xy xz yy yz zz.\n/**:\n  ros__parameters:\n    anchors:\n      ids: [{}]\n",
+    "      anchor_{}:\n        position: [{}]\n        covariance: [{}]\n",
+)
+TOML = (
+    "# covariance_m2: xx xy xz yy yz zz, m^2.\n",
+    "\n[[anchors]]\nid = {}\nposition_m = [{}]\ncovariance_m2 = [{}]\n",
+)
+ANCHORS = {".toml": TOML, ".yaml": YAML, ".yml": YAML}
+"""Head and rows of files of anchors: of all ids, and of id, position and upper triangle of the covariance."""
+
 
 @dataclass(frozen=True, slots=True)
 class SurveyedBoard:
@@ -170,31 +181,18 @@ class SurveyResult:
 
         `arrangement` names which, where there are several. Raises `BadInputError`.
         """
-        place = Path(path)
-        one = self.arrangement(arrangement)
-        if place.suffix.lower() not in (".toml", ".yaml", ".yml"):
+        place, one = Path(path), self.arrangement(arrangement)
+        if place.suffix.lower() not in ANCHORS:
             raise BadInputError(f"found {place.suffix or 'no suffix'}, expected .toml or .yaml", parameter="anchors")
+        head, row = ANCHORS[place.suffix.lower()]
         boards = [board for board in one.boards if board.determined]
-        toml = place.suffix.lower() == ".toml"
-        key = "covariance_m2" if toml else "covariance"
-        lines = [
-            f"# Arrangement {one.name}, surveyed from ranges. Frame: {one.frame}. Metres.",
-            f"# {key}: xx xy xz yy yz zz{', m^2' if toml else ''}.",
-        ]
-        if not toml:
-            lines += ["/**:", "  ros__parameters:", "    anchors:"]
-            lines += [f"      ids: [{', '.join(str(board.tag) for board in boards)}]"]
+        ids = ", ".join(str(board.tag) for board in boards)
+        text = f"# Arrangement {one.name}, surveyed from ranges. Frame: {one.frame}. Metres.\n" + head.format(ids)
         for board in boards:
-            position = ", ".join(str(round(value, 5)) for value in board.position_m)
             upper = board.covariance_m2[np.triu_indices(3)].tolist()
             covariance = ", ".join(str(float(f"{value:.6g}")) for value in upper)
-            if toml:
-                lines += ["", "[[anchors]]", f"id = {board.tag}"]
-                lines += [f"position_m = [{position}]", f"covariance_m2 = [{covariance}]"]
-            else:
-                lines += [f"      anchor_{board.tag}:"]
-                lines += [f"        position: [{position}]", f"        covariance: [{covariance}]"]
-        write_text(place, "\n".join(lines) + "\n", force=force)
+            text += row.format(board.tag, ", ".join(str(round(value, 5)) for value in board.position_m), covariance)
+        write_text(place, text, force=force)
 
     def save_picture(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Draw where boards stood, with the ellipses that hold them with 95 %, as .svg, .png or .pdf.
