@@ -114,36 +114,38 @@ def _notes(
     found: Solution, second: SecondBest | None, verdict: Verdict, reflected: Sequence[ReflectedPair]
 ) -> list[str]:
     """Return what a user should know, a line each."""
-    notes = [
-        f"{one.arrangement}: the range of {one.first} and {one.second} is {100 * one.longer_m:+.0f} cm off what all "
-        f"others say: believed to be reflected ({100 * one.chance:.0f} %), and hardly counted"
-        for one in reflected
-        if one.chance >= MIN_BELIEVED
-    ]
-    perhaps = [
+    believed = [one for one in reflected if one.chance >= MIN_BELIEVED]
+    perhaps = ", ".join(
         f"{one.first}-{one.second} in {one.arrangement} ({100 * one.chance:.0f} %)"
         for one in reflected
         if one.chance < MIN_BELIEVED
-    ]
-    if perhaps:
-        notes.append(f"may be reflected, too: {', '.join(perhaps)}; intervals are wider by that")
-    if not found.settled:
-        notes.append("the search stopped before it settled: delays and places are not final")
-    if not verdict.determined.all():
-        notes.append(f"not determined, and left out: {'; '.join(d.words for d in verdict.free)}")
-    if found.network.curve is not None:
-        notes.append(
+    )
+    where, who, worse = ("", (), 0.0) if second is None else (second.arrangement, second.tags, second.worse)
+    notes = [
+        *(
+            (
+                True,
+                f"{one.arrangement}: the range of {one.first} and {one.second} is {100 * one.longer_m:+.0f} cm off "
+                f"what all others say: believed to be reflected ({100 * one.chance:.0f} %), and hardly counted",
+            )
+            for one in believed
+        ),
+        (perhaps, f"may be reflected, too: {perhaps}; intervals are wider by that"),
+        (not found.settled, "the search stopped before it settled: delays and places are not final"),
+        (verdict.free, f"not determined, and left out: {'; '.join(d.words for d in verdict.free)}"),
+        (
+            found.network.curve is not None,
             "a constant of the curve and one of all delays are the same to ranges: what the delays share is known only "
             "as well as the curve at its reference power; differences of delays are known better, and a "
-            "taped distance (`known`) tells what they share"
-        )
-    if second is not None and second.ambiguous:
-        who = ", ".join(map(str, second.tags))
-        notes.append(
-            f"{second.arrangement}: another solution agrees as well with the ranges (worse by {second.worse:.1f}), in "
-            f"which boards {who} are elsewhere"
-        )
-    return notes
+            "taped distance (`known`) tells what they share",
+        ),
+        (
+            second is not None and second.ambiguous,
+            f"{where}: another solution agrees as well with the ranges (worse by {worse:.1f}), in which boards "
+            f"{', '.join(map(str, who))} are elsewhere",
+        ),
+    ]
+    return [text for needed, text in notes if needed]
 
 
 def _calibration(

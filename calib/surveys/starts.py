@@ -35,15 +35,13 @@ def exchanged_boards(said: Sequence[int], coordinates: Floats) -> set[tuple[int,
     More than one pair where the ranges cannot tell: 1-2-3-4 with the inner two exchanged is the same with the outer two
     exchanged, from the other end.
     """
-    fitting = {}
+    fitting = set()
     for i, j in combinations(range(len(said)), 2):
         changed = coordinates.copy()
         changed[[i, j]] = coordinates[[j, i]]
         if is_in_order(changed):
-            apart = (changed[:, None] - changed)[np.triu_indices(len(changed), 1)]
-            off = float(min(np.maximum(apart, 0).sum(), np.maximum(-apart, 0).sum()))
-            fitting[min(said[i], said[j]), max(said[i], said[j])] = off
-    return {pair for pair, off in fitting.items() if off <= min(fitting.values()) + TOGETHER_M}
+            fitting.add((min(said[i], said[j]), max(said[i], said[j])))
+    return fitting
 
 
 def first_start(network: Network, delays: Floats | None = None) -> Floats:

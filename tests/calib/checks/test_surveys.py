@@ -35,11 +35,11 @@ def save(world, path, known="line", distances=(), power_dbm=None):
 
 
 def world_of(seed=9, **settings):
-    return standing_boards(seed, **{"places": FOUR, "pair_error_m": 0.01, "bias_size_m": 0.02} | settings)
+    return standing_boards(seed, **{"places": FOUR[:5], "pair_error_m": 0.01, "bias_size_m": 0.02} | settings)
 
 
 def crooked():
-    places = [p.copy() for p in FOUR]
+    places = [p.copy() for p in FOUR[:5]]
     places[2][3, 1] = 1.2
     return world_of(places=places)
 
