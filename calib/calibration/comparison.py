@@ -9,9 +9,8 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calib.calibration.document import for_json
-from calib.calibration.model import Calibration, require_calibration
+from calib.calibration.model import Calibration, interval, require_calibration
 from calib.errors import UnanswerableError
-from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -54,7 +53,7 @@ class Comparison:
     def table(self, first: str = "the first", second: str = "the second") -> str:
         """Return a line a tag in ns, the common shift in cm, and the verdict; `first` and `second` name the two."""
         lines = [
-            f"  tag {tag:3d}  {difference:+.4f} ns  {_interval(self.std_ns[tag])}"
+            f"  tag {tag:3d}  {difference:+.4f} ns  {interval(self.std_ns[tag])}"
             for tag, difference in self.difference_ns.items()
         ]
         lines.append(
@@ -78,10 +77,6 @@ class Comparison:
         """Return what `calib compare --json` prints."""
         table: dict[str, Any] = for_json(asdict(self) | {"verdict": self.verdict})
         return table
-
-
-def _interval(std_ns: float) -> str:
-    return f"± {TWO_SIDED_95 * std_ns:.4f} (95 %)" if np.isfinite(std_ns) else "standard error not stated"
 
 
 def compare(first: Calibration, second: Calibration) -> Comparison:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Any, Final, TypeVar
 
 from pydantic import (
@@ -156,7 +156,7 @@ def is_pair(text: object) -> bool:
     return len(ends) == 2 and all(map(is_tag, ends))
 
 
-def pair_name(pair: tuple[int, int]) -> str:
+def pair_name(pair: Sequence[int]) -> str:
     """Return a pair as files and tables name it: 1-2."""
     return "-".join(map(str, pair))
 

@@ -21,8 +21,8 @@ from scipy.special import log_ndtr, ndtr
 
 from calib.calibration.document import Metres, Number, OpenShare, PairName, Positive, Share, StdM, joint
 from calib.calibration.lasting import LastingErrors
-from calib.calibration.parts import pairs_of
 from calib.errors import BadInputError
+from calib.pairs import Pairs, pairs_of
 from calib.range_errors.densities import ROOT_2PI, LongDetours, densities
 from uwblink.arrays import Floats, Ints
 
@@ -95,8 +95,8 @@ class ErrorModel:
 
     def shapes(self, lifted: Floats, initiator: Ints, target: Ints) -> ErrorShapes:
         """Return the shape of the errors of ranges (n,) at lifted powers between two tags, in either direction."""
-        pairs, number = pairs_of(initiator, target)
-        return self._shapes(lifted, self._factors_of(pairs)[number])
+        pairs = pairs_of(initiator, target)
+        return self._shapes(lifted, self._factors_of(pairs)[pairs.number])
 
     def _shapes(self, lifted: Floats, factors: Floats) -> ErrorShapes:
         """Return shapes at lifted powers (...), from logarithms of factors (..., 3)."""
@@ -122,9 +122,10 @@ class ErrorModel:
             for name, one in self.pairs.items()
         }
 
-    def _factors_of(self, pairs: Sequence[tuple[int, ...]]) -> Floats:
+    def _factors_of(self, pairs: Pairs) -> Floats:
         """Return logarithms of the factors of pairs (pairs, 3); an unknown pair has none."""
-        return np.array([self.factors.get(pair, (0.0, 0.0, 0.0)) for pair in pairs]).reshape(-1, 3)
+        rows = [self.factors.get(tuple(ends), (0.0, 0.0, 0.0)) for ends in pairs.ends.tolist()]
+        return np.array(rows).reshape(-1, 3)
 
     def mean_m(self, shapes: ErrorShapes) -> Floats:
         """Return the mean of the errors (n,)."""
@@ -161,11 +162,11 @@ class ErrorModel:
         given = np.asarray(probabilities, dtype=np.float64)
         if given.ndim != 1 or not len(given) or not np.all((given > 0) & (given < 1)):
             raise BadInputError(f"found {probabilities!r:.60}, expected shares between 0 and 1", parameter="shares")
-        pairs, number = pairs_of(initiator, target)
+        pairs = pairs_of(initiator, target)
         tables = self._table(self._own_levels(given), self._factors_of(pairs))
         found = np.full((len(lifted), len(given)), np.nan)
         for pair, table in enumerate(tables):
-            rows = np.flatnonzero((number == pair) & np.isfinite(lifted))
+            rows = np.flatnonzero((pairs.number == pair) & np.isfinite(lifted))
             for k, column in enumerate(table.T):
                 found[rows, k] = np.interp(lifted[rows], self.lifted, column)
         return found

@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.document import Metres, Positive
-from calib.calibration.parts import pairs_of
 from calib.data.ranges import Ranges
+from calib.pairs import pairs_of
 from uwblink.arrays import Floats
 
 GATE: Final = 10.83
@@ -41,8 +41,8 @@ def lasting_errors(ranges: Ranges, z: Floats) -> LastingErrors | None:
     The autocovariance is averaged in bins of the logarithm of the lag; bins with few products are left out.
     """
     inside = np.flatnonzero(z**2 < GATE)
-    pairs, number = pairs_of(ranges.initiator[inside], ranges.target[inside])
-    pair = ranges.session[inside] * len(pairs) + number
+    pairs = pairs_of(ranges.initiator[inside], ranges.target[inside])
+    pair = ranges.session[inside] * np.int64(len(pairs.ends)) + pairs.number
     order = np.lexsort((ranges.time_ns[inside], pair))
     pair, time_s = pair[order], ranges.time_ns[inside][order] * 1e-9
     mean, total = float(np.mean(z[inside])), float(np.var(z[inside]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from html import escape
@@ -45,6 +45,7 @@ from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats
+from uwblink.display import as_html, as_text
 from uwblink.output import write_text
 from uwblink.recording.antenna_delays import REGISTER_MAX, AntennaDelay
 from uwblink.text_files import read_text
@@ -117,31 +118,13 @@ class Calibration:
         return lifted if self.needs_power else np.where(np.isfinite(lifted), lifted, self.bias_curve.range[0])
 
     def __repr__(self) -> str:
-        """Return a table of delays, and of the curves at a few powers."""
-        lines = [_headline(self)]
-        apart = self.pair_offsets and not any(self.delays_ns.values())
-        for name, value, interval in () if apart else (DELAY_HEAD, *delay_rows(self)):
-            lines.append(f"  {name:>5}  {value:>11}  {interval}")
-        if self.pair_offsets:
-            for name, value, interval in (PAIR_HEAD, *pair_rows(self)):
-                lines.append(f"  {name:>9}  {value:>13}  {interval}")
-        power, *curves = curve_rows(self)
-        for name, *cells in (power, *curves):
-            lines.append(f"  {name:18s}" + "".join(f"{cell:>9s}" for cell in cells))
-        return "\n".join(lines)
+        """Return tables of delays, and of the curves at a few powers."""
+        return "\n".join([_headline(self), *(as_text(title, rows) for title, rows in _tables(self).items())])
 
     def _repr_html_(self) -> str:
         """Return the same as HTML, for notebooks."""
-        delays = [DELAY_HEAD, *delay_rows(self)]
-        pairs = [PAIR_HEAD, *pair_rows(self)] if self.pair_offsets else []
-        tables: list[Sequence[tuple[str, ...]]] = [delays, pairs, curve_rows(self)]
-        return f"<p>{escape(_headline(self))}</p>" + "".join(
-            "<table>"
-            + "".join(f"<tr>{''.join(f'<td>{escape(str(cell))}</td>' for cell in row)}</tr>" for row in rows)
-            + "</table>"
-            for rows in tables
-            if rows
-        )
+        tables = [as_html(title, rows) for title, rows in _tables(self).items()]
+        return f"<p>{escape(_headline(self))}</p>{''.join(tables)}"
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write the calibration as JSON, whole or not at all; replaces a file only with `force`."""
@@ -307,35 +290,41 @@ def given_calibration(source: Calibration | str | os.PathLike[str] | None, param
     return known
 
 
-DELAY_HEAD: Final = ("tag", "delay (ns)", "95 % interval")
-PAIR_HEAD: Final = ("pair", "constant (cm)", "95 % interval")
 MAX_ROWS: Final = 40
 """Maximum number of tags or pairs that are printed, about a screen."""
 
 
-def pair_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
-    """Yield each pair, the constant of its ranges in cm, and its interval in words."""
-    rows = sorted(calibration.pair_offsets.items())
-    for pair, one in rows[:MAX_ROWS]:
-        yield pair_name(pair), f"{100 * one.offset_m:+.2f}", f"± {100 * TWO_SIDED_95 * one.std_m:.2f}"
-    if len(rows) > MAX_ROWS:
-        yield "...", "", f"{len(rows) - MAX_ROWS} more"
+def _tables(calibration: Calibration) -> dict[str, list[tuple[str, ...]]]:
+    """Return the tables of a calibration by title: delays, constants of pairs, and curves."""
+    heads = {"Antenna delays": ("tag", "delay (ns)", "interval"), "Constants": ("pair", "constant (cm)", "interval")}
+    bodies = delay_rows(calibration), pair_rows(calibration)
+    tables: dict[str, list[tuple[str, ...]]] = {}
+    for (title, head), rows in zip(heads.items(), bodies, strict=True):
+        more = [("...", "", f"{len(rows) - MAX_ROWS} more")] if len(rows) > MAX_ROWS else []
+        tables |= {title: [head, *rows[:MAX_ROWS], *more]} if rows else {}
+    return tables | {"Curves": curve_rows(calibration)}
 
 
-def delay_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
-    """Yield tag, delay in ns, and its interval in words."""
-    rows = sorted(calibration.delays_ns.items())
-    for tag, delay in rows[:MAX_ROWS]:
-        half = TWO_SIDED_95 * calibration.delays_std_ns.get(tag, math.nan)
-        if math.isinf(half):
-            interval = "undetermined"
-        elif half == 0:
-            interval = "pinned"
-        else:
-            interval = f"± {half:.4f}" if math.isfinite(half) else "unknown"
-        yield str(tag), f"{delay:+.4f}", interval
-    if len(rows) > MAX_ROWS:
-        yield "...", "", f"{len(rows) - MAX_ROWS} more"
+def interval(std: float, digits: int = 4) -> str:
+    """Return in words the 95 % interval of a value with such a standard error."""
+    words = {0.0: "pinned", math.inf: "undetermined"}
+    known = f"± {TWO_SIDED_95 * std:.{digits}f} (95 %)" if math.isfinite(std) else "standard error not stated"
+    return words.get(std, known)
+
+
+def pair_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
+    """Return each pair, the constant of its ranges in cm, and its interval in words."""
+    offsets = sorted(calibration.pair_offsets.items())
+    return [(pair_name(pair), f"{100 * one.offset_m:+.2f}", interval(100 * one.std_m, 2)) for pair, one in offsets]
+
+
+def delay_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
+    """Return tag, delay in ns, and its interval in words; nothing where pairs have constants instead of delays."""
+    if calibration.pair_offsets and not any(calibration.delays_ns.values()):
+        return []
+    std_ns = calibration.delays_std_ns
+    delays = sorted(calibration.delays_ns.items())
+    return [(str(tag), f"{delay:+.4f}", interval(std_ns.get(tag, math.nan))) for tag, delay in delays]
 
 
 def curve_rows(calibration: Calibration) -> list[tuple[str, ...]]:

@@ -12,7 +12,8 @@ from calib.calibration.document import Metres, Number, StdM, number, pair_name
 from calib.calibration.power_curves import BiasCurve, SigmaCurve
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError
-from uwblink.arrays import Bools, Floats, Ints
+from calib.pairs import pairs_of
+from uwblink.arrays import Bools, Floats
 from uwblink.display import as_text, excerpt
 from uwblink.twr import LARGEST_ID
 
@@ -59,13 +60,6 @@ class PairOffset:
     std_m: StdM
 
 
-def pairs_of(initiator: Ints, target: Ints) -> tuple[list[tuple[int, int]], Ints]:
-    """Return the pairs among ranges (n,), in order and with the smaller id first, and the number of each one's pair."""
-    low, high = np.sort([initiator, target], axis=0).astype(np.int64)
-    codes, number = np.unique(low << 32 | high, return_inverse=True)
-    return list(zip((codes >> 32).tolist(), (codes % 2**32).tolist(), strict=True)), number
-
-
 def offset_of(offsets: Mapping[tuple[int, int], PairOffset], first: int, second: int) -> PairOffset:
     """Return the constant of a pair, in either direction; raises `BadInputError` for a pair that has none."""
     try:
@@ -82,8 +76,8 @@ def offsets_m(offsets: Mapping[tuple[int, int], PairOffset], ranges: Ranges) -> 
     """Return the constant of each range's pair (n,), zeros where there are none; raises what `offset_of` raises."""
     if not offsets or not len(ranges):
         return np.zeros(len(ranges))
-    pairs, number = pairs_of(ranges.initiator, ranges.target)
-    return np.array([offset_of(offsets, *pair).offset_m for pair in pairs])[number]
+    pairs = pairs_of(ranges.initiator, ranges.target)
+    return np.array([offset_of(offsets, *pair).offset_m for pair in pairs.ends.tolist()])[pairs.number]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

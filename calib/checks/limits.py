@@ -16,8 +16,8 @@ from calib.data.clocks import LeftSkew, corrected
 from calib.data.ranges import NO_STAMPS, STATIC, Ranges
 from calib.errors import UnanswerableError
 from calib.estimator.known_distances import KnownDistances
-from calib.estimator.pairs import pairs_of
 from calib.findings import SMALLEST_NS
+from calib.pairs import pairs_of
 from calib.spread import STD_OF_MEDIAN, TWO_SIDED_95, medians, robust_spread, spreads
 from uwblink.arrays import Floats
 from uwblink.protocols.table import is_single_sided
@@ -27,6 +27,9 @@ from uwblink.twr import names_in
 
 RANGES_A_MEDIAN: Final = 20
 """Ranges at one power from which their median error is told."""
+
+WITHOUT_CURVE: Final = "delays only"
+"""How warnings of fits without a curve begin."""
 
 MANY_MISSING: Final = 0.05
 MANY_OUTLIERS: Final = 0.4
@@ -132,8 +135,8 @@ def _without_curve(ranges: Ranges, residuals_m: Floats) -> str:
     known = np.isfinite(lifted)
     if not known.any():
         return (
-            "delays only, without any power: how ranges change with power cannot be seen, is in delays and errors, and "
-            "delays from other distances will differ"
+            f"{WITHOUT_CURVE}, without any power: how ranges change with power cannot be seen, is in delays and "
+            "errors, and delays from other distances will differ"
         )
     low, high = np.percentile(_mean_dbm(ranges), SPREAD)
     number = equal_bins(lifted[known]).number
@@ -141,8 +144,8 @@ def _without_curve(ranges: Ranges, residuals_m: Floats) -> str:
     reach = float(np.ptp(np.percentile(middle, SPREAD))) if len(middle) else 0.0
     differ_ns = reach / SPEED_OF_LIGHT * 1e9
     return (
-        f"delays only: errors that change with power stay in the ranges, here {_length(reach)} between {low:.0f} and "
-        f"{high:.0f} dBm; delays hold for the recorded powers, and differ by up to {differ_ns:.2f} ns "
+        f"{WITHOUT_CURVE}: errors that change with power stay in the ranges, here {_length(reach)} between {low:.0f} "
+        f"and {high:.0f} dBm; delays hold for the recorded powers, and differ by up to {differ_ns:.2f} ns "
         "at others among them"
     )
 

@@ -21,9 +21,9 @@ from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
 from calib.data.ranges import Ranges
 from calib.errors import CalibError
 from calib.estimator.known_distances import FEWEST_RANGES, KnownDistances, Recipe, fit_known_distances
-from calib.estimator.pairs import pairs_of
 from calib.estimator.score_tests import Tested, findings
 from calib.findings import BUDGET, Candidate, exceeds, positive, stretches
+from calib.pairs import pairs_of
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT

@@ -8,10 +8,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+import calib
 from calib.cli.shared import (
     STOPPED,
     NewCalibration,
@@ -19,7 +20,6 @@ from calib.cli.shared import (
     TrimStatic,
     command_line,
     known_calibration,
-    progress_bar,
     warn,
     with_flags,
 )
@@ -39,9 +39,7 @@ from uwblink.cli.shared import (
     tags_of,
     waiting,
 )
-
-if TYPE_CHECKING:
-    import calib
+from uwblink.output import check_apart, check_output
 
 
 def add_to(app: typer.Typer) -> None:
@@ -97,9 +95,6 @@ def fit(
     force: Force = False,
 ) -> None:
     """Fit the tags' antenna delays (ns) and the curves of bias and standard deviation over first-path power (m)."""
-    import calib
-    from uwblink.output import check_output
-
     check_choice("truth", truth, ("recorded", "ranges"))
     if truth == "recorded":
         for one in fields(flight):
@@ -114,19 +109,21 @@ def fit(
                 ranges = calib.load_ranges(recordings, trim_static=trim_static, need_power=not settings.delays_only)
                 result = calib.fit(ranges, settings)
     result.save(output, force=force)
-    if as_json:
-        typer.echo(result.calibration.to_json(), nl=False)
-    else:
-        found = result.calibration
-        typer.echo(f"{output}: {len(result.ranges)} exchanges, {result.message}, scale {found.scale_ns:.3f} ns")
-        for line in delay_lines(found):
-            typer.echo(line)
-        for reason, number in result.ranges.excluded.items():
-            typer.echo(f"  left out: {number} exchanges, {reason}")
-        from calib.calibration import held_out_line
+    _print_fit(result, output, as_json=as_json)
 
-        if told := held_out_line(found):
-            typer.echo(f"  {told}")
+
+def _print_fit(result: calib.FitResult, output: Path, *, as_json: bool) -> None:
+    """Print what was fitted and the warnings; end with another status where the fit stopped before it settled."""
+    from calib.calibration import held_out_line
+
+    found, left_out = result.calibration, result.ranges.excluded.items()
+    if as_json:
+        typer.echo(found.to_json(), nl=False)
+    else:
+        typer.echo(f"{output}: {len(result.ranges)} exchanges, {result.message}, scale {found.scale_ns:.3f} ns")
+        lines = [*delay_lines(found), *(f"  left out: {number} exchanges, {reason}" for reason, number in left_out)]
+        for line in filter(str.strip, [*lines, f"  {held_out_line(found)}"]):
+            typer.echo(line)
         for warning in result.warnings:
             warn(warning)
     if not result.success:
@@ -148,31 +145,20 @@ def _fit_from_ranges(
     recordings: Sequence[Path], flight: FlightSettings, settings: FitSettings, *, trim_static: bool
 ) -> calib.FitResult:
     """Fit without known distances; raises `BadInputError` for settings that need them."""
-    import calib
-
     if len(recordings) != 1:
         raise BadInputError("ranges takes one recording, of one flight", parameter="truth")
     if trim_static:
         raise BadInputError("goes with known distances only", parameter="trim_static")
-    with progress_bar(recordings[0].name) as report:
+    with waiting(recordings[0].name) as report:
         return calib.fit_from_ranges(recordings[0], flight, settings, progress=report)
 
 
-def delay_lines(found: calib.Calibration) -> Iterator[str]:
-    """Yield a line per pair with a constant and per tag: constant or delay, and its 95 % interval."""
-    from calib.spread import TWO_SIDED_95
+def delay_lines(found: calib.Calibration) -> list[str]:
+    """Return a line per pair with a constant and per tag: constant or delay, and its 95 % interval."""
+    from calib.calibration import delay_rows, pair_rows
 
-    for pair, offset in sorted(found.pair_offsets.items()):
-        half = 100 * TWO_SIDED_95 * offset.std_m
-        yield f"  pair {pair[0]:3d} {pair[1]:3d}  ranges {100 * offset.offset_m:+.2f} cm too long  ± {half:.2f} (95 %)"
-    if found.pair_offsets and not any(found.delays_ns.values()):
-        return
-    for tag, delay in sorted(found.delays_ns.items()):
-        half = TWO_SIDED_95 * found.delays_std_ns.get(tag, math.nan)
-        interval = f"  ± {half:.4f} (95 %)"
-        if not math.isfinite(half):
-            interval = "  undetermined" if math.isinf(half) else "  standard error not stated"
-        yield f"  tag {tag:3d}  delay {delay:+.4f} ns{'  pinned' if half == 0 else interval}"
+    pairs = [f"  pair {pair:>7}  ranges {value} cm too long  {interval}" for pair, value, interval in pair_rows(found)]
+    return pairs + [f"  tag {tag:>3}  delay {value} ns  {interval}" for tag, value, interval in delay_rows(found)]
 
 
 def add_tag(
@@ -183,16 +169,11 @@ def add_tag(
     force: Force = False,
 ) -> None:
     """Fit the delay of one more tag from its ranges with calibrated ones, and leave everything else as it is."""
-    import calib
-    from calib.spread import TWO_SIDED_95
-    from uwblink.output import check_output
-
     check_output(output, force=force)
     with waiting("fitting"):
-        found = calib.add_tag(recording, known_calibration(calibration), tag)
-    found.save(output, force=force)
-    half = TWO_SIDED_95 * found.delays_std_ns[tag]
-    typer.echo(f"{output}: tag {tag}  delay {found.delays_ns[tag]:+.4f} ns  ± {half:.4f} (95 %)")
+        result = calib.add_tag(recording, known_calibration(calibration), tag)
+    result.save(output, force=force)
+    _print_fit(result, output, as_json=False)
 
 
 def survey(
@@ -213,9 +194,6 @@ def survey(
     force: Force = False,
 ) -> None:
     """Calibrate without true distances: boards that stand still, in arrangements of which little is known."""
-    import calib
-    from uwblink.output import check_apart, check_output
-
     arrangement, anchors = _named_file(save_anchors)
     written = {"output": output, "save_anchors": anchors, "plot": plot, "report": report}
     for path in filter(None, written.values()):
@@ -283,7 +261,6 @@ def show(
     calibration: Annotated[Path, typer.Argument(help="Calibration to show (.json).")], as_json: AsJson = False
 ) -> None:
     """Print a calibration: delays, curves, the data of its fit, and its limits."""
-    import calib
     from calib.calibration import rests_on
 
     known = calib.load_calibration(calibration)
@@ -325,9 +302,7 @@ def sample(
     force: Force = False,
 ) -> None:
     """Write a small flight with known delays, to try the other commands with; no simulator is needed for it."""
-    import calib
     from uwblink import Contents
-    from uwblink.output import check_output
 
     check_output(output, force=force, recording=True)
     seed = 1 if seed is None else seed

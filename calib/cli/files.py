@@ -7,6 +7,7 @@ from typing import Annotated, Final
 
 import typer
 
+import calib
 from calib.cli.shared import known_calibration, warn
 from uwblink.cli.shared import CalibrationFile, Force, Group, add, choice, epilog, output, waiting
 
@@ -56,8 +57,6 @@ def apply(
     force: Force = False,
 ) -> None:
     """Write a recording again with its ranges corrected (range_m); all else stays as it was."""
-    import calib
-
     with waiting("correcting"):
         applied = calib.apply(recording, known_calibration(calibration, [recording]), output, to=to, force=force)
     typer.echo(f"{output}: {applied.count} ranges corrected, {applied.clamped} beyond the fitted power")
@@ -86,7 +85,6 @@ def export(
     force: Force = False,
 ) -> None:
     """Write a calibration as register values, CSV, MILUV's JSON, YAML for ROS or a C header."""
-    import calib
     from calib.calibration import free_delays, programmed
 
     registers = programmed(antenna_delays) if antenna_delays else None

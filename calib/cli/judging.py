@@ -6,16 +6,16 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import calib
 from calib.cli.shared import STOPPED, Recordings, TrimStatic, command_line, known_calibration, warn, with_flags
 from calib.settings import FitSettings
 from uwblink.cli.shared import AsJson, CalibrationFile, Figures, Force, ReportFile, Seeds, add, choice, output, waiting
 
 if TYPE_CHECKING:
-    from calib import Calibration
     from calib.evaluation import Evaluation
 
 
@@ -52,7 +52,6 @@ def evaluate(
     force: Force = False,
 ) -> None:
     """Compare raw, delay-corrected and fully corrected ranges with the true distances, in cm, pair by pair."""
-    import calib
     from calib.data import load_each
 
     if report or figures:
@@ -115,57 +114,39 @@ def localize(
     force: Force = False,
 ) -> None:
     """Track each moving body by its ranges, with and without calibration, and print the RMSE in m."""
-    import calib
-    from calib.evaluation import Settings, localization_json, localization_text, summarize, write_tum
+    from calib.evaluation import (
+        Settings,
+        localization_json,
+        localization_text,
+        onboard_json,
+        onboard_text,
+        write_tum,
+    )
 
     if figures:
-        from calib.report import check_places, write_track_figures
+        from calib.report import check_places, write_onboard_figures, write_track_figures
 
         check_places(None, None, figures, force=force)
     known = known_calibration(calibration, recordings)
-    if model != "poses":
-        _onboard(recordings, known, model, tum, figures, as_json=as_json, force=force)
-        return
-    settings = Settings(velocity_std_mps=process_noise, seeds=3 if seeds is None else seeds)
+    found: list[Any]
+    table: Any
     with waiting("localizing"):
-        found = [one for path in recordings for one in calib.localize(path, known, settings, training=training)]
-    # The text first: where it cannot be made, nothing is written.
-    text = (
-        json.dumps(localization_json(found), indent=1)
-        if as_json
-        else localization_text(found, summarize(found), settings)
-    )
+        if model == "poses":
+            settings = Settings(velocity_std_mps=process_noise, seeds=3 if seeds is None else seeds)
+            found = [one for path in recordings for one in calib.localize(path, known, settings, training=training)]
+            # The text first: where it cannot be made, nothing is written.
+            table = localization_json(found)
+            text = localization_text(found, settings)
+        else:
+            onboard = calib.OnboardSettings(model=model)
+            found = [one for path in recordings for one in calib.localize_onboard(path, known, onboard)]
+            table, text = onboard_json(found), onboard_text(found, onboard)
     if tum:
         write_tum(found, tum, force=force)
     if figures:
-        write_track_figures(found, figures, force=force)
-    typer.echo(text)
-
-
-def _onboard(
-    recordings: list[Path],
-    known: Calibration,
-    model: str,
-    tum: Path | None,
-    figures: Path | None,
-    *,
-    as_json: bool,
-    force: bool,
-) -> None:
-    """Localize by on-board sensors, and print the result."""
-    from calib.evaluation import OnboardSettings, localize_onboard, onboard_json, onboard_text, write_onboard_tum
-
-    settings = OnboardSettings(model=model)
-    with waiting("localizing"):
-        found = [one for path in recordings for one in localize_onboard(path, known, settings)]
-    text = json.dumps(onboard_json(found), indent=1) if as_json else onboard_text(found, settings)
-    if tum:
-        write_onboard_tum(found, tum, force=force)
-    if figures:
-        from calib.report import write_onboard_figures
-
-        write_onboard_figures(found, figures, force=force)
-    typer.echo(text)
+        write = write_track_figures if model == "poses" else write_onboard_figures
+        write(found, figures, force=force)
+    typer.echo(json.dumps(table, indent=1) if as_json else text)
 
 
 def doctor(
@@ -177,7 +158,6 @@ def doctor(
     """Find faults in recordings, each with evidence and remedy, and compare the clocks of pairs."""
     from dataclasses import asdict, replace
 
-    import calib
     from calib.checks import examined_part
     from uwblink import Recording
     from uwblink.recording import clock_skews
@@ -218,8 +198,6 @@ def compare(
     force: Force = False,
 ) -> None:
     """Test whether the delays of two calibrations differ by more than their standard errors explain (ns)."""
-    import calib
-
     if figures:
         from calib.report import check_places, write_comparison_figures
 
@@ -265,7 +243,6 @@ def report(
     """Fit, judge on other recordings, localize, and write everything as one page with tables and figures."""
     from rich.console import Console
 
-    import calib
     from calib.report import check_places
 
     check_places(output, pdf, figures, force=force)

@@ -5,17 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+import calib
 from calib.errors import BadInputError
 from calib.planning import FlightPlanSettings, SurveyPlanSettings, read_whole
 from uwblink.cli.shared import AsJson, Figures, Force, Group, add, epilog, output, waiting
-
-if TYPE_CHECKING:
-    import calib
-
 
 PlanPage = Annotated[Path | None, output("Plan to write (.html or .pdf).")]
 Ports = Annotated[str, typer.Option(help="Serial ports of the boards, for the printed commands, as in 'ports/*'.")]
@@ -63,8 +60,6 @@ def survey(
     force: Force = False,
 ) -> None:
     """Plan arrangements of boards that stand still: the steps, and how well each delay will be known."""
-    import calib
-
     _check_places(output, figures, force=force)
     if boards.endswith(".uwb"):
         raise BadInputError("a recording is planned from with `calib plan flight`", parameter="boards")
@@ -92,8 +87,6 @@ def flight(
     force: Force = False,
 ) -> None:
     """Plan a flight without true distances: the steps, and how well each delay will be known."""
-    import calib
-
     _check_places(output, figures, force=force)
     who: Any = Path(robots)
     if robots.endswith(".uwb"):

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import typer
 
+import calib
 from calib.settings import FitSettings, FlightSettings, SurveySettings
 from uwblink.cli import shared
 from uwblink.cli.shared import output
 from uwblink.settings import flags_of
-
-if TYPE_CHECKING:
-    from calib import Calibration
 
 STOPPED: Final = 1
 """Exit status of a command whose fit stopped before it converged: its output is marked as not final."""
@@ -62,12 +59,11 @@ def command_line() -> str:
     return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
-def known_calibration(path: Path, recordings: Iterable[Path] = ()) -> Calibration:
+def known_calibration(path: Path, recordings: Iterable[Path] = ()) -> calib.Calibration:
     """Return a calibration from its file, and warn on standard error where its fit stopped before it converged.
 
     Warns, too, where other antenna delays were programmed into the tags of recordings than where it was fitted.
     """
-    import calib
     from calib.calibration import antenna_delays_warning
 
     known = calib.load_calibration(path)
@@ -78,18 +74,3 @@ def known_calibration(path: Path, recordings: Iterable[Path] = ()) -> Calibratio
         if warning:
             warn(f"{recording}: {path}: {warning}")
     return known
-
-
-@contextmanager
-def progress_bar(name: str) -> Iterator[Callable[[float], None] | None]:
-    """Show a bar on a terminal, and nothing elsewhere."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(escape(name), total=1.0)
-        yield lambda fraction: bar.update(task, completed=fraction)

@@ -17,10 +17,10 @@ from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.error_unknowns import error_unknowns, scattered
 from calib.estimator.identifiability import free_directions, square_of
-from calib.estimator.pairs import Pairs, pairs_of
 from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Unknown
+from calib.pairs import Pairs, pairs_of
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT

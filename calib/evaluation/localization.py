@@ -18,7 +18,7 @@ from calib.data.ranges import Ranges
 from calib.data.sources import Data, Flight, load_flight, require_times
 from calib.errors import UnanswerableError
 from calib.evaluation.range_updates import range_errors
-from calib.evaluation.tracking import FILTERS, FilterRanges, Settings, Track, problems, run_filters
+from calib.evaluation.tracking import FILTERS, FilterRanges, Settings, Track, Trajectory, problems, run_filters
 from uwblink.arrays import Floats
 
 PAPER_RMSE_M: Final = {"raw": 0.804, "calibrated": 0.500, "variance": 0.431}
@@ -52,6 +52,17 @@ class Localization:
     rmse_m: dict[str, Floats]
     fixed: FixedStd
     simulated: bool
+
+    @property
+    def label(self) -> str:
+        """The body, as names of files have it."""
+        return self.body
+
+    def trajectories(self) -> dict[str, Trajectory]:
+        """Return the trajectory of each filter and the true one, by name, with the attitudes that were given."""
+        found = {name: (one.time_ns, one.estimate_m, one.attitude) for name, one in self.tracks.items()}
+        one = self.tracks["raw"]
+        return found | {"truth": (one.time_ns, one.truth_m, one.attitude)}
 
     def __repr__(self) -> str:
         """Return the RMSE of each filter, over seeds, on one line."""

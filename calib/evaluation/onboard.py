@@ -23,7 +23,7 @@ from calib.data.sources import Data, opened, require_times
 from calib.errors import BadInputError, UnanswerableError
 from calib.evaluation.inertial_filter import GRAVITY, InertialFilter, Noise, P
 from calib.evaluation.range_updates import Fix, RangeErrors, multilaterate, range_errors
-from calib.evaluation.tracking import nearest_attitude
+from calib.evaluation.tracking import Trajectory, nearest_attitude
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import bodies_m
 from uwblink.recording.schema import Poses
@@ -109,6 +109,18 @@ class OnboardTrack:
         known = np.isfinite(self.truth_m).all(axis=1)
         wrong = self.estimate_m[known] - self.truth_m[known]
         return float(np.sqrt(np.mean(np.sum(wrong**2, axis=1)))) if known.any() else float("nan")
+
+    @property
+    def label(self) -> str:
+        """The body and the model, as names of files have them."""
+        return f"{self.body}-{self.model}"
+
+    def trajectories(self) -> dict[str, Trajectory]:
+        """Return the trajectory, and as "truth" the true one where there is one."""
+        found = {"": (self.time_ns, self.estimate_m, self.attitude)}
+        known = np.isfinite(self.truth_m).all(axis=1) & np.isfinite(self.true_attitude).all(axis=1)
+        truth = self.time_ns[known], self.truth_m[known], self.true_attitude[known]
+        return found | ({"truth": truth} if known.any() else {})
 
     def __repr__(self) -> str:
         """Return the inputs and the RMSE, on one line."""

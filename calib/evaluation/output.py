@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from itertools import count
 from pathlib import Path
@@ -11,16 +11,17 @@ from typing import Any
 import numpy as np
 
 from calib.calibration.document import for_json
-from calib.evaluation.localization import PAPER_RMSE_M, Localization, Summary, summarize
+from calib.evaluation.localization import PAPER_RMSE_M, Localization, summarize
 from calib.evaluation.onboard import OnboardSettings, OnboardTrack
-from calib.evaluation.tracking import Settings, Track
+from calib.evaluation.tracking import Settings
 from uwblink.arrays import Floats, Ints
 from uwblink.display import printable
 from uwblink.output import write_files
 
 
-def localization_text(found: list[Localization], summary: Summary, settings: Settings) -> str:
+def localization_text(found: list[Localization], settings: Settings) -> str:
     """Return the table that `calib localize` prints, a row per body, with the settings below."""
+    summary = summarize(found)
     filters, width = list(summary.rmse_m), 12
     first = max(30, *(len(one.source) + len(one.body) + 2 for one in found))
     lines = [f"{'RMSE of the position (m)':{first}s}" + "".join(f"{name:>{width}s}" for name in filters)]
@@ -67,13 +68,12 @@ def localization_json(found: list[Localization]) -> dict[str, Any]:
     return {"scenarios": rows, "summary": for_json(asdict(summarize(found)))}
 
 
-def write_tum(found: list[Localization], folder: Path, *, force: bool = False) -> None:
-    """Write the trajectory of each body and filter, and the true one, into a folder, which is made if it is missing."""
+def write_tum(found: Sequence[Localization | OnboardTrack], folder: Path, *, force: bool = False) -> None:
+    """Write the trajectories of each body, the true one among them, into a folder, which is made if it is missing."""
     files: dict[str, bytes] = {}
-    for name, one in zip(_names(f"{one.source}-{one.body}" for one in found), found, strict=True):
-        texts = {stage: as_tum(track) for stage, track in one.tracks.items()}
-        texts["truth"] = as_tum(one.tracks["raw"], truth=True)
-        files |= {f"{name}-{stage}.tum": text.encode() for stage, text in texts.items()}
+    for name, one in zip(_names(f"{one.source}-{one.label}" for one in found), found, strict=True):
+        texts = {kind: _tum(*columns).encode() for kind, columns in one.trajectories().items()}
+        files |= {f"{name}{'-' if kind else ''}{kind}.tum": text for kind, text in texts.items()}
     write_files(folder, files, force=force)
 
 
@@ -122,23 +122,6 @@ def onboard_json(found: list[OnboardTrack]) -> list[dict[str, Any]]:
         }
         for one in found
     ]
-
-
-def write_onboard_tum(found: list[OnboardTrack], folder: Path, *, force: bool = False) -> None:
-    """Write the trajectory of each body with its attitudes, and the true one where there is one, into a folder."""
-    files = {}
-    for name, one in zip(_names(f"{one.source}-{one.body}-{one.model}" for one in found), found, strict=True):
-        files[f"{name}.tum"] = _tum(one.time_ns, one.estimate_m, one.attitude).encode()
-        known = np.isfinite(one.truth_m).all(axis=1) & np.isfinite(one.true_attitude).all(axis=1)
-        if known.any():
-            text = _tum(one.time_ns[known], one.truth_m[known], one.true_attitude[known])
-            files[f"{name}-truth.tum"] = text.encode()
-    write_files(folder, files, force=force)
-
-
-def as_tum(track: Track, *, truth: bool = False) -> str:
-    """Return an estimated trajectory in TUM form, or the true one, with the attitude that was the filter's input."""
-    return _tum(track.time_ns, track.truth_m if truth else track.estimate_m, track.attitude)
 
 
 def _tum(time_ns: Ints, place_m: Floats, attitude: Floats) -> str:

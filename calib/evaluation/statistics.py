@@ -12,9 +12,10 @@ from scipy.interpolate import BSpline
 
 from calib.calibration.document import for_json, pair_name
 from calib.calibration.model import Calibration, require_calibration
-from calib.calibration.parts import CorrectedRanges, pairs_of
+from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, load_ranges
+from calib.pairs import pairs_of
 from calib.spread import TWO_SIDED_95, robust_spread
 from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -234,8 +235,8 @@ def planted_curve(ranges: Ranges, which: str, lifted: Floats) -> Floats | None:
 
 def pair_rows(ranges: Ranges) -> dict[str, Bools]:
     """Return which ranges belong to each pair of tags, whoever initiated."""
-    pairs, number = pairs_of(ranges.initiator, ranges.target)
-    return {pair_name(pair): number == k for k, pair in enumerate(pairs)}
+    pairs = pairs_of(ranges.initiator, ranges.target)
+    return {pair_name(ends): pairs.number == k for k, ends in enumerate(pairs.ends.tolist())}
 
 
 def split_error(ranges: Ranges, error_m: Floats) -> ErrorSplit:

@@ -20,6 +20,9 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
 from uwblink.recording.schema import Poses
 
+Trajectory = tuple[Ints, Floats, Floats]
+"""Times in ns (n,), positions in metres (n, 3), attitudes x y z w (n, 4)."""
+
 FILTERS: Final = ("raw", "calibrated", "variance", "robust")
 
 PATIENCE_S: Final = 10.0

@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from html import escape
-from typing import TYPE_CHECKING
+from typing import Literal
 
+from calib import figures
 from calib.calibration.model import Calibration
 from calib.data.ranges import Ranges
+from calib.figures import Axes
 from uwblink.arrays import Bools, Floats
-
-if TYPE_CHECKING:
-    from calib.figures import Axes
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,24 +65,24 @@ class FitResult:
 
     def plot_bias(self, axes: Axes | None = None) -> Axes:
         """Draw medians of the delay-corrected errors over lifted power, in cm, and the fitted curve with its band."""
-        from calib.figures import curve_over_power
-
-        return curve_over_power(self.ranges, self.calibration.apply(self.ranges), self.calibration, "bias", axes)
+        return figures.curve_over_power(
+            self.ranges, self.calibration.apply(self.ranges), self.calibration, "bias", axes
+        )
 
     def plot_sigma(self, axes: Axes | None = None) -> Axes:
         """Draw robust standard deviations of the errors over lifted power, in cm, and the curve with its band."""
-        from calib.figures import curve_over_power
-
-        return curve_over_power(self.ranges, self.calibration.apply(self.ranges), self.calibration, "sigma", axes)
+        return figures.curve_over_power(
+            self.ranges, self.calibration.apply(self.ranges), self.calibration, "sigma", axes
+        )
 
     def plot_residuals(self, axes: Axes | None = None) -> Axes:
         """Draw a histogram of the errors in cm: raw, with the delays corrected, and fully corrected."""
-        from calib.figures import histogram
-
-        return histogram(self.ranges, self.calibration.apply(self.ranges), axes)
+        return figures.histogram(self.ranges, self.calibration.apply(self.ranges), axes)
 
     def plot_delays(self, axes: Axes | None = None) -> Axes:
         """Draw the antenna delays in ns with their 95 % intervals."""
-        from calib.figures import delays
+        return figures.delays(self.calibration, axes=axes)
 
-        return delays(self.calibration, axes=axes)
+    def _curve(self, which: Literal["bias", "sigma"], axes: Axes | None) -> Axes:
+        applied = self.calibration.apply(self.ranges)
+        return figures.curve_over_power(self.ranges, applied, self.calibration, which, axes)

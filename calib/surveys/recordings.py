@@ -19,7 +19,6 @@ from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data, antenna_delays_of, each, opened
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.optimize import maximize
-from calib.estimator.pairs import Pairs, pairs_of
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, Part
 from calib.estimator.unknowns import Prior, Priors, Unknown

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calib.estimator.pairs import pairs_of
+from calib.pairs import pairs_of
 
 
 def test_pairs_are_numbered_by_their_tags_and_a_single_range_makes_one():

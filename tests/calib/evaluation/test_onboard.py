@@ -15,7 +15,7 @@ from calib.data.samples import stamped
 from calib.errors import BadInputError, UnanswerableError
 from calib.evaluation.inertial_filter import Noise
 from calib.evaluation.onboard import OnboardSettings, localize_onboard
-from calib.evaluation.output import onboard_json, onboard_text, write_onboard_tum
+from calib.evaluation.output import onboard_json, onboard_text, write_tum
 from calib.evaluation.range_updates import multilaterate
 from tests.shared_data import shared
 from uwblink.importers import read_source
@@ -168,14 +168,14 @@ def test_no_truth_is_needed(tmp_path):
     replace(contents, poses=contents.poses[still]).save(tmp_path / "f.uwb")
     (track,) = localize_onboard(tmp_path / "f.uwb", calibration(), OnboardSettings(noise=IMU))
     assert np.isnan(track.rmse_m)
-    write_onboard_tum([track], tmp_path / "blind")
+    write_tum([track], tmp_path / "blind")
     assert [path.name for path in (tmp_path / "blind").iterdir()] == ["f_uwb-drone-imu.tum"]
     assert onboard_json([track])[0]["rmse_m"] is None
     assert "used: ranges, imu, height" in onboard_text([track], OnboardSettings())
     assert "no truth to judge by" in repr(track)
     (known,) = localize_onboard(contents, calibration(), OnboardSettings(noise=IMU))
     np.testing.assert_allclose(track.estimate_m, known.estimate_m, atol=1e-6)
-    write_onboard_tum([known], tmp_path / "both")
+    write_tum([known], tmp_path / "both")
     truth = np.loadtxt(tmp_path / "both" / "memory-drone-imu-truth.tum")
     t = (known.time_ns - 10**12) * 1e-9
     np.testing.assert_allclose(truth[:, 1:4], place(t), atol=1e-3)
