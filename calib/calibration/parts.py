@@ -131,6 +131,11 @@ class CorrectedRange(NamedTuple, Generic[T]):
     sigma_total_m: T
     tail_share: T
 
+    def __repr__(self) -> str:
+        """Return a headline and the first rows, in lines of 79 characters."""
+        columns = {name: np.atleast_1d(values) for name, values in self._asdict().items()}
+        return as_text(f"{len(columns['range_m'])} corrected ranges", excerpt(columns))
+
 
 def columns_of(applied: CorrectedRanges) -> CorrectedRange[Floats]:
     """Return corrected ranges as columns; those without a power have the delays' part only."""
