@@ -22,6 +22,7 @@ from calib.estimator.optimize import maximize
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, Part
 from calib.estimator.unknowns import Prior, Priors, Unknown
+from calib.pairs import Pairs, pairs_of
 from calib.spread import STD_OF_MEDIAN, medians, robust_spread
 from calib.surveys.knowledge import Knowledge
 from calib.surveys.result import Contradiction
