@@ -25,7 +25,7 @@ from uwblink.database import log_of
 from uwblink.errors import PlanError, RecordingError
 from uwblink.output import check_output
 from uwblink.recording.antenna_delays import meta_of_delays
-from uwblink.recording.file import Recording, SnapshotMaker
+from uwblink.recording.file import Recording
 from uwblink.recording.schema import SHAPES, Arrangement, CirRow, Fault, FrameRow, Tag
 from uwblink.twr import Exchanges
 from uwblink.wire.codec import exchanges_of
@@ -218,7 +218,6 @@ class RecordingWriter(Closing, Listener):
         self.behind_s, self._checked_s = 0.0, time.monotonic()
         self._file = recording.path.stat()
         self._error: RecordingError | None = None
-        self._snapshots = SnapshotMaker(recording.path, recording.snapshot)
         self._thread = threading.Thread(target=self._work, name="uwblink writer", daemon=True)
         self._thread.start()
 
@@ -271,7 +270,6 @@ class RecordingWriter(Closing, Listener):
                     with suppress(OSError):  # there is no log
                         if log_of(path).stat().st_size > LONG_LOG and (shortening is None or shortening.done()):
                             shortening = other.submit(self._recording.shorten_log)
-                    self._snapshots.look()
                 except RecordingError as error:
                     self._error = error
                 except Exception as error:  # it would end the thread unnoticed
@@ -281,7 +279,6 @@ class RecordingWriter(Closing, Listener):
                     )
                 if last:
                     break
-        self._snapshots.close()
 
     def _write(self) -> None:
         """Commit the rows that wait; raises `RecordingError` if the file was removed or replaced."""

@@ -2,28 +2,24 @@
 
 Column meanings are those of `uwblink.twr.Exchanges`; the tables are listed in docs/architecture.md.
 
-Only one process can open a DuckDB file for writing. A reader of a recording in use creates a request beside it, an
-empty hidden file; the writer copies the committed rows into a file beside the request, on a second connection, while
-recording continues; and the reader opens that file and deletes its name. No files remain.
+Only one process can open a DuckDB file for writing, and no other can open it meanwhile. The writer appends what it
+commits to a log beside the file. A reader of a recording in use copies the two and opens the copy, whose names it
+removes at once.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-import threading
-import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self, TypeVar
-from uuid import uuid4
+from typing import Any, Final, Self
 
 from uwblink.database import log_of
 from uwblink.errors import RecordingError, RecordingInUseError, RecordingMissingError
-from uwblink.output import PARTIAL, check_output, place_beside
+from uwblink.output import check_output, place_beside
 from uwblink.recording.intake import is_locked
 from uwblink.recording.schema import FORMAT_VERSION, SUFFIX, TABLES, standard_meta
 from uwblink.recording.store import Store
@@ -31,15 +27,8 @@ from uwblink.recording.summary import Summary, summarize
 from uwblink.recording.tables import Tables, known_tables
 from uwblink.text_files import require_regular
 
-WANTED: Final = ".wanted"
-BEGUN: Final = ".partial-begun"
-READY: Final = ".snapshot"
-"""Endings of a request for a snapshot, of a request in progress, and of the snapshot."""
-
-PATIENCE_S: Final = 30.0
-"""Longest time for a snapshot: a disk of 100 MB/s copies 3 GB in this time."""
-
-Opened = TypeVar("Opened")
+COPIES: Final = 20
+"""Copies that are tried of a recording in use. The file changes once in hours: when its log is put into it."""
 
 
 class Recording(Tables):
@@ -108,9 +97,8 @@ class Recording(Tables):
 
         At most `memory_mb` of the read data is kept in memory; sorting can take more.
 
-        A recording in progress is opened as a snapshot of everything until now, which its recorder makes. Raises
-        `RecordingMissingError` or `RecordingError` (a directory, not a recording, truncated, tables or columns missing,
-        a newer format, in use by something that makes no snapshots).
+        A recording in progress is opened as a copy of everything until now. Raises `RecordingMissingError` or
+        `RecordingError` (a directory, not a recording, truncated, tables or columns missing, a newer format, in use).
         """
         source = Path(path)
         if not source.exists():
@@ -121,8 +109,7 @@ class Recording(Tables):
         except RecordingInUseError:
             if update:
                 raise
-            store = open_snapshot(source, partial(Store.open, update=False, memory_mb=memory_mb))
-            store.path = source
+            store = _open_copy(source, memory_mb)
         recording = cls(store)
         try:
             version = recording.meta().get("format_version")
@@ -168,10 +155,6 @@ class Recording(Tables):
         if self._partial:
             log_of(self.path).unlink(missing_ok=True)  # of the file that had the name before
             self._partial.replace(self.path)
-
-    def snapshot(self, place: str | os.PathLike[str]) -> None:
-        """Write all committed rows to a new file while other threads append; raises `RecordingError`."""
-        self._store.copy_to(Path(place))
 
     def shorten_log(self) -> None:
         """Write the log beside the file into the file while other threads append; raises `RecordingError`."""
@@ -225,82 +208,26 @@ class Recording(Tables):
             yield written
 
 
-class SnapshotMaker:
-    """Makes a snapshot for every request, in a thread of its own; used by the writer.
+def _open_copy(source: Path, memory_mb: int | None) -> Store:
+    """Open a copy of a recording that another process is writing: all that it has committed.
 
-    `make(place)` writes the committed rows to a new file. If it raises `RecordingError` there is no snapshot.
+    File and log belong together if the file did not change while both were copied. What is incomplete at the end of
+    the log was not committed, and DuckDB leaves it out. Raises `RecordingInUseError` if no copy can be made.
     """
-
-    def __init__(self, recording: Path, make: Callable[[Path], None]) -> None:
-        """Answer requests for a recording; removes files of processes that were killed."""
-        self._recording, self._make = recording, make
-        self._thread: threading.Thread | None = None
-        for left in (place for kind in (WANTED, BEGUN, READY, PARTIAL) for place in _beside(recording, kind)):
-            if left.is_dir() and not left.is_symlink():
-                shutil.rmtree(left, ignore_errors=True)
-            else:
-                left.unlink(missing_ok=True)
-
-    def look(self) -> None:
-        """Start to answer requests, unless earlier ones are in progress; for ten calls a second."""
-        if self._thread is not None and self._thread.is_alive():
-            return
-        wanted = _beside(self._recording, WANTED)
-        if wanted:
-            self._thread = threading.Thread(target=self._answer, args=(wanted,), name="uwblink snapshot", daemon=True)
-            self._thread.start()
-
-    def close(self) -> None:
-        """Wait for the snapshot that is being made."""
-        if self._thread is not None:
-            self._thread.join(PATIENCE_S)
-
-    def _answer(self, wanted: list[Path]) -> None:
-        for request in wanted:
-            begun = request.with_suffix(BEGUN)
-            with suppress(OSError, RecordingError):
-                request.rename(begun)  # the reader then waits
-                with place_beside(self._recording) as place:
-                    self._make(place)
-                    place.rename(request.with_suffix(READY))
-            begun.unlink(missing_ok=True)
-
-
-def open_snapshot(recording: Path, reopen: Callable[[Path], Opened]) -> Opened:
-    """Request a snapshot from a recording's writer and open it, or open the recording if its writer ends meanwhile.
-
-    Raises `RecordingInUseError` if the writer makes no snapshots (another program, an older version), the folder cannot
-    be written, or the disk is full.
-    """
-    request = recording.with_name(f".{recording.name}.{uuid4().hex}{WANTED}")
-    ready, begun = request.with_suffix(READY), request.with_suffix(BEGUN)
-    refused = f"{recording}: another process is writing it, and {{}}; wait until that ends"
+    file, why = source.resolve(), "changes faster than it can be copied"
     try:
-        request.touch()
+        with place_beside(file) as copy:
+            for _ in range(COPIES):
+                before = file.stat()
+                shutil.copyfile(file, copy)
+                log_of(copy).unlink(missing_ok=True)
+                with suppress(FileNotFoundError):
+                    shutil.copyfile(log_of(file), log_of(copy))
+                after = file.stat()
+                if (before.st_mtime_ns, before.st_size) == (after.st_mtime_ns, after.st_size):
+                    store = Store.open(copy, update=False, memory_mb=memory_mb)
+                    store.path = source
+                    return store
     except OSError as error:
-        why = f"no request can be put beside it: {error.strerror}"
-        raise RecordingInUseError(refused.format(why)) from error
-    asked_s = time.monotonic()
-    try:
-        while time.monotonic() < asked_s + PATIENCE_S:
-            if ready.exists():
-                return reopen(ready)
-            if not request.exists() and not begun.exists() and not ready.exists():
-                break  # the writer began, and gave up
-            # A writer looks for requests ten times a second; one that has not begun after two seconds makes none.
-            if request.exists() and time.monotonic() > asked_s + 2.0:
-                break
-            time.sleep(0.02)
-            with suppress(RecordingInUseError):
-                return reopen(recording)
-        raise RecordingInUseError(refused.format("it makes no snapshots"))
-    finally:
-        request.unlink(missing_ok=True)
-        ready.unlink(missing_ok=True)
-
-
-def _beside(recording: Path, kind: str) -> list[Path]:
-    """Return the hidden files of a kind that belong to a recording."""
-    start = f".{recording.name}."
-    folder = recording.parent
-    return [folder / name for name in os.listdir(folder) if name.startswith(start) and name.endswith(kind)]
+        why = f"cannot be copied ({error.strerror})"
+    raise RecordingInUseError(f"{source}: another process is writing it, and it {why}; wait until that ends")

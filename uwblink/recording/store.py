@@ -115,22 +115,6 @@ class Store:
         with self._writing(), self._db.cursor() as db:
             db.execute("CHECKPOINT")
 
-    def copy_to(self, place: Path) -> None:
-        """Write what is committed to a new file, on a connection of its own; raises `RecordingError`."""
-        target = str(place).replace("'", "''")
-        try:
-            with self._db.cursor() as db:
-                (source,) = db.execute("SELECT current_database()").fetchone() or ("",)
-                named = source.replace('"', '""')
-                db.execute(f"ATTACH '{target}' AS uwblink_snapshot")
-                try:
-                    db.execute(f'COPY FROM DATABASE "{named}" TO uwblink_snapshot')
-                finally:
-                    db.execute("DETACH uwblink_snapshot")
-        except duckdb.Error as error:
-            place.unlink(missing_ok=True)
-            raise RecordingError(f"{place}: cannot be written ({first_line(error)})") from error
-
     def execute(self, statement: str, values: list[Any] | None = None) -> None:
         """Execute a statement of SQL; raises `RecordingError` where the file cannot be written."""
         with self._writing():

@@ -1,9 +1,9 @@
 """A recording can be read by others while it is written: they get everything until now, and leave nothing behind."""
 
 import json
+import os
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -11,9 +11,8 @@ import pytest
 
 import uwblink
 from tests.boards import bench_scenario
-from uwblink.errors import RecordingError, RecordingInUseError
-from uwblink.recording.file import Recording, SnapshotMaker, open_snapshot
-from uwblink.recording.schema import Fault
+from uwblink.errors import RecordingInUseError
+from uwblink.recording.file import Recording
 from uwbsim.boards.virtual_board import VirtualPorts
 
 BIN = Path(sys.executable).parent
@@ -21,7 +20,10 @@ READ = "import sys, uwblink\nwith uwblink.Recording.open(sys.argv[1]) as r: prin
 
 WRITE = """
 import sys, time, uwblink
-with uwblink.Recording.create(sys.argv[1], live=True):
+from uwblink.recording.schema import Fault
+with uwblink.Recording.create(sys.argv[1], live=True) as recording:
+    for k in range(50):
+        recording.append("faults", [Fault(k, "1", "kind", f"row {k}")])
     print("writing", flush=True)
     time.sleep(60)
 """
@@ -56,77 +58,50 @@ def test_another_process_reads_what_is_recorded_so_far(tmp_path, command):
     assert done.returncode == 0, done.stderr
     read = json.loads(done.stdout)["counts"]["exchanges"] if command else int(done.stdout)
     assert read == 300
-    assert [p.name for p in tmp_path.iterdir()] == [path.name], "no request, no snapshot, no log is left"
+    assert [p.name for p in tmp_path.iterdir()] == [path.name], "no copy, no log is left"
     with Recording.open(path) as recording:
         assert len(recording.exchanges()) > 300
 
 
-def test_rows_are_the_same_and_in_their_order(tmp_path):
-    with Recording.create(tmp_path / "f.uwb", live=True) as recording:
-        for k in range(50):
-            with recording.transaction():
-                recording.append("faults", [Fault(50 - k, "1", "kind", f"row {k}")])
-        recording.snapshot(tmp_path / "s.uwb")
-        recording.append("faults", [Fault(99, "1", "kind", "later")])
-    with Recording.open(tmp_path / "s.uwb") as copy:
-        assert {f.detail for f in copy.faults()} == {f"row {k}" for k in range(50)}
-        with Recording.open(tmp_path / "f.uwb") as whole:
-            assert copy.meta() == whole.meta()
-            assert len(whole.faults()) == 51
+@pytest.fixture
+def writer(tmp_path):
+    """Another process that has committed fifty faults, and keeps the recording open."""
+    words = [sys.executable, "-c", WRITE, str(tmp_path / "f.uwb")]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        yield tmp_path / "f.uwb"
+        process.kill()
 
 
-def test_a_writer_that_makes_no_snapshots_is_named_soon(tmp_path):
-    path = tmp_path / "f.uwb"
-    writer = subprocess.Popen([sys.executable, "-c", WRITE, str(path)], stdout=subprocess.PIPE)
-    try:
-        writer.stdout.readline()
-        with pytest.raises(RecordingInUseError, match="is writing it, and it makes no snapshots; wait until that ends"):
-            Recording.open(path)
-        with pytest.raises(RecordingInUseError, match="has it open; wait"):
-            Recording.open(path, update=True)
-    finally:
-        writer.kill()
-        writer.communicate()
-    assert {p.suffix for p in tmp_path.iterdir()} <= {".uwb", ".wal"}
-    Recording.open(path).__exit__(None, None, None)
+def test_what_any_writer_has_committed_is_read_and_not_updated(writer):
+    with Recording.open(writer) as recording:
+        assert [fault.detail for fault in recording.faults()] == [f"row {k}" for k in range(50)]
+        assert recording.path == writer
+    with pytest.raises(RecordingInUseError, match="has it open; wait"):
+        Recording.open(writer, update=True)
+    assert sorted(p.name for p in writer.parent.iterdir()) == ["f.uwb", "f.uwb.wal"]
 
 
-def test_a_snapshot_that_cannot_be_written_is_an_error_of_the_reader_alone(tmp_path):
-    path = tmp_path / "f.uwb"
-    path.touch()
-    begun = threading.Event()
-
-    def make(place):
-        begun.set()
-        raise RecordingError("disk full")
-
-    maker = SnapshotMaker(path, make)
-    stop = threading.Event()
-
-    def look():
-        while not stop.wait(0.02):
-            maker.look()
-
-    thread = threading.Thread(target=look)
-    thread.start()
-
-    def reopen(place):
-        raise RecordingInUseError("still in use")
-
-    try:
-        with pytest.raises(RecordingInUseError, match="makes no snapshots"):
-            open_snapshot(path, reopen)
-    finally:
-        stop.set()
-        thread.join()
-    assert begun.is_set()
-    assert [p.name for p in tmp_path.iterdir()] == ["f.uwb"]
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.77, 0.999])
+def test_of_a_log_that_was_copied_while_it_grew_whole_commits_are_read(writer, tmp_path, share):
+    copy, log = tmp_path / "copy.uwb", (tmp_path / "f.uwb.wal").read_bytes()
+    copy.write_bytes(writer.read_bytes())
+    (tmp_path / "copy.uwb.wal").write_bytes(log[: int(share * len(log))])
+    with Recording.open(copy) as recording:
+        found = [fault.detail for fault in recording.faults()]
+    assert found == [f"row {k}" for k in range(len(found))]
+    assert abs(len(found) - share * 50) < 10
 
 
-def test_what_killed_processes_have_left_is_swept_away(tmp_path):
-    for kind in (".wanted", ".snapshot", ".partial"):
-        (tmp_path / f".f.uwb.123{kind}").touch()
-    (tmp_path / ".f.uwb.456.partial" / "f.uwb").mkdir(parents=True)
-    (tmp_path / ".other.uwb.123.wanted").touch()
-    SnapshotMaker(tmp_path / "f.uwb", lambda place: None)
-    assert [p.name for p in tmp_path.iterdir()] == [".other.uwb.123.wanted"]
+@pytest.mark.parametrize("changing", [True, False])
+def test_a_copy_that_cannot_be_made_is_an_error_of_the_reader_alone(writer, monkeypatch, changing):
+    def copy(source, _target):
+        if not changing:
+            raise OSError(28, "No space left on device")
+        os.utime(source)
+
+    monkeypatch.setattr("shutil.copyfile", copy)
+    why = "changes faster than it can be copied" if changing else r"cannot be copied \(No space left on device\)"
+    with pytest.raises(RecordingInUseError, match=f"another process is writing it, and it {why}; wait until that"):
+        Recording.open(writer)
+    assert sorted(p.name for p in writer.parent.iterdir()) == ["f.uwb", "f.uwb.wal"]
