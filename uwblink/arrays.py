@@ -86,9 +86,7 @@ def length(name: str, values: ArrayLike) -> int:
 
 def whole_numbers(name: str, values: ArrayLike, count: int, low: int, high: int, hint: str = "") -> Ints:
     """Return int64 (count,) of whole numbers from `low` to `high`; `hint` is added to the error."""
-    found = _rows(name, values, count)
-    if found.dtype.kind not in "iufb" or found.dtype.kind == "b":
-        raise ArgumentError(f"{name}: found {_kind(found)}, expected whole numbers")
+    found = _rows(name, values, count, "iuf", "whole numbers")
     with np.errstate(invalid="ignore"):
         bad = ~((found >= low) & (found <= high))
         if found.dtype.kind == "f":
@@ -101,21 +99,16 @@ def numbers(name: str, values: ArrayLike | None, count: int) -> Floats:
     """Return float64 (count,), NaN for unknown values; all are NaN if `values` is None."""
     if values is None:
         return np.full(count, np.nan)
-    found = _rows(name, values, count)
-    if found.dtype.kind not in "iuf":
-        raise ArgumentError(f"{name}: found {_kind(found)}, expected numbers")
+    found = _rows(name, values, count, "iuf", "numbers")
     reject(name, found, np.isinf(found), "a finite number, or NaN where nothing is known")
     return found.astype(np.float64)
 
 
 def words(name: str, values: ArrayLike, count: int) -> NDArray[np.str_]:
     """Return text (count,)."""
-    found = _rows(name, values, count)
     if not count:  # an empty list has no type of its own
         return np.zeros(0, np.str_)
-    if found.dtype.kind not in "UTO" or not all(isinstance(value, str) for value in found.tolist()):
-        raise ArgumentError(f"{name}: found {_kind(found)}, expected text")
-    return found.astype(np.str_)
+    return _rows(name, values, count, "UT", "text").astype(np.str_)
 
 
 def vectors(name: str, values: ArrayLike, count: int, size: int) -> Floats:
@@ -133,29 +126,6 @@ def vectors(name: str, values: ArrayLike, count: int, size: int) -> Floats:
     return found
 
 
-def few_words(column: NDArray[Any]) -> tuple[NDArray[np.str_], Ints] | None:
-    """Return the distinct words of a column of text (n,) in order of appearance, and the index of each row's word (n,).
-
-    None if there are more than 16 words, for which sorting is faster, and for an empty column or one that is not text.
-
-    >>> words, which = few_words(np.array(["b", "a", "b"]))
-    >>> words.tolist(), which.tolist()
-    (['b', 'a'], [0, 1, 0])
-    """
-    if column.dtype.kind != "U" or isinstance(column, np.ma.MaskedArray) or not len(column):
-        return None
-    which = np.zeros(len(column), dtype=np.int64)
-    words: list[Any] = []
-    row = 0
-    while row < len(column):
-        if len(words) == 16:
-            return None
-        words.append(column[row])
-        which[column == column[row]] = len(words)
-        row += int(np.argmin(which[row:])) if not which[row:].all() else len(column)
-    return np.array(words), which - 1
-
-
 def reject(name: str, values: NDArray[Any], bad: Bools, expected: str) -> None:
     """Raise `ArgumentError` for the first bad row, if there is one."""
     if bad.any():
@@ -163,19 +133,17 @@ def reject(name: str, values: NDArray[Any], bad: Bools, expected: str) -> None:
         raise ArgumentError(f"{name}: row {row}: found {str(values[row])[:60]}, expected {expected}")
 
 
-def _rows(name: str, values: ArrayLike, count: int) -> NDArray[Any]:
+def _rows(name: str, values: ArrayLike, count: int, kinds: str, expected: str) -> NDArray[Any]:
+    """Return a column (count,) of one of NumPy's kinds; raises `ArgumentError` for another."""
     try:
         found = np.asarray(values)
     except ValueError as error:
         raise ArgumentError(f"{name}: its rows have different lengths, expected one value a row") from error
-    if found.ndim == 0:
-        return np.full(count, found)
-    if length(name, found) != count:
+    if found.dtype.kind == "O" and all(isinstance(value, str) for value in found.flat):
+        found = found.astype(np.str_)  # text of a data frame
+    if found.ndim and length(name, found) != count:
         raise ArgumentError(f"{name}: found {len(found)} rows, expected {count} as in the first column")
-    return found
-
-
-def _kind(values: NDArray[Any]) -> str:
-    if not values.size:
-        return f"nothing (of type {values.dtype})"
-    return f"{str(values.flat[0])[:40]!r} (of type {values.dtype})"
+    if found.dtype.kind not in kinds:
+        first = f"{str(found.flat[0])[:40]!r}" if found.size else "nothing"
+        raise ArgumentError(f"{name}: found {first} (of type {found.dtype}), expected {expected}")
+    return found if found.ndim else np.full(count, found)

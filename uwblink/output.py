@@ -49,11 +49,8 @@ def write_text(path: Path, text: str, *, force: bool) -> None:
 
 def is_utf8(path: Path) -> bool:
     """Return whether the absolute path of a file is UTF-8, as DuckDB requires."""
-    try:
-        str(path.absolute()).encode()
-    except UnicodeEncodeError:
-        return False
-    return True
+    text = str(path.absolute())
+    return text.encode(errors="replace").decode() == text
 
 
 def write_bytes(path: Path, data: bytes, *, force: bool) -> None:
@@ -163,15 +160,13 @@ def check_apart(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = ())
 
     `outputs` are files and folders by the parameter that names them.
     """
-    read = {path.resolve() for path in inputs}
-    taken: dict[Path, str] = {}
-    for name, path in ((name, path) for name, path in outputs.items() if path is not None):
-        place = path.resolve()
-        if place in read:
-            raise ArgumentError(f"{path}: is what is read; give another name", parameter=name)
-        if place in taken:
-            raise ArgumentError(f"{path}: is what `{taken[place]}` names already; give another name", parameter=name)
-        taken[place] = name
+    taken = {path.resolve(): "is what is read" for path in inputs}
+    for name, path in outputs.items():
+        if path is not None:
+            place = path.resolve()
+            if place in taken:
+                raise ArgumentError(f"{path}: {taken[place]}; give another name", parameter=name)
+            taken[place] = f"is what `{name}` names already"
 
 
 def check_output(path: Path, *, force: bool, recording: bool = False) -> None:
@@ -181,21 +176,31 @@ def check_output(path: Path, *, force: bool, recording: bool = False) -> None:
     """
     tables = (".csv", ".tsv", ".txt", ".gz", ".parquet", ".json", ".jsonl", ".ndjson")
     others = (".bag", ".mcap", ".db3", ".toml", ".html", ".pdf")
-    if recording and path.suffix.lower() in tables + others:
-        raise RecordingError(
-            f"{path}: a recording is written here, and {path.suffix} is the ending of another kind of file; name it "
-            f"{path.stem}.uwb (`uwblink export` makes tables of it)"
-        )
-    if path.is_dir():
-        raise RecordingError(f"{path}: is a directory, expected the name of an output file")
-    if path.exists() and not path.is_file():
-        raise RecordingError(f"{path}: is a FIFO, socket or device, expected the name of an output file")
-    if path.exists() and not force:
-        raise RecordingExistsError(f"{path}: exists already; give another name, or `force` to replace it")
-    if not path.parent.is_dir():
-        raise RecordingError(f"{path}: the folder {path.parent} does not exist; create it first")
-    if not os.access(path.parent, os.W_OK):
-        raise RecordingError(f"{path}: no permission to write in {path.parent}")
+    text = path.suffix.lower() in tables + others
+    rules = (
+        (
+            recording and text,
+            RecordingError,
+            f"a recording is written here, and {path.suffix} is the ending of another "
+            f"kind of file; name it {path.stem}.uwb (`uwblink export` makes tables of it)",
+        ),
+        (path.is_dir(), RecordingError, "is a directory, expected the name of an output file"),
+        (
+            path.exists() and not path.is_file(),
+            RecordingError,
+            "is a FIFO, socket or device, expected the name of an output file",
+        ),
+        (
+            path.exists() and not force,
+            RecordingExistsError,
+            "exists already; give another name, or `force` to replace it",
+        ),
+        (not path.parent.is_dir(), RecordingError, f"the folder {path.parent} does not exist; create it first"),
+        (not os.access(path.parent, os.W_OK), RecordingError, f"no permission to write in {path.parent}"),
+    )
+    for broken, error, why in rules:
+        if broken:
+            raise error(f"{path}: {why}")
 
 
 def check_folder(path: Path, names: Iterable[str] = (), *, force: bool = False) -> None:

@@ -95,7 +95,10 @@ class Exchanges(ColumnTable):
         arrays.reject(
             "target", chosen["target"], chosen["target"] == chosen["initiator"], "another tag than the initiator"
         )
-        names = arrays.words("protocol", _protocol_of(protocol, tx3, rx3), count)
+        if protocol is None and (tx3 is None) != (rx3 is None):
+            raise ArgumentError(f"{'tx3' if tx3 is None else 'rx3'}: is not given; a third message has both stamps")
+        default = "ss" if tx3 is None else "ds"
+        names = arrays.words("protocol", default if protocol is None else protocol, count)
         messages = np.zeros(count, dtype=np.int64)
         for row, rows in _rows_by_protocol(names):
             messages[rows] = len(row.messages)
@@ -144,18 +147,9 @@ LARGEST_ID: Final = 65_535
 LATEST_NS: Final = 2**62
 
 
-def _protocol_of(protocol: ArrayLike | None, tx3: ArrayLike | None, rx3: ArrayLike | None) -> ArrayLike:
-    if protocol is not None:
-        return protocol
-    if (tx3 is None) != (rx3 is None):
-        raise ArgumentError(f"{'tx3' if tx3 is None else 'rx3'}: is not given; a third message has both stamps")
-    return "ss" if tx3 is None else "ds"
-
-
 def names_in(words: NDArray[np.str_]) -> list[str]:
     """Return the distinct words of a column (n,), sorted."""
-    coded = arrays.few_words(words)
-    return sorted(map(str, np.unique(words) if coded is None else coded[0]))
+    return [str(word) for word in np.unique(words)]
 
 
 def intervals(exchanges: Exchanges) -> Intervals:

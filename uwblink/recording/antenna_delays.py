@@ -23,6 +23,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from uwblink.display import first_few
 from uwblink.errors import PlanError
 from uwblink.text_files import FileKey, TomlReader, is_number
 from uwblink.ticks import ANTENNA_DELAY_TICKS, SPEED_OF_LIGHT, TICK_S
@@ -170,19 +171,16 @@ def delays_differ(then: AntennaDelays, now: AntennaDelays, tags: Iterable[int]) 
     A calibration fitted with other delays makes a range wrong by half of the difference of a tag's sum. The division of
     the sum between the two registers has no effect.
     """
-    pairs = {tag: (delay_of(then, tag), delay_of(now, tag)) for tag in sorted(tags)}
-    changes, far_m = [], 0.0
-    for tag, (before, after) in pairs.items():
-        if before is None or after is None:
-            continue
-        longer = after.tx + after.rx - before.tx - before.rx
-        if longer or after.reply - after.tx != before.reply - before.tx:
-            changes.append(f"tag {tag}: {before} then, {after} now")
-            far_m = max(far_m, abs(longer) / 2 * TICK_S * SPEED_OF_LIGHT)
-    if not changes:
+    longer_m: dict[str, float] = {}
+    for tag in sorted(tags):
+        old, new = delay_of(then, tag), delay_of(now, tag)
+        if old is not None and new is not None:
+            longer = new.tx + new.rx - old.tx - old.rx
+            if longer or new.reply - new.tx != old.reply - old.tx:
+                longer_m[f"tag {tag}: {old} then, {new} now"] = abs(longer) / 2 * TICK_S * SPEED_OF_LIGHT
+    if not longer_m:
         return ""
-    more = f" and {len(changes) - 3} more" if len(changes) > 3 else ""
     return (
         "it was fitted with other programmed antenna delays than these ranges have, which makes them wrong by up to "
-        f"{100 * far_m:.1f} cm for each tag ({'; '.join(changes[:3])}{more}); fit again"
+        f"{100 * max(longer_m.values()):.1f} cm for each tag ({first_few(longer_m, 3)}); fit again"
     )

@@ -238,9 +238,8 @@ class Tables:
         """Return the rows of a table in its order; raises `RecordingError` for a missing value."""
         rows = self._store.rows(_query(table, start_ns, end_ns))
         needed = 4 if table == "faults" else None  # all but the ends of the exchange, which most faults lack
-        for row in rows:
-            if None in row[:needed]:
-                raise RecordingError(f"{self.path}: table {table}: a row with nothing in one of its columns, {row}")
+        if empty := [row for row in rows if None in row[:needed]]:
+            raise RecordingError(f"{self.path}: table {table}: a row with nothing in one of its columns, {empty[0]}")
         return rows
 
 
@@ -259,12 +258,9 @@ def _column(kind: str, values: tuple[Any, ...]) -> NDArray[Any]:
     """Return values as a column, masked where they are None."""
     if kind == "BLOB" or kind.endswith("[]"):
         column = np.empty(len(values), dtype=object)
-        column[:] = [list(value) if kind.endswith("[]") else value for value in values]
+        column[:] = [list(value) if isinstance(value, tuple) else value for value in values]
         return column
-    missing = [value is None for value in values]
-    if any(missing):
-        return np.ma.array([0 if value is None else value for value in values], mask=missing)
-    return np.array(values)
+    return np.ma.array([0 if value is None else value for value in values], mask=[value is None for value in values])
 
 
 def _filled(kind: str, column: NDArray[Any]) -> NDArray[Any]:
@@ -275,9 +271,8 @@ def _filled(kind: str, column: NDArray[Any]) -> NDArray[Any]:
 
 def known_tables(names: Iterable[str]) -> None:
     """Raise `RecordingError` for a table that recordings do not have."""
-    for name in names:
-        if name not in TABLES:
-            raise RecordingError(f"no table {name!r} in a recording; there are {', '.join(TABLES)}")
+    if unknown := set(names) - TABLES.keys():
+        raise RecordingError(f"no table {min(unknown)!r} in a recording; there are {', '.join(TABLES)}")
 
 
 def _query(table: str, start_ns: int | None, end_ns: int | None) -> str:

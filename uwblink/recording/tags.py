@@ -25,14 +25,11 @@ def load_places(path: Path) -> tuple[tuple[Tag, ...], dict[int, tuple[float, flo
     if not tags and not rows:
         raise PlanError(f"{path}: holds no [[tags]] with id, body and lever_arm_m, and no [[anchors]]")
     found: dict[int, tuple[float, float, float]] = {}
-    taken = {tag.tag for tag in tags}
     for k, row in enumerate(rows):
-        number = _new_id(file, f"anchors[{k}].id", row, {*found} | taken)
-        place: Any = row.get("position_m")
-        file.check(f"anchors[{k}].position_m", place, _are_numbers(place, 3), "three numbers (metres)")
+        number = _new_id(file, f"anchors[{k}].id", row, {*found, *(tag.tag for tag in tags)})
+        found[number] = _point(file, f"anchors[{k}].position_m", row.get("position_m"))
         spread = row.get("covariance_m2", [0.0] * 6)
         file.check(f"anchors[{k}].covariance_m2", spread, _are_numbers(spread, 6), "xx xy xz yy yz zz, six numbers")
-        found[number] = (float(place[0]), float(place[1]), float(place[2]))
     return tags, found
 
 
@@ -45,11 +42,15 @@ def read_tags(file: TomlReader) -> tuple[Tag, ...]:
     for k, row in enumerate(file.rows("tags", None if _is_scenario(file) else ("id", "body", "lever_arm_m"))):
         number = _new_id(file, f"tags[{k}].id", row, {tag.tag for tag in tags})
         body: Any = row.get("body")
-        arm = row.get("lever_arm_m", [0.0, 0.0, 0.0])
         file.check(f"tags[{k}].body", body, isinstance(body, str) and bool(body), "the name of a body")
-        file.check(f"tags[{k}].lever_arm_m", arm, _are_numbers(arm, 3), "three numbers (metres)")
-        tags.append(Tag(number, body, (float(arm[0]), float(arm[1]), float(arm[2]))))
+        tags.append(Tag(number, body, _point(file, f"tags[{k}].lever_arm_m", row.get("lever_arm_m", [0.0, 0.0, 0.0]))))
     return tuple(tags)
+
+
+def _point(file: TomlReader, key: str, value: Any) -> tuple[float, float, float]:
+    file.check(key, value, _are_numbers(value, 3), "three numbers (metres)")
+    x, y, z = map(float, value)
+    return x, y, z
 
 
 def _new_id(file: TomlReader, key: str, row: dict[str, Any], taken: set[int]) -> int:
