@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -115,21 +115,16 @@ class Recorded(Section):
 Motion = Annotated[RandomFlight | Waypoints | Figure | Static | Carried | Recorded, Field(discriminator="model")]
 
 
-class Errors(NamedTuple):
-    """Of a gyroscope or accelerometer, in SI units: a constant bias, its walk in a second, noise a root of Hz."""
-
-    bias: float
-    wander: float
-    noise: float
-
-
 GRADES: Final = {
-    "consumer": {"gyro": Errors(0.5, 0.01, 0.01), "force": Errors(0.1, 2e-3, 3e-3)},
-    "industrial": {"gyro": Errors(0.1, 2e-3, 5e-3), "force": Errors(0.03, 5e-4, 1e-3)},
-    "tactical": {"gyro": Errors(5e-3, 1e-4, 1e-3), "force": Errors(0.01, 5e-5, 3e-4)},
-    "perfect": {"gyro": Errors(0.0, 0.0, 0.0), "force": Errors(0.0, 0.0, 0.0)},
+    "consumer": {"gyro": (0.5, 0.01, 0.01), "force": (0.1, 2e-3, 3e-3)},
+    "industrial": {"gyro": (0.1, 2e-3, 5e-3), "force": (0.03, 5e-4, 1e-3)},
+    "tactical": {"gyro": (5e-3, 1e-4, 1e-3), "force": (0.01, 5e-5, 3e-4)},
+    "perfect": {"gyro": (0.0, 0.0, 0.0), "force": (0.0, 0.0, 0.0)},
 }
-"""Orders of magnitude of data sheets: phones and small drones, better drones, aircraft; the gyroscopes' in degrees."""
+"""Constant bias, its walk in a second, and noise per root of Hz, of gyroscopes in degrees and of accelerometers.
+
+Orders of magnitude of data sheets: phones and small drones, better drones, aircraft.
+"""
 
 
 class Imu(Section):
@@ -160,14 +155,14 @@ class Imu(Section):
         0.0, description="Standard deviation of vibration in each reading of the accelerometer."
     )
 
-    def errors(self, which: str) -> Errors:
-        """Return the errors of the "gyro" or of the "force", in SI units."""
+    def errors(self, which: str) -> tuple[float, float, float]:
+        """Return bias, its walk in a second, and noise per root of Hz, of the "gyro" or "force", in SI units."""
         bias, wander, noise = GRADES[self.grade][which]
         scale, given = 1.0, (self.accel_bias_mps2, self.accel_noise_mps2_per_sqrt_hz)
         if which == "gyro":
             scale, given = math.pi / 180, (self.gyro_bias_dps, self.gyro_noise_dps_per_sqrt_hz)
         bias, noise = (known if own is None else own for own, known in zip(given, (bias, noise), strict=True))
-        return Errors(scale * bias, scale * wander, scale * noise)
+        return scale * bias, scale * wander, scale * noise
 
 
 class Height(Section):

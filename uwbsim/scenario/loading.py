@@ -265,16 +265,12 @@ def _key_path(root: type[BaseModel], parts: Sequence[str | int], unknown: bool) 
         elif nested or (unknown and k == len(parts) - 1):
             path += f".{part}"
         else:
-            models = [m for m in models if part == m.__name__ or part in _kinds(m)] or models
+            # The name of a table, or the value of its key `model`, is that of one of several tables.
+            kinds = [get_args(getattr(m.model_fields.get("model"), "annotation", None)) for m in models]
+            models = [m for m, kind in zip(models, kinds, strict=True) if part in (m.__name__, *kind)] or models
         known = sorted({name for m in models for name in m.model_fields})
         models = [m for annotation in nested for m in _models_in(annotation)] or models
     return path.lstrip("."), known
-
-
-def _kinds(model: type[BaseModel]) -> tuple[Any, ...]:
-    """Return the values of the key `model` that mean this one of several tables."""
-    field = model.model_fields.get("model")
-    return get_args(field.annotation) if field else ()
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:

@@ -147,7 +147,7 @@ class Air:
         self._completed, count = itertools.count(1), len(self._start)
         self.outcomes = Outcomes([-1] * count, [-1] * count, [""] * count)
 
-    def execute(self, progress: Callable[[float], None] | None) -> None:
+    def execute(self, progress: Callable[[float], None] | None = None) -> Outcomes:
         """Execute the plans of all hosts; `progress` is called with the completed share of all exchanges."""
         hosts = self._slots.plan.host
         self._next_begin = dict.fromkeys(np.unique(hosts).tolist(), 0)
@@ -156,6 +156,7 @@ class Air:
             for host in self._next_begin
         ]
         self.env.run(until=self.env.all_of(processes))
+        return self.outcomes
 
     def _host(self, host: int, numbers: list[int], progress: Callable[[float], None] | None) -> Steps:
         """Execute the exchanges of one host, one after the other."""
@@ -257,19 +258,6 @@ class Air:
             if signal < power + self._radio.capture_db or frame.start > other.start:
                 return COLLIDED
         return ""
-
-
-def run(
-    protocol: RangingProtocol,
-    slots: Slots,
-    powers: Powers,
-    radio: Radio,
-    progress: Callable[[float], None] | None = None,
-) -> Outcomes:
-    """Execute a plan; return the outcome of every exchange."""
-    air = Air(protocol, slots, powers, radio)
-    air.execute(progress)
-    return air.outcomes
 
 
 def _subticks(seconds: float) -> int:

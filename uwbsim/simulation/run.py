@@ -167,7 +167,7 @@ def simulate(
         def powers(sender: int, time: int) -> Floats:
             return sampled.from_sender(sender, max(time, 0)).power_dbm
 
-        outcomes = air.run(protocol, slots, powers, scenario.radio, progress)
+        outcomes = air.Air(protocol, slots, powers, scenario.radio).execute(progress)
     else:
         outcomes = _undisturbed(scenario, slots)
     begun, lost = np.array(outcomes.start, dtype=np.int64), np.array(outcomes.lost)

@@ -20,7 +20,7 @@ from uwblink.arrays import Complexes, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.wire.messages import Cir
 from uwbsim.scenario.radio import Radio
-from uwbsim.world.radio import ALPHA_DBM, FPP_OFFSET_DB
+from uwbsim.world.radio import FPP_OFFSET_DB
 
 PULSE_TAPS: Final = 1.2
 """Half width of a pulse at 1/e of its height: 2 ns full width at half maximum, a bandwidth of 440 MHz."""
@@ -95,22 +95,18 @@ def peak_amplitude(power_dbm: float) -> float:
     return float(118 * np.sqrt(10 ** ((power_dbm + FPP_OFFSET_DB) / 10) / squares))
 
 
-def impulse_response(
-    rng: np.random.Generator, stamp: int | None = None, paths: PathsHeard | None = None
-) -> tuple[int, tuple[int, ...]]:
+def impulse_response(rng: np.random.Generator, stamp: int, paths: PathsHeard) -> tuple[int, tuple[int, ...]]:
     """Draw a response: index of the first path in thousandths of a tap, and 1016 magnitudes.
 
-    The index has the fraction of the receive `stamp` (ticks), or a random one. Diffuse echoes are added to `paths`,
-    unless these are complex. Without `paths` the first path has -82 dBm, as is usual on boards.
+    The index has the fraction of the receive `stamp` (ticks), 64 of which are a tap. Diffuse echoes are added to
+    `paths`, unless these are complex.
     """
-    ticks_per_tap = 64
-    fraction = rng.uniform() if stamp is None else stamp % ticks_per_tap / ticks_per_tap
     # The chip puts the first path at 745, give or take a tap (DW1000 User Manual, 7.2.40.1).
-    index = int(INDEX_STEPS * (745.0 + rng.integers(-1, 2) + fraction))
+    index = int(INDEX_STEPS * (745.0 + rng.integers(-1, 2) + stamp % 64 / 64))
     # The chip reports the leading edge; the peak of the pulse follows it.
     peak = index / INDEX_STEPS + EDGE_TO_PEAK
     noise = 45.0
-    if paths and np.iscomplexobj(paths.amplitude):
+    if np.iscomplexobj(paths.amplitude):
         wave = _from_geometry(peak, paths)
         # Noise of real and imaginary part: 28 counts of a response at full gain, and a fraction of the strongest tap,
         # as preambles do not correlate perfectly. By power, 265 responses of MILUV's boards have 0.0090 (at -82 dBm),
@@ -124,16 +120,16 @@ def impulse_response(
     return index, tuple((np.maximum(re, im) + np.minimum(re, im) // 4).astype(np.int64).tolist())
 
 
-def _with_diffuse(rng: np.random.Generator, peak: float, paths: PathsHeard | None) -> Complexes:
+def _with_diffuse(rng: np.random.Generator, peak: float, paths: PathsHeard) -> Complexes:
     """Return a first path, known echoes and diffuse ones, all with random phases."""
     taps = np.arange(Cir.TAPS)
-    amplitude = peak_amplitude(paths.power_dbm if paths else ALPHA_DBM)
+    amplitude = peak_amplitude(paths.power_dbm)
     wave = amplitude * np.exp(-(((taps - peak) / PULSE_TAPS) ** 2)) + 0j
     count, decay_taps = rng.poisson(12), 14.0
     later = rng.exponential(decay_taps, count)
     strength = 0.25 * np.exp(-later / decay_taps) * rng.rayleigh(size=count)
     known = [*zip(later.tolist(), strength.tolist(), strict=True)]
-    known += [*zip((paths.delay_s / TAP_S).tolist(), paths.amplitude.tolist(), strict=True)] if paths else []
+    known += [*zip((paths.delay_s / TAP_S).tolist(), paths.amplitude.tolist(), strict=True)]
     for (place, share), phase in zip(known, rng.uniform(0, 2 * np.pi, len(known)), strict=True):
         wave += amplitude * share * np.exp(1j * phase - ((taps - peak - place) / PULSE_TAPS) ** 2)
     return np.asarray(wave)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass, field, fields, replace
+from dataclasses import KW_ONLY, dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -89,7 +89,7 @@ class Ends:
 
     `time_s` (n,) is true time; `places` are the indices of the two tags in the scenario, (n,) each; `antennas_m` the
     positions of their antennas, (n, 3) each, and `rotations` their attitudes, body to world, (n, 3, 3) each. `shadows`
-    are the bodies that may obstruct links. `distance_m` (n,) is the length of the straight lines.
+    are the bodies that may obstruct links.
     """
 
     world: World
@@ -98,12 +98,12 @@ class Ends:
     antennas_m: tuple[Floats, Floats]
     rotations: tuple[Floats, Floats]
     shadows: Sequence[PlacedBody]
-    distance_m: Floats = field(init=False)
 
-    def __post_init__(self) -> None:
-        """Compute the distances."""
+    @property
+    def distance_m(self) -> Floats:
+        """Return the lengths of the straight lines, (n,)."""
         apart = self.antennas_m[1] - self.antennas_m[0]
-        object.__setattr__(self, "distance_m", np.sqrt(np.einsum("ij,ij->i", apart, apart)))
+        return np.asarray(np.sqrt(np.einsum("ij,ij->i", apart, apart)))
 
     @property
     def scenario(self) -> Scenario:

@@ -219,7 +219,6 @@ def true_motion(path: Trajectory, time_s: Floats) -> tuple[Floats, Floats]:
 
 def _errors(rng: np.random.Generator, imu: Imu, which: str, count: int) -> Floats:
     """Return the sum of constant bias, random walk of the bias, and white noise, (n, 3), in SI units."""
-    found = imu.errors(which)
-    root = np.sqrt(imu.rate_hz)
-    wander = np.cumsum(rng.normal(0.0, found.wander / root, (count, 3)), axis=0)
-    return np.asarray(rng.normal(0.0, found.bias, 3) + wander + rng.normal(0.0, found.noise * root, (count, 3)))
+    (bias, walk, noise), root = imu.errors(which), np.sqrt(imu.rate_hz)
+    wander = np.cumsum(rng.normal(0.0, walk / root, (count, 3)), axis=0)
+    return np.asarray(rng.normal(0.0, bias, 3) + wander + rng.normal(0.0, noise * root, (count, 3)))

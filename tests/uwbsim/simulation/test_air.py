@@ -44,7 +44,7 @@ def played(hosts, powers=None, progress=None):
     assert [row[0] for row in rows] == list(range(len(rows)))
     _, start, initiator, target, pause, heard, delay, number = map(np.array, zip(*rows, strict=True))
     slots = air.Slots(air.Schedule(start, initiator, target, number), pause, heard.T, delay.T)
-    return air.run(DS, slots, lambda sender, _time: table[sender], rules, progress)
+    return air.Air(DS, slots, lambda sender, _time: table[sender], rules).execute(progress)
 
 
 def with_powers(*changes, everywhere=-80.0):
