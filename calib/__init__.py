@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from calib.evaluation.localization import localize
     from calib.evaluation.onboard import OnboardSettings, localize_onboard
     from calib.evaluation.statistics import evaluate
-    from calib.fitting.fitting import fit
-    from calib.fitting.new_tag import add_tag
+    from calib.fitting.fitting import add_tag, fit
     from calib.fitting.result import FitResult
     from calib.planning.flights import plan_flight
     from calib.planning.result import FlightPlan, Plan
@@ -102,7 +101,7 @@ _HOMES: Final = {
     "SurveyResult": "calib.surveys.result",
     "SurveySettings": "calib.settings",
     "UnanswerableError": "calib.errors",
-    "add_tag": "calib.fitting.new_tag",
+    "add_tag": "calib.fitting.fitting",
     "apply": "calib.calibration.correction",
     "compare": "calib.calibration.comparison",
     "evaluate": "calib.evaluation.statistics",

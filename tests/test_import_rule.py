@@ -25,7 +25,6 @@ CONFINED = {
         path
         in {
             "calib/fitting/fitting.py",
-            "calib/fitting/new_tag.py",
             "calib/planning/flights.py",
             "calib/surveys/survey.py",
             "calib/trajectories/fitting.py",

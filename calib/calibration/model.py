@@ -354,18 +354,16 @@ def rests_on(provenance: Mapping[str, Any]) -> str:
     known = provenance.get("rests_on")
     if provenance.get("truth") != "ranges" or not isinstance(known, Mapping):
         return ""
-    parts = [f"ranges alone, of {_listed(known.get('moving'), 'moving body', 'moving bodies')}"]
-    seconds = known.get("known_s")
-    if isinstance(seconds, int | float) and seconds > 0:
-        parts.append(f"positions known for {seconds:.1f} s")
-    for key, word in (("anchors_given", "given"), ("anchors_sought", "found")):
-        if known.get(key):
-            parts.append(f"{_listed(known[key], 'anchor', 'anchors')} at places that were {word}")
-    parts.append(f"attitudes from {known.get('attitudes', 'nowhere')}")
-    off = provenance.get("distance_std_m")
-    if isinstance(off, int | float):
-        parts.append(f"distances found to {100 * off:.1f} cm (standard error)")
-    return ", ".join(parts)
+    off, seconds = provenance.get("distance_std_m"), known.get("known_s")
+    anchors = {"given": known.get("anchors_given"), "found": known.get("anchors_sought")}
+    parts = [
+        f"ranges alone, of {_listed(known.get('moving'), 'moving body', 'moving bodies')}",
+        f"positions known for {seconds:.1f} s" if isinstance(seconds, int | float) and seconds > 0 else "",
+        *(f"{_listed(one, 'anchor', 'anchors')} at places that were {how}" for how, one in anchors.items() if one),
+        f"attitudes from {known.get('attitudes', 'nowhere')}",
+        f"distances found to {100 * off:.1f} cm (standard error)" if isinstance(off, int | float) else "",
+    ]
+    return ", ".join(filter(None, parts))
 
 
 def held_out_line(calibration: Calibration) -> str:

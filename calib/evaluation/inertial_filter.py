@@ -144,12 +144,6 @@ class InertialFilter:
         ranges."""
         self._update_linear([(V, np.eye(3))], -self.velocity, speed_m_s)
 
-    def update_standstill(self, gyro: Floats, force: Floats) -> None:
-        """Update by standstill: no velocity (1 cm/s), no rotation (3 mrad/s), no acceleration (3 cm/s^2)."""
-        self._update_linear([(V, np.eye(3))], -self.velocity, 0.01)
-        self._update_linear([(G, np.eye(3))], gyro - self.gyro_bias, 0.003)
-        self.update_gravity(force, 0.03)
-
     def _update_linear(self, parts: Sequence[tuple[slice, Floats]], innovation: Floats, std: float) -> None:
         """Update by a linear measurement of parts of the state (headings, 3, 3 each) with normal noise."""
         rows = np.zeros((len(self.place), 3, SIZE))

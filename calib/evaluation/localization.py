@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from scipy.signal import correlate
 from scipy.stats import chi2
 
 from calib.calibration.model import Calibration, require_calibration
@@ -237,10 +238,7 @@ def _independent(values: Floats) -> float:
     The sum ends where the autocorrelation first falls below a twentieth.
     """
     centred = values - values.mean()
-    size = 1 << int(2 * len(centred) - 1).bit_length()
-    power = np.abs(np.fft.rfft(centred, size)) ** 2
-    correlation = np.fft.irfft(power, size)[: len(centred)]
+    correlation = correlate(centred, centred, method="fft")[len(centred) - 1 :]
     correlation = correlation / max(float(correlation[0]), 1e-300)
-    small = np.flatnonzero(correlation < 0.05)
-    end = int(small[0]) if len(small) else len(centred)
+    end = int(np.argmax(np.append(correlation, 0.0) < 0.05))
     return len(centred) / (1 + 2 * float(correlation[1:end].sum()))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from calib.calibration.lasting import GATE
+from calib.calibration.error_model import GATE
 from calib.calibration.model import Calibration, require_calibration
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, opened, require_times
@@ -37,7 +37,7 @@ MIN_ANCHORS: Final = 3
 
 MIN_RANGES_PER_FIX: Final = 6
 SPAN_S: Final = 0.5
-"""Seconds over which standstill is detected, and gravity averaged for the first tilt."""
+"""Seconds over which gravity is averaged for the first tilt."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -332,27 +332,10 @@ def _means(one: _Readings, edges: Floats) -> Floats:
     return np.asarray(np.where(span > 1e-9, sums / np.maximum(span, 1e-9), readings(inside[1:])))
 
 
-def _still_spans(one: _Readings) -> set[int]:
-    """Return the half seconds in which inertial readings show standstill.
-
-    A body at rest varies by less than 4 mrad/s and 5 cm/s^2: rotors vibrate twenty times as much.
-    """
-    span = np.floor(one.imu_s / SPAN_S).astype(np.int64)
-    edges = np.flatnonzero(np.diff(span, prepend=span[:1] - 1)) if len(span) else np.zeros(0, dtype=np.int64)
-    found = set()
-    for begin, end in zip(edges, np.append(edges[1:], len(span)), strict=True):
-        turns, pulls = one.imu[begin:end, :3], one.imu[begin:end, 3:]
-        calm = turns.std(axis=0).max() < 0.004 and pulls.std(axis=0).max() < 0.05
-        if end - begin > 1 and calm and np.abs(turns.mean(axis=0)).max() < 0.02:
-            found.add(int(span[begin]))
-    return found
-
-
 def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
-    """Process ranges, steps and heights in order of time, and return the states of the likeliest heading."""
+    """Process ranges, steps and heights in order of time, and return the track of the likeliest heading."""
     first, running = _begin(one, settings)
     now = heard = float(one.time_s[first])
-    calm = _still_spans(one) if running.inertial else set()
     states: list[tuple[float, Floats, Floats, Floats]] = []
     updates: list[tuple[float, float, bool]] = []
     restarts: list[float] = []
@@ -367,8 +350,6 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         best = int(np.argmax(running.likelihood))
         if kind == "height":
             running.update_height(float(one.height_m[number]))
-        elif kind == "step" and int(now // SPAN_S) in calm and number % 5 == 0:
-            running.update_standstill(gyro, force)
         elif kind == "step" and number % slow_every == 0:
             running.limit_speed(settings.speed_m_s)
         elif kind == "range":
@@ -388,23 +369,6 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         best = int(np.argmax(running.likelihood))
         covariance = running.covariance[best][P, P]
         states.append((now, running.place[best].copy(), running.attitude[best].copy(), covariance.copy()))
-    return _told(one, settings, states, updates, restarts)
-
-
-def _latest(one: _Readings, last: int, settings: OnboardSettings) -> Ints:
-    """Return the ranges of the last `reopen_s`, or as many as a fix needs."""
-    first = int(np.searchsorted(one.time_s, one.time_s[last] - settings.reopen_s))
-    return np.arange(max(min(first, last + 1 - MIN_RANGES_PER_FIX), 0), last + 1)
-
-
-def _told(
-    one: _Readings,
-    settings: OnboardSettings,
-    states: list[tuple[float, Floats, Floats, Floats]],
-    updates: list[tuple[float, float, bool]],
-    restarts: list[float],
-) -> OnboardTrack:
-    """Return a track of states (time, place, attitude, covariance) and ranges (time, nis, whether believed)."""
 
     def nanoseconds(seconds: Any) -> Ints:
         return one.began_ns + np.rint(np.array(seconds) * 1e9).astype(np.int64)
@@ -435,3 +399,9 @@ def _told(
         believed=np.array(believed),
         restarts_s=tuple(restarts),
     )
+
+
+def _latest(one: _Readings, last: int, settings: OnboardSettings) -> Ints:
+    """Return the ranges of the last `reopen_s`, or as many as a fix needs."""
+    first = int(np.searchsorted(one.time_s, one.time_s[last] - settings.reopen_s))
+    return np.arange(max(min(first, last + 1 - MIN_RANGES_PER_FIX), 0), last + 1)

@@ -166,10 +166,8 @@ def nearest_attitude(poses: Poses, body: str, time_ns: Ints) -> Floats:
     """Return the attitude of a body at the pose nearest to each time, (n, 4)."""
     rows = np.flatnonzero(poses.body == body)
     known = poses.time_ns[rows]
-    after = np.clip(np.searchsorted(known, time_ns), 1, max(len(known) - 1, 1))
-    later = known[np.minimum(after, len(known) - 1)] - time_ns
-    nearest = np.where(time_ns - known[after - 1] < later, after - 1, after)
-    return poses.quaternion[rows[np.minimum(nearest, len(rows) - 1)]]
+    place = np.interp(time_ns - known[0], known - known[0], np.arange(len(rows)))
+    return np.asarray(poses.quaternion[rows[np.rint(place).astype(np.int64)]])
 
 
 @dataclass(frozen=True, slots=True)

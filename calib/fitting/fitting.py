@@ -1,4 +1,4 @@
-"""`calib.fit`: from settings and ranges to a calibration with warnings.
+"""`calib.fit` and `calib.add_tag`: from settings and ranges to a calibration with warnings.
 
 A constant of the curve and a common shift of all delays cannot be distinguished (docs/theory.md). Delays are therefore
 stated for a curve that is zero at a reference power: the same boards then get the same delays whatever powers a
@@ -16,11 +16,12 @@ from threadpoolctl import threadpool_limits
 
 import uwblink
 from calib.calibration.document import for_json
-from calib.calibration.lasting import lasting_errors
+from calib.calibration.error_model import lasting_errors
 from calib.calibration.model import Calibration, given_calibration
 from calib.calibration.power_curves import lift as lift_power
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import (
+    WITHOUT_CURVE,
     implausible,
     limits,
     one_way,
@@ -31,17 +32,22 @@ from calib.checks.limits import (
 )
 from calib.data.ranges import Ranges, held_out
 from calib.data.sources import Data, load_ranges
-from calib.errors import BadInputError
+from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.known_distances import KnownDistances, Recipe, fit_known_distances
 from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
 from calib.fitting.result import FitResult, HeldOut
-from calib.settings import FitSettings
+from calib.settings import FitSettings, check_tag
 from uwblink.arrays import Bools, Floats
+from uwblink.recording.antenna_delays import delays_differ, known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 
 INLIER_SIGMAS = 3.0
+
+MIN_RANGES = 50
+"""With so many ranges one delay has a standard error of a seventh of the noise of a range, 0.03 ns."""
+
 ROBUST_LOSS = "cauchy"
 """The loss of ICRA 2023. Without a curve errors depend on power, which the likelihood would take for reflections."""
 
@@ -127,6 +133,62 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         more=_stopped(found, settings.loss),
     )
     return replace(result, held_out=held)
+
+
+def add_tag(data: Data | Iterable[Data], calibration: Calibration, tag: int, loss: str = MIXTURE) -> FitResult:
+    """Fit the delay of one more tag; everything else in the calibration stays as it was.
+
+    `data` is what `load_ranges` takes. It is the fit of `calib.fit` to all exchanges of the tag with calibrated ones,
+    whose delays and curve are known. Raises `BadInputError` where the tag is known already or not in the data, and what
+    `calib.fit` raises.
+
+    >>> import calib, dataclasses
+    >>> known = calib.fit(calib.sample_flight()).calibration
+    >>> two = dataclasses.replace(known, delays_ns={tag: known.delays_ns[tag] for tag in (1, 2)})
+    >>> found = calib.add_tag(calib.sample_flight(seed=2), two, 3).calibration
+    >>> abs(found.delays_ns[3] - known.delays_ns[3]) < 0.02
+    True
+    """
+    check_tag(tag)
+    if calibration.pair_offsets:
+        raise BadInputError("has constants of pairs, which say nothing of a tag; fit anew", parameter="calibration")
+    ranges = load_ranges(data, need_power=calibration.needs_power)
+    if tag in calibration.delays_ns:
+        raise BadInputError(f"tag {tag} has a delay in the calibration already; fit anew to change it", parameter="tag")
+    differ = delays_differ(calibration.antenna_delays, ranges.antenna_delays, calibration.delays_ns)
+    if differ:
+        raise BadInputError(differ, parameter="calibration")
+    if tag not in ranges.tags():
+        raise BadInputError(
+            f"tag {tag} does not range in {ranges.source}; its tags are {', '.join(map(str, ranges.tags()))}",
+            parameter="tag",
+        )
+    known = list(calibration.delays_ns)
+    first, second = (np.isin(ends, known) for ends in (ranges.initiator, ranges.target))
+    some = ranges[(first & (ranges.target == tag)) | (second & (ranges.initiator == tag))]
+    if len(some) < MIN_RANGES:
+        raise UnanswerableError(
+            f"{ranges.source}: {len(some)} exchanges of tag {tag} with calibrated tags are too few, "
+            f"at least {MIN_RANGES} are needed"
+        )
+    applied = replace(calibration, delays_ns=calibration.delays_ns | {tag: 0.0}).apply(some)
+    straight = replace(some, raw_m=some.raw_m + applied.corrected_m - applied.delay_corrected_m)
+    settings = FitSettings(loss=loss, delays_from=calibration, delays_only=True, alpha_dbm=calibration.alpha_dbm)
+    found = fit(straight, settings, lift=calibration.lift)
+    added = {"tag": tag, "recording": ranges.source, "exchanges": len(some)}
+    return replace(
+        found,
+        calibration=replace(
+            calibration,
+            delays_ns=calibration.delays_ns | {tag: found.calibration.delays_ns[tag]},
+            delays_std_ns=calibration.delays_std_ns | {tag: found.calibration.delays_std_ns[tag]},
+            antenna_delays={**calibration.antenna_delays, **known_delays(ranges.antenna_delays, [tag])},
+            provenance=calibration.provenance | {"added": [*calibration.provenance.get("added", []), added]},
+        ),
+        ranges=some,
+        # The curve is known, and was taken off before.
+        warnings=[text for text in found.warnings if not text.startswith(WITHOUT_CURVE)],
+    )
 
 
 def _taken_over(known: Calibration | None, ranges: Ranges, *, curve: bool) -> dict[int, float]:

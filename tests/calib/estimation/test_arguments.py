@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from calib.errors import BadInputError
-from calib.fitting.fitting import fit
-from calib.fitting.new_tag import add_tag
+from calib.fitting.fitting import add_tag, fit
 from tests.calib.synthetic import ranges
 
 

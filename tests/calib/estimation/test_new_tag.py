@@ -8,8 +8,7 @@ import pytest
 
 from calib.data.sources import load_ranges
 from calib.errors import BadInputError, UnanswerableError
-from calib.fitting.fitting import fit
-from calib.fitting.new_tag import add_tag
+from calib.fitting.fitting import add_tag, fit
 from tests.calib.synthetic import DELAYS_NS, ranges
 
 ROOT = Path(__file__).parents[3]
