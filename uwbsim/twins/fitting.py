@@ -367,6 +367,7 @@ def summary(flight: Flight, fitted: Fitted) -> dict[str, Any]:
                 "exchanges": int(np.count_nonzero(flight.pair == k)),
                 "reflected_share": float(errors.pair_share[k]),
                 "mean_excess_m": float(errors.pair_excess_m[k]),
+                "life_s": None if errors.life_s is None else float(errors.pair_life_s[k]),
             }
             for k, (a, b) in enumerate(flight.pairs)
         },

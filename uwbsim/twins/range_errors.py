@@ -94,9 +94,9 @@ class RangeErrors:
 
     `delays_ns` is what the flight adds to the delays of tags, by id. `direct_std_m` is the spread of direct ranges
     beyond the noise of receive stamps; `share` that of reflected ranges; `mean_excess_m` the mean of their detours and
-    `excess_shape` the shape of a gamma distribution with their mean and variance. `pair_share` and `pair_excess_m` are
-    those of pairs (pairs,), drawn towards all by how little each tells. `life_s` is None where the recording does not
-    tell it. `reflected` (n,) is the probability that a range was reflected.
+    `excess_shape` the shape of a gamma distribution with their mean and variance. `pair_share`, `pair_excess_m` and
+    `pair_life_s` are those of pairs (pairs,), drawn towards all by how little each tells. `life_s` is None, and those
+    of pairs NaN, where the recording does not tell it. `reflected` (n,) is the probability that a range was reflected.
     """
 
     delays_ns: dict[int, float]
@@ -107,6 +107,7 @@ class RangeErrors:
     life_s: float | None
     pair_share: Floats
     pair_excess_m: Floats
+    pair_life_s: Floats
     reflected: Floats
 
 
@@ -138,7 +139,7 @@ def fit_range_errors(flight: Flight, receive_noise_s: Floats) -> RangeErrors:
     shapes = found.errors.shapes(applied.lifted, x.initiator, x.target)
     excess, reflected = found.errors.least_m + shapes.detour_m, applied.tail_probability
     mean, shape, share = TwoStateMultipath(model="two-state").mean_excess_m, 1.0, np.zeros(count)
-    pair_excess, life = np.full(count, mean), None
+    pair_excess, life, pair_life = np.full(count, mean), None, np.full(count, np.nan)
     # Fewer than five ranges that are rather reflected than direct are no tail.
     if np.count_nonzero(reflected > 0.5) < 5:
         reflected = np.zeros(len(x))
@@ -149,6 +150,8 @@ def fit_range_errors(flight: Flight, receive_noise_s: Floats) -> RangeErrors:
         number = np.bincount(pair, minlength=count)
         share, pair_excess = (np.bincount(pair, v, count) / number for v in (shapes.tail_share, excess))
         _, life = lasting(flight.time_s, pair, reflected)
+        if life is not None:
+            pair_life = _lives(flight, reflected, life, share)
     white = range_noise_m(flight, receive_noise_s)
     # Ranges of two messages err by the skew of the clocks, which the fit takes for delays and the twin simulates.
     from_delays = len(flight.row.messages) > 2
@@ -161,8 +164,24 @@ def fit_range_errors(flight: Flight, receive_noise_s: Floats) -> RangeErrors:
         life_s=life,
         pair_share=share,
         pair_excess_m=pair_excess,
+        pair_life_s=pair_life,
         reflected=reflected,
     )
+
+
+def _lives(flight: Flight, reflected: Floats, life_s: float, share: Floats) -> Floats:
+    """Return the lives of pairs (pairs,), drawn towards that of all.
+
+    The logarithm of a life has the variance 2/spells; that between pairs is what theirs have beyond it.
+    """
+    spells = np.maximum(2 * share * (1 - share) * flight.time_s[-1] / life_s, 1e-9)
+    off, told = np.zeros(len(share)), np.flatnonzero(spells >= 6)
+    for k in told:
+        rows = np.flatnonzero(flight.pair == k)
+        _, own = lasting(flight.time_s[rows], np.zeros(len(rows), dtype=np.int64), reflected[rows])
+        off[k] = np.log((own or life_s) / life_s)
+    between = max(np.var(off[told]) - np.mean(2 / spells[told]), 0.0) if len(told) > 2 else 0.0
+    return np.asarray(life_s * np.exp(off * between / (between + 2 / spells)))
 
 
 def range_noise_m(flight: Flight, receive_noise_s: Floats) -> Floats:

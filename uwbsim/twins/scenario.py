@@ -181,7 +181,10 @@ def _multipath(flight: Flight, fitted: Fitted) -> dict[str, Any] | None:
     default = TwoStateMultipath(model="two-state")
     # Where consecutive ranges show no correlation, paths change faster than a pair ranges.
     life_s = min(default.life_s, flight.interval_s / 3) if found.life_s is None else found.life_s
-    own = zip(flight.pairs, np.clip(found.pair_share, 0, 1).tolist(), found.pair_excess_m.tolist(), strict=True)
+    # Pairs whose life is not told have that of all.
+    lives = np.maximum(np.nan_to_num(found.pair_life_s, nan=life_s), SHORTEST_LIFE_S)
+    columns = (np.clip(found.pair_share, 0, 1), found.pair_excess_m, lives)
+    pairs = zip(flight.pairs, *(column.tolist() for column in columns), strict=True)
     return _given(
         model="two-state",
         share=found.share,
@@ -192,7 +195,9 @@ def _multipath(flight: Flight, fitted: Fitted) -> dict[str, Any] | None:
         first_path_loss_db=loss,
         loss_std_db=None if loss is None else fitted.powers.reflection_loss_std_db,
         total_loss_db=None if loss is None else min(default.total_loss_db, loss),
-        pairs=[{"tags": list(pair), "share": share, "mean_excess_m": excess} for pair, share, excess in own],
+        pairs=[
+            {"tags": list(p), "share": share, "mean_excess_m": mean, "life_s": own} for p, share, mean, own in pairs
+        ],
     )
 
 

@@ -55,9 +55,13 @@ def flight(time_s, pair, error):
 
 @pytest.fixture(scope="module")
 def made():
-    """Six pairs at 20 Hz each for 300 s: two that are reflected often, and four that are less."""
-    rng = np.random.default_rng(77)
-    whiles = [(1.2, 0.6), (1.2, 0.6), (3.0, 0.5), (3.0, 0.5), (4.0, 0.4), (4.0, 0.4)]
+    """Six pairs: two that are reflected often, and four that are less."""
+    return several(77, [(1.2, 0.6), (1.2, 0.6), (3.0, 0.5), (3.0, 0.5), (4.0, 0.4), (4.0, 0.4)])
+
+
+def several(seed, whiles):
+    """Return a flight of pairs at 20 Hz each for 300 s, which ranges are reflected, and the mean shares of pairs."""
+    rng = np.random.default_rng(seed)
     time_s = np.arange(0, 300, 0.05)
     parts = [residuals(rng, time_s + 0.005 * k, *pair) for k, pair in enumerate(whiles)]
     times = np.concatenate([time_s + 0.005 * k for k in range(len(whiles))])
@@ -104,6 +108,11 @@ def integral_s(centred, step_s, longest_s=3.0):
     correlation = [np.mean(centred[k:] * centred[:-k]) / np.mean(centred**2) for k in lags]
     first = next((k for k, value in enumerate(correlation) if value < 0.02), len(correlation))
     return step_s * (0.5 + sum(correlation[:first]))
+
+
+def test_pairs_whose_reflections_last_longer_are_told_from_others():
+    lives = fit_range_errors(several(78, [(0.6, 0.3)] * 2 + [(4.0, 2.0)] * 2)[0], np.zeros(24_000)).pair_life_s
+    assert min(lives[2:]) > 3 * max(lives[:2])
 
 
 def test_independent_reflections_have_no_life(made):
