@@ -177,26 +177,18 @@ def _settled(results: Results) -> Criterion | None:
     known = results.calibration
     if known.pair_offsets:
         return None
-    free = known.provenance.get("undetermined", [])
-    half = {t: TWO_SIDED_95 * known.delays_std_ns.get(t, math.nan) for t in known.delays_ns}
-    measured = {tag: h for tag, h in half.items() if np.isfinite(h)}
-    asked = f"95 % interval of each within ± {MOST_NS:g} ns (3 cm)"
-    question = "Are the antenna delays known well enough?"
-    if free:
-        return Criterion(question, asked, left_open(results), BAD, left_open(results))
-    if not measured:
-        return Criterion(question, asked, "the calibration states no intervals", DOUBT, "delays have no intervals")
-    tag = max(measured, key=lambda t: measured[t])
-    fine = measured[tag] <= MOST_NS
-    return Criterion(
-        question,
-        asked,
-        f"widest: tag {tag}, ± {measured[tag]:.3f} ns",
-        _graded(fine, measured[tag] <= 3 * MOST_NS),
-        f"delays are known to ± {measured[tag]:.3f} ns or better"
-        if fine
-        else f"the delay of tag {tag} is known to ± {measured[tag]:.2f} ns only",
-    )
+    asked = ("Are the antenna delays known well enough?", f"95 % interval of each within ± {MOST_NS:g} ns (3 cm)")
+    if known.provenance.get("undetermined"):
+        return Criterion(*asked, left_open(results), BAD, left_open(results))
+    half = {tag: TWO_SIDED_95 * std for tag, std in known.delays_std_ns.items() if np.isfinite(std)}
+    if not half:
+        return Criterion(*asked, "the calibration states no intervals", DOUBT, "delays have no intervals")
+    tag = max(half, key=lambda t: half[t])
+    told = f"delays are known to ± {half[tag]:.3f} ns or better"
+    if half[tag] > MOST_NS:
+        told = f"the delay of tag {tag} is known to ± {half[tag]:.2f} ns only"
+    grade = _graded(half[tag] <= MOST_NS, half[tag] <= 3 * MOST_NS)
+    return Criterion(*asked, f"widest: tag {tag}, ± {half[tag]:.3f} ns", grade, told)
 
 
 def left_open(results: Results) -> str:

@@ -130,7 +130,7 @@ def room(width_in: float, scenario: Scenario) -> Figure:
             _draw_box(axes, corners[:, [x, y]], fill=False, ec=INK, lw=1.2, zorder=1)
         for k, body in enumerate(scenario.bodies):
             own = {tag.id: tags[tag.id][[x, y]] for tag in scenario.tags if tag.body == body.name}
-            _draw_body(axes, body.name, paths[body.name][:, [x, y]], own, look(k), middle[x])
+            _draw_body(axes, body.name, paths[body.name][:, [x, y]], own, look(k), middle[[x, y]])
         axes.set(xlim=(low[x], high[x]), ylim=(low[y], high[y]), aspect="equal", axisbelow=True)
         axes.set(xlabel=f"{'xyz'[x]} (m)", ylabel=f"{'xyz'[y]} (m)")
         axes.grid(True)
@@ -146,15 +146,16 @@ def _draw_box(axes: Axes, corners: Floats, **line: Any) -> Floats:
     return size
 
 
-def _draw_body(axes: Axes, name: str, path: Floats, tags: Mapping[int, Floats], own: Look, middle: float) -> None:
-    """Draw a path (n, 2), and tags with their numbers at the first, on the side of `middle`."""
+def _draw_body(axes: Axes, name: str, path: Floats, tags: Mapping[int, Floats], own: Look, middle: Floats) -> None:
+    """Draw a path (n, 2), and tags with their numbers at the first, towards `middle` (2,)."""
     axes.plot(*path.T, color=own.colour, lw=0.6, alpha=0.6)
     spots = np.array(list(tags.values())).reshape(-1, 2)
     mark(axes.plot(*spots.T, own.marker, color=own.colour, ms=4, label=name)[0], name)
     if tags:
-        side = -1 if spots[0, 0] > middle else 1
-        place: dict[str, Any] = {"ha": "right" if side < 0 else "left", "textcoords": "offset points"}
-        axes.annotate(", ".join(map(str, tags)), (spots[0, 0], spots[0, 1]), (4 * side, 4), color=INK, **place)
+        left, down = (spots[0] > middle).tolist()
+        place: dict[str, Any] = {"ha": "right" if left else "left", "va": "top" if down else "bottom", "color": INK}
+        away = (-4 if left else 4, -4 if down else 4)
+        axes.annotate(", ".join(map(str, tags)), tuple(spots[0]), away, textcoords="offset points", **place)
 
 
 def _to_scale(width_in: float, size_m: Floats) -> tuple[Figure, list[Axes]]:
