@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -100,15 +101,14 @@ def read_exported(folder: Path, _map_file: Path | None = None) -> Contents:
         raise ImportTableError(f"{folder}: holds no exchanges.csv or exchanges.parquet, as 'uwblink export' writes")
     with TemporaryDirectory() as place:
         path = Path(place) / "exported.uwb"
-        store = Store.write(path, path)
-        try:
+        with closing(Store.write(path, path)) as store:
             for table, source in paths.items():
-                with connected([source]) as db:
-                    store.insert(table, dict(db.execute(_query(db, table, source), [str(source)]).fetchnumpy()))
-        except duckdb.Error as error:
-            raise ImportTableError(f"{source}: not in the form of 'uwblink export' ({first_line(error)})") from error
-        finally:
-            store.close()
+                try:
+                    with connected([source]) as db:
+                        store.insert(table, dict(db.execute(_query(db, table, source), [str(source)]).fetchnumpy()))
+                except duckdb.Error as error:
+                    why = f"not in the form of 'uwblink export' ({first_line(error)})"
+                    raise ImportTableError(f"{source}: {why}") from error
         return load(path)
 
 

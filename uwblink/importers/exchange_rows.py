@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import IDS
-from uwblink.importers.plausibility import counter_format
+from uwblink.importers.plausibility import SAMPLE_ROWS, counter_format
 from uwblink.importers.staging import Rows, Staging, Watch
 from uwblink.importers.tables import Table
 from uwblink.recording.schema import Fault
@@ -110,14 +110,12 @@ def _times(rows: Rows) -> list[Condition]:
     return [Condition("time_s", "a time", "time_ns IS NULL")] if rows.has("time_s") else []
 
 
-def usable_exchanges(
-    staging: Staging, rows: Rows, faults: Faults, stamps: Sequence[str], sample_size: int
-) -> tuple[Rows, int, int, str]:
+def usable_exchanges(staging: Staging, rows: Rows, faults: Faults, stamps: Sequence[str]) -> tuple[Rows, int, int, str]:
     """Return the rows that have all stamps, without repetitions of an exchange.
 
     Also returns the number of repetitions, and width and format of the counter.
     """
-    column_map, sample = staging.column_map, rows.sample(sample_size)
+    column_map, sample = staging.column_map, rows.sample(SAMPLE_ROWS)
     scale = column_map.ticks_per_unit
     ticks = [sample[name] * scale for name in stamps]
     bits, counter = counter_format(ticks, column_map.bits, column_map.counter)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -79,51 +78,40 @@ def import_tables(
         staging = Staging(db, paths, column_map, watch)
         faults, notes = Faults(staging), _notes(staging)
         rows, reading = _usable(staging, faults, notes, watch)
-        total = rows.count()
-        blocks = iter(faults)
-        if count := len(faults) + sum(len(table.rejected()) for table in staging.tables):
-            first = next(blocks)
-            rest = f"rows cannot be used and are kept as faults; the first: {first[0].detail}"
-            notes.append(f"{count} of {total + count} {rest}")
-            blocks = chain([first], blocks)
+        total, done = rows.count(), 0
         delays = column_map.antenna_delays
         if reading and reading.undelayed:
             delays = {None: AntennaDelay(0, 0, 0)}
-        tags = {str(number): name for number, name in sorted(staging.names.items())}
-        meta = {
-            **meta,
-            "timestamp_bits": reading.bits if reading else 32,
-            "notes": notes,
-            **({"tag_names": tags} if tags else {}),
-            **meta_of_delays(delays),
-        }
-        counts = {"exchanges": 0, "poses": 0, "powers": 0, "faults": 0}
+        names = {str(tag): name for tag, name in sorted(staging.names.items())}
+        meta = {**meta, "timestamp_bits": reading.bits if reading else 32, **meta_of_delays(delays)}
+        meta |= {"tag_names": names} if names else {}
         with Recording.create(output, meta=meta, force=force, memory_mb=250) as recording:
             ends = " UNION ".join(f"SELECT {name} AS id FROM {rows.name} WHERE {rows.condition}" for name in IDS)
-            bodies = {
-                tag: staging.names.get(tag, f"tag{tag}") for (tag,) in db.execute(f"{ends} ORDER BY id").fetchall()
-            }
+            tags = [tag for (tag,) in db.execute(f"{ends} ORDER BY id").fetchall()]
+            bodies = {tag: staging.names.get(tag, f"tag{tag}") for tag in tags}
             recording.append_tags(Tag(tag, body, (0.0, 0.0, 0.0)) for tag, body in bodies.items())
             for block in rows.blocks():
-                watch("writing", counts["exchanges"] / total)
-                exchanges = exchanges_of(column_map, block, reading, counts["exchanges"])
-                known = np.isfinite(exchanges.range_m)
-                if not known.all():
-                    raw = raw_range(exchanges)
-                    exchanges = replace(exchanges, range_m=np.where(known, exchanges.range_m, raw))
+                watch("writing", done / total)
+                exchanges = exchanges_of(column_map, block, reading, done)
+                done += len(exchanges)
+                if not np.isfinite(exchanges.range_m).all():
+                    raw, reported = raw_range(exchanges), exchanges.range_m
+                    exchanges = replace(exchanges, range_m=np.where(np.isfinite(reported), reported, raw))
                 recording.append_exchanges(exchanges)
-                counts["exchanges"] += len(exchanges)
                 if "rxp1" in block or "rxp2" in block:
                     powers = {name: getattr(exchanges, name) for name in ("time_ns", "initiator", "target")}
-                    powers |= {f"{name}_dbm": optional(block, name) for name in ("rxp1", "rxp2")}
-                    recording.append("powers", powers)
-                    counts["powers"] += len(exchanges)
+                    recording.append("powers", powers | {f"{n}_dbm": optional(block, n) for n in ("rxp1", "rxp2")})
             for poses in _poses(rows, bodies):
                 recording.append_poses(poses)
-                counts["poses"] += len(poses)
-            for some in blocks:
+            first = ""
+            for some in faults:
+                first = first or some[0].detail
                 recording.append("faults", some)
-                counts["faults"] += len(some)
+            counts = {name: recording.count(name) for name in ("exchanges", "poses", "powers", "faults")}
+            if first:
+                lost = counts["faults"]
+                notes.append(f"{lost} of {total + lost} rows cannot be used and are kept as faults; the first: {first}")
+            recording.append_meta({"notes": notes})
         return Imported({name: n for name, n in counts.items() if n or name == "exchanges"}, notes)
 
 
@@ -162,7 +150,7 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
         return rows, None
     protocol = protocol or ("ds" if rows.has("tx3") and rows.has("rx3") else "ss")
     staging.require(rows, stamps_of(protocol))
-    rows, repeats, bits, counter = usable_exchanges(staging, rows, faults, stamps_of(protocol), SAMPLE_ROWS)
+    rows, repeats, bits, counter = usable_exchanges(staging, rows, faults, stamps_of(protocol))
     faults.check(total)
     if repeats:
         notes.append(
