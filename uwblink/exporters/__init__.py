@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,18 +32,8 @@ from uwblink.recording.intake import check_name
 from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM, Poses
 
 
-def write_csv(recording: Path, folder: Path) -> dict[str, int]:
-    """Write a CSV file a table, with a header; returns the rows by file. Raises `RecordingError`."""
-    cells = {"BLOB": "hex({0})", "USMALLINT[]": "CAST({0} AS VARCHAR)"}
-    return _write(recording, folder, "csv", "FORMAT csv, HEADER true, NULLSTR ''", cells)
-
-
-def write_parquet(recording: Path, folder: Path) -> dict[str, int]:
-    """Write a Parquet file a table; returns the rows by file. Raises `RecordingError`."""
-    return _write(recording, folder, "parquet", "FORMAT parquet, COMPRESSION zstd", {})
-
-
-def _write(recording: Path, folder: Path, suffix: str, options: str, cells: Mapping[str, str]) -> dict[str, int]:
+def _write(recording: Path, folder: Path, *, suffix: str, options: str, cells: Mapping[str, str]) -> dict[str, int]:
+    """Write a file a table; returns the rows by file. `cells` are SQL of values by kind. Raises `RecordingError`."""
     with Recording.open(recording) as opened:
         # The checks of every reader, before DuckDB reads the file directly.
         counts = {table: opened.count(table) for table in TABLES}
@@ -154,8 +145,21 @@ EXPORTERS: Final[Registry[Exporter]] = Registry(
     "exporter",
     "uwbcal.exporters",
     (
-        Exporter("csv", write_csv, "a CSV file a table"),
-        Exporter("parquet", write_parquet, "a Parquet file a table"),
+        Exporter(
+            "csv",
+            partial(
+                _write,
+                suffix="csv",
+                options="FORMAT csv, HEADER true, NULLSTR ''",
+                cells={"BLOB": "hex({0})", "USMALLINT[]": "CAST({0} AS VARCHAR)"},
+            ),
+            "a CSV file a table",
+        ),
+        Exporter(
+            "parquet",
+            partial(_write, suffix="parquet", options="FORMAT parquet, COMPRESSION zstd", cells={}),
+            "a Parquet file a table",
+        ),
         Exporter("tum", write_tum, "a trajectory a body (time x y z qx qy qz qw)"),
         Exporter("mcap", write_mcap, "one file of JSON messages, for Foxglove and PlotJuggler"),
         Exporter("rosbag2", write_rosbag2, "a bag of ROS 2: PoseStamped, tf, sensor_msgs/Range and Imu"),

@@ -202,7 +202,8 @@ def load_map(path: Path) -> ColumnMap:
     each = table.get("each")
     file.check("each", each, each is None or isinstance(each, str), "the name of a field")
     for name, value in ids.items():
-        file.check(f"ids.{name}", value, _is_id(value), f"a whole number from 0 to {LARGEST_ID}")
+        is_id = type(value) is int and 0 <= value <= LARGEST_ID
+        file.check(f"ids.{name}", value, is_id, f"a whole number from 0 to {LARGEST_ID}")
     within = table.get("within_s", 1.0)
     file.check("within_s", within, is_number(within) and within > 0, "seconds")
     return ColumnMap(
@@ -235,10 +236,6 @@ def _constants(file: TomlReader, where: str, values: dict[str, Any]) -> None:
             )
         else:
             file.check(f"{where}.{name}", value, is_number(value), "a finite number")
-
-
-def _is_id(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= LARGEST_ID
 
 
 def _ticks_per_unit(file: TomlReader, unit: Any) -> float:

@@ -161,12 +161,11 @@ def try_reading(rows: Columns, column_map: ColumnMap, reading: Reading) -> Trial
 
 def _longer_m(column_map: ColumnMap, rows: Columns) -> Floats:
     """Return the lengths (n,) that missing antenna delays add to ranges, by the map."""
-    lacking, delays = np.zeros(len(rows["origin"])), column_map.antenna_delays
-    for name in IDS if delays else ():
-        ids, back = np.unique(rows[name], return_inverse=True)
-        programmed = [delay_of(delays, int(tag)) or AntennaDelay() for tag in ids]
-        lacking += (2 * ANTENNA_DELAY_TICKS - np.array([one.tx + one.rx for one in programmed], np.float64))[back]
-    return lacking / 2 * METRES_PER_TICK
+    ends = np.array([rows[name] for name in IDS])
+    tags, which = np.unique(ends, return_inverse=True)
+    programmed = [delay_of(column_map.antenna_delays, int(tag)) or AntennaDelay() for tag in tags]
+    lacking = np.array([2 * ANTENNA_DELAY_TICKS - one.tx - one.rx for one in programmed], np.float64)
+    return np.asarray(lacking[which.reshape(ends.shape)].sum(axis=0) / 2 * METRES_PER_TICK)
 
 
 def settle_reading(path: Path, column_map: ColumnMap, rows: Columns, reading: Reading) -> tuple[Reading, str]:

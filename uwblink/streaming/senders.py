@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import ipaddress
 import json
+import re
 import secrets
 import select
 import socket
@@ -51,21 +52,14 @@ def is_viewer(host: str, origin: str | None, own: str) -> bool:
         page = site.hostname or ""
     except ValueError:
         return False
-    # Names without a dot and in .local are of this network, so no site can let one of them point here.
-    is_own = name == own.lower() or name.endswith(".local") or "." not in name or _is_address(name)
+    # Addresses, names without a dot and in .local are of this network, so no site can let one of them point here.
+    is_own = name == own.lower() or name.endswith(".local") or re.fullmatch(r"[0-9.]+|[^.]+|.*:.*", name) is not None
     is_page = site.scheme in ("http", "https")  # a viewer on the desktop has another scheme
     is_trusted = page in (name, "localhost", LOOPBACK, "::1") or (
         site.scheme == "https" and (page == VIEWERS or page.endswith(f".{VIEWERS}"))
     )
     # Programs that are no browsers send no origin; pages without an origin send "null".
     return bool(name) and is_own and (origin is None or (is_trusted if is_page else bool(site.scheme)))
-
-
-def _is_address(name: str) -> bool:
-    try:
-        return bool(ipaddress.ip_address(name))
-    except ValueError:
-        return False
 
 
 class Gate(socketserver.ThreadingTCPServer):

@@ -84,8 +84,14 @@ def test_the_public_table_of_single_sided_ranges(tmp_path):
     assert (found.columns["time_s"], found.columns["range_m"]) == ("host_t_s", "device_range_m")
 
 
-@pytest.mark.parametrize(("event", "words"), [("event", ("tx", "rx")), ("direction", ("Sent", "Received"))])
-@pytest.mark.parametrize("clock", ["ticks", "device_timestamp", "stamp"])
+@pytest.mark.parametrize(
+    ("event", "words", "clock"),
+    [
+        ("event", ("tx", "rx"), "ticks"),
+        ("direction", ("Sent", "Received"), "device_timestamp"),
+        ("event", ("tx", "rx"), "stamp"),
+    ],
+)
 def test_a_row_a_stamp(tmp_path, event, words, clock):
     rows = flights()
     lines = []
