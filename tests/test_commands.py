@@ -2,20 +2,18 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 import uwblink
-
-BIN = Path(sys.executable).parent
+from tests import processes
 
 
 @pytest.mark.parametrize("command", ["uwbsim", "uwblink", "calib"])
 def test_usage_errors_have_status_2(command):
-    assert subprocess.run([str(BIN / command), "--nonsense"], capture_output=True).returncode == 2
-    assert subprocess.run([str(BIN / command), "nonsense"], capture_output=True).returncode == 2
-    done = subprocess.run([str(BIN / command), "--version"], capture_output=True, text=True)
+    assert processes.run(command, "--nonsense").returncode == 2
+    assert processes.run(command, "nonsense").returncode == 2
+    done = processes.run(command, "--version")
     assert done.stdout.splitlines()[0] == f"{command} {uwblink.__version__}"
 
 

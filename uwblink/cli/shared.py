@@ -13,7 +13,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import Field, fields, is_dataclass
 from functools import wraps
 from inspect import Parameter, Signature, signature
@@ -283,22 +283,19 @@ def new_app(text: str) -> typer.Typer:
         ] = False,
     ) -> None:
         if version:
-            typer.echo("\n".join(_versions(ctx.info_name or "uwbcal")))
+            typer.echo(_versions(ctx.info_name or "uwbcal"))
             raise typer.Exit
 
     return app
 
 
-def _versions(command: str) -> Iterator[str]:
-    """Yield the version of a command, and those of the libraries on which its results depend."""
-    from importlib.metadata import PackageNotFoundError, version
+def _versions(command: str) -> str:
+    """Return the version of a command, and those of the libraries on which its results depend."""
+    from importlib.metadata import version
 
-    yield f"{command.split()[-1]} {__version__}"
-    found = [f"Python {platform.python_version()}"]
-    for name in ("numpy", "scipy", "duckdb", "pydantic", "simpy", "matplotlib"):
-        with suppress(PackageNotFoundError):
-            found.append(f"{name} {version(name)}")
-    yield ", ".join(found)
+    names = ("numpy", "scipy", "duckdb", "pydantic", "simpy", "matplotlib")
+    libraries = ", ".join(f"{name} {version(name)}" for name in names)
+    return f"{command.split()[-1]} {__version__}\nPython {platform.python_version()}, {libraries}"
 
 
 def run(

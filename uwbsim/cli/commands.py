@@ -380,9 +380,6 @@ def twin(
         check_output(path, force=force)
     with waiting("fitting"):
         found = uwbsim.twin(recording, calibration)
-    files = found.files(output)
-    for path in files:
-        check_output(path, force=force)
     with waiting(output.name) as report:
         compared = found.compare(seeds, report)
     found.save(output, force=force)
@@ -393,7 +390,7 @@ def twin(
         return
     rows_of_text = [[show(one) for show in uwbsim.pages.TWIN_COLUMNS.values()] for one in compared]
     _print_table([[*uwbsim.pages.TWIN_COLUMNS], *rows_of_text], "measured / simulated")
-    typer.echo(", ".join(map(str, (*files, page))))
+    typer.echo(", ".join(map(str, (*found.files(output), page))))
 
 
 app = new_app("Simulate tags that range with ultra-wideband radios.")
