@@ -67,7 +67,7 @@ def test_every_offered_name_is_in_the_reference(package):
 
 def test_what_doors_return_is_in_the_reference():
     page = doors.reference("calib")
-    names = ("evaluation.error_statistics.ErrorStatistics", "calibration.runtime.CorrectedRange", "findings.Finding")
+    names = ("evaluation.error_statistics.ErrorStatistics", "calibration.parts.CorrectedRanges", "findings.Finding")
     for name in names:
         assert f"calib.{name}" in page or name.split(".")[-1] in page
 

@@ -40,13 +40,13 @@ def programmed(world, path):
     return world if path is None else world.model_copy(update={"tags": with_antenna_delays(world.tags, path)})
 
 
-def record(world, path, delays=None, protocol="ss", said=True):
+def record(world, path, delays=None, protocol="ss", said=True, duration_s=2.0):
     """Record virtual boards into which a file of antenna delays is programmed, with their poses."""
     ports = uwbsim.VirtualPorts(programmed(world, delays))
     told = load_antenna_delays(delays) if delays and said else {}
     tags = tuple(uwblink.Tag(tag, f"b{tag}", (0.0, 0.0, 0.0)) for tag in PLACES_M)
     plan = uwblink.RangingPlan(rate_hz=200.0, protocol=protocol, tags=tags, antenna_delays=told)
-    uwblink.record(ports.names.values(), path, plan, duration_s=3.0, using=ports)
+    uwblink.record(ports.names.values(), path, plan, duration_s=duration_s, using=ports)
     time_ns = uwblink.load(path).exchanges.time_ns
     rows = [
         f"{when},b{tag},{x},{y},{z},0,0,0,1"
@@ -138,7 +138,7 @@ def test_stamps_are_those_of_the_firmware(tmp_path, protocol, through):
     (tmp_path / "d.toml").write_text(text)
     world = scenario(dict.fromkeys(rows, 0.0), noise_ps=0.0, protocol=protocol)
     if through == "boards":
-        record(world, tmp_path / "f.uwb", tmp_path / "d.toml", protocol)
+        record(world, tmp_path / "f.uwb", tmp_path / "d.toml", protocol, duration_s=1.0)
     else:
         uwbsim.simulate(programmed(world, tmp_path / "d.toml")).save(tmp_path / "f.uwb")
     with uwblink.Recording.open(tmp_path / "f.uwb") as recording:
@@ -210,17 +210,8 @@ def test_where_nothing_says_what_was_programmed_no_register_is_guessed(tmp_path)
     done = run("calib", "export", tmp_path / "c.json", "--to", "registers", status=2)
     assert "--antenna-delays" in done.stderr
     (tmp_path / "d.toml").write_text("[antenna_delays]\ntx = 100\nrx = 200\nreply = 300\n")
-    run(
-        "calib",
-        "export",
-        tmp_path / "c.json",
-        "--to",
-        "firmware",
-        "--antenna-delays",
-        tmp_path / "d.toml",
-        "-o",
-        tmp_path / "o.toml",
-    )
+    words = ("--to", "firmware", "--antenna-delays", tmp_path / "d.toml", "-o", tmp_path / "o.toml")
+    run("calib", "export", tmp_path / "c.json", *words)
     for tag, total in totals(tmp_path / "o.toml").items():
         assert total == 300 + round(-known.delays_ns[tag] * 1e-9 / TICK_S)
     rows = tomllib.loads((tmp_path / "o.toml").read_text())["antenna_delays"]["tags"]
