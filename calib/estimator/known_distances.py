@@ -274,13 +274,7 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted) -> Fitted:
         (*model.gauge_rows(layout), *model.held_rows(layout)),
         layout.indices([u.kind for u in model.unknowns]),
     )
-    x, priors = layout.start(pilot.values), Priors(layout)
-    order = np.random.default_rng(0).permutation(len(error))
-    size, steps = FIRST_SAMPLE, pilot.steps
-    while 2 * size < len(error):
-        found = maximize([rows.sample(np.sort(order[:size])), *gauge], priors, x, tolerance=1.0, asked=asked)
-        x, size, steps = found.x, size * GROWTH, steps + found.steps
-    found = maximize([rows, *gauge], priors, x, asked=asked)
+    found, steps = _maximize_by_samples(rows, gauge, Priors(layout), layout.start(pilot.values), asked)
     return Fitted(
         rows=rows,
         gauge=gauge,
@@ -288,8 +282,21 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted) -> Fitted:
         residuals=rows.residuals(found.x),
         loss=MIXTURE,
         scale_m=pilot.scale_m,
-        steps=steps + found.steps,
+        steps=pilot.steps + steps,
     )
+
+
+def _maximize_by_samples(
+    rows: RangeRows, gauge: Sequence[NormalRows], priors: Priors, x: Floats, asked: Ints | None = None
+) -> tuple[Optimum, int]:
+    """Return the optimum of rows, found on samples of growing size and then on all of them, and the steps taken."""
+    order = np.random.default_rng(0).permutation(len(rows))
+    size, steps = FIRST_SAMPLE, 0
+    while 2 * size < len(rows):
+        found = maximize([rows.sample(np.sort(order[:size])), *gauge], priors, x, tolerance=1.0, asked=asked)
+        x, size, steps = found.x, size * GROWTH, steps + found.steps
+    found = maximize([rows, *gauge], priors, x, asked=asked)
+    return found, steps + found.steps
 
 
 def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDistances:
@@ -407,7 +414,7 @@ def described_errors(found: KnownDistances) -> DescribedErrors:
         centre = Unknown(kind="centre", names=("",), start=np.array([-float(np.median(found.residuals))]))
         everyone = Part(parameter=RESIDUAL, kind="centre", columns=np.zeros((1, 1), dtype=np.int64))
         layout, rows = model.build(found.residuals, mixture, [centre, *unknowns], [everyone, *parts], only=())
-        optimum = maximize([rows], Priors(layout), layout.start())
+        optimum, _ = _maximize_by_samples(rows, (), Priors(layout), layout.start())
         x, location = optimum.x, -float(optimum.of("centre")[0])
         values = {kind: x[where] for kind, where in layout.where.items()}
         noise = layout.indices([kind for kind in values if kind.startswith(("noise level", "noise curve"))])
