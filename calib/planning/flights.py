@@ -19,6 +19,7 @@ from calib.planning.result import FlightPlan, NextBest, mean_std_ns
 from calib.planning.settings import FlightPlanSettings
 from calib.settings import FlightSettings
 from calib.spread import TWO_SIDED_95
+from calib.trajectories.attitudes import WINDOW_S
 from uwblink.arrays import Floats
 
 MORE_KNOWN_S = 10.0
@@ -34,7 +35,6 @@ ACCELEROMETERS = {"consumer": 3e-3, "industrial": 1e-3, "tactical": 3e-4}
 VIBRATION_M_S2 = 0.2
 """Vibration that is left in a mean over a tenth of a second."""
 
-WINDOW_S = 0.1
 TRUSTED = 3.0
 """Factor on the residuals of an accelerometer in a fit."""
 

@@ -154,15 +154,16 @@ def predict(inputs: SurveyPlanSettings, layouts: Sequence[Layout], *, curve: boo
 
 def _averaged(verdicts: list[Verdict]) -> Prediction:
     """Return root mean squares over the draws that determine it; infinite where most do not."""
-    rows = []
-    for one in verdicts:
-        whole = one.determined.all()
-        centre = np.eye(len(one.std)) - 1 / len(one.std)
-        apart = np.sqrt(np.diag(centre @ one.covariance @ centre)) if whole else np.full(len(one.std), math.inf)
-        rows.append([*one.std, *apart, math.sqrt(float(one.covariance.mean())) if whole else math.inf])
-    every = np.array(rows)
-    good = np.isfinite(every)
-    mean = np.sqrt((np.where(good, every, 0.0) ** 2).sum(axis=0) / np.maximum(good.sum(axis=0), 1))
-    found = np.where(good.mean(axis=0) > 0.5, mean, math.inf)
-    count = len(found) // 2
-    return Prediction(found[:count], found[count:-1], float(found[-1]))
+    covariance = np.array([one.covariance for one in verdicts])
+    centre = np.eye(covariance.shape[1]) - 1 / covariance.shape[1]
+    apart = np.diagonal(centre @ covariance @ centre, axis1=1, axis2=2)
+    common = covariance.mean(axis=(1, 2))[:, None]
+    each = np.array([one.std for one in verdicts]) ** 2
+    return Prediction(_root_mean(each), _root_mean(apart), float(_root_mean(common)[0]))
+
+
+def _root_mean(variances: Floats) -> Floats:
+    """Return roots of means (n,) over the draws (k, n) that are finite; infinite where most are not."""
+    good = np.isfinite(variances)
+    mean = np.where(good, variances, 0.0).sum(axis=0) / np.maximum(good.sum(axis=0), 1)
+    return np.where(good.mean(axis=0) > 0.5, np.sqrt(mean), math.inf)

@@ -11,6 +11,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from calib.data.samples import SampleFlight, stamped
 from calib.planning.settings import FlightPlanSettings
+from calib.trajectories.motion import GRAVITY_M_S2
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
@@ -27,7 +28,6 @@ TURNS_S = (11.0, 19.0)
 HANGING_M = 0.05
 POWER_AT_2_M_DBM = -80.0
 FADING_DB = 3.0
-GRAVITY_M_S2 = 9.81
 EDGE = 0.05
 SAMPLE_S = 0.02
 """Sampling interval of motion: cubic splines through the samples are exact to micrometres and 1e-4 m/s^2."""

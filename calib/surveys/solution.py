@@ -141,9 +141,7 @@ def adjust(
     case = Case(none if marks is None else marks, network.pair_m or start_m, CURVE_STD_M)
     for _ in range(rounds):
         before = case
-        x, _ = optimize(network, x, case)
-        case = replace(case, marks=Marks.at(network, x, case).searched())
-        x, _ = optimize(network, x, case)
+        x, case = settle(network, x, case)
         case = _spreads(network, x, case)
         if abs(case.pair_m - before.pair_m) < 0.02 * case.pair_m and np.array_equal(case.marks, before.marks):
             break
@@ -225,24 +223,20 @@ def solve(network: Network, *, moves: int = 6) -> tuple[Solution, SecondBest | N
     found = min((adjust(network, start, start_m=spread) for spread in spreads), key=least)
     # Once more with the delays that came out: the first guess of places was made without any.
     found = min(found, adjust(network, first_start(network, found.delays)), key=least)
-    worse: list[tuple[float, tuple[str, tuple[int, ...]]]] = []
+    worse: list[SecondBest] = []
     for _ in range(moves):
         here = unlikelihood(network, found.x, found.case)
         others = [other for k in range(len(network.arrangements)) for other in _other_solutions(found, k)]
         # Rounded, so that of mirror images the same one is named on every machine.
-        worse = [(round(value - here, 3), who) for value, _, _, who in others if value >= here - 1e-3]
-        better = [other for other in others if other[0] < here - 1e-3]
-        if not better:
-            break
-        _, x, case, _ = min(better, key=itemgetter(0))
-        moved = adjust(network, x, marks=case.marks)
+        worse = [
+            SecondBest(*who, max(0.0, round(value - here, 3))) for value, _, _, who in others if value > here - 1e-3
+        ]
+        value, x, case, _ = min(others, key=itemgetter(0), default=(here, found.x, found.case, None))
+        moved = adjust(network, x, marks=case.marks) if value < here - 1e-3 else found
         if moved.unlikely > found.unlikely - 1e-3:
             break
         found = moved
-    if not worse:
-        return found, None
-    gap, (name, tags) = min(worse)
-    return found, SecondBest(name, tags, max(0.0, gap))
+    return found, min(worse, key=attrgetter("worse", "arrangement", "tags"), default=None)
 
 
 def _other_solutions(
