@@ -252,18 +252,15 @@ class Network:
     @cached_property
     def layout(self) -> Layout:
         """The unknowns and their priors, with a curve of 1 m."""
-        centre, std = np.zeros((len(self.points), 3)), np.full((len(self.points), 3), PLACE_STD_M)
-        known = np.zeros((len(self.points), 3), dtype=bool)
-        for k, boards in enumerate(self.arrangements):
-            mine = self.seats(k)
-            known[mine] = np.arange(3) >= boards.dimensions
-            if boards.freed:
-                std[mine, boards.dimensions - 1] = BESIDE_STD_M
-            if there := [self.known_places[point][0] for point in mine.tolist() if point in self.known_places]:
-                centre[mine] = np.mean(there, axis=0)
+        boards, axis = [self.arrangements[k] for k in self.owner.tolist()], np.arange(3)
+        known = axis >= np.array([[one.dimensions] for one in boards])
+        known.ravel()[list(self.held)] = True
+        beside = axis == np.array([[one.dimensions - 1 if one.freed else -1] for one in boards])
+        std, centre = np.where(beside, BESIDE_STD_M, PLACE_STD_M), np.zeros((len(boards), 3))
+        for point, (place, _) in self.known_places.items():
+            centre[self.owner == self.owner[point]] = place
         for point, (place, sigma) in self.known_places.items():
             centre[point], std[point] = place, sigma
-        known.ravel()[list(self.held)] = True
         delays = np.array([self.fixed_ns.get(tag, 0.0) for tag in self.tags])
         certain = np.array([FIXED_STD_NS if tag in self.fixed_ns else DELAY_STD_NS for tag in self.tags])
         blocks = [("place", centre.ravel(), np.diag(std.ravel() ** -2)), ("delay", delays, np.diag(certain**-2))]
