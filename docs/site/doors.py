@@ -125,6 +125,6 @@ def _functions(thing: Any) -> Iterator[Any]:
 def _classes(hint: Any) -> Iterator[type]:
     if inspect.isclass(hint) and not isinstance(hint, ModuleType):
         yield hint
-    # The parameters of a callable are a list.
-    for part in hint if isinstance(hint, list) else typing.get_args(hint):
+    # The parameters of a callable are a list; a generic class is the origin of its hint.
+    for part in hint if isinstance(hint, list) else filter(None, (typing.get_origin(hint), *typing.get_args(hint))):
         yield from _classes(part)
