@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from itertools import cycle
 from typing import Any, Final
 
@@ -35,7 +36,7 @@ STATES: Final = 16_384
 """States of the world that are sampled; it is also the length of the pieces that fit into a core's cache."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Conditions:
     """The state of the world in exchanges, columns of length n; times of flight and delays in seconds.
 
@@ -262,32 +263,48 @@ def exchange(protocol: RangingProtocol, c: Conditions, noise: Noise | None = Non
     A clock reads 1 + rate times the true time, plus half of drift times its square, plus the phase of its noise.
     Antenna delays and power add to stamps.
     """
-    rate, drift, tx, rx = (c.by_side(name) for name in ("rate", "drift", "tx_delay", "rx_delay"))
+    way, tx, late, faster, carrier = _in_ticks(c)
+    drift = c.by_side("drift")
     stamps: dict[str, Floats] = {}
     leave, arrive = [], []
-    carrier = c.carrier_sign * (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
-    way = (c.flight + c.excess) / TICK_S
+    drifting, moving = any(column.any() for column in drift.values()), c.flight_rate.any()
     if noise:
         noise.begin(c)
         way = way + noise.detours(c) / TICK_S
     for k, message in enumerate(protocol.messages):
         sender, receiver = SIDES if message.sender == "initiator" else SIDES[::-1]
         sent = _transmit_stamp(message, stamps, c, noise)
-        left = (sent - tx[sender] / TICK_S) / (1 + rate[sender])
-        left = left - drift[sender] * (TICK_S / 2) * left**2
+        left = (sent - tx[sender]) / faster[sender]
+        if drifting:
+            left -= drift[sender] * (TICK_S / 2) * left**2
+        if noise and k == 1:
+            carrier = carrier + noise.carrier_ppm(c, left)
+        if noise and noise.white:
+            left -= noise.phase(sender, left)
+        came = left + way
+        if moving:
+            came += c.flight_rate * left
+        seen = faster[receiver] * came
+        seen += late[receiver]
+        if drifting:
+            seen += drift[receiver] * (TICK_S / 2) * came**2
         if noise:
-            if k == 1:
-                carrier = carrier + noise.carrier_ppm(c, left)
-            left = left - noise.phase(sender, left)
-        came = left + way + c.flight_rate * left
-        seen = (1 + rate[receiver]) * came + drift[receiver] * (TICK_S / 2) * came**2 + (c.late + rx[receiver]) / TICK_S
-        if noise:
-            seen = noise.received(c, k, receiver, seen + noise.phase(receiver, came))
+            seen = noise.received(c, k, receiver, seen, came)
         stamps[f"tx{k + 1}"], stamps[f"rx{k + 1}"] = sent, seen
         leave.append(left)
         arrive.append(came)
     truth = c.flight / TICK_S + c.flight_rate * (leave[0] + leave[1]) / 2
     return Stamps(stamps=stamps, leave=leave, arrive=arrive, truth=truth, carrier_ppm=carrier)
+
+
+@lru_cache(maxsize=8)
+def _in_ticks(c: Conditions) -> tuple[Floats, dict[str, Floats], dict[str, Floats], dict[str, Floats], Floats]:
+    """Return first path, and errors of transmit and receive stamps by side, in ticks; rates by side; carrier in ppm."""
+    tx = {side: delay / TICK_S for side, delay in c.by_side("tx_delay").items()}
+    late = {side: (delay + c.late) / TICK_S for side, delay in c.by_side("rx_delay").items()}
+    faster = {side: 1 + rate for side, rate in c.by_side("rate").items()}
+    carrier = c.carrier_sign * (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
+    return (c.flight + c.excess) / TICK_S, tx, late, faster, carrier
 
 
 def _transmit_stamp(message: ProtocolMessage, stamps: dict[str, Floats], c: Conditions, noise: Noise | None) -> Floats:
@@ -317,13 +334,13 @@ class Noise:
         self._multipath, self._carrier = stream(seed, "multipath"), stream(seed, "skew reading", 2)
         self._counters = {side: stream(seed, "counter phase", side) for side in SIDES}
         self._clocks = {side: stream(seed, "clock noise", side) for side in SIDES}
-        self._radio = bool(np.any(c.tx_std) or np.any(c.rx_std))
-        self._white = bool(np.any(c.white_initiator) or np.any(c.white_target))
+        self.white = bool(np.any(c.white_initiator) or np.any(c.white_target))
 
     def begin(self, c: Conditions) -> None:
         """Begin exchanges: draw the phases of the counters; the phases of the clocks' noise are zero."""
         if c.quantize:
             self.grid = {side: own.random(len(c)) * DELAYED_TX_GRID for side, own in self._counters.items()}
+        self._std = np.sqrt(c.tx_std**2 + c.rx_std**2) / TICK_S
         self._walks: dict[str, tuple[Floats, Floats]] = {}
         # The standard deviation of a clock's phase after a tick, in ticks.
         self._wander = {side: white * TICK_S**-0.5 for side, white in c.by_side("white").items()}
@@ -337,10 +354,8 @@ class Noise:
         units = np.where(hit < c.multipath, -np.log(np.maximum(hit / c.multipath, 1e-300)), 0.0)
         return units * c.detour_s
 
-    def phase(self, side: str, time: Floats) -> Floats | float:
+    def phase(self, side: str, time: Floats) -> Floats:
         """Return the phase of a clock by the white noise of its rate at times in ticks, none earlier than the last."""
-        if not self._white:
-            return 0.0
         last, phase = self._walks.get(side, (time, np.zeros_like(time)))
         step = np.sqrt(np.maximum(time - last, 0)) * self._clocks[side].standard_normal(len(time))
         self._walks[side] = time, phase + self._wander[side] * step
@@ -349,16 +364,19 @@ class Noise:
     def carrier_ppm(self, c: Conditions, departure: Floats) -> Floats | float:
         """Return the noise of the carrier integrator, with that of the clocks over the preamble before a departure."""
         noise = self._carrier.standard_normal(len(c)) * c.carrier_std_ppm if c.carrier_std_ppm else 0.0
+        if not self.white:
+            return noise
         span = RATE_SPAN_S / TICK_S
         before = [self.phase(side, departure - span) for side in SIDES]
         mine, other = (self.phase(side, departure) - phase for side, phase in zip(SIDES, before, strict=True))
         return noise + c.carrier_sign * (mine - other) / span * 1e6
 
-    def received(self, c: Conditions, k: int, side: str, seen: Floats) -> Floats:
-        """Return receive stamps of message k with the noise of both radios, in whole ticks of the receiver's counter.
+    def received(self, c: Conditions, k: int, side: str, seen: Floats, time: Floats) -> Floats:
+        """Return receive stamps of message k at times in ticks with all noise, in ticks of the receiver's counter.
 
         Transmit noise is added here, too: its effect on later departures is below 1e-7 of it.
         """
-        if self._radio:
-            seen = seen + self._frames[k].standard_normal(len(c)) * (np.hypot(c.tx_std, c.rx_std) / TICK_S)
+        if self.white:
+            seen += self.phase(side, time)
+        seen += self._frames[k].standard_normal(len(c)) * self._std
         return np.rint(seen + self.grid[side]) - self.grid[side] if c.quantize else seen
