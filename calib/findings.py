@@ -31,9 +31,6 @@ SMALLEST_NS: Final = 0.02
 STRETCHES: Final = 16
 """Stretches of time over which a statistic is averaged: their variance is then known to about a third."""
 
-RANGES_A_STRETCH: Final = 30
-"""Ranges of a stretch, so that its spread is known to an eighth."""
-
 CERTAIN: Final = "none: no chance is involved"
 
 
@@ -115,6 +112,6 @@ def more_often(count: int, of: int, chance: float, *, tried: float = 1) -> float
 
 def stretches(count: int) -> list[slice]:
     """Return stretches of equal count of `count` rows in order of time, none where there are too few rows."""
-    some = min(STRETCHES, count // RANGES_A_STRETCH)
+    some = min(STRETCHES, count // 30)
     edges = np.linspace(0, count, some + 1).astype(int) if some >= STRETCHES // 2 else np.zeros(1, dtype=int)
     return [slice(a, b) for a, b in pairwise(edges.tolist())]

@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 
-from calib.checks.limits import skew_sentence
 from calib.checks.recording_view import RecordingView, quick_fit
 from calib.data.clocks import PPM_TO_METRES, corrected, left_skew
 from calib.findings import Candidate, exceeds
@@ -18,20 +17,15 @@ from uwblink.ticks import TICK_S
 from uwblink.twr import intervals, without_stamps
 
 RANGES_OF_A_SLOPE: Final = 100
-SPREAD_M: Final = 0.03
-"""Skew must be expected to change ranges by more, for it to be seen in them."""
 
 ONE_WAY_M: Final = 0.05
 """By how much ranges of a sound pair may differ by who initiates: the powers of both ways are not quite alike."""
 
-RANGES_A_WAY: Final = 15
 NEAR: Final = 0.5
 """A slope is that of a fault, of 1 or of 2, or none: halfway lies the edge."""
 
 LEFT: Final = "skew in single-sided ranges"
 WRONG_SIGN: Final = "carrier readings with the wrong sign"
-SCATTER_PPM: Final = 1.5
-"""What single readings of a sound board may scatter: a reply of 1.5 ms then adds a third of a metre to a range."""
 
 NORMAL: Final = 1e6
 """Degrees of freedom of what many ranges tell."""
@@ -55,14 +49,16 @@ def skew(view: RecordingView) -> Iterator[Candidate]:
     some = e[known][fit.rows]
     # A target's reply lasts longer by the clock of a faster initiator, and so does the range.
     expected = PPM_TO_METRES * some.skew2_ppm * intervals(some).dt32 * TICK_S
-    slope, _, std, dof = fit.offsets(expected[:, None])
+    found = fit.offsets(expected[:, None])
+    slope = float(found.size[0])
     reach = float(np.ptp(np.percentile(expected, (5, 95))))
-    if reach < SPREAD_M:
+    # Skew must be expected to change ranges by more, for it to be seen in them.
+    if reach < 0.03:
         return
-    p_value = exceeds(float(slope[0]), float(std[0]), dof, tolerance=NEAR)
-    evidence = f"errors grow by {slope[0]:.2f} m in a metre of c/2 times carrier's skew times reply, over {reach:.2f} m"
+    p_value = exceeds(slope, float(found.std[0]), found.dof, tolerance=NEAR)
+    evidence = f"errors grow by {slope:.2f} m in a metre of c/2 times carrier's skew times reply, over {reach:.2f} m"
     for at, fault, remedy in SLOPES[taken.pop()]:
-        if abs(slope[0] - at) < NEAR:
+        if abs(slope - at) < NEAR:
             yield Candidate(fault, evidence, p_value, {"more": remedy})
 
 
@@ -72,13 +68,14 @@ def _by_direction(single: RecordingView) -> Iterator[Candidate]:
     if fit is None:
         return
     e = single.exchanges[fit.rows]
-    size, _, error, dof = fit.offsets_of_pairs(np.where(e.initiator < e.target, 0.5, -0.5)[:, None])
-    ways, std = size[:, 0], error[:, 0]
-    worst = int(np.argmax((np.abs(ways) - ONE_WAY_M) / std))
+    of_pairs = np.equal.outer(fit.pair, np.arange(len(fit.ends)))
+    found = fit.offsets(of_pairs * np.where(e.initiator < e.target, 0.5, -0.5)[:, None])
+    ways = found.size
+    worst = int(np.argmax((np.abs(ways) - ONE_WAY_M) / found.std))
     evidence = (
         f"ranges of pair {fit.names[worst]} differ by {100 * abs(ways[worst]):.0f} cm by who initiates, the most of all"
     )
-    p_value = exceeds(float(ways[worst]), float(std[worst]), dof, tolerance=ONE_WAY_M, tried=len(ways))
+    p_value = exceeds(float(ways[worst]), float(found.std[worst]), found.dof, tolerance=ONE_WAY_M, tried=len(ways))
     remedy = "record the carrier integrator, or use double-sided ranging; until then take the mean of both ways"
     yield Candidate(LEFT, evidence, p_value, {"more": remedy})
 
@@ -88,7 +85,7 @@ def swapped_roles(view: RecordingView) -> Iterator[Candidate]:
     e = view.exchanges
     e = e[(e.protocol == "ds") & (e.tx3 != 0) & np.isfinite(e.skew1_ppm)]
     _, link, count = np.unique(e.initiator * 65_536 + e.target, return_inverse=True, return_counts=True)
-    enough = count > RANGES_A_WAY
+    enough = count > 15
     if len(e) < RANGES_OF_A_SLOPE or not enough.any():
         return
     variance = (np.pi / 2 * np.maximum(spreads(e.skew1_ppm, link), 1e-4) ** 2 / count)[enough]
@@ -121,7 +118,7 @@ def unread(view: RecordingView) -> Iterator[Candidate]:
     """Single-sided ranges whose carriers were not read: nothing says what skew left in them."""
     left = left_skew(view.exchanges)
     if left and not np.isfinite(left.told_m):
-        yield Candidate("single-sided without carrier readings", skew_sentence(left))
+        yield Candidate("single-sided without carrier readings", str(left))
 
 
 def carriers(view: RecordingView) -> Iterator[Candidate]:
@@ -135,7 +132,8 @@ def carriers(view: RecordingView) -> Iterator[Candidate]:
         # That of most pairs: one board that scatters is not the unit of all.
         scatter, count, pair = known[(len(known) - 1) // 2]
         # Of the logarithm of a median absolute deviation (efficiency 0.37).
-        p_value = exceeds(max(np.log(scatter / SCATTER_PPM), 0.0), float(1 / np.sqrt(2 * 0.37 * count)), NORMAL)
+        # Of a sound board: a reply of 1.5 ms then adds a third of a metre to a range.
+        p_value = exceeds(max(np.log(scatter / 1.5), 0.0), float(1 / np.sqrt(2 * 0.37 * count)), NORMAL)
         yield Candidate(
             "carrier readings that say little",
             f"they scatter by {scatter:.1f} ppm about their median (pair {pair}), and as much or more in half of the "

@@ -19,15 +19,7 @@ from uwblink.recording import target_faster_ppm
 from uwblink.ticks import SPEED_OF_LIGHT, TICKS_PER_SECOND
 from uwblink.twr import Exchanges, board_range, intervals, raw_range, without_stamps
 
-FARTHEST_M: Final = 50.0
-CONTRADICTS_M: Final = 0.01
-LEAST_CORRUPT: Final = 0.001
-"""Share of damaged rows of a sound recording."""
-
-MOST_CORRUPT: Final = 0.5
 VACUUM_OVER_AIR: Final = 299_792_458.0 / SPEED_OF_LIGHT
-RANGES_OF_A_RATIO: Final = 100
-"""Ranges whose median ratio tells the speed of light in air from that in vacuum."""
 
 
 def ticks(view: RecordingView) -> Iterator[Candidate]:
@@ -58,15 +50,12 @@ def impossible(view: RecordingView) -> Bools:
     e, ratios = view.exchanges, _reported_over_stamps(view)
     with np.errstate(all="ignore"):
         bad = ~(np.abs(view.raw_m) < PLAUSIBLE_M) | ~_sound_clocks(e) | (e.initiator == e.target)
-        if not len(ratios) or abs(np.median(ratios) - 1) <= SCALED:
-            bad |= np.abs(board_range(e) - e.range_m) > CONTRADICTS_M
-        away = np.abs(view.error_m) > FARTHEST_M
+        # Where reported ranges are in another unit by more, none of them contradicts its stamps.
+        if not len(ratios) or abs(np.median(ratios) - 1) <= 1e-4:
+            bad |= np.abs(board_range(e) - e.range_m) > 0.01
+        away = np.abs(view.error_m) > 50.0
     # Where most are far off, something else is wrong with all of them.
-    return np.asarray(bad | away if np.mean(away) < MOST_CORRUPT else bad)
-
-
-SCALED: Final = 1e-4
-"""Where reported ranges are in another unit by more, none of them contradicts its stamps."""
+    return np.asarray(bad | away if np.mean(away) < 0.5 else bad)
 
 
 def with_itself(view: RecordingView) -> Iterator[Candidate]:
@@ -90,12 +79,12 @@ def corrupted(view: RecordingView) -> Iterator[Candidate]:
     """Exchanges that are impossible, or contradict themselves; the other examinations do without them."""
     bad = impossible(view)
     count = int(np.count_nonzero(bad))
-    if count < MOST_CORRUPT * len(bad):
+    if count < 0.5 * len(bad):
         yield Candidate(
             "corrupted exchanges",
             f"{count} of {len(bad)} exchanges have impossible stamps, or stamps that contradict the "
             "range reported with them or the clocks of their pair; what else is said here is said without them",
-            more_often(count, len(bad), LEAST_CORRUPT),
+            more_often(count, len(bad), 0.001),
         )
 
 
@@ -120,31 +109,29 @@ def reported(view: RecordingView) -> Iterator[Candidate]:
     """Reported ranges that were computed with the speed of light in vacuum, or are in another unit than metres."""
     ratios = _reported_over_stamps(view)
     ratio = float(np.median(ratios)) if len(ratios) >= RANGES_OF_A_UNIT else 1.0
-    if len(ratios) >= RANGES_OF_A_RATIO and abs(ratio / VACUUM_OVER_AIR - 1) < 5e-5:
+    # So many medians of ratios tell the speed of light in air from that in vacuum.
+    if len(ratios) >= 100 and abs(ratio / VACUUM_OVER_AIR - 1) < 5e-5:
         evidence = (
             f"reported ranges are {ratio:.5f} times those from the stamps: 299 792 458 m/s instead of 299 702 547"
         )
         yield Candidate("speed of light in vacuum", evidence)
     for unit, many in LENGTHS.items():
-        if abs(ratio / many - 1) < UNIT_OFF:
+        # Delays of boards may change a range of some metres by so much.
+        if abs(ratio / many - 1) < 0.05:
             evidence = f"reported ranges are {ratio:.5g} times those from the stamps"
             yield Candidate(REPORTED, evidence, words={"unit": unit})
 
 
-WIDTHS: Final = (32, 40)
 POSSIBLE_SHARE: Final = 0.5
 """Another reading must make at least this share of the ranges possible, and `MORE_POSSIBLE` more than its own."""
 
 MORE_POSSIBLE: Final = 0.2
 MORE_BY_WIDTH: Final = 0.01
-SKEW_PPM: Final = 100.0
-TRIED: Final = 4000
-"""Exchanges on which other protocols are tried."""
 
 
 def another(view: RecordingView) -> Iterator[Candidate]:
     """Try every other protocol with as many messages, and every width of the counter."""
-    e = view.exchanges[:: max(len(view.exchanges) // TRIED, 1)]
+    e = view.exchanges[:: max(len(view.exchanges) // 4000, 1)]
     names, counts = np.unique(e.protocol, return_counts=True)
     said = str(names[int(np.argmax(counts))])
     third = bool(np.mean((e.tx3 | e.rx3) != 0) > POSSIBLE_SHARE)
@@ -153,7 +140,7 @@ def another(view: RecordingView) -> Iterator[Candidate]:
     tried = {
         (name, bits): _possible_share(replace(e, protocol=np.full(len(e), name), bits=bits))
         for name, row in PROTOCOLS.items()
-        for bits in WIDTHS
+        for bits in (32, 40)
         if highest < 1 << bits and (name, bits) != (said, e.bits) and (row.third_sender is not None) == third
     }
     if not tried:
@@ -182,7 +169,7 @@ def _possible_share(e: Exchanges) -> float:
 def _sound_clocks(e: Exchanges) -> Bools:
     """Return where the third leg says that clocks run alike as crystals do, (n,); so they do where there is none."""
     names = [name for name in np.unique(e.protocol).tolist() if PROTOCOLS[name].third_sender is not None]
-    return np.asarray(~np.isin(e.protocol, names) | (np.abs(target_faster_ppm(e)) < SKEW_PPM))
+    return np.asarray(~np.isin(e.protocol, names) | (np.abs(target_faster_ppm(e)) < 100.0))
 
 
 LENGTHS: Final = {"mm": 1000.0, "cm": 100.0, "in": 1 / 0.0254, "ft": 1 / 0.3048}
@@ -201,14 +188,6 @@ USUAL_DBM: Final = (-115.0, -55.0)
 """First-path powers of these radios, from their sensitivity to a metre apart."""
 
 RANGES_OF_A_UNIT: Final = 20
-UNIT_OFF: Final = 0.05
-"""By which delays of boards may change a range of some metres."""
-
-SPREAD_BY_UNIT: Final = MATERIAL / 2
-"""Feet taken for metres leave two thirds of the ranges' own spread, the right unit noise and delays."""
-
-ONE_DISTANCE_M: Final = 0.5
-"""Ranges that spread by less are of one distance."""
 
 REPORTED: Final = "unit of the reported ranges"
 POWER: Final = "unit of the powers"
@@ -244,10 +223,11 @@ def _unit(metres: Floats, others: Floats) -> str | None:
     left = {name: robust_spread(metres - others / many) for name, many in LENGTHS.items()}
     best = min(left, key=lambda name: left[name])
     # Distances that say nothing are best when they are divided by most.
-    if left[best] < SPREAD_BY_UNIT * min(robust_spread(metres - others), robust_spread(metres)):
+    # Feet taken for metres leave two thirds of the ranges' own spread, the right unit noise and delays.
+    if left[best] < 0.5 * MATERIAL * min(robust_spread(metres - others), robust_spread(metres)):
         return best
     # Of one distance, the unit that makes both alike.
-    if robust_spread(metres) > ONE_DISTANCE_M or np.median(others) < PLAUSIBLE_M:
+    if robust_spread(metres) > 0.5 or np.median(others) < PLAUSIBLE_M:
         return None
     return min(LENGTHS, key=lambda name: abs(float(np.median(metres - others / LENGTHS[name]))))
 

@@ -170,7 +170,7 @@ RADIO: Final = (
         {
             reflected.MANY: "{more}",
             reflected.LASTING: "such ranges do not average out within a spell: record for many spells, move walls, "
-            "bodies or antennas{advice}",
+            "bodies or antennas",
         },
         reflected.reflections,
     ),

@@ -26,18 +26,11 @@ SEGMENTS, SPAN_S = 6, 20.0
 """Spans of time in which a tag may have an offset of its own, and how long they are at least: errors that last must be
 known within them."""
 
-NEIGHBOUR_S = 1.0
-"""Two ranges of a pair further apart say nothing of a speed: bodies turn round within seconds."""
-
-DECIBEL = float(10**0.1)
 MATTERS, CLEARLY = 1.0, 4.0
 """A finding is named that moves some delay by so many of its standard errors, a small one by so many."""
 
 SMALLEST_M = 0.01
 """An offset of less is nobody's fault: it widens intervals, and is not named unless it matters clearly."""
-
-SUGGESTED = 2.5
-"""So many standard errors of decibels, beside certainty that a tag's errors go with power."""
 
 READINGS = ("readings",)
 """The finding that powers are read with noise: the curve is right for the powers that are read."""
@@ -190,7 +183,8 @@ def _late(found: KnownDistances) -> dict[str, Floats]:
     time_s, truth_m = ranges.time_ns[order] * 1e-9, ranges.truth_m[order]
     same = (np.diff(pair[order]) == 0) & (np.diff(ranges.session[order]) == 0)
     step = np.diff(time_s)
-    usual = same & (step > 0) & (step < NEIGHBOUR_S)
+    # Two ranges of a pair further apart say nothing of a speed: bodies turn round within seconds.
+    usual = same & (step > 0) & (step < 1.0)
     rate = np.where(usual, np.diff(truth_m) / np.where(usual, step, 1.0), 0.0)
     # The mean of both sides, or the one that there is.
     sides = np.add(np.append(usual, False), np.insert(usual, 0, False), dtype=np.float64)
@@ -207,7 +201,7 @@ def _root_mean_square(values: Floats) -> float:
 def change_per_decibel(found: KnownDistances) -> Floats:
     """Return by how much ranges (n,) would read otherwise, had their powers been a decibel higher."""
     curves, lifted = list(bias_curves(found).values()), found.model.lifted
-    return np.asarray(np.mean([curve(DECIBEL * lifted) - curve(lifted) for curve in curves], axis=0))
+    return np.asarray(np.mean([curve(10**0.1 * lifted) - curve(lifted) for curve in curves], axis=0))
 
 
 def _without_repeats(findings: list[FoundOffset]) -> list[FoundOffset]:
@@ -234,7 +228,7 @@ def _wrong_decibels(findings: list[FoundOffset], tested: list[Tested]) -> Iterat
         k = list(result.family.names).index(name)
         known = max(float(result.information[k, k]), 1e-300)
         offset = float(result.total[k]) / known
-        if known > 1e-3 * result.whole and abs(offset) > SUGGESTED * np.sqrt(result.covariance[k, k]) / known:
+        if known > 1e-3 * result.whole and abs(offset) > 2.5 * np.sqrt(result.covariance[k, k]) / known:
             yield FoundOffset(
                 kind="decibels",
                 names=(name,),

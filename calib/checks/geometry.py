@@ -9,26 +9,17 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
-from scipy import optimize, sparse, special
+from scipy import optimize, special
 
-from calib.checks.pairs import standing_still
 from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
-from calib.estimator.score_tests import Family
+from calib.estimator.score_tests import Tested
 from calib.findings import Candidate, positive, stretches
+from calib.information import LOOSEST
 from calib.spread import TWO_SIDED_95, less_medians, medians, robust_spread
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.recording.distances import antennas_m, distances_m, find_offset
 from uwblink.recording.schema import Poses, Tag
-
-LARGEST_OFFSET_S: Final = 3.0
-SMALLEST_OFFSET_S: Final = 0.03
-"""Host times of ranges are as late as USB makes them, and poses as a camera's exposure and network."""
-
-LONGEST_ARM_M: Final = 1.0
-"""Robots that carry these boards are smaller; longer arms may be in another unit."""
-
-ARM_UNITS: Final = {"mm": 0.001, "cm": 0.01, "in": 0.0254}
 
 
 def pose_clock(view: RecordingView) -> Iterator[Candidate]:
@@ -36,11 +27,12 @@ def pose_clock(view: RecordingView) -> Iterator[Candidate]:
     if not len(view.poses):
         return
     try:
-        offset_ns = find_offset(view.exchanges, view.poses, view.tags, within_s=LARGEST_OFFSET_S)
+        offset_ns = find_offset(view.exchanges, view.poses, view.tags, within_s=3.0)
     except ImportTableError:
         return
     shift_s, e = offset_ns * 1e-9, view.exchanges
-    if abs(shift_s) > SMALLEST_OFFSET_S:
+    # Host times of ranges are as late as USB makes them, and poses as a camera's exposure and network.
+    if abs(shift_s) > 0.03:
         moved = distances_m(view.poses, view.tags, e.initiator, e.target, e.time_ns - offset_ns)
         evidence = f"with the poses {shift_s:+.3f} s later"
         yield _undone(view, Candidate("pose time offset", evidence, words={"shift": f"{shift_s:.3f}"}), moved)
@@ -51,18 +43,19 @@ def _trials(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]
     for body in sorted({tag.body for tag in view.tags}):
         arms = {tag.tag: np.array(tag.lever_arm_m) for tag in view.tags if tag.body == body}
         longest = max(np.linalg.norm(arm) for arm in arms.values())
-        scales = [("lever arm sign", -1.0, "")] if longest > 0 else []
-        if longest > LONGEST_ARM_M:
-            scales += [("lever arm unit", length, f" in {unit}") for unit, length in ARM_UNITS.items()]
-        for fault, length, unit in scales:
-            seen = Candidate(fault, f"of body {body}{unit}: undone,", words={"body": body, "length": length})
+        scales = [("lever arm sign", -1.0)] if longest > 0 else []
+        if longest > 1.0:
+            # Robots that carry these boards are smaller: mm, cm or inches.
+            scales += [("lever arm unit", length) for length in (0.001, 0.01, 0.0254)]
+        for fault, length in scales:
+            seen = Candidate(fault, f"of body {body}: times {length:g}", words={"body": body, "length": length})
             yield seen, view.poses, _with_arms(view.tags, {tag: length * arm for tag, arm in arms.items()})
         for a, b in combinations(arms, 2):
-            seen = Candidate("swapped tag ids", f"of tags {a} and {b}: undone,", words={"a": a, "b": b})
+            seen = Candidate("swapped tag ids", f"of tags {a} and {b}: undone", words={"a": a, "b": b})
             yield seen, view.poses, _with_arms(view.tags, {a: arms[b], b: arms[a]})
     if len(view.poses):
         turned = replace(view.poses, quaternion=view.poses.quaternion[:, [1, 2, 3, 0]])
-        yield Candidate("wxyz quaternion", "of the poses: undone,"), turned, view.tags
+        yield Candidate("wxyz quaternion", "of the poses: undone"), turned, view.tags
 
 
 def _with_arms(tags: list[Tag], arms: dict[int, Floats]) -> list[Tag]:
@@ -85,7 +78,7 @@ def _undone(view: RecordingView, seen: Candidate, truth_m: Floats, *, tried: int
     """Return a suspected fault with how the spread of ranges changes with the true distances (n,) without it."""
     p_value, gain = narrower(view, view.error_m, view.raw_m - truth_m, tried=tried)
     after, before = (100 * view.spread_m(view.raw_m - truth) for truth in (truth_m, view.truth_m))
-    evidence = f"{seen.evidence} the ranges' spread is {after:.1f} cm instead of {before:.1f} cm"
+    evidence = f"{seen.evidence}, the ranges' spread is {after:.1f} cm instead of {before:.1f} cm"
     return replace(seen, evidence=evidence, p_value=p_value, gain=gain)
 
 
@@ -93,17 +86,8 @@ ELSEWHERE: Final = "anchor stands elsewhere"
 TOLERANCE_M: Final = 0.05
 """What a place by tape or markers is off by, with the antenna beside the marker."""
 
-RANGES_OF_A_PLACE: Final = 200
-"""Ranges from which three coordinates are told, and how errors of them last."""
-
-ASTRAY_M: Final = 0.3
-"""Spread of an anchor's ranges beyond which its place is wrong by more than power and noise explain."""
-
-ANCHOR_STANDS_M: Final = 0.02
-"""What motion capture says of the place of a body that does not move."""
-
-SAME_PLACE_M: Final = 0.3
-"""A place nearer to another anchor's is that anchor's."""
+MISPLACED_M: Final = 0.5
+"""How far a place is known without ranges, where ranges are not astray: a tape misread, a tripod moved."""
 
 EXPLAINED: Final = 1.5
 """Times the spread of other ranges that are left where another place explains an anchor's ranges."""
@@ -115,39 +99,41 @@ HELD: Final = 1e-3
 def anchors(view: RecordingView) -> Iterator[Candidate]:
     """Anchors whose ranges ask for another place, which is `away_m` (3,) among the words."""
     # Where nothing moves, each pair has a level that is its own.
-    if view.posed and standing_still(view) is None and view.quick_fit is not None:
+    if view.posed and view.standing_m is None and view.quick_fit is not None:
         places = places_m(view)
         for body in places:
             yield from _displaced(view, view.quick_fit, body, places)
 
 
 def places_m(view: RecordingView) -> dict[str, Floats]:
-    """Return the places (3,) of the bodies that carry tags and do not move."""
+    """Return the places (3,) of the bodies that carry tags and do not move, within what motion capture says of that."""
     bodies = sorted({tag.body for tag in view.tags} & set(np.unique(view.poses.body).tolist()))
     points = {body: view.poses.position_m[view.poses.body == body] for body in bodies}
-    return {
-        body: np.asarray(np.median(some, axis=0))
-        for body, some in points.items()
-        if np.ptp(some, axis=0).max() < ANCHOR_STANDS_M
-    }
+    still = {body: some for body, some in points.items() if np.ptp(some, axis=0).max() < 0.02}
+    return {body: np.asarray(np.median(some, axis=0)) for body, some in still.items()}
 
 
 def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, Floats]) -> Iterator[Candidate]:
-    """Yield an anchor whose ranges fit another place, tested by the slopes of its distances at that place."""
+    """Yield an anchor whose ranges fit another place, tested by the slopes of its distances at that place.
+
+    In a direction that ranges hardly determine, as the height where robots keep theirs, some place far away always fits
+    reflections better than the given one. So the direction must be determined at the given place, as an information
+    matrix is judged (`calib.information`), unless ranges are astray there.
+    """
     tags = [tag.tag for tag in view.tags if tag.body == body]
     e = view.exchanges[fit.rows]
-    mine = np.isin(e.initiator, tags) != np.isin(e.target, tags)
-    own, e = view.chosen(fit.rows[mine]), e[mine]
     first = np.isin(e.initiator, tags)
+    mine = first != np.isin(e.target, tags)
     ids = np.where(first, e.initiator, e.target), np.where(first, e.target, e.initiator)
     here, there = (antennas_m(view.poses, view.tags, ends, e.time_ns) for ends in ids)
-    apart, pair = here - there, np.unique(fit.pair[mine], return_inverse=True)[1]
-    if len(apart) < RANGES_OF_A_PLACE or not np.isfinite(apart).all():
+    every = np.where(mine[:, None], here - there, 1.0)
+    apart, own = every[mine], view.chosen(fit.rows[mine])
+    if len(apart) < 200 or not np.isfinite(apart).all():
         return
-    here_m = np.linalg.norm(apart, axis=1)
+    pair, here_m = np.unique(fit.pair[mine], return_inverse=True)[1], np.linalg.norm(apart, axis=1)
     # Where anchors are metres off, what power does is not known, and small beside that.
-    loud = robust_spread(fit.residual[mine]) > ASTRAY_M
-    measured = here_m + (own.error_m if loud else fit.residual[mine])
+    astray = robust_spread(fit.residual[mine]) > 0.3
+    measured = here_m + (own.error_m if astray else fit.residual[mine])
     tried = [_place(apart, measured, pair, place - places[body]) for place in places.values()]
     before, *spreads = (
         robust_spread(less_medians(measured - np.linalg.norm(apart + away, axis=1), pair))
@@ -161,16 +147,19 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
     usual = EXPLAINED * robust_spread(fit.residual[~mine]) if not mine.all() else np.inf
     if size <= TOLERANCE_M or gain <= 0 or after >= min(before, usual) or moved is None:
         return
-    derivative = sparse.csr_matrix(((apart + away) / there_m[:, None])[moved.rows])
-    tested = moved.slopes.test(Family(kind="place", names="xyz", derivative=derivative))
-    slope = tested.information @ away * (1 - TOLERANCE_M / size)
-    square = float(slope @ np.linalg.lstsq(tested.covariance, slope, rcond=1e-12)[0])
-    p_value = float(special.fdtrc(3, tested.blocks - 3.0, square / 3))
+    at_other = moved.test(((apart + away) / there_m[:, None])[moved.rows])
+    slope = at_other.information @ away * (1 - TOLERANCE_M / size)
+    square = float(slope @ np.linalg.lstsq(at_other.covariance, slope, rcond=1e-12)[0])
+    p_value = float(special.fdtrc(3, at_other.blocks - 3.0, square / 3))
+    if not astray:
+        at_given = fit.test(np.where(mine[:, None], every / np.linalg.norm(every, axis=1)[:, None], 0.0))
+        if _std_m(at_given, away / size) > LOOSEST * MISPLACED_M:
+            return
     # Places above and below each other are alike to robots that move in a plane; a displacement is known to a tenth.
     near = {name: float(np.hypot(*(place - places[body] - away)[:2])) for name, place in places.items()}
-    others = " and ".join(name for name in places if name != body and near[name] < SAME_PLACE_M + 0.1 * size)
-    inverse = np.linalg.pinv(tested.information, rcond=1e-12, hermitian=True)
-    half = TWO_SIDED_95 * np.sqrt(np.diag(inverse @ tested.covariance @ inverse))
+    others = " and ".join(name for name in places if name != body and near[name] < 0.3 + 0.1 * size)
+    inverse = np.linalg.pinv(at_other.information, rcond=1e-12, hermitian=True)
+    half = TWO_SIDED_95 * np.sqrt(np.diag(inverse @ at_other.covariance @ inverse))
     axes = ", ".join(f"{name} {one:+.2f} ± {far:.2f}" for name, one, far in zip("xyz", away, half, strict=True))
     yield Candidate(
         ELSEWHERE,
@@ -181,6 +170,12 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
         {"body": body, "away_m": away, "place": [round(value, 2) for value in (places[body] + away).tolist()]},
         gain,
     )
+
+
+def _std_m(tested: Tested, direction: Floats) -> float:
+    """Return the standard error of a displacement along a direction (3,)."""
+    slope = np.linalg.lstsq(tested.information, direction, rcond=1e-12)[0]
+    return float(np.sqrt(slope @ tested.covariance @ slope))
 
 
 def _place(apart: Floats, measured: Floats, pair: Ints, start: Floats) -> Floats:
@@ -210,12 +205,9 @@ def narrower(view: RecordingView, before_m: Floats, after_m: Floats, *, tried: f
     if not cuts:
         return 1.0, 0.0
     wider = np.array([np.log(max(robust_spread(a[s], 0.0), 1e-6) / max(robust_spread(b[s], 0.0), 1e-6)) for s in cuts])
-    gain = float(np.sum(np.minimum(np.abs(a), FAR_M) - np.minimum(np.abs(b), FAR_M)))
+    gain = float(np.sum(np.minimum(np.abs(a), 10.0) - np.minimum(np.abs(b), 10.0)))
     return positive(wider + np.log(MATERIAL), tried=tried), gain
 
 
 MATERIAL: Final = 0.95
 """Undoing a fault that narrows ranges by less than a twentieth is not worth a word: curves that are left in do that."""
-
-FAR_M: Final = 10.0
-"""Errors beyond count no further in a gain."""

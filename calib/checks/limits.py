@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import ALPHA_DBM, equal_bins, lifted_power
-from calib.data.clocks import LeftSkew, corrected
+from calib.data.clocks import as_length, corrected
 from calib.data.ranges import NO_STAMPS, STATIC, Ranges
 from calib.errors import UnanswerableError
 from calib.estimator.known_distances import KnownDistances
@@ -25,20 +25,9 @@ from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import names_in
 
-RANGES_A_MEDIAN: Final = 20
-"""Ranges at one power from which their median error is told."""
-
 WITHOUT_CURVE: Final = "delays only"
 """How warnings of fits without a curve begin."""
 
-MANY_MISSING: Final = 0.05
-MANY_OUTLIERS: Final = 0.4
-SHORT_S: Final = 25.0
-SPREAD: Final = (5, 95)
-"""Percent of the powers between which errors are compared."""
-
-
-MOST_LEFT_OUT: Final = 0.5
 SCALE: Final = (0.75, 1.35)
 """How many metres a range may grow in a metre of true distance: a foot is 0.305 m, a yard 0.914."""
 
@@ -46,18 +35,10 @@ RANGES_ASKED: Final = 100_000
 """Of more ranges, only every so many are asked for their scale and their clocks."""
 
 UNITS: Final = {0.001: "millimetres", 0.01: "centimetres", 0.3048: "feet"}
-FEWEST_SPREADS: Final = 3.0
-"""True distances must spread by so much more than errors for their scale to be known."""
-
-SKEW_PPM: Final = 100.0
-"""Clock ratios beyond this are none: crystals of these boards keep 20 ppm each, over temperature and age."""
 
 LONGEST_NS: Final = 2.5
 """Boards of one kind differ by less in their antenna delays (published ones by 0.6 ns)."""
 
-ONE_WAY_M: Final = 0.05
-WAYS_DIFFER: Final = 8.0
-RANGES_A_WAY: Final = 20
 LOUD_M: Final = 0.5
 """Errors that spread by more are not those of a UWB range."""
 
@@ -77,7 +58,7 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
             "a damaged range cannot be told from a reflected one"
         )
     if ranges.left_skew is not None:
-        yield skew_sentence(ranges.left_skew)
+        yield str(ranges.left_skew)
     elif any(is_single_sided(name) and not corrected(name) for name in names_in(ranges.protocol)):
         yield (
             "single-sided ranges without their reply times and carrier readings: what clock skew has left in them "
@@ -103,31 +84,8 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
         own = medians(residuals_m, pairs_of(ranges.initiator, ranges.target).number)
         yield (
             "curve only: the delays are those that were given; what they have in common that is wrong is in the curve, "
-            f"where they differ it stays in the ranges (medians of pairs lie within {_length(float(np.ptp(own)))})"
+            f"where they differ it stays in the ranges (medians of pairs lie within {as_length(float(np.ptp(own)))})"
         )
-
-
-def skew_sentence(left: LeftSkew) -> str:
-    """Return as a sentence what clock skew may have left in single-sided ranges."""
-    bound = (
-        f"clocks that are 20 ppm off each leave up to {_length(left.bound_m)} "
-        f"(c/2 x 40 ppm x {1e6 * left.reply_s:.0f} µs of reply)"
-    )
-    if not np.isfinite(left.told_m):
-        return (
-            f"single-sided ranges without carrier readings: {bound}, which looks like an antenna delay and changes its "
-            "sign with who initiates"
-        )
-    return (
-        f"single-sided ranges with clock skew in them: {bound}, and by the carriers' readings up to "
-        f"{_length(left.told_m)}; read as protocol ss-cfo they are corrected with those"
-    )
-
-
-def _length(metres: float) -> str:
-    if metres >= 1:
-        return f"{metres:.1f} m"
-    return f"{100 * metres:.0f} cm" if metres >= 0.01 else f"{1e3 * metres:.1f} mm"
 
 
 def _without_curve(ranges: Ranges, residuals_m: Floats) -> str:
@@ -138,14 +96,14 @@ def _without_curve(ranges: Ranges, residuals_m: Floats) -> str:
             f"{WITHOUT_CURVE}, without any power: how ranges change with power cannot be seen, is in delays and "
             "errors, and delays from other distances will differ"
         )
-    low, high = np.percentile(_mean_dbm(ranges), SPREAD)
+    low, high = np.percentile(_mean_dbm(ranges), (5, 95))
     number = equal_bins(lifted[known]).number
-    middle = medians(residuals_m[known], number)[np.bincount(number) >= RANGES_A_MEDIAN]
-    reach = float(np.ptp(np.percentile(middle, SPREAD))) if len(middle) else 0.0
+    middle = medians(residuals_m[known], number)[np.bincount(number) >= 20]
+    reach = float(np.ptp(np.percentile(middle, (5, 95)))) if len(middle) else 0.0
     differ_ns = reach / SPEED_OF_LIGHT * 1e9
     return (
-        f"{WITHOUT_CURVE}: errors that change with power stay in the ranges, here {_length(reach)} between {low:.0f} "
-        f"and {high:.0f} dBm; delays hold for the recorded powers, and differ by up to {differ_ns:.2f} ns "
+        f"{WITHOUT_CURVE}: errors that change with power stay in the ranges, here {as_length(reach)} between "
+        f"{low:.0f} and {high:.0f} dBm; delays hold for the recorded powers, and differ by up to {differ_ns:.2f} ns "
         "at others among them"
     )
 
@@ -166,7 +124,7 @@ def _impossible(ranges: Ranges) -> Iterator[str]:
     """Yield why ranges cannot be what they claim."""
     missing = {reason: count for reason, count in ranges.excluded.items() if reason != STATIC}
     share = sum(missing.values()) / max(len(ranges) + sum(missing.values()), 1)
-    if share > MOST_LEFT_OUT:
+    if share > 0.5:
         worst = max(missing, key=lambda reason: missing[reason])
         yield (
             f"{100 * share:.0f} % of the exchanges were left out, most for {worst}; more than half is no sample: see "
@@ -179,13 +137,14 @@ def _impossible(ranges: Ranges) -> Iterator[str]:
     # How ranges and true distances spread: a unit or two columns may be wrong.
     slope = _robust_slope(some.truth_m, some.raw_m)
     rest = robust_spread(some.raw_m - slope * some.truth_m)
-    if not SCALE[0] < slope < SCALE[1] and abs(slope) * robust_spread(some.truth_m) >= FEWEST_SPREADS * rest:
+    if not SCALE[0] < slope < SCALE[1] and abs(slope) * robust_spread(some.truth_m) >= 3.0 * rest:
         guess = _looks_like(slope)
         yield (f"ranges grow by {slope:.3g} m in a metre of true distance; {guess and guess + '; '}give both in metres")
     # Clock ratios that no crystals have: stamps that wrapped, or columns in the wrong order.
     weight = some.weight_target[some.protocol == "ds"]
     skew = 1e6 * float(np.median(np.abs(2 * weight - 1))) if len(weight) else 0.0
-    if skew > SKEW_PPM:
+    # Crystals of these boards keep 20 ppm each, over temperature and age.
+    if skew > 100.0:
         yield (
             f"clocks differ by {skew:.0f} ppm by their third messages, crystals by 40 at most; the third leg is longer "
             "than stamps count before they wrap, or the columns of stamps are in another order"
@@ -215,11 +174,11 @@ def one_way(ranges: Ranges) -> Iterator[str]:
     rows_of_pairs = np.split(np.argsort(pairs.number, kind="stable"), np.cumsum(np.bincount(pairs.number))[:-1])
     for (a, b), rows in zip(pairs.ends.tolist(), rows_of_pairs, strict=True):
         ways = [error[rows[forth[rows] == way]] for way in (True, False)]
-        if min(map(len, ways)) < RANGES_A_WAY:
+        if min(map(len, ways)) < 20:
             continue
         differ = float(np.median(ways[0]) - np.median(ways[1]))
         std = STD_OF_MEDIAN * float(np.hypot(*(robust_spread(some) / np.sqrt(len(some)) for some in ways)))
-        if abs(differ) > max(ONE_WAY_M, WAYS_DIFFER * std):
+        if abs(differ) > max(0.05, 8.0 * std):
             size = f"{100 * abs(differ):.0f} cm {'longer' if differ > 0 else 'shorter'} if tag {a} initiates"
             found.append((abs(differ), f"pair {a}-{b}: ranges read {size}"))
     if found:
@@ -281,11 +240,11 @@ def warnings_of(ranges: Ranges, inliers: float, free: list[list[int]], seconds: 
         )
     everything = len(ranges) + sum(ranges.excluded.values())
     for reason, count in ranges.excluded.items():
-        if reason != STATIC and count > MANY_MISSING * everything:
+        if reason != STATIC and count > 0.05 * everything:
             yield f"{100 * count / everything:.0f} % of the exchanges were left out: {reason}"
-    if 1 - inliers > MANY_OUTLIERS:
+    if 1 - inliers > 0.4:
         yield f"{100 * (1 - inliers):.0f} % of the ranges lie beyond three sigmas of the calibrated errors"
-    if seconds < SHORT_S:
+    if seconds < 25.0:
         yield f"only {seconds:.0f} s of data: errors that persist are few, so intervals may be too narrow"
 
 
@@ -295,14 +254,8 @@ RANGES_LOOKED_AT: Final = 6_000
 GOLDEN: Final = 0.618034
 """What numbers are multiplied by whose fractions keep in step with no schedule of pairs."""
 
-RANGES_A_LEVEL: Final = 20
-"""Ranges a pair by which its levels are told."""
-
 SAME_LEVEL_DB: Final = 0.5
 """Levels of tags that differ by less are taken for the same; medians of a pair's ranges are known to a tenth of it."""
-
-LEVELS_DIFFER: Final = 4.0
-"""Standard errors beyond which levels differ; readings of one place come together, so that these are a little small."""
 
 
 def unlike_powers(ranges: Ranges, calibration: Calibration) -> Iterator[str]:
@@ -324,7 +277,8 @@ def unlike_powers(ranges: Ranges, calibration: Calibration) -> Iterator[str]:
         tag: level
         for tag, (level, std) in levels.items()
         if half_ns[tag] > 0
-        and abs(level) > max(SAME_LEVEL_DB, LEVELS_DIFFER * std)
+        # Readings of one place come together, so that standard errors are a little small.
+        and abs(level) > max(SAME_LEVEL_DB, 4.0 * std)
         and abs(level) * each_ns > max(half_ns[tag], SMALLEST_NS)
     }
     if unlike:
@@ -347,7 +301,7 @@ def power_levels_db(ranges: Ranges) -> dict[int, tuple[float, float]]:
     known = np.isfinite(apart)
     link = (ranges.initiator * 65_536 + ranges.target)[known]
     links, number, count = np.unique(link, return_inverse=True, return_counts=True)
-    enough = count >= RANGES_A_LEVEL
+    enough = count >= 20
     if not enough.any():
         return {}
     ends = np.divmod(links[enough], 65_536)

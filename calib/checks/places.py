@@ -17,9 +17,6 @@ from calib.findings import SMALLEST_NS
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 
-TOGETHER_S = 1.0
-"""Bodies are in the same places for about so long."""
-
 WIDENING_DEVIATION, CERTAIN_DEVIATION = 2.3, 3.1
 """Deviations that no more than 1 % and 0.1 % of sound flights show: the first widens intervals, the second is said."""
 
@@ -119,7 +116,8 @@ def _moving(found: KnownDistances, slopes: Slopes, sums: Floats) -> tuple[float,
     that belong to a pair, leave nothing of them on average.
     """
     blocks, pair = found.blocks, found.model.pairs.number[slopes.order]
-    each = max(round(TOGETHER_S * blocks.count / max(blocks.seconds, 1e-9)), 1)
+    # Bodies are in the same places for about a second.
+    each = max(round(1.0 * blocks.count / max(blocks.seconds, 1e-9)), 1)
     count, size = (blocks.count - 1) // each + 1, sums.shape[1]
     where = blocks.number[slopes.order] // each * size + pair
     slope, known = (

@@ -14,14 +14,15 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from scipy import sparse
+from scipy import ndimage, sparse
 
+from calib.data.clocks import pair_ids
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import RecordedSource, Source
 from calib.estimator.known_distances import FEWEST_RANGES, PILOT, Fitted, Recipe, likeliest, model_of, robust_fit
 from calib.estimator.optimize import maximize
 from calib.estimator.range_model import RangeModel
-from calib.estimator.score_tests import REACHED, Family, Slopes
+from calib.estimator.score_tests import REACHED, Family, Slopes, Tested
 from calib.estimator.time_blocks import GAP_S, TimeBlocks, time_blocks
 from calib.estimator.unknowns import Priors
 from calib.range_errors.density import OUTLIERS_OVER_M, error_slopes
@@ -36,11 +37,6 @@ from uwblink.ticks import TICK_S
 from uwblink.twr import Exchanges, raw_range
 
 PLAUSIBLE_M: Final = 1000.0
-SAME_M: Final = 0.001
-"""Distances that are written down and those of the poses are the same if they differ by rounding."""
-
-RANGES_A_MEDIAN: Final = 11
-"""Ranges of a pair from which its median is taken off."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +71,20 @@ class RecordingView:
         """A quick fit with constants of pairs; None where too few ranges have a true distance."""
         return quick_fit([self])
 
+    @cached_property
+    def standing_m(self) -> float | None:
+        """The largest change of a pair's distance where none changes by more than 10 cm, else None.
+
+        Those are two wavelengths, over which power hardly varies.
+        """
+        good = np.isfinite(self.truth_m)
+        if not good.any():
+            return None
+        pair = np.unique(pair_ids(self.exchanges[good]), return_inverse=True)[1]
+        every, truth = np.arange(pair.max() + 1), self.truth_m[good]
+        span = float(np.max(ndimage.maximum(truth, pair, every) - ndimage.minimum(truth, pair, every)))
+        return span if span < 0.1 else None
+
     @property
     def error_m(self) -> Floats:
         """Range less truth, shape (n,)."""
@@ -90,7 +100,7 @@ class RecordingView:
         _, pair, count = np.unique(pair_ids(self.exchanges[good]), return_inverse=True, return_counts=True)
         left = np.full(len(error_m), np.nan)
         left[good] = less_medians(error_m[good], pair)
-        left[np.flatnonzero(good)[count[pair] < RANGES_A_MEDIAN]] = np.nan
+        left[np.flatnonzero(good)[count[pair] < 11]] = np.nan
         return left
 
     def spread_m(self, error_m: Floats) -> float:
@@ -115,7 +125,7 @@ def view_of(name: str, source: Source) -> RecordingView:
         given = np.isfinite(truth)
         # Tables with places of antennas bring both, which are then the same.
         apart = np.abs(truth - by_poses)[given & np.isfinite(by_poses)]
-        posed = not given.any() or (len(apart) > 0 and float(np.median(apart)) < SAME_M)
+        posed = not given.any() or (len(apart) > 0 and float(np.median(apart)) < 0.001)
         truth = by_poses if posed else truth
     return RecordingView(
         name=name,
@@ -131,11 +141,6 @@ def view_of(name: str, source: Source) -> RecordingView:
         doubled=int(np.count_nonzero(again)),
         posed=posed,
     )
-
-
-def pair_ids(e: Exchanges) -> Ints:
-    """Return one number for each pair of tags, whoever initiated, shape (n,)."""
-    return np.asarray(np.minimum(e.initiator, e.target) * 65_536 + np.maximum(e.initiator, e.target))
 
 
 EXAMINED_EXCHANGES: Final = 160_000
@@ -191,6 +196,36 @@ for a hundredth of the recording are in one stretch."""
 
 
 @dataclass(frozen=True, kw_only=True)
+class Offsets:
+    """Offsets (k,) that residuals ask for, metres, with their standard errors (k,), and degrees of freedom.
+
+    Standard errors contain errors that last; they are infinite for offsets of which nothing is known. `known` (k,) is
+    the information, which does not.
+    """
+
+    size: Floats
+    known: Floats
+    std: Floats
+    dof: float
+
+    @classmethod
+    def of(cls, tested: Tested, groups: Floats) -> Offsets:
+        """Return the offsets of `groups` (k, m) of tested ones (m,), which are shared by all in a group."""
+        information = np.einsum("km,mn,kn->k", groups, tested.information, groups, optimize=True)
+        variance = np.einsum("km,mn,kn->k", groups, tested.covariance, groups, optimize=True)
+        known = information > REACHED * tested.whole
+        divisor = np.where(known, information, 1.0)
+        std = np.where(known, np.sqrt(np.maximum(variance, 1e-300)) / divisor, np.inf)
+        size = np.where(known, -(groups @ tested.total) / divisor, 0.0)
+        return cls(
+            size=size,
+            known=np.where(known, information, 0.0),
+            std=std,
+            dof=min(tested.lasting.freedom, tested.blocks - 1.0),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class QuickFit:
     """A robust fit to the ranges (n,) of all pairs with enough of them, by session and time.
 
@@ -236,32 +271,13 @@ class QuickFit:
         """Return which ranges (n,) are a tag's."""
         return np.asarray((self.ends == tag).any(axis=1)[self.pair])
 
-    def offsets(self, derivative: Floats | sparse.csr_matrix) -> tuple[Floats, Floats, Floats, float]:
-        """Return offsets (k,), what is known of each in 1/m^2, standard errors (k,), and degrees of freedom.
+    def test(self, derivative: Floats | sparse.csr_matrix) -> Tested:
+        """Return the slopes of the residuals by offsets, of which each range has some (n, k)."""
+        return self.slopes.test(Family(kind="", names=(), derivative=sparse.csr_matrix(derivative)))
 
-        `derivative` (n, k) is that of each range by each offset. Errors that last are in the standard errors, which are
-        infinite for offsets of which nothing is known.
-        """
-        tested = self.slopes.test(Family(kind="", names=(), derivative=sparse.csr_matrix(derivative)))
-        information = np.diag(tested.information)
-        known = information > REACHED * tested.whole
-        information = np.where(known, information, 1.0)
-        std = np.sqrt(np.maximum(np.diag(tested.covariance), 1e-300)) / information
-        size = np.where(known, -tested.total / information, 0.0)
-        dof = min(tested.lasting.freedom, tested.blocks - 1.0)
-        return size, np.where(known, information, 0.0), np.where(known, std, np.inf), dof
-
-    def offsets_of_pairs(self, derivative: Floats | Bools) -> tuple[Floats, Floats, Floats, float]:
-        """Return the same (k, m) of offsets of each pair, with derivatives (n, m) of its ranges."""
-        shape = len(self.ends), derivative.shape[1]
-        rows, column = np.nonzero(derivative)
-        columns = self.pair[rows] * shape[1] + column
-        values = np.asarray(derivative[rows, column], dtype=np.float64)
-        *found, dof = self.offsets(
-            sparse.csr_matrix((values, (rows, columns)), shape=(len(derivative), shape[0] * shape[1]))
-        )
-        size, information, std = (one.reshape(shape) for one in found)
-        return size, information, std, dof
+    def offsets(self, derivative: Floats) -> Offsets:
+        """Return offsets of which each range has some (n, k)."""
+        return Offsets.of(self.test(derivative), np.eye(derivative.shape[1]))
 
 
 def quick_fit(
@@ -271,13 +287,10 @@ def quick_fit(
     kept = [_of_common_pairs(view, ranges_a_pair) for view in views]
     if sum(map(len, kept)) < FEWEST_RANGES or not all(map(len, kept)):
         return None
-    parts = [
-        Ranges.from_exchanges(view.exchanges[rows], view.truth_m[rows]) for view, rows in zip(views, kept, strict=True)
-    ]
-    ranges = parts[0] if len(parts) == 1 else concatenate(parts)
+    chosen = [view.chosen(rows) for view, rows in zip(views, kept, strict=True)]
+    ranges = concatenate([Ranges.from_exchanges(view.exchanges, view.truth_m) for view in chosen])
     model = model_of(ranges, Recipe(loss="cauchy", fixed_ns={}, groups={}, constants=constants), trimmed=False)
-    error = np.concatenate([view.error_m[rows] for view, rows in zip(views, kept, strict=True)])
-    return _fitted(model, error, np.concatenate(kept))
+    return _fitted(model, np.concatenate([view.error_m for view in chosen]), np.concatenate(kept))
 
 
 def _fitted(model: RangeModel, error: Floats, rows: Ints) -> QuickFit:
@@ -287,6 +300,12 @@ def _fitted(model: RangeModel, error: Floats, rows: Ints) -> QuickFit:
     optimum = maximize([whole, *start.gauge], Priors(layout), start.optimum.x, steps=20, evidence_steps=0)
     time_ns, session = model.ranges.time_ns, model.ranges.session
     steps_s = np.diff(time_ns * 1e-9, prepend=time_ns[0] * 1e-9) * (np.diff(session, prepend=0) == 0)
+    # Long blocks in the place of short ones: sums over them hardly share errors that last.
+    short = time_blocks(time_ns, session)
+    count = min(STRETCHES_OF_SCORES, short.count)
+    number = short.number.astype(np.int64) * count // short.count
+    bounds = np.unique(np.append(short.bounds[:-1] * count // short.count, count))
+    blocks = TimeBlocks(number=number, bounds=bounds, seconds=short.seconds)
     return QuickFit(
         rows=rows,
         model=model,
@@ -294,16 +313,8 @@ def _fitted(model: RangeModel, error: Floats, rows: Ints) -> QuickFit:
         start=start,
         residual=whole.residuals(optimum.x),
         time_s=np.cumsum(np.minimum(steps_s, GAP_S)),
-        slopes=Slopes(whole, optimum, _long(time_blocks(time_ns, session)), np.zeros((0, layout.size))),
+        slopes=Slopes(whole, optimum, blocks, np.zeros((0, layout.size))),
     )
-
-
-def _long(blocks: TimeBlocks) -> TimeBlocks:
-    """Return long blocks in the place of short ones: sums over them hardly share errors that last."""
-    count = min(STRETCHES_OF_SCORES, blocks.count)
-    number = blocks.number.astype(np.int64) * count // blocks.count
-    bounds = np.unique(np.append(blocks.bounds[:-1] * count // blocks.count, count))
-    return TimeBlocks(number=number.astype(np.int32), bounds=bounds, seconds=blocks.seconds)
 
 
 def _of_common_pairs(view: RecordingView, ranges_a_pair: int) -> Ints:

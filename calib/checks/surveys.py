@@ -38,9 +38,6 @@ REMEDIES: Final = {
 }
 """What to do by fault. The survey itself has judged: what it says is not tested again."""
 
-MANY: Final = 0.1
-"""Share of pairs that are believed to be reflected, from which places are worth a change."""
-
 
 def surveyed(recordings: list[Data]) -> Iterator[Candidate]:
     """Yield what a survey of recordings finds wrong: with what is known, with places, with powers."""
@@ -70,7 +67,7 @@ def _weak(found: SurveyResult) -> Iterator[Candidate]:
         who = ", ".join(map(str, made["undetermined"][0]))
         yield Candidate("delays that a survey leaves open", f"the arrangements do not determine the delays of {who}")
     likely = [f"{one.first}-{one.second} in {one.arrangement}" for one in found.reflected if one.chance > 0.5]
-    if len(likely) > MANY * made["pairs"]:
+    if len(likely) > 0.1 * made["pairs"]:
         evidence = f"{len(likely)} of {made['pairs']} pairs are believed to be reflected: {', '.join(likely)}"
         yield Candidate("many reflected pairs", evidence)
     if second is not None and second.ambiguous:

@@ -248,7 +248,8 @@ def starloc():
     ("marker_of", "wrong"),
     [
         (RADIOS, set()),
-        ({radio: radio for radio in RADIOS}, {"tag10", "tag11", "tag12"}),
+        # Radio 11 is 1.25 m above its marker then, which the rig, which keeps its height, does not determine.
+        ({radio: radio for radio in RADIOS}, {"tag10", "tag12"}),
         (dict(zip(sorted(RADIOS), sorted(RADIOS.values()), strict=True)), {"tag4", "tag5", "tag6", "tag9", "tag11"}),
     ],
     ids=["right", "by number", "by order"],
