@@ -45,25 +45,18 @@ class Unknown:
         return f"{self.kind} of {self.of}" if self.of else self.kind
 
 
-@dataclass(frozen=True, slots=True)
-class FreeDirection:
-    """A combination of unknowns that the data leave free, in words."""
-
-    words: str
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
     """What an information matrix determines.
 
     `std` (n,) is infinite where the data do not determine an unknown, and `covariance` (n, n) is NaN in its row and
-    column.
+    column. `free` are the combinations of unknowns that the data leave free, in words.
     """
 
     unknowns: tuple[Unknown, ...]
     std: Floats
     covariance: Floats
-    free: tuple[FreeDirection, ...]
+    free: tuple[str, ...]
 
     @property
     def determined(self) -> Bools:
@@ -77,7 +70,7 @@ class Verdict:
 
     def __str__(self) -> str:
         """Return what is free, a line each."""
-        return "\n".join(direction.words for direction in self.free) or "everything is determined"
+        return "\n".join(self.free) or "everything is determined"
 
 
 def judge(information: Floats, unknowns: Sequence[Unknown], *, loosest: float = LOOSEST) -> Verdict:
@@ -108,7 +101,7 @@ def judge(information: Floats, unknowns: Sequence[Unknown], *, loosest: float = 
         unknowns=tuple(unknowns),
         std=np.where(loose, math.inf, deviation * scale),
         covariance=np.where(loose[:, None] | loose, np.nan, (spread @ spread.T) * scale[:, None] * scale),
-        free=tuple(FreeDirection(_in_words(found, unknowns)) for found in _sparse(vectors[:, free])),
+        free=tuple(_in_words(found, unknowns) for found in _sparse(vectors[:, free])),
     )
 
 
@@ -137,14 +130,15 @@ def reduced(information: Floats, keep: Sequence[int] | Bools) -> Floats:
 
 
 def _checked(information: Floats, unknowns: Sequence[Unknown], loosest: float) -> Floats:
-    count = len(unknowns)
+    count, wrong = len(unknowns), ""
     if not count or np.shape(information) != (count, count):
-        found = f"has the shape {np.shape(information)}, expected {count} rows and columns, one an unknown"
-        raise BadInputError(found, parameter="information")
-    if not np.all(np.isfinite(information)):
-        raise BadInputError("holds a number that is not finite", parameter="information")
-    if np.abs(information - information.T).max() > 1e-6 * np.abs(information).max():
-        raise BadInputError("is not symmetric", parameter="information")
+        wrong = f"has the shape {np.shape(information)}, expected {count} rows and columns, one an unknown"
+    elif not np.all(np.isfinite(information)):
+        wrong = "holds a number that is not finite"
+    elif np.abs(information - information.T).max() > 1e-6 * np.abs(information).max():
+        wrong = "is not symmetric"
+    if wrong:
+        raise BadInputError(wrong, parameter="information")
     if not (math.isfinite(loosest) and loosest > 0):
         raise BadInputError(f"found {loosest}, expected a positive number", parameter="loosest")
     return np.array([unknown.scale for unknown in unknowns])

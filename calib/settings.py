@@ -20,11 +20,27 @@ if TYPE_CHECKING:
     from uwblink import KnownDistance
 
 LIFTS: Final = ("mean-of-lifted", "lift-of-mean")
-ATTITUDES: Final = ("poses", "imu", "none")
-ANCHOR_PLACES: Final = ("given", "sought")
-HEIGHTS: Final = ("used", "ignored")
-CONSTANTS: Final = ("tag", "pair")
-FOLDS: Final = ("time", "pair", "session")
+CHOICES: Final = {
+    "lift": LIFTS,
+    "constants": ("tag", "pair"),
+    "fold": ("time", "pair", "session"),
+    "attitudes": ("poses", "imu", "none"),
+    "anchors": ("given", "sought"),
+    "heights": ("used", "ignored"),
+}
+POSITIVE: Final = sys.float_info.min
+NUMBERS: Final = {
+    "scale_ns": (POSITIVE, math.inf, "a positive number of ns"),
+    "between_m": (0.0, math.nextafter(1.0, 0.0), "metres, 0 to 1"),
+    "alpha_dbm": (-math.inf, math.inf, "a power in dBm"),
+    "reference_power_dbm": (-math.inf, math.inf, "a power in dBm"),
+    "hold_out": (0.0, 0.9, "a share, 0 to 0.9"),
+    "poses_until_s": (0.0, math.inf, "a number of 0 or more"),
+    "heading_std_deg": (0.0, math.inf, "a number of 0 or more"),
+    "pair_error_m": (POSITIVE, math.inf, "a positive number of metres"),
+}
+"""The least and the largest value of a setting, and what is expected."""
+
 HIGHEST_TAG: Final = 65_535
 """Ids of tags have 16 bits in recordings."""
 
@@ -119,6 +135,19 @@ def _checked_delays(fixed_ns: Mapping[int, float] | None) -> dict[int, float]:
 @dataclass(frozen=True, slots=True)
 class _Settings:
     """Settings that results repeat."""
+
+    def __post_init__(self) -> None:
+        """Check choices, numbers and known delays; a number may be None if it is by default."""
+        for one in fields(self):
+            name, value = one.name, getattr(self, one.name)
+            if name in CHOICES:
+                check_choice(name, value, CHOICES[name])
+            if name in NUMBERS and (value is not None or one.default is not None):
+                least, most, expected = NUMBERS[name]
+                if not (_is_finite(value) and least <= value <= most):
+                    raise BadInputError(f"found {value!r}, expected {expected}", parameter=name)
+            if name == "fixed_ns":
+                object.__setattr__(self, name, _checked_delays(value))
 
     def changed(self) -> dict[str, Any]:
         """Return the settings that are not the defaults, as JSON has them: what calibrations and reports repeat."""
@@ -237,7 +266,7 @@ class FitSettings(_Settings):
     constants: str = setting(
         "tag",
         "What has a constant error: each tag (antenna delays), or each pair.",
-        names=CONSTANTS,
+        names=CHOICES["constants"],
         rich_help_panel=MODEL_PANEL,
     )
 
@@ -250,32 +279,17 @@ class FitSettings(_Settings):
     fold: str = setting(
         "time",
         "What is held out: tenths of each session's time, pairs, or sessions.",
-        names=FOLDS,
+        names=CHOICES["fold"],
         rich_help_panel=MODEL_PANEL,
     )
 
-    def _check_hold_out(self) -> None:
-        check_choice("fold", self.fold, FOLDS)
-        if not (_is_finite(self.hold_out) and 0 <= self.hold_out <= 0.9):
-            raise BadInputError(f"found {self.hold_out!r}, expected a share, 0 to 0.9", parameter="hold_out")
-
     def __post_init__(self) -> None:
         """Check the settings; whether a loss is known, the fit checks."""
-        self._check_hold_out()
-        check_choice("lift", self.lift, LIFTS)
-        check_choice("constants", self.constants, CONSTANTS)
-        if self.scale_ns is not None and not (_is_finite(self.scale_ns) and self.scale_ns > 0):
-            raise BadInputError(f"found {self.scale_ns!r}, expected a positive number of ns", parameter="scale_ns")
-        if self.between_m is not None and not (_is_finite(self.between_m) and 0 <= self.between_m < 1):
-            raise BadInputError(f"found {self.between_m!r}, expected metres, 0 to 1", parameter="between_m")
-        for name, power in (("alpha_dbm", self.alpha_dbm), ("reference_power_dbm", self.reference_power_dbm)):
-            if not _is_finite(power) and (name == "alpha_dbm" or power is not None):
-                raise BadInputError(f"found {power!r}, expected a power in dBm", parameter=name)
+        _Settings.__post_init__(self)
         if self.sequential and self.loss == "mixture":
             raise BadInputError(
                 "goes with a loss, not with the mixture; leave one of the two away", parameter="sequential"
             )
-        object.__setattr__(self, "fixed_ns", _checked_delays(self.fixed_ns))
         seen: dict[int, str] = {}
         for name, tags in (self.groups or {}).items():
             listed = list(tags) if isinstance(tags, Iterable) and not isinstance(tags, str) else []
@@ -311,7 +325,7 @@ def read_distances(texts: Iterable[str]) -> tuple[KnownDistance, ...]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlightSettings:
+class FlightSettings(_Settings):
     """What is known of a flight without true distances: settings of `fit_from_ranges`, which explains them.
 
     Raises `BadInputError` that names the setting.
@@ -332,7 +346,7 @@ class FlightSettings:
     attitudes: str = setting(
         "poses",
         "Source of attitudes: the poses, all along; the IMU; or none.",
-        names=ATTITUDES,
+        names=CHOICES["attitudes"],
         rich_help_panel=FLIGHT_PANEL,
     )
     heading_std_deg: float = setting(
@@ -345,7 +359,7 @@ class FlightSettings:
     anchors: str = setting(
         "given",
         "Positions of bodies that stand still: given by the poses, or sought (estimated).",
-        names=ANCHOR_PLACES,
+        names=CHOICES["anchors"],
         rich_help_panel=FLIGHT_PANEL,
     )
     distances: tuple[Any, ...] = setting(
@@ -361,7 +375,7 @@ class FlightSettings:
     heights: str = setting(
         "used",
         "Readings of height sensors in the recording: used or ignored.",
-        names=HEIGHTS,
+        names=CHOICES["heights"],
         rich_help_panel=FLIGHT_PANEL,
     )
     curve_from: Any = setting(  # a Calibration or its path
@@ -373,12 +387,7 @@ class FlightSettings:
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        check_choice("attitudes", self.attitudes, ATTITUDES)
-        check_choice("anchors", self.anchors, ANCHOR_PLACES)
-        check_choice("heights", self.heights, HEIGHTS)
-        for name, value in (("poses_until_s", self.poses_until_s), ("heading_std_deg", self.heading_std_deg)):
-            if value is not None and not (_is_finite(value) and value >= 0):
-                raise BadInputError(f"found {value!r}, expected a number of 0 or more", parameter=name)
+        _Settings.__post_init__(self)
         object.__setattr__(self, "distances", tuple(self.distances))
 
 
@@ -416,10 +425,6 @@ class SurveySettings(_Settings):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        object.__setattr__(self, "fixed_ns", _checked_delays(self.fixed_ns))
-        if self.pair_error_m is not None and not (_is_finite(self.pair_error_m) and self.pair_error_m > 0):
-            raise BadInputError(
-                f"found {self.pair_error_m!r}, expected a positive number of metres", parameter="pair_error_m"
-            )
+        _Settings.__post_init__(self)
         if self.curve_from is not None and self.delays_only:
             raise BadInputError("a curve is taken over, and `delays_only` asks for none", parameter="curve_from")

@@ -15,7 +15,7 @@ from calib.calibration.power_curves import basis
 from calib.checks.places import of_places
 from calib.estimator.known_distances import KnownDistances
 from calib.estimator.range_rows import Mixture
-from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes, Tested, search, widening
+from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes, search, widening
 from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.estimator.to_calibration import bias_curves
 from calib.findings import OF_A_FIT, SMALLEST_NS
@@ -55,7 +55,6 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
     louder, alone = change_per_decibel(found), len(found.searches) > 1
     tested = slopes.tests(list(families(found, louder, beside_curve=not alone)))
     findings = _without_repeats(search(tested, OF_A_FIT))
-    findings += list(_wrong_decibels(findings, tested))
     plain = found.covariances["delay"]
     for one in tested:
         if one.family.kind in ("pair", "session") and not len(one.family.fitted):
@@ -212,31 +211,6 @@ def _without_repeats(findings: list[FoundOffset]) -> list[FoundOffset]:
         for one in findings
         if one.kind != "time" or not any(between.get(name, 0.0) > abs(one.deviation) for name in one.names)
     ]
-
-
-def _wrong_decibels(findings: list[FoundOffset], tested: list[Tested]) -> Iterator[FoundOffset]:
-    """Yield wrong decibels of tags whose errors go with power in another way, where they suggest such.
-
-    How errors go with power says that a tag is not as the others, decibels what that does to its delay.
-    """
-    result = next((one for one in tested if one.family.kind == "decibels"), None)
-    certain = {name for one in findings if one.kind == "decibels" for name in one.names}
-    for one in findings:
-        name = one.names[0]
-        if result is None or one.kind != "power" or name not in result.family.names or name in certain:
-            continue
-        k = list(result.family.names).index(name)
-        known = max(float(result.information[k, k]), 1e-300)
-        offset = float(result.total[k]) / known
-        if known > 1e-3 * result.whole and abs(offset) > 2.5 * np.sqrt(result.covariance[k, k]) / known:
-            yield FoundOffset(
-                kind="decibels",
-                names=(name,),
-                offset_m=-offset,
-                deviation=one.deviation,
-                p_value=one.p_value,
-                effect_ns=result.effects[:, k] * offset,
-            )
 
 
 def _weighed(

@@ -31,9 +31,6 @@ WITHOUT_CURVE: Final = "delays only"
 SCALE: Final = (0.75, 1.35)
 """How many metres a range may grow in a metre of true distance: a foot is 0.305 m, a yard 0.914."""
 
-RANGES_ASKED: Final = 100_000
-"""Of more ranges, only every so many are asked for their scale and their clocks."""
-
 UNITS: Final = {0.001: "millimetres", 0.01: "centimetres", 0.3048: "feet"}
 
 LONGEST_NS: Final = 2.5
@@ -133,15 +130,14 @@ def _impossible(ranges: Ranges) -> Iterator[str]:
     sessions = np.unique(ranges.session)
     if len(ranges) > 1 and not any(np.ptp(ranges.time_ns[ranges.session == number]) for number in sessions):
         yield "all ranges have the same time, so nothing says how long errors last; give their times"
-    some = ranges[:: max(len(ranges) // RANGES_ASKED, 1)]
     # How ranges and true distances spread: a unit or two columns may be wrong.
-    slope = _robust_slope(some.truth_m, some.raw_m)
-    rest = robust_spread(some.raw_m - slope * some.truth_m)
-    if not SCALE[0] < slope < SCALE[1] and abs(slope) * robust_spread(some.truth_m) >= 3.0 * rest:
+    slope = _robust_slope(ranges.truth_m, ranges.raw_m)
+    rest = robust_spread(ranges.raw_m - slope * ranges.truth_m)
+    if not SCALE[0] < slope < SCALE[1] and abs(slope) * robust_spread(ranges.truth_m) >= 3.0 * rest:
         guess = _looks_like(slope)
         yield (f"ranges grow by {slope:.3g} m in a metre of true distance; {guess and guess + '; '}give both in metres")
     # Clock ratios that no crystals have: stamps that wrapped, or columns in the wrong order.
-    weight = some.weight_target[some.protocol == "ds"]
+    weight = ranges.weight_target[ranges.protocol == "ds"]
     skew = 1e6 * float(np.median(np.abs(2 * weight - 1))) if len(weight) else 0.0
     # Crystals of these boards keep 20 ppm each, over temperature and age.
     if skew > 100.0:
@@ -191,13 +187,12 @@ def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: 
     Delays beyond what registers hold, and errors as large as the ranges are: then true distances say nothing of the
     ranges, as they do in another unit where bodies move so little that how ranges grow with them is not seen.
     """
-    every = slice(None, None, max(len(ranges) // RANGES_ASKED, 1))
-    typical = float(np.median(np.abs(ranges.raw_m[every])))
+    typical = float(np.median(np.abs(ranges.raw_m)))
     largest = max(map(abs, delays_ns.values()), default=0.0)
-    spread = robust_spread(residuals_m[every])
+    spread = robust_spread(residuals_m)
     if largest < REGISTER_NS and spread < max(typical, LOUD_M):
         return
-    ratio = typical / max(float(np.median(np.abs(ranges.truth_m[every]))), 1e-9)
+    ratio = typical / max(float(np.median(np.abs(ranges.truth_m))), 1e-9)
     guess = _looks_like(ratio) or "they may be in another unit, or of other tags"
     raise UnanswerableError(
         f"{ranges.source}: no radio has a delay of {largest:.0f} ns (registers hold {REGISTER_NS:.0f}) or errors that "
@@ -248,12 +243,6 @@ def warnings_of(ranges: Ranges, inliers: float, free: list[list[int]], seconds: 
         yield f"only {seconds:.0f} s of data: errors that persist are few, so intervals may be too narrow"
 
 
-RANGES_LOOKED_AT: Final = 6_000
-"""Of more ranges so many are looked at, spread over all."""
-
-GOLDEN: Final = 0.618034
-"""What numbers are multiplied by whose fractions keep in step with no schedule of pairs."""
-
 SAME_LEVEL_DB: Final = 0.5
 """Levels of tags that differ by less are taken for the same; medians of a pair's ranges are known to a tenth of it."""
 
@@ -265,9 +254,6 @@ def unlike_powers(ranges: Ranges, calibration: Calibration) -> Iterator[str]:
     sends and how high it reads. Only the sum is seen. A tag that reads powers too high has its ranges corrected as
     stronger ones are, and its delay takes what that is on average: right for its ranges, not for its antenna.
     """
-    if len(ranges) > RANGES_LOOKED_AT:
-        number = np.arange(RANGES_LOOKED_AT)
-        ranges = ranges[((number + number * GOLDEN % 1) * len(ranges) / RANGES_LOOKED_AT).astype(np.int64)]
     levels = power_levels_db(ranges)
     if not levels:
         return

@@ -109,7 +109,7 @@ class _Plan:
         for tag, half in self.half_ns.items():
             lines.append(f"  tag {tag:3d}  " + (f"± {half:.3f} ns (95 %)" if math.isfinite(half) else self._open(tag)))
         lines += shared
-        lines += [f"not determined: {direction.words}" for direction in self.verdict.free if self.undetermined]
+        lines += [f"not determined: {words}" for words in self.verdict.free if self.undetermined]
         for k, best in enumerate(self.next_best):
             first = "or" if k else "next best"
             lines.append(f"{first}: {best.what}: ± {best.mean_ns:.3f} ns on average, not {best.instead_of_ns:.3f}")

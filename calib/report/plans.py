@@ -80,7 +80,7 @@ def _promise(plan: Plan | FlightPlan) -> Iterator[Block]:
     rows = [[str(tag), f"± {half:.3f} ns" if math.isfinite(half) else "undetermined"] for tag, half in halves]
     yield Table(["tag", "delay"], rows)
     if plan.undetermined:
-        yield Text(f"Not determined: {'; '.join(direction.words for direction in plan.verdict.free)}.", "warning")
+        yield Text(f"Not determined: {'; '.join(plan.verdict.free)}.", "warning")
     if plan.next_best:
         yield Heading("What one thing more would bring")
         caption = "The mean interval with each; 1.5 ns are taken for known of a delay that nothing determines."

@@ -73,7 +73,7 @@ def result_of(
     free = verdict.named("delay")
     if len(free) == len(network.tags) - len(network.fixed_ns):
         raise UnanswerableError(
-            f"the arrangements determine no delay: {'; '.join(d.words for d in verdict.free)} can change without "
+            f"the arrangements determine no delay: {'; '.join(verdict.free)} can change without "
             "changing any range; `calib plan` says which arrangements or distances would tell",
             undetermined=[[int(tag) for tag in free]],
         )
@@ -132,7 +132,7 @@ def _notes(
         ),
         (perhaps, f"may be reflected, too: {perhaps}; intervals are wider by that"),
         (not found.settled, "the search stopped before it settled: delays and places are not final"),
-        (verdict.free, f"not determined, and left out: {'; '.join(d.words for d in verdict.free)}"),
+        (verdict.free, f"not determined, and left out: {'; '.join(verdict.free)}"),
         (
             found.network.curve is not None,
             "a constant of the curve and one of all delays are the same to ranges: what the delays share is known only "
