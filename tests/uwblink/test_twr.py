@@ -37,25 +37,9 @@ def exchange(protocol, flight, reply, third, gamma_i, gamma_j, start=0, bits=32)
         rate = 1 + Fraction(gamma_i if name in own else gamma_j) / 10**6
         offset = start if name in own else 7 * start + 12345
         stamps[name] = np.array([int(offset + rate * Fraction(true[name])) % 2**bits])
-    one = np.array([1])
-    none = np.array([np.nan])
-    return Exchanges(
-        time_ns=np.array([0]),
-        initiator=one,
-        target=one + 1,
-        protocol=np.array([protocol]),
-        reporter=one,
-        range_m=none,
-        fpp1_dbm=none,
-        fpp2_dbm=none,
-        skew1_ppm=none,
-        skew2_ppm=np.array(
-            [float((Fraction(1) + Fraction(gamma_i, 10**6)) / (1 + Fraction(gamma_j, 10**6)) - 1) * 1e6]
-        ),
-        truth_m=none,
-        bits=bits,
-        **stamps,
-    )
+    rates = [1 + Fraction(gamma, 10**6) for gamma in (gamma_i, gamma_j)]
+    skew2_ppm = [float(rates[0] / rates[1] - 1) * 1e6]
+    return Exchanges.from_arrays([1], [2], **stamps, protocol=protocol, skew2_ppm=skew2_ppm, range_m=np.nan, bits=bits)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1), st.sampled_from([32, 40]))

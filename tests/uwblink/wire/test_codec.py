@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from tests.uwblink.wire import transcripts
 from uwblink.errors import FrameError
-from uwblink.twr import Exchanges, board_range, raw_range
+from uwblink.twr import board_range, raw_range
 from uwblink.wire import messages as m
-from uwblink.wire.codec import Decoder, encode
+from uwblink.wire.codec import Decoder, encode, exchanges_of
 
 REPORTED = [data for _, data in transcripts.captured("->host")]
 COMMANDED = [data for _, data in transcripts.captured("<-host")]
@@ -98,26 +98,11 @@ def test_values_of_captured_messages():
     assert heard.data == b"\x00test\x00\r\n|message"
 
 
-def columns_of(reports, protocol):
-    def ints(name):
-        return np.array([getattr(r, name) for r in reports], dtype=np.int64)
-
-    none = np.zeros(len(reports), dtype=np.int64)
-    levels = np.zeros(len(reports))
-    stamps = {name: ints(name) for name in ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")}
-    ranges = np.array([r.range_m for r in reports])
-    return Exchanges(
-        time_ns=none, initiator=none, target=none, protocol=np.full(len(reports), protocol), reporter=none,
-        range_m=ranges, **stamps,
-        fpp1_dbm=levels, fpp2_dbm=levels, skew1_ppm=levels, skew2_ppm=levels, truth_m=levels,
-    )  # fmt: skip
-
-
 def test_ranges_recomputed_from_every_captured_exchange():
     events = decode(b"".join(REPORTED), m.REPORTS)
     found = [e for e in events if isinstance(e, m.RangeReport | m.TargetRangeReport)]
-    double = columns_of([e for e in found if e.tx3], "ds")
-    single = columns_of([e for e in found if not e.tx3], "ss")
+    double = exchanges_of([(0, 9, e) for e in found if e.tx3])
+    single = exchanges_of([(0, 9, e) for e in found if not e.tx3])
     assert len(double) >= 5
     assert len(single) >= 5
     assert np.abs(raw_range(double) - double.range_m).max() < 1e-4

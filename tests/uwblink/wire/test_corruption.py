@@ -26,7 +26,7 @@ def stream_of(count, rng):
     return [kinds[k]() for k in rng.integers(0, len(kinds), count)]
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_one_percent_of_damaged_bytes(seed):
     rng = np.random.default_rng(seed)
     sent = stream_of(2000, rng)
@@ -56,12 +56,8 @@ def test_one_percent_of_damaged_bytes(seed):
     assert altered < 0.5 * touched.sum()
 
 
-def test_a_million_random_bytes_make_no_message():
-    rng = np.random.default_rng(7)
+def test_random_bytes_make_no_message():
     decoder = Decoder(REPORTS)
-    for _ in range(1000):
-        for event in decoder.feed(rng.integers(0, 256, 1000).astype(np.uint8).tobytes()):
-            assert isinstance(event, m.Skipped)
-    decoder.finish()
-    assert decoder.messages == 0
-    assert decoder.skipped_bytes == 1_000_000
+    events = decoder.feed(np.random.default_rng(7).bytes(200_000)) + decoder.finish()
+    assert {type(event) for event in events} == {m.Skipped}
+    assert (decoder.messages, decoder.skipped_bytes) == (0, 200_000)

@@ -1,4 +1,4 @@
-"""No byte from a client ends the bench or another board: a hundred thousand commands, right, wrong and mangled."""
+"""No byte from a client ends the bench or another board: thirty thousand commands, right, wrong and mangled."""
 
 import random
 import struct
@@ -9,7 +9,7 @@ from uwblink.wire import messages as m
 from uwbsim.boards.frames import NS_PER_MS
 from uwbsim.boards.virtual_board import VirtualPorts
 
-COMMANDS = 100_000
+COMMANDS = 30_000
 NUMBERS = (
     b"0",
     b"1",
@@ -92,5 +92,5 @@ def test_no_byte_ends_the_bench_or_another_board():
     victim.power_cycle()
     assert Board(ports.port(1)).request(m.GetId()) == m.IdReport(1)
     # Much of this kills a board, as it does a real one, and much is answered: the test reaches both.
-    assert deaths > 1000
-    assert answers > 10_000
+    assert deaths > 300
+    assert answers > 3_000
