@@ -248,6 +248,4 @@ def _rows_by_protocol(names: NDArray[np.str_]) -> list[tuple[RangingProtocol, Bo
 
 
 def _pick(spans: Intervals, rows: Bools) -> Intervals:
-    if rows.all():
-        return spans
     return Intervals(*(getattr(spans, field.name)[rows] for field in fields(Intervals)))

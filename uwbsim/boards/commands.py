@@ -97,11 +97,14 @@ def atoi(text: bytes) -> int:
     return max(-(2**31), min(int(found[1] + found[2][:11]), 2**31 - 1)) if found else 0
 
 
-def _flag(text: bytes) -> bool:
-    return atoi(text) != 0
-
-
-_UNTIL_BAR: Final[dict[Kind, Callable[[bytes], Any]]] = {INT: atoi, ID: atoi, STAMP: atoi, BOOL: _flag, TEXT: bytes}
+_UNTIL_BAR: Final[dict[Kind, Callable[[bytes], Any]]] = {
+    INT: atoi,
+    ID: atoi,
+    STAMP: atoi,
+    BOOL: lambda text: atoi(text) != 0,
+    TEXT: bytes,
+}
+"""How boards read fields that are text."""
 
 
 class Command(NamedTuple):
