@@ -9,12 +9,11 @@ from scipy.special import betaln, ndtr
 
 import calib
 from benchmarks.standing import standing_boards
-from calib.estimator.inverse import MOST_DENSE
 from calib.surveys.knowledge import Knowledge
 from calib.surveys.network import Case
 from calib.surveys.recordings import read_surveys
 from calib.surveys.reflections import Marks
-from calib.surveys.solution import adjust
+from calib.surveys.solution import optimize
 from calib.surveys.starts import first_start
 from calib.surveys.survey import network_of
 
@@ -71,14 +70,16 @@ def test_weights_are_those_of_the_likelihood_written_out(linear):
     assert weight == pytest.approx(expected / expected.sum(), rel=5e-3)
 
 
-def test_networks_whose_matrices_are_sparse_in_other_fits_are_solved():
-    world = standing_boards(3, boards=9, arrangements=15, each=5)
-    knowledge = Knowledge(shape="line", spans_s={str(k): (70.0 * k, 70.0 * k + 60) for k in range(15)})
+def test_sparse_matrices_of_many_unknowns_give_what_dense_ones_give(monkeypatch):
+    world, knowledge = standing_boards(3, boards=4, arrangements=3, each=20), Knowledge(shape="line")
     network = network_of(read_surveys(world.ranges, knowledge), knowledge, {}, curve=False)
-    assert network.layout.size > MOST_DENSE
     x = network.with_positions(network.layout.start(), np.concatenate(world.places))
-    found = adjust(network, x, rounds=1)
-    assert found.delays == pytest.approx(list(world.delays_ns.values()), abs=0.2)
+    case = Case(np.zeros(len(network.means.range_m), dtype=bool), PAIR_M, CURVE_M)
+    dense, unlikely = optimize(network, x, case)[0], network.at(x, case).unlikely()
+    for room in ("rows", "unknowns"):
+        monkeypatch.setattr(f"calib.estimator.{room}.MOST_DENSE", 10)
+    assert optimize(network, x, case)[0] == pytest.approx(dense, abs=1e-4)
+    assert network.at(x, case).unlikely() == pytest.approx(unlikely, rel=1e-9)
 
 
 def reflected(world, arrangement, first, second, longer_m):
