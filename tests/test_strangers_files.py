@@ -235,7 +235,7 @@ def test_delays_without_standard_errors_are_not_taken_for_exact(folder, tmp_path
     assert set(found["std_ns"].values()) == {None}
     assert found["difference_ns"]["2"] - found["difference_ns"]["1"] == pytest.approx(0.3)
     assert "no verdict" in processes.run(*words).stdout
-    assert "unknown" in processes.run("calib", "show", tmp_path / "c.json").stdout
+    assert "not stated" in processes.run("calib", "show", tmp_path / "c.json").stdout
     rows = processes.run("calib", "export", tmp_path / "c.json", "--to", "csv").stdout.splitlines()
     assert rows[1].endswith(",")
 

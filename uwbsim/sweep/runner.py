@@ -255,10 +255,13 @@ class Store:
         """Yield all rows in the order of their numbers; raises `TableError` where one is damaged."""
         with _reading(self._path):
             cursor = self._db.cursor()
-            cursor.execute("SELECT document FROM results ORDER BY number, part")
+            cursor.execute("SELECT number, document FROM results ORDER BY number, part")
             while batch := cursor.fetchmany(5000):
-                for (document,) in batch:
-                    yield dict(json.loads(document))
+                for number, document in batch:
+                    row = dict(json.loads(document))
+                    if row.get("number") != number:
+                        raise ValueError(f"the row of run {number} is not a result")
+                    yield row
 
 
 def _connect(path: Path) -> Any:

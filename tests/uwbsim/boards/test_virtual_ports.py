@@ -6,6 +6,7 @@ from collections import deque
 
 import uwblink
 import uwbsim
+from uwblink.boards.listeners import PairState
 from uwblink.boards.record import identify
 from uwblink.boards.recorder import Recorder
 
@@ -27,7 +28,10 @@ def test_nothing_grows_with_what_boards_sent():
     ports.transfers = deque(maxlen=50)
     found = identify(ports.names.values(), ports)
     plan = uwblink.RangingPlan(rate_hz=100.0)
-    recorder = Recorder(found, plan, plan.turns(sorted(found)), [], ports=ports)
+    turns = plan.turns(sorted(found))
+    recorder = Recorder(found, plan, turns, [], ports=ports)
+    assert PairState().reports.maxlen
+    recorder.progress.pairs = {pair: PairState(reports=deque(maxlen=50)) for pair in turns}
     for _ in recorder.steps(stop=lambda: len(held) == 2):
         if recorder.progress.exchanges == (WARM, LATER)[len(held)]:
             gc.collect()

@@ -154,8 +154,8 @@ def test_a_scheduler_that_goes_away_is_named_and_what_was_done_is_kept(tmp_path)
 
 def test_results_that_are_none_are_no_rows(tmp_path):
     with Store.open(tmp_path / "r.duckdb", {"name": "x"}) as store:
-        store.append([(1, [{"a": 1}]), (2, [])])
-        assert list(store) == [{"a": 1}]
+        store.append([(1, [{"number": 1, "a": 1}]), (2, [])])
+        assert list(store) == [{"number": 1, "a": 1}]
         with pytest.raises(TableError, match="damaged"):
             store._db.execute("UPDATE results SET document = 'x'")
             list(store)
