@@ -66,8 +66,12 @@ def run(
 def _run_limited(
     argv: list[str], cwd: str | os.PathLike[str] | None, env: dict[str, str], timeout: float | None, most_bytes: int
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command that may write no long file; coverage is not measured, because its file could not be written."""
+    """Run a command that may write no long file, neither one of coverage nor compiled modules.
+
+    Python would keep a compiled module that it could write in part only, and fail to import it ever after.
+    """
     plain = {name: value for name, value in env.items() if not name.startswith("COVERAGE_")}
+    plain["PYTHONDONTWRITEBYTECODE"] = "1"
     limit = functools.partial(resource.setrlimit, resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
     return subprocess.run(
         argv,
