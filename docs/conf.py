@@ -47,7 +47,7 @@ autodoc_type_aliases = {
     )
 }
 nitpicky = True
-# Names of Python, of NumPy and of matplotlib, whose documentation is elsewhere, and aliases of types of arrays.
+# Names of other libraries, whose documentation is elsewhere, aliases of types of arrays, and classes behind the doors.
 nitpick_ignore_regex = [
     (
         "py:class",
@@ -59,7 +59,7 @@ nitpick_ignore_regex = [
     ),  # models of files, which have pages of their own
     (
         "py:class",
-        r"(Mapping|tuple)\[.*|AbstractContextManager|AntennaDelays|Draw|DuckDBPyConnection|OverheardDelay|deque|PathLike|Path|ndarray|dtype|float64|complex128|ArrayLike|Bools|Floats|Ints|NDArray|Axes|Figure|Data|Source|Using",
+        r"(Mapping|tuple)\[.*|AbstractContextManager|AntennaDelays|Draw|DuckDBPyConnection|OverheardDelay|deque|PathLike|Path|ndarray|dtype|float64|complex128|ArrayLike|Bools|Floats|Ints|NDArray|Axes|Figure|Data|Source|Using|ListPortInfo|PlacedBody|T|World",
     ),
 ]
 
