@@ -68,7 +68,7 @@ def as_ranges(lifted: Floats, bias: Floats, seed: int) -> Ranges:
 
 def judged(lifted: Floats, bias: Floats, held: Chosen) -> HeldBack:
     """Fit what is not `held` back, and judge what is."""
-    known = calib.fit(as_ranges(lifted[~held], bias[~held], 1)).calibration
+    known = calib.fit(as_ranges(lifted[~held], bias[~held], 1), between_m=0.0).calibration
     others = as_ranges(lifted[held], bias[held], 2)
     applied, overall = known.apply(others), calib.evaluate(others, known).overall
     error = applied.corrected_m - others.truth_m

@@ -254,15 +254,15 @@ uwblink poses A.uwb --from A-rig.csv --tags rig.toml
 calib doctor A.uwb
 calib fit A.uwb -o A.json
 calib fit A.uwb -o A.json --minimum-norm
-calib fit A.uwb -o A-wide.json --minimum-norm --between 0.05
+calib fit A.uwb -o A-same.json --minimum-norm --between 0
 calib fit A-few.uwb -o A-few.json --minimum-norm
 calib evaluate B.uwb -c A.json
 calib localize B.uwb -c A.json
-calib evaluate B.uwb -c A-wide.json
+calib evaluate B.uwb -c A-same.json
 calib evaluate B.uwb -c A-few.json
 calib localize B.uwb -c A-few.json
 """,
-        {"A.json": "ours, by A", "A-wide.json": "with `--between 0.05`", "A-few.json": "every 50th range of A"},
+        {"A.json": "ours, by A", "A-same.json": "with `--between 0`", "A-few.json": "every 50th range of A"},
         starloc_authors,
     ),
     DataSet(

@@ -173,7 +173,8 @@ class FitSettings(_Settings):
     or a robust loss of residuals: "cauchy", "huber", "soft_l1", "l2", one that `register_loss` added; None chooses the
     mixture, and "cauchy" for a sequential fit and for one without a curve. `scale_ns` is the scale of a robust
     loss in time of flight, None to estimate it. `between_m` is the standard deviation of what stays in the ranges of a
-    pair for a recording and is another in the next; None to estimate it from pairs and from eight parts of the data.
+    pair for a recording and is another in the next; None to estimate it from several recordings, or for 5 cm with one
+    (more where eight parts of it differ by more).
     `lift` and `alpha_dbm` make the lifted power of an exchange.
 
     `fixed_ns` are known delays by tag; `groups` are tags that share curves, by name (all do by default); `sequential`
@@ -208,8 +209,8 @@ class FitSettings(_Settings):
     )
     between_m: float | None = setting(
         None,
-        "Standard deviation in metres by which ranges of a pair differ between recordings; by default estimated from "
-        "what stays for a part of this one.",
+        "Standard deviation in metres by which ranges of a pair differ between recordings; by default estimated if "
+        "several are fitted, else 0.05. Use 0 if nothing changes, as in simulated worlds.",
         flag="--between",
         metavar="M",
         rich_help_panel=ERRORS_PANEL,

@@ -100,10 +100,20 @@ class ErrorModel:
         """Return the model for other recordings, in which pairs differ by `between_m`.
 
         `correction_m` (nodes,) are standard deviations of the correction at the powers `lifted`: with few ranges,
-        delays and curve are uncertain, and corrected ranges share that error.
+        delays and curve are uncertain, and corrected ranges share that error. Both are the same for pairs with little
+        and with much noise, so the pairs' factors on noise shrink towards 1.
         """
-        noise_m = tuple(np.hypot(np.hypot(self.noise_m, between_m), correction_m).tolist())
-        return replace(self, noise_m=noise_m, between_m=between_m)
+        noise_m = np.hypot(np.hypot(self.noise_m, between_m), correction_m)
+        own, added = np.median(self.noise_m), np.hypot(between_m, np.median(correction_m))
+        pairs = {
+            name: replace(one, noise=float(np.hypot(one.noise * own, added) / np.hypot(own, added)))
+            for name, one in self.pairs.items()
+        }
+        return replace(self, noise_m=tuple(noise_m.tolist()), between_m=between_m, pairs=pairs)
+
+    def within_m(self, noise_m: Floats) -> Floats:
+        """Return the part of the noise of ranges (n,) that varies within a recording."""
+        return np.sqrt(np.maximum(np.square(noise_m) - self.between_m**2, (0.1 * noise_m) ** 2))
 
     @property
     def long(self) -> LongDetours:

@@ -48,6 +48,13 @@ a third and three times the common detour. What a few lasting reflections leave 
 SPELLS = 8
 """Number of spells of a recording that are compared."""
 
+BETWEEN_M = 0.05
+"""Standard deviation of a pair's offset between recordings, where only one is fitted.
+
+4 cm by which pairs of MILUV differ between two days (3.2 to 4.3 cm), and 2.15 mm/K for each of both tags (DW1000 user
+manual, section 8.3.1) whose temperatures differ by 10 K. Chosen without STAR-loc, on which it is tested.
+"""
+
 
 def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, blocks: TimeBlocks) -> ErrorModel:
     """Return the error model of residuals (n,), in the order of the model's ranges."""
@@ -101,8 +108,8 @@ def between_recordings(model: RangeModel, errors: DescribedErrors, blocks: TimeB
     """Return the standard deviation, in metres, of the difference of a pair's offset between this and another
     recording.
 
-    One recording shows offsets of pairs (`pairs_m`, None if they are not determined) and of pairs in spells. Both are
-    as large as the differences between days (public flights: 3 to 4 cm).
+    Several sessions show it: by offsets of pairs (`pairs_m`, None if they are not determined), and of pairs in spells.
+    One recording does not, because its delays contain what changes by the next; it shows the least.
     """
     pair, score = model.pairs.number, errors.slopes.by[RESIDUAL]
     pairs, cell = len(model.pairs.ends), pair * SPELLS + np.arange(len(pair)) * SPELLS // len(pair)
@@ -113,7 +120,8 @@ def between_recordings(model: RangeModel, errors: DescribedErrors, blocks: TimeB
     # The common part of all spells is the offset of the pair.
     slope -= known * slope.sum(axis=1, keepdims=True) / np.maximum(known.sum(axis=1, keepdims=True), 1e-300)
     spells_m = math.sqrt(mean_variance(known.ravel(), slope.ravel(), TYPICAL_OFFSET_M, OFFSETS[1:]))
-    return math.hypot(spells_m, spells_m if pairs_m is None else pairs_m)
+    found = math.hypot(spells_m, spells_m if pairs_m is None else pairs_m)
+    return found if np.ptp(model.ranges.session) else max(found, BETWEEN_M)
 
 
 def mean_variance(information: Floats, slope: Floats, typical: float, bounds: tuple[float, float]) -> float:

@@ -47,7 +47,7 @@ class RangeErrors:
 
 
 def range_errors(calibration: Calibration, ranges: Ranges) -> tuple[Floats, RangeErrors]:
-    """Return the noise (n,) of corrected ranges, and their error model.
+    """Return the noise (n,) of corrected ranges within a flight, and their error model.
 
     Outliers have a share of a thousandth at least, of about 3 m, because a filter meets errors that the calibration did
     not. Raises `UnanswerableError` for a calibration without an error model.
@@ -65,7 +65,7 @@ def range_errors(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Rang
         outlier_m=max(model.outlier_m, 3.0),
         long=model.long,
     )
-    return np.hypot(shapes.noise_m, calibration.bias_curve.beyond(lifted)), errors
+    return np.hypot(model.within_m(shapes.noise_m), calibration.bias_curve.beyond(lifted)), errors
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 import csv
 import tarfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -37,8 +38,11 @@ def test_draws_of_which_nothing_is_known_have_the_typical_variance():
     assert mean_variance(np.zeros(4), np.zeros(4), 0.035, BOUNDS) == pytest.approx(0.035**2, rel=0.01)
 
 
-def test_ranges_of_a_sound_world_show_no_difference_between_recordings():
-    assert calib.fit(make(CLEAN["iid"], 31).ranges).calibration.errors.between_m < 0.005
+def test_two_recordings_of_a_sound_world_show_no_difference_and_one_cannot():
+    first, second = (make(CLEAN["iid"], 31, flight).ranges for flight in (0, 1))
+    assert calib.fit(first).calibration.errors.between_m == 0.05
+    later = replace(second, time_ns=second.time_ns + 86_400 * 10**9, source="later")
+    assert calib.fit([first, later]).calibration.errors.between_m < 0.01
 
 
 def test_what_is_said_of_other_recordings_is_in_the_total_and_what_is_not_is_refused():
@@ -76,16 +80,14 @@ def starloc(tmp_path_factory):
     return flights
 
 
-@pytest.mark.parametrize(("one", "other", "least"), [(0, 1, 0.86), (1, 0, 0.92)])
-def test_a_flight_predicts_the_errors_of_another_day(starloc, one, other, least):
+@pytest.mark.parametrize(("one", "other"), [(0, 1), (1, 0)])
+def test_a_flight_predicts_the_errors_of_another_day(starloc, one, other):
     found = calib.fit(starloc[one], minimum_norm=True).calibration
-    # Two pairs of sixteen moved by 12 cm, and one is behind something in the second flight: 95 % is not reached.
-    assert calib.evaluate(starloc[other], found).overall.inside_95 > least
+    # STAR-loc chose none of the model's constants.
+    assert 0.92 < calib.evaluate(starloc[other], found).overall.inside_95 < 0.97
     # The smallest delays: what both tags of the rig have more and all anchors less is not in the data.
     of_tags = sum(found.delays_ns[tag] for tag in (1, 2))
     assert of_tags == pytest.approx(sum(found.delays_ns.values()) - of_tags, abs=0.01)
-    # Sound worlds show less than half a centimetre (above).
-    assert 0.008 < found.errors.between_m < 0.05
 
 
 def test_delays_of_150_ranges_of_a_real_flight_agree_with_those_of_all(starloc):
