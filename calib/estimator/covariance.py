@@ -12,13 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
 from scipy.special import stdtrit
 
 from calib.estimator.inverse import trace_of_product
 from calib.estimator.optimize import Optimum
 from calib.estimator.range_rows import RangeRows
-from calib.estimator.rows import Rows, projected, sum_rows
+from calib.estimator.rows import Rows, sum_rows
 from calib.estimator.time_blocks import Persistence, TimeBlocks, persistence
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
@@ -76,7 +75,7 @@ def sandwich(
     """
     keep = np.concatenate([sort.indices for sort in kept])
     reach = optimum.covariance[:, keep]
-    series = block_sums(rows, optimum.x, reach, blocks)
+    series = block_sums(rows, optimum.x, blocks) @ reach
     lasting, width, at = [], np.ones(len(keep)), 0
     for sort in kept:
         own = slice(at, at + len(sort.indices))
@@ -108,24 +107,22 @@ def of_weights(optimum: Optimum, keep: Ints) -> Floats:
     """
     found = np.zeros((len(keep),) * 2)
     priors = optimum.priors
-    for weight, rank, (where, prior) in zip(priors.weights, priors.ranks, priors.all, strict=True):
-        if prior.bounds is None:
-            continue
-        size = where.stop - where.start
-        structure = sparse.eye(size, format="csc") if prior.structure is None else prior.structure
-        pulled = np.zeros(optimum.layout.size)
-        pulled[where] = weight * np.asarray(structure @ (optimum.x[where] - prior.centre))
-        pull = (optimum.covariance @ pulled)[keep]
-        free = rank - weight * trace_of_product(optimum.covariance, structure, where)
-        found += np.outer(pull, pull) * (2 / max(free, 1.0))
+    for k, (where, prior) in enumerate(priors.all):
+        if prior.bounds is not None:
+            weight, structure, pulled = priors.weights[k], priors.structures[k], np.zeros(optimum.layout.size)
+            pulled[where] = weight * np.asarray(structure @ (optimum.x[where] - prior.centre))
+            pull = (optimum.covariance @ pulled)[keep]
+            free = priors.ranks[k] - weight * trace_of_product(optimum.covariance, structure, where)
+            found += np.outer(pull, pull) * (2 / max(free, 1.0))
     return found
 
 
-def block_sums(rows: RangeRows, x: Floats, reach: Floats, blocks: TimeBlocks) -> Floats:
-    """Return the slopes of ranges times `reach` (p, k), summed within blocks of time (blocks, k)."""
-    found = np.zeros((blocks.count, reach.shape[1]))
-    at = 0
-    for pull in projected(rows, x, reach):
-        np.add.at(found, blocks.number[rows.order[at : at + len(pull)]], pull)
-        at += len(pull)
+def block_sums(rows: RangeRows, x: Floats, blocks: TimeBlocks) -> Floats:
+    """Return the slopes of the ranges' log likelihood by all unknowns (p,), summed by block of time: (blocks, p)."""
+    found, at = np.zeros((blocks.count, len(x))), 0
+    for terms in rows.terms(x):
+        slopes = terms.as_matrix(terms.slopes, len(x))
+        given = rows.order[at : at + slopes.shape[0]]
+        found += (blocks.summing(given) @ slopes).toarray()
+        at += len(given)
     return found

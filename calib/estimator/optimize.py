@@ -105,7 +105,7 @@ def maximize(
         top, sums, shorter = x, found, 0
         precision = priors.precision()
         known = sums.information + precision
-        covariance = inverse_of(known, free, layout.local())
+        covariance = inverse_of(known, free)
         slope = sums.gradient + priors.pull(x)
         bent = [(moved, _damped(moved, fell + precision @ moved, known @ moved)) for moved, fell in changes]
         step = _corrected(covariance, slope, bent)

@@ -111,16 +111,6 @@ def _block_products(left: Floats, right: Floats, starts: Ints) -> Floats:
     return found
 
 
-def projected(rows: Rows, x: Floats, reach: Floats) -> Iterator[Floats]:
-    """Yield the slopes of rows times `reach` (p, k), (n, k) for some rows at a time: how each pulls k combinations."""
-    for terms in rows.terms(x):
-        counts = np.diff(terms.starts)
-        found = np.zeros((terms.slopes.shape[1], reach.shape[1]))
-        for slope, column in zip(terms.slopes, terms.columns.T, strict=True):
-            found += slope[:, None] * np.repeat(reach[column], counts, axis=0)
-        yield found
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NormalRows:
     """Linear measurements with normal errors: `value` (n,) = sum of `entries` (n, K) times the unknowns, +- `std` (n,).

@@ -163,7 +163,7 @@ class Slopes:
         self.score, self.tells = np.empty(len(rows)), np.zeros(len(rows))
         self.own = np.zeros((blocks.count, size))
         for which, terms, by in self._pieces():
-            self.own += (self._in_block(which) @ terms.as_matrix(terms.slopes, size)).toarray()
+            self.own += (blocks.summing(self.order[which]) @ terms.as_matrix(terms.slopes, size)).toarray()
             self.score[which] = by
             for part, weight in _weighed(terms):
                 self.tells[which] += weight if part.residual is None else weight * part.residual
@@ -174,12 +174,6 @@ class Slopes:
         for terms, by in self.rows.terms_and_scores(self.optimum.x):
             yield slice(at, at + len(by)), terms, by
             at += len(by)
-
-    def _in_block(self, which: slice) -> sparse.csr_matrix:
-        """Return a matrix (blocks, rows) that sums some rows by block of time."""
-        number = self.blocks.number[self.order[which]]
-        place = (number, np.arange(len(number)))
-        return sparse.csr_matrix((np.ones(len(number)), place), shape=(self.blocks.count, len(number)))
 
     def link(self, derivative: Derivative | sparse.csr_matrix) -> Floats:
         """Return what links offsets, as derivatives (n, k) of given ranges, to all unknowns (k, p)."""
@@ -198,7 +192,7 @@ class Slopes:
         """Return sums over all ranges for offsets with derivatives (n, k) of given ranges."""
         sums = [_Sums.empty(each.shape[1], *self.own.shape) for each in derivatives]
         for which, terms, by in self._pieces():
-            in_block = self._in_block(which)
+            in_block = self.blocks.summing(self.order[which])
             matrices = [
                 (weight, part.as_matrix(part.slopes if part.entries is None else part.entries, self.own.shape[1]))
                 for part, weight in _weighed(terms)

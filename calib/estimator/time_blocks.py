@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy import sparse
 from scipy.special import stdtrit
 
 from calib.data.ranges import Ranges
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import Floats, Ints
 
 MOST_BLOCKS: Final = 1000
 SHORTEST_S: Final = 0.1
@@ -50,11 +51,10 @@ class TimeBlocks:
         """Return the number of blocks."""
         return int(self.bounds[-1])
 
-    def among(self, rows: Bools | Ints | slice) -> TimeBlocks:
-        """Return the blocks of some of the ranges (n,), numbered without those that are empty."""
-        used, number = np.unique(self.number[rows], return_inverse=True)
-        bounds = np.unique(np.searchsorted(used, self.bounds))
-        return TimeBlocks(number=number.astype(np.int32), bounds=bounds, seconds=self.seconds)
+    def summing(self, rows: Ints) -> sparse.csr_matrix:
+        """Return a matrix (blocks, k) that sums over the given rows (k,) by block."""
+        place = (self.number[rows], np.arange(len(rows)))
+        return sparse.csr_matrix((np.ones(len(rows)), place), shape=(self.count, len(rows)))
 
     def pieces(self, series: Floats, spans: int = 1) -> Floats:
         """Return sums by block (blocks, k) as columns of pieces of equal length, less their means.

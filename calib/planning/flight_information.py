@@ -194,7 +194,7 @@ class Information:
         priors, self.delays = Priors(self.layout), self.layout.indices(["delay"])
         for _ in range(EVIDENCE_STEPS):
             known = of_ranges + beside + priors.precision()
-            self.covariance = inverse_of(known, self.layout.free(), self.layout.local())
+            self.covariance = inverse_of(known, self.layout.free())
             priors.update(self.x, self.covariance)
         self.without_motion = of_ranges + priors.precision()
 

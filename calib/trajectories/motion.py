@@ -128,11 +128,7 @@ class Motion:
             names = tuple(body for _ in range(several) for body in bodies for _ in range(axes))
             values = start.get(kind, np.zeros(len(names))).ravel()
             if names:
-                found.append(
-                    Unknown(
-                        kind=kind, names=names, start=values, priors=priors, scale=scale, local=kind in ("path", "turn")
-                    )
-                )
+                found.append(Unknown(kind=kind, names=names, start=values, priors=priors, scale=scale))
         return tuple(found)
 
     def numbers(self, layout: Layout, kind: str) -> Ints:
