@@ -54,24 +54,13 @@ class Kept:
         return cls(indices=indices, combinations=np.eye(len(indices)), independent=CURVE_SERIES)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Covariance:
-    """Covariance (k, k) of all kept unknowns in their order, and the persistence of each group.
-
-    1.96 standard errors make 95 % intervals: the factor of small samples is included.
-    """
-
-    matrix: Floats
-    lasting: tuple[Persistence, ...]
-    used: float
-
-
 def sandwich(
     optimum: Optimum, rows: RangeRows, kept: Sequence[Kept], blocks: TimeBlocks, beside: Sequence[Rows] = ()
-) -> Covariance:
-    """Return the covariance of the kept unknowns at an optimum of ranges in blocks of time.
+) -> tuple[Floats, list[Persistence]]:
+    """Return the covariance (k, k) of all kept unknowns in their order, and the persistence of each group of them.
 
-    The standard errors of rows `beside` ranges (poses, tapes) are taken as stated.
+    1.96 standard errors make 95 % intervals: the factor of small samples is included. The standard errors of rows
+    `beside` ranges (poses, tapes) are taken as stated.
     """
     keep = np.concatenate([sort.indices for sort in kept])
     reach = optimum.covariance[:, keep]
@@ -95,7 +84,7 @@ def sandwich(
     if beside:
         prior = prior + reach.T @ (sum_rows(beside, optimum.x).information @ reach)
     matrix = fresh * (series.T @ series) * width[:, None] * width + prior + of_weights(optimum, keep)
-    return Covariance(matrix=np.asarray(matrix), lasting=tuple(lasting), used=used)
+    return np.asarray(matrix), lasting
 
 
 def of_weights(optimum: Optimum, keep: Ints) -> Floats:

@@ -64,6 +64,10 @@ class Optimum:
         """Return the unknowns of a kind."""
         return self.x[self.layout.where[kind]]
 
+    def by_kind(self) -> dict[str, Floats]:
+        """Return all unknowns by their kinds."""
+        return {kind: self.x[where] for kind, where in self.layout.where.items()}
+
 
 def maximize(
     rows: Sequence[Rows],

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calib.errors import UnanswerableError
-from calib.estimator.range_model import FEWEST_OF_GROUP as FEWEST
+from calib.estimator.range_model import MIN_RANGES_OF_GROUP as FEWEST
 from calib.fitting.fitting import fit
 from tests.calib.synthetic import ranges
 
