@@ -25,7 +25,7 @@ from calib.estimator.range_model import RangeModel
 from calib.estimator.score_tests import REACHED, Family, Slopes, Tested
 from calib.estimator.time_blocks import GAP_S, TimeBlocks, time_blocks
 from calib.estimator.unknowns import Priors
-from calib.range_errors.density import OUTLIERS_OVER_M, error_slopes
+from calib.range_errors.densities import OUTLIERS_OVER_M, error_slopes
 from calib.settings import FitSettings
 from calib.spread import less_medians, robust_spread
 from uwblink.arrays import Bools, Floats, Ints

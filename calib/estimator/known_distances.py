@@ -22,7 +22,7 @@ from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows, Robus
 from calib.estimator.rows import NormalRows, Rows
 from calib.estimator.time_blocks import Persistence, TimeBlocks, in_order, time_blocks
 from calib.estimator.unknowns import Layout, Priors, Unknown
-from calib.range_errors.density import ErrorSlopes
+from calib.range_errors.densities import ErrorSlopes
 from calib.settings import FitSettings
 from calib.spread import medians, robust_spread
 from uwblink.arrays import Bools, Floats, Ints

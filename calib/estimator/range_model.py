@@ -15,7 +15,7 @@ from scipy.interpolate import BSpline
 from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, knots_for, lift, lifted_power, populated
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimator.error_unknowns import error_unknowns, scattered
+from calib.estimator.grouped_errors import error_unknowns, scattered
 from calib.estimator.identifiability import free_directions, square_of
 from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
 from calib.estimator.rows import NormalRows

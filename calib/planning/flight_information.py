@@ -20,7 +20,7 @@ from calib.estimator.range_rows import RESIDUAL, RangeRows
 from calib.estimator.rows import sum_rows
 from calib.estimator.unknowns import Layout, Priors
 from calib.information import Verdict
-from calib.range_errors.density import error_slopes
+from calib.range_errors.densities import error_slopes
 from calib.settings import FitSettings, FlightSettings
 from calib.trajectories.fitting import range_model
 from calib.trajectories.judging import GEOMETRY_ALONE_FACTOR, verdict_on, with_known_distances

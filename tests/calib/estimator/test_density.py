@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from calib.range_errors.density import error_slopes
+from calib.range_errors.densities import error_slopes
 
 SHAPE = {
     "noise": np.log(0.06),
