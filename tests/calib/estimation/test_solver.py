@@ -109,7 +109,7 @@ def test_the_smallest_delays_only_when_asked():
 
 def test_the_band_holds_the_curve():
     inside = []
-    for seed in range(12):
+    for seed in range(6):
         c = fit(ranges(4000, seed=seed)).calibration
         low, high = c.bias_curve.range
         grid = np.linspace(low, high, 50)
@@ -117,7 +117,7 @@ def test_the_band_holds_the_curve():
         band = c.band(grid, "bias")
         assert band is not None
         inside.append(np.abs(wrong - wrong.mean()) < 1.96 * band)
-    # 600 points, of which some eight a curve are independent: 95 % to within 2 % either side, and the tail of
+    # 300 points, of which some eight a curve are independent: 95 % to within 3 % either side, and the tail of
     # reflections that a Cauchy loss lets through takes a little more.
     assert np.mean(inside) > 0.88
 
@@ -189,6 +189,7 @@ def test_single_sided_ranges_and_missing_ones_are_warned_of():
 
 def test_a_likelihood_that_leaves_a_pair_out_is_not_believed(monkeypatch):
     found_by, r = known_distances.likeliest, ranges(2000)
+    assert fit(r).calibration.loss == "mixture"
 
     def lost(model, *words):
         found = found_by(model, *words)
@@ -198,7 +199,3 @@ def test_a_likelihood_that_leaves_a_pair_out_is_not_believed(monkeypatch):
     monkeypatch.setattr(known_distances, "likeliest", lost)
     assert fit(r).calibration.loss == "cauchy"
     assert any("left all ranges of a pair out" in warning for warning in fit(r, loss="mixture").warnings)
-
-
-def test_a_likelihood_that_stays_near_is_believed():
-    assert fit(ranges(2000)).calibration.loss == "mixture"
