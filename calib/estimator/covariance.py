@@ -8,7 +8,7 @@ pooled, and fitted with an autocorrelation a rho^h (`persistence`). What the fit
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,36 +55,31 @@ class Kept:
 
 
 def sandwich(
-    optimum: Optimum, rows: RangeRows, kept: Sequence[Kept], blocks: TimeBlocks, beside: Sequence[Rows] = ()
-) -> tuple[Floats, list[Persistence]]:
-    """Return the covariance (k, k) of all kept unknowns in their order, and the persistence of each group of them.
+    optimum: Optimum, rows: RangeRows, kept: Mapping[str, Kept], blocks: TimeBlocks, beside: Sequence[Rows] = ()
+) -> dict[str, tuple[Floats, Persistence]]:
+    """Return the covariance (k, k) of each group of kept unknowns by its name, and the persistence of its errors.
 
     1.96 standard errors make 95 % intervals: the factor of small samples is included. The standard errors of rows
     `beside` ranges (poses, tapes) are taken as stated.
     """
-    keep = np.concatenate([sort.indices for sort in kept])
-    reach = optimum.covariance[:, keep]
-    series = block_sums(rows, optimum.x, blocks) @ reach
-    lasting, width, at = [], np.ones(len(keep)), 0
-    for sort in kept:
-        own = slice(at, at + len(sort.indices))
-        at = own.stop
-        found = persistence(series[:, own] @ sort.combinations.T, blocks, sort.independent)
-        lasting.append(found)
-        quantile = max(found.quantile95, float(stdtrit(sort.freedom, 0.975)))
-        width[own] = np.sqrt(found.factor) * quantile / TWO_SIDED_95
+    sums, count, found = block_sums(rows, optimum.x, blocks), len(rows), {}
+    information, stated = optimum.information, optimum.priors.precision()
+    if beside:
+        information, others = (sum_rows(some, optimum.x).information for some in ([rows], beside))
+        stated = stated + others
     # Slopes at the optimum are smaller than at the truth: with information I and penalty P, the squares of so many
     # ranges are smaller by the share tr((I + P)^-1 I) / n on average, the unknowns that ranges determine by their
     # number.
-    count = len(rows)
-    information = sum_rows([rows], optimum.x).information if beside else optimum.information
     used = trace_of_product(optimum.covariance, information)
     fresh = count / max(count - used, 0.2 * count)
-    prior = reach.T @ (optimum.priors.precision() @ reach)
-    if beside:
-        prior = prior + reach.T @ (sum_rows(beside, optimum.x).information @ reach)
-    matrix = fresh * (series.T @ series) * width[:, None] * width + prior + of_weights(optimum, keep)
-    return np.asarray(matrix), lasting
+    for name, group in kept.items():
+        reach = optimum.covariance[:, group.indices]
+        series = sums @ reach
+        lasting = persistence(series @ group.combinations.T, blocks, group.independent)
+        width = max(lasting.quantile95, float(stdtrit(group.freedom, 0.975))) / TWO_SIDED_95
+        sampled = fresh * lasting.factor * width**2 * (series.T @ series)
+        found[name] = sampled + reach.T @ (stated @ reach) + of_weights(optimum, group.indices), lasting
+    return found
 
 
 def of_weights(optimum: Optimum, keep: Ints) -> Floats:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import expit
 
 from calib.estimator.optimize import maximize
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows
@@ -111,7 +112,7 @@ def fit_grouped_errors(groups: Sequence[Floats], most: int = 20_000) -> GroupedE
     rows = RangeRows.of(error_m - middle[group], group, parts, Mixture(), layout)
     found = maximize([rows], Priors(layout), layout.start())
     each = rows.error_slopes(found.x, ())
-    long = LongDetours(share=float(1 / (1 + np.exp(-found.of("long detours")[0]))), factor=LONG_FACTOR)
+    long = LongDetours(share=float(expit(found.of("long detours")[0])), factor=LONG_FACTOR)
     of_centre = layout.where["centre"]
     return GroupedErrors(
         centre_m=middle + found.of("centre"),

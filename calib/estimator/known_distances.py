@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
+from scipy.special import expit
 
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
@@ -271,25 +272,22 @@ def _maximize_by_samples(
 def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDistances:
     """Return a fit with the covariances of what was fitted."""
     layout = fitted.optimum.layout
-    parts = {
-        "delay": layout.indices(["delay"]),
-        "curve": layout.indices(model.curve_kinds()),
-        "noise": layout.indices(noise_kinds(layout)),
+    kept = {
+        "delay": Kept.delays(layout.indices(["delay"]), len(fitted.residuals) / len(model.pairs.ends)),
+        "curve": Kept.curve(layout.indices(model.curve_kinds())),
+        "noise": Kept.curve(layout.indices(noise_kinds(layout))),
     }
-    parts = {name: own for name, own in parts.items() if len(own)}
-    each = len(fitted.residuals) / len(model.pairs.ends)
-    kept = [Kept.delays(own, each) if name == "delay" else Kept.curve(own) for name, own in parts.items()]
-    matrix, lasting = sandwich(fitted.optimum, fitted.rows, kept, blocks, fitted.beside)
-    whose = np.repeat(np.arange(len(parts)), [len(own) for own in parts.values()])
-    covariances = {name: matrix[np.ix_(whose == k, whose == k)] for k, name in enumerate(parts)}
+    kept = {name: group for name, group in kept.items() if len(group.indices)}
+    found = sandwich(fitted.optimum, fitted.rows, kept, blocks, fitted.beside)
+    covariances = {name: matrix for name, (matrix, _) in found.items()}
     if "offset of pair" in layout.where and "odds of pair" in layout.where:
-        covariances["delay"] = covariances["delay"] + _of_another_shape(fitted.optimum, kept[0].indices)
+        covariances["delay"] = covariances["delay"] + _of_another_shape(fitted.optimum)
     return KnownDistances(
         model=model,
         values=model.at_reference(fitted.values),
         covariances=covariances,
         searches=(fitted,),
-        persistence=lasting[0],
+        persistence=found[next(iter(kept))][1],
         blocks=blocks,
         residuals=fitted.residuals,
     )
@@ -305,17 +303,17 @@ SHAPE = 0.1
 detours, or two lengths, shift delays by as much (`make worlds`)."""
 
 
-def _of_another_shape(optimum: Optimum, delays: Ints) -> Floats:
+def _of_another_shape(optimum: Optimum) -> Floats:
     """Return the covariance (tags, tags) of delays due to reflections of another shape, which shift the ranges of a
     pair.
 
     Ranges that are longer by b move all unknowns by the covariance times their information on an offset of the pair.
     """
     noise = np.exp(optimum.of("noise level") + optimum.of("noise of pair"))
-    share = 1 / (1 + np.exp(-optimum.of("odds level") - optimum.of("odds of pair")))
+    share = expit(optimum.of("odds level") + optimum.of("odds of pair"))
     unit = np.zeros((optimum.layout.size, len(share)))
     unit[optimum.layout.where["offset of pair"]] = np.eye(len(share))
-    moved = (optimum.covariance @ np.asarray(optimum.information @ unit))[delays]
+    moved = (optimum.covariance @ np.asarray(optimum.information @ unit))[optimum.layout.where["delay"]]
     return np.asarray((moved * (SHAPE * share * noise) ** 2) @ moved.T)
 
 

@@ -279,7 +279,6 @@ def _curve(kind: str, spline: Spline, share: Floats | None) -> tuple[Unknown, Pa
         kind=kind,
         names=tuple(map(str, range(spline.size))),
         start=np.zeros(spline.size),
-        scale=CURVE_M,
         priors=(rough, Prior.of_deviation(CURVE_M)),
     )
     values = -spline.values if share is None else -share[:, None] * spline.values

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import expit
 
 from calib.calibration.error_model import ErrorModel, PairErrors
 from calib.calibration.model import Calibration
@@ -33,12 +34,6 @@ LEAST_SPREAD_M = 1e-6
 NODES = 8
 """Number of powers at which noise and share are stated; between them both are linear."""
 
-JUDGED = 20_000
-"""Number of ranges from which quantiles and the total sigma are corrected; more change nothing."""
-
-FEWEST_JUDGED = 200
-"""With fewer ranges the quantiles of the model are not corrected."""
-
 LEVELS = (0.005, 0.025, 0.05, 0.16, 0.5, 0.84, 0.95, 0.975, 0.995)
 """Shares of errors at which the model's quantiles are corrected."""
 
@@ -46,7 +41,6 @@ BEYOND_MEANS = 8.0
 """Errors longer than so many means of the longer detours are excluded from the total sigma. An exponential distribution
 has 0.03 % of its values beyond, which carry 1.4 % of its mean square."""
 
-SMALLEST_SHARE = 1e-4
 WIDEST_ODDS, WIDEST_DETOUR = 4.0, 1.0
 """Variances of a pair's log odds and log detour: two in three pairs between an eighth and eight times the common odds,
 a third and three times the common detour. What a few lasting reflections leave open is more than any room has."""
@@ -76,7 +70,7 @@ def calibration_of(found: KnownDistances, delays_ns2: Floats) -> Calibration:
     biases = bias_curves(found)
     errors = None
     spread = robust_spread(found.residuals)
-    sigmas, sigma_m2 = _flat_sigma(model, spread, len(found.residuals))
+    sigmas, sigma_m2 = _flat_sigma(model, spread, 0.5 / len(found.residuals))
     if LEAST_SPREAD_M < spread < LARGEST_SPREAD_M:
         described = described_errors(found)
         errors = error_model(model, found.residuals, described, found.blocks)
@@ -136,11 +130,7 @@ def sigma_curves(
     """
     level = float(values["noise level"][0])
     if model.noise is None:
-        flat = max(math.exp(level), SIGMA_FLOOR_M)
-        curve = flat_curve(flat, model.span)
-        return dict.fromkeys(model.settings.groups or ("",), curve), np.full(
-            (DEGREE + 1,) * 2, flat**2 * covariance[0, 0]
-        )
+        return _flat_sigma(model, math.exp(level), float(covariance[0, 0]))
     knots = model.noise.knots
     lifted = np.linspace(knots[0], knots[-1], 8 * model.noise.size)
     at = Spline.at(lifted, knots)
@@ -160,10 +150,11 @@ def sigma_curves(
     return curves, np.asarray(slope @ covariance @ slope.T)
 
 
-def _flat_sigma(model: RangeModel, sigma: float, count: int) -> tuple[dict[str, Curve], Floats]:
-    value = max(sigma, SIGMA_FLOOR_M)
-    curve = flat_curve(value, model.span)
-    return dict.fromkeys(model.settings.groups or ("",), curve), np.full((DEGREE + 1,) * 2, value**2 / (2 * count))
+def _flat_sigma(model: RangeModel, sigma_m: float, variance: float) -> tuple[dict[str, Curve], Floats]:
+    """Return flat curves of noise whose logarithm has a variance, and their covariance."""
+    value = max(sigma_m, SIGMA_FLOOR_M)
+    curves = dict.fromkeys(model.settings.groups or ("",), flat_curve(value, model.span))
+    return curves, np.full((DEGREE + 1,) * 2, value**2 * variance)
 
 
 def _correction_std(found: KnownDistances, delays_ns2: Floats, lifted: Floats) -> Floats:
@@ -210,18 +201,18 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
     told = np.bincount(number, found.by["odds"] ** 2, pairs)
     # A wall has one detour: the number of reflections counts for the mean, not the number of ranges.
     reflected = np.bincount(number, found.reflected, pairs)
-    odds, odds_var, any_odds, any_odds_var = _drawn(values["odds of pair"], lasting / np.maximum(told, 1e-6))
-    detour, detour_var, any_detour, any_detour_var = _drawn(
-        values["detour of pair"], lasting / np.maximum(reflected, 1e-6)
+    odds, odds_var, any_odds, any_odds_var = _drawn(
+        values["odds of pair"], lasting / np.maximum(told, 1e-6), WIDEST_ODDS
     )
-    odds_var, any_odds_var = np.minimum(odds_var, WIDEST_ODDS), min(any_odds_var, WIDEST_ODDS)
-    detour_var, any_detour_var = np.minimum(detour_var, WIDEST_DETOUR), min(any_detour_var, WIDEST_DETOUR)
+    detour, detour_var, any_detour, any_detour_var = _drawn(
+        values["detour of pair"], lasting / np.maximum(reflected, 1e-6), WIDEST_DETOUR
+    )
     lifted, noise, curve = _at_nodes(model, values)
     level = float(values["odds level"][0])
     middle = level + float(np.mean(curve))
     common = float(_expected_odds(np.array(any_odds + middle), np.array(any_odds_var)))
     own = _expected_odds(odds + middle, odds_var)
-    long = LongDetours(share=float(1 / (1 + np.exp(-values["long detours"][0]))), factor=LONG_FACTOR)
+    long = LongDetours(share=float(expit(values["long detours"][0])), factor=LONG_FACTOR)
     above = float(np.exp(values["detour level"][0]))
     any_mean = above * float(np.exp(any_detour + any_detour_var / 2))
     means = above * np.exp(detour + detour_var / 2)
@@ -231,7 +222,7 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
     stated = ErrorModel(
         lifted=tuple(lifted.tolist()),
         noise_m=tuple(noise.tolist()),
-        tail_share=tuple(_share(common + curve - np.mean(curve)).tolist()),
+        tail_share=tuple(np.clip(expit(common + curve - np.mean(curve)), 1e-4, 1 - 1e-4).tolist()),
         least_m=float(np.exp(values["least detour"][0])),
         detour_m=long.mean * any_mean,
         outlier_share=max(float(np.mean(wild)), 1e-9),
@@ -240,9 +231,9 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
         long_share=long.share,
         long_factor=long.factor,
         pairs={
-            f"{a}-{b}": PairErrors(noise=float(one), odds=float(np.exp(two - common)), detour=float(three / any_mean))
-            for (a, b), one, two, three in zip(
-                model.pairs.ends.tolist(), np.exp(values["noise of pair"]), own, means, strict=True
+            name: PairErrors(noise=float(one), odds=float(np.exp(two - common)), detour=float(three / any_mean))
+            for name, one, two, three in zip(
+                model.pairs.names, np.exp(values["noise of pair"]), own, means, strict=True
             )
         },
     )
@@ -300,10 +291,11 @@ def _at_nodes(model: RangeModel, values: dict[str, Floats]) -> tuple[Floats, Flo
     return nodes, np.exp(level + curves["noise"]), curves["odds"]
 
 
-def _drawn(value: Floats, variance: Floats) -> tuple[Floats, Floats, float, float]:
+def _drawn(value: Floats, variance: Floats, widest: float) -> tuple[Floats, Floats, float, float]:
     """Shrink values (pairs,) with known variances to their mean; return them, their variances, and those of a new pair.
 
-    The variance between pairs is the maximum of a normal likelihood (by expectation-maximisation).
+    The variance between pairs is the maximum of a normal likelihood (by expectation-maximisation). Returned variances
+    are `widest` at most.
     """
     between = float(np.var(value)) + 1e-3
     for _ in range(50):
@@ -314,7 +306,7 @@ def _drawn(value: Floats, variance: Floats) -> tuple[Floats, Floats, float, floa
     of_centre = float(1 / np.sum(1 / (between + variance)))
     kept = between / (between + variance)
     drawn, left = centre + kept * (value - centre), kept * variance + (1 - kept) ** 2 * of_centre
-    return np.asarray(drawn), np.asarray(left), centre, between + of_centre
+    return np.asarray(drawn), np.minimum(left, widest), centre, min(between + of_centre, widest)
 
 
 def _expected_odds(log_odds: Floats, variance: Floats) -> Floats:
@@ -322,15 +314,13 @@ def _expected_odds(log_odds: Floats, variance: Floats) -> Floats:
     return np.asarray(log_odds / np.sqrt(1 + np.pi / 8 * variance))
 
 
-def _share(log_odds: Floats) -> Floats:
-    return np.clip(1 / (1 + np.exp(-log_odds)), SMALLEST_SHARE, 1 - SMALLEST_SHARE)
-
-
 def _put_right(model: ErrorModel, of: RangeModel, residual: Floats) -> ErrorModel:
     """Correct the quantiles and the total standard deviation so that they hold for the fitted ranges on average."""
-    rows = np.linspace(0, len(residual) - 1, min(JUDGED, len(residual))).astype(np.int64)
-    if len(rows) < FEWEST_JUDGED:
+    if len(residual) < 200:
+        # Two hundred ranges know the outer quantiles, those of half a per cent, by one range.
         return model
+    # More than 20 000 ranges change nothing.
+    rows = np.linspace(0, len(residual) - 1, min(20_000, len(residual))).astype(np.int64)
     error = residual[rows]
     shapes = model.shapes(of.lifted[rows], of.ranges.initiator[rows], of.ranges.target[rows])
     level = np.quantile(model.below(error, shapes), LEVELS)

@@ -1,8 +1,7 @@
 """The unknowns of a fit: blocks of numbers of one kind, what is known of them beforehand, and where they stand.
 
-A block is a named vector with a start, a scale (how far an ignorant guess is off, by which `calib.information.judge`
-decides what data determine), and Gaussian priors. The weight of a prior may be estimated with the unknowns, by the
-fixed point of Fellner and Schall as Wood and Fasiolo (Biometrics 2017) generalise it: the roughness of a curve, the
+A block is a named vector with a start and Gaussian priors. The weight of a prior may be estimated with the unknowns, by
+the fixed point of Fellner and Schall as Wood and Fasiolo (Biometrics 2017) generalise it: the roughness of a curve, the
 variance of offsets between pairs and between sessions, and the spread of error models between pairs are one mechanism.
 """
 
@@ -16,7 +15,6 @@ from scipy import sparse
 
 from calib.errors import BadInputError
 from calib.estimator.inverse import MOST_DENSE, Inverse, Matrix, trace_of_product
-from calib.information import Unknown as NamedUnknown
 from uwblink.arrays import Bools, Floats, Ints
 
 
@@ -61,14 +59,13 @@ class Prior:
 class Unknown:
     """A block of unknowns: `names` (k,) say of what each is, `start` (k,) where a search begins.
 
-    `known` (k,) marks those that keep their start. `scale` is the standard deviation of a guess without any data.
+    `known` (k,) marks those that keep their start.
     """
 
     kind: str
     names: tuple[str, ...]
     start: Floats
     priors: tuple[Prior, ...] = ()
-    scale: float = 1.0
     known: Bools | None = None
 
     def __post_init__(self) -> None:
@@ -114,10 +111,6 @@ class Layout:
         """Return the indices of some kinds, in the order given; kinds that are not there have none."""
         found = [np.arange(self.where[kind].start, self.where[kind].stop) for kind in kinds if kind in self.where]
         return np.concatenate([np.zeros(0, dtype=np.int64), *found])
-
-    def named(self) -> list[NamedUnknown]:
-        """Return every unknown with its name and scale, for `calib.information.judge`."""
-        return [NamedUnknown(block.kind, name, block.scale) for block in self.blocks for name in block.names]
 
 
 class Priors:

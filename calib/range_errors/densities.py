@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from scipy.special import erfcx
+from scipy.special import erfcx, expit
 
 from uwblink.arrays import Floats
 
@@ -167,9 +167,9 @@ def error_slopes(residual: Floats, parameters: dict[str, Floats], *, span_m: flo
     Outliers have the density 1/`span_m`.
     """
     sigma = np.exp(parameters["noise"])
-    share = _share(parameters["odds"])
+    share = expit(parameters["odds"])
     detour = np.exp(parameters["detour"])
-    least, wild, long_share = np.exp(parameters["least"]), _share(parameters["outliers"]), _share(parameters["long"])
+    least, wild, long_share = np.exp(parameters["least"]), expit(parameters["outliers"]), expit(parameters["long"])
     long = LongDetours(share=float(long_share[0]), factor=LONG_FACTOR)
     found = densities(residual, sigma, float(least[0]), long.mean * detour, long)
     inside = 1 - float(wild[0])
@@ -201,7 +201,3 @@ def error_slopes(residual: Floats, parameters: dict[str, Floats], *, span_m: flo
         reflected=reflected,
         inlier=both,
     )
-
-
-def _share(log_odds: Floats) -> Floats:
-    return np.asarray(1 / (1 + np.exp(-log_odds)))

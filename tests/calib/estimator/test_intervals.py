@@ -30,9 +30,8 @@ def squares():
 def test_few_ranges_of_a_pair_have_students_intervals(squares):
     model, found, delays = squares
     cut = time_blocks(model.ranges.time_ns, model.ranges.session)
-    (few, (last,)), (many, _) = (
-        sandwich(found.optimum, found.rows, [Kept.delays(delays, each)], cut) for each in (4, 1e9)
-    )
+    kept = {"few": Kept.delays(delays, 4), "many": Kept.delays(delays, 1e9)}
+    (few, last), (many, _) = sandwich(found.optimum, found.rows, kept, cut).values()
     assert last.freedom > 3
     assert np.sqrt(np.diag(few) / np.diag(many)) == pytest.approx(student.ppf(0.975, 3) / last.quantile95, rel=1e-6)
 
@@ -40,7 +39,7 @@ def test_few_ranges_of_a_pair_have_students_intervals(squares):
 def test_what_a_fit_uses_of_the_data_is_given_back(squares):
     model, found, delays = squares
     cut = time_blocks(model.ranges.time_ns, model.ranges.session)
-    whole, (lasting,) = sandwich(found.optimum, found.rows, [Kept.delays(delays, 1e9)], cut)
+    whole, lasting = sandwich(found.optimum, found.rows, {"delay": Kept.delays(delays, 1e9)}, cut)["delay"]
     # With NumPy alone: scores summed by block, the residual's share of degrees of freedom, and how long errors last.
     tags, ranges = np.array(model.tags), model.ranges
     weights = ((ranges.initiator, ranges.weight_initiator), (ranges.target, ranges.weight_target))
