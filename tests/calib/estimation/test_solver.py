@@ -107,6 +107,18 @@ def test_the_smallest_delays_only_when_asked():
         compare(whole, c)
 
 
+@pytest.mark.parametrize("settings", [{}, {"fixed_ns": {1: -0.3}}, {"constants": "pair"}])
+def test_a_reference_power_moves_a_constant_and_corrects_ranges_alike(settings):
+    r = ranges(600)
+    if settings.get("fixed_ns"):
+        # Of a single pair the other delay takes over the constant.
+        r = r[(r.initiator == 1) & (r.target == 2)]
+    plain, stated = (fit(r, sequential=True, reference_power_dbm=at, **settings).calibration for at in (None, -84.0))
+    assert stated.bias_curve(np.array([10**-0.2]))[0] == pytest.approx(0, abs=1e-9)
+    assert plain.bias_curve(np.array([10**-0.2]))[0] != pytest.approx(0, abs=1e-3)
+    np.testing.assert_allclose(stated.apply(r).corrected_m, plain.apply(r).corrected_m, atol=1e-6)
+
+
 def test_the_band_holds_the_curve():
     inside = []
     for seed in range(6):
