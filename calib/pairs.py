@@ -16,6 +16,11 @@ class Pairs:
     number: Ints
     ends: Ints
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the pairs, such as 1-2."""
+        return tuple(f"{a}-{b}" for a, b in self.ends.tolist())
+
 
 def pairs_of(initiator: Ints, target: Ints) -> Pairs:
     """Number the pairs of ranges (n,) in order of their lower tags, then of their higher ones."""

@@ -332,7 +332,7 @@ def _reflected(found: KnownDistances) -> Iterator[str]:
 
 def _short(found: KnownDistances) -> Iterator[str]:
     """Say where errors last so long that a recording holds few independent stretches of time."""
-    lasting = found.lasting.lasting[0]
+    lasting = found.persistence
     if lasting.stretches < FEWEST_STRETCHES:
         yield (
             f"errors last for {lasting.stretch_s:.1f} s, so the recording holds only {lasting.stretches:.0f} "
@@ -354,7 +354,7 @@ def _confounded(found: KnownDistances, slopes: Slopes) -> Iterator[str]:
     link = slopes.link(sparse.csr_matrix(far[:, None]))[0]
     taken = np.asarray(slopes.optimum.covariance @ link)
     own = float(slopes.tells @ far[slopes.order] ** 2)
-    known = (own - float(taken @ link)) / found.lasting.lasting[0].factor
+    known = (own - float(taken @ link)) / found.persistence.factor
     slope = 1 / np.sqrt(SCALE**-2 + max(known, 0.0))
     rows = basis(np.quantile(model.lifted, np.linspace(0.02, 0.98, 25)), model.curve.knots)
     count = len(model.curve_kinds())

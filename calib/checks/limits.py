@@ -46,7 +46,7 @@ REGISTER_NS: Final = 65_536 * TICK_S * 1e9
 
 def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Mapping[int, float]) -> Iterator[str]:
     """Yield what cannot be known, in sentences; `residuals_m` (n,) are fully corrected errors of the ranges."""
-    model, pairs = found.model, found.model.constants == "pair"
+    model, pairs = found.model, found.model.settings.constants == "pair"
     bare = int(np.count_nonzero(ranges.protocol == NO_STAMPS))
     if bare:
         yield (
@@ -70,7 +70,7 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
             "unknown, other pairs cannot be corrected, and what else is constant in the ranges of a pair (an obstacle, "
             "a wrong lever arm) is in its constant"
         )
-    if model.curve is None and model.looked_for_curve and model.powered.any():
+    if model.curve is None and not model.settings.delays_only and model.powered.any():
         yield (
             f"the first-path power never changes ({np.median(_mean_dbm(ranges)):.1f} dBm): the curve is flat, and "
             "delays hold at this power only"

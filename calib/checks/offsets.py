@@ -15,10 +15,11 @@ from calib.checks.geometry import anchors, places_m
 from calib.checks.recording_view import Offsets, QuickFit, RecordingView, quick_fit
 from calib.data.ranges import Ranges
 from calib.errors import CalibError
-from calib.estimator.known_distances import FEWEST_RANGES, Recipe, fit_known_distances
+from calib.estimator.known_distances import FEWEST_RANGES, fit_known_distances
 from calib.estimator.score_tests import findings
 from calib.findings import BUDGET, Candidate, exceeds, positive, stretches
 from calib.pairs import pairs_of
+from calib.settings import FitSettings
 from calib.spread import robust_spread
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -63,7 +64,7 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
     for _ in range(5):
         moved = replace(ranges, truth_m=ranges.truth_m + offset_m[pairs.number])
         try:
-            found = fit_known_distances(moved, Recipe(fixed_ns={}, groups={}, minimum_norm=True))
+            found = fit_known_distances(moved, FitSettings(minimum_norm=True))
         except CalibError:
             return
         # The pairs of the fit among all.

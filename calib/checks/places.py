@@ -83,7 +83,7 @@ def _as_one(likely: Floats) -> float:
 def _pairs_of_bodies(found: KnownDistances) -> Ints | None:
     """Return the number of the two bodies of each pair (pairs,); None where no two pairs are of the same ones."""
     carried = dict(found.model.ranges.bodies)
-    if found.model.constants == "pair" or not carried:
+    if found.model.settings.constants == "pair" or not carried:
         return None
     ends = [frozenset(carried.get(tag, f"tag {tag}") for tag in both) for both in found.model.pairs.ends.tolist()]
     groups = list(dict.fromkeys(ends))

@@ -19,13 +19,14 @@ from scipy import ndimage, sparse
 from calib.data.clocks import pair_ids
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import RecordedSource, Source
-from calib.estimator.known_distances import FEWEST_RANGES, PILOT, Fitted, Recipe, likeliest, model_of, robust_fit
+from calib.estimator.known_distances import FEWEST_RANGES, PILOT, Fitted, likeliest, model_of, robust_fit
 from calib.estimator.optimize import maximize
 from calib.estimator.range_model import RangeModel
 from calib.estimator.score_tests import REACHED, Family, Slopes, Tested
 from calib.estimator.time_blocks import GAP_S, TimeBlocks, time_blocks
 from calib.estimator.unknowns import Priors
-from calib.range_errors.density import OUTLIERS_OVER_M, error_slopes
+from calib.range_errors.densities import OUTLIERS_OVER_M, error_slopes
+from calib.settings import FitSettings
 from calib.spread import less_medians, robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.contents import Contents
@@ -289,7 +290,7 @@ def quick_fit(
         return None
     chosen = [view.chosen(rows) for view, rows in zip(views, kept, strict=True)]
     ranges = concatenate([Ranges.from_exchanges(view.exchanges, view.truth_m) for view in chosen])
-    model = model_of(ranges, Recipe(loss="cauchy", fixed_ns={}, groups={}, constants=constants), trimmed=False)
+    model = model_of(ranges, FitSettings(constants=constants), trimmed=False)
     return _fitted(model, np.concatenate([view.error_m for view in chosen]), np.concatenate(kept))
 
 

@@ -8,17 +8,16 @@ pooled, and fitted with an autocorrelation a rho^h (`persistence`). What the fit
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
 from scipy.special import stdtrit
 
 from calib.estimator.inverse import trace_of_product
 from calib.estimator.optimize import Optimum
 from calib.estimator.range_rows import RangeRows
-from calib.estimator.rows import Rows, projected, sum_rows
+from calib.estimator.rows import Rows, sum_rows
 from calib.estimator.time_blocks import Persistence, TimeBlocks, persistence
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
@@ -55,48 +54,32 @@ class Kept:
         return cls(indices=indices, combinations=np.eye(len(indices)), independent=CURVE_SERIES)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Covariance:
-    """Covariance (k, k) of all kept unknowns in their order, and the persistence of each group.
-
-    1.96 standard errors make 95 % intervals: the factor of small samples is included.
-    """
-
-    matrix: Floats
-    lasting: tuple[Persistence, ...]
-    used: float
-
-
 def sandwich(
-    optimum: Optimum, rows: RangeRows, kept: Sequence[Kept], blocks: TimeBlocks, beside: Sequence[Rows] = ()
-) -> Covariance:
-    """Return the covariance of the kept unknowns at an optimum of ranges in blocks of time.
+    optimum: Optimum, rows: RangeRows, kept: Mapping[str, Kept], blocks: TimeBlocks, beside: Sequence[Rows] = ()
+) -> dict[str, tuple[Floats, Persistence]]:
+    """Return the covariance (k, k) of each group of kept unknowns by its name, and the persistence of its errors.
 
-    The standard errors of rows `beside` ranges (poses, tapes) are taken as stated.
+    1.96 standard errors make 95 % intervals: the factor of small samples is included. The standard errors of rows
+    `beside` ranges (poses, tapes) are taken as stated.
     """
-    keep = np.concatenate([sort.indices for sort in kept])
-    reach = optimum.covariance[:, keep]
-    series = block_sums(rows, optimum.x, reach, blocks)
-    lasting, width, at = [], np.ones(len(keep)), 0
-    for sort in kept:
-        own = slice(at, at + len(sort.indices))
-        at = own.stop
-        found = persistence(series[:, own] @ sort.combinations.T, blocks, sort.independent)
-        lasting.append(found)
-        quantile = max(found.quantile95, float(stdtrit(sort.freedom, 0.975)))
-        width[own] = np.sqrt(found.factor) * quantile / TWO_SIDED_95
+    sums, count, found = block_sums(rows, optimum.x, blocks), len(rows), {}
+    information, stated = optimum.information, optimum.priors.precision()
+    if beside:
+        information, others = (sum_rows(some, optimum.x).information for some in ([rows], beside))
+        stated = stated + others
     # Slopes at the optimum are smaller than at the truth: with information I and penalty P, the squares of so many
     # ranges are smaller by the share tr((I + P)^-1 I) / n on average, the unknowns that ranges determine by their
     # number.
-    count = len(rows)
-    information = sum_rows([rows], optimum.x).information if beside else optimum.information
     used = trace_of_product(optimum.covariance, information)
     fresh = count / max(count - used, 0.2 * count)
-    prior = reach.T @ (optimum.priors.precision() @ reach)
-    if beside:
-        prior = prior + reach.T @ (sum_rows(beside, optimum.x).information @ reach)
-    matrix = fresh * (series.T @ series) * width[:, None] * width + prior + of_weights(optimum, keep)
-    return Covariance(matrix=np.asarray(matrix), lasting=tuple(lasting), used=used)
+    for name, group in kept.items():
+        reach = optimum.covariance[:, group.indices]
+        series = sums @ reach
+        lasting = persistence(series @ group.combinations.T, blocks, group.independent)
+        width = max(lasting.quantile95, float(stdtrit(group.freedom, 0.975))) / TWO_SIDED_95
+        sampled = fresh * lasting.factor * width**2 * (series.T @ series)
+        found[name] = sampled + reach.T @ (stated @ reach) + of_weights(optimum, group.indices), lasting
+    return found
 
 
 def of_weights(optimum: Optimum, keep: Ints) -> Floats:
@@ -108,24 +91,22 @@ def of_weights(optimum: Optimum, keep: Ints) -> Floats:
     """
     found = np.zeros((len(keep),) * 2)
     priors = optimum.priors
-    for weight, rank, (where, prior) in zip(priors.weights, priors.ranks, priors.all, strict=True):
-        if prior.bounds is None:
-            continue
-        size = where.stop - where.start
-        structure = sparse.eye(size, format="csc") if prior.structure is None else prior.structure
-        pulled = np.zeros(optimum.layout.size)
-        pulled[where] = weight * np.asarray(structure @ (optimum.x[where] - prior.centre))
-        pull = (optimum.covariance @ pulled)[keep]
-        free = rank - weight * trace_of_product(optimum.covariance, structure, where)
-        found += np.outer(pull, pull) * (2 / max(free, 1.0))
+    for k, (where, prior) in enumerate(priors.all):
+        if prior.bounds is not None:
+            weight, structure, pulled = priors.weights[k], priors.structures[k], np.zeros(optimum.layout.size)
+            pulled[where] = weight * np.asarray(structure @ (optimum.x[where] - prior.centre))
+            pull = (optimum.covariance @ pulled)[keep]
+            free = priors.ranks[k] - weight * trace_of_product(optimum.covariance, structure, where)
+            found += np.outer(pull, pull) * (2 / max(free, 1.0))
     return found
 
 
-def block_sums(rows: RangeRows, x: Floats, reach: Floats, blocks: TimeBlocks) -> Floats:
-    """Return the slopes of ranges times `reach` (p, k), summed within blocks of time (blocks, k)."""
-    found = np.zeros((blocks.count, reach.shape[1]))
-    at = 0
-    for pull in projected(rows, x, reach):
-        np.add.at(found, blocks.number[rows.order[at : at + len(pull)]], pull)
-        at += len(pull)
+def block_sums(rows: RangeRows, x: Floats, blocks: TimeBlocks) -> Floats:
+    """Return the slopes of the ranges' log likelihood by all unknowns (p,), summed by block of time: (blocks, p)."""
+    found, at = np.zeros((blocks.count, len(x))), 0
+    for terms in rows.terms(x):
+        slopes = terms.as_matrix(terms.slopes, len(x))
+        given = rows.order[at : at + slopes.shape[0]]
+        found += (blocks.summing(given) @ slopes).toarray()
+        at += len(given)
     return found

@@ -1,4 +1,7 @@
-"""The error model by group: by bins of power, by pair, or for one listener."""
+"""The parameters of the error model as unknowns: levels that all ranges share, and deviations of groups from them.
+
+Groups are the pairs of a fit, or whatever errors are compared by: bins of power, listeners (`fit_grouped_errors`).
+"""
 
 from __future__ import annotations
 
@@ -6,14 +9,65 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import expit
 
-from calib.estimator.error_unknowns import error_unknowns
 from calib.estimator.optimize import maximize
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows
 from calib.estimator.unknowns import Layout, Prior, Priors, Unknown
 from calib.range_errors.densities import LONG_FACTOR, LongDetours
 from calib.spread import robust_spread
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, Ints
+
+NOISE_M, NOISE_WORTH = 0.06, 20.0
+"""Prior of the noise of a range, and the number of ranges that it counts for. A stamp of a DW1000 has 0.15 ns of noise
+in the open (its user manual, 8.3), which gives 3 to 10 cm."""
+
+DETOUR_M, DETOUR_WORTH, LEAST_DETOUR_M = 0.2, 5.0, 0.03
+"""Prior of the mean of the shorter kind of exponential detours, the number of reflections that it counts for, and the
+least detour (published detours are 0.1 to 0.5 m: MILUV, STAR-loc)."""
+
+ODDS = -2.2
+"""Prior log odds of a reflection: one range in ten."""
+
+LONG_ODDS = -1.1
+"""Prior log odds that a reflection is of the longer kind: one in four; 11 to 48 % within one standard deviation."""
+
+LEVELS = {
+    "noise": ("noise level", np.log(NOISE_M), (2 * NOISE_WORTH) ** -0.5),
+    "odds": ("odds level", ODDS, 2.0),
+    "detour": ("detour level", np.log(DETOUR_M), DETOUR_WORTH**-0.5),
+    "least": ("least detour", np.log(LEAST_DETOUR_M), 2**0.5),
+    "outliers": ("outliers", -6.0, 3.0),
+    "long": ("long detours", LONG_ODDS, 1.0),
+}
+"""Kind of the unknown that all ranges share, centre and standard deviation of its prior, by parameter."""
+
+SCATTER = {"noise": (0.1, 0.01, 2.0), "odds": (0.7, 0.03, 2.0), "detour": (0.2, 0.03, 0.7)}
+"""Standard deviation of groups about these: its first value and bounds between which evidence finds it."""
+
+
+def error_unknowns(
+    spread_m: float, names: tuple[str, ...], group: Ints, whose: str = "pair"
+) -> tuple[list[Unknown], list[Part]]:
+    """Return the parameters of the error model, and the parts that ranges have in them.
+
+    `group` (n,) is the number of each range's group among `names`, `spread_m` a first guess of the noise.
+    """
+    everyone, own = np.zeros((1, 1), dtype=np.int64), group[:, None]
+    starts = {name: centre for name, (_, centre, _) in LEVELS.items()} | {"noise": np.log(0.9 * spread_m)}
+    unknowns = [
+        Unknown(kind=kind, names=("",), start=np.array([starts[name]]), priors=(Prior.of_deviation(deviation, centre),))
+        for name, (kind, centre, deviation) in LEVELS.items()
+    ]
+    unknowns += [scattered(f"{name} of {whose}", names, spread) for name, spread in SCATTER.items()]
+    parts = [Part(parameter=name, kind=kind, columns=everyone) for name, (kind, *_) in LEVELS.items()]
+    parts += [Part(parameter=name, kind=f"{name} of {whose}", columns=own) for name in SCATTER]
+    return unknowns, parts
+
+
+def scattered(kind: str, names: tuple[str, ...], spread: tuple[float, float, float]) -> Unknown:
+    """Return unknowns about zero whose standard deviation is estimated: its first value and bounds are `spread`."""
+    return Unknown(kind=kind, names=names, start=np.zeros(len(names)), priors=(Prior.of_spread(*spread),))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +90,7 @@ def fit_grouped_errors(groups: Sequence[Floats], most: int = 20_000) -> GroupedE
     """Return the maximum likelihood error model of groups of errors in metres; larger groups are thinned evenly to
     `most`.
 
-    The density is that of `calib.range_errors.density`. Each group has a centre and a noise; shares and detours of
+    The density is that of `calib.range_errors.densities`. Each group has a centre and a noise; shares and detours of
     groups scatter about common values, as those of pairs do in a fit (`error_unknowns`).
     """
     members = [own[:: -(-len(own) // most)] for own in groups]
@@ -58,7 +112,7 @@ def fit_grouped_errors(groups: Sequence[Floats], most: int = 20_000) -> GroupedE
     rows = RangeRows.of(error_m - middle[group], group, parts, Mixture(), layout)
     found = maximize([rows], Priors(layout), layout.start())
     each = rows.error_slopes(found.x, ())
-    long = LongDetours(share=float(1 / (1 + np.exp(-found.of("long detours")[0]))), factor=LONG_FACTOR)
+    long = LongDetours(share=float(expit(found.of("long detours")[0])), factor=LONG_FACTOR)
     of_centre = layout.where["centre"]
     return GroupedErrors(
         centre_m=middle + found.of("centre"),

@@ -20,31 +20,15 @@ from uwblink.arrays import Floats, Ints
 SETTLED = 1e-2
 """A step that promises less log likelihood than this moves no unknown by more than a tenth of its standard error."""
 
-ROUGHLY = 0.3
-"""The same for all unknowns together, where only some are asked for: a share of nothing may be any small number."""
-
 EVIDENCE_STEPS = 9
 """Steps near the top in which weights of priors are estimated: they converge as fast as the unknowns do, then stand."""
 
 MOST_STEPS = 100
 """Steps after which a search is given up: sound ones take ten to sixty."""
 
-CHANGE = 0.05
-"""Relative change of a weight below which it has settled."""
-
-SHORTENED = 8
-"""How many times a step is shortened before it is taken as it is: to a thousandth or less."""
-
-REMEMBERED = 10
-"""Steps from whose changes of slopes the inverse curvature is corrected: 3 to 20 do alike (Nocedal and Wright 2006,
-section 7.2)."""
-
 LONGER = 4.0
 """How many times longer a corrected step may be than one by the information alone, in standard errors: a judgement.
 Without a limit, logarithms of shares overflowed in a fit of 3.8 million ranges."""
-
-LEAST_CURVATURE = 0.2
-"""Curvature along a step over that of the information, below which it is damped (Powell's constant)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +47,10 @@ class Optimum:
     def of(self, kind: str) -> Floats:
         """Return the unknowns of a kind."""
         return self.x[self.layout.where[kind]]
+
+    def by_kind(self) -> dict[str, Floats]:
+        """Return all unknowns by their kinds."""
+        return {kind: self.x[where] for kind, where in self.layout.where.items()}
 
 
 def maximize(
@@ -85,7 +73,8 @@ def maximize(
     """
     layout, free = priors.layout, priors.layout.free()
     most, near, shorter = MOST_STEPS if steps is None else steps, 0, 0
-    changes = deque[tuple[Floats, Floats]](maxlen=REMEMBERED)
+    # The last 3 to 20 steps do alike (Nocedal and Wright 2006, section 7.2).
+    changes = deque[tuple[Floats, Floats]](maxlen=10)
     sums = Sums(-np.inf, np.zeros_like(x), np.zeros((0, 0)))
     best, gain, promised, settled, taken = -np.inf, np.inf, 0.0, False, 0
     top, slope, step = x, np.zeros_like(x), np.zeros_like(x)
@@ -95,7 +84,8 @@ def maximize(
         value = found.value + priors.value(x)
         if gain < len(free):
             changes.append((x - top, sums.gradient - found.gradient))
-        if not value >= best - tolerance and shorter < SHORTENED:
+        # After eight reductions, to a thousandth or less, a step is taken as it is.
+        if not value >= best - tolerance and shorter < 8:
             # To the top of the parabola through both values and the slope (Nocedal and Wright 2006, equation 3.58).
             share = 0.5 * promised / (promised + best - value)
             step *= float(np.clip(share, 0.1, 0.5)) if np.isfinite(share) else 0.1
@@ -105,7 +95,7 @@ def maximize(
         top, sums, shorter = x, found, 0
         precision = priors.precision()
         known = sums.information + precision
-        covariance = inverse_of(known, free, layout.local())
+        covariance = inverse_of(known, free)
         slope = sums.gradient + priors.pull(x)
         bent = [(moved, _damped(moved, fell + precision @ moved, known @ moved)) for moved, fell in changes]
         step = _corrected(covariance, slope, bent)
@@ -114,14 +104,15 @@ def maximize(
         gain, best = float(slope @ step), value
         settled = gain < tolerance
         if asked is not None:
-            settled = abs(float(slope[asked] @ step[asked])) < tolerance and gain < max(ROUGHLY, tolerance)
+            # The others may settle less closely: the log odds of a share of nothing may be any small number.
+            settled = abs(float(slope[asked] @ step[asked])) < tolerance and gain < max(0.3, tolerance)
         near += gain < len(free)
         if near < evidence_steps:
             before = list(priors.weights)
             # At the start nothing has moved yet, and says nothing of how far it may.
             priors.update(x + step, covariance)
             change = [abs(np.log(a / b)) for a, b in zip(priors.weights, before, strict=True)]
-            settled = settled and max(change, default=0.0) < CHANGE
+            settled = settled and max(change, default=0.0) < 0.05
             best = sums.value + priors.value(x)
         step *= 1.0 if longest is None else min(1.0, longest(step))
         promised = float(slope @ step)
@@ -141,12 +132,12 @@ def maximize(
 def _damped(moved: Floats, fell: Floats, expected: Floats) -> Floats:
     """Return by how much slopes fell (p,) over a move (p,), no less than a fifth of what was expected (p,).
 
-    Powell's damping (Nocedal and Wright 2006, procedure 18.2) keeps the curvature positive.
+    Powell's damping (Nocedal and Wright 2006, procedure 18.2, with its constant 0.2) keeps the curvature positive.
     """
     whole, own = float(moved @ expected), float(moved @ fell)
-    if own >= LEAST_CURVATURE * whole:
+    if own >= 0.2 * whole:
         return fell
-    share = (1 - LEAST_CURVATURE) * whole / (whole - own)
+    share = 0.8 * whole / (whole - own)
     return share * fell + (1 - share) * expected
 
 

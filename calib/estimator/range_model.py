@@ -6,21 +6,22 @@ and differ only in the source of distances.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import BSpline
 
-from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, knots_for, lifted_power, populated
+from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, knots_for, lift, lifted_power, populated
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimator.error_unknowns import error_unknowns, scattered
+from calib.estimator.grouped_errors import error_unknowns, scattered
 from calib.estimator.identifiability import free_directions, square_of
 from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Unknown
 from calib.pairs import Pairs, pairs_of
+from calib.settings import FitSettings
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -40,7 +41,7 @@ SEGMENTS_A_FOLD, SEGMENTS = 4.5, (10, 28)
 """Segments of a bias curve per factor e of lifted power, and their bounds. Roughness is estimated, so more segments
 change nothing (the study of `make accuracy`)."""
 
-FEWEST_OF_GROUP = 20
+MIN_RANGES_OF_GROUP = 20
 """Minimum number of ranges for the curve of a group."""
 
 SAME_POWER = 1e-6
@@ -78,107 +79,91 @@ class Spline:
 class RangeModel:
     """Unknowns and parts of `ranges` (n,), with curves over `lifted` powers within `span`.
 
-    `unknowns` are delays, curves and offsets; `error_model` adds those of errors. `gauged` tells for each group whether
-    its curve is zero at `reference`; the others keep a constant that pinned delays determine. Delays have no part
-    along the directions `held` (tags, k), which no range determines and which shift the tags of the groups `free`.
+    `unknowns` are delays, curves and offsets; `error_model` adds those of errors. `carriers` has for each curve the
+    weights (tags,) with which delays can take over a constant of it, or None: such a curve keeps the constant, which
+    pinned delays determine. Delays have no part along the directions `held` (tags, k), which no range determines and
+    which shift the tags of the groups `free`.
     """
 
     ranges: Ranges
+    settings: FitSettings
     lifted: Floats
     powered: Bools
     span: tuple[float, float]
     pairs: Pairs
     tags: list[int]
-    groups: Mapping[str, tuple[int, ...]]
     curve: Spline | None
     noise: Spline | None
     unknowns: tuple[Unknown, ...]
     parts: tuple[Part, ...]
-    gauged: tuple[bool, ...]
-    reference: float | None
-    constants: str
-    looked_for_curve: bool
+    carriers: tuple[Floats | None, ...]
     held: Floats
     free: list[list[int]]
 
     @classmethod
-    def of(  # noqa: PLR0913 - keyword-only settings of one fit
-        cls,
-        ranges: Ranges,
-        *,
-        lift: str,
-        alpha_dbm: float,
-        fixed_ns: Mapping[int, float],
-        groups: Mapping[str, tuple[int, ...]],
-        curve: bool,
-        constants: str = "tag",
-        reference: float | None = 1.0,
-        offsets: bool = True,
-        trimmed: bool = True,
-    ) -> RangeModel:
-        """Return the model of ranges; `reference` is the lifted power at which curves are zero, None for no such
-        condition.
+    def of(cls, ranges: Ranges, settings: FitSettings, *, offsets: bool = True, trimmed: bool = True) -> RangeModel:
+        """Return the model of ranges, with `offsets` of pairs and sessions.
 
         With `trimmed`, ranges at the outer half per cent of powers at either end are left out, because they do not
         determine the curve there. Raises `BadInputError` for tags and groups that are not in the ranges.
         """
-        lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, lift, alpha_dbm)
+        lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, settings.lift, settings.alpha_dbm)
         powered = np.isfinite(lifted)
         # Ranges without power get the median power, where they do not bend the curve.
         lifted = np.where(powered, lifted, np.median(lifted[powered]) if powered.any() else 1.0)
         ordered = np.sort(lifted)
         low, high = populated(ordered)
         varied = high - low > SAME_POWER
-        looked_for, curve = curve, curve and varied
+        curve = varied and not settings.delays_only
         if curve and trimmed:
             inside = (lifted >= low) & (lifted <= high)
             ranges, lifted, powered = ranges[inside], lifted[inside], powered[inside]
             ordered = ordered[np.searchsorted(ordered, low) : np.searchsorted(ordered, high, side="right")]
         tags = ranges.tags()
-        _check_tags(ranges, tags, fixed_ns, groups)
+        _check_tags(ranges, tags, settings)
         pairs = pairs_of(ranges.initiator, ranges.target)
-        held, free = _free_directions(ranges, tags, fixed_ns, constants)
-        unknowns, parts = _constants(ranges, pairs, tags, fixed_ns, constants)
+        held, free = _free_directions(ranges, tags, settings)
+        blocks = [_constants(ranges, pairs, tags, settings)]
         bias = noise = None
-        gauged: list[bool] = []
+        carriers: list[Floats | None] = []
         if curve:
             bias = Spline.at(lifted, _knots(ordered, low, high))
-            for name, share in _shares(ranges, groups):
-                kind = f"curve {name}".strip()
-                unknowns.append(_curve(kind, bias))
-                values = -bias.values if share is None else -share[:, None] * bias.values
-                parts.append(Part(parameter=RESIDUAL, kind=kind, columns=bias.columns, values=values))
-                gauged.append(constants == "pair" or _delays_absorb(pairs, tags, fixed_ns, groups.get(name)))
+            for name, share in _shares(ranges, settings.groups):
+                blocks.append(_curve(f"curve {name}".strip(), bias, share))
+                carriers.append(_carrier(pairs, tags, settings, settings.groups.get(name)))
         if powered.all() and varied:
             noise = Spline.at(lifted, knots_for(ordered, SIGMA_SEGMENTS, (low, high)))
         if offsets:
-            _add_offsets(
-                ranges,
-                pairs,
-                tags,
-                unknowns,
-                parts,
-                identifiable=_offsets_identifiable(pairs, tags, fixed_ns, constants, gauged),
-            )
+            blocks += _offsets(ranges, pairs, tags, of_pairs=_offsets_identifiable(pairs, tags, settings, carriers))
         return cls(
             ranges=ranges,
+            settings=settings,
             lifted=lifted,
             powered=powered,
             span=(low, high),
             pairs=pairs,
             tags=tags,
-            groups=groups,
             curve=bias,
             noise=noise,
-            unknowns=tuple(unknowns),
-            parts=tuple(parts),
-            gauged=tuple(gauged),
-            reference=reference,
-            constants=constants,
-            looked_for_curve=looked_for,
+            unknowns=tuple(unknown for unknown, _ in blocks),
+            parts=tuple(part for _, part in blocks),
+            carriers=tuple(carriers),
             held=held,
             free=free,
         )
+
+    @property
+    def reference(self) -> float | None:
+        """Return the lifted power at which curves are zero, None for no such condition."""
+        power_dbm, alpha_dbm = self.settings.reference_power_dbm, self.settings.alpha_dbm
+        if power_dbm is None:
+            return None if self.settings.sequential else 1.0
+        return float(lift(np.array(power_dbm), alpha_dbm))
+
+    @property
+    def pinned(self) -> bool:
+        """Return whether all delays are known."""
+        return set(self.tags) <= set(self.settings.fixed_ns)
 
     def curve_kinds(self) -> list[str]:
         """Return the kinds of unknowns that are curves, one a group."""
@@ -198,16 +183,11 @@ class RangeModel:
         """Return rows that set curves to zero at the reference power, where delays can take the constant."""
         if self.curve is None or self.reference is None:
             return []
-        at = Spline.at(np.array([self.reference]), self.curve.knots)
+        at, zero, std = Spline.at(np.array([self.reference]), self.curve.knots), np.zeros(1), np.full(1, HELD_M)
         return [
-            NormalRows(
-                value=np.zeros(1),
-                std=np.full(1, HELD_M),
-                entries=at.values,
-                columns=at.columns + layout.where[kind].start,
-            )
-            for kind, gauged in zip(self.curve_kinds(), self.gauged, strict=True)
-            if gauged
+            NormalRows(value=zero, std=std, entries=at.values, columns=at.columns + layout.where[kind].start)
+            for kind, carrier in zip(self.curve_kinds(), self.carriers, strict=True)
+            if carrier is not None
         ]
 
     def held_rows(self, layout: Layout) -> list[NormalRows]:
@@ -218,14 +198,26 @@ class RangeModel:
             for one in self.held.T
         ]
 
+    def at_reference(self, values: Mapping[str, Floats]) -> dict[str, Floats]:
+        """Return unknowns by kind with curves that are zero at the reference power: delays take over the constants."""
+        stated = dict(values)
+        if self.curve is None or self.reference is None:
+            return stated
+        at = Spline.at(np.array([self.reference]), self.curve.knots)
+        for kind, carrier in zip(self.curve_kinds(), self.carriers, strict=True):
+            if carrier is not None:
+                constant_m = float(at.values[0] @ values[kind][at.columns[0]])
+                stated[kind] = values[kind] - constant_m
+                stated["delay"] = stated["delay"] - carrier * constant_m / METRES_A_NS
+        return stated
+
     def error_model(self, residual: Floats) -> tuple[Mixture, tuple[Unknown, ...], tuple[Part, ...]]:
         """Return the error model with its unknowns and parts, started from robust spreads of residuals (n,)."""
-        names = tuple(f"{a}-{b}" for a, b in self.pairs.ends.tolist())
-        unknowns, parts = error_unknowns(max(robust_spread(residual), 1e-3), names, self.pairs.number)
+        unknowns, parts = error_unknowns(max(robust_spread(residual), 1e-3), self.pairs.names, self.pairs.number)
         if self.noise is not None:
             rough = Prior(weight=1.0, structure=curvature(self.noise.knots), bounds=(1e-3, 1e6))
             several = tuple(map(str, range(self.noise.size)))
-            for name, share in _shares(self.ranges, self.groups):
+            for name, share in _shares(self.ranges, self.settings.groups):
                 values = self.noise.values if share is None else share[:, None] * self.noise.values
                 for parameter, deviation in (("noise", 1.0), ("odds", 0.7)):
                     kind = f"{parameter} curve {name}".strip()
@@ -251,50 +243,46 @@ class RangeModel:
         return layout, RangeRows.of(residual, self.key(), used, errors, layout, geometry)
 
 
-def _free_directions(
-    ranges: Ranges, tags: list[int], fixed_ns: Mapping[int, float], constants: str
-) -> tuple[Floats, list[list[int]]]:
+def _free_directions(ranges: Ranges, tags: list[int], settings: FitSettings) -> tuple[Floats, list[list[int]]]:
     """Return the directions of delays (tags, k) that the pairs leave free, and their tags."""
-    own = [k for k, tag in enumerate(tags) if tag not in fixed_ns]
-    held, free = np.zeros((len(tags), 0)), list[list[int]]()
-    if own and constants == "tag":
-        square, ends = square_of(tags, ranges.initiator, ranges.target, ranges.weight_initiator, ranges.weight_target)
-        directions, free = free_directions(square[np.ix_(own, own)], [tags[k] for k in own], ends)
-        held = np.zeros((len(tags), directions.shape[1]))
-        held[own] = directions
+    own = [k for k, tag in enumerate(tags) if tag not in settings.fixed_ns]
+    if not own or settings.constants == "pair":
+        return np.zeros((len(tags), 0)), []
+    square, ends = square_of(tags, ranges.initiator, ranges.target, ranges.weight_initiator, ranges.weight_target)
+    directions, free = free_directions(square[np.ix_(own, own)], [tags[k] for k in own], ends)
+    held = np.zeros((len(tags), directions.shape[1]))
+    held[own] = directions
     return held, free
 
 
-def _constants(
-    ranges: Ranges, pairs: Pairs, tags: list[int], fixed_ns: Mapping[int, float], constants: str
-) -> tuple[list[Unknown], list[Part]]:
+def _constants(ranges: Ranges, pairs: Pairs, tags: list[int], settings: FitSettings) -> tuple[Unknown, Part]:
     """Return delays of tags, or constants of pairs, in ns."""
-    if constants == "pair":
-        names = tuple(f"{a}-{b}" for a, b in pairs.ends.tolist())
+    prior = (Prior.of_deviation(DELAY_NS),)
+    if settings.constants == "pair":
+        block = Unknown(kind="delay", names=pairs.names, start=np.zeros(len(pairs.ends)), priors=prior)
         values = np.full((len(ranges), 1), METRES_A_NS)
-        block = Unknown(kind="delay", names=names, start=np.zeros(len(names)), priors=(Prior.of_deviation(DELAY_NS),))
-        return [block], [Part(parameter=RESIDUAL, kind="delay", columns=pairs.number[:, None], values=values)]
-    known = np.array([tag in fixed_ns for tag in tags])
-    start = np.array([fixed_ns.get(tag, 0.0) for tag in tags])
-    block = Unknown(
-        kind="delay", names=tuple(map(str, tags)), start=start, known=known, priors=(Prior.of_deviation(DELAY_NS),)
-    )
+        return block, Part(parameter=RESIDUAL, kind="delay", columns=pairs.number[:, None], values=values)
+    known = np.array([tag in settings.fixed_ns for tag in tags])
+    start = np.array([settings.fixed_ns.get(tag, 0.0) for tag in tags])
+    block = Unknown(kind="delay", names=tuple(map(str, tags)), start=start, known=known, priors=prior)
     columns = np.searchsorted(tags, pairs.ends)[pairs.number]
     lower_first = (ranges.initiator < ranges.target)[:, None]
     weights = np.column_stack([ranges.weight_initiator, ranges.weight_target])
     values = METRES_A_NS * np.where(lower_first, weights, weights[:, ::-1])
-    return [block], [Part(parameter=RESIDUAL, kind="delay", columns=columns, values=values)]
+    return block, Part(parameter=RESIDUAL, kind="delay", columns=columns, values=values)
 
 
-def _curve(kind: str, spline: Spline) -> Unknown:
+def _curve(kind: str, spline: Spline, share: Floats | None) -> tuple[Unknown, Part]:
+    """Return the coefficients of a curve, of which each range has a `share` (n,), None for all of it."""
     rough = Prior(weight=1e2, structure=curvature(spline.knots), bounds=(1e-3, 1e9))
-    return Unknown(
+    block = Unknown(
         kind=kind,
         names=tuple(map(str, range(spline.size))),
         start=np.zeros(spline.size),
-        scale=CURVE_M,
         priors=(rough, Prior.of_deviation(CURVE_M)),
     )
+    values = -spline.values if share is None else -share[:, None] * spline.values
+    return block, Part(parameter=RESIDUAL, kind=kind, columns=spline.columns, values=values)
 
 
 TYPICAL_OFFSET_M = 0.035
@@ -304,45 +292,53 @@ OFFSETS = (0.01, 1e-4, 1.0)
 """Standard deviation of other constants in the ranges of a pair, such as a wall: start and bounds, m."""
 
 
-def _add_offsets(
-    ranges: Ranges, pairs: Pairs, tags: list[int], unknowns: list[Unknown], parts: list[Part], *, identifiable: bool
-) -> None:
-    """Add offsets of pairs, and of pairs and tags in each of several sessions."""
-    names = tuple(f"{a}-{b}" for a, b in pairs.ends.tolist())
-    number = pairs.number[:, None]
-    if identifiable:
-        unknowns.append(scattered("offset of pair", names, OFFSETS))
-        parts.append(Part(parameter=RESIDUAL, kind="offset of pair", columns=number))
-    count = len(ranges.sessions)
+def _offsets(ranges: Ranges, pairs: Pairs, tags: list[int], *, of_pairs: bool) -> Iterator[tuple[Unknown, Part]]:
+    """Yield offsets of pairs, and of pairs and tags in each of several sessions."""
+    number, count = pairs.number[:, None], len(ranges.sessions)
+    if of_pairs:
+        kind = "offset of pair"
+        yield scattered(kind, pairs.names, OFFSETS), Part(parameter=RESIDUAL, kind=kind, columns=number)
     if count < 2:
         return
-    session = ranges.session[:, None].astype(np.int64)
     ends = np.searchsorted(tags, pairs.ends)[pairs.number]
     for kind, whose, columns in (
-        ("offset of pair in session", names, number * count + session),
-        ("offset of tag in session", tuple(map(str, tags)), ends * count + session),
+        ("offset of pair in session", pairs.names, number),
+        ("offset of tag in session", tuple(map(str, tags)), ends),
     ):
-        several = tuple(f"{name} in {where}" for name in whose for where in ranges.sessions)
-        unknowns.append(scattered(kind, several, OFFSETS))
-        parts.append(Part(parameter=RESIDUAL, kind=kind, columns=columns.astype(np.int32)))
+        names = tuple(f"{name} in {where}" for name in whose for where in ranges.sessions)
+        own: Ints = np.asarray(columns.astype(np.int64) * count + ranges.session[:, None], dtype=np.int32)
+        yield scattered(kind, names, OFFSETS), Part(parameter=RESIDUAL, kind=kind, columns=own)
+
+
+def _free_ends(pairs: Pairs, tags: list[int], settings: FitSettings) -> Floats:
+    """Return which of the tags (tags,) with unknown delays each pair has, as 0 and 1 (pairs, tags)."""
+    free = np.array([tag not in settings.fixed_ns for tag in tags])
+    return np.asarray((pairs.ends[:, :, None] == np.array(tags)).sum(axis=1) * free, dtype=np.float64)
 
 
 def _offsets_identifiable(
-    pairs: Pairs, tags: list[int], fixed: Mapping[int, float], constants: str, gauged: Sequence[bool]
+    pairs: Pairs, tags: list[int], settings: FitSettings, carriers: Sequence[Floats | None]
 ) -> bool:
     """Return whether ranges determine offsets of pairs beside delays and constants of curves."""
-    if constants == "pair":
-        return False
-    free = [tag for tag in tags if tag not in fixed]
-    ends = (pairs.ends[:, :, None] == np.array(free, dtype=np.int64)).sum(axis=1)
-    taken = np.linalg.matrix_rank(ends) if ends.size else 0
-    return len(pairs.ends) > taken + sum(not zero for zero in gauged)
+    taken = np.linalg.matrix_rank(_free_ends(pairs, tags, settings))
+    return settings.constants == "tag" and len(pairs.ends) > taken + sum(one is None for one in carriers)
 
 
-def _check_tags(
-    ranges: Ranges, tags: list[int], fixed: Mapping[int, float], groups: Mapping[str, tuple[int, ...]]
-) -> None:
-    unknown = sorted(set(fixed) - set(tags))
+def _carrier(pairs: Pairs, tags: list[int], settings: FitSettings, group: tuple[int, ...] | None) -> Floats | None:
+    """Return the weights (tags,), or (pairs,) for constants of pairs, with which delays make up for a constant of a
+    group's curve; None where free delays cannot."""
+    aim = np.ones(len(pairs.ends)) if group is None else 0.5 * np.isin(pairs.ends, group).sum(axis=1)
+    if settings.constants == "pair":
+        return aim
+    ends = 0.5 * _free_ends(pairs, tags, settings)
+    weights = np.asarray(np.linalg.lstsq(ends, aim, rcond=None)[0])
+    left = aim - ends @ weights
+    return weights if left @ left < 1e-4 * (aim @ aim) else None
+
+
+def _check_tags(ranges: Ranges, tags: list[int], settings: FitSettings) -> None:
+    groups = settings.groups
+    unknown = sorted(set(settings.fixed_ns) - set(tags))
     if unknown:
         raise BadInputError(f"found tag {unknown[0]}, the tags are {', '.join(map(str, tags))}", parameter="fixed_ns")
     member = {tag for own in groups.values() for tag in own}
@@ -356,29 +352,16 @@ def _check_tags(
 
 def _shares(ranges: Ranges, groups: Mapping[str, tuple[int, ...]]) -> list[tuple[str, Floats | None]]:
     """Return the weight of each group's curve in each range (n,): a half for each end; None for a single curve."""
-    if not groups:
-        return [("", None)]
-    shares: list[tuple[str, Floats | None]] = [
-        (name, 0.5 * np.isin(ranges.initiator, own) + 0.5 * np.isin(ranges.target, own)) for name, own in groups.items()
-    ]
-    for name, share in shares:
-        if share is not None and np.count_nonzero(share) < FEWEST_OF_GROUP:
+    shares: list[tuple[str, Floats | None]] = [] if groups else [("", None)]
+    for name, own in groups.items():
+        share = 0.5 * np.isin(ranges.initiator, own) + 0.5 * np.isin(ranges.target, own)
+        if np.count_nonzero(share) < MIN_RANGES_OF_GROUP:
             raise UnanswerableError(
-                f"group {name!r} has too few ranges for a curve, at least {FEWEST_OF_GROUP} are needed",
+                f"group {name!r} has too few ranges for a curve, at least {MIN_RANGES_OF_GROUP} are needed",
                 parameter="groups",
             )
+        shares.append((name, share))
     return shares
-
-
-def _delays_absorb(pairs: Pairs, tags: list[int], fixed: Mapping[int, float], group: tuple[int, ...] | None) -> bool:
-    """Return whether free delays can compensate a constant of a group's curve."""
-    free = [tag for tag in tags if tag not in fixed]
-    if not free:
-        return False
-    aim = np.ones(len(pairs.ends)) if group is None else 0.5 * np.isin(pairs.ends, group).sum(axis=1)
-    ends = 0.5 * (pairs.ends[:, :, None] == np.array(free)).sum(axis=1)
-    left = aim - ends @ np.linalg.lstsq(ends, aim, rcond=None)[0]
-    return bool(left @ left < 1e-4 * (aim @ aim))
 
 
 def _knots(ordered: Floats, low: float, high: float) -> Floats:

@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.estimator.rows import ROWS_AT_ONCE, Terms
 from calib.estimator.unknowns import Layout
-from calib.range_errors.density import OUTLIERS_OVER_M, ErrorSlopes, error_slopes
+from calib.range_errors.densities import OUTLIERS_OVER_M, ErrorSlopes, error_slopes
 from uwblink.arrays import Floats, Ints
 
 RESIDUAL = "residual"
@@ -69,7 +69,7 @@ class Errors(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mixture:
-    """Direct, reflected or an outlier (`calib.range_errors.density`): the likelihood of ranges.
+    """Direct, reflected or an outlier (`calib.range_errors.densities`): the likelihood of ranges.
 
     With `expected` what a residual tells is what the model says on average (Fisher's information), not the square of
     its slope: where few ranges determine an unknown, such as a place on a path, their squares are too unsteady. `used`
@@ -221,14 +221,9 @@ class RangeRows:
 
     def terms(self, x: Floats) -> Iterator[Terms]:
         """Yield all ranges, some blocks at a time."""
-        for terms, _ in self.terms_and_scores(x):
-            yield terms
-
-    def terms_and_scores(self, x: Floats) -> Iterator[tuple[Terms, Floats]]:
-        """Yield the same with the slope of the log likelihood of each range by its residual (n,)."""
         for blocks, rows, values, moved in self._pieces(x):
             log_density, by, tells = self.errors.slopes(values)
-            yield self._as_terms(blocks, rows, float(np.sum(log_density)), by, tells, moved), by[RESIDUAL]
+            yield self._as_terms(blocks, rows, float(np.sum(log_density)), by, tells, moved)
 
     def residuals(self, x: Floats) -> Floats:
         """Return the residuals (n,) at unknowns (p,), in the order in which rows were given; a sample's in its own."""
@@ -314,7 +309,8 @@ class RangeRows:
         slopes = np.concatenate([by[name] * own for name, own in zip(names, entries, strict=True)])
         stacked = np.concatenate(columns, axis=1)
         of_residual = [k for k, name in enumerate(names) if name == RESIDUAL]
-        found = Terms(value=value, slopes=slopes, columns=stacked, starts=starts, residual=by[RESIDUAL])
+        score = by[RESIDUAL]
+        found = Terms(value=value, slopes=slopes, columns=stacked, starts=starts, score=score, residual=score)
         if tells is None:
             return found
         unit = np.ones(count)

@@ -31,8 +31,8 @@ class Terms:
     `slopes` (K, n) are derivatives of a row's log likelihood by the unknowns `columns` (blocks, K); `starts`
     (blocks + 1,) bound the blocks. What rows know of the unknowns is the sum of `weight` (n,) times outer squares of
     `entries` (K, n); None stands for 1 and the slopes themselves (Berndt, Hall, Hall, Hausman 1974). What rows know
-    `beside` that is added. `residual` (n,) are the entries that a unit offset of each row would have, where rows have
-    residuals.
+    `beside` that is added. Where rows have residuals, `score` (n,) are their slopes by the residual, and
+    `residual` (n,) the entries that a unit offset of each row would have.
     """
 
     value: float
@@ -41,6 +41,7 @@ class Terms:
     starts: Ints
     weight: Floats | None = None
     entries: Floats | None = None
+    score: Floats | None = None
     residual: Floats | None = None
     beside: Terms | None = None
 
@@ -69,18 +70,18 @@ class Sums:
     information: Matrix
 
 
-def sum_rows(rows: Sequence[Rows], x: Floats, *, information: bool = True) -> Sums:
-    """Sum over all rows at unknowns (p,); without `information` that is zero."""
+def sum_rows(rows: Sequence[Rows], x: Floats) -> Sums:
+    """Sum over all rows at unknowns (p,)."""
     size, value = len(x), 0.0
     many = size > MOST_DENSE
-    gradient, square = np.zeros(size), np.zeros(size * size if information and not many else 0)
+    gradient, square = np.zeros(size), np.zeros(0 if many else size * size)
     loose: list[sparse.csr_matrix] = []
     for kind in rows:
         for terms in kind.terms(x):
             value += terms.value
             sums = np.add.reduceat(terms.slopes, terms.starts[:-1], axis=1)
             gradient += np.bincount(terms.columns.ravel(), sums.T.ravel(), size)
-            for part in (terms, terms.beside) if information else ():
+            for part in (terms, terms.beside):
                 if part is None:
                     continue
                 entries = part.slopes if part.entries is None else part.entries
@@ -94,9 +95,9 @@ def sum_rows(rows: Sequence[Rows], x: Floats, *, information: bool = True) -> Su
                     loose.append(sparse.csr_matrix((products, divmod(place, size)), shape=(size, size)))
                 else:
                     np.add.at(square, place, products)
-    if many and information:
+    if many:
         return Sums(value, gradient, sparse.csc_matrix(sum(loose, sparse.csr_matrix((size, size)))))
-    found = square.reshape((size, size) if information else (0, 0))
+    found = square.reshape(size, size)
     for product in loose:
         found += product.toarray()
     return Sums(value, gradient, found)
@@ -109,16 +110,6 @@ def _block_products(left: Floats, right: Floats, starts: Ints) -> Floats:
         own = slice(bounds[k], bounds[k + 1])
         np.matmul(left[:, own], right[:, own].T, out=found[k])
     return found
-
-
-def projected(rows: Rows, x: Floats, reach: Floats) -> Iterator[Floats]:
-    """Yield the slopes of rows times `reach` (p, k), (n, k) for some rows at a time: how each pulls k combinations."""
-    for terms in rows.terms(x):
-        counts = np.diff(terms.starts)
-        found = np.zeros((terms.slopes.shape[1], reach.shape[1]))
-        for slope, column in zip(terms.slopes, terms.columns.T, strict=True):
-            found += slope[:, None] * np.repeat(reach[column], counts, axis=0)
-        yield found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -143,11 +143,6 @@ class _Sums:
     square: Floats
     link: Floats
 
-    @classmethod
-    def empty(cls, count: int, blocks: int, size: int) -> _Sums:
-        """Return sums over no ranges."""
-        return cls(*(np.zeros(shape) for shape in ((blocks, count), (blocks, count), (count, count), (count, size))))
-
 
 class Slopes:
     """The slopes of a fit's ranges by the residual and by all unknowns, as sums and products that tests are made of.
@@ -162,24 +157,19 @@ class Slopes:
         self.order, size = rows.order, optimum.layout.size
         self.score, self.tells = np.empty(len(rows)), np.zeros(len(rows))
         self.own = np.zeros((blocks.count, size))
-        for which, terms, by in self._pieces():
-            self.own += (self._in_block(which) @ terms.as_matrix(terms.slopes, size)).toarray()
-            self.score[which] = by
+        for which, terms in self._pieces():
+            self.own += (blocks.summing(self.order[which]) @ terms.as_matrix(terms.slopes, size)).toarray()
+            self.score[which] = terms.score
             for part, weight in _weighed(terms):
                 self.tells[which] += weight if part.residual is None else weight * part.residual
 
-    def _pieces(self) -> Iterator[tuple[slice, Terms, Floats]]:
-        """Yield which rows, their terms, and their slopes by the residual."""
+    def _pieces(self) -> Iterator[tuple[slice, Terms]]:
+        """Yield which rows, and their terms."""
         at = 0
-        for terms, by in self.rows.terms_and_scores(self.optimum.x):
-            yield slice(at, at + len(by)), terms, by
-            at += len(by)
-
-    def _in_block(self, which: slice) -> sparse.csr_matrix:
-        """Return a matrix (blocks, rows) that sums some rows by block of time."""
-        number = self.blocks.number[self.order[which]]
-        place = (number, np.arange(len(number)))
-        return sparse.csr_matrix((np.ones(len(number)), place), shape=(self.blocks.count, len(number)))
+        for terms in self.rows.terms(self.optimum.x):
+            which = slice(at, at + terms.slopes.shape[1])
+            yield which, terms
+            at = which.stop
 
     def link(self, derivative: Derivative | sparse.csr_matrix) -> Floats:
         """Return what links offsets, as derivatives (n, k) of given ranges, to all unknowns (k, p)."""
@@ -196,17 +186,20 @@ class Slopes:
 
     def _sums(self, derivatives: Sequence[Derivative | sparse.csr_matrix]) -> list[_Sums]:
         """Return sums over all ranges for offsets with derivatives (n, k) of given ranges."""
-        sums = [_Sums.empty(each.shape[1], *self.own.shape) for each in derivatives]
-        for which, terms, by in self._pieces():
-            in_block = self._in_block(which)
+        (blocks, size), counts = self.own.shape, [each.shape[1] for each in derivatives]
+        sums = [
+            _Sums(np.zeros((blocks, k)), np.zeros((blocks, k)), np.zeros((k, k)), np.zeros((k, size))) for k in counts
+        ]
+        for which, terms in self._pieces():
+            in_block = self.blocks.summing(self.order[which])
             matrices = [
-                (weight, part.as_matrix(part.slopes if part.entries is None else part.entries, self.own.shape[1]))
+                (weight, part.as_matrix(part.slopes if part.entries is None else part.entries, size))
                 for part, weight in _weighed(terms)
             ]
             for own, derivative in zip(sums, derivatives, strict=True):
                 kept = derivative[self.order[which]]
                 told = sparse.diags(self.tells[which])
-                own.plain += (in_block @ sparse.diags(by) @ kept).toarray()
+                own.plain += (in_block @ sparse.diags(self.score[which]) @ kept).toarray()
                 own.known += (in_block @ told @ kept.power(2)).toarray()
                 own.square += (kept.T @ told @ kept).toarray()
                 for weight, matrix in matrices:

@@ -14,24 +14,15 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy import sparse
 from scipy.special import stdtrit
 
 from calib.data.ranges import Ranges
-from uwblink.arrays import Bools, Floats, Ints
-
-MOST_BLOCKS: Final = 1000
-SHORTEST_S: Final = 0.1
-FEWEST_BLOCKS: Final = 30
-"""Shortest block in seconds, unless a recording has few blocks: with fewer blocks than unknowns (some twenty) the
-covariance of block sums is singular and too small."""
+from uwblink.arrays import Floats, Ints
 
 GAP_S: Final = 10.0
-USUAL_STEPS: Final = 20
-"""Ranges that are further apart than ten seconds, and than twenty usual intervals, have a gap in between. Errors in
-recordings last for seconds (docs/accuracy.md); slow schedules and pairs in turn make no gaps."""
-
-PIECE: Final = 0.75
-"""Length of pieces over the mean length of sessions, so that sessions of different lengths have pieces too."""
+"""Ranges that are further apart than this, and than twenty usual intervals, have a gap in between. Errors in recordings
+last for seconds (docs/accuracy.md); slow schedules and pairs in turn make no gaps."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,11 +41,10 @@ class TimeBlocks:
         """Return the number of blocks."""
         return int(self.bounds[-1])
 
-    def among(self, rows: Bools | Ints | slice) -> TimeBlocks:
-        """Return the blocks of some of the ranges (n,), numbered without those that are empty."""
-        used, number = np.unique(self.number[rows], return_inverse=True)
-        bounds = np.unique(np.searchsorted(used, self.bounds))
-        return TimeBlocks(number=number.astype(np.int32), bounds=bounds, seconds=self.seconds)
+    def summing(self, rows: Ints) -> sparse.csr_matrix:
+        """Return a matrix (blocks, k) that sums over the given rows (k,) by block."""
+        place = (self.number[rows], np.arange(len(rows)))
+        return sparse.csr_matrix((np.ones(len(rows)), place), shape=(self.count, len(rows)))
 
     def pieces(self, series: Floats, spans: int = 1) -> Floats:
         """Return sums by block (blocks, k) as columns of pieces of equal length, less their means.
@@ -67,7 +57,8 @@ class TimeBlocks:
             return series
         length = self.count // spans
         if len(sizes) > 1:
-            length = max(int(PIECE * self.count / max(spans, len(sizes))), 1)
+            # A quarter shorter than the mean session, so that sessions of different lengths have pieces too.
+            length = max(int(0.75 * self.count / max(spans, len(sizes))), 1)
         starts = [
             first + length * k
             for first, size in zip(self.bounds[:-1].tolist(), sizes.tolist(), strict=True)
@@ -87,17 +78,18 @@ def in_order(ranges: Ranges) -> Ranges:
 
 
 def time_blocks(time_ns: Ints, session: Ints) -> TimeBlocks:
-    """Cut the time that ranges (n,) cover into short blocks, a thousand or so.
+    """Cut the time that ranges (n,) cover into a thousand short blocks, fewer where these were shorter than 0.1 s.
 
-    Ranges are in order of their sessions, and of time within each. A block ends where a session or a gap does.
+    Ranges are in order of their sessions, and of time within each. A block ends where a session or a gap does. There
+    are thirty blocks at least: with fewer than unknowns (some twenty) the covariance of block sums is singular.
     """
     steps = np.diff(time_ns, prepend=time_ns[:1])
     changed = np.diff(session, prepend=session[:1]) != 0
-    cut = changed | (steps > max(GAP_S * 1e9, USUAL_STEPS * float(np.median(steps))))
+    cut = changed | (steps > max(GAP_S * 1e9, 20 * float(np.median(steps))))
     steps[cut] = 0
     elapsed = np.cumsum(steps)
     whole = int(elapsed[-1])
-    length = max(whole // MOST_BLOCKS, min(int(SHORTEST_S * 1e9), whole // FEWEST_BLOCKS), 1)
+    length = max(whole // 1000, min(100_000_000, whole // 30), 1)
     cut[1:] |= np.diff(elapsed // length) > 0
     number: Ints = np.asarray(np.cumsum(cut), dtype=np.int32)
     first = np.concatenate([[0], np.flatnonzero(changed)])
@@ -105,19 +97,8 @@ def time_blocks(time_ns: Ints, session: Ints) -> TimeBlocks:
     return TimeBlocks(number=number, bounds=bounds, seconds=float(elapsed[-1]) * 1e-9)
 
 
-FEWEST_GROUPS: Final = 8
-"""Minimum number of groups of blocks that are compared."""
-
 FEWEST_STRETCHES: Final = 20.0
 """With fewer independent stretches of time an interval is a guess."""
-
-NESTED: Final = 2.0
-"""Sums over 2 and over 4 blocks share blocks: their joint information counts so many times less."""
-
-SHARES: Final = np.concatenate([[0.0], np.linspace(0.01, 1, 40) ** 1.5])
-DURATIONS: Final = 40
-LONGEST: Final = 6.0
-"""Errors that last longer than this share of a recording cannot be distinguished from delays."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,13 +139,17 @@ def persistence(slopes: Floats, time: TimeBlocks, independent: int, within: int 
     blocks = len(slopes)
     size = np.sum(slopes**2, axis=0)
     series = slopes[:, size > 0] / np.sqrt(size[size > 0])
-    scales = [2**k for k in range(1, 12) if blocks // 2**k >= FEWEST_GROUPS]
+    # Eight sums at least are compared: the variance of fewer is hardly known.
+    scales = [2**k for k in range(1, 12) if blocks // 2**k >= 8]
     if not series.shape[1] or not scales:
         return Persistence(factor=1.0, freedom=max(blocks - 1.0, 1.0), stretches=float(time.count), stretch_s=0.0)
     found = np.log([_ratio(series, scale) for scale in scales])
-    certain = 0.5 * max(independent, 1) * blocks / np.array(scales) / NESTED
-    rho = np.exp(-1 / np.geomspace(0.3, blocks / LONGEST, DURATIONS))
-    share, keep = (grid.ravel() for grid in np.meshgrid(SHARES, rho, indexing="ij"))
+    # Sums over 2 and over 4 blocks share blocks: together they know half of what independent ones would.
+    certain = 0.5 * max(independent, 1) * blocks / np.array(scales) / 2
+    # Errors that last longer than a sixth of a recording cannot be distinguished from delays.
+    rho = np.exp(-1 / np.geomspace(0.3, blocks / 6, 40))
+    shares = np.concatenate([[0.0], np.linspace(0.01, 1, 40) ** 1.5])
+    share, keep = (grid.ravel() for grid in np.meshgrid(shares, rho, indexing="ij"))
     factor = 1 + 2 * share * keep / (1 - keep)
     expected = np.array([_expected(share, keep, factor, scale, blocks) for scale in scales])
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -1,18 +1,28 @@
-"""A calibration from a fit: delays, curves, their uncertainty, and the error model."""
+"""A calibration from a fit: delays, curves, their uncertainty, and the error model of future ranges.
+
+Reflections last, so the share of reflections of a pair in one recording predicts its share in another less well than
+independent ranges would. The loss of information is estimated from sums of slopes over blocks of time. Parameters of
+pairs are shrunk to their common value accordingly, and the remaining uncertainty of a share enters the predicted share.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
+from scipy.special import expit
 
+from calib.calibration.error_model import ErrorModel, PairErrors
 from calib.calibration.model import Calibration
 from calib.calibration.parts import PairOffset, TagGroup, Uncertainty, matrix_of
 from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, flat_curve
-from calib.estimator.error_summary import between_recordings, error_model
-from calib.estimator.known_distances import LARGEST_SPREAD_M, KnownDistances, described_errors
-from calib.estimator.range_model import METRES_A_NS, RangeModel, Spline
+from calib.estimator.known_distances import LARGEST_SPREAD_M, DescribedErrors, KnownDistances, described_errors
+from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel, Spline
+from calib.estimator.range_rows import RESIDUAL
+from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
+from calib.range_errors.densities import LONG_FACTOR, LongDetours
 from calib.spread import robust_spread
 from uwblink.arrays import Floats
 from uwblink.recording.antenna_delays import known_delays
@@ -21,24 +31,37 @@ from uwblink.ticks import SPEED_OF_LIGHT
 LEAST_SPREAD_M = 1e-6
 """Smallest noise: errors without spread have no distribution."""
 
+NODES = 8
+"""Number of powers at which noise and share are stated; between them both are linear."""
 
-def calibration_of(
-    found: KnownDistances,
-    delays_ns2: Floats,
-    *,
-    lift: str,
-    alpha_dbm: float,
-    fixed: Mapping[int, float],
-    groups: Mapping[str, tuple[int, ...]],
-    between_m: float | None = None,
-) -> Calibration:
-    """Return the calibration of a fit; `covariance` (tags, tags) is that of its delays.
+LEVELS = (0.005, 0.025, 0.05, 0.16, 0.5, 0.84, 0.95, 0.975, 0.995)
+"""Shares of errors at which the model's quantiles are corrected."""
 
-    `between_m` is the standard deviation of a pair's offset between recordings, None to estimate it.
-    """
-    model, search = found.model, found.searches[0]
-    names = model.unknowns[0].names
-    of_pairs = model.constants == "pair"
+BEYOND_MEANS = 8.0
+"""Errors longer than so many means of the longer detours are excluded from the total sigma. An exponential distribution
+has 0.03 % of its values beyond, which carry 1.4 % of its mean square."""
+
+WIDEST_ODDS, WIDEST_DETOUR = 4.0, 1.0
+"""Variances of a pair's log odds and log detour: two in three pairs between an eighth and eight times the common odds,
+a third and three times the common detour. What a few lasting reflections leave open is more than any room has."""
+
+
+SPELLS = 8
+"""Number of spells of a recording that are compared."""
+
+BETWEEN_M = 0.05
+"""Standard deviation of a pair's offset between recordings, where only one is fitted.
+
+4 cm by which pairs of MILUV differ between two days (3.2 to 4.3 cm), and 2.15 mm/K for each of both tags (DW1000 user
+manual, section 8.3.1) whose temperatures differ by 10 K. Chosen without STAR-loc, on which it is tested.
+"""
+
+
+def calibration_of(found: KnownDistances, delays_ns2: Floats) -> Calibration:
+    """Return the calibration of a fit; `delays_ns2` (tags, tags) is the covariance of its delays."""
+    model, search, settings = found.model, found.searches[0], found.model.settings
+    names, fixed = model.unknowns[0].names, settings.fixed_ns
+    of_pairs = settings.constants == "pair"
     free = {tag for group in found.free for tag in group}
     std = [
         math.inf if not of_pairs and int(name) in free else math.sqrt(max(value, 0.0))
@@ -54,21 +77,22 @@ def calibration_of(
     biases = bias_curves(found)
     errors = None
     spread = robust_spread(found.residuals)
-    sigmas, sigma_m2 = _flat_sigma(model, spread, len(found.residuals))
+    sigmas, sigma_m2 = _flat_sigma(model, spread, 0.5 / len(found.residuals))
     if LEAST_SPREAD_M < spread < LARGEST_SPREAD_M:
         described = described_errors(found)
         errors = error_model(model, found.residuals, described, found.blocks)
+        between_m = settings.between_m
         if between_m is None:
             between_m = between_recordings(model, described, found.blocks, _between_pairs(found))
         errors = errors.between(between_m, _correction_std(found, delays_ns2, np.array(errors.lifted)))
-        sigmas, sigma_m2 = sigma_curves(model, described.values, described.covariances["noise"])
+        sigmas, sigma_m2 = sigma_curves(model, described.values, described.noise)
     return Calibration(
         delays_ns={tag: float(found.delays[k]) for k, tag in zip(fitted, tags, strict=not of_pairs)} | dict(fixed),
         delays_std_ns={tag: std[k] for k, tag in zip(fitted, tags, strict=not of_pairs)} | dict.fromkeys(fixed, 0.0),
         loss=search.loss,
         scale_ns=search.scale_m / METRES_A_NS,
-        lift=lift,
-        alpha_dbm=alpha_dbm,
+        lift=settings.lift,
+        alpha_dbm=settings.alpha_dbm,
         speed_of_light=SPEED_OF_LIGHT,
         bias_curve=_average(list(biases.values())),
         sigma_curve=_average(list(sigmas.values())),
@@ -79,7 +103,7 @@ def calibration_of(
             matrix_of(sigma_m2),
         ),
         pair_offsets=offsets,
-        groups={name: TagGroup(tuple(own), biases[name], sigmas[name]) for name, own in groups.items()},
+        groups={name: TagGroup(tuple(own), biases[name], sigmas[name]) for name, own in settings.groups.items()},
         errors=errors,
         antenna_delays=known_delays(model.ranges.antenna_delays, model.ranges.tags()),
     )
@@ -96,16 +120,12 @@ def bias_curves(found: KnownDistances) -> dict[str, Curve]:
     """Return the curve of each group, zero at the reference power where delays take its constant."""
     model = found.model
     if model.curve is None:
-        return dict.fromkeys(model.groups or ("",), flat_curve(0.0, model.span))
-    curves, knots = {}, tuple(model.curve.knots.tolist())
-    for kind, gauged in zip(model.curve_kinds(), model.gauged, strict=True):
-        values = found.values[kind]
-        if gauged and model.reference is not None:
-            # A row of the fit holds it there within a hundredth of a millimetre; splines sum to one everywhere.
-            at = Spline.at(np.array([model.reference]), model.curve.knots)
-            values = values - float(at.values[0] @ values[at.columns[0]])
-        curves[kind.removeprefix("curve").strip()] = Curve(knots, tuple(values.tolist()), DEGREE, model.span)
-    return curves
+        return dict.fromkeys(model.settings.groups or ("",), flat_curve(0.0, model.span))
+    knots = tuple(model.curve.knots.tolist())
+    return {
+        kind.removeprefix("curve").strip(): Curve(knots, tuple(found.values[kind].tolist()), DEGREE, model.span)
+        for kind in model.curve_kinds()
+    }
 
 
 def sigma_curves(
@@ -117,15 +137,13 @@ def sigma_curves(
     """
     level = float(values["noise level"][0])
     if model.noise is None:
-        flat = max(math.exp(level), SIGMA_FLOOR_M)
-        curve = flat_curve(flat, model.span)
-        return dict.fromkeys(model.groups or ("",), curve), np.full((DEGREE + 1,) * 2, flat**2 * covariance[0, 0])
+        return _flat_sigma(model, math.exp(level), float(covariance[0, 0]))
     knots = model.noise.knots
     lifted = np.linspace(knots[0], knots[-1], 8 * model.noise.size)
     at = Spline.at(lifted, knots)
     splines = np.zeros((len(lifted), model.noise.size))
     np.put_along_axis(splines, at.columns, at.values, axis=1)
-    through, names = np.linalg.pinv(splines), list(model.groups) or [""]
+    through, names = np.linalg.pinv(splines), list(model.settings.groups) or [""]
     curves, slope = {}, np.zeros((model.noise.size, len(covariance)))
     for k, name in enumerate(names):
         sigma = np.exp(level + splines @ values[f"noise curve {name}".strip()])
@@ -139,10 +157,11 @@ def sigma_curves(
     return curves, np.asarray(slope @ covariance @ slope.T)
 
 
-def _flat_sigma(model: RangeModel, sigma: float, count: int) -> tuple[dict[str, Curve], Floats]:
-    value = max(sigma, SIGMA_FLOOR_M)
-    curve = flat_curve(value, model.span)
-    return dict.fromkeys(model.groups or ("",), curve), np.full((DEGREE + 1,) * 2, value**2 / (2 * count))
+def _flat_sigma(model: RangeModel, sigma_m: float, variance: float) -> tuple[dict[str, Curve], Floats]:
+    """Return flat curves of noise whose logarithm has a variance, and their covariance."""
+    value = max(sigma_m, SIGMA_FLOOR_M)
+    curves = dict.fromkeys(model.settings.groups or ("",), flat_curve(value, model.span))
+    return curves, np.full((DEGREE + 1,) * 2, value**2 * variance)
 
 
 def _correction_std(found: KnownDistances, delays_ns2: Floats, lifted: Floats) -> Floats:
@@ -152,7 +171,7 @@ def _correction_std(found: KnownDistances, delays_ns2: Floats, lifted: Floats) -
     The correction of a pair has half of both delays, times the speed of light, and the curve.
     """
     model = found.model
-    if model.constants == "pair":
+    if model.settings.constants == "pair":
         of_pairs = METRES_A_NS**2 * np.diag(delays_ns2)
     else:
         delays = np.sum(model.pairs.ends[:, :, None] == np.array(model.tags), axis=1) * METRES_A_NS / 2
@@ -178,3 +197,143 @@ def _average(curves: list[Curve]) -> Curve:
     """Return the mean of curves over the same knots."""
     mean = np.mean([curve.coefficients for curve in curves], axis=0)
     return Curve(curves[0].knots, tuple(mean.tolist()), curves[0].degree, curves[0].range)
+
+
+def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, blocks: TimeBlocks) -> ErrorModel:
+    """Return the error model of residuals (n,), in the order of the model's ranges."""
+    values, number = errors.values, model.pairs.number
+    found = errors.slopes
+    lasting = lasting_in_pairs(found.by["odds"], number, blocks)
+    pairs = len(model.pairs.ends)
+    told = np.bincount(number, found.by["odds"] ** 2, pairs)
+    # A wall has one detour: the number of reflections counts for the mean, not the number of ranges.
+    reflected = np.bincount(number, found.reflected, pairs)
+    odds, odds_var, any_odds, any_odds_var = _drawn(
+        values["odds of pair"], lasting / np.maximum(told, 1e-6), WIDEST_ODDS
+    )
+    detour, detour_var, any_detour, any_detour_var = _drawn(
+        values["detour of pair"], lasting / np.maximum(reflected, 1e-6), WIDEST_DETOUR
+    )
+    lifted, noise, curve = _at_nodes(model, values)
+    level = float(values["odds level"][0])
+    middle = level + float(np.mean(curve))
+    common = float(_expected_odds(np.array(any_odds + middle), np.array(any_odds_var)))
+    own = _expected_odds(odds + middle, odds_var)
+    long = LongDetours(share=float(expit(values["long detours"][0])), factor=LONG_FACTOR)
+    above = float(np.exp(values["detour level"][0]))
+    any_mean = above * float(np.exp(any_detour + any_detour_var / 2))
+    means = above * np.exp(detour + detour_var / 2)
+    reach = BEYOND_MEANS * long.longest * long.mean * float(means.max())
+    wild = np.clip(1 - found.inlier, 0, 1) * (np.abs(residual - errors.location_m) < reach)
+    square = float(np.sum(wild * (residual - errors.location_m) ** 2))
+    stated = ErrorModel(
+        lifted=tuple(lifted.tolist()),
+        noise_m=tuple(noise.tolist()),
+        tail_share=tuple(np.clip(expit(common + curve - np.mean(curve)), 1e-4, 1 - 1e-4).tolist()),
+        least_m=float(np.exp(values["least detour"][0])),
+        detour_m=long.mean * any_mean,
+        outlier_share=max(float(np.mean(wild)), 1e-9),
+        outlier_m=float(np.sqrt(square / max(float(np.sum(wild)), 1e-9))) or reach,
+        location_m=errors.location_m,
+        long_share=long.share,
+        long_factor=long.factor,
+        pairs={
+            name: PairErrors(noise=float(one), odds=float(np.exp(two - common)), detour=float(three / any_mean))
+            for name, one, two, three in zip(
+                model.pairs.names, np.exp(values["noise of pair"]), own, means, strict=True
+            )
+        },
+    )
+    return _put_right(stated, model, residual)
+
+
+def between_recordings(model: RangeModel, errors: DescribedErrors, blocks: TimeBlocks, pairs_m: float | None) -> float:
+    """Return the standard deviation, in metres, of the difference of a pair's offset between this and another
+    recording.
+
+    Several sessions show it: by offsets of pairs (`pairs_m`, None if they are not determined), and of pairs in spells.
+    One recording does not, because its delays contain what changes by the next; it shows the least.
+    """
+    pair, score = model.pairs.number, errors.slopes.by[RESIDUAL]
+    pairs, cell = len(model.pairs.ends), pair * SPELLS + np.arange(len(pair)) * SPELLS // len(pair)
+    lasting = lasting_in_pairs(score, pair, blocks, SPELLS)
+    slope, known = (
+        np.bincount(cell, column, pairs * SPELLS).reshape(pairs, SPELLS) / lasting for column in (score, score**2)
+    )
+    # The common part of all spells is the offset of the pair.
+    slope -= known * slope.sum(axis=1, keepdims=True) / np.maximum(known.sum(axis=1, keepdims=True), 1e-300)
+    spells_m = math.sqrt(mean_variance(known.ravel(), slope.ravel(), TYPICAL_OFFSET_M, OFFSETS[1:]))
+    found = math.hypot(spells_m, spells_m if pairs_m is None else pairs_m)
+    return found if np.ptp(model.ranges.session) else max(found, BETWEEN_M)
+
+
+def mean_variance(information: Floats, slope: Floats, typical: float, bounds: tuple[float, float]) -> float:
+    """Return the posterior mean of the variance of independent draws (k,).
+
+    `information` (k,) and `slope` (k,) are those of the log likelihood of each draw at zero: its marginal likelihood
+    under a variance s is (1 + s l)^-1/2 exp(b^2 s / (1 + s l) / 2). The prior of the standard deviation is half-normal
+    with scale `typical`, within `bounds` (Gelman 2006). The maximum of the likelihood would be zero with few uncertain
+    values.
+    """
+    deviation = np.geomspace(*bounds, 200)
+    variance = deviation[:, None] ** 2
+    told = 1 + variance * information
+    likelihood = 0.5 * np.sum(slope**2 * variance / told - np.log(told), axis=1)
+    # In steps of the logarithm, each is as wide as the deviation.
+    posterior = likelihood - 0.5 * (deviation / typical) ** 2 + np.log(deviation)
+    share = np.exp(posterior - posterior.max())
+    return float(share @ deviation**2 / share.sum())
+
+
+def _at_nodes(model: RangeModel, values: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:
+    """Return lifted powers (NODES,), the noise there in metres, and the log odds there less their level."""
+    level = float(values["noise level"][0])
+    if model.noise is None:
+        return np.array([0.999, 1.001]) * np.median(model.lifted), np.full(2, np.exp(level)), np.zeros(2)
+    nodes = np.quantile(model.lifted, (np.arange(NODES) + 0.5) / NODES) + 1e-9 * np.arange(NODES)
+    at, several = Spline.at(nodes, model.noise.knots), list(model.settings.groups) or [""]
+    curves = {}
+    for parameter in ("noise", "odds"):
+        mean = np.mean([values[f"{parameter} curve {name}".strip()] for name in several], axis=0)
+        curves[parameter] = np.sum(at.values * mean[at.columns], axis=1)
+    return nodes, np.exp(level + curves["noise"]), curves["odds"]
+
+
+def _drawn(value: Floats, variance: Floats, widest: float) -> tuple[Floats, Floats, float, float]:
+    """Shrink values (pairs,) with known variances to their mean; return them, their variances, and those of a new pair.
+
+    The variance between pairs is the maximum of a normal likelihood (by expectation-maximisation). Returned variances
+    are `widest` at most.
+    """
+    between = float(np.var(value)) + 1e-3
+    for _ in range(50):
+        weight = 1 / (between + variance)
+        centre = float(np.sum(weight * value) / np.sum(weight))
+        kept = between / (between + variance)
+        between = max(float(np.mean((kept * (value - centre)) ** 2 + kept * variance)), 1e-4)
+    of_centre = float(1 / np.sum(1 / (between + variance)))
+    kept = between / (between + variance)
+    drawn, left = centre + kept * (value - centre), kept * variance + (1 - kept) ** 2 * of_centre
+    return np.asarray(drawn), np.minimum(left, widest), centre, min(between + of_centre, widest)
+
+
+def _expected_odds(log_odds: Floats, variance: Floats) -> Floats:
+    """Return the log odds of the mean share, where log odds are known with a variance (MacKay 1992)."""
+    return np.asarray(log_odds / np.sqrt(1 + np.pi / 8 * variance))
+
+
+def _put_right(model: ErrorModel, of: RangeModel, residual: Floats) -> ErrorModel:
+    """Correct the quantiles and the total standard deviation so that they hold for the fitted ranges on average."""
+    if len(residual) < 200:
+        # Two hundred ranges know the outer quantiles, those of half a per cent, by one range.
+        return model
+    # More than 20 000 ranges change nothing.
+    rows = np.linspace(0, len(residual) - 1, min(20_000, len(residual))).astype(np.int64)
+    error = residual[rows]
+    shapes = model.shapes(of.lifted[rows], of.ranges.initiator[rows], of.ranges.target[rows])
+    level = np.quantile(model.below(error, shapes), LEVELS)
+    away = error - model.mean_m(shapes)
+    within = np.abs(away) < BEYOND_MEANS * (model.least_m + model.long.longest * shapes.detour_m)
+    z = away[within] / model.total_m(shapes)[within]
+    levels = tuple(zip(LEVELS, np.maximum.accumulate(level).tolist(), strict=True))
+    return replace(model, scale=float(np.sqrt(np.mean(z**2))), levels=levels)

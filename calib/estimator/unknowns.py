@@ -1,8 +1,7 @@
 """The unknowns of a fit: blocks of numbers of one kind, what is known of them beforehand, and where they stand.
 
-A block is a named vector with a start, a scale (how far an ignorant guess is off, by which `calib.information.judge`
-decides what data determine), and Gaussian priors. The weight of a prior may be estimated with the unknowns, by the
-fixed point of Fellner and Schall as Wood and Fasiolo (Biometrics 2017) generalise it: the roughness of a curve, the
+A block is a named vector with a start and Gaussian priors. The weight of a prior may be estimated with the unknowns, by
+the fixed point of Fellner and Schall as Wood and Fasiolo (Biometrics 2017) generalise it: the roughness of a curve, the
 variance of offsets between pairs and between sessions, and the spread of error models between pairs are one mechanism.
 """
 
@@ -16,7 +15,6 @@ from scipy import sparse
 
 from calib.errors import BadInputError
 from calib.estimator.inverse import MOST_DENSE, Inverse, Matrix, trace_of_product
-from calib.information import Unknown as NamedUnknown
 from uwblink.arrays import Bools, Floats, Ints
 
 
@@ -44,29 +42,31 @@ class Prior:
         """Return independent priors about zero, whose standard deviation is estimated between `least` and `most`."""
         return cls(weight=start**-2, bounds=(most**-2, least**-2))
 
-    @property
-    def rank(self) -> int | None:
-        """Return the rank of the structure, None for the identity."""
-        if self.rows is not None or not isinstance(self.structure, np.ndarray):
-            return self.rows
-        return int(np.linalg.matrix_rank(self.structure, hermitian=True))
+    def matrix(self, size: int) -> Matrix:
+        """Return the structure as a matrix, the identity (size, size) where it is None."""
+        if self.structure is not None:
+            return self.structure
+        return np.eye(size) if size <= MOST_DENSE else sparse.eye(size, format="csc")
+
+    def rank(self, matrix: Matrix) -> int:
+        """Return the rank of the structure as a `matrix`."""
+        if self.rows is not None or self.structure is None or not isinstance(matrix, np.ndarray):
+            return int(matrix.shape[0]) if self.rows is None else self.rows
+        return int(np.linalg.matrix_rank(matrix, hermitian=True))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Unknown:
     """A block of unknowns: `names` (k,) say of what each is, `start` (k,) where a search begins.
 
-    `known` (k,) marks those that keep their start; `local` are unknowns each of which meets few others, as control
-    points of a path do. `scale` is what a guess without any data is good to.
+    `known` (k,) marks those that keep their start.
     """
 
     kind: str
     names: tuple[str, ...]
     start: Floats
     priors: tuple[Prior, ...] = ()
-    scale: float = 1.0
     known: Bools | None = None
-    local: bool = False
 
     def __post_init__(self) -> None:
         """Raise `BadInputError` where start and names differ in length."""
@@ -107,30 +107,30 @@ class Layout:
         known = [np.zeros(len(b.start), bool) if b.known is None else b.known for b in self.blocks]
         return np.flatnonzero(~np.concatenate(known))
 
-    def local(self) -> Bools:
-        """Return which unknowns (p,) meet few others, and have a banded matrix among themselves."""
-        return np.repeat([block.local for block in self.blocks], [len(block.start) for block in self.blocks])
-
     def indices(self, kinds: Sequence[str]) -> Ints:
         """Return the indices of some kinds, in the order given; kinds that are not there have none."""
         found = [np.arange(self.where[kind].start, self.where[kind].stop) for kind in kinds if kind in self.where]
         return np.concatenate([np.zeros(0, dtype=np.int64), *found])
 
-    def named(self) -> list[NamedUnknown]:
-        """Return every unknown with its name and scale, for `calib.information.judge`."""
-        return [NamedUnknown(block.kind, name, block.scale) for block in self.blocks for name in block.names]
-
 
 class Priors:
-    """The priors of a layout with their present weights."""
+    """The priors of a layout with their present weights, and their structures as matrices."""
 
     def __init__(self, layout: Layout, weights: Sequence[float] | None = None) -> None:
         """Take the priors' own weights, or others in the order of blocks and priors."""
         self.layout = layout
+        self.keys = [(block.kind, k) for block in layout.blocks for k in range(len(block.priors))]
         self.all = [(layout.where[block.kind], prior) for block in layout.blocks for prior in block.priors]
         self.weights = [prior.weight for _, prior in self.all] if weights is None else list(weights)
-        self.keys = [(block.kind, k) for block in layout.blocks for k in range(len(block.priors))]
-        self.ranks = [where.stop - where.start if prior.rank is None else prior.rank for where, prior in self.all]
+        self.structures = [prior.matrix(where.stop - where.start) for where, prior in self.all]
+        self.ranks = [prior.rank(matrix) for (_, prior), matrix in zip(self.all, self.structures, strict=True)]
+        entries = [sparse.coo_matrix(matrix) for matrix in self.structures]
+        starts = np.repeat([where.start for where, _ in self.all], [one.nnz for one in entries]).astype(np.int64)
+        self._which = np.repeat(np.arange(len(entries)), [one.nnz for one in entries])
+        self._data, row, column = (
+            np.concatenate([np.zeros(0), *(getattr(one, name) for one in entries)]) for name in ("data", "row", "col")
+        )
+        self._place = (starts + row.astype(np.int64), starts + column.astype(np.int64))
 
     def by_key(self) -> dict[tuple[str, int], float]:
         """Return the present weights by kind and number of the prior."""
@@ -143,56 +143,35 @@ class Priors:
     def precision(self) -> Matrix:
         """Return the precision of all priors (p, p); a sparse one for many unknowns."""
         size = self.layout.size
-        if size > MOST_DENSE:
-            entries = []
-            for weight, (where, prior) in zip(self.weights, self.all, strict=True):
-                structure = sparse.eye(where.stop - where.start) if prior.structure is None else prior.structure
-                own = sparse.coo_matrix(structure)
-                entries.append((weight * own.data, own.row + where.start, own.col + where.start))
-            value, row, column = (np.concatenate([np.zeros(0), *parts]) for parts in zip(*entries, strict=True))
-            return sparse.csc_matrix((value, (row.astype(np.int64), column.astype(np.int64))), shape=(size, size))
-        found = np.zeros((size, size))
-        for weight, (where, prior) in zip(self.weights, self.all, strict=True):
-            dense = _structure(prior, where)
-            found[where, where] += weight * (dense if isinstance(dense, np.ndarray) else dense.toarray())
-        return found
+        found = sparse.csc_matrix((np.array(self.weights)[self._which] * self._data, self._place), shape=(size, size))
+        return found if size > MOST_DENSE else found.toarray()
 
     def value(self, x: Floats) -> float:
         """Return the log density of the priors at unknowns (p,), less its constant."""
-        found = 0.0
-        for weight, (where, prior) in zip(self.weights, self.all, strict=True):
-            away = x[where] - prior.centre
-            found -= 0.5 * weight * float(away @ _times(prior, away))
-        return found
+        return -0.5 * sum(weight * float(away @ pulled) for weight, _, away, pulled in self._distances(x))
 
     def pull(self, x: Floats) -> Floats:
         """Return the slope of the log density of the priors at unknowns (p,)."""
         found = np.zeros(len(x))
-        for weight, (where, prior) in zip(self.weights, self.all, strict=True):
-            found[where] -= weight * _times(prior, x[where] - prior.centre)
+        for weight, where, _, pulled in self._distances(x):
+            found[where] -= weight * pulled
         return found
 
     def update(self, x: Floats, covariance: Inverse) -> None:
         """Estimate the weights that may be, from unknowns (p,) and their covariance (p, p)."""
-        for k, (where, prior) in enumerate(self.all):
-            if prior.bounds is None:
-                continue
-            away, structure = x[where] - prior.centre, _structure(prior, where)
-            left = self.ranks[k] - self.weights[k] * trace_of_product(covariance, structure, where)
-            used = max(left, 1e-2)
-            size = max(float(away @ structure @ away), 1e-300)
-            self.weights[k] = float(np.clip(used / size, *prior.bounds))
+        for k, (_, where, away, pulled) in enumerate(self._distances(x)):
+            bounds = self.all[k][1].bounds
+            if bounds is not None:
+                left = self.ranks[k] - self.weights[k] * trace_of_product(covariance, self.structures[k], where)
+                size = max(float(away @ pulled), 1e-300)
+                self.weights[k] = float(np.clip(max(left, 1e-2) / size, *bounds))
 
     def deviation(self, kind: str) -> float:
         """Return the standard deviation that the last prior of a kind has now."""
-        where = self.layout.where[kind]
-        weights = [weight for weight, (own, _) in zip(self.weights, self.all, strict=True) if own == where]
-        return float(weights[-1] ** -0.5)
+        return float({own: weight for (own, _), weight in self.by_key().items()}[kind] ** -0.5)
 
-
-def _structure(prior: Prior, where: slice) -> Matrix:
-    return np.eye(where.stop - where.start) if prior.structure is None else prior.structure
-
-
-def _times(prior: Prior, values: Floats) -> Floats:
-    return values if prior.structure is None else np.asarray(prior.structure @ values)
+    def _distances(self, x: Floats) -> list[tuple[float, slice, Floats, Floats]]:
+        """Return of each prior its weight, block, distance from the centre (k,), and structure times distance (k,)."""
+        away = [x[where] - prior.centre for where, prior in self.all]
+        pulled = [np.asarray(matrix @ own) for matrix, own in zip(self.structures, away, strict=True)]
+        return list(zip(self.weights, [where for where, _ in self.all], away, pulled, strict=True))

@@ -18,7 +18,6 @@ import uwblink
 from calib.calibration.document import for_json
 from calib.calibration.error_model import lasting_errors
 from calib.calibration.model import Calibration, given_calibration
-from calib.calibration.power_curves import lift as lift_power
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import (
     WITHOUT_CURVE,
@@ -33,7 +32,7 @@ from calib.checks.limits import (
 from calib.data.ranges import Ranges, held_out
 from calib.data.sources import Data, load_ranges
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimator.known_distances import KnownDistances, Recipe, fit_known_distances
+from calib.estimator.known_distances import KnownDistances, fit_known_distances
 from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
@@ -41,15 +40,11 @@ from calib.fitting.result import FitResult, HeldOut
 from calib.settings import FitSettings, check_tag
 from uwblink.arrays import Bools, Floats
 from uwblink.recording.antenna_delays import delays_differ, known_delays
-from uwblink.ticks import SPEED_OF_LIGHT
 
 INLIER_SIGMAS = 3.0
 
 MIN_RANGES = 50
 """With so many ranges one delay has a standard error of a seventh of the noise of a range, 0.03 ns."""
-
-ROBUST_LOSS = "cauchy"
-"""The loss of ICRA 2023. Without a curve errors depend on power, which the likelihood would take for reflections."""
 
 
 def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **changes: Any) -> FitResult:
@@ -72,54 +67,33 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     '0.41 ns, planted 0.40 ns'
     """
     settings = replace(settings or FitSettings(), **changes)
-    alpha_dbm, delays_only, sequential = settings.alpha_dbm, settings.delays_only, settings.sequential
     check_loss(settings.loss)
     source = given_calibration(settings.delays_from, "delays_from")
-    ranges = load_ranges(data, need_power=not delays_only)
-    fixed = _taken_over(source, ranges, curve=not delays_only) | dict(settings.fixed_ns)
+    ranges = load_ranges(data, need_power=not settings.delays_only)
+    fixed = _taken_over(source, ranges, curve=not settings.delays_only) | dict(settings.fixed_ns)
     refuse_impossible(ranges)
-    loss = settings.loss or (ROBUST_LOSS if sequential or delays_only else MIXTURE)
-    reference = settings.reference_power_dbm
-    reference = alpha_dbm if reference is None and not sequential else reference
-    recipe = Recipe(
-        loss=loss,
-        scale_m=None if settings.scale_ns is None else settings.scale_ns * 1e-9 * SPEED_OF_LIGHT,
-        lift=settings.lift,
-        alpha_dbm=alpha_dbm,
-        fixed_ns=fixed,
-        groups=dict(settings.groups),
-        minimum_norm=settings.minimum_norm,
-        reference=None if reference is None else _lifted(reference, alpha_dbm),
-        curve=not delays_only,
-        constants=settings.constants,
-        sequential=sequential,
-    )
     # One thread: sums of several threads differ in the last digits, and threads slow small matrices down.
     with threadpool_limits(limits=1, user_api="blas"):
-        found = fit_known_distances(ranges, recipe)
+        found = fit_known_distances(ranges, replace(settings, fixed_ns=fixed))
         fitted = dict(zip(found.model.tags, found.delays.tolist(), strict=False))
         refuse_refuted(fitted, found.residuals, found.model.ranges)
         covariance_ns2, findings = examine_fit(found)
-        calibration = calibration_of(
-            found,
-            covariance_ns2,
-            lift=settings.lift,
-            alpha_dbm=alpha_dbm,
-            fixed=fixed,
-            groups=settings.groups,
-            between_m=settings.between_m,
-        )
+        calibration = calibration_of(found, covariance_ns2)
     given = set(fixed) - set(settings.fixed_ns)
+    taken = {tag: std for tag, std in source.delays_std_ns.items() if tag in given} if source else {}
     stated = {tag: std for tag, std in calibration.delays_std_ns.items() if tag not in given}
-    calibration = replace(calibration, delays_std_ns=stated | _std_taken_over(source, given))
+    calibration = replace(calibration, delays_std_ns=stated | taken)
     held = _held_out(ranges, settings) if settings.hold_out else None
+    reference = settings.reference_power_dbm
+    if reference is None and not settings.sequential:
+        reference = settings.alpha_dbm
     provenance = {
         **({"undetermined": found.free} if found.free else {}),
         **({} if reference is None else {"reference_power_dbm": reference}),
         "recordings": ranges.source.split(", "),
         "recording_ids": [name for _, name in ranges.recordings],
-        "recipe": "sequential" if recipe.sequential else "joint",
-        "fitted": _fitted(found, recipe),
+        "recipe": "sequential" if settings.sequential else "joint",
+        "fitted": _fitted(found),
         "gauge": _gauge(found, reference),
         **({"held_out": _judged(held, settings)} if held else {}),
     }
@@ -210,11 +184,6 @@ def _taken_over(known: Calibration | None, ranges: Ranges, *, curve: bool) -> di
     return found
 
 
-def _std_taken_over(known: Calibration | None, tags: Iterable[int]) -> dict[int, float]:
-    """Return the standard errors of delays that were taken from a calibration."""
-    return {} if known is None else {tag: known.delays_std_ns[tag] for tag in tags if tag in known.delays_std_ns}
-
-
 def result_of(
     found: KnownDistances,
     calibration: Calibration,
@@ -243,7 +212,7 @@ def result_of(
         *one_way(ranges),
         *implausible(calibration.delays_ns, residuals),
         *unlike_powers(ranges, calibration),
-        *_beyond(calibration.provenance.get("reference_power_dbm"), calibration.alpha_dbm, found),
+        *_beyond(found),
         *warnings_of(ranges, float(np.mean(inliers)), found.free, found.blocks.seconds),
     ]
     provenance: dict[str, Any] = {
@@ -252,7 +221,7 @@ def result_of(
         "inliers": int(np.count_nonzero(inliers)),
         "excluded": ranges.excluded,
         "converged": found.success,
-        "standard_errors": f"sandwich over {found.lasting.lasting[0].stretches:.0f} independent stretches of time",
+        "standard_errors": f"sandwich over {found.persistence.stretches:.0f} independent stretches of time",
         "warnings": warnings,
         "error_std_m": {"raw": float(np.std(ranges.raw_m - ranges.truth_m)), "corrected": float(np.std(residuals))},
     }
@@ -302,10 +271,6 @@ def _left(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Bools, Floa
     return left, np.asarray(np.abs(over_sigma) < INLIER_SIGMAS), over_sigma
 
 
-def _lifted(power_dbm: float, alpha_dbm: float) -> float:
-    return float(lift_power(np.array(power_dbm), alpha_dbm))
-
-
 def _stopped(found: KnownDistances, asked_for: str | None) -> list[str]:
     if asked_for == MIXTURE and found.searches[0].loss != MIXTURE:
         return ["the likelihood left all ranges of a pair out, so a robust loss was fitted: compare with other losses"]
@@ -314,35 +279,43 @@ def _stopped(found: KnownDistances, asked_for: str | None) -> list[str]:
     return [f"the fit stopped after {found.steps} steps before it settled: delays and intervals are not final"]
 
 
-def _beyond(reference: float | None, alpha_dbm: float, found: KnownDistances) -> list[str]:
+def _beyond(found: KnownDistances) -> list[str]:
     """Return a warning if no range has the reference power, so that delays are stated at the nearest power."""
-    if reference is None or not any(found.model.gauged):
+    model, settings = found.model, found.model.settings
+    if model.reference is None or not _has_gauge(found):
         return []
-    low, high = found.model.span
-    if low <= _lifted(reference, alpha_dbm) <= high:
+    near = float(np.clip(model.reference, *model.span))
+    if near == model.reference:
         return []
-    near = low if _lifted(reference, alpha_dbm) < low else high
+    asked = settings.alpha_dbm if settings.reference_power_dbm is None else settings.reference_power_dbm
     return [
-        f"no ranges at the reference power of {reference:.1f} dBm: delays are stated at "
-        f"{alpha_dbm + 10 * np.log10(near):.1f} dBm, the nearest recorded, and compare only with others stated there"
+        f"no ranges at the reference power of {asked:.1f} dBm: delays are stated at "
+        f"{settings.alpha_dbm + 10 * np.log10(near):.1f} dBm, the nearest recorded, and compare only with others "
+        "stated there"
     ]
 
 
-def _fitted(found: KnownDistances, recipe: Recipe) -> str:
+def _has_gauge(found: KnownDistances) -> bool:
+    """Return whether delays can take over the constant of any curve."""
+    return any(carrier is not None for carrier in found.model.carriers)
+
+
+def _fitted(found: KnownDistances) -> str:
     """Return what was fitted, in words."""
-    constants = "constants of pairs" if recipe.constants == "pair" else "delays"
-    if found.model.curve is None:
-        return constants if recipe.constants == "pair" else "delays only"
-    pinned = recipe.constants == "tag" and set(found.model.tags) <= set(recipe.fixed_ns)
-    return "curve only" if pinned else f"{constants} and curve"
+    model = found.model
+    if model.settings.constants == "pair":
+        return "constants of pairs" if model.curve is None else "constants of pairs and curve"
+    if model.curve is None:
+        return "delays only"
+    return "curve only" if model.pinned else "delays and curve"
 
 
 def _gauge(found: KnownDistances, reference: float | None) -> str:
     """Return in words how the common constant of delays and curve was chosen."""
-    carrier = "constants of pairs" if found.model.constants == "pair" else "delays"
+    carrier = "constants of pairs" if found.model.settings.constants == "pair" else "delays"
     if found.model.curve is None:
         return f"no curve; the {carrier} carry the constant"
-    if not any(found.model.gauged):
+    if not _has_gauge(found):
         return "pinned delays; the curve carries the constant"
     if reference is None:
         return "that of the recipe: delays as fitted without a curve, which carries the constant"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from html import escape
-from typing import Literal
 
 from calib import figures
 from calib.calibration.model import Calibration
@@ -82,7 +81,3 @@ class FitResult:
     def plot_delays(self, axes: Axes | None = None) -> Axes:
         """Draw the antenna delays in ns with their 95 % intervals."""
         return figures.delays(self.calibration, axes=axes)
-
-    def _curve(self, which: Literal["bias", "sigma"], axes: Axes | None) -> Axes:
-        applied = self.calibration.apply(self.ranges)
-        return figures.curve_over_power(self.ranges, applied, self.calibration, which, axes)

@@ -20,7 +20,7 @@ from calib.estimator.range_rows import RESIDUAL, RangeRows
 from calib.estimator.rows import sum_rows
 from calib.estimator.unknowns import Layout, Priors
 from calib.information import Verdict
-from calib.range_errors.density import error_slopes
+from calib.range_errors.densities import error_slopes
 from calib.settings import FitSettings, FlightSettings
 from calib.trajectories.fitting import range_model
 from calib.trajectories.judging import GEOMETRY_ALONE_FACTOR, verdict_on, with_known_distances
@@ -194,7 +194,7 @@ class Information:
         priors, self.delays = Priors(self.layout), self.layout.indices(["delay"])
         for _ in range(EVIDENCE_STEPS):
             known = of_ranges + beside + priors.precision()
-            self.covariance = inverse_of(known, self.layout.free(), self.layout.local())
+            self.covariance = inverse_of(known, self.layout.free())
             priors.update(self.x, self.covariance)
         self.without_motion = of_ranges + priors.precision()
 

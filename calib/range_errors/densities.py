@@ -1,7 +1,8 @@
-"""Densities of the errors of direct and reflected ranges, and the noise in them.
+"""The one model of a range's error: direct with normal noise, reflected by a detour besides, or an outlier.
 
-A direct range has normal noise. A reflected range has a detour besides: a least one plus an exponential one of one of
-two kinds with different means.
+A detour is a least one plus an exponential one of one of two kinds with different means; outliers are anywhere in a
+room. Four of the numbers differ between ranges (location, noise, share, detour), three are common (least detour,
+outliers, share of the second kind); the likelihood has a slope by each of the seven.
 """
 
 from __future__ import annotations
@@ -10,15 +11,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from scipy.special import erfcx
+from scipy.special import erfcx, expit
 
 from uwblink.arrays import Floats
 
 ROOT_2: Final = float(np.sqrt(2))
 ROOT_2PI: Final = float(np.sqrt(2 * np.pi))
-FARTHEST: Final = 30.0
-"""Sigmas beyond which the noise in a detour no longer depends on the error."""
-
 LONG_FACTOR: Final = 4.0
 """Mean of the second kind of detour over that of the first, where it is fitted.
 
@@ -127,17 +125,79 @@ def _kind(v: Floats, normal: Floats, sigma_m: Floats, share: float, detour_m: An
     """Return reflected ranges of a kind at errors `v` (n,) beyond the least detour, in sigmas."""
     ratio = sigma_m / detour_m
     u = v - ratio
-    far = u > FARTHEST
-    some = bool(far.any())
-    scaled = erfcx((np.minimum(u, FARTHEST) if some else u) * (-1 / ROOT_2))
-    density = normal * scaled
-    density *= 0.5 * share / detour_m
-    if some:
-        density = np.where(far, np.exp(np.minimum(ratio * (0.5 * ratio - v), 50.0)) * (share / detour_m), density)
+    # Thirty sigmas beyond the least detour erfcx overflows, and the noise in a detour no longer depends on the error.
+    near = np.minimum(u, 30.0)
+    scaled = erfcx(near * (-1 / ROOT_2))
+    density = normal * scaled * (0.5 * share / detour_m)
+    if np.any(near < u):
+        far = np.exp(np.minimum(ratio * (0.5 * ratio - v), 50.0)) * (share / detour_m)
+        density = np.where(near < u, far, density)
     hazard = (2 / ROOT_2PI) / scaled
     return Kind(
         density=density,
         detour_m=detour_m,
         noise_m=np.asarray(sigma_m * (ratio - hazard)),
         noise_var=np.maximum(1 - hazard * (u + hazard), 0.0),
+    )
+
+
+OUTLIERS_OVER_M: Final = 10.0
+"""Smallest span of outliers, that of a room: with a smaller span they would be taken for long detours."""
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorSlopes:
+    """Log densities of errors (n,), and their slopes (n,) by each parameter's logarithm or log odds.
+
+    `residual` is the slope by the error itself, 1/m; `reflected` is the probability that a range was reflected,
+    `inlier` that it is no outlier.
+    """
+
+    log_density: Floats
+    by: dict[str, Floats]
+    reflected: Floats
+    inlier: Floats
+
+
+def error_slopes(residual: Floats, parameters: dict[str, Floats], *, span_m: float) -> ErrorSlopes:
+    """Return the log density of errors (n,) in metres and its slopes.
+
+    `parameters` are "noise" (log sigma), "odds" (log odds of a reflection), "detour" (log of the first kind's
+    mean), "least" (log of the least detour), "outliers" and "long" (log odds), arrays (n,) or (1,).
+    Outliers have the density 1/`span_m`.
+    """
+    sigma = np.exp(parameters["noise"])
+    share = expit(parameters["odds"])
+    detour = np.exp(parameters["detour"])
+    least, wild, long_share = np.exp(parameters["least"]), expit(parameters["outliers"]), expit(parameters["long"])
+    long = LongDetours(share=float(long_share[0]), factor=LONG_FACTOR)
+    found = densities(residual, sigma, float(least[0]), long.mean * detour, long)
+    inside = 1 - float(wild[0])
+    core, tail = inside * (1 - share) * found.direct, inside * share
+    total = core + tail * found.reflected + float(wild[0]) / span_m
+    core, tail = core / total, tail / total
+    tails = [tail * kind.density for kind in found.kinds]
+    reflected = tails[0] + tails[1]
+    z, inverse = residual / sigma, 1 / sigma
+    noise, mean, tail_noise = core * (z * z - 1), np.zeros_like(z), np.zeros_like(z)
+    beyond = residual - least
+    for part, kind in zip(tails, found.kinds, strict=True):
+        own = kind.noise_m * inverse
+        tail_noise += part * own
+        noise += part * (own * own + kind.noise_var - 1)
+        mean += part * ((beyond - kind.noise_m) / kind.detour_m - 1)
+    both = core + reflected
+    return ErrorSlopes(
+        log_density=np.log(total),
+        by={
+            "residual": -(core * z + tail_noise) * inverse,
+            "noise": noise,
+            "odds": reflected - share * both,
+            "detour": mean,
+            "least": tail_noise * inverse * least,
+            "outliers": inside - both,
+            "long": tails[1] - long_share * reflected,
+        },
+        reflected=reflected,
+        inlier=both,
     )

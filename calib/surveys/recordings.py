@@ -23,6 +23,7 @@ from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, Part
 from calib.estimator.unknowns import Prior, Priors, Unknown
 from calib.pairs import Pairs, pairs_of
+from calib.settings import FitSettings
 from calib.spread import STD_OF_MEDIAN, medians, robust_spread
 from calib.surveys.knowledge import Knowledge
 from calib.surveys.result import Contradiction
@@ -278,7 +279,7 @@ def _locations(ranges: Ranges, groups: Pairs) -> tuple[Floats, Floats, Floats]:
     """
     group, count = groups.number, np.bincount(groups.number)
     median = medians(ranges.raw_m, group)
-    model = RangeModel.of(ranges, lift=LIFT, alpha_dbm=ALPHA_DBM, fixed_ns={}, groups={}, curve=False, offsets=False)
+    model = RangeModel.of(ranges, FitSettings(delays_only=True), offsets=False)
     model = replace(model, noise=None, pairs=groups)
     residual = ranges.raw_m - median[group]
     errors, unknowns, parts = model.error_model(residual)

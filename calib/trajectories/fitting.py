@@ -13,7 +13,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calib.calibration.model import Calibration, given_calibration
-from calib.calibration.power_curves import lift as lift_power
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import refuse_refuted
 from calib.data.sources import Data
@@ -134,16 +133,7 @@ def range_model(scene: Scene, settings: FitSettings, *, curve: bool, offsets: bo
         )
     # The truth is not known. In its place stands the number of the row, which says what rows the model keeps.
     numbered = replace(scene.ranges, truth_m=np.arange(len(scene.ranges), dtype=np.float64))
-    model = RangeModel.of(
-        numbered,
-        lift=settings.lift,
-        alpha_dbm=settings.alpha_dbm,
-        fixed_ns=dict(settings.fixed_ns),
-        groups=settings.groups,
-        curve=curve,
-        reference=float(lift_power(np.array(_reference_dbm(settings)), settings.alpha_dbm)),
-        offsets=offsets,
-    )
+    model = RangeModel.of(numbered, replace(settings, delays_only=not curve), offsets=offsets)
     return model, scene.only(model.ranges.truth_m.astype(np.int64))
 
 
@@ -207,15 +197,7 @@ def _result(
     )
     covariance_ns2, findings = examine_fit(found)
     covariance = judgement.widened(covariance_ns2)
-    calibration = calibration_of(
-        found,
-        covariance,
-        lift=settings.lift,
-        alpha_dbm=settings.alpha_dbm,
-        fixed=fixed,
-        groups=settings.groups,
-        between_m=settings.between_m,
-    )
+    calibration = calibration_of(found, covariance)
     if known is not None:
         calibration = _with_curve(calibration, known)
     calibration = replace(

@@ -191,7 +191,8 @@ def curve_uncertainty(found: KnownDistances, known: Calibration) -> Floats:
     splines = basis(np.clip(model.lifted, low, high), np.array(known.bias_curve.knots))[rows.order]
     # Derivatives of the unknowns by an error of each range: covariance times information.
     linked, at = np.zeros((optimum.layout.size, splines.shape[1])), 0
-    for terms, score in rows.terms_and_scores(optimum.x):
+    for terms in rows.terms(optimum.x):
+        score = np.asarray(terms.score)
         here = slice(at, at + len(score))
         linked += terms.as_matrix(terms.slopes, optimum.layout.size).T @ (score[:, None] * splines[here])
         at = here.stop

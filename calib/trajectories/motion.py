@@ -117,22 +117,18 @@ class Motion:
         turn = [(0, np.ravel([attitude.std_rad for attitude in attitudes])), (1, wander)]
         turns = tuple(_differences(self.turns.count, order, std) for order, std in turn)
         blocks = [
-            ("path", (count, scene.moving, 3), (smooth, Prior.of_deviation(FAR_M, here), *path), FAR_M),
-            ("turn", (self.turns.count, [scene.moving[k] for k in self.turning], 3), turns, 1.0),
-            ("stand", (1, scene.sought, 3), (Prior.of_deviation(STANDS_M),), FAR_M),
-            ("bias", (1, [scene.moving[k] for k in self.sensed], 3), (Prior.of_deviation(BIAS_M_S2),), BIAS_M_S2),
-            ("level", (1, [scene.moving[k] for k in self.levelled], 1), (Prior.of_deviation(LEVEL_M),), LEVEL_M),
+            ("path", (count, scene.moving, 3), (smooth, Prior.of_deviation(FAR_M, here), *path)),
+            ("turn", (self.turns.count, [scene.moving[k] for k in self.turning], 3), turns),
+            ("stand", (1, scene.sought, 3), (Prior.of_deviation(STANDS_M),)),
+            ("bias", (1, [scene.moving[k] for k in self.sensed], 3), (Prior.of_deviation(BIAS_M_S2),)),
+            ("level", (1, [scene.moving[k] for k in self.levelled], 1), (Prior.of_deviation(LEVEL_M),)),
         ]
         found = []
-        for kind, (several, bodies, axes), priors, scale in blocks:
+        for kind, (several, bodies, axes), priors in blocks:
             names = tuple(body for _ in range(several) for body in bodies for _ in range(axes))
             values = start.get(kind, np.zeros(len(names))).ravel()
             if names:
-                found.append(
-                    Unknown(
-                        kind=kind, names=names, start=values, priors=priors, scale=scale, local=kind in ("path", "turn")
-                    )
-                )
+                found.append(Unknown(kind=kind, names=names, start=values, priors=priors))
         return tuple(found)
 
     def numbers(self, layout: Layout, kind: str) -> Ints:

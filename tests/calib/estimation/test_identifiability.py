@@ -1,4 +1,4 @@
-"""Which delays the pairs of tags determine."""
+"""Pairs of tags, which delays they determine, and from how many ranges on a group has a curve."""
 
 from dataclasses import replace
 
@@ -6,52 +6,40 @@ import numpy as np
 import pytest
 
 from calib.errors import UnanswerableError
-from calib.estimator.identifiability import free_directions, square_of
+from calib.estimator.range_model import MIN_RANGES_OF_GROUP as FEWEST
 from calib.fitting.fitting import fit
-from tests.calib.synthetic import design, ranges
-from uwblink.ticks import SPEED_OF_LIGHT
+from calib.pairs import pairs_of
+from tests.calib.synthetic import ranges
 
 
-def directions_of(r):
-    square, pairs = square_of(r.tags(), r.initiator, r.target, r.weight_initiator, r.weight_target)
-    return free_directions(square, r.tags(), pairs)
+def test_pairs_are_numbered_by_their_tags_and_a_single_range_makes_one():
+    initiator, target = np.array([9, 2, 5, 2, 5]), np.array([2, 9, 2, 9, 9])
+    found = pairs_of(initiator, target)
+    assert found.ends.tolist() == [[2, 5], [2, 9], [5, 9]]
+    assert found.number.tolist() == [1, 1, 0, 1, 2]
+    assert found.names == ("2-5", "2-9", "5-9")
+    assert pairs_of(np.array([1, 3]), np.array([3, 7])).number.tolist() == [0, 1]
 
 
-def test_the_square_is_that_of_the_matrix_written_out():
-    r = ranges(600)
-    matrix = design(r, r.tags()) / (SPEED_OF_LIGHT * 1e-9)
-    square, pairs = square_of(r.tags(), r.initiator, r.target, r.weight_initiator, r.weight_target)
-    np.testing.assert_allclose(square, matrix.T @ matrix, rtol=1e-12)
-    there = set(zip(r.initiator.tolist(), r.target.tolist(), strict=True))
-    assert {(a, b) for a, b in pairs.tolist()} == there | {(b, a) for a, b in there}
-
-
-@pytest.mark.parametrize("pairs", [[(1, 2)], [(1, 2), (1, 3), (1, 7)], [(1, 3), (1, 7), (2, 3), (2, 7)]])
-def test_bipartite_pairs_do_not_determine_delays(pairs):
-    r = ranges(600)
-    keep = np.array([(i, j) in pairs for i, j in zip(r.initiator, r.target, strict=True)])
-    r = r[keep]
-    directions, free = directions_of(r)
-    assert free == [r.tags()]
-    sides = np.where(np.isin(r.tags(), [low for low, _ in pairs]), 1, -1)
-    np.testing.assert_allclose(directions * sides[:, None] * sides[0], directions[0, 0], rtol=1e-4)
-    with pytest.raises(UnanswerableError, match=r"tags 1, (2|3)"):
-        fit(r)
-
-
-def test_three_tags_that_all_range_are_determined():
-    r = ranges(600)
-    r = r[np.isin(r.initiator, [1, 2, 3]) & np.isin(r.target, [1, 2, 3])]
-    directions, free = directions_of(r)
-    assert free == []
-    assert directions.shape == (3, 0)
-
-
-def test_groups_that_shift_together_are_told_apart():
-    r = ranges(600)
-    keep = np.array([(i, j) in [(1, 2), (3, 7)] for i, j in zip(r.initiator, r.target, strict=True)])
-    r = r[keep]
-    assert directions_of(r)[1] == [[1, 2], [3, 7]]
+@pytest.mark.parametrize(
+    ("pairs", "free"),
+    [
+        ([(1, 2)], [[1, 2]]),
+        ([(1, 2), (1, 3), (1, 7)], [[1, 2, 3, 7]]),
+        ([(1, 3), (1, 7), (2, 3), (2, 7)], [[1, 2, 3, 7]]),
+        ([(1, 2), (3, 7)], [[1, 2], [3, 7]]),
+        ([(1, 2), (1, 3), (2, 3), (3, 7)], []),
+    ],
+)
+def test_delays_that_pairs_leave_free_are_named(pairs, free):
+    r = ranges(1200)
+    r = r[np.array([(i, j) in pairs for i, j in zip(r.initiator, r.target, strict=True)])]
+    found = fit(r, minimum_norm=True).calibration
+    assert found.provenance.get("undetermined", []) == free
+    if free:
+        with pytest.raises(UnanswerableError) as refused:
+            fit(r)
+        assert refused.value.undetermined == free
 
 
 @pytest.mark.parametrize("loss", ["mixture", "cauchy"])
@@ -62,3 +50,16 @@ def test_delays_of_bipartite_pairs_are_the_smallest_on_request(loss):
     r = replace(r, weight_target=0.5 * (1 + skew))[np.isin(r.initiator, [1, 2]) & np.isin(r.target, [3, 7])]
     delays = fit(r, minimum_norm=True, loss=loss).calibration.delays_ns
     assert delays[1] + delays[2] == pytest.approx(delays[3] + delays[7], abs=0.01)
+
+
+@pytest.mark.parametrize("count", [FEWEST - 1, FEWEST])
+def test_a_group_has_a_curve_from_the_fewest_ranges_on(count):
+    r = ranges(3000)
+    rare = (r.initiator != 7) & (r.target != 7)
+    rare[np.flatnonzero(~rare)[:count]] = True
+    groups = {"a": (1, 2, 3), "b": (7,)}
+    if count < FEWEST:
+        with pytest.raises(UnanswerableError, match="group 'b'"):
+            fit(r[rare], groups=groups, loss="cauchy")
+    else:
+        assert set(fit(r[rare], groups=groups, loss="cauchy").calibration.groups) == {"a", "b"}

@@ -41,16 +41,12 @@ def lifted_bent(r):
     return bias_m(np.mean(10 ** ((np.stack([r.fpp1_dbm, r.fpp2_dbm]) + 82) / 10), axis=0))
 
 
-def test_levels_without_noise_are_exact():
-    found = power_levels_db(world(SENT_DB, READ_DB))
+def test_levels_are_exact_without_noise_and_as_near_as_they_say_with_it():
+    exact, noisy = (power_levels_db(world(SENT_DB, READ_DB, noise_db=noise)) for noise in (0.0, 1.0))
     # What a tag sends more weakly looks like what it reads higher.
-    assert {tag: level for tag, (level, _) in found.items()} == pytest.approx({1: 0, 2: 3, 3: 2, 7: 0}, abs=1e-9)
-
-
-def test_levels_with_noise_are_as_near_as_they_say():
-    found = power_levels_db(world(SENT_DB, READ_DB, noise_db=1.0))
     for tag, expected in {1: 0, 2: 3, 3: 2, 7: 0}.items():
-        level, std = found[tag]
+        assert exact[tag][0] == pytest.approx(expected, abs=1e-9)
+        level, std = noisy[tag]
         assert 0.005 < std < 0.05
         assert level == pytest.approx(expected, abs=5 * std)
 

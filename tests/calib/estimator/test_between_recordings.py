@@ -9,7 +9,7 @@ import pytest
 
 import calib
 from benchmarks.worlds import CLEAN, make
-from calib.estimator.error_summary import mean_variance
+from calib.estimator.to_calibration import mean_variance
 from tests.shared_data import shared
 
 BOUNDS = (1e-4, 1.0)

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from benchmarks.worlds import CLEAN, make
-from calib.estimator.known_distances import Recipe, likeliest, model_of, robust_fit
+from calib.estimator.known_distances import likeliest, model_of, robust_fit
 from calib.estimator.optimize import maximize
 from calib.estimator.range_rows import RESIDUAL, Part
 from calib.estimator.rows import normal_terms
 from calib.estimator.unknowns import Prior, Priors, Unknown
+from calib.settings import FitSettings
 
 PER_KELVIN_M = 0.004
 
@@ -31,7 +32,7 @@ class Thermostat:
 @pytest.fixture(scope="module")
 def warmed():
     ranges = make(CLEAN["short, 30 s"], 12_001).ranges
-    model = model_of(ranges, Recipe(fixed_ns={}, groups={}))
+    model = model_of(ranges, FitSettings())
     warmer = 10 * np.sin(model.ranges.time_ns * 2e-9)
     error = model.ranges.raw_m - model.ranges.truth_m + PER_KELVIN_M * warmer
     pilot = robust_fit(model, error, "cauchy", None, ("delay", *model.curve_kinds()))
@@ -71,7 +72,7 @@ def test_one_more_kind_of_row_is_one_class(warmed):
 
 def test_least_squares_with_delays_alone_is_numpys():
     ranges = make(CLEAN["short, 30 s"], 12_002).ranges
-    model = model_of(ranges, Recipe(fixed_ns={}, groups={}, curve=False))
+    model = model_of(ranges, FitSettings(delays_only=True))
     error = model.ranges.raw_m - model.ranges.truth_m
     found = robust_fit(model, error, "l2", None, ("delay",))
     weights = [(model.ranges.initiator[:, None] == model.tags) * model.ranges.weight_initiator[:, None],
