@@ -122,10 +122,10 @@ class Case:
 class Linear:
     """A network that is linear about unknowns (p,) in a case: all errors are normal.
 
-    `left` (n,) is measured less predicted, `jacobian` (n, p) the derivative of what is predicted, `std` (n,) the
-    standard deviation of each row. `prior` (p, p) is the precision of the priors, whose slope is `pull` (p,) and value
-    -2 log density `prior_value`. `free` are the indices of the unknowns that are sought, `guessed` those whose prior is
-    no knowledge but the usual size.
+    `left` (n,) is measured less predicted and `jacobian` (n, p) the derivative of what is predicted, both over the
+    standard deviation `std` (n,) of each row. `prior` (p, p) is the precision of the priors, whose slope is `pull` (p,)
+    and value -2 log density `prior_value`. `free` are the indices of the unknowns that are sought, `guessed` those whose
+    prior is no knowledge but the usual size.
     """
 
     left: Floats
@@ -137,18 +137,17 @@ class Linear:
     free: Ints
     guessed: Ints
 
+    @cached_property
+    def information(self) -> Floats:
+        """The information (p, p) of the rows."""
+        return self.jacobian.T @ self.jacobian
+
     @property
     def known(self) -> Floats:
         """The information (p, p) of the rows and of what is known, without guesses."""
         found = self.information + self.prior
         found[self.guessed, self.guessed] -= self.prior[self.guessed, self.guessed]
         return found
-
-    @cached_property
-    def information(self) -> Floats:
-        """The information (p, p) of the rows."""
-        rows = self.jacobian / self.std[:, None]
-        return rows.T @ rows
 
     @cached_property
     def covariance(self) -> Floats:
@@ -158,7 +157,7 @@ class Linear:
     @cached_property
     def slope(self) -> Floats:
         """The slope (p,) of the log likelihood by the unknowns."""
-        return np.asarray(self.jacobian.T @ (self.left / self.std**2) + self.pull)
+        return np.asarray(self.jacobian.T @ self.left + self.pull)
 
     @cached_property
     def step(self) -> Floats:
@@ -168,7 +167,7 @@ class Linear:
     def unlikely(self) -> float:
         """Return -2 log likelihood of the rows, integrated over the unknowns (Laplace's approximation)."""
         own = np.ix_(self.free, self.free)
-        value = float(np.sum((self.left / self.std) ** 2)) + self.prior_value - float(self.slope @ self.step)
+        value = float(self.left @ self.left) + self.prior_value - float(self.slope @ self.step)
         value += 2 * float(np.log(self.std).sum()) + float(np.linalg.slogdet((self.information + self.prior)[own])[1])
         return value - float(np.linalg.slogdet(self.prior[own])[1])
 
@@ -339,9 +338,8 @@ class Network:
         left = measured - length - found @ x
         # Boards on top of each other have no direction: any will do to part them.
         unit = np.where(length[:, None] > 1e-9, apart / np.maximum(length, 1e-9)[:, None], [1.0, 0.0, 0.0])
-        rows = np.arange(len(length))[:, None]
-        for end, sign in ((0, 1.0), (1, -1.0)):
-            found[rows, 3 * self.ends[:, [end]] + np.arange(3)] = sign * unit
+        columns = 3 * self.ends[:, :, None] + np.arange(3)
+        np.put_along_axis(found, columns.reshape(len(found), -1), np.hstack([unit, -unit]), axis=1)
         return left, found
 
     def std_m(self, case: Case) -> Floats:
@@ -355,12 +353,12 @@ class Network:
 
     def at(self, x: Floats, case: Case) -> Linear:
         """Return the network about unknowns (p,) in a case."""
-        (left, jacobian), priors = self.linear(x, case.marks), self.priors(case.curve_m)
+        (left, jacobian), priors, std = self.linear(x, case.marks), self.priors(case.curve_m), self.std_m(case)
         precision = priors.precision()
         return Linear(
-            left=left,
-            jacobian=jacobian,
-            std=self.std_m(case),
+            left=left / std,
+            jacobian=jacobian / std[:, None],
+            std=std,
             prior=precision.toarray() if sparse.issparse(precision) else precision,
             pull=priors.pull(x),
             prior_value=-2 * priors.value(x),

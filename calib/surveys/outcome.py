@@ -222,9 +222,9 @@ def _of_curve(taken: Calibration) -> Floats:
 def widened_by(found: Solution, curve: Calibration) -> Solution:
     """Return a solution whose covariance has what the errors of a curve that was taken over do to delays and places."""
     here, means = found.linear, found.network.means
-    weighed = here.jacobian / here.std[:, None] ** 2
     splines = basis(np.clip(means.lifted, *curve.bias_curve.range), np.array(curve.bias_curve.knots))
-    gain = here.covariance @ (weighed[: len(splines)].T @ splines)
+    count = len(splines)
+    gain = here.covariance @ (here.jacobian[:count].T @ (splines / here.std[:count, None]))
     return replace(found, more=found.more + gain @ _of_curve(curve) @ gain.T)
 
 

@@ -121,12 +121,10 @@ def settle(network: Network, x: Floats, case: Case) -> tuple[Floats, Case]:
     """Return the unknowns from a start, and the case with the means that are likeliest reflected."""
     for _ in range(2):
         x, _ = optimize(network, x, case)
-        marks = Marks.at(network, x, case).searched()
-        if np.array_equal(marks, case.marks):
-            break
-        case = replace(case, marks=marks)
-        x, _ = optimize(network, x, case)
-    return x, case
+        before, case = case.marks, replace(case, marks=Marks.at(network, x, case).searched())
+        if np.array_equal(before, case.marks):
+            return x, case
+    return optimize(network, x, case)[0], case
 
 
 def adjust(
