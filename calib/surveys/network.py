@@ -123,9 +123,9 @@ class Linear:
     """A network that is linear about unknowns (p,) in a case: all errors are normal.
 
     `left` (n,) is measured less predicted and `jacobian` (n, p) the derivative of what is predicted, both over the
-    standard deviation `std` (n,) of each row. `prior` (p, p) is the precision of the priors, whose slope is `pull` (p,)
-    and value -2 log density `prior_value`. `free` are the indices of the unknowns that are sought, `guessed` those whose
-    prior is no knowledge but the usual size.
+    standard deviation `std` (n,) of each row. `prior` (p, p) is the precision of the priors, whose slope is `pull`
+    (p,) and value -2 log density `prior_value`. `free` are the indices of the unknowns that are sought, `guessed` those
+    whose prior is no knowledge but the usual size.
     """
 
     left: Floats
@@ -318,13 +318,6 @@ class Network:
         if self.curve is not None:
             found[: len(rows), self.layout.where["curve"]] = self.curve.design
         return found
-
-    @cached_property
-    def curve_root(self) -> Floats:
-        """What independent unknowns of unit variance do to means (n, m) as a curve of 1 m; zero without a curve."""
-        if self.curve is None:
-            return np.zeros((len(self.means.range_m), 1))
-        return np.asarray(self.curve.design @ np.linalg.cholesky(np.linalg.inv(self.curve.precision)))
 
     def linear(self, x: Floats, marks: Bools | float = 0.0) -> tuple[Floats, Floats]:
         """Return what is left of each row (n,), and derivatives (n, p): means, known distances.

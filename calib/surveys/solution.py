@@ -15,6 +15,7 @@ from functools import cached_property
 from operator import attrgetter, itemgetter
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from calib.estimator.optimize import maximize
 from calib.surveys.network import Case, Lengths, Linear, Network
@@ -99,9 +100,16 @@ def optimize(network: Network, x: Floats, case: Case) -> tuple[Floats, bool]:
     return found.x, found.success
 
 
+def of_spreads(network: Network, x: Floats, case: Case) -> float:
+    """Return -2 log likelihood near an optimum, integrated over the unknowns, with the prior density of the spreads."""
+    pairs = PAIR_PRIOR_FREEDOM * (2 * math.log(case.pair_m) + (PAIR_STD_M / case.pair_m) ** 2)
+    curve = (math.log(case.curve_m / CURVE_STD_M) / math.log(CURVE_FACTOR)) ** 2
+    return network.at(x, case).unlikely() + pairs + curve
+
+
 def unlikelihood(network: Network, x: Floats, case: Case) -> float:
-    """Return -2 log likelihood at an optimum, integrated over the unknowns."""
-    value = network.at(x, case).unlikely() + unlikely(int(case.marks.sum()), len(case.marks))
+    """Return the same with how unlikely the reflections and the order of the boards are."""
+    value = of_spreads(network, x, case) + unlikely(int(case.marks.sum()), len(case.marks))
     if case.marks.any():
         value += float(Marks.at(network, x, case).penalties()[case.marks].sum())
     return value + WRONG_ORDER_PENALTY * len(out_of_order(network, x))
@@ -148,38 +156,25 @@ def adjust(
         network=network,
         x=x,
         case=case,
-        unlikely=unlikelihood(network, x, case) + _unlikely_spreads(case),
+        unlikely=unlikelihood(network, x, case),
         settled=settled,
         chance=case.marks.astype(float),
         more=np.zeros((len(x),) * 2),
     )
 
 
-def _unlikely_spreads(case: Case) -> float:
-    """Return -2 log of the prior density of the spreads."""
-    pairs = PAIR_PRIOR_FREEDOM * (2 * math.log(case.pair_m) + (PAIR_STD_M / case.pair_m) ** 2)
-    return pairs + (math.log(case.curve_m / CURVE_STD_M) / math.log(CURVE_FACTOR)) ** 2
-
-
-def _spreads(network: Network, x: Floats, case: Case, steps: int = 20) -> Case:
-    """Return a case with the likeliest spreads of pairs and curve, by Fisher's scoring of their logarithms.
-
-    With the inverse covariance P of rows y, of which each spread adds R R', -2 log likelihood has the slopes
-    2 tr(R' P R) - 2 |R' P y|^2 and the expected curvatures 4 |R_i' P R_j|^2 (Patterson and Thompson).
-    """
-    free, width = [network.pair_m is None, True], math.log(CURVE_FACTOR) ** 2
-    for _ in range(steps):
-        marks, ratio = Marks.at(network, x, case), (PAIR_STD_M / case.pair_m) ** 2
-        roots = [case.pair_m * np.eye(len(case.marks)), case.curve_m * network.curve_root]
-        slope = [2 * np.sum(root * (marks.inverse @ root)) - 2 * np.sum((root.T @ marks.pull) ** 2) for root in roots]
-        slope[0] += 2 * PAIR_PRIOR_FREEDOM * (1 - ratio)
-        slope[1] += 2 * math.log(case.curve_m / CURVE_STD_M) / width
-        bend = 4 * np.array([[np.sum((one.T @ marks.inverse @ other) ** 2) for other in roots] for one in roots])
-        bend += np.diag([4 * PAIR_PRIOR_FREEDOM * max(ratio, 1.0), 2 / width])
-        step = np.clip(-np.linalg.solve(bend, slope * np.array(free)), -1.0, 1.0) * free
-        case = case.scaled(*step.tolist())
-        if np.abs(step).max() < 0.01:
-            break
+def _spreads(network: Network, x: Floats, case: Case) -> Case:
+    """Return a case with the likeliest spread of pairs, and then of the curve."""
+    for pair, curve in ((network.pair_m is None, False), (False, network.curve is not None)):
+        if pair or curve:
+            found = minimize_scalar(
+                lambda step, pair=pair, curve=curve, case=case: of_spreads(
+                    network, x, case.scaled(pair * step, curve * step)
+                ),
+                bounds=(-1.0, 1.0),
+                options={"xatol": 0.01},
+            )
+            case = case.scaled(pair * found.x, curve * found.x)
     return case
 
 
@@ -196,7 +191,7 @@ def averaged(found: Solution) -> Solution:
         # Steps of logarithms of about half of what a survey knows of either.
         steps = [(0.3 * i, 0.4 * k) for i in range(-2, 3) for k in range(-4, 5) if network.pair_m is None or not i]
         cases = [case.scaled(*step) for step in steps]
-        worse = np.array([network.at(x, one).unlikely() + _unlikely_spreads(one) for one in cases])
+        worse = np.array([of_spreads(network, x, one) for one in cases])
         likely = np.exp(-0.5 * (worse - worse.min()))
         step, wider = _mixed(found, cases, likely / likely.sum())
         mean, more = mean + step, more + wider
