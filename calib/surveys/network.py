@@ -192,7 +192,7 @@ class Network:
 
     `pair_m` is the constant error of pairs, None to estimate it. The unknowns are three coordinates of each point
     (a tag in an arrangement), delays in ns, and coefficients of the curve over power. Coordinates beyond an
-    arrangement's dimensions are zero, as are those of the indices `held`, which fix the frame of an arrangement.
+    arrangement's dimensions are zero; the unknowns `held` (indices) stay as they are, as those that fix a frame.
     """
 
     means: PairMeans
@@ -253,7 +253,6 @@ class Network:
         """The unknowns and their priors, with a curve of 1 m."""
         boards, axis = [self.arrangements[k] for k in self.owner.tolist()], np.arange(3)
         known = axis >= np.array([[one.dimensions] for one in boards])
-        known.ravel()[list(self.held)] = True
         beside = axis == np.array([[one.dimensions - 1 if one.freed else -1] for one in boards])
         std, centre = np.where(beside, BESIDE_STD_M, PLACE_STD_M), np.zeros((len(boards), 3))
         for point, (place, _) in self.known_places.items():
@@ -265,16 +264,19 @@ class Network:
         blocks = [("place", centre.ravel(), np.diag(std.ravel() ** -2)), ("delay", delays, np.diag(certain**-2))]
         if self.curve is not None:
             blocks.append(("curve", np.zeros(len(self.curve.precision)), self.curve.precision))
+        every = np.append(known, np.zeros(sum(len(start) for _, start, _ in blocks[1:]), dtype=bool))
+        every[list(self.held)] = True
+        parts = np.split(every, np.cumsum([len(start) for _, start, _ in blocks])[:-1])
         return Layout(
             tuple(
                 Unknown(
                     kind=kind,
                     names=("",) * len(start),
                     start=start,
-                    known=known.ravel() if kind == "place" else None,
+                    known=own,
                     priors=(Prior(weight=1.0, structure=structure, centre=start, rows=len(start)),),
                 )
-                for kind, start, structure in blocks
+                for (kind, start, structure), own in zip(blocks, parts, strict=True)
             )
         )
 
@@ -359,18 +361,9 @@ class Network:
             guessed=self.guessed,
         )
 
-    def alone(self, arrangement: int, x: Floats) -> tuple[Network, Floats]:
-        """Return one arrangement as a network whose delays and curve are known, and its unknowns."""
-        rows = self.means.arrangement == arrangement
-        means = self.means[rows]
-        if self.curve is not None:
-            bias = self.curve.design[rows] @ x[self.layout.where["curve"]]
-            means = replace(means, range_m=means.range_m - bias)
-        found = replace(
-            self,
-            means=replace(means, arrangement=np.zeros_like(means.arrangement)),
-            arrangements=(self.arrangements[arrangement],),
-            fixed_ns=dict(zip(self.tags, x[self.layout.where["delay"]].tolist(), strict=True)),
-            curve=None,
-        )
-        return found, found.with_positions(found.layout.start(), self.positions_m(x)[self.seats(arrangement)])
+    def alone(self, arrangement: int) -> Network:
+        """Return the network of the means of one arrangement, in which only its places are sought."""
+        rows, unknowns = self.means.arrangement == arrangement, np.arange(self.layout.size)
+        curve = None if self.curve is None else replace(self.curve, design=self.curve.design[rows])
+        own = np.isin(unknowns // 3, self.seats(arrangement)) & np.isin(unknowns, self.layout.free())
+        return replace(self, means=self.means[rows], curve=curve, held=tuple(unknowns[~own].tolist()))

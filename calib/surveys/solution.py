@@ -22,7 +22,7 @@ from calib.surveys.network import Case, Lengths, Linear, Network
 from calib.surveys.reflections import Marks, unlikely
 from calib.surveys.result import SecondBest
 from calib.surveys.starts import first_start, is_in_order, other_starts
-from uwblink.arrays import Bools, Floats
+from uwblink.arrays import Bools, Floats, Ints
 
 PAIR_STD_M, PAIR_PRIOR_FREEDOM = 0.02, 3.0
 """Prior standard deviation of the constant error of a pair, and the degrees of freedom that it counts as."""
@@ -237,28 +237,27 @@ def _other_solutions(
 ) -> Iterator[tuple[float, Floats, Case, tuple[str, tuple[int, ...]]]]:
     """Yield other solutions that differ in one arrangement: how likely, unknowns, errors, and who is elsewhere."""
     network, boards, seats = found.network, found.network.arrangements[arrangement], found.network.seats(arrangement)
-    alone, start = network.alone(arrangement, found.x)
-    mine = network.means.arrangement == arrangement
+    alone, mine = network.alone(arrangement), network.means.arrangement == arrangement
     case = replace(found.case, marks=found.case.marks[mine])
-    most, seen = unlikelihood(alone, start, case) + MAX_WORSE_ALONE, [_signature(alone, start)]
-    for points in other_starts(alone.positions_m(start), boards, seed=arrangement):
-        x, own = settle(alone, alone.with_positions(start, points), replace(case, marks=np.zeros_like(case.marks)))
-        mark = _signature(alone, x)
+    most, seen = unlikelihood(alone, found.x, case) + MAX_WORSE_ALONE, [_signature(network, found.x, seats)]
+    for points in other_starts(network.positions_m(found.x)[seats], boards, seed=arrangement):
+        start = network.with_positions(found.x, points, seats)
+        x, own = settle(alone, start, replace(case, marks=np.zeros_like(case.marks)))
+        mark = _signature(network, x, seats)
         if unlikelihood(alone, x, own) > most or any(np.abs(mark - one).max() < MIN_DIFFERENCE_M for one in seen):
             continue
         seen.append(mark)
         marks = found.case.marks.copy()
         marks[mine] = own.marks
-        moved = network.with_positions(found.x, alone.positions_m(x), seats)
-        x, whole = settle(network, moved, replace(found.case, marks=marks))
-        change = np.abs(_signature(*network.alone(arrangement, x)) - seen[0]).max(axis=1)
+        x, whole = settle(network, x, replace(found.case, marks=marks))
+        change = np.abs(_signature(network, x, seats) - seen[0]).max(axis=1)
         if change.max() >= MIN_DIFFERENCE_M:
             tags = np.array(boards.tags)[change > max(MIN_DIFFERENCE_M, 0.5 * change.max())]
             yield unlikelihood(network, x, whole), x, whole, (boards.name, tuple(tags.tolist()))
 
 
-def _signature(alone: Network, x: Floats) -> Floats:
+def _signature(network: Network, x: Floats, seats: Ints) -> Floats:
     """Return what tells solutions of an arrangement apart (points, k): distances, and places where a frame is known."""
-    place = alone.positions_m(x)
+    place = network.positions_m(x)[seats]
     apart = np.linalg.norm(place[:, None] - place, axis=2)
-    return np.hstack([apart, place]) if alone.known_places else apart
+    return np.hstack([apart, place]) if network.known_places.keys() & set(seats.tolist()) else apart
