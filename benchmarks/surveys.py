@@ -11,7 +11,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -24,7 +24,8 @@ import numpy as np
 import calib
 from benchmarks.standing import DIMENSIONS, Standing, power_dbm, standing_boards
 from calib.planning import SurveyPlanSettings
-from calib.planning.predicted import Layout, predict
+from calib.planning.predicted import predict
+from calib.planning.result import PlannedArrangement
 from uwblink.arrays import Floats
 
 PAGE = Path(__file__).parents[1] / "docs" / "accuracy.md"
@@ -107,6 +108,13 @@ def orders_of(world: Standing, wrong: int | None) -> tuple[dict[str, tuple[int, 
     return {name: tuple(order) for name, order in orders.items()}, text
 
 
+def planned(places: Iterable[Floats]) -> list[PlannedArrangement]:
+    """Return arrangements of tags 1, 2 ... at given places (tags, 3) each."""
+    return [
+        PlannedArrangement("", {k + 1: (x, y, z) for k, (x, y, z) in enumerate(one.tolist())}, ()) for one in places
+    ]
+
+
 def promised(world: Standing, dimensions: int, curve_m: float, reflected: float) -> Floats:
     """Return how well delays (tags,) can be known, ns, by Fisher's information of the very arrangements.
 
@@ -116,7 +124,7 @@ def promised(world: Standing, dimensions: int, curve_m: float, reflected: float)
     if not curve_m:
         shape = {1: "line", 2: "plane", 3: "space"}[dimensions]
         inputs = SurveyPlanSettings(tags=tuple(world.delays_ns), on=shape, pair_error_m=PAIR_M, reflected=reflected)
-        return predict(inputs, [Layout(place, dimensions) for place in world.places])[-1].each
+        return predict(inputs, planned(world.places))[-1].each
     boards = len(world.places[0])
     pairs = np.array(list(combinations(range(boards), 2)))
     lines, powers = [], []

@@ -19,7 +19,6 @@ from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, RangeRows
 from calib.estimator.rows import sum_rows
 from calib.estimator.unknowns import Layout, Priors
-from calib.information import Verdict
 from calib.range_errors.densities import error_slopes
 from calib.settings import FitSettings, FlightSettings
 from calib.trajectories.fitting import range_model
@@ -42,6 +41,7 @@ ENDS = 4
 """Control points at either end of a path that planned positions do not determine well."""
 
 MIN_JERK_M_S3 = 0.2
+"""Jerk of a body that hardly moves: no real flight is smoother."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,28 +66,18 @@ class Errors:
         """Return the information of a range on its distance, 1/m^2: the mean squared slope of the log likelihood."""
         longest = 12 * self.detour_m if self.reflected else 0.0
         error = np.linspace(-8 * self.noise_m, 8 * self.noise_m + longest, 4001)
-        share = max(self.reflected, 1e-9)
-        logarithms = {
-            "noise": np.log(self.noise_m),
-            "odds": np.log(share / (1 - share)),
-            "detour": np.log(self.detour_m),
-            "least": np.log(1e-3),
-            "outliers": -30.0,
-            "long": -30.0,
+        share, none = max(self.reflected, 1e-9), np.exp(-30.0)
+        sizes = {
+            "noise": self.noise_m,
+            "odds": share / (1 - share),
+            "detour": self.detour_m,
+            "least": 1e-3,
+            "outliers": none,
+            "long": none,
         }
-        parameters = {name: np.array([value]) for name, value in logarithms.items()}
-        found = error_slopes(error, parameters, span_m=1.0)
+        found = error_slopes(error, {name: np.log([value]) for name, value in sizes.items()}, span_m=1.0)
         weight = np.exp(found.log_density)
         return float(weight @ found.by[RESIDUAL] ** 2 / weight.sum())
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Predicted:
-    """The prediction: covariance (tags, tags) of the delays in ns^2, and the verdict on them."""
-
-    tags: tuple[int, ...]
-    covariance_ns2: Floats
-    verdict: Verdict
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,23 +105,6 @@ class Flight:
         bodies = {tag: body for tag, (body, _) in self.scene.arms.items()}
         tapes = tapes_of(stated, (), bodies, self.scene.still, 0, float(self.scene.time_s[-1]))
         return replace(self, scene=replace(self.scene, tapes=tapes))
-
-    def pairs_to_tape(self, still_s: float) -> list[tuple[int, int]]:
-        """Return the pairs of tags whose taped distance adds information: of bodies that stand at unknown positions."""
-        stand = set(self.scene.sought) | (set(self.scene.moving) if still_s else set())
-        body = {tag: one for tag, (one, _) in self.scene.arms.items() if one in stand}
-        return [(a, b) for a, b in combinations(sorted(body), 2) if body[a] != body[b]]
-
-    def predicted(self) -> Predicted:
-        """Return the prediction for a fit of the flight."""
-        return Information(self).predicted()
-
-    def best_tape(self, still_s: float, sigma_m: float) -> tuple[int, int] | None:
-        """Return the pair of tags whose taped distance reduces the variance of delays most; None if none does."""
-        pairs = [pair for pair in self.pairs_to_tape(still_s) if pair not in self.tapes]
-        if not pairs:
-            return None
-        return Information(self).best_tape(pairs, still_s, sigma_m)
 
 
 def flight_of(
@@ -169,12 +142,15 @@ def flight_of(
 
 
 class Information:
-    """The information on a flight's unknowns at its planned trajectories."""
+    """The information on a flight's unknowns at its planned trajectories.
+
+    `covariance_ns2` (tags, tags) is that of the delays of `tags`, `verdict` says which of them are determined.
+    """
 
     def __init__(self, flight: Flight) -> None:
         """Sum the information of all rows at the planned trajectories."""
         scene, model = flight.scene, flight.model
-        self.flight, self.motion = flight, Motion.of(scene)
+        self.flight, self.motion, self.tags = flight, Motion.of(scene), tuple(model.tags)
         stand = np.array([flight.stands[body] for body in scene.sought]).reshape(-1, 3)
         start = flight.path.state(scene, stand)
         self.jerk_m_s3 = _jerk(start["path"], self.motion.places.step_s)
@@ -182,9 +158,8 @@ class Information:
         fixed = [replace(one, priors=tuple(replace(prior, bounds=None) for prior in one.priors)) for one in motion]
         self.layout = Layout((*model.unknowns, *fixed))
         self.x = self.layout.start()
-        knots = np.zeros(0) if model.curve is None else model.curve.knots
-        for kind in model.curve_kinds():
-            centres = np.convolve(knots[1:-1], np.full(3, 1 / 3), mode="valid")
+        for kind in model.curve_kinds() if model.curve is not None else ():
+            centres = np.convolve(model.curve.knots[1:-1], np.full(3, 1 / 3), mode="valid")
             self.x[self.layout.where[kind]] = CURVE_M * np.sin(CURVE_BENDS * centres)
         geometry = Distances.of(self.motion, self.layout, (model.ranges.initiator, model.ranges.target), scene.time_s)
         raw = np.zeros(len(scene.time_s))
@@ -196,27 +171,33 @@ class Information:
             known = of_ranges + beside + priors.precision()
             self.covariance = inverse_of(known, self.layout.free())
             priors.update(self.x, self.covariance)
-        self.without_motion = of_ranges + priors.precision()
+        with_truth = with_known_distances(of_ranges + priors.precision(), self.layout, self.delays)
+        factor = GEOMETRY_ALONE_FACTOR if scene.by_geometry_alone else 1.0
+        self.covariance_ns2 = self.covariance[:, self.delays][self.delays] * factor**2
+        self.verdict = verdict_on(self.covariance_ns2, with_truth, self.tags)
 
-    def predicted(self) -> Predicted:
-        """Return the prediction."""
-        tags = tuple(self.flight.model.tags)
-        with_truth = with_known_distances(self.without_motion, self.layout, self.delays)
-        factor = GEOMETRY_ALONE_FACTOR if self.flight.scene.by_geometry_alone else 1.0
-        covariance = self.covariance[:, self.delays][self.delays] * factor**2
-        return Predicted(tags=tags, covariance_ns2=covariance, verdict=verdict_on(covariance, with_truth, tags))
+    def best_tape(self, still_s: float, sigma_m: float) -> tuple[int, int] | None:
+        """Return the pair of tags whose taped distance reduces the variance of the delays most; None if none does.
 
-    def best_tape(self, pairs: Sequence[tuple[int, int]], still_s: float, sigma_m: float) -> tuple[int, int]:
-        """Return the pair of tags whose taped distance reduces the variance of the delays most."""
+        Only distances between bodies that stand at unknown positions add information.
+        """
+        scene = self.flight.scene
+        stand = set(scene.sought) | (set(scene.moving) if still_s else set())
+        body = {tag: one for tag, (one, _) in scene.arms.items() if one in stand}
+        pairs = [(a, b) for a, b in combinations(sorted(body), 2) if body[a] != body[b]]
+        pairs = [pair for pair in pairs if pair not in self.flight.tapes]
+        if not pairs:
+            return None
         rows = np.zeros((len(pairs), self.layout.size))
         for row, pair in zip(rows, pairs, strict=True):
             tapes = self.flight.taped([pair], still_s, sigma_m).scene.tapes
-            time_s = np.nan_to_num(tapes.time_s, nan=self.flight.scene.time_s[0])
+            time_s = np.nan_to_num(tapes.time_s, nan=scene.time_s[0])
             geometry = Distances.of(self.motion, self.layout, (tapes.first, tapes.second), time_s)
             moved = geometry.distances(self.x)[1]
             np.add.at(row, geometry.columns, moved / len(moved))
         reach = self.covariance @ rows.T
         gain = np.sum(reach[self.delays] ** 2, axis=0) / (np.einsum("kp,pk->k", rows, reach) + sigma_m**2)
+        # Rounded, so that of equal pairs every machine takes the first.
         return pairs[int(np.argmax(np.round(gain, 9)))]
 
 

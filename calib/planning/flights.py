@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from calib.data.sources import Data
 from calib.errors import BadInputError
-from calib.planning.flight_information import Errors, Flight, Predicted, flight_of
+from calib.planning.flight_information import Errors, Flight, Information, flight_of
 from calib.planning.reference_motion import reference_motion
 from calib.planning.result import FlightPlan, NextBest, mean_std_ns
 from calib.planning.settings import FlightPlanSettings
@@ -22,10 +22,10 @@ from calib.spread import TWO_SIDED_95
 from calib.trajectories.attitudes import WINDOW_S
 from uwblink.arrays import Floats
 
-MORE_KNOWN_S = 10.0
-MORE_ANCHORS = 4
-STANDS_S = 5.0
-HEADING_DEG = 0.5
+MORE_KNOWN_S, MORE_ANCHORS, STANDS_S, HEADING_DEG = 10.0, 4, 5.0, 0.5
+"""Further measurements that are proposed: so many seconds of known positions, anchors, seconds at a stand, and degrees
+of error of headings. Each is what a team can do without other equipment."""
+
 DELAY_STD_NS = 0.05
 """Standard error of the delay of one tag from another calibration or a survey."""
 
@@ -58,11 +58,10 @@ def plan_flight(robots: Robots | Data, settings: FlightPlanSettings | None = Non
     data = None if isinstance(robots, int | Sequence) and not isinstance(robots, str) else robots
     asked = replace(settings or FlightPlanSettings(), robots=robots if data is None else None, **changes)
     with threadpool_limits(limits=1, user_api="blas"):
-        flight = _flight(asked, data)
-        found = flight.predicted()
-        next_best = sorted(_more(asked, data, flight, found), key=lambda one: one.mean_ns)
-    std, count = found.verdict.std, len(found.tags)
-    which = np.isfinite(std) if np.isfinite(std).any() else np.ones(count, dtype=bool)
+        found = _information(asked, data)
+        next_best = sorted(_more(asked, data, found), key=lambda one: one.mean_ns)
+    flight, std = found.flight, found.verdict.std
+    which = np.isfinite(std) | ~np.isfinite(std).any()
     covariance = found.covariance_ns2[np.ix_(which, which)]
     common = covariance.mean()
     every = TWO_SIDED_95 * np.sqrt(np.diag(found.covariance_ns2))
@@ -85,8 +84,8 @@ def plan_flight(robots: Robots | Data, settings: FlightPlanSettings | None = Non
     )
 
 
-def _flight(asked: FlightPlanSettings, data: Data | None) -> Flight:
-    """Return the flight of a recording, or of robots that fly about a room, with as many tapes as are asked for."""
+def _information(asked: FlightPlanSettings, data: Data | None) -> Information:
+    """Return that of a recorded flight, or of robots that fly about a room, with as many tapes as are asked for."""
     force = None
     if asked.imu is not None:
         force = TRUSTED * math.hypot(ACCELEROMETERS[asked.imu] / math.sqrt(WINDOW_S), VIBRATION_M_S2)
@@ -102,16 +101,17 @@ def _flight(asked: FlightPlanSettings, data: Data | None) -> Flight:
         curve=not asked.delays_only,
         force_std_m_s2=force,
     )
+    found = Information(flight)
     for count in range(asked.taped):
-        best = flight.best_tape(asked.still_s, asked.tape_sigma_m)
+        best = found.best_tape(asked.still_s, asked.tape_sigma_m)
         if best is None:
             raise BadInputError(
                 f"only {count} can be measured: of robots while they stand (`still_s`), and of anchors whose places "
                 "are sought",
                 parameter="taped",
             )
-        flight = flight.taped([*flight.tapes, best], asked.still_s, asked.tape_sigma_m)
-    return flight
+        found = Information(flight.taped([*found.flight.tapes, best], asked.still_s, asked.tape_sigma_m))
+    return found
 
 
 def _mean_ns(covariance: Floats) -> float:
@@ -119,19 +119,17 @@ def _mean_ns(covariance: Floats) -> float:
     return TWO_SIDED_95 * mean_std_ns(np.asarray(np.linalg.pinv(covariance, hermitian=True), np.float64))
 
 
-def _more(asked: FlightPlanSettings, data: Data | None, flight: Flight, found: Predicted) -> Iterator[NextBest]:
+def _more(asked: FlightPlanSettings, data: Data | None, found: Information) -> Iterator[NextBest]:
     """Yield the gain of single further measurements, for the same tags."""
     now = _mean_ns(found.covariance_ns2)
-    for what, changes in _changes(asked, flight):
+    for what, changes in _changes(asked, found.flight):
         # Invalid changes are not proposed.
         with suppress(BadInputError):
-            changed = _flight(replace(asked, **changes), data)
-            with_it = changed.predicted()
-            same = [with_it.tags.index(tag) for tag in found.tags]
-            mean = _mean_ns(with_it.covariance_ns2[np.ix_(same, same)])
+            changed = _information(replace(asked, **changes), data)
+            same = [changed.tags.index(tag) for tag in found.tags]
+            mean = _mean_ns(changed.covariance_ns2[np.ix_(same, same)])
             if mean < now:
-                pair = changed.tapes[-1] if changed.tapes else ()
-                yield NextBest(what.format(*pair), mean, now)
+                yield NextBest(what.format(*changed.flight.tapes[-1:]), mean, now)
     c = found.covariance_ns2
     means = [_mean_ns(c - np.outer(c[k], c[k]) / (c[k, k] + DELAY_STD_NS**2)) for k in range(len(c))]
     best = int(np.argmin(np.round(means, 6)))
@@ -141,7 +139,7 @@ def _more(asked: FlightPlanSettings, data: Data | None, flight: Flight, found: P
 def _changes(asked: FlightPlanSettings, flight: Flight) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield further measurements in words, with the changes of the settings that they are.
 
-    The words have places for the two tags of the last taped distance.
+    The words have places for both tags of the last taped distance.
     """
     longer, poses = (asked.poses_until_s or 0.0) + MORE_KNOWN_S, asked.attitudes == "poses"
     free, given = asked.robots is not None, {"anchor_places": "given"}
@@ -158,7 +156,7 @@ def _changes(asked: FlightPlanSettings, flight: Flight) -> Iterator[tuple[str, d
             f"positions known for the first {longer:g} s",
             {"poses_until_s": longer},
         ),
-        (True, "the distance of tags {} and {} by tape", tape),
+        (True, "the distance of tags {0[0]} and {0[1]} by tape", tape),
         (bool(flight.scene.sought), "the places of the anchors, measured", given),
         (
             poses and asked.heading_std_deg > HEADING_DEG,

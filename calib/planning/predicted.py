@@ -1,8 +1,8 @@
-"""What arrangements of boards would say of their delays: Fisher's information of a survey's own rows, without data.
+"""Prediction for arrangements of boards: Fisher's information of a survey's own rows, without data.
 
-Places are unknown. With reflections, which pairs are reflected is drawn, and what is promised is the root mean square
-over the draws: a reflected pair says nearly nothing of the delays. A curve over power is what a survey takes it for, a
-smooth function of the power, which falls with distance as in free space, of 5 cm.
+Places are unknown. With reflections, which pairs are reflected is drawn, and the prediction is the root mean square
+over the draws: a reflected pair has nearly no information on the delays. A curve over power is what a survey takes it
+for, a smooth function of the power, which falls with distance as in free space, of 5 cm.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from itertools import combinations
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM
-from calib.information import Verdict, reduced
+from calib.information import reduced
+from calib.planning.result import PlannedArrangement
 from calib.planning.settings import SurveyPlanSettings
 from calib.surveys.knowledge import KnownPosition
 from calib.surveys.network import Boards, Case, CurvePrior, Network
@@ -25,7 +26,7 @@ from uwblink.arrays import Bools, Floats
 from uwblink.recording.schema import KnownDistance
 
 SIZES_M = {"line": (5.0, 0.0, 0.0), "plane": (3.0, 2.0, 0.0), "space": (6.0, 5.0, 2.5)}
-"""Where boards may stand if nobody says: a string across a room, a large table, a room."""
+"""Where boards may stand by default: a string across a room, a large table, a room."""
 
 NEAREST_M = 0.4
 """Boards stand no nearer to each other; nearer, powers saturate and fields are not yet waves."""
@@ -40,87 +41,75 @@ DRAWS = 100
 """Draws of which pairs are reflected: a root mean square over them is good to a few per cent."""
 
 
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Places (boards, 3) of an arrangement in metres, and the pairs of boards (by number) whose distance is taped."""
-
-    place_m: Floats
-    dimensions: int
-    taped: tuple[tuple[int, int], ...] = ()
-
-    def powers_dbm(self) -> Floats:
-        """Return the received powers of all pairs, which fall with distance as in free space."""
-        length = [float(np.linalg.norm(one - other)) for one, other in combinations(self.place_m, 2)]
-        return np.asarray(POWER_AT_1_M_DBM - 20 * np.log10(length))
-
-
-def random_layouts(inputs: SurveyPlanSettings, count: int, tries: int = 400) -> list[Layout]:
+def random_arrangements(inputs: SurveyPlanSettings, count: int, tries: int = 400) -> list[PlannedArrangement]:
     """Return random arrangements: orders on a line at even steps, random places on a table or in a room.
 
     Fewer than `count` where a line has fewer orders, or a room too little space. Anchors stay where the first one has
     them: the corners of a room are as good a guess as any.
     """
-    rng, boards, dimensions = np.random.default_rng(inputs.seed), len(inputs.tags), inputs.dimensions
+    rng, tags, dimensions = np.random.default_rng(inputs.seed), inputs.tags, inputs.dimensions
     size = np.array(SIZES_M[inputs.on] if inputs.size_m is None else inputs.size_m, dtype=float)[:dimensions]
     if inputs.on == "line" and inputs.size_m is None:
-        size = np.maximum(size, 0.8 * (boards - 1))
-    anchors = [inputs.tags.index(tag) for tag in inputs.anchors]
-    found: dict[tuple[int, ...] | int, Layout] = {}
+        size = np.maximum(size, 0.8 * (len(tags) - 1))
+    found: dict[tuple[int, ...] | int, PlannedArrangement] = {}
     for number in range(tries):
         if len(found) == count:
             break
+        key, place = number, np.zeros((len(tags), 3))
         if inputs.on == "line":
-            order = tuple(rng.permutation(boards).tolist())
-            found.setdefault(min(order, order[::-1]), on_line(order, float(size[0])))
-            continue
-        place = np.zeros((boards, 3))
-        place[:, :dimensions] = np.round(rng.uniform(0, size, (boards, dimensions)), 1)
-        if min(np.linalg.norm(one - other) for one, other in combinations(place, 2)) >= NEAREST_M:
-            place[anchors] = next(iter(found.values())).place_m[anchors] if found else place[anchors]
-            found[number] = Layout(place, dimensions)
+            order = tuple(rng.permutation(len(tags)).tolist())
+            # A line may be read from either end.
+            key = min(order, order[::-1])
+            place[list(order), 0] = np.round(np.linspace(0, float(size[0]), len(tags)), 1)
+        else:
+            place[:, :dimensions] = np.round(rng.uniform(0, size, (len(tags), dimensions)), 1)
+            if min(np.linalg.norm(one - other) for one, other in combinations(place, 2)) < NEAREST_M:
+                continue
+        spots = {tag: (x, y, z) for tag, (x, y, z) in zip(tags, place.tolist(), strict=True)}
+        first = next(iter(found.values())).place_m if found else spots
+        found.setdefault(key, PlannedArrangement("", spots | {tag: first[tag] for tag in inputs.anchors}, ()))
     return list(found.values())
 
 
-def on_line(order: tuple[int, ...], length_m: float) -> Layout:
-    """Return boards (by number) in an order, at even steps along a line."""
-    place = np.zeros((len(order), 3))
-    place[list(order), 0] = np.round(np.linspace(0, length_m, len(order)), 1)
-    return Layout(place, 1)
-
-
 def delay_information(
-    inputs: SurveyPlanSettings, layout: Layout, curve: CurvePrior | None = None, reflected: Bools | None = None
+    inputs: SurveyPlanSettings,
+    one: PlannedArrangement,
+    curve: CurvePrior | None = None,
+    reflected: Sequence[Bools | float] = (0.0,),
 ) -> Floats:
     """Return the information on delays, 1/ns^2, and on a curve, that an arrangement gives, whatever its places.
 
-    `reflected` (pairs,) tells which pairs are. Boards are numbered.
+    It is (draws, k, k): `reflected` tells for each draw which pairs are reflected.
     """
-    boards = range(len(inputs.tags))
+    # A network has its tags in order, a plan as they are given: boards are numbered.
+    boards, number = tuple(range(len(inputs.tags))), inputs.tags.index
     pairs = np.array(list(combinations(boards, 2)))
-    none, number = np.zeros(len(pairs)), np.zeros(len(pairs), dtype=np.int64)
+    none = np.zeros(len(pairs))
     means = PairMeans(
-        arrangement=number,
+        arrangement=none.astype(int),
         ends=pairs,
         weights=np.full((len(pairs), 2), 0.5),
         range_m=none,
         std_m=none,
         noise_m=none,
-        count=number,
+        count=none,
         lifted=none,
     )
-    anchors = [(inputs.tags.index(tag), inputs.anchor_sigma_m) for tag in inputs.anchors]
     network = Network(
         means=means,
-        arrangements=(Boards("", layout.dimensions, tuple(boards)),),
-        tags=tuple(boards),
-        distances=tuple(KnownDistance(i, j, 1.0, inputs.tape_sigma_m) for i, j in layout.taped),
-        positions=tuple(KnownPosition(k, tuple(layout.place_m[k].tolist()), sigma) for k, sigma in anchors),
+        arrangements=(Boards("", inputs.dimensions, boards),),
+        tags=boards,
+        distances=tuple(KnownDistance(number(i), number(j), 1.0, inputs.tape_sigma_m) for i, j in one.taped),
+        positions=tuple(KnownPosition(number(tag), one.place_m[tag], inputs.anchor_sigma_m) for tag in inputs.anchors),
         fixed_ns={},
         curve=curve,
     )
-    case = Case(none > 0 if reflected is None else reflected, inputs.pair_error_m, CURVE_M)
-    x, free = network.with_positions(network.layout.start(), layout.place_m), network.layout.free()
-    return reduced(network.at(x, case).known[np.ix_(free, free)], free >= layout.place_m.size)
+    x, free = (
+        network.with_positions(network.layout.start(), np.array(list(one.place_m.values()))),
+        network.layout.free(),
+    )
+    cases = [Case(none + marks > 0, inputs.pair_error_m, CURVE_M) for marks in reflected]
+    return np.array([reduced(network.at(x, case).known[np.ix_(free, free)], free >= 3 * len(boards)) for case in cases])
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,38 +121,38 @@ class Prediction:
     common: float
 
 
-def predict(inputs: SurveyPlanSettings, layouts: Sequence[Layout], *, curve: bool = False) -> list[Prediction]:
+def predict(
+    inputs: SurveyPlanSettings, arrangements: Sequence[PlannedArrangement], *, curve: bool = False
+) -> list[Prediction]:
     """Return what is predicted of the first of the arrangements, of the first two, and so on."""
-    powers = np.array([one.powers_dbm() for one in layouts])
+    places = np.array([list(one.place_m.values()) for one in arrangements])
+    first, second = np.array(list(combinations(range(len(inputs.tags)), 2))).T
+    powers = POWER_AT_1_M_DBM - 20 * np.log10(np.linalg.norm(places[:, first] - places[:, second], axis=2))
     prior = CurvePrior.at(10 ** ((powers.ravel() - ALPHA_DBM) / 10)) if curve else None
-    boards, own, parts = len(inputs.tags), None, []
-    for k, layout in enumerate(layouts):
+    own, parts = None, []
+    for k, one in enumerate(arrangements):
         if prior is not None:
-            rows = slice(k * powers.shape[1], (k + 1) * powers.shape[1])
             # The prior counts once, below.
-            own = replace(prior, design=prior.design[rows], precision=np.zeros_like(prior.precision))
-        shape = (DRAWS if inputs.reflected else 1, powers.shape[1])
+            design = prior.design.reshape(*powers.shape, -1)[k]
+            own = replace(prior, design=design, precision=np.zeros_like(prior.precision))
+        shape = (DRAWS if inputs.reflected else 1, len(first))
         drawn = np.random.default_rng([inputs.seed, k]).uniform(size=shape) < inputs.reflected
-        parts.append([delay_information(inputs, layout, own, marks) for marks in drawn])
-    totals = np.cumsum(parts, axis=0)
+        parts.append(delay_information(inputs, one, own, drawn))
+    totals, delays = np.cumsum(parts, axis=0), np.arange(parts[0].shape[-1]) < len(inputs.tags)
     if prior is not None:
-        totals[:, :, boards:, boards:] += prior.precision / CURVE_M**2
-    delays = np.arange(totals.shape[-1]) < boards
-    return [_averaged([verdict_on_delays(reduced(one, delays), inputs.tags) for one in draws]) for draws in totals]
+        totals[..., len(inputs.tags) :, len(inputs.tags) :] += prior.precision / CURVE_M**2
+    return [_averaged(np.array([reduced(one, delays) for one in draws]), inputs.tags) for draws in totals]
 
 
-def _averaged(verdicts: list[Verdict]) -> Prediction:
-    """Return root mean squares over the draws that determine it; infinite where most do not."""
+def _averaged(informations: Floats, tags: Sequence[int]) -> Prediction:
+    """Return root mean squares over the draws (k, tags, tags) that determine it; infinite where most do not."""
+    verdicts = [verdict_on_delays(one, tags) for one in informations]
     covariance = np.array([one.covariance for one in verdicts])
-    centre = np.eye(covariance.shape[1]) - 1 / covariance.shape[1]
+    centre = np.eye(len(tags)) - 1 / len(tags)
     apart = np.diagonal(centre @ covariance @ centre, axis1=1, axis2=2)
     common = covariance.mean(axis=(1, 2))[:, None]
-    each = np.array([one.std for one in verdicts]) ** 2
-    return Prediction(_root_mean(each), _root_mean(apart), float(_root_mean(common)[0]))
-
-
-def _root_mean(variances: Floats) -> Floats:
-    """Return roots of means (n,) over the draws (k, n) that are finite; infinite where most are not."""
+    variances = np.hstack([np.array([one.std for one in verdicts]) ** 2, apart, common])
     good = np.isfinite(variances)
     mean = np.where(good, variances, 0.0).sum(axis=0) / np.maximum(good.sum(axis=0), 1)
-    return np.where(good.mean(axis=0) > 0.5, np.sqrt(mean), math.inf)
+    std = np.where(good.mean(axis=0) > 0.5, np.sqrt(mean), math.inf)
+    return Prediction(std[: len(tags)], std[len(tags) : -1], float(std[-1]))

@@ -16,22 +16,6 @@ from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
 
-POSES_HZ = 20.0
-IMU_HZ = 50.0
-MIDDLES = 0.3
-REACH = 0.12
-"""Shares of the room: how far from its middle bodies fly about, and the size of each of the two sines an axis."""
-
-PERIODS = (0.65, 1.7)
-TURN_RAD = 1.2
-TURNS_S = (11.0, 19.0)
-HANGING_M = 0.05
-POWER_AT_2_M_DBM = -80.0
-FADING_DB = 3.0
-EDGE = 0.05
-SAMPLE_S = 0.02
-"""Sampling interval of motion: cubic splines through the samples are exact to micrometres and 1e-4 m/s^2."""
-
 STARTING_S = 3.0
 """Seconds from standstill to full speed."""
 
@@ -47,12 +31,17 @@ def reference_motion(flown: FlightPlanSettings) -> SampleFlight:
     ]
     tags += [Tag(tag, f"anchor{tag}", (0.0, 0.0, 0.0)) for tag in flown.anchors]
     poses = _poses(flown, bodies)
-    time_ns = np.rint(np.arange(int(flown.seconds * flown.rate_hz)) / flown.rate_hz * 1e9).astype(np.int64)
+    time_ns = _ns(np.arange(int(flown.seconds * flown.rate_hz)) / flown.rate_hz)
     pair = _in_turn(flown, len(time_ns), rng)
     distance = distances_m(poses, tags, pair[:, 0], pair[:, 1], time_ns)
-    power = POWER_AT_2_M_DBM - 20 * np.log10(distance / 2) + rng.normal(0, FADING_DB, (2, len(time_ns)))
+    # As in free space, -80 dBm at 2 m, with 3 dB of fading.
+    power = -80.0 - 20 * np.log10(distance / 2) + rng.normal(0, 3.0, (2, len(time_ns)))
     imu = _readings(bodies, flown.seconds) if flown.inertial else {}
     return SampleFlight(stamped(time_ns, pair, distance, power), poses, tags, {}, imu)
+
+
+def _ns(time_s: Floats) -> Ints:
+    return np.rint(time_s * 1e9).astype(np.int64)
 
 
 def _motion(flown: FlightPlanSettings, number: int, rng: np.random.Generator) -> BSpline:
@@ -62,35 +51,38 @@ def _motion(flown: FlightPlanSettings, number: int, rng: np.random.Generator) ->
     Until it starts it stands; `STARTING_S` later it is as fast as it will be.
     """
     size, angle = np.array(flown.size_m), 2 * np.pi * number / len(flown.robots) + 0.4
-    middle = size * (0.5 + MIDDLES * np.array([np.cos(angle), np.sin(angle), 0.0]))
-    reach = REACH * size
+    # Middles lie on an ellipse of 0.3 of the room; each of the two sines is 0.12 of it.
+    middle = size * (0.5 + 0.3 * np.array([np.cos(angle), np.sin(angle), 0.0]))
+    reach = 0.12 * size
     slow = 2 * np.pi * float(np.linalg.norm(reach)) / flown.speed_m_s
-    rate = 2 * np.pi / (slow * rng.uniform(*PERIODS, (3, 2)))
+    rate = 2 * np.pi / (slow * rng.uniform(0.65, 1.7, (3, 2)))
     phase = rng.uniform(0, 2 * np.pi, (3, 2))
-    turning = 2 * np.pi / rng.uniform(*TURNS_S)
+    # A turn by up to 1.2 rad either way takes 11 to 19 s.
+    turning = 2 * np.pi / rng.uniform(11.0, 19.0)
     heading = float(rng.uniform(-np.pi, np.pi))
-    time = np.arange(-1.5, flown.seconds + 1.5, SAMPLE_S)
-    along = time
+    # Cubic splines through samples every 0.02 s are exact to micrometres and 1e-4 m/s^2.
+    along = time = np.arange(-1.5, flown.seconds + 1.5, 0.02)
     if flown.still_s:
         # The pace rises from 0 to 1 by 3 u^2 - 2 u^3, whose integral this is.
         u = np.clip((time - flown.still_s) / STARTING_S, 0.0, 1.0)
         along = STARTING_S * (u**3 - u**4 / 2) + np.maximum(time - flown.still_s - STARTING_S, 0.0)
     place = middle + reach * np.sin(rate * along[:, None, None] + phase).sum(axis=2)
-    return make_interp_spline(time, np.column_stack([place, heading + TURN_RAD * np.sin(turning * along)]))
+    return make_interp_spline(time, np.column_stack([place, heading + 1.2 * np.sin(turning * along)]))
 
 
 def _arms(count: int, apart_m: float) -> Floats:
+    """Return lever arms of the tags of a body (count, 3): on a circle, 5 cm below the body."""
     angle = 2 * np.pi * np.arange(count) / count + np.pi / 4
-    return np.column_stack([apart_m / 2 * np.cos(angle), apart_m / 2 * np.sin(angle), np.full(count, -HANGING_M)])
+    return np.column_stack([apart_m / 2 * np.cos(angle), apart_m / 2 * np.sin(angle), np.full(count, -0.05)])
 
 
 def _corners(flown: FlightPlanSettings) -> Floats:
-    """Return places of anchors (n, 3) around the room, high and low in turn."""
+    """Return places of anchors (n, 3) around the room, at 5 % and 95 % of its height in turn."""
     number = np.arange(len(flown.anchors))
     angle = 2 * np.pi * number / max(len(number), 1) + np.pi / 4
     around = np.column_stack([np.cos(angle), np.sin(angle)])
     around = 0.5 + 0.5 * around / np.abs(around).max(axis=1, keepdims=True)
-    return np.asarray(flown.size_m * np.column_stack([around, np.where(number % 2, 1 - EDGE, EDGE)]))
+    return np.asarray(flown.size_m * np.column_stack([around, np.where(number % 2, 0.95, 0.05)]))
 
 
 def _in_turn(flown: FlightPlanSettings, count: int, rng: np.random.Generator) -> Ints:
@@ -104,27 +96,26 @@ def _in_turn(flown: FlightPlanSettings, count: int, rng: np.random.Generator) ->
 
 def _poses(flown: FlightPlanSettings, bodies: Mapping[str, BSpline]) -> Poses:
     """Return the poses of all bodies, those of anchors at the first and the last instant."""
-    time = np.arange(-1.0, flown.seconds + 1.0, 1 / POSES_HZ)
-    ends = np.rint(time[[0, -1]] * 1e9).astype(np.int64)
-    rows = [(name, np.rint(time * 1e9).astype(np.int64), motion(time)) for name, motion in bodies.items()]
+    time = np.arange(-1.0, flown.seconds + 1.0, 0.05)
+    rows = [(name, time, motion(time)) for name, motion in bodies.items()]
     rows += [
-        (f"anchor{tag}", ends, np.tile([*place, 0.0], (2, 1)))
+        (f"anchor{tag}", time[[0, -1]], np.tile([*place, 0.0], (2, 1)))
         for tag, place in zip(flown.anchors, _corners(flown), strict=True)
     ]
     names, times, where = zip(*rows, strict=True)
     x, y, z, yaw = np.concatenate(where).T
     upright = np.column_stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)])
-    places = np.column_stack([x, y, z])
-    return Poses.from_arrays(np.concatenate(times), np.repeat(names, [len(one) for one in times]), places, upright)
+    body = np.repeat(names, [len(one) for one in times])
+    return Poses.from_arrays(_ns(np.concatenate(times)), body, np.column_stack([x, y, z]), upright)
 
 
 def _readings(bodies: Mapping[str, BSpline], seconds: float) -> dict[str, Any]:
-    """Return the table of inertial readings, without errors."""
-    time, rows = np.arange(0.0, seconds + 0.5, 1 / IMU_HZ), []
+    """Return the table of inertial readings, 50 a second, without errors."""
+    time, rows = np.arange(0.0, seconds + 0.5, 0.02), []
     for name, motion in bodies.items():
         yaw, rate, (x, y, z, _) = motion(time)[:, 3], motion(time, 1)[:, 3], motion(time, 2).T
         c, s, zero = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)
         turns, forces = (zero, zero, rate), (c * x + s * y, c * y - s * x, z + GRAVITY_M_S2)
-        rows.append((np.rint(time * 1e9).astype(np.int64), np.full(len(time), name), *turns, *forces))
+        rows.append((_ns(time), np.full(len(time), name), *turns, *forces))
     names = ("time_ns", "body", "wx", "wy", "wz", "ax", "ay", "az")
     return {name: np.concatenate(parts) for name, parts in zip(names, zip(*rows, strict=True), strict=True)}

@@ -31,7 +31,7 @@ class PlannedArrangement:
     """One arrangement: its name, where about the boards stand (metres, by tag), and distances to tape, by pairs."""
 
     name: str
-    place_m: Mapping[int, tuple[float, ...]]
+    place_m: Mapping[int, tuple[float, float, float]]
     taped: tuple[tuple[int, int], ...]
 
     def order(self) -> tuple[int, ...]:

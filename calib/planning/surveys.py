@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 from string import ascii_uppercase
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from calib.errors import BadInputError, UnanswerableError
-from calib.planning.predicted import Layout, delay_information, predict, random_layouts
+from calib.planning.predicted import delay_information, predict, random_arrangements
 from calib.planning.result import Halves, NextBest, Plan, PlannedArrangement, mean_std_ns
 from calib.planning.settings import SurveyPlanSettings
 from calib.spread import TWO_SIDED_95
@@ -48,41 +48,42 @@ def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None
     if len(tags) < 2:
         raise BadInputError(f"found {boards!r:.60}, expected 2 to 30 boards, each once", parameter="boards")
     inputs = replace(settings or SurveyPlanSettings(), tags=tags, **changes)
-    candidates = random_layouts(inputs, CANDIDATES)
+    candidates = random_arrangements(inputs, CANDIDATES)
     if not candidates:
         raise UnanswerableError(f"{len(tags)} boards find no room: they must stand 0.4 m from each other")
-    informations = [delay_information(inputs, layout) for layout in candidates]
+    informations = [delay_information(inputs, one)[0] for one in candidates]
     chosen = [candidates[k] for k in _choose(informations, inputs.arrangements)]
+    chosen = [replace(one, name=name) for name, one in zip(ascii_uppercase, chosen, strict=False)]
     for _ in range(inputs.taped):
-        chosen, _ = min(_taped(inputs, chosen), key=_mean_of_second, default=(chosen, None))
-    names = [*ascii_uppercase, ascii_uppercase[-1]]
-    total = np.sum([delay_information(inputs, layout) for layout in chosen], axis=0)
-    wide, predictions = _interval(inputs, chosen), predict(inputs, chosen)
-    curved = predict(inputs, chosen, curve=True)[-1]
-    each, apart = (wide * float(np.sqrt(np.mean(std**2))) for std in (curved.each, curved.apart))
-    now = wide * mean_std_ns(total)
-    k = min(range(len(candidates)), key=lambda k: mean_std_ns(total + informations[k]))
-    where = _named(names[len(chosen)], candidates[k], tags).where(inputs.on)
-    more = [(f"an arrangement {where}", total + informations[k])]
-    for after, information in sorted(_taped(inputs, chosen), key=_mean_of_second)[:1]:
-        number = next(n for n, (old, new) in enumerate(zip(chosen, after, strict=True)) if old is not new)
-        i, j = after[number].taped[-1]
-        more.append((f"the distance of {tags[i]} and {tags[j]} in {names[number]} by tape", information))
-    next_best = [NextBest(what, wide * mean_std_ns(information), now) for what, information in more]
+        best = _best_tape(inputs, chosen)
+        if best is not None:
+            chosen = [best[1] if one.name == best[1].name else one for one in chosen]
+    total = np.sum([delay_information(inputs, one)[0] for one in chosen], axis=0)
+    predictions, curved = predict(inputs, chosen), predict(inputs, chosen, curve=True)[-1]
+    wide = [_interval(inputs, chosen[: k + 1]) for k in range(len(chosen))]
     after_ns = [
-        dict(zip(tags, (_interval(inputs, chosen[: n + 1]) * one.each).tolist(), strict=True))
-        for n, one in enumerate(predictions)
+        dict(zip(tags, (factor * one.each).tolist(), strict=True))
+        for factor, one in zip(wide, predictions, strict=True)
     ]
+    k = min(range(len(candidates)), key=lambda k: mean_std_ns(total + informations[k]))
+    more = [(f"an arrangement {candidates[k].where(inputs.on)}", total + informations[k])]
+    best = _best_tape(inputs, chosen)
+    if best is not None:
+        i, j = best[1].taped[-1]
+        more.append((f"the distance of {i} and {j} in {best[1].name} by tape", best[0]))
+    now, *means = (wide[-1] * mean_std_ns(information) for information in (total, *(one[1] for one in more)))
+    next_best = [NextBest(what, mean, now) for (what, _), mean in zip(more, means, strict=True) if mean < now]
+    each, apart = (wide[-1] * float(np.sqrt(np.mean(std**2))) for std in (curved.each, curved.apart))
     return Plan(
         on="" if inputs.on == "space" else inputs.on,
         tags=tags,
-        arrangements=tuple(_named(name, layout, tags) for name, layout in zip(names, chosen, strict=False)),
+        arrangements=tuple(chosen),
         half_ns=after_ns[-1],
         after_ns=tuple(after_ns),
-        common_ns=wide * predictions[-1].common,
-        with_curve_ns=Halves(each, apart, wide * curved.common),
+        common_ns=wide[-1] * predictions[-1].common,
+        with_curve_ns=Halves(each, apart, wide[-1] * curved.common),
         verdict=verdict_on_delays(total, tags),
-        next_best=tuple(sorted((one for one in next_best if one.mean_ns < now), key=lambda one: one.mean_ns)),
+        next_best=tuple(sorted(next_best, key=lambda one: one.mean_ns)),
         rate_hz=inputs.rate_hz,
         seconds_each=max(30.0, math.ceil(RANGES_A_PAIR * math.comb(len(tags), 2) / inputs.rate_hz / 10) * 10.0),
         pair_error_m=inputs.pair_error_m,
@@ -107,31 +108,25 @@ def _choose(informations: list[Floats], count: int | None) -> list[int]:
     return found
 
 
-def _taped(inputs: SurveyPlanSettings, chosen: list[Layout]) -> Iterator[tuple[list[Layout], Floats]]:
-    """Yield the arrangements with each further distance that may be taped, and what all then say."""
-    each = [delay_information(inputs, layout) for layout in chosen]
-    total = np.sum(each, axis=0)
-    for k, layout in enumerate(chosen):
-        for pair in set(combinations(range(len(inputs.tags)), 2)) - set(layout.taped):
-            taped = replace(layout, taped=(*layout.taped, pair))
-            yield [*chosen[:k], taped, *chosen[k + 1 :]], total - each[k] + delay_information(inputs, taped)
+def _best_tape(
+    inputs: SurveyPlanSettings, chosen: Sequence[PlannedArrangement]
+) -> tuple[Floats, PlannedArrangement] | None:
+    """Return the arrangement with the further taped distance that brings most, and the information of all then."""
+    found = []
+    each = [delay_information(inputs, one)[0] for one in chosen]
+    for one, own in zip(chosen, each, strict=True):
+        for pair in combinations(inputs.tags, 2):
+            if pair not in one.taped:
+                taped = replace(one, taped=(*one.taped, pair))
+                found.append((np.sum(each, axis=0) - own + delay_information(inputs, taped)[0], taped))
+    return min(found, key=lambda one: mean_std_ns(one[0]), default=None)
 
 
-def _mean_of_second(one: tuple[list[Layout], Floats]) -> float:
-    return mean_std_ns(one[1])
-
-
-def _interval(inputs: SurveyPlanSettings, chosen: Sequence[Layout]) -> float:
+def _interval(inputs: SurveyPlanSettings, chosen: Sequence[PlannedArrangement]) -> float:
     """Return the factor of a standard deviation that makes half an interval of 95 %, by the freedoms that are left."""
     boards, dimensions = len(inputs.tags), inputs.dimensions
     motions = 0 if inputs.anchors else math.comb(dimensions + 1, 2)
     rows, unknown = math.comb(boards, 2), boards * dimensions - motions
     known = len(inputs.anchors) * dimensions
-    left = sum(rows + len(layout.taped) + known - min(unknown, rows) for layout in chosen)
+    left = sum(rows + len(one.taped) + known - min(unknown, rows) for one in chosen)
     return TWO_SIDED_95 * students_factor(max(left - boards, 0.0))
-
-
-def _named(name: str, layout: Layout, tags: tuple[int, ...]) -> PlannedArrangement:
-    """Return an arrangement under a name, with boards by their ids."""
-    place = {tag: tuple(p.tolist()) for tag, p in zip(tags, layout.place_m, strict=True)}
-    return PlannedArrangement(name, place, tuple((tags[i], tags[j]) for i, j in layout.taped))

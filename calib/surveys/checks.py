@@ -51,9 +51,9 @@ def _distances(found: Solution) -> Iterator[tuple[str, Solution]]:
         loose = list(network.distances)
         loose[k] = replace(one, sigma_m=math.hypot(one.sigma_m, TAPE_ERROR_M))
         without = adjust(replace(network, distances=tuple(loose)), found.x, start_m=found.case.pair_m)
-        left, rows = without.linear.left[len(network.means.range_m) :], network.tapes[1][:, 2] == k
+        left = network.linear(without.x)[0][len(network.means.range_m) :]
         where = f" in {one.arrangement}" if one.arrangement else ""
-        off = 100 * float(np.mean(left[rows]))
+        off = 100 * float(np.mean(left[network.tapes[1][:, 2] == k]))
         yield (
             f"the known distance of {one.first} and {one.second}{where} is {off:+.0f} cm off what the ranges say",
             without,
@@ -88,13 +88,13 @@ def _shapes(found: Solution) -> Iterator[tuple[str, Solution]]:
 def _exchanged(found: Solution) -> Iterator[tuple[str, Solution]]:
     """Yield the solution with two tags exchanged in what is known, where something known is off or reflected."""
     network, here, count = found.network, found.linear, len(found.network.means.range_m)
-    rows, std = here.jacobian[count:], here.std[count:]
+    rows = here.jacobian[count:]
     # Residuals of what is known vary less than it does by what the fit makes of it.
-    off = list(here.left[count:] / np.sqrt(np.maximum(std**2 - np.diag(rows @ here.covariance @ rows.T), 1e-12)))
+    off = list(here.left[count:] / np.sqrt(np.maximum(1 - np.diag(rows @ here.covariance @ rows.T), 1e-6)))
     for point, (place, sigma) in network.known_places.items():
         own = np.arange(3 * point, 3 * point + 3)
         off += list((found.x[own] - place) / np.sqrt(np.maximum(sigma**2 - here.covariance[own, own], 1e-12)))
-    if not off or not (np.abs(off).max() > MIN_LABEL_SIGMAS or found.case.marks.any()):
+    if not (np.abs(off).max(initial=0.0) > MIN_LABEL_SIGMAS or (off and found.case.marks.any())):
         return
     involved = {tag for one in network.distances for tag in (one.first, one.second)}
     for one, other in combinations(sorted(involved | {place.tag for place in network.positions}), 2):

@@ -11,10 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from calib.surveys.result import SurveyedArrangement
-from uwblink.arrays import Floats
-
-INK, LOOSE = "#0072B2", "#D55E00"
-"""Colours of boards whose place is determined, and of others (Okabe and Ito, told apart by the colour-blind)."""
+from uwblink.pages.colours import BLUE, VERMILION
+from uwblink.pages.figures import sheet
 
 
 def board_figure(arrangements: Sequence[SurveyedArrangement], width_in: float | None = None) -> Figure:
@@ -25,14 +23,10 @@ def board_figure(arrangements: Sequence[SurveyedArrangement], width_in: float | 
     """
     width = 3.0 * min(3, len(arrangements)) if width_in is None else width_in
     across = max(1, min(3, len(arrangements), int(width / 2.2)))
-    down = -(-len(arrangements) // across)
     tall = 1.1 if all(one.known == "line" for one in arrangements) else min(3.0, width / across)
-    figure = Figure(figsize=(width, (tall + 0.4) * down), layout="constrained")
-    panels = figure.subplots(down, across, squeeze=False).ravel()
-    for axes, one in zip(panels, arrangements, strict=False):
+    figure, panels = sheet(width, len(arrangements), height_in=tall + 0.4, across=across)
+    for axes, one in zip(panels, arrangements, strict=True):
         _draw_boards(axes, one)
-    for axes in panels[len(arrangements) :]:
-        axes.set_visible(False)
     return figure
 
 
@@ -40,17 +34,23 @@ def _draw_boards(axes: Axes, one: SurveyedArrangement) -> None:
     """Draw the boards of an arrangement from above, each with its ellipse, into axes."""
     place = np.array([board.position_m for board in one.boards])
     width = float(np.ptp(place[:, :2], axis=0).max()) or 1.0
-    for board, (x, y, z) in zip(one.boards, place.tolist(), strict=True):
-        colour = INK if board.determined else LOOSE
+    for board in one.boards:
+        x, y, z = board.position_m
+        colour = BLUE if board.determined else VERMILION
         axes.plot(x, y, "o", ms=3, color=colour)
         high = f" ({z:+.2f})" if one.known == "" else ""
         axes.annotate(f"{board.tag}{high}", (x, y), xytext=(0, 7), textcoords="offset points", ha="center", fontsize=8)
-        axes.add_patch(_ellipse((x, y), board.covariance_m2[:2, :2], width, colour))
-    margin = 0.12 * width
+        values, vectors = np.linalg.eigh(board.covariance_m2[:2, :2])
+        # 5.991 is the 95 % quantile of chi-square with two degrees of freedom.
+        long, short = 2 * np.sqrt(5.991 * np.maximum(values[::-1], 0.0))
+        factor, style = (10.0, "--") if long < 0.01 * width else (1.0, "-")
+        turn = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
+        axes.add_patch(
+            Ellipse((x, y), factor * long, factor * short, angle=turn, fill=False, ec=colour, lw=1.0, ls=style)
+        )
     if one.known == "line":
-        axes.set_xlim(place[:, 0].min() - margin, place[:, 0].max() + margin)
-        axes.set_ylim(-0.5, 0.8)
-        axes.set_yticks([])
+        axes.set_xlim(place[:, 0].min() - 0.12 * width, place[:, 0].max() + 0.12 * width)
+        axes.set(ylim=(-0.5, 0.8), yticks=[])
     else:
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.15)
@@ -58,12 +58,3 @@ def _draw_boards(axes: Axes, one: SurveyedArrangement) -> None:
     axes.set_xlabel("m", fontsize=8)
     axes.tick_params(labelsize=8)
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def _ellipse(centre: tuple[float, float], covariance: Floats, width: float, colour: str) -> Ellipse:
-    """Return the ellipse of 95 % in a picture so wide: 5.991 is that quantile of chi-square with two freedoms."""
-    values, vectors = np.linalg.eigh(covariance)
-    long, short = 2 * np.sqrt(5.991 * np.maximum(values[::-1], 0.0))
-    factor, style = (10.0, "--") if long < 0.01 * width else (1.0, "-")
-    turn = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
-    return Ellipse(centre, factor * long, factor * short, angle=turn, fill=False, ec=colour, lw=1.0, ls=style)

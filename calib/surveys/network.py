@@ -122,10 +122,10 @@ class Case:
 class Linear:
     """A network that is linear about unknowns (p,) in a case: all errors are normal.
 
-    `left` (n,) is measured less predicted, `jacobian` (n, p) the derivative of what is predicted, `std` (n,) the
-    standard deviation of each row. `prior` (p, p) is the precision of the priors, whose slope is `pull` (p,) and value
-    -2 log density `prior_value`. `free` are the indices of the unknowns that are sought, `guessed` those whose prior is
-    no knowledge but the usual size.
+    `left` (n,) is measured less predicted and `jacobian` (n, p) the derivative of what is predicted, both over the
+    standard deviation `std` (n,) of each row. `prior` (p, p) is the precision of the priors, whose slope is `pull`
+    (p,) and value -2 log density `prior_value`. `free` are the indices of the unknowns that are sought, `guessed` those
+    whose prior is no knowledge but the usual size.
     """
 
     left: Floats
@@ -137,18 +137,17 @@ class Linear:
     free: Ints
     guessed: Ints
 
+    @cached_property
+    def information(self) -> Floats:
+        """The information (p, p) of the rows."""
+        return self.jacobian.T @ self.jacobian
+
     @property
     def known(self) -> Floats:
         """The information (p, p) of the rows and of what is known, without guesses."""
         found = self.information + self.prior
         found[self.guessed, self.guessed] -= self.prior[self.guessed, self.guessed]
         return found
-
-    @cached_property
-    def information(self) -> Floats:
-        """The information (p, p) of the rows."""
-        rows = self.jacobian / self.std[:, None]
-        return rows.T @ rows
 
     @cached_property
     def covariance(self) -> Floats:
@@ -158,7 +157,7 @@ class Linear:
     @cached_property
     def slope(self) -> Floats:
         """The slope (p,) of the log likelihood by the unknowns."""
-        return np.asarray(self.jacobian.T @ (self.left / self.std**2) + self.pull)
+        return np.asarray(self.jacobian.T @ self.left + self.pull)
 
     @cached_property
     def step(self) -> Floats:
@@ -168,7 +167,7 @@ class Linear:
     def unlikely(self) -> float:
         """Return -2 log likelihood of the rows, integrated over the unknowns (Laplace's approximation)."""
         own = np.ix_(self.free, self.free)
-        value = float(np.sum((self.left / self.std) ** 2)) + self.prior_value - float(self.slope @ self.step)
+        value = float(self.left @ self.left) + self.prior_value - float(self.slope @ self.step)
         value += 2 * float(np.log(self.std).sum()) + float(np.linalg.slogdet((self.information + self.prior)[own])[1])
         return value - float(np.linalg.slogdet(self.prior[own])[1])
 
@@ -193,7 +192,7 @@ class Network:
 
     `pair_m` is the constant error of pairs, None to estimate it. The unknowns are three coordinates of each point
     (a tag in an arrangement), delays in ns, and coefficients of the curve over power. Coordinates beyond an
-    arrangement's dimensions are zero, as are those of the indices `held`, which fix the frame of an arrangement.
+    arrangement's dimensions are zero; the unknowns `held` (indices) stay as they are, as those that fix a frame.
     """
 
     means: PairMeans
@@ -254,7 +253,6 @@ class Network:
         """The unknowns and their priors, with a curve of 1 m."""
         boards, axis = [self.arrangements[k] for k in self.owner.tolist()], np.arange(3)
         known = axis >= np.array([[one.dimensions] for one in boards])
-        known.ravel()[list(self.held)] = True
         beside = axis == np.array([[one.dimensions - 1 if one.freed else -1] for one in boards])
         std, centre = np.where(beside, BESIDE_STD_M, PLACE_STD_M), np.zeros((len(boards), 3))
         for point, (place, _) in self.known_places.items():
@@ -266,16 +264,19 @@ class Network:
         blocks = [("place", centre.ravel(), np.diag(std.ravel() ** -2)), ("delay", delays, np.diag(certain**-2))]
         if self.curve is not None:
             blocks.append(("curve", np.zeros(len(self.curve.precision)), self.curve.precision))
+        every = np.append(known, np.zeros(sum(len(start) for _, start, _ in blocks[1:]), dtype=bool))
+        every[list(self.held)] = True
+        parts = np.split(every, np.cumsum([len(start) for _, start, _ in blocks])[:-1])
         return Layout(
             tuple(
                 Unknown(
                     kind=kind,
                     names=("",) * len(start),
                     start=start,
-                    known=known.ravel() if kind == "place" else None,
+                    known=own,
                     priors=(Prior(weight=1.0, structure=structure, centre=start, rows=len(start)),),
                 )
-                for kind, start, structure in blocks
+                for (kind, start, structure), own in zip(blocks, parts, strict=True)
             )
         )
 
@@ -320,13 +321,6 @@ class Network:
             found[: len(rows), self.layout.where["curve"]] = self.curve.design
         return found
 
-    @cached_property
-    def curve_root(self) -> Floats:
-        """What independent unknowns of unit variance do to means (n, m) as a curve of 1 m; zero without a curve."""
-        if self.curve is None:
-            return np.zeros((len(self.means.range_m), 1))
-        return np.asarray(self.curve.design @ np.linalg.cholesky(np.linalg.inv(self.curve.precision)))
-
     def linear(self, x: Floats, marks: Bools | float = 0.0) -> tuple[Floats, Floats]:
         """Return what is left of each row (n,), and derivatives (n, p): means, known distances.
 
@@ -339,9 +333,8 @@ class Network:
         left = measured - length - found @ x
         # Boards on top of each other have no direction: any will do to part them.
         unit = np.where(length[:, None] > 1e-9, apart / np.maximum(length, 1e-9)[:, None], [1.0, 0.0, 0.0])
-        rows = np.arange(len(length))[:, None]
-        for end, sign in ((0, 1.0), (1, -1.0)):
-            found[rows, 3 * self.ends[:, [end]] + np.arange(3)] = sign * unit
+        columns = 3 * self.ends[:, :, None] + np.arange(3)
+        np.put_along_axis(found, columns.reshape(len(found), -1), np.hstack([unit, -unit]), axis=1)
         return left, found
 
     def std_m(self, case: Case) -> Floats:
@@ -355,12 +348,12 @@ class Network:
 
     def at(self, x: Floats, case: Case) -> Linear:
         """Return the network about unknowns (p,) in a case."""
-        (left, jacobian), priors = self.linear(x, case.marks), self.priors(case.curve_m)
+        (left, jacobian), priors, std = self.linear(x, case.marks), self.priors(case.curve_m), self.std_m(case)
         precision = priors.precision()
         return Linear(
-            left=left,
-            jacobian=jacobian,
-            std=self.std_m(case),
+            left=left / std,
+            jacobian=jacobian / std[:, None],
+            std=std,
             prior=precision.toarray() if sparse.issparse(precision) else precision,
             pull=priors.pull(x),
             prior_value=-2 * priors.value(x),
@@ -368,18 +361,9 @@ class Network:
             guessed=self.guessed,
         )
 
-    def alone(self, arrangement: int, x: Floats) -> tuple[Network, Floats]:
-        """Return one arrangement as a network whose delays and curve are known, and its unknowns."""
-        rows = self.means.arrangement == arrangement
-        means = self.means[rows]
-        if self.curve is not None:
-            bias = self.curve.design[rows] @ x[self.layout.where["curve"]]
-            means = replace(means, range_m=means.range_m - bias)
-        found = replace(
-            self,
-            means=replace(means, arrangement=np.zeros_like(means.arrangement)),
-            arrangements=(self.arrangements[arrangement],),
-            fixed_ns=dict(zip(self.tags, x[self.layout.where["delay"]].tolist(), strict=True)),
-            curve=None,
-        )
-        return found, found.with_positions(found.layout.start(), self.positions_m(x)[self.seats(arrangement)])
+    def alone(self, arrangement: int) -> Network:
+        """Return the network of the means of one arrangement, in which only its places are sought."""
+        rows, unknowns = self.means.arrangement == arrangement, np.arange(self.layout.size)
+        curve = None if self.curve is None else replace(self.curve, design=self.curve.design[rows])
+        own = np.isin(unknowns // 3, self.seats(arrangement)) & np.isin(unknowns, self.layout.free())
+        return replace(self, means=self.means[rows], curve=curve, held=tuple(unknowns[~own].tolist()))

@@ -153,10 +153,10 @@ def _calibration(
 ) -> Calibration:
     """Return the calibration: delays that are determined, the curve, how well both are known and what they rest on."""
     network, known, freedom = found.network, verdict.determined, found.freedom
-    factor = students_factor(freedom)
-    std = dict(zip(network.tags, (verdict.std * factor).tolist(), strict=True)) | dict.fromkeys(network.fixed_ns, 0.0)
-    delays = dict(zip(network.tags, found.delays.tolist(), strict=True)) | network.fixed_ns
     tags = [tag for tag, good in zip(network.tags, known.tolist(), strict=True) if good]
+    covariance = students_factor(freedom) ** 2 * verdict.covariance[np.ix_(known, known)]
+    std = dict(zip(tags, np.sqrt(np.diag(covariance)).tolist(), strict=True)) | dict.fromkeys(network.fixed_ns, 0.0)
+    delays = dict(zip(network.tags, found.delays.tolist(), strict=True)) | network.fixed_ns
     noise = float(np.sqrt(np.average(network.means.noise_m**2, weights=network.means.count)))
     sigma = math.hypot(noise, found.case.pair_m)
     lifted = network.means.lifted[np.isfinite(network.means.lifted)]
@@ -170,7 +170,7 @@ def _calibration(
         where, knots = network.layout.where["curve"], network.curve.knots
         span = (float(knots[0]), float(knots[-1]))
         curve = Curve(tuple(knots.tolist()), tuple(found.x[where].tolist()), DEGREE, span)
-        curve_covariance = found.covariance()[where, where] * factor**2
+        curve_covariance = found.covariance()[where, where] * students_factor(freedom) ** 2
         gauge = f"the bias curve is zero at {ALPHA_DBM:g} dBm; the delays carry the constant"
     fixed = {"fixed_ns": {str(tag): delay for tag, delay in sorted(network.fixed_ns.items())}}
     provenance = (fixed if network.fixed_ns else {}) | {
@@ -195,7 +195,6 @@ def _calibration(
         "undetermined": [[int(tag) for tag in verdict.named("delay")]] if verdict.free else [],
         "gauge": gauge,
     }
-    covariance = verdict.covariance[np.ix_(known, known)] * factor**2
     of_sigma = np.full((DEGREE + 1,) * 2, (0.5 * sigma / math.sqrt(max(freedom, 1.0))) ** 2)
     return Calibration(
         delays_ns={tag: delays[tag] for tag in tags},
@@ -222,9 +221,9 @@ def _of_curve(taken: Calibration) -> Floats:
 def widened_by(found: Solution, curve: Calibration) -> Solution:
     """Return a solution whose covariance has what the errors of a curve that was taken over do to delays and places."""
     here, means = found.linear, found.network.means
-    weighed = here.jacobian / here.std[:, None] ** 2
     splines = basis(np.clip(means.lifted, *curve.bias_curve.range), np.array(curve.bias_curve.knots))
-    gain = here.covariance @ (weighed[: len(splines)].T @ splines)
+    count = len(splines)
+    gain = here.covariance @ (here.jacobian[:count].T @ (splines / here.std[:count, None]))
     return replace(found, more=found.more + gain @ _of_curve(curve) @ gain.T)
 
 

@@ -104,24 +104,22 @@ def read_surveys(data: Data | Iterable[Data], knowledge: Knowledge) -> SurveyDat
     recordings = [_load(one) for one in each(data)]
     if knowledge.spans_s and len(recordings) > 1:
         raise BadInputError("gives times of arrangements, which is for one recording only", parameter="known")
-    arrangements, numbers, findings = list[Arrangement](), list[Ints](), list[Contradiction]()
+    arrangements, numbers, findings = dict[str, Arrangement](), list[Ints](), list[Contradiction]()
     for ranges, marked, _ in recordings:
-        number = np.full(len(ranges), -1)
+        numbers.append(np.full(len(ranges), -1))
         for one in _arrangements(ranges, marked, knowledge, several=len(recordings) > 1):
+            if one.name in arrangements:
+                text = f"two arrangements are called {one.name!r:.40}; give each its own name"
+                raise BadInputError(text, parameter="data")
             rows = (ranges.time_ns >= one.start_ns) & (ranges.time_ns < one.end_ns)
-            number[rows] = len(arrangements)
+            numbers[-1][rows] = len(arrangements)
             findings += find_motion(one.name, ranges[rows])
-            arrangements.append(one)
-        numbers.append(number)
-    names = [one.name for one in arrangements]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise BadInputError(f"two arrangements are called {twice[0]!r:.40}; give each its own name", parameter="data")
+            arrangements[one.name] = one
     whole = concatenate([ranges for ranges, _, _ in recordings])
     means, few = pair_means(whole, np.concatenate(numbers))
     return SurveyData(
         means=means,
-        arrangements=tuple(arrangements),
+        arrangements=tuple(arrangements.values()),
         distances=tuple(distance for _, _, stated in recordings for distance in stated),
         sources=tuple(ranges.source for ranges, _, _ in recordings),
         findings=tuple(findings),
@@ -242,8 +240,8 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
     `UnanswerableError` where none is left.
     """
     pairs = pairs_of(ranges.initiator, ranges.target)
-    key = np.where(arrangement >= 0, arrangement * len(pairs.ends) + pairs.number, -1)
-    keys, counts = np.unique(key[key >= 0], return_counts=True)
+    key = arrangement * len(pairs.ends) + pairs.number
+    keys, counts = np.unique(key[arrangement >= 0], return_counts=True)
     kept = keys[counts >= MIN_RANGES]
     if not len(kept):
         raise UnanswerableError(f"{ranges.source}: no two boards range five times while all stand still")
@@ -252,16 +250,18 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
     own, group = ranges[rows], np.searchsorted(kept, key[rows])
     ends, count = pairs.ends[kept % len(pairs.ends)], np.bincount(group)
     range_m, std_m, noise_m = _locations(own, Pairs(group, ends))
-    weights = np.column_stack([own.weight_initiator, own.weight_target])
-    weights = np.where((own.initiator == ends[group, 0])[:, None], weights, weights[:, ::-1])
+    forward = own.initiator == ends[group, 0]
+    weights = [
+        np.bincount(group, np.where(forward == lower, own.weight_initiator, own.weight_target)) / count
+        for lower in (True, False)
+    ]
     lifted = lifted_power(own.fpp1_dbm, own.fpp2_dbm, LIFT, ALPHA_DBM)
-    powered = np.isfinite(lifted)
     with np.errstate(invalid="ignore"):
-        power = np.bincount(group, np.where(powered, lifted, 0.0)) / np.bincount(group, powered)
+        power = np.bincount(group, np.nan_to_num(lifted)) / np.bincount(group, np.isfinite(lifted))
     means = PairMeans(
         arrangement=kept // len(pairs.ends),
         ends=ends,
-        weights=np.column_stack([np.bincount(group, weight) / count for weight in weights.T]),
+        weights=np.column_stack(weights),
         range_m=range_m,
         std_m=std_m,
         noise_m=noise_m,

@@ -51,9 +51,9 @@ class Marks:
     def at(cls, network: Network, x: Floats, case: Case) -> Marks:
         """Return the marks of a case, linear about unknowns (p,)."""
         here, count = network.at(x, case), len(case.marks)
-        weighed = here.jacobian / here.std[:, None] ** 2
-        inverse = np.diag(here.std**-2) - weighed @ here.covariance @ weighed.T
-        return cls(case.marks, inverse[:count, :count], ((here.left - here.jacobian @ here.step) / here.std**2)[:count])
+        rows, std = here.jacobian[:count], here.std[:count]
+        inverse = (np.eye(count) - rows @ here.covariance @ rows.T) / std[:, None] / std
+        return cls(case.marks, inverse, (here.left[:count] - rows @ here.step) / std)
 
     @property
     def sign(self) -> Floats:

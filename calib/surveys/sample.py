@@ -12,9 +12,6 @@ from uwblink.ticks import SPEED_OF_LIGHT
 
 DELAYS_NS: Final = {1: -0.3, 2: 0.1, 3: -0.1, 4: 0.2}
 ORDERS: Final = ((1, 2, 3, 4), (2, 1, 4, 3), (3, 1, 4, 2), (2, 4, 1, 3), (4, 3, 2, 1), (1, 3, 4, 2))
-PAIR_ERROR_M: Final = 0.01
-NOISE_M: Final = 0.03
-STAY_S: Final = 30.0
 
 
 def sample_arrangements(count: int = 6, *, seed: int = 1) -> Ranges:
@@ -27,20 +24,24 @@ def sample_arrangements(count: int = 6, *, seed: int = 1) -> Ranges:
     >>> calib.sample_arrangements(2)
     <Ranges of memory: 1200 of tags 1, 2, 3, 4>
     """
-    rng = np.random.default_rng(seed)
+    rng, held = np.random.default_rng(seed), 600
     pairs = np.array(list(combinations(DELAYS_NS, 2)))
-    held = int(STAY_S * 20)
-    raw, time, ends = [], [], []
-    for k, order in enumerate(ORDERS[:count]):
-        place = dict(zip(order, np.cumsum(rng.uniform(0.5, 1.5, 4)).tolist(), strict=True))
-        pair = np.arange(held) % len(pairs)
-        error = PAIR_ERROR_M * rng.normal(size=len(pairs))
-        length = np.array([abs(place[i] - place[j]) for i, j in pairs.tolist()])
-        delay = np.array([DELAYS_NS[i] + DELAYS_NS[j] for i, j in pairs.tolist()]) * 0.5e-9 * SPEED_OF_LIGHT
-        raw.append((length - delay + error)[pair] + NOISE_M * rng.normal(size=held))
-        time.append(((k * (STAY_S + 10.0) + np.arange(held) / 20.0) * 1e9).astype(np.int64))
-        ends.append(pairs[pair])
-    tags = np.concatenate(ends)
+    delays = np.array([0.0, *DELAYS_NS.values()])[pairs].sum(axis=1)
+    pair = np.arange(held) % len(pairs)
+    raw = []
+    for order in ORDERS[:count]:
+        place = np.zeros(5)
+        place[list(order)] = np.cumsum(rng.uniform(0.5, 1.5, 4))
+        error = 0.01 * rng.normal(size=len(pairs))
+        mean = np.abs(np.diff(place[pairs])[:, 0]) - 0.5e-9 * SPEED_OF_LIGHT * delays + error
+        raw.append(mean[pair] + 0.03 * rng.normal(size=held))
+    # Ten seconds between two arrangements.
+    time_s = [40.0 * k + np.arange(held) / 20.0 for k in range(len(raw))]
+    tags = np.tile(pairs[pair], (len(raw), 1))
     return Ranges.from_arrays(
-        np.concatenate(raw), initiator=tags[:, 0], target=tags[:, 1], fpp1_dbm=np.nan, time_ns=np.concatenate(time)
+        np.concatenate(raw),
+        initiator=tags[:, 0],
+        target=tags[:, 1],
+        fpp1_dbm=np.nan,
+        time_ns=(np.concatenate(time_s) * 1e9).astype(np.int64),
     )

@@ -15,13 +15,14 @@ from functools import cached_property
 from operator import attrgetter, itemgetter
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from calib.estimator.optimize import maximize
 from calib.surveys.network import Case, Lengths, Linear, Network
 from calib.surveys.reflections import Marks, unlikely
 from calib.surveys.result import SecondBest
 from calib.surveys.starts import first_start, is_in_order, other_starts
-from uwblink.arrays import Bools, Floats
+from uwblink.arrays import Bools, Floats, Ints
 
 PAIR_STD_M, PAIR_PRIOR_FREEDOM = 0.02, 3.0
 """Prior standard deviation of the constant error of a pair, and the degrees of freedom that it counts as."""
@@ -99,9 +100,16 @@ def optimize(network: Network, x: Floats, case: Case) -> tuple[Floats, bool]:
     return found.x, found.success
 
 
+def of_spreads(network: Network, x: Floats, case: Case) -> float:
+    """Return -2 log likelihood near an optimum, integrated over the unknowns, with the prior density of the spreads."""
+    pairs = PAIR_PRIOR_FREEDOM * (2 * math.log(case.pair_m) + (PAIR_STD_M / case.pair_m) ** 2)
+    curve = (math.log(case.curve_m / CURVE_STD_M) / math.log(CURVE_FACTOR)) ** 2
+    return network.at(x, case).unlikely() + pairs + curve
+
+
 def unlikelihood(network: Network, x: Floats, case: Case) -> float:
-    """Return -2 log likelihood at an optimum, integrated over the unknowns."""
-    value = network.at(x, case).unlikely() + unlikely(int(case.marks.sum()), len(case.marks))
+    """Return the same with how unlikely the reflections and the order of the boards are."""
+    value = of_spreads(network, x, case) + unlikely(int(case.marks.sum()), len(case.marks))
     if case.marks.any():
         value += float(Marks.at(network, x, case).penalties()[case.marks].sum())
     return value + WRONG_ORDER_PENALTY * len(out_of_order(network, x))
@@ -121,12 +129,10 @@ def settle(network: Network, x: Floats, case: Case) -> tuple[Floats, Case]:
     """Return the unknowns from a start, and the case with the means that are likeliest reflected."""
     for _ in range(2):
         x, _ = optimize(network, x, case)
-        marks = Marks.at(network, x, case).searched()
-        if np.array_equal(marks, case.marks):
-            break
-        case = replace(case, marks=marks)
-        x, _ = optimize(network, x, case)
-    return x, case
+        before, case = case.marks, replace(case, marks=Marks.at(network, x, case).searched())
+        if np.array_equal(before, case.marks):
+            return x, case
+    return optimize(network, x, case)[0], case
 
 
 def adjust(
@@ -150,38 +156,25 @@ def adjust(
         network=network,
         x=x,
         case=case,
-        unlikely=unlikelihood(network, x, case) + _unlikely_spreads(case),
+        unlikely=unlikelihood(network, x, case),
         settled=settled,
         chance=case.marks.astype(float),
         more=np.zeros((len(x),) * 2),
     )
 
 
-def _unlikely_spreads(case: Case) -> float:
-    """Return -2 log of the prior density of the spreads."""
-    pairs = PAIR_PRIOR_FREEDOM * (2 * math.log(case.pair_m) + (PAIR_STD_M / case.pair_m) ** 2)
-    return pairs + (math.log(case.curve_m / CURVE_STD_M) / math.log(CURVE_FACTOR)) ** 2
-
-
-def _spreads(network: Network, x: Floats, case: Case, steps: int = 20) -> Case:
-    """Return a case with the likeliest spreads of pairs and curve, by Fisher's scoring of their logarithms.
-
-    With the inverse covariance P of rows y, of which each spread adds R R', -2 log likelihood has the slopes
-    2 tr(R' P R) - 2 |R' P y|^2 and the expected curvatures 4 |R_i' P R_j|^2 (Patterson and Thompson).
-    """
-    free, width = [network.pair_m is None, True], math.log(CURVE_FACTOR) ** 2
-    for _ in range(steps):
-        marks, ratio = Marks.at(network, x, case), (PAIR_STD_M / case.pair_m) ** 2
-        roots = [case.pair_m * np.eye(len(case.marks)), case.curve_m * network.curve_root]
-        slope = [2 * np.sum(root * (marks.inverse @ root)) - 2 * np.sum((root.T @ marks.pull) ** 2) for root in roots]
-        slope[0] += 2 * PAIR_PRIOR_FREEDOM * (1 - ratio)
-        slope[1] += 2 * math.log(case.curve_m / CURVE_STD_M) / width
-        bend = 4 * np.array([[np.sum((one.T @ marks.inverse @ other) ** 2) for other in roots] for one in roots])
-        bend += np.diag([4 * PAIR_PRIOR_FREEDOM * max(ratio, 1.0), 2 / width])
-        step = np.clip(-np.linalg.solve(bend, slope * np.array(free)), -1.0, 1.0) * free
-        case = case.scaled(*step.tolist())
-        if np.abs(step).max() < 0.01:
-            break
+def _spreads(network: Network, x: Floats, case: Case) -> Case:
+    """Return a case with the likeliest spread of pairs, and then of the curve."""
+    for pair, curve in ((network.pair_m is None, False), (False, network.curve is not None)):
+        if pair or curve:
+            found = minimize_scalar(
+                lambda step, pair=pair, curve=curve, case=case: of_spreads(
+                    network, x, case.scaled(pair * step, curve * step)
+                ),
+                bounds=(-1.0, 1.0),
+                options={"xatol": 0.01},
+            )
+            case = case.scaled(pair * found.x, curve * found.x)
     return case
 
 
@@ -198,7 +191,7 @@ def averaged(found: Solution) -> Solution:
         # Steps of logarithms of about half of what a survey knows of either.
         steps = [(0.3 * i, 0.4 * k) for i in range(-2, 3) for k in range(-4, 5) if network.pair_m is None or not i]
         cases = [case.scaled(*step) for step in steps]
-        worse = np.array([network.at(x, one).unlikely() + _unlikely_spreads(one) for one in cases])
+        worse = np.array([of_spreads(network, x, one) for one in cases])
         likely = np.exp(-0.5 * (worse - worse.min()))
         step, wider = _mixed(found, cases, likely / likely.sum())
         mean, more = mean + step, more + wider
@@ -244,28 +237,27 @@ def _other_solutions(
 ) -> Iterator[tuple[float, Floats, Case, tuple[str, tuple[int, ...]]]]:
     """Yield other solutions that differ in one arrangement: how likely, unknowns, errors, and who is elsewhere."""
     network, boards, seats = found.network, found.network.arrangements[arrangement], found.network.seats(arrangement)
-    alone, start = network.alone(arrangement, found.x)
-    mine = network.means.arrangement == arrangement
+    alone, mine = network.alone(arrangement), network.means.arrangement == arrangement
     case = replace(found.case, marks=found.case.marks[mine])
-    most, seen = unlikelihood(alone, start, case) + MAX_WORSE_ALONE, [_signature(alone, start)]
-    for points in other_starts(alone.positions_m(start), boards, seed=arrangement):
-        x, own = settle(alone, alone.with_positions(start, points), replace(case, marks=np.zeros_like(case.marks)))
-        mark = _signature(alone, x)
+    most, seen = unlikelihood(alone, found.x, case) + MAX_WORSE_ALONE, [_signature(network, found.x, seats)]
+    for points in other_starts(network.positions_m(found.x)[seats], boards, seed=arrangement):
+        start = network.with_positions(found.x, points, seats)
+        x, own = settle(alone, start, replace(case, marks=np.zeros_like(case.marks)))
+        mark = _signature(network, x, seats)
         if unlikelihood(alone, x, own) > most or any(np.abs(mark - one).max() < MIN_DIFFERENCE_M for one in seen):
             continue
         seen.append(mark)
         marks = found.case.marks.copy()
         marks[mine] = own.marks
-        moved = network.with_positions(found.x, alone.positions_m(x), seats)
-        x, whole = settle(network, moved, replace(found.case, marks=marks))
-        change = np.abs(_signature(*network.alone(arrangement, x)) - seen[0]).max(axis=1)
+        x, whole = settle(network, x, replace(found.case, marks=marks))
+        change = np.abs(_signature(network, x, seats) - seen[0]).max(axis=1)
         if change.max() >= MIN_DIFFERENCE_M:
             tags = np.array(boards.tags)[change > max(MIN_DIFFERENCE_M, 0.5 * change.max())]
             yield unlikelihood(network, x, whole), x, whole, (boards.name, tuple(tags.tolist()))
 
 
-def _signature(alone: Network, x: Floats) -> Floats:
+def _signature(network: Network, x: Floats, seats: Ints) -> Floats:
     """Return what tells solutions of an arrangement apart (points, k): distances, and places where a frame is known."""
-    place = alone.positions_m(x)
+    place = network.positions_m(x)[seats]
     apart = np.linalg.norm(place[:, None] - place, axis=2)
-    return np.hstack([apart, place]) if alone.known_places else apart
+    return np.hstack([apart, place]) if network.known_places.keys() & set(seats.tolist()) else apart

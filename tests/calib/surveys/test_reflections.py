@@ -49,19 +49,16 @@ def linear():
     return Marks.at(network, x, Case(np.zeros(rows, dtype=bool), PAIR_M, CURVE_M)), unlikely
 
 
-def test_the_search_ends_where_no_change_of_two_rows_is_likelier(linear):
+def test_the_search_and_the_weights_are_those_of_the_likelihood_written_out(linear):
     none, unlikely = linear
     marks = none.searched()
     assert marks.any()
     here = unlikely(marks)
+    # No change of two rows is likelier.
     for rows in [*combinations(range(len(marks)), 1), *combinations(range(len(marks)), 2)]:
         other = marks.copy()
         other[list(rows)] ^= True
         assert unlikely(other) > here - 1e-3
-
-
-def test_weights_are_those_of_the_likelihood_written_out(linear):
-    none, unlikely = linear
     found, weight = none.window()
     assert len(weight) > 3
     value = np.array([unlikely(marks) for marks in found])

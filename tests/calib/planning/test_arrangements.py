@@ -1,0 +1,219 @@
+"""Plans of boards that stand still: what counting degrees of freedom says, and what a survey then finds."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import calib
+from benchmarks import surveys
+from benchmarks.standing import places_of, standing_boards
+from calib.cli.commands import app
+from calib.planning import SurveyPlanSettings
+from calib.planning.predicted import CURVE_M, POWER_AT_1_M_DBM, delay_information, predict
+
+C_M_PER_NS = 0.299702547
+
+
+def given(boards, on="line", **settings):
+    return SurveyPlanSettings(tags=tuple(range(1, boards + 1)), on=on, **settings)
+
+
+def in_orders(*orders):
+    """Arrangements on a line by the tags from its beginning on, a metre apart."""
+    return surveys.planned(np.array([[[order.index(tag), 0, 0] for tag in sorted(order)] for order in orders], float))
+
+
+def information(inputs, one):
+    """Of the delays, in units of a pair's error."""
+    return delay_information(inputs, one)[0] * (0.02 / C_M_PER_NS) ** 2
+
+
+def test_boards_in_a_row_give_what_was_counted_by_hand():
+    """r12 + r23 - r13 is twice half the middle's delay: its variance is that of three pairs."""
+    values, vectors = np.linalg.eigh(information(given(3), *in_orders((1, 2, 3))))
+    assert np.count_nonzero(values > 1e-6 * values[-1]) == 1
+    assert np.abs(vectors[:, -1]) == pytest.approx([0, 1, 0], abs=1e-9)
+    assert values[-1] == pytest.approx(1 / 3)
+    # Four say of each board inside its own delay and nothing else. So eight orders, in which each of four stands inside
+    # four times, leave sqrt(2 / 4) of a pair's error, at best.
+    four = information(given(4), *in_orders((3, 1, 4, 2)))
+    assert four == pytest.approx(np.diag([0.5, 0, 0, 0.5]), abs=1e-6)
+
+
+def test_information_of_a_known_place_is_that_of_its_coordinates():
+    found = information(given(2, "plane", anchors=(1, 2), anchor_sigma_m=1e-6), *in_orders((1, 2)))
+    assert found == pytest.approx(np.full((2, 2), 0.25), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("boards", "on", "count", "each", "common"), [(4, "line", 8, 0.71, 0.35), (6, "plane", 10, 0.58, 0.24)]
+)
+def test_a_plan_promises_what_counting_says(boards, on, count, each, common):
+    """Random arrangements: 0.76 and 0.38 on a line, 0.78 and 0.30 in a plane; chosen ones are a little better."""
+    found = calib.plan(boards, on=on, arrangements=count)
+    # Student's factor of the degrees of freedom, about 1.05, is in the intervals.
+    unit = 1.96 * found.pair_error_m / C_M_PER_NS * 1.05
+    assert np.sqrt(np.mean(np.square(list(found.half_ns.values())))) / unit == pytest.approx(each, rel=0.08)
+    assert found.common_ns / unit == pytest.approx(common, rel=0.1)
+
+
+def test_one_arrangement_of_eight_in_space_says_nothing_useful():
+    found = calib.plan(8, on="space", arrangements=1)
+    assert len(found.undetermined) >= 7
+    assert found.next_best[0].what.startswith("an arrangement with 1 at (")
+    assert found.next_best[0].mean_ns < found.next_best[0].instead_of_ns
+
+
+@pytest.mark.parametrize(
+    ("boards", "settings", "undetermined"),
+    [
+        (3, {"arrangements": 1}, (1, 3)),
+        (3, {"arrangements": 3}, ()),
+        (3, {"arrangements": 1, "taped": 2}, ()),
+        (6, {"on": "space", "arrangements": 2, "anchors": [1, 2, 3, 4]}, ()),
+    ],
+)
+def test_delays_stay_open_until_something_tells_them(boards, settings, undetermined):
+    found = calib.plan(boards, **settings)
+    assert found.undetermined == undetermined
+    assert all(half < 0.4 for tag, half in found.half_ns.items() if tag not in undetermined)
+
+
+def test_a_taped_distance_brings_what_it_is_said_to_bring():
+    without = calib.plan(5, on="plane", arrangements=3)
+    tape = next(best for best in without.next_best if "by tape" in best.what)
+    with_it = calib.plan(5, on="plane", arrangements=3, taped=1)
+    mean = math.sqrt(np.mean(np.square(list(with_it.half_ns.values()))))
+    assert mean == pytest.approx(tape.mean_ns, rel=0.05)
+    assert mean < tape.instead_of_ns
+    # It counts by its own sigma.
+    common = [
+        calib.plan(3, arrangements=2, taped=2, tape_sigma_m=sigma, pair_error_m=0.02).common_ns
+        for sigma in (0.002, 0.02, 0.2)
+    ]
+    assert common[0] < 0.9 * common[1] < 0.7 * common[2]
+
+
+def test_what_was_promised_is_what_a_survey_says():
+    plan = calib.plan(4, on="line", arrangements=7)
+    places = [np.array([a.place_m[t] for t in plan.tags]) for a in plan.arrangements]
+    world = standing_boards(3, places=places)
+    result = calib.survey(world.ranges, known="line", pair_error_m=0.02)
+    found = np.array([1.96 * result.calibration.delays_std_ns[t] for t in plan.tags])
+    assert found == pytest.approx(np.array([plan.half_ns[t] for t in plan.tags]), rel=0.1)
+
+
+def test_without_a_number_it_stops_when_more_are_not_worth_it():
+    found = calib.plan(4)
+    assert 5 <= len(found.arrangements) <= 12
+    assert found.undetermined == ()
+
+
+def test_the_command_prints_steps_and_json():
+    done = CliRunner().invoke(app, ["plan", "survey", "7,12,3", "--on", "line", "--arrangements", "2"])
+    assert done.exit_code == 0
+    found = calib.plan([7, 12, 3], on="line", arrangements=2)
+    assert done.stdout.startswith("\n".join(found.steps))
+    assert found.steps[-1] == "4. Survey all recordings together, known to be on a line."
+    for one, step in zip(found.arrangements, found.steps[1:], strict=False):
+        order = list(map(str, one.order()))
+        assert f"boards in the order {' '.join(order)}." in step
+        line = f"--arrangement {one.name} --known line --order {','.join(order)} --pairs all --rate 50 --duration 30"
+        assert f"  uwblink record PORTS {line} -o {one.name}.uwb\n" in done.stdout
+    assert done.stdout.endswith("  calib survey A.uwb B.uwb -o calibration.json\n")
+    told = json.loads(CliRunner().invoke(app, ["plan", "survey", "1,2,5", "--arrangements", "1", "--json"]).stdout)
+    assert sorted(told["half_interval_ns"]) == ["1", "2", "5"]
+    assert len(told["undetermined"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("boards", "settings", "message"),
+    [
+        (1, {}, "boards"),
+        ([1, 1], {}, "boards"),
+        (4, {"on": "ring"}, "on"),
+        (4, {"arrangements": 0}, "arrangements"),
+        (4, {"size_m": (1.0, 2.0)}, "size_m"),
+        (4, {"taped": -1}, "taped"),
+        (4, {"tape_sigma_m": 0.0}, "tape_sigma_m"),
+        (4, {"pair_error_m": math.nan}, "pair_error_m"),
+        (4, {"reflected": 0.4}, "reflected"),
+        (4, {"on": "plane", "anchors": [9]}, "anchors"),
+        (4, {"on": "line", "anchors": [1]}, "anchors"),
+        (4, {"rate_hz": 0.0}, "rate_hz"),
+        (30, {"on": "plane", "size_m": (0.5, 0.5)}, "find no room"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused(boards, settings, message):
+    with pytest.raises(ValueError, match=message):
+        calib.plan(boards, **settings)
+
+
+def test_without_reflections_and_curve_a_prediction_is_the_inverse_of_the_information():
+    orders = in_orders((1, 2, 3, 4), (2, 1, 4, 3), (2, 4, 1, 3))
+    covariance = np.linalg.inv(sum(delay_information(given(4), one)[0] for one in orders))
+    last = predict(given(4), orders)[-1]
+    assert last.each == pytest.approx(np.sqrt(np.diag(covariance)))
+    assert last.common == pytest.approx(math.sqrt(covariance.mean()))
+    centre = np.eye(4) - 0.25
+    assert last.apart == pytest.approx(np.sqrt(np.diag(centre @ covariance @ centre)))
+    assert np.isinf(predict(given(4), orders)[0].common)
+
+
+def test_three_in_a_row_say_nothing_where_one_of_their_pairs_is_mostly_reflected():
+    """All three are straight with 0.9^3 = 0.73 and 0.7^3 = 0.34; then the middle delay is what it always is."""
+    row = in_orders((1, 2, 3))
+    assert predict(given(3, reflected=0.1), row)[0].each[1] == pytest.approx(0.02 * math.sqrt(3) / C_M_PER_NS)
+    assert np.isinf(predict(given(3, reflected=0.3), row)[0].each[1])
+
+
+def test_reflected_pairs_cost_what_their_loss_costs():
+    """Beside draws of one's own over the same arrangements: as if there were no such pairs."""
+    rng = np.random.default_rng(5)
+    places = [places_of(rng, 6, 2, 4.0, 0.4) for _ in range(6)]
+    of_draws = []
+    for _ in range(30):
+        total = np.zeros((6, 6))
+        for place in places:
+            rows, steps = [], []
+            for i in range(6):
+                for j in range(i + 1, 6):
+                    if rng.uniform() >= 0.1:
+                        unit = (place[i] - place[j])[:2] / np.linalg.norm(place[i] - place[j])
+                        step = np.zeros((6, 2))
+                        step[i], step[j] = unit, -unit
+                        steps.append(step.ravel())
+                        rows.append(-0.5 * (np.eye(6)[i] + np.eye(6)[j]))
+            wanted, others = np.array(rows), np.array(steps)
+            left = wanted - others @ np.linalg.pinv(others) @ wanted
+            total += left.T @ left / 0.02**2
+        of_draws.append(np.diag(np.linalg.pinv(total)))
+    expected = np.sqrt(np.mean(of_draws)) / C_M_PER_NS
+    found, plain = (
+        predict(given(6, "plane", reflected=share), surveys.planned(places))[-1].each for share in (0.1, 0.0)
+    )
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(expected, rel=0.15)
+    assert np.mean(found) > 1.05 * np.mean(plain)
+
+
+def test_a_curve_costs_what_a_process_of_its_size_costs(monkeypatch):
+    """The benchmark's own formula has the process itself where plan and survey have splines."""
+    monkeypatch.setattr(surveys, "power_dbm", lambda length: POWER_AT_1_M_DBM - 20 * math.log10(length))
+    world = standing_boards(3, "plane", boards=5, arrangements=5, size_m=6.0, each=5)
+    expected = surveys.promised(world, 2, CURVE_M, 0.0)
+    found = predict(given(5, "plane"), surveys.planned(world.places), curve=True)[-1].each
+    assert found == pytest.approx(expected, rel=0.1)
+
+
+def test_a_plan_says_what_reflections_and_a_curve_cost():
+    plain, reflected = (calib.plan(4, on="line", arrangements=4, reflected=share) for share in (0.0, 0.1))
+    assert "and 10 % of the pairs are reflected:" in str(reflected)
+    assert max(reflected.half_ns.values()) > max(plain.half_ns.values())
+    curved = plain.with_curve_ns
+    assert curved.each > max(plain.half_ns.values())
+    assert curved.each == pytest.approx(math.hypot(curved.apart, curved.common), rel=1e-6)
+    assert f"what all share ± {curved.common:.3f} ns." in str(plain)
+    assert reflected.to_dict()["with_curve_ns"]["common"] > plain.to_dict()["with_curve_ns"]["common"]
