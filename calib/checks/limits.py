@@ -28,9 +28,6 @@ from uwblink.twr import names_in
 WITHOUT_CURVE: Final = "delays only"
 """How warnings of fits without a curve begin."""
 
-SCALE: Final = (0.75, 1.35)
-"""How many metres a range may grow in a metre of true distance: a foot is 0.305 m, a yard 0.914."""
-
 UNITS: Final = {0.001: "millimetres", 0.01: "centimetres", 0.3048: "feet"}
 
 LONGEST_NS: Final = 2.5
@@ -133,7 +130,8 @@ def _impossible(ranges: Ranges) -> Iterator[str]:
     # How ranges and true distances spread: a unit or two columns may be wrong.
     slope = _robust_slope(ranges.truth_m, ranges.raw_m)
     rest = robust_spread(ranges.raw_m - slope * ranges.truth_m)
-    if not SCALE[0] < slope < SCALE[1] and abs(slope) * robust_spread(ranges.truth_m) >= 3.0 * rest:
+    # A foot is 0.305 m, and ranges that follow other distances grow by anything.
+    if not 0.75 < slope < 1.35 and abs(slope) * robust_spread(ranges.truth_m) >= 3.0 * rest:
         guess = _looks_like(slope)
         yield (f"ranges grow by {slope:.3g} m in a metre of true distance; {guess and guess + '; '}give both in metres")
     # Clock ratios that no crystals have: stamps that wrapped, or columns in the wrong order.
@@ -161,24 +159,6 @@ def _robust_slope(x: Floats, y: Floats) -> float:
     low, high = order[:third], order[-third:]
     run = float(np.median(x[high]) - np.median(x[low]))
     return float(np.median(y[high]) - np.median(y[low])) / run if run > 0 else 1.0
-
-
-def one_way(ranges: Ranges) -> Iterator[str]:
-    """Name the pair whose ranges depend most on who initiates, as they do where clock skew is left in them."""
-    pairs = pairs_of(ranges.initiator, ranges.target)
-    error, forth, found = ranges.raw_m - ranges.truth_m, ranges.initiator < ranges.target, list[tuple[float, str]]()
-    rows_of_pairs = np.split(np.argsort(pairs.number, kind="stable"), np.cumsum(np.bincount(pairs.number))[:-1])
-    for (a, b), rows in zip(pairs.ends.tolist(), rows_of_pairs, strict=True):
-        ways = [error[rows[forth[rows] == way]] for way in (True, False)]
-        if min(map(len, ways)) < 20:
-            continue
-        differ = float(np.median(ways[0]) - np.median(ways[1]))
-        std = STD_OF_MEDIAN * float(np.hypot(*(robust_spread(some) / np.sqrt(len(some)) for some in ways)))
-        if abs(differ) > max(0.05, 8.0 * std):
-            size = f"{100 * abs(differ):.0f} cm {'longer' if differ > 0 else 'shorter'} if tag {a} initiates"
-            found.append((abs(differ), f"pair {a}-{b}: ranges read {size}"))
-    if found:
-        yield f"{max(found)[1]}: clock skew is not corrected, or with the wrong sign of the carrier's reading"
 
 
 def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: Ranges) -> None:
@@ -212,7 +192,7 @@ def implausible(delays_ns: Mapping[int, float], residuals_m: Floats) -> Iterator
         )
     spread = robust_spread(residuals_m)
     if spread > LOUD_M:
-        yield f"errors spread by {spread:.2f} m after the fit, those of UWB ranges by a decimetre: whose truth is it?"
+        yield f"errors spread by {spread:.2f} m after the fit, those of UWB ranges by 10 cm: check the true distances"
 
 
 def warnings_of(ranges: Ranges, inliers: float, free: list[list[int]], seconds: float) -> Iterator[str]:
