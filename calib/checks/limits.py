@@ -161,6 +161,32 @@ def _robust_slope(x: Floats, y: Floats) -> float:
     return float(np.median(y[high]) - np.median(y[low])) / run if run > 0 else 1.0
 
 
+def one_way(ranges: Ranges) -> Iterator[str]:
+    """Name the pair whose ranges depend most on who initiates, as they do if clock skew is left in them.
+
+    Medians of raw errors show it also where a fit takes such ranges for reflections.
+    """
+    pairs = pairs_of(ranges.initiator, ranges.target)
+    way = 2 * pairs.number + (ranges.initiator < ranges.target)
+    count = np.bincount(way, minlength=2 * len(pairs.ends)).reshape(-1, 2)
+    enough = count.min(axis=1) >= 20
+    rows = enough[pairs.number]
+    way = np.unique(way[rows], return_inverse=True)[1]
+    middle, spread = (of((ranges.raw_m - ranges.truth_m)[rows], way).reshape(-1, 2) for of in (medians, spreads))
+    differ_m = middle[:, 1] - middle[:, 0]
+    std_m = STD_OF_MEDIAN * np.hypot(*(spread / np.sqrt(count[enough])).T)
+    # The powers of both ways are not quite alike, and errors last: eight standard errors are no chance.
+    sure_m = np.where(np.abs(differ_m) > np.maximum(0.05, 8 * std_m), differ_m, 0.0)
+    if sure_m.any():
+        worst = int(np.argmax(np.abs(sure_m)))
+        a, b = pairs.ends[enough][worst].tolist()
+        yield (
+            f"pair {a}-{b}: ranges read {100 * abs(sure_m[worst]):.0f} cm "
+            f"{'longer' if sure_m[worst] > 0 else 'shorter'} if tag {a} initiates: clock skew is not corrected, or "
+            "with the wrong sign of the carrier's reading"
+        )
+
+
 def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: Ranges) -> None:
     """Raise `UnanswerableError` where a fit found what no radio has, so that its calibration is of no use.
 
