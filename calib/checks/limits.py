@@ -166,25 +166,31 @@ def one_way(ranges: Ranges) -> Iterator[str]:
 
     Medians of raw errors show it also where a fit takes such ranges for reflections.
     """
-    pairs = pairs_of(ranges.initiator, ranges.target)
-    way = 2 * pairs.number + (ranges.initiator < ranges.target)
-    count = np.bincount(way, minlength=2 * len(pairs.ends)).reshape(-1, 2)
-    enough = count.min(axis=1) >= 20
-    rows = enough[pairs.number]
-    way = np.unique(way[rows], return_inverse=True)[1]
-    middle, spread = (of((ranges.raw_m - ranges.truth_m)[rows], way).reshape(-1, 2) for of in (medians, spreads))
-    differ_m = middle[:, 1] - middle[:, 0]
-    std_m = STD_OF_MEDIAN * np.hypot(*(spread / np.sqrt(count[enough])).T)
+    ways = _medians_by_way(ranges.raw_m - ranges.truth_m, ranges)
     # The powers of both ways are not quite alike, and errors last: eight standard errors are no chance.
-    sure_m = np.where(np.abs(differ_m) > np.maximum(0.05, 8 * std_m), differ_m, 0.0)
-    if sure_m.any():
-        worst = int(np.argmax(np.abs(sure_m)))
-        a, b = pairs.ends[enough][worst].tolist()
+    differ_m = {
+        (a, b): middle - ways[b, a][0]
+        for (a, b), (middle, std) in ways.items()
+        if a < b and (b, a) in ways and abs(middle - ways[b, a][0]) > max(0.05, 8.0 * np.hypot(std, ways[b, a][1]))
+    }
+    if differ_m:
+        a, b = max(differ_m, key=lambda pair: abs(differ_m[pair]))
         yield (
-            f"pair {a}-{b}: ranges read {100 * abs(sure_m[worst]):.0f} cm "
-            f"{'longer' if sure_m[worst] > 0 else 'shorter'} if tag {a} initiates: clock skew is not corrected, or "
+            f"pair {a}-{b}: ranges read {100 * abs(differ_m[a, b]):.0f} cm "
+            f"{'longer' if differ_m[a, b] > 0 else 'shorter'} if tag {a} initiates: clock skew is not corrected, or "
             "with the wrong sign of the carrier's reading"
         )
+
+
+def _medians_by_way(values: Floats, ranges: Ranges) -> dict[tuple[int, int], tuple[float, float]]:
+    """Return the median of values (n,) by (initiator, target), with its standard error, of 20 finite ones at least."""
+    known = np.isfinite(values)
+    link, number, count = np.unique(
+        (ranges.initiator * 65_536 + ranges.target)[known], return_inverse=True, return_counts=True
+    )
+    std = STD_OF_MEDIAN * spreads(values[known], number) / np.sqrt(count)
+    found = zip(link.tolist(), medians(values[known], number).tolist(), std.tolist(), count.tolist(), strict=True)
+    return {divmod(of, 65_536): (middle, error) for of, middle, error, several in found if several >= 20}
 
 
 def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: Ranges) -> None:
@@ -289,22 +295,18 @@ def power_levels_db(ranges: Ranges) -> dict[int, tuple[float, float]]:
     In dB, each with its standard error; tags of which no pair has enough ranges with both powers are left out.
     """
     # The initiator reads what the target sent, and the target what the initiator sent.
-    apart = ranges.fpp2_dbm - ranges.fpp1_dbm
-    known = np.isfinite(apart)
-    link = (ranges.initiator * 65_536 + ranges.target)[known]
-    links, number, count = np.unique(link, return_inverse=True, return_counts=True)
-    enough = count >= 20
-    if not enough.any():
+    ways = _medians_by_way(ranges.fpp2_dbm - ranges.fpp1_dbm, ranges)
+    if not ways:
         return {}
-    ends = np.divmod(links[enough], 65_536)
+    ends, (middle, std) = np.array([*ways]).T, np.array([*ways.values()]).T
     tags = np.unique(ends)
     inverse = np.linalg.pinv(np.subtract(*(np.equal.outer(end, tags).astype(float) for end in ends)))
-    middle, spread = (of(apart[known], number)[enough] for of in (medians, spreads))
     levels: Floats = inverse @ middle
     near = np.abs(np.subtract.outer(levels, levels)) < SAME_LEVEL_DB
     levels -= levels[near[np.argmax(near.sum(axis=1))]].mean()
-    std = np.sqrt(inverse**2 @ ((STD_OF_MEDIAN * spread) ** 2 / count[enough]))
-    return dict(zip(tags.tolist(), zip(levels.tolist(), std.tolist(), strict=True), strict=True))
+    return dict(
+        zip(tags.tolist(), zip(levels.tolist(), np.sqrt(inverse**2 @ std**2).tolist(), strict=True), strict=True)
+    )
 
 
 def _ns_a_decibel(ranges: Ranges, calibration: Calibration) -> float:
