@@ -10,7 +10,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -28,11 +27,10 @@ from calib.estimator.unknowns import Priors
 from calib.spread import less_medians
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.contents import Contents
-from uwblink.recording.distances import distances_m, poses_around, tracks_of
+from uwblink.recording.distances import distances_m
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.recording.summary import differences, repeated_rows, single_reports
-from uwblink.ticks import TICK_S
 from uwblink.twr import Exchanges
 
 
@@ -131,25 +129,14 @@ EXAMINED_STRETCHES: Final = 40
 
 
 def looked_at(source: Source) -> Source:
-    """Return what to look at of a source: all of it, or stretches of a long recording with the poses around them."""
+    """Return what to look at of a source: all of it, or stretches of the exchanges of a long recording."""
     if not isinstance(source, RecordedSource) or source.recording.count("exchanges") <= EXAMINED_EXCHANGES:
         return source
-    recording = source.recording
-    *edges, last_ns = recording.dividing_times("exchanges", EXAMINED_EXCHANGES // EXAMINED_STRETCHES)
-    spans = list(pairwise([*edges, last_ns + 1]))
-    tracks, parts, poses = tracks_of(source.poses), list[Exchanges](), list[Poses]()
-    for k in np.unique(np.linspace(0, len(spans) - 1, EXAMINED_STRETCHES).round().astype(int)).tolist():
-        start_ns, end_ns = spans[k]
-        parts.append(recording.exchanges(start_ns, end_ns))
-        # Offsets of clocks are looked for within 3 s; a range belongs to the middle of its first two messages, which is
-        # after its time, by half a wrap at most.
-        margin_ns, later_ns = 4_000_000_000, int(2 ** parts[-1].bits * TICK_S * 0.5e9) + 1
-        poses.append(poses_around(tracks, start_ns - margin_ns, end_ns + later_ns + margin_ns))
-    every = Poses.concatenate(poses)
-    # Poses of two stretches are there once.
-    places = np.column_stack([every.time_ns, np.unique(every.body, return_inverse=True)[1]])
-    every = every[np.unique(places, axis=0, return_index=True)[1]]
-    return Contents(exchanges=Exchanges.concatenate(parts), poses=every, tags=source.tags, faults=source.faults)
+    edges = source.recording.dividing_times("exchanges", EXAMINED_EXCHANGES // EXAMINED_STRETCHES)
+    edges[-1] += 1
+    chosen = np.unique(np.linspace(0, len(edges) - 2, EXAMINED_STRETCHES).round().astype(int)).tolist()
+    parts = [source.recording.exchanges(edges[k], edges[k + 1]) for k in chosen]
+    return Contents(exchanges=Exchanges.concatenate(parts), poses=source.poses, tags=source.tags, faults=source.faults)
 
 
 def examined_part(recording: str | os.PathLike[str]) -> str:
