@@ -63,11 +63,12 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """A row of the table of checks: question, statistic, its distribution on sound data, and remedies.
+    """A row of the table of checks: when it is run, question, statistic, its distribution on sound data, and remedies.
 
     `remedies` maps names of faults to what to do, with fields for the words of a candidate; `look` yields candidates.
     """
 
+    stage: str
     question: str
     statistic: str
     sound: str

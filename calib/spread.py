@@ -27,10 +27,7 @@ def robust_spread(values: Floats, centre: float | None = None) -> float:
     Deviations are from the median, unless another `centre` is known.
     """
     middle = np.median(values) if centre is None else centre
-    # Of millions of values one copy at a time: it is made absolute, and put into order, where it lies.
-    apart = np.asarray(values - middle)
-    np.abs(apart, out=apart)
-    return SIGMA_OF_MAD * float(np.median(apart, overwrite_input=True))
+    return SIGMA_OF_MAD * float(np.median(np.abs(values - middle)))
 
 
 def medians(values: Floats, group: Ints) -> Floats:

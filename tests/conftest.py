@@ -8,7 +8,7 @@ LONGEST: Final = (
     "tests/calib/report/test_report.py",
     "tests/test_pages.py",
     "tests/calib/report/test_files.py",
-    "tests/calib/checks/test_checks.py",
+    "tests/calib/checks/test_examine.py",
     "tests/uwblink/boards/test_recorder.py",
     "tests/loop/test_wire.py",
     "tests/calib/surveys/test_surveying.py",

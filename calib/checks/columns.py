@@ -1,4 +1,4 @@
-"""Checks of the columns of a recording: stamps, protocols, ids, and units that contradict each other or physics."""
+"""Checks of the columns of a recording: stamps, protocols, ids and units, who ranges with whom, and what is missing."""
 
 from __future__ import annotations
 
@@ -8,31 +8,56 @@ from typing import Final
 
 import numpy as np
 
-from calib.checks.geometry import MATERIAL
-from calib.checks.recording_view import PLAUSIBLE_M, RecordingView
-from calib.data.ranges import measured_powers
-from calib.findings import Candidate, more_often
+from calib.calibration.power_curves import ALPHA_DBM, lifted_power
+from calib.checks.recording_view import RecordingView
+from calib.data.clocks import left_skew, pair_ids
+from calib.estimator.identifiability import free_directions, square_of
+from calib.findings import Candidate, exceeds, more_often
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats
 from uwblink.protocols.table import PROTOCOLS, single_sided
-from uwblink.recording import target_faster_ppm
+from uwblink.recording import clock_skews, target_faster_ppm
+from uwblink.recording.summary import failures_by_pair
 from uwblink.ticks import SPEED_OF_LIGHT, TICKS_PER_SECOND
 from uwblink.twr import Exchanges, board_range, intervals, raw_range, without_stamps
 
 VACUUM_OVER_AIR: Final = 299_792_458.0 / SPEED_OF_LIGHT
+
+PLAUSIBLE_M: Final = 1000.0
+"""Longer than any range of a UWB radio."""
+
+LENGTHS: Final = {"mm": 1000.0, "cm": 100.0, "in": 1 / 0.0254, "ft": 1 / 0.3048}
+"""Units of length by the names that a map takes: how many are a metre."""
+
+POWERS: Final = {
+    "256 steps a dBm": 1 / 256,
+    "tenths of a dBm": 0.1,
+    "hundredths of a dBm, and the other sign": -0.01,
+    "hundredths of a dBm": 0.01,
+    "the other sign": -1.0,
+}
+"""Factors that make dBm of powers: firmwares print a loss, or integers. The last that fits is the simplest."""
+
+MIN_RANGES: Final = 20
+"""Fewer ranges, or powers, say nothing of a unit."""
+
+
+def empty(view: RecordingView) -> Iterator[Candidate]:
+    """Recordings without an exchange."""
+    if not len(view.exchanges):
+        yield Candidate("empty", "the recording holds no exchanges")
 
 
 def ticks(view: RecordingView) -> Iterator[Candidate]:
     """Stamps in nanoseconds taken for ticks make every duration 64 times too short."""
     spans, third = intervals(view.exchanges), view.exchanges.tx3 != 0
     legs = [float(np.median(spans.dt41)), float(np.median(spans.dt53[third])) if third.any() else 0.0]
-    longest = max(legs) / TICKS_PER_SECOND
-    per_ns = TICKS_PER_SECOND * 1e-9
-    if longest < 60e-6 and longest * per_ns > 150e-6 and len(np.unique(view.exchanges.tx1 % 512)) > 8:
+    longest_us, per_ns = max(legs) / TICKS_PER_SECOND * 1e6, TICKS_PER_SECOND * 1e-9
+    if longest_us < 60 and longest_us * per_ns > 150 and len(np.unique(view.exchanges.tx1 % 512)) > 8:
         yield Candidate(
             "unit slip",
-            f"the longest leg of an exchange lasts {longest * 1e6:.1f} µs, too short for a frame; "
-            f"read as nanoseconds it would be {longest * per_ns * 1e6:.0f} µs",
+            f"the longest leg of an exchange lasts {longest_us:.1f} µs, too short for a frame; "
+            f"read as nanoseconds it would be {longest_us * per_ns:.0f} µs",
         )
 
 
@@ -49,7 +74,7 @@ def impossible(view: RecordingView) -> Bools:
     """Return which exchanges are impossible, or contradict their reported range or the clocks of their pair (n,)."""
     e, ratios = view.exchanges, _reported_over_stamps(view)
     with np.errstate(all="ignore"):
-        bad = ~(np.abs(view.raw_m) < PLAUSIBLE_M) | ~_sound_clocks(e) | (e.initiator == e.target)
+        bad = ~(np.abs(view.ranges.raw_m) < PLAUSIBLE_M) | ~_sound_clocks(e) | (e.initiator == e.target)
         # Where reported ranges are in another unit by more, none of them contradicts its stamps.
         if not len(ratios) or abs(np.median(ratios) - 1) <= 1e-4:
             bad |= np.abs(board_range(e) - e.range_m) > 0.01
@@ -76,7 +101,7 @@ def doubled(view: RecordingView) -> Iterator[Candidate]:
 
 
 def corrupted(view: RecordingView) -> Iterator[Candidate]:
-    """Exchanges that are impossible, or contradict themselves; the other examinations do without them."""
+    """Exchanges that are impossible, or contradict themselves; the other checks do without them."""
     bad = impossible(view)
     count = int(np.count_nonzero(bad))
     if count < 0.5 * len(bad):
@@ -101,32 +126,22 @@ def contradicting(view: RecordingView) -> Iterator[Candidate]:
 def _reported_over_stamps(view: RecordingView) -> Floats:
     """Return reported ranges over those from the stamps, where both are known and longer than a metre."""
     with np.errstate(all="ignore"):
-        ratio = view.exchanges.range_m / view.raw_m
-    return np.asarray(ratio[np.isfinite(ratio) & (np.abs(view.raw_m) > 1) & ~without_stamps(view.exchanges)])
+        ratio = view.exchanges.range_m / view.ranges.raw_m
+    return np.asarray(ratio[np.isfinite(ratio) & (np.abs(view.ranges.raw_m) > 1) & ~without_stamps(view.exchanges)])
 
 
 def reported(view: RecordingView) -> Iterator[Candidate]:
     """Reported ranges that were computed with the speed of light in vacuum, or are in another unit than metres."""
     ratios = _reported_over_stamps(view)
-    ratio = float(np.median(ratios)) if len(ratios) >= RANGES_OF_A_UNIT else 1.0
+    ratio = float(np.median(ratios)) if len(ratios) >= MIN_RANGES else 1.0
+    evidence = f"reported ranges are {ratio:.5g} times those from the stamps"
     # So many medians of ratios tell the speed of light in air from that in vacuum.
     if len(ratios) >= 100 and abs(ratio / VACUUM_OVER_AIR - 1) < 5e-5:
-        evidence = (
-            f"reported ranges are {ratio:.5f} times those from the stamps: 299 792 458 m/s instead of 299 702 547"
-        )
-        yield Candidate("speed of light in vacuum", evidence)
+        yield Candidate("speed of light in vacuum", f"{evidence}: 299 792 458 m/s instead of 299 702 547")
     for unit, many in LENGTHS.items():
         # Delays of boards may change a range of some metres by so much.
         if abs(ratio / many - 1) < 0.05:
-            evidence = f"reported ranges are {ratio:.5g} times those from the stamps"
-            yield Candidate(REPORTED, evidence, words={"unit": unit})
-
-
-POSSIBLE_SHARE: Final = 0.5
-"""Another reading must make at least this share of the ranges possible, and `MORE_POSSIBLE` more than its own."""
-
-MORE_POSSIBLE: Final = 0.2
-MORE_BY_WIDTH: Final = 0.01
+            yield Candidate("unit of the reported ranges", evidence, words={"unit": unit})
 
 
 def another(view: RecordingView) -> Iterator[Candidate]:
@@ -134,9 +149,8 @@ def another(view: RecordingView) -> Iterator[Candidate]:
     e = view.exchanges[:: max(len(view.exchanges) // 4000, 1)]
     names, counts = np.unique(e.protocol, return_counts=True)
     said = str(names[int(np.argmax(counts))])
-    third = bool(np.mean((e.tx3 | e.rx3) != 0) > POSSIBLE_SHARE)
+    third = bool(np.mean((e.tx3 | e.rx3) != 0) > 0.5)
     highest = max(int(stamps.max(initial=0)) for stamps in (e.tx1, e.rx1, e.tx2, e.rx2))
-    own = _possible_share(e)
     tried = {
         (name, bits): _possible_share(replace(e, protocol=np.full(len(e), name), bits=bits))
         for name, row in PROTOCOLS.items()
@@ -146,8 +160,9 @@ def another(view: RecordingView) -> Iterator[Candidate]:
     if not tried:
         return
     name, bits = max(tried, key=lambda key: (round(tried[key], 2), key[1] == e.bits, key[0] == said))
-    share = tried[name, bits]
-    if share < max(POSSIBLE_SHARE, own + (MORE_BY_WIDTH if name == said else MORE_POSSIBLE)):
+    share, own = tried[name, bits], _possible_share(e)
+    # A wrong width spoils only exchanges during which the counter wraps; a wrong protocol spoils most.
+    if share < max(0.5, own + (0.01 if name == said else 0.2)):
         return
     numbers = f"{100 * share:.1f} % of the ranges are possible, {100 * own:.1f} % as the recording has it"
     if name == said:
@@ -168,29 +183,7 @@ def _possible_share(e: Exchanges) -> float:
 
 def _sound_clocks(e: Exchanges) -> Bools:
     """Return where the third leg says that clocks run alike as crystals do, (n,); so they do where there is none."""
-    names = [name for name in np.unique(e.protocol).tolist() if PROTOCOLS[name].third_sender is not None]
-    return np.asarray(~np.isin(e.protocol, names) | (np.abs(target_faster_ppm(e)) < 100.0))
-
-
-LENGTHS: Final = {"mm": 1000.0, "cm": 100.0, "in": 1 / 0.0254, "ft": 1 / 0.3048}
-"""How many of a unit are a metre, by the names that a map takes."""
-
-POWERS: Final = {
-    "the other sign": -1.0,
-    "hundredths of a dBm": 0.01,
-    "hundredths of a dBm, and the other sign": -0.01,
-    "tenths of a dBm": 0.1,
-    "256 steps a dBm": 1 / 256,
-}
-"""What makes dBm of powers that are none: firmwares print a loss, or integers."""
-
-USUAL_DBM: Final = (-115.0, -55.0)
-"""First-path powers of these radios, from their sensitivity to a metre apart."""
-
-RANGES_OF_A_UNIT: Final = 20
-
-REPORTED: Final = "unit of the reported ranges"
-POWER: Final = "unit of the powers"
+    return np.asarray(np.isin(e.protocol, single_sided()) | (np.abs(target_faster_ppm(e)) < 100.0))
 
 
 def lengths(view: RecordingView) -> Iterator[Candidate]:
@@ -199,20 +192,20 @@ def lengths(view: RecordingView) -> Iterator[Candidate]:
     The unit is the one that leaves the least between them; where the ranges have no stamps, and none that a radio can
     measure, theirs is wrong.
     """
-    good = np.isfinite(view.raw_m) & np.isfinite(view.truth_m)
-    raw, truth = view.raw_m[good], view.truth_m[good]
+    good = np.isfinite(view.ranges.raw_m) & np.isfinite(view.ranges.truth_m)
+    raw, truth = view.ranges.raw_m[good], view.ranges.truth_m[good]
     bare = bool(without_stamps(view.exchanges).mean() > 0.5)
-    if len(raw) < RANGES_OF_A_UNIT:
-        if bare and np.nanmedian(np.abs(view.raw_m)) > PLAUSIBLE_M:
+    if len(raw) < MIN_RANGES:
+        if bare and np.nanmedian(np.abs(view.ranges.raw_m)) > PLAUSIBLE_M:
             evidence = f"half of the ranges are longer than {PLAUSIBLE_M:.0f} m, which no UWB radio measures"
             yield Candidate("unit of the ranges", evidence, words={"unit": "mm"})
     elif unit := _unit(raw, truth):
-        name, whose = ("unit of the poses", "poses") if view.posed else ("unit of the true distances", "true distances")
+        whose = "poses" if view.posed else "true distances"
         evidence = (
             f"true distances have a median of {np.median(truth):.6g}, ranges one of {np.median(raw):.6g} m: they agree "
             f"if {whose} are in {unit}"
         )
-        yield Candidate(name, evidence, words={"unit": unit, "many": f"{LENGTHS[unit]:g}"})
+        yield Candidate(f"unit of the {whose}", evidence, words={"unit": unit, "many": f"{LENGTHS[unit]:g}"})
     elif bare and (unit := _unit(truth, raw)):
         evidence = f"ranges are in {unit} if true distances are in m: half of them are longer than {np.median(raw):.0f}"
         yield Candidate("unit of the ranges", evidence, words={"unit": unit})
@@ -224,7 +217,7 @@ def _unit(metres: Floats, others: Floats) -> str | None:
     best = min(left, key=lambda name: left[name])
     # Distances that say nothing are best when they are divided by most.
     # Feet taken for metres leave two thirds of the ranges' own spread, the right unit noise and delays.
-    if left[best] < 0.5 * MATERIAL * min(robust_spread(metres - others), robust_spread(metres)):
+    if left[best] < 0.5 * min(robust_spread(metres - others), robust_spread(metres)):
         return best
     # Of one distance, the unit that makes both alike.
     if robust_spread(metres) > 0.5 or np.median(others) < PLAUSIBLE_M:
@@ -235,14 +228,145 @@ def _unit(metres: Floats, others: Floats) -> str | None:
 def powers(view: RecordingView) -> Iterator[Candidate]:
     """Powers that cannot be dBm at an antenna."""
     every = np.concatenate([view.exchanges.fpp1_dbm, view.exchanges.fpp2_dbm])
-    every = every[np.isfinite(every) & (every != 0)]
-    if len(every) < RANGES_OF_A_UNIT or np.mean(np.isfinite(measured_powers(every))) > 0.5:
+    known = np.isfinite(np.concatenate([view.ranges.fpp1_dbm, view.ranges.fpp2_dbm]))
+    given = np.isfinite(every) & (every != 0)
+    if np.count_nonzero(given) < MIN_RANGES or np.mean(known[given]) > 0.5:
         return
-    middle = float(np.median(every))
+    middle = float(np.median(every[given]))
     guess, factor = "no usual factor makes them so", "give fpp1 and fpp2 in dBm"
-    for name, times in reversed(POWERS.items()):
-        if USUAL_DBM[0] < times * middle < USUAL_DBM[1]:
+    for name, times in POWERS.items():
+        # From their sensitivity to a metre apart.
+        if -115 < times * middle < -55:
             guess = f"they look like {name}: times {times:g} they would be {times * middle:.0f} dBm"
             factor = f"multiply fpp1 and fpp2 by {times:g}"
     evidence = f"the median power is {middle:+.5g} dBm, where these radios receive -115 to -55; {guess}"
-    yield Candidate(POWER, evidence, words={"factor": factor})
+    yield Candidate("unit of the powers", evidence, words={"factor": factor})
+
+
+def undetermined(view: RecordingView) -> Iterator[Candidate]:
+    """Pairs that leave antenna delays undetermined."""
+    some = view.ranges[np.isfinite(view.ranges.weight_initiator) & np.isfinite(view.ranges.weight_target)]
+    if len(some):
+        tags = some.tags()
+        square, ends = square_of(tags, some.initiator, some.target, some.weight_initiator, some.weight_target)
+        _, free = free_directions(square, tags, ends)
+        if free:
+            groups = "; ".join(", ".join(map(str, group)) for group in free)
+            yield Candidate("too few pairs", f"the pairs do not determine the delays of tags {groups}")
+
+
+def silent(view: RecordingView) -> Iterator[Candidate]:
+    """A tag whose exchanges nearly all fail, where those of others do not."""
+    e, failed = view.exchanges, failures_by_pair(view.faults)
+    tags = sorted({tag.tag for tag in view.tags})
+    for tag in sorted(tags, key=lambda tag: -sum(n for pair, n in failed.items() if tag in pair)):
+        bad = sum(n for pair, n in failed.items() if tag in pair)
+        done = int(np.count_nonzero((e.initiator == tag) | (e.target == tag)))
+        # What fails with a dead tag is no fault of the other one.
+        failed = {pair: n for pair, n in failed.items() if tag not in pair or bad <= done}
+        others, others_bad = len(e) - done, sum(n for pair, n in failed.items() if tag not in pair)
+        if others + others_bad:
+            # A tag that answers half of the time is at the edge of its range, and no worse.
+            usual = max(0.5, others_bad / (others + others_bad))
+            evidence = f"tag {tag} took part in {done} exchanges, {bad} failed"
+            p_value = more_often(bad, bad + done, usual, tried=len(tags))
+            yield Candidate("dead or deaf tag", evidence, p_value, {"tag": tag})
+
+
+def still(view: RecordingView) -> Iterator[Candidate]:
+    """Tags that keep their distances."""
+    if view.standing_m is not None:
+        yield Candidate("static data", f"no distance changes by more than {100 * view.standing_m:.0f} cm")
+
+
+def missing(view: RecordingView) -> Iterator[Candidate]:
+    """Exchanges without a first-path power at either end, of which no curve can be fitted, or without true distance."""
+    powers, truth = np.stack([view.ranges.fpp1_dbm, view.ranges.fpp2_dbm]), view.ranges.truth_m
+    powered, true = (100 * float(np.mean(known)) for known in (np.isfinite(powers).any(axis=0), np.isfinite(truth)))
+    if powered < 50:
+        yield Candidate("no powers", f"{powered:.0f} % of the exchanges have a first-path power")
+    if true < 50 and not view.standing:
+        evidence = f"{true:.0f} % of the exchanges have one: poses are missing or do not cover the recording"
+        yield Candidate("no true distances", evidence)
+
+
+def confounded(view: RecordingView) -> Iterator[Candidate]:
+    """Power that is a function of distance and nothing else lets the curve learn distance.
+
+    The scatter of readings is no power that varies, and is taken off: readings of a pair within 0.2 s, in which a robot
+    turns its antenna by a few degrees, differ by their noise. So is what groups of distances explain by chance, as
+    powers of a pair within 2 s, in which it turns, are nearly one (adjusted share).
+    """
+    lifted = lifted_power(view.ranges.fpp1_dbm, view.ranges.fpp2_dbm, "mean-of-lifted", ALPHA_DBM)
+    rows = np.flatnonzero(np.isfinite(lifted) & (view.ranges.truth_m > 0))
+    if len(rows) < 300 or np.ptp(view.ranges.truth_m[rows]) < 0.5:
+        return
+    pairs = pair_ids(view.exchanges)
+    rows = rows[np.lexsort((view.exchanges.time_ns[rows], pairs[rows]))]
+    pair, time_ns, shares, groups = pairs[rows], view.exchanges.time_ns[rows], [0.0], 40
+    alone = len(np.unique(np.column_stack([pair, time_ns // 2_000_000_000]), axis=0))
+    together = (np.diff(pair) == 0) & (np.diff(time_ns) < 200_000_000)
+    # Lifted powers near the antennas outweigh all others, their decibels do not; either way is too much.
+    for power in (lifted[rows], np.log(lifted[rows])):
+        noise = float(np.mean(np.diff(power)[together] ** 2)) / 2 if np.count_nonzero(together) >= 100 else 0.0
+        parts = np.array_split(power[np.argsort(view.ranges.truth_m[rows], kind="stable")], groups)
+        within, between = float(np.mean([np.var(one) for one in parts])), float(np.var([np.mean(one) for one in parts]))
+        if between > within:
+            share = between / (between + max(within - noise, 0.0))
+            shares.append(1 - (1 - share) * (alone - 1) / max(alone - groups, 1))
+    # Beyond, what is fitted over power has ten times its own variance (variance inflation, Marquardt 1970).
+    if max(shares) > 0.9:
+        evidence = f"distance explains {100 * max(shares):.0f} % of the power's variance"
+        yield Candidate("power confounded with distance", evidence)
+
+
+def swapped_roles(view: RecordingView) -> Iterator[Candidate]:
+    """Carriers and stamps that say the opposite of which clock of a pair is faster.
+
+    The readings' own offset of a tenth of a ppm, which is no noise, hides no slope of 1.
+    """
+    known = [one for one in clock_skews(view.exchanges) if one.count > 15 and one.carrier_ppm is not None]
+    stamps, readings, spread, count = np.array(
+        [(one.stamps_ppm, one.carrier_ppm, one.residual_ppm, one.count) for one in known], dtype=float
+    ).reshape(-1, 4).T  # fmt: skip
+    weight = count / (np.pi / 2 * np.maximum(spread, 1e-4) ** 2)
+    square = float(weight @ stamps**2)
+    if count.sum() < 100 or not square > 0:
+        return
+    slope = float(weight @ (stamps * readings)) / square
+    left = float(np.mean((readings - slope * stamps) ** 2 * weight))
+    # Half a slope is halfway between what is right and what is swapped.
+    if slope < -0.5:
+        yield Candidate(
+            "swapped roles",
+            "the carriers say that the targets' clocks are slower where the stamps say faster, and the other way round",
+            exceeds(slope, float(np.sqrt(max(left, 1.0) / square)), np.inf, tolerance=0.5),
+        )
+
+
+def unread(view: RecordingView) -> Iterator[Candidate]:
+    """Single-sided ranges whose carriers were not read: nothing says how much skew is left in them."""
+    left = left_skew(view.exchanges)
+    if left and not np.isfinite(left.told_m):
+        yield Candidate("single-sided without carrier readings", str(left))
+
+
+def carriers(view: RecordingView) -> Iterator[Candidate]:
+    """Carriers' readings that do not follow the clocks' ratios by the stamps."""
+    known = sorted(
+        (one.residual_ppm, one.count, one.pair)
+        for one in clock_skews(view.exchanges)
+        if one.residual_ppm and one.count >= 100
+    )
+    if known:
+        # That of most pairs: one board that scatters is not the unit of all.
+        scatter, count, pair = known[(len(known) - 1) // 2]
+        # Of the logarithm of a median absolute deviation (efficiency 0.37).
+        # Of a sound board: a reply of 1.5 ms then adds a third of a metre to a range.
+        p_value = exceeds(max(np.log(scatter / 1.5), 0.0), float(1 / np.sqrt(2 * 0.37 * count)), np.inf)
+        yield Candidate(
+            "carrier readings that say little",
+            f"they scatter by {scatter:.1f} ppm about their median (pair {pair}), and as much or more in half of the "
+            "pairs",
+            p_value,
+        )

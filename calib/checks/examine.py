@@ -1,19 +1,19 @@
 """The table of checks, each with its question, statistic, distribution on sound data and remedies; and examinations.
 
-Each examination of a recording is a row of the table. Those that suspect the truth (poses, lever arms, ids, clocks)
-work by trial: they undo the suspected fault, and if the ranges then agree better with the distances, it was there; of
-several, the one that explains most.
+Checks of geometry suspect the true distances (poses, lever arms, ids, clocks), and work by trial: they undo the
+suspected fault, and if the ranges then agree better with the distances, it was there; of several, the one that explains
+most.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from calib.checks import clocks, columns, geometry, offsets, pairs, reflected, surveys
+from calib.checks import columns, geometry, offsets, residuals, surveys
 from calib.checks.recording_view import RecordingView, view_of
 from calib.data.sources import Data, each, opened
 from calib.findings import BUDGET, CERTAIN, OF_A_FIT, Check, Finding
@@ -21,20 +21,28 @@ from calib.findings import BUDGET, CERTAIN, OF_A_FIT, Check, Finding
 ALONE: Final = "Student's t over 16 stretches of time"
 BLOCKS: Final = "Student's t, variances by stretches of time"
 
-GROSS: Final = (
+CHECKS: Final = (
     Check(
+        "reading",
+        "Does the recording hold exchanges?",
+        "number of exchanges", CERTAIN, {"empty": "record or import some"}, columns.empty,
+    ),
+    Check(
+        "reading",
         "Do double-sided exchanges have a third message?",
         "share without one, above a half", CERTAIN,
         {"single-sided data taken for double-sided": 'import again with protocol = "ss"'},
         columns.single_as_double,
     ),
     Check(
+        "reading",
         "Does a frame last as long as frames do?",
         "longest leg, shorter than a frame as ticks and not as ns", CERTAIN,
         {"unit slip": 'the stamps are nanoseconds, not ticks: import again with [units] stamps = "ns"'},
         columns.ticks,
     ),
     Check(
+        "reading",
         "Are true distances and ranges in one unit?",
         "spread of ranges less true distances, halved by mm, cm, in or ft", CERTAIN,
         {
@@ -47,6 +55,7 @@ GROSS: Final = (
         columns.lengths,
     ),
     Check(
+        "reading",
         "Do the stamps make ranges as the recording says?",
         "share of possible ranges by another protocol or width", CERTAIN,
         {
@@ -55,10 +64,8 @@ GROSS: Final = (
         },
         columns.another,
     ),
-)  # fmt: skip
-
-ROWS: Final = (
     Check(
+        "rows",
         "Are more rows damaged than one in a thousand?",
         "count of impossible rows", "binomial",
         {
@@ -68,12 +75,14 @@ ROWS: Final = (
         columns.corrupted,
     ),
     Check(
+        "rows",
         "Is each exchange there once?",
         "rows with all stamps of another", CERTAIN,
         {"doubled exchanges": "import one log of each exchange; what is said here counts each once"},
         columns.doubled,
     ),
     Check(
+        "rows",
         "Do both reports of an exchange agree?",
         "reports that differ", CERTAIN,
         {"contradicting reports": "look at the cables and ports of the two boards; what a damaged line says is not "
@@ -81,6 +90,7 @@ ROWS: Final = (
         columns.contradicting,
     ),
     Check(
+        "rows",
         "Does a tag range with itself?",
         "exchanges with one tag at both ends", CERTAIN,
         {"a tag with itself": "import again with other columns for from_id and to_id; a fit leaves these exchanges "
@@ -88,27 +98,28 @@ ROWS: Final = (
         columns.with_itself,
     ),
     Check(
+        "rows",
         "Does a tag fail in more than half of its exchanges, and more than others?",
         "count of failures", "binomial, for all tags",
         {"dead or deaf tag": "check power, antenna and USB of tag {tag}"},
-        pairs.silent,
+        columns.silent,
     ),
     Check(
+        "rows",
         "Are powers dBm at an antenna?",
         "median outside of -140 to -30 dBm", CERTAIN,
-        {columns.POWER: "{factor}, and import again"},
+        {"unit of the powers": "{factor}, and import again"},
         columns.powers,
     ),
-)  # fmt: skip
-
-GEOMETRY: Final = (
     Check(
+        "geometry",
         "Do poses fit better more than 30 ms earlier or later?",
         "log of the spread before over after", ALONE,
         {"pose time offset": "shift the poses: uwblink poses ... --offset {shift}"},
         geometry.pose_clock,
     ),
     Check(
+        "geometry",
         "Do other lever arms or quaternions fit better?",
         "log of the spread before over after, the best trial", f"{ALONE}, for all trials",
         {
@@ -120,123 +131,133 @@ GEOMETRY: Final = (
         geometry.geometry,
     ),
     Check(
+        "geometry",
         "Does an anchor stand more than 5 cm elsewhere?",
         "displacement that ranges ask for", "F(3, 9), variances by stretches of time, for all anchors",
         {
-            geometry.ELSEWHERE: "measure the place of {body} again, and see whose number it has; these ranges give "
-            "position_m = {place}"
+            "anchor stands elsewhere": "measure the place of {body} again, and see whose number it has; these ranges "
+            "give position_m = {place}"
         },
         geometry.anchors,
     ),
-)  # fmt: skip
-
-RADIO: Final = (
     Check(
+        "radio",
         "Do ranges follow the true distances within 30 cm?",
         "mean absolute error of a pair, its median aside", f"{ALONE}, for all pairs",
         {
-            offsets.ASTRAY: "see whether numbers of anchors belong to other places, and times to another clock; or "
-            "whether a wall stands between these tags"
+            "ranges that do not follow the distances": "see whether numbers of anchors belong to other places, and "
+            "times to another clock; or whether a wall stands between these tags"
         },
-        offsets.astray,
+        residuals.astray,
     ),
     Check(
+        "radio",
         "Do errors follow the clocks' skew?",
         "slope over the carriers' readings above 0.5, or ranges by who initiates above 5 cm",
-        "normal, or Student's t among pairs", {clocks.LEFT: "{more}", clocks.WRONG_SIGN: "{more}"},
-        clocks.skew,
+        "normal, or Student's t among pairs",
+        {"skew in single-sided ranges": "{more}", "carrier readings with the wrong sign": "{more}"},
+        residuals.skew,
     ),
     Check(
+        "radio",
         "Do all pairs of a tag shift by more than 2 cm at one time, and no others?",
         "mean shift at the best of 60 times and all tags", BLOCKS,
         {
-            offsets.MOVED: "look for a loose antenna or another voltage on tag {tag}; calibrate the two parts apart",
-            offsets.DRIFTED: "let tag {tag} warm up, see to its supply; calibrate short parts apart",
+            "delay changed mid-flight": "look for a loose antenna or another voltage on tag {tag}; calibrate the "
+            "two parts apart",
+            "delay drifts": "let tag {tag} warm up, see to its supply; calibrate short parts apart",
         },
         offsets.changed_delays,
     ),
     Check(
+        "radio",
         "Is a pair more than 4 cm off what delays of tags explain?",
         "a pair's own offset, the largest", f"{BLOCKS}, for all pairs",
         {
-            offsets.OPEN: "look for a wall or a body between these two, and at their lever arms; record the pair "
-            "anew, or fit with `constants` pair"
+            "pairs that do not close": "look for a wall or a body between these two, and at their lever arms; record "
+            "the pair anew, or fit with `constants` pair"
         },
         offsets.closures,
     ),
     Check(
+        "radio",
         "Are more than a fifth of the ranges reflected, or of one tag more than of others, or do reflections last?",
         "share of long ranges; long ranges after long ones", f"{ALONE}; binomial, for all tags or pairs",
         {
-            reflected.MANY: "{more}",
-            reflected.LASTING: "such ranges do not average out within a spell: record for many spells, move walls, "
-            "bodies or antennas",
+            "reflections": "{more}",
+            "reflections that last": "such ranges do not average out within a spell: record for many spells, move "
+            "walls, bodies or antennas",
         },
-        reflected.reflections,
+        residuals.reflections,
     ),
-)  # fmt: skip
-
-STRUCTURE: Final = (
     Check(
+        "structure",
         "Do carriers and stamps call the same clocks faster?",
         "slope of the one over the other below -0.5", "normal",
         {
             "swapped roles": "initiator and target (ids, powers and skews) are exchanged, or the readings have the "
             "other sign: change it on import"
         },
-        clocks.swapped_roles,
+        columns.swapped_roles,
     ),
     Check(
+        "structure",
         "Are reported ranges those of the stamps, in metres?",
         "median of their ratio", CERTAIN,
         {
             "speed of light in vacuum": "nothing for a fit, which uses the stamps; multiply reported ranges by 0.9997 "
             "before using them",
-            columns.REPORTED: 'nothing for a fit, which uses stamps; else import again with [units] distance = '
-            '"{unit}"',
+            "unit of the reported ranges": 'nothing for a fit, which uses stamps; else import again with [units] '
+            'distance = "{unit}"',
         },
         columns.reported,
     ),
     Check(
+        "structure",
         "Were carriers read where one reply is all that there is?",
         "single-sided exchanges without", CERTAIN,
         {
             "single-sided without carrier readings": "range in both directions of every pair, so that half of the "
             "skew's sign is the other way; or record the carrier integrator, or use double-sided ranging"
         },
-        clocks.unread,
+        columns.unread,
     ),
     Check(
+        "structure",
         "Do carriers' readings scatter by more than 1.5 ppm?",
         "log of the median pair's scatter", "normal",
         {
             "carrier readings that say little": "do not correct single-sided ranges with them; see to their unit and "
             "register"
         },
-        clocks.carriers,
+        columns.carriers,
     ),
     Check(
+        "structure",
         "Do the pairs determine all delays?",
         "null space of the design", CERTAIN,
         {"too few pairs": "record three tags that all range with each other, or pin a known delay with `fixed_ns`"},
-        pairs.pairs,
+        columns.undetermined,
     ),
     Check(
+        "structure",
         "Does any distance change by 10 cm?",
         "largest change", CERTAIN,
-        {pairs.STATIC: "move the tags while recording, so that powers and reflections vary"},
-        pairs.still,
+        {"static data": "move the tags while recording, so that powers and reflections vary"},
+        columns.still,
     ),
     Check(
+        "structure",
         "Does distance explain more than 90 % of the power?",
         "share of variance between distances, noise of readings aside (variance inflation of 10)", CERTAIN,
         {
-            pairs.CONFOUNDED: "turn the antennas while recording; until then the curve may hold what belongs to "
-            "distance, and `delays_only` fits none"
+            "power confounded with distance": "turn the antennas while recording; until then the curve may hold "
+            "what belongs to distance, and `delays_only` fits none"
         },
-        pairs.confounded,
+        columns.confounded,
     ),
     Check(
+        "structure",
         "Were powers measured, and are true distances known?",
         "share of exchanges with one, below a half", CERTAIN,
         {
@@ -244,46 +265,56 @@ STRUCTURE: Final = (
             "no true distances": "add motion capture with uwblink poses, or measured distances in gt_range_m; without "
             "any, survey boards that stood still, and fit moving ones with the truth from ranges",
         },
-        pairs.missing,
+        columns.missing,
+    ),
+    Check(
+        "between",
+        "Did an anchor or a delay change between recordings?",
+        "displacement of an anchor; mean change of a tag's pairs above 2 cm", f"as above; {BLOCKS}, for all tags",
+        {
+            "anchor moved between recordings": "measure the place of {body} anew, and fit recordings apart until then",
+            "delay changed between recordings": "was the antenna of tag {tag} touched, or its board replaced? "
+            "calibrate the recordings apart",
+        },
+        offsets.compared,
+    ),
+    Check(
+        "survey",
+        "What does a survey of standing boards contradict?",
+        "contradictions of the survey, which has tested them", CERTAIN,
+        {
+            "board moved within an arrangement": "record that arrangement again, or end it before",
+            "arrangement not as it is said to be": "put the boards straight, or record without `known`",
+            "wrong known distance": "measure it again, antenna to antenna, or leave it out",
+            "exchanged labels": "look at the labels of these two boards",
+            "survey determines nothing": "make the arrangements that calib plan advises",
+            "delays that a survey leaves open": "make another arrangement, or tape a distance: calib plan says which",
+            "many reflected pairs": "put boards where they see each other, away from walls and metal",
+            "two solutions of a survey": "tape a distance that tells them apart, and give it as known",
+            "powers that hardly vary": "make arrangements with nearer and farther boards, or take the curve of another "
+            "calibration (`curve_from`)",
+        },
+        surveys.surveyed,
     ),
 )  # fmt: skip
 
-BETWEEN: Final = Check(
-    "Did an anchor or a delay change between recordings?",
-    "displacement of an anchor; mean change of a tag's pairs above 2 cm", f"as above; {BLOCKS}, for all tags",
-    {
-        offsets.MOVED_ANCHOR: "measure the place of {body} anew, and fit recordings apart until then",
-        offsets.OTHER_DELAY: "was the antenna of tag {tag} touched, or its board replaced? calibrate the recordings "
-        "apart",
-    },
-    offsets.compared,
-)  # fmt: skip
-
-SURVEYS: Final = Check(
-    "What does a survey of standing boards contradict?",
-    "contradictions of the survey, which has tested them", CERTAIN, surveys.REMEDIES, surveys.surveyed,
-)  # fmt: skip
-
-CHECKS: Final = (*GROSS, *ROWS, *GEOMETRY, *RADIO, *STRUCTURE, BETWEEN, SURVEYS)
 LEVEL: Final = (BUDGET - OF_A_FIT) / sum(not check.certain for check in CHECKS)
 """p-value below which a candidate is a finding: checks have equal shares of the budget, beside that of a fit."""
 
-EMPTY: Final = "empty"
-ORDER: Final = (EMPTY, *(fault for check in CHECKS for fault in check.remedies))
-CHANGED: Final = {offsets.OPEN, reflected.MANY, reflected.LASTING}
-IMPLIED: Final = (
+OF_PAIRS: Final = {"pairs that do not close", "reflections", "reflections that last"}
+IMPLIED: Final = {
     # Where nothing moves, every pair has one distance and one power, and the one explains the other.
-    (pairs.STATIC, {pairs.CONFOUNDED}),
-    (geometry.ELSEWHERE, {offsets.OPEN}),
-    (offsets.MOVED, CHANGED),
-    (offsets.DRIFTED, CHANGED),
-    (offsets.ASTRAY, {*CHANGED, offsets.MOVED, offsets.DRIFTED}),
-    (clocks.LEFT, {*CHANGED, offsets.ASTRAY}),
-    (clocks.WRONG_SIGN, {*CHANGED, offsets.ASTRAY}),
-    (columns.POWER, {"no powers"}),
-    (columns.REPORTED, {"corrupted exchanges"}),
-)
-"""What follows from a fault and is not told beside it."""
+    "static data": {"power confounded with distance"},
+    "anchor stands elsewhere": {"pairs that do not close"},
+    "delay changed mid-flight": OF_PAIRS,
+    "delay drifts": OF_PAIRS,
+    "ranges that do not follow the distances": {*OF_PAIRS, "delay changed mid-flight", "delay drifts"},
+    "skew in single-sided ranges": {*OF_PAIRS, "ranges that do not follow the distances"},
+    "carrier readings with the wrong sign": {*OF_PAIRS, "ranges that do not follow the distances"},
+    "unit of the powers": {"no powers"},
+    "unit of the reported ranges": {"corrupted exchanges"},
+}
+"""Faults that follow from a fault, and are not reported beside it."""
 
 
 def examine(data: Data | Iterable[Data]) -> list[Finding]:
@@ -309,44 +340,44 @@ def examine(data: Data | Iterable[Data]) -> list[Finding]:
         findings += [replace(finding, evidence=prefix + finding.evidence) for finding in found]
         views += [view] if view else []
     if len(views) > 1:
-        between = BETWEEN.findings(offsets.compared(views, LEVEL), LEVEL)
+        between = _run("between", views, LEVEL)
         # What moved between two recordings is no fault of either one.
-        moved = any(finding.fault == offsets.MOVED_ANCHOR for finding in between)
-        findings = [one for one in findings if not (moved and one.fault == geometry.ELSEWHERE)] + between
+        moved = any(finding.fault == "anchor moved between recordings" for finding in between)
+        findings = [one for one in findings if not (moved and one.fault == "anchor stands elsewhere")] + between
     if views and len(views) == len(recordings) and all(view.standing for view in views):
-        findings += SURVEYS.findings(surveys.surveyed(recordings), LEVEL)
-    return sorted(findings, key=lambda finding: ORDER.index(finding.fault))
+        findings += _run("survey", recordings)
+    order = [fault for check in CHECKS for fault in check.remedies]
+    return sorted(findings, key=lambda finding: order.index(finding.fault))
 
 
-def _run(checks: Sequence[Check], view: RecordingView) -> list[Finding]:
-    return [finding for check in checks for finding in check.findings(check.look(view), LEVEL)]
+def _run(stage: str, *given: Any) -> list[Finding]:
+    return [found for check in CHECKS if check.stage == stage for found in check.findings(check.look(*given), LEVEL)]
 
 
 def _examined(view: RecordingView) -> tuple[list[Finding], RecordingView | None]:
     """Return what is wrong with one recording, and the recording without its impossible rows, if that can be used."""
-    if not len(view.exchanges):
-        return [Finding(EMPTY, "the recording holds no exchanges", "record or import some", 0.0)], None
-    for check in GROSS:
-        if gross := check.findings(check.look(view), LEVEL):
-            return gross, None
-    findings = _run(ROWS, view)
+    for check in CHECKS:
+        # With such a fault, the other numbers of a recording mean something else.
+        if check.stage == "reading" and (misread := check.findings(check.look(view), LEVEL)):
+            return misread, None
+    findings = _run("rows", view)
     bad = columns.impossible(view)
     if bad.all():
         return findings, None
     view = view.chosen(~bad)
-    if columns.POWER in {finding.fault for finding in findings}:
+    if any(finding.fault == "unit of the powers" for finding in findings):
         unknown = np.full(len(view.exchanges), np.nan)
-        view = replace(view, exchanges=replace(view.exchanges, fpp1_dbm=unknown, fpp2_dbm=unknown))
+        view = replace(view, ranges=replace(view.ranges, fpp1_dbm=unknown, fpp2_dbm=unknown))
     # Only stamps that make sense can say something about poses, and only right poses something about radios.
-    findings += _best(view) or _run(RADIO, view)
-    findings += _run(STRUCTURE, view)
-    found = {finding.fault for finding in findings}
-    implied = set[str]().union(*(follows for fault, follows in IMPLIED if fault in found))
+    findings += _best(view) or _run("radio", view)
+    findings += _run("structure", view)
+    implied = set[str]().union(*(IMPLIED.get(finding.fault, ()) for finding in findings))
     return [finding for finding in findings if finding.fault not in implied], view
 
 
 def _best(view: RecordingView) -> list[Finding]:
     """Return the fault of poses and lever arms that explains most of the errors."""
-    seen = [(check, [one for one in check.look(view) if one.p_value < LEVEL]) for check in GEOMETRY]
+    tried = [check for check in CHECKS if check.stage == "geometry"]
+    seen = [(check, [one for one in check.look(view) if one.p_value < LEVEL]) for check in tried]
     check, best = max(seen, key=lambda one: sum(fault.gain for fault in one[1]))
     return check.findings(best, LEVEL)

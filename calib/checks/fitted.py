@@ -32,18 +32,8 @@ MATTERS, CLEARLY = 1.0, 4.0
 SMALLEST_M = 0.01
 """An offset of less is nobody's fault: it widens intervals, and is not named unless it matters clearly."""
 
-READINGS = ("readings",)
-"""The finding that powers are read with noise: the curve is right for the powers that are read."""
-
-FAR_M, MOSTLY, OFTEN, FOUR = 0.12, 0.8, 0.45, 4
-"""Detours of less may as well be an error that wanders. A pair, or all pairs of a tag, with such shares of reflected
-ranges are named; over four tags a pair's offset and that of the two others leave the same trace."""
-
 UNIT = np.ones((1, 1))
 """The derivative of a range by an offset of it."""
-
-SCALE = 0.01
-"""Relative error of true distances that a recording may have and not show: a judgement."""
 
 
 def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
@@ -232,7 +222,8 @@ def _weighed(
             # Ranges of two bodies are wrong together then, too: the narrower cause is named.
             said = []
         large = abs(one.offset_m) > SMALLEST_M or (moved > CLEARLY and one.largest_ns > SMALLEST_NS)
-        if one.names != READINGS and (cause or (moved > MATTERS and large)):
+        # Powers that are read with noise: the curve is right for the powers that are read.
+        if one.names != ("readings",) and (cause or (moved > MATTERS and large)):
             # A tag that was moved stands out in more than one span of time: once is enough.
             matter.setdefault((one.kind, one.names), one)
     return covariance, [*said, *map(sentence_of, matter.values())]
@@ -243,7 +234,7 @@ def _is_cause(finding: FoundOffset, before_ns2: Floats, *, certain: bool) -> boo
 
     True distances of another time than ranges move ranges, and hardly delays.
     """
-    if finding.kind != "shared" or finding.names == READINGS:
+    if finding.kind != "shared" or finding.names == ("readings",):
         return False
     large = abs(finding.offset_m) > SMALLEST_M
     return certain or (large and ("late" in finding.names or _moved(finding, before_ns2) > MATTERS))
@@ -296,36 +287,33 @@ def sentence_of(finding: FoundOffset) -> str:
     return "; or ".join(SENTENCES[name].format(**words) for name in names)
 
 
-def has_shares(found: KnownDistances) -> bool:
-    """Return whether the share of reflected ranges was fitted by pair."""
-    return isinstance(found.searches[-1].rows.errors, Mixture) and "odds of pair" in found.values
-
-
 def shares_of_pairs(found: KnownDistances) -> tuple[Floats, Floats]:
-    """Return the share of reflected ranges of each pair (k,) and their mean detour (k,), metres."""
+    """Return the share of reflected ranges of each pair (k,) and their mean detour (k,), metres; 0 if not fitted."""
     values = found.values
+    if not isinstance(found.searches[-1].rows.errors, Mixture) or "odds of pair" not in values:
+        return np.zeros(len(found.model.pairs.ends)), np.zeros(len(found.model.pairs.ends))
     share = 1 / (1 + np.exp(-values["odds level"] - values["odds of pair"]))
     detour = np.exp(values["least detour"]) + np.exp(values["detour level"] + values["detour of pair"])
     return share, detour
 
 
 def _reflected(found: KnownDistances) -> Iterator[str]:
-    """Name the pairs of which hardly a range is direct, or else tags most of whose are not, where that was fitted."""
-    if not has_shares(found):
-        return
-    share, detour = shares_of_pairs(found)
-    ends, far = found.model.pairs.ends, detour > FAR_M
-    hidden, tags = np.flatnonzero((share > MOSTLY) & far).tolist(), np.unique(ends).tolist()
+    """Name the pairs of which hardly a range is direct, or else a tag about half of whose ranges are not."""
+    share, detour_m = shares_of_pairs(found)
+    # Shorter detours may as well be an error that wanders.
+    ends, far = found.model.pairs.ends, detour_m > 0.12
+    hidden, tags = np.flatnonzero((share > 0.8) & far).tolist(), np.unique(ends).tolist()
     for number in hidden:
         a, b = ends[number].tolist()
         others = [tag for tag in tags if tag not in (a, b)]
-        either = f" or pair {others[0]}-{others[1]}" if len(tags) == FOUR else ""
+        # Among four tags a pair's offset and that of the two others leave the same trace.
+        either = f" or pair {others[0]}-{others[1]}" if len(tags) == 4 else ""
         yield (
             f"pair {a}-{b}{either}: {100 * share[number]:.0f} % of its ranges are reflected, or off by "
-            f"{100 * detour[number]:.0f} cm; record it anew, delays rest on the other pairs"
+            f"{100 * detour_m[number]:.0f} cm; record it anew, delays rest on the other pairs"
         )
     means = {tag: float(np.where(far, share, 0.0)[np.any(ends == tag, axis=1)].mean()) for tag in tags}
-    often = [tag for tag in tags if means[tag] > OFTEN and not hidden]
+    often = [tag for tag in tags if means[tag] > 0.45 and not hidden]
     for tag in often[:1]:
         yield f"tag {tag}: {100 * means[tag]:.0f} % of its ranges are reflected; what stands near its antenna?"
 
@@ -344,8 +332,8 @@ def _short(found: KnownDistances) -> Iterator[str]:
 def _confounded(found: KnownDistances, slopes: Slopes) -> Iterator[str]:
     """Say where a small error that grows with the distance would pass for a curve over power.
 
-    The curve is fitted beside such an error, of which `SCALE` is known beforehand. It is named where it adds more to
-    the variance of the curve than all else does.
+    The curve is fitted beside such an error of 1 %, which true distances may have without showing it (a judgement). It
+    is named where it adds more to the variance of the curve than all else does.
     """
     model, truth_m = found.model, found.model.ranges.truth_m
     if model.curve is None or len(found.searches) > 1 or not np.ptp(truth_m) > 0:
@@ -355,7 +343,7 @@ def _confounded(found: KnownDistances, slopes: Slopes) -> Iterator[str]:
     taken = np.asarray(slopes.optimum.covariance @ link)
     own = float(slopes.tells @ far[slopes.order] ** 2)
     known = (own - float(taken @ link)) / found.persistence.factor
-    slope = 1 / np.sqrt(SCALE**-2 + max(known, 0.0))
+    slope = 1 / np.sqrt(0.01**-2 + max(known, 0.0))
     rows = basis(np.quantile(model.lifted, np.linspace(0.02, 0.98, 25)), model.curve.knots)
     count = len(model.curve_kinds())
     rows = np.tile(rows - rows.mean(axis=0), count) / count
@@ -365,7 +353,7 @@ def _confounded(found: KnownDistances, slopes: Slopes) -> Iterator[str]:
     band = float(np.sqrt(max(float(np.mean(variance)), 0.0)))
     if more >= band:
         yield (
-            f"power and distance are confounded: true distances {100 * SCALE:.0f} % off would pass for "
+            f"power and distance are confounded: true distances 1 % off would pass for "
             f"{1e3 * more:.0f} mm of the curve, whose band says {1e3 * band:.0f} mm; turn the antennas while "
             "recording, or fit with `delays_only`"
         )

@@ -12,7 +12,6 @@ import numpy as np
 from scipy import optimize, special
 
 from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
-from calib.estimator.score_tests import Tested
 from calib.findings import Candidate, positive, stretches
 from calib.information import LOOSEST
 from calib.spread import TWO_SIDED_95, less_medians, medians, robust_spread
@@ -75,25 +74,35 @@ def geometry(view: RecordingView) -> Iterator[Candidate]:
 
 
 def _undone(view: RecordingView, seen: Candidate, truth_m: Floats, *, tried: int = 1) -> Candidate:
-    """Return a suspected fault with how the spread of ranges changes with the true distances (n,) without it."""
-    p_value, gain = narrower(view, view.error_m, view.raw_m - truth_m, tried=tried)
-    after, before = (100 * view.spread_m(view.raw_m - truth) for truth in (truth_m, view.truth_m))
-    evidence = f"{seen.evidence}, the ranges' spread is {after:.1f} cm instead of {before:.1f} cm"
-    return replace(seen, evidence=evidence, p_value=p_value, gain=gain)
+    """Return a suspected fault with how the spread of ranges changes with the true distances (n,) without it.
+
+    The statistic is the logarithm of how much wider they spread before, by stretches of time. Undoing a fault that
+    narrows ranges by less than a twentieth is not worth a word: curves that are left in do that.
+    """
+    before, after = (view.less_pairs(view.ranges.raw_m - true) for true in (view.ranges.truth_m, truth_m))
+    known = np.isfinite(before) & np.isfinite(after)
+    rows = np.flatnonzero(known & (np.abs(view.ranges.truth_m - truth_m) > 1e-3))
+    rows = rows[np.argsort(view.exchanges.time_ns[rows], kind="stable")]
+    cuts = [rows[cut] for cut in stretches(len(rows))]
+    if not cuts:
+        return replace(seen, p_value=1.0)
+    old, new = ([max(robust_spread(errors[cut], 0.0), 1e-6) for cut in cuts] for errors in (before, after))
+    old_cm, new_cm = (100 * robust_spread(errors[np.isfinite(errors)], 0.0) for errors in (before, after))
+    return replace(
+        seen,
+        evidence=f"{seen.evidence}, the ranges' spread is {new_cm:.1f} cm instead of {old_cm:.1f} cm",
+        p_value=positive(np.log(0.95) + np.log(old) - np.log(new), tried=tried),
+        gain=_gain(before[rows], after[rows]),
+    )
 
 
-ELSEWHERE: Final = "anchor stands elsewhere"
+def _gain(before_m: Floats, after_m: Floats) -> float:
+    """Return by how much errors (n,) shrink together, metres; errors of 10 m are as bad as any larger ones."""
+    return float(np.nansum(np.minimum(np.abs(before_m), 10.0) - np.minimum(np.abs(after_m), 10.0)))
+
+
 TOLERANCE_M: Final = 0.05
 """What a place by tape or markers is off by, with the antenna beside the marker."""
-
-MISPLACED_M: Final = 0.5
-"""How far a place is known without ranges, where ranges are not astray: a tape misread, a tripod moved."""
-
-EXPLAINED: Final = 1.5
-"""Times the spread of other ranges that are left where another place explains an anchor's ranges."""
-
-HELD: Final = 1e-3
-"""Share of a range that holds a place where ranges do not: robots that move in a plane do not see its height."""
 
 
 def anchors(view: RecordingView) -> Iterator[Candidate]:
@@ -109,8 +118,7 @@ def places_m(view: RecordingView) -> dict[str, Floats]:
     """Return the places (3,) of the bodies that carry tags and do not move, within what motion capture says of that."""
     bodies = sorted({tag.body for tag in view.tags} & set(np.unique(view.poses.body).tolist()))
     points = {body: view.poses.position_m[view.poses.body == body] for body in bodies}
-    still = {body: some for body, some in points.items() if np.ptp(some, axis=0).max() < 0.02}
-    return {body: np.asarray(np.median(some, axis=0)) for body, some in still.items()}
+    return {body: np.median(some, axis=0) for body, some in points.items() if np.ptp(some, axis=0).max() < 0.02}
 
 
 def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, Floats]) -> Iterator[Candidate]:
@@ -121,30 +129,34 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
     matrix is judged (`calib.information`), unless ranges are astray there.
     """
     tags = [tag.tag for tag in view.tags if tag.body == body]
-    e = view.exchanges[fit.rows]
-    first = np.isin(e.initiator, tags)
-    mine = first != np.isin(e.target, tags)
-    ids = np.where(first, e.initiator, e.target), np.where(first, e.target, e.initiator)
-    here, there = (antennas_m(view.poses, view.tags, ends, e.time_ns) for ends in ids)
-    every = np.where(mine[:, None], here - there, 1.0)
-    apart, own = every[mine], view.chosen(fit.rows[mine])
+    first, second = (np.isin(view.exchanges[fit.rows].initiator, tags), np.isin(view.exchanges[fit.rows].target, tags))
+    mine = first != second
+    own = view.chosen(fit.rows[mine])
+    ends = own.exchanges.initiator, own.exchanges.target
+    here, there = (
+        antennas_m(view.poses, view.tags, np.where(first[mine], *ids), own.exchanges.time_ns)
+        for ids in (ends, ends[::-1])
+    )
+    apart, pair = here - there, np.unique(fit.pair[mine], return_inverse=True)[1]
     if len(apart) < 200 or not np.isfinite(apart).all():
         return
-    pair, here_m = np.unique(fit.pair[mine], return_inverse=True)[1], np.linalg.norm(apart, axis=1)
+    here_m = np.linalg.norm(apart, axis=1)
     # Where anchors are metres off, what power does is not known, and small beside that.
     astray = robust_spread(fit.residual[mine]) > 0.3
     measured = here_m + (own.error_m if astray else fit.residual[mine])
-    tried = [_place(apart, measured, pair, place - places[body]) for place in places.values()]
-    before, *spreads = (
-        robust_spread(less_medians(measured - np.linalg.norm(apart + away, axis=1), pair))
-        for away in (np.zeros(3), *tried)
-    )
-    away, after = tried[int(np.argmin(spreads))], min(spreads)
+
+    def spread_at(away: Floats) -> float:
+        return robust_spread(less_medians(measured - np.linalg.norm(apart + away, axis=1), pair))
+
+    away = min((_place(apart, measured, pair, place - places[body]) for place in places.values()), key=spread_at)
+    before, after, size = spread_at(np.zeros(3)), spread_at(away), float(np.linalg.norm(away))
     # The ranges of this anchor alone, at its other place: their noise is theirs, whatever else is wrong.
-    size, there_m = float(np.linalg.norm(away)), np.linalg.norm(apart + away, axis=1)
-    elsewhere = replace(own, truth_m=own.truth_m + (there_m - here_m))
-    moved, gain = quick_fit([elsewhere]), narrower(own, own.error_m, elsewhere.error_m)[1]
-    usual = EXPLAINED * robust_spread(fit.residual[~mine]) if not mine.all() else np.inf
+    there_m = np.linalg.norm(apart + away, axis=1)
+    truth_m = own.ranges.truth_m + (there_m - here_m)
+    moved = quick_fit([replace(own, ranges=replace(own.ranges, truth_m=truth_m))])
+    gain = _gain(own.less_pairs(own.error_m), own.less_pairs(own.ranges.raw_m - truth_m))
+    # The spread of other ranges, and half of it more.
+    usual = 1.5 * robust_spread(fit.residual[~mine]) if not mine.all() else np.inf
     if size <= TOLERANCE_M or gain <= 0 or after >= min(before, usual) or moved is None:
         return
     at_other = moved.test(((apart + away) / there_m[:, None])[moved.rows])
@@ -152,8 +164,12 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
     square = float(slope @ np.linalg.lstsq(at_other.covariance, slope, rcond=1e-12)[0])
     p_value = float(special.fdtrc(3, at_other.blocks - 3.0, square / 3))
     if not astray:
-        at_given = fit.test(np.where(mine[:, None], every / np.linalg.norm(every, axis=1)[:, None], 0.0))
-        if _std_m(at_given, away / size) > LOOSEST * MISPLACED_M:
+        derivative = np.zeros((len(mine), 3))
+        derivative[mine] = apart / here_m[:, None]
+        at_given = fit.test(derivative)
+        direction = np.linalg.lstsq(at_given.information, away / size, rcond=1e-12)[0]
+        # Without ranges a place is known to half a metre: a tape misread, a tripod moved.
+        if np.sqrt(direction @ at_given.covariance @ direction) > LOOSEST * 0.5:
             return
     # Places above and below each other are alike to robots that move in a plane; a displacement is known to a tenth.
     near = {name: float(np.hypot(*(place - places[body] - away)[:2])) for name, place in places.items()}
@@ -162,7 +178,7 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
     half = TWO_SIDED_95 * np.sqrt(np.diag(inverse @ at_other.covariance @ inverse))
     axes = ", ".join(f"{name} {one:+.2f} ± {far:.2f}" for name, one, far in zip("xyz", away, half, strict=True))
     yield Candidate(
-        ELSEWHERE,
+        "anchor stands elsewhere",
         f"ranges with {body} fit a place {size:.2f} m away ({axes} m, 95 %): their "
         f"spread is {100 * after:.1f} cm there instead of {100 * before:.1f} cm"
         + (f"; there the recording has {others}: are numbers exchanged?" if others else ""),
@@ -172,42 +188,18 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
     )
 
 
-def _std_m(tested: Tested, direction: Floats) -> float:
-    """Return the standard error of a displacement along a direction (3,)."""
-    slope = np.linalg.lstsq(tested.information, direction, rcond=1e-12)[0]
-    return float(np.sqrt(slope @ tested.covariance @ slope))
-
-
 def _place(apart: Floats, measured: Floats, pair: Ints, start: Floats) -> Floats:
-    """Return the displacement (3,) that ranges ask for, beside a constant of each pair, by robust least squares."""
+    """Return the displacement (3,) that ranges ask for, beside a constant of each pair, by robust least squares.
+
+    A thousandth of a range holds the place where ranges do not: robots that move in a plane do not see its height.
+    """
     every = slice(None, None, max(len(apart) // 2000, 1))
     apart, measured, pair = apart[every], measured[every], pair[every]
 
     def residuals(x: Floats) -> Floats:
         rest = measured - np.linalg.norm(apart + x[:3], axis=1) - x[3:][pair]
-        return np.append(rest, HELD * len(rest) ** 0.5 * x[:3])
+        return np.append(rest, 1e-3 * len(rest) ** 0.5 * x[:3])
 
     constants = medians(measured - np.linalg.norm(apart + start, axis=1), pair)
     found = optimize.least_squares(residuals, np.append(start, constants), loss="soft_l1", f_scale=0.1)
     return np.asarray(found.x[:3])
-
-
-def narrower(view: RecordingView, before_m: Floats, after_m: Floats, *, tried: float = 1) -> tuple[float, float]:
-    """Return p-value and gain of errors `after_m` (n,) instead of `before_m`, each less its pair's own median.
-
-    The statistic is the logarithm of how much wider they spread before, by stretches of time, less `MATERIAL`.
-    """
-    a, b = view.less_pairs(before_m), view.less_pairs(after_m)
-    rows = np.flatnonzero(np.isfinite(a) & np.isfinite(b) & (np.abs(before_m - after_m) > 1e-3))
-    rows = rows[np.argsort(view.exchanges.time_ns[rows], kind="stable")]
-    a, b = a[rows], b[rows]
-    cuts = stretches(len(rows))
-    if not cuts:
-        return 1.0, 0.0
-    wider = np.array([np.log(max(robust_spread(a[s], 0.0), 1e-6) / max(robust_spread(b[s], 0.0), 1e-6)) for s in cuts])
-    gain = float(np.sum(np.minimum(np.abs(a), 10.0) - np.minimum(np.abs(b), 10.0)))
-    return positive(wider + np.log(MATERIAL), tried=tried), gain
-
-
-MATERIAL: Final = 0.95
-"""Undoing a fault that narrows ranges by less than a twentieth is not worth a word: curves that are left in do that."""

@@ -28,9 +28,6 @@ from uwblink.twr import names_in
 WITHOUT_CURVE: Final = "delays only"
 """How warnings of fits without a curve begin."""
 
-SCALE: Final = (0.75, 1.35)
-"""How many metres a range may grow in a metre of true distance: a foot is 0.305 m, a yard 0.914."""
-
 UNITS: Final = {0.001: "millimetres", 0.01: "centimetres", 0.3048: "feet"}
 
 LONGEST_NS: Final = 2.5
@@ -133,7 +130,8 @@ def _impossible(ranges: Ranges) -> Iterator[str]:
     # How ranges and true distances spread: a unit or two columns may be wrong.
     slope = _robust_slope(ranges.truth_m, ranges.raw_m)
     rest = robust_spread(ranges.raw_m - slope * ranges.truth_m)
-    if not SCALE[0] < slope < SCALE[1] and abs(slope) * robust_spread(ranges.truth_m) >= 3.0 * rest:
+    # A foot is 0.305 m, and ranges that follow other distances grow by anything.
+    if not 0.75 < slope < 1.35 and abs(slope) * robust_spread(ranges.truth_m) >= 3.0 * rest:
         guess = _looks_like(slope)
         yield (f"ranges grow by {slope:.3g} m in a metre of true distance; {guess and guess + '; '}give both in metres")
     # Clock ratios that no crystals have: stamps that wrapped, or columns in the wrong order.
@@ -164,21 +162,35 @@ def _robust_slope(x: Floats, y: Floats) -> float:
 
 
 def one_way(ranges: Ranges) -> Iterator[str]:
-    """Name the pair whose ranges depend most on who initiates, as they do where clock skew is left in them."""
-    pairs = pairs_of(ranges.initiator, ranges.target)
-    error, forth, found = ranges.raw_m - ranges.truth_m, ranges.initiator < ranges.target, list[tuple[float, str]]()
-    rows_of_pairs = np.split(np.argsort(pairs.number, kind="stable"), np.cumsum(np.bincount(pairs.number))[:-1])
-    for (a, b), rows in zip(pairs.ends.tolist(), rows_of_pairs, strict=True):
-        ways = [error[rows[forth[rows] == way]] for way in (True, False)]
-        if min(map(len, ways)) < 20:
-            continue
-        differ = float(np.median(ways[0]) - np.median(ways[1]))
-        std = STD_OF_MEDIAN * float(np.hypot(*(robust_spread(some) / np.sqrt(len(some)) for some in ways)))
-        if abs(differ) > max(0.05, 8.0 * std):
-            size = f"{100 * abs(differ):.0f} cm {'longer' if differ > 0 else 'shorter'} if tag {a} initiates"
-            found.append((abs(differ), f"pair {a}-{b}: ranges read {size}"))
-    if found:
-        yield f"{max(found)[1]}: clock skew is not corrected, or with the wrong sign of the carrier's reading"
+    """Name the pair whose ranges depend most on who initiates, as they do if clock skew is left in them.
+
+    Medians of raw errors show it also where a fit takes such ranges for reflections.
+    """
+    ways = _medians_by_way(ranges.raw_m - ranges.truth_m, ranges)
+    # The powers of both ways are not quite alike, and errors last: eight standard errors are no chance.
+    differ_m = {
+        (a, b): middle - ways[b, a][0]
+        for (a, b), (middle, std) in ways.items()
+        if a < b and (b, a) in ways and abs(middle - ways[b, a][0]) > max(0.05, 8.0 * np.hypot(std, ways[b, a][1]))
+    }
+    if differ_m:
+        a, b = max(differ_m, key=lambda pair: abs(differ_m[pair]))
+        yield (
+            f"pair {a}-{b}: ranges read {100 * abs(differ_m[a, b]):.0f} cm "
+            f"{'longer' if differ_m[a, b] > 0 else 'shorter'} if tag {a} initiates: clock skew is not corrected, or "
+            "with the wrong sign of the carrier's reading"
+        )
+
+
+def _medians_by_way(values: Floats, ranges: Ranges) -> dict[tuple[int, int], tuple[float, float]]:
+    """Return the median of values (n,) by (initiator, target), with its standard error, of 20 finite ones at least."""
+    known = np.isfinite(values)
+    link, number, count = np.unique(
+        (ranges.initiator * 65_536 + ranges.target)[known], return_inverse=True, return_counts=True
+    )
+    std = STD_OF_MEDIAN * spreads(values[known], number) / np.sqrt(count)
+    found = zip(link.tolist(), medians(values[known], number).tolist(), std.tolist(), count.tolist(), strict=True)
+    return {divmod(of, 65_536): (middle, error) for of, middle, error, several in found if several >= 20}
 
 
 def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: Ranges) -> None:
@@ -212,7 +224,7 @@ def implausible(delays_ns: Mapping[int, float], residuals_m: Floats) -> Iterator
         )
     spread = robust_spread(residuals_m)
     if spread > LOUD_M:
-        yield f"errors spread by {spread:.2f} m after the fit, those of UWB ranges by a decimetre: whose truth is it?"
+        yield f"errors spread by {spread:.2f} m after the fit, those of UWB ranges by 10 cm: check the true distances"
 
 
 def warnings_of(ranges: Ranges, inliers: float, free: list[list[int]], seconds: float) -> Iterator[str]:
@@ -283,22 +295,18 @@ def power_levels_db(ranges: Ranges) -> dict[int, tuple[float, float]]:
     In dB, each with its standard error; tags of which no pair has enough ranges with both powers are left out.
     """
     # The initiator reads what the target sent, and the target what the initiator sent.
-    apart = ranges.fpp2_dbm - ranges.fpp1_dbm
-    known = np.isfinite(apart)
-    link = (ranges.initiator * 65_536 + ranges.target)[known]
-    links, number, count = np.unique(link, return_inverse=True, return_counts=True)
-    enough = count >= 20
-    if not enough.any():
+    ways = _medians_by_way(ranges.fpp2_dbm - ranges.fpp1_dbm, ranges)
+    if not ways:
         return {}
-    ends = np.divmod(links[enough], 65_536)
+    ends, (middle, std) = np.array([*ways]).T, np.array([*ways.values()]).T
     tags = np.unique(ends)
     inverse = np.linalg.pinv(np.subtract(*(np.equal.outer(end, tags).astype(float) for end in ends)))
-    middle, spread = (of(apart[known], number)[enough] for of in (medians, spreads))
     levels: Floats = inverse @ middle
     near = np.abs(np.subtract.outer(levels, levels)) < SAME_LEVEL_DB
     levels -= levels[near[np.argmax(near.sum(axis=1))]].mean()
-    std = np.sqrt(inverse**2 @ ((STD_OF_MEDIAN * spread) ** 2 / count[enough]))
-    return dict(zip(tags.tolist(), zip(levels.tolist(), std.tolist(), strict=True), strict=True))
+    return dict(
+        zip(tags.tolist(), zip(levels.tolist(), np.sqrt(inverse**2 @ std**2).tolist(), strict=True), strict=True)
+    )
 
 
 def _ns_a_decibel(ranges: Ranges, calibration: Calibration) -> float:

@@ -10,42 +10,24 @@ from typing import Final
 import numpy as np
 from scipy import sparse, special
 
-from calib.checks.fitted import has_shares, of_pairs, shares_of_pairs, slopes_of
+from calib.checks.fitted import of_pairs, shares_of_pairs, slopes_of
 from calib.checks.geometry import anchors, places_m
 from calib.checks.recording_view import Offsets, QuickFit, RecordingView, quick_fit
-from calib.data.ranges import Ranges
 from calib.errors import CalibError
 from calib.estimator.known_distances import FEWEST_RANGES, fit_known_distances
 from calib.estimator.score_tests import findings
-from calib.findings import BUDGET, Candidate, exceeds, positive, stretches
+from calib.findings import BUDGET, Candidate, exceeds
 from calib.pairs import pairs_of
 from calib.settings import FitSettings
 from calib.spread import robust_spread
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
-MOVED: Final = "delay changed mid-flight"
-DRIFTED: Final = "delay drifts"
-OPEN: Final = "pairs that do not close"
-ASTRAY: Final = "ranges that do not follow the distances"
-MOVED_ANCHOR: Final = "anchor moved between recordings"
-OTHER_DELAY: Final = "delay changed between recordings"
-
 DELAY_M: Final = 0.02
 """What temperature does to the delay of a sound board: 2.15 mm a degree (DW1000 user manual), ten degrees."""
 
 PAIR_M: Final = 0.04
 """What lever arms by a ruler and phase centres of antennas do to a pair: 2 cm at either end."""
-
-LOUD_M: Final = 0.3
-"""Mean absolute error of a pair, about its median, that reflections may explain: half of the ranges by 60 cm."""
-
-MARGIN: Final = 1 / 8
-"""Part of a recording at either end in which no change is looked for: four of the stretches of time of its scores. Sums
-over fewer are far from normal where reflections last, and their variance is not known."""
-
-OTHERS: Final = 0.4
-"""Share of a tag's change by which other pairs may change: an antenna, or a voltage, is one tag's."""
 
 
 def closures(view: RecordingView) -> Iterator[Candidate]:
@@ -58,7 +40,7 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
     rows = np.flatnonzero(np.isfinite(view.error_m))
     if len(rows) < FEWEST_RANGES:
         return
-    ranges = Ranges.from_exchanges(view.exchanges[rows], view.truth_m[rows])
+    ranges = view.ranges[rows]
     pairs = pairs_of(ranges.initiator, ranges.target)
     offset_m = np.zeros(len(pairs.ends))
     for _ in range(5):
@@ -75,9 +57,8 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
         offset_m, names = np.zeros(len(before)), list(tested.family.names)
         for one in findings(tested, len(names), BUDGET):
             offset_m[at[names.index(one.names[0])]] = one.offset_m
-        if has_shares(found):
-            for k in np.flatnonzero(shares_of_pairs(found)[0] > 0.5).tolist():
-                offset_m[at[k]] = before[at[k]] + np.median(found.residuals[found.model.pairs.number == k])
+        for k in np.flatnonzero(shares_of_pairs(found)[0] > 0.5).tolist():
+            offset_m[at[k]] = before[at[k]] + np.median(found.residuals[found.model.pairs.number == k])
         if np.max(np.abs(offset_m - before)) < 0.01:
             break
     # Where reflections make all pairs differ, one of them has to stand out among these.
@@ -87,28 +68,12 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
         tolerance += 0.2
     for one in findings(tested, len(offset_m), BUDGET, tolerance):
         yield Candidate(
-            OPEN,
+            "pairs that do not close",
             f"ranges of {' or '.join(one.names)} are {100 * abs(one.offset_m):.1f} cm too "
             f"{'long' if one.offset_m > 0 else 'short'} for the delays of their tags, by closed loops of the other "
             "pairs",
             one.p_value,
         )
-
-
-def astray(view: RecordingView) -> Iterator[Candidate]:
-    """Pairs whose ranges and true distances have little to do with each other."""
-    fit, found = view.quick_fit, list[tuple[float, str]]()
-    if fit is None:
-        return
-    for pair, name in enumerate(fit.names):
-        rest = np.minimum(np.abs(fit.residual[fit.pair == pair]), 10 * LOUD_M)
-        means = np.array([float(np.mean(rest[s])) for s in stretches(len(rest))])
-        p_value = positive(means - LOUD_M, tried=len(fit.ends))
-        if p_value < BUDGET:
-            found.append((p_value, f"{name} by {np.mean(means):.2f} m"))
-    if found:
-        named = ", ".join(name for _, name in found[:6]) + (f" and {len(found) - 6} pairs more" if found[6:] else "")
-        yield Candidate(ASTRAY, f"ranges of pairs {named} differ on average, each pair's median aside", min(found)[0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,35 +95,35 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
     fit = view.quick_fit
     if fit is None or fit.time_s[-1] < 10.0:
         return
-    # So close that a step between two times loses 1 % of its size; fewer for many pairs, for the sake of memory.
-    cuts = fit.time_s[-1] * np.linspace(MARGIN, 1 - MARGIN, min(47, 1500 // len(fit.ends)))
+    # No change is looked for within four of the stretches of time of scores at either end: sums over fewer are far from
+    # normal where reflections last, and their variance is not known. Times are so close that a step between two loses
+    # 1 % of its size; they are fewer for many pairs, for the sake of memory.
+    cuts = fit.time_s[-1] * np.linspace(1 / 8, 7 / 8, min(47, 1500 // len(fit.ends)))
     courses = np.column_stack([fit.time_s[:, None] >= cuts, fit.time_s / fit.time_s[-1]])
     time_ns = fit.model.ranges.time_ns
     for one in changes_of_tags(fit, courses):
-        drifts = one.course == len(cuts)
-        when_s = (time_ns[np.argmax(courses[:, one.course] > 0)] - time_ns[0]) * 1e-9
-        what, when = ("drift", "over the recording") if drifts else ("shift", f"{when_s:.0f} s after the start")
+        fault, what, when = "delay drifts", "drift", "over the recording"
+        if one.course < len(cuts):
+            when_s = (time_ns[np.argmax(courses[:, one.course] > 0)] - time_ns[0]) * 1e-9
+            fault, what, when = "delay changed mid-flight", "shift", f"{when_s:.0f} s after the start"
         evidence = f"ranges of tag {one.tag} {what} by {100 * one.size_m:+.1f} cm {when} {one} do not"
-        yield Candidate(DRIFTED if drifts else MOVED, evidence, one.p_value, {"tag": one.tag})
+        yield Candidate(fault, evidence, one.p_value, {"tag": one.tag})
 
 
-def changes_of_tags(fit: QuickFit, courses: Floats) -> list[Change]:
-    """Return changes of single tags, unless another change that is found says that it was no delay.
+def changes_of_tags(fit: QuickFit, courses: Floats) -> Iterator[Change]:
+    """Yield changes of single tags, unless another change that is found says that it was no delay.
 
-    Such are one of a pair, or of all tags, and one back: a body in the way goes again.
+    Such are one of a pair, or of all tags, and one back: a body in the way goes again. An antenna, or a voltage, is one
+    tag's, so that other pairs change by 40 % of it at most.
     """
-    found = _changes(fit, courses)
-    named: dict[int, Change] = {}
+    named, found = set[int | None]({None}), _changes(fit, courses)
     for one in found:
-        against = [
-            other for other in found
-            if other.tag is None or (other.tag == one.tag and other.size_m * one.size_m < 0)
-        ]  # fmt: skip
-        alone = not any(abs(other.size_m) > OTHERS * abs(one.size_m) for other in against)
+        against = [two for two in found if two.tag is None or (two.tag == one.tag and two.size_m * one.size_m < 0)]
+        alone = all(abs(two.size_m) <= 0.4 * abs(one.size_m) for two in against)
         # No antenna and no voltage does more than 5 ns.
-        if one.tag is not None and alone and abs(one.size_m) < 0.75:
-            named.setdefault(one.tag, one)
-    return list(named.values())
+        if one.tag not in named and alone and abs(one.size_m) < 0.75:
+            named.add(one.tag)
+            yield one
 
 
 def _changes(fit: QuickFit, courses: Floats) -> list[Change]:
@@ -171,17 +136,15 @@ def _changes(fit: QuickFit, courses: Floats) -> list[Change]:
         if min(mine.sum(), pairs - mine.sum()) > 0 and (mine.sum() > 1 or pairs - mine.sum() > 2):
             groups.append((tag, mine.astype(float)))
     groups += [(None, row) for row in np.eye(pairs)]
-    among, tried = np.kron(np.array([group for _, group in groups]), np.eye(width)), len(tags) * width
-    found = list[Change]()
+    among, found = np.kron(np.array([group for _, group in groups]), np.eye(width)), list[Change]()
     while len(found) < 3:
         offsets = Offsets.of(fit.test(_by_pair(fit, courses)), among)
         gain = (np.maximum(np.abs(offsets.size) - DELAY_M, 0.0) ** 2 * offsets.known).reshape(len(groups), width)
-        first = np.argsort(-gain.max(axis=1))[:4]
         # By how much variances exceed those of slopes that are a likelihood's, for most changes.
         excess = float(np.median((offsets.std**2 * offsets.known)[offsets.known > 0]))
-        likely = first[gain.max(axis=1)[first] > 4 * excess]
-        trials = (_change(fit, groups[k], courses, int(np.argmax(gain[k])), tried) for k in likely.tolist())
-        best = next((one for one in trials if one[0].p_value < BUDGET), None)
+        likely = [k for k in np.argsort(-gain.max(axis=1))[:4].tolist() if gain[k].max() > 4 * excess]
+        trials = (_change(fit, groups[k], courses, int(np.argmax(gain[k])), len(tags) * width) for k in likely)
+        best = next(((change, rest) for change, rest in trials if change.p_value < BUDGET), None)
         if best is None:
             break
         found.append(best[0])
@@ -231,7 +194,7 @@ def compared(views: Sequence[RecordingView], level: float) -> Iterator[Candidate
             away = there - here
             if np.linalg.norm(away) > 0.08:
                 yield Candidate(
-                    MOVED_ANCHOR,
+                    "anchor moved between recordings",
                     f"{body} stands {np.linalg.norm(away):.2f} m elsewhere ({away[0]:+.2f} {away[1]:+.2f} "
                     f"{away[2]:+.2f} m) in {second.name} than in {first.name}, by its ranges and the places that the "
                     "recordings give it",
@@ -244,7 +207,7 @@ def compared(views: Sequence[RecordingView], level: float) -> Iterator[Candidate
         fit = quick_fit([view.chosen(rows) for view, rows in zip((first, second), others, strict=True)])
         for one in changes_of_tags(fit, (fit.model.ranges.session == 1)[:, None]) if fit else ():
             yield Candidate(
-                OTHER_DELAY,
+                "delay changed between recordings",
                 f"ranges of tag {one.tag} are {100 * one.size_m:+.1f} cm longer in {second.name} than in {first.name} "
                 f"{one} are not",
                 one.p_value,

@@ -10,11 +10,10 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from scipy import ndimage, sparse
+from scipy import sparse
 
 from calib.data.clocks import pair_ids
 from calib.data.ranges import Ranges, concatenate
@@ -23,92 +22,73 @@ from calib.estimator.known_distances import FEWEST_RANGES, PILOT, Fitted, likeli
 from calib.estimator.optimize import maximize
 from calib.estimator.range_model import RangeModel
 from calib.estimator.score_tests import REACHED, Family, Slopes, Tested
-from calib.estimator.time_blocks import GAP_S, TimeBlocks, time_blocks
+from calib.estimator.time_blocks import time_blocks
 from calib.estimator.unknowns import Priors
 from calib.range_errors.densities import OUTLIERS_OVER_M, error_slopes
 from calib.settings import FitSettings
-from calib.spread import less_medians, robust_spread
+from calib.spread import less_medians
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.contents import Contents
-from uwblink.recording.distances import distances_m, poses_around, tracks_of
+from uwblink.recording.distances import distances_m
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Arrangement, Fault, Poses, Tag
+from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.recording.summary import differences, repeated_rows, single_reports
-from uwblink.ticks import TICK_S
-from uwblink.twr import Exchanges, raw_range
-
-PLAUSIBLE_M: Final = 1000.0
+from uwblink.twr import Exchanges
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingView:
-    """A recording as the checks see it; `truth_m` (n,) is NaN where nothing says it.
+    """A recording as the checks see it: its exchanges, each once, and their `ranges`, with NaN for unknown truth.
 
-    Each exchange is there once; `reported_twice` were reported by both ends, and `contradictions` say how two reports
-    of one differ; `doubled` rows repeated another one. It is `posed` where true distances come from poses.
-    `arrangements` are those that it marks.
+    `reported_twice` exchanges were reported by both ends, and `contradictions` are the differences of such reports;
+    `doubled` rows repeated another one. A recording is `posed` if true distances come from poses, and `standing` if it
+    was made for a survey: arrangements of boards, without poses and true distances.
     """
 
     name: str
     exchanges: Exchanges
+    ranges: Ranges
     poses: Poses
     tags: list[Tag]
     faults: list[Fault]
-    arrangements: list[Arrangement]
-    raw_m: Floats
-    truth_m: Floats
     reported_twice: int
     contradictions: list[str]
     doubled: int
     posed: bool
-
-    @property
-    def standing(self) -> bool:
-        """Whether this was recorded to be surveyed: arrangements of boards, and nothing that says where they were."""
-        return bool(self.arrangements) and not len(self.poses) and not np.isfinite(self.truth_m).any()
+    standing: bool
 
     @cached_property
     def quick_fit(self) -> QuickFit | None:
-        """A quick fit with constants of pairs; None where too few ranges have a true distance."""
+        """A quick fit with constants of pairs; None if too few ranges have a true distance."""
         return quick_fit([self])
 
     @cached_property
     def standing_m(self) -> float | None:
-        """The largest change of a pair's distance where none changes by more than 10 cm, else None.
+        """The largest change of a pair's distance if none changes by more than 10 cm, else None.
 
         Those are two wavelengths, over which power hardly varies.
         """
-        good = np.isfinite(self.truth_m)
-        if not good.any():
-            return None
-        pair = np.unique(pair_ids(self.exchanges[good]), return_inverse=True)[1]
-        every, truth = np.arange(pair.max() + 1), self.truth_m[good]
-        span = float(np.max(ndimage.maximum(truth, pair, every) - ndimage.minimum(truth, pair, every)))
-        return span if span < 0.1 else None
+        good = np.isfinite(self.ranges.truth_m)
+        pair, truth_m = pair_ids(self.exchanges[good]), self.ranges.truth_m[good]
+        span_m = max((float(np.ptp(truth_m[pair == one])) for one in np.unique(pair)), default=np.inf)
+        return span_m if span_m < 0.1 else None
 
     @property
     def error_m(self) -> Floats:
         """Range less truth, shape (n,)."""
-        return self.raw_m - self.truth_m
+        return self.ranges.raw_m - self.ranges.truth_m
 
     def chosen(self, rows: Bools | Ints) -> RecordingView:
         """Return a view of some exchanges."""
-        return replace(self, exchanges=self.exchanges[rows], raw_m=self.raw_m[rows], truth_m=self.truth_m[rows])
+        return replace(self, exchanges=self.exchanges[rows], ranges=self.ranges[rows])
 
     def less_pairs(self, error_m: Floats) -> Floats:
         """Return errors (n,) less the median of their pair, NaN for pairs with ten or fewer."""
         good = np.isfinite(error_m)
         _, pair, count = np.unique(pair_ids(self.exchanges[good]), return_inverse=True, return_counts=True)
         left = np.full(len(error_m), np.nan)
-        left[good] = less_medians(error_m[good], pair)
-        left[np.flatnonzero(good)[count[pair] < 11]] = np.nan
+        left[good] = np.where(count[pair] > 10, less_medians(error_m[good], pair), np.nan)
         return left
-
-    def spread_m(self, error_m: Floats) -> float:
-        """Return the robust spread of errors (n,) after each pair's own median; infinity where nothing is known."""
-        left = self.less_pairs(error_m)
-        good = np.isfinite(left)
-        return robust_spread(left[good], 0.0) if good.any() else float("inf")
 
 
 def view_of(name: str, source: Source) -> RecordingView:
@@ -118,29 +98,28 @@ def view_of(name: str, source: Source) -> RecordingView:
     both = looked.exchanges[~again]
     reports = single_reports(both)
     e = reports.exchanges
-    with np.errstate(all="ignore"):
-        raw = raw_range(e)
-    truth, posed = e.truth_m, False
+    truth_m, posed = e.truth_m, False
     if len(looked.poses):
         by_poses = distances_m(looked.poses, looked.tags, e.initiator, e.target, e.time_ns)
-        given = np.isfinite(truth)
-        # Tables with places of antennas bring both, which are then the same.
-        apart = np.abs(truth - by_poses)[given & np.isfinite(by_poses)]
+        given = np.isfinite(truth_m)
+        # Tables with places of antennas have both, which are then equal.
+        apart = np.abs(truth_m - by_poses)[given & np.isfinite(by_poses)]
         posed = not given.any() or (len(apart) > 0 and float(np.median(apart)) < 0.001)
-        truth = by_poses if posed else truth
+        truth_m = by_poses if posed else truth_m
+    with np.errstate(all="ignore"):
+        ranges = Ranges.from_exchanges(e, truth_m)
     return RecordingView(
         name=name,
         exchanges=e,
+        ranges=ranges,
         poses=looked.poses,
         tags=list(looked.tags),
         faults=list(getattr(looked, "faults", ())),
-        arrangements=list(getattr(source, "arrangements", ())),
-        raw_m=raw,
-        truth_m=truth,
         reported_twice=reports.repeated,
         contradictions=[", ".join(differences(both, a, b)) for a, b in reports.differing.tolist()],
         doubled=int(np.count_nonzero(again)),
         posed=posed,
+        standing=bool(getattr(source, "arrangements", ())) and not len(looked.poses) and not np.isfinite(truth_m).any(),
     )
 
 
@@ -148,29 +127,18 @@ EXAMINED_EXCHANGES: Final = 160_000
 """Exchanges of a recording that are looked at: four training flights' worth."""
 
 EXAMINED_STRETCHES: Final = 40
-MARGIN_NS: Final = 4_000_000_000
-"""Poses are needed so far around exchanges: farther than the largest offset of clocks that is looked for."""
+"""Stretches of time, evenly spread over a long recording, in which these are."""
 
 
 def looked_at(source: Source) -> Source:
-    """Return what to look at of a source: everything, of a long recording stretches of it with the poses around."""
+    """Return what to look at of a source: all of it, or stretches of the exchanges of a long recording."""
     if not isinstance(source, RecordedSource) or source.recording.count("exchanges") <= EXAMINED_EXCHANGES:
         return source
-    recording = source.recording
-    *edges, last_ns = recording.dividing_times("exchanges", EXAMINED_EXCHANGES // EXAMINED_STRETCHES)
-    spans = list(pairwise([*edges, last_ns + 1]))
-    tracks, parts, poses = tracks_of(source.poses), list[Exchanges](), list[Poses]()
-    for k in np.unique(np.linspace(0, len(spans) - 1, EXAMINED_STRETCHES).round().astype(int)).tolist():
-        start_ns, end_ns = spans[k]
-        parts.append(recording.exchanges(start_ns, end_ns))
-        # A range belongs to the middle of its first two messages, which is after its time, by half a wrap at most.
-        later = int(2 ** parts[-1].bits * TICK_S * 0.5e9) + 1
-        poses.append(poses_around(tracks, start_ns - MARGIN_NS, end_ns + later + MARGIN_NS))
-    every = Poses.concatenate(poses)
-    # Poses of two stretches are there once.
-    places = np.column_stack([every.time_ns, np.unique(every.body, return_inverse=True)[1]])
-    every = every[np.unique(places, axis=0, return_index=True)[1]]
-    return Contents(exchanges=Exchanges.concatenate(parts), poses=every, tags=source.tags, faults=source.faults)
+    edges = source.recording.dividing_times("exchanges", EXAMINED_EXCHANGES // EXAMINED_STRETCHES)
+    edges[-1] += 1
+    chosen = np.unique(np.linspace(0, len(edges) - 2, EXAMINED_STRETCHES).round().astype(int)).tolist()
+    parts = [source.recording.exchanges(edges[k], edges[k + 1]) for k in chosen]
+    return Contents(exchanges=Exchanges.concatenate(parts), poses=source.poses, tags=source.tags, faults=source.faults)
 
 
 def examined_part(recording: str | os.PathLike[str]) -> str:
@@ -188,9 +156,6 @@ def examined_part(recording: str | os.PathLike[str]) -> str:
     )
 
 
-RANGES_A_PAIR: Final = 40
-"""Ranges of a pair, below which its median is not known to a fifth of their spread; it is left out."""
-
 STRETCHES_OF_SCORES: Final = 32
 """Stretches of time over which scores are summed: variances of sums are then known to a quarter, and errors that last
 for a hundredth of the recording are in one stretch."""
@@ -198,7 +163,7 @@ for a hundredth of the recording are in one stretch."""
 
 @dataclass(frozen=True, kw_only=True)
 class Offsets:
-    """Offsets (k,) that residuals ask for, metres, with their standard errors (k,), and degrees of freedom.
+    """Offsets (k,) in metres that residuals ask for, with their standard errors (k,) and degrees of freedom.
 
     Standard errors contain errors that last; they are infinite for offsets of which nothing is known. `known` (k,) is
     the information, which does not.
@@ -211,19 +176,16 @@ class Offsets:
 
     @classmethod
     def of(cls, tested: Tested, groups: Floats) -> Offsets:
-        """Return the offsets of `groups` (k, m) of tested ones (m,), which are shared by all in a group."""
-        information = np.einsum("km,mn,kn->k", groups, tested.information, groups, optimize=True)
-        variance = np.einsum("km,mn,kn->k", groups, tested.covariance, groups, optimize=True)
-        known = information > REACHED * tested.whole
-        divisor = np.where(known, information, 1.0)
-        std = np.where(known, np.sqrt(np.maximum(variance, 1e-300)) / divisor, np.inf)
-        size = np.where(known, -(groups @ tested.total) / divisor, 0.0)
-        return cls(
-            size=size,
-            known=np.where(known, information, 0.0),
-            std=std,
-            dof=min(tested.lasting.freedom, tested.blocks - 1.0),
+        """Return the offsets of `groups` (k, m) of tested ones (m,), which all members of a group share."""
+        known, variance = (
+            np.einsum("km,mn,kn->k", groups, square, groups, optimize=True)
+            for square in (tested.information, tested.covariance)
         )
+        known = np.where(known > REACHED * tested.whole, known, 0.0)
+        with np.errstate(divide="ignore"):
+            std = np.sqrt(np.maximum(variance, 1e-300)) / known
+        size = -(groups @ tested.total) / np.where(known > 0, known, np.inf)
+        return cls(size=size, known=known, std=std, dof=min(tested.lasting.freedom, tested.blocks - 1.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,12 +227,7 @@ class QuickFit:
     def reflected(self) -> Floats:
         """The probability (n,) that each range is reflected, by the likeliest error model beside all else."""
         found = likeliest(self.model, self.error, self.start)
-        values = {name: np.atleast_1d(of) for name, of in found.rows.values(found.optimum.x).items()}
-        return error_slopes(found.residuals, values, span_m=OUTLIERS_OVER_M).reflected
-
-    def of_tag(self, tag: int) -> Bools:
-        """Return which ranges (n,) are a tag's."""
-        return np.asarray((self.ends == tag).any(axis=1)[self.pair])
+        return found.rows.error_slopes(found.optimum.x, ()).reflected
 
     def test(self, derivative: Floats | sparse.csr_matrix) -> Tested:
         """Return the slopes of the residuals by offsets, of which each range has some (n, k)."""
@@ -281,17 +238,17 @@ class QuickFit:
         return Offsets.of(self.test(derivative), np.eye(derivative.shape[1]))
 
 
-def quick_fit(
-    views: Sequence[RecordingView], constants: str = "pair", ranges_a_pair: int = RANGES_A_PAIR
-) -> QuickFit | None:
-    """Fit a curve over power and constants by "pair" or "tag" to recordings, a session each; None if ranges are few."""
+def quick_fit(views: Sequence[RecordingView], constants: str = "pair", ranges_a_pair: int = 40) -> QuickFit | None:
+    """Fit a curve over power and constants by "pair" or "tag" to recordings, a session each; None if ranges are few.
+
+    Pairs with fewer than `ranges_a_pair` are left out: with 40 a median is known to a fifth of the ranges' spread.
+    """
     kept = [_of_common_pairs(view, ranges_a_pair) for view in views]
     if sum(map(len, kept)) < FEWEST_RANGES or not all(map(len, kept)):
         return None
-    chosen = [view.chosen(rows) for view, rows in zip(views, kept, strict=True)]
-    ranges = concatenate([Ranges.from_exchanges(view.exchanges, view.truth_m) for view in chosen])
-    model = model_of(ranges, FitSettings(constants=constants), trimmed=False)
-    return _fitted(model, np.concatenate([view.error_m for view in chosen]), np.concatenate(kept))
+    ranges = concatenate([view.ranges[rows] for view, rows in zip(views, kept, strict=True)])
+    model = model_of(ranges, FitSettings(loss="cauchy", constants=constants), trimmed=False)
+    return _fitted(model, model.ranges.raw_m - model.ranges.truth_m, np.concatenate(kept))
 
 
 def _fitted(model: RangeModel, error: Floats, rows: Ints) -> QuickFit:
@@ -299,22 +256,19 @@ def _fitted(model: RangeModel, error: Floats, rows: Ints) -> QuickFit:
     start = robust_fit(model, error, "cauchy", None, kinds, sample=PILOT)
     layout, whole = model.build(error, start.rows.errors, only=kinds)
     optimum = maximize([whole, *start.gauge], Priors(layout), start.optimum.x, steps=20, evidence_steps=0)
-    time_ns, session = model.ranges.time_ns, model.ranges.session
-    steps_s = np.diff(time_ns * 1e-9, prepend=time_ns[0] * 1e-9) * (np.diff(session, prepend=0) == 0)
     # Long blocks in the place of short ones: sums over them hardly share errors that last.
-    short = time_blocks(time_ns, session)
+    short = time_blocks(model.ranges.time_ns, model.ranges.session)
     count = min(STRETCHES_OF_SCORES, short.count)
     number = short.number.astype(np.int64) * count // short.count
     bounds = np.unique(np.append(short.bounds[:-1] * count // short.count, count))
-    blocks = TimeBlocks(number=number, bounds=bounds, seconds=short.seconds)
     return QuickFit(
         rows=rows,
         model=model,
         error=error,
         start=start,
         residual=whole.residuals(optimum.x),
-        time_s=np.cumsum(np.minimum(steps_s, GAP_S)),
-        slopes=Slopes(whole, optimum, blocks, np.zeros((0, layout.size))),
+        time_s=np.asarray(short.number * (short.seconds / short.count), dtype=np.float64),
+        slopes=Slopes(whole, optimum, replace(short, number=number, bounds=bounds), np.zeros((0, layout.size))),
     )
 
 

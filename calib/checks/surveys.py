@@ -22,25 +22,14 @@ FAULTS: Final = {
     "distance": "wrong known distance",
     "labels": "exchanged labels",
 }
-"""What a contradiction is called."""
-
-REMEDIES: Final = {
-    FAULTS["moved"]: "record that arrangement again, or end it before",
-    FAULTS["shape"]: "put the boards straight, or record without `known`",
-    FAULTS["distance"]: "measure it again, antenna to antenna, or leave it out",
-    FAULTS["labels"]: "look at the labels of these two boards",
-    "survey determines nothing": "make the arrangements that calib plan advises",
-    "delays that a survey leaves open": "make another arrangement, or tape a distance: calib plan says which",
-    "many reflected pairs": "put boards where they see each other, away from walls and metal",
-    "two solutions of a survey": "tape a distance that tells them apart, and give it as known",
-    "powers that hardly vary": "make arrangements with nearer and farther boards, or take the curve of another "
-    "calibration (`curve_from`)",
-}
-"""What to do by fault. The survey itself has judged: what it says is not tested again."""
+"""Faults by kind of contradiction."""
 
 
 def surveyed(recordings: list[Data]) -> Iterator[Candidate]:
-    """Yield what a survey of recordings finds wrong: with what is known, with places, with powers."""
+    """Yield what a survey of recordings finds wrong: with what is known, with places, with powers.
+
+    The survey itself has judged: what it says is not tested again.
+    """
     contradictions: tuple[Contradiction, ...] = ()
     found: SurveyResult | None = None
     try:
