@@ -15,9 +15,9 @@ from matplotlib.axes import Axes as Axes
 from matplotlib.figure import Figure
 from scipy.stats import norm
 
+from calib.calibration.applying import CorrectedRanges
 from calib.calibration.comparison import Comparison
 from calib.calibration.model import Calibration
-from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges
 from calib.estimator.grouped_errors import fit_grouped_errors
 from calib.evaluation.statistics import CORRECTION_STAGES, compare_with_planted, pair_rows, planted_curve

@@ -156,6 +156,12 @@ def is_pair(text: object) -> bool:
     return len(ends) == 2 and all(map(is_tag, ends))
 
 
+def ends_of(name: str) -> tuple[int, int]:
+    """Return the tags of a pair, the smaller id first, by its name."""
+    low, high = sorted(map(int, name.split("-")))
+    return low, high
+
+
 def pair_name(pair: Sequence[int]) -> str:
     """Return a pair as files and tables name it: 1-2."""
     return "-".join(map(str, pair))
@@ -195,12 +201,10 @@ FreeStdNs = Annotated[
 """A standard error, which is infinite (null in files) where data leave a delay free."""
 
 TagKey = Annotated[int, expect("tag ids as keys", is_tag, int)]
-PairName = Annotated[str, expect("names of pairs, as in 1-2", is_pair)]
 PairKey = Annotated[
-    tuple[int, int],
-    expect("two tag ids as keys, as in 1-2", is_pair, lambda name: tuple(sorted(map(int, name.split("-"))))),
-    PlainSerializer(pair_name),
+    tuple[int, int], expect("two tag ids as keys, as in 1-2", is_pair, ends_of), PlainSerializer(pair_name)
 ]
+PairName = Annotated[str, expect("names of pairs, as in 1-2", is_pair, lambda name: pair_name(ends_of(name)))]
 IN_ORDER: Final = WrapSerializer(lambda table, write: write(dict(sorted(table.items()))))
 """Writes a table in the order of its keys."""
 

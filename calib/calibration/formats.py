@@ -12,8 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 import yaml
+from scipy.interpolate import PPoly
 
-from calib.calibration.applying import PiecewiseCurve
 from calib.calibration.document import finite
 from calib.calibration.error_model import ErrorModel
 from calib.calibration.model import Calibration, require_calibration
@@ -324,8 +324,8 @@ def c_header(calibration: Calibration) -> str:
         f"#define UWB_LOUDEST_DBM {_number(LOUDEST_DBM)}",
         f"static const int uwb_tag[UWB_TAGS] = {{{', '.join(map(str, tags))}}};",
         f"static const double uwb_delay_m[UWB_TAGS] = {{{_numbers(metres)}}};",
-        *_c_curve("bias", PiecewiseCurve(bias)),
-        *_c_curve("sigma", PiecewiseCurve(calibration.sigma_curve)),
+        *_c_curve("bias", bias),
+        *_c_curve("sigma", calibration.sigma_curve),
     ]
     text = "\n".join(lines) + _C_CODE
     if calibration.errors:
@@ -366,15 +366,19 @@ def _c_errors(model: ErrorModel, bias: Curve) -> list[str]:
     ]
 
 
-def _c_curve(name: str, curve: PiecewiseCurve) -> list[str]:
-    terms, upper = len(curve.pieces[0]), name.upper()
+def _c_curve(name: str, curve: Curve) -> list[str]:
+    """Return a curve as polynomials between its knots: where each begins, and its coefficients, the highest first."""
+    degree, count = curve.degree, len(curve.coefficients)
+    whole = PPoly.from_spline((np.array(curve.knots), np.array(curve.coefficients), degree))
+    pieces = [k for k in range(degree, count) if whole.x[k + 1] > whole.x[k]]  # none between two equal knots
+    low, high = curve.range
     return [
-        f"static const double uwb_{name}_left[] = {{{_numbers(curve.left)}}};",
+        f"static const double uwb_{name}_left[] = {{{_numbers(whole.x[pieces])}}};",
         f"static const double uwb_{name}_coefficients[] = {{",
-        *(f"    {_numbers(row)}," for row in curve.pieces),
+        *(f"    {_numbers(row)}," for row in whole.c[:, pieces].T),
         "};",
-        f"#define UWB_{upper}(lifted) uwb_curve(uwb_{name}_left, uwb_{name}_coefficients, {len(curve.pieces)}, \\",
-        f"    {terms}, {_number(curve.low)}, {_number(curve.high)}, lifted)",
+        f"#define UWB_{name.upper()}(lifted) uwb_curve(uwb_{name}_left, uwb_{name}_coefficients, {len(pieces)}, \\",
+        f"    {degree + 1}, {_number(low)}, {_number(high)}, lifted)",
     ]
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -13,33 +12,29 @@ from typing import Annotated, Any, Final, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, PlainSerializer, TypeAdapter
+from pydantic import PlainSerializer, TypeAdapter
 
-from calib.calibration.applying import RangeCorrector, corrected_ranges
+from calib.calibration.applying import CorrectedRange, CorrectedRanges, columns_of, corrected_ranges
 from calib.calibration.document import (
     IN_ORDER,
     DelayNs,
     FreeStdNs,
     Light,
+    Metres,
+    Number,
     PairKey,
     PowerDbm,
+    StdM,
     StdNs,
     TagKey,
     expect,
+    number,
     one_of,
     pair_name,
     read,
     write,
 )
 from calib.calibration.error_model import CheckedErrors
-from calib.calibration.parts import (
-    CorrectedRange,
-    CorrectedRanges,
-    PairOffset,
-    TagGroup,
-    Uncertainty,
-    columns_of,
-)
 from calib.calibration.power_curves import LIFTS, BiasCurve, SigmaCurve, basis, lifted_power
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
@@ -49,6 +44,47 @@ from uwblink.display import as_html, as_text
 from uwblink.output import write_text
 from uwblink.recording.antenna_delays import REGISTER_MAX, AntennaDelay
 from uwblink.text_files import read_text
+from uwblink.twr import LARGEST_ID
+
+Tags = tuple[Annotated[int, number(0, LARGEST_ID, "the id of a tag", int)], ...]
+
+Matrix = tuple[tuple[Number, ...], ...]
+"""A matrix as a tuple of rows."""
+
+
+def matrix_of(values: Floats) -> Matrix:
+    """Return an array (n, k) as a tuple of rows."""
+    return tuple(map(tuple, values.tolist()))
+
+
+@dataclass(frozen=True, slots=True)
+class TagGroup:
+    """Tags of one design, and their curves; a range between groups gets the mean of both groups' curves."""
+
+    tags: Tags
+    bias_curve: BiasCurve
+    sigma_curve: SigmaCurve
+
+
+@dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """Covariance matrices of a fit.
+
+    `delays_ns2` (tags, tags) goes with `tags`; `bias_m2` and `sigma_m2` (m, m) go with the coefficients of the curves.
+    """
+
+    tags: Tags
+    delays_ns2: Matrix
+    bias_m2: Matrix
+    sigma_m2: Matrix
+
+
+@dataclass(frozen=True, slots=True)
+class PairOffset:
+    """By how much the ranges of a pair are too long, and its standard error, in metres."""
+
+    offset_m: Metres
+    std_m: StdM
 
 
 def _are_registers(table: Any) -> bool:
@@ -97,7 +133,6 @@ class Calibration:
     pair_offsets: Annotated[dict[PairKey, PairOffset], IN_ORDER] = field(default_factory=dict)
     antenna_delays: Annotated[Mapping[TagKey | None, Registers], IN_ORDER] = field(default_factory=dict)
     uncertainty: Uncertainty | None = None
-    _corrector: Annotated[Any, Field(exclude=True)] = field(default=None, init=False, compare=False)
 
     @property
     def stopped(self) -> bool:
@@ -194,10 +229,10 @@ class Calibration:
     ) -> CorrectedRange[Any]:
         """Correct one range, or arrays of them (n,): the corrected range and its standard deviations, in metres.
 
-        `range_m` is as the board gives it, powers are in dBm, NaN or 0 where a board has none. One range takes a few
-        microseconds, for a robot's loop. `weights` are those of the two delays (`uwblink.twr.delay_weights`); halves
-        take both clocks for equally fast (K = 1), wrong by a millionth of the delays, a hundredth of a millimetre at
-        most. Equals `apply` otherwise, and raises what that raises.
+        `range_m` is as the board gives it, powers are in dBm, NaN or 0 where a board has none. A call takes half a
+        millisecond, for one range or for hundreds. `weights` are those of the two delays
+        (`uwblink.twr.delay_weights`); halves take both clocks for equally fast (K = 1), wrong by a millionth of the
+        delays, a hundredth of a millimetre at most. Equals `apply` otherwise, and raises what that raises.
 
         >>> import calib
         >>> known = calib.fit(calib.sample_flight()).calibration
@@ -205,16 +240,13 @@ class Calibration:
         >>> f"{corrected.range_m:.2f} m, sigma {corrected.sigma_m:.2f} m"
         '2.94 m, sigma 0.03 m'
         """
-        given = (range_m, fpp1_dbm, fpp2_dbm, initiator, target, *weights)
-        if all([isinstance(value, float | int | np.generic) for value in given]):  # noqa: C419 - a list takes half the time of a generator
-            corrector = self._corrector or RangeCorrector(self)
-            object.__setattr__(self, "_corrector", corrector)
-            with suppress(KeyError):  # an unknown tag is named below
-                return corrector(range_m, fpp1_dbm, fpp2_dbm, initiator, target, weights)
         ranges = Ranges.from_arrays(
             range_m, initiator=initiator, target=target, fpp1_dbm=fpp1_dbm, fpp2_dbm=fpp2_dbm, weights=weights
         )
-        return columns_of(self.apply(ranges))
+        found = columns_of(self.apply(ranges))
+        if any(map(np.ndim, (range_m, fpp1_dbm, fpp2_dbm, initiator, target, *weights))):
+            return found
+        return CorrectedRange(*(column.item() for column in found))
 
     def band(self, lifted: Floats, which: Literal["bias", "sigma"]) -> Floats | None:
         """Return the standard error of a curve at lifted powers (n,), in metres; None where it is not known."""

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calib.calibration.model import Calibration
-from calib.calibration.parts import PairOffset, TagGroup, Uncertainty, matrix_of
+from calib.calibration.model import Calibration, PairOffset, TagGroup, Uncertainty, matrix_of
 from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, flat_curve
 from calib.estimator.error_summary import between_recordings, error_model
 from calib.estimator.known_distances import LARGEST_SPREAD_M, KnownDistances, described_errors

@@ -10,9 +10,9 @@ from typing import Any, Final
 import numpy as np
 from scipy.interpolate import BSpline
 
+from calib.calibration.applying import CorrectedRanges
 from calib.calibration.document import for_json, pair_name
 from calib.calibration.model import Calibration, require_calibration
-from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, load_ranges
 from calib.pairs import pairs_of

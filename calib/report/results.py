@@ -11,8 +11,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from calib.calibration.applying import CorrectedRanges
 from calib.calibration.model import Calibration
-from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data
 from calib.evaluation.statistics import Evaluation, PlantedComparison, compare_with_planted, evaluate

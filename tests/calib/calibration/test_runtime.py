@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from calib.calibration.error_model import ErrorModel, PairErrors
-from calib.calibration.model import Calibration
-from calib.calibration.parts import TagGroup
+from calib.calibration.model import Calibration, TagGroup
 from calib.calibration.power_curves import Curve
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError
