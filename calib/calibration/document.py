@@ -253,12 +253,9 @@ def _explained(errors: list[ErrorDetails]) -> str:
     """Return the first mistake, that of a key which is there if there is one."""
     first = min(errors, key=lambda one: one["type"] == "missing")
     path = [str(part) for part in first["loc"]]
-    where = ": ".join(path[:-2] if path[-1:] == ["[key]"] else path)
-    if first["type"] == "missing":
-        return f"{where}: missing"
-    message = first["msg"].removeprefix("Value error, ")
+    message = "missing" if first["type"] == "missing" else first["msg"].removeprefix("Value error, ")
     found = "" if isinstance(first["input"], dict) else f"found {first['input']!r:.60}, "
-    return f"{where}: {found}{message}"
+    return ": ".join([*(path[:-2] if path[-1:] == ["[key]"] else path), found + message])
 
 
 def for_json(value: Any) -> Any:

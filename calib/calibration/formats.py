@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 from scipy.interpolate import PPoly
 
-from calib.calibration.document import finite
+from calib.calibration.document import ends_of, finite
 from calib.calibration.error_model import ErrorModel
 from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.power_curves import ALPHA_DBM, Curve
@@ -151,13 +151,10 @@ def _miluv(calibration: Calibration) -> str:
 
 
 def _ros_yaml(calibration: Calibration, base: AntennaDelays | None) -> str:
-    to_program = _on_top(calibration, base)
-    tags: dict[str, Any] = {}
-    for tag, delay in sorted(calibration.delays_ns.items()):
-        tags[str(tag)] = {"delay_ns": delay}
-        if tag in to_program:
-            registers = {"tx_antenna_delay": to_program[tag].tx, "rx_antenna_delay": to_program[tag].rx}
-            tags[str(tag)] |= registers
+    to_program = {
+        tag: {"tx_antenna_delay": one.tx, "rx_antenna_delay": one.rx} for tag, one in _on_top(calibration, base).items()
+    }
+    tags = {str(t): {"delay_ns": d} | to_program.get(t, {}) for t, d in sorted(calibration.delays_ns.items())}
     document: dict[str, Any] = {
         "alpha_dbm": calibration.alpha_dbm,
         "lift": calibration.lift,
@@ -176,8 +173,7 @@ def _error_tables(model: ErrorModel) -> dict[str, Any]:
     """Return the error model by pair and lifted power, as tables for interpolation."""
     lifted, pairs = np.array(model.lifted), {}
     for name in [*model.pairs, "other"]:
-        ends = [0, 0] if name == "other" else [int(end) for end in name.split("-")]
-        first, second = (np.full(len(lifted), end) for end in ends)
+        first, second = np.repeat((0, 0) if name == "other" else ends_of(name), len(lifted)).reshape(2, -1)
         shapes = model.shapes(lifted, first, second)
         low, high = model.quantiles((0.025, 0.975), lifted, first, second).T
         rows = {
@@ -346,12 +342,8 @@ def _c_errors(model: ErrorModel, bias: Curve) -> list[str]:
         "SLOPE_BELOW": slopes[0],
         "SLOPE_ABOVE": slopes[1],
     }
-    rows = {
-        "lifted": model.lifted,
-        "log_noise": log_noise.tolist(),
-        "log_odds": log_odds.tolist(),
-    }
-    ends = [name.split("-") for name in model.pairs] + [["-1", "-1"]]
+    rows = {"lifted": model.lifted, "log_noise": log_noise.tolist(), "log_odds": log_odds.tolist()}
+    ends = [*map(ends_of, model.pairs), (-1, -1)]
     factors = [(np.log(p.noise), np.log(p.odds), p.detour * model.detour_m) for p in model.pairs.values()]
     return [
         f"#define UWB_ERROR_POWERS {len(model.lifted)}",

@@ -28,6 +28,7 @@ from calib.calibration.document import (
     StdNs,
     TagKey,
     expect,
+    joint,
     number,
     one_of,
     pair_name,
@@ -264,13 +265,7 @@ class Calibration:
     @staticmethod
     def from_json(text: str, where: str = "calibration") -> Calibration:
         """Read a calibration; raises `BadInputError` that names `where` and the key."""
-        found = read(_ADAPTER, text, where)
-        if wrong := _misfit(found):
-            raise BadInputError(f"{where}: uncertainty: {wrong}")
-        return found
-
-
-_ADAPTER: Final = TypeAdapter(Calibration)
+        return read(_ADAPTER, text, where)
 
 
 def _misfit(calibration: Calibration) -> str:
@@ -287,8 +282,11 @@ def _misfit(calibration: Calibration) -> str:
         rows = getattr(known, name)
         # A variance of 0 may come out of a decomposition a little below 0.
         if len(rows) != size or any(len(row) != size or row[k] < -1e-9 for k, row in enumerate(rows)):
-            return f"{name}: expected {size} rows of {size} numbers, and no variance below 0"
+            return f"uncertainty: {name}: expected {size} rows of {size} numbers, and no variance below 0"
     return ""
+
+
+_ADAPTER: Final[TypeAdapter[Calibration]] = TypeAdapter(Annotated[Calibration, joint(_misfit)])
 
 
 def require_calibration(value: object, parameter: str = "calibration") -> None:
