@@ -223,9 +223,9 @@ def survey(
         (plot, "where boards stood, with ellipses of 95 %"),
         (report, "whether it is fit for use"),
     )
-    for path, what in contents:
-        if path:
-            typer.echo(f"{path}: {what}")
+    for file, what in contents:
+        if file:
+            typer.echo(f"{file}: {what}")
     for warning in result.warnings:
         warn(warning)
 
