@@ -139,11 +139,11 @@ def test_it_knows_how_good_it_is(seed):
 
 
 @pytest.mark.parametrize("model", ["imu", "constant-velocity"])
-@pytest.mark.parametrize("away", [(5.0, 0.0, 0.0), (-3.0, 4.0, 0.0), (0.0, -10.0, 0.0), (7.0, 7.0, 1.0)])
+@pytest.mark.parametrize("away", [(-3.0, 4.0, 0.0), (0.0, -10.0, 0.0)])
 def test_a_wrong_start_is_left_within_two_seconds(model, away):
     start = tuple((place(np.array(0.0)) + away).tolist())
     settings = OnboardSettings(model=model, noise=IMU if model == "imu" else Noise(), start_m=start)
-    (track,) = localize_onboard(flight(6.0, reflected=0.1), calibration(0.1), settings)
+    (track,) = localize_onboard(flight(4.0, reflected=0.1), calibration(0.1), settings)
     first = np.linalg.norm(track.estimate_m[0] - track.truth_m[0])
     assert first > 4
     assert track.restarts_s
