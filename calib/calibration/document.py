@@ -219,10 +219,7 @@ def write(calibration: T, adapter: TypeAdapter[T]) -> str:
     reception (taken at the mean power it is wrong by up to a decimetre), 4 with constants of pairs.
     """
     table = adapter.dump_python(calibration, mode="json")
-    optional = {key: table.pop(key) for key in OPTIONAL_KEYS}
-    if optional["power_at"] == "exchange":
-        del optional["power_at"]
-    used = {key: value for key, value in optional.items() if value}
+    used = {key: value for key in OPTIONAL_KEYS if (value := table.pop(key)) and value != "exchange"}
     needed = (("pair_offsets", 4), ("power_at", 3), ("groups", 2))
     version = next((version for key, version in needed if key in used), 1)
     text = json.dumps({"schema_version": version} | table | used, indent=1, allow_nan=False)

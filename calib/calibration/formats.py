@@ -395,9 +395,6 @@ FORMATS: Final[dict[str, Callable[[Calibration, AntennaDelays | None], str]]] = 
 }
 """Functions from a calibration and programmed delays to text, by format."""
 
-ONE_CURVE: Final = ("miluv", "ros-yaml", "c-header")
-"""Formats that have one curve for all tags."""
-
 
 def export(
     calibration: Calibration,
@@ -424,7 +421,7 @@ def export(
         raise BadInputError(f"found {to!r}, allowed: {', '.join(FORMATS)}", parameter="to")
     if calibration.pair_offsets and to != "json":
         raise BadInputError(f"{to} has no place for constants of pairs; export it as json", parameter="to")
-    if calibration.groups and to in ONE_CURVE:
+    if calibration.groups and to in ("miluv", "ros-yaml", "c-header"):
         raise BadInputError(
             f"{to} has one curve for all tags, this calibration one for each of the groups "
             f"{', '.join(calibration.groups)}; export it as json",

@@ -35,8 +35,7 @@ MIN_ANCHORS: Final = 3
 """
 
 MIN_RANGES_PER_FIX: Final = 6
-SPAN_S: Final = 0.5
-"""Seconds over which gravity is averaged for the first tilt."""
+"""Two for each coordinate, so that the median of their errors excludes a reflected one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -258,7 +257,7 @@ def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilt
         if first < 0:
             raise UnanswerableError(f"{one.source}: {one.body} ranges with too few anchors for a start; give it one")
         fix = _fix(one, np.arange(first + 1), settings)
-    near = np.abs(one.imu_s - float(one.time_s[first])) < SPAN_S / 2
+    near = np.abs(one.imu_s - float(one.time_s[first])) < 0.25  # s: the first tilt is that of half a second
     force = one.imu[near, 3:].mean(axis=0) if near.any() else np.array([0.0, 0.0, GRAVITY])
     turned = _attitudes(force, settings.headings) if inertial else np.eye(3)[None]
     found = InertialFilter(fix, turned, settings.noise, inertial=inertial, speed_m_s=settings.speed_m_s)

@@ -32,14 +32,11 @@ Section = Callable[[Results], list[Block]]
 
 
 def _verdict(results: Results) -> list[Block]:
-    if results.recordings:
-        lead = _summary(results)
-    else:
-        lead = (
-            "Nothing of this was held against a true distance. Where a recording has them, evaluate the calibration "
-            "on it: the report of that evaluation has this section, too."
-        )
-    return [*verdict(results), Text(lead, "lead")]
+    unjudged = (
+        "Nothing of this was compared with a true distance. If a recording has true distances, evaluate the "
+        "calibration on it: the report of that evaluation has this section, too."
+    )
+    return [*verdict(results), Text(_summary(results) if results.recordings else unjudged, "lead")]
 
 
 def _summary(results: Results) -> str:
@@ -197,10 +194,9 @@ def _determined(results: Results) -> list[Block]:
     if results.fit is None:
         return []
     calibration, pairs = results.calibration, pair_rows(results.trained)
+    answer = f"Yes: the {len(pairs)} pairs of {len(results.trained.tags())} tags determine every delay."
     if calibration.provenance.get("undetermined"):
         answer = f"No: {left_open(results)}."
-    else:
-        answer = f"Yes: the {len(pairs)} pairs of {len(results.trained.tags())} tags determine every delay."
     counts = [int(np.count_nonzero(rows)) for rows in pairs.values()]
     changed = calibration.provenance.get("settings", {})
     settings = f" Settings: {', '.join(f'{name} = {value}' for name, value in changed.items())}." if changed else ""

@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Final
 
 from calib import figures as drawings
 from calib.calibration.comparison import Comparison
@@ -22,9 +21,6 @@ from calib.report.results import Origin, Results, origin_of
 from calib.report.sections import document
 from uwblink.output import check_folder, check_output
 from uwblink.pages.blocks import Block, Document, Picture, write_document
-
-EVALUATION: Final = "Calibration report"
-"""Title of the report of an evaluation."""
 
 
 def check_places(output: Path | None, pdf: Path | None, figures: Path | None, *, force: bool) -> None:
@@ -76,7 +72,7 @@ def write_report(
     loaded = load_each(recordings, need_power=calibration.needs_power)
     made = origin or origin_of(recordings)
     results = Results(calibration=calibration, tests=loaded, evaluated=evaluation, origin=made)
-    write_document(document(results, EVALUATION), output, None, folder, force=force)
+    write_document(document(results, "Calibration report"), output, None, folder, force=force)
 
 
 def write_survey_report(
