@@ -18,7 +18,7 @@ def evaluate_flight(flight: Data) -> Mapping[str, Any]:
 
     `flight` is what `uwbsim.simulate` gives, or one of whatever else `load_ranges` takes. The row has the number of
     `exchanges` that could be used; mean, standard deviation and robust spread in metres of the errors of `raw`,
-    `delays` and `full` ranges; `rejected`; and, beside what was planted, `delays_rms_ns`, `curve_rms_m` and
+    `delays` and `full` ranges; `rejected`; and, compared with what was planted, `delays_rms_ns`, `curve_rms_m` and
     `correction_rms_m`, None where nothing was; and `settled`, 0 where the fit stopped before it did. Raises
     `UnanswerableError` where the flight cannot be fitted.
     """
