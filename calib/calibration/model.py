@@ -113,8 +113,8 @@ class Calibration:
     powers, half of either in a range, as curves are published that correct single stamps. With `groups`, each has its
     own curves, and the plain ones are the groups' average, for display only. `errors` is the error model of corrected
     ranges, by pair and power; None where that is not known, as in older and in imported calibrations. With
-    `pair_offsets`, by pair with the smaller id first, ranges of a pair read longer by its constant, in addition to delays
-    and curves, and a pair that has none cannot be corrected. `antenna_delays` is what was programmed into the tags
+    `pair_offsets`, by pair with the smaller id first, ranges of a pair read longer by its constant, in addition to
+    delays and curves, and a pair that has none cannot be corrected. `antenna_delays` is what was programmed into the tags
     when they were recorded, which delays are on top of; empty where that is not known.
     """
 

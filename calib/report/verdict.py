@@ -136,8 +136,8 @@ def _bias(results: Results) -> Criterion:
     return Criterion(
         "Is no pair left with a bias?",
         f"median of each pair, less what chance explains, within {most:g} of its spread",
-        f"worst: {name} with {100 * full.median_m:+.1f} cm of {full.n} ranges; beyond chance {ratio:.2f} of its spread of "
-        f"{100 * full.robust_std_m:.1f} cm",
+        f"worst: {name} with {100 * full.median_m:+.1f} cm of {full.n} ranges; beyond chance {ratio:.2f} of its "
+        f"spread of {100 * full.robust_std_m:.1f} cm",
         _graded(ratio <= most, ratio <= 1.0),
         f"no pair is sure to keep a bias beyond {most:g} of its spread"
         if ratio <= most
