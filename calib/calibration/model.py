@@ -114,8 +114,8 @@ class Calibration:
     own curves, and the plain ones are the groups' average, for display only. `errors` is the error model of corrected
     ranges, by pair and power; None where that is not known, as in older and in imported calibrations. With
     `pair_offsets`, by pair with the smaller id first, ranges of a pair read longer by its constant, in addition to
-    delays and curves, and a pair that has none cannot be corrected. `antenna_delays` is what was programmed into the tags
-    when they were recorded, which delays are on top of; empty where that is not known.
+    delays and curves, and a pair that has none cannot be corrected. `antenna_delays` is what was programmed into the
+    tags when they were recorded, which delays are on top of; empty where that is not known.
     """
 
     delays_ns: Annotated[dict[TagKey, DelayNs], IN_ORDER]
@@ -230,8 +230,8 @@ class Calibration:
     ) -> CorrectedRange[Any]:
         """Correct one range, or arrays of them (n,): the corrected range and its standard deviations, in metres.
 
-        `range_m` is as the board gives it, powers are in dBm, NaN or 0 where a board has none. A call takes half a
-        millisecond, for one range or for hundreds. `weights` are those of the two delays
+        `range_m` is as the board gives it, powers are in dBm, NaN or 0 where a board has none. A call takes
+        less than a millisecond, for one range or for hundreds. `weights` are those of the two delays
         (`uwblink.twr.delay_weights`); halves take both clocks for equally fast (K = 1), wrong by a millionth of the
         delays, a hundredth of a millimetre at most. Equals `apply` otherwise, and raises what that raises.
 
