@@ -284,7 +284,7 @@ def _attitudes(force: Floats, headings: int) -> Floats:
     east = np.cross((0.0, 1.0, 0.0), up)
     east = east / np.linalg.norm(east)
     tilt = np.vstack([east, np.cross(up, east), up])
-    turns = Rotation.from_euler("z", 2 * np.pi * np.arange(headings) / headings)
+    turns = Rotation.from_rotvec(np.outer(2 * np.pi * np.arange(headings) / headings, (0.0, 0.0, 1.0)))
     return np.asarray(turns.as_matrix() @ tilt)
 
 

@@ -75,7 +75,7 @@ def test_the_filter_is_consistent_on_clean_ranges(flights):
 def test_a_body_that_ranges_only_where_its_place_is_unknown_is_left_out(flights):
     flight, calibration = clean(beginning(flights["test1"], 2))
     bodies = sorted({tag.body for tag in flight.tags})
-    last = flight.ranges.time_ns.max()
+    last = flights["test1"].ranges.time_ns.max()
     # One body's poses come after all ranges.
     late = flight.poses.body == bodies[0]
     time = np.where(late, flight.poses.time_ns + last, flight.poses.time_ns)
