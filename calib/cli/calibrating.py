@@ -6,7 +6,6 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -97,9 +96,8 @@ def fit(
     """Fit the tags' antenna delays (ns) and the curves of bias and standard deviation over first-path power (m)."""
     check_choice("truth", truth, ("recorded", "ranges"))
     if truth == "recorded":
-        for one in fields(flight):
-            if getattr(flight, one.name) != one.default:
-                raise BadInputError("goes with a fit whose `truth` is ranges", parameter=one.name)
+        for name in flight.changed():
+            raise BadInputError("goes with a fit whose `truth` is ranges", parameter=name)
     check_output(output, force=force)
     with _undetermined_as_json(as_json):
         if truth == "ranges":

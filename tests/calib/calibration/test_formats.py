@@ -122,24 +122,6 @@ def test_miluv_is_read_and_given_back_unchanged():
     assert np.isfinite(found.apply(r).corrected_m).all()
 
 
-def test_a_published_curve_is_taken_at_each_reception():
-    found = read_miluv(shared("miluv_published_calibration.json"))
-    powers = np.array([-80.5, -95.0, -88.0]), np.array([-96.0, -81.0, -88.0])
-    n = np.zeros(3)
-    columns = found.correct(n + 3.0, *powers, np.full(3, 10), np.full(3, 20))
-    lifted = [10 ** ((power + 82) / 10) for power in powers]
-    delays = 0.299702547 * (found.delays_ns[10] + found.delays_ns[20]) / 2
-    expected = 3.0 + delays - (found.bias_curve(lifted[0]) + found.bias_curve(lifted[1])) / 2
-    np.testing.assert_allclose(columns.range_m, expected, atol=1e-12)
-    at_the_mean = replace(found, power_at="exchange").correct(n + 3.0, *powers, np.full(3, 10), np.full(3, 20))
-    assert np.abs(at_the_mean.range_m - expected)[:2].min() > 0.05, "metres; the two ways differ"
-    assert at_the_mean.range_m[2] == pytest.approx(expected[2])
-    again = Calibration.from_json(found.to_json())
-    assert (again.power_at, json.loads(found.to_json())["schema_version"]) == ("reception", 3)
-    with pytest.raises(BadInputError, match="power_at: found 'somewhere'"):
-        Calibration.from_json(found.to_json().replace('"reception"', '"somewhere"'))
-
-
 def test_the_published_calibration_gives_the_published_ranges(tmp_path):
     """Within what a fault of the authors' code adds: it corrects the last stamp with the wrong tag's delay."""
     with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:

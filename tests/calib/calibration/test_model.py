@@ -1,5 +1,6 @@
 """The calibration file, and what applying it does."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -19,11 +20,14 @@ def fitted():
     return fit(ranges()).calibration
 
 
-def test_json_both_ways_without_loss(fitted, tmp_path):
-    fitted.save(tmp_path / "c.json")
+@pytest.mark.parametrize(("changes", "version"), [({}, 1), ({"power_at": "reception"}, 3)])
+def test_json_both_ways_without_loss(fitted, tmp_path, changes, version):
+    known = replace(fitted, **changes)
+    known.save(tmp_path / "c.json")
     again = load_calibration(tmp_path / "c.json")
-    assert again == fitted
-    assert again.to_json() == fitted.to_json()
+    assert again == known
+    assert again.to_json() == known.to_json()
+    assert json.loads(known.to_json())["schema_version"] == version
 
 
 def lifted(dbm):
@@ -102,6 +106,7 @@ def test_an_unknown_tag_is_named(fitted):
         ('"loss": "mixture"', '"loss": 5'),
         ('"delays_ns": {', '"delays_ns": {"x": 1, '),
         ('"alpha_dbm": -82.0', '"alpha_dbm": "low"'),
+        ('"alpha_dbm": -82.0', '"alpha_dbm": -82.0, "power_at": "somewhere"'),
         ('"speed_of_light": 299702547.0', '"speed_of_light": NaN'),
         ('"scale_ns": ', '"scale_ns": 1e300, "was": '),
         ('"delays_ns2": [', '"delays_ns2": [[1.0], '),
