@@ -110,7 +110,7 @@ def test_without_tests_errors_are_those_of_ranges_that_were_held_out(campaign, f
     page = (tmp_path / "r.html").read_text()
     assert f"Over {held.sum()} ranges that were held out" in page
     assert "30 % of the same recordings" in page
-    assert "Settings: loss = l2." in page
+    assert "Settings: loss = l2" in page
 
 
 def test_ranges_too_few_to_hold_out_are_judged_themselves(folder):
