@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -270,19 +270,17 @@ def split_error(ranges: Ranges, error_m: Floats) -> ErrorSplit:
 
 def statistics(error_m: Floats) -> Stats:
     """Return the statistics of range errors (n,); NaN where there are none."""
-    if not len(error_m):
-        nothing: dict[str, Any] = dict.fromkeys((field.name for field in fields(Stats)), float("nan"))
-        return Stats(**nothing | {"n": 0})
-    low, high = np.quantile(error_m, (0.025, 0.975))
+    some = error_m if len(error_m) else np.full(1, np.nan)
+    low, high = np.quantile(some, (0.025, 0.975))
     return Stats(
         n=len(error_m),
-        mean_m=float(np.mean(error_m)),
-        median_m=float(np.median(error_m)),
-        std_m=float(np.std(error_m)),
-        robust_std_m=robust_spread(error_m),
+        mean_m=float(np.mean(some)),
+        median_m=float(np.median(some)),
+        std_m=float(np.std(some)),
+        robust_std_m=robust_spread(some),
         low_m=float(low),
         high_m=float(high),
-        abs95_m=float(np.quantile(np.abs(error_m), 0.95)),
+        abs95_m=float(np.quantile(np.abs(some), 0.95)),
     )
 
 

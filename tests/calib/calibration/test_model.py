@@ -109,7 +109,7 @@ def test_an_unknown_tag_is_named(fitted):
         ('"alpha_dbm": -82.0', '"alpha_dbm": -82.0, "power_at": "somewhere"'),
         ('"speed_of_light": 299702547.0', '"speed_of_light": NaN'),
         ('"scale_ns": ', '"scale_ns": 1e300, "was": '),
-        ('"delays_ns2": [', '"delays_ns2": [[1.0], '),
+        ('"tags": [', '"tags": [9, '),
         ('"provenance": {', '"provenance": {"added": 1e400, '),
         ('"provenance": {', '"provenance": {"added": -Infinity, '),
     ],
