@@ -19,6 +19,8 @@ DEGREE: Final = 3
 """Curves that are fitted are cubic splines: smooth to the second derivative, which their roughness is measured by."""
 
 SIGMA_SEGMENTS: Final = 4
+"""Segments of the curve of the noise, which a prior on its roughness makes as straight as the data allow."""
+
 SIGMA_FLOOR_M: Final = 0.002
 """A tick is 4.7 mm long; no range is better than half of one."""
 
