@@ -52,7 +52,8 @@ def test_what_is_no_calibration_is_refused_by_its_parameter(tmp_path):
         "apply": lambda wrong: calib.apply(tmp_path / "f.uwb", wrong, tmp_path / "g.uwb"),
         "write_report": lambda wrong: calib.write_report(tmp_path / "r.html", flight, wrong),
     }
-    for wrong in (None, "calibration.json", {}, result):
+    no_calibrations: tuple[Any, ...] = (None, "calibration.json", {}, result)
+    for wrong in no_calibrations:
         for name, call in calls.items():
             with pytest.raises(calib.BadInputError, match="expected a Calibration") as caught:
                 call(wrong)
