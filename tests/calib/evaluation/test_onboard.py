@@ -65,7 +65,9 @@ def flight(seconds=20.0, seed=1, reflected=0.0, rate=50.0, start=0.0):
     measured += np.where(rng.random(len(t)) < reflected, rng.exponential(0.35, len(t)), 0.0)
     ns = 10**12
     power = np.full((2, len(t)), -85.0)
-    exchanges = stamped((t * 1e9).astype(np.int64) + ns, np.column_stack([tag, anchor]), measured, power)
+    ends = np.column_stack([tag, anchor])
+    ends[::3] = ends[::3, ::-1]  # some that the anchor initiates
+    exchanges = stamped((t * 1e9).astype(np.int64) + ns, ends, measured, power)
     ti = start + np.arange(-1.0, seconds + 1, 0.01)
     # White noise of a density d in readings 10 ms apart has the standard deviation d / sqrt(10 ms).
     gyro = turning(ti) + BIASES[0] + rng.normal(size=(len(ti), 3)) * IMU.gyro / 0.1
