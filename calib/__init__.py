@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
+    from calib.calibration.applying import CorrectedRanges
     from calib.calibration.comparison import compare
     from calib.calibration.correction import apply
     from calib.calibration.formats import export
     from calib.calibration.model import Calibration, load_calibration
-    from calib.calibration.parts import CorrectedRanges
     from calib.checks.examine import examine
     from calib.data.ranges import Ranges
     from calib.data.samples import sample_flight
@@ -86,7 +86,7 @@ _HOMES: Final = {
     "BadInputError": "calib.errors",
     "CalibError": "calib.errors",
     "Calibration": "calib.calibration.model",
-    "CorrectedRanges": "calib.calibration.parts",
+    "CorrectedRanges": "calib.calibration.applying",
     "FitResult": "calib.fitting.result",
     "FitSettings": "calib.settings",
     "FlightPlan": "calib.planning.result",

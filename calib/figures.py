@@ -15,14 +15,14 @@ from matplotlib.axes import Axes as Axes
 from matplotlib.figure import Figure
 from scipy.stats import norm
 
+from calib.calibration.applying import CorrectedRanges
 from calib.calibration.comparison import Comparison
 from calib.calibration.model import Calibration
-from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges
 from calib.estimator.grouped_errors import fit_grouped_errors
 from calib.evaluation.statistics import CORRECTION_STAGES, compare_with_planted, pair_rows, planted_curve
 from calib.spread import TWO_SIDED_95
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, Ints
 from uwblink.pages.colours import BLUE, GREEN, INK, MUTED, PALE, VERMILION, WINE
 from uwblink.pages.figures import NARROW_IN, WIDTHS, label, legend, mark, outlines, series, sheet
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -67,34 +67,33 @@ def over_power(
 
     They are the delay-corrected errors for the "bias" curve, and the fully corrected ones for "sigma".
     """
-    lifted = applied.lifted
     error_m = (applied.delay_corrected_m if which == "bias" else applied.corrected_m) - ranges.truth_m
-    sets = {name: (lifted[rows], error_m[rows], 6) for name, rows in pair_rows(ranges).items()}
-    return binned({**sets, "all": (lifted, error_m, 20)}, calibration.loss)
+    sets = {name: (np.flatnonzero(rows), 6) for name, rows in pair_rows(ranges).items()}
+    return binned(applied.lifted, error_m, sets | {"all": (np.arange(len(error_m)), 20)}, calibration.loss)
 
 
-def binned(sets: Mapping[str, tuple[Floats, Floats, int]], loss: str) -> dict[str, Binned]:
-    """Return sets of (lifted powers (n,), errors (n,), number of bins) in bins of equal counts, as a fit weighs them.
+def binned(lifted: Floats, error_m: Floats, sets: Mapping[str, tuple[Ints, int]], loss: str) -> dict[str, Binned]:
+    """Return errors (n,) of sets of rows, by lifted power (n,) in a number of bins of equal counts, as a fit has them.
 
     The curve of a fit follows the errors of direct ranges; reflections only lengthen, so medians and means lie above
     it. Least squares ("l2") follow the mean.
     """
     groups = {
-        name: np.array_split(np.argsort(x), max(1, min(bins, len(x) // MIN_RANGES_PER_BIN)))
-        for name, (x, _, bins) in sets.items()
+        name: np.array_split(rows[np.argsort(lifted[rows])], max(1, min(bins, len(rows) // MIN_RANGES_PER_BIN)))
+        for name, (rows, bins) in sets.items()
     }
-    errors = [sets[name][1][rows] for name, some in groups.items() for rows in some]
-    centres = np.array([(np.mean(e) if loss == "l2" else np.median(e), np.std(e)) for e in errors])
+    errors = [error_m[rows] for some in groups.values() for rows in some]
+    powers = [np.median(lifted[rows]) for some in groups.values() for rows in some]
+    medians = [np.median(e) for e in errors]
+    centre_m = np.array([np.mean(e) for e in errors] if loss == "l2" else medians)
+    std_m = np.array([np.std(e) for e in errors])
     told = [k for k, e in enumerate(errors) if len(e) >= MIN_RANGES_PER_BIN and float(np.ptp(e)) >= 1e-9]
     if loss != "l2" and told:
         core = fit_grouped_errors([errors[k] for k in told], MOST_RANGES_PER_BIN)
-        centres[told] = np.column_stack([core.centre_m, core.sigma_m])
-    parts = np.split(centres, np.cumsum([len(some) for some in groups.values()])[:-1])
-    found = {}
-    for (name, some), own in zip(groups.items(), parts, strict=True):
-        lifted, medians = ([float(np.median(column[rows])) for rows in some] for column in sets[name][:2])
-        found[name] = Binned(np.array(lifted), own[:, 0], own[:, 1], np.array(medians))
-    return found
+        centre_m[told], std_m[told] = core.centre_m, core.sigma_m
+    ends = np.cumsum([len(some) for some in groups.values()])[:-1]
+    parts = zip(*(np.split(column, ends) for column in (powers, centre_m, std_m, medians)), strict=True)
+    return {name: Binned(*own) for name, own in zip(groups, parts, strict=True)}
 
 
 def histogram(ranges: Ranges, applied: CorrectedRanges, axes: Axes | None = None) -> Axes:

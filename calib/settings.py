@@ -27,8 +27,10 @@ CHOICES: Final = {
     "attitudes": ("poses", "imu", "none"),
     "anchors": ("given", "sought"),
     "heights": ("used", "ignored"),
+    "model": ("imu", "constant-velocity"),
 }
 POSITIVE: Final = sys.float_info.min
+ABOVE_ZERO: Final = (POSITIVE, math.inf, "a number above 0")
 NUMBERS: Final = {
     "scale_ns": (POSITIVE, math.inf, "a positive number of ns"),
     "between_m": (0.0, math.nextafter(1.0, 0.0), "metres, 0 to 1"),
@@ -38,6 +40,9 @@ NUMBERS: Final = {
     "poses_until_s": (0.0, math.inf, "a number of 0 or more"),
     "heading_std_deg": (0.0, math.inf, "a number of 0 or more"),
     "pair_error_m": (POSITIVE, math.inf, "a positive number of metres"),
+    **dict.fromkeys(("velocity_std_mps", "velocity_rate_hz", "initial_std_m", "gate", "reopen_s"), ABOVE_ZERO),
+    **dict.fromkeys(("start_std_m", "rate_hz", "speed_m_s"), ABOVE_ZERO),
+    "seeds": (1, 1000, "1 to 1000"),
 }
 """The least and the largest value of a setting, and what is expected."""
 
@@ -133,7 +138,7 @@ def _checked_delays(fixed_ns: Mapping[int, float] | None) -> dict[int, float]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Settings:
+class CheckedSettings:
     """Settings that results repeat."""
 
     def __post_init__(self) -> None:
@@ -166,7 +171,7 @@ def _as_json(value: object) -> object:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FitSettings(_Settings):
+class FitSettings(CheckedSettings):
     """The settings of `fit`, which it takes as keyword arguments, too; raises `BadInputError` that names the setting.
 
     `loss` is "mixture", the likelihood of direct ranges, reflections and outliers with a share of reflections by pair,
@@ -286,7 +291,7 @@ class FitSettings(_Settings):
 
     def __post_init__(self) -> None:
         """Check the settings; whether a loss is known, the fit checks."""
-        _Settings.__post_init__(self)
+        CheckedSettings.__post_init__(self)
         if self.sequential and self.loss == "mixture":
             raise BadInputError(
                 "goes with a loss, not with the mixture; leave one of the two away", parameter="sequential"
@@ -326,7 +331,7 @@ def read_distances(texts: Iterable[str]) -> tuple[KnownDistance, ...]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlightSettings(_Settings):
+class FlightSettings(CheckedSettings):
     """What is known of a flight without true distances: settings of `fit_from_ranges`, which explains them.
 
     Raises `BadInputError` that names the setting.
@@ -388,12 +393,12 @@ class FlightSettings(_Settings):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        _Settings.__post_init__(self)
+        CheckedSettings.__post_init__(self)
         object.__setattr__(self, "distances", tuple(self.distances))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SurveySettings(_Settings):
+class SurveySettings(CheckedSettings):
     """What is known of boards that stand still, and the settings of `survey`, which it takes as keyword arguments, too.
 
     `known` is "line" or "plane" for all arrangements, the path of a TOML file (`load_knowledge`), or a `Knowledge`:
@@ -426,6 +431,6 @@ class SurveySettings(_Settings):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        _Settings.__post_init__(self)
+        CheckedSettings.__post_init__(self)
         if self.curve_from is not None and self.delays_only:
             raise BadInputError("a curve is taken over, and `delays_only` asks for none", parameter="curve_from")

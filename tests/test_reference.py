@@ -67,7 +67,7 @@ def test_every_offered_name_is_in_the_reference(package):
 
 def test_what_doors_return_is_in_the_reference():
     page = doors.reference("calib")
-    names = ("evaluation.statistics.Stats", "calibration.parts.Uncertainty", "findings.Finding")
+    names = ("evaluation.statistics.Stats", "calibration.model.Uncertainty", "findings.Finding")
     for name in names:
         assert f"calib.{name}" in page
 

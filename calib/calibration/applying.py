@@ -1,29 +1,82 @@
-"""Correct ranges by a calibration, as columns and one at a time: delays, curve, expected errors.
-
-A single range takes a few microseconds of plain Python, for the loop of a robot: curves are split into polynomials
-between knots. Both ways give the same numbers.
-"""
+"""Correct ranges by a calibration: delays, curve, expected errors."""
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
-from typing import TYPE_CHECKING, Any, Final, Literal
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
-from scipy.interpolate import PPoly
 
-from calib.calibration.error_model import ErrorShapes
-from calib.calibration.parts import CorrectedRange, CorrectedRanges, offset_of, offsets_m
-from calib.calibration.power_curves import Curve, ends, lift
-from calib.data.ranges import FAINTEST_DBM, LOUDEST_DBM, Ranges
+from calib.calibration.document import pair_name
+from calib.calibration.power_curves import ends, lift
+from calib.data.ranges import Ranges
 from calib.errors import BadInputError
-from uwblink.arrays import Floats
+from calib.pairs import pairs_of
+from uwblink.arrays import Bools, Floats
+from uwblink.display import as_text, excerpt, first_few
 
 if TYPE_CHECKING:
     from calib.calibration.model import Calibration
 
-NEPERS_PER_DB: Final = math.log(10) / 10
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CorrectedRanges:
+    """Ranges in three stages, metres, and what is known of them, shape (n,).
+
+    `sigma_m` is the noise of direct ranges. `sigma_total_m` is the standard deviation of all of them, reflected ones
+    included, about a mean of `mean_error_m`; `tail_share` is the share of such ranges of this pair at this power that
+    are reflected. `tail_probability` is the same given the range itself, where its true distance is known, and
+    `outlier` marks what is then neither noise nor a reflection; elsewhere it equals `tail_share`, and nothing is
+    marked. `clamped` marks lifted powers at which the curves had no data and are held constant; `sigma_total_m` grows
+    there by the slope of the curve at its end. All but `sigma_m` and `clamped` are NaN where a calibration has no error
+    model (`Calibration.errors`), and without a power.
+
+    >>> import calib
+    >>> flight = calib.load_ranges(calib.sample_flight())
+    >>> corrected = calib.fit(flight).calibration.apply(flight)
+    >>> corrected.corrected_m.shape
+    (900,)
+    """
+
+    raw_m: Floats
+    delay_corrected_m: Floats
+    corrected_m: Floats
+    sigma_m: Floats
+    lifted: Floats
+    clamped: Bools
+    sigma_total_m: Floats
+    mean_error_m: Floats
+    tail_share: Floats
+    tail_probability: Floats
+    outlier: Bools
+
+    def __repr__(self) -> str:
+        """Return a headline and the first rows, in lines of 79 characters."""
+        columns = {column.name: getattr(self, column.name) for column in fields(self)}
+        return as_text(f"{len(self.raw_m)} corrected ranges", excerpt(columns))
+
+
+class CorrectedRange(NamedTuple, Generic[T]):
+    """A corrected range and its standard deviation, metres; `clamped` where its power is beyond the curves'.
+
+    `sigma_m` is the noise of a direct range; `sigma_total_m` includes reflections, which are the share `tail_share` of
+    the ranges of this pair at this power; both are NaN without an error model. Without a power at either end the range
+    has the delays' part only, and its standard deviations are NaN. Each is a number, or an array (n,).
+    """
+
+    range_m: T
+    sigma_m: T
+    clamped: Any
+    sigma_total_m: T
+    tail_share: T
+
+    def __repr__(self) -> str:
+        """Return a headline and the first rows, in lines of 79 characters."""
+        columns = {name: np.atleast_1d(values) for name, values in self._asdict().items()}
+        return as_text(f"{len(columns['range_m'])} corrected ranges", excerpt(columns))
 
 
 def corrected_ranges(calibration: Calibration, ranges: Ranges) -> CorrectedRanges:
@@ -54,7 +107,20 @@ def _without_delays(calibration: Calibration, ranges: Ranges) -> Floats:
     size = max(ranges.tags(), default=0) + 1
     delay_s = np.array([calibration.delays_ns.get(t, math.nan) for t in range(size)]) * 1e-9
     flight = ranges.weight_initiator * delay_s[ranges.initiator] + ranges.weight_target * delay_s[ranges.target]
-    return ranges.raw_m + calibration.speed_of_light * flight - offsets_m(calibration.pair_offsets, ranges)
+    return ranges.raw_m + calibration.speed_of_light * flight - _offsets_m(calibration, ranges)
+
+
+def _offsets_m(calibration: Calibration, ranges: Ranges) -> Floats:
+    """Return the constant of each range's pair (n,), zeros where the calibration has none for pairs."""
+    offsets, pairs = calibration.pair_offsets, pairs_of(ranges.initiator, ranges.target)
+    if not offsets:
+        return np.zeros(len(ranges))
+    ends = list(map(tuple, pairs.ends.tolist()))
+    missing = [pair_name(pair) for pair in ends if pair not in offsets]
+    if missing:
+        known = first_few(map(pair_name, sorted(offsets)))
+        raise BadInputError(f"no constant for pair {missing[0]} in the calibration, which knows {known}")
+    return np.array([offsets[pair].offset_m for pair in ends])[pairs.number]
 
 
 def _errors(calibration: Calibration, ranges: Ranges, lifted: Floats, error_m: Floats) -> dict[str, Any]:
@@ -105,103 +171,13 @@ def _curve(
     return values
 
 
-class PiecewiseCurve:
-    """A curve as polynomials between its knots, for one power at a time.
-
-    `left` are the lifted powers at which the polynomials begin; `pieces` their coefficients, the highest power first,
-    of the distance from there.
-    """
-
-    def __init__(self, curve: Curve) -> None:
-        """Split a curve into polynomials."""
-        self.low, self.high = curve.range
-        first, count = curve.degree, len(curve.coefficients)
-        whole = PPoly.from_spline((np.array(curve.knots), np.array(curve.coefficients), curve.degree))
-        edges = whole.x[first : count + 1]
-        pieces = np.diff(edges) > 0  # no polynomial lies between two equal knots
-        self.left: list[float] = edges[:-1][pieces].tolist()
-        self.pieces: list[list[float]] = whole.c[:, first:count].T[pieces].tolist()
-
-    def __call__(self, lifted: float) -> float:
-        """Return the curve at a lifted power, in metres."""
-        x = min(max(lifted, self.low), self.high)
-        piece = max(bisect_right(self.left, x) - 1, 0)
-        t, value = x - self.left[piece], 0.0
-        for coefficient in self.pieces[piece]:
-            value = value * t + coefficient
-        return value
-
-
-class RangeCorrector:
-    """Corrects single ranges by a calibration; make one object and call it for every range."""
-
-    def __init__(self, calibration: Calibration) -> None:
-        """Prepare the curves of every tag, and those of the error model."""
-        self._calibration, self._flat = calibration, not calibration.needs_power
-        self._metres = {tag: d * 1e-9 * calibration.speed_of_light for tag, d in calibration.delays_ns.items()}
-        self._plain = PiecewiseCurve(calibration.bias_curve), PiecewiseCurve(calibration.sigma_curve)
-        self._curves = {} if calibration.groups else dict.fromkeys(calibration.delays_ns, self._plain)
-        for group in calibration.groups.values():
-            curves = PiecewiseCurve(group.bias_curve), PiecewiseCurve(group.sigma_curve)
-            self._curves |= dict.fromkeys(group.tags, curves)
-        if model := calibration.errors:
-            low, high = model.lifted[0], model.lifted[-1]
-            self._noise, self._odds = (
-                PiecewiseCurve(Curve((low, *model.lifted, high), tuple(values.tolist()), 1, (low, high)))
-                for values in model.logarithms
-            )
-
-    def __call__(
-        self,
-        range_m: float,
-        fpp1_dbm: float,
-        fpp2_dbm: float,
-        initiator: int,
-        target: int,
-        weights: tuple[float, float],
-    ) -> CorrectedRange[float]:
-        """Return what `Calibration.correct` returns for one range; raises `KeyError` for a tag that is not known."""
-        known = self._calibration
-        corrected = range_m + weights[0] * self._metres[initiator] + weights[1] * self._metres[target]
-        first, second = self._curves[initiator], self._curves[target]
-        if known.pair_offsets:
-            corrected -= offset_of(known.pair_offsets, initiator, target).offset_m
-        lifted = self._lifted(fpp1_dbm, fpp2_dbm)
-        if lifted != lifted:
-            if not self._flat:
-                return CorrectedRange(corrected, math.nan, True, math.nan, math.nan)
-            lifted = self._plain[0].low
-        powers = [lifted]
-        if known.power_at == "reception":
-            ends = [self._lifted(power, power) for power in (fpp1_dbm, fpp2_dbm)]
-            powers = [power for power in ends if power == power] or powers
-        bias = sum(first[0](power) + second[0](power) for power in powers) / (2 * len(powers))
-        sigma = (first[1](lifted) + second[1](lifted)) / 2
-        clamped = not (self._flat or self._plain[0].low <= lifted <= self._plain[0].high)
-        errors = self._errors(lifted, initiator, target, clamped=clamped)
-        return CorrectedRange(corrected - bias, sigma, clamped, *errors)
-
-    def _errors(self, lifted: float, initiator: int, target: int, *, clamped: bool) -> tuple[float, float]:
-        """Return the total standard deviation in metres, and the share of reflections; NaN without an error model."""
-        model = self._calibration.errors
-        if model is None:
-            return math.nan, math.nan
-        pair = (initiator, target) if initiator < target else (target, initiator)
-        noise, odds, detour = model.factors.get(pair, (0.0, 0.0, 0.0))
-        shape = ErrorShapes(
-            noise_m=math.exp(noise + self._noise(lifted)),
-            tail_share=1 / (1 + math.exp(-odds - self._odds(lifted))),
-            detour_m=model.detour_m * math.exp(detour),
-        )
-        beyond = float(self._calibration.bias_curve.beyond(lifted)) if clamped else 0.0
-        return math.hypot(model.total_m(shape), beyond), shape.tail_share
-
-    def _lifted(self, first: float, second: float) -> float:
-        """Return the lifted power; if one of both powers is missing, the other replaces it."""
-        known = [power for power in (first, second) if FAINTEST_DBM < power < LOUDEST_DBM]
-        if not known:
-            return math.nan
-        alpha, count = self._calibration.alpha_dbm, len(known)
-        if self._calibration.lift == "lift-of-mean":
-            return math.exp((sum(known) / count - alpha) * NEPERS_PER_DB)
-        return sum(math.exp((power - alpha) * NEPERS_PER_DB) for power in known) / count
+def columns_of(applied: CorrectedRanges) -> CorrectedRange[Floats]:
+    """Return corrected ranges as columns; those without a power have the delays' part only."""
+    powered = np.isfinite(applied.lifted)
+    return CorrectedRange(
+        np.where(powered, applied.corrected_m, applied.delay_corrected_m),
+        np.where(powered, applied.sigma_m, np.nan),
+        applied.clamped,
+        applied.sigma_total_m,
+        applied.tail_share,
+    )

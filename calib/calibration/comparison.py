@@ -56,22 +56,20 @@ class Comparison:
             f"  tag {tag:3d}  {difference:+.4f} ns  {interval(self.std_ns[tag])}"
             for tag, difference in self.difference_ns.items()
         ]
-        lines.append(
+        shapes = (
             f"offset of all ranges {100 * self.offset_m:+.1f} cm, "
             f"shape of the bias curves {100 * self.curve_rms_m:.1f} cm rms"
         )
-        for name, tags in ((first, self.only_first), (second, self.only_second)):
-            if tags:
-                lines.append(f"only in {name}: tags {', '.join(map(str, tags))}")
+        sides = (first, self.only_first), (second, self.only_second)
+        only = [f"only in {name}: tags {', '.join(map(str, tags))}" for name, tags in sides if tags]
         tested = sum(np.isfinite(std) for std in self.std_ns.values())
-        if self.verdict == "unknown":
-            lines.append("no verdict: fewer than two tags have a standard error in both calibrations")
-        else:
-            lines.append(
+        verdict = "no verdict: fewer than two tags have a standard error in both calibrations"
+        if self.verdict != "unknown":
+            verdict = (
                 f"the delays are {'the same' if self.same else 'different'}: chi-square {self.chi_square:.1f} with "
                 f"{tested - 1} degrees of freedom, probability {self.probability:.3f}"
             )
-        return "\n".join(lines)
+        return "\n".join([*lines, shapes, *only, verdict])
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `calib compare --json` prints."""

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.calibration.applying import CorrectedRanges
 from calib.calibration.model import Calibration, require_calibration
-from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError
 from uwblink.exporters import check_export, export_recording

@@ -156,6 +156,12 @@ def is_pair(text: object) -> bool:
     return len(ends) == 2 and all(map(is_tag, ends))
 
 
+def ends_of(name: str) -> tuple[int, int]:
+    """Return the tags of a pair, the smaller id first, by its name."""
+    low, high = sorted(map(int, name.split("-")))
+    return low, high
+
+
 def pair_name(pair: Sequence[int]) -> str:
     """Return a pair as files and tables name it: 1-2."""
     return "-".join(map(str, pair))
@@ -195,12 +201,10 @@ FreeStdNs = Annotated[
 """A standard error, which is infinite (null in files) where data leave a delay free."""
 
 TagKey = Annotated[int, expect("tag ids as keys", is_tag, int)]
-PairName = Annotated[str, expect("names of pairs, as in 1-2", is_pair)]
 PairKey = Annotated[
-    tuple[int, int],
-    expect("two tag ids as keys, as in 1-2", is_pair, lambda name: tuple(sorted(map(int, name.split("-"))))),
-    PlainSerializer(pair_name),
+    tuple[int, int], expect("two tag ids as keys, as in 1-2", is_pair, ends_of), PlainSerializer(pair_name)
 ]
+PairName = Annotated[str, expect("names of pairs, as in 1-2", is_pair, lambda name: pair_name(ends_of(name)))]
 IN_ORDER: Final = WrapSerializer(lambda table, write: write(dict(sorted(table.items()))))
 """Writes a table in the order of its keys."""
 
@@ -215,10 +219,7 @@ def write(calibration: T, adapter: TypeAdapter[T]) -> str:
     reception (taken at the mean power it is wrong by up to a decimetre), 4 with constants of pairs.
     """
     table = adapter.dump_python(calibration, mode="json")
-    optional = {key: table.pop(key) for key in OPTIONAL_KEYS}
-    if optional["power_at"] == "exchange":
-        del optional["power_at"]
-    used = {key: value for key, value in optional.items() if value}
+    used = {key: value for key in OPTIONAL_KEYS if (value := table.pop(key)) and value != "exchange"}
     needed = (("pair_offsets", 4), ("power_at", 3), ("groups", 2))
     version = next((version for key, version in needed if key in used), 1)
     text = json.dumps({"schema_version": version} | table | used, indent=1, allow_nan=False)
@@ -249,12 +250,9 @@ def _explained(errors: list[ErrorDetails]) -> str:
     """Return the first mistake, that of a key which is there if there is one."""
     first = min(errors, key=lambda one: one["type"] == "missing")
     path = [str(part) for part in first["loc"]]
-    where = ": ".join(path[:-2] if path[-1:] == ["[key]"] else path)
-    if first["type"] == "missing":
-        return f"{where}: missing"
-    message = first["msg"].removeprefix("Value error, ")
+    message = "missing" if first["type"] == "missing" else first["msg"].removeprefix("Value error, ")
     found = "" if isinstance(first["input"], dict) else f"found {first['input']!r:.60}, "
-    return f"{where}: {found}{message}"
+    return ": ".join([*(path[:-2] if path[-1:] == ["[key]"] else path), found + message])
 
 
 def for_json(value: Any) -> Any:

@@ -11,7 +11,6 @@ ranges share a part of their errors, and a filter that assumes independent ones 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -22,7 +21,7 @@ import numpy as np
 from scipy.optimize.elementwise import find_root
 from scipy.special import log_ndtr, ndtr
 
-from calib.calibration.document import Metres, Number, OpenShare, PairName, Positive, Share, StdM, joint
+from calib.calibration.document import Metres, Number, OpenShare, PairName, Positive, Share, StdM, joint, pair_name
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError
 from calib.pairs import Pairs, pairs_of
@@ -145,18 +144,11 @@ class ErrorModel:
         share = np.array(self.tail_share)
         return np.log(self.noise_m), np.log(share / (1 - share))
 
-    @cached_property
-    def factors(self) -> dict[tuple[int, ...], tuple[float, ...]]:
-        """Logarithms of the factors on noise, odds and detour, by pair with the smaller id first."""
-        return {
-            tuple(sorted(map(int, name.split("-")))): (math.log(one.noise), math.log(one.odds), math.log(one.detour))
-            for name, one in self.pairs.items()
-        }
-
     def _factors_of(self, pairs: Pairs) -> Floats:
-        """Return logarithms of the factors of pairs (pairs, 3); an unknown pair has none."""
-        rows = [self.factors.get(tuple(ends), (0.0, 0.0, 0.0)) for ends in pairs.ends.tolist()]
-        return np.array(rows).reshape(-1, 3)
+        """Return logarithms of the factors of pairs (pairs, 3) on noise, odds and detour; an unknown pair has none."""
+        common = PairErrors(1.0, 1.0, 1.0)
+        known = [self.pairs.get(pair_name(ends), common) for ends in pairs.ends.tolist()]
+        return np.log([(one.noise, one.odds, one.detour) for one in known]).reshape(-1, 3)
 
     def mean_m(self, shapes: ErrorShapes) -> Floats:
         """Return the mean of the errors (n,)."""

@@ -12,9 +12,9 @@ from typing import Any, Final
 
 import numpy as np
 import yaml
+from scipy.interpolate import PPoly
 
-from calib.calibration.applying import PiecewiseCurve
-from calib.calibration.document import finite
+from calib.calibration.document import ends_of, finite
 from calib.calibration.error_model import ErrorModel
 from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.power_curves import ALPHA_DBM, Curve
@@ -151,13 +151,10 @@ def _miluv(calibration: Calibration) -> str:
 
 
 def _ros_yaml(calibration: Calibration, base: AntennaDelays | None) -> str:
-    to_program = _on_top(calibration, base)
-    tags: dict[str, Any] = {}
-    for tag, delay in sorted(calibration.delays_ns.items()):
-        tags[str(tag)] = {"delay_ns": delay}
-        if tag in to_program:
-            registers = {"tx_antenna_delay": to_program[tag].tx, "rx_antenna_delay": to_program[tag].rx}
-            tags[str(tag)] |= registers
+    to_program = {
+        tag: {"tx_antenna_delay": one.tx, "rx_antenna_delay": one.rx} for tag, one in _on_top(calibration, base).items()
+    }
+    tags = {str(t): {"delay_ns": d} | to_program.get(t, {}) for t, d in sorted(calibration.delays_ns.items())}
     document: dict[str, Any] = {
         "alpha_dbm": calibration.alpha_dbm,
         "lift": calibration.lift,
@@ -176,8 +173,7 @@ def _error_tables(model: ErrorModel) -> dict[str, Any]:
     """Return the error model by pair and lifted power, as tables for interpolation."""
     lifted, pairs = np.array(model.lifted), {}
     for name in [*model.pairs, "other"]:
-        ends = [0, 0] if name == "other" else [int(end) for end in name.split("-")]
-        first, second = (np.full(len(lifted), end) for end in ends)
+        first, second = np.repeat((0, 0) if name == "other" else ends_of(name), len(lifted)).reshape(2, -1)
         shapes = model.shapes(lifted, first, second)
         low, high = model.quantiles((0.025, 0.975), lifted, first, second).T
         rows = {
@@ -324,8 +320,8 @@ def c_header(calibration: Calibration) -> str:
         f"#define UWB_LOUDEST_DBM {_number(LOUDEST_DBM)}",
         f"static const int uwb_tag[UWB_TAGS] = {{{', '.join(map(str, tags))}}};",
         f"static const double uwb_delay_m[UWB_TAGS] = {{{_numbers(metres)}}};",
-        *_c_curve("bias", PiecewiseCurve(bias)),
-        *_c_curve("sigma", PiecewiseCurve(calibration.sigma_curve)),
+        *_c_curve("bias", bias),
+        *_c_curve("sigma", calibration.sigma_curve),
     ]
     text = "\n".join(lines) + _C_CODE
     if calibration.errors:
@@ -346,12 +342,8 @@ def _c_errors(model: ErrorModel, bias: Curve) -> list[str]:
         "SLOPE_BELOW": slopes[0],
         "SLOPE_ABOVE": slopes[1],
     }
-    rows = {
-        "lifted": model.lifted,
-        "log_noise": log_noise.tolist(),
-        "log_odds": log_odds.tolist(),
-    }
-    ends = [name.split("-") for name in model.pairs] + [["-1", "-1"]]
+    rows = {"lifted": model.lifted, "log_noise": log_noise.tolist(), "log_odds": log_odds.tolist()}
+    ends = [*map(ends_of, model.pairs), (-1, -1)]
     factors = [(np.log(p.noise), np.log(p.odds), p.detour * model.detour_m) for p in model.pairs.values()]
     return [
         f"#define UWB_ERROR_POWERS {len(model.lifted)}",
@@ -366,15 +358,19 @@ def _c_errors(model: ErrorModel, bias: Curve) -> list[str]:
     ]
 
 
-def _c_curve(name: str, curve: PiecewiseCurve) -> list[str]:
-    terms, upper = len(curve.pieces[0]), name.upper()
+def _c_curve(name: str, curve: Curve) -> list[str]:
+    """Return a curve as polynomials between its knots: where each begins, and its coefficients, the highest first."""
+    degree, count = curve.degree, len(curve.coefficients)
+    whole = PPoly.from_spline((np.array(curve.knots), np.array(curve.coefficients), degree))
+    pieces = [k for k in range(degree, count) if whole.x[k + 1] > whole.x[k]]  # none between two equal knots
+    low, high = curve.range
     return [
-        f"static const double uwb_{name}_left[] = {{{_numbers(curve.left)}}};",
+        f"static const double uwb_{name}_left[] = {{{_numbers(whole.x[pieces])}}};",
         f"static const double uwb_{name}_coefficients[] = {{",
-        *(f"    {_numbers(row)}," for row in curve.pieces),
+        *(f"    {_numbers(row)}," for row in whole.c[:, pieces].T),
         "};",
-        f"#define UWB_{upper}(lifted) uwb_curve(uwb_{name}_left, uwb_{name}_coefficients, {len(curve.pieces)}, \\",
-        f"    {terms}, {_number(curve.low)}, {_number(curve.high)}, lifted)",
+        f"#define UWB_{name.upper()}(lifted) uwb_curve(uwb_{name}_left, uwb_{name}_coefficients, {len(pieces)}, \\",
+        f"    {degree + 1}, {_number(low)}, {_number(high)}, lifted)",
     ]
 
 
@@ -398,9 +394,6 @@ FORMATS: Final[dict[str, Callable[[Calibration, AntennaDelays | None], str]]] = 
     "c-header": lambda calibration, _: c_header(calibration),
 }
 """Functions from a calibration and programmed delays to text, by format."""
-
-ONE_CURVE: Final = ("miluv", "ros-yaml", "c-header")
-"""Formats that have one curve for all tags."""
 
 
 def export(
@@ -428,7 +421,7 @@ def export(
         raise BadInputError(f"found {to!r}, allowed: {', '.join(FORMATS)}", parameter="to")
     if calibration.pair_offsets and to != "json":
         raise BadInputError(f"{to} has no place for constants of pairs; export it as json", parameter="to")
-    if calibration.groups and to in ONE_CURVE:
+    if calibration.groups and to in ("miluv", "ros-yaml", "c-header"):
         raise BadInputError(
             f"{to} has one curve for all tags, this calibration one for each of the groups "
             f"{', '.join(calibration.groups)}; export it as json",

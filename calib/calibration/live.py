@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from calib.calibration.applying import columns_of
 from calib.calibration.model import load_calibration
-from calib.calibration.parts import columns_of
 from calib.data.ranges import Ranges
 from uwblink.arrays import Floats
 from uwblink.twr import Exchanges

@@ -19,7 +19,8 @@ DEGREE: Final = 3
 """Curves that are fitted are cubic splines: smooth to the second derivative, which their roughness is measured by."""
 
 SIGMA_SEGMENTS: Final = 4
-SIGMA_BINS: Final = 30
+"""Segments of the curve of the noise, which a prior on its roughness makes as straight as the data allow."""
+
 SIGMA_FLOOR_M: Final = 0.002
 """A tick is 4.7 mm long; no range is better than half of one."""
 
@@ -155,20 +156,8 @@ def curvature(knots: Floats) -> Floats:
     return np.asarray((second * weight[:, None]).T @ second)
 
 
-@dataclass(frozen=True, slots=True)
-class Bins:
-    """Ranges in bins of power of equal count: the bin of each (n,), the middle power of each bin, and its count."""
-
-    number: Ints
-    middle: Floats
-    count: Ints
-
-
-def equal_bins(lifted: Floats, most: int = SIGMA_BINS, order: Ints | None = None) -> Bins:
-    """Return bins of lifted powers (n,), at least 20 each, in order of power; `order` sorts them, if that is known."""
-    count, size = min(most, max(1, len(lifted) // 20)), len(lifted)
-    order = np.argsort(lifted) if order is None else order
-    number = np.empty(size, dtype=np.int64)
-    number[order] = np.arange(size) * count // size
-    edges = -(-np.arange(count + 1) * size // count)
-    return Bins(number, lifted[order[(edges[1:] + edges[:-1]) // 2]], np.diff(edges))
+def equal_bins(lifted: Floats) -> Ints:
+    """Return the bin of each lifted power (n,), in order of power: bins of equal counts, at most 30, of at least 20."""
+    count, number = len(lifted), np.empty(len(lifted), dtype=np.int64)
+    number[np.argsort(lifted)] = np.arange(count) * min(30, max(1, count // 20)) // max(count, 1)
+    return number

@@ -91,7 +91,7 @@ def _without_curve(ranges: Ranges, residuals_m: Floats) -> str:
             "errors, and delays from other distances will differ"
         )
     low, high = np.percentile(_mean_dbm(ranges), (5, 95))
-    number = equal_bins(lifted[known]).number
+    number = equal_bins(lifted[known])
     middle = medians(residuals_m[known], number)[np.bincount(number) >= 20]
     reach = float(np.ptp(np.percentile(middle, (5, 95)))) if len(middle) else 0.0
     differ_ns = reach / SPEED_OF_LIGHT * 1e9

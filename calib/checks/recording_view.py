@@ -24,7 +24,6 @@ from calib.estimator.range_model import RangeModel
 from calib.estimator.score_tests import REACHED, Family, Slopes, Tested
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.unknowns import Priors
-from calib.range_errors.densities import OUTLIERS_OVER_M, error_slopes
 from calib.settings import FitSettings
 from calib.spread import less_medians
 from uwblink.arrays import Bools, Floats, Ints

@@ -6,7 +6,6 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -97,9 +96,8 @@ def fit(
     """Fit the tags' antenna delays (ns) and the curves of bias and standard deviation over first-path power (m)."""
     check_choice("truth", truth, ("recorded", "ranges"))
     if truth == "recorded":
-        for one in fields(flight):
-            if getattr(flight, one.name) != one.default:
-                raise BadInputError("goes with a fit whose `truth` is ranges", parameter=one.name)
+        for name in flight.changed():
+            raise BadInputError("goes with a fit whose `truth` is ranges", parameter=name)
     check_output(output, force=force)
     with _undetermined_as_json(as_json):
         if truth == "ranges":
@@ -122,8 +120,7 @@ def _print_fit(result: calib.FitResult, output: Path, *, as_json: bool) -> None:
     else:
         typer.echo(f"{output}: {len(result.ranges)} exchanges, {result.message}, scale {found.scale_ns:.3f} ns")
         lines = [*delay_lines(found), *(f"  left out: {number} exchanges, {reason}" for reason, number in left_out)]
-        for line in filter(str.strip, [*lines, f"  {held_out_line(found)}"]):
-            typer.echo(line)
+        typer.echo("\n".join(filter(str.strip, [*lines, f"  {held_out_line(found)}"])))
         for warning in result.warnings:
             warn(warning)
     if not result.success:
@@ -216,15 +213,17 @@ def survey(
     if as_json:
         typer.echo(json.dumps(_survey_figures(result), indent=1))
         return
-    typer.echo(f"{output}: {result.headline()}")
-    for line in [*delay_lines(result.calibration), *_arrangement_lines(result)]:
-        typer.echo(line)
-    if anchors:
-        typer.echo(f"{anchors}: boards of {result.arrangement(arrangement).name}")
-    if plot:
-        typer.echo(f"{plot}: where boards stood, with ellipses of 95 %")
-    if report:
-        typer.echo(f"{report}: whether it is fit for use")
+    lines = [*delay_lines(result.calibration), *_arrangement_lines(result)]
+    typer.echo("\n".join([f"{output}: {result.headline()}", *lines]))
+    boards = f"boards of {result.arrangement(arrangement).name}" if anchors else ""
+    contents = (
+        (anchors, boards),
+        (plot, "where boards stood, with ellipses of 95 %"),
+        (report, "whether it is fit for use"),
+    )
+    for file, what in contents:
+        if file:
+            typer.echo(f"{file}: {what}")
     for warning in result.warnings:
         warn(warning)
 
@@ -267,19 +266,16 @@ def show(
     if as_json:
         typer.echo(known.to_json(), nl=False)
         return
-    typer.echo(repr(known))
+    made, lines = known.provenance, [repr(known)]
     for name in ("fitted", "gauge", "recordings"):
-        if name in known.provenance:
-            value = known.provenance[name]
-            typer.echo(f"  {name}: {', '.join(map(str, value)) if isinstance(value, list) else value}")
-    settings = known.provenance.get("settings")
-    if isinstance(settings, dict):
-        typer.echo(f"  settings: {', '.join(f'{name} = {value}' for name, value in settings.items())}")
-    distances = rests_on(known.provenance)
-    for line in [f"distances: {distances}"] if distances else _survey_lines(known.provenance.get("rests_on")):
-        typer.echo(f"  {line}")
-    for warning in known.provenance.get("warnings", []):
-        typer.echo(f"warning: {with_flags(str(warning))}")
+        value = made.get(name)
+        lines += [f"  {name}: {', '.join(map(str, value)) if isinstance(value, list) else value}"] if value else []
+    if isinstance(settings := made.get("settings"), dict):
+        lines.append(f"  settings: {', '.join(f'{name} = {value}' for name, value in settings.items())}")
+    distances = rests_on(made)
+    rests = [f"distances: {distances}"] if distances else _survey_lines(made.get("rests_on"))
+    lines += [*(f"  {line}" for line in rests), *(f"warning: {with_flags(str(w))}" for w in made.get("warnings", []))]
+    typer.echo("\n".join(lines))
 
 
 def _survey_lines(rests: object) -> Iterator[str]:

@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import calib
-from calib.cli.shared import STOPPED, Recordings, TrimStatic, command_line, known_calibration, warn, with_flags
+from calib.cli.shared import (
+    STOPPED,
+    Recordings,
+    TrimStatic,
+    check_report,
+    command_line,
+    known_calibration,
+    warn,
+    with_flags,
+)
 from calib.settings import FitSettings
 from uwblink.cli.shared import AsJson, CalibrationFile, Figures, Force, ReportFile, Seeds, add, choice, output, waiting
 
@@ -21,26 +30,15 @@ if TYPE_CHECKING:
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
-    for command, *examples in (
-        (
-            evaluate,
-            "calib evaluate test.uwb -c calibration.json",
-            "calib evaluate test.uwb -c calibration.json --report r.html",
-        ),
-        (
-            localize,
-            "calib localize test.uwb -c calibration.json",
-            "calib localize test.uwb -c calibration.json --model imu",
-        ),
-        (doctor, "calib doctor flight.uwb"),
-        (compare, "calib compare before.json after.json"),
-        (
-            report,
-            "calib report train.uwb --tests test1.uwb test2.uwb -o report.html",
-            "calib report train.uwb -o report.html --pdf report.pdf --figures figures",
-        ),
-    ):
-        add(app, command, *examples, panel="Judge")
+    judged = "calib evaluate test.uwb -c calibration.json"
+    tracked = "calib localize test.uwb -c calibration.json"
+    reported = "calib report train.uwb --tests test1.uwb test2.uwb -o report.html"
+    files = "calib report train.uwb -o report.html --pdf report.pdf --figures figures"
+    add(app, evaluate, judged, f"{judged} --report r.html", panel="Judge")
+    add(app, localize, tracked, f"{tracked} --model imu", panel="Judge")
+    add(app, doctor, "calib doctor flight.uwb", panel="Judge")
+    add(app, compare, "calib compare before.json after.json", panel="Judge")
+    add(app, report, reported, files, panel="Judge")
 
 
 def evaluate(
@@ -54,10 +52,7 @@ def evaluate(
     """Compare raw, delay-corrected and fully corrected ranges with the true distances, in cm, pair by pair."""
     from calib.data import load_each
 
-    if report or figures:
-        from calib.report import check_places
-
-        check_places(report, None, figures, force=force)
+    check_report(report, figures, force=force)
     known = known_calibration(calibration, recordings)
     with waiting("evaluating"):
         parts = load_each(recordings, need_power=known.needs_power)
@@ -71,11 +66,8 @@ def evaluate(
     if as_json:
         typer.echo(json.dumps(evaluation.to_dict(), indent=1))
         return
-    typer.echo(repr(evaluation))
-    for line in _remarks(evaluation):
-        typer.echo(line)
-    for path in filter(None, (report, figures)):
-        typer.echo(f"report: {path}")
+    written = [f"report: {path}" for path in (report, figures) if path]
+    typer.echo("\n".join([repr(evaluation), *_remarks(evaluation), *written]))
 
 
 def _warn_of_seen(evaluation: Evaluation) -> None:
@@ -123,10 +115,7 @@ def localize(
         write_tum,
     )
 
-    if figures:
-        from calib.report import check_places, write_onboard_figures, write_track_figures
-
-        check_places(None, None, figures, force=force)
+    check_report(None, figures, force=force)
     known = known_calibration(calibration, recordings)
     found: list[Any]
     table: Any
@@ -144,8 +133,9 @@ def localize(
     if tum:
         write_tum(found, tum, force=force)
     if figures:
-        write = write_track_figures if model == "poses" else write_onboard_figures
-        write(found, figures, force=force)
+        from calib.report import write_track_figures
+
+        write_track_figures(found, figures, force=force)
     typer.echo(json.dumps(table, indent=1) if as_json else text)
 
 
@@ -162,32 +152,29 @@ def doctor(
     from uwblink import Recording
     from uwblink.recording import clock_skews
 
-    skews = {}
+    def skews_of(path: Path) -> list[Any]:
+        with Recording.open(path) as recording:
+            return clock_skews(recording.exchange_blocks())
+
     with waiting("examining"):
         found = calib.examine(recordings)
         parts = {str(path): part for path in recordings if (part := examined_part(path))}
-        for path in recordings:
-            with Recording.open(path) as recording:
-                skews[str(path)] = clock_skews(recording.exchange_blocks())
+        skews = {str(path): skews_of(path) for path in recordings}
     findings = [replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in found]
     if as_json:
         clocks = {path: [asdict(one) for one in some] for path, some in skews.items()}
         found_all = {"findings": [asdict(f) for f in findings], "clock_skews": clocks}
         typer.echo(json.dumps(found_all | ({"examined": parts} if parts else {}), indent=1))
         return
-    for name, part in parts.items():
-        typer.echo(f"{name}: {part}")
-    if not findings:
-        typer.echo(f"{', '.join(map(str, recordings))}: nothing found")
+    lines = [f"{name}: {part}" for name, part in parts.items()]
+    lines += [] if findings else [f"{', '.join(map(str, recordings))}: nothing found"]
     for finding in findings:
-        typer.echo(f"{finding.fault}" + (f" (p = {finding.p_value:.1g})" if finding.p_value else ""))
-        typer.echo(f"  evidence: {finding.evidence}")
-        typer.echo(f"  remedy:   {finding.remedy}")
+        by_chance = f" (p = {finding.p_value:.1g})" if finding.p_value else ""
+        lines += [f"{finding.fault}{by_chance}", f"  evidence: {finding.evidence}", f"  remedy:   {finding.remedy}"]
     for name, some in skews.items():
-        if some:
-            typer.echo(f"clock skew in {name}, the second tag against the first")
-        for one in some:
-            typer.echo(f"  {one}")
+        lines += [f"clock skew in {name}, the second tag against the first"] if some else []
+        lines += [f"  {one}" for one in some]
+    typer.echo("\n".join(lines))
 
 
 def compare(
@@ -198,13 +185,12 @@ def compare(
     force: Force = False,
 ) -> None:
     """Test whether the delays of two calibrations differ by more than their standard errors explain (ns)."""
-    if figures:
-        from calib.report import check_places, write_comparison_figures
-
-        check_places(None, None, figures, force=force)
+    check_report(None, figures, force=force)
     known = [known_calibration(path) for path in (first, second)]
     found = calib.compare(*known)
     if figures:
+        from calib.report import write_comparison_figures
+
         write_comparison_figures(found, known, [first.stem, second.stem], figures, force=force)
     if as_json:
         typer.echo(json.dumps(found.to_dict(), indent=1))
@@ -243,9 +229,7 @@ def report(
     """Fit, judge on other recordings, localize, and write everything as one page with tables and figures."""
     from rich.console import Console
 
-    from calib.report import check_places
-
-    check_places(output, pdf, figures, force=force)
+    check_report(output, figures, pdf=pdf, force=force)
     with Console(file=sys.stderr).status("loading") as status:
         campaign = calib.run_campaign(
             recordings,
@@ -259,8 +243,7 @@ def report(
     if as_json:
         typer.echo(json.dumps(campaign.to_dict(), indent=1))
     else:
-        for path in filter(None, (output, pdf, figures)):
-            typer.echo(f"report: {path}")
+        typer.echo("\n".join(f"report: {path}" for path in (output, pdf, figures) if path))
         if tests:  # without tests the report itself states that the training was judged
             _warn_of_seen(campaign.evaluation)
         findings = [f"{name}: {finding.fault}" for name, finding in campaign.findings]

@@ -54,6 +54,14 @@ def warn(text: str) -> None:
     typer.echo(f"warning: {with_flags(text)}", err=True)
 
 
+def check_report(report: Path | None, figures: Path | None, *, pdf: Path | None = None, force: bool) -> None:
+    """Check the files of a report, if there are any, before anything is computed."""
+    if report or figures:
+        from calib.report import check_places
+
+        check_places(report, pdf, figures, force=force)
+
+
 def command_line() -> str:
     """Return how the command was called, for reports."""
     return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
@@ -70,7 +78,6 @@ def known_calibration(path: Path, recordings: Iterable[Path] = ()) -> calib.Cali
     if known.stopped:
         warn(f"{path}: its fit stopped before it settled: delays and intervals are not final")
     for recording in recordings:
-        warning = antenna_delays_warning(known, recording)
-        if warning:
+        if warning := antenna_delays_warning(known, recording):
             warn(f"{recording}: {path}: {warning}")
     return known

@@ -15,8 +15,7 @@ import numpy as np
 from scipy.special import expit
 
 from calib.calibration.error_model import ErrorModel, PairErrors
-from calib.calibration.model import Calibration
-from calib.calibration.parts import PairOffset, TagGroup, Uncertainty, matrix_of
+from calib.calibration.model import Calibration, PairOffset, TagGroup, Uncertainty, matrix_of
 from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, flat_curve
 from calib.estimator.known_distances import LARGEST_SPREAD_M, DescribedErrors, KnownDistances, described_errors
 from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel, Spline

@@ -51,29 +51,27 @@ class InertialFilter:
         """Start at a fix with attitudes (headings, 3, 3), body to world."""
         count = len(attitudes)
         self.noise, self.inertial = noise, inertial
-        self.place, self.velocity = np.tile(fix.place_m, (count, 1)), np.zeros((count, 3))
-        self.attitude = attitudes.copy()
-        self.gyro_bias, self.force_bias = np.zeros((count, 3)), np.zeros((count, 3))
-        self.offset = np.zeros(count)
+        # Attitude errors move into the attitude, so that part of the state stays zero.
+        self.state, self.attitude = np.zeros((count, SIZE)), attitudes.copy()
         self.likelihood = np.zeros(count)
         spread = np.zeros(SIZE)
-        spread[V] = speed_m_s
         if inertial:
             # Headings are those of a grid; other standard deviations are those of consumer sensors.
             spread[A], spread[G], spread[F] = (0.3, 0.3, np.pi / count), 0.02, 0.4
         spread[H] = 0.15
         self.covariance = np.tile(np.diag(spread**2), (count, 1, 1))
-        self.covariance[:, P, P] = fix.covariance_m2
+        self.restart(fix, speed_m_s)
 
     def predict(self, dt: float, gyro: Floats, force: Floats) -> None:
         """Predict over `dt` seconds with mean angular velocity (3,) and specific force (3,); without an IMU they are
         ignored."""
-        noise, step = self.noise, np.zeros((len(self.place), SIZE, SIZE))
+        noise, state = self.noise, self.state
+        step = np.zeros((len(state), SIZE, SIZE))
         step[:, P, V] = np.eye(3) * dt
         added = np.zeros(SIZE)
         if self.inertial:
-            turn, pull = gyro - self.gyro_bias, force - self.force_bias
-            world = np.einsum("hij,hj->hi", self.attitude, pull) - (0.0, 0.0, GRAVITY)
+            turn, pull = gyro - state[:, G], force - state[:, F]
+            world = self._acceleration(pull)
             step[:, V, A] = -self.attitude @ _cross(pull) * dt
             step[:, V, F] = -self.attitude * dt
             step[:, A, A] = -_cross(turn) * dt
@@ -82,10 +80,10 @@ class InertialFilter:
             added[V], added[A] = noise.force**2 * dt, noise.gyro**2 * dt
             added[G], added[F] = noise.gyro_bias**2 * dt, noise.force_bias**2 * dt
         else:
-            world = np.zeros_like(self.velocity)
+            world = np.zeros((len(state), 3))
             added[P], added[V] = noise.acceleration**2 * dt**3 / 3, noise.acceleration**2 * dt
-        self.place = self.place + self.velocity * dt + 0.5 * world * dt**2
-        self.velocity = self.velocity + world * dt
+        state[:, P] += state[:, V] * dt + 0.5 * world * dt**2
+        state[:, V] += world * dt
         added[H] = noise.height_offset**2 * dt
         whole = np.eye(SIZE) + step
         self.covariance = whole @ self.covariance @ whole.transpose(0, 2, 1) + np.diag(added)
@@ -95,7 +93,7 @@ class InertialFilter:
         self, range_m: float, noise_m: float, errors: RangeErrors, arm_m: Floats, anchor_m: Floats
     ) -> RangeUpdate:
         """Update by a range to an anchor (3,); return the update."""
-        towards = self.place - anchor_m
+        towards = self.state[:, P] - anchor_m
         if self.inertial:
             towards = towards + self.attitude @ arm_m
         else:
@@ -103,7 +101,7 @@ class InertialFilter:
             noise_m = float(np.hypot(noise_m, np.hypot(arm_m[0], arm_m[1]) / np.sqrt(2)))
             towards = towards + np.array([0.0, 0.0, arm_m[2]])
         distance = np.maximum(np.linalg.norm(towards, axis=1), 1e-6)
-        row = np.zeros((len(distance), SIZE))
+        row = np.zeros_like(self.state)
         row[:, P] = towards / distance[:, None]
         if self.inertial:
             row[:, A] = -np.einsum("hi,hij->hj", row[:, P], self.attitude @ _cross(np.tile(arm_m, (len(distance), 1))))
@@ -113,10 +111,10 @@ class InertialFilter:
 
     def update_height(self, height_m: float) -> None:
         """Update by a height above the world's zero; the sensor may have an offset."""
-        row = np.zeros((len(self.place), SIZE))
+        row = np.zeros_like(self.state)
         row[:, [2, H]] = 1.0
         errors = RangeErrors(share=1e-6, least_m=0.0, detour_m=1.0, outlier=0.05, outlier_m=1.0)
-        self._update_scalar(row, height_m - self.place[:, 2] - self.offset, self.noise.height_m, errors)
+        self._update_scalar(row, height_m - self.state[:, 2] - self.state[:, H], self.noise.height_m, errors)
 
     def _update_scalar(self, row: Floats, innovation: Floats, noise_m: float, errors: RangeErrors) -> RangeUpdate:
         """Update by a scalar measurement with derivatives `row` (headings, states) and a non-normal error."""
@@ -135,18 +133,22 @@ class InertialFilter:
 
         The update determines the sum of tilt error and accelerometer bias.
         """
-        pull = force - self.force_bias
-        world = np.einsum("hij,hj->hi", self.attitude, pull) - (0.0, 0.0, GRAVITY)
-        self._update_linear([(A, -self.attitude @ _cross(pull)), (F, -self.attitude)], -world, std)
+        pull = force - self.state[:, F]
+        slopes = [(A, -self.attitude @ _cross(pull)), (F, -self.attitude)]
+        self._update_linear(slopes, -self._acceleration(pull), std)
+
+    def _acceleration(self, force: Floats) -> Floats:
+        """Return the acceleration in the world (headings, 3) of specific forces (headings, 3) in the body's axes."""
+        return np.asarray(np.einsum("hij,hj->hi", self.attitude, force) - (0.0, 0.0, GRAVITY))
 
     def limit_speed(self, speed_m_s: float) -> None:
         """Update by a velocity of zero with standard deviation `speed_m_s`: it bounds the state while there are no
         ranges."""
-        self._update_linear([(V, np.eye(3))], -self.velocity, speed_m_s)
+        self._update_linear([(V, np.eye(3))], -self.state[:, V], speed_m_s)
 
     def _update_linear(self, parts: Sequence[tuple[slice, Floats]], innovation: Floats, std: float) -> None:
         """Update by a linear measurement of parts of the state (headings, 3, 3 each) with normal noise."""
-        rows = np.zeros((len(self.place), 3, SIZE))
+        rows = np.zeros((len(self.state), 3, SIZE))
         for part, slopes in parts:
             rows[:, :, part] = slopes
         reach = self.covariance @ rows.transpose(0, 2, 1)
@@ -158,18 +160,16 @@ class InertialFilter:
 
     def restart(self, fix: Fix, speed_m_s: float) -> None:
         """Restart at a fix, with the present attitude and biases."""
-        self.place, self.velocity = np.tile(fix.place_m, (len(self.place), 1)), np.zeros_like(self.velocity)
-        for part in (P, V):
+        self.state[:, P], self.state[:, V] = fix.place_m, 0.0
+        for part, covariance in ((P, fix.covariance_m2), (V, np.eye(3) * speed_m_s**2)):
             self.covariance[:, part, :] = self.covariance[:, :, part] = 0
-        self.covariance[:, P, P] = fix.covariance_m2
-        self.covariance[:, V, V] = np.eye(3) * speed_m_s**2
+            self.covariance[:, part, part] = covariance
 
     def _move(self, by: Floats) -> None:
-        self.place, self.velocity = self.place + by[:, P], self.velocity + by[:, V]
-        self.offset = self.offset + by[:, H]
+        self.state = self.state + by
         if self.inertial:
             self.attitude = self.attitude @ _rotation(by[:, A])
-            self.gyro_bias, self.force_bias = self.gyro_bias + by[:, G], self.force_bias + by[:, F]
+        self.state[:, A] = 0.0
 
 
 def _cross(vectors: Floats) -> Floats:

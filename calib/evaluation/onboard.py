@@ -24,25 +24,23 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.evaluation.inertial_filter import GRAVITY, InertialFilter, Noise, P
 from calib.evaluation.range_updates import Fix, RangeErrors, multilaterate, range_errors
 from calib.evaluation.tracking import Trajectory, nearest_attitude
+from calib.settings import CheckedSettings
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import bodies_m
 from uwblink.recording.schema import Poses
 from uwblink.recording.summary import single_reports
-
-MODELS: Final = ("imu", "constant-velocity")
 
 MIN_ANCHORS: Final = 3
 """Anchors of a fix: fewer leave the position ambiguous; a start needs one more, because three leave its mirror image.
 """
 
 MIN_RANGES_PER_FIX: Final = 6
-SPAN_S: Final = 0.5
-"""Seconds over which gravity is averaged for the first tilt."""
+"""Two for each coordinate, so that the median of their errors excludes a reflected one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OnboardSettings:
-    """How a body is localized: `model` is one of `MODELS`, `height` whether its height sensor is used.
+class OnboardSettings(CheckedSettings):
+    """How a body is localized: `model` is "imu" or "constant-velocity", `height` whether its height sensor is used.
 
     `start_m` is where it begins, with a standard deviation of `start_std_m` an axis, instead of where its first ranges
     say; a wrong one is left after `reopen_s`, or as many ranges as a fix takes. `headings` are tried at once;
@@ -65,14 +63,7 @@ class OnboardSettings:
 
     def __post_init__(self) -> None:
         """Check the settings; raises `BadInputError`."""
-        if self.model not in MODELS:
-            raise BadInputError(
-                f"found {self.model!r:.40}, allowed: {', '.join(MODELS)}, or poses with motion capture",
-                parameter="model",
-            )
-        for name in ("start_std_m", "reopen_s", "rate_hz", "speed_m_s"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise BadInputError(f"found {getattr(self, name)!r:.40}, expected a number above 0", parameter=name)
+        CheckedSettings.__post_init__(self)
         if self.start_m is not None and not (len(self.start_m) == 3 and np.isfinite(self.start_m).all()):
             raise BadInputError(f"found {self.start_m!r:.60}, expected three numbers", parameter="start_m")
 
@@ -181,11 +172,9 @@ def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
         imu, heights = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))
     ranges = Ranges.from_exchanges(exchanges, source=name)
     ranges = ranges.usable(need_power=calibration.needs_power, need_truth=False)
-    anchors = {}
-    for body in sorted(set(poses.body.tolist())):
-        place = poses.position_m[poses.body == body]
-        if np.ptp(place, axis=0).max() <= 0.1:
-            anchors[body] = np.asarray(np.median(place, axis=0))
+    places = {body: poses.position_m[poses.body == body] for body in np.unique(poses.body).tolist()}
+    still_m = 0.1  # poses of a body that stands still have some noise
+    anchors = {body: np.median(some, axis=0) for body, some in places.items() if np.ptp(some, axis=0).max() <= still_m}
     fixed = {tag.tag: anchors[tag.body] + tag.lever_arm_m for tag in tags if tag.body in anchors}
     if len(fixed) < MIN_ANCHORS:
         raise UnanswerableError(
@@ -197,15 +186,14 @@ def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
     found = []
     for body in sorted({tag.body for tag in tags if tag.body not in anchors}):
         arms = {tag.tag: np.array(tag.lever_arm_m) for tag in tags if tag.body == body}
-        own, theirs = list(arms), list(fixed)
-        first = np.isin(ranges.initiator, own) & np.isin(ranges.target, theirs)
-        second = np.isin(ranges.target, own) & np.isin(ranges.initiator, theirs)
-        some = ranges[np.flatnonzero(first | second)]
-        if not len(some):
+        initiates = np.isin(ranges.initiator, list(arms))
+        ends = [ranges.initiator, ranges.target]
+        mine, other = np.where(initiates, ends, ends[::-1])
+        rows = np.flatnonzero(np.isin(mine, list(arms)) & np.isin(other, list(fixed)))
+        if not len(rows):
             continue
-        some = some[np.argsort(some.time_ns, kind="stable")]
-        initiates = np.isin(some.initiator, own)
-        mine, other = np.where(initiates, [some.initiator, some.target], [some.target, some.initiator])
+        rows = rows[np.argsort(ranges.time_ns[rows], kind="stable")]
+        some = ranges[rows]
         corrected, noise, errors = _corrected(some, calibration)
         imu_s, inertial = _table(imu, body, ("wx", "wy", "wz", "ax", "ay", "az"), began)
         height_s, height = _table(heights, body, ("height_m",), began)
@@ -218,8 +206,8 @@ def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
                 range_m=corrected,
                 noise_m=noise,
                 errors=errors,
-                arm_m=np.array([arms[tag] for tag in mine.tolist()]),
-                anchor_m=np.array([fixed[tag] for tag in other.tolist()]),
+                arm_m=np.array([arms[tag] for tag in mine[rows].tolist()]),
+                anchor_m=np.array([fixed[tag] for tag in other[rows].tolist()]),
                 imu_s=imu_s,
                 imu=inertial,
                 height_s=height_s,
@@ -269,7 +257,7 @@ def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilt
         if first < 0:
             raise UnanswerableError(f"{one.source}: {one.body} ranges with too few anchors for a start; give it one")
         fix = _fix(one, np.arange(first + 1), settings)
-    near = np.abs(one.imu_s - float(one.time_s[first])) < SPAN_S / 2
+    near = np.abs(one.imu_s - float(one.time_s[first])) < 0.25  # s: the first tilt is that of half a second
     force = one.imu[near, 3:].mean(axis=0) if near.any() else np.array([0.0, 0.0, GRAVITY])
     turned = _attitudes(force, settings.headings) if inertial else np.eye(3)[None]
     found = InertialFilter(fix, turned, settings.noise, inertial=inertial, speed_m_s=settings.speed_m_s)
@@ -296,9 +284,8 @@ def _attitudes(force: Floats, headings: int) -> Floats:
     east = np.cross((0.0, 1.0, 0.0), up)
     east = east / np.linalg.norm(east)
     tilt = np.vstack([east, np.cross(up, east), up])
-    angles = 2 * np.pi * np.arange(headings) / headings
-    turns = [[[c, -s, 0], [s, c, 0], [0, 0, 1]] for c, s in zip(np.cos(angles), np.sin(angles), strict=True)]
-    return np.array([np.array(turn) @ tilt for turn in turns])
+    turns = Rotation.from_rotvec(np.outer(2 * np.pi * np.arange(headings) / headings, (0.0, 0.0, 1.0)))
+    return np.asarray(turns.as_matrix() @ tilt)
 
 
 def _events(one: _Readings, settings: OnboardSettings, begin_s: float) -> Iterator[tuple[float, str, int, Floats]]:
@@ -336,9 +323,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
     """Process ranges, steps and heights in order of time, and return the track of the likeliest heading."""
     first, running = _begin(one, settings)
     now = heard = float(one.time_s[first])
-    states: list[tuple[float, Floats, Floats, Floats]] = []
-    updates: list[tuple[float, float, bool]] = []
-    restarts: list[float] = []
+    states, updates, restarts = list[Any](), list[tuple[float, float, bool]](), list[float]()
     unexplained_s = 0.0
     # The speed limit counts once a second: velocities are independent after a second.
     slow_every = max(round(settings.rate_hz), 1)
@@ -367,8 +352,8 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
                 restarts.append(now)
                 unexplained_s = 0.0
         best = int(np.argmax(running.likelihood))
-        covariance = running.covariance[best][P, P]
-        states.append((now, running.place[best].copy(), running.attitude[best].copy(), covariance.copy()))
+        state = running.state[best, P], running.attitude[best], running.covariance[best, P, P]
+        states.append((now, *(part.copy() for part in state)))
 
     def nanoseconds(seconds: Any) -> Ints:
         return one.began_ns + np.rint(np.array(seconds) * 1e9).astype(np.int64)

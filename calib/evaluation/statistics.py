@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
-from html import escape
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
 from scipy.interpolate import BSpline
 
+from calib.calibration.applying import CorrectedRanges
 from calib.calibration.document import for_json, pair_name
 from calib.calibration.model import Calibration, require_calibration
-from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, load_ranges
 from calib.pairs import pairs_of
-from calib.spread import TWO_SIDED_95, robust_spread
+from calib.spread import TWO_SIDED_95, medians, robust_spread, spreads
 from uwblink.arrays import Bools, Floats
+from uwblink.display import as_html
 from uwblink.ticks import SPEED_OF_LIGHT
 
 CORRECTION_STAGES: Final = {"raw": "raw_m", "delays": "delay_corrected_m", "full": "corrected_m"}
@@ -130,8 +130,7 @@ class Evaluation:
 
     def _repr_html_(self) -> str:
         """Return the same as HTML, for notebooks."""
-        rows = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in self._rows())
-        return f"<p>{escape(TITLE)}</p><table>{rows}</table>"
+        return as_html(TITLE, self._rows())
 
     def _rows(self) -> list[list[str]]:
         above = ["", "", "raw", "", "", "delay", "", "", "full", "", "", "chi2", "total", "in"]
@@ -247,26 +246,23 @@ def split_error(ranges: Ranges, error_m: Floats) -> ErrorSplit:
     Errors that last for seconds count as independent, so short sessions seem to differ. Groups of fewer than 5 ranges
     are left out.
     """
-    rows = []
-    for name, mine in pair_rows(ranges).items():
-        for session in np.unique(ranges.session[mine]).tolist():
-            own = error_m[mine & (ranges.session == session)]
-            if len(own) >= 5:
-                rows.append((name, session, float(np.median(own)), robust_spread(own) ** 2, len(own)))
-    if not rows:
+    pair, count = pairs_of(ranges.initiator, ranges.target).number, int(ranges.session.max(initial=0)) + 1
+    codes, group, counts = np.unique(pair * count + ranges.session, return_inverse=True, return_counts=True)
+    told = counts >= 5
+    if not told.any():
         return ErrorSplit(within_m=np.nan, between_pairs_m=np.nan, between_sessions_m=np.nan, sessions=0)
-    names, sessions, medians, squares, counts = (np.array(column) for column in zip(*rows, strict=True))
-    chance = 1.57 * squares / counts
-    pairs = [names == name for name in np.unique(names)]
-    centres = np.array([medians[mine].mean() for mine in pairs])
-    freedom = len(rows) - len(pairs)
-    apart = sum(float(np.sum((medians[mine] - medians[mine].mean()) ** 2)) for mine in pairs)
+    centre, squares = medians(error_m, group)[told], spreads(error_m, group)[told] ** 2
+    chance, (pairs, sessions) = 1.57 * squares / counts[told], np.divmod(codes[told], count)
+    _, number, members = np.unique(pairs, return_inverse=True, return_counts=True)
+    centres = np.bincount(number, centre) / members
+    freedom = len(pairs) - len(centres)
+    apart = float(np.sum((centre - centres[number]) ** 2))
     between_sessions = max(apart / freedom - float(chance.mean()), 0.0) if freedom else np.nan
-    within_centres = [float(np.nan_to_num(between_sessions) + chance[mine].mean()) / int(mine.sum()) for mine in pairs]
-    between_pairs = float(np.var(centres, ddof=1)) - float(np.mean(within_centres)) if len(pairs) > 1 else np.nan
+    of_centres = (np.nan_to_num(between_sessions) + np.bincount(number, chance) / members) / members
+    between_pairs = float(np.var(centres, ddof=1) - np.mean(of_centres)) if len(centres) > 1 else np.nan
     return ErrorSplit(
-        within_m=float(np.sqrt(np.average(squares, weights=counts))),
-        between_pairs_m=float(np.sqrt(max(between_pairs, 0.0))) if len(pairs) > 1 else np.nan,
+        within_m=float(np.sqrt(np.average(squares, weights=counts[told]))),
+        between_pairs_m=float(np.sqrt(np.maximum(between_pairs, 0.0))),
         between_sessions_m=float(np.sqrt(between_sessions)),
         sessions=len(np.unique(sessions)),
     )
@@ -274,19 +270,17 @@ def split_error(ranges: Ranges, error_m: Floats) -> ErrorSplit:
 
 def statistics(error_m: Floats) -> Stats:
     """Return the statistics of range errors (n,); NaN where there are none."""
-    if not len(error_m):
-        nothing: dict[str, Any] = dict.fromkeys((field.name for field in fields(Stats)), float("nan"))
-        return Stats(**nothing | {"n": 0})
-    low, high = np.quantile(error_m, (0.025, 0.975))
+    some = error_m if len(error_m) else np.full(1, np.nan)
+    low, high = np.quantile(some, (0.025, 0.975))
     return Stats(
         n=len(error_m),
-        mean_m=float(np.mean(error_m)),
-        median_m=float(np.median(error_m)),
-        std_m=float(np.std(error_m)),
-        robust_std_m=robust_spread(error_m),
+        mean_m=float(np.mean(some)),
+        median_m=float(np.median(some)),
+        std_m=float(np.std(some)),
+        robust_std_m=robust_spread(some),
         low_m=float(low),
         high_m=float(high),
-        abs95_m=float(np.quantile(np.abs(error_m), 0.95)),
+        abs95_m=float(np.quantile(np.abs(some), 0.95)),
     )
 
 

@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 
 from calib.data.sources import Flight
-from calib.errors import BadInputError
 from calib.evaluation.range_updates import RangeErrors, gated_update, mixture_update, multilaterate
+from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
 from uwblink.recording.schema import Poses
@@ -37,7 +37,7 @@ MIN_RANGES_PER_FIX: Final = 12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
+class Settings(CheckedSettings):
     """How the filters are set up.
 
     The velocity input comes at `velocity_rate_hz` with white noise of `velocity_std_mps` an axis; that is the process
@@ -47,7 +47,7 @@ class Settings:
     quantile); the robust filter has no gate. A filter begins anew where its last ranges say
     (`multilaterate`) once the time in which it explained its ranges, 10 s at most, is used up by time in which it did
     not, and half of `reopen_s` besides. `seeds` are runs with other noise, each body and flight with its own; tracks
-    are those of the first, `seed`.
+    are those of the first, `seed`. Raises `BadInputError` that names the setting.
     """
 
     velocity_std_mps: float = 0.3
@@ -59,14 +59,6 @@ class Settings:
     reopen_s: float = 1.0
     seed: int = 0
     seeds: int = 3
-
-    def __post_init__(self) -> None:
-        """Check the settings; raises `BadInputError`."""
-        for name in ("velocity_std_mps", "velocity_rate_hz", "initial_std_m", "gate", "reopen_s"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise BadInputError(f"found {getattr(self, name)!r:.40}, expected a number above 0", parameter=name)
-        if not 1 <= self.seeds <= 1000:
-            raise BadInputError(f"found {self.seeds!r:.40}, expected 1 to 1000", parameter="seeds")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

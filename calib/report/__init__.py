@@ -5,7 +5,6 @@ from calib.report.results import origin_of
 from calib.report.writing import (
     check_places,
     write_comparison_figures,
-    write_onboard_figures,
     write_survey_report,
     write_track_figures,
 )
@@ -20,7 +19,6 @@ __all__ = [
     "check_places",
     "origin_of",
     "write_comparison_figures",
-    "write_onboard_figures",
     "write_plan",
     "write_survey_report",
     "write_track_figures",

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from calib.calibration.model import Calibration
 from calib.checks.examine import examine
@@ -25,9 +25,6 @@ from calib.report.sections import document
 from calib.report.writing import check_places
 from calib.settings import FitSettings
 from uwblink.pages.blocks import write_document
-
-HELD_OUT_SHARE: Final = 0.3
-"""Share of the recordings that judges a report without tests: three of the tenths of `FitSettings.fold`."""
 
 Progress = Callable[[str], None]
 
@@ -146,7 +143,7 @@ def _fit_and_hold_out(ranges: Ranges, settings: FitSettings) -> FitResult:
     if settings.hold_out:
         return fit(ranges, settings)
     try:
-        return fit(ranges, settings, hold_out=HELD_OUT_SHARE)
+        return fit(ranges, settings, hold_out=0.3)  # three of the tenths of `FitSettings.fold`
     except UnanswerableError:
         return fit(ranges, settings)
 

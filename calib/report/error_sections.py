@@ -80,11 +80,11 @@ def before_after(results: Results) -> list[Block]:
         Heading("Before and after"),
         Table(header, [[name, *_error_cells(group)] for name, group in groups], above, total=True),
         Text(
-            "Errors in cm. Means contain the reflections that remain, medians hardly do. "
+            "Errors in cm. Means contain the reflections that remain; medians nearly exclude them. "
             "Robust is 1.4826 median absolute deviations; 95 % |e| is what 95 % of the calibrated errors "
             f"stay below in size (95 % of all lie between {low:+.1f} and {high:+.1f} cm). Noise: share of corrected "
             "ranges that their own sigma explains at 95 %, 95 % without reflections; the rest are mostly reflected. In "
-            "95 %: share within the 95 % intervals that reckon with reflections. New p: share at powers the curves "
+            "95 %: share within the 95 % intervals that include reflections. New p: share at powers the curves "
             "were not fitted at.",
             "note",
         ),
@@ -97,8 +97,8 @@ def before_after(results: Results) -> list[Block]:
         Picture(
             "errors",
             partial(figures.distribution, **known),
-            "Range errors: how many of which size and sign (the outermost bins hold everything beyond them), and how "
-            "many are smaller than so much.",
+            "Range errors: shares by size and sign (the outermost bins hold everything beyond them), and the share of "
+            "errors below each size.",
         ),
         Picture(
             "z-scores",
@@ -176,13 +176,13 @@ def localization(results: Results) -> list[Block]:
         ["ICRA 2023, its own flights", *(f"{PAPER_RMSE_M[n]:.3f}" if n in PAPER_RMSE_M else "" for n in names)],
     ]
     (nis_low, nis_high), (nees_low, nees_high) = total.nis_bounds, total.nees_bounds
-    meaning = "Both lie within: the filter knows how good it is."
+    meaning = "Both lie within: the filter is consistent."
     if total.nis > nis_high or total.nees > nees_high:
         meaning = (
-            "Above their bounds: the filter is surer than it should be, as with reflections, which sigma leaves out."
+            "Above their bounds: the filter is overconfident, for example because sigma does not include reflections."
         )
     elif total.nis < nis_low or total.nees < nees_low:
-        meaning = "Below their bounds: the filter is less sure than it could be, as where a gate refuses the tail."
+        meaning = "Below their bounds: the filter is underconfident, for example because a gate rejects the tail."
     heads = [FILTER_NAMES[name].removeprefix("calibrated, ") for name in names]
     shown = [
         Picture(

@@ -22,7 +22,7 @@ FILTER_NAMES: Final = {
     "raw": "raw",
     "calibrated": "calibrated",
     "variance": "calibrated, with variance",
-    "robust": "reckoning with reflections",
+    "robust": "calibrated, with reflections",
 }
 FILTER_LINES: Final[dict[str, tuple[str, Any, str]]] = {
     "raw": (VERMILION, (0, (1.5, 1.2)), ""),

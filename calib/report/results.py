@@ -9,19 +9,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from calib.calibration.applying import CorrectedRanges
 from calib.calibration.model import Calibration
-from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data
+from calib.evaluation.localization import Localization
 from calib.evaluation.statistics import Evaluation, PlantedComparison, compare_with_planted, evaluate
-
-if TYPE_CHECKING:
-    from calib.evaluation.localization import Localization
-    from calib.findings import Finding
-    from calib.fitting.passive_listeners import OverheardDelay
-    from calib.fitting.result import FitResult
+from calib.findings import Finding
+from calib.fitting.passive_listeners import OverheardDelay
+from calib.fitting.result import FitResult
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,13 +8,14 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from functools import partial
-from math import isfinite, sqrt
+from math import isfinite, isnan, nan, sqrt
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from calib import figures
+from calib.calibration.document import pair_name
 from calib.calibration.model import pair_rows as offset_rows
 from calib.calibration.model import rests_on
 from calib.errors import BadInputError
@@ -31,14 +32,11 @@ Section = Callable[[Results], list[Block]]
 
 
 def _verdict(results: Results) -> list[Block]:
-    if results.recordings:
-        lead = _summary(results)
-    else:
-        lead = (
-            "Nothing of this was held against a true distance. Where a recording has them, evaluate the calibration "
-            "on it: the report of that evaluation has this section, too."
-        )
-    return [*verdict(results), Text(lead, "lead")]
+    unjudged = (
+        "Nothing of this was compared with a true distance. If a recording has true distances, evaluate the "
+        "calibration on it: the report of that evaluation has this section, too."
+    )
+    return [*verdict(results), Text(_summary(results) if results.recordings else unjudged, "lead")]
 
 
 def _summary(results: Results) -> str:
@@ -179,10 +177,10 @@ def _of_survey(made: Any) -> list[Block]:
     )
     header = ["arrangement", "boards", "said to be", "places within (95 %)", "frame"]
     blocks += [Table(header, rows, words=True), Picture("places", draw, caption)]
-    reflected = []
-    for row in made.get("reflected", []):
-        pair, longer_cm = "-".join(map(str, row["between"])), 100 * row["longer_m"]
-        reflected.append([row["arrangement"], pair, f"{longer_cm:+.0f}", f"{100 * row['chance']:.0f} %"])
+    reflected = [
+        [row["arrangement"], pair_name(row["between"]), f"{100 * row['longer_m']:+.0f}", f"{100 * row['chance']:.0f} %"]
+        for row in made.get("reflected", [])
+    ]
     if reflected:
         blocks += [
             Text("Pairs that are, or may be, longer by a reflection; they count for less by as much:"),
@@ -196,10 +194,9 @@ def _determined(results: Results) -> list[Block]:
     if results.fit is None:
         return []
     calibration, pairs = results.calibration, pair_rows(results.trained)
+    answer = f"Yes: the {len(pairs)} pairs of {len(results.trained.tags())} tags determine every delay."
     if calibration.provenance.get("undetermined"):
         answer = f"No: {left_open(results)}."
-    else:
-        answer = f"Yes: the {len(pairs)} pairs of {len(results.trained.tags())} tags determine every delay."
     counts = [int(np.count_nonzero(rows)) for rows in pairs.values()]
     changed = calibration.provenance.get("settings", {})
     settings = f" Settings: {', '.join(f'{name} = {value}' for name, value in changed.items())}." if changed else ""
@@ -229,26 +226,32 @@ def _delays(results: Results) -> list[Block]:
     truth: dict[str, Any] = (results.trained.planted or {}).get("delays_ns", {}) if planted else {}
     known = {int(tag): float(delay) for tag, delay in truth.items()}
     shift = planted.shift_ns if planted else 0.0
-    header = ["tag", "delay (ns)", "95 % from", "to"]
-    header += ["planted, same gauge (ns)", "difference (ps)"] if known else []
-    header += ["heard by others (ns)", "± 1 std"] if heard else []
-    rows = []
-    for tag, delay in sorted(calibration.delays_ns.items()):
-        half = TWO_SIDED_95 * calibration.delays_std_ns.get(tag, float("nan"))
-        unknown = ["not stated" if np.isnan(half) else "undetermined", ""]
-        row = [str(tag), f"{delay:+.4f}"]
-        row += [f"{delay - half:+.4f}", f"{delay + half:+.4f}"] if isfinite(half) else unknown
-        if known and planted:
-            beside = (known.get(tag, 0.0) + shift, 1e3 * planted.delay_error_ns.get(tag, 0.0))
-            row += [f"{beside[0]:+.4f}", f"{beside[1]:+.1f}"] if tag in known else ["", ""]
-        if heard:
-            row += [f"{heard[tag].delay_ns:+.4f}", f"{heard[tag].std_ns:.4f}"] if tag in heard else ["", ""]
-        rows.append(row)
+    delays = dict(sorted(calibration.delays_ns.items()))
+    half = {tag: TWO_SIDED_95 * calibration.delays_std_ns.get(tag, nan) for tag in delays}
+    unknown = {tag: "not stated" if isnan(one) else "undetermined" for tag, one in half.items() if not isfinite(one)}
+    columns = {
+        "tag": list(map(str, delays)),
+        "delay (ns)": [f"{delay:+.4f}" for delay in delays.values()],
+        "95 % from": [unknown.get(tag, f"{delay - half[tag]:+.4f}") for tag, delay in delays.items()],
+        "to": ["" if tag in unknown else f"{delay + half[tag]:+.4f}" for tag, delay in delays.items()],
+    }
+    if known and planted:
+        errors_ns = planted.delay_error_ns
+        columns |= {
+            "planted, same gauge (ns)": [f"{known[tag] + shift:+.4f}" if tag in known else "" for tag in delays],
+            "difference (ps)": [f"{1e3 * errors_ns[tag]:+.1f}" if tag in errors_ns else "" for tag in delays],
+        }
+    if heard:
+        columns |= {
+            "heard by others (ns)": [f"{heard[tag].delay_ns:+.4f}" if tag in heard else "" for tag in delays],
+            "± 1 std": [f"{heard[tag].std_ns:.4f}" if tag in heard else "" for tag in delays],
+        }
+    rows = list(map(list, zip(*columns.values(), strict=True)))
     caption = "Antenna delays with their 95 % intervals" + (
         ", and what was planted, in the same gauge." if known else "."
     )
     draw = partial(figures.alone, partial(figures.delays, calibration, known, shift))
-    blocks: list[Block] = [Heading("Antenna delays"), Table(header, rows), Picture("delays", draw, caption)]
+    blocks: list[Block] = [Heading("Antenna delays"), Table(list(columns), rows), Picture("delays", draw, caption)]
     if planted:
         text = (
             "A constant of the bias curve and a common shift of all delays cannot be distinguished: planted delays, "

@@ -110,7 +110,7 @@ def _held_out(results: Results) -> Criterion:
 
 
 def _gain(results: Results) -> Criterion:
-    least = 0.05  # of the typical error: a calibration that takes off less is hardly worth its trouble
+    least = 0.05  # of the typical error: a calibration that removes less is not worth its use
     truth, corrected = results.judged.truth_m, results.corrected
     raw, full = (float(np.median(np.abs(range_m - truth))) for range_m in (corrected.raw_m, corrected.corrected_m))
     less = 1 - full / raw if raw > 0 else 0.0
@@ -136,8 +136,8 @@ def _bias(results: Results) -> Criterion:
     return Criterion(
         "Is no pair left with a bias?",
         f"median of each pair, less what chance explains, within {most:g} of its spread",
-        f"worst: {name} with {100 * full.median_m:+.1f} cm of {full.n} ranges; for sure {ratio:.2f} of its spread of "
-        f"{100 * full.robust_std_m:.1f} cm",
+        f"worst: {name} with {100 * full.median_m:+.1f} cm of {full.n} ranges; beyond chance {ratio:.2f} of its "
+        f"spread of {100 * full.robust_std_m:.1f} cm",
         _graded(ratio <= most, ratio <= 1.0),
         f"no pair is sure to keep a bias beyond {most:g} of its spread"
         if ratio <= most
@@ -217,7 +217,7 @@ def _of_survey(results: Results) -> Iterator[Criterion]:
     against = list(map(str, made.get("findings", [])))
     yield Criterion(
         "Do the ranges agree with what is said to be known?",
-        "no line that is none, no wrong tape, no exchanged labels, no board that was moved",
+        "lines are straight, tapes are right, no labels are exchanged, no board was moved",
         "; ".join(against) or "they do",
         _graded(not against, False),
         f"{len(against)} contradiction{'s' * (len(against) > 1)} to what is known"
@@ -278,7 +278,7 @@ def _of_distances(std_m: Any) -> Iterator[Criterion]:
     if isinstance(std_m, int | float):
         most_m = 0.02
         yield Criterion(
-            "Are the distances that stand for the true ones known well enough?",
+            "Are the estimated distances known well enough?",
             f"standard error at most {100 * most_m:g} cm",
             f"{100 * std_m:.1f} cm",
             _graded(std_m <= most_m, std_m <= 0.05),

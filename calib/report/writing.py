@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Final
 
 from calib import figures as drawings
 from calib.calibration.comparison import Comparison
@@ -21,10 +20,7 @@ from calib.report.figures import onboard, rmse_bars, track
 from calib.report.results import Origin, Results, origin_of
 from calib.report.sections import document
 from uwblink.output import check_folder, check_output
-from uwblink.pages.blocks import Block, Document, Picture, to_html, write_document
-
-EVALUATION: Final = "Calibration report"
-"""Title of the report of an evaluation."""
+from uwblink.pages.blocks import Block, Document, Picture, write_document
 
 
 def check_places(output: Path | None, pdf: Path | None, figures: Path | None, *, force: bool) -> None:
@@ -42,13 +38,6 @@ def check_places(output: Path | None, pdf: Path | None, figures: Path | None, *,
         if not force and any(path.suffix in (".pdf", ".svg") for path in figures.glob("*.*")):
             text = "holds figures already; give another folder, or `force` to replace them"
             raise BadInputError(f"{figures} {text}", parameter="figures")
-
-
-def render(data: Data | Iterable[Data], calibration: Calibration) -> str:
-    """Return the report of an evaluation as HTML text; `data` is what `load_ranges` takes."""
-    recordings = each(data)
-    results = Results(calibration=calibration, tests=load_each(recordings), origin=origin_of(recordings))
-    return to_html(document(results, EVALUATION))
 
 
 def write_report(
@@ -83,7 +72,7 @@ def write_report(
     loaded = load_each(recordings, need_power=calibration.needs_power)
     made = origin or origin_of(recordings)
     results = Results(calibration=calibration, tests=loaded, evaluated=evaluation, origin=made)
-    write_document(document(results, EVALUATION), output, None, folder, force=force)
+    write_document(document(results, "Calibration report"), output, None, folder, force=force)
 
 
 def write_survey_report(
@@ -100,19 +89,19 @@ def write_survey_report(
     write_document(document(results, title), Path(path), force=force)
 
 
-def write_track_figures(found: Sequence[Localization], folder: Path, *, force: bool = False) -> None:
-    """Write bars of the RMSE and each body's track into a folder, as PDF and SVG at two widths.
+def write_track_figures(
+    found: Sequence[Localization] | Sequence[OnboardTrack], folder: Path, *, force: bool = False
+) -> None:
+    """Write each body's track into a folder, as PDF and SVG at two widths; of filters also bars of their RMSE.
 
     Raises what `check_places` raises.
     """
-    tracks = [Picture(track_name(one.source, one.body), partial(track, one=one), one.body) for one in found]
-    _write_figures([Picture("rmse", partial(rmse_bars, found=list(found)), "RMSE"), *tracks], folder, force)
-
-
-def write_onboard_figures(found: Sequence[OnboardTrack], folder: Path, *, force: bool = False) -> None:
-    """Write the track of each body by on-board sensors into a folder, as PDF and SVG at two widths."""
-    tracks = [Picture(track_name(one.source, one.body), partial(onboard, one=one), one.body) for one in found]
-    _write_figures(tracks, folder, force)
+    compared = [one for one in found if isinstance(one, Localization)]
+    pictures = [Picture("rmse", partial(rmse_bars, found=compared), "RMSE")] if compared else []
+    for one in found:
+        draw = partial(track, one=one) if isinstance(one, Localization) else partial(onboard, one=one)
+        pictures.append(Picture(track_name(one.source, one.body), draw, one.body))
+    _write_figures(pictures, folder, force)
 
 
 def write_comparison_figures(

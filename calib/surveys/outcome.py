@@ -11,8 +11,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 import uwblink
-from calib.calibration.model import Calibration
-from calib.calibration.parts import Uncertainty, matrix_of
+from calib.calibration.model import Calibration, Uncertainty, matrix_of
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis, flat_curve
 from calib.errors import UnanswerableError
 from calib.estimator.range_model import METRES_A_NS

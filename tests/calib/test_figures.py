@@ -39,13 +39,14 @@ def test_points_are_the_core_that_the_curve_follows_and_medians_lie_above():
     # Planted: a core of 5 cm about nothing, a fifth of it lengthened by 40 cm in the mean.
     rng = np.random.default_rng(5)
     error = rng.normal(0, 0.05, 40_000) + np.where(rng.random(40_000) < 0.2, rng.exponential(0.4, 40_000), 0)
-    found = binned({"": (rng.uniform(0, 1.5, 40_000), error, 20)}, "mixture")[""]
+    everything = {"": (np.arange(40_000), 20)}
+    found = binned(rng.uniform(0, 1.5, 40_000), error, everything, "mixture")[""]
     # Of 2000 in a bin the centre is known to 1.5 mm, and its spread, told with the tail's, to 2 mm.
     assert np.abs(found.centre_m).max() < 0.006
     assert np.abs(found.centre_m.mean()) < 0.001
     assert found.std_m == pytest.approx(0.05, abs=0.008)
     assert found.median_m.mean() == pytest.approx(0.0145, abs=0.003)
-    squares = binned({"": (np.arange(40_000.0), error, 4)}, "l2")[""]
+    squares = binned(np.arange(40_000.0), error, everything, "l2")[""]
     assert squares.centre_m.mean() == pytest.approx(error.mean(), abs=1e-9)
 
 
@@ -61,6 +62,9 @@ def test_the_drawn_curve_goes_through_the_drawn_points(fitted):
     planted = 100 * bias_m(points.get_xdata())
     away = points.get_ydata() - planted
     assert np.abs(away - away.mean()).max() < 1.2, "and both follow what was planted"
+    (top,) = axes.child_axes  # first-path powers in dBm
+    for place, text in zip(top.get_xticks(), top.get_xticklabels(), strict=True):
+        assert 10 ** ((float(text.get_text().replace("−", "-")) + 82) / 10) == pytest.approx(place)
 
 
 def test_the_sigma_curve_goes_through_its_points(fitted):
@@ -68,13 +72,6 @@ def test_the_sigma_curve_goes_through_its_points(fitted):
     points, curve = labelled(axes, "core of all pairs"), labelled(axes, "fitted")
     at = np.interp(points.get_xdata(), curve.get_xdata(), curve.get_ydata())
     assert np.mean(points.get_ydata() / at) == pytest.approx(1, abs=0.06)
-
-
-def test_powers_in_dbm_stand_above_the_same_places(fitted):
-    axes = axes_of(fitted.plot_bias)
-    (top,) = axes.child_axes
-    for place, text in zip(top.get_xticks(), top.get_xticklabels(), strict=True):
-        assert 10 ** ((float(text.get_text().replace("−", "-")) + 82) / 10) == pytest.approx(place)
 
 
 def test_one_stray_delay_does_not_flatten_the_others(fitted):
@@ -126,3 +123,8 @@ def test_a_delay_that_nothing_determines_is_a_circle_without_an_interval(fitted)
         "without an interval: pinned or undetermined"
         not in axes_of(lambda axes: delays(known, axes=axes)).get_legend_handles_labels()[1]
     )
+
+
+def test_planted_delays_are_drawn_moved_by_the_common_shift(fitted):
+    axes = axes_of(lambda axes: delays(fitted.calibration, {1: 0.1, 2: -0.2, 3: 0.0, 7: 0.3}, 0.05, axes))
+    assert labelled(axes, "planted, same gauge").get_ydata() == pytest.approx([0.15, -0.15, 0.05, 0.35])

@@ -29,27 +29,36 @@ def test_a_full_matrix_gives_the_inverse():
     np.testing.assert_allclose(verdict.std, np.sqrt(np.diag(np.linalg.inv(information))), rtol=1e-9)
 
 
-def test_an_even_ring_leaves_one_direction_free_and_says_which():
-    verdict = judge(from_rows(ring(closed=False)), DELAYS)
-    assert list(verdict.free) == ["delays of 1 and 3 against delays of 2 and 4"]
-    assert np.isinf(verdict.std).all()
-    assert np.isnan(verdict.covariance).all()
-    assert verdict.named("delay") == ("1", "2", "3", "4")
+SIDES = [Unknown("delay", t) for t in "123"] + [Unknown("distance", p) for p in ("1-2", "2-3", "1-3")]
+# Ranges are distances less delays, and differences of distances are known.
+TRIANGLE = [
+    [-1, -1, 0, 1, 0, 0], [0, -1, -1, 0, 1, 0], [-1, 0, -1, 0, 0, 1], [0, 0, 0, 1, -1, 0], [0, 0, 0, 0, 1, -1]
+]  # fmt: skip
+BOARDS = [Unknown("position", "3"), Unknown("position", "3"), Unknown("position", "4"), Unknown("delay", "3")]
 
 
-def test_two_free_directions_are_told_apart_whatever_basis_rounding_chose():
-    """Two pairs that range with each other alone: each shifts within itself."""
-    verdict = judge(from_rows([[1, 1, 0, 0], [0, 0, 1, 1]]), DELAYS)
-    assert sorted(verdict.free) == ["delay of 1 against delay of 2", "delay of 3 against delay of 4"]
-
-
-def test_a_common_shift_with_distances_is_called_so():
-    """Three delays and a distance each: ranges are distances less delays, and differences of distances are known."""
-    unknowns = [Unknown("delay", t) for t in "123"] + [Unknown("distance", p) for p in ("1-2", "2-3", "1-3")]
-    rows = [[-1, -1, 0, 1, 0, 0], [0, -1, -1, 0, 1, 0], [-1, 0, -1, 0, 0, 1], [0, 0, 0, 1, -1, 0], [0, 0, 0, 0, 1, -1]]
+@pytest.mark.parametrize(
+    ("rows", "unknowns", "free", "kind", "of"),
+    [
+        (ring(closed=False), DELAYS, ["delays of 1 and 3 against delays of 2 and 4"], "delay", ("1", "2", "3", "4")),
+        (
+            [[1, 1, 0, 0], [0, 0, 1, 1]],
+            DELAYS,
+            ["delay of 1 against delay of 2", "delay of 3 against delay of 4"],
+            "delay",
+            ("1", "2", "3", "4"),
+        ),
+        (TRIANGLE, SIDES, ["all delays together with all distances together"], "distance", ("1-2", "2-3", "1-3")),
+        ([[1, 2, 0, 1], [0, 0, 1, 0], [1, -1, 0, 0]], BOARDS, ["position of 3 with delay of 3"], "delay", ("3",)),
+        (np.zeros((1, 2)), DELAYS[:2], ["delay of 1", "delay of 2"], "delay", ("1", "2")),
+    ],
+)
+def test_free_directions_are_found_and_named(rows, unknowns, free, kind, of):
     verdict = judge(from_rows(rows), unknowns)
-    assert list(verdict.free) == ["all delays together with all distances together"]
-    assert verdict.named("distance") == ("1-2", "2-3", "1-3")
+    assert sorted(verdict.free) == free
+    assert verdict.named(kind) == of
+    loose = ~verdict.determined
+    assert np.isnan(verdict.covariance[loose]).all()
 
 
 def test_what_is_hardly_known_counts_as_free_by_the_scale_of_an_unknown():
@@ -70,18 +79,6 @@ def test_a_known_unknown_beside_free_ones_keeps_its_variance():
     assert verdict.determined.tolist() == [False, False, True, True]
     assert verdict.std[2] == pytest.approx(0.01)
     assert verdict.covariance[2, 3] == pytest.approx(-1e-4)
-
-
-def test_coordinates_of_one_thing_are_named_once():
-    unknowns = [Unknown("position", "3"), Unknown("position", "3"), Unknown("position", "4"), Unknown("delay", "3")]
-    verdict = judge(from_rows([[1, 2, 0, 1], [0, 0, 1, 0], [1, -1, 0, 0]]), unknowns)
-    assert list(verdict.free) == ["position of 3 with delay of 3"]
-
-
-def test_nothing_measured_leaves_everything_free():
-    verdict = judge(np.zeros((2, 2)), DELAYS[:2])
-    assert len(verdict.free) == 2
-    assert np.isinf(verdict.std).all()
 
 
 def test_reducing_is_what_the_inverse_says_and_leaves_free_what_was():

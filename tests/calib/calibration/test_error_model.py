@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
 from scipy.signal import lfilter
 from scipy.stats import exponnorm, norm
 
@@ -31,7 +30,7 @@ TWO_KINDS = replace(MODEL, long_share=0.4, long_factor=4.0)
 
 
 def drawn(model, lifted, known, seed=0):
-    """Draw errors of one kind of range, which were reflected, and which are outliers; straight from the definition."""
+    """Draw errors of one kind of range, and which were reflected, straight from the definition."""
     rng = np.random.default_rng(seed)
     noise = np.exp(np.interp(lifted, MODEL.lifted, np.log(MODEL.noise_m))) * (1.5 if known else 1)
     odds = np.exp(np.interp(lifted, MODEL.lifted, [np.log(t / (1 - t)) for t in MODEL.tail_share]))
@@ -42,13 +41,13 @@ def drawn(model, lifted, known, seed=0):
     reflected, wild = kind < 0.998 * share, kind > 0.998
     error += reflected * (0.05 + rng.exponential(mean * longer))
     error = np.where(wild, rng.normal(0, 0.9, COUNT), error)
-    return error + 0.02, reflected, wild
+    return error + 0.02, reflected
 
 
 @pytest.mark.parametrize("model", [MODEL, TWO_KINDS], ids=["one kind", "two kinds"])
 @pytest.mark.parametrize(("lifted", "first", "second"), [(0.1, 1, 2), (0.7, 2, 1), (0.7, 1, 3), (4.0, 7, 3)])
 def test_mean_spread_quantiles_and_shares_are_those_of_draws(model, lifted, first, second):
-    error, reflected, wild = drawn(model, lifted, {first, second} == {1, 2})
+    error, reflected = drawn(model, lifted, {first, second} == {1, 2})
     ends = np.full(1, first), np.full(1, second)
     shapes = model.shapes(np.full(1, lifted), *ends)
     # Four standard errors of each figure, from 400 000 draws.
@@ -61,10 +60,6 @@ def test_mean_spread_quantiles_and_shares_are_those_of_draws(model, lifted, firs
         np.testing.assert_allclose([np.mean(error < q) for q in found], shares, atol=0.002)
     for value in (-0.1, 0.05, 0.15, 0.6):
         assert model.below(np.full(1, value), shapes)[0] == pytest.approx(np.mean(error < value), abs=0.0032)
-        near = np.abs(error - value) < 0.01
-        tail, outlier = model.tail_given(np.full(1, value), shapes)
-        assert tail[0] == pytest.approx(np.mean(reflected[near]), abs=0.02 + 3 / np.sqrt(np.count_nonzero(near) + 1))
-        assert outlier[0] == pytest.approx(np.mean(wild[near]), abs=0.02 + 3 / np.sqrt(np.count_nonzero(near) + 1))
 
 
 def test_errors_beyond_everything_are_outliers():
@@ -84,12 +79,6 @@ def test_what_an_error_was_follows_from_the_densities_of_scipy():
     wild = 0.05 * norm.pdf(error - 0.02, scale=3.0)
     found = model.tail_given(error, shapes)
     np.testing.assert_allclose(found, [tail / (core + tail + wild), wild / (core + tail + wild)], atol=1e-9)
-
-
-def test_levels_put_quantiles_right():
-    lowered = replace(MODEL, levels=((0.025, 0.01), (0.5, 0.5), (0.975, 0.99)))
-    where = np.full(1, 0.5), np.full(1, 1), np.full(1, 2)
-    assert lowered.quantiles([0.025, 0.975], *where) == pytest.approx(MODEL.quantiles([0.01, 0.99], *where))
 
 
 @pytest.fixture(scope="module")
@@ -159,15 +148,3 @@ def test_a_fit_says_how_long_errors_of_a_pair_last():
 def test_shares_that_are_none(fitted, shares):
     with pytest.raises(calib.BadInputError, match=r"`shares`: .*between 0 and 1"):
         fitted.quantiles(calib.load_ranges(calib.sample_flight()), shares)
-
-
-def test_the_yaml_has_tables_to_interpolate_in(fitted):
-    errors = yaml.safe_load(calib.export(fitted, "ros-yaml"))["uwb_calibration"]["errors"]
-    assert set(errors["pairs"]) == {*fitted.errors.pairs, "other"}
-    lifted = np.array(errors["lifted"])
-    ends = np.full(len(lifted), 2), np.full(len(lifted), 1)
-    np.testing.assert_allclose(
-        errors["pairs"]["1-2"]["sigma_total_m"], fitted.errors.total_m(fitted.errors.shapes(lifted, *ends))
-    )
-    low = fitted.errors.quantiles([0.025], lifted, *ends)[:, 0]
-    np.testing.assert_allclose(errors["pairs"]["1-2"]["low95_m"], low)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import calib
-from calib.calibration.formats import FORMATS, programmed, read_miluv, registers
+from calib.calibration.formats import programmed, read_miluv, registers
 from calib.calibration.model import Calibration
 from calib.data.ranges import Ranges
 from calib.data.samples import sample_flight
@@ -30,17 +30,6 @@ from uwblink.ticks import TICK_S
 @pytest.fixture(scope="module")
 def fitted():
     return fit(ranges()).calibration
-
-
-def test_registers_undo_the_delay(fitted):
-    """A board with the new registers prints stamps as if its delay were zero, to the rounding of a tick."""
-    known = replace(fitted, delays_ns=DELAYS_NS)
-    for tag, (tx, rx, _) in registers(known, {None: AntennaDelay()}).items():
-        d = DELAYS_NS[tag] * 1e-9 / TICK_S
-        # Printed transmit stamps are raw + TX, receive stamps raw - RX; true ones less 0.44 d and plus 0.56 d.
-        assert (tx - 16436) + 0.44 * d == pytest.approx(0, abs=0.75)
-        assert -(rx - 16436) - 0.56 * d == pytest.approx(0, abs=1)
-        assert (tx - 16436) + (rx - 16436) == pytest.approx(-d, abs=0.5)
 
 
 def test_no_register_is_written_for_a_delay_that_the_data_left_free(fitted):
@@ -123,18 +112,6 @@ def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
     assert found[-1][0] == "-1"
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_every_form_holds_the_delays(fitted, name):
-    text = calib.export(fitted, name, base={None: AntennaDelay()})
-    assert text.endswith("\n")
-    for tag in fitted.delays_ns:
-        assert str(tag) in text
-    if name == "json":
-        assert json.loads(text)["delays_ns"]["1"] == fitted.delays_ns[1]
-    if name == "csv":
-        assert float(text.splitlines()[1].split(",")[1]) == fitted.delays_ns[1]
-
-
 def test_miluv_is_read_and_given_back_unchanged():
     path = shared("miluv_published_calibration.json")
     found = read_miluv(path)
@@ -143,29 +120,6 @@ def test_miluv_is_read_and_given_back_unchanged():
     assert found.bias_curve(np.array([0.5]))[0] == pytest.approx(0.081, abs=0.002)
     r = replace(ranges(500), initiator=np.full(500, 10), target=np.full(500, 20))
     assert np.isfinite(found.apply(r).corrected_m).all()
-
-
-def test_a_published_curve_is_taken_at_each_reception():
-    found = read_miluv(shared("miluv_published_calibration.json"))
-    powers = np.array([-80.5, -95.0, -88.0]), np.array([-96.0, -81.0, -88.0])
-    n = np.zeros(3)
-    columns = found.correct(n + 3.0, *powers, np.full(3, 10), np.full(3, 20))
-    lifted = [10 ** ((power + 82) / 10) for power in powers]
-    delays = 0.299702547 * (found.delays_ns[10] + found.delays_ns[20]) / 2
-    expected = 3.0 + delays - (found.bias_curve(lifted[0]) + found.bias_curve(lifted[1])) / 2
-    np.testing.assert_allclose(columns.range_m, expected, atol=1e-12)
-    at_the_mean = replace(found, power_at="exchange").correct(n + 3.0, *powers, np.full(3, 10), np.full(3, 20))
-    assert np.abs(at_the_mean.range_m - expected)[:2].min() > 0.05, "metres; the two ways differ"
-    assert at_the_mean.range_m[2] == pytest.approx(expected[2])
-    for k in range(3):
-        one = found.correct(3.0, float(powers[0][k]), float(powers[1][k]), 10, 20)
-        assert one.range_m == pytest.approx(expected[k], abs=1e-9)
-    lonely = [found.correct(3.0, *pair, 10, 20).range_m for pair in ((-85.0, 0.0), (0.0, -85.0), (-85.0, -85.0))]
-    assert lonely == pytest.approx([lonely[0]] * 3)
-    again = Calibration.from_json(found.to_json())
-    assert (again.power_at, json.loads(found.to_json())["schema_version"]) == ("reception", 3)
-    with pytest.raises(BadInputError, match="power_at: found 'somewhere'"):
-        Calibration.from_json(found.to_json().replace('"reception"', '"somewhere"'))
 
 
 def test_the_published_calibration_gives_the_published_ranges(tmp_path):

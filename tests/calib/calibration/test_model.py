@@ -1,17 +1,18 @@
 """The calibration file, and what applying it does."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import BSpline
 
-from calib.calibration.model import Calibration, load_calibration, rests_on
+from calib.calibration.error_model import PairErrors
+from calib.calibration.model import Calibration, TagGroup, load_calibration
 from calib.errors import BadInputError
 from calib.fitting.fitting import fit
 from tests.calib.synthetic import ranges
 from uwblink.ticks import SPEED_OF_LIGHT
-
-KNOWN = {"known_s": 9.9, "moving": ["a", "b", "c"], "anchors_given": ["m"], "anchors_sought": [], "attitudes": "imu"}
 
 
 @pytest.fixture(scope="module")
@@ -19,35 +20,76 @@ def fitted():
     return fit(ranges()).calibration
 
 
-def test_json_both_ways_without_loss(fitted, tmp_path):
-    fitted.save(tmp_path / "c.json")
+@pytest.mark.parametrize(("changes", "version"), [({}, 1), ({"power_at": "reception"}, 3)])
+def test_json_both_ways_without_loss(fitted, tmp_path, changes, version):
+    known = replace(fitted, **changes)
+    known.save(tmp_path / "c.json")
     again = load_calibration(tmp_path / "c.json")
-    assert again == fitted
-    assert again.to_json() == fitted.to_json()
+    assert again == known
+    assert again.to_json() == known.to_json()
+    assert json.loads(known.to_json())["schema_version"] == version
 
 
-def test_the_file_has_the_documented_keys(fitted):
-    document = json.loads(fitted.to_json())
-    assert {
-        "schema_version", "delays_ns", "delays_std_ns", "loss", "scale_ns", "lift", "alpha_dbm", "speed_of_light",
-        "bias_curve", "sigma_curve", "provenance", "uncertainty",
-        "errors",
-    } == set(document)  # fmt: skip
-    assert set(document["bias_curve"]) == {"knots", "coefficients", "degree", "range"} == set(document["sigma_curve"])
-    assert document["loss"] == "mixture"
-    assert document["lift"] == "mean-of-lifted"
-    assert document["speed_of_light"] == SPEED_OF_LIGHT
+def lifted(dbm):
+    return 10 ** ((dbm + 82) / 10)
 
 
-def test_apply_adds_half_the_delays_and_takes_off_the_curve(fitted):
-    r = ranges(10, seed=9)
-    applied = fitted.apply(r)
-    for k in range(len(r)):
-        d_i, d_j = fitted.delays_ns[int(r.initiator[k])], fitted.delays_ns[int(r.target[k])]
-        expected = r.raw_m[k] + SPEED_OF_LIGHT * 1e-9 * (0.5 * d_i + r.weight_target[k] * d_j)
-        assert applied.delay_corrected_m[k] == pytest.approx(expected, abs=1e-12)
-        lifted = (10 ** ((r.fpp1_dbm[k] + 82) / 10) + 10 ** ((r.fpp2_dbm[k] + 82) / 10)) / 2
-        assert applied.corrected_m[k] == pytest.approx(expected - fitted.bias_curve(np.array([lifted]))[0], abs=1e-12)
+def powers_at(lift, power_at, first, second):
+    """Return the lifted powers at which the bias is taken."""
+    if power_at == "reception":
+        return [lifted(first), lifted(second)]
+    return [lifted((first + second) / 2) if lift == "lift-of-mean" else (lifted(first) + lifted(second)) / 2]
+
+
+@pytest.mark.parametrize(
+    ("lift", "power_at"),
+    [("mean-of-lifted", "exchange"), ("lift-of-mean", "exchange"), ("mean-of-lifted", "reception")],
+)
+@pytest.mark.parametrize("grouped", [False, True])
+def test_a_range_is_corrected_as_the_formulas_say(fitted, lift, power_at, grouped):
+    """Half of each delay and the mean curve of both tags, at the powers that there are; one at a time or together."""
+    lower = replace(fitted.bias_curve, coefficients=tuple(c - 0.1 for c in fitted.bias_curve.coefficients))
+    noisy = replace(fitted.sigma_curve, coefficients=tuple(2 * c for c in fitted.sigma_curve.coefficients))
+    own = {"a": TagGroup((1, 2), fitted.bias_curve, fitted.sigma_curve), "b": TagGroup((3, 7), lower, noisy)}
+    known = replace(fitted, lift=lift, power_at=power_at, groups=own if grouped else {})
+    powers = {(-85.0, -92.0): (-85.0, -92.0), (0.0, -90.0): (-90.0, -90.0), (-88.0, np.nan): (-88.0, -88.0)}
+    for (printed, both), (i, j) in zip(powers.items(), [(1, 2), (3, 1), (7, 3)], strict=True):
+        found = known.correct(3.0, *printed, i, j, weights=(0.5, 0.50001))
+        at = powers_at(lift, power_at, *both)
+        away = 0.1 * sum(tag > 2 for tag in (i, j)) / 2 if grouped else 0.0
+        delays = SPEED_OF_LIGHT * 1e-9 * (0.5 * known.delays_ns[i] + 0.50001 * known.delays_ns[j])
+        curve = BSpline(fitted.bias_curve.knots, fitted.bias_curve.coefficients, 3)
+        bias = np.mean([curve(np.clip(one, *fitted.bias_curve.range)) for one in at]) - away
+        assert found.range_m == pytest.approx(3.0 + delays - bias, abs=1e-9)
+        assert type(found.range_m) is float
+        at_both = replace(known, power_at="exchange").correct(3.0, *both, i, j)
+        times = 1 + sum(tag > 2 for tag in (i, j)) / 2 if grouped else 1
+        (middle,) = powers_at(lift, "exchange", *both)
+        plain = fitted.sigma_curve(np.clip(middle, *fitted.sigma_curve.range))
+        assert found.sigma_m == at_both.sigma_m == pytest.approx(times * plain)
+        together = known.correct(np.array([3.0, 4.0]), *printed, i, [j, j], weights=(0.5, 0.50001))
+        np.testing.assert_array_equal([column[0] for column in together], found)
+        assert together.range_m[1] == pytest.approx(1 + found.range_m)
+    blind = known.correct(3.0, 0.0, np.nan, 1, 2)
+    assert blind.range_m == pytest.approx(3.0 + SPEED_OF_LIGHT * 5e-10 * (known.delays_ns[1] + known.delays_ns[2]))
+    assert np.isnan([blind.sigma_m, blind.sigma_total_m, blind.tail_share]).all()
+    far = known.correct(3.0, -60.0, -60.0, 1, 2)
+    assert far.clamped
+    assert far.sigma_total_m > known.correct(3.0, -79.0, -79.0, 1, 2).sigma_total_m
+
+
+@pytest.mark.parametrize("name", ["1-2", "2-1"])
+def test_factors_of_a_pair_hold_in_both_directions(fitted, name):
+    errors = replace(fitted.errors, pairs={name: PairErrors(1.0, 3.0, 1.0)})
+    known = Calibration.from_json(replace(fitted, errors=errors).to_json())
+    there, back, other = (known.correct(3.0, -85.0, -86.0, *ends).tail_share for ends in ((1, 2), (2, 1), (1, 3)))
+    assert there == back
+    assert there / (1 - there) == pytest.approx(3 * other / (1 - other))
+
+
+def test_a_tag_in_no_group_is_named(fitted):
+    with pytest.raises(BadInputError, match="tag 7 is in none"):
+        replace(fitted, groups={"a": TagGroup((1, 2, 3), fitted.bias_curve, fitted.sigma_curve)}).apply(ranges(10))
 
 
 def test_an_unknown_tag_is_named(fitted):
@@ -64,8 +106,10 @@ def test_an_unknown_tag_is_named(fitted):
         ('"loss": "mixture"', '"loss": 5'),
         ('"delays_ns": {', '"delays_ns": {"x": 1, '),
         ('"alpha_dbm": -82.0', '"alpha_dbm": "low"'),
+        ('"alpha_dbm": -82.0', '"alpha_dbm": -82.0, "power_at": "somewhere"'),
         ('"speed_of_light": 299702547.0', '"speed_of_light": NaN'),
         ('"scale_ns": ', '"scale_ns": 1e300, "was": '),
+        ('"tags": [', '"tags": [9, '),
         ('"provenance": {', '"provenance": {"added": 1e400, '),
         ('"provenance": {', '"provenance": {"added": -Infinity, '),
     ],
@@ -75,20 +119,3 @@ def test_a_damaged_file_is_one_clear_error(fitted, old, new):
     assert old in text
     with pytest.raises(BadInputError, match=r"^here"):
         Calibration.from_json(text.replace(old, new), "here")
-
-
-@pytest.mark.parametrize(
-    ("provenance", "told"),
-    [
-        (
-            {"truth": "ranges", "rests_on": KNOWN, "distance_std_m": 0.0123},
-            "ranges alone, of 3 moving bodies, positions known for 9.9 s, 1 anchor at places that were given, "
-            "attitudes from imu, distances found to 1.2 cm (standard error)",
-        ),
-        ({}, ""),
-        ({"truth": "ranges", "rests_on": "a lake"}, ""),
-        ({"truth": "recorded", "rests_on": KNOWN}, ""),
-    ],
-)
-def test_what_a_fit_without_known_distances_rests_on_is_one_phrase(provenance, told):
-    assert rests_on(provenance) == told

@@ -1,6 +1,5 @@
 """The command line names options where the library names parameters, and makes the fit's options of its settings."""
 
-import html
 import re
 from pathlib import Path
 from typing import Any
@@ -36,16 +35,6 @@ def test_every_parameter_that_an_error_names_has_its_option():
         named |= set(re.findall(r'(?:parameter=|check_choice\()"([a-z_0-9]+)"', path.read_text()))
     assert {"fixed_ns", "groups", "loss", "tag", "to"} <= named
     assert {with_flags(f"`{name}`") for name in named - ONLY_FROM_PYTHON} <= OPTIONS
-
-
-def test_the_library_names_no_options():
-    for path in (ROOT / "calib").rglob("*.py"):
-        # Help texts of settings, and the commands that a plan prints.
-        if "cli" in path.parts or path.name == "settings.py" or path.parts[-2:] == ("planning", "result.py"):
-            continue
-        texts = re.findall(r'"[^"\n]*?(?<![-\w])--[a-z][-a-z]+[^"\n]*"', path.read_text())
-        # Docstrings and remedies may name a whole command.
-        assert [text for text in texts if "uwblink" not in text and "`calib " not in text] == [], path
 
 
 def test_other_text_stays_as_it_is():
@@ -90,16 +79,12 @@ def test_settings_and_keywords_make_the_same_fit():
         calib.fit(flight, los="huber")
 
 
-def test_commands_and_reports_repeat_the_settings(tmp_path):
+def test_a_fit_repeats_its_settings(tmp_path):
     flight, made = tmp_path / "f.uwb", tmp_path / "c.json"
-    words = ("--loss", "huber", "--fix", "1=-0.3")
     for line in (
         ["sample", "-o", flight, "-n", 300],
-        ["fit", flight, "-o", made, *words],
-        ["report", flight, "-o", tmp_path / "r.html", *words],
+        ["fit", flight, "-o", made, "--loss", "huber", "--fix", "1=-0.3"],
     ):
-        done = processes.run("calib", *map(str, line))
+        done = processes.run("calib", *line)
         assert done.returncode == 0, done.stderr
-    repeated = "loss = huber, fixed_ns = {'1': -0.3}"
-    assert f"settings: {repeated}" in processes.run("calib", "show", str(made)).stdout
-    assert f"Settings: {html.escape(repeated)}" in (tmp_path / "r.html").read_text()
+    assert "settings: loss = huber, fixed_ns = {'1': -0.3}" in processes.run("calib", "show", made).stdout

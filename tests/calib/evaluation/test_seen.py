@@ -20,10 +20,6 @@ def test_the_recording_is_known_by_what_it_holds_and_not_by_its_name(tmp_path):
     assert calib.evaluate([train, test], found.calibration).seen == ("memory",)
 
     found.save(tmp_path / "c.json")
-    done = processes.run(
-        "calib", "evaluate", tmp_path / "c" / "flight.uwb", tmp_path / "b" / "flight.uwb", "-c", tmp_path / "c.json"
-    )
-    assert done.returncode == 0
-    assert done.stderr.startswith("warning: the calibration was fitted to flight.uwb: ")
-    other = processes.run("calib", "evaluate", tmp_path / "b" / "flight.uwb", "-c", tmp_path / "c.json")
-    assert (other.returncode, other.stderr) == (0, "")
+    for folder, warned in (("c", "warning: the calibration was fitted to flight.uwb: "), ("b", "")):
+        done = processes.run("calib", "evaluate", tmp_path / folder / "flight.uwb", "-c", tmp_path / "c.json")
+        assert (done.returncode, done.stderr[: len(warned) or None]) == (0, warned)

@@ -7,40 +7,10 @@ import pytest
 from scipy.stats import norm
 
 from calib.data.ranges import Ranges, concatenate
-from calib.evaluation.statistics import evaluate, pair_rows, split_error, statistics
+from calib.evaluation.statistics import evaluate, split_error
 from calib.fitting.fitting import fit
 from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
 from uwblink.ticks import SPEED_OF_LIGHT
-
-
-def test_statistics_of_known_numbers():
-    s = statistics(np.array([-1.0, 0.0, 1.0, 2.0, 98.0]))
-    assert (s.n, s.mean_m, s.median_m) == (5, 20.0, 1.0)
-    assert s.std_m == pytest.approx(np.sqrt(np.mean((np.array([-21, -20, -19, -18, 78])) ** 2)))
-    assert s.robust_std_m == pytest.approx(1.4826)
-    s = statistics(np.arange(-100.0, 101.0))
-    assert [s.low_m, s.high_m, s.abs95_m] == pytest.approx([-95.0, 95.0, 95.0])
-
-
-def test_pairs_do_not_depend_on_who_initiates():
-    r = ranges(12)
-    swapped = replace(r, initiator=r.target, target=r.initiator)
-    assert pair_rows(r).keys() == pair_rows(swapped).keys() == {"1-2", "1-3", "1-7", "2-3", "2-7", "3-7"}
-
-
-def test_json_has_stages_and_figures_for_all_and_each_pair():
-    r = ranges()
-    calibration = fit(r).calibration
-    document = evaluate(r, calibration).to_dict()
-    assert set(document) == {"seen_by_fit", "overall", "pairs", "split"}
-    for group in (document["overall"], *document["pairs"].values()):
-        for stage in ("raw", "delays", "full"):
-            assert {"n", "mean_m", "median_m", "std_m", "robust_std_m"} <= set(group[stage])
-    assert sum(g["raw"]["n"] for g in document["pairs"].values()) == document["overall"]["raw"]["n"] == len(r)
-    unseen = evaluate(ranges(seed=2), calibration).overall
-    assert abs(unseen.full.mean_m) < abs(unseen.raw.mean_m)
-    assert unseen.full.std_m < unseen.raw.std_m
-    assert unseen.full.robust_std_m < unseen.raw.robust_std_m
 
 
 @pytest.mark.parametrize(("pairs_m", "sessions_m"), [(0.0, 0.0), (0.05, 0.0), (0.05, 0.04)])
@@ -69,17 +39,6 @@ def test_errors_are_split_into_within_and_between_pairs_and_sessions(pairs_m, se
     assert found.between_sessions_m == pytest.approx(sessions_m, abs=0.008)
 
 
-def test_coverage_is_nominal_on_clean_data_and_raw_rejection_is_its_own():
-    r = ranges(40_000, tail=0.0)
-    found = evaluate(r, fit(r).calibration).overall
-    # 40 000 draws: 0.11 %; the sigma curve is known to 1 %, which is another 0.3 %.
-    assert found.rejected == pytest.approx(0.05, abs=0.007)
-    for name, share in found.coverage.items():
-        assert share == pytest.approx(float(name if name != "68" else "68.27") / 100, abs=0.007), name
-    error = r.raw_m - r.truth_m
-    assert found.rejected_raw == np.mean(error**2 > 3.841458820694124 * np.var(error))
-
-
 def test_the_planted_calibration_is_found_beside():
     from scipy.interpolate import make_interp_spline
 
@@ -87,7 +46,7 @@ def test_the_planted_calibration_is_found_beside():
     curve = make_interp_spline(grid, bias_m(grid))
     planted: dict[str, object] = {"delays_ns": {str(t): d for t, d in DELAYS_NS.items()}}
     planted["bias_curve"] = {"knots": curve.t.tolist(), "coefficients": curve.c.tolist(), "degree": 3}
-    r = replace(ranges(20_000), planted=planted)
+    r = replace(ranges(), planted=planted)
     calibration = fit(r).calibration
     found = evaluate(r, calibration).planted
     assert sum(found.delay_error_ns.values()) == pytest.approx(0, abs=1e-12)
@@ -119,14 +78,8 @@ def test_an_evaluation_prints_on_a_screen():
     r = ranges(2000)
     found = evaluate(r, fit(r).calibration)
     lines = repr(found).splitlines()
-    assert len(lines) == 3 + 6 + 1
     assert max(map(len, lines[1:])) <= 80, "a terminal has room for every figure"
-    everything = found.overall
-    assert lines[-1].split() == [
-        "all", "2000", *(
-            f"{100 * value:.1f}"
-            for stats in (everything.raw, everything.delays, everything.full)
-            for value in (stats.mean_m, stats.median_m, stats.robust_std_m)
-        ), f"{100 * everything.rejected:.1f}", f"{everything.total_std:.2f}", f"{100 * everything.inside_95:.1f}",
-    ]  # fmt: skip
-    assert found._repr_html_().count("<tr>") == 9
+    cells, full = lines[-1].split(), found.overall.full
+    assert cells[:2] == ["all", "2000"]
+    assert cells[8:11] == [f"{100 * value:.1f}" for value in (full.mean_m, full.median_m, full.robust_std_m)]
+    assert found._repr_html_().count("<tr>") == 3 + 6

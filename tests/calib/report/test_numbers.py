@@ -12,6 +12,7 @@ from scipy.stats import t as student
 
 import calib
 from calib.data.samples import stamped
+from calib.report.sections import SECTIONS
 from tests import processes
 from tests.calib.report.page_of_numpy import LIGHT, TICK_S, Tables, columns, corrected, curve, number
 from uwblink import Contents, Tag
@@ -137,6 +138,16 @@ def test_the_report_has_the_evaluation_s_numbers(page, tables):
         assert [number(cell) for cell in cells[1:]] == pytest.approx(
             [100 * s for s in of["coverage"].values()], abs=0.51
         )
+
+
+def test_the_report_says_where_it_comes_from(folder, monkeypatch):
+    page = (folder / "r.html").read_text()
+    assert "calib evaluate f.uwb -c c.json --json --report r.html" in page
+    assert page.count("SHA-256 ") == 2, "of the recording and of the calibration"
+    few = {name: SECTIONS[name] for name in ("verdict", "provenance")}
+    monkeypatch.setattr("calib.report.sections.SECTIONS", few)
+    calib.write_report(folder / "r.pdf", folder / "f.uwb", calib.load_calibration(folder / "c.json"))
+    assert (folder / "r.pdf").read_bytes().startswith(b"%PDF")
 
 
 def found_of(tables, question):
