@@ -283,9 +283,8 @@ def _results(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> dict[str
     beside = {"scenario", "number", "seed", "uwbcal", "numpy", "python", "status", "error", "protocol", *keys}
     found = {}
     for name in dict.fromkeys(name for row in rows for name in row if name not in beside):
-        cells = (row.get(name) for row in rows)
-        numbers = [v if isinstance(v, int | float) and not isinstance(v, bool) else np.nan for v in cells]
-        values = np.array(numbers, dtype=np.float64)
+        cells = [row.get(name) for row in rows]
+        values = np.array([cell if type(cell) in (int, float) else np.nan for cell in cells], dtype=np.float64)
         known = values[np.isfinite(values)]
         if len(known) and np.ptp(known) > 0:
             found[name] = values

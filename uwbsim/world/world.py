@@ -15,11 +15,10 @@ from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import GeometricMultipath, TwoStateMultipath
-from uwbsim.world.channel import link_between, paths_heard
+from uwbsim.world.channel import Ends, Link, PlacedBody, link_between, paths_heard
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS_PER_SECOND
 from uwbsim.world.geometric import GeometricResponses
 from uwbsim.world.impulse_response import PathsHeard
-from uwbsim.world.links import Ends, Link, PlacedBody
 from uwbsim.world.pair_states import pair_levels, reflected_states
 from uwbsim.world.radio import shadowing_phases
 from uwbsim.world.trajectories import Trajectory, sample

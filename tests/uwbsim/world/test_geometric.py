@@ -211,7 +211,7 @@ def test_responses_have_the_first_path_where_the_stamp_is_with_its_power(slow_fl
 
 
 def test_scatterers_stay_where_they_are_and_more_of_them_leave_the_first_there():
-    few, many = (World(scenario(room=ROOM, scatterers=n)).responses.around.scatterers for n in (5, 40))
+    few, many = (World(scenario(room=ROOM, scatterers=n)).responses.scatterers for n in (5, 40))
     for name in ("place_m", "extra_m", "gain"):
         np.testing.assert_array_equal(getattr(few, name), getattr(many, name)[:5])
     assert np.all((many.place_m >= 0) & (many.place_m <= np.array([8.0, 6.0, 3.0])))
