@@ -251,11 +251,9 @@ def _reflections(link: Link, ends: Ends) -> Link:
 
 
 def _images(room: Room, spots: Floats) -> Floats:
-    """Return the images of points (n, 6, 3) in the surfaces of their columns."""
-    image = spots.copy()
-    for axis in range(3):
-        for side, wall in enumerate((room.min_m[axis], room.max_m[axis])):
-            image[:, 2 * axis + side, axis] = 2 * wall - image[:, 2 * axis + side, axis]
+    """Return the images of points (n, 6, 3) in the surfaces of their columns, two across each axis."""
+    image, surface, axis = spots.copy(), np.arange(6), np.repeat(np.arange(3), 2)
+    image[:, surface, axis] = 2 * np.array([room.min_m, room.max_m]).T.ravel() - spots[:, surface, axis]
     return image
 
 

@@ -126,15 +126,6 @@ def test_compare_counts_as_many_exchanges_a_second_as_a_run_has(name):
     assert 1e9 * (len(time_ns) - 1) / np.ptp(time_ns) == pytest.approx(said, rel=0.004)
 
 
-def test_calibrated_leaves_skew_and_noise(scenario):
-    c = calibrated(conditions_of(scenario, 200))
-    assert not c.late.any()
-    assert not c.tx_delay_initiator.any()
-    assert c.multipath == 0
-    assert c.rx_std.any()
-    assert c.rate_initiator.any()
-
-
 def test_compare_writes_a_page_and_tables(tmp_path):
     out = tmp_path / "out"
     done = run("compare", TEST1, "-o", out, "--protocols", "ss, ds", "-n", "20000", "--json")
