@@ -108,11 +108,13 @@ def test_the_rate_of_a_noisy_clock_is_what_its_reading_gains_over_a_preamble_or_
 
 
 # For the long ones two days and a half altogether: 200 independent spans of 1000 s, known to 5 %.
-@pytest.mark.parametrize(("step_s", "duration_s", "taus"), [(0.5e-3, 30.0, SHORT), (0.5, 109_000.0, LONG)])
-@pytest.mark.parametrize("kinds", [*([kind] for kind in NOMINAL), [*NOMINAL]], ids="+".join)
-def test_allan_deviations_are_nominal_and_add_up_in_variance(step_s, duration_s, taus, kinds):
+@pytest.mark.parametrize(
+    ("kinds", "long"), [([kind], long) for kind in NOMINAL for long in (False, True)] + [([*NOMINAL], False)]
+)
+def test_allan_deviations_are_nominal_and_add_up_in_variance(kinds, long):
+    step_s, duration_s, taus, seeds = (0.5, 109_000.0, LONG, 1) if long else (0.5e-3, 30.0, SHORT, 3)
     time, squares = subticks(np.arange(0, duration_s, step_s)), []
-    for seed in range(3 if duration_s < 100 else 1):
+    for seed in range(seeds):
         c = clocks(duration_s, seed=seed + 1, **dict.fromkeys(kinds, 0.01))
         phases = [ahead_s(c, time, k) for k in (0, 1)]
         squares += [allantools.oadev(p, rate=1 / step_s, data_type="phase", taus=taus)[1] ** 2 for p in phases]
