@@ -29,11 +29,9 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Callable, Container, Generator
+from collections.abc import Callable, Container
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
-
-import simpy
 
 from uwblink.wire.fields import (
     BOOL,
@@ -70,7 +68,7 @@ from uwblink.wire.messages import (
     SetPassive,
     SetResponseDelay,
 )
-from uwbsim.boards.frames import NS_PER_MS, NS_PER_US
+from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, Attempt
 from uwbsim.boards.ranging import TO_AIR, initiate
 from uwbsim.errors import UwbsimError
 
@@ -180,9 +178,6 @@ def _value(field: Kind, buffer: bytes, at: int) -> tuple[Any, int]:
 
 ANSWER: Final = 195 * NS_PER_US
 """From the read of the USB buffer with a command to its answer on the bus."""
-
-Attempt = Generator[simpy.Event, Any, bool]
-"""An execution that takes time: yields SimPy events of the bench, and returns whether the command is done."""
 
 Executor = Callable[..., "Message | bytes | Attempt"]
 """Called with the board and the command's values; returns the reply, or an `Attempt` that does everything itself.

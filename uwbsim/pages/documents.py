@@ -18,11 +18,11 @@ from uwblink.pages.figures import picture
 from uwblink.protocols.table import PROTOCOLS
 from uwbsim.errors import ScenarioError
 from uwbsim.pages import figures
-from uwbsim.pages.preview import preview
 from uwbsim.protocols.comparison import Comparison, Optimum, ProtocolErrors, over_reply, over_skew, over_state
 from uwbsim.protocols.conditions import conditions_of
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
+from uwbsim.simulation.run import preview
 from uwbsim.sweep.design import SweepDesign
 from uwbsim.sweep.runner import STORE, Store
 from uwbsim.tables import write_tables

@@ -41,16 +41,6 @@ if TYPE_CHECKING:
 CELLS: Final = 128
 """Cells along a side of the table of an antenna's gains: a resolution of a degree."""
 
-MOST_KEPT: Final = 500_000
-"""Readings of responses that are kept, some 100 MB."""
-
-
-FEW: Final = 100
-"""A call for no more new responses than these comes from a served board, which asks for the next step soon."""
-
-AHEAD: Final = 16
-"""Steps that are computed at once for such a call: together they take a third of the time."""
-
 
 def antenna_tables(scenario: Scenario, phases: Floats) -> Floats:
     """Return the amplitude gains of antennas with their bodies by direction, (tags, cells).
@@ -156,12 +146,14 @@ class GeometricResponses:
     def at(self, places: tuple[Ints, Ints], time_s: Floats) -> Detected:
         """Return the readings of the responses between tags with indices (n,) at true times (n,)."""
         keys = self._key(places, time_s).tolist()
-        if len(self._known) > MOST_KEPT:
+        if len(self._known) > 500_000:  # some 100 MB
             self._known.clear()
         missing = set(keys).difference(self._known)
-        if len(missing) <= FEW:
+        # Few new responses are asked for by served boards, which soon ask for the next steps, too: 16 of them at once
+        # take a third of the time.
+        if len(missing) <= 100:
             step = len(self.scenario.tags) ** 2
-            missing = {key + step * k for key in missing for k in range(AHEAD)}.difference(self._known)
+            missing = {key + step * k for key in missing for k in range(16)}.difference(self._known)
         if missing:
             noise_share = 1 / self.model.threshold_to_noise if self.model.stamp_noise else 0.0
             read = detect(self._paths(np.array([*missing])), self.scenario.radio, noise_share)
