@@ -5,26 +5,22 @@ import time
 import numpy as np
 import pytest
 
+import uwbsim
 from tests.boards import bench_scenario, served
 from uwblink.boards.board import Board
 from uwblink.importers.poses import read_poses
 from uwbsim.boards.server import LivePoses
-from uwbsim.scenario.model import Scenario
 from uwbsim.world.world import World
 
 EPOCH_NS = 1_700_000_000_000_000_000
 
 
 def flight(**mocap):
-    """Two tags, one of which circles within a minute."""
-    scenario = bench_scenario().model_dump(by_alias=True)
-    scenario["bodies"][0]["motion"] = {
-        "model": "random-flight",
-        "box_min_m": [-2.0, -2.0, 0.5],
-        "box_max_m": [2.0, 2.0, 2.0],
-        "speed_mps": 1.0,
-    }
-    return Scenario.model_validate(scenario | {"mocap": {"rate_hz": 120.0, **mocap}})
+    """Boards of which one flies."""
+    box = {"box_min_m": [-2.0, -2.0, 0.5], "box_max_m": [2.0, 2.0, 2.0]}
+    motion = {"model": "random-flight", "speed_mps": 1.0} | box
+    tables = bench_scenario().model_dump(by_alias=True) | {"mocap": {"rate_hz": 120.0, **mocap}}
+    return uwbsim.load(tables, {"bodies.0.motion": motion})
 
 
 def written(world, path, steps):
