@@ -44,15 +44,13 @@ def test_a_grid_has_every_combination_with_every_seed(tmp_path):
 
 
 def test_a_latin_hypercube_has_one_value_in_each_part_of_each_axis(tmp_path):
-    text = (
-        HEAD + 'design = "latin-hypercube"\nsamples = 20\n[vary]\n"radio.rx_noise_ps" = { low = 10.0, high = 1000.0, '
-    )
-    text += 'scale = "log" }\n"ranging.response_delay_uus" = { low = 300, high = 6000 }\n'
-    p = plan(tmp_path, text)
-    noise = np.array([p.run(k).values["radio.rx_noise_ps"] for k in range(20)])
-    delay = np.array([p.run(k).values["ranging.response_delay_uus"] for k in range(20)])
+    spans = '{ low = 10.0, high = 1000.0, scale = "log" }', "{ low = 300, high = 6000 }"
+    vary = f'[vary]\n"radio.rx_noise_ps" = {spans[0]}\n"ranging.response_delay_uus" = {spans[1]}\n'
+    p = plan(tmp_path, f'{HEAD}design = "latin-hypercube"\nsamples = 20\n{vary}')
+    points = [p.run(k).values for k in range(20)]
+    noise, delay = (np.array([point[key] for point in points]) for key in points[0])
     assert sorted(np.floor(np.log10(noise / 10) / 2 * 20).astype(int)) == list(range(20))
-    assert all(isinstance(p.run(k).values["ranging.response_delay_uus"], int) for k in range(20))
+    assert {type(point["ranging.response_delay_uus"]) for point in points} == {int}
     assert np.all(np.diff(np.histogram(delay, np.linspace(300, 6000, 6))[0]) <= 1)
     assert abs(np.corrcoef(np.log(noise), delay)[0, 1]) < 0.6, "axes are shuffled apart"
 

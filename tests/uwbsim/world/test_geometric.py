@@ -174,17 +174,6 @@ def test_excess_lasts_as_long_as_geometry_does(slow_flight):
         assert autocorrelation(excess, 1) > autocorrelation(excess, 100) + 0.2
 
 
-def test_pairs_have_their_own_excess(slow_flight):
-    pairs = [of_pair(slow_flight, target)[1] for target in (2, 3, 4)]
-    means = [np.mean(pair) for pair in pairs]
-    assert np.ptp(means) > 0.05
-    count = min(map(len, pairs))
-    first, second = (pair[:count] - pair.mean() for pair in pairs[:2])
-    # What they have in common is the one tag's slow way; from a tenth of a second to the next each goes its own.
-    changes = [pair[10:] - pair[:-10] for pair in (first, second)]
-    assert abs(np.corrcoef(*changes)[0, 1]) < 0.4
-
-
 def test_excess_shows_in_powers_and_responses(slow_flight):
     """The later the first path seems, the more of the power comes after it, in what boards print."""
     rows, _ = of_pair(slow_flight, 2)
