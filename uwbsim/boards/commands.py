@@ -126,11 +126,9 @@ class _Incomplete(Exception):  # noqa: N818 - a signal of the parser, not an err
     """A command ends too early: the lines that the board prints, and whether it is alive afterwards."""
 
     def __init__(self, missing_fields: int, *, alive: bool) -> None:
-        self.lines = (*[b"No next key character found."] * missing_fields, NO_END)
+        no_end = b"Failed to detect USB command terminator char! Trying my best"
+        self.lines = (*[b"No next key character found."] * missing_fields, no_end)
         self.alive = alive
-
-
-NO_END: Final = b"Failed to detect USB command terminator char! Trying my best"
 
 
 def read_commands(buffer: bytes, known: Container[bytes] = COMMANDS) -> Reading:

@@ -313,10 +313,6 @@ def _both(measured: float, simulated: float, form: str = ".3g") -> str:
 def write_twin(found: Twin, compared: Sequence[Compared], path: Path, *, force: bool = False) -> None:
     """Write the page of a twin; raises what `check_output` raises."""
     check_output(path, force=force)
-    write_text(path, to_html(_twin(found, compared)), force=force)
-
-
-def _twin(found: Twin, compared: Sequence[Compared]) -> Document:
     alike = sum(one.verdict == "alike" for one in compared)
     pairs = [one for one in compared if one.name in ("residual of calibrated ranges", "first-path power at initiator")]
     numbers = {name: value for name, value in found.found.items() if value is None or isinstance(value, int | float)}
@@ -361,7 +357,7 @@ def _twin(found: Twin, compared: Sequence[Compared]) -> Document:
         Heading("What the recording does not determine"),
         Table(["kept at its default, or chosen without the recording"], [[text] for text in found.unknown], words=True),
     ]
-    return Document(f"The twin of {Path(found.recording).name}", blocks)
+    write_text(path, to_html(Document(f"The twin of {Path(found.recording).name}", blocks)), force=force)
 
 
 def _shown(value: object) -> str:

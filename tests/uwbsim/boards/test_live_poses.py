@@ -78,11 +78,12 @@ def test_poses_that_cannot_be_written_end_and_the_serving_goes_on(tmp_path):
     told: list[str] = []
     with served(flight(), tell=told.append) as server:
         server.write_poses(tmp_path / "p.csv")
-        server._poses._file.close()
-        server._poses._file = open("/dev/full", "w", encoding="utf-8")  # noqa: SIM115 - closed by the server
+        # The first file is closed after the serving, which may be writing to it now.
+        first, server._poses._file = server._poses._file, open("/dev/full", "w", encoding="utf-8")  # noqa: SIM115 - closed by the server
         for _ in range(100):
             with Board.open(server.names[2]) as board:
                 assert board.id == 2
             if told:
                 break
+    first.close()
     assert told == ["the poses end here: No space left on device"]
