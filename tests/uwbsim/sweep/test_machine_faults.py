@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -165,6 +166,12 @@ def session(leader):
     return found
 
 
+def signals_blocked(pid):
+    status = Path(f"/proc/{pid}/status").read_text()
+    bits = int(re.search(r"SigBlk:\s*(\w+)", status)[1], 16)
+    return {number for number in signal.Signals if bits >> (number - 1) & 1}
+
+
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are looked up in /proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_a_sweep_that_ends_early_leaves_no_worker_and_goes_on_where_it_was(tmp_path, number):
@@ -176,7 +183,9 @@ def test_a_sweep_that_ends_early_leaves_no_worker_and_goes_on_where_it_was(tmp_p
         # The log grows with every result; ten thousand bytes are a few of them.
         log = out / "results.duckdb.wal"
         wait_until(lambda: log.exists() and log.stat().st_size > 10_000)
-        # As a terminal does it: Ctrl-C goes to all of them.
+        # Workers leave Ctrl-C, which a terminal sends to all of them, to the sweep, and can be terminated.
+        blocked = [signals_blocked(pid) for pid in session(process.pid)]
+        assert [sum(one in some for some in blocked) for one in (signal.SIGINT, signal.SIGTERM)] == [2, 0]
         (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
         assert process.wait(60) == (130 if number == signal.SIGINT else -number)
         wait_until(lambda: not session(process.pid))
