@@ -19,7 +19,7 @@ from uwbsim.scenario.loading import load
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import TwoStateMultipath
 from uwbsim.twins.fitting import Twin
-from uwbsim.world.pair_states import share_and_life
+from uwbsim.world.world import share_and_life
 
 ROBOTS = {
     "hare": [[-3.0, -3.5, 0.3], [3.0, -0.3, 2.4]],

@@ -18,12 +18,11 @@ if TYPE_CHECKING:
     from uwbsim.boards.virtual_board import VirtualPorts
     from uwbsim.errors import ParameterError, ScenarioError, UwbsimError
     from uwbsim.pages.documents import show
-    from uwbsim.pages.preview import preview
     from uwbsim.protocols.comparison import Comparison, compare, optimum
     from uwbsim.protocols.prediction import Prediction, State, predict_state
     from uwbsim.scenario.loading import load, shipped_scenarios
     from uwbsim.scenario.model import Scenario
-    from uwbsim.simulation.run import Simulated, simulate, through_wire
+    from uwbsim.simulation.run import Simulated, preview, simulate, through_wire
     from uwbsim.sweep.design import load_design
     from uwbsim.sweep.runner import run_sweep
     from uwbsim.twins.fitting import Twin, twin
@@ -75,7 +74,7 @@ _HOMES: Final = {
     "load_faults": "uwbsim.boards.server",
     "optimum": "uwbsim.protocols.comparison",
     "predict_state": "uwbsim.protocols.prediction",
-    "preview": "uwbsim.pages.preview",
+    "preview": "uwbsim.simulation.run",
     "register_channel_effect": "uwbsim.world.channel",
     "run_sweep": "uwbsim.sweep.runner",
     "shipped_scenarios": "uwbsim.scenario.loading",

@@ -29,11 +29,9 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Callable, Container, Generator
+from collections.abc import Callable, Container
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
-
-import simpy
 
 from uwblink.wire.fields import (
     BOOL,
@@ -70,7 +68,7 @@ from uwblink.wire.messages import (
     SetPassive,
     SetResponseDelay,
 )
-from uwbsim.boards.frames import NS_PER_MS, NS_PER_US
+from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, Attempt
 from uwbsim.boards.ranging import TO_AIR, initiate
 from uwbsim.errors import UwbsimError
 
@@ -128,11 +126,9 @@ class _Incomplete(Exception):  # noqa: N818 - a signal of the parser, not an err
     """A command ends too early: the lines that the board prints, and whether it is alive afterwards."""
 
     def __init__(self, missing_fields: int, *, alive: bool) -> None:
-        self.lines = (*[b"No next key character found."] * missing_fields, NO_END)
+        no_end = b"Failed to detect USB command terminator char! Trying my best"
+        self.lines = (*[b"No next key character found."] * missing_fields, no_end)
         self.alive = alive
-
-
-NO_END: Final = b"Failed to detect USB command terminator char! Trying my best"
 
 
 def read_commands(buffer: bytes, known: Container[bytes] = COMMANDS) -> Reading:
@@ -180,9 +176,6 @@ def _value(field: Kind, buffer: bytes, at: int) -> tuple[Any, int]:
 
 ANSWER: Final = 195 * NS_PER_US
 """From the read of the USB buffer with a command to its answer on the bus."""
-
-Attempt = Generator[simpy.Event, Any, bool]
-"""An execution that takes time: yields SimPy events of the bench, and returns whether the command is done."""
 
 Executor = Callable[..., "Message | bytes | Attempt"]
 """Called with the board and the command's values; returns the reply, or an `Attempt` that does everything itself.

@@ -95,6 +95,12 @@ class Received:
 
 NS_PER_US: Final = 1_000
 NS_PER_MS: Final = 1_000_000
+Steps = Generator[simpy.Event, Any, None]
+"""What a board does in time: yields the SimPy events that it waits for."""
+
+Attempt = Generator[simpy.Event, Any, bool]
+"""An execution of a command that takes time; returns whether the command is done."""
+
 Wait = Generator[simpy.Event, Any, Received | None]
 
 

@@ -7,10 +7,7 @@ reads no USB commands meanwhile (firmware wire format, 3.3).
 
 from __future__ import annotations
 
-from collections.abc import Generator
 from typing import TYPE_CHECKING, Any, Final
-
-import simpy
 
 from uwblink.twr import Exchanges, board_range
 from uwblink.wire.codec import encode
@@ -27,11 +24,13 @@ from uwblink.wire.messages import (
 from uwbsim.boards.frames import (
     NS_PER_MS,
     NS_PER_US,
+    Attempt,
     FinalPayload,
     Frame,
     Payload,
     Received,
     ResponsePayload,
+    Steps,
     Wait,
 )
 from uwbsim.scenario.ranging import PREAMBLE_TIMEOUT_S
@@ -45,9 +44,6 @@ if TYPE_CHECKING:
 
 TO_AIR: Final = 330 * NS_PER_US
 """From the read of the USB buffer with a command to the marker of its frame: set-up and half a preamble."""
-
-Steps = Generator[simpy.Event, Any, None]
-Attempt = Generator[simpy.Event, Any, bool]
 
 PREAMBLE_TIMEOUT: Final = round(PREAMBLE_TIMEOUT_S * NS_PER_S)
 AT_HOST: Final = 474 * NS_PER_US

@@ -20,9 +20,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 import simpy
 
@@ -30,8 +30,8 @@ from uwblink.boards.ports import Transport
 from uwblink.errors import PortLostError, PortMissingError
 from uwblink.wire.codec import encode
 from uwblink.wire.messages import Message
-from uwbsim.boards.commands import ANSWER, EXECUTORS, Attempt, Command, read_commands
-from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, BoardAir, Radio, Received
+from uwbsim.boards.commands import ANSWER, EXECUTORS, Command, read_commands
+from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, Attempt, BoardAir, Radio, Received, Steps
 from uwbsim.boards.ranging import received_by
 from uwbsim.errors import ParameterError
 from uwbsim.random_streams import stream
@@ -116,7 +116,6 @@ class UsbLink:
         self._send(data)
 
 
-Steps = Generator[simpy.Event, Any, None]
 Sender = Callable[[int, int, bytes], None]
 """Called with time (ns), board and the bytes of one USB transfer."""
 

@@ -18,11 +18,11 @@ from uwblink.pages.figures import picture
 from uwblink.protocols.table import PROTOCOLS
 from uwbsim.errors import ScenarioError
 from uwbsim.pages import figures
-from uwbsim.pages.preview import preview
 from uwbsim.protocols.comparison import Comparison, Optimum, ProtocolErrors, over_reply, over_skew, over_state
 from uwbsim.protocols.conditions import conditions_of
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
+from uwbsim.simulation.run import preview
 from uwbsim.sweep.design import SweepDesign
 from uwbsim.sweep.runner import STORE, Store
 from uwbsim.tables import write_tables
@@ -283,9 +283,8 @@ def _results(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> dict[str
     beside = {"scenario", "number", "seed", "uwbcal", "numpy", "python", "status", "error", "protocol", *keys}
     found = {}
     for name in dict.fromkeys(name for row in rows for name in row if name not in beside):
-        cells = (row.get(name) for row in rows)
-        numbers = [v if isinstance(v, int | float) and not isinstance(v, bool) else np.nan for v in cells]
-        values = np.array(numbers, dtype=np.float64)
+        cells = [row.get(name) for row in rows]
+        values = np.array([cell if type(cell) in (int, float) else np.nan for cell in cells], dtype=np.float64)
         known = values[np.isfinite(values)]
         if len(known) and np.ptp(known) > 0:
             found[name] = values
@@ -314,10 +313,6 @@ def _both(measured: float, simulated: float, form: str = ".3g") -> str:
 def write_twin(found: Twin, compared: Sequence[Compared], path: Path, *, force: bool = False) -> None:
     """Write the page of a twin; raises what `check_output` raises."""
     check_output(path, force=force)
-    write_text(path, to_html(_twin(found, compared)), force=force)
-
-
-def _twin(found: Twin, compared: Sequence[Compared]) -> Document:
     alike = sum(one.verdict == "alike" for one in compared)
     pairs = [one for one in compared if one.name in ("residual of calibrated ranges", "first-path power at initiator")]
     numbers = {name: value for name, value in found.found.items() if value is None or isinstance(value, int | float)}
@@ -362,7 +357,7 @@ def _twin(found: Twin, compared: Sequence[Compared]) -> Document:
         Heading("What the recording does not determine"),
         Table(["kept at its default, or chosen without the recording"], [[text] for text in found.unknown], words=True),
     ]
-    return Document(f"The twin of {Path(found.recording).name}", blocks)
+    write_text(path, to_html(Document(f"The twin of {Path(found.recording).name}", blocks)), force=force)
 
 
 def _shown(value: object) -> str:

@@ -18,17 +18,12 @@ from uwblink.arrays import Bools, Floats
 from uwblink.pages.colours import BLUE, GRID, INK, MUTED, PALE, SERIES, VERMILION, Look, look
 from uwblink.pages.figures import NARROW_IN, label, legend, mark, outlines, series, sheet
 from uwblink.protocols.table import PROTOCOLS, RangingProtocol
-from uwblink.ticks import TICK_S
+from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S
 from uwbsim.protocols.comparison import ErrorCurve, Optimum
-from uwbsim.protocols.conditions import interval_stamps
-from uwbsim.random_streams import stream
+from uwbsim.protocols.conditions import Conditions, exchange, interval_stamps
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.ranging import after_marker_s, before_marker_s, message_bytes
-from uwbsim.simulation.air import Schedule
-from uwbsim.simulation.timestamps import Draws, Stamped, draw_reply_s, stamp
 from uwbsim.twins import Compared
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND
-from uwbsim.world.reception import Medium
 from uwbsim.world.world import World
 
 
@@ -119,7 +114,10 @@ def room(width_in: float, scenario: Scenario) -> Figure:
     middle, half = (points.max(axis=0) + points.min(axis=0)) / 2, np.maximum(np.ptp(points, axis=0) / 2, 0.5)
     half = half + (0.04 if scenario.room else 0.12) * float(half.max())
     low, high = middle - half, middle + half
-    figure, panels = _to_scale(width_in, 2 * half)
+    # Panels are as high as their views at the scale that the width allows, above each other in a column.
+    narrow, heights = width_in < NARROW_IN, half[1:] / half[0] * (width_in - 0.7)
+    height_in = min(float(heights.mean() if narrow else heights.max() / 2), 4.2) + 0.6
+    figure, panels = sheet(width_in, 2, height_in=height_in, height_ratios=heights if narrow else None)
     for axes, (x, y), name in zip(panels, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
         for text, corners in boxes.items():
             size = _draw_box(axes, corners[:, [x, y]], fc=GRID, ec=MUTED, lw=0.6)
@@ -158,32 +156,23 @@ def _draw_body(axes: Axes, name: str, path: Floats, tags: Mapping[int, Floats], 
         axes.annotate(", ".join(map(str, tags)), tuple(spots[0]), away, textcoords="offset points", **place)
 
 
-def _to_scale(width_in: float, size_m: Floats) -> tuple[Figure, list[Axes]]:
-    """Return a figure whose two panels have the same scale; on a phone above each other."""
-    narrow = width_in < NARROW_IN
-    across = size_m[0] if narrow else 2 * size_m[0]
-    scale = min((width_in - (0.7 if narrow else 1.4)) / across, (3.6 if narrow else 4.2) / max(size_m[1], size_m[2]))
-    heights = [size_m[1] * scale, size_m[2] * scale]
-    figure, panels = sheet(width_in, 2, height_ratios=heights if narrow else None)
-    figure.set_figheight(sum(heights) + 1.9 if narrow else max(heights) + 1.2)
-    return figure, panels
-
-
 def timing(width_in: float, scenario: Scenario, name: str) -> Figure:
-    """Draw one exchange of the first pair with its real delays: who sends what when, each stamp, and all intervals.
+    """Draw one exchange with the scenario's delays: who sends what when, each stamp, and all intervals.
 
-    Stamps have the names of ICRA 2023 (Fig. 2) beside them.
+    Stamps have the names of ICRA 2023 (Fig. 2) beside them. Clocks are exact, and flights too short to be seen.
     """
-    protocol, narrow = PROTOCOLS[name], width_in < NARROW_IN
-    stamped, pair = _one_exchange(scenario, protocol)
-    departures = [int(frame.departure[0]) for frame in stamped.frames]
-    times_us = [(one - departures[0]) / SUBTICKS_PER_SECOND * 1e6 for one in departures]
+    protocol, narrow, ranging = PROTOCOLS[name], width_in < NARROW_IN, scenario.ranging
+    # A delayed frame leaves later than scheduled by the antenna delay of its board.
+    scheduled_s = ranging.scheduled_s + ANTENNA_DELAY_TICKS * TICK_S
+    found = exchange(protocol, Conditions.single(at_once=ranging.at_once_s, scheduled=scheduled_s))
+    stamps_us = {stamp: float(ticks[0]) * TICK_S * 1e6 for stamp, ticks in found.stamps.items()}
     figure, (axes,) = sheet(width_in, height_in=2.3)
     for level in (0, 1):
         axes.axhline(level, color=MUTED, lw=0.8)
-    _draw_messages(axes, scenario, protocol, times_us)
-    _draw_spans(axes, protocol, stamped, times_us, width_in)
-    axes.set_yticks([0, 1], [f"target {pair[1]}", f"initiator {pair[0]}"], rotation=90 if narrow else 0, va="center")
+    _draw_messages(axes, scenario, protocol, stamps_us)
+    _draw_spans(axes, protocol, stamps_us, width_in)
+    names = [f"{side} {tag}" for side, tag in zip(("initiator", "target"), scenario.pairs()[0], strict=True)]
+    axes.set_yticks([1, 0], names, rotation=90 if narrow else 0, va="center")
     marker = "marker" if narrow else "ranging marker"
     axes.set(ylim=(-0.8, 1.8), xlabel=f"time since the poll's {marker} (µs)")
     axes.set_title(protocol.title, loc="left")
@@ -193,13 +182,13 @@ def timing(width_in: float, scenario: Scenario, name: str) -> Figure:
     return figure
 
 
-def _draw_messages(axes: Axes, scenario: Scenario, protocol: RangingProtocol, times_us: list[float]) -> None:
-    """Draw each message on the lane of who sends it (initiator 1, target 0), and its stamps on both lanes."""
+def _draw_messages(axes: Axes, scenario: Scenario, protocol: RangingProtocol, stamps_us: Mapping[str, float]) -> None:
+    """Draw each message on the lane of its sender (initiator 1, target 0), and its stamps on both lanes."""
     before = before_marker_s(scenario.radio.preamble_symbols) * 1e6
-    for k, (message, size, at_us) in enumerate(zip(protocol.messages, message_bytes(protocol), times_us, strict=True)):
-        y = 1.0 if message.sender == "initiator" else 0.0
-        axes.add_patch(Rectangle((at_us - before, y - 0.09), before, 0.18, fc=SERIES[k], alpha=0.35))
-        axes.add_patch(Rectangle((at_us, y - 0.09), after_marker_s(size) * 1e6, 0.18, fc=SERIES[k], alpha=0.9))
+    for k, (message, size) in enumerate(zip(protocol.messages, message_bytes(protocol), strict=True)):
+        y, at_us = 1.0 if message.sender == "initiator" else 0.0, stamps_us[f"tx{k + 1}"]
+        parts = [(at_us - before, before), (at_us, after_marker_s(size) * 1e6)]
+        axes.broken_barh(parts, (y - 0.09, 0.18), facecolors=[(SERIES[k], 0.35), (SERIES[k], 0.9)])
         arrow: dict[str, Any] = {"arrowstyle": "->", "color": SERIES[k], "lw": 1.2}
         axes.annotate("", (at_us, 1.0 - y), (at_us, y), arrowprops=arrow)
         for level, text in ((y, f"tx{k + 1} (t{2 * k + 1})"), (1.0 - y, f"rx{k + 1} (t{2 * k + 2})")):
@@ -209,9 +198,7 @@ def _draw_messages(axes: Axes, scenario: Scenario, protocol: RangingProtocol, ti
             axes.annotate(text, (at_us, level), (0, away), textcoords="offset points", **upright)
 
 
-def _draw_spans(
-    axes: Axes, protocol: RangingProtocol, stamped: Stamped, times_us: list[float], width_in: float
-) -> None:
+def _draw_spans(axes: Axes, protocol: RangingProtocol, stamps_us: Mapping[str, float], width_in: float) -> None:
     """Draw the intervals a time of flight is made of between the lanes, with name and length.
 
     dt53 is the third leg as its sender has it, dt64 as its receiver.
@@ -219,29 +206,15 @@ def _draw_spans(
     for name, (second, first) in interval_stamps(protocol).items():
         # The initiator's intervals stand above.
         sends = protocol.messages[int(first[2]) - 1].sender == "initiator"
-        above = sends == first.startswith("tx")
-        length_us = (int(stamped.stamps[second][0]) - int(stamped.stamps[first][0])) * TICK_S * 1e6
-        left, right = (times_us[int(end[-1]) - 1] for end in (first, second))
+        above, left, right = sends == first.startswith("tx"), stamps_us[first], stamps_us[second]
         level = 0.62 if above else 0.38
         axes.annotate("", (right, level), (left, level), arrowprops={"arrowstyle": "<->", "color": MUTED, "lw": 0.7})
-        text = f"{name} = {length_us:.1f} µs"
-        if (right - left) / (max(times_us) - min(times_us)) * (width_in - 1.2) < 0.074 * len(text):
+        text = f"{name} = {right - left:.1f} µs"
+        if (right - left) / max(stamps_us.values()) * (width_in - 1.2) < 0.074 * len(text):
             text = name
         place, away = ((left + right) / 2, level), (0, 1.5 if above else -1.5)
         upright: dict[str, Any] = {"ha": "center", "va": "bottom" if above else "top", "color": INK}
         axes.annotate(text, place, away, textcoords="offset points", **upright)
-
-
-def _one_exchange(scenario: Scenario, protocol: RangingProtocol) -> tuple[Stamped, tuple[int, int]]:
-    """Return an exchange of the first pair without noise, and the pair."""
-    first, second = scenario.pairs()[0]
-    place = {tag.id: k for k, tag in enumerate(scenario.tags)}
-    zeros = np.zeros((len(protocol.messages), 1))
-    reply = stream(scenario.run.seed, "timing diagram")
-    draws = Draws(zeros, zeros, draw_reply_s(scenario, reply, 1), np.zeros(1))
-    start = np.array([SUBTICKS_PER_SECOND // 100])
-    begun = Schedule(start, np.array([place[first]]), np.array([place[second]]), np.zeros(1, dtype=np.int64))
-    return stamp(Medium(scenario, World(scenario)), protocol, begun, draws), (first, second)
 
 
 def result_over_keys(

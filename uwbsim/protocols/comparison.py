@@ -269,21 +269,12 @@ def over_state(
     """Return the error over a property of the states, `values` (states,), from `errors` of ranges in these in turn."""
     # Range k has the state k modulo their number: of few ranges some states have none.
     values = values[: len(errors)]
-    groups = min(groups, len(values))
-    prediction, place = predict(protocol, conditions), np.empty(len(values), dtype=np.int64)
-    states = np.array_split(np.argsort(values), groups)
-    for k, rows in enumerate(states):
-        place[rows] = k
-    group = np.resize(place, len(errors))
-    ranges = [errors[group == k] for k in range(groups)]
-    means = [prediction.mean_m[rows].mean() for rows in states]
-    variances = [prediction.variance_m2[rows].mean() + prediction.mean_m[rows].var() for rows in states]
-    columns = (
-        [np.median(values[rows]) for rows in states],
-        [part.mean() for part in ranges],
-        [part.std() for part in ranges],
-    )
-    return ErrorCurve(*(np.array(column) for column in (*columns, means, np.sqrt(variances))))
+    rows = []
+    for states in np.array_split(np.argsort(values), min(groups, len(values))):
+        own = errors[np.isin(np.arange(len(errors)) % len(values), states)]
+        bias, variance = predict(protocol, conditions[states]).pooled()
+        rows.append((np.median(values[states]), own.mean(), own.std(), bias, np.sqrt(variance)))
+    return ErrorCurve(*np.array(rows).T)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -315,8 +306,7 @@ class Optimum:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `uwbsim optimum --json` prints."""
-        document = asdict(self)
-        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in document.items()}
+        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
 
 
 def optimum(scenario: Scenario | Source, protocol: str | RangingProtocol = "ds", overhead_s: float = 0.0) -> Optimum:

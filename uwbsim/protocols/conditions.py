@@ -27,7 +27,7 @@ from uwbsim.simulation.air import schedule
 from uwbsim.simulation.timestamps import draw_reply_s
 from uwbsim.world.clocks import RATE_SPAN_S, SUBTICKS_PER_SECOND, WALK_STEP_S, Clocks
 from uwbsim.world.radio import carrier_bias_ppm
-from uwbsim.world.reception import AntennaDelays, arrive
+from uwbsim.world.reception import AntennaDelays, stamp_errors_s
 from uwbsim.world.world import World
 
 SIDES: Final = ("initiator", "target")
@@ -175,10 +175,10 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
     link = world.link(i, j, start)
     step_s = 1e-3  # over which the speed along the line between two tags is measured
     later = world.link(i, j, start + round(step_s * SUBTICKS_PER_SECOND))
-    arrivals, back = [arrive(radio, link)], link
+    errors_s, back = [stamp_errors_s(radio, link)], link
     if any(tag.tx_power_db for tag in scenario.tags):
         back = world.link(j, i, start)
-        arrivals.append(arrive(radio, back))
+        errors_s.append(stamp_errors_s(radio, back))
     delays = AntennaDelays.of(scenario)
     white = np.array([(tag.white_ppm_sqrt_s * 1e-6) for tag in scenario.tags])
     share, mean_m = radio.independent_multipath
@@ -193,8 +193,8 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
         drift_target=nothing,
         white_initiator=white[i],
         white_target=white[j],
-        late=np.mean([arrival.bias_s for arrival in arrivals], axis=0),
-        rx_std=np.sqrt(np.mean([arrival.std_s**2 for arrival in arrivals], axis=0)),
+        late=np.mean([bias for bias, _ in errors_s], axis=0),
+        rx_std=np.sqrt(np.mean([std**2 for _, std in errors_s], axis=0)),
         tx_std=np.full(len(rows), (radio.tx_noise_ps * 1e-12)),
         tx_delay_initiator=delays.transmit_s(i, start),
         rx_delay_initiator=delays.receive_s(i, start),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -132,21 +132,16 @@ class State:
     whole_ticks: bool = False
 
 
-LEAST: Final = {
-    **dict.fromkeys(("reply_delay_us", "distance_m", "tx_noise_ps", "rx_noise_ps", "carrier_noise_ppm"), 0.0),
-    "final_delay_us": 1.0,
-}
-"""Least values of a state; a third message that follows at once would not tell the clocks' rates."""
-
-
 def _check(q: State) -> None:
+    """Raise `ParameterError` for a value of a state that is out of range."""
+    lows = dict.fromkeys(("reply_delay_us", "distance_m", "tx_noise_ps", "rx_noise_ps", "carrier_noise_ppm"), 0.0)
+    lows["final_delay_us"] = 1.0  # a third message that follows at once would not tell the clocks' rates
     for name, value in asdict(q).items():
         if name in ("protocol", "whole_ticks") or value is None:
             continue
         if not isinstance(value, int | float) or not abs(value) < 1e9:
             raise ParameterError(f"found {value}, expected a number below 1e+09", parameter=name)
-        least = LEAST.get(name, -math.inf)
-        if value < least:
+        if value < (least := lows.get(name, -math.inf)):
             raise ParameterError(f"found {value:g}, expected {least:g} or more", parameter=name)
 
 

@@ -8,50 +8,42 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache
 from itertools import pairwise
-from typing import Annotated, Any, Final, NamedTuple, Self
+from typing import Annotated, Any, Final, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-
-class Limit(NamedTuple):
-    """The largest absolute value, and why."""
-
-    most: float
-    reason: str
-
-
 BY_UNIT: Final = {
-    "_per_k": Limit(1e4, "effects of a kelvin are far smaller"),
-    "_per_v": Limit(1e4, "effects of a volt are far smaller"),
-    "_mps2": Limit(1e5, "bodies accelerate far less"),
-    "_dps": Limit(1e4, "bodies turn far more slowly"),
-    "_dps_per_sqrt_hz": Limit(1e3, "sensors have far less noise"),
-    "_mps2_per_sqrt_hz": Limit(1e3, "sensors have far less noise"),
-    "_mps": Limit(1e4, "bodies are far slower"),
-    "_dbm": Limit(500.0, "powers of radios are far smaller"),
-    "_db": Limit(500.0, "differences of powers are far smaller"),
-    "_ppm": Limit(1e4, "a crystal is good to some 20 ppm"),
-    "_ppm_per_s": Limit(1e4, "a crystal is good to some 20 ppm"),
-    "_ppm_per_sqrt_s": Limit(1e4, "a crystal is good to some 20 ppm"),
-    "_ppm_sqrt_s": Limit(1e4, "a crystal is good to some 20 ppm"),
-    "_hz": Limit(1e6, "a frame lasts longer than the interval"),
-    "_ns": Limit(1e6, "an antenna delays by less than a microsecond"),
-    "_ps": Limit(1e6, "a receiver times first paths to some nanoseconds"),
-    "_m": Limit(1e6, "the radio reaches some hundred metres"),
-    "_rad": Limit(1e3, "a full turn is 6.3"),
-    "_deg": Limit(1e6, "a full turn is 360"),
-    "_s": Limit(1e7, "time is simulated for 36 hours"),
-    "_ms": Limit(1e9, "time is simulated for 36 hours"),
-    "_c": Limit(1e3, "boards melt at lower temperatures"),
-    "_v": Limit(1e3, "boards take 3.6 V"),
-    "": Limit(1e6, "settings are far smaller"),
+    "_per_k": (1e4, "effects of a kelvin are far smaller"),
+    "_per_v": (1e4, "effects of a volt are far smaller"),
+    "_mps2": (1e5, "bodies accelerate far less"),
+    "_dps": (1e4, "bodies turn far more slowly"),
+    "_dps_per_sqrt_hz": (1e3, "sensors have far less noise"),
+    "_mps2_per_sqrt_hz": (1e3, "sensors have far less noise"),
+    "_mps": (1e4, "bodies are far slower"),
+    "_dbm": (500.0, "powers of radios are far smaller"),
+    "_db": (500.0, "differences of powers are far smaller"),
+    "_ppm": (1e4, "a crystal is good to some 20 ppm"),
+    "_ppm_per_s": (1e4, "a crystal is good to some 20 ppm"),
+    "_ppm_per_sqrt_s": (1e4, "a crystal is good to some 20 ppm"),
+    "_ppm_sqrt_s": (1e4, "a crystal is good to some 20 ppm"),
+    "_hz": (1e6, "a frame lasts longer than the interval"),
+    "_ns": (1e6, "an antenna delays by less than a microsecond"),
+    "_ps": (1e6, "a receiver times first paths to some nanoseconds"),
+    "_m": (1e6, "the radio reaches some hundred metres"),
+    "_rad": (1e3, "a full turn is 6.3"),
+    "_deg": (1e6, "a full turn is 360"),
+    "_s": (1e7, "time is simulated for 36 hours"),
+    "_ms": (1e9, "time is simulated for 36 hours"),
+    "_c": (1e3, "boards melt at lower temperatures"),
+    "_v": (1e3, "boards take 3.6 V"),
+    "": (1e6, "settings are far smaller"),
 }
-"""Limits by the unit at the end of a key: beyond what physics and the chip allow."""
+"""The largest absolute value by the unit at the end of a key, beyond what physics and the chip allow, and why."""
 
 
 @cache
-def limit_of(key: str) -> Limit:
-    """Return the limit of a key by the unit that it ends with."""
+def limit_of(key: str) -> tuple[float, str]:
+    """Return the limit of a key by the unit that it ends with, and the reason."""
     fitting = [unit for unit in BY_UNIT if key.endswith(unit)]
     return BY_UNIT[max(fitting, key=len)]
 
@@ -61,9 +53,9 @@ def check_limits(key: str, value: Any) -> None:
     if isinstance(value, tuple):
         for one in value:
             check_limits(key, one)
-    elif isinstance(value, int | float) and abs(value) > limit_of(key).most:
-        limit, shown = limit_of(key), f"{value:g}" if value < 1e300 else "a number of hundreds of digits"
-        raise ValueError(f"{key}: found {shown}, at most {limit.most:g} is allowed ({limit.reason})")
+    elif isinstance(value, int | float) and abs(value) > limit_of(key)[0]:
+        (most, reason), shown = limit_of(key), f"{value:g}" if value < 1e300 else "a number of hundreds of digits"
+        raise ValueError(f"{key}: found {shown}, at most {most:g} is allowed ({reason})")
 
 
 def _increasing(values: Sequence[float]) -> Sequence[float]:
@@ -95,11 +87,11 @@ def _limits_in_schema(schema: dict[str, Any]) -> None:
             continue
         for choice in (described, *described.get("anyOf", ())):
             if choice.get("type") in ("number", "integer"):
-                limit = limit_of(key)
+                most, _ = limit_of(key)
                 if not {"minimum", "exclusiveMinimum"} & choice.keys():
-                    choice["minimum"] = -limit.most
+                    choice["minimum"] = -most
                 if "exclusiveMaximum" not in choice:
-                    choice.setdefault("maximum", limit.most)
+                    choice.setdefault("maximum", most)
 
 
 class Section(BaseModel):

@@ -29,10 +29,9 @@ from uwbsim.scenario.model import Scenario
 from uwbsim.simulation import air
 from uwbsim.simulation.air import Schedule
 from uwbsim.tables import in_time_order
-from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS
+from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, Link
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.impulse_response import INDEX_STEPS, impulse_response
-from uwbsim.world.links import Link
 from uwbsim.world.reception import Frames, Medium
 from uwbsim.world.world import World
 

@@ -169,7 +169,12 @@ def load_design(path: str | os.PathLike[str], *, allow_files: Folders = ()) -> S
     text = read_text(path, ScenarioError, "file of a sweep (.toml)")
     file = validated(SweepFile, parse_toml(text, path), path)
     settings = file.sweep
-    scenario = _scenario(path, settings.scenario, folders)
+    scenario, shipped = path.parent / settings.scenario, shipped_scenarios()
+    name = settings.scenario.removesuffix(".toml")
+    if name in shipped and not scenario.exists():
+        scenario = shipped[name]
+    else:
+        check_linked(scenario, f"{path}: sweep.scenario: found {settings.scenario!r}", path.parent, folders)
     known = read_text(scenario, ScenarioError, "scenario file (.toml)")
     axes, rows = _points(path, file)
     seeds = settings.seeds
@@ -189,13 +194,6 @@ def load_design(path: str | os.PathLike[str], *, allow_files: Folders = ()) -> S
         raise ScenarioError(f"{path}: {plan.total} runs are too many, at most {MOST_RUNS}")
     _check_keys(plan)
     return plan
-
-
-def _scenario(path: Path, name: str, folders: Folders) -> Path:
-    beside, shipped = path.parent / name, shipped_scenarios().get(name.removesuffix(".toml"))
-    if shipped is not None and not beside.exists():
-        return shipped
-    return check_linked(beside, f"{path}: sweep.scenario: found {name!r}", path.parent, folders)
 
 
 def _points(path: Path, file: SweepFile) -> tuple[dict[str, list[Any]], list[dict[str, Any]] | None]:

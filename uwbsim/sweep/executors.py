@@ -14,7 +14,7 @@ import platform
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     CancelledError,
@@ -24,7 +24,7 @@ from concurrent.futures import (
     wait,
 )
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -37,6 +37,7 @@ from threadpoolctl import threadpool_limits
 
 import uwblink
 from uwblink.errors import UwblinkError
+from uwblink.output import interrupts_held
 from uwblink.protocols.table import PROTOCOLS, RangingProtocol, register_protocol
 from uwbsim.errors import ParameterError, UwbsimError
 from uwbsim.protocols.comparison import compare
@@ -217,7 +218,7 @@ class Processes(Workers):
         held, self._held = context.Pipe(duplex=False)
         pool = ProcessPoolExecutor(self.size, context, initializer=_end_with, initargs=(held,))
         try:
-            with _interrupts_blocked():
+            with interrupts_held():  # workers inherit this: a terminal sends Ctrl-C to all, and this process handles it
                 list(pool.map(abs, range(self.size)))
         except BrokenProcessPool as error:
             self._held.close()
@@ -228,13 +229,12 @@ class Processes(Workers):
         return pool
 
     def submit(self, chunk: Chunk) -> None:
-        """Submit a chunk; a process may be started for it."""
-        with _interrupts_blocked():
-            try:
-                super().submit(chunk)
-            except BrokenProcessPool:
-                self._pool = self._start_pool()
-                super().submit(chunk)
+        """Submit a chunk, to new processes if one has died."""
+        try:
+            super().submit(chunk)
+        except BrokenProcessPool:
+            self._pool = self._start_pool()
+            super().submit(chunk)
 
     def close(self) -> None:
         """End the processes, without waiting for running chunks."""
@@ -298,7 +298,9 @@ def workers_for(count: int | None, scheduler: str | None, work: Work) -> Workers
 
 
 def _end_with(held: Connection) -> None:
-    """End this process when the other end of a pipe is closed, by its holder or with it."""
+    """End this process when the other end of a pipe is closed, by its holder or with it, or when it is told to."""
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
 
     def wait_for_end() -> None:
         with suppress(EOFError, OSError):
@@ -306,16 +308,3 @@ def _end_with(held: Connection) -> None:
         os._exit(1)
 
     Thread(target=wait_for_end, daemon=True).start()
-
-
-@contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C, which a terminal sends to all of them; this process handles it."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)

@@ -189,18 +189,29 @@ TABLES: Final = {
 }
 
 
+@dataclass(frozen=True, slots=True)
 class Store:
     """Results by number of run, committed as they come: a killed sweep loses only results not yet committed."""
 
-    def __init__(self, connection: Any, path: Path) -> None:
-        """Wrap an open database; use `open`."""
-        self._db, self._path = connection, path
+    _db: Any
+    _path: Path
 
     @classmethod
-    def open(cls, path: Path, identity: Mapping[str, Any] | None = None) -> Self:
+    @contextmanager
+    def open(cls, path: Path, identity: Mapping[str, Any] | None = None) -> Iterator[Self]:
         """Open a store, or make one for the sweep with this identity; raises `TableError` if it is no store."""
-        db = _connect(path)
+        if not is_utf8(path):
+            raise TableError(f"{path}: its name and those of its folders must be UTF-8; give another one")
+        if path.is_symlink():
+            raise TableError(f"{path}: is a link; give the folder in which the sweep was begun")
         try:
+            db = connect(path)
+        except duckdb.Error as error:
+            locked = "lock" in first_line(error)
+            reason = f"cannot be opened ({first_line(error)})"
+            other = "another sweep writes its results there; give another folder"
+            raise TableError(f"{path}: {other if locked else reason}") from error
+        with db:
             with _reading(path):
                 check_tables(lambda query: db.execute(query).fetchall(), path, path.stat().st_size, TABLES)
                 asked = "SELECT table_name, column_name FROM system.main.duckdb_columns() WHERE NOT internal"
@@ -208,29 +219,18 @@ class Store:
             # A sweep killed at its start leaves a file without tables.
             if identity is not None and not found:
                 with _writing(path):
-                    cls._make(db, identity)
+                    db.execute("BEGIN")
+                    for table, columns in TABLES.items():
+                        db.execute(
+                            f"CREATE TABLE {table} ({', '.join(f'{name} {kind}' for name, kind in columns.items())})"
+                        )
+                    db.executemany(
+                        "INSERT INTO identity VALUES (?, ?)", [[k, json.dumps(v)] for k, v in identity.items()]
+                    )
+                    db.execute("COMMIT")
             elif not {(table, column) for table, columns in TABLES.items() for column in columns} <= found:
                 raise TableError(f"{path}: not a store of results")
-        except UwblinkError:
-            db.close()
-            raise
-        return cls(db, path)
-
-    @staticmethod
-    def _make(db: Any, identity: Mapping[str, Any]) -> None:
-        db.execute("BEGIN")
-        for table, columns in TABLES.items():
-            db.execute(f"CREATE TABLE {table} ({', '.join(f'{name} {kind}' for name, kind in columns.items())})")
-        db.executemany("INSERT INTO identity VALUES (?, ?)", [[k, json.dumps(v)] for k, v in identity.items()])
-        db.execute("COMMIT")
-
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close the store."""
-        self._db.close()
+            yield cls(db, path)
 
     def identity(self) -> dict[str, Any]:
         """Return the identity of the sweep whose results it holds."""
@@ -262,20 +262,6 @@ class Store:
                     if row.get("number") != number:
                         raise ValueError(f"the row of run {number} is not a result")
                     yield row
-
-
-def _connect(path: Path) -> Any:
-    if not is_utf8(path):
-        raise TableError(f"{path}: its name and those of its folders must be UTF-8; give another one")
-    if path.is_symlink():
-        raise TableError(f"{path}: is a link; give the folder in which the sweep was begun")
-    try:
-        return connect(path)
-    except duckdb.Error as error:
-        reason = f"cannot be opened ({first_line(error)})"
-        if "lock" in reason:
-            reason = "another sweep writes its results there; give another folder"
-        raise TableError(f"{path}: {reason}") from error
 
 
 @contextmanager

@@ -138,7 +138,7 @@ class _Search:
         return np.asarray(np.sqrt((variance + steps.mean()) / self.knots / self.step_s))
 
     def warmed_up(self) -> float:
-        """Return how much more than its walk does meanwhile the clock that warms up most does, from all others."""
+        """Return the largest warm-up of a clock, less the median of all, in units of what its walk does meanwhile."""
         warm = self.found[self.tags * self.knots : -2]
         return float(np.max(np.abs(warm - np.median(warm)) / (self.walk * np.sqrt(self.decay_s or 1.0))))
 

@@ -224,10 +224,8 @@ class Twin:
 
     def files(self, output: str | os.PathLike[str]) -> tuple[Path, ...]:
         """Return the names of what `save` writes: the scenario, and beside it its poses and its plan where needed."""
-        path = Path(output)
-        poses = [path.with_suffix(".poses.uwb")] if self.paths else []
-        plan = [path.with_suffix(".plan.csv")] if "plan" in self.table["ranging"] else []
-        return (path, *poses, *plan)
+        path, parts = Path(output), {".poses.uwb": self.paths, ".plan.csv": self.table["ranging"].get("plan")}
+        return (path, *(path.with_suffix(suffix) for suffix, part in parts.items() if part))
 
     def save(self, output: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write the scenario (.toml) and what it names; raises what `check_output` raises, with nothing written."""

@@ -194,9 +194,9 @@ class Flight:
         )
 
     def some(self, most: int) -> Ints:
-        """Return rows of `most` exchanges, all where there are no more: blocks all over the flight.
+        """Return the rows of at most `most` exchanges, in blocks that are spread evenly over the flight.
 
-        What comes soon after one another stays together, so that short lags stay.
+        Within a block exchanges are consecutive, so that short lags are kept.
         """
         if len(self) <= most:
             return np.arange(len(self))

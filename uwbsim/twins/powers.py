@@ -75,7 +75,7 @@ def fit_powers(flight: Flight, reflected: Floats) -> PowerFit:
         # Detours shorter than the noise of ranges show in powers.
         reflected = _by_power(solved, reflected)
         solved = _solve(flight, power, reflected, best.antenna, rounds=5, scale_db2=scale_db2)
-    # Where a tag was seen from one side only, its antenna can take its offsets over; towards there they count together.
+    # The pattern of a tag that ranges in one direction only may contain its offsets: there both are added.
     seen = _mean_gains(flight, solved.pattern_db)
     level, own, tx, offset = _split(*(solved.tags_db + seen))
     fading, loss_std = _common(solved, reflected)
@@ -132,9 +132,9 @@ def _solve(
 ) -> _Solved:
     """Solve one penalized least-squares problem: two readings an exchange, weighed anew in each of the rounds.
 
-    `scale_db2` is the variance in dB^2 with which a reading tells something of an antenna. Offsets of tags are thought
-    to differ by 4 dB before anything is seen, harmonics of degree 1 of an antenna by 2 dB, and higher ones as much less
-    as their degree. Degrees are those that a tag's readings can tell.
+    `scale_db2` is the variance in dB^2 of a reading about the gain of an antenna. The priors have a mean of zero and
+    standard deviations of 4 dB for offsets of tags, 2/k dB for harmonics of degree k of an antenna. The highest degree
+    is the one that the readings of a tag determine.
     """
     tags, each = len(flight.tags), 4 * len(flight) / len(flight.tags)
     degree = next((degree for least, degree in ((800, 3), (250, 2), (80, 1)) if each >= least), 0)
@@ -192,9 +192,9 @@ def _mean_gains(flight: Flight, pattern_db: Floats) -> Floats:
 def _split(sends_db: Floats, reads_db: Floats) -> tuple[float, Floats, Floats, Floats]:
     """Split what tags send and read too strong into the level of all, antenna, transmitter and receiver, (tags,) each.
 
-    What differs between the two directions is certain, but for a constant that all have in common: the median tag
-    differs by nothing. It is put on one of the two, on that which leaves less to the antenna, whose is what both have
-    in common.
+    The difference of the two directions is known but for a constant, which is chosen so that the median tag has no
+    difference. It is assigned to the transmitter or to the receiver, whichever leaves less to the antenna. The antenna
+    has what both directions have in common.
     """
     between, common = sends_db - reads_db, (sends_db + reads_db) / 2
     level = float(np.median(common))

@@ -95,8 +95,9 @@ class RangeErrors:
     `delays_ns` is what the flight adds to the delays of tags, by id. `direct_std_m` is the spread of direct ranges
     beyond the noise of receive stamps; `share` that of reflected ranges; `mean_excess_m` the mean of their detours and
     `excess_shape` the shape of a gamma distribution with their mean and variance. `pair_share`, `pair_excess_m` and
-    `pair_life_s` are those of pairs (pairs,), drawn towards all by how little each tells. `life_s` is None, and those
-    of pairs NaN, where the recording does not tell it. `reflected` (n,) is the probability that a range was reflected.
+    `pair_life_s` are those of pairs (pairs,), shrunk towards the mean of all pairs the more the less each determines.
+    `life_s` is None, and those of pairs NaN, where the recording does not determine it. `reflected` (n,) is the
+    probability that a range was reflected.
     """
 
     delays_ns: dict[int, float]
@@ -170,9 +171,9 @@ def fit_range_errors(flight: Flight, receive_noise_s: Floats) -> RangeErrors:
 
 
 def _lives(flight: Flight, reflected: Floats, life_s: float, share: Floats) -> Floats:
-    """Return the lives of pairs (pairs,), drawn towards that of all.
+    """Return the lives of pairs (pairs,), shrunk towards the life of all.
 
-    The logarithm of a life has the variance 2/spells; that between pairs is what theirs have beyond it.
+    The logarithm of a life has the variance 2/spells; the variance between pairs is what is observed beyond it.
     """
     spells = np.maximum(2 * share * (1 - share) * flight.time_s[-1] / life_s, 1e-9)
     off, told = np.zeros(len(share)), np.flatnonzero(spells >= 6)

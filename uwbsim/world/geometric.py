@@ -1,7 +1,7 @@
 """Impulse responses of links from geometry: direct path, reflections by faces, and scatterers.
 
-`Surroundings.paths` computes the paths of many links at once, `GeometricResponses.at` what receivers read from their
-responses. A pair has one response every few milliseconds, and all that ask for it get that of the nearest step.
+`GeometricResponses.paths` computes the paths of many links at once, and `at` what receivers read from their responses.
+A pair has one response every few milliseconds, and all that ask for it get that of the nearest step.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.bodies import Obstacle, properties
 from uwbsim.scenario.model import WAVELENGTH_M, Scenario
 from uwbsim.scenario.radio import GeometricMultipath
+from uwbsim.world.channel import Ends
 from uwbsim.world.diffraction import (
     AXIAL,
     WAVENUMBER,
@@ -32,7 +33,6 @@ from uwbsim.world.diffraction import (
     roughness_factor,
 )
 from uwbsim.world.impulse_response import Detected, Paths, detect
-from uwbsim.world.links import Ends
 from uwbsim.world.radio import NEAREST_PATH_M, antenna_gain_db, path_gain_db
 
 if TYPE_CHECKING:
@@ -40,16 +40,6 @@ if TYPE_CHECKING:
 
 CELLS: Final = 128
 """Cells along a side of the table of an antenna's gains: a resolution of a degree."""
-
-MOST_KEPT: Final = 500_000
-"""Readings of responses that are kept, some 100 MB."""
-
-
-FEW: Final = 100
-"""A call for no more new responses than these comes from a served board, which asks for the next step soon."""
-
-AHEAD: Final = 16
-"""Steps that are computed at once for such a call: together they take a third of the time."""
 
 
 def antenna_tables(scenario: Scenario, phases: Floats) -> Floats:
@@ -119,17 +109,76 @@ def free_space_field(scenario: Scenario, length: Floats) -> Floats:
     return np.asarray(10 ** (path_gain_db(radio, length) / 20))
 
 
-class Surroundings:
-    """What paths depend on in a world: the faces, the scatterers, and the gains of the antennas by direction."""
+def _phasors(length: Floats) -> Complexes:
+    """Return the phase factors of the carrier after path lengths, to single precision, which is much faster."""
+    turns = length / WAVELENGTH_M
+    angle = (-2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
+    turned = np.empty(length.shape, dtype=np.complex128)
+    turned.real, turned.imag = np.cos(angle), np.sin(angle)
+    return turned
+
+
+def _inside_boxes(boxes: Sequence[Obstacle], a: Floats, b: Floats) -> tuple[Floats, Floats]:
+    """Return loss in dB and excess length in metres of paths through each box, (n, boxes) each.
+
+    A path close to an edge goes through the least thickness of the box.
+    """
+    thinnest = np.array([min(hi - lo for lo, hi in zip(box.min_m, box.max_m, strict=True)) for box in boxes])
+    chords = np.maximum(box_chords_m(boxes, a, b), thinnest)
+    loss, index = np.array([properties(box.material) for box in boxes]).T
+    return chords * loss, chords * (index - 1)
+
+
+class GeometricResponses:
+    """The paths of a world's pairs of tags, and what receivers read from their responses; computed readings are kept.
+
+    Both directions of a pair have one response, unless the tags' powers differ, which changes detection.
+    """
 
     def __init__(self, world: World, model: GeometricMultipath) -> None:
-        """Collect the faces, draw the scatterers, tabulate the antennas."""
-        self.scenario, self.phases = world.scenario, world.phases
+        """Collect the faces, draw the scatterers, tabulate the antennas; responses are computed when asked for."""
+        self.world, self.model, self.scenario = world, model, world.scenario
         self.mirrors = Mirrors.of(world.scenario)
         self.scatterers = Scatterers.of(world.scenario, model)
         self.tables = antenna_tables(world.scenario, world.phases)
+        self._known: dict[int, list[float]] = {}
 
-    def paths(self, ends: Ends) -> Paths:
+    def at(self, places: tuple[Ints, Ints], time_s: Floats) -> Detected:
+        """Return the readings of the responses between tags with indices (n,) at true times (n,)."""
+        keys = self._key(places, time_s).tolist()
+        if len(self._known) > 500_000:  # some 100 MB
+            self._known.clear()
+        missing = set(keys).difference(self._known)
+        # Few new responses are asked for by served boards, which soon ask for the next steps, too: 16 of them at once
+        # take a third of the time.
+        if len(missing) <= 100:
+            step = len(self.scenario.tags) ** 2
+            missing = {key + step * k for key in missing for k in range(16)}.difference(self._known)
+        if missing:
+            noise_share = 1 / self.model.threshold_to_noise if self.model.stamp_noise else 0.0
+            read = detect(self._paths(np.array([*missing])), self.scenario.radio, noise_share)
+            columns = (read.excess_m, read.power_dbm, read.total_dbm, read.noise_s)
+            self._known.update(zip(missing, np.column_stack(columns).tolist(), strict=True))
+        return Detected(*np.array([self._known[key] for key in keys]).reshape(-1, 4).T)
+
+    def paths(self, places: tuple[Ints, Ints], time_s: Floats) -> Paths:
+        """Return the paths between tags with indices (n,) at the steps nearest to true times (n,)."""
+        return self._paths(self._key(places, time_s))
+
+    def _key(self, places: tuple[Ints, Ints], time_s: Floats) -> Ints:
+        """Return one number for step, sender and receiver, increasing with time."""
+        (a, b), tags = places, self.scenario.tags
+        if not any(tag.tx_power_db for tag in tags):
+            a, b = np.minimum(a, b), np.maximum(a, b)
+        step = np.rint(np.maximum(time_s, 0) / (self.model.step_ms * 1e-3)).astype(np.int64)
+        return (step * len(tags) + a) * len(tags) + b
+
+    def _paths(self, keys: Ints) -> Paths:
+        pair_step, b = np.divmod(keys, len(self.scenario.tags))
+        step, a = np.divmod(pair_step, len(self.scenario.tags))
+        return self.paths_between(self.world.ends((a, b), step * (self.model.step_ms * 1e-3)))
+
+    def paths_between(self, ends: Ends) -> Paths:
         """Return all paths of n links."""
         parts = [self._direct(ends), self._mirrored(ends), self._scattered(ends)]
         length, field = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
@@ -167,7 +216,7 @@ class Surroundings:
         field = free_space_field(scenario, distance) * self._polarisation_match(ends, towards)
         for tag, rotation, way in zip(ends.places, ends.rotations, (towards, -towards), strict=True):
             own = np.einsum("nj,njk->nk", way, rotation)
-            field = field * 10 ** (antenna_gain_db(scenario, self.phases, tag, own) / 20)
+            field = field * 10 ** (antenna_gain_db(scenario, self.world.phases, tag, own) / 20)
         for placed in ends.shadows:
             field = field * placed.gain(np.arange(len(field)), a, b)
         if not scenario.obstacles:
@@ -229,68 +278,3 @@ class Surroundings:
         match = np.where(size < AXIAL, 1.0, match)
         # Chosen: cross-polarised antennas are coupled by a tenth of the field, -20 dB.
         return np.copysign(np.maximum(np.abs(match), 0.1), match)
-
-
-def _phasors(length: Floats) -> Complexes:
-    """Return the phase factors of the carrier after path lengths, to single precision, which is much faster."""
-    turns = length / WAVELENGTH_M
-    angle = (-2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
-    turned = np.empty(length.shape, dtype=np.complex128)
-    turned.real, turned.imag = np.cos(angle), np.sin(angle)
-    return turned
-
-
-def _inside_boxes(boxes: Sequence[Obstacle], a: Floats, b: Floats) -> tuple[Floats, Floats]:
-    """Return loss in dB and excess length in metres of paths through each box, (n, boxes) each.
-
-    A path close to an edge goes through the least thickness of the box.
-    """
-    thinnest = np.array([min(hi - lo for lo, hi in zip(box.min_m, box.max_m, strict=True)) for box in boxes])
-    chords = np.maximum(box_chords_m(boxes, a, b), thinnest)
-    loss, index = np.array([properties(box.material) for box in boxes]).T
-    return chords * loss, chords * (index - 1)
-
-
-class GeometricResponses:
-    """What receivers read from the responses of a world's pairs of tags; computed readings are kept.
-
-    Both directions of a pair have one response, unless the tags' powers differ, which changes detection.
-    """
-
-    def __init__(self, world: World, model: GeometricMultipath) -> None:
-        """Collect the surroundings; responses are computed when they are asked for."""
-        self.world, self.model, self.around = world, model, Surroundings(world, model)
-        self._known: dict[int, list[float]] = {}
-
-    def at(self, places: tuple[Ints, Ints], time_s: Floats) -> Detected:
-        """Return the readings of the responses between tags with indices (n,) at true times (n,)."""
-        keys = self._key(places, time_s).tolist()
-        if len(self._known) > MOST_KEPT:
-            self._known.clear()
-        missing = set(keys).difference(self._known)
-        if len(missing) <= FEW:
-            step = len(self.world.scenario.tags) ** 2
-            missing = {key + step * k for key in missing for k in range(AHEAD)}.difference(self._known)
-        if missing:
-            noise_share = 1 / self.model.threshold_to_noise if self.model.stamp_noise else 0.0
-            read = detect(self._paths(np.array([*missing])), self.world.scenario.radio, noise_share)
-            columns = (read.excess_m, read.power_dbm, read.total_dbm, read.noise_s)
-            self._known.update(zip(missing, np.column_stack(columns).tolist(), strict=True))
-        return Detected(*np.array([self._known[key] for key in keys]).reshape(-1, 4).T)
-
-    def paths(self, places: tuple[Ints, Ints], time_s: Floats) -> Paths:
-        """Return the paths between tags with indices (n,) at the steps nearest to true times (n,)."""
-        return self._paths(self._key(places, time_s))
-
-    def _key(self, places: tuple[Ints, Ints], time_s: Floats) -> Ints:
-        """Return one number for step, sender and receiver, increasing with time."""
-        (a, b), tags = places, self.world.scenario.tags
-        if not any(tag.tx_power_db for tag in tags):
-            a, b = np.minimum(a, b), np.maximum(a, b)
-        step = np.rint(np.maximum(time_s, 0) / (self.model.step_ms * 1e-3)).astype(np.int64)
-        return (step * len(tags) + a) * len(tags) + b
-
-    def _paths(self, keys: Ints) -> Paths:
-        pair_step, b = np.divmod(keys, len(self.world.scenario.tags))
-        step, a = np.divmod(pair_step, len(self.world.scenario.tags))
-        return self.around.paths(self.world.ends((a, b), step * (self.model.step_ms * 1e-3)))

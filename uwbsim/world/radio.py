@@ -19,9 +19,6 @@ from uwbsim.scenario.devices import GroupDelay, GroupDelayTable
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import AntennaTable, BiasTable, Radio, SigmaSpline, Spline
 
-ALPHA_DBM: Final = -82.0
-"""Powers are lifted relative to this: 10^((p - alpha)/10) (ICRA 2023, section IV)."""
-
 FPP_OFFSET_DB: Final = 121.74
 """DW1000 User Manual, section 4.7.1, for a pulse repetition frequency of 64 MHz."""
 
@@ -132,8 +129,8 @@ def path_gain_db(radio: Radio, distance_m: Floats) -> Floats:
 
 
 def lifted(power_dbm: Floats) -> Floats:
-    """Return lifted power 10^((p - alpha)/10) (ICRA 2023, section IV)."""
-    return np.asarray(10 ** ((power_dbm - ALPHA_DBM) / 10))
+    """Return lifted power 10^((p - alpha)/10) with alpha = -82 dBm (ICRA 2023, section IV)."""
+    return np.asarray(10 ** ((power_dbm + 82.0) / 10))
 
 
 SATURATION_SHARPNESS: Final = 1.5

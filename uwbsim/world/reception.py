@@ -1,7 +1,7 @@
 """Reception of frames: time of arrival, receive stamp, detection, and the readings that boards print.
 
 Simulated flights, served boards and passive listeners call `Medium.receive`. Comparisons of protocols need the
-distribution of an arrival instead of a draw: they call `arrive`, which `receive` uses, too.
+distribution of stamps instead of a draw: they call `stamp_errors_s`, which `receive` uses, too.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.devices import TX_SHARE
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Radio
+from uwbsim.world.channel import Link
 from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks, range_shift_m
-from uwbsim.world.links import Link
 from uwbsim.world.radio import (
     printed_power_dbm,
     printed_skew_ppm,
@@ -67,24 +67,12 @@ class AntennaDelays:
         return total
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Arrival:
-    """Arrival of n frames: seconds of flight, bias and standard deviation of their stamps, (n,) each."""
-
-    flight_s: Floats
-    bias_s: Floats
-    std_s: Floats
-
-
-def arrive(radio: Radio, link: Link) -> Arrival:
-    """Return flight time, stamp bias and stamp noise of frames on a link."""
+def stamp_errors_s(radio: Radio, link: Link) -> tuple[Floats, Floats]:
+    """Return bias and standard deviation of the receive stamps of frames on n links, in seconds, (n,) each."""
     seen_dbm = reported_dbm(radio, link.power_dbm)
     std_s = reception_noise_s(radio, seen_dbm)
-    return Arrival(
-        flight_s=(link.distance_m + link.excess_m) / SPEED_OF_LIGHT,
-        bias_s=reception_bias_s(radio, seen_dbm, link.total_dbm),
-        std_s=std_s if link.noise_s is None else np.hypot(std_s, link.noise_s),
-    )
+    bias_s = reception_bias_s(radio, seen_dbm, link.total_dbm)
+    return bias_s, std_s if link.noise_s is None else np.hypot(std_s, link.noise_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,13 +116,13 @@ class Medium:
         `noise` is standard normal, (n,), `detour_m` a random additional path length.
         """
         link = self.links.link(frames.sender, frames.receiver, frames.departure)
-        arrival = arrive(self.scenario.radio, link)
+        bias_s, std_s = stamp_errors_s(self.scenario.radio, link)
+        flight_s = (link.distance_m + link.excess_m) / SPEED_OF_LIGHT
         detour = np.asarray(detour_m) / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND
-        flight = np.rint(arrival.flight_s * SUBTICKS_PER_SECOND + detour).astype(np.int64)
-        late_s = arrival.bias_s + noise * arrival.std_s
+        flight = np.rint(flight_s * SUBTICKS_PER_SECOND + detour).astype(np.int64)
         arrives = frames.departure + flight
         delay = self.delays.receive_s(frames.receiver, arrives) * SUBTICKS_PER_SECOND
-        shift = np.rint(late_s * SUBTICKS_PER_SECOND + delay).astype(np.int64)
+        shift = np.rint((bias_s + noise * std_s) * SUBTICKS_PER_SECOND + delay).astype(np.int64)
         reading = self.clocks.read(frames.receiver, arrives)
         return (reading + shift + SUBTICKS // 2) // SUBTICKS, link
 

@@ -17,7 +17,9 @@ from uwbsim.scenario.devices import Body
 from uwbsim.scenario.model import Scenario
 from uwbsim.tables import Columns, in_time_order
 from uwbsim.world.clocks import NS_PER_S
-from uwbsim.world.pair_states import Draw
+
+Draw = Callable[[str], np.random.Generator]
+"""Returns the random stream of a body, or of a pair of tags, for a purpose."""
 
 
 @dataclass(frozen=True, slots=True)

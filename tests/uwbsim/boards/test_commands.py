@@ -47,6 +47,7 @@ def test_a_new_command_is_one_message_class_and_one_executor(voltage):
     ports = VirtualPorts(bench_scenario())
     assert Board(ports.port(2)).request(GetVoltage(2, "core")) == Voltage(2, 6.5, "core")
     assert Board(ports.port(1)).request(m.GetId()) == m.IdReport(1)
+    assert ports.transfers.maxlen == 20_000, "what boards sent long ago is not kept"
 
 
 def test_an_executor_may_take_its_time_and_may_fail(voltage):
@@ -68,12 +69,9 @@ def test_an_executor_may_take_its_time_and_may_fail(voltage):
     assert board.request(GetVoltage(5, "last")) == Voltage(1, 1.0, "last")
 
 
-def test_commands_that_cannot_be_registered():
+def test_commands_and_fields_that_boards_cannot_read_are_refused(monkeypatch):
     with pytest.raises(UwbsimError, match="GetVoltage: not a command that uwblink knows"):
         register_command(GetVoltage, lambda board: m.IdleSet())
-
-
-def test_fields_that_boards_cannot_read_are_refused(monkeypatch):
     monkeypatch.setitem(m.COMMANDS, b"R10", Voltage)
     with pytest.raises(UwbsimError, match=r"Voltage\.volts: boards read no printed number from the host; they read"):
         register_command(Voltage, lambda board: m.IdleSet())

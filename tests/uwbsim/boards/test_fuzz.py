@@ -1,4 +1,4 @@
-"""No byte from a client ends the bench or another board: thirty thousand commands, right, wrong and mangled."""
+"""No byte from a client ends the bench or another board: six thousand commands, right, wrong and mangled."""
 
 import random
 import struct
@@ -9,52 +9,23 @@ from uwblink.wire import messages as m
 from uwbsim.boards.frames import NS_PER_MS
 from uwbsim.boards.virtual_board import VirtualPorts
 
-COMMANDS = 30_000
-NUMBERS = (
-    b"0",
-    b"1",
-    b"2",
-    b"9",
-    b"255",
-    b"258",
-    b"-1",
-    b"65536",
-    b"2147483648",
-    b"9" * 40,
-    b"",
-    b"two",
-    b"1.5",
-    b"\xff",
-)
+COMMANDS = 6_000
+NUMBERS = [*(b"%d" % n for n in (0, 1, 2, 9, 255, 258, -1, 65536, 2**31)), b"9" * 40, b"", b"two", b"1.5", b"\xff"]
 FLOATS = (0.0, -0.0, 1.5, 1e10, -1e30, 3.4e38, 1e-40, float("nan"), float("inf"), -float("inf"))
 RANDOM_SHARE, MANGLED_SHARE, RANGE_SHARE = 0.1, 0.2, 0.03
 
 
-def counted(rng):
-    data = rng.randbytes(rng.choice((0, 1, 5, 40, 92, 93, 200)))
-    length = len(data) if rng.random() < 0.9 else rng.randrange(65_536)
-    return struct.pack("<H", length) + data
-
-
 def command(rng):
     """A command whose fields are of the right kinds, with values that nobody asked for."""
-    number = lambda: rng.choice(NUMBERS)  # noqa: E731 - a name for the table below
-    fields = {
-        0: (),
-        1: (),
-        2: (),
-        3: (number(), rng.randbytes(rng.randrange(8)), number(), struct.pack("<f", rng.choice(FLOATS)), counted(rng)),
-        4: (number(),),
-        6: (counted(rng),),
-        7: (),
-        8: (number(),),
-        9: (),
-        rng.randrange(10, 100): (number(),),
-    }
-    key = rng.choice(list(fields))
-    parts = fields[key]
+    numbers = [rng.choice(NUMBERS) for _ in range(4)]
+    data = rng.randbytes(rng.choice((0, 1, 5, 40, 92, 93, 200)))
+    counted = struct.pack("<H", len(data) if rng.random() < 0.9 else rng.randrange(65_536)) + data
+    tests = (numbers[0], rng.randbytes(rng.randrange(8)), numbers[1], struct.pack("<f", rng.choice(FLOATS)), counted)
+    fields = {0: (), 1: (), 2: (), 3: tests, 4: numbers[:1], 6: (counted,), 7: (), 8: numbers[:1], 9: ()}
+    key = rng.choice([*fields, rng.randrange(10, 100)])
+    parts = fields.get(key, numbers[:1])
     if rng.random() < RANGE_SHARE:
-        key, parts = 5, (number(), number(), number(), number())
+        key, parts = 5, numbers
     if rng.random() < 0.1:
         parts = parts[: rng.randrange(len(parts) + 1)]
     return b"C%02d" % key + b"".join(b"|" + part for part in parts) + b"\r"
@@ -92,5 +63,5 @@ def test_no_byte_ends_the_bench_or_another_board():
     victim.power_cycle()
     assert Board(ports.port(1)).request(m.GetId()) == m.IdReport(1)
     # Much of this kills a board, as it does a real one, and much is answered: the test reaches both.
-    assert deaths > 300
-    assert answers > 3_000
+    assert deaths > 60
+    assert answers > 600

@@ -5,26 +5,22 @@ import time
 import numpy as np
 import pytest
 
+import uwbsim
 from tests.boards import bench_scenario, served
 from uwblink.boards.board import Board
 from uwblink.importers.poses import read_poses
 from uwbsim.boards.server import LivePoses
-from uwbsim.scenario.model import Scenario
 from uwbsim.world.world import World
 
 EPOCH_NS = 1_700_000_000_000_000_000
 
 
 def flight(**mocap):
-    """Two tags, one of which circles within a minute."""
-    scenario = bench_scenario().model_dump(by_alias=True)
-    scenario["bodies"][0]["motion"] = {
-        "model": "random-flight",
-        "box_min_m": [-2.0, -2.0, 0.5],
-        "box_max_m": [2.0, 2.0, 2.0],
-        "speed_mps": 1.0,
-    }
-    return Scenario.model_validate(scenario | {"mocap": {"rate_hz": 120.0, **mocap}})
+    """Boards of which one flies."""
+    box = {"box_min_m": [-2.0, -2.0, 0.5], "box_max_m": [2.0, 2.0, 2.0]}
+    motion = {"model": "random-flight", "speed_mps": 1.0} | box
+    tables = bench_scenario().model_dump(by_alias=True) | {"mocap": {"rate_hz": 120.0, **mocap}}
+    return uwbsim.load(tables, {"bodies.0.motion": motion})
 
 
 def written(world, path, steps):
@@ -82,11 +78,12 @@ def test_poses_that_cannot_be_written_end_and_the_serving_goes_on(tmp_path):
     told: list[str] = []
     with served(flight(), tell=told.append) as server:
         server.write_poses(tmp_path / "p.csv")
-        server._poses._file.close()
-        server._poses._file = open("/dev/full", "w", encoding="utf-8")  # noqa: SIM115 - closed by the server
+        # The first file is closed after the serving, which may be writing to it now.
+        first, server._poses._file = server._poses._file, open("/dev/full", "w", encoding="utf-8")  # noqa: SIM115 - closed by the server
         for _ in range(100):
             with Board.open(server.names[2]) as board:
                 assert board.id == 2
             if told:
                 break
+    first.close()
     assert told == ["the poses end here: No space left on device"]

@@ -20,9 +20,6 @@ def scenario(stays=((0.2, 0.1),), places=3):
 def test_boards_stand_while_nobody_is_carried():
     found = stays_s(scenario(((10.0, 2.0), (5.0, 4.0)), places=2))
     assert found == [(0.0, 5.0), (9.0, 10.0), (12.0, math.inf)]
-
-
-def test_boards_that_are_never_carried_have_no_stays():
     assert stays_s(scenario(())) == []
     assert stays_s(scenario(((10.0, 2.0),), places=1)) == [(0.0, math.inf)]
 

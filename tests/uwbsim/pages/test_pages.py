@@ -70,29 +70,17 @@ def test_a_timing_diagram_has_every_interval_with_its_length(name):
     assert any(abs(length - reply_us) < 1 for length in lengths)
 
 
-@pytest.mark.parametrize("width", [1280, 390])
-def test_a_scene_lies_well(width, tmp_path):
-    lies_well(to_html(scene(uwbsim.load(OFFICE))), width, tmp_path)
-
-
 @pytest.fixture(scope="module")
-def compared():
-    return to_html(comparison(uwbsim.compare(uwbsim.load(BENCH), list(PROTOCOLS.values()), 3000)))
+def pages():
+    found = uwbsim.compare(uwbsim.load(BENCH), None, 3000)
+    return {"scene": to_html(scene(uwbsim.load(OFFICE))), "comparison": to_html(comparison(found))}
 
 
 @pytest.mark.parametrize("width", [1280, 390])
-def test_a_comparison_lies_well(width, compared, tmp_path):
-    lies_well(compared, width, tmp_path)
-    assert "log axis" in compared
-    assert "logarithmic beyond" in compared
-
-
-PLAN = """
-sweep = {{ scenario = "{scenario}", kind = "calibrate", seeds = 3 }}
-[vary]
-"radio.rx_noise_ps" = [50.0, 100.0, 200.0]
-{more}
-"""
+@pytest.mark.parametrize("name", ["scene", "comparison"])
+def test_pages_lie_well(width, name, pages, tmp_path):
+    lies_well(pages[name], width, tmp_path)
+    assert ("log axis" in pages[name]) == ("logarithmic beyond" in pages[name]) == (name == "comparison")
 
 
 def judged(flight):
@@ -101,28 +89,24 @@ def judged(flight):
     return {"spread_m": spread, "same": 1.0, "word": "none"}
 
 
-@pytest.mark.parametrize("more", ["", "'radio.tx_noise_ps' = [0.0, 90.0]"])
-def test_a_sweep_draws_what_came_out(tmp_path, more):
-    plan = tmp_path / "plan.toml"
-    plan.write_text(PLAN.format(scenario=BENCH.as_posix(), more=more))
-    design = uwbsim.load_design(plan, allow_files=[BENCH.parent])
-    uwbsim.run_sweep(design, tmp_path / "out", workers=1, evaluate=judged)
-    page = write_sweep_page(design, tmp_path / "out").read_text()
-    assert re.findall("<figcaption>(.*?)</figcaption>", page) == ["Figure 1. spread (cm)."]
-
-    assert "rx_noise_ps" in page
-    assert f"{len(design.seeds)} seeds each" in page
-
-
-def test_a_sweep_says_what_its_figures_are(tmp_path):
-    plan = tmp_path / "plan.toml"
-    head = f"sweep = {{ scenario = '{BENCH.as_posix()}', protocols = ['ds'], ranges = 50, seeds = 1 }}"
-    plan.write_text(f"{head}\n[vary]\n'radio.rx_noise_ps' = [50.0, 200.0]\n")
-    design = uwbsim.load_design(plan, allow_files=[BENCH.parent])
-    uwbsim.run_sweep(design, tmp_path / "out", workers=1)
+@pytest.mark.parametrize(
+    ("kind", "more", "caption"),
+    [
+        ("'calibrate'", "", "Figure 1. spread (cm)."),
+        ("'calibrate'", "'radio.tx_noise_ps' = [0.0, 90.0]", "Figure 1. spread (cm)."),
+        ("'compare', ranges = 50", "", "Figure 4. low (cm): 2.5 % quantile of the errors of raw ranges."),
+    ],
+)
+def test_a_sweep_draws_what_came_out_and_says_what_it_is(tmp_path, kind, more, caption):
+    head = f"sweep = {{ scenario = '{BENCH.as_posix()}', kind = {kind}, protocols = ['ds'], seeds = 3 }}"
+    (tmp_path / "plan.toml").write_text(f"{head}\n[vary]\n'radio.rx_noise_ps' = [50.0, 100.0, 200.0]\n{more}\n")
+    design = uwbsim.load_design(tmp_path / "plan.toml", allow_files=[BENCH.parent])
+    uwbsim.run_sweep(design, tmp_path / "out", workers=1, evaluate=judged if "calibrate" in kind else None)
     page = write_sweep_page(design, tmp_path / "out").read_text()
     captions = re.findall("<figcaption>(.*?)</figcaption>", page)
-    assert "Figure 4. low (cm): 2.5 % quantile of the errors of raw ranges." in captions
+    assert caption in captions
+    assert len(captions) == (1 if "calibrate" in kind else 8)
+    assert ("rx_noise_ps" in page, "3 seeds each" in page) == (True, True)
 
 
 def test_bands_over_seeds_reach_from_the_least_to_the_largest():

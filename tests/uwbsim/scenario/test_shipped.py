@@ -1,6 +1,5 @@
 """Scenarios that come along, by name: found, listed, copied."""
 
-import doctest
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +7,7 @@ import pytest
 
 import uwbsim
 from tests import processes
-from uwbsim.scenario import copy_scenarios, listed, loading, shipped_scenarios
-
-
-def test_the_examples_run():
-    assert doctest.testmod(loading).failed == 0
+from uwbsim.scenario import copy_scenarios, listed, shipped_scenarios
 
 
 def test_every_one_is_told_of():
@@ -40,13 +35,6 @@ def test_a_name_does_for_a_file_where_there_is_none(tmp_path, monkeypatch):
     number: Any = 3
     with pytest.raises(uwbsim.UwbsimError, match="`source`: found int, expected a path, a name"):
         uwbsim.simulate(number)
-
-
-def test_a_sweep_may_name_one(tmp_path):
-    (tmp_path / "plan.toml").write_text(
-        "sweep = { scenario = 'noiseless', protocols = ['ds'], ranges = 10, seeds = 2 }\n"
-    )
-    assert uwbsim.load_design(tmp_path / "plan.toml").scenario == shipped_scenarios()["noiseless"]
 
 
 def test_copies_run_on_their_own(tmp_path):

@@ -27,9 +27,6 @@ TRAIN = Path(__file__).parents[3] / "scenarios" / "icra2023" / "train.toml"
 def test_frames_last_as_long_as_on_the_boards(length, us):
     assert frame_s(length, 128) * 1e6 == pytest.approx(us, abs=0.01)
     assert before_marker_s(128) * 1e6 == pytest.approx(138.397, abs=0.001)
-
-
-def test_an_exchange_keeps_the_air_busy_for_its_three_frames():
     assert exchange_air_s(DS, 128) * 1e6 == pytest.approx(177.37 + 174.29 + 194.81, abs=0.02)
 
 
@@ -110,8 +107,7 @@ def test_what_becomes_of_exchanges_that_meet(hosts, powers, reasons):
 
 
 def test_the_message_that_is_lost_is_named():
-    assert played([[slot(0, 0, 0, 1)], [slot(1, 50, 2, 3)]]).lost == [0, 0]
-    assert played([[slot(0, 0, 0, 1)], [slot(1, 800, 2, 3)]]).lost[0] == 2
+    assert [played([[slot(0, 0, 0, 1)], [slot(1, at, 2, 3)]]).lost[0] for at in (50, 800)] == [0, 2]
 
 
 FINAL_US = 305 + 1538 + after_marker_s(28) * 1e6 + before_marker_s(128) * 1e6
@@ -158,8 +154,7 @@ def test_replies_are_drawn_from_two_modes_a_shoulder_and_a_tail():
     # 400 000 draws know a share to 0.0008.
     for below_us, share in ((304.1, 0.207), (305.9, 0.635), (308.3, 0.885), (310.0, 0.9096), (348.25, 0.955)):
         assert np.mean(micro < below_us) == pytest.approx(share, abs=0.003), below_us
-    assert micro.min() == pytest.approx(303.4, abs=1e-6)
-    assert 386.0 < micro.max() < 386.5
+    assert (micro.min(), micro.max()) == (pytest.approx(303.4, abs=1e-6), pytest.approx(386.25, abs=0.25))
     assert np.std(micro[(micro > 303.5) & (micro < 304.7)]) == pytest.approx(0.28, abs=0.03)
     shoulder = micro[(micro > 308.5) & (micro < 310.0)]
     assert len(shoulder) / len(micro) == pytest.approx(0.05 * 0.38, abs=0.002)
@@ -171,32 +166,18 @@ def test_detours_have_the_share_and_the_mean_of_the_scenario_and_noise_is_standa
     hit = drawn.excess_m > 0
     assert hit.mean() == pytest.approx(0.2, abs=0.005)
     assert drawn.excess_m[hit].mean() == pytest.approx(0.5, rel=0.03)
-    for noise in (drawn.transmit, drawn.receive):
-        assert noise.shape == (3, 100_000)
-        assert abs(noise.mean()) < 0.01
-        assert noise.std() == pytest.approx(1.0, rel=0.01)
-        assert abs(np.corrcoef(noise)[0, 1]) < 0.015
-    some = drawn[np.array([5, 7])]
-    np.testing.assert_array_equal(some.reply_s, drawn.reply_s[[5, 7]])
-    np.testing.assert_array_equal(some.transmit, drawn.transmit[:, [5, 7]])
-    assert SUBTICKS_PER_SECOND == 1024 * 63_897_600_000
+    # Six sequences of 100 000: their covariances are known to 0.003.
+    noise = np.concatenate([drawn.transmit, drawn.receive])
+    np.testing.assert_allclose(np.cov(noise), np.eye(6), atol=0.015)
+    assert np.abs(noise.mean(axis=1)).max() < 0.015
     quiet = draw(bench(), 100, 3)
-    assert not quiet.excess_m.any()
-    assert set(quiet.reply_s.tolist()) == {305e-6}
+    assert (quiet.excess_m.any(), set(quiet.reply_s.tolist())) == (False, {305e-6})
 
 
 def test_an_answer_leaves_at_the_first_grid_point_after_its_latency():
     e = simulate(bench("ds", reply_us=305.0)).exchanges
     late = elapsed(e.tx2, e.rx1) - round(305e-6 / TICK_S)
-    assert late.min() >= 0
-    assert late.max() < 512
-
-
-def test_replies_by_quantiles_have_those_quantiles():
-    scenario = with_replies({"model": "quantiles", "delays_us": [300.0, 310.0, 400.0]})
-    found = draw_reply_s(scenario, stream(1, "reply"), 100_000) * 1e6
-    for share, us in ((0.25, 305.0), (0.5, 310.0), (0.75, 355.0)):
-        assert np.quantile(found, share) == pytest.approx(us, abs=0.5)
+    assert 0 <= late.min() <= late.max() < 512
 
 
 @pytest.mark.parametrize(

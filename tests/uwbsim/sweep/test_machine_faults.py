@@ -2,11 +2,11 @@
 
 import contextlib
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -14,11 +14,12 @@ import duckdb
 import pytest
 
 from tests.processes import CONTEXT, run
-from tests.uwbsim.sweep.test_sweep import HEAD, plan, rows
+from tests.uwbsim.sweep.test_sweep import GRID, HEAD, plan, rows
 from uwblink.errors import UwblinkError
 from uwbsim.sweep.executors import ClusterLostError
-from uwbsim.sweep.runner import Store, TableError, run_sweep
+from uwbsim.sweep.runner import Store, Summary, TableError, run_sweep
 
+UWBSIM = Path(sys.executable).parent / "uwbsim"
 SMALL = HEAD + 'ranges = 100\n[vary]\n"radio.rx_noise_ps" = [0.0, 50.0]\n'
 
 
@@ -133,32 +134,13 @@ def test_a_scheduler_that_goes_away_is_named_and_what_was_done_is_kept(tmp_path)
     words = [sys.executable, "-c", SCHEDULER]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as cluster:
         address = cluster.stdout.readline().strip()
-        begun = threading.Event()
-
-        def kill():
-            begun.wait(60)
-            cluster.send_signal(signal.SIGKILL)
-
-        killer = threading.Thread(target=kill)
-        killer.start()
         gone = pytest.raises(ClusterLostError, match=rf"^{address}: the scheduler is gone; results so far are kept")
         # The client tries to come back for so long, half a minute otherwise.
         with dask.config.set({"distributed.comm.timeouts.connect": "1s"}), gone:
-            run_sweep(p, tmp_path / "out", scheduler=address, progress=lambda _: begun.set())
-        begun.set()
-        killer.join()
+            run_sweep(p, tmp_path / "out", scheduler=address, progress=lambda _: cluster.kill())
     with Store.open(tmp_path / "out" / "results.duckdb") as store:
         before = store.done()
     assert 0 < len(before) < p.total
-
-
-def test_results_that_are_none_are_no_rows(tmp_path):
-    with Store.open(tmp_path / "r.duckdb", {"name": "x"}) as store:
-        store.append([(1, [{"number": 1, "a": 1}]), (2, [])])
-        assert list(store) == [{"number": 1, "a": 1}]
-        with pytest.raises(TableError, match="damaged"):
-            store._db.execute("UPDATE results SET document = 'x'")
-            list(store)
 
 
 def test_results_of_another_version_are_not_gone_on_with(done):
@@ -184,37 +166,46 @@ def session(leader):
     return found
 
 
+def signals_blocked(pid):
+    status = Path(f"/proc/{pid}/status").read_text()
+    bits = int(re.search(r"SigBlk:\s*(\w+)", status)[1], 16)
+    return {number for number in signal.Signals if bits >> (number - 1) & 1}
+
+
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are looked up in /proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_workers_say_nothing_and_end_with_their_sweep(tmp_path, number):
-    (tmp_path / "p.toml").write_text(ENDLESS)
-    words = [str(Path(sys.executable).parent / "uwbsim"), "sweep", "p.toml", "-o", "out", "--workers", "2"]
-    out = tmp_path / "words"
-    with out.open("w") as stream:
-        process = subprocess.Popen(words, cwd=tmp_path, stdout=stream, stderr=stream, start_new_session=True)
+def test_a_sweep_that_ends_early_leaves_no_worker_and_goes_on_where_it_was(tmp_path, number):
+    p, out, words = plan(tmp_path, HEAD + "ranges = 4_000\nseeds = 12\n" + GRID), tmp_path / "out", tmp_path / "words"
+    with words.open("w") as stream:
+        command = [UWBSIM, "sweep", p.path, "-o", out, "--workers", "2"]
+        process = subprocess.Popen(command, stdout=stream, stderr=stream, start_new_session=True)
     try:
-        wait_until(lambda: (tmp_path / "out" / "results.duckdb").exists() and len(session(process.pid)) > 2, process)
-        # As a terminal does it: Ctrl-C goes to all of them.
+        # The log grows with every result; ten thousand bytes are a few of them.
+        log = out / "results.duckdb.wal"
+        wait_until(lambda: log.exists() and log.stat().st_size > 10_000)
+        # Workers leave Ctrl-C, which a terminal sends to all of them, to the sweep, and can be terminated.
+        blocked = [signals_blocked(pid) for pid in session(process.pid)]
+        assert [sum(one in some for some in blocked) for one in (signal.SIGINT, signal.SIGTERM)] == [2, 0]
         (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
         assert process.wait(60) == (130 if number == signal.SIGINT else -number)
-        for _ in range(200):
-            if not session(process.pid):
-                break
-            time.sleep(0.05)
-        assert session(process.pid) == []
+        wait_until(lambda: not session(process.pid))
     finally:
         for left in session(process.pid):
             os.kill(left, signal.SIGKILL)
     if number == signal.SIGINT:  # of a kill Python's own tracker of resources may tell
-        (said,) = out.read_text().splitlines()
+        (said,) = words.read_text().splitlines()
         assert "--resume" in said
+    with Store.open(out / "results.duckdb") as store:
+        before = len(store.done())
+    assert 0 < before < p.total
+    assert run_sweep(p, out, workers=1, resume=True) == Summary(p.total - before, 0, before)
+    assert [int(row["number"]) for row in rows(out)] == [k for k in range(p.total) for _ in range(2)], "nothing twice"
 
 
-def wait_until(ready, process):
+def wait_until(ready):
     for _ in range(1200):
         if ready():
             return
-        assert process.poll() is None
         time.sleep(0.05)
     raise AssertionError("nothing happened for a minute")
 
@@ -224,7 +215,7 @@ def test_a_worker_that_dies_as_it_begins_is_one_line(tmp_path):
     (tmp_path / "p.toml").write_text(ENDLESS)
     (tmp_path / "sitecustomize.py").write_text("import os, sys\nif '--multiprocessing-fork' in sys.argv: os._exit(9)\n")
     env = os.environ | {"PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
-    words = [str(Path(sys.executable).parent / "uwbsim"), "sweep", "p.toml", "-o", "out", "--workers", "2"]
+    words = [UWBSIM, "sweep", "p.toml", "-o", "out", "--workers", "2"]
     done = subprocess.run(words, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert "--workers" in done.stderr

@@ -95,12 +95,9 @@ def test_the_tail_and_the_core_are_found(found):
 def test_the_life_is_that_of_the_states(made, found):
     """The states' own integral of the autocorrelation, which no fit and no drawing at random instants is in."""
     whole, state, _ = made
-    lives = []
-    for k in range(6):
-        one = state[whole.pair == k].astype(float)
-        lives.append(integral_s(one - one.mean(), 0.05))
-    weights = [np.var(state[whole.pair == k]) for k in range(6)]
-    assert found.life_s == pytest.approx(np.average(lives, weights=weights), rel=0.2)
+    pairs = [state[whole.pair == k].astype(float) for k in range(6)]
+    lives = [integral_s(one - one.mean(), 0.05) for one in pairs]
+    assert found.life_s == pytest.approx(np.average(lives, weights=list(map(np.var, pairs))), rel=0.2)
 
 
 def integral_s(centred, step_s, longest_s=3.0):
@@ -129,18 +126,17 @@ def test_some_rows_are_of_all_pairs_that_take_turns():
     assert np.array_equal(some_rows(10, 10), np.arange(10))
 
 
-def autoregressive(rng, count, share):
-    values, now = np.empty(count), 0.0
-    for k, step in enumerate(rng.normal(size=count)):
-        now = share * now + np.sqrt(1 - share**2) * step
-        values[k] = now
+def autoregressive(steps, keep):
+    """Each value is the share `keep` of the one before it, and a step that leaves the variance at one."""
+    values, now = np.empty(len(steps)), 0.0
+    for k, (share, step) in enumerate(zip(keep, steps, strict=True)):
+        values[k] = now = share * now + np.sqrt(1 - share**2) * step
     return values
 
 
 def test_values_are_worth_what_their_dependence_leaves():
     """An autoregressive sequence of coefficient a is worth (1 - a)/(1 + a) of its length."""
-    value = autoregressive(np.random.default_rng(3), 60_000, 0.8)
-    group = np.zeros(60_000, dtype=np.int64)
+    value, group = autoregressive(np.random.default_rng(3).normal(size=60_000), [0.8] * 60_000), np.zeros(60_000, int)
     assert effective_size(value, group) / 60_000 == pytest.approx(0.2 / 1.8, rel=0.1)
     r, error = lag_one(value, group)
     assert r == pytest.approx(0.8, abs=0.02)
@@ -151,11 +147,7 @@ def test_values_are_worth_what_their_dependence_leaves():
 def test_a_life_is_found_below_noise_and_between_uneven_times():
     rng = np.random.default_rng(9)
     time_s = np.sort(rng.uniform(0, 2000, 40_000))
-    steps = np.exp(-np.diff(time_s, prepend=0.0) / 0.7)
-    value, now = np.empty(len(time_s)), 0.0
-    for k, (keep, step) in enumerate(zip(steps, rng.normal(size=len(time_s)), strict=True)):
-        now = keep * now + np.sqrt(1 - keep**2) * step
-        value[k] = now
+    value = autoregressive(rng.normal(size=len(time_s)), np.exp(-np.diff(time_s, prepend=0.0) / 0.7))
     noisy = value + rng.normal(0, 1.5, len(value))
     variance, life_s = lasting(time_s, np.zeros(len(time_s), dtype=np.int64), noisy)
     assert life_s == pytest.approx(0.7, rel=0.1)

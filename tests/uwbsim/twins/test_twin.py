@@ -8,12 +8,16 @@ import pytest
 from typer.testing import CliRunner
 
 import uwbsim
+from calib import Calibration
+from tests import processes
 from tests.uwbsim.twins.worlds import known, world
 from uwblink import Poses, UwblinkError, load
-from uwbsim.cli import main
 from uwbsim.cli.commands import _print_table, app
 from uwbsim.pages import TWIN_COLUMNS
+from uwbsim.scenario.radio import Radio
 from uwbsim.twins import LEVEL
+from uwbsim.twins.range_errors import read_calibration
+from uwbsim.world.radio import reception_bias_s
 
 
 @pytest.fixture(scope="module")
@@ -103,11 +107,11 @@ def test_what_persists_differently_is_not_alike(found):
     assert one.verdict == "differ"
 
 
-def test_the_command_writes_a_scenario_and_a_page(tmp_path):
+def test_the_command_writes_a_scenario_and_a_page(tmp_path, monkeypatch):
     uwbsim.simulate(world(4.0), contention=False).save(tmp_path / "f.uwb")
     (tmp_path / "c.json").write_text(json.dumps(known(world())))
-    command = ["twin", str(tmp_path / "f.uwb"), "-c", str(tmp_path / "c.json"), "-o", str(tmp_path / "t.toml")]
-    done = CliRunner().invoke(app, [*command, "--seeds", "1"])
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["twin", "f.uwb", "-c", "c.json", "-o", "t.toml", "--seeds", "1"])
     assert done.exit_code == 0, done.output
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c.json", "f.uwb", "t.html", "t.poses.uwb", "t.toml"]
     page = (tmp_path / "t.html").read_text()
@@ -134,18 +138,28 @@ def test_recordings_without_a_twin(flight, what):
         uwbsim.twin(change(flight), known(world()))
 
 
-def test_a_recording_that_says_too_little_ends_with_status_1(tmp_path, monkeypatch, capsys):
-    uwbsim.simulate(uwbsim.load("scenarios/noiseless.toml", {"run.duration_s": 0.2})).save(tmp_path / "short.uwb")
+def test_a_recording_that_says_too_little_ends_with_status_1(tmp_path):
+    uwbsim.simulate(uwbsim.load("noiseless", {"run.duration_s": 0.2})).save(tmp_path / "short.uwb")
     (tmp_path / "c.json").write_text(json.dumps(known(world())))
-    words = ["uwbsim", "twin", tmp_path / "short.uwb", "-c", tmp_path / "c.json", "-o", tmp_path / "twin.toml"]
-    monkeypatch.setattr("sys.argv", [str(word) for word in words])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 1
-    assert "exchanges, a twin needs 100 or more" in capsys.readouterr().err
+    done = processes.run("uwbsim", "twin", "short.uwb", "-c", "c.json", "-o", "twin.toml", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "exchanges, a twin needs 100 or more" in done.stderr
 
 
 CURVE = known(world())["bias_curve"]
+
+
+@pytest.mark.parametrize("alpha_dbm", [-82.0, -85.0])
+def test_the_scenario_has_the_curve_of_the_calibration_at_any_level_of_lifting(flight, alpha_dbm, tmp_path):
+    curve = {"knots": [0.01] * 4 + [1.8] * 4, "coefficients": [-0.07, 0.32, -0.18, -0.08], "degree": 3}
+    table = known(world()) | {"alpha_dbm": alpha_dbm, "bias_curve": curve | {"range": [0.01, 1.8]}}
+    (tmp_path / "c.json").write_text(json.dumps(table))
+    calibration, power = Calibration.from_json(json.dumps(table)), np.linspace(-100.0, -78.0, 50)
+    expected = calibration.bias_curve(10 ** ((power - alpha_dbm) / 10))
+    for source in (table, tmp_path / "c.json", calibration):
+        found = reception_bias_s(Radio(bias=read_calibration(source).bias), power) * 299_702_547.0
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert np.ptp(expected) > 0.1
 
 
 @pytest.mark.parametrize(
