@@ -35,9 +35,9 @@ CURVE = {"knots": [0.0] * 4 + [2.0] * 4, "coeffs": [0.1] * 4, "degree": 3}
 PUBLISHED = {"delays_ns": {"1": 0.1, "2": 1e12}, "bias_spline_m": CURVE, "std_spline_m": CURVE}
 
 
-def changed(path, poses=None, tags=None, rows=slice(None), **columns):
+def changed(path, poses=None, tags=None, rows=slice(None), anchors=False, **columns):
     """Save the small flight that `calib sample` makes, with other columns of its exchanges, poses or tags."""
-    flight = calib.sample_flight(COUNT)
+    flight = calib.sample_flight(COUNT, anchors=anchors)
     exchanges = replace(flight.exchanges, **columns)[rows]
     poses, tags = flight.poses if poses is None else poses, flight.tags if tags is None else tags
     Contents(exchanges=exchanges, poses=poses, tags=tags).save(path)
@@ -308,7 +308,7 @@ def test_a_server_says_how_to_record_and_a_recording_is_replayed_as_it_was(tmp_p
     said = succeed("uwbsim", "serve", BENCH, "--link-dir", tmp_path / "ports", "--duration", 0.1)
     assert said.stdout.startswith("tag  10  ")
     assert f"uwblink record {tmp_path / 'ports'}/* --pairs all -o flight.uwb" in said.stderr
-    succeed("uwblink", "record", ports[1], ports[2], "-o", "f.uwb", "--pairs", "all", "--duration", 0.5, cwd=tmp_path)
+    succeed("uwblink", "record", ports[1], ports[2], "-o", "f.uwb", "--pairs", "all", "--duration", 2, cwd=tmp_path)
     done = succeed("uwblink", "replay", "f.uwb", "--serve", "--speed", 10, "--link-dir", "again", cwd=tmp_path)
     assert "pieces played" in done.stdout
     done = succeed("uwblink", "replay", "f.uwb", "-o", "again.uwb", "--json", cwd=tmp_path)
@@ -451,7 +451,7 @@ def test_delays_without_standard_errors_are_not_taken_for_exact(seeds, tmp_path)
 
 
 def test_what_needs_no_powers_works_without_any(tmp_path):
-    path = changed(tmp_path / "f.uwb", **nothing("fpp1_dbm", "fpp2_dbm"))
+    path = changed(tmp_path / "f.uwb", anchors=True, **nothing("fpp1_dbm", "fpp2_dbm"))
     (finding,) = calib.examine(path)
     assert (finding.fault, finding.evidence) == ("no powers", "0 % of the exchanges have a first-path power")
     calib.fit(path, delays_only=True).calibration.save(tmp_path / "d.json")
