@@ -1,9 +1,14 @@
 """Boards to test with: a scenario of three on a bench, served in a thread, and real ones where there are any."""
 
+import os
 import threading
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
+import pytest
+
+from uwblink.boards.ports import SerialPort
 from uwbsim.boards.server import Faults, Server
+from uwbsim.boards.virtual_board import VirtualPorts
 from uwbsim.scenario.model import Scenario
 
 
@@ -36,3 +41,24 @@ def served(scenario=None, faults=None, link_dir=None, **more):
         stop.set()
         thread.join(5)
         server.close()
+
+
+@contextmanager
+def two_ports(kind, **served_how):
+    """Give the ports of two boards: "virtual" in process, "terminal" served, or "real", of which UWB_PORTS names two.
+
+    Gives the bench of the boards, too, where they are ours.
+    """
+    if kind == "virtual":
+        ports = VirtualPorts(bench_scenario())
+        yield [ports.port(1), ports.port(2)], ports.bench
+        return
+    with ExitStack() as stack:
+        server = stack.enter_context(served(**served_how)) if kind == "terminal" else None
+        names = [server.names[1], server.names[2]] if server else os.environ.get("UWB_PORTS", "").split(",")
+        if len(names) != 2:
+            pytest.skip("no real boards: UWB_PORTS does not name two ports")
+        found = [SerialPort(name) for name in names]
+        for port in found:
+            stack.callback(port.close)
+        yield found, server and server.bench

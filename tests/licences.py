@@ -5,12 +5,16 @@ Names are those of requirements-dev.lock; licences are what the installed distri
 
 from __future__ import annotations
 
+import contextlib
 import re
 import sys
 import tomllib
-from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Final
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT: Final = Path(__file__).parents[1]
 LOCK: Final = ROOT / "requirements-dev.lock"
@@ -58,18 +62,15 @@ SPELT: Final = {
 
 def names_of(lock: str) -> list[str]:
     """Return the names in a lock, each once, in order."""
-    found = re.findall(r"^([A-Za-z0-9][A-Za-z0-9._-]*)==", lock, flags=re.MULTILINE)
-    return sorted({normal(name) for name in found})
+    return sorted({canonicalize_name(name) for name in re.findall(r"^([\w.-]+)==", lock, flags=re.MULTILINE)})
 
 
-def normal(name: str) -> str:
-    """Return a distribution's name as all tools compare it."""
-    return re.sub(r"[-_.]+", "-", name).lower()
-
-
-def licence_of(found: Distribution) -> str:
+def licence_of(name: str) -> str:
     """Return the licence of a distribution as an SPDX expression, or what it says itself where that is none."""
-    told = found.metadata
+    try:
+        told = distribution(name).metadata
+    except PackageNotFoundError:
+        return ELSEWHERE.get(name, "")
     if told["License-Expression"]:
         return str(told["License-Expression"])
     classified = [c.split(" :: ")[-1] for c in told.get_all("Classifier") or [] if c.startswith("License ::")]
@@ -77,46 +78,28 @@ def licence_of(found: Distribution) -> str:
     return " AND ".join(sorted({SPELT.get(word.lower(), word) for word in words}))
 
 
-def installed_with(names: list[str], extras: frozenset[str] = frozenset()) -> set[str]:
-    """Return the names of distributions that are installed with those of `names`, themselves included."""
-    waiting, known = [(normal(name), extras) for name in names], set()
+def installed_with(requirements: list[str]) -> set[str]:
+    """Return the names of distributions that are installed with some, themselves included."""
+    waiting, known = list(map(Requirement, requirements)), set()
     while waiting:
-        name, wanted = waiting.pop()
-        if name in known:
-            continue
-        known.add(name)
-        try:
-            needs = distribution(name).requires or []
-        except PackageNotFoundError:
-            continue
-        waiting += [(normal(re.match(r"[\w.-]+", need)[0]), frozenset()) for need in needs if _counts(need, wanted)]
+        name = canonicalize_name(waiting.pop().name)
+        if name not in known:
+            known.add(name)
+            with contextlib.suppress(PackageNotFoundError):
+                needs = map(Requirement, distribution(name).requires or [])
+                waiting += [need for need in needs if "extra ==" not in str(need.marker)]
     return known
-
-
-def _counts(need: str, wanted: frozenset[str]) -> bool:
-    """Return whether a requirement is not one of an extra that nobody asked for."""
-    extra = re.search(r"extra\s*==\s*['\"]([^'\"]+)", need)
-    return extra is None or extra[1] in wanted
 
 
 def rows() -> list[tuple[str, str, str]]:
     """Return name, licence and what it is for, of everything in the lock that is installed here."""
-    with (ROOT / "pyproject.toml").open("rb") as file:
-        project = tomllib.load(file)["project"]
-    plain = installed_with([re.split(r"[><=\[]", row)[0] for row in project["dependencies"]])
-    extra = {
-        name: installed_with([re.split(r"[><=\[]", row)[0] for row in listed]) - plain
-        for name, listed in project["optional-dependencies"].items()
-    }
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    plain = installed_with(project["dependencies"])
+    extra = {name: installed_with(listed) - plain for name, listed in project["optional-dependencies"].items()}
     found = []
     for name in names_of(LOCK.read_text(encoding="utf-8")):
-        try:
-            licence = licence_of(distribution(name))
-        except PackageNotFoundError:
-            licence = ELSEWHERE.get(name, "")
         extras = [f"extra `{key}`" for key, members in extra.items() if name in members]
-        purpose = "always" if name in plain else ", ".join(extras) or "development"
-        found.append((name, licence, purpose))
+        found.append((name, licence_of(name), "always" if name in plain else ", ".join(extras) or "development"))
     return found
 
 
@@ -141,14 +124,9 @@ def table(found: list[tuple[str, str, str]]) -> str:
 
 def allowed(name: str, licence: str) -> bool:
     """Return whether one of the alternatives of an expression, with all its parts, is compatible."""
-    if name in JUDGED:
-        return True
-    known = PERMISSIVE | LINKED
-    for alternative in re.split(r"\s+OR\s+", licence.replace("(", "").replace(")", "")):
-        parts = [re.sub(r"\s+WITH\s+.*", "", part) for part in re.split(r"\s+AND\s+", alternative)]
-        if all(part in known for part in parts):
-            return True
-    return False
+    bare = re.sub(r"\s+WITH\s+\S+", "", licence.replace("(", "").replace(")", ""))
+    alternatives = ({part.strip() for part in one.split(" AND ")} for one in bare.split(" OR "))
+    return name in JUDGED or any(parts <= PERMISSIVE | LINKED for parts in alternatives)
 
 
 def main() -> int:

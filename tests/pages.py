@@ -41,9 +41,10 @@ LEFT: Final = "..."
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A block of code: its language, its text, the line it begins at, and why it is not run, if so."""
+    """A block of code: language, label, text, the line it begins at, and why it is not run, if so."""
 
     language: str
+    label: str
     code: str
     line: int
     mark: str
@@ -62,6 +63,7 @@ def blocks(path: Path) -> list[Block]:
     return [
         Block(
             (found["info"].split() or [DRAWING])[0],
+            found["info"].partition(" ")[2].strip(),
             found["code"],
             text.count("\n", 0, found.start("ticks")) + 1,
             found["mark"] or "",

@@ -6,8 +6,8 @@ A command takes 0.4 s to import what it needs and often less to do its work, and
 from __future__ import annotations
 
 import atexit
-import functools
 import importlib
+import io
 import multiprocessing
 import os
 import resource
@@ -16,7 +16,7 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,19 +40,20 @@ def run(
     env: Mapping[str, str] | None = None,
     timeout: float | None = None,
     most_bytes: int | None = None,
+    limits: Mapping[int, int] | None = None,
     user: int | None = None,
 ) -> subprocess.CompletedProcess[str]:
     """Run a command as `subprocess.run` does with captured text, its first word the name of the command.
 
     `env` is the whole environment; what is set there for the time of importing has no effect. No file that the command
-    writes may be longer than `most_bytes`, as on a full disk; `user` takes its rights away.
+    writes may be longer than `most_bytes`, as on a full disk; `limits` are others of `resource`. `user` takes its
+    rights away.
     """
     argv = [str(BIN / str(words[0])), *map(str, words[1:])]
-    if most_bytes is not None:
-        return _run_limited(argv, cwd, dict(os.environ if env is None else env), timeout, most_bytes)
+    limits = dict(limits or {}) | ({} if most_bytes is None else {resource.RLIMIT_FSIZE: most_bytes})
     with tempfile.TemporaryDirectory() as folder:
         printed = [Path(folder) / name for name in ("out", "err")]
-        settings = (str(cwd or Path.cwd()), dict(os.environ if env is None else env), user)
+        settings = (str(cwd or Path.cwd()), dict(os.environ if env is None else env), limits, user)
         process = CONTEXT.Process(target=_work, args=(argv, [*map(str, printed)], *settings))
         process.start()
         process.join(timeout)
@@ -63,36 +64,36 @@ def run(
         return subprocess.CompletedProcess(argv, process.exitcode, *(path.read_text("utf-8") for path in printed))
 
 
-def _run_limited(
-    argv: list[str], cwd: str | os.PathLike[str] | None, env: dict[str, str], timeout: float | None, most_bytes: int
-) -> subprocess.CompletedProcess[str]:
-    """Run a command that may write no long file, neither one of coverage nor compiled modules.
-
-    Python would keep a compiled module that it could write in part only, and fail to import it ever after.
-    """
-    plain = {name: value for name, value in env.items() if not name.startswith("COVERAGE_")}
-    plain["PYTHONDONTWRITEBYTECODE"] = "1"
-    limit = functools.partial(resource.setrlimit, resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
-    return subprocess.run(
-        argv,
-        cwd=cwd,
-        env=plain,
-        timeout=timeout,
-        preexec_fn=limit,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def succeed(*words: object, **how: Any) -> subprocess.CompletedProcess[str]:
+    """Run a command that must end with status 0."""
+    ended = run(*words, **how)
+    assert ended.returncode == 0, ended
+    return ended
 
 
-def _work(argv: list[str], printed: list[str], cwd: str, env: dict[str, str], user: int | None) -> None:
+def refuse(*words: object, naming: Iterable[object] = (), status: int = 2, **how: Any) -> str:
+    """Run a command that must print nothing but one line of error, which has every text of `naming`; returns it."""
+    ended = run(*words, **how)
+    assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (status, "", 1), ended
+    assert ended.stderr.startswith("error: "), ended
+    for text in naming:
+        assert str(text) in ended.stderr, ended
+    return ended.stderr
+
+
+def _work(
+    argv: list[str], printed: list[str], cwd: str, env: dict[str, str], limits: dict[int, int], user: int | None
+) -> None:
     """Become a command: its folder, environment, output and limits; ends the process with its status."""
     for descriptor, path in enumerate([os.devnull, *printed]):
         opened = os.open(path, os.O_CREAT | os.O_WRONLY if descriptor else os.O_RDONLY, 0o600)
         os.dup2(opened, descriptor)
         os.close(opened)
     sys.stdin = open(0, encoding="utf-8", closefd=False)  # noqa: SIM115 - it is the process's own
+    if resource.RLIMIT_FSIZE in limits:
+        # Python would keep a compiled module that it could write in part only. Text is kept until the limit is lifted.
+        sys.dont_write_bytecode = True
+        sys.stdout, sys.stderr = io.StringIO(), io.StringIO()
     os.chdir(cwd)
     os.environ.clear()
     os.environ.update(env)
@@ -100,13 +101,24 @@ def _work(argv: list[str], printed: list[str], cwd: str, env: dict[str, str], us
     try:
         if user is not None:
             os.seteuid(user)
+        _limit(limits)
         status = _call(argv)
     except BaseException:
         traceback.print_exc()
     finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        _limit(dict.fromkeys(limits, resource.RLIM_INFINITY))
+        for descriptor, stream in enumerate((sys.stdout, sys.stderr), 1):
+            stream.flush()
+            if isinstance(stream, io.StringIO):
+                os.write(descriptor, stream.getvalue().encode())
         os._exit(status)
+
+
+def _limit(limits: Mapping[int, int]) -> None:
+    """Set limits of this process, which it may lift again up to those that it had."""
+    for kind, most in limits.items():
+        hard = resource.getrlimit(kind)[1]
+        resource.setrlimit(kind, (hard if most == resource.RLIM_INFINITY else most, hard))
 
 
 def _call(argv: list[str]) -> int:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -45,25 +46,17 @@ def rooms(package: str, root: Path = ROOT) -> Rooms:
     return found
 
 
-def circle(graph: Rooms) -> list[str]:
-    """Return rooms that cannot be put on floors because they import each other in a circle; empty if there are none."""
-    left = {name: set(others) for name, others in graph.items()}
-    while low := [name for name, others in left.items() if not others & left.keys()]:
-        for name in low:
-            del left[name]
-    return sorted(left)
-
-
 def floors(graph: Rooms) -> list[list[str]]:
-    """Return the rooms by floor, the ground first: each stands one above the highest that it imports."""
-    if found := circle(graph):
-        raise ValueError(f"rooms import each other in a circle: {', '.join(found)}")
-    height: dict[str, int] = {}
-    while len(height) < len(graph):
-        for name, others in graph.items():
-            if others <= height.keys():
-                height[name] = 1 + max((height[other] for other in others), default=-1)
-    return [sorted(n for n, h in height.items() if h == level) for level in range(max(height.values()) + 1)]
+    """Return the rooms by floor, the ground first: each stands one above the highest that it imports.
+
+    Raises `graphlib.CycleError` for rooms that import each other in a circle.
+    """
+    found, sorter = [], TopologicalSorter(graph)
+    sorter.prepare()
+    while ready := sorter.get_ready():
+        found.append(sorted(ready))
+        sorter.done(*ready)
+    return found
 
 
 def drawing(root: Path = ROOT) -> str:
@@ -74,11 +67,10 @@ def drawing(root: Path = ROOT) -> str:
         lines.append(package)
         for level, names in reversed([*enumerate(floors(graph))]):
             for k, name in enumerate(names):
-                label = f"  {level if not k else ' '}  {name:15}"
-                below = ", ".join(sorted(graph[name]))
-                lines.append(f"{label} imports {below}" if below else label.rstrip())
+                below = f" imports {', '.join(sorted(graph[name]))}" if graph[name] else ""
+                lines.append(f"  {'' if k else level!s:1}  {name:15}{below}".rstrip())
         lines.append("")
-    return "\n".join(lines[:-1]) + "\n"
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

@@ -1,251 +1,528 @@
-"""Mistakes that a user can make at the three commands: one line, the right status, nothing written."""
+"""Mistakes that a user or a stranger's file can make at the commands: one line, the right status, nothing written.
+
+`{name}` in a line is a file of the fixture `seeds`; `own.*` is a file with the text of the row, in the working folder.
+"""
 
 import gzip
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
 import duckdb
+import numpy as np
 import pytest
 
-from tests import processes
-from uwblink.recording.file import Recording
+import calib
+import uwbsim
+from calib.errors import BadInputError
+from tests.boards import served
+from tests.processes import refuse, run, succeed
+from uwblink import Contents, Exchanges, Poses
+from uwblink.boards.ports import Terminal
+from uwblink.errors import ImportTableError, PortError
+from uwblink.importers.guess import guess_map
 
 ROOT = Path(__file__).parents[1]
-NOISELESS = ROOT / "scenarios" / "noiseless.toml"
+NOISELESS = (ROOT / "scenarios" / "noiseless.toml").read_text()
+BENCH = ROOT / "scenarios" / "two_boards_on_a_bench" / "bench.toml"
 HEADER = "time_s,from_id,to_id,tx1,rx1,tx2,rx2"
 GOOD = "0.0,1,2,100,200,300,500"
-DELETE = object()
+COUNT = 900
+NO_UTF8 = os.fsdecode(b"no\xff")
+DEEP = "a = " + "[" * 5000 + "]" * 5000
+CURVE = {"knots": [0.0] * 4 + [2.0] * 4, "coeffs": [0.1] * 4, "degree": 3}
+PUBLISHED = {"delays_ns": {"1": 0.1, "2": 1e12}, "bias_spline_m": CURVE, "std_spline_m": CURVE}
 
 
-def run(*arguments):
-    return processes.run(*(str(a) for a in arguments))
-
-
-def refused(done, status, *fragments):
-    assert done.returncode == status, done.stdout + done.stderr
-    assert done.stdout == ""
-    assert done.stderr.startswith("error: ")
-    assert done.stderr.count("\n") == 1, done.stderr
-    for fragment in fragments:
-        assert fragment in done.stderr
+def changed(path, poses=None, tags=None, rows=slice(None), anchors=False, **columns):
+    """Save the small flight that `calib sample` makes, with other columns of its exchanges, poses or tags."""
+    flight = calib.sample_flight(COUNT, anchors=anchors)
+    exchanges = replace(flight.exchanges, **columns)[rows]
+    poses, tags = flight.poses if poses is None else poses, flight.tags if tags is None else tags
+    Contents(exchanges=exchanges, poses=poses, tags=tags).save(path)
+    return path
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("flight")
-    for words in (
-        ("uwbsim", "run", NOISELESS, "-o", folder / "f.uwb", "--set", "run.duration_s=5"),
-        ("calib", "fit", folder / "f.uwb", "-o", folder / "c.json"),
-    ):
-        done = run(*words)
-        assert done.returncode == 0, done.stderr
+def seeds(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("seeds")
+    whole = changed(folder / "f.uwb").read_bytes()
+    calib.fit(folder / "f.uwb").calibration.save(folder / "c.json")
+    (folder / "cut.uwb").write_bytes(whole[: len(whole) // 2])
+    (folder / "again.uwb").write_bytes(whole)
+    with duckdb.connect(str(folder / "other.uwb")) as db:
+        db.execute("CREATE TABLE planets (name VARCHAR)")
+    broken = gzip.compress((HEADER + "\n" + (GOOD + "\n") * 5000).encode(), mtime=0)
+    (folder / "t.csv.gz").write_bytes(broken[:40] + broken[60:80] * 100 + broken[40:])
+    (folder / "r.csv").write_text("time_s,from_id,to_id,range_m\n0.0,1,2,3.0\n")
+    (folder / f"{NO_UTF8}.uwb").write_bytes(whole)
+    (folder / f"{NO_UTF8}.csv").write_text((folder / "r.csv").read_text())
+    (folder / "poses.csv").write_text("time_s,body,x,y,z,qx,qy,qz,qw\n0.0,robot1,0,0,0,0,0,0,1\n")
+    for name in ("p.json", "p.uwb", "p.csv", "p.toml", "p.mcap"):
+        os.mkfifo(folder / name)
     return folder
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "fragments"),
-    [
-        ("rate_hz = 160.0", "rate_hz = -1.0", ["ranging.rate_hz", "-1.0", "greater than 0"]),
-        ("rate_hz = 160.0", "rate_hz = 9000.0", ["ranging.rate_hz", "at most"]),
-        ("rate_hz = 160.0", "rate_hertz = 1.0", ["ranging.rate_hertz", "unknown key", "rate_hz"]),
-        ("rate_hz = 160.0", "rate_hz = inf", ["ranging.rate_hz", "inf"]),
-        ("duration_s = 60.0", "duration_s = 0", ["run.duration_s", "greater than 0"]),
-        ("id = 2\n", "id = 1\n", ["tags[1].id", "second 1"]),
-        ('id = 2\nbody = "ifo001"', 'id = 2\nbody = "ifo9"', ["tags[1].body", "ifo9", "ifo001"]),
-        ('protocol = "ds"', 'protocol = "tdoa"', ["ranging.protocol", "tdoa", "ds-alt"]),
-        ('antenna = "dipole"', 'antenna = "yagi"', ["radio.antenna", "yagi", "isotropic"]),
-        ("[run]", "[scenario", ["not valid TOML", "line"]),
-    ],
-)
-def test_scenarios_that_cannot_be(tmp_path, old, new, fragments):
-    text = NOISELESS.read_text()
-    assert old in text
-    bad = tmp_path / "bad.toml"
-    bad.write_text(text.replace(old, new, 1))
-    refused(run("uwbsim", "run", bad, "-o", tmp_path / "out.uwb"), 2, "bad.toml", *fragments)
-    assert [p.name for p in tmp_path.iterdir()] == ["bad.toml"]
+def listed(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
-@pytest.mark.parametrize(
-    ("content", "fragments"),
-    [
-        ("", ["empty"]),
-        (HEADER + "\n", ["no rows"]),
-        (HEADER.replace(",tx2", "") + "\n0,1,2,1,2,3\n", ["'tx2'", "missing", "--map"]),
-        (HEADER + "\n" + GOOD + "\n0.1,1,2,100,abc,300,500\n", ["row 3", "'rx1'", "'abc'"]),
-        (HEADER + "\n0.1,1,2,100,nan,300,500\n", ["row 2", "'rx1'", "'nan'"]),
-        (HEADER + "\n0.1,1,2,100,,300,500\n", ["row 2", "'rx1'"]),
-        (HEADER + "\n0.1,1,2,100,4294967296,300,500\n", ["row 2", "'rx1'", "4294967295"]),
-        (HEADER + "\n0.1,1,2,100,1.5,300,500\n", ["row 2", "'rx1'", "whole number"]),
-        (HEADER + "\n0.1,1,1,100,200,300,500\n", ["row 2", "'to_id'", "from_id"]),
-        (HEADER + "\n0.1,1,2,100,200,300\n", ["row 2", "'rx2'", "''"]),
-        (HEADER + ",tx1\n" + GOOD + ",1\n", ["two columns", "tx1"]),
-    ],
-)
-def test_tables_that_cannot_be(tmp_path, content, fragments):
-    table = tmp_path / "t.csv"
-    table.write_text(content)
-    refused(run("uwblink", "import", "csv", table, "-o", tmp_path / "o.uwb"), 2, "t.csv", *fragments)
-    assert [p.name for p in tmp_path.iterdir()] == ["t.csv"]
+def refused(seeds, folder, line, naming, text="", status=2, **names):
+    """Run a line in a folder in which nothing may change but the row's own file, which is written before."""
+    names |= {path.name.replace(".", "_"): path for path in seeds.iterdir()} | {"here": folder, "long": "a" * 5000}
+    words = [word.format(**names, bench=BENCH, no=NO_UTF8) if "{" in word else word for word in line.split()]
+    (folder / "mine").write_text("mine")
+    for own in {word for word in words if word.startswith("own.")}:
+        (folder / own).write_text(text)
+    before = listed(folder), listed(seeds)
+    told = refuse(*words, cwd=folder, naming=naming, status=status, timeout=180)
+    assert (listed(folder), listed(seeds)) == before
+    return told
 
 
-def test_a_broken_gzip_is_refused_and_not_read_for_ever(tmp_path):
-    whole = gzip.compress((HEADER + "\n" + (GOOD + "\n") * 5000).encode(), mtime=0)
-    (tmp_path / "t.csv.gz").write_bytes(whole[:40] + whole[60:80] * 100 + whole[40:])
-    refused(run("uwblink", "import", "csv", tmp_path / "t.csv.gz", "-o", tmp_path / "o.uwb"), 2, "t.csv.gz", "gzip")
-
-
-@pytest.mark.parametrize(
-    ("line", "status", "fragments"),
-    [
-        ("uwbsim run {here}/no.toml -o {here}/o.uwb", 2, ["no.toml", "no such"]),
-        ("uwbsim run {here} -o {here}/o.uwb", 2, ["directory"]),
-        ("uwbsim run {noiseless} -o {here}/o.uwb --set ranging.rate", 2, ["ranging.rate"]),
-        ("uwbsim run {noiseless} -o {here}/no/x.uwb", 2, ["does not exist"]),
-        ("uwbsim run {noiseless} -o {here}/mine", 2, ["mine", "--force"]),
-        ("uwblink show {long}", 2, ["File name too long"]),
-        ("calib fit {f} -o {long}", 2, ["File name too long"]),
-        ("calib fit {f} -o {here}/mine", 2, ["mine", "--force"]),
-        ("calib fit {f} -o {here}/c.json --loss tukey", 2, ["--loss", "tukey"]),
-        ("calib fit {f} -o {here}/c.json --scale -1", 2, ["--scale", "-1"]),
-        ("calib fit {f} -o {here}/c.json --lift up", 2, ["--lift", "up"]),
-        ("calib fit {f} -o {here}/c.json --fix 1", 2, ["--fix", "'1'", "TAG=NS"]),
-        ("calib apply {f} -c {c} -o {here}/mine", 2, ["mine", "--force"]),
-        ("calib evaluate {f} -c {c} --report {here}/mine", 2, ["mine", "--force"]),
-        ("calib report {f} -o {here}/r.html --pdf {here}/mine", 2, ["mine", "--force"]),
-        ("calib report {f} -o {here}/r.html --figures {here}/mine", 2, ["mine", "is a file"]),
-        ("calib report {f} -o {here}/r.html --figures {here}/no/figures", 2, ["no", "does not exist"]),
-        ("calib report {f} -o {here}/r.html --loss mixture --sequential", 2, ["--sequential"]),
-        ("calib report {here}/no.uwb -o {here}/r.html", 2, ["no.uwb", "no such"]),
-    ],
-)
-def test_words_that_cannot_be_are_named_and_nothing_is_written(tmp_path, flight, line, status, fragments):
-    (tmp_path / "mine").write_text("mine")
-    names = {
-        "f": flight / "f.uwb",
-        "c": flight / "c.json",
-        "here": tmp_path,
-        "noiseless": NOISELESS,
-        "long": "a" * 5000,
-    }
-    refused(run(*line.format(**names).split()), status, *fragments)
-    assert (tmp_path / "mine").read_text() == "mine"
-    assert [p.name for p in tmp_path.iterdir()] == ["mine"]
-
-
-def test_recordings_that_are_not(tmp_path, flight):
-    whole = (flight / "f.uwb").read_bytes()
-    (tmp_path / "cut.uwb").write_bytes(whole[: len(whole) // 2])
-    with duckdb.connect(str(tmp_path / "other.uwb")) as db:
-        db.execute("CREATE TABLE planets (name VARCHAR)")
-    before = sorted(p.name for p in tmp_path.iterdir())
-    for name, fragment in (("no.uwb", "no such"), ("cut.uwb", "truncated"), ("other.uwb", "not a"), ("", "directory")):
-        for words in (
-            ("uwblink", "show", tmp_path / name),
-            ("calib", "fit", tmp_path / name, "-o", tmp_path / "c.json"),
-            ("calib", "apply", tmp_path / name, "-c", flight / "c.json", "-o", tmp_path / "o.uwb"),
-            ("calib", "evaluate", tmp_path / name, "-c", flight / "c.json"),
-        ):
-            refused(run(*words), 2, name, fragment)
-    assert sorted(p.name for p in tmp_path.iterdir()) == before
-
-
-@pytest.mark.parametrize(
-    ("change", "fragments"),
-    [
+SCENARIOS = [
+    ("rate_hz = 160.0", "rate_hz = -1.0", ["ranging.rate_hz", "-1.0", "greater than 0"]),
+    ("rate_hz = 160.0", "rate_hz = 9000.0", ["ranging.rate_hz", "at most"]),
+    ("rate_hz = 160.0", "rate_hertz = 1.0", ["ranging.rate_hertz", "unknown key", "rate_hz"]),
+    ("rate_hz = 160.0", "rate_hz = inf", ["ranging.rate_hz", "inf"]),
+    ("duration_s = 60.0", "duration_s = 0", ["run.duration_s", "greater than 0"]),
+    ("id = 2\n", "id = 1\n", ["tags[1].id", "second 1"]),
+    ('id = 2\nbody = "ifo001"', 'id = 2\nbody = "ifo9"', ["tags[1].body", "ifo9", "ifo001"]),
+    ('protocol = "ds"', 'protocol = "tdoa"', ["ranging.protocol", "tdoa", "ds-alt"]),
+    ('antenna = "dipole"', 'antenna = "yagi"', ["radio.antenna", "yagi", "isotropic"]),
+    ("[run]", "[scenario", ["not valid TOML", "line"]),
+    ("lever_arm_m", "lever_arm", ["lever_arm"]),
+]
+TABLES = [
+    ("", ["empty"]),
+    (HEADER + "\n", ["no rows"]),
+    (HEADER.replace(",tx2", "") + "\n0,1,2,1,2,3\n", ["'tx2'", "missing", "--map"]),
+    (HEADER + "\n" + GOOD + "\n0.1,1,2,100,abc,300,500\n", ["row 3", "'rx1'", "'abc'"]),
+    (HEADER + "\n0.1,1,2,100,nan,300,500\n", ["row 2", "'rx1'", "'nan'"]),
+    (HEADER + "\n0.1,1,2,100,,300,500\n", ["row 2", "'rx1'"]),
+    (HEADER + "\n0.1,1,2,100,4294967296,300,500\n", ["row 2", "'rx1'", "4294967295"]),
+    (HEADER + "\n0.1,1,2,100,1.5,300,500\n", ["row 2", "'rx1'", "whole number"]),
+    (HEADER + "\n0.1,1,1,100,200,300,500\n", ["row 2", "'to_id'", "from_id"]),
+    (HEADER + "\n0.1,1,2,100,200,300\n", ["row 2", "'rx2'", "''"]),
+    (HEADER + ",tx1\n" + GOOD + ",1\n", ["two columns", "tx1"]),
+]
+GROUPS = [
+    ("groups", ["not valid TOML"]),
+    ("x = 1", ["expected one table [groups]"]),
+    ("[groups]\na = 1", ["a:", "list of tag ids"]),
+    ("[groups]\na = [1, 2]\nb = [2]", ["tag 2", "'a'", "'b'"]),
+    ("[groups]\na = [1, 2]", ["tag 3", "in no group"]),
+    ("[groups]\na = [1]\n[group]\nb = [2]\n", ["own.toml", "groups"]),
+]
+WORDS = [
+    ("uwbsim run no.toml -o o.uwb", ["no.toml", "no such"]),
+    ("uwbsim run {here} -o o.uwb", ["directory"]),
+    ("uwbsim run noiseless -o o.uwb --set ranging.rate", ["ranging.rate"]),
+    ("uwbsim run noiseless -o no/x.uwb", ["does not exist"]),
+    ("uwbsim run noiseless -o mine", ["mine", "--force"]),
+    ("uwblink show {long}", ["File name too long"]),
+    ("calib fit {f_uwb} -o {long}", ["File name too long"]),
+    ("calib fit {f_uwb} -o mine", ["mine", "--force"]),
+    ("calib fit {f_uwb} -o c.json --loss tukey", ["--loss", "tukey"]),
+    ("calib fit {f_uwb} -o c.json --scale -1", ["--scale", "-1"]),
+    ("calib fit {f_uwb} -o c.json --lift up", ["--lift", "up"]),
+    ("calib fit {f_uwb} -o c.json --fix 1", ["--fix", "'1'", "TAG=NS"]),
+    ("calib apply {f_uwb} -c {c_json} -o mine", ["mine", "--force"]),
+    ("calib evaluate {f_uwb} -c {c_json} --report mine", ["mine", "--force"]),
+    ("calib report {f_uwb} -o r.html --pdf mine", ["mine", "--force"]),
+    ("calib report {f_uwb} -o r.html --figures mine", ["mine", "is a file"]),
+    ("calib report {f_uwb} -o r.html --figures no/figures", ["no", "does not exist"]),
+    ("calib report {f_uwb} -o r.html --loss mixture --sequential", ["--sequential"]),
+    ("calib report no.uwb -o r.html", ["no.uwb", "no such"]),
+    ("calib export {c_json} --to csv -o no/out.csv", ["no"]),
+    ("uwblink import csv {t_csv_gz} -o o.uwb", ["t.csv.gz", "gzip"]),
+    # A recording that is given twice, under another name, too, would count as twice the evidence.
+    ("calib fit {f_uwb} {f_uwb} -o o.json", ["f.uwb"]),
+    ("calib evaluate {again_uwb} {f_uwb} -c {c_json}", ["f.uwb"]),
+    # A recording is not written under the name of a table.
+    ("calib apply {f_uwb} -c {c_json} -o c.csv", ["c.csv", "c.uwb"]),
+    ("calib sample -o c.parquet", ["c.parquet", "c.uwb"]),
+    ("uwbsim run noiseless -o c.mcap", ["c.mcap", "c.uwb"]),
+    ("uwblink import csv {r_csv} -o c.csv", ["c.csv", "c.uwb"]),
+    *((f"uwbsim predict --protocol {name} --final-delay-us 500", [name, "--final-delay"]) for name in
+      ("ds-sym", "ss", "ss-cfo")),
+    # Names of files that are no UTF-8, which the system takes and DuckDB does not.
+    *((line, [r"no\udcff", "must be UTF-8"]) for line in (
+        "uwblink show {here}/../{no}.uwb",
+        "uwbsim run noiseless -o new{no}.uwb",
+        "uwblink export {f_uwb} --to csv -o {no}",
+        "uwblink import csv {here}/../{no}.csv -o o.uwb",
+        "uwbsim compare noiseless -o {no} -n 200 --protocols ds",
+    )),
+    ("uwblink send /dev/nothing {no}", ["/dev/nothing: no such port"]),
+    # What is no recording.
+    *((line.format(name, c="{c_json}"), [named, fragment])
+      for name, named, fragment in (("no.uwb", "no.uwb", "no such"), ("{cut_uwb}", "cut.uwb", "truncated"),
+                                    ("{other_uwb}", "other.uwb", "not a"), ("{here}", "", "directory"))
+      for line in ("uwblink show {}", "calib fit {} -o c.json", "calib apply {} -c {c} -o o.uwb",
+                   "calib evaluate {} -c {c}")),
+    # FIFOs are not opened.
+    *((line, ["p.", "FIFO"]) for line in (
+        "calib show {p_json}",
+        "calib evaluate {f_uwb} -c {p_json}",
+        "calib fit {p_uwb} -o o.json",
+        "calib fit {f_uwb} -o o.json --group {p_toml}",
+        "calib survey {f_uwb} -o o.json --known {p_toml}",
+        "calib import miluv {p_json} -o o.json",
+        "uwblink show {p_uwb}",
+        "uwblink import csv {p_csv} -o o.uwb",
+        "uwblink import csv {p_csv} --map {p_toml} -o o.uwb",
+        "uwblink import guess {p_csv}",
+        "uwblink import bag {p_mcap} -o o.uwb",
+        "uwblink poses {f_uwb} --from {p_csv}",
+        "uwblink stream {f_uwb} -c {p_json} --speed inf",
+        "uwbsim run {p_toml} -o o.uwb",
+        "uwbsim sweep {p_toml} -o o",
+    )),
+    ("uwbsim run noiseless -o o.uwb --set run.seed=" + "[" * 3000, ["run.seed"]),
+    # Boards that are not there.
+    *((f"uwblink {words}", ["/dev/nothing", "no such port"]) for words in (
+        "info /dev/nothing", "twr /dev/nothing 2", "test /dev/nothing", "set-delay /dev/nothing 1500",
+        "passive /dev/nothing on", "send /dev/nothing x", "cir /dev/nothing 2",
+        "record /dev/nothing -o x.uwb --pairs all",
+    )),
+    ("uwblink replay {f_uwb}", ["no bytes from boards"]),
+    ("uwblink replay {f_uwb} --serve", ["no bytes from boards"]),
+    ("uwblink replay no.uwb", ["no such"]),
+    ("uwbsim serve {bench} --link-dir mine --duration 1", ["tag10"]),
+    ("uwbsim serve {bench} --poses mine --duration 1", ["--force"]),
+]  # fmt: skip
+TAGS = "[[tags]]\nid = 1\nbody = 'robot1'\n"
+TAGS_LINE = "uwblink poses {f_uwb} --from {poses_csv} --tags own.toml"
+OWN = [
+    # Nested too deeply.
+    *((line, ["own.toml"], DEEP) for line in (
+        "uwbsim validate own.toml",
+        "uwbsim sweep own.toml -o o",
+        "uwbsim serve noiseless --faults own.toml",
+        "uwblink import csv {r_csv} --map own.toml -o o.uwb",
+        "calib survey {f_uwb} --known own.toml -o o.json",
+    )),
+    # Misspelt keys.
+    (TAGS_LINE, ["own.toml", "lever_arm"], TAGS + "lever_arm = [0.1, 0.0, 0.0]\n"),
+    (TAGS_LINE, ["own.toml", "sigma_m"],
+     TAGS + "[[anchors]]\nid = 2\nposition_m = [0.0, 0.0, 1.0]\nsigma_m = 0.1\n"),
+    (TAGS_LINE, ["own.toml", "anchor"], TAGS + "[[anchor]]\nid = 2\n"),
+    ("uwblink record none -o o.uwb --plan own.toml", ["own.toml", "lever_arm"], TAGS + "lever_arm = [0.1, 0.0, 0.0]\n"),
+    ("uwblink record none -o o.uwb --plan own.toml", ["own.toml", "rate"], "rate = 3\n" + TAGS),
+    ("calib survey {f_uwb} -o o.json --known own.toml", ["own.toml", "betwen"], "[[distances]]\nbetwen = [1, 2]\n"),
+    ("calib survey {f_uwb} -o o.json --known own.toml", ["own.toml", "shape"], "shape = 'line'\n"),
+    ("uwblink import csv {r_csv} -o o.uwb --map own.toml", ["own.toml", "from"], "[columns]\nfrom = 'a'\n"),
+    ("uwblink import csv {r_csv} -o o.uwb --map own.toml", ["own.toml", "transmit"],
+     "[antenna_delays]\ntransmit = 3\n"),
+    ("uwbsim sweep own.toml -o o", ["own.toml", "seed"], "[sweep]\nscenario = 'noiseless'\nseed = 3\n"),
+    ("uwbsim sweep own.toml -o o", ["own.toml", "rx_noise"],
+     "sweep = {scenario = 'noiseless', design = 'list', protocols = ['ds'], ranges = 10}\n"
+     "[[list]]\n'radio.rx_noise_ps' = 50.0\n[[list]]\n'radio.rx_noise' = 50.0\n"),
+    *(("uwbsim serve {bench} --faults own.toml --duration 1", ["own.toml", *named], text) for named, text in (
+        (["at"], "faults = [{kind = 'unplug', tag = 10, at = 1.0}]\n"),
+        (["faults", "flood"], "[[faults]]\nkind = 'flood'"),
+        (["faults[0].tag", "99", "10, 20"], "[[faults]]\nkind = 'hang'\ntag = 99\nat_s = 1"),
+        (["share"], "[[faults]]\nkind = 'lose-frames'\nshare = 2"),
+        (["not valid TOML"], "faults = ["),
+    )),
+    *(("uwbsim run own.toml -o o.uwb", ["own.toml", *named], NOISELESS.replace(old, new, 1))
+      for old, new, named in SCENARIOS),
+    *(("uwblink import csv own.csv -o o.uwb", ["own.csv", *named], text) for text, named in TABLES),
+    *(("calib fit {f_uwb} -o c.json --group own.toml", ["--group", *named], text) for text, named in GROUPS),
+    *(("calib evaluate {f_uwb} -c own.json", named, text) for text, named in (
         ("{", ["not JSON"]),
         ("[]", ["not a calibration"]),
         ('{"schema_version": 99}', ["99"]),
+        ('{"schema_version": 7}', ["schema version 7", "reads 1, 2, 3 and 4"]),
         ('{"schema_version": 1}', ["missing"]),
         ('{"schema_version": 1, "lift": "up"}', ["mean-of-lifted"]),
-        ({"delays_ns.3": DELETE}, ["no delay for tag 3"]),
-        ({"schema_version": 7}, ["schema version 7", "reads 1, 2, 3 and 4"]),
-        ({"delays_ns.3": 10**400}, ["delays_ns: 3", "nanoseconds"]),
-        ({f"delays_ns.{'9' * 5000}": 0.1}, ["delays_ns", "tag ids as keys"]),
-        ({"uncertainty.bias_m2": [[1.0]]}, ["uncertainty", "bias_m2", "rows"]),
-    ],
-)
-def test_calibrations_that_cannot_be(tmp_path, flight, change, fragments):
-    text = change
-    if isinstance(change, dict):
-        document = json.loads((flight / "c.json").read_text())
-        (key, value) = next(iter(change.items()))
-        table, _, name = key.rpartition(".")
-        place = document[table] if table else document
-        place[name] = value
-        if value is DELETE:
-            del place[name]
-        text = json.dumps(document)
-    (tmp_path / "c.json").write_text(text)
-    refused(run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"), 2, *fragments)
+    )),
+    ("calib import miluv own.json -o c.json", ["own.json", "delays_ns"], json.dumps(PUBLISHED)),
+]  # fmt: skip
 
 
-def test_pairs_that_cannot_determine_delays_are_status_1(tmp_path):
-    words = ("--set", "run.duration_s=5", "--set", "ranging.pairs=[[1, 3], [1, 5]]")
-    assert run("uwbsim", "run", NOISELESS, "-o", tmp_path / "f.uwb", *words).returncode == 0
-    refused(run("calib", "fit", tmp_path / "f.uwb", "-o", tmp_path / "c.json"), 1, "1, 3, 5")
-    assert not (tmp_path / "c.json").exists()
+@pytest.mark.parametrize(("line", "naming", "text"), [*((line, naming, "") for line, naming in WORDS), *OWN])
+def test_what_cannot_be_is_named_and_nothing_is_written(seeds, tmp_path, line, naming, text):
+    line = line.replace("{here}/../", f"{seeds}/")
+    refused(seeds, tmp_path, line, naming, text)
 
 
-def test_a_table_without_truth_is_status_1(tmp_path):
-    (tmp_path / "t.csv").write_text(HEADER + "\n" + GOOD + "\n")
-    assert run("uwblink", "import", "csv", tmp_path / "t.csv", "-o", tmp_path / "o.uwb").returncode == 0
-    refused(run("calib", "fit", tmp_path / "o.uwb", "-o", tmp_path / "c.json"), 1, "no true distance")
+def test_every_change_of_a_scenario_finds_its_place():
+    assert [old for old, _, _ in SCENARIOS if old not in NOISELESS] == []
 
 
-def altered(source, target, change):
-    """Copy a recording with its exchanges and poses changed."""
-    with Recording.open(source) as opened:
-        exchanges, poses, tags, meta = opened.exchanges(), opened.poses(), opened.tags(), opened.meta()
-    exchanges, poses = change(exchanges, poses)
-    with Recording.create(target, meta=meta) as written:
-        written.append_tags(tags)
-        written.append_poses(poses)
-        written.append_exchanges(exchanges)
-    return target
-
-
-def powers(first, second):
-    return lambda e, p: (replace(e, fpp1_dbm=e.fpp1_dbm * 0 + first, fpp2_dbm=e.fpp2_dbm * 0 + second), p)
+@pytest.fixture(scope="module")
+def ports():
+    with served() as server:
+        yield server.names
 
 
 @pytest.mark.parametrize(
-    ("change", "fragments"),
+    ("line", "naming"),
     [
-        (powers(float("nan"), float("nan")), ["no power"]),
-        (powers(0.0, 3.0), ["no power", "+3 dBm"]),
-        (lambda e, p: (replace(e, rx2=e.rx2 + 2**30 & 2**32 - 1), p), ["none of its", "impossible stamps"]),
+        ("twr {one} 1", ["own id"]),
+        ("twr {one} 9", ["COMMANDED TASK FAILED AFTER 5 ATTEMPTS"]),
+        ("twr {one} 2 --protocol tdoa", ["tdoa", "ds and ss"]),
+        ("set-delay {one} 279", ["279", "280 to 6500"]),
+        ("set-delay {one} 100000", ["100000", "280 to 6500"]),
+        ("passive {one} maybe", ["maybe", "on or off"]),
+        ("send {one} " + "x" * 58, ["58 bytes", "at most 57", "one USB packet"]),
+        ("cir {one} 2 --plot {here}/c.xyz", [".xyz", ".png"]),
+        ("record {one} {two} -o f.uwb --plan own.toml", ["names 9", "1, 2"]),
+        ("record {one} {two} -o f.uwb", ["--plan", "--pairs"]),
+        ("record {one} {two} -o f.uwb --pairs some", ["some"]),
+        ("record {one} {two} -o f.uwb --plan no.toml", ["no.toml"]),
+        ("record {one} -o f.uwb --pairs all", ["no two boards"]),
+        ("record {one} {two} -o f.uwb --pairs all -c no.json", ["--live"]),
+        ("record {one} {two} -o f.uwb --pairs all --live --calibration no.json", ["no.json"]),
+        ("info {silent}", ["b'C07\\r'", "heard nothing", "is this a ranging board"]),
+    ],
+)
+def test_what_a_board_or_a_recorder_cannot_do(seeds, ports, tmp_path, line, naming):
+    silent = Terminal()
+    names = {"one": ports[1], "two": ports[2], "silent": silent.name}
+    refused(seeds, tmp_path, f"uwblink {line}", naming, "pairs = [[1, 9]]", **names)
+    silent.unplug()
+
+
+def test_ports_that_are_and_are_not_boards(ports):
+    silent = Terminal()
+    done = succeed("uwblink", "ports", "--probe", ports[1], silent.name, timeout=180)
+    assert "board 1" in done.stdout
+    assert "no answer" in done.stdout
+    silent.unplug()
+
+
+def test_a_second_server_does_not_take_the_links_of_the_first(tmp_path):
+    first = Terminal(tmp_path / "tag1")
+    with pytest.raises(PortError, match="in use by another server"):
+        Terminal(tmp_path / "tag1")
+    first.unplug()
+    (tmp_path / "tag1").symlink_to(tmp_path / "gone")
+    Terminal(tmp_path / "tag1").unplug()
+
+
+def test_a_server_says_how_to_record_and_a_recording_is_replayed_as_it_was(tmp_path, ports):
+    said = succeed("uwbsim", "serve", BENCH, "--link-dir", tmp_path / "ports", "--duration", 0.1)
+    assert said.stdout.startswith("tag  10  ")
+    assert f"uwblink record {tmp_path / 'ports'}/* --pairs all -o flight.uwb" in said.stderr
+    succeed("uwblink", "record", ports[1], ports[2], "-o", "f.uwb", "--pairs", "all", "--duration", 2, cwd=tmp_path)
+    done = succeed("uwblink", "replay", "f.uwb", "--serve", "--speed", 10, "--link-dir", "again", cwd=tmp_path)
+    assert "pieces played" in done.stdout
+    done = succeed("uwblink", "replay", "f.uwb", "-o", "again.uwb", "--json", cwd=tmp_path)
+    assert '"skipped_bytes": 0' in done.stdout
+    assert (tmp_path / "again.uwb").exists()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "calib export {c_json} --to csv --force -o own.there",
+        "calib fit {f_uwb} --force -o own.there",
+        "calib apply {f_uwb} -c {c_json} --force -o own.there",
+        "uwblink import guess {r_csv} --force -o own.there",
+    ],
+)
+def test_no_fifo_or_device_is_replaced(seeds, tmp_path, line):
+    os.mkfifo(tmp_path / "there")
+    refused(seeds, tmp_path, line.replace("own.", "./"), ["there", "FIFO"])
+    assert (tmp_path / "there").is_fifo()
+
+
+def test_a_folder_with_something_else_in_it_is_not_replaced(seeds, tmp_path):
+    """`--force` of an export deletes what was exported before, and nothing else."""
+    export = "uwblink export {f_uwb} --to csv --force -o out"
+    for _ in range(2):
+        succeed(*export.format(f_uwb=seeds / "f.uwb").split(), cwd=tmp_path)
+    (tmp_path / "out" / "deep").mkdir()
+    (tmp_path / "out" / "deep" / "thesis.txt").write_text("mine")
+    refused(seeds, tmp_path, export, ["out", "deep"])
+
+
+def nothing(*names):
+    return {name: np.full(COUNT, np.nan) for name in names}
+
+
+def late_poses():
+    poses = calib.sample_flight(COUNT).poses
+    return replace(poses, time_ns=poses.time_ns + 100_000_000_000)
+
+
+SAMPLE = calib.sample_flight(COUNT).exchanges
+FIT = "calib fit {here}/bad.uwb -o c.json"
+
+
+@pytest.mark.parametrize(
+    ("change", "line", "naming"),
+    [
+        (nothing("fpp1_dbm", "fpp2_dbm"), FIT, ["bad.uwb", "no power"]),
+        ({"fpp1_dbm": np.zeros(COUNT), "fpp2_dbm": np.full(COUNT, 3.0)}, FIT, ["bad.uwb", "no power", "+3 dBm"]),
+        ({"rx2": SAMPLE.rx2 + 2**30 & 2**32 - 1}, FIT, ["bad.uwb", "none of its", "impossible stamps"]),
+        ({"poses": late_poses()}, FIT, ["poses cover 0.0 to 11.0 s", "exchanges -99.0 to -90.0 s", "--offset"]),
+        ({"poses": late_poses()[:0]}, FIT, ["bad.uwb", "no true distance"]),
+        # Two pairs do not determine three delays.
+        ({"rows": (SAMPLE.initiator == 1) | (SAMPLE.target == 1)}, FIT, ["1, 2, 3"]),
+        ({"tags": []}, "uwbsim twin {here}/bad.uwb -c {c_json} -o t.toml", ["tag 1, 2, 3", "uwblink poses --tags"]),
         (
-            lambda e, p: (e, replace(p, time_ns=p.time_ns + 100_000_000_000)),
-            ["poses cover 0.0 to 5.1 s", "exchanges -100.0 to -95.0 s", "--offset"],
+            {"time_ns": np.zeros(COUNT, np.int64)},
+            "calib localize {here}/bad.uwb -c {c_json}",
+            ["all of its 900 ranges have the same time"],
+        ),
+        (
+            nothing("fpp1_dbm", "fpp2_dbm"),
+            "calib localize {here}/bad.uwb -c {c_json}",
+            ["bad.uwb", "no power; a calibration without a curve needs none: `calib fit --delays-only`"],
         ),
     ],
 )
-def test_recordings_that_leave_nothing_to_fit_are_status_1(tmp_path, flight, change, fragments):
-    bad = altered(flight / "f.uwb", tmp_path / "bad.uwb", change)
-    refused(run("calib", "fit", bad, "-o", tmp_path / "c.json"), 1, "bad.uwb", *fragments)
-    assert not (tmp_path / "c.json").exists()
+def test_what_a_recording_cannot_answer_is_status_1(seeds, tmp_path, change, line, naming):
+    changed(tmp_path / "bad.uwb", **change)
+    refused(seeds, tmp_path, line, naming, status=1)
 
 
-def test_poses_of_a_part_of_the_flight_are_enough_for_a_warning(tmp_path, flight):
-    cut = altered(flight / "f.uwb", tmp_path / "cut.uwb", lambda e, p: (e, p[p.time_ns < p.time_ns.min() + 3 * 10**9]))
-    done = run("calib", "fit", cut, "-o", tmp_path / "c.json")
-    assert done.returncode == 0
+def test_poses_of_a_part_of_the_flight_are_enough_for_a_warning(tmp_path):
+    poses = calib.sample_flight(COUNT).poses
+    cut = changed(tmp_path / "cut.uwb", poses=poses[poses.time_ns < 64 * 10**8])
+    done = succeed("calib", "fit", cut, "-o", tmp_path / "c.json")
     assert "40 % of the exchanges were left out: no true distance" in done.stderr
 
 
 @pytest.mark.parametrize(
-    ("text", "fragments"),
+    ("path", "value"),
     [
-        ("groups", ["not valid TOML"]),
-        ("x = 1", ["expected one table [groups]"]),
-        ("[groups]\na = 1", ["a:", "list of tag ids"]),
-        ("[groups]\na = [1, 2]\nb = [2]", ["tag 2", "'a'", "'b'"]),
-        ("[groups]\na = [1, 2]", ["tag 3", "in no group"]),
+        ("speed_of_light", 0),
+        ("speed_of_light", 3e5),
+        ("delays_std_ns/2", -0.05),
+        ("delays_ns/2", 9.2e18),
+        ("delays_ns/2", 10**400),
+        ("delays_ns/2", None),
+        ("delays_ns/" + "9" * 5000, 0.1),
+        ("delays_std_ns/2", 9.2e18),
+        ("scale_ns", -1.0),
+        ("alpha_dbm", 4000.0),
+        ("bias_curve/coefficients/0", 1e30),
+        ("sigma_curve/coefficients/0", -0.5),
+        ("errors/outlier_share", 1.5),
+        ("errors/outlier_m", -3.0),
+        ("errors/scale", 0.0),
+        ("errors/detour_m", -0.1),
+        ("errors/levels/0/0", 2.0),
+        ("uncertainty/delays_ns2/0/0", -0.01),
+        ("uncertainty/bias_m2", [[1.0]]),
     ],
 )
-def test_designs_that_cannot_be(tmp_path, flight, text, fragments):
-    (tmp_path / "d.toml").write_text(text)
-    done = run("calib", "fit", flight / "f.uwb", "-o", tmp_path / "c.json", "--group", tmp_path / "d.toml")
-    refused(done, 2, "--group", *fragments)
+def test_numbers_that_no_calibration_can_have_are_refused_and_named(seeds, path, value):
+    text = (seeds / "c.json").read_text()
+    table = inner = json.loads(text)
+    *outer, last = path.split("/")
+    for key in outer:
+        inner = inner[int(key) if isinstance(inner, list) else key]
+    inner[int(last) if isinstance(inner, list) else last] = value
+    with pytest.raises(BadInputError) as caught:
+        calib.Calibration.from_json(json.dumps(table), "own.json")
+    assert str(caught.value).startswith("own.json: ")
+    assert path.split("/")[1 if "errors/" in path else 0] in str(caught.value)
+    assert calib.Calibration.from_json(text) == calib.load_calibration(seeds / "c.json")
+
+
+def test_a_calibration_without_a_tag_of_the_recording_is_refused(seeds, tmp_path):
+    table = json.loads((seeds / "c.json").read_text())
+    del table["delays_ns"]["3"]
+    refused(seeds, tmp_path, "calib evaluate {f_uwb} -c own.json", ["no delay for tag 3"], json.dumps(table))
+
+
+def test_delays_without_standard_errors_are_not_taken_for_exact(seeds, tmp_path):
+    fitted = calib.load_calibration(seeds / "c.json")
+    delays = {str(tag): delay + 0.3 * (tag == 2) for tag, delay in fitted.delays_ns.items()}
+    (tmp_path / "m.json").write_text(json.dumps(PUBLISHED | {"delays_ns": delays}))
+    succeed("calib", "import", "miluv", "m.json", "-o", "c.json", cwd=tmp_path)
+    words = ("calib", "compare", seeds / "c.json", "c.json")
+    found = json.loads(run(*words, "--json", cwd=tmp_path).stdout)
+    assert found["verdict"] == "unknown"
+    assert found["probability"] is None
+    assert set(found["std_ns"].values()) == {None}
+    assert found["difference_ns"]["2"] - found["difference_ns"]["1"] == pytest.approx(0.3)
+    assert "no verdict" in run(*words, cwd=tmp_path).stdout
+    assert "not stated" in run("calib", "show", "c.json", cwd=tmp_path).stdout
+    rows = run("calib", "export", "c.json", "--to", "csv", cwd=tmp_path).stdout.splitlines()
+    assert rows[1].endswith(",")
+
+
+def test_what_needs_no_powers_works_without_any(tmp_path):
+    path = changed(tmp_path / "f.uwb", anchors=True, **nothing("fpp1_dbm", "fpp2_dbm"))
+    (finding,) = calib.examine(path)
+    assert (finding.fault, finding.evidence) == ("no powers", "0 % of the exchanges have a first-path power")
+    calib.fit(path, delays_only=True).calibration.save(tmp_path / "d.json")
+    succeed("calib", "localize", path, "-c", tmp_path / "d.json", "--model", "constant-velocity")
+    one_end = calib.examine(changed(tmp_path / "one.uwb", **nothing("fpp2_dbm")))
+    assert "no powers" not in {found.fault for found in one_end}
+
+
+@pytest.mark.parametrize("share", [0.01, 1.0])
+def test_a_tag_that_ranges_with_itself_is_named_and_left_out(share, tmp_path):
+    rows = np.arange(COUNT) < share * COUNT
+    path = changed(tmp_path / "f.uwb", target=np.where(rows, SAMPLE.initiator, SAMPLE.target))
+    assert "a tag with itself" in {f.fault for f in calib.examine(path)}
+    if share == 1:
+        with pytest.raises(calib.UnanswerableError, match="a tag with itself; look at from_id and to_id"):
+            calib.fit(path)
+    else:
+        assert calib.load_ranges(path).excluded == {"a tag with itself": rows.sum()}
+
+
+def test_a_twin_does_without_exchanges_of_a_tag_with_itself(tmp_path):
+    flight = uwbsim.simulate(uwbsim.load("icra2023/test1", {"run.duration_s": 5.0}))
+    target = flight.exchanges.target.copy()
+    target[::50] = flight.exchanges.initiator[::50]
+    mixed = Contents(
+        exchanges=replace(flight.exchanges, target=target), poses=flight.poses, tags=flight.tags, faults=flight.faults
+    )
+    calib.fit(flight).save(tmp_path / "k.json")
+    with_itself, whole = (uwbsim.twin(data, tmp_path / "k.json").found for data in (mixed, flight))
+    assert with_itself["exchanges"] == whole["exchanges"] - len(target[::50])
+    # Two in a hundred fewer say the same to a few per cent.
+    assert with_itself["receive_noise_ps"] == pytest.approx(whole["receive_noise_ps"], rel=0.1)
+
+
+def test_delays_of_all_tags_and_no_curve_blame_the_calibration(seeds):
+    with pytest.raises(calib.BadInputError, match="`delays_from`: it has the delays of all tags"):
+        calib.fit(calib.sample_flight(COUNT), delays_from=seeds / "c.json", delays_only=True)
+    with pytest.raises(calib.BadInputError, match="`fixed_ns`: every tag is pinned"):
+        calib.fit(calib.sample_flight(COUNT), fixed_ns={1: 0.0, 2: 0.0, 3: 0.0}, delays_only=True)
+
+
+def test_a_recording_is_no_table_to_guess_at(seeds):
+    with pytest.raises(ImportTableError, match="is a recording already"):
+        guess_map(seeds / "f.uwb")
+
+
+def test_nothing_is_something_to_begin_with():
+    assert len(Poses.from_arrays([], [], [])) == 0
+    assert len(Poses.from_arrays([], "drone", np.zeros((0, 3)))) == 0
+    assert len(Exchanges.from_arrays([], [], tx1=[], rx1=[], tx2=[], rx2=[])) == 0
+
+
+def test_evaluating_ranges_of_the_first_calibrated_tags_only():
+    """A simulation plants delays of tags that do not range in the part that is evaluated."""
+    flight = calib.sample_flight(anchors=True)
+    known = calib.fit(flight).calibration
+    planted = {"knots": [0.0] * 4 + [2.0] * 4, "coefficients": [0.0, 0.01, 0.02, 0.03], "degree": 3}
+    ranges = calib.load_ranges(flight)
+    ranges = replace(ranges, planted={**(ranges.planted or {}), "bias_curve": planted})
+    some = ranges[(ranges.initiator <= 2) & (ranges.target <= 2)]
+    full = calib.evaluate(ranges, known).planted
+    assert calib.evaluate(some, known).planted.delay_error_ns == full.delay_error_ns
+
+
+def test_the_delay_of_the_final_changes_the_prediction_of_protocols_that_have_one():
+    words = ("uwbsim", "predict", "--protocol", "ds-alt", "--json")
+    quick, usual = (json.loads(run(*words, *more).stdout)["std_m"] for more in (("--final-delay-us", "300"), ()))
+    assert quick != usual
+
+
+def test_text_is_written_under_names_that_are_no_utf8(seeds, tmp_path):
+    (tmp_path / f"{NO_UTF8}.json").write_bytes((seeds / "c.json").read_bytes())
+    succeed("calib", "export", f"{NO_UTF8}.json", "--to", "c-header", "-o", "c.h", cwd=tmp_path)
+    assert (tmp_path / "c.h").read_text(encoding="utf-8")

@@ -1,5 +1,6 @@
-"""The three commands: versions, usage errors, Ctrl-C while they begin."""
+"""The three commands: versions, usage errors, Ctrl-C while they begin; and they behave in forks as in new processes."""
 
+import os
 import subprocess
 import sys
 
@@ -13,8 +14,7 @@ from tests import processes
 def test_usage_errors_have_status_2(command):
     assert processes.run(command, "--nonsense").returncode == 2
     assert processes.run(command, "nonsense").returncode == 2
-    done = processes.run(command, "--version")
-    assert done.stdout.splitlines()[0] == f"{command} {uwblink.__version__}"
+    assert processes.succeed(command, "--version").stdout.splitlines()[0] == f"{command} {uwblink.__version__}"
 
 
 @pytest.mark.parametrize("package", ["uwbsim", "uwblink", "calib"])
@@ -32,3 +32,39 @@ def test_interrupted_while_it_is_imported(package, module):
     )
     done = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("uwbsim", "validate", "scenarios/noiseless.toml"),
+        ("calib", "fit", "nowhere.uwb", "-o", "c.json"),
+        ("uwblink", "nonsense"),
+        ("calib", "--help"),
+    ],
+)
+def test_status_and_output_of_a_fork_are_those_of_a_new_process(words, monkeypatch):
+    monkeypatch.chdir(processes.ROOT)
+    plain = subprocess.run([processes.BIN / words[0], *words[1:]], capture_output=True, text=True)
+    forked = processes.run(*words)
+    assert (forked.returncode, forked.stdout, forked.stderr) == (plain.returncode, plain.stdout, plain.stderr)
+
+
+def test_a_fork_has_a_folder_an_environment_and_limits_of_its_own(tmp_path):
+    show = ("uwbsim", "show", processes.ROOT / "scenarios" / "noiseless.toml", "-o")
+    processes.succeed(*show, "s.svg", cwd=tmp_path)
+    processes.refuse(*show, "full.svg", cwd=tmp_path, most_bytes=1000, naming=["File too large"])
+    assert [path.name for path in tmp_path.iterdir()] == ["s.svg"]
+    wide, narrow = (
+        processes.run("calib", "fit", "--help", env=os.environ | {"COLUMNS": columns}).stdout.splitlines()
+        for columns in ("150", "80")
+    )
+    assert max(map(len, wide)) > 120
+    assert max(map(len, narrow)) <= 80
+
+
+def test_what_hangs_is_ended():
+    bench = processes.ROOT / "scenarios/two_boards_on_a_bench/bench.toml"
+    with pytest.raises(subprocess.TimeoutExpired):
+        processes.run("uwbsim", "serve", bench, timeout=1.0)
+    processes.succeed("uwbsim", "--version")

@@ -1,21 +1,17 @@
-"""The commands call nothing but what everybody may call: names of the front doors and of the doors of rooms."""
+"""What packages and rooms offer: complete, cheap to import, and all that commands call."""
 
 import ast
+import doctest
 import importlib
 import pkgutil
-from pathlib import Path
+import subprocess
+import sys
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
-PACKAGES = ("uwblink", "uwbsim", "calib")
+from tests.rooms import PACKAGES, ROOT
 
-ROOMS = {
-    f"{package}.{room.name}"
-    for package in PACKAGES
-    for room in pkgutil.iter_modules(importlib.import_module(package).__path__)
-    if room.ispkg
-}
+HEAVY = ("numpy", "scipy", "duckdb", "matplotlib", "pydantic", "simpy", "typer", "rich", "serial")
 
 # What commands use beside doors, each with its reason.
 BESIDE = {
@@ -30,8 +26,17 @@ BESIDE = {
 }
 
 
+def modules(package):
+    """Return the modules right below a package or a room, by name, and whether each is a folder."""
+    return {found.name: found.ispkg for found in pkgutil.iter_modules(importlib.import_module(package).__path__)}
+
+
+DOORS = {package: {f"{package}.{name}" for name, folder in modules(package).items() if folder} for package in PACKAGES}
+ROOMS = set().union(*DOORS.values())
+
+
 def offered(module):
-    """What a front door or the door of a room (a module of the first level with `__all__`) offers."""
+    """Return what a front door or the door of a room (a module of the first level with `__all__`) offers."""
     return set(getattr(importlib.import_module(module), "__all__", ()))
 
 
@@ -89,25 +94,47 @@ def test_the_walk_sees_a_back_door(package, source, found):
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_what_the_door_of_a_room_offers_is_there(package):
-    rooms = {path.relative_to(ROOT / package).parts[0].removesuffix(".py") for path in (ROOT / package).rglob("*.py")}
-    for room in sorted(rooms - {"__init__", "__main__", "cli"}):
-        module = importlib.import_module(f"{package}.{room}")
+def test_what_doors_offer_is_there_once_and_by_no_name_of_a_module(package):
+    """Importing a module of such a name, from anywhere, would put it in the place of what the door offers."""
+    for door in [package, *(f"{package}.{name}" for name in modules(package) if name != "__main__")]:
+        module = importlib.import_module(door)
         names = list(getattr(module, "__all__", ()))
-        assert len(names) == len(set(names))
-        for name in names:
-            assert getattr(module, name) is not None
-
-
-def rooms(package):
-    """A package and its rooms, by the names that import them."""
-    path = importlib.import_module(package).__path__
-    return [package, *(f"{package}.{room.name}" for room in pkgutil.iter_modules(path) if room.ispkg)]
+        assert len(names) == len(set(names)), door
+        assert [name for name in names if getattr(module, name) is None] == [], door
+        if hasattr(module, "__path__"):
+            assert sorted(modules(door).keys() & set(names)) == [], door
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_no_name_at_a_door_is_that_of_a_module_behind_it(package):
-    """Importing such a module, from anywhere, would put it in the place of what the door offers."""
-    for room in rooms(package):
-        modules = {found.name for found in pkgutil.iter_modules(importlib.import_module(room).__path__)}
-        assert sorted(modules & offered(room)) == [], room
+def test_what_dir_shows_is_what_is_offered(package):
+    module = importlib.import_module(package)
+    assert sorted(dir(module)) == sorted(offered(package))
+    with pytest.raises(AttributeError, match=f"module '{package}' has no attribute 'nothing'"):
+        _ = module.nothing
+
+
+# Values have no docstring, and a scenario's is the description in the JSON Schema: `load` shows one.
+WITHOUT = {("uwblink", "PROTOCOLS"), ("uwblink", "SPEED_OF_LIGHT"), ("uwbsim", "Scenario")}
+SHOWN = {(package, name) for package in PACKAGES for name in offered(package) if not name.endswith("Error")} - WITHOUT
+
+
+@pytest.mark.parametrize(("package", "name"), sorted(SHOWN))
+def test_everything_but_errors_has_an_example_and_those_of_uwblink_run(package, name, tmp_path, monkeypatch):
+    """The examples of the other two need files and leave rows behind: tests/uwbsim and tests/calib run theirs."""
+    monkeypatch.chdir(tmp_path)
+    thing = getattr(importlib.import_module(package), name)
+    module = sys.modules.get(getattr(thing, "__module__", None) or package)
+    examples = [example for example in doctest.DocTestFinder().find(thing, name, module=module) if example.examples]
+    assert examples
+    runner = doctest.DocTestRunner(verbose=False)
+    for example in examples if package == "uwblink" else ():
+        runner.run(example)
+    assert runner.failures == 0
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_the_example_at_the_head_of_a_package_runs_and_importing_it_loads_nothing_large(package, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert doctest.testmod(importlib.import_module(package)).failed == 0
+    code = f"import sys, {package}; print(*(m for m in {HEAVY} if m in sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split() == []

@@ -18,7 +18,7 @@ import uwblink
 import uwbsim
 from docs.site.commands import leaves
 from tests.boards import served
-from tests.processes import run
+from tests.processes import refuse, run
 from uwblink.cli.shared import WRITTEN
 from uwblink.exporters import export_recording
 
@@ -35,9 +35,8 @@ def seeds(tmp_path_factory):
     flight.save(folder / "f.uwb")
     calib.fit(flight).calibration.save(folder / "c.json")
     one_less = flight.exchanges[(flight.exchanges.initiator != 6) & (flight.exchanges.target != 6)]
-    calib.fit(uwblink.Contents(exchanges=one_less, tags=flight.tags, poses=flight.poses)).calibration.save(
-        folder / "five.json"
-    )
+    five = uwblink.Contents(exchanges=one_less, tags=flight.tags, poses=flight.poses)
+    calib.fit(five).calibration.save(folder / "five.json")
     shutil.copyfile(ROOT / "docs" / "examples" / "exchanges.csv", folder / "t.csv")
     ports = uwbsim.VirtualPorts(uwbsim.load(folder / "s.toml"))
     uwblink.record([*ports.names.values()], folder / "boards.uwb", uwblink.RangingPlan(), using=ports, duration_s=2.0)
@@ -162,59 +161,35 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(seeds, tmp_path, line, most_
     assert list(tmp_path.iterdir()) == []
 
 
-def test_where_the_disk_has_room_the_same_commands_write(seeds, tmp_path):
-    assert run("uwblink", "import", "csv", seeds / "t.csv", "-o", "out.uwb", cwd=tmp_path).returncode == 0
-    assert run("uwblink", "show", "out.uwb", cwd=tmp_path).stdout.startswith("out.uwb: ")
-
-
-def test_a_folder_that_vanishes_is_one_line(seeds, tmp_path):
-    ended = run("calib", "export", seeds / "c.json", "--to", "csv", "-o", "no/out.csv", cwd=tmp_path)
-    assert ended.returncode == 2
-    assert ended.stderr.count("\n") == 1
-
-
-def test_poses_for_which_the_disk_has_no_room_leave_the_recording_as_it_was(seeds, tmp_path):
+@pytest.mark.parametrize("room", [0, 20_000])
+def test_poses_for_which_the_disk_has_no_room_or_room_in_the_log_alone(seeds, tmp_path, room):
     path = tmp_path / "f.uwb"
     flight = uwblink.load(seeds / "f.uwb")
     replace(flight, poses=flight.poses[:0]).save(path)
     source = [word for body in ("ifo001", "ifo002") for word in ("--from", f"{body}={seeds / 'tum' / body}.tum")]
-    ended = run("uwblink", "poses", path, *source, cwd=tmp_path, most_bytes=1000)
-    assert ended.returncode == 2, ended
-    assert ended.stderr.count("\n") == 1
-    assert "cannot be written" in ended.stderr
-    # DuckDB's log of the update that failed may lie beside it, until the recording is next written to.
-    assert {each.name for each in tmp_path.iterdir()} <= {"f.uwb", "f.uwb.wal"}
+    most_bytes = path.stat().st_size + room if room else 1000
+    naming = ["everything before is kept", "keep the two together"] if room else ["cannot be written"]
+    refuse("uwblink", "poses", path, *source, cwd=tmp_path, most_bytes=most_bytes, naming=naming)
+    # DuckDB's log of an update that failed may lie beside it, too, until the recording is next written to.
+    names = {each.name for each in tmp_path.iterdir()}
+    assert {"f.uwb", *(["f.uwb.wal"] if room else [])} <= names <= {"f.uwb", "f.uwb.wal"}
     after = uwblink.load(path)
-    assert len(after.poses) == 0
+    assert set(after.poses.body) == ({"ifo001", "ifo002"} if room else set())
     assert len(after.exchanges) == len(flight.exchanges)
 
 
-def test_poses_that_fit_into_the_log_alone_are_kept_in_it(seeds, tmp_path):
-    path = tmp_path / "f.uwb"
-    flight = uwblink.load(seeds / "f.uwb")
-    replace(flight, poses=flight.poses[:0]).save(path)
-    source = [word for body in ("ifo001", "ifo002") for word in ("--from", f"{body}={seeds / 'tum' / body}.tum")]
-    ended = run("uwblink", "poses", path, *source, cwd=tmp_path, most_bytes=path.stat().st_size + 20_000)
-    assert ended.returncode == 2, ended
-    assert ended.stderr.count("\n") == 1
-    assert "everything before is kept" in ended.stderr
-    assert "keep the two together" in ended.stderr
-    assert {each.name for each in tmp_path.iterdir()} == {"f.uwb", "f.uwb.wal"}
-    after = uwblink.load(path)
-    assert len(after.exchanges) == len(flight.exchanges)
-    assert set(after.poses.body) == {"ifo001", "ifo002"}
-
-
-@pytest.mark.parametrize(("most_bytes", "said", "kept"), [(4_000, "cannot be written (", False), (900_000, "", True)])
-def test_a_stream_for_which_the_disk_has_no_room(tmp_path, most_bytes, said, kept):
+@pytest.mark.parametrize(
+    ("most_bytes", "said"), [(4_000, "cannot be written ("), (900_000, "cannot be written any more (")]
+)
+def test_a_stream_for_which_the_disk_has_no_room(tmp_path, most_bytes, said):
     """It is full when the recording begins, or when all has been written to the log and is put into the file."""
     with served() as server:
         words = ["uwblink", "stream", *server.names.values(), "-o", "out.uwb", "--duration", "1.5", "--rate", "100"]
         ended = run(*words, cwd=tmp_path, most_bytes=most_bytes)
     assert ended.returncode == 2, ended
     assert ended.stderr.count("\n") == 1
-    assert (said or "cannot be written any more (") in ended.stderr
-    if not kept:
+    assert said in ended.stderr
+    if most_bytes == 4_000:
         assert list(tmp_path.iterdir()) == []
         return
     assert (tmp_path / "out.uwb").stat().st_size == most_bytes
@@ -226,7 +201,6 @@ def test_a_plot_of_a_board_for_which_the_disk_has_no_room(tmp_path):
     with served() as server:
         here, there, *_ = server.names
         words = ["uwblink", "cir", server.names[here], there, "--plot", "out.png"]
-        ended = run(*words, cwd=tmp_path, most_bytes=1000)
-    assert ended.returncode == 2, ended
-    assert ended.stderr == "error: out.png: cannot be written (File too large)\n"
+        told = refuse(*words, cwd=tmp_path, most_bytes=1000)
+    assert told == "error: out.png: cannot be written (File too large)\n"
     assert list(tmp_path.iterdir()) == []

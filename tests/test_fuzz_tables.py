@@ -10,7 +10,7 @@ from tests.fuzz.seeds import KINDS
 LINES = sorted({line for kind in KINDS for line in (*kind.commands, *kind.seldom)})
 OF_BOARDS = {f"uwblink {name}" for name in ("ports", "info", "twr", "test", "passive", "send", "cir", "set-delay")}
 OF_BOARDS |= {"uwblink record"}
-"""Commands that do nothing without boards, which `test_bad_input_boards.py` and the decoder's fuzzer try."""
+"""Commands that do nothing without boards, which `test_bad_input.py` and the decoder's fuzzer try."""
 
 OF_FOLDERS = {"uwblink import miluv"}
 """Of whose files `tests/uwblink/importers/test_miluv.py` damages each."""

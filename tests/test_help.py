@@ -1,78 +1,76 @@
-"""Help as people see it in a terminal of 80 columns: whole texts, panels, examples that parse, completion."""
+"""Help as people see it in a terminal of 80 columns: whole texts, panels, examples that parse, completion, speed."""
 
+import json
 import os
 import re
 import shlex
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
 import typer
 from rich.text import Text
+from typer import rich_utils
 
 import calib
 import uwbsim
 from calib.cli.commands import app as calib_app
 from calib.cli.judging import spread_tests
+from calib.fitting import known_losses
 from tests import processes
+from uwblink import PROTOCOLS
 from uwblink.cli.commands import app as uwblink_app
+from uwblink.exporters import EXPORTERS
 from uwbsim.cli.commands import app as uwbsim_app
 
-APPS = {"uwblink": uwblink_app, "uwbsim": uwbsim_app, "calib": calib_app}
-COMMANDS: dict[str, Any] = {name: typer.main.get_command(app) for name, app in APPS.items()}
-BIN = Path(sys.executable).parent
+COMMANDS: dict[str, Any] = {
+    name: typer.main.get_command(app)
+    for name, app in (("uwblink", uwblink_app), ("uwbsim", uwbsim_app), ("calib", calib_app))
+}
 
 
-def leaves(group: Any, path: list[str]):
+def below(group: Any, path: list[str]):
     """Yield every command below a group, with the words that call it."""
     context = group.make_context(path[-1], [], resilient_parsing=True)
     for name in group.list_commands(context):
         command = group.get_command(context, name)
-        words = [*path, name]
-        yield words, command
+        yield [*path, name], command
         if hasattr(command, "list_commands"):
-            yield from leaves(command, words)
+            yield from below(command, [*path, name])
 
 
-EVERY = [one for name, command in COMMANDS.items() for one in leaves(command, [name])]
-NAMES = [" ".join(words) for words, _ in EVERY]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _terminal_of_80_columns():
-    from typer import rich_utils
-
-    before = rich_utils.MAX_WIDTH
-    rich_utils.MAX_WIDTH = 80
-    yield
-    rich_utils.MAX_WIDTH = before
-
-
-def shown(command, words, capsys):
-    context = command.make_context(" ".join(words), [], resilient_parsing=True)
-    text = command.get_help(context)
-    return text + capsys.readouterr().out
+EVERY = [one for name, command in COMMANDS.items() for one in below(command, [name])]
 
 
 def words_of(text):
     return re.findall(r"[\w.\[\]=-]+", Text.from_markup(text).plain)
 
 
-@pytest.mark.parametrize(("words", "command"), EVERY, ids=NAMES)
-def test_help_fits_80_columns_and_loses_no_word(words, command, capsys):
-    text = shown(command, words, capsys)
+@pytest.mark.parametrize(("words", "command"), EVERY, ids=[" ".join(words) for words, _ in EVERY])
+def test_help_fits_80_columns_loses_no_word_and_has_examples_that_parse(words, command, capsys, monkeypatch):
+    monkeypatch.setattr(rich_utils, "MAX_WIDTH", 80)
+    context = command.make_context(" ".join(words), [], resilient_parsing=True)
+    text = command.get_help(context) + capsys.readouterr().out
     assert max(map(len, text.splitlines())) <= 80
     seen = re.sub(r"[│╭╮╰╯─]", " ", text)
     for told in [command.help, *(getattr(p, "help", None) for p in command.params)]:
-        assert Text.from_markup(told or "").plain == (told or "").replace("\\[", "["), (
-            "brackets that rich takes for markup"
-        )
-        missing = [word for word in words_of(told or "") if word not in seen]
-        assert missing == [], told
-    assert not re.search(r"\\\[", text)
+        assert Text.from_markup(told or "").plain == (told or "").replace("\\[", "["), "brackets that are markup"
+        assert [word for word in words_of(told or "") if word not in seen] == [], told
+    assert "\\[" not in text
     assert "<bool>" not in text, "a flag takes no value"
+    if len(words) == 2:
+        assert isinstance(command.rich_help_panel, str), "commands stand in panels"
+    examples = [line.strip() for line in Text.from_markup(command.epilog).plain.splitlines()[1:] if line.strip()]
+    assert examples
+    for line in examples:
+        said = spread_tests(shlex.split(line.partition(" > ")[0]))
+        assert said[: len(words)] == words
+        deeper, rest = command, said[len(words) :]
+        while hasattr(deeper, "get_command"):
+            inner = deeper.make_context(rest[0], [], resilient_parsing=True)
+            deeper, rest = deeper.get_command(inner, rest[0]), rest[1:]
+        deeper.make_context(line, rest)
 
 
 @pytest.mark.parametrize(
@@ -89,78 +87,42 @@ def test_help_fits_80_columns_and_loses_no_word(words, command, capsys):
     ],
 )
 def test_old_names_are_answered_with_the_new_ones(words, new, tmp_path):
-    done = processes.run(*words.split(), "-o", tmp_path / "x.uwb")
-    assert done.returncode == 2
-    assert done.stderr.startswith(f"error: {new}")
-    assert done.stderr.count("\n") == 1
+    told = processes.refuse(*words.split(), "-o", tmp_path / "x.uwb")
+    assert told.startswith(f"error: {new}")
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("words", "command"), EVERY, ids=NAMES)
-def test_every_command_has_an_example_that_parses(words, command):
-    lines = [line.strip() for line in Text.from_markup(command.epilog).plain.splitlines()[1:]]
-    examples = [line for line in lines if line]
-    assert examples
-    for line in examples:
-        said = spread_tests(shlex.split(line.partition(" > ")[0]))
-        assert said[: len(words)] == words
-        deeper = command
-        rest = said[len(words) :]
-        while hasattr(deeper, "get_command"):
-            context = deeper.make_context(rest[0], [], resilient_parsing=True)
-            deeper, rest = deeper.get_command(context, rest[0]), rest[1:]
-        deeper.make_context(line, rest)
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_commands_stand_in_panels(name, capsys):
-    top = COMMANDS[name]
-    context = top.make_context(name, [], resilient_parsing=True)
-    for command in top.list_commands(context):
-        assert isinstance(top.get_command(context, command).rich_help_panel, str), command
-
-
 def completed(words, cwd=None):
-    """What a shell is told where it asks for what may follow `words`."""
-    name = words[0]
-    line = " ".join(words)
-    environment = os.environ | {
-        f"_{name.upper()}_COMPLETE": "complete_bash",
-        "COMP_WORDS": line,
-        "COMP_CWORD": str(len(words) - 1),
-    }
-    done = subprocess.run([BIN / name], cwd=cwd, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.split()
+    """Return what a shell is told where it asks for what may follow `words`."""
+    asked = {f"_{words[0].upper()}_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(words)}
+    asked["COMP_CWORD"] = str(len(words) - 1)
+    return processes.succeed(words[0], cwd=cwd, env=os.environ | asked).stdout.split()
 
 
-def test_a_shell_completes_commands_and_names(tmp_path):
+def test_a_shell_completes_commands_names_and_the_tags_of_a_recording(tmp_path):
     assert "localize" in completed(["calib", "lo"])
-    assert {"cauchy"} == set(completed(["calib", "fit", "x.uwb", "--loss", "ca"]))
-    assert {"ds", "ds-alt", "ds-sym"} == set(completed(["uwbsim", "predict", "--protocol", "ds"]))
-    assert {"ss,ds", "ss,ds-alt", "ss,ds-sym"} == set(
-        completed(["uwbsim", "optimum", "x.toml", "--protocols", "ss,ds"])
-    )
-
-
-def test_a_shell_completes_the_tags_of_a_recording(tmp_path):
+    assert completed(["calib", "fit", "x.uwb", "--loss", "ca"]) == ["cauchy"]
+    assert completed(["uwbsim", "predict", "--protocol", "ds"]) == ["ds", "ds-alt", "ds-sym"]
+    further = completed(["uwbsim", "optimum", "x.toml", "--protocols", "ss,ds"])
+    assert further == ["ss,ds", "ss,ds-alt", "ss,ds-sym"]
     world = {"run": {"duration_s": 0.2}, "ranging": {"rate_hz": 50}}
     world["bodies"] = [
         {"name": str(tag), "motion": {"model": "static", "position_m": [float(tag), 0.0, 1.0]}} for tag in (1, 7, 71)
     ]
     world["tags"] = [{"id": tag, "body": str(tag)} for tag in (1, 7, 71)]
     uwbsim.simulate(uwbsim.load(world)).save(tmp_path / "f.uwb")
-    told = completed(["calib", "add-tag", "f.uwb", "-c", "c.json", "--tag", "7"], tmp_path)
-    assert told == ["7", "71"]
+    assert completed(["calib", "add-tag", "f.uwb", "-c", "c.json", "--tag", "7"], tmp_path) == ["7", "71"]
     assert completed(["calib", "fit", "f.uwb", "--fix", "1"], tmp_path) == ["1="]
     assert completed(["calib", "fit", "absent.uwb", "--fix", "1"], tmp_path) == []
 
 
-def test_what_the_help_lists_is_what_the_packages_know():
-    from calib.fitting import known_losses
-    from uwblink import PROTOCOLS
-    from uwblink.exporters import EXPORTERS
+def test_completion_installs_itself(tmp_path):
+    home = {"HOME": str(tmp_path), "SHELL": "/bin/bash", "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
+    processes.succeed("calib", "--install-completion", "bash", env=os.environ | home)
+    assert "calib" in (tmp_path / ".bashrc").read_text()
 
+
+def test_what_the_help_lists_is_what_the_packages_know():
     parameters = {
         (" ".join(words), p.name): p.metavar.replace(" ", "").split("|")
         for words, c in EVERY
@@ -175,13 +137,29 @@ def test_what_the_help_lists_is_what_the_packages_know():
         assert calib.export(known, form)
 
 
-def test_completion_installs_itself(tmp_path):
-    environment = os.environ | {
-        "HOME": str(tmp_path),
-        "SHELL": "/bin/bash",
-        "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1",
-    }
-    install = [str(BIN / "calib"), "--install-completion", "bash"]
-    done = subprocess.run(install, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert "calib" in (tmp_path / ".bashrc").read_text()
+HEAVY = ["numpy", "scipy", "duckdb", "matplotlib", "simpy", "serial", "pandas", "pypdf", "rosbags"]
+SCRIPT = """
+import contextlib, importlib, io, json, sys
+
+main, seen = importlib.import_module(sys.argv[1] + ".cli").main, []
+for words, heavy in [(words, json.loads(sys.argv[3])) for words in json.loads(sys.argv[2])]:
+    sys.argv = [*words, "--help"]
+    with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
+        main()
+    seen.append([len(text.getvalue()), [name for name in heavy if name in sys.modules]])
+print(json.dumps(seen))
+"""
+
+
+@pytest.mark.parametrize("package", COMMANDS)
+def test_help_is_printed_before_anything_heavy_is_imported(package):
+    """`uwblink import` lists the table of importers, plug-ins included, so its commands may import three of them."""
+    called = [[package], *(words for words, _ in EVERY if words[0] == package)]
+    assert len(called) > 5
+    # What one command imports stays for those after it, so the importers come last.
+    called.sort(key=lambda words: words[1:2] == ["import"])
+    script = [sys.executable, "-c", SCRIPT, package, json.dumps(called), json.dumps(HEAVY)]
+    seen = json.loads(subprocess.run(script, capture_output=True, text=True, check=True).stdout)
+    for words, (length, loaded) in zip(called, seen, strict=True):
+        assert length > 100, words
+        assert set(loaded) <= ({"numpy", "scipy", "duckdb"} if words[1:2] == ["import"] else set()), words

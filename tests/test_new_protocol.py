@@ -1,14 +1,11 @@
 """A protocol registered at run time goes through every command, and is exact where there is no noise."""
 
 import json
-import sys
+import shlex
 
 import numpy as np
 import pytest
 
-import calib.cli
-import uwblink.cli
-import uwbsim.cli
 from tests import pages
 from tests.uwblink.test_register_protocol import SYMMETRIC, TARGETS
 from uwblink.protocols.table import PROTOCOLS, register_protocol
@@ -21,7 +18,11 @@ from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.model import Scenario
 
 SCENARIO = "scenarios/noiseless.toml"
-MAINS = {"uwblink": uwblink.cli.main, "uwbsim": uwbsim.cli.main, "calib": calib.cli.main}
+
+
+def command(*words):
+    """Run a command in this process, which alone knows the protocol; returns what it prints."""
+    return pages.command(shlex.join(map(str, words)))
 
 
 @pytest.fixture(params=[SYMMETRIC, TARGETS], ids=lambda row: row.name)
@@ -29,21 +30,6 @@ def row(request):
     register_protocol(request.param)
     yield request.param
     PROTOCOLS.remove(request.param.name)
-
-
-@pytest.fixture
-def command(monkeypatch, capsys):
-    """Runs a command in this process, which alone knows the protocol; returns what it prints."""
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", [str(word) for word in words])
-        with pytest.raises(SystemExit) as end:
-            MAINS[words[0]]()
-        out, err = capsys.readouterr()
-        assert end.value.code in (0, None), err
-        return out
-
-    return run
 
 
 def bench(row, skews, delays):
@@ -86,7 +72,7 @@ def test_prediction_and_monte_carlo_agree_with_each_other_and_with_the_formula(r
     assert errors.std() == pytest.approx(np.sqrt(predict(row, noisy).variance_m2[0]), rel=0.01)
 
 
-def test_run_show_and_fit(row, command, tmp_path):
+def test_run_show_and_fit(row, tmp_path):
     flight, fitted = tmp_path / "flight.uwb", tmp_path / "c.json"
     settings = ["--set", f"ranging.protocol={row.name}", "--set", "run.duration_s=60"]
     command("uwbsim", "run", SCENARIO, "-o", flight, *settings)
@@ -101,7 +87,7 @@ def test_run_show_and_fit(row, command, tmp_path):
     assert found == pytest.approx(planted, abs=5e-3)
 
 
-def test_compare_optimum_and_predict_know_it_without_being_told(row, command, tmp_path, monkeypatch):
+def test_compare_optimum_and_predict_know_it_without_being_told(row, tmp_path, monkeypatch):
     monkeypatch.setattr("uwblink.pages.figures.drawn", pages.outline)
     compared = json.loads(command("uwbsim", "compare", SCENARIO, "-o", tmp_path / "out", "-n", 4096, "--json"))
     assert [line["protocol"] for line in compared["protocols"]] == list(PROTOCOLS)
@@ -116,7 +102,7 @@ def test_compare_optimum_and_predict_know_it_without_being_told(row, command, tm
     assert said["std_m"] > 0
 
 
-def test_schema_and_summary_know_it(row, command):
+def test_schema_and_summary_know_it(row):
     assert row.name in json.loads(command("uwbsim", "schema"))["$defs"]["Ranging"]["properties"]["protocol"]["enum"]
     said = command("uwbsim", "validate", SCENARIO, "--set", f"ranging.protocol={row.name}")
     assert row.title in said

@@ -59,7 +59,7 @@ def test_a_notebook_runs_and_stands_with_its_outputs(notebook, monkeypatch):
     runner = pages.Runner()
     cells = [cell for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"] if cell["cell_type"] == "code"]
     for cell in cells:
-        runner.run(pages.Block("python", "".join(cell["source"]), 1, "", ""))
+        runner.run(pages.Block("python", "", "".join(cell["source"]), 1, "", ""))
     assert all(cell["outputs"] for cell in cells[2:]), "make notebooks"
     pyplot.close("all")
 

@@ -7,11 +7,10 @@ import sys
 import warnings
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
-from pathlib import Path
 
 import pytest
 
-from uwblink import plugins
+from tests import processes
 from uwblink.errors import ArgumentError, PluginWarning
 from uwblink.plugins import Registry
 
@@ -89,11 +88,11 @@ def installed(tmp_path_factory):
 
 @pytest.fixture
 def run(installed):
-    def run(*words):
-        program = Path(sys.executable).parent / words[0]
-        return subprocess.run(
-            [program, *map(str, words[1:])], env=installed, capture_output=True, text=True, check=False, timeout=300
-        )
+    """Runs a command in a new process, which finds the distribution."""
+
+    def run(name, *words):
+        argv = [processes.BIN / name, *map(str, words)]
+        return subprocess.run(argv, env=installed, capture_output=True, text=True, check=False, timeout=300)
 
     return run
 
@@ -126,21 +125,14 @@ def test_workers_in_other_processes_know_it_too(run, tmp_path):
     assert (tmp_path / "out" / "results.csv").read_text().count("strange-ds") == 4
 
 
-def test_the_importer_of_another_distribution_is_a_command(run, tmp_path):
+def test_the_importer_of_another_distribution_is_a_command_and_without_it_its_recordings_say_so(run, tmp_path):
     (tmp_path / "t.eight").write_text("1 2 0 5 1005 3000 99005 101000\n")
     done = run("uwblink", "import", "eight", tmp_path / "t.eight", "-o", tmp_path / "t.uwb")
     assert (done.returncode, done.stdout) == (0, f"{tmp_path / 't.uwb'}: 1 exchanges\n"), done.stderr
     shown = json.loads(run("uwblink", "show", tmp_path / "t.uwb", "--json").stdout)
     assert shown["protocols"] == {"strange-ds": 1}
-
-
-def test_without_the_distribution_its_recordings_say_what_is_missing(run, tmp_path):
-    (tmp_path / "t.eight").write_text("1 2 0 5 1005 3000 99005 101000\n")
-    run("uwblink", "import", "eight", tmp_path / "t.eight", "-o", tmp_path / "t.uwb")
-    words = [str(Path(sys.executable).parent / "uwblink"), "show", str(tmp_path / "t.uwb")]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith(f"error: {tmp_path / 't.uwb'}: exchanges of an unknown protocol; known are ss, ")
+    told = processes.refuse("uwblink", "show", tmp_path / "t.uwb")
+    assert told.startswith(f"error: {tmp_path / 't.uwb'}: exchanges of an unknown protocol; known are ss, ")
 
 
 @pytest.mark.parametrize("command", ["uwblink", "uwbsim", "calib"])
@@ -209,4 +201,3 @@ def test_a_name_that_is_not_among_the_known_is_looked_for(table):
     with pytest.warns(PluginWarning):
         assert registry["three"] is MANY[1]
     assert asked == ["g"]
-    assert plugins.NAME.fullmatch("ds-alt")

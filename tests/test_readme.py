@@ -1,102 +1,110 @@
-"""The commands of the README, and those for boards, run as they stand there; the make targets exist."""
+"""The commands and the script of the README, and the commands for boards, run as they stand there."""
 
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
 import time
 import tomllib
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
+import pytest
 
-from tests import processes
+from tests import pages, processes
 
-ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-BOARDS = (ROOT / "docs" / "boards.md").read_text(encoding="utf-8")
-NUMBER = r"[+-]?\d+\.\d+|\d+"
-BIN = Path(sys.executable).parent
-TRAIN = "scenarios/icra2023/train.toml"
-
-
-def shell_commands(page, label=""):
-    blocks = re.findall(rf"^```sh{label}\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
-    return [line for block in blocks for line in block.splitlines() if line.strip()]
+README = (pages.ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = {block.language: block for block in pages.blocks(pages.ROOT / "README.md")}
+BOARDS = {block.label: [*pages.lines(block.code)] for block in pages.blocks(pages.DOCS / "boards.md")}
+SCRIPT = (pages.DOCS / "examples" / "first_calibration.py").read_text(encoding="utf-8")
 
 
-def test_the_two_commands_of_the_readme_print_what_it_says(tmp_path):
-    shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios")
-    environment = os.environ | {"PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"}
-    printed = ""
-    for command in shell_commands(README):
-        printed += subprocess.check_output(command.split(), cwd=tmp_path, env=environment, text=True)
-    shown = re.search(r"^```text\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)[1]
-    assert re.sub(NUMBER, "#", printed).split() == re.sub(NUMBER, "#", shown).split()
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The working folder as the README has it."""
+    for name in ("scenarios", "docs"):
+        (tmp_path / name).symlink_to(pages.ROOT / name)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.usefixtures("folder")
+def test_the_two_commands_of_the_readme_print_what_it_says():
+    runner = pages.Runner()
+    runner.run(BLOCKS["sh"])
+    assert pages.masked(runner.printed) == pages.masked(BLOCKS["text"].code)
     # Versions of libraries move delays by less than their own intervals, and nothing else.
-    delays, said = (np.array(re.findall(r"delay (\S+) ns", text), dtype=float) for text in (printed, shown))
-    np.testing.assert_allclose(delays, said, atol=0.005)
+    printed, said = (re.findall(r"delay (\S+) ns", text) for text in (runner.printed, BLOCKS["text"].code))
+    np.testing.assert_allclose(np.array(printed, float), np.array(said, float), atol=0.005)
+
+
+def test_the_script_of_the_readme_simulates_fits_corrects_and_judges(folder):
+    assert BLOCKS["python"].code == SCRIPT
+    assert len(SCRIPT.splitlines()) <= 25
+    runner = pages.Runner()
+    runner.run(BLOCKS["python"])
+    assert (folder / "bias.png").stat().st_size > 5000
+    assert (folder / "first.json").exists()
+    range_m, sigma_m = map(float, re.search(r"3.21 m corrected: (\S+) m, .* (\S+) m", runner.printed).groups())
+    first_m = float(re.search(r"^\[ *(\S+) +\S+ +\S+ *\]$", runner.printed, flags=re.MULTILINE)[1])
+    # The first of the array has the same range, and both powers where the one has its first: some millimetres apart.
+    assert abs(first_m - range_m) < 0.03
+    assert 0.03 < sigma_m < 0.15
+    raw, full = (
+        tuple(map(float, re.search(rf"{name} +mean (\S+) cm.*deviation (\S+) cm", runner.printed).groups()))
+        for name in ("raw", "corrected")
+    )
+    # What the paper's flights leave: reflections keep the mean above zero, and the spread falls to the noise's.
+    assert abs(full[0]) < 0.6 * abs(raw[0])
+    assert full[1] < 0.9 * raw[1]
 
 
 @contextmanager
 def serving(folder, label, *files):
-    """Run the README's server in a folder until the block ends; `files` are there when it begins."""
-    environment = os.environ | {"PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"}
-    (serve,) = shell_commands(BOARDS, label)
-    server = subprocess.Popen(serve.split(), cwd=folder, env=environment, stdout=subprocess.DEVNULL)
+    """Run a server of the page in a folder until the block ends; `files` are there when it begins."""
+    (serve,) = BOARDS[label]
+    words = serve.split()
+    server = subprocess.Popen([processes.BIN / words[0], *words[1:]], cwd=folder, stdout=subprocess.DEVNULL)
     try:
         while not all((folder / name).exists() for name in files):
             assert server.poll() is None
             time.sleep(0.05)
-        yield environment
+        yield
     finally:
         server.send_signal(signal.SIGINT)
         assert server.wait(30) == 0
 
 
-def test_the_commands_for_boards_work_on_served_ones(tmp_path):
-    shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios")
-    with serving(tmp_path, " serve", "poses.csv", "ports/tag20") as environment:
-        commands = shell_commands(BOARDS, " boards")
-        assert len(commands) >= 8
-        for command in commands:
-            done = processes.run(*command.split(), cwd=tmp_path, env=environment)
-            assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
-        script = re.search(r"^```python\n(.*?)^```", BOARDS, flags=re.MULTILINE | re.DOTALL)[1]
-        done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+def test_the_commands_for_boards_work_on_served_ones(folder):
+    (script,) = (b.code for b in pages.blocks(pages.DOCS / "boards.md") if "ports/tag10" in b.code and not b.label)
+    with serving(folder, "serve", "poses.csv", "ports/tag20"):
+        assert len(BOARDS["boards"]) >= 8
+        for command in BOARDS["boards"]:
+            processes.succeed(*command.split(), cwd=folder)
+        done = subprocess.run([sys.executable, "-c", script], cwd=folder, capture_output=True, text=True)
         assert 2 < float(done.stdout) < 4
-    assert not (tmp_path / "ports" / "tag10").exists()
-    assert (tmp_path / "cir.png").stat().st_size > 1000
+    assert not os.path.lexists(folder / "ports" / "tag10")
+    assert (folder / "cir.png").stat().st_size > 1000
 
 
-def test_the_way_from_served_drones_to_a_calibration_works(tmp_path):
-    for name in ("scenarios", "docs"):
-        shutil.copytree(ROOT / name, tmp_path / name)
-    with serving(tmp_path, " serve-drones", "motion.csv", "drones/tag6") as environment:
-        for command in shell_commands(BOARDS, " drones"):
-            done = processes.run(*command.split(), cwd=tmp_path, env=environment)
-            assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
-    fitted = json.loads((tmp_path / "drones.json").read_text())["delays_ns"]
-    planted = {str(t["id"]): t["delay_ns"] for t in tomllib.loads((tmp_path / TRAIN).read_text())["tags"]}
+def test_the_way_from_served_drones_to_a_calibration_works(folder):
+    with serving(folder, "serve-drones", "motion.csv", "drones/tag6"):
+        for command in BOARDS["drones"]:
+            processes.succeed(*command.split(), cwd=folder)
+    fitted = json.loads((folder / "drones.json").read_text())["delays_ns"]
+    tags = tomllib.loads((folder / "scenarios/icra2023/train.toml").read_text())["tags"]
+    apart = np.array([fitted[str(tag["id"])] - tag["delay_ns"] for tag in tags])
     # A shift common to all delays is the curve's constant; apart from it they are found to 0.15 ns from 20 s.
-    apart = {tag: fitted[tag] - planted[tag] for tag in planted}
-    common = sum(apart.values()) / len(apart)
-    assert max(abs(value - common) for value in apart.values()) < 0.15
+    assert np.abs(apart - apart.mean()).max() < 0.15
 
 
-def test_make_knows_the_targets_that_the_readme_names():
+def test_make_knows_the_targets_that_the_readme_names_and_its_links_lead_somewhere():
     named = set(re.findall(r"\bmake ([a-z-]+)\b", README)) - {"alone"}
     assert {"demo", "test", "setup"} <= named
-    for target in sorted(named):
-        done = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True)
-        assert done.returncode == 0, f"make {target}: {done.stderr}"
-
-
-def test_links_of_the_readme_lead_somewhere():
+    done = subprocess.run(["make", "-n", *sorted(named)], cwd=pages.ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
     links = re.findall(r"\]\((?!http)([^)#]+)\)", README)
     assert links
-    assert [link for link in links if not (ROOT / link).exists()] == []
+    assert [link for link in links if not (pages.ROOT / link).exists()] == []

@@ -17,8 +17,10 @@ import pytest
 import calib
 import uwblink
 import uwbsim
-from tests.processes import run
+from tests.boards import served
+from tests.processes import refuse, run, succeed
 from uwblink.database import STORAGE_VERSION
+from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("uwblink", "uwbsim", "calib")
@@ -48,14 +50,9 @@ def place(seeds, tmp_path):
     return folder
 
 
-def refused(ended, *named):
-    """Whether a command ended with one line and status 2, which names what it must and quotes no secret."""
-    assert ended.returncode == 2, ended
-    assert ended.stderr.count("\n") == 1, ended
-    assert SECRET not in ended.stdout + ended.stderr
-    for name in named:
-        assert str(name) in ended.stderr
-    return True
+def refused(*words, naming=(), **how):
+    """Run a command that must end with one line, which names what it must and quotes no secret."""
+    assert SECRET not in refuse(*words, naming=naming, **how)
 
 
 def names(folder):
@@ -65,39 +62,29 @@ def names(folder):
 # One place opens DuckDB.
 
 
-def opens_duckdb(source):
-    """Whether a module takes anything from duckdb but types, errors and its version."""
-    harmless = ("Exception", "Error", "DuckDBPyConnection", "__version__")
+def taken_from_duckdb(source):
+    """Return what a module takes from duckdb beside types, errors and its version."""
+    found = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "duckdb":
-            taken = [alias.name for alias in node.names]
-        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "duckdb":
-            taken = [node.attr]
-        else:
-            continue
-        if not all(name.endswith(harmless) for name in taken):
-            return True
-    return False
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "duckdb":
+            found.add(node.attr)
+    return {name for name in found if not name.endswith(("Exception", "Error", "DuckDBPyConnection", "__version__"))}
 
 
 def test_one_module_opens_duckdb():
     files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
-    found = [path.relative_to(ROOT).as_posix() for path in files if opens_duckdb(path.read_text(encoding="utf-8"))]
+    found = [path.relative_to(ROOT).as_posix() for path in files if taken_from_duckdb(path.read_text(encoding="utf-8"))]
     assert found == ["uwblink/database.py"]
-
-
-@pytest.mark.parametrize("source", ["duckdb.connect()", "from duckdb import connect", "x = duckdb.sql"])
-def test_the_walk_sees_what_opens_duckdb(source):
-    assert opens_duckdb(source)
+    for source in ("duckdb.connect()", "from duckdb import connect", "x = duckdb.sql"):
+        assert taken_from_duckdb(source)
 
 
 # Sweep folders of strangers.
 
 
-def spoil(store, *statements):
-    with duckdb.connect(str(store)) as db:
-        for statement in statements:
-            db.execute(statement)
+RESUME = ("sweep", "plan.toml", "-o", "results", "--resume", "--workers", "1")
 
 
 @pytest.mark.parametrize(
@@ -116,11 +103,11 @@ def spoil(store, *statements):
     ],
 )
 def test_a_sweep_folder_of_a_stranger_holds_results_and_no_programs(place, statements):
-    store = place / "results" / "results.duckdb"
-    spoil(store, *(statement.format(secret=place / "secret.txt") for statement in statements))
+    with duckdb.connect(str(place / "results" / "results.duckdb")) as db:
+        for statement in statements:
+            db.execute(statement.format(secret=place / "secret.txt"))
     before = (place / "results" / "results.csv").read_bytes()
-    ended = run("uwbsim", "sweep", place / "plan.toml", "-o", place / "results", "--resume", "--workers", 1)
-    assert refused(ended, store)
+    refused("uwbsim", *RESUME, cwd=place, naming=["results.duckdb"])
     assert (place / "results" / "results.csv").read_bytes() == before
 
 
@@ -128,8 +115,7 @@ def test_the_store_of_a_sweep_is_no_link_to_another_file(place):
     store = place / "results" / "results.duckdb"
     store.rename(place / "elsewhere.duckdb")
     store.symlink_to(place / "elsewhere.duckdb")
-    ended = run("uwbsim", "sweep", place / "plan.toml", "-o", place / "results", "--resume", "--workers", 1)
-    assert refused(ended, store)
+    refused("uwbsim", *RESUME, cwd=place, naming=["results.duckdb"])
 
 
 # Files that scenarios and sweeps name.
@@ -180,9 +166,8 @@ def test_an_allowed_folder_holds_files_of_scenarios(place):
     (place / "other" / "slots.csv").write_text("time_s,initiator,target\n0,1,2\n0.1,2,3\n")
     linked(place, "outside")
     words = ["s/s.toml", "--set", "ranging.plan={file='../other/slots.csv'}"]
-    assert refused(run("uwbsim", "validate", *words, cwd=place), "ranging.plan.file", "--allow-files")
-    done = run("uwbsim", "validate", *words, "--allow-files", "other", cwd=place)
-    assert done.returncode == 0, done
+    refused("uwbsim", "validate", *words, cwd=place, naming=["ranging.plan.file", "--allow-files"])
+    succeed("uwbsim", "validate", *words, "--allow-files", "other", cwd=place)
     loaded = uwbsim.load(place / "s" / "s.toml", {"ranging.plan": {"file": "../other/slots.csv"}},
                          allow_files=[place / "other"])  # fmt: skip
     assert loaded.ranging.plan.model_dump()["slots"] == ((0.0, 1, 2), (0.1, 2, 3))
@@ -193,10 +178,9 @@ def test_a_sweep_reaches_no_scenario_that_nobody_named(place):
     plan = place / "s" / "plan.toml"
     for name in ("../s.toml", str(place / "s.toml"), "/dev/zero"):
         plan.write_text(f"sweep = {{ scenario = '{name}', protocols = ['ds'], ranges = 10 }}\n")
-        assert refused(run("uwbsim", "sweep", plan, "-o", place / "out", "--workers", 1), plan, "sweep.scenario")
+        refused("uwbsim", "sweep", plan, "-o", place / "out", "--workers", 1, naming=[plan, "sweep.scenario"])
     plan.write_text("sweep = { scenario = '../s.toml', protocols = ['ds'], ranges = 10 }\n")
-    words = ["sweep", plan, "-o", place / "out", "--workers", 1, "--allow-files", place]
-    assert run("uwbsim", *words).returncode == 0
+    succeed("uwbsim", "sweep", plan, "-o", place / "out", "--workers", 1, "--allow-files", place)
 
 
 @pytest.mark.parametrize("design", ["grid", "latin-hypercube"])
@@ -205,8 +189,7 @@ def test_a_sweep_without_end_is_refused(place, design):
     keys = "".join(f"'radio.{' ' * k}rx_noise_ps' = {value}\n" for k in range(64))  # 2 to the power of 64 points
     head = f"scenario = 's.toml', protocols = ['ds'], design = '{design}', samples = 1000000"
     (place / "plan.toml").write_text(f"sweep = {{ {head} }}\n[vary]\n{keys}")
-    ended = run("uwbsim", "sweep", place / "plan.toml", "-o", place / "out", "--workers", 1)
-    assert refused(ended, place / "plan.toml", 10_000_000)
+    refused("uwbsim", "sweep", "plan.toml", "-o", "out", "--workers", 1, cwd=place, naming=["plan.toml", 10_000_000])
     assert not (place / "out").exists()
 
 
@@ -231,19 +214,16 @@ def test_what_lies_beside_a_recording_leads_nowhere(place, kind, beside, words):
     else:
         log.symlink_to("secret.txt" if kind == "link" else "new.txt")
     before = names(place)
-    assert refused(run(*words, cwd=place), log.name)
+    refused(*words, cwd=place, naming=[log.name])
     assert (place / "secret.txt").read_text() == SECRET
     assert names(place) == before
 
 
-@pytest.mark.parametrize("what", ["pipe", "device"])
-def test_a_recording_is_a_file(place, what):
-    path = place / "x.uwb"
-    if what == "pipe":
-        os.mkfifo(path)
-    else:
-        path.symlink_to("/dev/zero")
-    assert refused(run("uwblink", "show", path), path)
+def test_a_recording_is_a_file(place):
+    os.mkfifo(place / "pipe.uwb")
+    (place / "device.uwb").symlink_to("/dev/zero")
+    for name in ("pipe.uwb", "device.uwb"):
+        refused("uwblink", "show", name, cwd=place, naming=[name])
 
 
 # What a stranger's file says.
@@ -308,8 +288,7 @@ def test_outputs_go_through_no_planted_link(place, line, output):
         link.unlink(missing_ok=True)
         if "--force" in line or name != path.name or output.startswith("results"):
             link.symlink_to(secret)
-    ended = run(*line.split(), cwd=place)
-    assert ended.returncode == 0, ended
+    succeed(*line.split(), cwd=place)
     assert secret.read_text() == SECRET
     assert not path.is_symlink()
     assert path.exists()
@@ -328,7 +307,7 @@ def test_no_name_of_a_partial_file_can_be_guessed(place):
 
 def test_a_name_may_be_as_long_as_the_file_system_takes(tmp_path):
     name = "n" * 240 + ".uwb"
-    assert run("calib", "sample", "-o", tmp_path / name, "-n", 30).returncode == 0
+    succeed("calib", "sample", "-o", tmp_path / name, "-n", 30)
     assert names(tmp_path) == [name]
 
 
@@ -346,8 +325,6 @@ def test_a_live_recording_goes_through_no_planted_link(tmp_path):
 
 
 def test_live_poses_go_through_no_planted_link(tmp_path):
-    from tests.boards import served
-
     (tmp_path / "poses.csv").symlink_to(tmp_path / "secret.txt")
     (tmp_path / "secret.txt").write_text(SECRET)
     with served() as server:
@@ -362,13 +339,11 @@ def test_a_log_left_by_the_file_that_is_replaced_goes_with_it(place):
         recording.append_tags([uwblink.Tag(7, "old", (0.0, 0.0, 0.0))])
         shutil.copy(place / "old.uwb", path)
         shutil.copy(place / "old.uwb.wal", place / "f.uwb.wal")
-    assert run("calib", "sample", "-o", path, "-n", 100, "--force").returncode == 0
+    succeed("calib", "sample", "-o", path, "-n", 100, "--force")
     assert 7 not in {tag.tag for tag in uwblink.load(path).tags}
 
 
 def test_an_output_that_cannot_be_written_leaves_the_folder_that_it_would_have_replaced(place):
-    from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
-
     def write(recording, folder):
         (folder / "half.txt").write_text("half")
         raise uwblink.errors.RecordingError("no more")
@@ -398,7 +373,7 @@ def test_what_is_written_the_lowest_allowed_version_reads(place):
     assert f'"duckdb>={STORAGE_VERSION.removeprefix("v").rpartition(".")[0]}.' in text
     with uwblink.Recording.create(place / "live.uwb", live=True):
         pass
-    assert run("calib", "sample", "-o", place / "sample.uwb", "-n", 100).returncode == 0
+    succeed("calib", "sample", "-o", place / "sample.uwb", "-n", 100)
     made = [*place.glob("*.uwb"), place / "results" / "results.duckdb"]
     assert {path.name: storage(path) for path in made} == {path.name: STORAGE_OF_1_5 for path in made}
     assert len(made) == 4
@@ -416,4 +391,5 @@ def test_a_file_of_a_newer_duckdb_is_named_so(place):
     words = struct.unpack("<511Q", data[8:4096])
     data[:8] = struct.pack("<Q", functools.reduce(operator.xor, (w * 0xBF58476D1CE4E5B9 % 2**64 for w in words), 5381))
     path.write_bytes(data)
-    assert refused(run("uwblink", "show", path), path, "DuckDB v9.8.7", f"installed DuckDB {duckdb.__version__}")
+    naming = [path, "DuckDB v9.8.7", f"installed DuckDB {duckdb.__version__}"]
+    refused("uwblink", "show", path, naming=naming)

@@ -3,48 +3,23 @@
 Real boards are tested when the environment variable UWB_PORTS names two ports, separated by a comma.
 """
 
-import os
-from contextlib import ExitStack
-
 import pytest
 
-from tests.boards import bench_scenario, served
+from tests.boards import two_ports
 from uwblink.boards.board import Board
-from uwblink.boards.ports import SerialPort
 from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
 from uwblink.ticks import elapsed
 from uwblink.twr import truncate4
 from uwblink.wire import messages as m
-from uwbsim.boards.virtual_board import VirtualPorts
 
 ABSENT = 9
 
 
 @pytest.fixture(params=["virtual", "terminal", "real"])
-def transports(request):
-    """The ports of two boards, the initiator first."""
-    if request.param == "virtual":
-        ports = VirtualPorts(bench_scenario())
-        yield ports.port(1), ports.port(2)
-        return
-    with ExitStack() as stack:
-        if request.param == "terminal":
-            server = stack.enter_context(served())
-            names = [server.names[1], server.names[2]]
-        else:
-            names = [n for n in os.environ.get("UWB_PORTS", "").split(",") if n]
-            if len(names) != 2:
-                pytest.skip("no real boards: UWB_PORTS does not name two ports")
-        found = [SerialPort(name) for name in names]
-        for port in found:
-            stack.callback(port.close)
-        yield tuple(found)
-
-
-@pytest.fixture
-def pair(transports):
-    """The two boards."""
-    return Board(transports[0]), Board(transports[1])
+def pair(request):
+    """The two boards, the initiator first."""
+    with two_ports(request.param) as (ports, _):
+        yield [Board(port) for port in ports]
 
 
 def heard(board, *kinds, within_s=10.0):
@@ -99,9 +74,9 @@ def test_single_sided_report_has_no_third_message_and_whole_ticks(pair):
     assert report.range_m == pytest.approx(ticks * 299_702_547 / (128 * 499.2e6), abs=2e-4)
 
 
-def test_response_delay_is_set_at_the_target(pair):
+def test_every_delay_that_the_driver_sets_is_set_at_the_target_and_works(pair):
     one, two = pair
-    for delay in (700, 3000, 1500):
+    for delay in (280, 700, 3000, 6400, 6500, 1500):
         two.set_response_delay(delay)
         report = one.range(two.id)
         assert int(elapsed(report.tx3, report.tx2)) == 65536 * delay + 16384
@@ -183,16 +158,6 @@ def test_the_longest_broadcast_fits_one_packet(pair):
     assert one.request(m.GetId()) == m.IdReport(one.id)
 
 
-@pytest.mark.parametrize("delay", [280, 6400, 6500])
-def test_every_delay_that_the_driver_sets_works(pair, delay):
-    one, two = pair
-    two.set_response_delay(delay)
-    try:
-        assert int(elapsed((report := one.range(two.id)).tx3, report.tx2)) == 65536 * delay + 16384
-    finally:
-        two.set_response_delay(1500)
-
-
 def test_a_target_that_prints_its_impulse_response_is_left_alone(pair):
     one, two = pair
     # Served boards may be late by more than the driver waits, on a busy machine; then a response may be damaged.
@@ -228,14 +193,7 @@ def test_many_exchanges_in_a_row_are_all_good(pair):
 
 @pytest.mark.parametrize("kind", ["virtual", "terminal"])
 def test_a_hanging_board_is_named_with_what_was_sent_and_heard(kind):
-    if kind == "virtual":
-        ports = VirtualPorts(bench_scenario())
-        board = Board(ports.port(1))
-        ports.bench.boards[1].hang()
+    with two_ports(kind) as ((port, _), bench):
+        bench.boards[1].hang()
         with pytest.raises(NoAnswerError, match=r"b'C01\\r'.*nothing"):
-            board.id  # noqa: B018 - the property asks the board
-        return
-    with served() as server, Board.open(server.names[1]) as board:
-        server.bench.boards[1].hang()
-        with pytest.raises(NoAnswerError, match=r"b'C01\\r'.*nothing"):
-            board.id  # noqa: B018 - the property asks the board
+            _ = Board(port).id

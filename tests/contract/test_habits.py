@@ -3,19 +3,16 @@
 It keeps no bytes between two reads, scans ids 0 to 10, and takes one line with a time-out at each call.
 """
 
-import os
 import random
 import re
 
 import pytest
 
-from tests.boards import bench_scenario, served
+from tests.boards import two_ports
 from uwblink.boards.board import Board
-from uwblink.boards.ports import SerialPort
 from uwblink.wire import messages as m
 from uwblink.wire.codec import Decoder
 from uwblink.wire.messages import REPORTS
-from uwbsim.boards.virtual_board import VirtualPorts
 
 TIMEOUT_S = 0.1
 LATENCY_S = (0.0002, 0.0015)
@@ -56,17 +53,9 @@ class Client:
 @pytest.fixture(params=["virtual", "terminal", "real"])
 def clients(request):
     """Two clients and how many exchanges to try, the initiator first."""
-    if request.param == "virtual":
-        ports = VirtualPorts(bench_scenario())
-        yield [Client(ports.port(tag), tag) for tag in (1, 2)], 100
-    elif request.param == "terminal":
-        with served(speed=1 / SLOWER) as server:
-            yield [Client(SerialPort(server.names[tag]), tag, SLOWER) for tag in (1, 2)], 20
-    else:
-        names = [n for n in os.environ.get("UWB_PORTS", "").split(",") if n]
-        if len(names) != 2:
-            pytest.skip("no real boards: UWB_PORTS does not name two ports")
-        yield [Client(SerialPort(name), seed) for seed, name in enumerate(names)], 100
+    slower = SLOWER if request.param == "terminal" else 1
+    with two_ports(request.param, speed=1 / SLOWER) as (ports, _):
+        yield [Client(port, seed, slower) for seed, port in enumerate(ports, 1)], 100 if slower == 1 else 20
 
 
 def board_id(client):

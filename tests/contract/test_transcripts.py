@@ -2,6 +2,7 @@
 
 import ast
 import re
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -97,8 +98,6 @@ def test_a_power_cycle_forgets_passive_listening_and_the_delay():
 
 
 def test_a_listener_that_misses_the_response_prints_26_fields_and_otherwise_nothing():
-    from collections import Counter
-
     ports = VirtualPorts(bench_scenario(), lost_share=0.3)
     bench = ports.bench
     bench.boards[3].write(b"C04|1\r")

@@ -20,11 +20,8 @@ ROOT = Path(__file__).parents[2]
 SCENARIOS = ROOT / "scenarios" / "icra2023"
 
 
-def run(*arguments):
-    words = [str(a) for a in arguments]
-    done = processes.run(*words)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+def run(*words):
+    return processes.succeed(*words).stdout
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import calib
 import uwblink
 import uwbsim
 from calib.errors import BadInputError
-from tests import processes
+from tests.processes import refuse, run, succeed
 from uwblink.errors import PlanError
 from uwblink.importers import add_poses
 from uwblink.recording import load_antenna_delays
@@ -59,14 +59,8 @@ def record(world, path, delays=None, protocol="ss", said=True, duration_s=2.0):
     return path
 
 
-def run(*words, status=0):
-    done = processes.run(*words)
-    assert done.returncode == status, done
-    return done
-
-
 def exported(calibration, to, path):
-    run("calib", "export", calibration, "--to", to, "-o", path)
+    succeed("calib", "export", calibration, "--to", to, "-o", path)
     return path
 
 
@@ -93,11 +87,11 @@ def loop(tmp_path_factory):
     folder = tmp_path_factory.mktemp("loop")
     world = scenario(DELAYS_NS)
     record(world, folder / "first.uwb")
-    run("calib", "fit", folder / "first.uwb", "-o", folder / "first.json", "--delays-only")
+    succeed("calib", "fit", folder / "first.uwb", "-o", folder / "first.json", "--delays-only")
     for to in ("registers", "firmware"):
         exported(folder / "first.json", to, folder / f"{to}.toml")
     record(world, folder / "second.uwb", folder / "firmware.toml")
-    run("calib", "fit", folder / "second.uwb", "-o", folder / "second.json", "--delays-only")
+    succeed("calib", "fit", folder / "second.uwb", "-o", folder / "second.json", "--delays-only")
     exported(folder / "second.json", "firmware", folder / "second.toml")
     return folder
 
@@ -109,7 +103,9 @@ def test_what_was_programmed_comes_out_again(loop):
         assert again[tag] == pytest.approx(once[tag], abs=1)
     delays = json.loads((loop / "second.json").read_text())["delays_ns"]
     assert max(map(abs, delays.values())) < 1.5 * TICK_S * 1e9
-    by_base = run("calib", "export", loop / "second.json", "--to", "firmware", "--antenna-delays", loop / "second.uwb")
+    by_base = succeed(
+        "calib", "export", loop / "second.json", "--to", "firmware", "--antenna-delays", loop / "second.uwb"
+    )
     assert by_base.stdout == (loop / "second.toml").read_text()
 
 
@@ -124,7 +120,7 @@ def test_registers_alone_leave_the_constant_of_delayed_replies(loop):
     for (_, target), error in alone.items():
         left = 100 * LIGHT / 2 * TICK_S * (rows[str(target)]["tx"] - 16436)
         assert error - with_constant[_, target] == pytest.approx(left, abs=0.15)
-    done = run("calib", "fit", loop / "registers.uwb", "-o", loop / "registers.json", "--delays-only")
+    done = succeed("calib", "fit", loop / "registers.uwb", "-o", loop / "registers.json", "--delays-only")
     assert "delayed replies" in done.stderr
     assert {row["reply"] for row in rows.values()} == {16436}
 
@@ -189,16 +185,13 @@ def test_a_calibration_of_other_delays_is_told_wherever_it_is_used(loop, tmp_pat
         ("calib", "apply", second, "-c", first, "-o", tmp_path / "c.uwb"),
         ("uwblink", "stream", second, "-c", first, "--speed", "inf"),
     ):
-        done = run(*words)
+        done = succeed(*words)
         assert "warning: " in done.stderr
         assert "tag 1: 16436/16436 then" in done.stderr
-        assert (
-            "tag 1" not in processes.run(*[loop / "second.json" if w == first else w for w in words], "--force").stderr
-        )
-    done = processes.run("calib", "localize", second, "-c", first)
-    assert "tag 1: 16436/16436 then" in done.stderr
-    done = run("calib", "export", first, "--to", "registers", "--antenna-delays", second, status=2)
-    assert "--antenna-delays" in done.stderr
+        own = [loop / "second.json" if w == first else w for w in words]
+        assert "tag 1" not in run(*own, "--force").stderr
+    assert "tag 1: 16436/16436 then" in run("calib", "localize", second, "-c", first).stderr
+    refuse("calib", "export", first, "--to", "registers", "--antenna-delays", second, naming=["--antenna-delays"])
     with pytest.raises(BadInputError, match=r"second\.uwb: tag 1"):
         calib.load_ranges([loop / "first.uwb", second])
 
@@ -207,11 +200,10 @@ def test_where_nothing_says_what_was_programmed_no_register_is_guessed(tmp_path)
     flight = calib.sample_flight()
     known = calib.fit(replace(calib.load_ranges(flight), antenna_delays={})).calibration
     known.save(tmp_path / "c.json")
-    done = run("calib", "export", tmp_path / "c.json", "--to", "registers", status=2)
-    assert "--antenna-delays" in done.stderr
+    refuse("calib", "export", tmp_path / "c.json", "--to", "registers", naming=["--antenna-delays"])
     (tmp_path / "d.toml").write_text("[antenna_delays]\ntx = 100\nrx = 200\nreply = 300\n")
     words = ("--to", "firmware", "--antenna-delays", tmp_path / "d.toml", "-o", tmp_path / "o.toml")
-    run("calib", "export", tmp_path / "c.json", *words)
+    succeed("calib", "export", tmp_path / "c.json", *words)
     for tag, total in totals(tmp_path / "o.toml").items():
         assert total == 300 + round(-known.delays_ns[tag] * 1e-9 / TICK_S)
     rows = tomllib.loads((tmp_path / "o.toml").read_text())["antenna_delays"]["tags"]
@@ -220,11 +212,11 @@ def test_where_nothing_says_what_was_programmed_no_register_is_guessed(tmp_path)
 
 def test_a_flight_into_whose_tags_something_was_programmed_has_the_planted_delays_of_that(loop, tmp_path):
     words = ("uwbsim", "run", "noiseless", "--set", "run.duration_s=10")
-    run(*words, "-o", tmp_path / "a.uwb")
+    succeed(*words, "-o", tmp_path / "a.uwb")
     rows = {tag: (16440 + tag, 16450 - 2 * tag) for tag in range(1, 7)}
     text = "".join(f"[antenna_delays.tags.{t}]\ntx = {a}\nrx = {b}\nreply = {a}\n" for t, (a, b) in rows.items())
     (tmp_path / "d.toml").write_text(text)
-    run(*words, "-o", tmp_path / "b.uwb", "--antenna-delays", tmp_path / "d.toml")
+    succeed(*words, "-o", tmp_path / "b.uwb", "--antenna-delays", tmp_path / "d.toml")
     planted = []
     for name in "ab":
         with uwblink.Recording.open(tmp_path / f"{name}.uwb") as recording:

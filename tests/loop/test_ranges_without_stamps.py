@@ -55,8 +55,7 @@ def folder(tmp_path_factory):
 
 
 def run(folder, *words):
-    done = processes.run(*words, cwd=folder, timeout=300)
-    assert done.returncode == 0, done.stderr
+    done = processes.succeed(*words, cwd=folder, timeout=300)
     return done.stdout + done.stderr
 
 
