@@ -14,14 +14,14 @@ import numpy as np
 
 with atheris.instrument_imports(include=["uwblink.importers"]):
     from uwblink.errors import UwblinkError
-    from uwblink.importers import read_table
+    from uwblink.importers import read_source
     from uwblink.importers.guess import guess_map
     from uwblink.importers.poses import read_poses
 
 PLACE = Path(tempfile.mkdtemp())
 READERS = (
-    ("t.csv", read_table),
-    ("t.jsonl", read_table),
+    ("t.csv", read_source),
+    ("t.jsonl", read_source),
     ("g.csv", guess_map),
     ("p.csv", read_poses),
     ("p.tum", read_poses),

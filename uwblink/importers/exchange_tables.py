@@ -18,7 +18,7 @@ import numpy as np
 
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import IDS, POSITIONS, ColumnMap, load_map
-from uwblink.importers.exchange_rows import ENDS, Faults, assemble_exchanges, usable_exchanges, usable_ranges
+from uwblink.importers.exchange_rows import SOUND_IDS, Faults, assemble_exchanges, usable_exchanges, usable_ranges
 from uwblink.importers.plausibility import (
     MIN_ROWS,
     ROW_PERIOD_NS,
@@ -138,7 +138,7 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
         rows, found = assemble_exchanges(staging, layout, faults, watch)
         protocol = protocol or found
     else:
-        rows = faults.reject(staging.rows, ENDS)
+        rows = faults.reject(staging.rows, SOUND_IDS)
     total = rows.count() + len(faults)
     watch("checking", 0.0)
     if layout == "ranges":

@@ -160,7 +160,7 @@ def _from_bag(path: Path, topics: Mapping[str, str] | None) -> Poses:
             try:
                 for time_ns, child, numbers in _of_message(kind, message):
                     times.append(time_ns)
-                    bodies.append(wanted[topic] or child or body_of(topic))
+                    bodies.append(wanted[topic] or child or _body_in(topic) or topic)
                     values.extend(numbers)
             except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
                 # The content of JSON messages need not agree with the name of their schema.
@@ -168,12 +168,8 @@ def _from_bag(path: Path, topics: Mapping[str, str] | None) -> Poses:
     return _poses(path, np.array(times, dtype=np.int64), np.array(bodies, np.str_), np.array(values).reshape(-1, 7))
 
 
-def body_of(topic: str) -> str:
-    """Return the body of a topic: the first part of its name that is not in `DRIVERS`."""
-    return _body_in(topic) or topic
-
-
 def _body_in(name: str) -> str:
+    """Return the body in the name of a topic or a frame: the first part that is not in `DRIVERS`; "" without one."""
     return next((part for part in name.split("/") if part and part not in DRIVERS), "")
 
 

@@ -206,8 +206,9 @@ def _from_parts(kind: type[Message], parts: list[bytes]) -> Message:
 FIELDS: Final = tuple(RangeReport.FIELDS)
 """The fields of R05, in their order."""
 
-_REPORT: Final = rb"\|".join(b"(?:%s)" % kind.pattern for kind in RangeReport.FIELDS.values())
-RUN: Final = re.compile(rb"(?:[RS]05\|" + _REPORT + rb"\r\n)++")
+RUN: Final = re.compile(
+    rb"(?:[RS]05\|" + rb"\|".join(b"(?:%s)" % kind.pattern for kind in RangeReport.FIELDS.values()) + rb"\r\n)++"
+)
 """Reports one after the other; whole numbers may still be larger than a board's."""
 
 
