@@ -162,12 +162,13 @@ def check_output(path: Path, *, force: bool, recording: bool = False) -> None:
 
     A `recording` must not have the suffix of another format.
     """
-    tables = (".csv", ".tsv", ".txt", ".gz", ".parquet", ".json", ".jsonl", ".ndjson")
-    others = (".bag", ".mcap", ".db3", ".toml", ".html", ".pdf")
-    text = path.suffix.lower() in tables + others
+    is_other = path.suffix.lower() in (
+        ".csv", ".tsv", ".txt", ".gz", ".parquet", ".json", ".jsonl", ".ndjson", ".bag", ".mcap", ".db3", ".toml",
+        ".html", ".pdf",
+    )  # fmt: skip
     rules = (
         (
-            recording and text,
+            recording and is_other,
             RecordingError,
             f"a recording is written here, and {path.suffix} is the ending of another "
             f"kind of file; name it {path.stem}.uwb (`uwblink export` makes tables of it)",

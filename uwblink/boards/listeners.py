@@ -327,8 +327,7 @@ def load_correction(path: Path) -> Correction:
         raise PlanError(f"{path}: no installed distribution corrects ranges (entry points of uwbcal.corrections)")
     with _as_plan_errors():
         make: Callable[[Path], Correction] = found[0].load()
-        made = make(path)
-    return _as_plan_errors()(made)
+        return _as_plan_errors()(make(path))
 
 
 @contextmanager

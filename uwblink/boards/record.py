@@ -101,8 +101,8 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
     meta = _meta(found, plan, turns, passive) | (meta_of_delays(delays) if plan.antenna_delays else {})
     try:
         with Recording.create(path, meta=meta, force=force, live=True, memory_mb=FILE_MB) as recording:
-            seats = {tag.tag: tag for tag in plan.tags}
-            recording.append_tags(seats.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
+            placed = {tag.tag: tag for tag in plan.tags}
+            recording.append_tags(placed.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
             with RecordingWriter(recording) as writer:
                 listening = [writer, DelayCheck(delays), *others]
                 recorder = Recorder(found, plan, turns, listening, passive=passive, ports=using)
@@ -137,16 +137,16 @@ def _check_arrangement(mark: Arrangement) -> None:
 
 def _check_boards(found: Mapping[int, str], plan: RangingPlan, mark: Arrangement) -> None:
     """Raise `PlanError` if an order or places of tags are for other boards than those at the ports."""
-    there, seats = ", ".join(map(str, sorted(found))), {tag.tag for tag in plan.tags}
+    there, placed = ", ".join(map(str, sorted(found))), {tag.tag for tag in plan.tags}
     if mark.order and sorted(mark.order) != sorted(found):
         raise PlanError(
             f"found {', '.join(map(str, mark.order))}, expected each of the boards at the ports, {there}",
             parameter="order",
         )
-    if seats and not seats & found.keys():
-        seated = ", ".join(map(str, sorted(seats)))
+    if placed and not placed & found.keys():
+        named = ", ".join(map(str, sorted(placed)))
         raise PlanError(
-            f"the plan has places of the tags {seated}, but the boards at the ports are {there}; check the plan"
+            f"the plan has places of the tags {named}, but the boards at the ports are {there}; check the plan"
         )
 
 

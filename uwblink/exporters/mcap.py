@@ -216,8 +216,7 @@ def write_rosbag2(recording: Path, folder: Path) -> dict[str, int]:
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
     store = get_typestore(Stores.ROS2_JAZZY)
-    place = folder / "rosbag2"
-    with Writer(place, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as bag:
+    with Writer(folder / "rosbag2", version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as bag:
         connection = cache(lambda topic, kind: bag.add_connection(topic, kind, typestore=store))
 
         def publish(time_ns: int, topic: str, kind: str, message: Any) -> None:
@@ -295,8 +294,7 @@ class _RosMessages:
         turn, pull = (self._new("geometry_msgs/Vector3", *part) for part in (values[:3], values[3:]))
         level, unknown = self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0), np.zeros(9)
         # -1 stands first in the covariance of what an Imu does not measure, by the definition of the message.
-        unmeasured = np.array([-1.0] + [0.0] * 8)
-        readings = (level, unmeasured, turn, unknown, pull, unknown)
+        readings = (level, np.array([-1.0] + [0.0] * 8), turn, unknown, pull, unknown)
         return [(f"/imu/{topic_name(body)}", self._new("sensor_msgs/Imu", self._header(stamp, body), *readings))]
 
 

@@ -230,8 +230,7 @@ def import_file(
         if row.tables is not None:
             watch("reading", 0.0)
             paths, column_map = row.tables(sources, explained, Path(folder))
-            names = ", ".join(path.name for path in sources)
-            meta = {"source": f"import {row.name}", "imported_from": names}
+            meta = {"source": f"import {row.name}", "imported_from": ", ".join(path.name for path in sources)}
             return import_tables(paths, column_map, Path(output), meta, watch, force=force)
         read: Any = row.read
         contents = read(sources[0], explained)

@@ -117,8 +117,7 @@ def usable_exchanges(staging: Staging, rows: Rows, faults: Faults, stamps: Seque
     """
     column_map, sample = staging.column_map, rows.sample(SAMPLE_ROWS)
     scale = column_map.ticks_per_unit
-    ticks = [sample[name] * scale for name in stamps]
-    bits, counter = counter_format(ticks, column_map.bits, column_map.counter)
+    bits, counter = counter_format((sample[name] * scale for name in stamps), column_map.bits, column_map.counter)
     low = 0 if counter == "wrapped" else -(1 << (bits - 1))
     number = "a whole number" if scale == 1.0 else "a stamp in ticks"
     conditions = _times(rows)
@@ -168,8 +167,7 @@ def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Wat
             theirs |= {name: f"CASE WHEN event = {k} THEN stamp END" for k, name in ((1.0, "tx"), (2.0, "rx"))}
         for n in (1, 2, 3):
             cells |= {f"{name}{n}": (cell, f"{number} = {n}") for name, cell in theirs.items()}
-        of_exchange = ("gt_range_m", "range_m")
-        cells |= {name: (name, "true") for name in of_exchange if rows.has(name)}
+        cells |= {name: (name, "true") for name in ("gt_range_m", "range_m") if rows.has(name)}
     else:
         # The initiator is whoever the row with its first stamp names first.
         first = "tx1 IS NOT NULL" if rows.has("tx1") else "false"

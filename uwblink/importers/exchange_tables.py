@@ -196,12 +196,11 @@ def _poses(rows: Rows, bodies: Mapping[int, str]) -> Iterator[Poses]:
         f"SELECT time_ns AS origin, tag, x, y, z FROM places WINDOW tags AS (PARTITION BY tag) "
         f"QUALIFY {moves} OR time_ns = min(time_ns) OVER tags ORDER BY time_ns, tag"
     )
-    level = np.array([0.0, 0.0, 0.0, 1.0])
     for found in Rows(rows.db, "posed", ("origin", "tag", "x", "y", "z")).blocks():
         tags, which = np.unique(found["tag"], return_inverse=True)
         position = np.column_stack([found[axis] for axis in "xyz"])
         names = np.array([bodies[int(tag)] for tag in tags])[which]
-        yield Poses(found["origin"], names, position, np.tile(level, (len(which), 1)))
+        yield Poses(found["origin"], names, position, np.tile([0.0, 0.0, 0.0, 1.0], (len(which), 1)))
 
 
 def _note_on_repeats(rows: Rows) -> str:

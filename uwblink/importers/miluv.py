@@ -76,8 +76,7 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
     ranging = {*exchanges.initiator.tolist(), *exchanges.target.tolist()} - {tag.tag for tag in tags}
     tags += [Tag(number, f"tag{number}", (0.0, 0.0, 0.0)) for number in ranging]
     heard = _read_overheard(flight)
-    taps = {"board": "my_id"} | _PAIR | {"first_path_index": "idx", "taps": "cir"}
-    cirs = _read(flight, "uwb_cir.csv", taps)
+    cirs = _read(flight, "uwb_cir.csv", {"board": "my_id", **_PAIR, "first_path_index": "idx", "taps": "cir"})
     sensed = {f"w{axis}": f"angular_velocity.{axis}" for axis in "xyz"}
     sensed |= {f"a{axis}": f"linear_acceleration.{axis}" for axis in "xyz"}
     imu, height = _read(flight, "imu_px4.csv", sensed), _read(flight, "height.csv", {"height_m": "range"})
@@ -198,8 +197,7 @@ def _read_overheard(flight: Flight) -> Columns:
     by_clock = (tuple(own), *(tuple(f"{name}_n" for name in clock) for clock in clocks("ds")))
     ends = ("1", "2", "3", "1_n", "2_n")
     optional = {f"fpp{end}_dbm": f"fpp{end}" for end in ends} | {f"skew{end}_ppm": f"skew{end}" for end in ends}
-    needed = {"listener": "my_id"} | _PAIR | own | neighbours
-    return _read(flight, "uwb_passive.csv", needed, optional, by_clock)
+    return _read(flight, "uwb_passive.csv", {"listener": "my_id", **_PAIR, **own, **neighbours}, optional, by_clock)
 
 
 def _cir_rows(columns: Columns) -> list[CirRow]:
@@ -242,8 +240,7 @@ def _find_anchors(
     path = flight.folder / "anchors.yaml"
     known: Vectors = _read_yaml(path, _vectors, _XYZ, {})
     if wanted is not None and wanted not in known:
-        listed = ", ".join(known) or "none"
-        raise ImportTableError(f"{path}: no constellation {wanted[:40]!r}; there are {listed}")
+        raise ImportTableError(f"{path}: no constellation {wanted[:40]!r}; there are {', '.join(known) or 'none'}")
     ends = exchanges.initiator, exchanges.target
     ranging = {*ends[0].tolist(), *ends[1].tolist()} - {tag.tag for tag in tags}
     if not known or not (ranging or wanted):

@@ -127,8 +127,7 @@ def _draw(page: Figure, strip: Strip, y: float) -> None:
 
 def _strips(document: Document, heights: Mapping[str, float]) -> list[Strip]:
     """Return the strips of a document with figures of given heights."""
-    captions = document.captions()
-    parts = [_of_block(block, captions, heights) for block in document.blocks]
+    parts = [_of_block(block, document.captions(), heights) for block in document.blocks]
     for k, block in enumerate(document.blocks[:-1]):
         if isinstance(block, Heading):
             # A heading stays with the figure or the short table that follows, or with some lines.

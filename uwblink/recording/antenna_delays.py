@@ -73,8 +73,7 @@ def delay_of(delays: AntennaDelays, tag: int) -> AntennaDelay | None:
 
 def known_delays(delays: AntennaDelays, tags: Iterable[int]) -> AntennaDelays:
     """Return the known delays of some devices by id."""
-    found = {tag: delay_of(delays, tag) for tag in tags}
-    return {tag: delay for tag, delay in found.items() if delay is not None}
+    return {tag: delay for tag in tags if (delay := delay_of(delays, tag)) is not None}
 
 
 def delays_in_meta(meta: Mapping[str, Any]) -> AntennaDelays:

@@ -67,8 +67,7 @@ class Recording(Tables):
             raise RecordingInUseError(f"{final}: another process is writing it; give another name")
         with raising(RecordingError, f"{final}: cannot be written"):
             with ExitStack() as place:
-                partial = place.enter_context(place_beside(final))
-                recording = cls._open_to_write(final, partial, memory_mb)
+                recording = cls._open_to_write(final, place.enter_context(place_beside(final)), memory_mb)
                 recording.append_meta(standard_meta() | dict(meta or {}))
                 if not live:
                     recording._place = place.pop_all()

@@ -184,8 +184,7 @@ class Tables(Store):
         if not self.count("corrected"):
             return False
         differs = " OR ".join(f"e.{n} IS DISTINCT FROM c.{n}" for n in ("time_ns", "initiator", "target"))
-        query = f"SELECT 1 FROM exchanges e POSITIONAL JOIN corrected c WHERE {differs} LIMIT 1"  # noqa: S608 - names
-        return not self._fetch(query)
+        return not self._fetch(f"SELECT 1 FROM exchanges e POSITIONAL JOIN corrected c WHERE {differs} LIMIT 1")  # noqa: S608 - names
 
     def tags(self) -> list[Tag]:
         """Return the tags in order of id."""

@@ -174,8 +174,7 @@ class FoxgloveServer(Closing):
             failing.callback(self._server.stop)
             self._gate = Gate(host, port, (behind, self._server.port))
             failing.pop_all()
-        layout = json.dumps(SCHEMAS[RANGE]).encode()
-        schema = foxglove.Schema(name=RANGE, encoding="jsonschema", data=layout)
+        schema = foxglove.Schema(name=RANGE, encoding="jsonschema", data=json.dumps(SCHEMAS[RANGE]).encode())
         settings: dict[str, Any] = {"message_encoding": "json", "schema": schema, "context": self._context}
         self._channel = cache(lambda pair: foxglove.Channel(f"/ranges/{pair}", **settings))
         self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self._gate.server_address[1]}"
@@ -189,5 +188,4 @@ class FoxgloveServer(Closing):
         """Send a range to the viewers of its topic, `/ranges/INITIATOR_TARGET`."""
         row = found.to_dict()
         data = json.dumps(stamped(row.pop("time_ns"), row)).encode()
-        channel = self._channel(f"{found.initiator}_{found.target}")
-        channel.log(data, log_time=max(found.time_ns, 0))
+        self._channel(f"{found.initiator}_{found.target}").log(data, log_time=max(found.time_ns, 0))

@@ -137,8 +137,7 @@ class Decoder:
 
     def _understand(self, buffer: bytes, at: int, *, clean: bool) -> tuple[Event, int]:
         """Return the message or text at a position and its end; raises `NeedMore` or `Malformed`."""
-        key = buffer[at : at + 3]
-        kind = self._table.get(key)
+        kind = self._table.get(buffer[at : at + 3])
         if kind is not None and (clean or buffer[at + 3 : at + 4] == b"|"):
             return self._message(kind, buffer, at)
         for text in self._texts:
