@@ -67,8 +67,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
         with raising(ImportTableError, needed, ImportError):
             from rosbags.highlevel import AnyReader, AnyReaderError
             from rosbags.typesys import Stores, get_typestore
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        with raising(ImportTableError, wrong, AnyReaderError), reader:
+        store = get_typestore(Stores.ROS2_HUMBLE)
+        with raising(ImportTableError, wrong, AnyReaderError), AnyReader([path], default_typestore=store) as reader:
             yield _ros_bag(path, reader)
 
 
