@@ -6,7 +6,7 @@
 [4.69]
 """
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from uwblink.lazy import offer
 
@@ -62,7 +62,7 @@ __all__ = [
     "stream",
 ]
 
-_HOMES: Final = {
+_homes = {
     "PROTOCOLS": "uwblink.protocols.table",
     "SPEED_OF_LIGHT": "uwblink.ticks",
     "Arrangement": "uwblink.recording.schema",
@@ -91,4 +91,4 @@ _HOMES: Final = {
 }
 
 if not TYPE_CHECKING:
-    __getattr__, __dir__ = offer(__name__, _HOMES)
+    __getattr__, __dir__ = offer(__name__, _homes)

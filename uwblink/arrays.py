@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uwblink.display import as_html, as_text, excerpt
-from uwblink.errors import ArgumentError
+from uwblink.errors import ArgumentError, raising
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -58,7 +58,13 @@ class ColumnTable:
         return self if np.all(np.diff(self.time_ns) >= 0) else self[np.argsort(self.time_ns, kind="stable")]
 
     def to_dict(self) -> dict[str, NDArray[Any]]:
-        """Return the columns by name, (n,) each."""
+        """Return the columns by name, (n,) each, as `pandas.DataFrame` and `polars.DataFrame` take them.
+
+        >>> from uwblink import Exchanges
+        >>> x = Exchanges.from_arrays([1], [2], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
+        >>> [*x.to_dict()][:5], x.to_dict()["rx2"].tolist()
+        (['time_ns', 'initiator', 'target', 'protocol', 'reporter'], [3000])
+        """
         return self._columns()
 
     def _title(self) -> str:
@@ -113,10 +119,8 @@ def words(name: str, values: ArrayLike, count: int) -> NDArray[np.str_]:
 
 def vectors(name: str, values: ArrayLike, count: int, size: int) -> Floats:
     """Return float64 (count, size) of finite numbers; one vector stands for all rows."""
-    try:
+    with raising(ArgumentError, f"{name}: expected numbers of shape ({count}, {size})", TypeError, ValueError):
         found = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ArgumentError(f"{name}: found what is no array of numbers, expected shape ({count}, {size})") from error
     if not count and not found.size:
         return np.zeros((0, size))
     if found.shape not in ((size,), (count, size)):
@@ -135,10 +139,8 @@ def reject(name: str, values: NDArray[Any], bad: Bools, expected: str) -> None:
 
 def _rows(name: str, values: ArrayLike, count: int, kinds: str, expected: str) -> NDArray[Any]:
     """Return a column (count,) of one of NumPy's kinds; raises `ArgumentError` for another."""
-    try:
+    with raising(ArgumentError, f"{name}: expected one value a row", ValueError):
         found = np.asarray(values)
-    except ValueError as error:
-        raise ArgumentError(f"{name}: its rows have different lengths, expected one value a row") from error
     if found.dtype.kind == "O" and all(isinstance(value, str) for value in found.flat):
         found = found.astype(np.str_)  # text of a data frame
     if found.ndim and length(name, found) != count:

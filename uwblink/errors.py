@@ -1,5 +1,10 @@
 """The errors of `uwblink`; each is also derived from a matching standard exception."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
 
 class OfParameter(Exception):  # noqa: N818 - the base of the bases
     """Base of the errors of all three packages; `parameter` is the name of the parameter at fault, if there is one.
@@ -64,10 +69,6 @@ class PlanError(UwblinkError, ValueError):
 class PortError(UwblinkError, OSError):
     """A serial port that cannot be used, with its name and the reason."""
 
-    def __str__(self) -> str:
-        """Return the message (an `OSError` would print its arguments)."""
-        return str(self.args[0]) if self.args else ""
-
 
 class PortMissingError(PortError, FileNotFoundError):
     """No such port."""
@@ -104,3 +105,19 @@ class RefusedError(BoardError, ValueError):
 def first_line(error: Exception) -> str:
     """Return the first line of an error's text, 200 characters at most."""
     return (str(error).splitlines() or [""])[0][:200]
+
+
+@contextmanager
+def raising(error: Callable[[str], Exception], what: str, *kinds: type[Exception], remedy: str = "") -> Iterator[None]:
+    """Raise `error` in place of exceptions of `kinds` (default: `OSError`): "`what` (reason)" and what to do.
+
+    Errors of the three packages pass, because their texts are complete.
+    """
+    kinds = kinds or (OSError,)
+    try:
+        yield
+    except OfParameter:
+        raise
+    except kinds as problem:
+        reason = getattr(problem, "strerror", None) or first_line(problem)
+        raise error(f"{what} ({reason}){remedy}") from problem

@@ -8,9 +8,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final, TextIO
+from typing import TextIO
 
-from uwblink.errors import ArgumentError, OutputError, RecordingError, RecordingExistsError, UwblinkError
+from uwblink.errors import ArgumentError, OutputError, RecordingError, RecordingExistsError, raising
 
 __all__ = [
     "check_apart",
@@ -24,9 +24,6 @@ __all__ = [
     "write_files",
     "write_text",
 ]
-
-PARTIAL: Final = ".partial"
-"""Ending of folders for what is being written."""
 
 
 @contextmanager
@@ -67,14 +64,9 @@ def whole(path: Path, *, force: bool) -> Iterator[Path]:
     if the file cannot be written.
     """
     check_output(path, force=force)
-    try:
-        with place_beside(path) as partial:
-            yield partial
-            take_name(partial, path)
-    except UwblinkError:
-        raise  # also of other files in the block
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    with raising(OutputError, f"{path}: cannot be written"), place_beside(path) as partial:
+        yield partial
+        take_name(partial, path)
 
 
 @contextmanager
@@ -84,12 +76,12 @@ def place_beside(path: Path) -> Iterator[Path]:
     The folder has a random name and private permissions, so that other users cannot place links in it.
     """
     prefix = f".{path.name}."
-    # File systems take names of 255 bytes, of which `tempfile` draws eight.
-    if len(os.fsencode(prefix)) > 255 - len(PARTIAL) - 8:
+    # File systems take names of 255 bytes, of which `tempfile` draws eight, and nine are ".partial".
+    if len(os.fsencode(prefix)) > 255 - 8 - 9:
         prefix = "."
     # It is removed at the end of the process at the latest, also after an interrupt.
     with interrupts_held():  # an interrupt between creating and storing it would leave the folder
-        made = TemporaryDirectory(PARTIAL, prefix, path.absolute().parent, ignore_cleanup_errors=True)
+        made = TemporaryDirectory(".partial", prefix, path.absolute().parent, ignore_cleanup_errors=True)
     with made as folder:
         yield Path(folder) / path.name
 
@@ -117,12 +109,10 @@ def new_file(path: Path, *, force: bool) -> TextIO:
     `check_output` raises.
     """
     check_output(path, force=force)
-    try:
+    with raising(OutputError, f"{path}: cannot be written"):
         if force:
             path.unlink(missing_ok=True)
         return path.open("x", 2**20, encoding="utf-8", newline="\n")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 @contextmanager
@@ -133,10 +123,8 @@ def made_folder(folder: Path) -> Iterator[None]:
     """
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        try:
+        with raising(OutputError, f"{folder}: cannot be made"):
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"{folder}: cannot be made ({error.strerror})") from error
         yield
     except BaseException:
         for place in missing:
@@ -174,12 +162,13 @@ def check_output(path: Path, *, force: bool, recording: bool = False) -> None:
 
     A `recording` must not have the suffix of another format.
     """
-    tables = (".csv", ".tsv", ".txt", ".gz", ".parquet", ".json", ".jsonl", ".ndjson")
-    others = (".bag", ".mcap", ".db3", ".toml", ".html", ".pdf")
-    text = path.suffix.lower() in tables + others
+    is_other = path.suffix.lower() in (
+        ".csv", ".tsv", ".txt", ".gz", ".parquet", ".json", ".jsonl", ".ndjson", ".bag", ".mcap", ".db3", ".toml",
+        ".html", ".pdf",
+    )  # fmt: skip
     rules = (
         (
-            recording and text,
+            recording and is_other,
             RecordingError,
             f"a recording is written here, and {path.suffix} is the ending of another "
             f"kind of file; name it {path.stem}.uwb (`uwblink export` makes tables of it)",

@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from uwblink.errors import raising
+
 __all__ = ["FileKey", "TomlReader", "heads", "is_number", "read_text", "require_regular"]
 
 
@@ -41,12 +43,9 @@ def read_text(path: str | os.PathLike[str], error: Callable[[str], Exception], w
     Raises `error` with a line of text if there is no such `what`, or if it is not a readable text file.
     """
     require_regular(path, error, what)
-    try:
+    not_text = raising(error, f"{path}: not a text file in UTF-8", UnicodeDecodeError, remedy=f", expected a {what}")
+    with raising(error, f"{path}: cannot be read"), not_text:
         return Path(path).read_text(encoding="utf-8")
-    except UnicodeDecodeError as problem:
-        raise error(f"{path}: not a text file in UTF-8 (byte {problem.start}), expected a {what}") from problem
-    except OSError as problem:
-        raise error(f"{path}: cannot be read ({problem.strerror})") from problem
 
 
 class FileKey(NamedTuple):
@@ -70,10 +69,8 @@ class TomlReader:
         """Read `path`, which holds a `what`."""
         self.path, self.error = path, error
         self.text = read_text(path, error, what)
-        try:
+        with raising(error, f"{path}: not valid TOML", tomllib.TOMLDecodeError, RecursionError):
             self.table: dict[str, Any] = tomllib.loads(self.text)
-        except (tomllib.TOMLDecodeError, RecursionError) as problem:
-            raise error(f"{path}: not valid TOML: {problem}") from problem
 
     def known(self, table: dict[str, Any], names: Iterable[str], prefix: str = "") -> None:
         """Raise for a key that is none of `names`."""

@@ -38,6 +38,5 @@ def elapsed(later: ArrayLike, earlier: ArrayLike, bits: int = REPORT_BITS) -> In
 
     The only place where stamps are subtracted: correct as long as less than one wrap lies between.
     """
-    mask = np.int64((1 << bits) - 1)
     difference = np.asarray(later, dtype=np.int64) - np.asarray(earlier, dtype=np.int64)
-    return np.asarray(difference & mask, dtype=np.int64)
+    return np.asarray(difference & np.int64((1 << bits) - 1), dtype=np.int64)

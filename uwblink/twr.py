@@ -122,16 +122,6 @@ class Exchanges(ColumnTable):
         )
         return exchanges if range_m is not None else replace(exchanges, range_m=raw_range(exchanges))
 
-    def to_dict(self) -> dict[str, NDArray[Any]]:
-        """Return the columns by name, (n,) each, as `pandas.DataFrame` and `polars.DataFrame` take them.
-
-        >>> from uwblink import Exchanges
-        >>> x = Exchanges.from_arrays([1], [2], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
-        >>> [*x.to_dict()][:5], x.to_dict()["rx2"].tolist()
-        (['time_ns', 'initiator', 'target', 'protocol', 'reporter'], [3000])
-        """
-        return self._columns()
-
     def _title(self) -> str:
         ends = np.unique(np.column_stack([self.initiator, self.target]), axis=0)
         return f"{len(self)} exchanges of {len(ends)} pairs, protocols {first_few(np.unique(self.protocol).tolist())}"

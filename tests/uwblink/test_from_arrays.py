@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from tests.uwblink.recording.test_file import random_exchanges
-from tests.uwblink.test_twr import exchange
 from uwblink.errors import ArgumentError, UwblinkError
 from uwblink.recording.schema import Poses
-from uwblink.twr import COLUMNS, Exchanges, raw_range
+from uwblink.twr import COLUMNS, Exchanges
 
 SS: dict[str, Any] = {"tx1": [0, 9], "rx1": [5, 3], "tx2": [1005, 1003], "rx2": [3000, 3009]}
 DS: dict[str, Any] = SS | {"tx3": [99_005, 99_003], "rx3": [101_000, 101_009]}
@@ -53,21 +52,13 @@ def test_stamps_that_a_protocol_has_not_are_zero_and_mixed_protocols_keep_theirs
     assert Exchanges.from_arrays(1, 2, **DS).protocol.tolist() == ["ds", "ds"]
 
 
-def test_ranges_are_those_of_the_formula():
-    for protocol in ("ss", "ds", "ds-alt", "ds-sym"):
-        e = exchange(protocol, 1000, 20_000_000, 98_320_384, 0, 0, bits=40)
-        stamps: Any = {name: getattr(e, name) for name in ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")}
-        x = Exchanges.from_arrays(1, 2, **stamps, protocol=protocol, bits=40)
-        np.testing.assert_array_equal(x.range_m, raw_range(e))
-
-
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
         ({"rx2": [1, 2, 3]}, "rx2: found 3 rows, expected 2 as in the first column"),
         ({"tx1": [[1, 2]]}, r"tx1: found an array of shape \(1, 2\), expected one value a row"),
         ({"tx1": 5}, r"tx1: found an array of shape \(\), expected one value a row"),
-        ({"rx1": [[1], [2, 3]]}, "rx1: its rows have different lengths"),
+        ({"rx1": [[1], [2, 3]]}, "rx1: expected one value a row"),
         ({"rx1": [5, 2**32]}, "rx1: row 1: found 4294967296, expected a whole number from 0 to 4294967295; stamps of"),
         ({"rx1": [5, -1]}, "rx1: row 1: found -1, expected a whole number from 0"),
         ({"rx1": [5.5, 1]}, "rx1: row 0: found 5.5, expected a whole number"),
@@ -137,7 +128,7 @@ def test_poses_are_put_in_order_and_turned_to_length_one():
     [
         ({"position_m": [1, 2]}, r"position_m: found an array of shape \(2,\), expected \(2, 3\) or \(3,\)"),
         ({"position_m": [[1, 2, 3], [1, np.nan, 3]]}, "position_m: row 1: found .*, expected finite numbers"),
-        ({"position_m": "here"}, "position_m: found what is no array of numbers"),
+        ({"position_m": "here"}, r"position_m: expected numbers of shape \(2, 3\)"),
         ({"quaternion": [1, 1, 0, 0]}, "quaternion: row 0: found .*, expected x y z w of length 1"),
         ({"body": [1, 2]}, "body: found '1' .*, expected text"),
         ({"time_ns": [0.5, 1]}, "time_ns: row 0: found 0.5, expected a whole number"),

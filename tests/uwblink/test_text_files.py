@@ -11,7 +11,7 @@ from uwblink.text_files import read_text
     [
         ("nowhere", "no such map"),
         ("folder", "is a directory, expected a map"),
-        ("latin1", "not a text file in UTF-8 (byte 3), expected a map"),
+        ("latin1", "not a text file in UTF-8"),
         ("nowhere\0", "no path of a map"),
         ("n" * 300, "cannot be read (File name too long)"),
     ],

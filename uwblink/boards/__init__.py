@@ -83,12 +83,10 @@ def decode_again(recording: Recording) -> Decoded:
     """Decode all bytes from boards; raises `RecordingError` if there are none."""
     frames = _heard(recording)
     ids = board_ids(recording)
-    decoders: dict[str, ColumnDecoder] = {}
+    names = dict.fromkeys(frame.board for frame in frames)
+    decoders = {name: ColumnDecoder(ids.get(name, k)) for k, name in enumerate(names)}
     for frame in frames:
-        name = frame.board
-        if name not in decoders:
-            decoders[name] = ColumnDecoder(ids.get(name, len(decoders)))
-        decoders[name].feed(frame.data, frame.time_ns)
+        decoders[frame.board].feed(frame.data, frame.time_ns)
     others = []
     for name, decoder in decoders.items():
         decoder.finish(frames[-1].time_ns)

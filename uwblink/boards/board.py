@@ -185,8 +185,7 @@ class Board(Closing):
         transport, connection = self._transport, self._connection
         transport.write(connection.send(command, transport.now_s()))
         while True:
-            until_s = connection.deadline_s() or 0.0
-            data = transport.read(max(until_s - transport.now_s(), 0.0))
+            data = transport.read(max((connection.deadline_s() or 0.0) - transport.now_s(), 0.0))
             events, outcome = connection.receive(data, transport.now_s())
             self._keep(events, outcome.reply if outcome else None)
             if outcome and outcome.error:

@@ -44,8 +44,6 @@ for 22 to 28 ms (firmware wire format, 1.4)."""
 QUIET_TARGET_S: Final = 0.040
 """The same for the target, which prints its own before its report, if it was asked to report."""
 
-NO_ANSWER_HINT: Final = "is this a ranging board, and has it power? A board that hangs must be unplugged"
-
 
 @dataclass(frozen=True, slots=True)
 class CommandOutcome:
@@ -113,7 +111,7 @@ class Connection:
         if self._pending:
             self._pending.heard = (self._pending.heard + data)[-60:]
         for event in events:
-            if outcome is None and self._pending is not None:
+            if self._pending is not None:
                 outcome = self._ended_by(self._pending, event, now_s)
         if self._pending and now_s >= self._pending.until_s:
             outcome = self._expired(self._pending)
@@ -125,7 +123,7 @@ class Connection:
         sent = encode(pending.command)
         text = f"{self.name}: no answer to {sent!r} within {pending.answer_s * 1e3:.0f} ms; heard {heard}"
         if not pending.heard and pending.answer_s >= PATIENT_S:
-            text += f"; {NO_ANSWER_HINT}"
+            text += "; is this a ranging board, and has it power? A board that hangs must be unplugged"
         return CommandOutcome(pending.command, None, NoAnswerError(text))
 
     def _ended_by(self, pending: _Pending, event: Event, now_s: float) -> CommandOutcome | None:

@@ -142,7 +142,9 @@ class CallbackListener(Listener):
     """Calls a function with every message of boards."""
 
     def __init__(self, callback: Callable[[Heard], object]) -> None:
-        """Call `callback` with each `Heard`."""
+        """Call `callback` with each `Heard`; raises `TypeError` for what is no function."""
+        if not callable(callback):
+            raise TypeError(f"listeners: found {callback!r}, expected a Listener or a function of one Heard")
         self._callback = callback
 
     def on_message(self, heard: Heard) -> None:
@@ -152,15 +154,7 @@ class CallbackListener(Listener):
 
 def as_listeners(listeners: Iterable[Listener | Callable[[Heard], object]]) -> list[Listener]:
     """Return listeners, and functions as listeners; raises `TypeError` for other objects."""
-    found: list[Listener] = []
-    for listener in listeners:
-        if isinstance(listener, Listener):
-            found.append(listener)
-        elif callable(listener):
-            found.append(CallbackListener(listener))
-        else:
-            raise TypeError(f"listeners: found {listener!r}, expected a Listener or a function of one Heard")
-    return found
+    return [one if isinstance(one, Listener) else CallbackListener(one) for one in listeners]
 
 
 @dataclass(slots=True)
@@ -275,9 +269,7 @@ class DelayCheck(Listener):
         sent = {(initiator, "tx"): report.tx1, (target, "tx" if double_sided else "reply"): report.tx2}
         if double_sided:
             sent[target, "reply"] = report.tx3
-        for which, stamp in sent.items():
-            if which not in self._expected:
-                continue
+        for which, stamp in [(which, stamp) for which, stamp in sent.items() if which in self._expected]:
             delay, half = self._expected[which], DELAYED_TX_GRID // 2
             rest = (stamp - delay + half) % DELAYED_TX_GRID - half
             rests = self._rests.setdefault(which, deque(maxlen=3))
@@ -311,11 +303,10 @@ class ReportCheck:
         if before is None or before[0] == board or not same:
             self._last[pair] = board, report
             return None
-        names = [n for n in RangeReport.FIELDS if n != "neighbour" and getattr(before[1], n) != getattr(report, n)]
-        if not names:
-            return None
-        told = ", ".join(f"{n} {getattr(before[1], n)} and {getattr(report, n)}" for n in names)
-        return f"boards {before[0]} and {board} report one exchange of {pair[0]} with {pair[1]} differently: {told}"
+        both = ((n, getattr(before[1], n), getattr(report, n)) for n in RangeReport.FIELDS if n != "neighbour")
+        told = ", ".join(f"{name} {one} and {other}" for name, one, other in both if one != other)
+        whose = f"boards {before[0]} and {board} report one exchange of {pair[0]} with {pair[1]} differently"
+        return f"{whose}: {told}" if told else None
 
 
 Correction = Callable[[Exchanges], Mapping[str, Floats | Bools]]
@@ -336,8 +327,7 @@ def load_correction(path: Path) -> Correction:
         raise PlanError(f"{path}: no installed distribution corrects ranges (entry points of uwbcal.corrections)")
     with _as_plan_errors():
         make: Callable[[Path], Correction] = found[0].load()
-        made = make(path)
-    return _as_plan_errors()(made)
+        return _as_plan_errors()(make(path))
 
 
 @contextmanager

@@ -23,12 +23,9 @@ from typing import Final
 from uwblink.boards.listeners import Correction, Listener, Pair, Progress, check_pairs
 from uwblink.closing import Closing
 from uwblink.database import log_of
-from uwblink.errors import PortError
+from uwblink.errors import PortError, raising
 from uwblink.pages.blocks import CSS
 from uwblink.wire.codec import exchanges_of
-
-IDLE_S: Final = 10.0
-"""Connections without a request for this time are closed, because each has a thread."""
 
 WIDTH, HEIGHT, MARGIN = 260, 44, 3
 """Size of a pair's picture, and of the margin around its lines, in pixels."""
@@ -52,10 +49,8 @@ class LivePage(Closing, Listener):
         """
         self._path, self._correct = path, correct
         self._progress = Progress()
-        try:
+        with raising(PortError, f"port {port}: the page cannot be served there"):
             self._server = _Server(("127.0.0.1", port), type("Handler", (_Handler,), {"page": self}))
-        except OSError as error:
-            raise PortError(f"port {port}: the page cannot be served there ({error.strerror})") from error
         threading.Thread(target=self._server.serve_forever, name="uwblink page", daemon=True).start()
 
     @property
@@ -140,7 +135,7 @@ class LivePage(Closing, Listener):
 class _Handler(BaseHTTPRequestHandler):
     """Answers for one page."""
 
-    timeout = IDLE_S
+    timeout = 10.0  # seconds; idle connections are closed, because each has a thread
     page: LivePage
 
     def do_GET(self) -> None:

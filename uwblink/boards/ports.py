@@ -11,7 +11,8 @@ import errno
 import os
 import select
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -19,7 +20,7 @@ import serial
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from uwblink.errors import PortBusyError, PortError, PortLostError, PortMissingError, PortPermissionError
+from uwblink.errors import PortBusyError, PortError, PortLostError, PortMissingError, PortPermissionError, raising
 
 try:
     import pty
@@ -104,12 +105,12 @@ class SerialPort:
         """
         if self.fileno is not None and not select.select([self.fileno], [], [], max(timeout_s, 0.0))[0]:
             return b""
-        with self._reporting_loss():
+        with self._raising_loss():
             return bytes(self._serial.read(65_536))
 
     def write(self, data: bytes) -> None:
         """Send bytes in one write; raises `PortLostError`."""
-        with self._reporting_loss():
+        with self._raising_loss():
             self._serial.write(data)
 
     def now_s(self) -> float:
@@ -121,12 +122,9 @@ class SerialPort:
         with contextlib.suppress(OSError, serial.SerialException, TypeError):
             self._serial.close()
 
-    @contextlib.contextmanager
-    def _reporting_loss(self) -> Iterator[None]:
-        try:
-            yield
-        except (OSError, serial.SerialException, TypeError) as error:  # TypeError: another thread closed the port
-            raise PortLostError(f"{self.name}: the port is gone ({error}); plug the board in again") from error
+    def _raising_loss(self) -> AbstractContextManager[None]:
+        kinds = (OSError, serial.SerialException, TypeError)  # TypeError: another thread closed the port
+        return raising(PortLostError, f"{self.name}: the port is gone", *kinds, remedy="; plug the board in again")
 
 
 def _since_boot_ns() -> int:
@@ -295,10 +293,8 @@ class Terminal:
 def _point(link: Path, device: str) -> None:
     if link.is_symlink() and link.exists():
         raise PortError(f"{link}: is a port in use by another server; choose another folder, or remove the link")
-    try:
+    with raising(PortError, f"{link}: cannot be made a link to {device}"):
         link.parent.mkdir(parents=True, exist_ok=True)
         if link.is_symlink():  # left behind by a server that was killed
             link.unlink()
         link.symlink_to(device)
-    except OSError as error:
-        raise PortError(f"{link}: cannot be made a link to {device} ({error.strerror})") from error

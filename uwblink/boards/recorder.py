@@ -240,8 +240,8 @@ class Recorder:
         expected = ("WARNING", "COMMANDED TASK FAILED", "TWR FAIL")
         if isinstance(event, TextLine) and not event.text.startswith(expected):
             self._fault(station, "text", event.text.strip())
-        if isinstance(event, RangeReport) and (told := self._check.add(station.board, event)):
-            self._fault(station, "reports differ", told)
+        if isinstance(event, RangeReport) and (differences := self._check.add(station.board, event)):
+            self._fault(station, "reports differ", differences)
         heard = Heard(time_ns, station.board, event)
         for listener in self._listeners:
             listener.on_message(heard)

@@ -44,7 +44,7 @@ from uwblink.errors import PlanError, RangingFailedError, RecordingError, Refuse
 from uwblink.output import check_output
 
 if TYPE_CHECKING:
-    from uwblink.boards import Correction, LivePage, Progress
+    from uwblink.boards import Correction, Progress
     from uwblink.wire import RangeReport
 
 
@@ -103,7 +103,7 @@ def ports(
         {
             "device": name,
             "description": getattr(plugged.get(name), "description", ""),
-            "uwblink.boards.serial_number": getattr(plugged.get(name), "uwblink.boards.serial_number", None),
+            "serial_number": getattr(plugged.get(name), "serial_number", None),
         }
         for name in names or plugged
     ]
@@ -313,12 +313,15 @@ def record(
         chosen = replace(chosen, get_cir=True)
     with ExitStack() as stack:
         stop, watch = stack.enter_context(interrupts()), stack.enter_context(_watcher())
-        page = stack.enter_context(_page(output, calibration, live_port, chosen)) if live else None
+        pages = []
+        if live:
+            correct = _correction(calibration, chosen)
+            pages.append(stack.enter_context(uwblink.boards.LivePage(output, correct=correct, port=live_port)))
+            typer.echo(f"live page: {pages[0].url}", err=True)
 
         def watch_all(progress: Progress) -> None:
-            watch(progress)
-            if page:
-                page.watch(progress)
+            for show in (watch, *(page.watch for page in pages)):
+                show(progress)
 
         progress = uwblink.record(
             ports,
@@ -332,7 +335,7 @@ def record(
             force=force,
             stop=stop,
             watch=watch_all,
-            listeners=[page] if page else [],
+            listeners=pages,
         )
     typer.echo(f"{output}: {progress}")
 
@@ -447,13 +450,6 @@ def _ids(text: str) -> tuple[int, ...]:
     if not all(word.isascii() and word.isdigit() and len(word) < 6 for word in words):
         raise PlanError(f"--order: found {text!r:.40}, expected ids with commas, as in 3,1,2")
     return tuple(map(int, words))
-
-
-def _page(path: Path, calibration: Path | None, port: int, plan: uwblink.RangingPlan) -> LivePage:
-    """Return the served live page."""
-    page = uwblink.boards.LivePage(path, correct=_correction(calibration, plan), port=port)
-    typer.echo(f"live page: {page.url}", err=True)
-    return page
 
 
 @contextmanager

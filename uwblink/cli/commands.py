@@ -98,14 +98,14 @@ def _importing(row: Importer) -> Callable[..., None]:
     """Return the command of an importer. Typer reads its parameters from the annotations, which depend on the row."""
 
     def run(table: Any, output: Path, map_file: Path | None = None, force: bool = False) -> None:
-        with waiting("importing") as say:
+        with waiting("importing") as report:
             done = uwblink.importers.import_file(
                 table,
                 output,
                 importer=row.name,
                 map_file=map_file,
                 force=force,
-                watch=lambda what, share: say(f"{what}, {share:.0%}" if share else what),
+                watch=lambda what, share: report(f"{what}, {share:.0%}" if share else what),
             )
         typer.echo(f"{output}: {', '.join(f'{count} {table}' for table, count in done.counts.items())}")
         for note in done.notes:

@@ -13,7 +13,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import Field, fields, is_dataclass
 from functools import wraps
 from inspect import Parameter, Signature, signature
@@ -36,9 +36,6 @@ from uwblink.settings import flags_of
 
 FLAGS: Final = {"map_file": "--map", "tags_from": "--tags", "duration_s": "--duration"}
 """Flags of parameters of uwblink that differ from the parameter's name with dashes."""
-
-IMPORT_POLL_S: Final = 0.02
-"""Time between looks whether an import has ended that delays an interrupt; shorter than a person notices."""
 
 Flags = Mapping[str, str]
 """Flags by parameter, where they differ from the parameter's name with dashes."""
@@ -253,22 +250,16 @@ def tags_of(form: str = "{}") -> Callable[[typer.Context, str], list[str]]:
     """
 
     def complete(ctx: typer.Context, incomplete: str) -> list[str]:
-        return starting(incomplete, (form.format(tag) for tag in _tags(map(Path, ctx.args))))
+        from uwblink import Recording
+
+        found: set[int] = set()
+        for path in ctx.args:
+            # Completion does not report errors.
+            with suppress(UwblinkError), Recording.open(path) as recording:
+                found |= {tag.tag for tag in recording.tags()}
+        return starting(incomplete, map(form.format, sorted(found)))
 
     return complete
-
-
-def _tags(paths: Iterable[Path]) -> list[int]:
-    from uwblink import Recording, UwblinkError
-
-    found: set[int] = set()
-    for path in paths:
-        try:
-            with Recording.open(path) as recording:
-                found |= {tag.tag for tag in recording.tags()}
-        except UwblinkError:  # completion does not report errors
-            continue
-    return sorted(found)
 
 
 def new_app(text: str) -> typer.Typer:
@@ -389,7 +380,7 @@ def interrupts(*, at_once: bool = False) -> Iterator[Callable[[], bool]]:
         if not importing or not hasattr(signal, "setitimer"):
             raise KeyboardInterrupt
         signal.signal(signal.SIGALRM, leave)
-        signal.setitimer(signal.ITIMER_REAL, IMPORT_POLL_S)
+        signal.setitimer(signal.ITIMER_REAL, 0.02)  # look again soon, sooner than a person notices
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

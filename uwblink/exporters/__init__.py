@@ -22,7 +22,7 @@ import duckdb
 import numpy as np
 
 from uwblink.database import check_log, connect, log_of
-from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError, UwblinkError, first_line
+from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError, raising
 from uwblink.exporters.mcap import write_mcap, write_rosbag2
 from uwblink.output import place_beside, take_name
 from uwblink.plugins import Registry, check_row
@@ -42,20 +42,20 @@ def _write(recording: Path, folder: Path, *, suffix: str, options: str, cells: M
     # The log is beside the file, not beside a link to it.
     place = recording.resolve()
     check_log(place)
-    try:
+    with (
+        raising(RecordingError, f"{recording}: cannot be exported", duckdb.Error),
         # Several threads buffer rows to keep their order. One takes no more processor time, and 0.29 GB instead of
         # 0.41 GB for 4 million exchanges as CSV (2026-11-22). The limit is for reading; buffers for writing add to it.
-        with connect(paths=[place, log_of(place)], folders=[folder], memory_mb=400, threads=1) as db:
-            db.execute(f"ATTACH {_literal(place)} AS source (READ_ONLY)")
-            if by_poses:
-                db.register("truths", {"by_poses": np.concatenate(by_poses)})
-            for table, path in wanted.items():
-                words = [f'"{n}"' for n, kind in TABLES[table].items() if kind in ("VARCHAR", "BLOB", "USMALLINT[]")]
-                quoted = f", FORCE_QUOTE ({', '.join(words)})" if words and suffix == "csv" else ""
-                query = _query(db, table, cells, truths=bool(by_poses))
-                db.execute(f"COPY ({query}) TO {_literal(path)} ({options}{quoted})")
-    except duckdb.Error as error:
-        raise RecordingError(f"{recording}: cannot be exported ({first_line(error)})") from error
+        connect(paths=[place, log_of(place)], folders=[folder], memory_mb=400, threads=1) as db,
+    ):
+        db.execute(f"ATTACH {_literal(place)} AS source (READ_ONLY)")
+        if by_poses:
+            db.register("truths", {"by_poses": np.concatenate(by_poses)})
+        for table, path in wanted.items():
+            words = [f'"{n}"' for n, kind in TABLES[table].items() if kind in ("VARCHAR", "BLOB", "USMALLINT[]")]
+            quoted = f", FORCE_QUOTE ({', '.join(words)})" if words and suffix == "csv" else ""
+            query = _query(db, table, cells, truths=bool(by_poses))
+            db.execute(f"COPY ({query}) TO {_literal(path)} ({options}{quoted})")
     return {path.name: counts[table] for table, path in wanted.items()}
 
 
@@ -207,14 +207,9 @@ def export_recording(
     """
     final = Path(folder)
     check_export(final, to=to, force=force)
-    try:
-        with place_beside(final) as partial:
-            partial.mkdir()
-            with EXPORTERS.calling(to, RecordingError):
-                written = EXPORTERS[to].write(Path(recording), partial)
-            take_name(partial, final)
-    except OSError as error:
-        if isinstance(error, UwblinkError):
-            raise
-        raise RecordingError(f"{final}: cannot be written ({error.strerror or error})") from error
+    with raising(RecordingError, f"{final}: cannot be written"), place_beside(final) as partial:
+        partial.mkdir()
+        with EXPORTERS.calling(to, RecordingError):
+            written = EXPORTERS[to].write(Path(recording), partial)
+        take_name(partial, final)
     return written

@@ -23,13 +23,12 @@ import numpy as np
 from mcap.writer import Writer
 
 from uwblink.arrays import Floats
-from uwblink.errors import RecordingError
+from uwblink.errors import RecordingError, raising
 from uwblink.recording.contents import READING_MB, Contents, distances_by_poses_m, pieces
 from uwblink.recording.file import Recording
 
 WORLD: Final = "world"
 RANGE: Final = "uwb.Range"
-ENDS: Final = ("time_ns", "initiator", "target")
 READINGS: Final = {
     "imu": ("body", "wx", "wy", "wz", "ax", "ay", "az"),
     "height": ("body", "height_m"),
@@ -102,13 +101,6 @@ def _readings(table: str, columns: Any) -> Iterator[TimedRow]:
     return ((time_ns, table, whose, values) for time_ns, whose, *values in rows)
 
 
-def fits_exchanges(held: Contents) -> bool:
-    """Return whether the table `corrected` has the same rows as the exchanges."""
-    return bool(held.corrected) and all(
-        np.array_equal(held.corrected[name], getattr(held.exchanges, name)) for name in ENDS
-    )
-
-
 Message = tuple[int, str, str, Any]
 """Time in nanoseconds, topic, type, and content."""
 
@@ -128,12 +120,9 @@ def _write(
         for time_ns, topic, kind, content in (row for held in pieces(opened) for row in encode(opened, held)):
             if time_ns < 0:
                 raise RecordingError(f"{recording}: has times before 1970, which {form} cannot hold")
-            try:
+            wrong = f"{recording}: {topic}: has a number that is not finite or too large, which {form} cannot represent"
+            with raising(RecordingError, wrong, ValueError, OverflowError):
                 publish(time_ns, topic, kind, content)
-            except (ValueError, OverflowError) as error:
-                raise RecordingError(
-                    f"{recording}: {topic}: has a number that is not finite or too large, which {form} cannot represent"
-                ) from error
             count += 1
     return count
 
@@ -171,9 +160,9 @@ def _ranges(held: Contents, by_poses: Floats) -> Callable[[int], dict[str, Any]]
     """Return a function for the content of a range, with `corrected_m` and so on if ranges were corrected."""
     e = replace(held.exchanges, truth_m=np.where(np.isfinite(held.exchanges.truth_m), held.exchanges.truth_m, by_poses))
     columns = {name: getattr(e, name).tolist() for name in ("initiator", "target", "protocol", *_MEASURED)}
-    if fits_exchanges(held):
-        columns["range_m"] = held.corrected["raw_m"].tolist()  # the measured range
-        columns |= {n: column.tolist() for n, column in held.corrected.items() if n not in (*ENDS, "raw_m")}
+    if held.corrected:  # with the rows of the exchanges
+        corrected = {name: column.tolist() for name, column in held.corrected.items() if name != "time_ns"}
+        columns |= {"range_m": corrected.pop("raw_m"), **corrected}  # the measured range
     return lambda k: _known({name: column[k] for name, column in columns.items()})
 
 
@@ -223,14 +212,11 @@ def write_rosbag2(recording: Path, folder: Path) -> dict[str, int]:
 
     Raises `RecordingError` where rosbags is not installed, for times before 1970, and for values beyond 32-bit floats.
     """
-    try:
+    with raising(RecordingError, "writing bags needs rosbags; pip install 'uwbcal[bags]'", ImportError):
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise RecordingError("writing bags needs rosbags; pip install 'uwbcal[bags]'") from error
     store = get_typestore(Stores.ROS2_JAZZY)
-    place = folder / "rosbag2"
-    with Writer(place, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as bag:
+    with Writer(folder / "rosbag2", version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as bag:
         connection = cache(lambda topic, kind: bag.add_connection(topic, kind, typestore=store))
 
         def publish(time_ns: int, topic: str, kind: str, message: Any) -> None:
@@ -308,14 +294,13 @@ class _RosMessages:
         turn, pull = (self._new("geometry_msgs/Vector3", *part) for part in (values[:3], values[3:]))
         level, unknown = self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0), np.zeros(9)
         # -1 stands first in the covariance of what an Imu does not measure, by the definition of the message.
-        unmeasured = np.array([-1.0] + [0.0] * 8)
-        readings = (level, unmeasured, turn, unknown, pull, unknown)
+        readings = (level, np.array([-1.0] + [0.0] * 8), turn, unknown, pull, unknown)
         return [(f"/imu/{topic_name(body)}", self._new("sensor_msgs/Imu", self._header(stamp, body), *readings))]
 
 
 def _variances(held: Contents) -> Floats:
     """Return the variances of ranges (n,), reflections counted in where that is known; 0 where nothing is."""
-    if not fits_exchanges(held):
+    if not held.corrected:
         return np.zeros(len(held.exchanges))
     total, noise = held.corrected["sigma_total_m"], held.corrected["sigma_m"]
     return np.asarray(np.nan_to_num(np.where(np.isfinite(total), total, noise) ** 2))

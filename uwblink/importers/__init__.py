@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +15,7 @@ from typing import Any, Final
 
 import duckdb
 
-from uwblink.errors import ArgumentError, ImportTableError, first_line
+from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.importers.bags import BAG_SUFFIXES, bag_to_table
 from uwblink.importers.column_map import ColumnMap
 from uwblink.importers.exchange_tables import TABLE_SUFFIXES, Imported, find_tables, import_tables
@@ -27,8 +26,9 @@ from uwblink.importers.tables import connected
 from uwblink.output import check_output
 from uwblink.plugins import Registry, check_row, is_text
 from uwblink.recording.contents import Contents, load
+from uwblink.recording.file import Recording
+from uwblink.recording.intake import decode_json
 from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM
-from uwblink.recording.store import Store
 
 __all__ = [
     "IMPORTERS",
@@ -86,11 +86,6 @@ def check_importer(row: Any) -> None:
     )
 
 
-def read_table(source: Source, map_file: Path | None = None) -> Contents:
-    """Return the exchanges of one table, all tables of a folder, or several tables; raises `ImportTableError`."""
-    return read_source(source, importer="csv", map_file=map_file)
-
-
 def read_exported(folder: Path, _map_file: Path | None = None) -> Contents:
     """Read an export to CSV or Parquet, every column of every table; raises `ImportTableError`."""
     if not folder.is_dir():
@@ -101,14 +96,17 @@ def read_exported(folder: Path, _map_file: Path | None = None) -> Contents:
         raise ImportTableError(f"{folder}: holds no exchanges.csv or exchanges.parquet, as 'uwblink export' writes")
     with TemporaryDirectory() as place:
         path = Path(place) / "exported.uwb"
-        with closing(Store.write(path, path)) as store:
+        with Recording.create(path) as recording:
             for table, source in paths.items():
-                try:
+                wrong = f"{source}: not in the form of 'uwblink export'"
+                with raising(ImportTableError, wrong, duckdb.Error):
                     with connected([source]) as db:
-                        store.insert(table, dict(db.execute(_query(db, table, source), [str(source)]).fetchnumpy()))
-                except duckdb.Error as error:
-                    why = f"not in the form of 'uwblink export' ({first_line(error)})"
-                    raise ImportTableError(f"{source}: {why}") from error
+                        columns = dict(db.execute(_query(db, table, source), [str(source)]).fetchnumpy())
+                    if table == "meta":
+                        rows = zip(columns["key"], columns["value"], strict=True)
+                        recording.append_meta({str(key): decode_json(text, source, str(key)) for key, text in rows})
+                    else:
+                        recording.append(table, columns)
         return load(path)
 
 
@@ -228,17 +226,18 @@ def import_file(
     """
     check_output(Path(output), force=force, recording=True)
     sources, row, explained = _choose(source, importer, map_file)
-    with IMPORTERS.calling(row.name, ImportTableError):
-        if row.tables is None:
-            contents = _read(sources, row, explained)
-            contents.save(output, force=force)
-            return Imported(contents.counts(), list(contents.meta.get("notes", ())))
-        with TemporaryDirectory(prefix="uwblink-") as folder:
+    with IMPORTERS.calling(row.name, ImportTableError), TemporaryDirectory(prefix="uwblink-") as folder:
+        if row.tables is not None:
             watch("reading", 0.0)
             paths, column_map = row.tables(sources, explained, Path(folder))
-            names = ", ".join(path.name for path in sources)
-            meta = {"source": f"import {row.name}", "imported_from": names}
+            meta = {"source": f"import {row.name}", "imported_from": ", ".join(path.name for path in sources)}
             return import_tables(paths, column_map, Path(output), meta, watch, force=force)
+        read: Any = row.read
+        contents = read(sources[0], explained)
+        if not isinstance(contents, Contents):
+            raise ArgumentError(f"importer {row.name!r}: returned {contents!r:.60}, expected Contents")
+        contents.save(output, force=force)
+        return Imported(contents.counts(), list(contents.meta.get("notes", ())))
 
 
 def read_source(
@@ -248,13 +247,10 @@ def read_source(
 
     Importers put notes for the user into `meta["notes"]`, a list of lines.
     """
-    sources, row, explained = _choose(source, importer, map_file)
-    if row.tables is None:
-        with IMPORTERS.calling(row.name, ImportTableError):
-            return _read(sources, row, explained)
     with TemporaryDirectory(prefix="uwblink-") as folder:
-        import_file(sources, Path(folder) / "imported.uwb", importer=row.name, map_file=explained)
-        return load(Path(folder) / "imported.uwb")
+        output = Path(folder) / "imported.uwb"
+        import_file(source, output, importer=importer, map_file=map_file)
+        return load(output)
 
 
 def _choose(
@@ -270,14 +266,6 @@ def _choose(
     if len(sources) > 1 and not row.several:
         raise ArgumentError(f"importer {row.name!r} takes one file, found {len(sources)}", parameter="source")
     return sources, row, None if map_file is None else Path(map_file)
-
-
-def _read(sources: list[Path], row: Importer, map_file: Path | None) -> Contents:
-    read: Any = row.read
-    contents = read(sources[0], map_file)
-    if not isinstance(contents, Contents):
-        raise ArgumentError(f"importer {row.name!r}: returned {contents!r:.60}, expected Contents")
-    return contents
 
 
 def _importer(source: Path, name: str | None) -> Importer:

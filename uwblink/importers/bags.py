@@ -20,7 +20,7 @@ import numpy as np
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from uwblink.errors import ImportTableError, first_line
+from uwblink.errors import ImportTableError, raising
 from uwblink.exporters.mcap import RANGE
 from uwblink.importers.column_map import ColumnMap, load_map
 from uwblink.text_files import require_regular
@@ -58,24 +58,18 @@ def open_bag(path: Path) -> Iterator[Bag]:
     require_regular(path, ImportTableError, "bag", folders=True)
     for part in path.iterdir() if path.is_dir() else ():
         require_regular(part, ImportTableError, "part of a bag", folders=True)
-    try:
+    wrong = f"{path}: cannot be read as a bag"
+    with raising(ImportTableError, wrong, OSError, ValueError):
         if path.is_file() and _is_json(path):
             yield _json_bag(path)
             return
-        try:
+        needed = f"{path}: reading bags needs rosbags; pip install 'uwbcal[bags]'"
+        with raising(ImportTableError, needed, ImportError):
             from rosbags.highlevel import AnyReader, AnyReaderError
             from rosbags.typesys import Stores, get_typestore
-        except ImportError as error:
-            raise ImportTableError(f"{path}: reading bags needs rosbags; pip install 'uwbcal[bags]'") from error
-        try:
-            with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-                yield _ros_bag(path, reader)
-        except AnyReaderError as error:
-            raise ImportTableError(f"{path}: cannot be read as a bag ({error})") from error
-    except ImportTableError:
-        raise
-    except (OSError, ValueError) as error:
-        raise ImportTableError(f"{path}: cannot be read as a bag ({error})") from error
+        store = get_typestore(Stores.ROS2_HUMBLE)
+        with raising(ImportTableError, wrong, AnyReaderError), AnyReader([path], default_typestore=store) as reader:
+            yield _ros_bag(path, reader)
 
 
 def _ros_bag(path: Path, reader: Any) -> Bag:
@@ -115,10 +109,9 @@ def _json_bag(path: Path) -> Bag:
         for record in _records(path):
             topic, kind = channels.get(record.channel_id, ("", "")) if isinstance(record, Message) else ("", "")
             if isinstance(record, Message) and topic in wanted:
-                try:
+                wrong = f"{path}: a message of {topic[:80]!r} is not JSON"
+                with raising(ImportTableError, wrong, ValueError, RecursionError):
                     message = _plain(json.loads(record.data))
-                except (ValueError, RecursionError) as error:
-                    raise ImportTableError(f"{path}: a message of {topic[:80]!r} is not JSON") from error
                 if not isinstance(message, dict):
                     raise ImportTableError(f"{path}: a message of {topic[:80]!r} is not an object of JSON")
                 yield topic, kind, record.log_time, message
@@ -138,24 +131,18 @@ def _channels(path: Path) -> Iterator[tuple[int, str, str, str]]:
 
 def _records(path: Path) -> Iterator[McapRecord]:
     """Yield the records of a file, and of its chunks; raises `ImportTableError` for a file that is damaged."""
-    with path.open("rb") as file:
-        try:
-            for record in StreamReader(file, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES).records:
-                if not isinstance(record, Chunk):
-                    yield record
-                elif record.uncompressed_size <= MAX_RECORD_BYTES:
-                    yield from breakup_chunk(record)
-                else:
-                    size = record.uncompressed_size
-                    raise ImportTableError(
-                        f"{path}: a chunk unpacks to {size} bytes, at most {MAX_RECORD_BYTES} are read"
-                    )
-        except ImportTableError:
-            raise
-        except Exception as error:  # the library passes on whatever its decompressors raise of damaged data
-            raise ImportTableError(
-                f"{path}: is cut off or damaged ({first_line(error)}); was it written to the end?"
-            ) from error
+    # The library passes on whatever its decompressors raise of damaged data.
+    damaged = raising(
+        ImportTableError, f"{path}: is cut off or damaged", Exception, remedy="; was it written to the end?"
+    )
+    with path.open("rb") as file, damaged:
+        for record in StreamReader(file, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES).records:
+            if not isinstance(record, Chunk):
+                yield record
+                continue
+            if (size := record.uncompressed_size) > MAX_RECORD_BYTES:
+                raise ImportTableError(f"{path}: a chunk unpacks to {size} bytes, at most {MAX_RECORD_BYTES} are read")
+            yield from breakup_chunk(record)
 
 
 def bag_to_table(sources: Sequence[Path], map_file: Path | None, folder: Path) -> tuple[list[Path], ColumnMap]:
@@ -168,16 +155,11 @@ def bag_to_table(sources: Sequence[Path], map_file: Path | None, folder: Path) -
     first: dict[str, Any] | None = None
     with open_bag(source) as bag:
         column_map = _with_topics(bag, column_map)
-        try:
-            with table.open("w", encoding="utf-8") as file:
-                for row in _rows(bag, column_map):
-                    first = first or row
-                    file.write(json.dumps(row, allow_nan=False) + "\n")
-        except (OSError, RecursionError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise ImportTableError(
-                f"{source.name}: cannot be turned into a table in {table.parent} ({reason})"
-            ) from error
+        wrong = f"{source.name}: cannot be turned into a table in {table.parent}"
+        with raising(ImportTableError, wrong, OSError, RecursionError), table.open("w", encoding="utf-8") as file:
+            for row in _rows(bag, column_map):
+                first = first or row
+                file.write(json.dumps(row, allow_nan=False) + "\n")
     if first is None:
         raise ImportTableError(f"{source}: no message on the topics of the map")
     # Times are in nanoseconds unless the map says otherwise.

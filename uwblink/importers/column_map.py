@@ -206,6 +206,11 @@ def load_map(path: Path) -> ColumnMap:
         file.check(f"ids.{name}", value, is_id, f"a whole number from 0 to {LARGEST_ID}")
     within = table.get("within_s", 1.0)
     file.check("within_s", within, is_number(within) and within > 0, "seconds")
+    stamps = units.get("stamps", "ticks")
+    if is_number(stamps) and stamps > 0:
+        scale = float(stamps * TICKS_PER_SECOND)
+    else:
+        scale = STAMP_UNITS[file.choice("units.stamps", stamps, STAMP_UNITS)]
     return ColumnMap(
         layout=file.choice("layout", table.get("layout"), (None, "exchanges", "messages", "stamps", "parts", "ranges")),
         bits=file.choice("bits", table.get("bits"), (None, *BITS)),
@@ -215,7 +220,7 @@ def load_map(path: Path) -> ColumnMap:
         decimal=file.choice("decimal", table.get("decimal"), (None, ".", ",")),
         within_s=float(within),
         columns=columns,
-        ticks_per_unit=_ticks_per_unit(file, units.get("stamps", "ticks")),
+        ticks_per_unit=scale,
         time_unit=file.choice("units.time", units.get("time"), (None, "iso", *TIME_UNITS)),
         distance_unit=file.choice("units.distance", units.get("distance"), (None, *DISTANCE_UNITS)),
         power_unit=file.choice("units.power", units.get("power"), (None, "dBm", "-dBm")),
@@ -236,9 +241,3 @@ def _constants(file: TomlReader, where: str, values: dict[str, Any]) -> None:
             )
         else:
             file.check(f"{where}.{name}", value, is_number(value), "a finite number")
-
-
-def _ticks_per_unit(file: TomlReader, unit: Any) -> float:
-    if is_number(unit) and unit > 0:
-        return float(unit * TICKS_PER_SECOND)
-    return STAMP_UNITS[file.choice("units.stamps", unit, STAMP_UNITS)]

@@ -31,7 +31,7 @@ class Condition(NamedTuple):
     wrong: str
 
 
-ENDS: Final = (
+SOUND_IDS: Final = (
     *(Condition(name, f"a whole number from 0 to {LARGEST_ID}", f"{name} IS NULL") for name in IDS),
     Condition("to_id", "another tag than from_id", "from_id = to_id"),
 )
@@ -117,8 +117,7 @@ def usable_exchanges(staging: Staging, rows: Rows, faults: Faults, stamps: Seque
     """
     column_map, sample = staging.column_map, rows.sample(SAMPLE_ROWS)
     scale = column_map.ticks_per_unit
-    ticks = [sample[name] * scale for name in stamps]
-    bits, counter = counter_format(ticks, column_map.bits, column_map.counter)
+    bits, counter = counter_format((sample[name] * scale for name in stamps), column_map.bits, column_map.counter)
     low = 0 if counter == "wrapped" else -(1 << (bits - 1))
     number = "a whole number" if scale == 1.0 else "a stamp in ticks"
     conditions = _times(rows)
@@ -141,11 +140,6 @@ def usable_exchanges(staging: Staging, rows: Rows, faults: Faults, stamps: Seque
     return good.where("rowid NOT IN (SELECT rowid FROM repeats)") if repeats else good, repeats, bits, counter
 
 
-_PAIR: Final = "CAST(least(from_id, to_id) AS UINTEGER) * 65536 + greatest(from_id, to_id)"
-_WHOLE: Final = ("gt_range_m", "range_m")
-"""Columns that belong to the whole exchange."""
-
-
 def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Watch) -> tuple[Rows, str | None]:
     """Combine rows of "messages", "stamps" or "parts" into exchanges.
 
@@ -156,7 +150,7 @@ def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Wat
     rows, of_messages = staging.rows, layout != "parts"
     staging.require(rows, {"messages": ("tx", "rx"), "stamps": ("stamp", "event", "message")}.get(layout, ()))
     watch("sorting", 0.0)
-    rows = faults.reject(rows, ENDS)
+    rows = faults.reject(rows, SOUND_IDS)
     number, follows = "place", ""
     if of_messages and rows.has("message"):
         some, zeros, largest = rows.values("count(message), count(*) FILTER (message = 0), max(message)")
@@ -173,7 +167,7 @@ def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Wat
             theirs |= {name: f"CASE WHEN event = {k} THEN stamp END" for k, name in ((1.0, "tx"), (2.0, "rx"))}
         for n in (1, 2, 3):
             cells |= {f"{name}{n}": (cell, f"{number} = {n}") for name, cell in theirs.items()}
-        cells |= {name: (name, "true") for name in _WHOLE if rows.has(name)}
+        cells |= {name: (name, "true") for name in ("gt_range_m", "range_m") if rows.has(name)}
     else:
         # The initiator is whoever the row with its first stamp names first.
         first = "tx1 IS NOT NULL" if rows.has("tx1") else "false"
@@ -212,7 +206,7 @@ def _group(rows: Rows, values: Mapping[str, str], follows: str, within_s: float)
     cells = {name: name for name in rows.columns}
     kinds = {"sequence": "BIGINT", "message": "TINYINT"}
     cells |= {name: f"TRY_CAST(trunc({name}) AS {kind})" for name, kind in kinds.items() if name in cells}
-    cells["link"] = f"CAST({_PAIR} AS UINTEGER)"
+    cells["link"] = "CAST(CAST(least(from_id, to_id) AS UINTEGER) * 65536 + greatest(from_id, to_id) AS UINTEGER)"
     listed = ", ".join(f"{cell} AS {column}" for column, cell in cells.items())
     keys = ["link", *(name for name in ("sequence",) if name in cells)]
     order = ", ".join([*keys, *(name for name in ("time_ns",) if name in cells), "origin"])

@@ -18,7 +18,7 @@ import numpy as np
 
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import IDS, POSITIONS, ColumnMap, load_map
-from uwblink.importers.exchange_rows import ENDS, Faults, assemble_exchanges, usable_exchanges, usable_ranges
+from uwblink.importers.exchange_rows import SOUND_IDS, Faults, assemble_exchanges, usable_exchanges, usable_ranges
 from uwblink.importers.plausibility import (
     MIN_ROWS,
     ROW_PERIOD_NS,
@@ -138,7 +138,7 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
         rows, found = assemble_exchanges(staging, layout, faults, watch)
         protocol = protocol or found
     else:
-        rows = faults.reject(staging.rows, ENDS)
+        rows = faults.reject(staging.rows, SOUND_IDS)
     total = rows.count() + len(faults)
     watch("checking", 0.0)
     if layout == "ranges":
@@ -196,12 +196,11 @@ def _poses(rows: Rows, bodies: Mapping[int, str]) -> Iterator[Poses]:
         f"SELECT time_ns AS origin, tag, x, y, z FROM places WINDOW tags AS (PARTITION BY tag) "
         f"QUALIFY {moves} OR time_ns = min(time_ns) OVER tags ORDER BY time_ns, tag"
     )
-    level = np.array([0.0, 0.0, 0.0, 1.0])
     for found in Rows(rows.db, "posed", ("origin", "tag", "x", "y", "z")).blocks():
         tags, which = np.unique(found["tag"], return_inverse=True)
         position = np.column_stack([found[axis] for axis in "xyz"])
         names = np.array([bodies[int(tag)] for tag in tags])[which]
-        yield Poses(found["origin"], names, position, np.tile(level, (len(which), 1)))
+        yield Poses(found["origin"], names, position, np.tile([0.0, 0.0, 0.0, 1.0], (len(which), 1)))
 
 
 def _note_on_repeats(rows: Rows) -> str:

@@ -144,8 +144,7 @@ def _plain_names(headers: Iterable[str]) -> dict[str, str]:
     matches = {h: re.fullmatch(forms[0], name) or re.fullmatch(forms[1], name) for h, name in names.items()}
     ends = {match["whose"] for match in matches.values() if match}
     numbers = _AT_DEVICE | _OF_MESSAGE | ({"resp": 1, "response": 1} if ends & {"init", "initiator", "tag"} else {})
-    levels = {h: f"{m['level']}_{numbers[m['whose']]}{m['end']}" for h, m in matches.items() if m}
-    return names | levels
+    return names | {h: f"{m['level']}_{numbers[m['whose']]}{m['end']}" for h, m in matches.items() if m}
 
 
 def named_columns(headers: Iterable[str]) -> dict[str, str]:
@@ -370,8 +369,7 @@ def _units(columns: dict[str, str], cells: dict[str, Floats]) -> Entries:
         found["distance"] = min(units), "by the columns' names"
     elif not units and "range_m" in cells and (why := reason_against_metres(cells["range_m"])):
         found["distance"] = ASKED, f"{why}: write {', '.join(DISTANCE_UNITS)}"
-    reasons = [reason_against_dbm(cells[name]) for name in POWERS if name in cells]
-    if why := next(filter(None, reasons), ""):
+    if why := next(filter(None, (reason_against_dbm(cells[name]) for name in POWERS if name in cells)), ""):
         found["power"] = ASKED, f"{why}: write -dBm if they lack their sign"
     return found
 
@@ -397,8 +395,7 @@ def _time_unit(header: str, values: Floats) -> tuple[str, str]:
 
 def _ended(columns: dict[str, str], names: Iterable[str], units: Iterable[str]) -> set[str]:
     """Return the units at the ends of the headers of some columns."""
-    found = (_suffix(columns[name], units) for name in names if name in columns)
-    return {unit for unit in found if unit}
+    return {unit for name in names if name in columns and (unit := _suffix(columns[name], units))}
 
 
 def _suffix(header: str, units: Iterable[str]) -> str | None:

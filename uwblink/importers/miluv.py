@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from uwblink.arrays import Floats
-from uwblink.errors import ImportTableError, first_line
+from uwblink.errors import ImportTableError, raising
 from uwblink.importers.plausibility import clocks, to_ticks
 from uwblink.importers.tables import Columns, number, open_table, time_ns, whole_number
 from uwblink.recording.contents import Contents
@@ -33,9 +33,9 @@ Found = TypeVar("Found")
 Vectors = dict[str, dict[int, tuple[float, float, float]]]
 """Vectors by name and number: lever arms by robot and tag, or places in metres by constellation and anchor."""
 
-_ENDS: Final = {"initiator": "from_id", "target": "to_id"}
+_PAIR: Final = {"initiator": "from_id", "target": "to_id"}
 _XYZ: Final = "groups of tags, each with [x, y, z] in metres"
-_IDS: Final = (*_ENDS, "listener", "board")
+_IDS: Final = (*_PAIR, "listener", "board")
 
 
 @dataclass(slots=True)
@@ -65,8 +65,7 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
     flight = Flight(folder, tuple(sorted(path.parent for path in folder.glob("*/uwb_range.csv"))))
     if not flight.robots:
         raise ImportTableError(f"{folder}: no folder in it holds uwb_range.csv, as those of MILUV's robots do")
-    clock, shift = folder / "timeshift.yaml", "whole numbers timeshift_s and timeshift_ns"
-    start_ns = _read_yaml(clock, _start_ns, shift) if clock.exists() else 0
+    start_ns = _read_yaml(folder / "timeshift.yaml", _start_ns, "whole numbers timeshift_s and timeshift_ns", 0)
     exchanges, measured_m = _read_exchanges(flight)
     poses, tags = _read_poses(flight), _read_tags(flight)
     constellation, off_m, places = _find_anchors(flight, exchanges, measured_m, poses, tags, wanted)
@@ -77,8 +76,7 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
     ranging = {*exchanges.initiator.tolist(), *exchanges.target.tolist()} - {tag.tag for tag in tags}
     tags += [Tag(number, f"tag{number}", (0.0, 0.0, 0.0)) for number in ranging]
     heard = _read_overheard(flight)
-    taps = {"board": "my_id"} | _ENDS | {"first_path_index": "idx", "taps": "cir"}
-    cirs = _read(flight, "uwb_cir.csv", taps)
+    cirs = _read(flight, "uwb_cir.csv", {"board": "my_id", **_PAIR, "first_path_index": "idx", "taps": "cir"})
     sensed = {f"w{axis}": f"angular_velocity.{axis}" for axis in "xyz"}
     sensed |= {f"a{axis}": f"linear_acceleration.{axis}" for axis in "xyz"}
     imu, height = _read(flight, "imu_px4.csv", sensed), _read(flight, "height.csv", {"height_m": "range"})
@@ -181,7 +179,7 @@ def _cell(name: str, text: str) -> str:
 
 def _read_exchanges(flight: Flight) -> tuple[Exchanges, Floats]:
     """Return all exchanges in order of time, without truth, and the distances that the authors measured (n,)."""
-    needed = _ENDS | {"range_m": "range{raw}"} | {name: f"{name}{{raw}}" for name in STAMPS}
+    needed = _PAIR | {"range_m": "range{raw}"} | {name: f"{name}{{raw}}" for name in STAMPS}
     optional = {"measured_m": "gt_range"} | {f"fpp{k}_dbm": f"fpp{k}" for k in (1, 2)}
     optional |= {f"skew{k}_ppm": f"skew{k}" for k in (1, 2)}
     columns: dict[str, Any] = _read(flight, "uwb_range.csv", needed, optional, clocks("ds"))
@@ -199,12 +197,11 @@ def _read_overheard(flight: Flight) -> Columns:
     by_clock = (tuple(own), *(tuple(f"{name}_n" for name in clock) for clock in clocks("ds")))
     ends = ("1", "2", "3", "1_n", "2_n")
     optional = {f"fpp{end}_dbm": f"fpp{end}" for end in ends} | {f"skew{end}_ppm": f"skew{end}" for end in ends}
-    needed = {"listener": "my_id"} | _ENDS | own | neighbours
-    return _read(flight, "uwb_passive.csv", needed, optional, by_clock)
+    return _read(flight, "uwb_passive.csv", {"listener": "my_id", **_PAIR, **own, **neighbours}, optional, by_clock)
 
 
 def _cir_rows(columns: Columns) -> list[CirRow]:
-    names = ("time_ns", "board", *_ENDS, "first_path_index", "taps")
+    names = ("time_ns", "board", *_PAIR, "first_path_index", "taps")
     cells = [columns[name].tolist() for name in names] if columns else []
     return [CirRow(*plain, tuple(taps.tolist())) for *plain, taps in zip(*cells, strict=True)]  # type: ignore[call-arg]
 
@@ -226,8 +223,8 @@ def _read_poses(flight: Flight) -> Poses:
 
 def _read_tags(flight: Flight) -> list[Tag]:
     """Return the robots' tags and lever arms from tags.yaml; none without such a file."""
-    path = flight.folder / "tags.yaml"
-    arms, names = _read_yaml(path, _vectors, _XYZ) if path.exists() else {}, {robot.name for robot in flight.robots}
+    arms: Vectors = _read_yaml(flight.folder / "tags.yaml", _vectors, _XYZ, {})
+    names = {robot.name for robot in flight.robots}
     return [Tag(number, body, arm) for body, tags in arms.items() if body in names for number, arm in tags.items()]
 
 
@@ -241,10 +238,9 @@ def _find_anchors(
     constellation fits.
     """
     path = flight.folder / "anchors.yaml"
-    known = _read_yaml(path, _vectors, _XYZ) if path.exists() else {}
+    known: Vectors = _read_yaml(path, _vectors, _XYZ, {})
     if wanted is not None and wanted not in known:
-        listed = ", ".join(known) or "none"
-        raise ImportTableError(f"{path}: no constellation {wanted[:40]!r}; there are {listed}")
+        raise ImportTableError(f"{path}: no constellation {wanted[:40]!r}; there are {', '.join(known) or 'none'}")
     ends = exchanges.initiator, exchanges.target
     ranging = {*ends[0].tolist(), *ends[1].tolist()} - {tag.tag for tag in tags}
     if not known or not (ranging or wanted):
@@ -295,11 +291,10 @@ def _vectors(table: Any) -> Vectors:
     return found
 
 
-def _read_yaml(path: Path, convert: Callable[[Any], Found], expected: str) -> Found:
-    """Return a YAML file as `convert` makes it; raises `ImportTableError` if it fails."""
-    try:
+def _read_yaml(path: Path, convert: Callable[[Any], Found], expected: str, absent: Found) -> Found:
+    """Return a YAML file as `convert` makes it, `absent` without a file; raises `ImportTableError` if it fails."""
+    if not path.exists():
+        return absent
+    kinds = (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, RecursionError)
+    with raising(ImportTableError, f"{path}: cannot be understood", *kinds, remedy=f"; expected {expected}"):
         return convert(yaml.safe_load(read_text(path, ImportTableError)))
-    except ImportTableError:
-        raise
-    except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise ImportTableError(f"{path}: {first_line(error)}; expected {expected}") from error

@@ -160,7 +160,7 @@ def _from_bag(path: Path, topics: Mapping[str, str] | None) -> Poses:
             try:
                 for time_ns, child, numbers in _of_message(kind, message):
                     times.append(time_ns)
-                    bodies.append(wanted[topic] or child or body_of(topic))
+                    bodies.append(wanted[topic] or child or _body_in(topic) or topic)
                     values.extend(numbers)
             except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
                 # The content of JSON messages need not agree with the name of their schema.
@@ -168,12 +168,8 @@ def _from_bag(path: Path, topics: Mapping[str, str] | None) -> Poses:
     return _poses(path, np.array(times, dtype=np.int64), np.array(bodies, np.str_), np.array(values).reshape(-1, 7))
 
 
-def body_of(topic: str) -> str:
-    """Return the body of a topic: the first part of its name that is not in `DRIVERS`."""
-    return _body_in(topic) or topic
-
-
 def _body_in(name: str) -> str:
+    """Return the body in the name of a topic or a frame: the first part that is not in `DRIVERS`; "" without one."""
     return next((part for part in name.split("/") if part and part not in DRIVERS), "")
 
 
@@ -251,51 +247,50 @@ def add_poses(
     parts = [read_poses(path, name, topics) for name, path in files.items()]
     what = ", ".join(str(path) for path in files.values())
     given, anchors = load_places(tags_from) if tags_from else ((), {})
-    standing = [Tag(number, f"anchor{number}", (0.0, 0.0, 0.0)) for number in anchors]
+    fixed = [Tag(number, f"anchor{number}", (0.0, 0.0, 0.0)) for number in anchors]
     poses = _in_order([*parts, *(Poses.from_arrays([0], f"anchor{n}", [place]) for n, place in anchors.items())])
     with Recording.open(recording, update=True) as opened:
         if not force and (there := opened.count("poses")):
             raise RecordingExistsError(f"{recording}: holds {there} poses already; `force` replaces them")
         exchanges = opened.exchanges()
-        seats = [tag for tag in (given or opened.tags()) if tag.tag not in anchors] + standing
+        placed = [tag for tag in (given or opened.tags()) if tag.tag not in anchors] + fixed
         if not len(exchanges):
             raise ImportTableError(f"{recording}: holds no exchanges to add truth to")
         bodies = set(names_in(poses.body))
-        sitting = [tag for tag in seats if tag.body in bodies]
-        if len(sitting) < 2:
-            found = ", ".join(sorted({tag.body for tag in seats})) or "none"
+        with_poses = [tag for tag in placed if tag.body in bodies]
+        if len(with_poses) < 2:
+            found = ", ".join(sorted({tag.body for tag in placed})) or "none"
             raise ImportTableError(
                 f"{what}: its bodies are {', '.join(sorted(bodies))}, those of the tags {found}; "
                 "give the bodies of the tags with `tags_from`"
             )
         if shift_ns is None:
-            _check_units(what, exchanges, poses, seats, int(exchanges.time_ns.min() - poses.time_ns.min()))
-            shift_ns = find_offset(exchanges, poses, seats)
+            _check_units(what, exchanges, poses, placed, int(exchanges.time_ns.min() - poses.time_ns.min()))
+            shift_ns = find_offset(exchanges, poses, placed)
         moved = replace(poses, time_ns=poses.time_ns + shift_ns)
-        truth = distances_m(moved, seats, exchanges.initiator, exchanges.target, exchanges.time_ns)
+        truth = distances_m(moved, placed, exchanges.initiator, exchanges.target, exchanges.time_ns)
         covered = int(np.count_nonzero(np.isfinite(truth)))
         if not covered:
             raise ImportTableError(
                 f"{what}: no exchange lies within its poses, which end {_apart(exchanges.time_ns, moved.time_ns)}; "
                 "give `offset` in seconds, or auto"
             )
-        _check_units(what, exchanges, moved, seats)
+        _check_units(what, exchanges, moved, placed)
         meta = {"poses_from": ", ".join(path.name for path in files.values()), "poses_offset_s": shift_ns * 1e-9}
-        opened.replace_poses(moved, meta, seats if tags_from else None)
+        opened.replace_poses(moved, meta, placed if tags_from else None)
     return AddedPoses(len(poses), tuple(sorted(bodies)), shift_ns * 1e-9, len(exchanges), covered)
 
 
 def _check_units(what: str, exchanges: Exchanges, poses: Poses, tags: Sequence[Tag], shift_ns: int = 0) -> None:
     """Raise `ImportTableError` if positions, lever arms or ranges are evidently not in metres."""
-    rows = np.unique(np.linspace(0, len(exchanges) - 1, 2000).astype(np.int64))
-    some = exchanges[rows]
+    some = exchanges[np.unique(np.linspace(0, len(exchanges) - 1, 2000).astype(np.int64))]
     ranges, time_ns = raw_range(some), some.time_ns - shift_ns
 
     def distances(place: float, arm: float) -> Floats:
         moved = replace(poses, position_m=poses.position_m * place)
         arms = [[arm * x for x in tag.lever_arm_m] for tag in tags]
-        seats = [replace(tag, lever_arm_m=(x, y, z)) for tag, (x, y, z) in zip(tags, arms, strict=True)]
-        return distances_m(moved, seats, some.initiator, some.target, time_ns)
+        placed = [replace(tag, lever_arm_m=(x, y, z)) for tag, (x, y, z) in zip(tags, arms, strict=True)]
+        return distances_m(moved, placed, some.initiator, some.target, time_ns)
 
     errors = {
         "its positions": lambda factor: ranges - distances(factor, 1.0),

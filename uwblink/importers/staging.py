@@ -19,7 +19,7 @@ from uwblink.importers.column_map import DISTANCE_UNITS, DISTANCES, IDS, NAMES, 
 from uwblink.importers.tables import Columns, Table, number, time_ns, whole_number
 from uwblink.twr import LARGEST_ID, STAMPS
 
-ROWS_AT_ONCE: Final = 245_760
+ROWS_PER_BLOCK: Final = 245_760
 """Two row groups of DuckDB: smaller blocks would remain separate row groups in a recording."""
 
 Watch = Callable[[str, float], object]
@@ -73,9 +73,9 @@ class Rows:
 
     def blocks(self) -> Iterator[Columns]:
         """Yield the rows in their order, block by block; empty blocks are left out."""
-        for start in range(0, replace(self, condition="true").count(), ROWS_AT_ONCE):
+        for start in range(0, replace(self, condition="true").count(), ROWS_PER_BLOCK):
             # DuckDB keeps the order of rows; ORDER BY would sort them.
-            columns = self.read(f"AND rowid >= {start} AND rowid < {start + ROWS_AT_ONCE}")
+            columns = self.read(f"AND rowid >= {start} AND rowid < {start + ROWS_PER_BLOCK}")
             if len(columns["origin"]):
                 yield columns
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
 from uwblink.database import connect
-from uwblink.errors import ImportTableError, first_line
+from uwblink.errors import ImportTableError, first_line, raising
 from uwblink.output import is_utf8
 from uwblink.text_files import require_regular
 from uwblink.twr import LATEST_NS
@@ -49,16 +49,13 @@ def open_file(path: Path) -> IO[bytes]:
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
     """Convert errors of reading a text file into `ImportTableError`."""
-    try:
+    with (
+        raising(ImportTableError, f"{path}: not a CSV table", csv.Error),
+        raising(ImportTableError, f"{path}: cannot be read", OSError),
+        raising(ImportTableError, f"{path}: broken or truncated gzip", gzip.BadGzipFile, EOFError, zlib.error),
+        raising(ImportTableError, f"{path}: not a text file in UTF-8", UnicodeDecodeError),
+    ):
         yield
-    except UnicodeDecodeError as error:
-        raise ImportTableError(f"{path}: not a text file in UTF-8") from error
-    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-        raise ImportTableError(f"{path}: broken or truncated gzip ({error})") from error
-    except OSError as error:
-        raise ImportTableError(f"{path}: cannot be read ({error.strerror})") from error
-    except csv.Error as error:
-        raise ImportTableError(f"{path}: not a CSV table ({first_line(error)})") from error
 
 
 def detect(path: Path, delimiter: str | None, decimal: str | None) -> tuple[tuple[str, ...], str, bool, int]:
@@ -125,14 +122,19 @@ def connected(paths: Sequence[Path]) -> Iterator[duckdb.DuckDBPyConnection]:
     for path in paths:
         if not is_utf8(path):
             raise ImportTableError(f"{path}: its name and those of its folders must be UTF-8; rename it")
-    with TemporaryDirectory(prefix="uwblink-") as folder, connect(paths=paths, temporary=folder, memory_mb=350) as db:
-        try:
-            yield db
-        except (duckdb.OutOfMemoryException, duckdb.IOException) as error:
-            raise ImportTableError(
-                f"{gettempdir()}: what does not fit into memory cannot be written there ({first_line(error)}); "
-                "TMPDIR names another folder"
-            ) from error
+    full = raising(
+        ImportTableError,
+        f"{gettempdir()}: what does not fit into memory cannot be written there",
+        duckdb.OutOfMemoryException,
+        duckdb.IOException,
+        remedy="; TMPDIR names another folder",
+    )
+    with (
+        TemporaryDirectory(prefix="uwblink-") as folder,
+        connect(paths=paths, temporary=folder, memory_mb=350) as db,
+        full,
+    ):
+        yield db
 
 
 @contextmanager
@@ -188,21 +190,21 @@ class Table:
         """
         require_regular(path, ImportTableError, "table (.csv, .csv.gz, .parquet or .jsonl)")
         self.db, self.path, self._key = db, path, key
-        self._skip, self._decimal_comma, self._is_csv = 0, False, False
+        self._skip, self._decimal_comma = 0, False
         db.execute(f"SET VARIABLE file{key} = ?", [str(path)])
         ending = path.name.lower().removesuffix(".gz")
         self._is_parquet = ending.endswith(".parquet")
-        if self._is_parquet:
-            self._open_parquet()
-        elif ending.endswith((".jsonl", ".ndjson", ".json")):
-            self._open_json()
-        else:
+        self._is_csv = not ending.endswith((".parquet", ".jsonl", ".ndjson", ".json"))
+        if self._is_csv:
             self._open_csv(delimiter, decimal)
+        elif self._is_parquet:
+            self._open_parquet()
+        else:
+            self._open_json()
         if len(self.names) > MAX_CELLS:
             raise ImportTableError(f"{path}: has {len(self.names)} columns, expected {MAX_CELLS} at most")
 
     def _open_csv(self, delimiter: str | None, decimal: str | None) -> None:
-        self._is_csv = True
         self.names, mark, self._decimal_comma, self._skip = detect(self.path, delimiter, decimal)
         check_lines(self.path, mark)
         self._cells = [f"c{k}" for k in range(len(self.names))]

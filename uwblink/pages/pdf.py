@@ -32,12 +32,8 @@ ROOM: Final = 72 * WIDTHS["page"]
 
 MARGIN: Final = (PAPER[0] - ROOM) / 2
 
-SIZE: Final = 9.5
 SMALL: Final = 8.0
-"""Text, and the smallest text: that of tables, notes, captions and figures."""
-
-ROW: Final = 1.55 * SMALL
-"""Height of a line of a table."""
+"""The smallest text: that of tables, notes, captions and figures."""
 
 FILLS: Final = {
     "lead": "#f3f5f7",
@@ -131,8 +127,7 @@ def _draw(page: Figure, strip: Strip, y: float) -> None:
 
 def _strips(document: Document, heights: Mapping[str, float]) -> list[Strip]:
     """Return the strips of a document with figures of given heights."""
-    captions = document.captions()
-    parts = [_of_block(block, captions, heights) for block in document.blocks]
+    parts = [_of_block(block, document.captions(), heights) for block in document.blocks]
     for k, block in enumerate(document.blocks[:-1]):
         if isinstance(block, Heading):
             # A heading stays with the figure or the short table that follows, or with some lines.
@@ -151,7 +146,7 @@ def _of_block(block: Block, captions: Mapping[str, str], heights: Mapping[str, f
         case Text(_, kind):
             large, rest = block.parts()
             fill = FILLS.get(kind, "")
-            size = SMALL if kind == "note" else SIZE
+            size = SMALL if kind == "note" else 9.5
             return [*_paragraph(large, 13, fill, weight="bold")[:-1], *_paragraph(rest, size, fill)]
         case Listing(text):
             return _paragraph(text, SMALL, FILLS["lead"], family="DejaVu Sans Mono")
@@ -174,6 +169,7 @@ def _paragraph(text: str, size: float, fill: str = "", **font: Any) -> list[Stri
 def _table(table: Table, columns: list[int], widths: list[float]) -> list[Strip]:
     """Return some columns of a table as strips; a table of up to half a page is not parted."""
     edges = [MARGIN + sum(widths[:k]) for k in range(len(widths) + 1)]
+    line_height = 1.55 * SMALL
 
     def row(texts: list[str], weight: str = "normal") -> Strip:
         font, words, most = _font(SMALL, weight=weight), [], 1
@@ -181,9 +177,9 @@ def _table(table: Table, columns: list[int], widths: list[float]) -> list[Strip]
             left = table.words or k == 0
             x, align = (edges[k] + 2, "left") if left else (edges[k + 1] - 2, "right")
             lines = _lines(texts[column], widths[k] - 4, font)
-            words += [Words(line, x, n * ROW + 1.1 * SMALL + 1.2, align, font) for n, line in enumerate(lines)]
+            words += [Words(line, x, n * line_height + 1.1 * SMALL + 1.2, align, font) for n, line in enumerate(lines)]
             most = max(most, len(lines))
-        return Strip(ROW * most + 2.4, tuple(words), ruled=True)
+        return Strip(line_height * most + 2.4, tuple(words), ruled=True)
 
     over = [name for name, span in table.above for _ in range(span)]
     above = []
@@ -191,7 +187,7 @@ def _table(table: Table, columns: list[int], widths: list[float]) -> list[Strip]
         places = list(group)
         middle = (edges[places[0]] + edges[places[-1] + 1]) / 2
         above.append(Words(name, middle, 1.1 * SMALL, "center", _font(SMALL, weight="bold")))
-    heads = (Strip(ROW + 2.4 if above else 0.0, tuple(above)), row(table.header, "bold"))
+    heads = (Strip(line_height + 2.4 if above else 0.0, tuple(above)), row(table.header, "bold"))
     last = len(table.rows) - 1 if table.total else None
     rows = [replace(row(texts, "bold" if k == last else "normal"), heads=heads) for k, texts in enumerate(table.rows)]
     whole = sum(strip.height for strip in (*heads, *rows))

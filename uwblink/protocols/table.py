@@ -136,7 +136,6 @@ def alternative_delays(t: Intervals) -> tuple[Floats, Floats]:
 def _own_rows() -> tuple[RangingProtocol, ...]:
     poll, reply = ProtocolMessage("initiator", "", "at once"), ProtocolMessage("target", "rx1", "at once")
     delayed, last = replace(reply, timing="scheduled"), ProtocolMessage("initiator", "rx2", "scheduled")
-    from_target = ProtocolMessage("target", "tx2", "scheduled")
     return (
         RangingProtocol("ss", "SS-TWR", (poll, delayed), single_sided_flight, half_delays),
         RangingProtocol(
@@ -149,7 +148,7 @@ def _own_rows() -> tuple[RangingProtocol, ...]:
         RangingProtocol(
             "ds",
             "DS-TWR, third message from the target",
-            (poll, reply, from_target),
+            (poll, reply, ProtocolMessage("target", "tx2", "scheduled")),
             double_sided,
             double_sided_delays,
         ),
@@ -237,12 +236,11 @@ def _tried(flight: Floats, third: str | None, delays: tuple[float, float]) -> In
     """Return the intervals of two exchanges between equal clocks, with the aggregate delay of each side in them."""
     i, j = delays
     reply, final = np.array([2e7, 9.8e7]), np.array([9.8e7, 3e7])
-    round_trip = 2 * flight + reply - i
     if third == "initiator":
         legs = final + i, 2 * flight + final - j
     else:
         legs = (final, final) if third else (np.zeros(2), np.zeros(2))
-    return Intervals(round_trip, reply + j, *legs, np.zeros(2))
+    return Intervals(2 * flight + reply - i, reply + j, *legs, np.zeros(2))
 
 
 PROTOCOLS: Final[Registry[RangingProtocol]] = Registry("protocol", "uwbcal.protocols", _own_rows(), check_protocol)

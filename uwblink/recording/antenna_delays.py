@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from uwblink.display import first_few
-from uwblink.errors import PlanError
+from uwblink.errors import PlanError, raising
 from uwblink.text_files import FileKey, TomlReader, is_number
 from uwblink.ticks import ANTENNA_DELAY_TICKS, SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import LARGEST_ID
@@ -73,8 +73,7 @@ def delay_of(delays: AntennaDelays, tag: int) -> AntennaDelay | None:
 
 def known_delays(delays: AntennaDelays, tags: Iterable[int]) -> AntennaDelays:
     """Return the known delays of some devices by id."""
-    found = {tag: delay_of(delays, tag) for tag in tags}
-    return {tag: delay for tag, delay in found.items() if delay is not None}
+    return {tag: delay for tag in tags if (delay := delay_of(delays, tag)) is not None}
 
 
 def delays_in_meta(meta: Mapping[str, Any]) -> AntennaDelays:
@@ -83,14 +82,13 @@ def delays_in_meta(meta: Mapping[str, Any]) -> AntennaDelays:
     The default of the constant for replies is the transmitter's delay.
     """
     rows: dict[int | None, Any] = {None: meta[ALL]} if ALL in meta else {}
-    try:
+    wrong = f"has no usable antenna delays of its devices in {ALL}"
+    with raising(ValueError, wrong, KeyError, TypeError, ValueError, AttributeError):
         rows |= {int(tag): row for tag, row in meta.get(BY_TAG, {}).items()}
         return {
             tag: AntennaDelay(int(row["tx"]), int(row["rx"]), int(row.get("reply", row["tx"])))
             for tag, row in rows.items()
         }
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"has no usable antenna delays of its devices ({ALL})") from error
 
 
 def meta_of_delays(delays: AntennaDelays) -> dict[str, Any]:

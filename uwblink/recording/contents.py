@@ -95,11 +95,10 @@ class Contents:
             columns = {name: np.array([getattr(row, name) for row in listed]) for name in ("time_ns", *names)}
             return [row for row, good in zip(listed, chosen(columns).tolist(), strict=True) if good]
 
-        tables = {name: getattr(self, name) for name in _COLUMNS}
         cut: dict[str, Any] = {
             name: {word: column[chosen(columns)] for word, column in columns.items()}
-            for name, columns in tables.items()
-            if columns
+            for name in _COLUMNS
+            if (columns := getattr(self, name))
         }
         return replace(
             self,
@@ -193,8 +192,7 @@ def _ids(name: str, values: ArrayLike) -> Ints:
 def _pairs(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     if pairs and np.shape(pairs) != (len(pairs), 2):
         raise ArgumentError(f"pairs: found {pairs!r:.60}, expected pairs of initiator and target, as [(1, 2)]")
-    ends = (_ids("pairs", [pair[k] for pair in pairs]).tolist() for k in (0, 1))
-    return list(zip(*ends, strict=True))
+    return list(zip(*(_ids("pairs", [pair[k] for pair in pairs]).tolist() for k in (0, 1)), strict=True))
 
 
 def pieces(recording: Recording, rows: int = 50_000) -> Iterator[Contents]:

@@ -107,8 +107,7 @@ def find_offset(exchanges: Exchanges, poses: Poses, tags: list[Tag], within_s: f
     `ImportTableError` where none stands out.
     """
     # 4000 exchanges tell an offset; more only take longer.
-    rows = np.unique(np.linspace(0, len(exchanges) - 1, min(len(exchanges), 4000)).astype(np.int64))
-    some = exchanges[rows]
+    some = exchanges[np.unique(np.linspace(0, len(exchanges) - 1, min(len(exchanges), 4000)).astype(np.int64))]
     ranges, pair, tracks = raw_range(some), some.initiator * 65_536 + some.target, tracks_of(poses)
 
     def loss(offset_ns: int, scale_m: float | None = None) -> float:

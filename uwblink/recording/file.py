@@ -12,23 +12,19 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Self
 
 from uwblink.database import log_of
-from uwblink.errors import RecordingError, RecordingInUseError, RecordingMissingError
+from uwblink.errors import RecordingError, RecordingInUseError, RecordingMissingError, raising
 from uwblink.output import check_output, place_beside
 from uwblink.recording.intake import is_locked
 from uwblink.recording.schema import FORMAT_VERSION, SUFFIX, TABLES, standard_meta
-from uwblink.recording.store import Store
 from uwblink.recording.summary import Summary, summarize
 from uwblink.recording.tables import Tables, known_tables
 from uwblink.text_files import require_regular
-
-COPIES: Final = 20
-"""Copies that are tried of a recording in use. The file changes once in hours: when its log is put into it."""
 
 
 class Recording(Tables):
@@ -48,14 +44,6 @@ class Recording(Tables):
       faults: none
           1 -> 2             1 exchanges
     """
-
-    def __init__(self, store: Store, partial: Path | None = None) -> None:
-        """Wrap an open store; `partial` is the file that takes the store's name when writing went well."""
-        self._store = store
-        self.path = store.path
-        self._partial = partial
-        self._place = ExitStack()
-        """The folder of `partial`, which is removed at the end."""
 
     @classmethod
     def create(
@@ -77,19 +65,16 @@ class Recording(Tables):
         check_output(final, force=force, recording=True)
         if final.exists() and is_locked(final, update=False):
             raise RecordingInUseError(f"{final}: another process is writing it; give another name")
-        try:
+        with raising(RecordingError, f"{final}: cannot be written"):
             with ExitStack() as place:
-                partial = place.enter_context(place_beside(final))
-                recording = cls(Store.write(partial, final, memory_mb), partial)
+                recording = cls._open_to_write(final, place.enter_context(place_beside(final)), memory_mb)
                 recording.append_meta(standard_meta() | dict(meta or {}))
                 if not live:
                     recording._place = place.pop_all()
                     return recording
                 # So that the tables are in the file itself, and only rows ever in the log beside it.
                 recording._complete()
-            return cls(Store.write(final, final, memory_mb))
-        except OSError as error:
-            raise RecordingError(f"{final}: cannot be written ({error.strerror or error})") from error
+            return cls._open_to_write(final, None, memory_mb)
 
     @classmethod
     def open(cls, path: str | os.PathLike[str], *, update: bool = False, memory_mb: int | None = None) -> Self:
@@ -105,25 +90,23 @@ class Recording(Tables):
             raise RecordingMissingError(f"{source}: no such recording")
         require_regular(source, RecordingError, f"{SUFFIX} recording")
         try:
-            store = Store.open(source, update=update, memory_mb=memory_mb)
+            return cls._open_to_read(source, update=update, memory_mb=memory_mb)
         except RecordingInUseError:
             if update:
                 raise
-            store = _open_copy(source, memory_mb)
-        recording = cls(store)
-        try:
-            version = recording.meta().get("format_version")
-            if not isinstance(version, int):
-                raise RecordingError(f"{source}: not a {SUFFIX} recording (no format_version in meta)")
-            if version > FORMAT_VERSION:
-                raise RecordingError(
-                    f"{source}: format version {version} is newer than this uwbcal reads ({FORMAT_VERSION}); "
-                    "update uwbcal"
-                )
-        except RecordingError:
-            store.close()
-            raise
-        return recording
+            return cls._open_copy(source, memory_mb)
+
+    def _check_tables(self) -> None:
+        """Check the version of the format, too."""
+        super()._check_tables()
+        version = self.meta().get("format_version")
+        if not isinstance(version, int):
+            raise RecordingError(f"{self.path}: not a {SUFFIX} recording (no format_version in meta)")
+        if version > FORMAT_VERSION:
+            raise RecordingError(
+                f"{self.path}: format version {version} is newer than this uwbcal reads ({FORMAT_VERSION}); "
+                "update uwbcal"
+            )
 
     def __enter__(self) -> Self:
         """Return the recording itself."""
@@ -139,26 +122,17 @@ class Recording(Tables):
 
         Raises `RecordingError` if it cannot be written completely.
         """
-        with self._place:
-            try:
-                if kind is None and self._store.writes:
-                    self._complete()
-            except OSError as error:
-                raise RecordingError(f"{self.path}: cannot be written ({error.strerror})") from error
-            finally:
-                self._store.close()
+        with self._place, closing(self._db), raising(RecordingError, f"{self.path}: cannot be written"):
+            if kind is None and self._writes:
+                self._complete()
 
     def _complete(self) -> None:
         """Write everything into the file, close it, and give it its name."""
-        self._store.shorten_log()
-        self._store.close()
+        self.shorten_log()
+        self._db.close()
         if self._partial:
             log_of(self.path).unlink(missing_ok=True)  # of the file that had the name before
             self._partial.replace(self.path)
-
-    def shorten_log(self) -> None:
-        """Write the log beside the file into the file while other threads append; raises `RecordingError`."""
-        self._store.shorten_log()
 
     def show(self) -> Summary:
         """Return the summary of the recording, which has a text form."""
@@ -204,30 +178,31 @@ class Recording(Tables):
         with type(self).create(path, meta=entries, force=force, memory_mb=300) as written:
             for table in TABLES:
                 if table != "meta" and table not in without:
-                    written._store.take(self._store, table)
+                    written._take(self, table)
             yield written
 
+    @classmethod
+    def _open_copy(cls, source: Path, memory_mb: int | None) -> Self:
+        """Open a copy of a recording that another process is writing: all that it has committed.
 
-def _open_copy(source: Path, memory_mb: int | None) -> Store:
-    """Open a copy of a recording that another process is writing: all that it has committed.
-
-    File and log belong together if the file did not change while both were copied. What is incomplete at the end of
-    the log was not committed, and DuckDB leaves it out. Raises `RecordingInUseError` if no copy can be made.
-    """
-    file, why = source.resolve(), "changes faster than it can be copied"
-    try:
-        with place_beside(file) as copy:
-            for _ in range(COPIES):
-                before = file.stat()
-                shutil.copyfile(file, copy)
-                log_of(copy).unlink(missing_ok=True)
-                with suppress(FileNotFoundError):
-                    shutil.copyfile(log_of(file), log_of(copy))
-                after = file.stat()
-                if (before.st_mtime_ns, before.st_size) == (after.st_mtime_ns, after.st_size):
-                    store = Store.open(copy, update=False, memory_mb=memory_mb)
-                    store.path = source
-                    return store
-    except OSError as error:
-        why = f"cannot be copied ({error.strerror})"
-    raise RecordingInUseError(f"{source}: another process is writing it, and it {why}; wait until that ends")
+        File and log belong together if the file did not change while both were copied. What is incomplete at the end of
+        the log was not committed, and DuckDB leaves it out. Raises `RecordingInUseError` if no copy can be made.
+        """
+        file, why = source.resolve(), "changes faster than it can be copied"
+        try:
+            with place_beside(file) as copy:
+                # The file changes once in hours: when its log is put into it.
+                for _ in range(20):
+                    before = file.stat()
+                    shutil.copyfile(file, copy)
+                    log_of(copy).unlink(missing_ok=True)
+                    with suppress(FileNotFoundError):
+                        shutil.copyfile(log_of(file), log_of(copy))
+                    after = file.stat()
+                    if (before.st_mtime_ns, before.st_size) == (after.st_mtime_ns, after.st_size):
+                        recording = cls._open_to_read(copy, update=False, memory_mb=memory_mb)
+                        recording.path = source
+                        return recording
+        except OSError as error:
+            why = f"cannot be copied ({error.strerror})"
+        raise RecordingInUseError(f"{source}: another process is writing it, and it {why}; wait until that ends")

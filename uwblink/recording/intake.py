@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from uwblink.database import duckdb, log_of
 from uwblink.display import printable
-from uwblink.errors import RecordingError, first_line
+from uwblink.errors import RecordingError, first_line, raising
 from uwblink.output import is_utf8
 from uwblink.recording.schema import SUFFIX, TABLES
 
@@ -49,7 +49,7 @@ _REFUSED: Final = (
 )
 """Objects that recordings do not have: a word, and the column and the function of DuckDB with their names."""
 
-COLUMNS: Final = (
+COLUMNS_OF_FILE: Final = (
     "SELECT table_name, column_name, data_type FROM system.main.duckdb_columns() "
     "WHERE NOT internal AND schema_name = 'main'"
 )
@@ -75,7 +75,7 @@ def check_tables(ask: Ask, path: Path, size: int, tables: Mapping[str, Mapping[s
                 f"{path}: holds {word}, {printable(str(found[0][0]))}, and such files consist of tables alone; "
                 "it is not read, because such objects are programs"
             )
-    for table, column, kind_found in ask(COLUMNS):
+    for table, column, kind_found in ask(COLUMNS_OF_FILE):
         expected = tables.get(table, {}).get(column)
         if expected not in (None, kind_found):
             raise RecordingError(
@@ -125,11 +125,10 @@ def decode_json(text: object, path: Path, key: str) -> Any:
     """
     if not isinstance(text, str):
         raise RecordingError(f"{path}: table meta: {printable(key)} has no value")
-    try:
+    wrong = f"{path}: table meta holds a value that is not JSON, that of {printable(key)}"
+    with raising(RecordingError, wrong, ValueError, RecursionError):
         value = json.loads(text)
         json.dumps(value, allow_nan=False)  # Python reads NaN and 1e400, which are not JSON
-    except (ValueError, RecursionError) as error:
-        raise RecordingError(f"{path}: table meta holds a value that is not JSON, that of {printable(key)}") from error
     return value
 
 

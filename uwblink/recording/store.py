@@ -1,4 +1,4 @@
-"""Tables of a recording in a DuckDB file: columns in, columns out, and every error with the file's name.
+"""A DuckDB file of tables: SQL in, rows and columns out, and every error with the file's name.
 
 Files may come from anyone, so they are data: they are opened read-only, without access to other files and with locked
 settings, and are checked (`uwblink.recording.intake`) before anything in them is read.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from uwblink.database import connect, duckdb, log_of
 from uwblink.errors import RecordingError, RecordingInUseError, first_line
 from uwblink.recording.intake import (
-    COLUMNS,
+    COLUMNS_OF_FILE,
     check_intake,
     check_length,
     check_name,
@@ -29,33 +29,39 @@ from uwblink.recording.intake import (
 )
 from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
 
-ROWS_AT_A_TIME: Final = 100_000
-"""Rows that a copy holds in memory at once; 0.2 GB of impulse responses, which are the largest rows."""
-
 _UNFIT: Final = (duckdb.DataError, duckdb.InvalidInputException, duckdb.BinderException)
 """DuckDB's errors for values that do not fit into a table; other errors are of the file."""
 
 
 class Store:
-    """An open file with the tables of `TABLES`; `path` is its name in messages."""
+    """An open file with the tables of `TABLES`, on which `Recording` is built; `path` is its name in messages."""
 
     def __init__(
-        self, connection: duckdb.DuckDBPyConnection, path: Path, size: int = 0, *, writes: bool, vanishes: bool = False
+        self,
+        connection: duckdb.DuckDBPyConnection,
+        path: Path,
+        *,
+        writes: bool,
+        size: int = 0,
+        partial: Path | None = None,
     ) -> None:
         """Wrap an open connection to a file of `size` bytes, which limits the time of reading.
 
-        `writes`: the file is open for writing. `vanishes`: its owner removes it if writing fails.
+        `writes`: the file is open for writing. `partial` is the file that takes the name `path` when it is complete.
         """
-        self._db, self.path, self.writes, self.vanishes = connection, path, writes, vanishes
+        self._db, self.path, self._writes, self._partial = connection, path, writes, partial
         self._longest_read_s = longest_read_s(size)
+        self._place = ExitStack()
+        """The folder of `partial`, which is removed at the end."""
 
     @classmethod
-    def write(cls, place: Path, path: Path, memory_mb: int | None = None) -> Self:
-        """Open or make the file at `place` for a recording called `path`; raises `RecordingError`.
+    def _open_to_write(cls, path: Path, partial: Path | None, memory_mb: int | None = None) -> Self:
+        """Open or make the file `partial`, or else `path`, for a recording called `path`; raises `RecordingError`.
 
         A reader that checks a file which was just made holds it for a moment: the writer waits up to two seconds.
         """
         check_name(path)
+        place = partial or path
         end_s = time.monotonic() + 2.0
         while True:
             try:
@@ -66,12 +72,12 @@ class Store:
                 if time.monotonic() > end_s or not is_locked(place, update=True):
                     raise RecordingError(f"{path}: cannot be written ({first_line(error)})") from error
                 time.sleep(0.02)
-        store = cls(db, path, writes=True, vanishes=place != path)
+        store = cls(db, path, writes=True, partial=partial)
         store._create()
         return store
 
     @classmethod
-    def open(cls, path: Path, *, update: bool, memory_mb: int | None = None) -> Self:
+    def _open_to_read(cls, path: Path, *, update: bool, memory_mb: int | None = None) -> Self:
         """Open a file for reading, or to `update` it; raises `RecordingError` if it is none, or is in use.
 
         At most `memory_mb` of what was read, and of what a query works on, is kept in memory, by default most of what
@@ -92,20 +98,16 @@ class Store:
                 use = "has it open" if update else "is writing it"
                 raise RecordingInUseError(f"{path}: another process {use}; wait until that ends") from error
             raise damaged(path, error) from error
-        store = cls(connection, path, size, writes=update)
+        store = cls(connection, path, writes=update, size=size)
         try:
-            check_intake(store.rows, path, size)
+            check_intake(store._fetch, path, size)
             store._check_tables()
             if update:
                 store._create()
         except RecordingError:
-            store.close()
+            store._db.close()
             raise
         return store
-
-    def close(self) -> None:
-        """Close the file."""
-        self._db.close()
 
     def shorten_log(self) -> None:
         """Write the log into the file, also while other threads write; raises `RecordingError`.
@@ -115,7 +117,7 @@ class Store:
         with self._writing(), self._db.cursor() as db:
             db.execute("CHECKPOINT")
 
-    def execute(self, statement: str, values: list[Any] | None = None) -> None:
+    def _execute(self, statement: str, values: list[Any] | None = None) -> None:
         """Execute a statement of SQL; raises `RecordingError` where the file cannot be written."""
         with self._writing():
             self._db.execute(statement, values)
@@ -126,18 +128,18 @@ class Store:
         try:
             yield
         except _UNFIT:
-            raise  # `insert` knows of which table
+            raise  # `_insert` knows of which table
         except duckdb.Error as error:
             disk = isinstance(error, duckdb.IOException | duckdb.TransactionException | duckdb.FatalException)
             reason = f"{first_line(error)}){'; is the disk full?' if disk else ';'}"
-            if self.vanishes:
+            if self._partial:
                 raise RecordingError(f"{self.path}: cannot be written ({reason} nothing was written") from error
             raise RecordingError(
                 f"{self.path}: cannot be written any more ({reason} everything before is kept, perhaps some of it in "
                 f"{log_of(self.path).name} beside it: keep the two together"
             ) from error
 
-    def insert(self, table: str, columns: Mapping[str, NDArray[Any]]) -> None:
+    def _insert(self, table: str, columns: Mapping[str, NDArray[Any]]) -> None:
         """Add rows from columns with the table's names; masked values are missing in the table.
 
         Raises `RecordingError` for values that do not fit into the table.
@@ -153,7 +155,7 @@ class Store:
         listed = ", ".join(f'"{name}"' for name in names)
         self._db.register("batch", arrays)
         try:
-            self.execute(f"INSERT INTO {table} ({listed}) SELECT {', '.join(values)} FROM batch", bound)  # noqa: S608 - keys of TABLES
+            self._execute(f"INSERT INTO {table} ({listed}) SELECT {', '.join(values)} FROM batch", bound)  # noqa: S608 - keys of TABLES
         except _UNFIT as error:
             raise RecordingError(
                 f"{self.path}: table {table}: values that do not fit ({first_line(error)}); "
@@ -161,12 +163,12 @@ class Store:
             ) from error
         self._db.unregister("batch")
 
-    def read(self, query: str, values: list[Any] | None = None) -> dict[str, NDArray[Any]]:
+    def _select(self, query: str, values: list[Any] | None = None) -> dict[str, NDArray[Any]]:
         """Return the result of a query as columns, masked where values are missing; raises `RecordingError`."""
         with self._reading():
             return dict(self._db.execute(query, values).fetchnumpy())
 
-    def rows(self, query: str) -> list[tuple[Any, ...]]:
+    def _fetch(self, query: str) -> list[tuple[Any, ...]]:
         """Return the result of a query as rows; raises `RecordingError`."""
         with self._reading():
             return self._db.execute(query).fetchall()
@@ -181,36 +183,37 @@ class Store:
             why = f"took longer than {self._longest_read_s:.0f} s" if late else first_line(error)
             raise RecordingError(f"{self.path}: cannot be read, truncated or damaged ({why})") from error
 
-    def blocks(self, table: str, rows: int) -> Iterator[str]:
+    def _blocks(self, table: str, rows: int) -> Iterator[str]:
         """Yield conditions of queries for all rows of a table in their order, some at a time."""
-        ((last,),) = self.rows(f"SELECT coalesce(max(rowid), -1) FROM {table}")  # noqa: S608 - a key of TABLES
+        ((last,),) = self._fetch(f"SELECT coalesce(max(rowid), -1) FROM {table}")  # noqa: S608 - a key of TABLES
         for start in range(0, last + 1, rows):
             yield f"WHERE rowid >= {start} AND rowid < {start + rows}"
 
-    def take(self, source: Store, table: str) -> None:
+    def _take(self, source: Store, table: str) -> None:
         """Add all rows of another file's table in their order, missing values included, some at a time."""
-        for block in source.blocks(table, ROWS_AT_A_TIME):
-            self.insert(table, source.read(f"SELECT {', '.join(TABLES[table])} FROM {table} {block}"))  # noqa: S608 - keys of TABLES
+        # 100 000 impulse responses, which are the largest rows, take 0.2 GB.
+        for block in source._blocks(table, 100_000):
+            self._insert(table, source._select(f"SELECT {', '.join(TABLES[table])} FROM {table} {block}"))  # noqa: S608 - keys of TABLES
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
         """Return a context: everything inserted in it is written at once, or not at all; raises `RecordingError`."""
         try:
-            self.execute("BEGIN")
+            self._execute("BEGIN")
             yield
-            self.execute("COMMIT")
+            self._execute("COMMIT")
         except BaseException:
             with suppress(duckdb.Error, RecordingError):
-                self.execute("ROLLBACK")
+                self._execute("ROLLBACK")
             raise
 
     def _create(self) -> None:
         """Create the tables and columns that the file does not have: all in a new one, later ones in an older one."""
         for table, columns in TABLES.items():
             spec = ", ".join(f"{name} {kind}" for name, kind in columns.items())
-            self.execute(f"CREATE TABLE IF NOT EXISTS {table} ({spec})")
+            self._execute(f"CREATE TABLE IF NOT EXISTS {table} ({spec})")
             for name in ADDED_LATER.get(table, ()):
-                self.execute(f"ALTER TABLE {table} ADD COLUMN IF NOT EXISTS {name} {columns[name]}")
+                self._execute(f"ALTER TABLE {table} ADD COLUMN IF NOT EXISTS {name} {columns[name]}")
 
     def _check_tables(self) -> None:
         """Raise `RecordingError` where the file lacks a table or column that every recording has.
@@ -218,7 +221,7 @@ class Store:
         Later ones are read as empty ones in memory.
         """
         present: dict[str, set[str]] = {table: set() for table in TABLES}
-        for table, column, _kind in self.rows(COLUMNS):
+        for table, column, _kind in self._fetch(COLUMNS_OF_FILE):
             present.setdefault(table, set()).add(column)
         if not present["meta"]:
             raise RecordingError(f"{self.path}: a DuckDB file, but not a {SUFFIX} recording (no table meta)")
@@ -226,10 +229,10 @@ class Store:
             missing = frozenset(columns.keys() - present[table])
             if missing and missing != ADDED_LATER.get(table, frozenset()):
                 raise RecordingError(f"{self.path}: table {table} lacks {', '.join(sorted(missing))}")
-            if missing and not self.writes:
+            if missing and not self._writes:
                 values = ", ".join(f"NULL::{columns[n]} AS {n}" if n in missing else n for n in columns)
                 rows = f"FROM {table}" if present[table] else "LIMIT 0"
-                self.execute(f"CREATE TEMP TABLE {table} AS SELECT {values} {rows}")
+                self._execute(f"CREATE TEMP TABLE {table} AS SELECT {values} {rows}")
 
 
 def _value(name: str, kind: str, column: NDArray[Any], arrays: dict[str, NDArray[Any]], bound: list[Any]) -> str:

@@ -19,14 +19,11 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import as_html, cut, first_few, printable
 from uwblink.protocols.table import PROTOCOLS, third_from_target
 from uwblink.recording.schema import TABLES, Fault, Tag
-from uwblink.recording.tables import ROWS_AT_ONCE, Tables
+from uwblink.recording.tables import EXCHANGES_PER_BLOCK, Tables
 from uwblink.twr import STAMPS, Exchanges, intervals, names_in, without_stamps
 
 IMPOSSIBLE_PPM: Final = 1000.0
 """A larger skew is due to a damaged stamp: boards differ by up to 40 ppm (20 ppm each, DW1000 data sheet, table 7)."""
-
-CLEAR_PPM: Final = 0.5
-"""The sign of a smaller skew cannot be compared with readings of the carriers, which scatter by 0.2 ppm."""
 
 
 SIGNS: Final = {True: "same sign", False: "OTHER SIGN", None: ""}
@@ -90,7 +87,7 @@ def _neighbours(e: Exchanges, columns: Sequence[NDArray[Any]]) -> tuple[Ints, In
     return order[:-1][same], order[1:][same]
 
 
-def single_report_blocks(recording: Tables, rows: int = ROWS_AT_ONCE) -> Iterator[SingleReports]:
+def single_report_blocks(recording: Tables, rows: int = EXCHANGES_PER_BLOCK) -> Iterator[SingleReports]:
     """Yield the exchanges of a recording, each once, in blocks of about `rows`.
 
     A recording with reports of targets is one block, because the two reports of an exchange can be apart.
@@ -175,7 +172,8 @@ def _skew(pair: int, by_stamps: Floats, by_carriers: Floats) -> ClockSkew:
     carrier = float(np.median(known)) if len(known) else None
     # Between 16 and 84 percent lies one standard deviation to either side.
     spread = float(np.ptp(np.percentile(known, (16, 84)))) / 2 if len(known) else None
-    slope = None if carrier is None or abs(stamps) <= CLEAR_PPM else carrier / stamps
+    # The sign of a skew below 0.5 ppm cannot be compared with readings of the carriers, which scatter by 0.2 ppm.
+    slope = None if carrier is None or abs(stamps) <= 0.5 else carrier / stamps
     sign = None if slope is None else slope > 0
     return ClockSkew(f"{pair >> 16}-{pair & 0xFFFF}", len(by_stamps), stamps, carrier, spread, slope, sign)
 

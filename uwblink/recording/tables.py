@@ -5,16 +5,14 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager
 from dataclasses import fields
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwblink.display import printable
-from uwblink.errors import RecordingError
+from uwblink.errors import RecordingError, raising
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.intake import decode_json
 from uwblink.recording.schema import (
@@ -35,7 +33,7 @@ from uwblink.twr import BITS, COLUMNS, Exchanges
 Columns = dict[str, NDArray[Any]]
 """Columns of a table (n,) by name."""
 
-ROWS_AT_ONCE: Final = 131_072
+EXCHANGES_PER_BLOCK: Final = 131_072
 """Exchanges of a block: a little more than a row group of DuckDB (122880)."""
 
 
@@ -58,14 +56,11 @@ _ORDER: Final = {
 """Order of the rows of tables that are not read in order of time."""
 
 
-class Tables:
+class Tables(Store):
     """Methods that read and append rows; each raises `RecordingError` if it fails.
 
     Methods with `start_ns` and `end_ns` return the rows from the first until before the second.
     """
-
-    _store: Store
-    path: Path
 
     def append(self, table: str, what: Any) -> None:
         """Append exchanges, poses, columns or rows to one of `TABLES`, in the form in which they are read.
@@ -78,17 +73,15 @@ class Tables:
         elif not isinstance(what, Mapping):
             values = zip(*(_record(row, table) for row in what), strict=True)
             what = {n: _column(kind, v) for (n, kind), v in zip(TABLES[table].items(), values, strict=False)}
-        self._store.insert(table, what)
+        self._insert(table, what)
 
     def append_meta(self, meta: Mapping[str, Any]) -> None:
         """Add entries to `meta`, replacing those with the same key; values are stored as JSON."""
         for key, value in meta.items():
-            try:
+            with raising(RecordingError, f"{self.path}: meta {key!r}: cannot be stored as JSON", TypeError, ValueError):
                 text = json.dumps(value, sort_keys=True, allow_nan=False)
-            except (TypeError, ValueError) as error:
-                raise RecordingError(f"{self.path}: meta {key!r}: cannot be stored as JSON ({error})") from error
-            self._store.execute("DELETE FROM meta WHERE key = ?", [key])
-            self._store.execute("INSERT INTO meta VALUES (?, ?)", [key, text])
+            self._execute("DELETE FROM meta WHERE key = ?", [key])
+            self._execute("INSERT INTO meta VALUES (?, ?)", [key, text])
 
     def append_tags(self, tags: Iterable[Tag]) -> None:
         """Add tags with their bodies and lever arms."""
@@ -102,29 +95,25 @@ class Tables:
         """Add poses, in one transaction."""
         self.append("poses", poses)
 
-    def transaction(self) -> AbstractContextManager[None]:
-        """Return a context: everything appended in it is written at once, or not at all."""
-        return self._store.transaction()
-
     def replace_poses(self, poses: Poses, meta: Mapping[str, Any], tags: Iterable[Tag] | None = None) -> None:
         """Replace the poses, and the tags if given."""
         with self.transaction():
-            self._store.execute("DELETE FROM poses")
+            self._execute("DELETE FROM poses")
             self.append_poses(poses)
             self.append_meta(meta)
             if tags is not None:
-                self._store.execute("DELETE FROM tags")
+                self._execute("DELETE FROM tags")
                 self.append_tags(tags)
 
     def meta(self) -> dict[str, Any]:
         """Return all entries of `meta`, decoded."""
-        rows = self._store.rows("SELECT key, value FROM meta ORDER BY key")
+        rows = self._fetch("SELECT key, value FROM meta ORDER BY key")
         return {str(key): decode_json(value, self.path, str(key)) for key, value in rows}
 
     def count(self, table: str) -> int:
         """Return the number of rows of one of `TABLES`."""
         known_tables([table])
-        return int(self._store.rows(f"SELECT count(*) FROM {table}")[0][0])  # noqa: S608 - a key of TABLES
+        return int(self._fetch(f"SELECT count(*) FROM {table}")[0][0])  # noqa: S608 - a key of TABLES
 
     def tally(self, table: str, *columns: str) -> dict[tuple[Any, ...], int]:
         """Return the number of rows of one of `TABLES` by the values of some columns, in ascending order.
@@ -134,15 +123,15 @@ class Tables:
         known_tables([table])
         there = " AND ".join(f"{name} IS NOT NULL" for name in columns)
         query = f"SELECT {', '.join(columns)}, count(*) FROM {table} WHERE {there} GROUP BY ALL ORDER BY ALL"  # noqa: S608 - names
-        return {tuple(row[:-1]): int(row[-1]) for row in self._store.rows(query)}
+        return {tuple(row[:-1]): int(row[-1]) for row in self._fetch(query)}
 
     def exchanges(self, start_ns: int | None = None, end_ns: int | None = None) -> Exchanges:
         """Return all exchanges in the order in which they were written."""
         return self._exchanges(_within(start_ns, end_ns))
 
-    def exchange_blocks(self, rows: int = ROWS_AT_ONCE) -> Iterator[Exchanges]:
+    def exchange_blocks(self, rows: int = EXCHANGES_PER_BLOCK) -> Iterator[Exchanges]:
         """Return all exchanges in the same order, about so many `rows` at once."""
-        return map(self._exchanges, self._store.blocks("exchanges", rows))
+        return map(self._exchanges, self._blocks("exchanges", rows))
 
     def _exchanges(self, where: str) -> Exchanges:
         bits = self.meta().get("timestamp_bits", REPORT_BITS)
@@ -153,7 +142,7 @@ class Tables:
         # Plug-ins are loaded only for unknown protocols.
         for known in ([row.name for row in PROTOCOLS.known()], list(PROTOCOLS)):
             code = f"list_position({known}, protocol)::TINYINT"
-            columns = self._store.read(f"SELECT {plain}, {code} AS protocol FROM exchanges {where}")  # noqa: S608 - names are checked words
+            columns = self._select(f"SELECT {plain}, {code} AS protocol FROM exchanges {where}")  # noqa: S608 - names are checked words
             codes = columns.pop("protocol")
             if not np.ma.is_masked(codes):
                 found = {name: _filled(TABLES["exchanges"][name], column) for name, column in columns.items()}
@@ -167,7 +156,7 @@ class Tables:
         """
         parts = max(self.count(table) // rows, 1)
         shares = [part / parts for part in range(parts + 1)]
-        ((found,),) = self._store.rows(f"SELECT quantile_disc(time_ns, {shares}) FROM {table}")  # noqa: S608 - a key of TABLES
+        ((found,),) = self._fetch(f"SELECT quantile_disc(time_ns, {shares}) FROM {table}")  # noqa: S608 - a key of TABLES
         return sorted(set(found or []))
 
     def poses(self, start_ns: int | None = None, end_ns: int | None = None) -> Poses:
@@ -175,7 +164,7 @@ class Tables:
 
         Raises `RecordingError` for a body without a name, and for a pose without a time.
         """
-        if self._store.rows("SELECT 1 FROM poses WHERE body IS NULL OR time_ns IS NULL LIMIT 1"):
+        if self._fetch("SELECT 1 FROM poses WHERE body IS NULL OR time_ns IS NULL LIMIT 1"):
             raise RecordingError(f"{self.path}: table poses: a body without a name, or a pose without a time")
         r = self.columns("poses", start_ns, end_ns)
         position, quaternion = (np.column_stack([r[name] for name in names]) for names in (POSE[:3], POSE[3:]))
@@ -187,7 +176,7 @@ class Tables:
         `corrected` is in the order of the exchanges. Missing values are "", False, NaN or 0.
         """
         known_tables([table])
-        found = self._store.read(_query(table, start_ns, end_ns))
+        found = self._select(_query(table, start_ns, end_ns))
         return {name: _filled(TABLES[table][name], column) for name, column in found.items()}
 
     def corrected_is_of_exchanges(self) -> bool:
@@ -195,8 +184,7 @@ class Tables:
         if not self.count("corrected"):
             return False
         differs = " OR ".join(f"e.{n} IS DISTINCT FROM c.{n}" for n in ("time_ns", "initiator", "target"))
-        query = f"SELECT 1 FROM exchanges e POSITIONAL JOIN corrected c WHERE {differs} LIMIT 1"  # noqa: S608 - names
-        return not self._store.rows(query)
+        return not self._fetch(f"SELECT 1 FROM exchanges e POSITIONAL JOIN corrected c WHERE {differs} LIMIT 1")  # noqa: S608 - names
 
     def tags(self) -> list[Tag]:
         """Return the tags in order of id."""
@@ -236,7 +224,7 @@ class Tables:
 
     def _rows(self, table: str, start_ns: int | None = None, end_ns: int | None = None) -> list[tuple[Any, ...]]:
         """Return the rows of a table in its order; raises `RecordingError` for a missing value."""
-        rows = self._store.rows(_query(table, start_ns, end_ns))
+        rows = self._fetch(_query(table, start_ns, end_ns))
         needed = 4 if table == "faults" else None  # all but the ends of the exchange, which most faults lack
         if empty := [row for row in rows if None in row[:needed]]:
             raise RecordingError(f"{self.path}: table {table}: a row with nothing in one of its columns, {empty[0]}")

@@ -26,15 +26,12 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 
 from uwblink.closing import Closing
-from uwblink.errors import ArgumentError, PortError
+from uwblink.errors import ArgumentError, PortError, raising
 from uwblink.exporters.mcap import RANGE, SCHEMAS, stamped
 from uwblink.streaming.sources import StreamedRange
 
 LOOPBACK: Final = "127.0.0.1"
 """The address of this computer, where no other one can connect."""
-
-VIEWERS: Final = "foxglove.dev"
-"""The domain of Foxglove's own pages (https://app.foxglove.dev)."""
 
 
 def hidden_address() -> str:
@@ -56,7 +53,7 @@ def is_viewer(host: str, origin: str | None, own: str) -> bool:
     is_own = name == own.lower() or name.endswith(".local") or re.fullmatch(r"[0-9.]+|[^.]+|.*:.*", name) is not None
     is_page = site.scheme in ("http", "https")  # a viewer on the desktop has another scheme
     is_trusted = page in (name, "localhost", LOOPBACK, "::1") or (
-        site.scheme == "https" and (page == VIEWERS or page.endswith(f".{VIEWERS}"))
+        site.scheme == "https" and (page == "foxglove.dev" or page.endswith(".foxglove.dev"))
     )
     # Programs that are no browsers send no origin; pages without an origin send "null".
     return bool(name) and is_own and (origin is None or (is_trusted if is_page else bool(site.scheme)))
@@ -133,11 +130,9 @@ class UdpSender(Closing):
         host, port = host_and_port(address, "udp")
         if not port:
             raise ArgumentError(f"found {address!r:.60}, expected a port from 1 to 65535", parameter="udp")
-        try:
+        with raising(PortError, f"udp {address}: no such host", OSError, UnicodeError):
             family, kind, _, _, to = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
             self._socket, self._to = socket.socket(family, kind), to
-        except (OSError, UnicodeError) as error:
-            raise PortError(f"udp {address}: no such host ({_reason(error)})") from error
         self._address = address
 
     def close(self) -> None:
@@ -149,14 +144,8 @@ class UdpSender(Closing):
         pair = f"{found.initiator}_{found.target}"
         row = {n: value for n, value in found.to_dict().items() if n not in ("time_ns", "initiator", "target")}
         data = json.dumps({"timestamp": found.time_ns * 1e-9, "ranges": {pair: row}}).encode()
-        try:
+        with raising(PortError, f"udp {self._address}: cannot be sent there"):
             self._socket.sendto(data, self._to)
-        except OSError as error:
-            raise PortError(f"udp {self._address}: cannot be sent there ({_reason(error)})") from error
-
-
-def _reason(error: Exception) -> str:
-    return str(getattr(error, "strerror", None) or error)
 
 
 class FoxgloveServer(Closing):
@@ -173,27 +162,19 @@ class FoxgloveServer(Closing):
         Raises `ArgumentError`, and `PortError` where it cannot be served or the extra is not installed.
         """
         host, port = host_and_port(address, "foxglove")
-        try:
+        with raising(PortError, "`foxglove`: needs foxglove-sdk; pip install 'uwbcal[foxglove]'", ImportError):
             import foxglove
-        except ImportError as error:
-            raise PortError(
-                "serving Foxglove needs foxglove-sdk; pip install 'uwbcal[foxglove]'", parameter="foxglove"
-            ) from error
         # For a slow viewer the oldest of 1024 messages are dropped.
         self._context, behind = foxglove.Context(), hidden_address()
-        try:
+        wrong = f"foxglove {address}: cannot be served there"
+        with raising(PortError, wrong, RuntimeError, OSError, ValueError), contextlib.ExitStack() as failing:
             self._server = foxglove.start_server(
                 name="uwblink", host=behind, port=0, context=self._context, message_backlog_size=1024
             )
-        except (RuntimeError, OSError, ValueError) as error:
-            raise PortError(f"foxglove {address}: cannot be served ({str(error).splitlines()[0]})") from error
-        try:
+            failing.callback(self._server.stop)
             self._gate = Gate(host, port, (behind, self._server.port))
-        except OSError as error:
-            self._server.stop()
-            raise PortError(f"foxglove {address}: cannot be served there ({error.strerror or error})") from error
-        layout = json.dumps(SCHEMAS[RANGE]).encode()
-        schema = foxglove.Schema(name=RANGE, encoding="jsonschema", data=layout)
+            failing.pop_all()
+        schema = foxglove.Schema(name=RANGE, encoding="jsonschema", data=json.dumps(SCHEMAS[RANGE]).encode())
         settings: dict[str, Any] = {"message_encoding": "json", "schema": schema, "context": self._context}
         self._channel = cache(lambda pair: foxglove.Channel(f"/ranges/{pair}", **settings))
         self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self._gate.server_address[1]}"
@@ -207,5 +188,4 @@ class FoxgloveServer(Closing):
         """Send a range to the viewers of its topic, `/ranges/INITIATOR_TARGET`."""
         row = found.to_dict()
         data = json.dumps(stamped(row.pop("time_ns"), row)).encode()
-        channel = self._channel(f"{found.initiator}_{found.target}")
-        channel.log(data, log_time=max(found.time_ns, 0))
+        self._channel(f"{found.initiator}_{found.target}").log(data, log_time=max(found.time_ns, 0))

@@ -8,7 +8,7 @@ import os
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -56,31 +56,27 @@ class StreamedRange:
     initiator: int
     target: int
     range_m: float
+    corrected_m: float = math.nan
+    sigma_m: float = math.nan
     fpp1_dbm: float
     fpp2_dbm: float
     skew1_ppm: float
     skew2_ppm: float
-    corrected_m: float = math.nan
-    sigma_m: float = math.nan
     more: Mapping[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the known values by name; numbers that are not finite are left out, because JSON has none."""
-        ends = {name: getattr(self, name) for name in ("time_ns", "initiator", "target")}
-        levels = {name: getattr(self, name) for name in ("range_m", "corrected_m", "sigma_m", *_LEVELS)}
-        return ends | {name: value for name, value in (levels | dict(self.more)).items() if math.isfinite(value)}
+        own = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "more"}
+        return {name: value for name, value in (own | dict(self.more)).items() if math.isfinite(value)}
 
     def to_json(self) -> str:
         """Return the same as one line of JSON, without its end."""
         return json.dumps(self.to_dict(), allow_nan=False)
 
 
-_LEVELS = ("fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")
-
-
 def streamed(exchanges: Exchanges, correct: Correction | None) -> Iterator[StreamedRange]:
     """Yield exchanges as ranges of a stream, corrected where there is a correction."""
-    names = ("time_ns", "initiator", "target", "range_m", *_LEVELS)
+    names = [one.name for one in fields(StreamedRange) if hasattr(exchanges, one.name)]
     known = {name: column.tolist() for name, column in (correct(exchanges) if correct else {}).items()}
     own = {name: known.pop(name) for name in ("corrected_m", "sigma_m") if name in known}
     columns = {name: getattr(exchanges, name).tolist() for name in names} | own

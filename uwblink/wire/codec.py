@@ -137,8 +137,7 @@ class Decoder:
 
     def _understand(self, buffer: bytes, at: int, *, clean: bool) -> tuple[Event, int]:
         """Return the message or text at a position and its end; raises `NeedMore` or `Malformed`."""
-        key = buffer[at : at + 3]
-        kind = self._table.get(key)
+        kind = self._table.get(buffer[at : at + 3])
         if kind is not None and (clean or buffer[at + 3 : at + 4] == b"|"):
             return self._message(kind, buffer, at)
         for text in self._texts:
@@ -206,8 +205,9 @@ def _from_parts(kind: type[Message], parts: list[bytes]) -> Message:
 FIELDS: Final = tuple(RangeReport.FIELDS)
 """The fields of R05, in their order."""
 
-_REPORT: Final = rb"\|".join(b"(?:%s)" % kind.pattern for kind in RangeReport.FIELDS.values())
-RUN: Final = re.compile(rb"(?:[RS]05\|" + _REPORT + rb"\r\n)++")
+RUN: Final = re.compile(
+    rb"(?:[RS]05\|" + rb"\|".join(b"(?:%s)" % kind.pattern for kind in RangeReport.FIELDS.values()) + rb"\r\n)++"
+)
 """Reports one after the other; whole numbers may still be larger than a board's."""
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from uwblink.errors import FrameError
+from uwblink.errors import FrameError, raising
 
 LONGEST_TEXT: Final = 199
 """Bytes of a text that the boards' buffer takes (firmware wire format, 1.2)."""
@@ -113,10 +113,9 @@ def write_printed(value: float) -> bytes:
 
 
 def _write_raw_float(value: float) -> bytes:
-    try:
+    wrong = f"found {value!r}, expected a number that fits four bytes"
+    with raising(FrameError, wrong, OverflowError, struct.error):
         return struct.pack("<f", value)
-    except (OverflowError, struct.error) as error:
-        raise FrameError(f"found {value!r}, expected a number that fits four bytes") from error
 
 
 def _bytes(longest: int) -> Kind:

@@ -309,38 +309,19 @@ class Skipped:
     reason: str
 
 
-def _table(*classes: type[Message]) -> dict[bytes, type[Message]]:
-    return {c.KEY: c for c in classes}
-
-
-COMMANDS: Final = _table(
-    SetIdle,
-    GetId,
-    Reset,
-    DoTests,
-    SetPassive,
-    RangeCommand,
-    Broadcast,
-    GetMaxFrame,
-    SetResponseDelay,
-    Bootloader,
-)
-REPORTS: Final = _table(
-    IdleSet,
-    IdReport,
-    ResetDone,
-    TestsDone,
-    PassiveSet,
-    RangeReport,
-    BroadcastSent,
-    MaxFrameReport,
-    ResponseDelaySet,
-    EnteringBootloader,
-    Overheard,
-    TargetRangeReport,
-    BroadcastReceived,
-    Cir,
-)
+COMMANDS: Final[dict[bytes, type[Message]]] = {
+    kind.KEY: kind
+    for kind in (
+        SetIdle, GetId, Reset, DoTests, SetPassive, RangeCommand, Broadcast, GetMaxFrame, SetResponseDelay, Bootloader,
+    )
+}  # fmt: skip
+REPORTS: Final[dict[bytes, type[Message]]] = {
+    kind.KEY: kind
+    for kind in (
+        IdleSet, IdReport, ResetDone, TestsDone, PassiveSet, RangeReport, BroadcastSent, MaxFrameReport,
+        ResponseDelaySet, EnteringBootloader, Overheard, TargetRangeReport, BroadcastReceived, Cir,
+    )
+}  # fmt: skip
 
 
 def register_message(kind: type[Message]) -> None:

@@ -1,9 +1,9 @@
-"""The driver's side of a conversation, without ports: outcomes, late replies, fences, damage."""
+"""The driver's side of a conversation, without ports: outcomes, late replies, fences, times, what may be sent."""
 
 import pytest
 
-from uwblink.boards.connection import FENCE, Connection
-from uwblink.errors import NoAnswerError, RefusedError
+from uwblink.boards.connection import ANSWER_S, FENCE, PATIENT_S, Connection, checked
+from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
 from uwblink.wire import messages as m
 from uwblink.wire.codec import encode
 
@@ -47,7 +47,8 @@ def test_lines_of_bystanders_and_other_reports_do_not_end_it():
 def test_a_line_of_failure_does_not_end_a_command_that_cannot_fail():
     connection = asked(m.GetId())
     assert connection.receive(b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n", 0.001)[1] is None
-    assert connection.receive(b"R01|4\r\n", 0.002)[1].reply == m.IdReport(4)
+    # The first of two replies is the outcome.
+    assert connection.receive(b"R01|4\r\nR01|5\r\n", 0.002)[1].reply == m.IdReport(4)
 
 
 def test_time_runs_out_once_and_leaves_a_doubt_that_a_fence_settles():
@@ -65,3 +66,126 @@ def test_time_runs_out_once_and_leaves_a_doubt_that_a_fence_settles():
     assert outcome.reply == m.IdleSet()
     assert any(isinstance(e, m.RangeReport) for e in events)
     assert not connection.doubtful
+
+
+CIR = encode(m.Cir(1, 2, 747_015, tuple(range(1016))))
+
+
+@pytest.mark.parametrize(
+    ("command", "refused"),
+    [
+        *((m.SetResponseDelay(n), "280 to 6500" * (not 280 <= n <= 6500)) for n in (279, 280, 6500, 6501)),
+        *((m.DoTests(1, "a", True, n, b""), "" if abs(n) < 9999.1 else "memory") for n in (9999.0, -9999.0, 9999.1)),
+        (m.DoTests(1, "a", True, float("nan"), b""), "memory"),
+        (m.DoTests(1, "a" * 47, True, 1.0, b""), ""),
+        (m.DoTests(1, "a" * 48, True, 1.0, b""), "DoTests of 65 bytes"),
+        (m.Broadcast(bytes(57)), ""),
+        (m.Broadcast(bytes(58)), "at most 57"),
+        (m.IdReport(1), "IdReport is not a command"),
+        (m.RangeCommand(300), "C05 target"),
+    ],
+)
+def test_what_would_harm_a_board_is_not_sent(command, refused):
+    if refused:
+        with pytest.raises(RefusedError, match=refused):
+            checked(command)
+        return
+    assert checked(command) == encode(command)
+    assert len(encode(command)) <= 64
+
+
+def test_a_command_is_waited_for_150_ms_and_a_fence_in_doubt_a_second():
+    connection = Connection("port")
+    assert (connection.busy, connection.deadline_s()) == (False, None)
+    connection.send(FENCE, 5.0)
+    assert (connection.busy, connection.deadline_s()) == (True, 5.0 + ANSWER_S)
+    assert connection.receive(b"", 5.0 + ANSWER_S - 1e-9)[1] is None
+    assert connection.receive(b"", 5.0 + ANSWER_S)[1].reply is None
+    assert connection.doubtful
+    assert connection.receive(b"", 9.0)[1] is None
+    connection.send(FENCE, 10.0)
+    assert connection.deadline_s() == 10.0 + PATIENT_S
+    silent = connection.receive(b"", 11.0)[1]
+    assert "within 1000 ms; heard nothing; " in str(silent.error)
+    assert str(silent.error).endswith("must be unplugged")
+    connection.send(m.GetId(), 12.0)
+    assert connection.deadline_s() == 12.0 + ANSWER_S
+    assert "must be unplugged" not in str(connection.receive(b"", 13.0)[1].error)
+
+
+def test_a_patient_connection_stays_patient():
+    connection = Connection("port", answer_s=2.0)
+    connection.send(FENCE, 0.0)
+    assert connection.deadline_s() == 2.0
+    connection.receive(b"", 2.0)
+    connection.send(FENCE, 3.0)
+    assert connection.deadline_s() == 5.0
+    connection.receive(b"R00\r\n", 3.1)
+    assert not connection.doubtful
+
+
+def test_the_last_60_bytes_are_quoted():
+    connection = asked()
+    connection.receive(b"\xff" + b"a" * 40, 0.01)
+    connection.receive(b"b" * 21, 0.02)
+    error = connection.receive(b"", 1.0)[1].error
+    assert isinstance(error, NoAnswerError)
+    assert str(error).endswith("heard '" + "a" * 39 + "b" * 21 + "'")
+
+
+def test_only_an_impulse_response_that_was_asked_for_keeps_the_board_quiet():
+    connection = asked(m.RangeCommand(2))
+    connection.receive(REPORT, 1.0)
+    assert connection.ready_s(1.0) == 0.0
+    with_cir = asked(m.RangeCommand(2, get_cir=True))
+    with_cir.receive(REPORT, 1.0)
+    assert with_cir.ready_s(1.0) == pytest.approx(0.030)
+    assert with_cir.ready_s(1.02) == pytest.approx(0.010)
+    # Once it is there, the report of a target may follow within 3 ms.
+    with_cir.receive(CIR, 1.028)
+    assert with_cir.ready_s(1.03) == pytest.approx(0.003)
+    assert with_cir.ready_s(1.04) == 0.0
+
+
+def test_an_impulse_response_of_others_is_waited_out_piece_by_piece():
+    connection = Connection("port")
+    connection.receive(CIR[:400], 2.0)
+    assert connection.ready_s(2.0) == pytest.approx(0.005)
+    assert connection.ready_s(2.004) == pytest.approx(0.001)
+    connection.receive(b"", 2.004)
+    assert connection.ready_s(2.004) == pytest.approx(0.001), "nothing came"
+    connection.receive(CIR[400:800], 2.004)
+    assert connection.ready_s(2.004) == pytest.approx(0.005)
+    connection.keep_quiet(2.5)
+    connection.keep_quiet(2.4)  # which does not cut it short
+    assert connection.ready_s(2.4) == pytest.approx(0.1)
+    connection.receive(CIR[800:], 2.41)
+    assert connection.ready_s(2.5) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("command", "what"),
+    [(m.RangeCommand(2), "ranging with 2"), (m.Broadcast(b"x"), "the broadcast")],
+)
+def test_what_failed_is_named_and_each_line_quoted_once(command, what):
+    connection = asked(command)
+    warned = b"WARNING 0xC: TWR message is firing an interrupt when it shouldn't be.\r\n"
+    assert connection.receive(warned + warned, 0.01)[1] is None
+    outcome = connection.receive(b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n", 0.02)[1]
+    assert isinstance(outcome.error, RangingFailedError)
+    assert str(outcome.error).startswith(f"port: {what} failed; the board says: WARNING")
+    assert str(outcome.error).count("WARNING") == 1
+    assert (outcome.reply, connection.busy) == (None, False)
+    assert not connection.doubtful
+
+
+def test_a_report_answers_only_who_asked_for_that_target_and_that_protocol():
+    single = REPORT.replace(b"|1332123700|2454699099|", b"|0|0|")
+    connection = asked(m.RangeCommand(2, double_sided=False))
+    assert connection.receive(OTHER.replace(b"|1332123700|2454699099|", b"|0|0|"), 0.01)[1] is None
+    assert connection.receive(single, 0.02)[1].reply.tx3 == 0
+    both = asked(m.RangeCommand(2))
+    assert both.receive(single, 0.01)[1] is None
+    assert both.receive(REPORT, 0.02)[1].reply.tx3 != 0
+    other = asked(m.GetId())
+    assert other.receive(REPORT, 0.01)[1] is None

@@ -1,12 +1,14 @@
 """Ports: what cannot be opened says why, and a port can be a URL."""
 
 import errno
+import json
 import os
 import socket
 import threading
 
 import pytest
 
+from tests import processes
 from tests.boards import served
 from uwblink.boards.board import Board
 from uwblink.boards.ports import SerialPort, _explained
@@ -27,6 +29,11 @@ def test_what_cannot_be_opened(tmp_path):
         SerialPort(f"{tmp_path}/")
     with pytest.raises(PortError, match="not a port"):
         SerialPort("nonsense://x")
+
+
+def test_the_list_of_ports_as_json():
+    done = processes.run("uwblink", "ports", "/dev/nothing", "--json")
+    assert json.loads(done.stdout) == [{"device": "/dev/nothing", "description": "", "serial_number": None}]
 
 
 def test_permission_denied_names_the_group(tmp_path):

@@ -10,60 +10,12 @@ from uwblink.boards import record as writing
 from uwblink.boards.record import RecordingWriter
 from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import TABLES
-from uwblink.recording.store import Store
 
 
 @pytest.fixture
 def live(tmp_path):
     with Recording.create(tmp_path / "live.uwb", live=True) as recording:
         yield recording
-
-
-def test_the_trial_at_the_start_leaves_nothing(live):
-    with RecordingWriter(live) as writer:
-        writer.on_bytes(5, "port", "in", b"\x00\xff")
-    assert [frame.data for frame in live.frames()] == [b"\x00\xff"]
-    assert {table: live.count(table) for table in TABLES if table not in ("meta", "frames")} == dict.fromkeys(
-        [table for table in TABLES if table not in ("meta", "frames")], 0
-    )
-
-
-@pytest.mark.parametrize(
-    ("table", "column", "spoil"),
-    [
-        ("frames", "bytes", lambda data: data.replace(b"\xff", b"?")),
-        ("cirs", "magnitudes", lambda taps: [min(tap, 32767) for tap in taps]),
-        ("exchanges", "fpp1_dbm", round),
-        ("faults", "detail", lambda text: text.replace("'", "")),
-    ],
-)
-def test_a_library_that_writes_otherwise_is_found_before_anything_is_recorded(live, monkeypatch, table, column, spoil):
-    plain = Store.insert
-
-    def spoiling(store, name, columns):
-        if name == table:
-            spoiled = columns[column].copy()
-            spoiled[:] = [spoil(value) for value in spoiled.tolist()]
-            columns = dict(columns) | {column: spoiled}
-        plain(store, name, columns)
-
-    monkeypatch.setattr(Store, "insert", spoiling)
-    with pytest.raises(RecordingError, match=rf"live\.uwb: written rows are read back differently \(tables: {table}\)"):
-        RecordingWriter(live)
-    assert live.count(table) == 0
-
-
-def test_a_conversion_that_fails_is_no_full_disk(live, monkeypatch):
-    plain = Store.execute
-
-    def failing(store, statement, values=None):
-        plain(store, statement.replace('unhex("bytes")', "CAST('\\xZZ' AS BLOB)"), values)
-
-    monkeypatch.setattr(Store, "execute", failing)
-    with pytest.raises(RecordingError, match="Conversion Error") as caught:
-        RecordingWriter(live)
-    assert "disk" not in str(caught.value)
 
 
 def size(path):

@@ -84,6 +84,55 @@ def test_rosbags_reads_standard_messages(recording, tmp_path):
     assert by_topic["/faults"][0][2].msg == 'time-out: no "answer"'
 
 
+def test_every_message_is_there_in_order_of_time(recording, tmp_path):
+    held, messages = load(recording), []
+    # 50 poses are two messages each.
+    assert export_recording(recording, tmp_path / "out", to="mcap") == {"recording.mcap": 50 + 100 + 50 + 50 + 2 + 1}
+    with (tmp_path / "out" / "recording.mcap").open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            content = json.loads(message.data)
+            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            assert set(content) <= set(json.loads(schema.data)["properties"])
+            messages.append((message.log_time, channel.topic, schema.name, content))
+    times = [logged for logged, *_ in messages]
+    assert times == sorted(times)
+    first = {topic: (name, content) for _, topic, name, content in reversed(messages)}
+    name, content = first["/poses/drone"]
+    assert name == "foxglove.PoseInFrame"
+    assert [content["pose"]["position"][axis] for axis in "xyz"] == held.poses.position_m[1].tolist()
+    assert [content["pose"]["orientation"][axis] for axis in "xyzw"] == held.poses.quaternion[1].tolist()
+    assert content["timestamp"] == {"sec": 1_706_822_508, "nsec": 52_560_815}
+    name, content = first["/tf"]
+    ends = content["parent_frame_id"], content["child_frame_id"]
+    assert (name, *ends) == ("foxglove.FrameTransform", "world", "rover 1")
+    earliest = int(np.argmin(held.exchanges.time_ns))
+    name, content = next(first[topic] for _, topic, _, _ in messages if topic.startswith("/ranges/"))
+    for column in ("initiator", "target", "range_m", "fpp1_dbm"):
+        assert content[column] == getattr(held.exchanges, column)[earliest]
+    assert "fpp2_dbm" not in content, "JSON has no word for what was not measured"
+    pulls = {axis: held.imu[f"a{axis}"][0] for axis in "xyz"}
+    assert first["/imu/drone"][1]["linear_acceleration"] == pulls
+    assert first["/height/drone"][1]["height_m"] == held.height["height_m"][0]
+    celsius = [content for _, topic, _, content in messages if topic == "/temperature/2"]
+    assert [set(content) for content in celsius] == [
+        {"timestamp", "temperature_c", "supply_v"},
+        {"timestamp", "temperature_c"},
+    ]
+    assert first["/faults"][1]["message"] == 'time-out: no "answer"'
+
+
+@pytest.mark.parametrize(
+    ("time_ns", "x", "said"), [(-5, 1.0, "before 1970"), (5, np.nan, "a number that is not finite")]
+)
+def test_what_json_cannot_say_is_one_line(tmp_path, time_ns, x, said):
+    sample = Exchanges.from_arrays([1], [2], time_ns=[time_ns], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
+    poses = Poses(np.array([9]), np.array(["drone"]), np.array([[x, 1.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))
+    Contents(exchanges=sample, poses=poses).save(tmp_path / "r.uwb")
+    with pytest.raises(RecordingError, match=said):
+        export_recording(tmp_path / "r.uwb", tmp_path / "out", to="mcap")
+    assert not (tmp_path / "out").exists()
+
+
 def test_poses_of_an_exported_bag_come_in_again(recording, tmp_path):
     export_recording(recording, tmp_path / "out", to="rosbag2")
     held = load(recording).poses

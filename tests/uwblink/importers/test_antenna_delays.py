@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from tests.uwblink.importers.test_table_forms import AIR, HEADER, TICKS, flights, mapped, wrapped, write
+from tests.uwblink.importers.test_table_forms import AIR, HEADER, TICKS, flights, mapped, read_table, wrapped, write
 from uwblink.errors import ImportTableError
-from uwblink.importers import read_table
 from uwblink.importers.guess import guess_map
 
 PROGRAMMED = 16_436

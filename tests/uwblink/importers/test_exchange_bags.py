@@ -133,6 +133,9 @@ def test_what_a_bag_does_not_hold_is_said(tmp_path):
     (tmp_path / "no.bag").write_bytes(b"nothing")
     with pytest.raises(ImportTableError, match="cannot be read as a bag"):
         read_source(tmp_path / "no.bag")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(ImportTableError, match="cannot be read as a bag"):
+        read_source(tmp_path / "folder", importer="bag")
     with pytest.raises(ImportTableError, match="no such bag"):
         read_source(tmp_path / "absent.mcap")
     (tmp_path / "t.csv").write_text("from_id,to_id,range_m\n1,2,3\n")

@@ -7,9 +7,9 @@ import pytest
 
 from tests import processes
 from tests.shared_data import shared
-from tests.uwblink.importers.test_table_forms import HEADER, as_messages, flights, same, wrapped, write
+from tests.uwblink.importers.test_table_forms import HEADER, as_messages, flights, read_table, same, wrapped, write
 from uwblink.errors import ImportTableError
-from uwblink.importers import import_recording, read_table
+from uwblink.importers import import_recording
 from uwblink.importers.column_map import load_map
 from uwblink.importers.guess import guess_map
 from uwblink.recording.contents import load
@@ -17,6 +17,14 @@ from uwblink.ticks import TICKS_PER_SECOND
 from uwblink.twr import raw_range
 
 POLL = ("poll_tx", "poll_rx", "resp_tx", "resp_rx", "final_tx", "final_rx")
+
+
+def guessed(tmp_path, path):
+    """What comes in by the map that is proposed."""
+    guess = guess_map(path)
+    assert guess.complete
+    (tmp_path / "map.toml").write_text(guess.text)
+    return read_table(path, tmp_path / "map.toml")
 
 
 def renamed(rows, names, change=None):
@@ -36,11 +44,7 @@ def test_a_guess_reads_the_table_right(tmp_path, names, scale, third):
     rows = flights(third=third)
     names = names | {"time_s": "timestamp", "from_id": "Tag ID", "to_id": "anchor_id", "fpp1": "fp_power_1"}
     table = [{n: v * scale if n in HEADER[3:9] and scale != 1 else v for n, v in row.items()} for row in wrapped(rows)]
-    path = write(tmp_path / "t.csv", renamed(table, names), ";")
-    guess = guess_map(path)
-    assert guess.complete
-    (tmp_path / "map.toml").write_text(guess.text)
-    found = read_table(path, tmp_path / "map.toml")
+    found = guessed(tmp_path, write(tmp_path / "t.csv", renamed(table, names), ";"))
     same(found, rows)
     assert found.exchanges.fpp1_dbm.tolist() == [row["fpp1"] for row in rows]
     assert found.exchanges.time_ns.tolist() == [round(row["time_s"] * 1e9) for row in rows]
@@ -48,14 +52,10 @@ def test_a_guess_reads_the_table_right(tmp_path, names, scale, third):
 
 def test_messages_ranges_and_units(tmp_path):
     rows = flights()
-    path = write(tmp_path / "m.csv", as_messages(wrapped(rows)))
-    (tmp_path / "map.toml").write_text(guess_map(path).text)
+    assert len(guessed(tmp_path, write(tmp_path / "m.csv", as_messages(wrapped(rows)))).exchanges) == len(rows)
     assert load_map(tmp_path / "map.toml").layout == "messages"
-    assert len(read_table(path, tmp_path / "map.toml").exchanges) == len(rows)
     plain = [{"t_ms": k, "src": 1, "dst": 2, "dist_mm": 1500 + k, "rssi": -80} for k in range(30)]
-    path = write(tmp_path / "r.csv", plain)
-    (tmp_path / "map.toml").write_text(guess_map(path).text)
-    found = read_table(path, tmp_path / "map.toml")
+    found = guessed(tmp_path, write(tmp_path / "r.csv", plain))
     assert found.exchanges.range_m[3] == pytest.approx(1.503)
     assert found.exchanges.time_ns[3] == 3_000_000
     assert found.powers["rxp2_dbm"][0] == -80
@@ -100,13 +100,9 @@ def test_a_row_a_stamp(tmp_path, event, words, clock):
         lines += [
             head | {clock: row[n], event: word, "seq": row["seq"]} for n, word in zip(("tx", "rx"), words, strict=True)
         ]
-    path = write(tmp_path / "t.csv", lines)
-    guess = guess_map(path)
-    assert guess.complete
-    (tmp_path / "map.toml").write_text(guess.text)
+    e = guessed(tmp_path, write(tmp_path / "t.csv", lines)).exchanges
     found = load_map(tmp_path / "map.toml")
     assert (found.layout, found.columns["stamp"], found.columns["time_s"]) == ("stamps", clock, "timestamp")
-    e = read_table(path, tmp_path / "map.toml").exchanges
     order, expected = e.tx1.argsort(), sorted(rows, key=lambda row: row["tx1"] % 2**32)
     assert [[int(getattr(e, n)[k]) for n in HEADER[3:9]] for k in order] == [
         [row[n] % 2**32 for n in HEADER[3:9]] for row in expected
@@ -132,11 +128,7 @@ def test_places_beside_ranges(tmp_path, mine, other):
         row = {"t_s": k, "tag_id": 1, "anchor_id": 2, "range": (9 + k * k) ** 0.5 + 0.25}
         row |= {called(mine, axis): v for axis, v in zip("xyz", (k, 0, 1), strict=True)}
         rows.append(row | {called(other, axis): v for axis, v in zip("xyz", (0, 3, 1), strict=True)})
-    path = write(tmp_path / "t.csv", rows)
-    guess = guess_map(path)
-    assert guess.complete
-    (tmp_path / "map.toml").write_text(guess.text)
-    found = read_table(path, tmp_path / "map.toml")
+    found = guessed(tmp_path, write(tmp_path / "t.csv", rows))
     assert found.exchanges.range_m - found.exchanges.truth_m == pytest.approx(0.25)
     assert (len(found.poses), found.poses.position_m.max()) == (31, 29)
 
@@ -152,13 +144,6 @@ def test_a_table_without_time_between_the_last_messages_is_guessed_in_peace(tmp_
     """Of which some ranges are infinite; as in commands, a warning of NumPy would be an error."""
     rows = [row | ({"tx3": row["tx2"]} if k % 2 else {}) for k, row in enumerate(wrapped(flights()))]
     assert "tx3" in guess_map(write(tmp_path / "t.csv", rows, ",")).text
-
-
-def guessed(tmp_path, path):
-    guess = guess_map(path)
-    assert guess.complete
-    (tmp_path / "map.toml").write_text(guess.text)
-    return read_table(path, tmp_path / "map.toml")
 
 
 GERMAN = ("Zeit [s]", "Quelle", "Empfänger", *(f"T_{n} [ns]" for n in HEADER[3:9]), "FP1 [dBm]", "FP2 [dBm]")

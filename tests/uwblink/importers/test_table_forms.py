@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from uwblink.errors import ArgumentError, ImportTableError
-from uwblink.importers import import_recording, read_source, read_table
+from uwblink.importers import import_recording, read_source
 from uwblink.recording.contents import load
 
 TICKS = 128 * 499_200_000
@@ -73,6 +73,10 @@ def same(found, rows, bits=32):
     assert found.exchanges.bits == bits
     assert stamps(found.exchanges) == [[row[n] % 2**bits for n in HEADER[3:9]] for row in rows]
     np.testing.assert_allclose(found.exchanges.range_m, [row["truth"] for row in rows], atol=1e-9)
+
+
+def read_table(source, map_file=None):
+    return read_source(source, importer="csv", map_file=map_file)
 
 
 def test_poses_are_told_from_exchanges(tmp_path):

@@ -1,13 +1,11 @@
 """A recording that is read some rows at a time says what it says as a whole, wherever the pieces begin and end."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from uwblink import Contents, Exchanges, Recording
-from uwblink.recording.schema import Fault
 from uwblink.recording.summary import clock_skews
 
 COUNT = 700
@@ -31,24 +29,6 @@ def exchanges(seed):
     )
 
 
-def reported_by_both(whole, seed):
-    """The same with a second report of two in three, up to 50 ms later, some of which say otherwise."""
-    rng = np.random.default_rng(seed)
-    again = whole[np.flatnonzero(rng.random(COUNT) < 0.67)]
-    differs = rng.random(len(again)) < 0.1
-    second = replace(
-        again,
-        time_ns=again.time_ns + rng.integers(0, 50_000_000, len(again)),
-        reporter=again.target.copy(),
-        range_m=np.where(differs, again.range_m + 1.0, again.range_m),
-    )
-    columns: dict[str, Any] = {
-        name: np.concatenate([column, getattr(second, name)]) for name, column in whole.to_dict().items()
-    }
-    order = np.argsort(columns["time_ns"], kind="stable")
-    return Exchanges(**{name: column[order] for name, column in columns.items()}), int(np.count_nonzero(differs))
-
-
 @pytest.fixture
 def written(tmp_path):
     def write(x, **more):
@@ -66,20 +46,6 @@ def test_blocks_of_any_size_are_all_exchanges_in_their_order(written, rows):
     assert max(map(len, parts)) <= rows
     for name, column in whole.to_dict().items():
         np.testing.assert_array_equal(np.concatenate([getattr(part, name) for part in parts]), column)
-
-
-def test_reports_of_both_ends_count_once_in_a_summary(written):
-    both, differing = reported_by_both(exchanges(3), seed=7)
-    faults = [Fault(5, "1", "time-out", "", 1, 2), Fault(6, "1", "garbage", "x"), Fault(7, "2", "time-out", "", 1, 2)]
-    with Recording.open(written(both, faults=faults)) as recording:
-        found = recording.show()
-    assert (found.counts["exchanges"], found.reported_twice, found.contradictory) == (
-        COUNT,
-        len(both) - COUNT,
-        differing,
-    )
-    assert found.faults == {"garbage": 1, "time-out": 2}
-    assert {(p.initiator, p.target): p.failed for p in found.pairs}[1, 2] == 2
 
 
 def test_clocks_of_pairs_are_the_same_from_blocks(written):

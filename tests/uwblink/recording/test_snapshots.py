@@ -82,15 +82,15 @@ def test_what_any_writer_has_committed_is_read_and_not_updated(writer):
     assert sorted(p.name for p in writer.parent.iterdir()) == ["f.uwb", "f.uwb.wal"]
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.77, 0.999])
-def test_of_a_log_that_was_copied_while_it_grew_whole_commits_are_read(writer, tmp_path, share):
+def test_of_a_log_that_was_copied_while_it_grew_whole_commits_are_read(writer, tmp_path):
     copy, log = tmp_path / "copy.uwb", (tmp_path / "f.uwb.wal").read_bytes()
     copy.write_bytes(writer.read_bytes())
-    (tmp_path / "copy.uwb.wal").write_bytes(log[: int(share * len(log))])
-    with Recording.open(copy) as recording:
-        found = [fault.detail for fault in recording.faults()]
-    assert found == [f"row {k}" for k in range(len(found))]
-    assert abs(len(found) - share * 50) < 10
+    for share in (0.0, 0.1, 0.5, 0.77, 0.999):
+        (tmp_path / "copy.uwb.wal").write_bytes(log[: int(share * len(log))])
+        with Recording.open(copy) as recording:
+            found = [fault.detail for fault in recording.faults()]
+        assert found == [f"row {k}" for k in range(len(found))]
+        assert abs(len(found) - share * 50) < 10
 
 
 @pytest.mark.parametrize("changing", [True, False])

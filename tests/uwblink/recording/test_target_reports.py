@@ -111,6 +111,8 @@ def test_the_doctor_names_reports_that_contradict_each_other(both, tmp_path):
     exchanges = exchanges_of(both / "both.uwb")
     wrong = (exchanges.reporter == exchanges.target) & (exchanges.initiator == 1)
     rewritten(both / "both.uwb", path, replace(exchanges, range_m=exchanges.range_m + wrong))
+    with Recording.open(path) as recording:
+        assert recording.show().contradictory == np.count_nonzero(wrong)
     finding = next(f for f in examine(path) if f.fault == "contradicting reports")
     assert "the first: range_m" in finding.evidence
 
