@@ -17,8 +17,8 @@ from calib.estimator.rows import sum_rows
 from calib.estimator.unknowns import Layout
 from calib.information import Unknown, Verdict, judge
 from calib.spread import TWO_SIDED_95
-from calib.trajectories.motion import TapeRows
-from calib.trajectories.search import MOTION, Search
+from calib.trajectories.motion import MOTION, TapeRows
+from calib.trajectories.search import Search
 from uwblink.arrays import Floats, Ints
 
 PRIOR_NS = 2.0
@@ -162,7 +162,8 @@ def _of_tapes(top: Search) -> Iterator[str]:
     rows = top.known.get("tape")
     if not isinstance(rows, TapeRows):
         return
-    left, moved = rows.residuals(top.optimum.x), rows.geometry.distances(top.optimum.x)[1]
+    distance, moved = rows.geometry.distances(top.optimum.x)
+    left = rows.measured_m - distance
     for number, one in enumerate(top.motion.scene.tapes.stated):
         mine = np.flatnonzero(top.motion.scene.tapes.number == number)
         row = np.zeros(top.optimum.layout.size)

@@ -22,14 +22,12 @@ from calib.estimator.rows import NormalRows, Rows
 from calib.estimator.unknowns import Layout, Priors, Unknown
 from calib.spread import robust_spread
 from calib.trajectories.motion import Distances, Motion, known_rows
+from calib.trajectories.samples import TRUSTED
 from calib.trajectories.scene import Scene
 from uwblink.arrays import Floats, Ints
 
 State = Mapping[str, Floats]
 """Unknowns of motion by their kind."""
-
-MOTION = ("path", "turn", "stand", "bias", "level")
-"""Kinds of unknowns of motion."""
 
 JERK_M_S3, QUICK_M_S3 = 8.0, 100.0
 """Standard deviation of jerk before it is estimated; the second for refined control points."""
@@ -53,9 +51,6 @@ standard error."""
 
 MIN_POINT_S = 0.11
 """Control points are not refined below this interval."""
-
-TRUSTED = 3.0
-"""Factor on the residuals of a sensor: its errors last for some windows."""
 
 FORCE_BOUNDS_M_S2 = (0.02, 5.0)
 """Bounds of the standard error of a mean specific force."""
@@ -209,19 +204,14 @@ class Search:
 
     def update_sensor_errors(self) -> None:
         """Update the standard errors of accelerometers and height sensors from their residuals."""
-        scene, known = self.motion.scene, self.known
-        if isinstance(force := known.get("force"), NormalRows):
-            factor = TRUSTED * robust_spread(force.left(self.x) / force.std, 0.0)
-            scene = replace(
-                scene,
-                inertial={
-                    body: replace(some, std_m_s2=float(np.clip(some.std_m_s2 * factor, *FORCE_BOUNDS_M_S2)))
-                    for body, some in scene.inertial.items()
-                },
-            )
-        if isinstance(height := known.get("height"), NormalRows):
-            scene = replace(scene, heights=scene.heights.reweighted(height.left(self.x) / height.std))
-        self.motion = replace(self.motion, scene=scene)
+        scene = self.motion.scene
+        left = {kind: rows.left(self.x) for kind, rows in self.known.items() if isinstance(rows, NormalRows)}
+        inertial = {}
+        for body, some in scene.inertial.items():
+            std = TRUSTED * robust_spread(left[f"force {body}"], 0.0)
+            inertial[body] = replace(some, std_m_s2=float(np.clip(std, *FORCE_BOUNDS_M_S2)))
+        heights = scene.heights.reweighted(left.get("height", np.zeros(0)))
+        self.motion = replace(self.motion, scene=replace(scene, inertial=inertial, heights=heights))
         self.known = known_rows(self.motion, self.layout)
 
     def coarseness(self) -> Coarseness:
@@ -354,7 +344,7 @@ def coarseness(motion: Motion, rows: RangeRows, geometry: Distances, x: Floats) 
     low, high = (choose(scene.ranges.initiator, scene.ranges.target) for choose in (np.minimum, np.maximum))
     found = [np.zeros((3, 0))]
     for body in range(len(scene.moving)):
-        one, other = (side.ends.mover == body for side in geometry.sides)
+        one, other = (side.mover == body for side in geometry.sides)
         mine = np.flatnonzero(one != other)
         towards = away[mine] * np.where(one[mine], 1.0, -1.0)[:, None]
         for step in range(1, min(NEIGHBOURS, len(mine) - 1) + 1):
