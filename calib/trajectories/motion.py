@@ -257,6 +257,12 @@ class Distances:
             parts.append(side.turn_share[rows][:, :, None] * np.cross(arm, pull)[:, None, :])
         return distance, np.concatenate([part.reshape(len(away), -1) for part in parts], axis=1)
 
+    def derivatives(self, x: Floats, rows: Ints) -> Floats:
+        """Return the derivatives (m, p) of some distances by all unknowns (p,)."""
+        found = np.zeros((len(rows), len(x)))
+        np.add.at(found, (np.arange(len(rows))[:, None], self.columns[rows]), self.distances(x, rows)[1])
+        return found
+
 
 @dataclass(frozen=True)
 class TapeRows:
@@ -265,6 +271,10 @@ class TapeRows:
     geometry: Distances
     measured_m: Floats
     std_m: Floats
+
+    def left(self, x: Floats) -> Floats:
+        """Return taped less estimated distances (n,)."""
+        return self.measured_m - self.geometry.distances(x)[0]
 
     def terms(self, x: Floats) -> Iterator[Terms]:
         """Yield all rows."""
