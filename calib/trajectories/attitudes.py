@@ -70,9 +70,6 @@ INTEGRATED_WANDER_RAD = np.radians([0.5, 0.5, 0.5])
 """Standard deviations of integrated attitudes (rad), whose heading is unknown, and of their random walk (rad per root
 second): judgements for MEMS gyroscopes."""
 
-BIAS_STEP_S = 0.5
-"""Time over which turns by poses and by the gyroscope are compared."""
-
 
 @dataclass(frozen=True, slots=True)
 class Inertial(Samples):
@@ -177,15 +174,16 @@ def _carried_on(readings: Readings, first: int, attitude: Floats, bias: Floats) 
     return np.asarray(Rotation.from_matrix(found).as_quat())
 
 
-def _gyro_bias(readings: Readings, known: Attitude, until_s: float) -> Floats:
-    """Return the bias of the gyroscope (3,), rad/s: the median of its readings less the known turn rates."""
+def _gyro_bias(readings: Readings, known: Attitude, until_s: float, step_s: float = 0.5) -> Floats:
+    """Return the bias of the gyroscope (3,), rad/s: the median of its readings less the known turn rates, which are
+    means over `step_s`."""
     last = min(until_s, float(known.time_s[-1]), float(readings.time_s[-1]))
-    edges = np.arange(max(float(known.time_s[0]), float(readings.time_s[0])), last, BIAS_STEP_S)
+    edges = np.arange(max(float(known.time_s[0]), float(readings.time_s[0])), last, step_s)
     slot = np.searchsorted(edges, readings.time_s, side="right") - 1
     there = np.intersect1d(slot, np.arange(len(edges) - 1))
     if not len(there):
         return np.zeros(3)
     at = known.at(edges)
-    rates = (at[:-1].inv() * at[1:]).as_rotvec() / BIAS_STEP_S
+    rates = (at[:-1].inv() * at[1:]).as_rotvec() / step_s
     read = np.column_stack([ndimage.mean(axis, slot, there) for axis in readings.gyro.T])
     return np.asarray(np.median(read - rates[there], axis=0))

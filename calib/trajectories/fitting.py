@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -83,8 +82,7 @@ def fit_from_ranges(
     flight, settings, known = _settings(flight, settings, changes)
     report = progress or (lambda _: None)
     scene = scene_from(data, flight, need_power=not settings.delays_only)
-    # One thread: the same bytes on any machine. SciPy has its own linear algebra, which must be loaded to be limited.
-    import_module("scipy.linalg")
+    # One thread: the same bytes on any machine.
     with threadpool_limits(limits=1, user_api="blas"):
         model, scene = range_model(scene, settings, curve=not settings.delays_only and known is None)
         if not settings.minimum_norm:

@@ -36,9 +36,6 @@ JERK_M_S3, QUICK_M_S3 = 8.0, 100.0
 FIRST_SCALE_M = 0.15
 """First scale of Cauchy's loss, while delays and curve are unknown."""
 
-ROUNDS = 3
-"""Iterations of the scale of Cauchy's loss."""
-
 LITTLE_LEVERAGE, MAX_LEVERAGE = 0.5, 0.9
 """Ranges with a leverage up to the first inform about errors. Leverages are limited to the second, because residuals
 are divided by the root of 1 - leverage."""
@@ -176,7 +173,8 @@ class Search:
     def fit_robustly(self) -> None:
         """Maximise Cauchy's likelihood, whose scale is estimated."""
         scale = FIRST_SCALE_M
-        for turn in range(ROUNDS):
+        # The scale converges in three rounds.
+        for turn in range(3):
             self.optimize(Cauchy(scale), evidence_steps=12 if turn else 0)
             # The spread of residuals, combined with the prior of noise by their numbers of ranges.
             spread, free = robust_spread(self.residuals()[self.informative_rows()]), self.free_ranges

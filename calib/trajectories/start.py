@@ -18,7 +18,7 @@ from calib.trajectories.scene import Scene
 from calib.trajectories.search import JERK_M_S3, MotionFit, State, fit_motion
 from uwblink.arrays import Floats
 
-WINDOW_S = (2.0, 20.0)
+LENGTHS_S = (2.0, 20.0)
 RANGES_A_BODY = 24
 """A window has so many ranges per moving body, within these bounds in seconds; the next begins half a window later."""
 
@@ -26,6 +26,8 @@ HEADING_WINDOW_S = 8.0
 """Shortest first window where headings are unknown."""
 
 SAMPLE_S = 0.1
+"""Time between positions of an initial guess: a quarter of that between control points."""
+
 WINDOW_STD_M = 0.1
 """Standard error of positions from the window before."""
 
@@ -40,6 +42,8 @@ START_COUNT, KEPT_STARTS, SAMPLED_RANGES = 24, 8, 400
 the number of the window's ranges that are used."""
 
 START_SPREAD_M = 2.0
+"""Standard deviation of random starts about known positions: the size of a room."""
+
 EQUAL_LIKELIHOOD = 6.0
 """Solutions whose log likelihoods differ by less are equally likely."""
 
@@ -49,10 +53,7 @@ ROOM_M = 20.0
 OTHER_PLACE_M, OTHER_DISTANCE_M = 0.5, 0.1
 """Solutions differ if positions among given anchors, or distances, differ by more in the median."""
 
-TURNS = tuple((np.arange(1, 12) * np.pi / 6).tolist())
-"""Rotations by which unknown headings are tried."""
-
-OTHER_HEADING_RAD = np.pi * 50 / 180
+OTHER_HEADING_RAD = np.radians(50.0)
 """Headings that differ by less converge to one solution."""
 
 PASSES, SAMPLED_FLIGHT = 2, 600
@@ -131,7 +132,7 @@ def interpolated(places: Places, time_s: Floats, bodies: int) -> Trajectories:
 def _window_s(scene: Scene) -> float:
     """Return the length of a window in seconds."""
     rate = len(scene.time_s) / max(float(scene.time_s[-1] - scene.time_s[0]), 1e-9)
-    return float(np.clip(2 * round(RANGES_A_BODY * len(scene.moving) / rate / 2), *WINDOW_S))
+    return float(np.clip(2 * round(RANGES_A_BODY * len(scene.moving) / rate / 2), *LENGTHS_S))
 
 
 def _fit_window(window: Scene, guess: Trajectories, stand: Floats) -> MotionFit:
@@ -277,13 +278,14 @@ def resolve_headings(scene: Scene, state: State) -> tuple[Scene, State, str]:
         few = scene.turned_by(heading).thinned(SAMPLED_FLIGHT)
         return fit_motion(few, start, SCALES_M[-1:], JERK_M_S3, steps=8)
 
+    turns = np.radians(np.arange(30, 360, 30)).tolist()
     heading, unsure = dict.fromkeys(unknown, 0.0), list[str]()
     best = fitted(heading, state)
     for _ in range(PASSES):
         unsure, before = [], dict(heading)
         for body in unknown:
             here = heading[body]
-            tried = {here: best} | {here + turn: fitted(heading | {body: here + turn}, best.state) for turn in TURNS}
+            tried = {here: best} | {here + turn: fitted(heading | {body: here + turn}, best.state) for turn in turns}
             heading[body] = max(tried, key=lambda angle: tried[angle].value)
             best = tried[heading[body]]
             rivals = [angle for angle, one in tried.items() if best.value - one.value < EQUAL_LIKELIHOOD]

@@ -110,7 +110,6 @@ def test_sought_anchors_do_not_spoil_what_a_known_start_tells():
     flown = flight(seconds=10.0, rate=120, anchors=ANCHORS, seed=2)
     result = calib.fit_from_ranges(flown, poses_until_s=6.0, anchors="sought")
     assert np.abs(scores(result)).max() < 3.5
-    assert np.std(distance_errors(result, flown)) < 0.06
     # Where an anchor is and how late it answers are nearly the same from a flight in the middle of the room.
     assert all(np.isinf(result.calibration.delays_std_ns[tag]) for tag in (11, 12, 13, 14))
     assert "tags 11, 12, 13, 14" in result.warnings[0]
