@@ -260,8 +260,8 @@ def _initial_anchors(scene: Scene, seed: Trajectories) -> Floats:
     starts = rng.normal(here.mean(axis=0), here.std(axis=0) + START_SPREAD_M, (START_COUNT // 3, len(sought), 3))
     fits = [_fit_window(window, seed, start) for start in starts]
     cost = [mine @ np.log1p((one.residuals / SCALES_M[-1]) ** 2) for one in fits]
-    found: Floats = np.array([_stand(one) for one in fits])
-    return found[np.argmin(cost, axis=0), np.arange(len(sought))]
+    best = np.argmin(cost, axis=0).tolist()
+    return np.array([_stand(fits[start])[number] for number, start in enumerate(best)])
 
 
 def resolve_headings(scene: Scene, state: State) -> tuple[Scene, State, str]:

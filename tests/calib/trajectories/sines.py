@@ -72,7 +72,6 @@ class Flight:
     imu: dict[str, Any] = field(default_factory=dict)
     height: dict[str, Any] = field(default_factory=dict)
     antennas: Any = None
-    arrangements: list[Any] = field(default_factory=list)
 
 
 def turned_anchor(tag):

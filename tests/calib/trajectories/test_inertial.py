@@ -14,6 +14,7 @@ from calib.trajectories.start import interpolated, resolve_headings
 from tests.calib.trajectories.sines import flight
 
 BOXES = {"a": ([-2.6, -2.6, 0.4], [-0.4, -0.2, 2.6]), "b": ([0.4, -2.6, 0.4], [2.6, -0.2, 2.6])}
+TWO_S = np.array([2.0])
 IMU = {"grade": "consumer", "vibration_mps2": 1.0}
 
 
@@ -64,8 +65,8 @@ def test_a_heading_that_is_wrong_by_a_right_angle_is_found_over_the_flight(flown
     known = scene_from(flown, FlightSettings(poses_until_s=4.0)).between(0.0, 4.0)
 
     def off(turned):
-        turns = [turned.attitudes[body].at(2.0) * known.attitudes[body].at(2.0).inv() for body in BOXES]
-        return np.array([turn.as_euler("ZYX")[0] for turn in turns])
+        turns = [turned.attitudes[body].at(TWO_S) * known.attitudes[body].at(TWO_S).inv() for body in BOXES]
+        return np.array([turn.as_euler("ZYX")[0, 0] for turn in turns])
 
     # Integrated from an unknown heading; "b" is put a right angle off, where a first window may have left it.
     scene = scene.turned_by(dict(zip(BOXES, (-off(scene) + [0.0, np.pi / 2]).tolist(), strict=True)))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import calib
+from calib.trajectories.samples import tapes_of
 from tests.calib.trajectories.sines import DELAYS_NS, flight, scores
 from uwblink import Arrangement, KnownDistance
 
@@ -65,22 +66,24 @@ def test_a_tape_that_was_misread_is_named_and_others_are_not():
 
 
 def test_a_tape_counts_as_much_whether_it_holds_for_long_or_short():
-    flown = flight(seconds=8.0, standing_s=4.0)
-    # An arrangement of the recording, and the same span and a shorter one in seconds since the first range.
-    begin_ns = int(flown.exchanges.time_ns[0])
-    flown.arrangements = [Arrangement("floor", begin_ns, begin_ns + 4_000_000_000)]
-    tape = by_tape(flown, 1, 3, std_m=0.3)
-    spans = ("floor", "0..4", "1..2")
-    stated = [KnownDistance(1, 3, tape.distance_m, tape.sigma_m, span) for span in spans]
-    found = [calib.fit_from_ranges(flown, distances=[one], **KNOWN_START).calibration for one in stated]
-    assert found[0].delays_ns == pytest.approx(found[1].delays_ns)
-    std = np.array([list(one.delays_std_ns.values()) for one in found])
-    assert std[2] == pytest.approx(std[0], rel=0.02)
+    bodies = {1: "a", 2: "a", 3: "b", 11: "c", 12: "d"}
+    stated = [
+        KnownDistance(11, 12, 4.0, 0.01),
+        KnownDistance(1, 3, 2.0, 0.01, "floor"),
+        KnownDistance(2, 3, 2.0, 0.02, "5..5.9"),
+    ]
+    found = tapes_of(stated, [Arrangement("floor", 10**9, 3 * 10**9)], bodies, {"c", "d"}, 0, 20.0)
+    assert np.isnan(found.time_s[found.number == 0]).tolist() == [True]
+    assert found.time_s[found.number == 1] == pytest.approx([1.2, 1.6, 2.0, 2.4, 2.8])
+    assert found.time_s[found.number == 2] == pytest.approx([5.225, 5.675])
+    for number, one in enumerate(stated):
+        assert np.sum(found.std_m[found.number == number] ** -2.0) == pytest.approx(one.sigma_m**-2.0)
+    assert found.between(10.0, 12.0).number.tolist() == [0]
 
 
 def test_tapes_between_given_anchors_are_compared_with_their_positions():
     flown = flight(seconds=4.0, anchors=CORNERS)
-    true_m = float(np.linalg.norm(np.subtract(*CORNERS[:2])))
+    true_m = float(np.linalg.norm(np.array(CORNERS[0]) - CORNERS[1]))
     tapes = [KnownDistance(11, 12, true_m + off_m, 0.005) for off_m in (0.0, 0.2)]
     result = calib.fit_from_ranges(flown, distances=tapes, poses_until_s=3.0, heading_std_deg=0.0)
     named = [warning for warning in result.warnings if "measure it again" in warning]
