@@ -1,4 +1,4 @@
-"""What ranges owe to clocks: two ways of telling clock skew that should agree, and skew left in single-sided ranges."""
+"""Effects of clocks on ranges: clock skew by stamps and by carriers, and skew left in single-sided ranges."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ PPM_TO_METRES: Final = 0.5 * SPEED_OF_LIGHT * 1e-6
 
 @dataclass(frozen=True, slots=True)
 class ClocksApart:
-    """A pair, the smaller id first, whose clocks differ by `stamps_ppm`, but by `carrier_ppm` for their carriers.
+    """A pair, the smaller id first, whose clocks differ by `stamps_ppm` by their stamps and `carrier_ppm` by carriers.
 
-    `moves_m` is what the difference does to its ranges.
+    `moves_m` is the error of its ranges if the stamps are wrong.
     """
 
     pair: tuple[int, int]
@@ -43,8 +43,8 @@ def clocks_apart(exchanges: Exchanges) -> ClocksApart | None:
     """Return the pair whose clock ratio by the stamps is farthest from that of the carriers, None where all agree.
 
     Compared are exchanges of three messages with readings, of which 0 is none. Most pairs settle which sign the
-    readings have: ranges with a third message do not depend on it. Readings of a carrier may be off by 1 ppm, and by a
-    tenth of the skew, without any fault; and eight standard errors of the median difference are no chance.
+    readings have: ranges with a third message do not depend on it. A difference of 1 ppm, of a tenth of the skew, or of
+    eight standard errors of the median is no fault.
     """
     readings = np.abs(exchanges.skew1_ppm) + np.abs(exchanges.skew2_ppm)
     triple = [name for name in names_in(exchanges.protocol) if PROTOCOLS[name].third_sender is not None]
@@ -78,10 +78,10 @@ def pair_ids(exchanges: Exchanges) -> Ints:
 
 @dataclass(frozen=True, slots=True)
 class LeftSkew:
-    """What clock skew may have left in single-sided ranges, metres.
+    """Errors of single-sided ranges by clock skew, metres.
 
-    `bound_m` is for crystals at the ends of their tolerance, `reply_s` the median reply time; `told_m` is what 95 % of
-    the carriers' readings stay below, NaN where they were not read.
+    `bound_m` is for crystals at the ends of their tolerance, `reply_s` the median reply time; `told_m` is the 95 %
+    quantile by the carriers' readings, NaN where they were not read.
     """
 
     bound_m: float
@@ -113,7 +113,7 @@ def as_length(metres: float) -> str:
 
 
 def left_skew(exchanges: Exchanges) -> LeftSkew | None:
-    """Return what skew may have left in the single-sided ranges that nothing corrected; None where there are none.
+    """Return the errors by skew of single-sided ranges that nothing corrected; None where there are none.
 
     A single-sided time of flight is half of round trip less reply, so a target's clock that is faster by s makes it
     longer by s times half the reply.

@@ -16,12 +16,10 @@ from uwblink.twr import Exchanges
 
 DELAYS_NS: Final = {1: -0.3, 2: 0.1, 3: -0.1}
 ANCHOR_DELAYS_NS: Final = DELAYS_NS | {4: 0.2, 5: 0.0}
-PAIRS: Final = np.array([(1, 2), (2, 3), (3, 1)])
-ANCHORS: Final = (2, 3, 4, 5)
-AMONG_ANCHORS: Final = np.array([(1, 2), (1, 3), (1, 4), (1, 5), (2, 3), (3, 4), (4, 5), (5, 2)])
-NOISE_M: Final = 0.03
+"""The planted delays of a flight without and with anchors."""
+
 REPLY_TICKS: Final = 20_000_000
-POSES_HZ: Final = 100
+"""Reply times, 0.3 ms: about those of the boards."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,22 +52,32 @@ def sample_flight(count: int = 900, *, seed: int = 1, anchors: bool = False) -> 
     """
     rng = np.random.default_rng(seed)
     time_ns = 1_000_000_000 + np.arange(count) * 10_000_000
-    pairs, fixed = (AMONG_ANCHORS, ANCHORS) if anchors else (PAIRS, ())
-    pair = pairs[np.arange(count) % len(pairs)]
+    pairs: list[tuple[int, int]] = [(1, 2), (2, 3), (3, 1)]
+    if anchors:
+        pairs = [(1, 2), (1, 3), (1, 4), (1, 5), (2, 3), (3, 4), (4, 5), (5, 2)]
+    pair, fixed = np.array(pairs)[np.arange(count) % len(pairs)], (2, 3, 4, 5) if anchors else ()
     initiator, target = pair.T
     away = np.linalg.norm(_place(initiator, time_ns, fixed) - _place(target, time_ns, fixed), axis=1)
     power = rng.uniform(-95, -80, (2, count))
     lifted = np.mean(10 ** ((power + 82) / 10), axis=0)
     delay = np.array([ANCHOR_DELAYS_NS.get(tag, 0.0) for tag in range(6)])
-    measured_m = away + 0.04 * np.tanh(2 * lifted) + NOISE_M * rng.normal(size=count)
+    measured_m = away + 0.04 * np.tanh(2 * lifted) + 0.03 * rng.normal(size=count)
     measured_m = measured_m - 0.5e-9 * SPEED_OF_LIGHT * (delay[initiator] + delay[target])
     tags = [Tag(int(tag), f"robot{tag}", (0.0, 0.0, 0.0)) for tag in np.unique(pair)]
-    poses = _poses(int(time_ns[-1]), tags, fixed)
-    return SampleFlight(stamped(time_ns, pair, measured_m, power), poses, tags, _planted(tags))
+    planted = {"delays_ns": {str(tag.tag): ANCHOR_DELAYS_NS[tag.tag] for tag in tags}}
+    # Poses 100 times a second, until a second after the last range.
+    pose_ns = np.arange(0, int(time_ns[-1]) + 1_000_000_000, 10_000_000)
+    poses = Poses(
+        np.tile(pose_ns, len(tags)),
+        np.repeat([tag.body for tag in tags], len(pose_ns)),
+        np.concatenate([_place(np.full(len(pose_ns), tag.tag), pose_ns, fixed) for tag in tags]),
+        np.tile([0.0, 0.0, 0.0, 1.0], (len(tags) * len(pose_ns), 1)),
+    )
+    return SampleFlight(stamped(time_ns, pair, measured_m, power), poses, tags, planted)
 
 
 def stamped(time_ns: Any, pair: Any, measured_m: Floats, power: Floats) -> Exchanges:
-    """Stamps of double-sided exchanges whose clocks run alike, so that the formula gives the measured range."""
+    """Return double-sided exchanges whose stamps give the measured ranges; all clocks run alike."""
     there_and_back = np.rint(2 * measured_m / SPEED_OF_LIGHT / TICK_S).astype(np.int64)
     zero, nothing = np.zeros_like(time_ns), np.zeros(len(time_ns))
     return Exchanges(
@@ -94,24 +102,8 @@ def stamped(time_ns: Any, pair: Any, measured_m: Floats, power: Floats) -> Excha
 
 
 def _place(tag: Any, time_ns: Any, fixed: tuple[int, ...] = ()) -> Floats:
-    """Where a tag is: each on its own slow figure about its own corner, or in the corner."""
+    """Return the position of tags: each on its own slow figure about its own corner, or in the corner if `fixed`."""
     phase = 2e-9 * time_ns + 2.0 * tag
     corner = 2.0 * np.stack([np.cos(2.1 * tag), np.sin(2.1 * tag), 0.3 * tag], axis=-1)
     away = np.stack([np.sin(phase), np.cos(1.3 * phase), 0.5 * np.sin(0.7 * phase)], axis=-1)
-    moved: Floats = corner + np.where(np.isin(tag, fixed)[..., None], 0.0, away)
-    return moved
-
-
-def _poses(last_ns: int, tags: list[Tag], fixed: tuple[int, ...]) -> Poses:
-    time_ns = np.arange(0, last_ns + 1_000_000_000, 1_000_000_000 // POSES_HZ)
-    upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(time_ns), 1))
-    return Poses(
-        np.tile(time_ns, len(tags)),
-        np.repeat([tag.body for tag in tags], len(time_ns)),
-        np.concatenate([_place(np.full(len(time_ns), tag.tag), time_ns, fixed) for tag in tags]),
-        np.tile(upright, (len(tags), 1)),
-    )
-
-
-def _planted(tags: list[Tag]) -> dict[str, Any]:
-    return {"delays_ns": {str(tag.tag): ANCHOR_DELAYS_NS[tag.tag] for tag in tags}}
+    return np.asarray(corner + np.where(np.isin(tag, fixed)[..., None], 0.0, away))

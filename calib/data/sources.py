@@ -1,4 +1,4 @@
-"""Where ranges come from: recordings, open ones, simulations in memory, or several of them."""
+"""Sources of ranges: recordings, open ones, simulations in memory, or several of them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from uwblink.twr import Exchanges
 
 @runtime_checkable
 class Source(Protocol):
-    """What anything may hand over instead of a file: exchanges, poses of bodies, and the tags on them.
+    """An object in place of a file: exchanges, poses of bodies, and the tags on them.
 
     A simulation's result has these attributes. Used where they exist: `planted`, what a simulation put in, which is
     shown and never used (or `meta` with that entry, and with the programmed antenna delays); `faults`; `overheard`,
@@ -60,11 +60,11 @@ READERS: Final[dict[str, Callable[[Recording], Any]]] = {
     "arrangements": Recording.arrangements,
     "known_distances": Recording.known_distances,
 }
-"""What a recording has beside exchanges, poses and tags, and what reads it."""
+"""The tables of a recording beside exchanges, poses and tags, and the functions that read them."""
 
 
 class RecordedSource:
-    """An open recording as a `Source`, which reads each table when it is asked for: all of `READERS`, too."""
+    """An open recording as a `Source` with the tables of `READERS`; each is read when it is first used."""
 
     def __init__(self, recording: Recording) -> None:
         """Take a recording, which must stay open."""
@@ -94,7 +94,7 @@ class RecordedSource:
 
 @contextmanager
 def opened(data: Data) -> Iterator[tuple[str, Source]]:
-    """Yield a name and a `Source`, which is good inside the block.
+    """Yield a name and a `Source`, which can be used inside the block.
 
     Raises the errors of `Recording.open`, and `BadInputError` for what is no recording at all.
     """
@@ -144,7 +144,10 @@ def load_each(data: Data | Iterable[Data], *, trim_static: bool = False, need_po
     Raises `BadInputError` where two recordings hold the same exchanges: counted twice, they would seem to tell more.
     """
     given = each(data)
-    parts = [_load(one, need_power) for one in given]
+    parts = [
+        one.usable(need_power=need_power) if isinstance(one, Ranges) else load_flight(one, need_power=need_power).ranges
+        for one in given
+    ]
     seen: dict[str, str] = {}
     for part in (p for one, p in zip(given, parts, strict=True) if not isinstance(one, Ranges)):
         for name, found in part.recordings:
@@ -166,35 +169,8 @@ def each(data: Data | Iterable[Data]) -> list[Data]:
     return found
 
 
-def _load(data: Data, need_power: bool) -> Ranges:
-    if isinstance(data, Ranges):
-        return data.usable(need_power=need_power)
-    with opened(data) as (name, source):
-        return _read(name, source, need_power=need_power)
-
-
-def _read(name: str, source: Source, *, need_power: bool) -> Ranges:
-    """Return the usable ranges of a source; of an exchange that both ends reported one report counts.
-
-    Raises `BadInputError` for planted values or antenna delays that cannot be read, `UnanswerableError` where no range
-    can be used.
-    """
-    exchanges = single_reports(source.exchanges).exchanges
-    found = Ranges.from_exchanges(
-        exchanges,
-        poses=source.poses,
-        tags=source.tags,
-        planted=planted_of(source, name),
-        source=name,
-        antenna_delays=antenna_delays_of(source, name),
-    )
-    fingerprint = sha256(exchanges.time_ns.tobytes() + exchanges.range_m.tobytes()).hexdigest()[:32]
-    usable = found.usable(_why_no_truth(source), _why_no_power(exchanges), need_power=need_power)
-    return replace(usable, recordings=((name, fingerprint),))
-
-
 def held_open(data: Data) -> AbstractContextManager[Data]:
-    """Return a context in which a file is open, for those who read it more than once; raises what opening it raises."""
+    """Return a context in which a file is open, so that it can be read more than once; raises what opening raises."""
     if isinstance(data, str | os.PathLike):
         return Recording.open(data, memory_mb=256)
     return nullcontext(data)
@@ -296,9 +272,8 @@ class Flight:
 
     def moving_bodies(self) -> list[str]:
         """Return the bodies whose position changes by more than a decimetre."""
-        names = sorted(set(self.poses.body.tolist()))
-        spans = {n: np.ptp(self.poses.position_m[self.poses.body == n], axis=0).max() for n in names}
-        return [name for name in names if spans[name] > 0.1]
+        tracks = {name: self.poses.position_m[self.poses.body == name] for name in np.unique(self.poses.body).tolist()}
+        return [name for name, track in tracks.items() if np.ptp(track, axis=0).max() > 0.1]
 
 
 def require_times(ranges: Ranges) -> None:
@@ -311,6 +286,22 @@ def require_times(ranges: Ranges) -> None:
 
 
 def load_flight(data: Data, *, need_power: bool = True) -> Flight:
-    """Return a recording's ranges with its poses; raises what `load_ranges` raises."""
+    """Return a recording's usable ranges with its poses; of an exchange that both ends reported one report counts.
+
+    Raises what `opened` raises, `BadInputError` for planted values or antenna delays that cannot be read, and
+    `UnanswerableError` where no range can be used.
+    """
     with opened(data) as (name, source):
-        return Flight(_read(name, source, need_power=need_power), source.poses, list(source.tags))
+        exchanges = single_reports(source.exchanges).exchanges
+        found = Ranges.from_exchanges(
+            exchanges,
+            poses=source.poses,
+            tags=source.tags,
+            planted=planted_of(source, name),
+            source=name,
+            antenna_delays=antenna_delays_of(source, name),
+        )
+        fingerprint = sha256(exchanges.time_ns.tobytes() + exchanges.range_m.tobytes()).hexdigest()[:32]
+        usable = found.usable(_why_no_truth(source), _why_no_power(exchanges), need_power=need_power)
+        ranges = replace(usable, recordings=((name, fingerprint),))
+        return Flight(ranges, source.poses, list(source.tags))

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -20,17 +18,15 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described, refuse_free
 from calib.estimator.losses import MIXTURE
 from calib.estimator.range_model import RangeModel
-from calib.estimator.range_rows import Mixture
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
 from calib.fitting.fitting import result_of
 from calib.fitting.result import FitResult
 from calib.settings import FitSettings, FlightSettings
-from calib.trajectories.judging import Judgement, curve_uncertainty, judge_delays
+from calib.trajectories.judging import curve_uncertainty, judge_delays
 from calib.trajectories.scene import Scene, scene_from
-from calib.trajectories.search import Cauchy, Search, search
+from calib.trajectories.search import Search, search
 from calib.trajectories.start import begin
-from uwblink.arrays import Floats
 
 SHARED = (
     "fixed_ns",
@@ -85,8 +81,7 @@ def fit_from_ranges(
     flight, settings, known = _settings(flight, settings, changes)
     report = progress or (lambda _: None)
     scene = scene_from(data, flight, need_power=not settings.delays_only)
-    # One thread: the same bytes on any machine. SciPy has its own linear algebra, which must be loaded to be limited.
-    import_module("scipy.linalg")
+    # One thread: the same bytes on any machine.
     with threadpool_limits(limits=1, user_api="blas"):
         model, scene = range_model(scene, settings, curve=not settings.delays_only and known is None)
         if not settings.minimum_norm:
@@ -94,12 +89,8 @@ def fit_from_ranges(
         scene, state, rival = begin(scene, lambda share: report(SHARE_OF_START * share))
         error = model.ranges.raw_m if known is None else model.ranges.raw_m - known.bias_curve(model.lifted)
         top = search(scene, model, error, state, lambda share: report(SHARE_OF_START + (1 - SHARE_OF_START) * share))
-        found = _described(model, top, known)
-        verdict = judge_delays(found, top)
-        result = _result(found, top, verdict, flight, settings, known, rival)
+        result = _result(_described(model, top, known), top, flight, settings, known, rival)
     report(1.0)
-    if not settings.minimum_norm:
-        _refuse_undetermined(verdict, model, scene)
     return result
 
 
@@ -116,13 +107,17 @@ def _settings(
     for name in settings.changed():
         if name not in SHARED:
             raise BadInputError("goes with known distances only", parameter=name)
-    known = _curve_source(
-        flight.curve_from, "delays_only" if settings.delays_only else "groups" * bool(settings.groups)
-    )
-    if known is not None:
-        reference = known.provenance.get("reference_power_dbm", known.alpha_dbm)
-        settings = replace(settings, lift=known.lift, alpha_dbm=known.alpha_dbm, reference_power_dbm=reference)
-    return flight, settings, known
+    known = given_calibration(flight.curve_from, "curve_from")
+    if known is None:
+        return flight, settings, None
+    if other := "delays_only" if settings.delays_only else "groups" if settings.groups else "":
+        raise BadInputError(f"gives the curve of all tags, and does not go with `{other}`", parameter="curve_from")
+    if known.groups or known.power_at != "exchange":
+        what = "curves of groups of tags" if known.groups else "a curve of each reception"
+        raise BadInputError(f"has {what}, expected one curve of all exchanges", parameter="curve_from")
+    reference = known.provenance.get("reference_power_dbm", known.alpha_dbm)
+    kept = replace(settings, lift=known.lift, alpha_dbm=known.alpha_dbm, reference_power_dbm=reference)
+    return flight, kept, known
 
 
 def range_model(scene: Scene, settings: FitSettings, *, curve: bool, offsets: bool = True) -> tuple[RangeModel, Scene]:
@@ -141,36 +136,17 @@ def _reference_dbm(settings: FitSettings) -> float:
     return settings.alpha_dbm if settings.reference_power_dbm is None else settings.reference_power_dbm
 
 
-def _curve_source(curve_from: Calibration | str | os.PathLike[str] | None, other: str) -> Calibration | None:
-    """Return the calibration whose curve is kept.
-
-    Raises `BadInputError` if it has more than one curve, or if the setting `other` ("" for none) excludes it.
-    """
-    known = given_calibration(curve_from, "curve_from")
-    if known is not None and other:
-        raise BadInputError(f"gives the curve of all tags, and does not go with `{other}`", parameter="curve_from")
-    if known is not None and (known.groups or known.power_at != "exchange"):
-        what = "curves of groups of tags" if known.groups else "a curve of each reception"
-        raise BadInputError(f"has {what}, expected one curve of all exchanges", parameter="curve_from")
-    return known
-
-
 def _described(model: RangeModel, top: Search, known: Calibration | None) -> KnownDistances:
     """Return the fit as one to the estimated distances, whose uncertainty is in its covariance."""
     distances = top.geometry.distances(top.optimum.x)[0]
     model = replace(model, ranges=replace(model.ranges, truth_m=distances))
-    errors = top.rows.errors
-    if isinstance(errors, Cauchy):
-        scale = errors.scale_m
-    else:
-        scale = float(np.median(np.exp(top.rows.values(top.optimum.x)["noise"])))
     fitted = Fitted(
         rows=top.rows,
         gauge=top.gauge,
         optimum=top.optimum,
         residuals=top.rows.residuals(top.optimum.x),
-        loss=MIXTURE if isinstance(errors, Mixture) else "cauchy",
-        scale_m=scale,
+        loss=MIXTURE,
+        scale_m=float(np.median(np.exp(top.rows.values(top.optimum.x)["noise"]))),
         steps=top.steps,
         beside=tuple(top.known.values()),
     )
@@ -185,92 +161,68 @@ def _described(model: RangeModel, top: Search, known: Calibration | None) -> Kno
 def _result(
     found: KnownDistances,
     top: Search,
-    judgement: Judgement,
     flight: FlightSettings,
     settings: FitSettings,
     known: Calibration | None,
     rival: str,
 ) -> FitResult:
-    fixed = dict(settings.fixed_ns)
-    refuse_refuted(
-        dict(zip(found.model.tags, found.delays.tolist(), strict=False)), found.residuals, found.model.ranges
-    )
-    covariance_ns2, findings = examine_fit(found)
-    covariance = judgement.widened(covariance_ns2)
+    """Return the result of a fit; raises `UnanswerableError` where no delay is determined, without `minimum_norm`."""
+    fixed, model, scene = dict(settings.fixed_ns), found.model, top.motion.scene
+    refuse_refuted(dict(zip(model.tags, found.delays.tolist(), strict=False)), found.residuals, model.ranges)
+    judgement = judge_delays(found, top)
+    covariance, findings = examine_fit(found)
+    covariance = judgement.variance_factor * covariance
+    free, left_open = judgement.free_tags, ""
+    if free and len(free) == len(judgement.tags) and not settings.minimum_norm:
+        raise UnanswerableError(
+            f"{scene.source}: {judgement.undetermined_text(covariance)}; let positions be known for some seconds "
+            "(`poses_until_s`), give the places of anchors, or pin a delay with `fixed_ns` (`minimum_norm` fits "
+            "regardless, and says so)",
+            undetermined=[free],
+        )
+    undetermined = found.free
+    # Delays that the pairs leave free are held at the smallest values, so that their covariance says nothing of them.
+    if not {tag for group in found.free for tag in group}.issuperset(free):
+        left_open, undetermined = judgement.undetermined_text(covariance), [free]
     calibration = calibration_of(found, covariance)
     if known is not None:
         calibration = _with_curve(calibration, known)
+    provenance = _provenance(found, top, flight, settings) | {"distance_std_m": judgement.distance_std_m}
+    provenance |= {"undetermined": undetermined} if undetermined else {}
+    provenance |= {"left_open": left_open} if left_open else {}
     calibration = replace(
         calibration,
-        delays_std_ns=calibration.delays_std_ns | dict.fromkeys(judgement.free_tags, math.inf),
-        provenance=_provenance(found, top, judgement, flight, settings, covariance),
+        delays_std_ns=calibration.delays_std_ns | dict.fromkeys(free, math.inf),
+        provenance=provenance,
     )
+    unsettled = f"the fit stopped after {top.steps} steps before it settled: delays are not final"
+    notes = [left_open, "" if top.optimum.success else unsettled, rival, *scene.tapes.left_out]
     return result_of(
         found,
         calibration,
-        found.model.ranges,
+        model.ranges,
         findings,
         settings=settings,
         fixed=fixed,
-        first=[*_left_open(found, judgement, covariance), *_of_search(top, rival), *top.motion.scene.tapes.left_out],
+        first=[note for note in notes if note],
         more=judgement.sentences,
     )
 
 
 def _with_curve(calibration: Calibration, known: Calibration) -> Calibration:
     """Return a calibration with the curve of another one and the covariance of that curve."""
-    uncertainty = calibration.uncertainty
+    uncertainty, size = calibration.uncertainty, len(known.bias_curve.coefficients)
     if uncertainty is not None:
-        size = len(known.bias_curve.coefficients)
-        of_curve = known.uncertainty.bias_m2 if known.uncertainty else tuple((0.0,) * size for _ in range(size))
+        of_curve = known.uncertainty.bias_m2 if known.uncertainty else ((0.0,) * size,) * size
         uncertainty = replace(uncertainty, bias_m2=of_curve)
     return replace(calibration, bias_curve=known.bias_curve, uncertainty=uncertainty)
 
 
-def _left_open(found: KnownDistances, judgement: Judgement, covariance: Floats) -> list[str]:
-    """Return a sentence on delays that trajectories leave open, beyond those that the pairs leave free.
-
-    The latter are held at the smallest values, so that their covariance says nothing of them.
-    """
-    free = {tag for group in found.free for tag in group}
-    return [] if free.issuperset(judgement.free_tags) else judgement.undetermined_sentences(covariance)
-
-
-def _of_search(top: Search, rival: str) -> Iterator[str]:
-    if not top.optimum.success:
-        yield f"the fit stopped after {top.steps} steps before it settled: delays are not final"
-    if rival:
-        yield rival
-
-
-def _refuse_undetermined(judgement: Judgement, model: RangeModel, scene: Scene) -> None:
-    free = judgement.free_tags
-    if not free or len(free) < len([tag for tag in model.tags if tag in judgement.tags]):
-        return
-    raise UnanswerableError(
-        f"{scene.source}: {judgement.undetermined_text}; let positions be known for some seconds (`poses_until_s`), "
-        "give the places of anchors, or pin a delay with `fixed_ns` (`minimum_norm` fits regardless, and says so)",
-        undetermined=[free],
-    )
-
-
-def _provenance(
-    found: KnownDistances,
-    top: Search,
-    judgement: Judgement,
-    flight: FlightSettings,
-    settings: FitSettings,
-    covariance: Floats,
-) -> dict[str, Any]:
+def _provenance(found: KnownDistances, top: Search, flight: FlightSettings, settings: FitSettings) -> dict[str, Any]:
     """Return the provenance that only fits of trajectories have."""
     scene, places_s, reference_dbm = top.motion.scene, top.motion.scene.places.time_s, _reference_dbm(settings)
-    more: dict[str, Any] = {}
-    if left_open := _left_open(found, judgement, covariance):
-        more = {"undetermined": [judgement.free_tags], "left_open": left_open[0]}
-    elif found.free:
-        more = {"undetermined": found.free}
     pinned = set(found.model.tags) <= set(settings.fixed_ns)
-    return more | {
+    return {
         "recordings": [scene.source],
         "recipe": "trajectories",
         "truth": "ranges",
@@ -285,7 +237,6 @@ def _provenance(
             "distances": len(scene.tapes.stated),
             "heights": sorted({scene.moving[body] for body in scene.heights.body.tolist()}),
         },
-        "distance_std_m": judgement.distance_std_m,
         "reference_power_dbm": reference_dbm,
         "gauge": f"the bias curve{' was kept, and' if flight.curve_from else ''} is zero at {reference_dbm:g} dBm; the "
         "delays carry the constant",

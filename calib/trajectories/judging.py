@@ -17,8 +17,8 @@ from calib.estimator.rows import sum_rows
 from calib.estimator.unknowns import Layout
 from calib.information import Unknown, Verdict, judge
 from calib.spread import TWO_SIDED_95
-from calib.trajectories.motion import TapeRows
-from calib.trajectories.search import MOTION, Search
+from calib.trajectories.motion import MOTION, TapeRows
+from calib.trajectories.search import Search
 from uwblink.arrays import Floats, Ints
 
 PRIOR_NS = 2.0
@@ -37,9 +37,6 @@ GEOMETRY_ALONE_FACTOR = 3.0
 """Factor on standard errors where only geometry determines distances: there the problem is not linear, and errors up to
 4.2 linearised standard errors were observed (docs/accuracy.md)."""
 
-SAMPLED_RANGES = 400
-"""Ranges whose distances give `distance_std_m`."""
-
 TAPE_UNCHECKED, TAPE_MIN_DEVIATION, TAPE_MIN_ERROR_M = 0.999, 4.0, 0.03
 """A tape that no range checks (leverage above the first) is not tested. Others contradict the fit if their deleted
 residual exceeds so many standard errors and so many metres."""
@@ -47,16 +44,17 @@ residual exceeds so many standard errors and so many metres."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judgement:
-    """The verdict on the delays of `tags` that are not pinned; `covariance_ns2` (tags, tags) is their covariance.
+    """The verdict on the delays of `tags` that are not pinned, which are those number `own` (k,) of all tags.
 
-    `distance_std_m` is the root mean square standard error of the distances. `sentences` name contradictions.
+    `variance_factor` inflates covariances where only geometry determines distances. `distance_std_m` is the root mean
+    square standard error of the distances. `sentences` name contradictions.
     """
 
     tags: tuple[int, ...]
+    own: Ints
     verdict: Verdict
-    covariance_ns2: Floats
+    variance_factor: float
     distance_std_m: float
-    by_geometry_alone: bool
     sentences: tuple[str, ...]
 
     @property
@@ -64,54 +62,42 @@ class Judgement:
         """Return the tags whose delays are not determined."""
         return [int(tag) for tag in self.verdict.named("delay") if tag]
 
-    @property
-    def undetermined_text(self) -> str:
-        """Return a sentence on the delays that are not determined, "" if all are."""
-        return "".join(self.undetermined_sentences(self.covariance_ns2))
-
-    def widened(self, covariance: Floats) -> Floats:
-        """Return a covariance of delays, inflated where only geometry determines distances."""
-        return covariance * GEOMETRY_ALONE_FACTOR**2 if self.by_geometry_alone else covariance
-
-    def undetermined_sentences(self, covariance_ns2: Floats) -> list[str]:
-        """Return a sentence on the delays that are not determined; none if all are. `covariance_ns2` is by tag."""
-        free = self.free_tags
-        if not free:
-            return []
+    def undetermined_text(self, covariance_ns2: Floats) -> str:
+        """Return a sentence on the delays that are not determined; `covariance_ns2` is that of all tags."""
+        free, own = self.free_tags, covariance_ns2[np.ix_(self.own, self.own)]
         if len(free) < len(self.tags):
-            known = np.sqrt([covariance_ns2[k, k] for k, tag in enumerate(self.tags) if tag in free])
-            return [
+            worst = np.sqrt(np.max(np.diag(own)[np.isin(self.tags, free)]))
+            return (
                 f"the ranges do not determine the delays of tags {', '.join(map(str, free))}: known to ± "
-                f"{TWO_SIDED_95 * float(known.max()):.2f} ns (95 %) at worst"
-            ]
-        count = len(self.tags)
+                f"{TWO_SIDED_95 * float(worst):.2f} ns (95 %) at worst"
+            )
+        count = len(own)
         rows = np.full((1, count), 1 / count), np.eye(count)[1:] - np.eye(count)[0]
-        spread, differences = (
-            TWO_SIDED_95 * float(np.sqrt(np.max(np.diag(row @ covariance_ns2[:count, :count] @ row.T)))) for row in rows
-        )
-        return [
+        spread, differences = (TWO_SIDED_95 * float(np.sqrt(np.max(np.diag(row @ own @ row.T)))) for row in rows)
+        return (
             f"the ranges determine no delay: what all have in common is known to ± {spread:.2f} ns (95 %), and "
             f"differences to ± {differences:.2f} ns"
-        ]
+        )
 
 
 def judge_delays(found: KnownDistances, top: Search) -> Judgement:
     """Return the verdict on the delays of a fit, and contradictions to its trajectories."""
     layout, optimum = top.optimum.layout, top.optimum
-    where = layout.where["delay"]
-    own = np.intersect1d(np.arange(where.start, where.stop), layout.free())
-    tags = tuple(int(layout.blocks[0].names[k - where.start]) for k in own)
-    some = np.ix_(own - where.start, own - where.start)
-    by_geometry_alone = top.motion.scene.by_geometry_alone
-    covariance = found.covariances["delay"][some] * (GEOMETRY_ALONE_FACTOR**2 if by_geometry_alone else 1.0)
+    unpinned = np.intersect1d(layout.indices(["delay"]), layout.free())
+    own = unpinned - layout.where["delay"].start
+    tags = tuple(found.model.tags[k] for k in own)
+    factor = GEOMETRY_ALONE_FACTOR**2 if top.motion.scene.by_geometry_alone else 1.0
     information = sum_rows([top.rows, *top.gauge], optimum.x).information + optimum.priors.precision()
-    with_truth = with_known_distances(information, layout, own)
+    with_truth = with_known_distances(information, layout, unpinned)
+    # The distances of 400 ranges give their root mean square standard error.
+    some = np.unique(np.linspace(0, len(top.rows) - 1, 400).astype(np.int64))
+    moved = top.geometry.derivatives(optimum.x, some)
     return Judgement(
         tags=tags,
-        verdict=verdict_on(covariance, with_truth, tags),
-        covariance_ns2=covariance,
-        distance_std_m=_distance_std(top),
-        by_geometry_alone=by_geometry_alone,
+        own=own,
+        verdict=verdict_on(factor * found.covariances["delay"][np.ix_(own, own)], with_truth, tags),
+        variance_factor=factor,
+        distance_std_m=float(np.sqrt(np.mean(np.einsum("kp,pk->k", moved, optimum.covariance @ moved.T)))),
         sentences=(*_of_motion(top), *_of_tapes(top)),
     )
 
@@ -138,46 +124,36 @@ def verdict_on(covariance: Floats, with_truth: Floats, tags: Sequence[int]) -> V
     return judge((information + information.T) / 2, unknowns, loosest=LOOSEST)
 
 
-def _distance_std(top: Search) -> float:
-    """Return the root mean square of the standard errors of some distances."""
-    some = np.unique(np.linspace(0, len(top.rows) - 1, SAMPLED_RANGES).astype(np.int64))
-    moved, columns = top.geometry.distances(top.optimum.x, some)[1], top.geometry.columns[some]
-    rows = np.zeros((len(some), top.optimum.layout.size))
-    np.add.at(rows, (np.arange(len(some))[:, None], columns), moved)
-    return float(np.sqrt(np.mean(np.einsum("kp,pk->k", rows, top.optimum.covariance @ rows.T))))
-
-
 def _of_motion(top: Search) -> Iterator[str]:
-    missed = top.coarseness()
-    if missed.shows:
+    missed_m = top.missed_motion_m()
+    if missed_m:
         yield (
             f"bodies move faster than control points every {top.motion.places.step_s:.1f} s follow: about "
-            f"{100 * missed.motion_m:.0f} cm of their motion is not in the trajectories, and distances are off "
+            f"{100 * missed_m:.0f} cm of their motion is not in the trajectories, and distances are off "
             "by it; fly more calmly"
         )
 
 
 def _of_tapes(top: Search) -> Iterator[str]:
     """Yield a sentence for each tape that the ranges contradict, by deleted residuals (Cook and Weisberg 1982)."""
-    rows = top.known.get("tape")
+    rows, x = top.known.get("tape"), top.optimum.x
     if not isinstance(rows, TapeRows):
         return
-    left, moved = rows.residuals(top.optimum.x), rows.geometry.distances(top.optimum.x)[1]
-    for number, one in enumerate(top.motion.scene.tapes.stated):
-        mine = np.flatnonzero(top.motion.scene.tapes.number == number)
-        row = np.zeros(top.optimum.layout.size)
-        np.add.at(row, rows.geometry.columns[mine], moved[mine] / len(mine))
-        share = min(float(row @ (top.optimum.covariance @ row)) / one.sigma_m**2, 1.0)
-        off = -float(left[mine].mean())
-        if share > TAPE_UNCHECKED or abs(off) < TAPE_MIN_DEVIATION * one.sigma_m * math.sqrt(1 - share):
+    left, tapes = rows.left(x), top.motion.scene.tapes
+    for number, one in enumerate(tapes.stated):
+        mine = np.flatnonzero(tapes.number == number)
+        moved = rows.geometry.derivatives(x, mine).mean(axis=0)
+        share = min(float(moved @ (top.optimum.covariance @ moved)) / one.sigma_m**2, 1.0)
+        if share > TAPE_UNCHECKED:
             continue
-        if abs(off) < TAPE_MIN_ERROR_M * (1 - share):
+        without = float(left[mine].mean()) / (1 - share)
+        deviation = abs(without) * math.sqrt(1 - share) / one.sigma_m
+        if deviation < TAPE_MIN_DEVIATION or abs(without) < TAPE_MIN_ERROR_M:
             continue
-        deviation, without = off / (one.sigma_m * math.sqrt(1 - share)), -off / (1 - share)
         way = "more" if without > 0 else "less"
         yield (
             f"the distance of tags {one.first} and {one.second}, {one.distance_m:.3f} m, is {100 * abs(without):.0f} "
-            f"cm {way} than all else says ({abs(deviation):.0f} standard errors): measure it again"
+            f"cm {way} than all else says ({deviation:.0f} standard errors): measure it again"
         )
 
 
@@ -190,11 +166,8 @@ def curve_uncertainty(found: KnownDistances, known: Calibration) -> Floats:
     low, high = known.bias_curve.range
     splines = basis(np.clip(model.lifted, low, high), np.array(known.bias_curve.knots))[rows.order]
     # Derivatives of the unknowns by an error of each range: covariance times information.
-    linked, at = np.zeros((optimum.layout.size, splines.shape[1])), 0
-    for terms in rows.terms(optimum.x):
-        score = np.asarray(terms.score)
-        here = slice(at, at + len(score))
-        linked += terms.as_matrix(terms.slopes, optimum.layout.size).T @ (score[:, None] * splines[here])
-        at = here.stop
+    pieces = list(rows.terms(optimum.x))
+    slopes = sparse.vstack([terms.as_matrix(terms.slopes, optimum.layout.size) for terms in pieces])
+    linked = slopes.T @ (np.concatenate([np.asarray(terms.score) for terms in pieces])[:, None] * splines)
     reach = (optimum.covariance @ linked)[optimum.layout.where["delay"]]
     return np.asarray(reach @ np.array(known.uncertainty.bias_m2) @ reach.T)

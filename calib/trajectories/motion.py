@@ -7,16 +7,18 @@ beside ranges.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
+from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from calib.estimator.rows import NormalRows, Terms, normal_terms
 from calib.estimator.unknowns import Layout, Prior, Unknown
-from calib.trajectories.scene import Ends, Scene, ends_of
+from calib.trajectories.attitudes import GRAVITY_M_S2, WINDOW_S
+from calib.trajectories.scene import Scene
 from uwblink.arrays import Floats, Ints
 
 POINT_S = 0.4
@@ -25,12 +27,13 @@ POINT_S = 0.4
 TURN_S = 1.0
 """Time between points of the errors of attitudes."""
 
-GRAVITY_M_S2 = 9.81
+MOTION = ("path", "turn", "stand", "bias", "level")
+"""Kinds of unknowns of motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """`count` control points, the first at `start_s`, the next every `step_s` seconds."""
+    """`count` control points of uniform B-splines, the first at `start_s`, the next every `step_s` seconds."""
 
     start_s: float
     step_s: float
@@ -41,42 +44,35 @@ class Grid:
         """Return the times (count,) at which control points have their greatest weight."""
         return np.asarray(self.start_s + self.step_s * np.arange(self.count), dtype=np.float64)
 
-    def piece(self, time_s: Floats, low: int, high: int) -> tuple[Ints, Floats]:
-        """Return the segment of each instant and the position inside it; the first and last segments are extended."""
-        place = (time_s - self.start_s) / self.step_s
-        first = np.clip(np.floor(place).astype(np.int64), low, self.count - high)
-        return first, place - first
+    def splines(self, time_s: Floats, degree: int = 3) -> tuple[Ints, Floats]:
+        """Return the control points (n, degree + 1) and weights (n, degree + 1) at instants (n,).
 
-    def cubic(self, time_s: Floats, derivative: int = 0) -> tuple[Ints, Floats]:
-        """Return the control points (n, 4) and weights (n, 4) of the cubic B-spline, or of its first derivative."""
-        first, x = self.piece(time_s, 1, 3)
-        if derivative:
-            share = np.column_stack([-((1 - x) ** 2), 3 * x**2 - 4 * x, -3 * x**2 + 2 * x + 1, x**2]) / 2 / self.step_s
-        else:
-            share = np.column_stack([(1 - x) ** 3, 3 * x**3 - 6 * x**2 + 4, -3 * x**3 + 3 * x**2 + 3 * x + 1, x**3]) / 6
-        return first[:, None] - 1 + np.arange(4), share
+        The first and last segments are extended.
+        """
+        knots = self.start_s + self.step_s * (np.arange(self.count + degree + 1) - (degree + 1) / 2)
+        found = BSpline.design_matrix(time_s, knots, degree, extrapolate=True)
+        shape = (len(time_s), degree + 1)
+        return found.indices.reshape(shape).astype(np.int64), found.data.reshape(shape)
 
-    def straight(self, time_s: Floats) -> tuple[Ints, Floats]:
-        """Return the control points (n, 2) and weights (n, 2) of linear interpolation."""
-        first, x = self.piece(time_s, 0, 2)
-        return first[:, None] + np.arange(2), np.column_stack([1 - x, x])
+    def velocities(self, time_s: Floats) -> tuple[Ints, Floats]:
+        """Return the control points (n, 4) and weights (n, 4) of the derivative of cubic B-splines."""
+        # The derivative has differences of control points, over the step, as points of quadratic B-splines.
+        first, share = Grid(self.start_s + self.step_s / 2, self.step_s, self.count - 1).splines(time_s, 2)
+        return first[:, :1] + np.arange(4), -np.diff(np.pad(share, ((0, 0), (1, 1)))) / self.step_s
 
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
     """The layout of the unknowns of motion.
 
-    Kinds are "path" (points, moving, 3), "turn" (points, turning, 3), "stand" (sought, 3), "bias" (sensed, 3) of
-    accelerometers and "level" (levelled,) of height sensors. `turning`, `sensed` and `levelled` are numbers of moving
-    bodies.
+    Kinds are "path" (points, moving, 3), "turn" (points, turning, 3), "stand" (1, sought, 3), "bias" (1, sensed, 3) of
+    accelerometers and "level" (1, levelled, 1) of height sensors; `bodies` names the bodies of each.
     """
 
     scene: Scene
     places: Grid
     turns: Grid
-    turning: tuple[int, ...]
-    sensed: tuple[int, ...]
-    levelled: tuple[int, ...]
+    bodies: Mapping[str, Sequence[str]]
 
     @classmethod
     def of(cls, scene: Scene, point_s: float = POINT_S) -> Motion:
@@ -84,68 +80,66 @@ class Motion:
         # At multiples of the interval, so that parts of a scene have the control points of the whole.
         begin = float(np.floor(scene.time_s[0] / TURN_S) * TURN_S)
         length = float(scene.time_s[-1]) - begin
-        names = list(enumerate(scene.moving))
         return cls(
             scene=scene,
             places=Grid(begin - point_s, point_s, max(int(np.ceil(length / point_s)), 1) + 3),
             turns=Grid(begin, TURN_S, max(int(np.ceil(length / TURN_S)), 1) + 1),
-            turning=tuple(k for k, body in names if body in scene.attitudes and not scene.attitudes[body].exact),
-            sensed=tuple(k for k, body in names if body in scene.inertial),
-            levelled=tuple(k for k, _ in names if k in scene.heights.body),
+            bodies={
+                "path": scene.moving,
+                "turn": [body for body, known in scene.attitudes.items() if not known.exact],
+                "stand": scene.sought,
+                "bias": list(scene.inertial),
+                "level": [scene.moving[k] for k in np.unique(scene.heights.body)],
+            },
         )
 
     def unknowns(self, start: Mapping[str, Floats], jerk_m_s3: float) -> tuple[Unknown, ...]:
         """Return the blocks of unknowns at `start`, or at zero. The variance of jerk is estimated, starting at
         `jerk_m_s3`."""
-        scene, count, moving = self.scene, self.places.count, len(self.scene.moving)
-        third = sparse.diags([-1.0, 3.0, -3.0, 1.0], [0, 1, 2, 3], shape=(count - 3, count)) / self.places.step_s**3
-        each = sparse.kron(third, sparse.eye(3 * moving), format="csc")
-        smooth = Prior(
-            weight=jerk_m_s3**-2,
-            structure=sparse.csc_matrix(each.T @ each),
-            rows=each.shape[0],
-            bounds=(MOST_JERK**-2, LEAST_JERK**-2),
-        )
-        here = start.get("path", np.zeros(3 * moving * count)).ravel()
-        calm = np.full(moving, CALM_M_S2)
-        calm[list(self.sensed)] = CALM_SENSED_M_S2
-        held = [(2, calm * self.places.step_s**2), (1, np.full(moving, SLOW_M_S * self.places.step_s))]
-        path = tuple(_differences(count, order, np.repeat(std, 3)) for order, std in held)
-        attitudes = [scene.attitudes[scene.moving[k]] for k in self.turning]
+        scene, count, step_s = self.scene, self.places.count, self.places.step_s
+        calm = np.array([CALM_SENSED_M_S2 if body in scene.inertial else CALM_M_S2 for body in scene.moving])
+        jerk = _differences(count, 3, np.full(3 * len(scene.moving), step_s**3))
+        attitudes = [scene.attitudes[body] for body in self.bodies["turn"]]
         # Unknown components have an infinite standard deviation: zero information.
-        wander = np.ravel([attitude.wander_rad * np.sqrt(self.turns.step_s) for attitude in attitudes])
-        turn = [(0, np.ravel([attitude.std_rad for attitude in attitudes])), (1, wander)]
-        turns = tuple(_differences(self.turns.count, order, std) for order, std in turn)
-        blocks = [
-            ("path", (count, scene.moving, 3), (smooth, Prior.of_deviation(FAR_M, here), *path)),
-            ("turn", (self.turns.count, [scene.moving[k] for k in self.turning], 3), turns),
-            ("stand", (1, scene.sought, 3), (Prior.of_deviation(STANDS_M),)),
-            ("bias", (1, [scene.moving[k] for k in self.sensed], 3), (Prior.of_deviation(BIAS_M_S2),)),
-            ("level", (1, [scene.moving[k] for k in self.levelled], 1), (Prior.of_deviation(LEVEL_M),)),
-        ]
+        std = np.ravel([attitude.std_rad for attitude in attitudes])
+        wander = np.ravel([attitude.wander_rad * np.sqrt(TURN_S) for attitude in attitudes])
+        blocks = {
+            "path": (
+                count,
+                [
+                    replace(jerk, weight=jerk_m_s3**-2, bounds=(MOST_JERK**-2, LEAST_JERK**-2)),
+                    Prior.of_deviation(FAR_M, start["path"].ravel() if "path" in start else 0.0),
+                    _differences(count, 2, np.repeat(calm * step_s**2, 3)),
+                    _differences(count, 1, np.full(3 * len(scene.moving), SLOW_M_S * step_s)),
+                ],
+            ),
+            "turn": (
+                self.turns.count,
+                [_differences(self.turns.count, k, one) for k, one in enumerate((std, wander))],
+            ),
+            "stand": (1, [Prior.of_deviation(STANDS_M)]),
+            "bias": (1, [Prior.of_deviation(BIAS_M_S2)]),
+            "level": (1, [Prior.of_deviation(LEVEL_M)]),
+        }
         found = []
-        for kind, (several, bodies, axes), priors in blocks:
-            names = tuple(body for _ in range(several) for body in bodies for _ in range(axes))
-            values = start.get(kind, np.zeros(len(names))).ravel()
+        for kind, (points, priors) in blocks.items():
+            names = tuple(np.repeat(self.bodies[kind], _axes(kind)).tolist()) * points
             if names:
-                found.append(Unknown(kind=kind, names=names, start=values, priors=priors))
+                values = np.ravel(start.get(kind, np.zeros(len(names))))
+                found.append(Unknown(kind=kind, names=names, start=values, priors=tuple(priors)))
         return tuple(found)
 
     def numbers(self, layout: Layout, kind: str) -> Ints:
         """Return the indices (points, bodies, axes) of a kind into all unknowns."""
-        bodies = {"path": len(self.scene.moving), "turn": len(self.turning), "stand": len(self.scene.sought)}
-        bodies |= {"bias": len(self.sensed), "level": len(self.levelled)}
-        where = layout.where.get(kind, slice(0, 0))
-        return np.arange(where.start, where.stop).reshape(-1, max(bodies[kind], 1), 1 if kind == "level" else 3)
+        return layout.indices([kind]).reshape(-1, max(len(self.bodies[kind]), 1), _axes(kind))
 
     def state(self, layout: Layout, x: Floats) -> dict[str, Floats]:
         """Return the unknowns of motion by kind, in their shapes."""
-        kinds = ("path", "turn", "stand", "bias", "level")
-        return {kind: x[self.numbers(layout, kind)] for kind in kinds if kind in layout.where}
+        return {kind: x[self.numbers(layout, kind)] for kind in MOTION if kind in layout.where}
 
     def positions(self, path: Floats, time_s: Floats) -> Floats:
         """Return the positions (k, bodies, 3) of the moving bodies at instants (k,)."""
-        point, share = self.places.cubic(time_s)
+        point, share = self.places.splines(time_s)
         return np.asarray(np.einsum("kp,kpba->kba", share, path.reshape(self.places.count, -1, 3)[point]))
 
     def refined(self, start: Mapping[str, Floats]) -> tuple[Motion, dict[str, Floats]]:
@@ -155,24 +149,66 @@ class Motion:
         """
         finer = Motion.of(self.scene, self.places.step_s / 2)
         points = start["path"].reshape(self.places.count, -1, 3)
-        whole = np.concatenate([2 * points[:1] - points[1:2], points, 2 * points[-1:] - points[-2:-1]])
-        place = np.rint(2 * (finer.places.times_s - self.places.start_s) / self.places.step_s).astype(np.int64)
-        near = np.clip(place // 2 + 1, 1, len(whole) - 2)
-        onto = (whole[near - 1] + 6 * whole[near] + whole[near + 1]) / 8
-        between = (whole[near] + whole[near + 1]) / 2
-        return finer, dict(start) | {"path": np.where((place % 2 == 1)[:, None, None], between, onto)}
+        found = np.empty((2 * len(points) - 3, *points.shape[1:]))
+        found[::2] = (points[:-1] + points[1:]) / 2
+        found[1::2] = (points[:-2] + 6 * points[1:-1] + points[2:]) / 8
+        return finer, {**start, "path": found[: finer.places.count]}
+
+
+def _axes(kind: str) -> int:
+    return 1 if kind == "level" else 3
 
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """One end of each distance: columns (n, k, 3) and weights (n, k) of the unknowns of its position and attitude."""
+    """One end of each distance (n,): where its antenna is as a function of the unknowns.
 
-    ends: Ends
+    `mover` is the number of the moving body, -1 for another one. Of a moving body, `place` (n, 4, 3) are the control
+    points of its path with weights `place_share` (n, 4), and `arm_m` (n, 3) is the lever arm by the given attitude,
+    whose errors are `turn` (n, 2, 3) with weights `turn_share` (n, 2). Of a standing body, `base_m` (n, 3) is the
+    antenna's position, or its offset from the sought position, the one entry of `place`. -1 is no unknown.
+    """
+
+    mover: Ints
+    base_m: Floats
+    arm_m: Floats
     place: Ints
     place_share: Floats
     turn: Ints
     turn_share: Floats
-    stand: Ints
+
+    @classmethod
+    def of(cls, motion: Motion, layout: Layout, ids: Ints, time_s: Floats) -> Side:
+        """Return the ends of tags `ids` (n,) at instants (n,)."""
+        scene, turning, count = motion.scene, motion.bodies["turn"], len(ids)
+        path, turn, stand = (motion.numbers(layout, kind) for kind in ("path", "turn", "stand"))
+        (point, share), (bend, part) = motion.places.splines(time_s), motion.turns.splines(time_s, 1)
+        found = cls(
+            mover=np.full(count, -1),
+            base_m=np.zeros((count, 3)),
+            arm_m=np.zeros((count, 3)),
+            place=np.full((count, 4, 3), -1),
+            place_share=np.zeros((count, 4)),
+            turn=np.full((count, 2 if turning else 0, 3), -1),
+            turn_share=np.zeros((count, 2 if turning else 0)),
+        )
+        for tag, (body, arm) in scene.arms.items():
+            rows = np.flatnonzero(ids == tag)
+            if body in scene.moving:
+                number = scene.moving.index(body)
+                found.mover[rows] = number
+                found.place[rows], found.place_share[rows] = path[point[rows], number], share[rows]
+                if body in scene.attitudes:
+                    found.arm_m[rows] = scene.attitudes[body].at(time_s[rows]).apply(arm)
+                if body in turning:
+                    found.turn[rows] = turn[bend[rows], turning.index(body)]
+                    found.turn_share[rows] = part[rows]
+            else:
+                place = scene.still[body]
+                found.base_m[rows] = arm if place is None else place + arm
+                if place is None:
+                    found.place[rows, 0], found.place_share[rows, 0] = stand[0, scene.sought.index(body)], 1.0
+        return found
 
 
 @dataclass(frozen=True)
@@ -185,51 +221,21 @@ class Distances:
     @classmethod
     def of(cls, motion: Motion, layout: Layout, ids: tuple[Ints, Ints], time_s: Floats) -> Distances:
         """Return the distances of tags `ids` (n,) each at instants (n,)."""
-        path, turn, stand = (motion.numbers(layout, kind) for kind in ("path", "turn", "stand"))
-        (point, share), (bend, part) = motion.places.cubic(time_s), motion.turns.straight(time_s)
-        turning = np.full(len(motion.scene.moving) + 1, -1)
-        turning[list(motion.turning)] = np.arange(len(motion.turning))
-        sides = []
-        for some in ids:
-            ends = ends_of(motion.scene, some, time_s)
-            moves, turns, stands = ends.mover >= 0, turning[ends.mover] >= 0, ends.stander >= 0
-            nowhere = np.full((1, 1, 1), -1)
-            sides.append(
-                Side(
-                    ends,
-                    np.where(moves[:, None, None], path[point, ends.mover[:, None]], nowhere),
-                    np.where(moves[:, None], share, 0.0),
-                    np.where(turns[:, None, None], turn[bend, turning[ends.mover][:, None]], nowhere)
-                    if turn.size
-                    else np.zeros((len(some), 0, 3), dtype=np.int64),
-                    np.where(turns[:, None], part, 0.0) if turn.size else np.zeros((len(some), 0)),
-                    np.where(stands[:, None], stand[0, ends.stander], -1)
-                    if stand.size
-                    else np.zeros((len(some), 0), dtype=np.int64),
-                )
-            )
-        count = len(time_s)
-        columns = np.concatenate(
-            [part.reshape(count, -1) for side in sides for part in (side.place, side.turn, side.stand)], axis=1
-        )
+        first, second = (Side.of(motion, layout, some, time_s) for some in ids)
+        blocks = [part.reshape(len(time_s), -1) for side in (first, second) for part in (side.place, side.turn)]
+        columns = np.concatenate(blocks, axis=1)
         # Where an end does not depend on an unknown, its entry is zero in a column that the other end uses.
         # Between anchors at given positions no entry is used, and any column is valid.
-        return cls((sides[0], sides[1]), np.maximum(np.where(columns < 0, columns.max(axis=1)[:, None], columns), 0))
+        return cls((first, second), np.maximum(np.where(columns < 0, columns.max(axis=1)[:, None], columns), 0))
 
     def antennas(self, x: Floats, rows: Ints | slice = slice(None)) -> tuple[Floats, Floats, Floats, Floats]:
         """Return the antennas of both ends (n, 3), and their lever arms in the world's axes (n, 3)."""
         found = []
         for side in self.sides:
             place = np.einsum("nk,nka->na", side.place_share[rows], x[side.place[rows]])
-            arm = side.ends.arm_m[rows]
-            if side.turn.shape[1]:
-                arm = Rotation.from_rotvec(np.einsum("nk,nka->na", side.turn_share[rows], x[side.turn[rows]])).apply(
-                    arm
-                )
-            stand = np.zeros_like(place)
-            if side.stand.shape[1]:
-                stand = np.where(side.ends.stander[rows, None] >= 0, x[side.stand[rows]], 0.0)
-            found += [side.ends.base_m[rows] + stand + place + arm, arm]
+            turn = np.einsum("nk,nka->na", side.turn_share[rows], x[side.turn[rows]])
+            arm = Rotation.from_rotvec(turn).apply(side.arm_m[rows])
+            found += [side.base_m[rows] + place + arm, arm]
         return found[0], found[2], found[1], found[3]
 
     def distances(self, x: Floats, rows: Ints | slice = slice(None)) -> tuple[Floats, Floats]:
@@ -244,9 +250,13 @@ class Distances:
             # By a turn t the arm a moves by t x a, and u (t x a) = t (a x u).
             parts.append(side.place_share[rows][:, :, None] * pull[:, None, :])
             parts.append(side.turn_share[rows][:, :, None] * np.cross(arm, pull)[:, None, :])
-            if side.stand.shape[1]:
-                parts.append(np.where(side.ends.stander[rows, None] >= 0, pull, 0.0))
         return distance, np.concatenate([part.reshape(len(away), -1) for part in parts], axis=1)
+
+    def derivatives(self, x: Floats, rows: Ints) -> Floats:
+        """Return the derivatives (m, p) of some distances by all unknowns (p,)."""
+        found = np.zeros((len(rows), len(x)))
+        np.add.at(found, (np.arange(len(rows))[:, None], self.columns[rows]), self.distances(x, rows)[1])
+        return found
 
 
 @dataclass(frozen=True)
@@ -257,7 +267,7 @@ class TapeRows:
     measured_m: Floats
     std_m: Floats
 
-    def residuals(self, x: Floats) -> Floats:
+    def left(self, x: Floats) -> Floats:
         """Return taped less estimated distances (n,)."""
         return self.measured_m - self.geometry.distances(x)[0]
 
@@ -274,6 +284,8 @@ FAR_M = 30.0
 """Prior standard deviation of a control point around its initial guess: it holds points without any range."""
 
 STANDS_M = 100.0
+"""Prior standard deviation of the position of a standing body: any hall."""
+
 BIAS_M_S2 = 0.4
 """Prior standard deviation of an accelerometer's bias."""
 
@@ -289,28 +301,30 @@ SLOW_M_S = 3.0
 
 
 def known_rows(motion: Motion, layout: Layout) -> dict[str, NormalRows | TapeRows]:
-    """Return the rows of positions, forces, heights and tapes, by kind."""
+    """Return the rows of positions ("place"), heights, tapes ("tape"), and forces of each body, by kind."""
     scene, path = motion.scene, motion.numbers(layout, "path")
     found: dict[str, NormalRows | TapeRows] = {}
-    known = scene.places
-    if len(known.time_s):
-        point, share = motion.places.cubic(known.time_s)
-        columns = np.moveaxis(path[point, known.body[:, None]], 1, 2)
-        found["place"] = _rows(columns, share[:, None, :], known.position_m, known.std_m[:, None])
-    if motion.sensed:
-        found["force"] = _forces(motion, layout)
-    if motion.levelled:
-        read, level = scene.heights, motion.numbers(layout, "level")[0, :, 0]
-        point, share = motion.places.cubic(read.time_s)
-        own = level[np.searchsorted(motion.levelled, read.body)]
+    if len(known := scene.places):
+        point, share = motion.places.splines(known.time_s)
+        found["place"] = NormalRows(
+            value=known.position_m.ravel(),
+            std=np.repeat(known.std_m, 3),
+            entries=np.repeat(share, 3, axis=0),
+            columns=np.swapaxes(path[point, known.body[:, None]], 1, 2).reshape(-1, 4),
+        )
+    for body, sensed in scene.inertial.items():
+        if len(sensed):
+            found[f"force {body}"] = _forces(motion, layout, body)
+    if len(read := scene.heights):
+        point, share = motion.places.splines(read.time_s)
+        own = motion.numbers(layout, "level")[0, np.unique(read.body, return_inverse=True)[1], 0]
         found["height"] = NormalRows(
             value=read.height_m,
             std=read.std_m,
             entries=np.column_stack([share, np.ones(len(own))]),
             columns=np.column_stack([path[point, read.body[:, None], 2], own]),
         )
-    tapes = scene.tapes
-    if len(tapes):
+    if len(tapes := scene.tapes):
         # Distances that always hold are between standing bodies: any instant is valid.
         time = np.where(np.isnan(tapes.time_s), scene.time_s[0], tapes.time_s)
         geometry = Distances.of(motion, layout, (tapes.first, tapes.second), time)
@@ -328,42 +342,29 @@ def _differences(count: int, order: int, std: Floats) -> Prior:
     return Prior(weight=1.0, structure=sparse.csc_matrix(each.T @ each), rows=each.shape[0])
 
 
-def _rows(columns: Ints, entries: Floats, value: Floats | float, std: Floats | float) -> NormalRows:
-    """Return a row for each element of columns (..., K) but the last axis; entries, value and std are broadcast."""
-    shape = columns.shape[:-1]
+def _forces(motion: Motion, layout: Layout, body: str) -> NormalRows:
+    """Return rows of mean accelerations (n x 3 axes): (v2 - v1) / dt = R (f - b) + g with bias b and rotation R."""
+    sensed, turning = motion.scene.inertial[body], motion.bodies["turn"]
+    path = motion.numbers(layout, "path")[:, motion.scene.moving.index(body)]
+    bias = motion.numbers(layout, "bias")[0, motion.bodies["bias"].index(body)]
+    count, force = len(sensed), sensed.force_m_s2
+    early, begin = motion.places.velocities(sensed.time_s - WINDOW_S / 2)
+    late, end = motion.places.velocities(sensed.time_s + WINDOW_S / 2)
+    # Columns and entries are (n, unknowns, axes).
+    columns = [path[late], path[early], np.broadcast_to(bias[:, None], (count, 3, 3))]
+    weights = [share[:, :, None] * np.full(3, 1 / WINDOW_S) for share in (end, -begin)]
+    entries = [*weights, np.swapaxes(sensed.turn, 1, 2)]
+    if body in turning:
+        # A turn t of the attitude adds t x (R f) to the force: along an axis by t about the next and the last one.
+        middle, part = motion.turns.splines(sensed.time_s, 1)
+        turn = motion.numbers(layout, "turn")[middle, turning.index(body)]
+        following, last = [1, 2, 0], [2, 0, 1]
+        columns += [turn[:, :, following], turn[:, :, last]]
+        entries += [-force[:, None, last] * part[:, :, None], force[:, None, following] * part[:, :, None]]
+    by_axis = [np.swapaxes(np.concatenate(some, axis=1), 1, 2).reshape(3 * count, -1) for some in (columns, entries)]
     return NormalRows(
-        value=np.broadcast_to(value, shape).ravel(),
-        std=np.broadcast_to(std, shape).ravel(),
-        entries=np.broadcast_to(entries, columns.shape).reshape(-1, columns.shape[-1]),
-        columns=columns.reshape(-1, columns.shape[-1]),
+        value=(force - (0, 0, GRAVITY_M_S2)).ravel(),
+        std=np.full(3 * count, sensed.std_m_s2),
+        columns=by_axis[0],
+        entries=by_axis[1],
     )
-
-
-def _forces(motion: Motion, layout: Layout) -> NormalRows:
-    """Return rows of mean accelerations: (v2 - v1) / dt = R (f - b) + g with bias b and rotation R."""
-    path, turn, bias = (motion.numbers(layout, kind) for kind in ("path", "turn", "bias"))
-    parts = []
-    for own, body in enumerate(motion.sensed):
-        sensed = motion.scene.inertial[motion.scene.moving[body]]
-        lasts = (sensed.end_s - sensed.begin_s)[:, None]
-        (late, end), (early, begin) = (motion.places.cubic(t, 1) for t in (sensed.end_s, sensed.begin_s))
-        middle, part = motion.turns.straight((sensed.begin_s + sensed.end_s) / 2)
-        for axis in range(3):
-            following, last = (axis + 1) % 3, (axis + 2) % 3
-            columns = [path[late, body, axis], path[early, body, axis], np.tile(bias[0, own], (len(lasts), 1))]
-            entries = [end / lasts, -begin / lasts, sensed.turn[:, axis, :]]
-            if body in motion.turning:
-                # A turn t of the attitude adds t x (R f) to the force.
-                k = motion.turning.index(body)
-                columns += [turn[middle, k, following], turn[middle, k, last]]
-                force = sensed.force_m_s2
-                entries += [-force[:, [last]] * part, force[:, [following]] * part]
-            else:
-                # As many columns as other bodies have.
-                columns += [path[late, body, axis]]
-                entries += [np.zeros(late.shape)]
-            aim = sensed.force_m_s2[:, axis] - GRAVITY_M_S2 * (axis == 2)
-            std = np.full(len(aim), sensed.std_m_s2)
-            parts.append((aim, std, np.concatenate(entries, axis=1), np.concatenate(columns, axis=1)))
-    whole = [np.concatenate([part[k] for part in parts]) for k in range(4)]
-    return NormalRows(value=whole[0], std=whole[1], entries=whole[2], columns=whole[3])

@@ -11,24 +11,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import BadInputError
-from calib.spread import robust_spread
+from calib.spread import medians, robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.schema import Arrangement, KnownDistance
 
 TAPE_EVERY_S = 0.4
-"""A taped distance is one measurement. While it holds it counts once in so many seconds, with a standard error that
-grows by the square root of the number of instants."""
-
-SPAN = re.compile(r"^\s*(\d+(?:\.\d*)?)\s*\.\.\s*(\d+(?:\.\d*)?)\s*$")
+"""A taped distance is one measurement. While it holds it counts once in so many seconds (the time between control
+points of a path), with a standard error that grows by the square root of the number of instants."""
 
 HEIGHT_WINDOW_S = 0.1
+"""Heights are medians over this time, as many as known positions."""
+
 HEIGHT_STD_M = 0.1
 """Standard error of the mean of a window beside the sensor's constant offset, before residuals are known."""
 
-HEIGHT_TRUST = 3.0
-"""Factor on the spread of residuals: errors of a height sensor last for some windows."""
+TRUSTED = 3.0
+"""Factor on the spread of a sensor's residuals: its errors last for some windows."""
 
 HEIGHT_BOUNDS_M = (0.02, 1.0)
+"""Bounds of the standard error of a height."""
+
 HUBER = 2.0
 """Readings beyond so many spreads count less (Huber 1964): the sensor looks at what stands below it."""
 
@@ -68,44 +70,32 @@ class Places(Samples):
 
 @dataclass(frozen=True, slots=True)
 class Heights(Samples):
-    """Mean heights of moving bodies: number of the body (k,), metres (k,), standard errors (k,)."""
+    """Median heights of moving bodies: number of the body (k,), metres (k,), standard errors (k,)."""
 
     body: Ints
     height_m: Floats
     std_m: Floats
 
-    def reweighted(self, residual: Floats) -> Heights:
-        """Return the readings with standard errors from their residuals (k,), in units of the present ones."""
-        if not len(residual):
+    def reweighted(self, residual_m: Floats) -> Heights:
+        """Return the readings with standard errors from their residuals (k,)."""
+        if not len(self):
             return self
-        residual_m = residual * self.std_m
-        spread = float(np.clip(HEIGHT_TRUST * robust_spread(residual_m, 0.0), *HEIGHT_BOUNDS_M))
-        weight = np.minimum(1.0, HUBER * spread / HEIGHT_TRUST / np.maximum(np.abs(residual_m), 1e-9))
-        return replace(self, std_m=spread / np.sqrt(weight))
-
-
-def no_heights() -> Heights:
-    """Return no readings."""
-    return Heights(np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0))
+        std_m = float(np.clip(TRUSTED * robust_spread(residual_m, 0.0), *HEIGHT_BOUNDS_M))
+        weight = np.minimum(1.0, HUBER * std_m / TRUSTED / np.maximum(np.abs(residual_m), 1e-9))
+        return replace(self, std_m=std_m / np.sqrt(weight))
 
 
 def heights_of(table: Mapping[str, NDArray[Any]], moving: Sequence[str], began_ns: int, last_s: float) -> Heights:
     """Return the readings of moving bodies in a recording's table, as medians over windows."""
     if not table:
-        return no_heights()
-    found = []
-    for number, body in enumerate(moving):
-        rows = np.flatnonzero((table["body"] == body) & np.isfinite(table["height_m"]))
-        time = np.asarray((table["time_ns"][rows] - began_ns) * 1e-9, dtype=np.float64)
-        inside = (time >= 0) & (time <= last_s)
-        order = np.argsort(time[inside], kind="stable")
-        time, height = time[inside][order], np.asarray(table["height_m"][rows][inside][order], dtype=np.float64)
-        starts = np.flatnonzero(np.diff(np.floor(time / HEIGHT_WINDOW_S), prepend=-np.inf))[1:]
-        for times, heights in zip(np.split(time, starts), np.split(height, starts), strict=True):
-            if len(times):
-                found.append((float(np.mean(times)), number, float(np.median(heights)), HEIGHT_STD_M))
-    time, body_number, height, std = np.array(found).reshape(-1, 4).T
-    return Heights(time, body_number.astype(np.int64), height, std)
+        return Heights(np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0))
+    time_s, height_m = (table["time_ns"] - began_ns) * 1e-9, np.asarray(table["height_m"], dtype=np.float64)
+    number = np.select([table["body"] == body for body in moving], range(len(moving)), -1)
+    rows = np.flatnonzero((number >= 0) & np.isfinite(height_m) & (time_s >= 0) & (time_s <= last_s))
+    window = np.column_stack([number, np.floor(time_s / HEIGHT_WINDOW_S)])[rows]
+    group = np.unique(window, axis=0, return_inverse=True)[1].ravel()
+    time, body, height = (medians(column[rows], group) for column in (time_s, number, height_m))
+    return Heights(time, body.astype(np.int64), height, np.full(len(time), HEIGHT_STD_M))
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,11 +115,6 @@ class Tapes(Samples):
     left_out: tuple[str, ...] = ()
 
 
-def no_tapes() -> Tapes:
-    """Return no distances."""
-    return tapes_of((), (), {}, (), 0, 0.0)
-
-
 def tapes_of(
     stated: Iterable[KnownDistance],
     arrangements: Iterable[Arrangement],
@@ -147,7 +132,8 @@ def tapes_of(
     spans = {one.name: ((one.start_ns - began_ns) * 1e-9, (one.end_ns - began_ns) * 1e-9) for one in arrangements}
     rows, used, left_out = list[tuple[float, ...]](), list[KnownDistance](), list[str]()
     for one in stated:
-        _check_distance(one, bodies)
+        if wrong := _unusable(one, bodies):
+            raise BadInputError(wrong, parameter="distances")
         times = _instants(one, spans, last_s)
         if {bodies[one.first], bodies[one.second]} <= set(still):
             times = [np.nan]
@@ -165,28 +151,23 @@ def tapes_of(
     return Tapes(time_s, whole[0], whole[1], distance_m, std, whole[2], tuple(used), tuple(left_out))
 
 
-def _check_distance(one: KnownDistance, bodies: Mapping[int, str]) -> None:
+def _unusable(one: KnownDistance, bodies: Mapping[int, str]) -> str:
+    """Return why a distance cannot be used, "" if it can."""
+    pair = f"tags {one.first} and {one.second}"
     for tag in (one.first, one.second):
         if tag not in bodies:
-            raise BadInputError(
-                f"found tag {tag}, the tags that range are {', '.join(map(str, sorted(bodies)))}", parameter="distances"
-            )
+            return f"found tag {tag}, the tags that range are {', '.join(map(str, sorted(bodies)))}"
     if bodies[one.first] == bodies[one.second]:
-        raise BadInputError(
-            f"tags {one.first} and {one.second} are on one body, whose lever arms say how far apart they are",
-            parameter="distances",
-        )
+        return f"{pair} are on one body, whose lever arms say how far apart they are"
     for value, what in ((one.distance_m, "distance"), (one.sigma_m, "standard error")):
         if not (np.isfinite(value) and value > 0):
-            raise BadInputError(
-                f"found {value!r} as the {what} of tags {one.first} and {one.second}, expected metres above 0",
-                parameter="distances",
-            )
+            return f"found {value!r} as the {what} of {pair}, expected metres above 0"
+    return ""
 
 
 def _instants(one: KnownDistance, spans: Mapping[str, tuple[float, float]], last_s: float) -> list[float]:
     """Return the seconds at which a distance between moving bodies counts."""
-    seconds = SPAN.match(one.arrangement)
+    seconds = re.match(r"^\s*(\d+(?:\.\d*)?)\s*\.\.\s*(\d+(?:\.\d*)?)\s*$", one.arrangement)
     if not one.arrangement:
         chosen = list(spans.values())
     elif one.arrangement in spans:
@@ -200,9 +181,9 @@ def _instants(one: KnownDistance, spans: Mapping[str, tuple[float, float]], last
             parameter="distances",
         )
     found = list[float]()
-    for begin, end in chosen:
-        begin_s, length_s = max(begin, 0.0), min(end, last_s) - max(begin, 0.0)
-        if length_s >= 0:
-            count = max(int(length_s / TAPE_EVERY_S), 1)
-            found += (begin_s + (np.arange(count) + 0.5) * length_s / count).tolist()
+    for start, end in chosen:
+        begin_s, end_s = max(start, 0.0), min(end, last_s)
+        if begin_s <= end_s:
+            count = max(int((end_s - begin_s) / TAPE_EVERY_S), 1)
+            found += np.linspace(begin_s, end_s, 2 * count + 1)[1::2].tolist()
     return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,15 +13,11 @@ from calib.data.sources import Data, antenna_delays_of, opened, planted_of
 from calib.errors import UnanswerableError
 from calib.settings import FlightSettings
 from calib.trajectories.attitudes import Attitude, Inertial, Readings, integrated, windows
-from calib.trajectories.samples import Heights, Places, Tapes, heights_of, no_heights, no_tapes, tapes_of
+from calib.trajectories.samples import Heights, Places, Samples, Tapes, heights_of, tapes_of
 from uwblink.arrays import Bools, Floats, Ints
-from uwblink.recording.antenna_delays import AntennaDelay
-from uwblink.recording.schema import Poses, Tag
+from uwblink.recording.schema import Poses
 from uwblink.recording.summary import single_reports
-from uwblink.ticks import TICK_S
-from uwblink.twr import Exchanges, intervals
-
-NOWHERE = -1
+from uwblink.twr import middle_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,8 +25,9 @@ class Scene:
     """Ranges (n,) at `time_s` (n,) between tags of bodies that move or stand.
 
     `moving` names the moving bodies. `still` gives the position of each standing body, None if it is estimated. `arms`
-    gives the body and the lever arm of each tag. `attitudes` are those of moving bodies; without an attitude the tags
-    of a body are at its centre. `tapes` are distances by tape, `heights` readings of height sensors.
+    gives the body and the lever arm of each tag: of moving bodies in the body's axes, of standing ones in the world's.
+    `attitudes` are those of moving bodies; without an attitude the tags of a body are at its centre. `tapes` are
+    distances by tape, `heights` readings of height sensors.
     """
 
     source: str
@@ -38,13 +35,12 @@ class Scene:
     time_s: Floats
     moving: tuple[str, ...]
     still: Mapping[str, Floats | None]
-    still_turned: Mapping[str, Floats] = field(default_factory=dict)
     arms: Mapping[int, tuple[str, Floats]]
     attitudes: Mapping[str, Attitude]
     places: Places
-    inertial: Mapping[str, Inertial] = field(default_factory=dict)
-    heights: Heights = field(default_factory=no_heights)
-    tapes: Tapes = field(default_factory=no_tapes)
+    inertial: Mapping[str, Inertial]
+    heights: Heights
+    tapes: Tapes
 
     @property
     def sought(self) -> list[str]:
@@ -61,12 +57,8 @@ class Scene:
         """Return the part of the scene within a span of time."""
         rows = np.flatnonzero((self.time_s >= begin_s) & (self.time_s <= end_s))
         samples = {name: getattr(self, name).between(begin_s, end_s) for name in ("places", "heights", "tapes")}
-        inertial = {body: windows.between(begin_s, end_s) for body, windows in self.inertial.items()}
+        inertial = {body: some.between(begin_s, end_s) for body, some in self.inertial.items()}
         return replace(self.only(rows), inertial=inertial, **samples)
-
-    def at(self, places: Places) -> Scene:
-        """Return the scene with these known positions instead of all positions, forces, heights and tapes."""
-        return replace(self, places=places, inertial={}, heights=no_heights(), tapes=no_tapes())
 
     @property
     def without_heading(self) -> list[str]:
@@ -79,53 +71,17 @@ class Scene:
 
     def turned_by(self, heading: Mapping[str, float]) -> Scene:
         """Return the scene with attitudes of some bodies rotated about the vertical."""
-        if not heading:
-            return self
-        attitudes = {body: known.turned_by(heading.get(body, 0.0)) for body, known in self.attitudes.items()}
-        inertial = {body: some.turned_by(heading.get(body, 0.0)) for body, some in self.inertial.items()}
-        return replace(self, attitudes=attitudes, inertial=inertial)
+        attitudes = {body: self.attitudes[body].turned_by(angle) for body, angle in heading.items()}
+        inertial = {body: some.turned_by(heading[body]) for body, some in self.inertial.items() if body in heading}
+        return replace(self, attitudes={**self.attitudes, **attitudes}, inertial={**self.inertial, **inertial})
 
     def only(self, rows: Ints) -> Scene:
         """Return the scene with some of its ranges."""
-        columns = {name: getattr(self, name)[rows] for name in ("ranges", "time_s")}
-        return replace(self, **columns)
+        return replace(self, ranges=self.ranges[rows], time_s=self.time_s[rows])
 
-
-@dataclass(frozen=True, slots=True)
-class Ends:
-    """One end of each range (n,).
-
-    `mover` and `stander` are the numbers of the moving body or of the body whose position is estimated, -1 for neither.
-    `base_m` (n, 3) is the antenna's position on a body with a known position, or its offset from the centre of a
-    standing body. `arm_m` (n, 3) is its offset from the centre of a moving body, by the given attitude.
-    """
-
-    mover: Ints
-    stander: Ints
-    base_m: Floats
-    arm_m: Floats
-
-
-def ends_of(scene: Scene, ids: Ints, time_s: Floats) -> Ends:
-    """Return the ends of tags `ids` (n,) at instants (n,)."""
-    count = len(ids)
-    mover, stander = np.full(count, NOWHERE), np.full(count, NOWHERE)
-    base, arm = np.zeros((count, 3)), np.zeros((count, 3))
-    sought = scene.sought
-    for tag, (body, lever) in scene.arms.items():
-        rows = np.flatnonzero(ids == tag)
-        if not len(rows):
-            continue
-        if body in scene.still:
-            place = scene.still[body]
-            turned = scene.still_turned.get(body, np.eye(3)) @ lever
-            base[rows] = turned if place is None else place + turned
-            stander[rows] = sought.index(body) if place is None else NOWHERE
-        else:
-            mover[rows] = scene.moving.index(body)
-            if body in scene.attitudes:
-                arm[rows] = scene.attitudes[body].at(time_s[rows]) @ lever
-    return Ends(mover, stander, base, arm)
+    def thinned(self, count: int) -> Scene:
+        """Return the scene with about `count` of its ranges, evenly spread."""
+        return self.only(np.arange(0, len(self.time_s), max(len(self.time_s) // count, 1)))
 
 
 STILL_M = 0.1
@@ -135,54 +91,81 @@ PLACE_STD_M = 0.02
 PLACE_EVERY_S = 0.1
 """Known positions are thinned to this interval and have this standard error: errors of motion capture last."""
 
-TILT_STD = float(np.radians(1.0))
-TILT_WANDER = float(np.radians(0.2))
-HEADING_WANDER = float(np.radians(0.5))
-"""Standard deviation of the tilt of an attitude reference (rad), and random walks of tilt and heading (rad per root
-second)."""
+TILT_STD_DEG, TILT_WANDER_DEG, HEADING_WANDER_DEG = 1.0, 0.2, 0.5
+"""Standard deviation of the tilt of an attitude reference (degrees), and random walks of tilt and heading (degrees per
+root second)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Track(Samples):
+    """Poses of one body in seconds since the first range; NaN where positions or attitudes are unknown."""
+
+    position_m: Floats
+    quaternion: Floats
 
 
 def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True) -> Scene:
     """Return the scene of a recording; raises `UnanswerableError` if it has no ranges or no body moves."""
     with opened(data) as (name, source):
         exchanges = single_reports(source.exchanges).exchanges
-        poses, tags, planted = source.poses, list(source.tags), planted_of(source, name)
-        delays = antenna_delays_of(source, name)
+        poses, tags = source.poses, list(source.tags)
+        planted, delays = planted_of(source, name), antenna_delays_of(source, name)
         # A source need not have any of these.
         imu, height = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))
         stated, arrangements = (tuple(getattr(source, one, ())) for one in ("known_distances", "arrangements"))
     if not tags:
         raise UnanswerableError(f"{name}: does not say which tag sits on which body; 'uwblink poses --tags' adds that")
-    rows, ranges = _ranges_between(tags, exchanges, name, planted, delays, need_power=need_power)
+    # The truth is not known. In its place stands the time to which a range belongs.
+    ranges = Ranges.from_exchanges(
+        exchanges,
+        np.asarray(middle_ns(exchanges) * 1e-9, dtype=np.float64),
+        tags=tags,
+        planted=planted,
+        source=name,
+        antenna_delays=delays,
+    ).usable(need_power=need_power)
+    carried = [tag.tag for tag in tags]
+    ranges = ranges[np.isin(ranges.initiator, carried) & np.isin(ranges.target, carried)].in_time_order()
+    if not len(ranges):
+        raise UnanswerableError(f"{name}: no ranges between tags whose bodies are known")
     began = int(ranges.time_ns[0])
-    # A range belongs to the middle of its first two messages.
-    half = np.nan_to_num(intervals(exchanges[rows]).dt41 * (TICK_S / 2), nan=0.0)
-    time = (ranges.time_ns - began) * 1e-9 + np.where(np.abs(half) < 1.0, half, 0.0)
+    time = ranges.truth_m - began * 1e-9
     ranging = set(ranges.tags())
     arms = {tag.tag: (tag.body, np.array(tag.lever_arm_m)) for tag in tags if tag.tag in ranging}
     bodies = sorted({body for body, _ in arms.values()})
-    tracks = {body: _BodyPoses(poses, body, began) for body in bodies}
-    still = {body: track.middle for body, track in tracks.items() if track.stands}
+    tracks = {body: _track(poses, body, began) for body in bodies}
+    placed = {body: track[_finite(track.position_m)] for body, track in tracks.items()}
+    turned = {body: track[_finite(track.quaternion)] for body, track in tracks.items()}
+    still = {
+        body: np.median(track.position_m, axis=0)
+        for body, track in placed.items()
+        if len(track) and np.ptp(track.position_m, axis=0).max() <= STILL_M
+    }
     moving = tuple(body for body in bodies if body not in still)
     if not moving:
         raise UnanswerableError(f"{ranges.source}: no body moves; boards that stand still are what a survey is for")
+    for tag, (body, arm) in arms.items():
+        if body in still and len(turned[body]):
+            arms[tag] = body, Rotation.from_quat(turned[body].quaternion[0]).apply(arm)
     last = float(time[-1])
     until = last if settings.poses_until_s is None else min(settings.poses_until_s, last)
     sensed = {body: Readings.of(imu, body, began) for body in moving}
-    attitudes = {body: _attitude(body, tracks[body], sensed[body], settings, until, ranges.source) for body in moving}
-    turned = {body: attitude for body, attitude in attitudes.items() if attitude is not None}
+    found = {body: _attitude(body, turned[body], sensed[body], settings, ranges.source) for body in moving}
+    attitudes = {body: attitude for body, attitude in found.items() if attitude is not None}
+    inertial = {
+        body: windows(some, attitudes[body], last) for body, some in sensed.items() if some and body in attitudes
+    }
     return Scene(
         source=ranges.source,
         ranges=replace(ranges, truth_m=np.full(len(time), np.nan)),
-        time_s=np.asarray(time),
+        time_s=time,
         moving=moving,
         still=still if settings.anchors == "given" else dict.fromkeys(still),
-        still_turned={body: tracks[body].turned for body in still},
         arms=arms,
-        attitudes=turned,
-        inertial={body: windows(some, turned[body], last) for body, some in sensed.items() if some and body in turned},
-        places=_places([tracks[body] for body in moving], until),
-        heights=heights_of(height, moving, began, last) if settings.heights == "used" else no_heights(),
+        attitudes=attitudes,
+        inertial={body: some for body, some in inertial.items() if len(some)},
+        places=_places([placed[body] for body in moving], until),
+        heights=heights_of(height if settings.heights == "used" else {}, moving, began, last),
         tapes=tapes_of(
             (*stated, *settings.distances),
             arrangements,
@@ -194,100 +177,38 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     )
 
 
-def _ranges_between(
-    tags: Sequence[Tag],
-    exchanges: Exchanges,
-    name: str,
-    planted: object,
-    delays: Mapping[int | None, AntennaDelay],
-    *,
-    need_power: bool,
-) -> tuple[Ints, Ranges]:
-    """Return the usable ranges between known tags in order of time, and their rows among the exchanges."""
-    # The truth is not known. In its place stands the number of the row, which tells what rows are left.
-    numbered = Ranges.from_exchanges(
-        exchanges,
-        np.arange(len(exchanges), dtype=np.float64),
-        tags=tags,
-        planted=planted if isinstance(planted, Mapping) else None,
-        source=name,
-        antenna_delays=delays,
-    ).usable(need_power=need_power)
-    carried = {tag.tag for tag in tags}
-    rows = numbered.truth_m.astype(np.int64)
-    mine = np.isin(numbered.initiator, list(carried)) & np.isin(numbered.target, list(carried))
-    mine &= numbered.initiator != numbered.target
-    rows, ranges = rows[mine], numbered[mine]
-    if not len(rows):
-        raise UnanswerableError(f"{name}: no ranges between tags whose bodies are known")
-    order = np.argsort(ranges.time_ns, kind="stable")
-    return rows[order], ranges[order]
+def _track(poses: Poses, body: str, began_ns: int) -> Track:
+    own = poses[poses.body == body]
+    return Track(np.asarray((own.time_ns - began_ns) * 1e-9, dtype=np.float64), own.position_m, own.quaternion)
 
 
-class _BodyPoses:
-    """The poses of one body, in seconds since the first range."""
-
-    def __init__(self, poses: Poses, body: str, began_ns: int) -> None:
-        rows = np.flatnonzero(poses.body == body)
-        self.time_s: Floats = np.asarray((poses.time_ns[rows] - began_ns) * 1e-9, dtype=np.float64)
-        self.position_m: Floats = poses.position_m[rows]
-        self.quaternion: Floats = poses.quaternion[rows]
-        self.placed: Bools = np.asarray(np.isfinite(self.position_m).all(axis=1))
-        self.known: Bools = np.asarray(np.isfinite(self.quaternion).all(axis=1))
-
-    @property
-    def stands(self) -> bool:
-        """Whether all poses have one position."""
-        here = self.position_m[self.placed]
-        return bool(len(here)) and bool(np.ptp(here, axis=0).max() <= STILL_M)
-
-    @property
-    def middle(self) -> Floats:
-        """Return the position of a standing body (3,)."""
-        return np.asarray(np.median(self.position_m[self.placed], axis=0))
-
-    @property
-    def turned(self) -> Floats:
-        """Return the rotation of a standing body (3, 3)."""
-        known = self.quaternion[self.known]
-        return np.asarray(Rotation.from_quat(known[0]).as_matrix()) if len(known) else np.eye(3)
-
-    def sampled_rows(self, until_s: float) -> Ints:
-        """Return the rows of positions since the first range, `PLACE_EVERY_S` apart."""
-        rows = np.flatnonzero(self.placed & (self.time_s >= 0) & (self.time_s < until_s))
-        slot = np.floor(self.time_s[rows] / PLACE_EVERY_S)
-        return rows[np.diff(slot, prepend=-np.inf) > 0]
+def _finite(values: Floats) -> Bools:
+    return np.asarray(np.isfinite(values).all(axis=1))
 
 
-def _places(tracks: list[_BodyPoses], until_s: float) -> Places:
-    rows = [track.sampled_rows(until_s) for track in tracks]
-    body = np.repeat(np.arange(len(tracks)), [len(some) for some in rows])
-    return Places(
-        np.concatenate([track.time_s[some] for track, some in zip(tracks, rows, strict=True)]),
-        body,
-        np.concatenate([track.position_m[some] for track, some in zip(tracks, rows, strict=True)]),
-        np.full(len(body), PLACE_STD_M),
-    )
+def _places(tracks: Sequence[Track], until_s: float) -> Places:
+    """Return the positions of each body since the first range, `PLACE_EVERY_S` apart."""
+    parts = []
+    for number, track in enumerate(tracks):
+        early = track[(track.time_s >= 0) & (track.time_s < until_s)]
+        some = early[np.diff(np.floor(early.time_s / PLACE_EVERY_S), prepend=-np.inf) > 0]
+        parts.append((some.time_s, np.full(len(some), number), some.position_m, np.full(len(some), PLACE_STD_M)))
+    return Places(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _attitude(
-    body: str, track: _BodyPoses, sensed: Readings | None, settings: FlightSettings, until_s: float, source: str
+    body: str, track: Track, sensed: Readings | None, settings: FlightSettings, source: str
 ) -> Attitude | None:
     """Return the attitudes of a moving body; None if there are none."""
-    given = _of_poses(track, settings) if track.known.any() else None
-    if settings.attitudes == "imu":
-        if sensed is None:
-            raise UnanswerableError(f"{source}: no inertial readings of body {body}; take `attitudes` from poses")
-        return integrated(sensed, given, until_s if settings.poses_until_s is not None else 0.0)
-    return given if settings.attitudes == "poses" else None
-
-
-def _of_poses(track: _BodyPoses, settings: FlightSettings) -> Attitude:
-    heading = float(np.radians(settings.heading_std_deg))
-    exact = heading == 0
-    return Attitude(
-        time_s=track.time_s[track.known],
-        quaternion=track.quaternion[track.known],
-        std_rad=np.zeros(3) if exact else np.array([TILT_STD, TILT_STD, heading]),
-        wander_rad=np.zeros(3) if exact else np.array([TILT_WANDER, TILT_WANDER, HEADING_WANDER]),
-    )
+    std = np.radians([TILT_STD_DEG, TILT_STD_DEG, settings.heading_std_deg])
+    wander = np.radians([TILT_WANDER_DEG, TILT_WANDER_DEG, HEADING_WANDER_DEG])
+    if settings.heading_std_deg == 0:
+        std, wander = np.zeros((2, 3))
+    given = Attitude(time_s=track.time_s, quaternion=track.quaternion, std_rad=std, wander_rad=wander)
+    if settings.attitudes != "imu":
+        return given if settings.attitudes == "poses" and len(track) else None
+    if sensed is None:
+        raise UnanswerableError(f"{source}: no inertial readings of body {body}; take `attitudes` from poses")
+    until_s = settings.poses_until_s or 0.0
+    early = until_s > 0 and bool(np.any(track.time_s < until_s))
+    return integrated(sensed, given if early else None, until_s)

@@ -5,10 +5,12 @@ Delays and curve are unknown, so ranges have a wide Cauchy likelihood, which nar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
+from scipy.sparse.csgraph import shortest_path
 
 from calib.trajectories.motion import Motion
 from calib.trajectories.samples import Places
@@ -16,7 +18,7 @@ from calib.trajectories.scene import Scene
 from calib.trajectories.search import JERK_M_S3, MotionFit, State, fit_motion
 from uwblink.arrays import Floats
 
-WINDOW_S = (2.0, 20.0)
+LENGTHS_S = (2.0, 20.0)
 RANGES_A_BODY = 24
 """A window has so many ranges per moving body, within these bounds in seconds; the next begins half a window later."""
 
@@ -24,6 +26,8 @@ HEADING_WINDOW_S = 8.0
 """Shortest first window where headings are unknown."""
 
 SAMPLE_S = 0.1
+"""Time between positions of an initial guess: a quarter of that between control points."""
+
 WINDOW_STD_M = 0.1
 """Standard error of positions from the window before."""
 
@@ -38,16 +42,18 @@ START_COUNT, KEPT_STARTS, SAMPLED_RANGES = 24, 8, 400
 the number of the window's ranges that are used."""
 
 START_SPREAD_M = 2.0
+"""Standard deviation of random starts about known positions: the size of a room."""
+
 EQUAL_LIKELIHOOD = 6.0
 """Solutions whose log likelihoods differ by less are equally likely."""
+
+ROOM_M = 20.0
+"""Distance of bodies in an initial guess that no ranges tell, and the largest one."""
 
 OTHER_PLACE_M, OTHER_DISTANCE_M = 0.5, 0.1
 """Solutions differ if positions among given anchors, or distances, differ by more in the median."""
 
-TURNS = tuple((np.arange(1, 12) * np.pi / 6).tolist())
-"""Rotations by which unknown headings are tried."""
-
-OTHER_HEADING_RAD = np.pi * 50 / 180
+OTHER_HEADING_RAD = np.radians(50.0)
 """Headings that differ by less converge to one solution."""
 
 PASSES, SAMPLED_FLIGHT = 2, 600
@@ -74,20 +80,18 @@ class Trajectories:
 
     def state(self, scene: Scene, stand: Floats) -> dict[str, Floats]:
         """Return control points of paths near the positions; before and after, bodies rest."""
-        times = Motion.of(scene).places.times_s
-        flat = self.position_m.reshape(len(self.time_s), -1)
-        path = np.column_stack([np.interp(times, self.time_s, line) for line in flat.T])
-        return {"path": path.reshape(len(times), -1, 3), "stand": stand}
+        return {"path": _linear(Motion.of(scene).places.times_s, self.time_s, self.position_m), "stand": stand}
 
     def places(self) -> Places:
         """Return the positions as known ones."""
         count, bodies = self.position_m.shape[:2]
-        return Places(
-            np.tile(self.time_s, bodies),
-            np.repeat(np.arange(bodies), count),
-            self.position_m.transpose(1, 0, 2).reshape(-1, 3),
-            np.full(count * bodies, WINDOW_STD_M),
-        )
+        body, std = np.tile(np.arange(bodies), count), np.full(count * bodies, WINDOW_STD_M)
+        return Places(np.repeat(self.time_s, bodies), body, self.position_m.reshape(-1, 3), std)
+
+
+def _linear(time_s: Floats, known_s: Floats, values: Floats) -> Floats:
+    """Return values (n, ...) at instants (n,), linear between those at `known_s` (k,) and constant outside."""
+    return np.apply_along_axis(lambda line: np.interp(time_s, known_s, line), 0, values)
 
 
 def begin(scene: Scene, done: Callable[[float], None]) -> tuple[Scene, State, str]:
@@ -109,41 +113,30 @@ def begin(scene: Scene, done: Callable[[float], None]) -> tuple[Scene, State, st
 def longest_known(scene: Scene) -> Trajectories | None:
     """Return the longest span in which the positions of all bodies are known; None without any."""
     places, bodies = scene.places, len(scene.moving)
-    if not len(places.time_s):
-        return None
     slots = np.floor(places.time_s / SAMPLE_S).astype(np.int64)
-    low = int(slots.min())
-    have = np.zeros((int(slots.max()) - low + 1, bodies), dtype=bool)
-    have[slots - low, places.body] = True
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], have.all(axis=1), [False]]).astype(int)))
-    if not len(edges):
+    common = reduce(np.intersect1d, [slots[places.body == body] for body in range(bodies)], slots)
+    if not len(common):
         return None
-    pieces = edges.reshape(-1, 2)
-    first, last = pieces[np.argmax(pieces[:, 1] - pieces[:, 0])]
-    return interpolated(places, (low + np.arange(first, last) + 0.5) * SAMPLE_S, bodies)
+    spans = np.split(common, np.flatnonzero(np.diff(common) > 1) + 1)
+    middles: Floats = np.asarray((max(spans, key=len) + 0.5) * SAMPLE_S, dtype=np.float64)
+    return interpolated(places, middles, bodies)
 
 
 def interpolated(places: Places, time_s: Floats, bodies: int) -> Trajectories:
     """Return the positions of bodies at instants (k,), linear between known positions."""
-    found = np.empty((len(time_s), bodies, 3))
-    for body in range(bodies):
-        mine = places.body == body
-        for axis in range(3):
-            found[:, body, axis] = np.interp(time_s, places.time_s[mine], places.position_m[mine, axis])
-    return Trajectories(time_s, found)
+    known = [places[places.body == body] for body in range(bodies)]
+    found = [_linear(time_s, own.time_s, own.position_m) for own in known]
+    return Trajectories(time_s, np.stack(found, axis=1))
 
 
 def _window_s(scene: Scene) -> float:
     """Return the length of a window in seconds."""
     rate = len(scene.time_s) / max(float(scene.time_s[-1] - scene.time_s[0]), 1e-9)
-    seconds = RANGES_A_BODY * len(scene.moving) / rate
-    return float(np.clip(2 * round(seconds / 2), *WINDOW_S))
+    return float(np.clip(2 * round(RANGES_A_BODY * len(scene.moving) / rate / 2), *LENGTHS_S))
 
 
-def _fit_window(window: Scene, guess: Trajectories, stand: Floats, anchor: Trajectories | None = None) -> MotionFit:
-    """Return the best motion of a window from a guess; `anchor` are positions of the window before."""
-    if anchor is not None:
-        window = replace(window, places=window.places + anchor.places())
+def _fit_window(window: Scene, guess: Trajectories, stand: Floats) -> MotionFit:
+    """Return the best motion of a window from a guess."""
     return fit_motion(window, guess.state(window, stand), SCALES_M, WINDOW_JERK_M_S3)
 
 
@@ -153,31 +146,32 @@ def _extend(
     """Extend paths from a seed to both ends of a scene; return them and the positions of standing bodies."""
     begin_s, end_s = float(scene.time_s[0]), float(scene.time_s[-1])
     found, step = seed, _window_s(scene) / 2
-    for sign in (1.0, -1.0):
-        while True:
-            edge = float(found.time_s[-1] if sign > 0 else found.time_s[0])
-            if (end_s - edge if sign > 0 else edge - begin_s) <= 1e-6:
-                break
-            low, high = sorted((edge - sign * step, edge + sign * step))
-            near = found.between(low, high)
-            fresh = np.asarray(np.arange(1, round(step / SAMPLE_S) + 1) * SAMPLE_S * sign + edge, dtype=np.float64)
-            fresh = fresh[(fresh >= begin_s - SAMPLE_S) & (fresh <= end_s + SAMPLE_S)]
-            placed, window = _carried_on(near, fresh, sign), scene.between(low, high)
+    for sign, last_s in ((1, end_s), (-1, begin_s)):
+        edge = float(found.time_s[::sign][-1])
+        while sign * (last_s - edge) > 1e-6:
+            near, window = found.between(edge - step, edge + step), scene.between(edge - step, edge + step)
+            fresh: Floats = np.asarray(edge + sign * SAMPLE_S * np.arange(1, round(step / SAMPLE_S) + 1))
+            fresh = fresh[sign * (fresh - last_s) <= SAMPLE_S]
+            new = Trajectories(fresh, _carried_on(near, fresh, sign))
             if len(window.time_s) >= 2:
-                settled = _fit_window(window, near.joined(Trajectories(fresh, placed)), stand, near)
-                placed, stand = settled.positions(fresh), settled.state.get("stand", stand[None])[0]
-            found = found.joined(Trajectories(fresh, placed))
+                window = replace(window, places=window.places + near.places())
+                fitted = _fit_window(window, near.joined(new), stand)
+                new, stand = Trajectories(fresh, fitted.positions(fresh)), _stand(fitted)
+            found, edge = found.joined(new), float(fresh[-1])
             done(float(found.time_s[-1] - found.time_s[0]) / max(end_s - begin_s, 1e-9))
     return found, stand
 
 
-def _carried_on(near: Trajectories, time_s: Floats, sign: float) -> Floats:
-    """Return extrapolated positions (k, bodies, 3) of bodies that slow down."""
-    edge, other = (-1, max(-4, -len(near.time_s))) if sign > 0 else (0, min(3, len(near.time_s) - 1))
-    span = near.time_s[edge] - near.time_s[other]
-    speed = (near.position_m[edge] - near.position_m[other]) / span if span else 0 * near.position_m[edge]
-    ahead = time_s - near.time_s[edge]
-    return np.asarray(near.position_m[edge] + speed * (np.tanh(ahead / 0.7) * 0.7)[:, None, None])
+def _stand(fitted: MotionFit) -> Floats:
+    """Return the positions (sought, 3) of standing bodies."""
+    return fitted.state["stand"][0] if "stand" in fitted.state else np.zeros((0, 3))
+
+
+def _carried_on(near: Trajectories, time_s: Floats, sign: int) -> Floats:
+    """Return extrapolated positions (k, bodies, 3) of bodies that slow down, forwards or backwards (`sign` -1)."""
+    time, place = near.time_s[::sign][-4:], near.position_m[::sign][-4:]
+    speed = (place[-1] - place[0]) / (time[-1] - time[0]) if len(time) > 1 else np.zeros_like(place[0])
+    return np.asarray(place[-1] + speed * (np.tanh((time_s - time[-1]) / 0.7) * 0.7)[:, None, None])
 
 
 def _fit_first_window(scene: Scene) -> tuple[Scene, Trajectories, Floats, str]:
@@ -185,38 +179,33 @@ def _fit_first_window(scene: Scene) -> tuple[Scene, Trajectories, Floats, str]:
     headless = scene.without_heading
     length = max(_window_s(scene), HEADING_WINDOW_S if headless else 0.0)
     time = np.arange(float(scene.time_s[0]), float(scene.time_s[0]) + length + SAMPLE_S / 2, SAMPLE_S)
-    window = scene.between(float(time[0]), float(time[-1]))
-    window = window.only(np.arange(0, len(window.time_s), max(len(window.time_s) // SAMPLED_RANGES, 1)))
-    wide = [
-        (fit_motion(window.turned_by(heading), guess.state(window, stand), SCALES_M[:1], WINDOW_JERK_M_S3), heading)
-        for guess, stand, heading in _guesses(window, time, headless)
-    ]
-    wide.sort(key=lambda one: -one[0].value)
-    tried = [
-        (fit_motion(window.turned_by(heading), one.state, SCALES_M[1:], WINDOW_JERK_M_S3), heading)
-        for one, heading in wide[:KEPT_STARTS]
-    ]
-    best, heading = max(tried, key=lambda one: one[0].value)
-    stand = best.state.get("stand", np.zeros((1, 0, 3)))[0]
-    rival = _second_solution(scene, best, [one for one, _ in tried], time)
-    return scene.turned_by(heading), Trajectories(time, best.positions(time)), stand, rival
+    window = scene.between(float(time[0]), float(time[-1])).thinned(SAMPLED_RANGES)
+
+    def tried(start: State, heading: Mapping[str, float], scales_m: tuple[float, ...]) -> MotionFit:
+        return fit_motion(window.turned_by(heading), start, scales_m, WINDOW_JERK_M_S3)
+
+    guesses = list(_guesses(window, time, headless))
+    wide = [(tried(guess.state(window, stand), heading, SCALES_M[:1]), heading) for guess, stand, heading in guesses]
+    kept = sorted(wide, key=lambda one: -one[0].value)[:KEPT_STARTS]
+    narrow = [(tried(one.state, heading, SCALES_M[1:]), heading) for one, heading in kept]
+    best, heading = max(narrow, key=lambda one: one[0].value)
+    rival = _second_solution(scene, best, [one for one, _ in narrow], time)
+    return scene.turned_by(heading), Trajectories(time, best.positions(time)), _stand(best), rival
 
 
 def _second_solution(scene: Scene, best: MotionFit, tried: list[MotionFit], time: Floats) -> str:
     """Return a sentence on a second solution of the first window (seconds (k,)), "" without one."""
-    close = sorted((one for one in tried if best.value - one.value < EQUAL_LIKELIHOOD), key=lambda one: -one.value)
     given = any(place is not None for place in scene.still.values())
-    for one in close:
-        if not given and float(np.median(np.abs(one.residuals - best.residuals))) < OTHER_DISTANCE_M:
-            continue
+    for one in sorted(tried, key=lambda one: -one.value):
         away = np.median(np.linalg.norm(one.positions(time) - best.positions(time), axis=2), axis=0)
-        if given and away.max() < OTHER_PLACE_M:
-            continue
-        what = f"{scene.moving[int(np.argmax(away))]} {away.max():.1f} m elsewhere" if given else "other distances"
-        return (
-            f"a second solution, with {what}, fits the first {time[-1] - time[0]:.0f} s as well: delays are those of "
-            "one of them; anchors out of one plane, heights or a known start tell which"
-        )
+        longer = float(np.median(np.abs(one.residuals - best.residuals)))
+        differs = away.max() >= OTHER_PLACE_M if given else longer >= OTHER_DISTANCE_M
+        if differs and best.value - one.value < EQUAL_LIKELIHOOD:
+            what = f"{scene.moving[int(np.argmax(away))]} {away.max():.1f} m elsewhere" if given else "other distances"
+            return (
+                f"a second solution, with {what}, fits the first {time[-1] - time[0]:.0f} s as well: delays are those "
+                "of one of them; anchors out of one plane, heights or a known start tell which"
+            )
     return ""
 
 
@@ -243,22 +232,18 @@ def _shape(scene: Scene) -> Floats:
     over others.
     """
     bodies = [*scene.moving, *scene.sought]
-    count = len(bodies)
     number = {tag: bodies.index(body) for tag, (body, _) in scene.arms.items() if body in bodies}
-    total, times = np.zeros((count, count)), np.zeros((count, count))
-    for a, b, r in zip(
-        scene.ranges.initiator.tolist(), scene.ranges.target.tolist(), scene.ranges.raw_m.tolist(), strict=True
-    ):
-        if a in number and b in number:
-            i, j = number[a], number[b]
-            total[[i, j], [j, i]] += r
-            times[[i, j], [j, i]] += 1
-    apart = np.where(times > 0, total / np.maximum(times, 1), 1e3)
-    np.fill_diagonal(apart, 0.0)
-    for k in range(count):
-        apart = np.minimum(apart, apart[:, [k]] + apart[[k], :])
-    apart = np.minimum(apart, 20.0)
-    centre = np.eye(count) - 1 / count
+    ends = [[number.get(tag, -1) for tag in ids.tolist()] for ids in (scene.ranges.initiator, scene.ranges.target)]
+    i, j = np.array(ends)
+    total, times = np.zeros((2, len(bodies), len(bodies)))
+    between = (i >= 0) & (j >= 0)
+    np.add.at(total, (i[between], j[between]), scene.ranges.raw_m[between])
+    np.add.at(times, (i[between], j[between]), 1.0)
+    total, times = total + total.T, times + times.T
+    mean = np.where(times > 0, total / np.maximum(times, 1.0), ROOM_M)
+    # A distance of zero would be no link, and delays can make a range negative.
+    apart = np.minimum(shortest_path(np.maximum(mean, 1e-3), directed=False), ROOM_M)
+    centre = np.eye(len(bodies)) - 1 / len(bodies)
     values, vectors = np.linalg.eigh(-0.5 * centre @ apart**2 @ centre)
     found = vectors[:, ::-1][:, :3] * np.sqrt(np.maximum(values[::-1][:3], 0.0))
     return np.pad(found, ((0, 0), (0, 3 - found.shape[1])))
@@ -269,20 +254,14 @@ def _initial_anchors(scene: Scene, seed: Trajectories) -> Floats:
     window = scene.between(float(seed.time_s[0]), float(seed.time_s[-1]))
     rng = np.random.default_rng(0)
     here, sought = seed.position_m.reshape(-1, 3), scene.sought
-    best, stand = np.full(len(sought), np.inf), np.zeros((len(sought), 3))
     ends = np.column_stack([window.ranges.initiator, window.ranges.target])
-    mine = [
-        np.isin(ends, [tag for tag, (body, _) in scene.arms.items() if body == name]).any(axis=1) for name in sought
-    ]
-    for _ in range(START_COUNT // 3):
-        settled = _fit_window(
-            window, seed, rng.normal(here.mean(axis=0), here.std(axis=0) + START_SPREAD_M, (len(sought), 3))
-        )
-        off = np.log1p((settled.residuals / SCALES_M[-1]) ** 2)
-        cost = np.array([off[own].sum() for own in mine])
-        better = cost < best
-        best[better], stand[better] = cost[better], settled.state["stand"][0][better]
-    return stand
+    tags = [[tag for tag, (body, _) in scene.arms.items() if body == name] for name in sought]
+    mine = np.array([np.isin(ends, own).any(axis=1) for own in tags], dtype=np.float64)
+    starts = rng.normal(here.mean(axis=0), here.std(axis=0) + START_SPREAD_M, (START_COUNT // 3, len(sought), 3))
+    fits = [_fit_window(window, seed, start) for start in starts]
+    cost = [mine @ np.log1p((one.residuals / SCALES_M[-1]) ** 2) for one in fits]
+    best = np.argmin(cost, axis=0).tolist()
+    return np.array([_stand(fits[start])[number] for number, start in enumerate(best)])
 
 
 def resolve_headings(scene: Scene, state: State) -> tuple[Scene, State, str]:
@@ -294,31 +273,28 @@ def resolve_headings(scene: Scene, state: State) -> tuple[Scene, State, str]:
     unknown = scene.without_heading
     if not unknown:
         return scene, state, ""
-    few = scene.only(np.arange(0, len(scene.time_s), max(len(scene.time_s) // SAMPLED_FLIGHT, 1)))
 
-    def settled(some: Scene, start: State) -> MotionFit:
-        return fit_motion(some, start, SCALES_M[-1:], JERK_M_S3, steps=8)
+    def fitted(heading: Mapping[str, float], start: State) -> MotionFit:
+        few = scene.turned_by(heading).thinned(SAMPLED_FLIGHT)
+        return fit_motion(few, start, SCALES_M[-1:], JERK_M_S3, steps=8)
 
-    best, unsure = settled(few, state), list[str]()
+    turns = np.radians(np.arange(30, 360, 30)).tolist()
+    heading, unsure = dict.fromkeys(unknown, 0.0), list[str]()
+    best = fitted(heading, state)
     for _ in range(PASSES):
-        unsure, turns = [], dict[str, float]()
+        unsure, before = [], dict(heading)
         for body in unknown:
-            tried = {0.0: best} | {turn: settled(few.turned_by({body: turn}), best.state) for turn in TURNS}
-            turn = max(tried, key=lambda angle: tried[angle].value)
-            best = tried[turn]
-            if turn:
-                turns[body], few = turn, few.turned_by({body: turn})
+            here = heading[body]
+            tried = {here: best} | {here + turn: fitted(heading | {body: here + turn}, best.state) for turn in turns}
+            heading[body] = max(tried, key=lambda angle: tried[angle].value)
+            best = tried[heading[body]]
             rivals = [angle for angle, one in tried.items() if best.value - one.value < EQUAL_LIKELIHOOD]
-            if any(abs(np.angle(np.exp(1j * (angle - turn)))) > OTHER_HEADING_RAD for angle in rivals):
+            if any(abs(np.angle(np.exp(1j * (angle - heading[body])))) > OTHER_HEADING_RAD for angle in rivals):
                 unsure.append(body)
-        scene = scene.turned_by(turns)
-        if not turns:
+        if heading == before:
             break
-    if not unsure:
-        return scene, best.state, ""
-    return (
-        scene,
-        best.state,
+    text = (
         f"a second solution, with another heading of {', '.join(unsure)}, fits as well: delays are those of one of "
-        "them; attitudes or a known start tell which",
+        "them; attitudes or a known start tell which"
     )
+    return scene.turned_by(heading), best.state, text if unsure else ""

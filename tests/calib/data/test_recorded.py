@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from hashlib import sha256
-from typing import Any
 
 import numpy as np
 
@@ -40,12 +39,7 @@ def awkward():
     still = Poses(
         np.array([last + 10**12]), np.array(["post"]), np.array([[3.0, 2.0, 1.0]]), np.array([[0.0, 0, 0, 1]])
     )
-    poses = Poses(
-        *(
-            np.concatenate([getattr(poses, n), getattr(still, n)])
-            for n in ("time_ns", "body", "position_m", "quaternion")
-        )
-    )
+    poses = Poses.concatenate([poses, still])
     tags = [tag if tag.tag != 3 else Tag(3, "post", (0.1, 0.0, 0.0)) for tag in flight.tags]
     exchanges = flight.exchanges[np.argsort(rng.random(ROWS) + np.arange(ROWS) / 20)]
     fpp1 = exchanges.fpp1_dbm.copy()
@@ -75,10 +69,8 @@ def both_ends(exchanges, poses, tags):
     second = replace(
         again, time_ns=again.time_ns + rng.integers(0, 50_000_000, len(again)), reporter=again.target.copy()
     )
-    kept = exchanges[np.flatnonzero(np.arange(ROWS) % 10 > 0)]
-    columns: dict[str, Any] = {n: np.concatenate([getattr(kept, n), getattr(second, n)]) for n in kept.to_dict()}
-    order = np.argsort(columns["time_ns"] + rng.integers(0, 10**9, len(columns["time_ns"])))
-    return Exchanges(**{name: column[order] for name, column in columns.items()}), poses, tags
+    whole = Exchanges.concatenate([exchanges[np.flatnonzero(np.arange(ROWS) % 10 > 0)], second])
+    return whole[np.argsort(whole.time_ns + rng.integers(0, 10**9, len(whole)))], poses, tags
 
 
 def test_of_two_reports_one_counts(tmp_path):

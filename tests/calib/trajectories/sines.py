@@ -55,6 +55,13 @@ def arm(tag, length_m=ARM):
     return np.array([1.0, -1.0, -0.2]) * length_m * (1 if tag % 2 else -1)
 
 
+def scores(result):
+    """Return errors of delays over their covariance's standard errors, of the tags on moving bodies."""
+    found = result.calibration
+    std = dict(zip(found.uncertainty.tags, np.sqrt(np.diag(found.uncertainty.delays_ns2)), strict=True))
+    return np.array([(found.delays_ns[tag] - delay) / std[tag] for tag, delay in DELAYS_NS.items()])
+
+
 @dataclass
 class Flight:
     exchanges: Exchanges
