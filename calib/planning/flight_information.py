@@ -158,8 +158,9 @@ class Information:
         fixed = [replace(one, priors=tuple(replace(prior, bounds=None) for prior in one.priors)) for one in motion]
         self.layout = Layout((*model.unknowns, *fixed))
         self.x = self.layout.start()
-        for kind in model.curve_kinds() if model.curve is not None else ():
-            centres = np.convolve(model.curve.knots[1:-1], np.full(3, 1 / 3), mode="valid")
+        knots = np.zeros(0) if model.curve is None else model.curve.knots
+        for kind in model.curve_kinds():
+            centres = np.convolve(knots[1:-1], np.full(3, 1 / 3), mode="valid")
             self.x[self.layout.where[kind]] = CURVE_M * np.sin(CURVE_BENDS * centres)
         geometry = Distances.of(self.motion, self.layout, (model.ranges.initiator, model.ranges.target), scene.time_s)
         raw = np.zeros(len(scene.time_s))

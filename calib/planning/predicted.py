@@ -55,7 +55,8 @@ def random_arrangements(inputs: SurveyPlanSettings, count: int, tries: int = 400
     for number in range(tries):
         if len(found) == count:
             break
-        key, place = number, np.zeros((len(tags), 3))
+        key: tuple[int, ...] | int = number
+        place = np.zeros((len(tags), 3))
         if inputs.on == "line":
             order = tuple(rng.permutation(len(tags)).tolist())
             # A line may be read from either end.
@@ -75,7 +76,7 @@ def delay_information(
     inputs: SurveyPlanSettings,
     one: PlannedArrangement,
     curve: CurvePrior | None = None,
-    reflected: Sequence[Bools | float] = (0.0,),
+    reflected: Bools | Sequence[float] = (0.0,),
 ) -> Floats:
     """Return the information on delays, 1/ns^2, and on a curve, that an arrangement gives, whatever its places.
 
@@ -92,7 +93,7 @@ def delay_information(
         range_m=none,
         std_m=none,
         noise_m=none,
-        count=none,
+        count=none.astype(int),
         lifted=none,
     )
     network = Network(

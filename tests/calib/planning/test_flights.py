@@ -129,7 +129,7 @@ def test_better_knowledge_never_widens(base_ns, flown, changes, least, most):
 
 
 def test_an_accelerometer_bridges_few_ranges_and_a_good_one_more():
-    few = {"rate_hz": 12.0, "seconds": 10.0}
+    few: Any = {"rate_hz": 12.0, "seconds": 10.0}
     plan = calib.plan_flight(2, anchors=ANCHORS, imu="consumer", poses_until_s=4.0, **few)
     seen = rehearsed(**few, imu="consumer")
     # A grade is the noise of a tenth of a second, and what propellers leave.

@@ -54,7 +54,7 @@ def test_without_noise_delays_and_places_are_exact():
     r, delay = world.ranges, np.array([0.0, *world.delays_ns.values()])
     low, high, count = np.minimum(r.initiator, r.target), np.maximum(r.initiator, r.target), np.ones(len(r))
     raw = r.raw_m - SPEED_OF_LIGHT * 0.2e-9 * (delay[low] - delay[high])
-    weights = {"weight_initiator": 0.7 * count, "weight_target": 0.3 * count}
+    weights: Any = {"weight_initiator": 0.7 * count, "weight_target": 0.3 * count}
     result = calib.survey(replace(r, initiator=low, target=high, raw_m=raw, **weights), known="line")
     # A tenth of a millimetre, 3e-4 ns: in ranges without noise, too, one may be reflected by less than its noise.
     assert result.calibration.delays_ns == pytest.approx(world.delays_ns, abs=3e-4)
@@ -403,6 +403,7 @@ def test_the_command_takes_a_recording_an_arrangement_and_writes_what_others_rea
     assert max(abs(d - DELAYS_NS[t]) for t, d in known.delays_ns.items()) < 0.2
     rows = tomllib.loads(anchors.read_text())["anchors"]
     assert [row["id"] for row in rows] == [1, 2, 3, 4]
+    assert [row["position_m"] for row in rows] == [one["position_m"] for one in told["arrangements"][1]["boards"]]
     assert rows[0]["position_m"] == [0.0, 0.0, 0.0]
     std = np.sqrt([row["covariance_m2"][0] for row in rows])
     assert std[0] == 0
