@@ -71,13 +71,13 @@ def sandwich(
     # ranges are smaller by the share tr((I + P)^-1 I) / n on average, the unknowns that ranges determine by their
     # number.
     used = trace_of_product(optimum.covariance, information)
-    fresh = count / max(count - used, 0.2 * count)
+    inflation = count / max(count - used, 0.2 * count)
     for name, group in kept.items():
         reach = optimum.covariance[:, group.indices]
         series = sums @ reach
         lasting = persistence(series @ group.combinations.T, blocks, group.independent)
         width = max(lasting.quantile95, float(stdtrit(group.freedom, 0.975))) / TWO_SIDED_95
-        sampled = fresh * lasting.factor * width**2 * (series.T @ series)
+        sampled = inflation * lasting.factor * width**2 * (series.T @ series)
         found[name] = sampled + reach.T @ (stated @ reach) + of_weights(optimum, group.indices), lasting
     return found
 

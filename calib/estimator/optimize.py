@@ -1,7 +1,7 @@
-"""The one loop: from a start to the top of the log likelihood of all rows and priors.
+"""The one search: Newton steps to the maximum of the log likelihood of all rows and priors.
 
-Steps are Newton's with the information of the rows (squared slopes of a likelihood), corrected by how slopes changed
-over the last steps; the weights of priors that data determine are estimated along.
+The information of the rows (squared slopes of a likelihood) stands for the curvature, corrected by how slopes changed
+over the last steps. The weights of priors that data determine are estimated in the same steps.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SETTLED = 1e-2
 """A step that promises less log likelihood than this moves no unknown by more than a tenth of its standard error."""
 
 EVIDENCE_STEPS = 9
-"""Steps near the top in which weights of priors are estimated: they converge as fast as the unknowns do, then stand."""
+"""Steps near the optimum in which weights of priors are estimated: they converge as fast as the unknowns, then stay."""
 
 MOST_STEPS = 100
 """Steps after which a search is given up: sound ones take ten to sixty."""
@@ -64,7 +64,7 @@ def maximize(
     asked: Ints | None = None,
     longest: Callable[[Floats], float] | None = None,
 ) -> Optimum:
-    """Climb from unknowns (p,) to the likeliest ones; of those that are `asked` for the search settles more closely.
+    """Search from unknowns (p,) for the likeliest ones; those that are `asked` for settle more closely.
 
     `longest` returns which share of a step (p,) may be taken at most, where unknowns are not linear.
 
@@ -77,22 +77,22 @@ def maximize(
     changes = deque[tuple[Floats, Floats]](maxlen=10)
     sums = Sums(-np.inf, np.zeros_like(x), np.zeros((0, 0)))
     best, gain, promised, settled, taken = -np.inf, np.inf, 0.0, False, 0
-    top, slope, step = x, np.zeros_like(x), np.zeros_like(x)
+    best_x, slope, step = x, np.zeros_like(x), np.zeros_like(x)
     while taken < most and not settled:
         taken += 1
         found = sum_rows(rows, x)
         value = found.value + priors.value(x)
         if gain < len(free):
-            changes.append((x - top, sums.gradient - found.gradient))
+            changes.append((x - best_x, sums.gradient - found.gradient))
         # After eight reductions, to a thousandth or less, a step is taken as it is.
         if not value >= best - tolerance and shorter < 8:
-            # To the top of the parabola through both values and the slope (Nocedal and Wright 2006, equation 3.58).
+            # To the maximum of the parabola through both values and the slope (Nocedal and Wright 2006, equation 3.58).
             share = 0.5 * promised / (promised + best - value)
             step *= float(np.clip(share, 0.1, 0.5)) if np.isfinite(share) else 0.1
             promised, shorter = float(slope @ step), shorter + 1
-            x = top + step
+            x = best_x + step
             continue
-        top, sums, shorter = x, found, 0
+        best_x, sums, shorter = x, found, 0
         precision = priors.precision()
         known = sums.information + precision
         covariance = inverse_of(known, free)
@@ -116,11 +116,11 @@ def maximize(
             best = sums.value + priors.value(x)
         step *= 1.0 if longest is None else min(1.0, longest(step))
         promised = float(slope @ step)
-        x = top + step
+        x = best_x + step
     return Optimum(
         layout=layout,
         priors=priors,
-        x=top,
+        x=best_x,
         covariance=covariance,
         information=sums.information,
         value=best,

@@ -207,10 +207,10 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
     told = np.bincount(number, found.by["odds"] ** 2, pairs)
     # A wall has one detour: the number of reflections counts for the mean, not the number of ranges.
     reflected = np.bincount(number, found.reflected, pairs)
-    odds, odds_var, any_odds, any_odds_var = _drawn(
+    odds, odds_var, any_odds, any_odds_var = _shrunk_to_mean(
         values["odds of pair"], lasting / np.maximum(told, 1e-6), WIDEST_ODDS
     )
-    detour, detour_var, any_detour, any_detour_var = _drawn(
+    detour, detour_var, any_detour, any_detour_var = _shrunk_to_mean(
         values["detour of pair"], lasting / np.maximum(reflected, 1e-6), WIDEST_DETOUR
     )
     lifted, noise, curve = _at_nodes(model, values)
@@ -223,16 +223,16 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
     any_mean = above * float(np.exp(any_detour + any_detour_var / 2))
     means = above * np.exp(detour + detour_var / 2)
     reach = BEYOND_MEANS * long.longest * long.mean * float(means.max())
-    wild = np.clip(1 - found.inlier, 0, 1) * (np.abs(residual - errors.location_m) < reach)
-    square = float(np.sum(wild * (residual - errors.location_m) ** 2))
+    outlying = np.clip(1 - found.inlier, 0, 1) * (np.abs(residual - errors.location_m) < reach)
+    square = float(np.sum(outlying * (residual - errors.location_m) ** 2))
     stated = ErrorModel(
         lifted=tuple(lifted.tolist()),
         noise_m=tuple(noise.tolist()),
         tail_share=tuple(np.clip(expit(common + curve - np.mean(curve)), 1e-4, 1 - 1e-4).tolist()),
         least_m=float(np.exp(values["least detour"][0])),
         detour_m=long.mean * any_mean,
-        outlier_share=max(float(np.mean(wild)), 1e-9),
-        outlier_m=float(np.sqrt(square / max(float(np.sum(wild)), 1e-9))) or reach,
+        outlier_share=max(float(np.mean(outlying)), 1e-9),
+        outlier_m=float(np.sqrt(square / max(float(np.sum(outlying)), 1e-9))) or reach,
         location_m=errors.location_m,
         long_share=long.share,
         long_factor=long.factor,
@@ -243,7 +243,7 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
             )
         },
     )
-    return _put_right(stated, model, residual)
+    return _with_quantiles(stated, model, residual)
 
 
 def between_recordings(model: RangeModel, errors: DescribedErrors, blocks: TimeBlocks, pairs_m: float | None) -> float:
@@ -298,7 +298,7 @@ def _at_nodes(model: RangeModel, values: dict[str, Floats]) -> tuple[Floats, Flo
     return nodes, np.exp(level + curves["noise"]), curves["odds"]
 
 
-def _drawn(value: Floats, variance: Floats, widest: float) -> tuple[Floats, Floats, float, float]:
+def _shrunk_to_mean(value: Floats, variance: Floats, widest: float) -> tuple[Floats, Floats, float, float]:
     """Shrink values (pairs,) with known variances to their mean; return them, their variances, and those of a new pair.
 
     The variance between pairs is the maximum of a normal likelihood (by expectation-maximisation). Returned variances
@@ -321,7 +321,7 @@ def _expected_odds(log_odds: Floats, variance: Floats) -> Floats:
     return np.asarray(log_odds / np.sqrt(1 + np.pi / 8 * variance))
 
 
-def _put_right(model: ErrorModel, of: RangeModel, residual: Floats) -> ErrorModel:
+def _with_quantiles(model: ErrorModel, of: RangeModel, residual: Floats) -> ErrorModel:
     """Correct the quantiles and the total standard deviation so that they hold for the fitted ranges on average."""
     if len(residual) < 200:
         # Two hundred ranges know the outer quantiles, those of half a per cent, by one range.

@@ -169,12 +169,12 @@ def error_slopes(residual: Floats, parameters: dict[str, Floats], *, span_m: flo
     sigma = np.exp(parameters["noise"])
     share = expit(parameters["odds"])
     detour = np.exp(parameters["detour"])
-    least, wild, long_share = np.exp(parameters["least"]), expit(parameters["outliers"]), expit(parameters["long"])
+    least, outlying, long_share = np.exp(parameters["least"]), expit(parameters["outliers"]), expit(parameters["long"])
     long = LongDetours(share=float(long_share[0]), factor=LONG_FACTOR)
     found = densities(residual, sigma, float(least[0]), long.mean * detour, long)
-    inside = 1 - float(wild[0])
+    inside = 1 - float(outlying[0])
     core, tail = inside * (1 - share) * found.direct, inside * share
-    total = core + tail * found.reflected + float(wild[0]) / span_m
+    total = core + tail * found.reflected + float(outlying[0]) / span_m
     core, tail = core / total, tail / total
     tails = [tail * kind.density for kind in found.kinds]
     reflected = tails[0] + tails[1]
