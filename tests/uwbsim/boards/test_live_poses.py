@@ -19,7 +19,7 @@ def flight(**mocap):
     """Boards of which one flies."""
     box = {"box_min_m": [-2.0, -2.0, 0.5], "box_max_m": [2.0, 2.0, 2.0]}
     motion = {"model": "random-flight", "speed_mps": 1.0} | box
-    tables = bench_scenario().model_dump(by_alias=True) | {"mocap": {"rate_hz": 120.0, **mocap}}
+    tables = bench_scenario().model_dump(mode="json") | {"mocap": {"rate_hz": 120.0, **mocap}}
     return uwbsim.load(tables, {"bodies.0.motion": motion})
 
 
