@@ -39,7 +39,7 @@ def served(scenario=None, faults=None, link_dir=None, **more):
         yield server
     finally:
         stop.set()
-        thread.join(5)
+        thread.join(60)  # a step takes long where the machine is busy, and what it writes to must not be closed
         server.close()
 
 

@@ -19,7 +19,7 @@ from uwblink.errors import UwblinkError
 from uwbsim.sweep.executors import ClusterLostError
 from uwbsim.sweep.runner import Store, Summary, TableError, run_sweep
 
-UWBSIM = Path(sys.executable).parent / "uwbsim"
+UWBSIM = str(Path(sys.executable).parent / "uwbsim")
 SMALL = HEAD + 'ranges = 100\n[vary]\n"radio.rx_noise_ps" = [0.0, 50.0]\n'
 
 
