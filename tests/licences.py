@@ -80,7 +80,8 @@ def licence_of(name: str) -> str:
 
 def installed_with(requirements: list[str]) -> set[str]:
     """Return the names of distributions that are installed with some, themselves included."""
-    waiting, known = list(map(Requirement, requirements)), set()
+    waiting = list(map(Requirement, requirements))
+    known: set[str] = set()
     while waiting:
         name = canonicalize_name(waiting.pop().name)
         if name not in known:
