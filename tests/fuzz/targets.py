@@ -18,7 +18,7 @@ with atheris.instrument_imports(include=["uwblink", "calib.calibration", "calib.
     from calib.data.sources import check_planted
     from calib.errors import CalibError
     from uwblink.errors import UwblinkError
-    from uwblink.importers import read_table
+    from uwblink.importers import read_source
     from uwblink.importers.guess import guess_map
     from uwblink.importers.poses import read_poses
     from uwblink.recording.intake import decode_json
@@ -27,8 +27,8 @@ with atheris.instrument_imports(include=["uwblink", "calib.calibration", "calib.
 
 PLACE = Path(tempfile.mkdtemp())
 READERS = (
-    ("t.csv", read_table),
-    ("t.jsonl", read_table),
+    ("t.csv", read_source),
+    ("t.jsonl", read_source),
     ("g.csv", guess_map),
     ("p.csv", read_poses),
     ("p.tum", read_poses),
