@@ -312,7 +312,7 @@ def test_boards_at_one_distance_are_asked_about_the_unit_of_the_tape():
 
 
 def test_reflections_that_last_are_named_with_their_life():
-    plan = replace(SHORT, seconds=100, tags_a_body=1, share=0.2, lasts_s=4.0)
+    plan = replace(SHORT, seconds=150, tags_a_body=1, share=0.2, lasts_s=4.0)
     found = only(fly(plan, 55), "reflections that last")
     lives = [float(life) for life in re.findall(r"for ([\d.]+) s at a time", found.evidence)]
     # A few dozen spells a pair, of which the short detours are not seen.
