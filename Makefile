@@ -7,6 +7,8 @@ LOCKED := --quiet --disable-pip-version-check --no-deps --require-hashes -r requ
 # Tests run in many processes: what the first compiles, the others need not (an empty value counts as none).
 TESTS := -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 test coverage lowest newest pythons: export PYTHONDONTWRITEBYTECODE :=
+# Threads of linear algebra in four processes compete for two cores.
+test coverage lowest newest pythons: export OPENBLAS_NUM_THREADS := 1
 ITSELF := --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 
 .PHONY: $(shell sed -n 's/^\([a-z -]*\):.*\#\# .*/\1/p' $(firstword $(MAKEFILE_LIST)))

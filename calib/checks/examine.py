@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from calib.checks import columns, geometry, offsets, residuals, surveys
 from calib.checks.recording_view import RecordingView, view_of
@@ -317,6 +318,8 @@ IMPLIED: Final = {
 """Faults that follow from a fault, and are not reported beside it."""
 
 
+# Small matrices: several threads make them slower, and the last digits another.
+@threadpool_limits.wrap(limits=1, user_api="blas")  # type: ignore[untyped-decorator]  # it has no types
 def examine(data: Data | Iterable[Data]) -> list[Finding]:
     """Return what is wrong with a recording, the gravest first: each fault with its evidence and what to do about it.
 
