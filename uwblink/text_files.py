@@ -22,14 +22,8 @@ def require_regular(
 
     FIFOs and devices must not be opened: reading them may never end.
     """
-    try:
+    with raising(error, f"{path}: no such {what}", OSError, ValueError):  # ValueError: a NUL in the path
         mode = os.stat(path).st_mode
-    except FileNotFoundError as problem:
-        raise error(f"{path}: no such {what}") from problem
-    except OSError as problem:
-        raise error(f"{path}: cannot be read ({problem.strerror})") from problem
-    except ValueError as problem:  # a NUL in the path
-        raise error(f"{str(path)!r}: no path of a {what} ({problem})") from problem
     if stat.S_ISDIR(mode):
         if not folders:
             raise error(f"{path}: is a directory, expected a {what}")

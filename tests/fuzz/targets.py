@@ -21,7 +21,7 @@ with atheris.instrument_imports(include=["uwblink", "calib.calibration", "calib.
     from uwblink.importers import read_source
     from uwblink.importers.guess import guess_map
     from uwblink.importers.poses import read_poses
-    from uwblink.recording.intake import decode_json
+    from uwblink.recording.store import decode_json
     from uwblink.wire.codec import ColumnDecoder, Decoder, encode
     from uwblink.wire.messages import REPORTS, RangeReport, Skipped, TextLine
 
