@@ -22,7 +22,8 @@ def require_regular(
 
     FIFOs and devices must not be opened: reading them may never end.
     """
-    with raising(error, f"{path}: no such {what}", OSError, ValueError):  # ValueError: a NUL in the path
+    not_path = raising(error, f"{str(path)!r}: no path of a {what}", ValueError)  # a NUL in the path
+    with not_path, raising(error, f"{path}: no such {what}"):
         mode = os.stat(path).st_mode
     if stat.S_ISDIR(mode):
         if not folders:
