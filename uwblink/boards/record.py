@@ -28,7 +28,7 @@ from uwblink.recording.antenna_delays import meta_of_delays
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import SHAPES, Arrangement, CirRow, Fault, FrameRow, Tag
 from uwblink.wire.codec import exchanges_of
-from uwblink.wire.messages import Cir, Message, Overheard, RangeReport
+from uwblink.wire.messages import Cir, Overheard
 
 FILE_MB: Final = 64
 """Memory limit for the file; by default DuckDB would cache all of it."""
@@ -185,22 +185,23 @@ def append_rows(recording: Recording, rows: Sequence[Row]) -> None:
     Messages other than reports of exchanges, overheard exchanges and impulse responses are stored as bytes only.
     """
 
-    def heard(kind: type[Message]) -> list[tuple[int, int, Any]]:
-        found = (row for row in rows if isinstance(row, Heard))
-        return [(one.time_ns, one.board, one.message) for one in found if isinstance(one.message, kind)]
-
+    heard = [(row.time_ns, row.board, row.message) for row in rows if isinstance(row, Heard)]
     recording.append("frames", [row for row in rows if isinstance(row, FrameRow)])
     recording.append("faults", [row for row in rows if isinstance(row, Fault)])
-    if ranges := heard(RangeReport):
-        recording.append_exchanges(exchanges_of(ranges))
+    recording.append_exchanges(exchanges_of(heard))
     # What a report lacks is None there, and unknown here.
     overheard = [
         {"time_ns": t, "listener": board} | {n: np.nan if (v := getattr(o, n)) is None else v for n in Overheard.FIELDS}
-        for t, board, o in heard(Overheard)
+        for t, board, o in heard
+        if isinstance(o, Overheard)
     ]
     recording.append("overheard", overheard)
-    cirs = [(t, board, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes) for t, board, c in heard(Cir)]
-    recording.append("cirs", [CirRow(*row) for row in cirs])
+    cirs = [
+        CirRow(t, board, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes)
+        for t, board, c in heard
+        if isinstance(c, Cir)
+    ]
+    recording.append("cirs", cirs)
 
 
 class RecordingWriter(Closing, Listener):
