@@ -30,9 +30,6 @@ from uwblink.recording.schema import SHAPES, Arrangement, CirRow, Fault, FrameRo
 from uwblink.wire.codec import exchanges_of
 from uwblink.wire.messages import Cir, Overheard
 
-FILE_MB: Final = 64
-"""Memory limit for the file; by default DuckDB would cache all of it."""
-
 LONGEST_BACKLOG_S: Final = 20.0
 """Longest delay of the disk that is tolerated; busy disks take a second or two."""
 
@@ -100,7 +97,8 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
         listener.on_start(turns)
     meta = _meta(found, plan, turns, passive) | (meta_of_delays(delays) if plan.antenna_delays else {})
     try:
-        with Recording.create(path, meta=meta, force=force, live=True, memory_mb=FILE_MB) as recording:
+        # Without a limit of memory DuckDB would cache the whole file.
+        with Recording.create(path, meta=meta, force=force, live=True, memory_mb=64) as recording:
             placed = {tag.tag: tag for tag in plan.tags}
             recording.append_tags(placed.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
             with RecordingWriter(recording) as writer:

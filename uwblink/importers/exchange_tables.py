@@ -16,6 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from uwblink.display import first_few
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import IDS, POSITIONS, ColumnMap, load_map
 from uwblink.importers.exchange_rows import SOUND_IDS, Faults, assemble_exchanges, usable_exchanges, usable_ranges
@@ -119,9 +120,8 @@ def _notes(staging: Staging) -> list[str]:
     notes, names = [], staging.names
     if names:
         # The first dozen; a recording has all, as its tags' bodies.
-        some = ", ".join(f"{name[:20]} = {number}" for number, name in list(names.items())[:12])
-        more = f" and {len(names) - 12} more" if len(names) > 12 else ""
-        notes.append(f"{len(names)} ids are words or too large, and get numbers: {some}{more}")
+        some = first_few((f"{name[:20]} = {number}" for number, name in names.items()), 12)
+        notes.append(f"{len(names)} ids are words or too large, and get numbers: {some}")
     if not staging.rows.has("time_s"):
         notes.append("there are no times; rows are taken as a millisecond apart, in their order")
     return notes
