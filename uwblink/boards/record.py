@@ -88,7 +88,6 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
         raise PlanError(f"duration_s: found {duration_s!r}, expected more than 0 seconds")
     path, others, using = Path(output), as_listeners(listeners), using or SerialPorts()
     mark = Arrangement(arrangement or "", 0, 0, known, tuple(order))
-    _check_arrangement(mark)
     check_output(path, force=force, recording=True)
     found = identify(ports, using)
     turns, delays = plan.turns(sorted(found)), plan.programmed(found)
@@ -124,17 +123,14 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
     return recorder.progress
 
 
-def _check_arrangement(mark: Arrangement) -> None:
+def _check_boards(found: Mapping[int, str], plan: RangingPlan, mark: Arrangement) -> None:
+    """Raise `PlanError` for an arrangement that cannot be, an order or places of tags that are of other boards."""
     if mark.known not in SHAPES or (mark.known and not mark.name):
         raise PlanError(
             f"found {mark.known!r:.40}, allowed: line, plane, of an `arrangement` that has a name", parameter="known"
         )
     if mark.order and mark.known != "line":
         raise PlanError("is the order of boards that are `known` to be on a line", parameter="order")
-
-
-def _check_boards(found: Mapping[int, str], plan: RangingPlan, mark: Arrangement) -> None:
-    """Raise `PlanError` if an order or places of tags are for other boards than those at the ports."""
     there, placed = ", ".join(map(str, sorted(found))), {tag.tag for tag in plan.tags}
     if mark.order and sorted(mark.order) != sorted(found):
         raise PlanError(
