@@ -28,7 +28,7 @@ from uwblink.boards import record as writer
 from uwblink.boards.listeners import Heard, Progress
 from uwblink.boards.ports import Transport
 from uwblink.boards.ranging_plan import RangingPlan
-from uwblink.boards.record import FILE_MB, record
+from uwblink.boards.record import record
 from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import FrameRow, Poses
@@ -186,7 +186,7 @@ def recording(hours: float, path: Path) -> None:
     print("|---|---|---|---|---|---|---|", flush=True)
     plan = RangingPlan(ports.pairs, rate_hz=RATE_HZ, tags=tuple(ports.flight.tags))
     record(ports.names, path, plan, duration_s=hours * 3600, using=ports, watch=_Lines(path).watch, force=True)
-    with Recording.open(path, update=True, memory_mb=FILE_MB) as recorded:
+    with Recording.open(path, update=True, memory_mb=64) as recorded:
         for poses in ports.poses(hours * 3600):
             recorded.append_poses(poses)
 

@@ -22,14 +22,9 @@ def require_regular(
 
     FIFOs and devices must not be opened: reading them may never end.
     """
-    try:
+    not_path = raising(error, f"{str(path)!r}: no path of a {what}", ValueError)  # a NUL in the path
+    with not_path, raising(error, f"{path}: no such {what}"):
         mode = os.stat(path).st_mode
-    except FileNotFoundError as problem:
-        raise error(f"{path}: no such {what}") from problem
-    except OSError as problem:
-        raise error(f"{path}: cannot be read ({problem.strerror})") from problem
-    except ValueError as problem:  # a NUL in the path
-        raise error(f"{str(path)!r}: no path of a {what} ({problem})") from problem
     if stat.S_ISDIR(mode):
         if not folders:
             raise error(f"{path}: is a directory, expected a {what}")

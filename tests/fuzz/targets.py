@@ -21,9 +21,9 @@ with atheris.instrument_imports(include=["uwblink", "calib.calibration", "calib.
     from uwblink.importers import read_source
     from uwblink.importers.guess import guess_map
     from uwblink.importers.poses import read_poses
-    from uwblink.recording.intake import decode_json
-    from uwblink.wire.codec import ColumnDecoder, Decoder, encode
-    from uwblink.wire.messages import REPORTS, RangeReport, Skipped, TextLine
+    from uwblink.recording.store import decode_json
+    from uwblink.wire.codec import Decoder, encode
+    from uwblink.wire.messages import REPORTS, Skipped, TextLine
 
 PLACE = Path(tempfile.mkdtemp())
 READERS = (
@@ -42,21 +42,18 @@ def as_bytes(event):
 
 
 def decoder(size: int, stream: bytes) -> None:
-    """Whole and in pieces agree, every byte is in one event, and the fast columns agree with the messages."""
+    """Whole and in pieces agree, and every byte is in one event."""
     size = size % 40 + 1
     whole = Decoder(REPORTS)
     events = whole.feed(stream) + whole.finish()
     assert b"".join(map(as_bytes, events)) == stream
-    pieces, columns = Decoder(REPORTS), ColumnDecoder(1)
+    pieces = Decoder(REPORTS)
     found = []
     for at in range(0, len(stream), size):
         found += pieces.feed(stream[at : at + size])
-        columns.feed(stream[at : at + size], at)
     found += pieces.finish()
-    columns.finish(len(stream))
     understood = [e for e in events if not isinstance(e, Skipped)]
     assert [e for e in found if not isinstance(e, Skipped)] == understood
-    assert len(columns.exchanges()) == sum(isinstance(e, RangeReport) for e in understood)
 
 
 def tables(kind: int, data: bytes) -> None:

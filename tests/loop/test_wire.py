@@ -13,7 +13,7 @@ from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.record import record
 from uwblink.importers import add_poses
 from uwblink.recording.file import Recording
-from uwblink.recording.tags import load_places
+from uwblink.recording.schema import load_places
 from uwbsim.scenario.loading import load
 
 ROOT = Path(__file__).parents[2]

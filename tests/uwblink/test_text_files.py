@@ -13,7 +13,7 @@ from uwblink.text_files import read_text
         ("folder", "is a directory, expected a map"),
         ("latin1", "not a text file in UTF-8"),
         ("nowhere\0", "no path of a map"),
-        ("n" * 300, "cannot be read (File name too long)"),
+        ("n" * 300, "(File name too long)"),
     ],
 )
 def test_what_cannot_be_read_is_one_line(tmp_path, name, line):

@@ -6,8 +6,9 @@ Replay is of the stored bytes of a recording: decoded again, or played back on p
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,8 @@ from uwblink.output import write_bytes
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import FrameRow
 from uwblink.twr import Exchanges
-from uwblink.wire.codec import ColumnDecoder, Event
-from uwblink.wire.messages import Cir, Overheard, TextLine
+from uwblink.wire.codec import Decoder, Event, exchanges_of
+from uwblink.wire.messages import REPORTS, Cir, Overheard, RangeReport, TextLine
 
 __all__ = [
     "Correction",
@@ -81,21 +82,27 @@ class Decoded:
 
 def decode_again(recording: Recording) -> Decoded:
     """Decode all bytes from boards; raises `RecordingError` if there are none."""
-    frames = _heard(recording)
-    ids = board_ids(recording)
-    names = dict.fromkeys(frame.board for frame in frames)
-    decoders = {name: ColumnDecoder(ids.get(name, k)) for k, name in enumerate(names)}
-    for frame in frames:
-        decoders[frame.board].feed(frame.data, frame.time_ns)
-    others = []
-    for name, decoder in decoders.items():
-        decoder.finish(frames[-1].time_ns)
-        others += [Heard(time_ns, ids.get(name, 0), event) for time_ns, event in decoder.events]
+    frames, ids = _heard(recording), board_ids(recording)
+    decoders = {frame.board: Decoder(REPORTS) for frame in frames}
+    boards = {name: ids.get(name, k) for k, name in enumerate(decoders)}
+    parts, others = [exchanges_of([])], list[Heard]()
+
+    def heard() -> Iterator[Heard]:
+        for frame in frames:
+            yield from (Heard(frame.time_ns, boards[frame.board], e) for e in decoders[frame.board].feed(frame.data))
+        for name, decoder in decoders.items():
+            yield from (Heard(frames[-1].time_ns, boards[name], e) for e in decoder.finish())
+
+    events = heard()
+    # In blocks, because messages as objects take ten times the memory of columns.
+    while block := list(islice(events, 10_000)):
+        parts.append(exchanges_of((one.time_ns, one.board, one.message) for one in block))
+        others += [one for one in block if not isinstance(one.message, RangeReport)]
     return Decoded(
-        Exchanges.concatenate([d.exchanges() for d in decoders.values()]).in_time_order(),
-        sorted(others, key=lambda one: one.time_ns),
-        sum(d.decoder.skipped_bytes for d in decoders.values()),
-        sum(d.decoder.messages for d in decoders.values()),
+        Exchanges.concatenate(parts).in_time_order(),
+        others,
+        sum(decoder.skipped_bytes for decoder in decoders.values()),
+        sum(decoder.messages for decoder in decoders.values()),
     )
 
 

@@ -31,8 +31,7 @@ from uwblink.errors import PlanError
 from uwblink.protocols.table import ON_BOARDS
 from uwblink.recording.antenna_delays import FILE_KEYS as DELAY_KEYS
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, known_delays, read_antenna_delays
-from uwblink.recording.schema import Tag
-from uwblink.recording.tags import is_board_id, read_tags
+from uwblink.recording.schema import Tag, is_board_id, read_tags
 from uwblink.text_files import FileKey, TomlReader, heads, is_number
 
 FILE_KEYS: Final = (

@@ -28,10 +28,7 @@ from uwblink.recording.antenna_delays import meta_of_delays
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import SHAPES, Arrangement, CirRow, Fault, FrameRow, Tag
 from uwblink.wire.codec import exchanges_of
-from uwblink.wire.messages import Cir, Message, Overheard, RangeReport
-
-FILE_MB: Final = 64
-"""Memory limit for the file; by default DuckDB would cache all of it."""
+from uwblink.wire.messages import Cir, Overheard
 
 LONGEST_BACKLOG_S: Final = 20.0
 """Longest delay of the disk that is tolerated; busy disks take a second or two."""
@@ -91,7 +88,6 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
         raise PlanError(f"duration_s: found {duration_s!r}, expected more than 0 seconds")
     path, others, using = Path(output), as_listeners(listeners), using or SerialPorts()
     mark = Arrangement(arrangement or "", 0, 0, known, tuple(order))
-    _check_arrangement(mark)
     check_output(path, force=force, recording=True)
     found = identify(ports, using)
     turns, delays = plan.turns(sorted(found)), plan.programmed(found)
@@ -100,7 +96,8 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
         listener.on_start(turns)
     meta = _meta(found, plan, turns, passive) | (meta_of_delays(delays) if plan.antenna_delays else {})
     try:
-        with Recording.create(path, meta=meta, force=force, live=True, memory_mb=FILE_MB) as recording:
+        # Without a limit of memory DuckDB would cache the whole file.
+        with Recording.create(path, meta=meta, force=force, live=True, memory_mb=64) as recording:
             placed = {tag.tag: tag for tag in plan.tags}
             recording.append_tags(placed.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
             with RecordingWriter(recording) as writer:
@@ -126,17 +123,14 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
     return recorder.progress
 
 
-def _check_arrangement(mark: Arrangement) -> None:
+def _check_boards(found: Mapping[int, str], plan: RangingPlan, mark: Arrangement) -> None:
+    """Raise `PlanError` for an arrangement that cannot be, an order or places of tags that are of other boards."""
     if mark.known not in SHAPES or (mark.known and not mark.name):
         raise PlanError(
             f"found {mark.known!r:.40}, allowed: line, plane, of an `arrangement` that has a name", parameter="known"
         )
     if mark.order and mark.known != "line":
         raise PlanError("is the order of boards that are `known` to be on a line", parameter="order")
-
-
-def _check_boards(found: Mapping[int, str], plan: RangingPlan, mark: Arrangement) -> None:
-    """Raise `PlanError` if an order or places of tags are for other boards than those at the ports."""
     there, placed = ", ".join(map(str, sorted(found))), {tag.tag for tag in plan.tags}
     if mark.order and sorted(mark.order) != sorted(found):
         raise PlanError(
@@ -185,22 +179,23 @@ def append_rows(recording: Recording, rows: Sequence[Row]) -> None:
     Messages other than reports of exchanges, overheard exchanges and impulse responses are stored as bytes only.
     """
 
-    def heard(kind: type[Message]) -> list[tuple[int, int, Any]]:
-        found = (row for row in rows if isinstance(row, Heard))
-        return [(one.time_ns, one.board, one.message) for one in found if isinstance(one.message, kind)]
-
+    heard = [(row.time_ns, row.board, row.message) for row in rows if isinstance(row, Heard)]
     recording.append("frames", [row for row in rows if isinstance(row, FrameRow)])
     recording.append("faults", [row for row in rows if isinstance(row, Fault)])
-    if ranges := heard(RangeReport):
-        recording.append_exchanges(exchanges_of(ranges))
+    recording.append_exchanges(exchanges_of(heard))
     # What a report lacks is None there, and unknown here.
     overheard = [
         {"time_ns": t, "listener": board} | {n: np.nan if (v := getattr(o, n)) is None else v for n in Overheard.FIELDS}
-        for t, board, o in heard(Overheard)
+        for t, board, o in heard
+        if isinstance(o, Overheard)
     ]
     recording.append("overheard", overheard)
-    cirs = [(t, board, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes) for t, board, c in heard(Cir)]
-    recording.append("cirs", [CirRow(*row) for row in cirs])
+    cirs = [
+        CirRow(t, board, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes)
+        for t, board, c in heard
+        if isinstance(c, Cir)
+    ]
+    recording.append("cirs", cirs)
 
 
 class RecordingWriter(Closing, Listener):

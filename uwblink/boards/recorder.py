@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import Final
 
-from uwblink.boards.board import Board
-from uwblink.boards.connection import FENCE, QUIET_AFTER_CIR_S, QUIET_TARGET_S, CommandOutcome, Connection
+from uwblink.boards.board import FENCE, QUIET_AFTER_CIR_S, QUIET_TARGET_S, Board, CommandOutcome, Connection
 from uwblink.boards.listeners import Heard, Listener, Pair, PairState, Progress, ReportCheck, Turn
 from uwblink.boards.ports import Ports, SerialPorts, Transport, serial_number
 from uwblink.boards.ranging_plan import RangingPlan

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -308,9 +308,7 @@ def record(
         raise PlanError(f"--pairs: found {pairs!r}, expected all or none; a plan file can name pairs")
     if calibration and not live:
         raise PlanError("--calibration: corrected ranges are shown on the page of --live; add --live")
-    chosen = _plan(plan, rate, antenna_delays, pairs="all" if pairs == "all" else ())
-    if cir:
-        chosen = replace(chosen, get_cir=True)
+    chosen = _plan(plan, antenna_delays, "all" if pairs == "all" else (), rate_hz=rate, get_cir=cir)
     with ExitStack() as stack:
         stop, watch = stack.enter_context(interrupts()), stack.enter_context(_watcher())
         pages = []
@@ -388,7 +386,7 @@ def stream(
             server = stack.enter_context(uwblink.streaming.FoxgloveServer(foxglove))
             typer.echo(f"foxglove: {server.url}", err=True)
             senders.append(server.send)
-        chosen = _plan(plan, rate, antenna_delays) if of_boards else None
+        chosen = _plan(plan, antenna_delays, rate_hz=rate) if of_boards else None
         correct = _correction(calibration, chosen, None if of_boards else source[0])
         duration_s = duration or math.inf
         try:
@@ -415,17 +413,20 @@ def stream(
 
 
 def _plan(
-    path: Path | None, rate: float | None, antenna_delays: Path | None, pairs: str | tuple[()] = "all"
+    path: Path | None, antenna_delays: Path | None, pairs: Literal["all"] | tuple[()] = "all", **options: Any
 ) -> uwblink.RangingPlan:
-    """Return the plan of a file, or one for `pairs`; raises `PlanError` if antenna delays are given twice."""
-    chosen = uwblink.boards.load_plan(path) if path else uwblink.RangingPlan("all" if pairs == "all" else ())
+    """Return the plan of a file, or one for `pairs`, with the `options` that are given.
+
+    Raises `PlanError` if antenna delays are given twice.
+    """
+    chosen = uwblink.boards.load_plan(path) if path else uwblink.RangingPlan(pairs)
     if antenna_delays and chosen.antenna_delays:
         raise PlanError(
             f"{antenna_delays}: the plan has [antenna_delays], too; leave one of them out", parameter="antenna_delays"
         )
     if antenna_delays:
-        chosen = replace(chosen, antenna_delays=uwblink.recording.load_antenna_delays(antenna_delays))
-    return replace(chosen, rate_hz=rate) if rate else chosen
+        options["antenna_delays"] = uwblink.recording.load_antenna_delays(antenna_delays)
+    return replace(chosen, **{name: value for name, value in options.items() if value})
 
 
 def _correction(path: Path | None, plan: uwblink.RangingPlan | None, recording: str | None = None) -> Correction | None:

@@ -28,8 +28,8 @@ from uwblink.output import place_beside, take_name
 from uwblink.plugins import Registry, check_row
 from uwblink.recording.contents import READING_MB, distances_by_poses_m, pieces
 from uwblink.recording.file import Recording
-from uwblink.recording.intake import check_name
 from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM, Poses
+from uwblink.recording.store import check_name
 
 
 def _write(recording: Path, folder: Path, *, suffix: str, options: str, cells: Mapping[str, str]) -> dict[str, int]:

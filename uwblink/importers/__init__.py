@@ -27,8 +27,8 @@ from uwblink.output import check_output
 from uwblink.plugins import Registry, check_row, is_text
 from uwblink.recording.contents import Contents, load
 from uwblink.recording.file import Recording
-from uwblink.recording.intake import decode_json
 from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM
+from uwblink.recording.store import decode_json
 
 __all__ = [
     "IMPORTERS",

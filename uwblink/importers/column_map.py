@@ -190,14 +190,12 @@ def load_map(path: Path) -> ColumnMap:
     file.known(table, heads(FILE_KEYS))
     columns, units, constants, ids = (file.section(name) for name in ("columns", "units", "constants", "ids"))
     file.known(columns, NAMES, "columns.")
-    file.known(constants, NAMES, "constants.")
     file.known(units, ("stamps", "time", "distance", "power"), "units.")
     for name, value in columns.items():
         file.check(f"columns.{name}", value, isinstance(value, str), "the name of a column")
     _constants(file, "constants", constants)
     for topic, values in file.section("topics").items():
         file.check(f"topics.{topic}", values, isinstance(values, dict), "a table of constants, which may be empty")
-        file.known(values, NAMES, f"topics.{topic}.")
         _constants(file, f"topics.{topic}", values)
     each = table.get("each")
     file.check("each", each, each is None or isinstance(each, str), "the name of a field")
@@ -207,10 +205,6 @@ def load_map(path: Path) -> ColumnMap:
     within = table.get("within_s", 1.0)
     file.check("within_s", within, is_number(within) and within > 0, "seconds")
     stamps = units.get("stamps", "ticks")
-    if is_number(stamps) and stamps > 0:
-        scale = float(stamps * TICKS_PER_SECOND)
-    else:
-        scale = STAMP_UNITS[file.choice("units.stamps", stamps, STAMP_UNITS)]
     return ColumnMap(
         layout=file.choice("layout", table.get("layout"), (None, "exchanges", "messages", "stamps", "parts", "ranges")),
         bits=file.choice("bits", table.get("bits"), (None, *BITS)),
@@ -220,7 +214,9 @@ def load_map(path: Path) -> ColumnMap:
         decimal=file.choice("decimal", table.get("decimal"), (None, ".", ",")),
         within_s=float(within),
         columns=columns,
-        ticks_per_unit=scale,
+        ticks_per_unit=float(stamps * TICKS_PER_SECOND)
+        if is_number(stamps) and stamps > 0
+        else STAMP_UNITS[file.choice("units.stamps", stamps, STAMP_UNITS)],
         time_unit=file.choice("units.time", units.get("time"), (None, "iso", *TIME_UNITS)),
         distance_unit=file.choice("units.distance", units.get("distance"), (None, *DISTANCE_UNITS)),
         power_unit=file.choice("units.power", units.get("power"), (None, "dBm", "-dBm")),
@@ -233,11 +229,9 @@ def load_map(path: Path) -> ColumnMap:
 
 
 def _constants(file: TomlReader, where: str, values: dict[str, Any]) -> None:
+    file.known(values, NAMES, f"{where}.")
     for name, value in values.items():
-        if name in IDS:
-            good = is_number(value) or (isinstance(value, str) and value != ASKED)
-            file.check(
-                f"{where}.{name}", value, good, f"{IDS[name]}: a number or a word; or name its column in [columns]"
-            )
-        else:
-            file.check(f"{where}.{name}", value, is_number(value), "a finite number")
+        is_word = name in IDS and isinstance(value, str) and value != ASKED
+        of_id = f"{IDS.get(name)}: a number or a word; or name its column in [columns]"
+        expected = of_id if name in IDS else "a finite number"
+        file.check(f"{where}.{name}", value, is_number(value) or is_word, expected)

@@ -1,10 +1,10 @@
 """Tables of exchanges, of messages or of plain ranges, one file or several, written to a recording.
 
-The steps: stage the tables (`staging`), combine the rows of each exchange and record unusable rows as faults
-(`exchange_rows`), find out how stamps are to be read (`plausibility`), write the exchanges in blocks. A table is
-refused if half of its rows or more are unusable. `range_m` is the range that the device reported, or else the range by
-the stamps. `gt_range_m`, or the distance between the two antenna positions (`from_x_m` ... `to_z_m`), is stored as the
-true distance of the exchange; antennas with positions become bodies with poses.
+The steps: stage the tables, combine the rows of each exchange and record unusable rows as faults (`staging`), find out
+how stamps are to be read (`plausibility`), write the exchanges in blocks. A table is refused if half of its rows or
+more are unusable. `range_m` is the range that the device reported, or else the range by the stamps. `gt_range_m`, or
+the distance between the two antenna positions (`from_x_m` ... `to_z_m`), is stored as the true distance of the
+exchange; antennas with positions become bodies with poses.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from uwblink.display import first_few
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import IDS, POSITIONS, ColumnMap, load_map
-from uwblink.importers.exchange_rows import SOUND_IDS, Faults, assemble_exchanges, usable_exchanges, usable_ranges
 from uwblink.importers.plausibility import (
     MIN_ROWS,
     ROW_PERIOD_NS,
@@ -30,7 +30,17 @@ from uwblink.importers.plausibility import (
     settle_reading,
     stamps_of,
 )
-from uwblink.importers.staging import Rows, Staging, Watch
+from uwblink.importers.staging import (
+    SOUND_IDS,
+    Condition,
+    Faults,
+    Rows,
+    Staging,
+    Watch,
+    assemble_exchanges,
+    time_conditions,
+    usable_exchanges,
+)
 from uwblink.importers.tables import connected
 from uwblink.recording.antenna_delays import AntennaDelay, meta_of_delays
 from uwblink.recording.file import Recording
@@ -119,9 +129,8 @@ def _notes(staging: Staging) -> list[str]:
     notes, names = [], staging.names
     if names:
         # The first dozen; a recording has all, as its tags' bodies.
-        some = ", ".join(f"{name[:20]} = {number}" for number, name in list(names.items())[:12])
-        more = f" and {len(names) - 12} more" if len(names) > 12 else ""
-        notes.append(f"{len(names)} ids are words or too large, and get numbers: {some}{more}")
+        some = first_few((f"{name[:20]} = {number}" for number, name in names.items()), 12)
+        notes.append(f"{len(names)} ids are words or too large, and get numbers: {some}")
     if not staging.rows.has("time_s"):
         notes.append("there are no times; rows are taken as a millisecond apart, in their order")
     return notes
@@ -143,7 +152,7 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
     watch("checking", 0.0)
     if layout == "ranges":
         staging.require(rows, ["range_m"])
-        rows = usable_ranges(rows, faults)
+        rows = faults.reject(rows, [*time_conditions(rows), Condition("range_m", "a finite number", "range_m IS NULL")])
         faults.check(total)
         check_units(column_map, path, rows.sample(SAMPLE_ROWS), None)
         notes += filter(None, [_note_on_repeats(rows)])

@@ -212,14 +212,16 @@ def _is_event(table: Table, name: str) -> bool:
     return sending + receiving > 0.9 and 0.25 < sending < 0.75
 
 
+_OF_EXCHANGES: Final = (*STAMPS, "fpp1", "fpp2", "rxp1", "rxp2", "skew1", "skew2")
+
 _LAYOUTS: Final = {
-    "exchanges": (STAMPS[:4], "a row has the stamps of a whole exchange"),
-    "messages": (("tx", "rx"), "a row has one stamp of a sender and one of a receiver"),
-    "stamps": (("message",), "a row has one stamp, and says whether it is of sending or of receiving"),
-    "ranges": (("range_m",), "there are ranges and no stamps"),
-    "nothing": ((), "neither stamps nor ranges were recognised: rename columns below"),
+    "exchanges": (STAMPS[:4], OF_MESSAGES, "a row has the stamps of a whole exchange"),
+    "messages": (("tx", "rx"), _OF_EXCHANGES, "a row has one stamp of a sender and one of a receiver"),
+    "stamps": (("message",), _OF_EXCHANGES, "a row has one stamp, and says whether it is of sending or of receiving"),
+    "ranges": (("range_m",), (*OF_MESSAGES, *STAMPS), "there are ranges and no stamps"),
+    "nothing": ((), OF_MESSAGES, "neither stamps nor ranges were recognised: rename columns below"),
 }
-"""The layouts that are recognised: the columns that each needs, and how it was recognised."""
+"""The layouts that are recognised: the columns that each needs, those that it does not have, and the reason."""
 
 Entries = dict[str, tuple[str | int, str]]
 """Values of a map by key, each with its reason."""
@@ -250,7 +252,7 @@ def guess_map(path: Path) -> Guess:
     words = {name for name, column in cells.items() if not np.isfinite(column).any()}
     fitting = (one for one in ("exchanges", "messages", "ranges") if all(name in cells for name in _LAYOUTS[one][0]))
     layout = "stamps" if "event" in columns else next(fitting, "nothing")
-    needed, why = _LAYOUTS[layout]
+    needed, foreign, why = _LAYOUTS[layout]
     if layout == "messages" and "message" in words and columns["message"] != "message":
         del columns["message"], cells["message"]  # without a column of that name messages are told by their order
     top: Entries = {} if layout == "nothing" else {"layout": (layout, why)}
@@ -279,7 +281,7 @@ def guess_map(path: Path) -> Guess:
         f"a column of numbers is still needed: {', '.join(lacking)}": lacking,
         f"distances have one unit for all, here they have {', '.join(mixed)}: convert some": len(mixed) > 1,
     }
-    named: Entries = {name: (header, "") for name, header in columns.items() if _belongs(name, layout)}
+    named: Entries = {name: (header, "") for name, header in columns.items() if name not in foreign}
     none: Entries = {"tx": (0, "by the true distances none were programmed into the devices"), "rx": (0, "")}
     sections = {"columns": named, "units": units, "constants": constants, "antenna_delays": none if undelayed else {}}
     # Names of files can have line breaks, which would end the comment.
@@ -293,12 +295,6 @@ def guess_map(path: Path) -> Guess:
 
 def _lines(entries: Entries) -> list[str]:
     return [f"{key} = {json.dumps(value)}" + (f"  # {why}" if why else "") for key, (value, why) in entries.items()]
-
-
-def _belongs(name: str, layout: str) -> bool:
-    if layout in ("messages", "stamps"):
-        return name not in (*STAMPS, "fpp1", "fpp2", "rxp1", "rxp2", "skew1", "skew2")
-    return name not in OF_MESSAGES and not (layout == "ranges" and name in STAMPS)
 
 
 StampEntries = tuple[Entries, tuple[str, str], bool]

@@ -127,10 +127,6 @@ class Trial:
         """Return the limits of ranges."""
         return f"{self.range_m[0]:.4g} to {self.range_m[1]:.4g} m"
 
-    def rank(self) -> tuple[float, float]:
-        """Return what is least for the best of several readings: the larger share, then the smaller spread."""
-        return -round(self.plausible, 2), self.error_m[1] - self.error_m[0]
-
 
 def try_reading(rows: Columns, column_map: ColumnMap, reading: Reading) -> Trial:
     """Return the result of a reading on a sample of rows, whose ranges are beside true distances if there are any."""
@@ -185,7 +181,8 @@ def settle_reading(path: Path, column_map: ColumnMap, rows: Columns, reading: Re
             f"the ranges are not plausible ({first}), and no other protocol, width or order of the columns makes "
             "better ones; check the map"
         )
-    best = min(fitting, key=Trial.rank)
+    # The larger share of plausible ranges, then the smaller spread.
+    best = min(fitting, key=lambda trial: (-round(trial.plausible, 2), trial.error_m[1] - trial.error_m[0]))
     found, difference = best.reading, best.reading.difference(reading)
     contradicted = (
         found.swapped

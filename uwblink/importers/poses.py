@@ -26,8 +26,7 @@ from uwblink.importers.plausibility import other_unit
 from uwblink.importers.tables import reading
 from uwblink.recording.distances import distances_m, find_offset
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import POSE, Poses, Tag
-from uwblink.recording.tags import load_places
+from uwblink.recording.schema import POSE, Poses, Tag, load_places
 from uwblink.text_files import require_regular
 from uwblink.twr import LATEST_NS, Exchanges, names_in, raw_range
 
@@ -77,33 +76,21 @@ def read_poses(path: Path, body: str | None = None, topics: Mapping[str, str] | 
     return poses
 
 
-@dataclass(frozen=True, slots=True)
-class Form:
-    """A form of text files without a header: its name, its columns, and their delimiter (None: blanks)."""
-
-    title: str
-    names: tuple[str, ...]
-    delimiter: str | None
-    more: bool = False
-    """Whether other columns may follow."""
-
-
-TUM: Final = Form("TUM", ("time_s", *POSE), None)
-EUROC: Final = Form("EuRoC", ("time_ns", "x", "y", "z", "qw", "qx", "qy", "qz"), ",", more=True)
-
-
 def _from_text(path: Path, file: TextIO, body: str | None) -> Poses:
-    """Return the poses of a CSV file with a header, or of a form without one."""
-    form: Form | None = TUM
-    if path.suffix.lower() == ".csv":
-        form = EUROC if file.readline().lower().startswith("#timestamp") else None
+    """Return the poses of a TUM or an EuRoC file, whose columns have no names, or of a CSV file with a header."""
+    lines: Iterator[list[str]] = csv.reader(file)
+    names: tuple[str, ...]
+    if path.suffix.lower() != ".csv":
+        form, names, lines = "TUM", ("time_s", *POSE), (line.split() for line in file)
+    elif file.readline().lower().startswith("#timestamp"):
+        form, names = "EuRoC", ("time_ns", "x", "y", "z", "qw", "qx", "qy", "qz")
+    else:
         file.seek(0)
-    lines = csv.reader(file) if form is None or form.delimiter else (line.split() for line in file)
-    names = form.names if form else tuple(name.strip() for name in next(lines, ()))
+        form, names = "", tuple(name.strip() for name in next(lines, ()))
     time = next((name for name in ("time_ns", "time_s") if name in names), "time_s")
     missing = [name for name in (time, *POSE, "body") if name not in names and not (name == "body" and body)]
     if form and missing:
-        raise ImportTableError(f"{path}: a {form.title} file has no names of bodies; name its body with `body`")
+        raise ImportTableError(f"{path}: a {form} file has no names of bodies; name its body with `body`")
     if missing:
         raise ImportTableError(
             f"{path}: column {missing[0]!r} is missing; there are {', '.join(names)[:400]}; "
@@ -112,10 +99,10 @@ def _from_text(path: Path, file: TextIO, body: str | None) -> Poses:
         )
     times, bodies, values = array("q"), list[str](), array("d")
     scale, places = 1 if time == "time_ns" else 10**9, {name: names.index(name) for name in (time, *POSE)}
-    for row, cells in enumerate(lines, start=1 if form else 2):
+    for row, cells in enumerate(lines, start=1 if form == "TUM" else 2):
         if not cells or (form and cells[0].startswith("#")):
             continue
-        if len(cells) < len(names) or (len(cells) > len(names) and not (form and form.more)):
+        if len(cells) < len(names) or (len(cells) > len(names) and form != "EuRoC"):
             raise ImportTableError(f"{path}: row {row}: found {len(cells)} cells, expected {' '.join(names)}")
         found = {name: _number(cells[place]) for name, place in places.items()}
         wrong = {name: "a number" for name, value in found.items() if not math.isfinite(value)}

@@ -23,7 +23,6 @@ from uwblink.recording.summary import counted
 from uwblink.ticks import TICK_S
 from uwblink.twr import LARGEST_ID, LATEST_NS, Exchanges, middle_ns
 
-Pairs = Iterable[tuple[int, int]]
 Row = TypeVar("Row", CirRow, FrameRow, Fault)
 
 READING_MB: Final = 300
@@ -66,7 +65,7 @@ class Contents:
         start_s: float | None = None,
         stop_s: float | None = None,
         tags: Collection[int] | None = None,
-        pairs: Pairs | None = None,
+        pairs: Iterable[tuple[int, int]] | None = None,
     ) -> Contents:
         """Return the contents from `start_s` to before `stop_s`, in seconds since the first exchange, for some tags.
 

@@ -20,8 +20,8 @@ from typing import Any, Self
 from uwblink.database import log_of
 from uwblink.errors import RecordingError, RecordingInUseError, RecordingMissingError, raising
 from uwblink.output import check_output, place_beside
-from uwblink.recording.intake import is_locked
 from uwblink.recording.schema import FORMAT_VERSION, SUFFIX, TABLES, standard_meta
+from uwblink.recording.store import is_locked
 from uwblink.recording.summary import Summary, summarize
 from uwblink.recording.tables import Tables, known_tables
 from uwblink.text_files import require_regular

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from uwblink.display import printable
 from uwblink.errors import RecordingError, raising
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.recording.intake import decode_json
 from uwblink.recording.schema import (
     POSE,
     TABLES,
@@ -26,7 +25,7 @@ from uwblink.recording.schema import (
     Poses,
     Tag,
 )
-from uwblink.recording.store import Store
+from uwblink.recording.store import Store, decode_json
 from uwblink.ticks import REPORT_BITS
 from uwblink.twr import BITS, COLUMNS, Exchanges
 

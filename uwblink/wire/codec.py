@@ -4,27 +4,22 @@ The input are bytes in pieces of any size; the output are messages, known text l
 is in one of them. A message starts at the beginning, after a decoded message or text, or after a line end. After
 damage a message with fields is also decoded in the middle of a line, because the line end before it may be damaged;
 one without fields (`R00`) is not, because the payload of a damaged broadcast could contain it.
-
-Runs of well-formed reports are checked by one regular expression and converted together; everything else goes
-through the message decoder, so that what is a message does not depend on the way it was read.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 import numpy as np
 
-from uwblink.arrays import Floats, Ints
 from uwblink.errors import FrameError
 from uwblink.ticks import REPORT_BITS, TICK_S, elapsed
 from uwblink.twr import STAMPS, Exchanges
 from uwblink.wire.fields import LONGEST_TEXT, Kind, Malformed, NeedMore
 from uwblink.wire.messages import (
     COMMANDS,
-    REPORTS,
     TEXTS,
     Message,
     Overheard,
@@ -77,18 +72,6 @@ class Decoder:
         """Take in bytes and return what they complete; never raises on any bytes."""
         self._buffer += data
         return self._drain(final=False)
-
-    def take_back(self) -> bytes:
-        """Remove and return the bytes of an incomplete message; none within damaged bytes."""
-        if not self._clean(b""):
-            return b""
-        data, self._buffer = self._buffer, b""
-        return data
-
-    @property
-    def between_messages(self) -> bool:
-        """Whether all bytes so far are decoded or skipped, so that the next byte begins a message."""
-        return self._clean(b"") and not self._buffer
 
     @property
     def begun(self) -> bytes:
@@ -202,88 +185,18 @@ def _from_parts(kind: type[Message], parts: list[bytes]) -> Message:
     return kind(*values)
 
 
-FIELDS: Final = tuple(RangeReport.FIELDS)
-"""The fields of R05, in their order."""
-
-RUN: Final = re.compile(
-    rb"(?:[RS]05\|" + rb"\|".join(b"(?:%s)" % kind.pattern for kind in RangeReport.FIELDS.values()) + rb"\r\n)++"
-)
-"""Reports one after the other; whole numbers may still be larger than a board's."""
-
-
-class ColumnDecoder:
-    """Decodes what a board sends. Ranges are gathered for `exchanges`, everything else is in `events`."""
-
-    def __init__(self, board: int) -> None:
-        """Decode for the board with this id."""
-        self.decoder = Decoder(REPORTS)
-        self.events: list[tuple[int, Event]] = []
-        self._board = board
-        self._times: list[Ints] = []
-        self._values: list[Floats] = []
-
-    def feed(self, data: bytes, time_ns: int) -> None:
-        """Take in bytes that came at a time; never raises on any bytes."""
-        data = self.decoder.take_back() + data
-        at = 0
-        while at < len(data):
-            run = RUN.match(data, at) if self.decoder.between_messages else None
-            if run and self._take(run.group(), time_ns):
-                at = run.end()
-                continue
-            end = data.find(b"\n", at) + 1 or len(data)
-            self._add(self.decoder.feed(data[at:end]), time_ns)
-            at = end
-
-    def finish(self, time_ns: int) -> None:
-        """Decode what is left when no more bytes will come."""
-        self._add(self.decoder.finish(), time_ns)
-
-    def exchanges(self) -> Exchanges:
-        """Return the exchanges so far, in the order of their reports."""
-        values = np.concatenate(self._values) if self._values else np.empty((0, 1 + len(FIELDS)))
-        times = np.concatenate(self._times) if self._times else np.empty(0, dtype=np.int64)
-        return _exchanges(times, np.full(len(times), self._board, dtype=np.int64), values)
-
-    def _take(self, lines: bytes, time_ns: int) -> bool:
-        """Convert a run of lines; False where an id or a stamp is too large, which the expression cannot see."""
-        numbers = lines.replace(b"R05|", b"1|").replace(b"S05|", b"0|").replace(b"\r\n", b"|")
-        values = np.fromstring(numbers[:-1].decode("ascii"), sep="|").reshape(-1, 1 + len(FIELDS))
-        ids, stamps = values[:, 1], values[:, 3:9]
-        if ids.min() < 0 or ids.max() > 255 or stamps.min() < 0 or stamps.max() >= 1 << REPORT_BITS:
-            return False
-        self.decoder.messages += len(values)
-        self._values.append(values)
-        self._times.append(np.full(len(values), time_ns, dtype=np.int64))
-        return True
-
-    def _add(self, events: list[Event], time_ns: int) -> None:
-        ranged = [e for e in events if isinstance(e, RangeReport)]
-        if ranged:
-            self._values.append(_values(ranged))
-            self._times.append(np.full(len(ranged), time_ns, dtype=np.int64))
-        self.events += [(time_ns, e) for e in events if not isinstance(e, RangeReport)]
-
-
-def exchanges_of(rows: list[tuple[int, int, RangeReport]]) -> Exchanges:
-    """Return reports as columns; each row is (time_ns of the report, board, report)."""
-    time_ns, board, reports = zip(*rows, strict=True)
-    return _exchanges(np.array(time_ns, dtype=np.int64), np.array(board, dtype=np.int64), _values(list(reports)))
-
-
-def _values(reports: list[RangeReport]) -> Floats:
-    return np.array([[r.KEY == b"R05", *(getattr(r, name) for name in FIELDS)] for r in reports], dtype=float)
-
-
-def _exchanges(time_ns: Ints, board: Ints, values: Floats) -> Exchanges:
-    """Name the columns of reports (n, 13): whose report it is, then the fields of R05.
+def exchanges_of(heard: Iterable[tuple[int, int, Event]]) -> Exchanges:
+    """Return the reports of exchanges among messages as columns; a row is (time_ns of the message, board, message).
 
     The time of an exchange is that of its poll: the report's, less what passed between the initiator's first and
     last stamps. Printing and USB make it late by 0.6 ms.
     """
-    column = dict(zip(FIELDS, values[:, 1:].T, strict=True))
+    rows = [(time_ns, board, event) for time_ns, board, event in heard if isinstance(event, RangeReport)]
+    time_ns, board = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2).T
+    column = {name: np.array([getattr(report, name) for *_, report in rows]) for name in RangeReport.FIELDS}
     stamps = {name: column[name].astype(np.int64) for name in STAMPS}
-    mine, other = values[:, 0] == 1, column["neighbour"].astype(np.int64)
+    mine = np.array([report.KEY == RangeReport.KEY for *_, report in rows], dtype=bool)
+    other = column["neighbour"].astype(np.int64)
     double = stamps["rx3"] != 0
     last = np.where(double, stamps["rx3"], stamps["rx2"])
     took_ns = np.rint(elapsed(last, stamps["tx1"]) * (TICK_S * 1e9)).astype(np.int64)
@@ -298,7 +211,7 @@ def _exchanges(time_ns: Ints, board: Ints, values: Floats) -> Exchanges:
         fpp2_dbm=column["fpp2_dbm"],
         skew1_ppm=column["skew1_ppm"],
         skew2_ppm=column["skew2_ppm"],
-        truth_m=np.full(len(values), np.nan),
+        truth_m=np.full(len(rows), np.nan),
         bits=REPORT_BITS,
         **stamps,
     )

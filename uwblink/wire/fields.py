@@ -37,8 +37,8 @@ class NeedMore(Exception):  # noqa: N818 - a signal inside the codec, not an err
 class Kind:
     """A kind of field. `size` is None for text between bars, `parts` pieces of it, else how many raw bytes.
 
-    `read` raises `Malformed`, `write` raises `FrameError`. Text that is read matches `pattern`. `size(data, at)`
-    returns the length at a place, or raises `NeedMore` or `Malformed`.
+    `read` raises `Malformed`, `write` raises `FrameError`. `size(data, at)` returns the length at a place, or raises
+    `NeedMore` or `Malformed`.
     """
 
     name: str
@@ -46,7 +46,6 @@ class Kind:
     write: Callable[[Any], bytes]
     size: Callable[[bytes, int], int] | None = None
     parts: int = 1
-    pattern: bytes = b""
 
 
 def _text(
@@ -74,7 +73,7 @@ def _text(
             raise FrameError(f"found {value!r:.60}, expected {expected}")
         return show(value)
 
-    return Kind(name, read, write, None, parts, pattern)
+    return Kind(name, read, write, None, parts)
 
 
 def _integer(low: int, high: int) -> Kind:

@@ -38,15 +38,13 @@ from uwblink.wire.fields import (
     Kind,
 )
 
-Layout = Mapping[str, Kind]
-
 
 @dataclass(frozen=True, slots=True)
 class Message:
     """Base of messages: a key of three bytes and a layout."""
 
     KEY: ClassVar[bytes] = b""
-    FIELDS: ClassVar[Layout] = {}
+    FIELDS: ClassVar[Mapping[str, Kind]] = {}
 
 
 _Kind = TypeVar("_Kind", bound=Message)

@@ -17,8 +17,8 @@ from uwblink.recording.file import Recording
 from uwblink.recording.schema import CirRow, Fault, FrameRow, Poses, Tag
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, UUS_TICKS, elapsed
 from uwblink.twr import Exchanges, raw_range
-from uwblink.wire.codec import ColumnDecoder, encode
-from uwblink.wire.messages import RangeReport
+from uwblink.wire.codec import Decoder, encode, exchanges_of
+from uwblink.wire.messages import REPORTS, RangeReport
 from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import Source, as_scenario
@@ -263,12 +263,10 @@ def through_wire(simulated: Simulated) -> tuple[Simulated, list[FrameRow]]:
         FrameRow(t, f"board {i}", "in", data)
         for t, i, data in zip(time_ns.tolist(), e.initiator.tolist(), reports, strict=True)
     ]
-    decoders = {f"board {i}": ColumnDecoder(int(i)) for i in np.unique(simulated.exchanges.initiator)}
-    for frame in frames:
-        decoders[frame.board].feed(frame.data, frame.time_ns)
-    parts = [d.exchanges() for d in decoders.values()] or [simulated.exchanges]  # nothing was received
-    exchanges = Exchanges.concatenate(parts).in_time_order()
-    ports = {name.removeprefix("board "): name for name in decoders}
+    decoder, by_board = Decoder(REPORTS), sorted(zip(e.initiator.tolist(), frames, strict=True), key=lambda row: row[0])
+    heard = ((frame.time_ns, board, event) for board, frame in by_board for event in decoder.feed(frame.data))
+    exchanges = exchanges_of(heard).in_time_order()
+    ports = {str(board): f"board {board}" for board in np.unique(e.initiator).tolist()}
     return replace(simulated, exchanges=exchanges, meta=simulated.meta | {"ports": ports}), frames
 
 

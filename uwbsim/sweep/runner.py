@@ -23,7 +23,7 @@ import uwblink
 from uwblink.database import connect
 from uwblink.errors import UwblinkError, first_line
 from uwblink.output import check_folder, is_utf8
-from uwblink.recording.intake import check_tables
+from uwblink.recording.store import check_tables
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.sweep.design import SweepDesign
 from uwbsim.sweep.executors import Chunk, Evaluate, Result, Work, Workers, evaluator, workers_for

@@ -24,8 +24,7 @@ from calib.surveys.knowledge import load_knowledge
 from calib.surveys.sample import DELAYS_NS
 from uwblink import Arrangement, Contents, Exchanges
 from uwblink.cli.shared import run
-from uwblink.recording.schema import KnownDistance
-from uwblink.recording.tags import load_places
+from uwblink.recording.schema import KnownDistance, load_places
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 
 

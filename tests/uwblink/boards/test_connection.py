@@ -2,7 +2,7 @@
 
 import pytest
 
-from uwblink.boards.connection import ANSWER_S, FENCE, PATIENT_S, Connection, checked
+from uwblink.boards.board import ANSWER_S, FENCE, PATIENT_S, Connection, checked
 from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
 from uwblink.wire import messages as m
 from uwblink.wire.codec import encode

@@ -4,8 +4,7 @@ import pytest
 
 from uwblink.boards.ranging_plan import RangingPlan, load_plan
 from uwblink.errors import PlanError
-from uwblink.recording.schema import Tag
-from uwblink.recording.tags import load_places
+from uwblink.recording.schema import Tag, load_places
 
 
 def written(tmp_path, text):

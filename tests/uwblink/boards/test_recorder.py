@@ -16,7 +16,8 @@ from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.record import record
 from uwblink.errors import PlanError, PortMissingError, RecordingError, RecordingExistsError
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Arrangement, Tag
+from uwblink.recording.schema import Arrangement, FrameRow, Tag
+from uwblink.wire.messages import IdReport, Skipped
 from uwbsim.boards.virtual_board import VirtualPorts
 
 BIN = Path(sys.executable).parent
@@ -304,3 +305,17 @@ def test_one_port_is_for_one_process(tmp_path):
         process.wait()
     assert done.returncode == 2
     assert "another process has this port open" in done.stderr
+
+
+def test_damage_other_messages_and_the_bytes_of_an_unfinished_one_are_decoded_again(tmp_path):
+    report = b"R05|2|3.0550|1|2|3|4|5|6|-87.4977|-87.5239|-3.4971|3.5222\r\n"
+    pieces = [("a", b"\xff" + report), ("b", b"R01|7\r\n\xff\r\n"), ("a", report + b"R05|2|3.0")]
+    with Recording.create(tmp_path / "r.uwb", meta={"ports": {"1": "a", "7": "b"}}) as recording:
+        recording.append("frames", [FrameRow(k, name, "in", data) for k, (name, data) in enumerate(pieces)])
+        again = decode_again(recording)
+    assert again.exchanges.initiator.tolist() == [1, 1]
+    assert [(one.board, one.message) for one in again.others if not isinstance(one.message, Skipped)] == [
+        (7, IdReport(7))
+    ]
+    assert again.messages == 3
+    assert again.skipped_bytes == len(b"\xff" + b"\xff\r\n" + b"R05|2|3.0")

@@ -12,7 +12,7 @@ import pytest
 import uwblink
 from tests.uwblink.importers.test_table_forms import as_messages, flights, mapped, read_table, repeated, wrapped, write
 from uwblink.errors import ImportTableError
-from uwblink.importers import bags, exchange_rows, import_file, staging
+from uwblink.importers import bags, import_file, staging
 
 SPOILT = ("", "nan", "x", "-1", "7.5", "99999999999999999999")
 
@@ -36,7 +36,7 @@ def told(contents):
 
 def few_at_once(monkeypatch, count=20):
     monkeypatch.setattr(staging, "ROWS_PER_BLOCK", count)
-    monkeypatch.setattr(exchange_rows, "FAULTS_AT_ONCE", 5)
+    monkeypatch.setattr(staging, "FAULTS_AT_ONCE", 5)
 
 
 @pytest.mark.parametrize("more", [{}, {"from_id": "a tag"}], ids=["numbers", "words"])

@@ -9,7 +9,7 @@ import pytest
 
 from uwblink.errors import RecordingError
 from uwblink.exporters import export_recording
-from uwblink.recording import intake
+from uwblink.recording import store
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Tag
 
@@ -136,13 +136,13 @@ def test_more_rows_than_a_file_can_hold_are_not_read(file, monkeypatch):
     assert size < 2_000_000  # three million rows that are all alike take no place
     with Recording.open(file) as recording:
         assert recording.count("height") == 3_000_000
-    monkeypatch.setattr(intake, "ROWS_OF_ANY_FILE", 2_000_000)
+    monkeypatch.setattr(store, "ROWS_OF_ANY_FILE", 2_000_000)
     with pytest.raises(RecordingError, match="table height holds 3000000 rows"):
         Recording.open(file)
 
 
 def test_meta_is_bounded_in_bytes(file):
-    change(file, f"INSERT INTO meta SELECT 'big', repeat('9', {intake.MOST_META_BYTES})")
+    change(file, f"INSERT INTO meta SELECT 'big', repeat('9', {store.MOST_META_BYTES})")
     with pytest.raises(RecordingError, match=r"table meta holds 64\d+ bytes, at most 64000000"):
         Recording.open(file)
 
@@ -186,11 +186,11 @@ def test_counters_that_no_chip_has(file, bits):
 
 
 def test_a_read_that_does_not_end_is_interrupted(file):
-    store = Recording.open(file)
-    store._longest_read_s = 0.3
+    recording = Recording.open(file)
+    recording._longest_read_s = 0.3
     with pytest.raises(RecordingError, match="took longer than 0 s"):
-        store._select("SELECT sum(a.range * b.range) FROM range(10000000) a, range(10000000) b")
-    store._longest_read_s = 60.0
-    assert store._select("SELECT 1 AS one")["one"].tolist() == [1]
-    store.__exit__(None, None, None)
+        recording._select("SELECT sum(a.range * b.range) FROM range(10000000) a, range(10000000) b")
+    recording._longest_read_s = 60.0
+    assert recording._select("SELECT 1 AS one")["one"].tolist() == [1]
+    recording.__exit__(None, None, None)
     assert not [t for t in threading.enumerate() if isinstance(t, threading.Timer) and not t.finished.is_set()]

@@ -6,34 +6,29 @@ import pytest
 from tests.uwblink.wire.test_codec import decode, understood
 from uwblink.errors import FrameError
 from uwblink.wire import messages as m
-from uwblink.wire.codec import LONGEST_LINE, ColumnDecoder, Decoder, encode
+from uwblink.wire.codec import LONGEST_LINE, Decoder, encode, exchanges_of
 from uwblink.wire.fields import BOOL, BYTES, ID, INT, STAMP, TEXT, Malformed, write_printed
 
 REPORT = b"R05|2|3.0550|2334148660|1211574983|1233803316|2356378373|1332123700|2454699099|-87.4977|-87.5239|-3.4971|3.5222\r\n"  # noqa: E501 - as captured
 
 
-def test_a_decoder_says_what_has_begun_and_forgets_it_on_demand():
+def test_a_decoder_says_what_has_begun():
     decoder = Decoder(m.REPORTS)
-    assert decoder.between_messages is True
     assert decoder.begun == b""
     decoder.feed(b"S10|1|2|7")
-    assert decoder.between_messages is False
     assert decoder.begun == m.Cir.KEY
-    assert decoder.take_back() == b"S10|1|2|7"
-    assert decoder.between_messages is True
+    decoder.feed(b"|x\r\n")
+    assert decoder.begun == b""
 
 
 def test_in_the_middle_of_damage_nothing_has_begun():
     decoder = Decoder(m.REPORTS)
     decoder.feed(b"\xff\xff R05|2|3.0")
     assert decoder.begun == b""
-    assert decoder.take_back() == b""
-    assert decoder.between_messages is False
     # A message taken up in the middle of a line counts once its end is there, and makes the decoder sure again.
     (taken_up,) = understood(decoder.feed(REPORT[9:]))
     assert taken_up.neighbour == 2
     assert decoder.messages == 1
-    assert decoder.between_messages is True
 
 
 def test_after_damage_a_message_without_fields_waits_for_a_line_end():
@@ -137,26 +132,22 @@ def test_numbers_are_printed_below_ten_billion_and_cut():
 
 
 def columns_of(*pieces):
-    decoder = ColumnDecoder(7)
-    for k, piece in enumerate(pieces):
-        decoder.feed(piece, 10**9 * k)
-    decoder.finish(10**9 * len(pieces))
-    return decoder
+    decoder = Decoder(m.REPORTS)
+    heard = [(10**9 * k, 7, event) for k, piece in enumerate(pieces) for event in decoder.feed(piece)]
+    return exchanges_of(heard), decoder
 
 
-def test_runs_of_reports_and_single_ones_become_rows_in_their_order_with_the_time_of_their_piece():
+def test_reports_become_rows_in_their_order_with_the_time_of_their_piece():
     other = REPORT.replace(b"R05|2|3.0550", b"S05|3|4.5000")
-    found = columns_of(REPORT * 2 + other, b"\xff" + REPORT, REPORT[:50], REPORT[50:] + b"R01|7\r\n")
-    e = found.exchanges()
+    e, decoder = columns_of(REPORT * 2 + other, b"\xff" + REPORT, REPORT[:50], REPORT[50:] + b"R01|7\r\n")
     assert e.range_m.tolist() == [3.055, 3.055, 4.5, 3.055, 3.055]
     assert e.initiator.tolist() == [7, 7, 3, 7, 7]
     assert e.target.tolist() == [2, 2, 7, 2, 2]
     assert e.reporter.tolist() == [7] * 5
     took_ns = np.rint((2454699099 - 2334148660) / 63.8976).astype(int)
     assert (e.time_ns + took_ns).tolist() == [0, 0, 0, 10**9, 3 * 10**9]
-    assert found.decoder.messages == 6
-    assert found.decoder.skipped_bytes == 1
-    assert [event for _, event in found.events if not isinstance(event, m.Skipped)] == [m.IdReport(7)]
+    assert decoder.messages == 6
+    assert decoder.skipped_bytes == 1
     for name, value in (("tx1", 2334148660), ("rx3", 2454699099), ("fpp2_dbm", -87.5239), ("skew2_ppm", 3.5222)):
         assert getattr(e, name).tolist() == [value] * 5
 
@@ -164,22 +155,29 @@ def test_runs_of_reports_and_single_ones_become_rows_in_their_order_with_the_tim
 def test_a_single_sided_report_ends_with_its_response():
     single = b"R05|2|3.8601|2795254324|1672694065|1771014196|2893576102|0|0|-87.6187|-88.0293|-3.5203|3.5054\r\n"
     for pieces in ((single,), (single[:9], single[9:])):
-        e = columns_of(*pieces).exchanges()
+        e, _ = columns_of(*pieces)
         assert e.protocol.tolist() == ["ss"]
         took_ns = round((2893576102 - 2795254324) / 63.8976)
         assert e.time_ns.tolist() == [10**9 * (len(pieces) - 1) - took_ns]
 
 
 @pytest.mark.parametrize("place", range(6))
-def test_a_stamp_of_33_bits_in_any_place_is_no_report_in_a_run_either(place):
+def test_a_stamp_of_33_bits_in_any_place_is_no_report(place):
     stamps = [b"%d" % (1000 + k) for k in range(6)]
     stamps[place] = b"4294967296"
     line = b"R05|2|3.0550|" + b"|".join(stamps) + b"|-87.4977|-87.5239|-3.4971|3.5222\r\n"
-    found = columns_of(REPORT + line + REPORT)
-    assert len(found.exchanges()) == 2
-    assert found.decoder.skipped_bytes == len(line)
+    e, decoder = columns_of(REPORT + line + REPORT)
+    assert len(e) == 2
+    assert decoder.skipped_bytes == len(line)
 
 
 def test_powers_beyond_32_bits_are_numbers_all_the_same():
     line = REPORT.replace(b"|-87.4977|", b"|4294967296.0000|")
-    assert columns_of(line).exchanges().fpp1_dbm.tolist() == [4294967296.0]
+    assert columns_of(line)[0].fpp1_dbm.tolist() == [4294967296.0]
+
+
+def test_the_time_of_an_exchange_is_that_of_its_poll():
+    line = b"R05|2|3.0000|4294967000|1|2|63897304|4|127794904|-87.0000|-87.0000|0.0000|0.0000\r\n"
+    e, _ = columns_of(b"", line)
+    # rx3 - tx1 is 127 795 200 ticks, 2 ms, across the wrap of the counter; the report came at 1 s.
+    assert e.time_ns[0] == 10**9 - 2_000_000
