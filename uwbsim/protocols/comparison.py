@@ -237,9 +237,7 @@ class ErrorCurve:
 def over_skew(scenario: Scenario, protocol: RangingProtocol, count: int = 16_384) -> ErrorCurve:
     """Return the error over the relative skew of the two clocks in ppm, all else as in the scenario."""
     skews = np.linspace(-20, 20, 17)
-    return _curve(
-        scenario, protocol, count, skews, lambda ppm: {"rate_initiator": ppm * 0.5e-6, "rate_target": -ppm * 0.5e-6}
-    )
+    return _curve(scenario, protocol, count, skews, lambda ppm: {"rate": np.array([[ppm], [-ppm]]) * 0.5e-6})
 
 
 def over_reply(scenario: Scenario, protocol: RangingProtocol, count: int = 16_384) -> ErrorCurve:
@@ -252,7 +250,7 @@ def _curve(
     protocol: RangingProtocol,
     count: int,
     x: Floats,
-    columns: Callable[[float], Mapping[str, float]],
+    columns: Callable[[float], Mapping[str, float | Floats]],
 ) -> ErrorCurve:
     """Return the error over values (n,) for which `columns` of the calibrated conditions change."""
     world = calibrated(conditions_of(scenario, 2048))
