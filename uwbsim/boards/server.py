@@ -230,7 +230,8 @@ class Server:
         self._start_ns = time.monotonic_ns()
         self.epoch_ns = time.time_ns()
         """Host time (Unix epoch) at which the scenario's time is zero."""
-        self._timed = sched.scheduler(self._now_ns)
+        self._reached_ns = 0
+        self._timed = sched.scheduler(lambda: self._reached_ns)
         try:
             for tag in scenario.tags:
                 self._terminals[tag.id] = Terminal(link_dir / f"tag{tag.id}" if link_dir else None)
@@ -272,7 +273,9 @@ class Server:
             if data:
                 self.bench.advance(self._now_ns())
                 self.bench.boards[tag].write(data)
-        self.bench.advance(self._now_ns())
+        self._reached_ns = self._now_ns()
+        self.bench.advance(self._reached_ns)
+        # The scheduler's time stands still meanwhile: an action that schedules the next one ends, however late it is.
         self._timed.run(blocking=False)
 
     def announce(self, tell: Callable[[str], object]) -> None:
@@ -286,18 +289,16 @@ class Server:
     def write_poses(self, path: Path) -> None:
         """Write motion capture to a file from now on, in host time, as `uwblink poses` reads it."""
         self._poses = LivePoses(self.bench.air.world, path, self.epoch_ns)
-        self._append_poses()
+        self._append_poses(self._poses)
 
-    def _append_poses(self) -> None:
-        if self._poses is None:
-            return
+    def _append_poses(self, poses: LivePoses) -> None:
         now = self._now_ns()
         try:
-            self._poses.write_until(now)
+            poses.write_until(now)
         except OSError as error:
             self._tell(f"the poses end here: {error.strerror or error}")
-            return
-        self._at(now + 100 * NS_PER_MS, self._append_poses)
+        else:
+            self._at(now + 100 * NS_PER_MS, partial(self._append_poses, poses))
 
     def close(self) -> None:
         """Unplug all boards, and close the file of poses."""

@@ -373,6 +373,14 @@ class Radio(Section):
         description="Intervals in which pairs do not hear each other; by default none.",
     )
 
+    def loses(self, signal_dbm: float, start: int, other_dbm: float, other_start: int) -> bool:
+        """Return whether a frame is lost that overlaps another one, from powers at the receiver and times of start.
+
+        It is received only if it is the first and stronger by `capture_db`; weak frames disturb no other.
+        """
+        weaker = signal_dbm < other_dbm + self.capture_db
+        return other_dbm >= self.sensitivity_dbm and (weaker or start > other_start)
+
     @property
     def independent_multipath(self) -> tuple[float, float]:
         """Return probability and mean in metres of detours that are drawn for each exchange alone; zeros for none."""

@@ -38,7 +38,7 @@ from uwbsim.simulation.timestamps import (
 )
 from uwbsim.world.clocks import LONGEST_RUN_S, NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND, readings
 from uwbsim.world.reception import Medium
-from uwbsim.world.trajectories import height_readings, inertial_readings
+from uwbsim.world.trajectories import sensor_readings
 from uwbsim.world.world import SampledWorld, World
 
 
@@ -186,8 +186,8 @@ def simulate(
         truth_m=(stamped.links[0].distance_m + stamped.links[1].distance_m) / 2,
         meta=provenance(scenario),
         temperature=readings(scenario),
-        imu=inertial_readings(scenario, world.trajectories),
-        height=height_readings(scenario, world.trajectories),
+        imu=sensor_readings(scenario, world.trajectories, "imu"),
+        height=sensor_readings(scenario, world.trajectories, "height"),
     )
 
 
