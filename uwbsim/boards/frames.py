@@ -15,7 +15,6 @@ from typing import Any, Final
 import numpy as np
 import simpy
 
-from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, TICK_S, UUS_TICKS
 from uwblink.wire.messages import Broadcast, RangeCommand
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
@@ -28,7 +27,7 @@ from uwbsim.scenario.ranging import (
     after_marker_s,
     before_marker_s,
 )
-from uwbsim.simulation.timestamps import draw_reply_s, next_grid
+from uwbsim.simulation.timestamps import draw_reply_s, next_grid, reply_counter, scheduled_counter
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.reception import Frames, Medium
@@ -130,16 +129,15 @@ class BoardAir:
 
     def reply_stamp(self, board: int, received: int) -> int:
         """Return the transmit stamp of an immediate reply to a frame received at a stamp, with a random latency."""
-        latency = round(float(draw_reply_s(self.scenario, self._rng, 1)[0]) / TICK_S)
-        return next_grid(received + latency - ANTENNA_DELAY_TICKS) + self._tx_register(board)
+        counter = reply_counter(received, draw_reply_s(self.scenario, self._rng, 1))
+        return int(counter[0]) + self._tx_register(board)
 
     def scheduled_stamps(self, board: int, reference: int, delay_uus: int) -> tuple[int, int]:
         """Return the transmit stamps of a frame scheduled a delay after the stamp `reference`.
 
-        The chip's stamp, which ignores the low nine bits of the scheduled time; and the one that the firmware computes
-        and sends, with a constant of its build.
+        The chip's stamp, and the one that the firmware computes and sends, with a constant of its build.
         """
-        due = (reference + delay_uus * UUS_TICKS) // DELAYED_TX_GRID * DELAYED_TX_GRID
+        due = scheduled_counter(reference, delay_uus)
         return due + self._tx_register(board), due + int(self.medium.reply_constant[self.place[board]])
 
     def _tx_register(self, board: int) -> int:

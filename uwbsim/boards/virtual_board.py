@@ -51,22 +51,18 @@ FULL: Final = b"USB Buffer full! Message rejected to prevent overflow."
 class UsbLink:
     """The USB interface of one board from power-up to power-off.
 
-    `arrived` is triggered when a packet comes; `lost` counts transfers that were dropped because the bus was busy.
+    `packets` wait to be read, and `arrived` is triggered when one comes; `lost` counts transfers that were dropped
+    because the bus was busy.
     """
 
     def __init__(self, env: simpy.Environment, send: Callable[[bytes], None]) -> None:
         """`send` is called with the bytes of each transfer at its time."""
         self._env, self._send = env, send
-        self._packets: list[bytes] = []
+        self.packets: list[bytes] = []
         self._busy_until = 0
         self._open = True
         self.arrived = env.event()
         self.lost = 0
-
-    @property
-    def waiting(self) -> bool:
-        """Whether packets wait to be read."""
-        return bool(self._packets)
 
     def close(self) -> None:
         """Unplug the board: transfers under way are lost."""
@@ -82,8 +78,8 @@ class UsbLink:
 
     def read(self) -> bytes:
         """Return the received bytes and clear the queue."""
-        data = b"".join(self._packets)
-        self._packets.clear()
+        data = b"".join(self.packets)
+        self.packets.clear()
         self.arrived = self._env.event()
         return data
 
@@ -98,10 +94,10 @@ class UsbLink:
         self._env.timeout(delay).callbacks.append(lambda _: work() if self._open else None)
 
     def _arrive(self, piece: bytes) -> None:
-        if len(self._packets) >= 8:
+        if len(self.packets) >= 8:
             self._transfer(FULL)
             return
-        self._packets.append(piece)
+        self.packets.append(piece)
         if not self.arrived.triggered:
             self.arrived.succeed()
 
@@ -263,7 +259,7 @@ class VirtualBoard:
     def _usb_task(self) -> Steps:
         """Read the USB buffer every millisecond, and execute its commands."""
         while True:
-            if not self.usb.waiting and self._command is None:
+            if not self.usb.packets and self._command is None:
                 yield self.usb.arrived
             yield self.until_next_poll()
             while self._released is not None:
@@ -275,7 +271,7 @@ class VirtualBoard:
                 yield from self._try(self._command)
 
     def _read_usb(self) -> Steps:
-        if not self.usb.waiting:
+        if not self.usb.packets:
             return
         self._buffer += self.usb.read()
         longest = 8000

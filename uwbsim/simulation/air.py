@@ -247,11 +247,14 @@ class Air:
         for other in others:
             if other.sender == receiver:
                 return BUSY
-            power, signal = (float(self._powers(one.sender, one.start)[receiver]) for one in (other, frame))
+            power = float(self._powers(other.sender, other.start)[receiver])
+            if power < self._radio.sensitivity_dbm:
+                continue
             if other.end > frame.start:
+                signal = float(self._powers(frame.sender, frame.start)[receiver])
                 if self._radio.loses(signal, frame.start, power, other.start):
                     return COLLIDED
-            elif k and other.start >= since and power >= self._radio.sensitivity_dbm:
+            elif k and other.start >= since:
                 return FOREIGN  # a board that waits for an answer receives the first frame that arrives
         return ""
 

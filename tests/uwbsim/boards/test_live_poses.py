@@ -75,8 +75,8 @@ def test_served_poses_go_on_after_the_scenario_s_duration(tmp_path):
 
 
 def test_a_step_ends_though_poses_take_longer_to_write_than_they_last(tmp_path):
-    # A tenth of a second of the boards takes a microsecond of the wall clock: the next poses are always due already.
-    server = Server(flight(rate_hz=20.0), speed=1e5)
+    # A tenth of a second of the boards is 5 us of the wall clock: the next poses are due before these are written.
+    server = Server(flight(rate_hz=0.2), speed=2e4)
     try:
         server.write_poses(tmp_path / "p.csv")
         for _ in range(3):
