@@ -225,7 +225,7 @@ def test_of_two_frames_at_once_the_first_is_received_where_it_is_stronger_by_the
     for board in sorted(starts, key=lambda b: starts[b]):
         bench.advance(2 * NS_PER_MS + starts[board])
         radio = bench.boards[board].radio
-        radio.send(board + 1, RangeCommand(board + 1), radio.first_stamp())
+        radio.send(board + 1, RangeCommand(board + 1), bench.air.first_stamp(board))
     bench.advance(3 * NS_PER_MS)
     assert next(r.frame.sender if r else None for r in came) == received
 

@@ -255,10 +255,6 @@ class Radio:
         self.listen()
         return self._pending
 
-    def first_stamp(self) -> int:
-        """Return the stamp of a frame that is sent now."""
-        return self._air.first_stamp(self._board)
-
     def wait(self, timeout: int | None = round(PREAMBLE_TIMEOUT_S * NS_PER_S)) -> Wait:
         """Wait for a frame and return it; None if it is damaged, or if no preamble is detected within the timeout.
 

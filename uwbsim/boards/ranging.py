@@ -67,13 +67,13 @@ def final_of(received: Received) -> FinalPayload:
 
 def initiate(board: VirtualBoard, request: RangeCommand) -> Attempt:
     """Range with a target: one attempt of C05."""
-    radio, target = board.radio, request.target
+    radio, air, target = board.radio, board.bench.air, request.target
     if target == board.id:
         return (yield from board.answer(b"TWR FAIL: The target ID is the same as the initiator's ID.\r\n"))
     radio.off()
     board.ranging = radio.masked = True
-    yield board.sleep(TO_AIR - board.bench.air.before_marker)
-    poll = radio.send(target, request, radio.first_stamp(), board.bench.air.excess_m())
+    yield board.sleep(TO_AIR - air.before_marker)
+    poll = radio.send(target, request, air.first_stamp(board.id), air.excess_m())
     first = last = None
     if request.double_sided:
         first = yield from expected(board, ResponsePayload, target, board.id)
@@ -94,7 +94,7 @@ def _report(board: VirtualBoard, poll: Frame, request: RangeCommand, first: Rece
     to_final = 136 * NS_PER_US if request.target_reports else 0  # from the end of the target's last frame
     if request.target_reports:
         yield board.sleep(to_final)
-        board.radio.send(target, final, board.radio.first_stamp(), poll.excess_m)
+        board.radio.send(target, final, board.bench.air.first_stamp(board.id), poll.excess_m)
     yield board.sleep(AT_HOST - to_final)
     board.send(range_report(RangeReport, target, final, final_of(last)))
     if request.get_cir:

@@ -95,10 +95,6 @@ class Faults(Section):
 
     faults: tuple[Fault, ...] = Field((), description="The faults, in any order.")
 
-    def lost_share(self) -> float:
-        """Return the share of frames that are lost on the air."""
-        return 1 - math.prod(1 - fault.share for fault in self.faults if isinstance(fault, LoseFrames))
-
 
 def load_faults(path: str | os.PathLike[str], tags: Iterable[int]) -> Faults:
     """Read a file of faults of boards with these tags; raises `ScenarioError` that says where it is wrong.
@@ -219,7 +215,8 @@ class Server:
         """
         self._speed, self._tell = speed, tell
         self._faults = faults or Faults()
-        self.bench = Bench(scenario, self._printed, self._faults.lost_share())
+        kept = math.prod(1 - fault.share for fault in self._faults.faults if isinstance(fault, LoseFrames))
+        self.bench = Bench(scenario, self._printed, 1 - kept)
         self.bench.crashed = lambda board, error: self._tell(
             f"board {board.id} hangs: its program failed with {type(error).__name__}: {error}"
         )

@@ -52,7 +52,7 @@ class UsbLink:
     """The USB interface of one board from power-up to power-off.
 
     `packets` wait to be read, and `arrived` is triggered when one comes; `lost` counts transfers that were dropped
-    because the bus was busy.
+    because the bus was busy. Where it is not `open`, the board is unplugged, and transfers under way are lost.
     """
 
     def __init__(self, env: simpy.Environment, send: Callable[[bytes], None]) -> None:
@@ -60,13 +60,9 @@ class UsbLink:
         self._env, self._send = env, send
         self.packets: list[bytes] = []
         self._busy_until = 0
-        self._open = True
+        self.open = True
         self.arrived = env.event()
         self.lost = 0
-
-    def close(self) -> None:
-        """Unplug the board: transfers under way are lost."""
-        self._open = False
 
     def write(self, data: bytes) -> None:
         """Receive one write of the host, in packets of 64 bytes."""
@@ -91,7 +87,7 @@ class UsbLink:
             self._transfer(data)
 
     def _after(self, delay: int, work: Callable[[], None]) -> None:
-        self._env.timeout(delay).callbacks.append(lambda _: work() if self._open else None)
+        self._env.timeout(delay).callbacks.append(lambda _: work() if self.open else None)
 
     def _arrive(self, piece: bytes) -> None:
         if len(self.packets) >= 8:
@@ -103,7 +99,7 @@ class UsbLink:
 
     def _transfer(self, data: bytes) -> None:
         now = int(self._env.now)
-        if not self._open:
+        if not self.open:
             return
         if now < self._busy_until:
             self.lost += 1
@@ -186,7 +182,7 @@ class VirtualBoard:
     def power_off(self) -> None:
         """Switch the power off: the board neither sends nor receives."""
         self.powered = False
-        self.usb.close()
+        self.usb.open = False
         self.hang()
 
     def hang(self) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from uwbsim.scenario.base import Increasing, NotNegative, Positive, Section, Vector
+from uwbsim.scenario.base import Increasing, NotNegative, Positive, Section, Vector, look_up
 
 
 class Box(Section):
@@ -197,8 +197,7 @@ class Material(Section):
 
 
 def _known(material: Any) -> Any:
-    if isinstance(material, str) and material not in MATERIALS:
-        raise ValueError(f"found {material!r}, known are {', '.join(MATERIALS)}")
+    look_up(MATERIALS, material)
     return material
 
 

@@ -163,11 +163,10 @@ def simulate(
     slots = _slots(medium, world, plan, draws)
     if contention:
         sampled = SampledWorld(world)
-
-        def powers(sender: int, time: int) -> Floats:
-            return sampled.from_sender(sender, max(time, 0)).power_dbm
-
-        outcomes = air.Air(protocol, slots, powers, scenario.radio).execute(progress)
+        execution = air.Air(
+            protocol, slots, lambda tag, time: sampled.from_sender(tag, max(time, 0)).power_dbm, scenario.radio
+        )
+        outcomes = execution.execute(progress)
     else:
         outcomes = _undisturbed(scenario, slots)
     begun, lost = np.array(outcomes.start, dtype=np.int64), np.array(outcomes.lost)

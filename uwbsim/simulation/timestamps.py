@@ -95,7 +95,7 @@ def draw_reply_s(scenario: Scenario, rng: np.random.Generator, count: int) -> Fl
     """
     reply = scenario.ranging.reply
     if reply.model == "fixed":
-        return np.full(count, reply.delay_s)
+        return np.full(count, reply.delay_us * 1e-6)
     if reply.model == "quantiles":
         return reply.at_s(rng.random(count))
     kind = rng.random(count)
@@ -185,21 +185,19 @@ def _readings(medium: Medium, number: int, kept: Ints, planned: int, stamped: St
 
 def reported_faults(scenario: Scenario, plan: Schedule, outcomes: air.Outcomes) -> list[Fault]:
     """Return the failed exchanges, with their reasons and initiators."""
-    ids = [tag.id for tag in scenario.tags]
-    found = []
-    for k in np.flatnonzero(np.array(outcomes.lost) >= 0):
-        a, b, reason = ids[plan.initiator[k]], ids[plan.target[k]], outcomes.reason[k]
-        found.append(
-            Fault(
-                round(outcomes.start[k] * (NS_PER_S / SUBTICKS_PER_SECOND)),
-                str(a),
-                "lost frame" if reason == air.WEAK else reason,
-                f"{a} ranged with {b}: message {outcomes.lost[k] + 1} {reason}",
-                a,
-                b,
-            )
+    ids, failed = np.array([tag.id for tag in scenario.tags]), np.flatnonzero(np.array(outcomes.lost) >= 0)
+    tags = zip(ids[plan.initiator[failed]].tolist(), ids[plan.target[failed]].tolist(), strict=True)
+    return [
+        Fault(
+            round(outcomes.start[k] * (NS_PER_S / SUBTICKS_PER_SECOND)),
+            str(a),
+            "lost frame" if outcomes.reason[k] == air.WEAK else outcomes.reason[k],
+            f"{a} ranged with {b}: message {outcomes.lost[k] + 1} {outcomes.reason[k]}",
+            a,
+            b,
         )
-    return found
+        for k, (a, b) in zip(failed.tolist(), tags, strict=True)
+    ]
 
 
 def provenance(scenario: Scenario) -> dict[str, Any]:
