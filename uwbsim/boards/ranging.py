@@ -214,9 +214,11 @@ def _overheard(initiator: int, target: int, request: RangeCommand, heard: list[R
     mine = final_of(heard[-1]) if request.target_reports else FinalPayload((0, 0, 0), 0.0, 0.0)
     (tx1, rx2, rx3), (rx1, tx2, tx3) = mine.stamps, theirs.stamps
     shown = [*signals[:2], third]
-    rest: list[Any] = [one.stamp & MASK if one else 0 for one in shown]
-    rest += [tx1, rx1, tx2, rx2, tx3, rx3]
-    rest += [one.power_dbm if one else None for one in shown]
-    rest += [one.skew_ppm if one else None for one in shown]
-    rest += [theirs.power_dbm, mine.power_dbm, theirs.skew_ppm, mine.skew_ppm]
+    rest: list[Any] = [
+        *(one.stamp & MASK if one else 0 for one in shown),
+        *(tx1, rx1, tx2, rx2, tx3, rx3),
+        *(one.power_dbm if one else None for one in shown),
+        *(one.skew_ppm if one else None for one in shown),
+        *(theirs.power_dbm, mine.power_dbm, theirs.skew_ppm, mine.skew_ppm),
+    ]
     return Overheard(initiator, target, *rest)

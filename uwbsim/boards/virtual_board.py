@@ -230,8 +230,8 @@ class VirtualBoard:
             return
         self.radio.masked = True
         self._released = self.bench.env.event()
-        self._processes = [p for p in self._processes if p.is_alive]
-        self._processes.append(self.bench.env.process(self._guarded(self._interrupt_task(steps))))
+        task = self.bench.env.process(self._guarded(self._interrupt_task(steps)))
+        self._processes = [*(p for p in self._processes if p.is_alive), task]
 
     def _interrupt_task(self, steps: Steps) -> Steps:
         yield from steps

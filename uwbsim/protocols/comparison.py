@@ -118,15 +118,15 @@ class Comparison:
 
     def __repr__(self) -> str:
         """Return a line a protocol."""
-        lines = [
-            f"{'protocol':10s}{'bias (cm)':>11s}{'predicted':>11s}{'std (cm)':>11s}{'predicted':>11s}{'air (us)':>10s}"
+        rows = [
+            f"{one.protocol:10s}{100 * one.bias_m:11.3f}{100 * one.predicted_bias_m:11.3f}{100 * one.std_m:11.3f}"
+            f"{100 * one.predicted_std_m:11.3f}{1e6 * one.air_s:10.0f}"
+            for one in self.outcomes
         ]
-        for one in self.outcomes:
-            errors = (one.bias_m, one.predicted_bias_m, one.std_m, one.predicted_std_m)
-            lines.append(
-                f"{one.protocol:10s}" + "".join(f"{100 * e:11.3f}" for e in errors) + f"{1e6 * one.air_s:10.0f}"
-            )
-        return "\n".join(lines)
+        head = (
+            f"{'protocol':10s}{'bias (cm)':>11s}{'predicted':>11s}{'std (cm)':>11s}{'predicted':>11s}{'air (us)':>10s}"
+        )
+        return "\n".join([head, *rows])
 
 
 def compare(

@@ -117,9 +117,8 @@ def chosen(protocols: Protocols | None, parameter: str = "protocols") -> list[Ra
 
     Raises `ParameterError` that lists what there is.
     """
-    wanted = list(PROTOCOLS) if protocols is None else protocols
     rows: dict[str, RangingProtocol] = {}
-    for one in wanted:
+    for one in PROTOCOLS if protocols is None else protocols:
         if not isinstance(one, RangingProtocol) and one not in PROTOCOLS:
             raise ParameterError(f"found {one!r}, allowed: {', '.join(PROTOCOLS)}", parameter=parameter)
         row = one if isinstance(one, RangingProtocol) else PROTOCOLS[one]

@@ -203,8 +203,9 @@ def predict_state(q: State) -> Prediction:
     target_waits, final_at_once = timings[1] == "scheduled", timings[1:] == ["scheduled", "at once"]
     if q.final_delay_us is not None and target_waits and not final_at_once:
         what = "has no third message" if len(timings) < 3 else "waits as long with its third message as with its reply"
-        text = f"{protocol.name} {what}; leave it out, and give that of the reply"
-        raise ParameterError(text, parameter="final_delay_us")
+        raise ParameterError(
+            f"{protocol.name} {what}; leave it out, and give that of the reply", parameter="final_delay_us"
+        )
     # The boards' firmware waits by default 1500 of its own microseconds (512/499.2 us), and a step of its clock.
     final_us = 1538.7 if q.final_delay_us is None else q.final_delay_us
     scheduled = q.reply_delay_us if target_waits else final_us

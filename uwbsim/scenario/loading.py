@@ -154,9 +154,9 @@ def _table(source: Source) -> tuple[dict[str, Any], Path]:
     if isinstance(source, str) and "\n" in source:
         return parse_toml(source, nowhere), nowhere
     if not isinstance(source, str | os.PathLike):
-        seen = type(source).__name__
         raise ParameterError(
-            f"found {seen}, expected a path, a name, TOML text, tables or a Scenario", parameter="source"
+            f"found {type(source).__name__}, expected a path, a name, TOML text, tables or a Scenario",
+            parameter="source",
         )
     path, known = Path(source), shipped_scenarios()
     what, plain = "scenario file (.toml) or name", path.as_posix().removesuffix(".toml")

@@ -184,7 +184,3 @@ class Ranging(Section):
         """Return how many exchanges a second one after the other allow."""
         row = PROTOCOLS[self.protocol]
         return 1 / (exchange_s(row, preamble_symbols, self.scheduled_s, self.at_once_s) + TURNAROUND_S)
-
-    def air_share(self, preamble_symbols: int) -> float:
-        """Return the share of time for which the plan keeps the air busy."""
-        return self.rate_hz * exchange_air_s(PROTOCOLS[self.protocol], preamble_symbols)

@@ -23,7 +23,7 @@ from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
-from uwbsim.scenario.ranging import UUS_S, before_marker_s
+from uwbsim.scenario.ranging import before_marker_s, exchange_air_s
 from uwbsim.simulation import air
 from uwbsim.simulation.air import Schedule, schedule
 from uwbsim.simulation.timestamps import (
@@ -361,8 +361,7 @@ def preview(scenario: Scenario | Source) -> Preview:
     plan, world = schedule(scenario), World(scenario)
     duration, radio, samples = scenario.run.duration_s, scenario.radio, 200
     time = (np.linspace(0, duration, samples) * SUBTICKS_PER_SECOND).astype(np.int64)
-    reply_s = scenario.ranging.response_delay_uus * UUS_S
-    pairs = []
+    ranging, pairs = scenario.ranging, []
     for i, j in sorted(set(zip(plan.initiator.tolist(), plan.target.tolist(), strict=True))):
         count = int(np.count_nonzero((plan.initiator == i) & (plan.target == j)))
         link = world.link(np.full(samples, i), np.full(samples, j), time)
@@ -376,7 +375,7 @@ def preview(scenario: Scenario | Source) -> Preview:
                 distance_m=(float(link.distance_m.min()), float(link.distance_m.max())),
                 power_dbm=(float(link.power_dbm.min()), float(link.power_dbm.max())),
                 audible=float(np.mean(link.power_dbm >= radio.sensitivity_dbm)),
-                ss_bias_m=SPEED_OF_LIGHT / 2 * (one.skew_ppm - two.skew_ppm) * 1e-6 * reply_s,
+                ss_bias_m=SPEED_OF_LIGHT / 2 * (one.skew_ppm - two.skew_ppm) * 1e-6 * ranging.scheduled_s,
             )
         )
     return Preview(
@@ -384,7 +383,7 @@ def preview(scenario: Scenario | Source) -> Preview:
         pairs=tuple(pairs),
         exchanges=len(plan.start),
         rate_hz=len(plan.start) / duration,
-        fastest_hz=scenario.ranging.fastest_hz(radio.preamble_symbols),
-        air_share=scenario.ranging.air_share(radio.preamble_symbols),
+        fastest_hz=ranging.fastest_hz(radio.preamble_symbols),
+        air_share=ranging.rate_hz * exchange_air_s(PROTOCOLS[ranging.protocol], radio.preamble_symbols),
         duration_s=duration,
     )

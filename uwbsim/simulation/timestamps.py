@@ -247,8 +247,8 @@ def _heard_by(medium: Medium, me: int, rows: Ints, stamped: Stamped, exchanges: 
     columns |= {"time_ns": exchanges.time_ns[rows], "listener": np.full(count, tag.id)}
     columns |= {name: getattr(exchanges, name)[rows] for name in ("initiator", "target")}
     columns |= {f"{name}_n": getattr(exchanges, name)[rows] for name in STAMPS}
-    for name in ("fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm"):
-        columns[name.replace("_", "_n_")] = getattr(exchanges, name)[rows]
+    readings = ("fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")
+    columns |= {name.replace("_", "_n_"): getattr(exchanges, name)[rows] for name in readings}
     return {name: column[heard] for name, column in columns.items()}
 
 

@@ -128,14 +128,12 @@ QUANTITIES: Final[dict[str, tuple[str, Column]]] = {
 def _compared(name: str, measured: Flight, flights: list[Flight]) -> Compared | None:
     unit, column = QUANTITIES[name]
     mine, group = _finite(column(measured), measured.pair)
-    if len(mine) < 8:
-        return None
     # A seed's pairs are pairs of their own.
     named = {pair: k for k, pair in enumerate(measured.pairs)}
     numbers = [np.array([named.get(pair, -1) for pair in flight.pairs], dtype=np.int64) for flight in flights]
     parts = [_finite(column(flight), number[flight.pair]) for flight, number in zip(flights, numbers, strict=True)]
     theirs, pair = (np.concatenate(values) for values in zip(*parts, strict=True))
-    if not len(theirs):
+    if len(mine) < 8 or not len(theirs):
         return None
     seed = np.repeat(np.arange(len(parts)), [len(values) for values, _ in parts])
     one, other = Side.of(mine, group), Side.of(theirs, pair + seed * len(named))
@@ -252,9 +250,9 @@ class Twin:
 
     def __repr__(self) -> str:
         """Return what was found, a line each."""
-        lines = [f"Twin of {self.recording}: {len(self.measured)} exchanges of {len(self.measured.pairs)} pairs"]
-        lines += [f"  {name}: {value:.4g}" for name, value in self.found.items() if isinstance(value, float)]
-        return "\n".join(lines)
+        head = f"Twin of {self.recording}: {len(self.measured)} exchanges of {len(self.measured.pairs)} pairs"
+        values = (f"  {name}: {value:.4g}" for name, value in self.found.items() if isinstance(value, float))
+        return "\n".join([head, *values])
 
 
 def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
