@@ -61,7 +61,7 @@ def pairs(folder: Path) -> list[Pair]:
     errors = ranges.raw_m - ranges.truth_m
     panels = [{"power_dbm": ranges.fpp1_dbm, "error_m": errors}] * FIGURES
     times = {"flight": 5 / SPEED_OF_LIGHT, "at_once": 305e-6, "scheduled": 1538.7e-6}
-    one = Conditions.single(**times, rate_initiator=5e-6, rate_target=-5e-6, rx_std=1e-10, tx_std=1e-10)
+    one = Conditions.single(**times, rate=(5e-6, -5e-6), rx_std=1e-10, tx_std=1e-10)
     states = one[np.zeros(STATES, dtype=np.int64)]
     write_table(folder, TABLE)
 

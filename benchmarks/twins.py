@@ -19,7 +19,7 @@ from uwbsim.scenario.loading import load
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import TwoStateMultipath
 from uwbsim.twins.fitting import Twin
-from uwbsim.world.world import share_and_life
+from uwbsim.world.world import pair_reflections
 
 ROBOTS = {
     "hare": [[-3.0, -3.5, 0.3], [3.0, -0.3, 2.4]],
@@ -110,7 +110,7 @@ def shares(scenario: Scenario) -> dict[str, float]:
         raise TypeError("the world has two states")
     pairs = {tuple(sorted(pair)) for pair in scenario.pairs()}
     draws = {pair: stream(scenario.run.seed, "reflected states", *pair, "pair") for pair in pairs}
-    return {f"{a}-{b}": share_and_life(model, [a, b], rng)[0] for (a, b), rng in draws.items()}
+    return {f"{a}-{b}": pair_reflections(model, [a, b], rng)[0] for (a, b), rng in draws.items()}
 
 
 Row = tuple[str, Callable[[Scenario, Twin], float], Callable[[Scenario, Twin], float]]

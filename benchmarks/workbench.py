@@ -71,7 +71,7 @@ def plain() -> str:
     from uwblink.ticks import SPEED_OF_LIGHT
     from uwbsim.protocols.conditions import STATES, Conditions
 
-    start = {"flight": 5 / SPEED_OF_LIGHT, "rate_initiator": 5e-6, "rate_target": -5e-6, "at_once": 305e-6}
+    start = {"flight": 5 / SPEED_OF_LIGHT, "rate": (5e-6, -5e-6), "at_once": 305e-6}
     one = Conditions.single(**start, scheduled=1538.7e-6, rx_std=1e-10, tx_std=1e-10)
     return _rate(one[np.zeros(STATES, dtype=np.int64)])
 

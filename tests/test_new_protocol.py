@@ -60,7 +60,7 @@ def test_simulated_ranges_are_exact_up_to_skew_and_planted_delays(row, delays):
 
 def test_prediction_and_monte_carlo_agree_with_each_other_and_with_the_formula(row):
     one = Conditions.single(
-        flight=5 / SPEED_OF_LIGHT, rate_initiator=5e-6, rate_target=-5e-6, at_once=305e-6, scheduled=1538.7e-6,
+        flight=5 / SPEED_OF_LIGHT, rate=(5e-6, -5e-6), at_once=305e-6, scheduled=1538.7e-6,
         quantize=False,
     )  # fmt: skip
     quiet = predict(row, one)

@@ -31,28 +31,18 @@ def in_time_order(parts: Sequence[Columns]) -> Columns:
     return {name: column[order] for name, column in columns.items()}
 
 
-def write_csv(path: Path, rows: Rows, *, force: bool) -> None:
-    """Write rows as CSV; raises what `whole` raises."""
-    with whole(path, force=force) as partial:
-        _fill(partial, rows)
-
-
 def write_tables(table: Path, parquet: Path, rows: Rows, *, force: bool) -> None:
     """Write rows as CSV and as Parquet, both or neither; raises what `whole` raises."""
     if not is_utf8(parquet):
         raise OutputError(f"{parquet}: its name and those of its folders must be UTF-8; give another one")
     with whole(table, force=force) as text, whole(parquet, force=force) as packed:
-        _fill(text, rows)
+        columns = dict.fromkeys(key for row in rows for key in row)
+        with text.open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.DictWriter(stream, list(columns), restval="")
+            writer.writeheader()
+            writer.writerows(rows)
         with connect(paths=[text, packed]) as db:
             try:
                 db.read_csv(str(text), header=True, sample_size=-1).write_parquet(str(packed))
             except duckdb.IOException as error:
                 raise OutputError(f"{parquet}: cannot be written ({first_line(error)})") from error
-
-
-def _fill(path: Path, rows: Rows) -> None:
-    columns = dict.fromkeys(key for row in rows for key in row)
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, list(columns), restval="")
-        writer.writeheader()
-        writer.writerows(rows)

@@ -64,14 +64,14 @@ def test_a_target_answers_its_host_after_the_exchange():
 
 
 def sent_frames(ports):
-    """Note every frame that is announced."""
-    frames, announce = [], ports.bench.air.announce
+    """Note every frame that is scheduled."""
+    frames, send = [], ports.bench.air.send
 
-    def noting(frame):
-        announce(frame)
-        frames.append(frame)
+    def noting(*frame):
+        frames.append(send(*frame))
+        return frames[-1]
 
-    ports.bench.air.announce = noting
+    ports.bench.air.send = noting
     return frames
 
 
@@ -140,14 +140,15 @@ def test_failed_tries_make_bystanders_warn():
 
 def test_a_listener_that_misses_the_last_frame_is_deaf_until_another_comes():
     ports = VirtualPorts(bench_scenario())
-    bench, announce = ports.bench, ports.bench.air.announce
+    bench, send = ports.bench, ports.bench.air.send
 
-    def losing(frame):
-        announce(frame)
+    def losing(*sent):
+        frame = send(*sent)
         if isinstance(frame.payload, FinalPayload) and frame.sender == 1:
             frame.received[3].heard = False
+        return frame
 
-    setattr(bench.air, "announce", losing)  # noqa: B010 - mypy minds an assignment
+    setattr(bench.air, "send", losing)  # noqa: B010 - mypy minds an assignment
     bench.boards[3].write(b"C04|1\r")
     bench.advance(5 * NS_PER_MS)
     bench.boards[1].write(b"C05|2|1|1|0\r")
@@ -224,7 +225,7 @@ def test_of_two_frames_at_once_the_first_is_received_where_it_is_stronger_by_the
     for board in sorted(starts, key=lambda b: starts[b]):
         bench.advance(2 * NS_PER_MS + starts[board])
         radio = bench.boards[board].radio
-        radio.send(board + 1, RangeCommand(board + 1), radio.first_stamp())
+        radio.send(board + 1, RangeCommand(board + 1), bench.air.first_stamp(board))
     bench.advance(3 * NS_PER_MS)
     assert next(r.frame.sender if r else None for r in came) == received
 

@@ -235,7 +235,7 @@ def _broadcast(board: VirtualBoard, data: bytes) -> Attempt:
         return False
     board.radio.off()
     yield board.sleep(TO_AIR - board.bench.air.before_marker)
-    board.radio.send(None, Broadcast(data), board.radio.first_stamp())
+    board.radio.send(None, Broadcast(data), board.bench.air.first_stamp(board.id))
     yield board.sleep(930 * NS_PER_US)
     board.send(BroadcastSent())
     return True

@@ -15,7 +15,6 @@ from typing import Any, Final
 import numpy as np
 import simpy
 
-from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, TICK_S, UUS_TICKS
 from uwblink.wire.messages import Broadcast, RangeCommand
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
@@ -28,7 +27,7 @@ from uwbsim.scenario.ranging import (
     after_marker_s,
     before_marker_s,
 )
-from uwbsim.simulation.timestamps import draw_reply_s, next_grid
+from uwbsim.simulation.timestamps import draw_reply_s, next_grid, reply_counter, scheduled_counter
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.reception import Frames, Medium
@@ -122,23 +121,23 @@ class BoardAir:
         self.before_marker = _ns(before_marker_s(scenario.radio.preamble_symbols))
         self._late_enough = _ns(scenario.radio.preamble_symbols / 2 * PREAMBLE_SYMBOL_S)
 
-    def next_stamp(self, board: int, time: int) -> int:
-        """Return the first transmit stamp that a board's clock allows at or after a true time (sub-ticks)."""
-        reading = int(self.medium.clocks.read(np.array([self.place[board]]), np.array([time]))[0])
+    def first_stamp(self, board: int) -> int:
+        """Return the stamp of a frame that a board sends now: its marker leaves at the end of its preamble."""
+        marker = (int(self.env.now) + self.before_marker) * SUBTICKS_PER_SECOND // NS_PER_S
+        reading = int(self.medium.clocks.read(np.array([self.place[board]]), np.array([marker]))[0])
         return next_grid(-(-reading // SUBTICKS)) + self._tx_register(board)
 
     def reply_stamp(self, board: int, received: int) -> int:
         """Return the transmit stamp of an immediate reply to a frame received at a stamp, with a random latency."""
-        latency = round(float(draw_reply_s(self.scenario, self._rng, 1)[0]) / TICK_S)
-        return next_grid(received + latency - ANTENNA_DELAY_TICKS) + self._tx_register(board)
+        counter = reply_counter(received, draw_reply_s(self.scenario, self._rng, 1))
+        return int(counter[0]) + self._tx_register(board)
 
     def scheduled_stamps(self, board: int, reference: int, delay_uus: int) -> tuple[int, int]:
         """Return the transmit stamps of a frame scheduled a delay after the stamp `reference`.
 
-        The chip's stamp, which ignores the low nine bits of the scheduled time; and the one that the firmware computes
-        and sends, with a constant of its build.
+        The chip's stamp, and the one that the firmware computes and sends, with a constant of its build.
         """
-        due = (reference + delay_uus * UUS_TICKS) // DELAYED_TX_GRID * DELAYED_TX_GRID
+        due = scheduled_counter(reference, delay_uus)
         return due + self._tx_register(board), due + int(self.medium.reply_constant[self.place[board]])
 
     def _tx_register(self, board: int) -> int:
@@ -157,8 +156,8 @@ class BoardAir:
         (found,) = self.world.paths(sender, receiver, np.array([frame.departure]), detour)
         return found
 
-    def frame(self, sender: int, receiver: int | None, payload: Payload, stamp: int, excess_m: float = 0.0) -> Frame:
-        """Return a frame with a transmit stamp of its sender's clock, and its reception at all boards."""
+    def send(self, sender: int, receiver: int | None, payload: Payload, stamp: int, excess_m: float = 0.0) -> Frame:
+        """Schedule a frame with a transmit stamp of its sender's clock; return it with its reception at all boards."""
         rng, place, count = self._rng, self.place[sender], len(self.place)
         departure = int(self.medium.leave(np.array([place]), np.array([stamp]), rng.normal(size=1))[0])
         excess = np.array([excess_m if board == receiver else 0.0 for board in self.place])
@@ -183,16 +182,16 @@ class BoardAir:
         columns = (column.tolist() for column in (stamp_of, *readings, link.power_dbm, heard))
         rows = zip(self.place, *columns, strict=True)
         frame.received = {board: Received(frame, *values) for board, *values in rows}
-        return frame
-
-    def announce(self, frame: Frame) -> None:
-        """Schedule a frame at its departure."""
         # A frame that ended 20 ms ago collides with no frame and is waited for by no board.
         oldest = int(self.env.now) - 20 * NS_PER_MS
         self._frames = [f for f in self._frames if f.end > oldest and not f.cancelled]
         self._frames.append(frame)
-        over = self.env.timeout(max(frame.end - int(self.env.now), 0))
-        over.callbacks.append(lambda _: self._arrive(frame))
+        self.over(frame).callbacks.append(lambda _: self._arrive(frame))
+        return frame
+
+    def over(self, frame: Frame) -> simpy.Event:
+        """Return the event of a frame's end."""
+        return self.env.timeout(max(frame.end - int(self.env.now), 0))
 
     def arriving(self, board: int, since: int) -> int | None:
         """Return the end of the frame that a board, whose receiver is on since `since`, receives now; else None."""
@@ -212,14 +211,14 @@ class BoardAir:
 
     def _collides(self, frame: Frame, board: int) -> bool:
         """Return whether a frame collides with another one at a board."""
-        radio, signal = self.scenario.radio, frame.received[board].antenna_dbm
-        for other in self._frames:
-            power = other.received[board].antenna_dbm
-            overlaps = other is not frame and other.end > frame.start and other.start < frame.end
-            disturbs = signal < power + radio.capture_db or frame.start > other.start
-            if overlaps and disturbs and power >= radio.sensitivity_dbm and not other.cancelled:
-                return True
-        return False
+        loses, signal = self.scenario.radio.loses, frame.received[board].antenna_dbm
+        others = [other for other in self._frames if other is not frame and not other.cancelled]
+        return any(
+            other.end > frame.start
+            and other.start < frame.end
+            and loses(signal, frame.start, other.received[board].antenna_dbm, other.start)
+            for other in others
+        )
 
 
 class Radio:
@@ -241,8 +240,7 @@ class Radio:
 
     def listen(self) -> None:
         """Switch the receiver on, at once or at the end of the frame that is being sent."""
-        now = int(self._air.env.now)
-        self.since = self._pending.end if self._pending is not None and self.sending else now
+        self.since = self._pending.end if self._pending is not None and self.sending else int(self._air.env.now)
 
     def off(self) -> None:
         """Switch receiver and transmitter off; a scheduled frame is never sent."""
@@ -253,20 +251,9 @@ class Radio:
 
     def send(self, receiver: int | None, payload: Payload, stamp: int, excess_m: float = 0.0) -> Frame:
         """Send a frame at a transmit stamp of the board's clock; the receiver is on again afterwards."""
-        frame = self._air.frame(self._board, receiver, payload, stamp, excess_m)
-        self._air.announce(frame)
-        self._pending = frame
+        self._pending = self._air.send(self._board, receiver, payload, stamp, excess_m)
         self.listen()
-        return frame
-
-    def first_stamp(self) -> int:
-        """Return the stamp of a frame that is sent now: its marker leaves at the end of its preamble."""
-        marker_ns = int(self._air.env.now) + self._air.before_marker
-        return self._air.next_stamp(self._board, marker_ns * SUBTICKS_PER_SECOND // NS_PER_S)
-
-    def over(self, frame: Frame) -> simpy.Event:
-        """Return the event of a frame's end."""
-        return self._air.env.timeout(max(frame.end - int(self._air.env.now), 0))
+        return self._pending
 
     def wait(self, timeout: int | None = round(PREAMBLE_TIMEOUT_S * NS_PER_S)) -> Wait:
         """Wait for a frame and return it; None if it is damaged, or if no preamble is detected within the timeout.

@@ -7,7 +7,7 @@ reads no USB commands meanwhile (firmware wire format, 3.3).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from uwblink.twr import Exchanges, board_range
 from uwblink.wire.codec import encode
@@ -61,22 +61,19 @@ def expected(
 
 
 def final_of(received: Received) -> FinalPayload:
-    """Return the payload of a final; raises `TypeError` for another frame."""
-    payload = received.frame.payload
-    if not isinstance(payload, FinalPayload):
-        raise TypeError(f"found {payload!r:.60}, expected a final")
-    return payload
+    """Return the payload of a final, for which `expected` was asked."""
+    return cast("FinalPayload", received.frame.payload)
 
 
 def initiate(board: VirtualBoard, request: RangeCommand) -> Attempt:
     """Range with a target: one attempt of C05."""
-    radio, target = board.radio, request.target
+    radio, air, target = board.radio, board.bench.air, request.target
     if target == board.id:
         return (yield from board.answer(b"TWR FAIL: The target ID is the same as the initiator's ID.\r\n"))
     radio.off()
     board.ranging = radio.masked = True
-    yield board.sleep(TO_AIR - board.bench.air.before_marker)
-    poll = radio.send(target, request, radio.first_stamp(), board.bench.air.excess_m())
+    yield board.sleep(TO_AIR - air.before_marker)
+    poll = radio.send(target, request, air.first_stamp(board.id), air.excess_m())
     first = last = None
     if request.double_sided:
         first = yield from expected(board, ResponsePayload, target, board.id)
@@ -91,15 +88,15 @@ def initiate(board: VirtualBoard, request: RangeCommand) -> Attempt:
 
 def _report(board: VirtualBoard, poll: Frame, request: RangeCommand, first: Received, last: Received) -> Steps:
     """Send the final if the target reports too, print the report, and the impulse response if requested."""
-    theirs, target = final_of(last), request.target
+    target = request.target
     mine = poll.stamp & MASK, first.stamp & MASK, last.stamp & MASK if request.double_sided else 0
+    final = FinalPayload(mine, first.power_dbm, first.skew_ppm)
     to_final = 136 * NS_PER_US if request.target_reports else 0  # from the end of the target's last frame
     if request.target_reports:
         yield board.sleep(to_final)
-        final = FinalPayload(mine, first.power_dbm, first.skew_ppm)
-        board.radio.send(target, final, board.radio.first_stamp(), poll.excess_m)
+        board.radio.send(target, final, board.bench.air.first_stamp(board.id), poll.excess_m)
     yield board.sleep(AT_HOST - to_final)
-    board.send(range_report(RangeReport, target, FinalPayload(mine, first.power_dbm, first.skew_ppm), theirs))
+    board.send(range_report(RangeReport, target, final, final_of(last)))
     if request.get_cir:
         yield from print_cir(board, board.id, target, last)
 
@@ -110,7 +107,7 @@ def answer(board: VirtualBoard, received: Received, request: RangeCommand) -> St
     excess = received.frame.excess_m
     if request.double_sided:
         first = air.reply_stamp(board.id, received.stamp)
-        yield radio.over(radio.send(initiator, ResponsePayload(), first, excess))
+        yield air.over(radio.send(initiator, ResponsePayload(), first, excess))
         # A transmission with a shorter delay would start in the past (firmware wire format, 3.6).
         if not 265 <= board.delay_uus <= 32_767:
             return
@@ -143,11 +140,10 @@ def _of_target(poll: Received, first: int, last: int, request: RangeCommand) -> 
 def range_report(kind: type[RangeReport], neighbour: int, initiator: FinalPayload, target: FinalPayload) -> RangeReport:
     """Return the report of an exchange, with the range that the boards compute from its stamps."""
     (tx1, rx2, rx3), (rx1, tx2, tx3) = initiator.stamps, target.stamps
-    stamps = {"tx1": tx1, "rx1": rx1, "tx2": tx2, "rx2": rx2, "tx3": tx3, "rx3": rx3}
-    columns: dict[str, Any] = {name: [stamp] for name, stamp in stamps.items()}
-    exchange = Exchanges.from_arrays([0], [1], **columns, protocol="ds" if rx3 or tx3 else "ss")
-    powers = [target.power_dbm, initiator.power_dbm, target.skew_ppm, initiator.skew_ppm]
-    rest: list[Any] = [*stamps.values(), *powers]
+    stamps: dict[str, Any] = {"tx1": tx1, "rx1": rx1, "tx2": tx2, "rx2": rx2, "tx3": tx3, "rx3": rx3}
+    exchange = Exchanges.from_arrays([0], [1], **stamps | {"tx1": [tx1]}, protocol="ds" if rx3 or tx3 else "ss")
+    readings = (target.power_dbm, initiator.power_dbm, target.skew_ppm, initiator.skew_ppm)
+    rest: list[Any] = [*stamps.values(), *readings]
     return kind(neighbour, float(board_range(exchange)[0]), *rest)
 
 
@@ -218,9 +214,11 @@ def _overheard(initiator: int, target: int, request: RangeCommand, heard: list[R
     mine = final_of(heard[-1]) if request.target_reports else FinalPayload((0, 0, 0), 0.0, 0.0)
     (tx1, rx2, rx3), (rx1, tx2, tx3) = mine.stamps, theirs.stamps
     shown = [*signals[:2], third]
-    rest: list[Any] = [one.stamp & MASK if one else 0 for one in shown]
-    rest += [tx1, rx1, tx2, rx2, tx3, rx3]
-    rest += [one.power_dbm if one else None for one in shown]
-    rest += [one.skew_ppm if one else None for one in shown]
-    rest += [theirs.power_dbm, mine.power_dbm, theirs.skew_ppm, mine.skew_ppm]
+    rest: list[Any] = [
+        *(one.stamp & MASK if one else 0 for one in shown),
+        *(tx1, rx1, tx2, rx2, tx3, rx3),
+        *(one.power_dbm if one else None for one in shown),
+        *(one.skew_ppm if one else None for one in shown),
+        *(theirs.power_dbm, mine.power_dbm, theirs.skew_ppm, mine.skew_ppm),
+    ]
     return Overheard(initiator, target, *rest)

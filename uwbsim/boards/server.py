@@ -95,10 +95,6 @@ class Faults(Section):
 
     faults: tuple[Fault, ...] = Field((), description="The faults, in any order.")
 
-    def lost_share(self) -> float:
-        """Return the share of frames that are lost on the air."""
-        return 1 - math.prod(1 - fault.share for fault in self.faults if isinstance(fault, LoseFrames))
-
 
 def load_faults(path: str | os.PathLike[str], tags: Iterable[int]) -> Faults:
     """Read a file of faults of boards with these tags; raises `ScenarioError` that says where it is wrong.
@@ -219,7 +215,8 @@ class Server:
         """
         self._speed, self._tell = speed, tell
         self._faults = faults or Faults()
-        self.bench = Bench(scenario, self._printed, self._faults.lost_share())
+        kept = math.prod(1 - fault.share for fault in self._faults.faults if isinstance(fault, LoseFrames))
+        self.bench = Bench(scenario, self._printed, 1 - kept)
         self.bench.crashed = lambda board, error: self._tell(
             f"board {board.id} hangs: its program failed with {type(error).__name__}: {error}"
         )
@@ -230,7 +227,8 @@ class Server:
         self._start_ns = time.monotonic_ns()
         self.epoch_ns = time.time_ns()
         """Host time (Unix epoch) at which the scenario's time is zero."""
-        self._timed = sched.scheduler(self._now_ns)
+        self._reached_ns = 0
+        self._timed = sched.scheduler(lambda: self._reached_ns)
         try:
             for tag in scenario.tags:
                 self._terminals[tag.id] = Terminal(link_dir / f"tag{tag.id}" if link_dir else None)
@@ -272,7 +270,9 @@ class Server:
             if data:
                 self.bench.advance(self._now_ns())
                 self.bench.boards[tag].write(data)
-        self.bench.advance(self._now_ns())
+        self._reached_ns = self._now_ns()
+        self.bench.advance(self._reached_ns)
+        # The scheduler's time stands still meanwhile: an action that schedules the next one ends, however late it is.
         self._timed.run(blocking=False)
 
     def announce(self, tell: Callable[[str], object]) -> None:
@@ -286,18 +286,16 @@ class Server:
     def write_poses(self, path: Path) -> None:
         """Write motion capture to a file from now on, in host time, as `uwblink poses` reads it."""
         self._poses = LivePoses(self.bench.air.world, path, self.epoch_ns)
-        self._append_poses()
+        self._append_poses(self._poses)
 
-    def _append_poses(self) -> None:
-        if self._poses is None:
-            return
+    def _append_poses(self, poses: LivePoses) -> None:
         now = self._now_ns()
         try:
-            self._poses.write_until(now)
+            poses.write_until(now)
         except OSError as error:
             self._tell(f"the poses end here: {error.strerror or error}")
-            return
-        self._at(now + 100 * NS_PER_MS, self._append_poses)
+        else:
+            self._at(now + 100 * NS_PER_MS, partial(self._append_poses, poses))
 
     def close(self) -> None:
         """Unplug all boards, and close the file of poses."""

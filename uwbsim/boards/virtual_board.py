@@ -51,26 +51,18 @@ FULL: Final = b"USB Buffer full! Message rejected to prevent overflow."
 class UsbLink:
     """The USB interface of one board from power-up to power-off.
 
-    `arrived` is triggered when a packet comes; `lost` counts transfers that were dropped because the bus was busy.
+    `packets` wait to be read, and `arrived` is triggered when one comes; `lost` counts transfers that were dropped
+    because the bus was busy. Where it is not `open`, the board is unplugged, and transfers under way are lost.
     """
 
     def __init__(self, env: simpy.Environment, send: Callable[[bytes], None]) -> None:
         """`send` is called with the bytes of each transfer at its time."""
         self._env, self._send = env, send
-        self._packets: list[bytes] = []
+        self.packets: list[bytes] = []
         self._busy_until = 0
-        self._open = True
+        self.open = True
         self.arrived = env.event()
         self.lost = 0
-
-    @property
-    def waiting(self) -> bool:
-        """Whether packets wait to be read."""
-        return bool(self._packets)
-
-    def close(self) -> None:
-        """Unplug the board: transfers under way are lost."""
-        self._open = False
 
     def write(self, data: bytes) -> None:
         """Receive one write of the host, in packets of 64 bytes."""
@@ -82,8 +74,8 @@ class UsbLink:
 
     def read(self) -> bytes:
         """Return the received bytes and clear the queue."""
-        data = b"".join(self._packets)
-        self._packets.clear()
+        data = b"".join(self.packets)
+        self.packets.clear()
         self.arrived = self._env.event()
         return data
 
@@ -95,19 +87,19 @@ class UsbLink:
             self._transfer(data)
 
     def _after(self, delay: int, work: Callable[[], None]) -> None:
-        self._env.timeout(delay).callbacks.append(lambda _: work() if self._open else None)
+        self._env.timeout(delay).callbacks.append(lambda _: work() if self.open else None)
 
     def _arrive(self, piece: bytes) -> None:
-        if len(self._packets) >= 8:
+        if len(self.packets) >= 8:
             self._transfer(FULL)
             return
-        self._packets.append(piece)
+        self.packets.append(piece)
         if not self.arrived.triggered:
             self.arrived.succeed()
 
     def _transfer(self, data: bytes) -> None:
         now = int(self._env.now)
-        if not self._open:
+        if not self.open:
             return
         if now < self._busy_until:
             self.lost += 1
@@ -190,7 +182,7 @@ class VirtualBoard:
     def power_off(self) -> None:
         """Switch the power off: the board neither sends nor receives."""
         self.powered = False
-        self.usb.close()
+        self.usb.open = False
         self.hang()
 
     def hang(self) -> None:
@@ -238,8 +230,8 @@ class VirtualBoard:
             return
         self.radio.masked = True
         self._released = self.bench.env.event()
-        self._processes = [p for p in self._processes if p.is_alive]
-        self._processes.append(self.bench.env.process(self._guarded(self._interrupt_task(steps))))
+        task = self.bench.env.process(self._guarded(self._interrupt_task(steps)))
+        self._processes = [*(p for p in self._processes if p.is_alive), task]
 
     def _interrupt_task(self, steps: Steps) -> Steps:
         yield from steps
@@ -263,7 +255,7 @@ class VirtualBoard:
     def _usb_task(self) -> Steps:
         """Read the USB buffer every millisecond, and execute its commands."""
         while True:
-            if not self.usb.waiting and self._command is None:
+            if not self.usb.packets and self._command is None:
                 yield self.usb.arrived
             yield self.until_next_poll()
             while self._released is not None:
@@ -275,7 +267,7 @@ class VirtualBoard:
                 yield from self._try(self._command)
 
     def _read_usb(self) -> Steps:
-        if not self.usb.waiting:
+        if not self.usb.packets:
             return
         self._buffer += self.usb.read()
         longest = 8000

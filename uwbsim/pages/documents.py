@@ -270,8 +270,9 @@ def _swept(plan: SweepDesign, rows: Sequence[Mapping[str, Any]]) -> Document:
         unit, scale = ("cm", 100.0) if unit == "m" else (unit, 1.0)
         shown = f"{stem} ({unit})" if unit in ("cm", "ns", "s", "hz", "ps", "ppm", "dbm") else f"{stem} {unit}".strip()
         described = f": {RESULTS[name]}" if RESULTS.get(name) else ""
-        known = {"keys": columns, "protocol": protocols, "result": scale * found[name]}
-        draw = partial(figures.result_over_keys, name=shown, **known)
+        draw = partial(
+            figures.result_over_keys, keys=columns, protocol=protocols, result=scale * found[name], name=shown
+        )
         blocks.append(Picture(name, draw, f"{shown}{described}."))
     if len(found) > most:
         blocks.append(Text(f"Not drawn: {', '.join(list(found)[most:])}.", "note"))

@@ -21,6 +21,7 @@ from uwblink.protocols.table import PROTOCOLS, RangingProtocol
 from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S
 from uwbsim.protocols.comparison import ErrorCurve, Optimum
 from uwbsim.protocols.conditions import Conditions, exchange, interval_stamps
+from uwbsim.scenario.bodies import Obstacle, Room
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.ranging import after_marker_s, before_marker_s, message_bytes
 from uwbsim.twins import Compared
@@ -107,9 +108,11 @@ def room(width_in: float, scenario: Scenario) -> Figure:
     paths = {body.name: world.trajectories[body.name].position_m(time) for body in scenario.bodies}
     spots, _ = world.antennas(np.arange(len(scenario.tags)), np.zeros(len(scenario.tags)))
     tags = {tag.id: spot for tag, spot in zip(scenario.tags, spots, strict=True)}
-    boxes = {box.name: np.array([box.min_m, box.max_m]) for box in scenario.obstacles}
-    walls = [np.array([scenario.room.min_m, scenario.room.max_m])] if scenario.room else []
-    points = np.concatenate([*paths.values(), spots, *boxes.values(), *walls])
+    boxes: list[tuple[Obstacle | Room, str, dict[str, Any]]] = []
+    boxes += [(box, box.name, {"fc": GRID, "ec": MUTED, "lw": 0.6}) for box in scenario.obstacles]
+    boxes += [(scenario.room, "", {"fill": False, "ec": INK, "lw": 1.2, "zorder": 1})] if scenario.room else []
+    corners = [np.array([box.min_m, box.max_m]) for box, _, _ in boxes]
+    points = np.concatenate([*paths.values(), spots, *corners])
     # What is drawn is at least a metre large, with a margin.
     middle, half = (points.max(axis=0) + points.min(axis=0)) / 2, np.maximum(np.ptp(points, axis=0) / 2, 0.5)
     half = half + (0.04 if scenario.room else 0.12) * float(half.max())
@@ -119,13 +122,12 @@ def room(width_in: float, scenario: Scenario) -> Figure:
     height_in = min(float(heights.mean() if narrow else heights.max() / 2), 4.2) + 0.6
     figure, panels = sheet(width_in, 2, height_in=height_in, height_ratios=heights if narrow else None)
     for axes, (x, y), name in zip(panels, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
-        for text, corners in boxes.items():
-            size = _draw_box(axes, corners[:, [x, y]], fc=GRID, ec=MUTED, lw=0.6)
-            if size.min() > 0.1 * half[0]:
-                spot, turned = corners[:, [x, y]].mean(axis=0), 90 if size[1] > size[0] else 0
-                axes.text(spot[0], spot[1], text, ha="center", va="center", rotation=turned, color=INK)
-        for corners in walls:
-            _draw_box(axes, corners[:, [x, y]], fill=False, ec=INK, lw=1.2, zorder=1)
+        for (_, text, line), ends in zip(boxes, corners, strict=True):
+            (left, bottom), (wide, tall) = ends[0, [x, y]], np.ptp(ends, axis=0)[[x, y]]
+            axes.add_patch(Rectangle((left, bottom), wide, tall, **line))
+            if min(wide, tall) > 0.1 * half[0]:
+                middle_x, middle_y, turned = left + wide / 2, bottom + tall / 2, 90 if tall > wide else 0
+                axes.text(middle_x, middle_y, text, ha="center", va="center", rotation=turned, color=INK)
         for k, body in enumerate(scenario.bodies):
             own = {tag.id: tags[tag.id][[x, y]] for tag in scenario.tags if tag.body == body.name}
             _draw_body(axes, body.name, paths[body.name][:, [x, y]], own, look(k), middle[[x, y]])
@@ -135,13 +137,6 @@ def room(width_in: float, scenario: Scenario) -> Figure:
         axes.set_title(name, loc="left")
     legend(figure, panels[0])
     return figure
-
-
-def _draw_box(axes: Axes, corners: Floats, **line: Any) -> Floats:
-    """Draw a rectangle between two corners, (2, 2), and return its size."""
-    size = np.asarray(corners[1] - corners[0])
-    axes.add_patch(Rectangle((corners[0, 0], corners[0, 1]), size[0], size[1], **line))
-    return size
 
 
 def _draw_body(axes: Axes, name: str, path: Floats, tags: Mapping[int, Floats], own: Look, middle: Floats) -> None:

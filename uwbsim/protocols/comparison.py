@@ -118,15 +118,15 @@ class Comparison:
 
     def __repr__(self) -> str:
         """Return a line a protocol."""
-        lines = [
-            f"{'protocol':10s}{'bias (cm)':>11s}{'predicted':>11s}{'std (cm)':>11s}{'predicted':>11s}{'air (us)':>10s}"
+        rows = [
+            f"{one.protocol:10s}{100 * one.bias_m:11.3f}{100 * one.predicted_bias_m:11.3f}{100 * one.std_m:11.3f}"
+            f"{100 * one.predicted_std_m:11.3f}{1e6 * one.air_s:10.0f}"
+            for one in self.outcomes
         ]
-        for one in self.outcomes:
-            errors = (one.bias_m, one.predicted_bias_m, one.std_m, one.predicted_std_m)
-            lines.append(
-                f"{one.protocol:10s}" + "".join(f"{100 * e:11.3f}" for e in errors) + f"{1e6 * one.air_s:10.0f}"
-            )
-        return "\n".join(lines)
+        head = (
+            f"{'protocol':10s}{'bias (cm)':>11s}{'predicted':>11s}{'std (cm)':>11s}{'predicted':>11s}{'air (us)':>10s}"
+        )
+        return "\n".join([head, *rows])
 
 
 def compare(
@@ -237,9 +237,7 @@ class ErrorCurve:
 def over_skew(scenario: Scenario, protocol: RangingProtocol, count: int = 16_384) -> ErrorCurve:
     """Return the error over the relative skew of the two clocks in ppm, all else as in the scenario."""
     skews = np.linspace(-20, 20, 17)
-    return _curve(
-        scenario, protocol, count, skews, lambda ppm: {"rate_initiator": ppm * 0.5e-6, "rate_target": -ppm * 0.5e-6}
-    )
+    return _curve(scenario, protocol, count, skews, lambda ppm: {"rate": np.array([[ppm], [-ppm]]) * 0.5e-6})
 
 
 def over_reply(scenario: Scenario, protocol: RangingProtocol, count: int = 16_384) -> ErrorCurve:
@@ -252,7 +250,7 @@ def _curve(
     protocol: RangingProtocol,
     count: int,
     x: Floats,
-    columns: Callable[[float], Mapping[str, float]],
+    columns: Callable[[float], Mapping[str, float | Floats]],
 ) -> ErrorCurve:
     """Return the error over values (n,) for which `columns` of the calibrated conditions change."""
     world = calibrated(conditions_of(scenario, 2048))

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
 from itertools import cycle
 from typing import Any, Final
 
@@ -32,13 +31,16 @@ from uwbsim.world.world import World
 
 SIDES: Final = ("initiator", "target")
 
+Both = Floats
+"""Columns (2, n): of the initiator, then of the target."""
+
 STATES: Final = 16_384
 """States of the world that are sampled; it is also the length of the pieces that fit into a core's cache."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Conditions:
-    """The state of the world in exchanges, columns of length n; times of flight and delays in seconds.
+    """The state of the world in exchanges, columns (n,) or `Both` (2, n); times of flight and delays in seconds.
 
     `flight` is that of the straight line, `excess` the additional time of the first path: an error of the range.
     Clocks run at 1 + rate; `drift` is the change of the rate in 1/s, `white` its white noise, a fraction times the root
@@ -53,19 +55,14 @@ class Conditions:
     flight: Floats
     excess: Floats
     flight_rate: Floats
-    rate_initiator: Floats
-    rate_target: Floats
-    drift_initiator: Floats
-    drift_target: Floats
-    white_initiator: Floats
-    white_target: Floats
+    rate: Both
+    drift: Both
+    white: Both
     late: Floats
     rx_std: Floats
     tx_std: Floats
-    tx_delay_initiator: Floats
-    rx_delay_initiator: Floats
-    tx_delay_target: Floats
-    rx_delay_target: Floats
+    tx_delay: Both
+    rx_delay: Both
     at_once: Floats
     scheduled: Floats
     power_dbm: Floats
@@ -80,10 +77,6 @@ class Conditions:
         """Return the number of states."""
         return len(self.flight)
 
-    def by_side(self, name: str) -> dict[str, Floats]:
-        """Return a property of which the two boards have one each, such as `rate`, by `SIDES`."""
-        return {side: getattr(self, f"{name}_{side}") for side in SIDES}
-
     @property
     def distance_m(self) -> Floats:
         """Return the distances of the states."""
@@ -91,25 +84,30 @@ class Conditions:
 
     def __getitem__(self, rows: slice | Ints) -> Conditions:
         """Return the chosen states."""
-        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in COLUMNS}
+        columns: dict[str, Any] = {name: getattr(self, name)[..., rows] for name in COLUMNS}
         return replace(self, **columns)
 
     def with_columns(self, **values: float | Floats) -> Conditions:
-        """Return the same states with some columns changed."""
+        """Return the same states with some columns changed; those of both boards may be given as (2, 1)."""
         columns: dict[str, Any] = {
-            name: np.broadcast_to(np.asarray(v, dtype=float), (len(self),)) for name, v in values.items()
+            name: np.broadcast_to(np.asarray(v, dtype=float), getattr(self, name).shape) for name, v in values.items()
         }
         return replace(self, **columns)
 
     @classmethod
     def single(cls, **values: Any) -> Conditions:
-        """Return one state: zeros, but for what is given."""
-        columns: dict[str, Any] = {name: np.array([float(values.pop(name, 0.0))]) for name in COLUMNS}
+        """Return one state: zeros, but for what is given; of both boards, a pair is given."""
+        # A pair is transposed into a column.
+        columns: dict[str, Any] = {
+            name: np.zeros(shape) + np.transpose([values.pop(name, 0.0)]) for name, shape in COLUMNS.items()
+        }
         return cls(**columns, **values)
 
 
-COLUMNS: Final = tuple(f.name for f in fields(Conditions) if f.type == "Floats")
-
+COLUMNS: Final = {
+    f.name: (2, 1) if f.type == "Both" else (1,) for f in fields(Conditions) if f.type in ("Both", "Floats")
+}
+"""The columns, with their shapes for a single state."""
 
 Protocols = Sequence[str | RangingProtocol]
 
@@ -119,9 +117,8 @@ def chosen(protocols: Protocols | None, parameter: str = "protocols") -> list[Ra
 
     Raises `ParameterError` that lists what there is.
     """
-    wanted = list(PROTOCOLS) if protocols is None else protocols
     rows: dict[str, RangingProtocol] = {}
-    for one in wanted:
+    for one in PROTOCOLS if protocols is None else protocols:
         if not isinstance(one, RangingProtocol) and one not in PROTOCOLS:
             raise ParameterError(f"found {one!r}, allowed: {', '.join(PROTOCOLS)}", parameter=parameter)
         row = one if isinstance(one, RangingProtocol) else PROTOCOLS[one]
@@ -182,24 +179,18 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
     delays = AntennaDelays.of(scenario)
     white = np.array([(tag.white_ppm_sqrt_s * 1e-6) for tag in scenario.tags])
     share, mean_m = radio.independent_multipath
-    nothing = np.zeros(len(rows))
     return Conditions(
         flight=link.distance_m / SPEED_OF_LIGHT,
         excess=link.excess_m / SPEED_OF_LIGHT,
         flight_rate=(later.distance_m - link.distance_m) / step_s / SPEED_OF_LIGHT,
-        rate_initiator=clocks.rate(i, start, WALK_STEP_S),
-        rate_target=clocks.rate(j, start, WALK_STEP_S),
-        drift_initiator=nothing,
-        drift_target=nothing,
-        white_initiator=white[i],
-        white_target=white[j],
+        rate=np.array([clocks.rate(end, start, WALK_STEP_S) for end in (i, j)]),
+        drift=np.zeros((2, len(rows))),
+        white=np.array([white[i], white[j]]),
         late=np.mean([bias for bias, _ in errors_s], axis=0),
         rx_std=np.sqrt(np.mean([std**2 for _, std in errors_s], axis=0)),
         tx_std=np.full(len(rows), (radio.tx_noise_ps * 1e-12)),
-        tx_delay_initiator=delays.transmit_s(i, start),
-        rx_delay_initiator=delays.receive_s(i, start),
-        tx_delay_target=delays.transmit_s(j, start),
-        rx_delay_target=delays.receive_s(j, start),
+        tx_delay=np.array([delays.transmit_s(end, start) for end in (i, j)]),
+        rx_delay=np.array([delays.receive_s(end, start) for end in (i, j)]),
         at_once=draw_reply_s(scenario, stream(scenario.run.seed, "reply latency"), len(rows)),
         scheduled=np.full(len(rows), scenario.ranging.response_delay_uus * UUS_TICKS * TICK_S),
         power_dbm=link.power_dbm,
@@ -214,8 +205,7 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
 
 def calibrated(conditions: Conditions) -> Conditions:
     """Return the same world as a calibration leaves it: no antenna delays, no bias by power, no reflections."""
-    delays = {f"{end}_delay_{side}": 0.0 for end in ("tx", "rx") for side in ("initiator", "target")}
-    return replace(conditions.with_columns(late=0.0, excess=0.0, **delays), multipath=0.0)
+    return replace(conditions.with_columns(late=0.0, excess=0.0, tx_delay=0.0, rx_delay=0.0), multipath=0.0)
 
 
 def range_errors_m(
@@ -263,31 +253,26 @@ def exchange(protocol: RangingProtocol, c: Conditions, noise: Noise | None = Non
     A clock reads 1 + rate times the true time, plus half of drift times its square, plus the phase of its noise.
     Antenna delays and power add to stamps.
     """
-    way, tx, late, faster, carrier = _in_ticks(c)
-    drift = c.by_side("drift")
+    way, tx, late = (c.flight + c.excess) / TICK_S, c.tx_delay / TICK_S, (c.rx_delay + c.late) / TICK_S
+    faster, drift = 1 + c.rate, c.drift * (TICK_S / 2)
+    carrier = c.carrier_sign * (c.rate[0] - c.rate[1]) * 1e6 + c.carrier_bias_ppm
     stamps: dict[str, Floats] = {}
     leave, arrive = [], []
-    drifting, moving = any(column.any() for column in drift.values()), c.flight_rate.any()
     if noise:
         noise.begin(c)
         way = way + noise.detours(c) / TICK_S
     for k, message in enumerate(protocol.messages):
-        sender, receiver = SIDES if message.sender == "initiator" else SIDES[::-1]
+        sender = SIDES.index(message.sender)
+        receiver = 1 - sender
         sent = _transmit_stamp(message, stamps, c, noise)
         left = (sent - tx[sender]) / faster[sender]
-        if drifting:
-            left -= drift[sender] * (TICK_S / 2) * left**2
+        left -= drift[sender] * left**2
         if noise and k == 1:
             carrier = carrier + noise.carrier_ppm(c, left)
         if noise and noise.white:
             left -= noise.phase(sender, left)
-        came = left + way
-        if moving:
-            came += c.flight_rate * left
-        seen = faster[receiver] * came
-        seen += late[receiver]
-        if drifting:
-            seen += drift[receiver] * (TICK_S / 2) * came**2
+        came = left + way + c.flight_rate * left
+        seen = faster[receiver] * came + late[receiver] + drift[receiver] * came**2
         if noise:
             seen = noise.received(c, k, receiver, seen, came)
         stamps[f"tx{k + 1}"], stamps[f"rx{k + 1}"] = sent, seen
@@ -295,16 +280,6 @@ def exchange(protocol: RangingProtocol, c: Conditions, noise: Noise | None = Non
         arrive.append(came)
     truth = c.flight / TICK_S + c.flight_rate * (leave[0] + leave[1]) / 2
     return Stamps(stamps=stamps, leave=leave, arrive=arrive, truth=truth, carrier_ppm=carrier)
-
-
-@lru_cache(maxsize=8)
-def _in_ticks(c: Conditions) -> tuple[Floats, dict[str, Floats], dict[str, Floats], dict[str, Floats], Floats]:
-    """Return first path, and errors of transmit and receive stamps by side, in ticks; rates by side; carrier in ppm."""
-    tx = {side: delay / TICK_S for side, delay in c.by_side("tx_delay").items()}
-    late = {side: (delay + c.late) / TICK_S for side, delay in c.by_side("rx_delay").items()}
-    faster = {side: 1 + rate for side, rate in c.by_side("rate").items()}
-    carrier = c.carrier_sign * (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
-    return (c.flight + c.excess) / TICK_S, tx, late, faster, carrier
 
 
 def _transmit_stamp(message: ProtocolMessage, stamps: dict[str, Floats], c: Conditions, noise: Noise | None) -> Floats:
@@ -318,11 +293,12 @@ def _transmit_stamp(message: ProtocolMessage, stamps: dict[str, Floats], c: Cond
     if noise is None:
         half = DELAYED_TX_GRID / 2
         return due + (ANTENNA_DELAY_TICKS - half if scheduled else half) if message.after else due
-    due = due + noise.grid[message.sender]
+    grid = noise.grid[SIDES.index(message.sender)]
+    due = due + grid
     slot = due // DELAYED_TX_GRID
     if message.timing == "at once":
         slot = np.ceil((due - ANTENNA_DELAY_TICKS) / DELAYED_TX_GRID)
-    return np.asarray(slot * DELAYED_TX_GRID + ANTENNA_DELAY_TICKS - noise.grid[message.sender])
+    return np.asarray(slot * DELAYED_TX_GRID + ANTENNA_DELAY_TICKS - grid)
 
 
 class Noise:
@@ -332,18 +308,18 @@ class Noise:
         """Open the streams; those that the conditions do not need are not drawn from."""
         self._frames = [stream(seed, "frame noise", k) for k in range(len(protocol.messages))]
         self._multipath, self._carrier = stream(seed, "multipath"), stream(seed, "skew reading", 2)
-        self._counters = {side: stream(seed, "counter phase", side) for side in SIDES}
-        self._clocks = {side: stream(seed, "clock noise", side) for side in SIDES}
-        self.white = bool(np.any(c.white_initiator) or np.any(c.white_target))
+        self._counters = [stream(seed, "counter phase", side) for side in SIDES]
+        self._clocks = [stream(seed, "clock noise", side) for side in SIDES]
+        self.white = bool(np.any(c.white))
 
     def begin(self, c: Conditions) -> None:
         """Begin exchanges: draw the phases of the counters; the phases of the clocks' noise are zero."""
         if c.quantize:
-            self.grid = {side: own.random(len(c)) * DELAYED_TX_GRID for side, own in self._counters.items()}
+            self.grid = [own.random(len(c)) * DELAYED_TX_GRID for own in self._counters]
         self._std = np.sqrt(c.tx_std**2 + c.rx_std**2) / TICK_S
-        self._walks: dict[str, tuple[Floats, Floats]] = {}
+        self._walks: dict[int, tuple[Floats, Floats]] = {}
         # The standard deviation of a clock's phase after a tick, in ticks.
-        self._wander = {side: white * TICK_S**-0.5 for side, white in c.by_side("white").items()}
+        self._wander = c.white * TICK_S**-0.5
 
     def detours(self, c: Conditions) -> Floats | float:
         """Return the detours of the exchanges in seconds."""
@@ -354,7 +330,7 @@ class Noise:
         units = np.where(hit < c.multipath, -np.log(np.maximum(hit / c.multipath, 1e-300)), 0.0)
         return units * c.detour_s
 
-    def phase(self, side: str, time: Floats) -> Floats:
+    def phase(self, side: int, time: Floats) -> Floats:
         """Return the phase of a clock by the white noise of its rate at times in ticks, none earlier than the last."""
         last, phase = self._walks.get(side, (time, np.zeros_like(time)))
         step = np.sqrt(np.maximum(time - last, 0)) * self._clocks[side].standard_normal(len(time))
@@ -367,11 +343,11 @@ class Noise:
         if not self.white:
             return noise
         span = RATE_SPAN_S / TICK_S
-        before = [self.phase(side, departure - span) for side in SIDES]
-        mine, other = (self.phase(side, departure) - phase for side, phase in zip(SIDES, before, strict=True))
+        before = [self.phase(side, departure - span) for side in (0, 1)]
+        mine, other = (self.phase(side, departure) - phase for side, phase in enumerate(before))
         return noise + c.carrier_sign * (mine - other) / span * 1e6
 
-    def received(self, c: Conditions, k: int, side: str, seen: Floats, time: Floats) -> Floats:
+    def received(self, c: Conditions, k: int, side: int, seen: Floats, time: Floats) -> Floats:
         """Return receive stamps of message k at times in ticks with all noise, in ticks of the receiver's counter.
 
         Transmit noise is added here, too: its effect on later departures is below 1e-7 of it.

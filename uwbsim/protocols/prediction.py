@@ -17,7 +17,7 @@ from uwblink.arrays import Floats
 from uwblink.protocols.table import RangingProtocol
 from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S
 from uwbsim.errors import ParameterError
-from uwbsim.protocols.conditions import Conditions, Stamps, chosen, exchange, intervals_of
+from uwbsim.protocols.conditions import SIDES, Conditions, Stamps, chosen, exchange, intervals_of
 from uwbsim.scenario.devices import TX_SHARE
 from uwbsim.world.clocks import RATE_SPAN_S
 
@@ -90,7 +90,7 @@ def _white_clocks(protocol: RangingProtocol, slopes: dict[str, Floats], mean: St
         mean.leave[1] - RATE_SPAN_S / TICK_S,
     )
     total = np.zeros(len(c))
-    for side, white, sign in (("initiator", c.white_initiator, 1), ("target", c.white_target, -1)):
+    for side, white, sign in zip(SIDES, c.white, (1, -1), strict=True):
         read = [(preamble, -sign * gain), (mean.leave[1], sign * gain)]
         for k, message in enumerate(protocol.messages):
             name, time = ("tx", mean.leave[k]) if message.sender == side else ("rx", mean.arrive[k])
@@ -203,25 +203,23 @@ def predict_state(q: State) -> Prediction:
     target_waits, final_at_once = timings[1] == "scheduled", timings[1:] == ["scheduled", "at once"]
     if q.final_delay_us is not None and target_waits and not final_at_once:
         what = "has no third message" if len(timings) < 3 else "waits as long with its third message as with its reply"
-        text = f"{protocol.name} {what}; leave it out, and give that of the reply"
-        raise ParameterError(text, parameter="final_delay_us")
+        raise ParameterError(
+            f"{protocol.name} {what}; leave it out, and give that of the reply", parameter="final_delay_us"
+        )
     # The boards' firmware waits by default 1500 of its own microseconds (512/499.2 us), and a step of its clock.
     final_us = 1538.7 if q.final_delay_us is None else q.final_delay_us
     scheduled = q.reply_delay_us if target_waits else final_us
     at_once = final_us if final_at_once else q.reply_delay_us
+    skew, aggregate = np.array([0.5e-6, -0.5e-6]), np.array([q.delay_initiator_ns, q.delay_target_ns])
     conditions = Conditions.single(
         flight=q.distance_m / SPEED_OF_LIGHT,
         flight_rate=q.speed_mps / SPEED_OF_LIGHT,
-        rate_initiator=q.skew_ppm * 0.5e-6,
-        rate_target=-q.skew_ppm * 0.5e-6,
-        drift_initiator=q.drift_ppm_per_s * 0.5e-6,
-        drift_target=-q.drift_ppm_per_s * 0.5e-6,
+        rate=q.skew_ppm * skew,
+        drift=q.drift_ppm_per_s * skew,
         tx_std=q.tx_noise_ps * 1e-12,
         rx_std=q.rx_noise_ps * 1e-12,
-        tx_delay_initiator=TX_SHARE * 1e-9 * q.delay_initiator_ns,
-        rx_delay_initiator=(TX_SHARE - 1) * 1e-9 * q.delay_initiator_ns,
-        tx_delay_target=TX_SHARE * 1e-9 * q.delay_target_ns,
-        rx_delay_target=(TX_SHARE - 1) * 1e-9 * q.delay_target_ns,
+        tx_delay=TX_SHARE * 1e-9 * aggregate,
+        rx_delay=(TX_SHARE - 1) * 1e-9 * aggregate,
         at_once=at_once * 1e-6,
         scheduled=scheduled * 1e-6,
         carrier_bias_ppm=q.carrier_bias_ppm,

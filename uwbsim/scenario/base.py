@@ -5,7 +5,7 @@ Beyond these limits numbers of a simulation would overflow, and its stamps mean 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import pairwise
 from typing import Annotated, Any, Final, Self
@@ -69,6 +69,15 @@ def not_decreasing(values: Sequence[float]) -> Sequence[float]:
     if any(b < a for a, b in pairwise(values)):
         raise ValueError("found a value that is below the one before; they must not decrease")
     return values
+
+
+def look_up(known: Mapping[str, Any], value: Any) -> Any:
+    """Return what a name stands for, and any other value as it is; raises `ValueError` for an unknown name."""
+    if not isinstance(value, str):
+        return value
+    if value not in known:
+        raise ValueError(f"found {value!r}, known are {', '.join(known)}")
+    return known[value]
 
 
 Positive = Annotated[float, Field(gt=0)]

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from uwbsim.scenario.base import Increasing, NotNegative, Positive, Section, Vector
+from uwbsim.scenario.base import Increasing, NotNegative, Positive, Section, Vector, look_up
 
 
 class Box(Section):
@@ -157,10 +157,11 @@ class Imu(Section):
 
     def errors(self, which: str) -> tuple[float, float, float]:
         """Return bias, its walk in a second, and noise per root of Hz, of the "gyro" or "force", in SI units."""
-        bias, wander, noise = GRADES[self.grade][which]
-        scale, given = 1.0, (self.accel_bias_mps2, self.accel_noise_mps2_per_sqrt_hz)
-        if which == "gyro":
-            scale, given = math.pi / 180, (self.gyro_bias_dps, self.gyro_noise_dps_per_sqrt_hz)
+        given = {
+            "gyro": (self.gyro_bias_dps, self.gyro_noise_dps_per_sqrt_hz),
+            "force": (self.accel_bias_mps2, self.accel_noise_mps2_per_sqrt_hz),
+        }[which]
+        scale, (bias, wander, noise) = math.pi / 180 if which == "gyro" else 1.0, GRADES[self.grade][which]
         bias, noise = (known if own is None else own for own, known in zip(given, (bias, noise), strict=True))
         return scale * bias, scale * wander, scale * noise
 
@@ -197,8 +198,7 @@ class Material(Section):
 
 
 def _known(material: Any) -> Any:
-    if isinstance(material, str) and material not in MATERIALS:
-        raise ValueError(f"found {material!r}, known are {', '.join(MATERIALS)}")
+    look_up(MATERIALS, material)
     return material
 
 

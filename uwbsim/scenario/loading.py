@@ -19,7 +19,7 @@ from contextlib import ExitStack
 from copy import deepcopy
 from itertools import islice, product, takewhile
 from pathlib import Path
-from typing import Any, Final, TypeVar, get_args
+from typing import Any, Final, TypeVar, cast, get_args
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
@@ -154,9 +154,9 @@ def _table(source: Source) -> tuple[dict[str, Any], Path]:
     if isinstance(source, str) and "\n" in source:
         return parse_toml(source, nowhere), nowhere
     if not isinstance(source, str | os.PathLike):
-        seen = type(source).__name__
         raise ParameterError(
-            f"found {seen}, expected a path, a name, TOML text, tables or a Scenario", parameter="source"
+            f"found {type(source).__name__}, expected a path, a name, TOML text, tables or a Scenario",
+            parameter="source",
         )
     path, known = Path(source), shipped_scenarios()
     what, plain = "scenario file (.toml) or name", path.as_posix().removesuffix(".toml")
@@ -195,21 +195,16 @@ def _override(table: dict[str, Any], key: str, value: Any) -> None:
         raise ParameterError(
             f"found key {key!r}, expected key.path=value, as in ranging.rate_hz=50", parameter="overrides"
         )
-    node: Any = table
+    node, place = cast("Any", {"": table}), cast("Any", "")
     for k, step in enumerate(keys):
-        place: Any = step
+        node = node.setdefault(place, {}) if isinstance(node, dict) else node[place]
         if isinstance(node, list):
             if not (step.isdecimal() and len(step) < 9 and int(step) < len(node)):
                 raise UnknownKeyError(f"{key}: found {step!r}, expected an index 0 to {len(node) - 1}")
-            place = int(step)
         elif not isinstance(node, dict):
             raise UnknownKeyError(f"{key}: {keys[k - 1]} is not a table")
-        elif k < len(keys) - 1:
-            node.setdefault(step, {})
-        if k == len(keys) - 1:
-            node[place] = value
-        else:
-            node = node[place]
+        place = int(step) if isinstance(node, list) else step
+    node[place] = value
 
 
 Model = TypeVar("Model", bound=BaseModel)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from uwbsim.scenario.base import NotDecreasing, NotNegative, Positive, Section, Share, TagId
+from uwbsim.scenario.base import NotDecreasing, NotNegative, Positive, Section, Share, TagId, look_up
 from uwbsim.scenario.devices import GroupDelay, check_grid
 
 _AUGUST: Final = [0.014173673264269979] * 4 + [1.599984520527571] * 4
@@ -268,17 +269,6 @@ class BiasTable(Section):
         return self
 
 
-def _named(known: dict[str, dict[str, Any] | None]) -> Any:
-    def look_up(value: Any) -> Any:
-        if not isinstance(value, str):
-            return value
-        if value not in known:
-            raise ValueError(f"found {value!r}, known curves are {', '.join(known)}")
-        return known[value]
-
-    return BeforeValidator(look_up)
-
-
 class AntennaTable(Section):
     """Gain in dB over azimuth and elevation in the body's frame: a full grid, interpolated linearly."""
 
@@ -354,12 +344,12 @@ class Radio(Section):
         15.0,
         description="Largest ratio of the strongest path to a first path that is still detected.",
     )
-    bias: Annotated[Spline | BiasTable | None, _named(BIAS)] = Field(
+    bias: Annotated[Spline | BiasTable | None, BeforeValidator(partial(look_up, BIAS))] = Field(
         None,
         description="Bias of ranges over power: a spline over lifted power, a table over dBm, or the name of a "
         "published curve.",
     )
-    sigma: Annotated[SigmaSpline | None, _named(SIGMA)] = Field(
+    sigma: Annotated[SigmaSpline | None, BeforeValidator(partial(look_up, SIGMA))] = Field(
         None,
         description="Standard deviation of ranges over lifted power: a spline, or the name of a published curve.",
     )
@@ -372,6 +362,14 @@ class Radio(Section):
         None,
         description="Intervals in which pairs do not hear each other; by default none.",
     )
+
+    def loses(self, signal_dbm: float, start: int, other_dbm: float, other_start: int) -> bool:
+        """Return whether a frame is lost that overlaps another one, from powers at the receiver and times of start.
+
+        It is received only if it is the first and stronger by `capture_db`; weak frames disturb no other.
+        """
+        weaker = signal_dbm < other_dbm + self.capture_db
+        return other_dbm >= self.sensitivity_dbm and (weaker or start > other_start)
 
     @property
     def independent_multipath(self) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from uwblink.arrays import Floats
 from uwblink.protocols.table import PROTOCOLS, RangingProtocol
-from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, not_decreasing
+from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, look_up, not_decreasing
 
 PREAMBLE_SYMBOL_S: Final = 508 / 499.2e6
 """Of a preamble at a pulse repetition frequency of 64 MHz (DW1000 User Manual, section 10)."""
@@ -72,8 +72,7 @@ def exchange_s(protocol: RangingProtocol, preamble_symbols: int, scheduled_s: fl
 
 
 def _known(name: str) -> str:
-    if name not in PROTOCOLS:
-        raise ValueError(f"found {name!r}, allowed: {', '.join(PROTOCOLS)}")
+    look_up(PROTOCOLS, name)
     return name
 
 
@@ -96,11 +95,6 @@ class FixedReply(Section):
 
     model: Literal["fixed"] = Field(description="The same latency for all replies.")
     delay_us: Annotated[float, Field(ge=180, le=6000)] = Field(description="Time from the reception to the reply.")
-
-    @property
-    def delay_s(self) -> float:
-        """Return the latency in seconds."""
-        return self.delay_us * 1e-6
 
 
 class QuantileReply(Section):
@@ -182,7 +176,7 @@ class Ranging(Section):
     def at_once_s(self) -> float:
         """Return the median latency of a reply at once, in seconds."""
         if self.reply.model == "fixed":
-            return self.reply.delay_s
+            return self.reply.delay_us * 1e-6
         median_s = 305e-6  # of boards (firmware wire format, 3.4)
         return float(self.reply.at_s(np.array(0.5))) if self.reply.model == "quantiles" else median_s
 
@@ -190,7 +184,3 @@ class Ranging(Section):
         """Return how many exchanges a second one after the other allow."""
         row = PROTOCOLS[self.protocol]
         return 1 / (exchange_s(row, preamble_symbols, self.scheduled_s, self.at_once_s) + TURNAROUND_S)
-
-    def air_share(self, preamble_symbols: int) -> float:
-        """Return the share of time for which the plan keeps the air busy."""
-        return self.rate_hz * exchange_air_s(PROTOCOLS[self.protocol], preamble_symbols)

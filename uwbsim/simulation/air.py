@@ -250,13 +250,12 @@ class Air:
             power = float(self._powers(other.sender, other.start)[receiver])
             if power < self._radio.sensitivity_dbm:
                 continue
-            if other.end <= frame.start:
-                if k and other.start >= since:
-                    return FOREIGN  # a board that waits for an answer receives the first frame that arrives
-                continue
-            signal = float(self._powers(frame.sender, frame.start)[receiver])
-            if signal < power + self._radio.capture_db or frame.start > other.start:
-                return COLLIDED
+            if other.end > frame.start:
+                signal = float(self._powers(frame.sender, frame.start)[receiver])
+                if self._radio.loses(signal, frame.start, power, other.start):
+                    return COLLIDED
+            elif k and other.start >= since:
+                return FOREIGN  # a board that waits for an answer receives the first frame that arrives
         return ""
 
 

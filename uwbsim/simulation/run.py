@@ -23,7 +23,7 @@ from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
-from uwbsim.scenario.ranging import UUS_S, before_marker_s
+from uwbsim.scenario.ranging import before_marker_s, exchange_air_s
 from uwbsim.simulation import air
 from uwbsim.simulation.air import Schedule, schedule
 from uwbsim.simulation.timestamps import (
@@ -38,7 +38,7 @@ from uwbsim.simulation.timestamps import (
 )
 from uwbsim.world.clocks import LONGEST_RUN_S, NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND, readings
 from uwbsim.world.reception import Medium
-from uwbsim.world.trajectories import height_readings, inertial_readings
+from uwbsim.world.trajectories import sensor_readings
 from uwbsim.world.world import SampledWorld, World
 
 
@@ -163,11 +163,10 @@ def simulate(
     slots = _slots(medium, world, plan, draws)
     if contention:
         sampled = SampledWorld(world)
-
-        def powers(sender: int, time: int) -> Floats:
-            return sampled.from_sender(sender, max(time, 0)).power_dbm
-
-        outcomes = air.Air(protocol, slots, powers, scenario.radio).execute(progress)
+        execution = air.Air(
+            protocol, slots, lambda tag, time: sampled.from_sender(tag, max(time, 0)).power_dbm, scenario.radio
+        )
+        outcomes = execution.execute(progress)
     else:
         outcomes = _undisturbed(scenario, slots)
     begun, lost = np.array(outcomes.start, dtype=np.int64), np.array(outcomes.lost)
@@ -186,8 +185,8 @@ def simulate(
         truth_m=(stamped.links[0].distance_m + stamped.links[1].distance_m) / 2,
         meta=provenance(scenario),
         temperature=readings(scenario),
-        imu=inertial_readings(scenario, world.trajectories),
-        height=height_readings(scenario, world.trajectories),
+        imu=sensor_readings(scenario, world.trajectories, "imu"),
+        height=sensor_readings(scenario, world.trajectories, "height"),
     )
 
 
@@ -360,8 +359,7 @@ def preview(scenario: Scenario | Source) -> Preview:
     plan, world = schedule(scenario), World(scenario)
     duration, radio, samples = scenario.run.duration_s, scenario.radio, 200
     time = (np.linspace(0, duration, samples) * SUBTICKS_PER_SECOND).astype(np.int64)
-    reply_s = scenario.ranging.response_delay_uus * UUS_S
-    pairs = []
+    ranging, pairs = scenario.ranging, []
     for i, j in sorted(set(zip(plan.initiator.tolist(), plan.target.tolist(), strict=True))):
         count = int(np.count_nonzero((plan.initiator == i) & (plan.target == j)))
         link = world.link(np.full(samples, i), np.full(samples, j), time)
@@ -375,7 +373,7 @@ def preview(scenario: Scenario | Source) -> Preview:
                 distance_m=(float(link.distance_m.min()), float(link.distance_m.max())),
                 power_dbm=(float(link.power_dbm.min()), float(link.power_dbm.max())),
                 audible=float(np.mean(link.power_dbm >= radio.sensitivity_dbm)),
-                ss_bias_m=SPEED_OF_LIGHT / 2 * (one.skew_ppm - two.skew_ppm) * 1e-6 * reply_s,
+                ss_bias_m=SPEED_OF_LIGHT / 2 * (one.skew_ppm - two.skew_ppm) * 1e-6 * ranging.scheduled_s,
             )
         )
     return Preview(
@@ -383,7 +381,7 @@ def preview(scenario: Scenario | Source) -> Preview:
         pairs=tuple(pairs),
         exchanges=len(plan.start),
         rate_hz=len(plan.start) / duration,
-        fastest_hz=scenario.ranging.fastest_hz(radio.preamble_symbols),
-        air_share=scenario.ranging.air_share(radio.preamble_symbols),
+        fastest_hz=ranging.fastest_hz(radio.preamble_symbols),
+        air_share=ranging.rate_hz * exchange_air_s(PROTOCOLS[ranging.protocol], radio.preamble_symbols),
         duration_s=duration,
     )

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
-from uwblink.protocols.table import ProtocolMessage, RangingProtocol
+from uwblink.protocols.table import RangingProtocol
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, meta_of_delays
 from uwblink.recording.schema import CirRow, Fault
 from uwblink.ticks import (
@@ -95,7 +95,7 @@ def draw_reply_s(scenario: Scenario, rng: np.random.Generator, count: int) -> Fl
     """
     reply = scenario.ranging.reply
     if reply.model == "fixed":
-        return np.full(count, reply.delay_s)
+        return np.full(count, reply.delay_us * 1e-6)
     if reply.model == "quantiles":
         return reply.at_s(rng.random(count))
     kind = rng.random(count)
@@ -113,11 +113,12 @@ def stamp(medium: Medium, protocol: RangingProtocol, begun: Schedule, draws: Dra
     ends = (begun.initiator, begun.target)
     for k, message in enumerate(protocol.messages):
         sender, receiver = ends if message.sender == "initiator" else ends[::-1]
-        if message.after:
-            delay_uus = medium.scenario.ranging.response_delay_uus
-            counter = _transmission(message, result.stamps[message.after], draws.reply_s, delay_uus)
-        else:
+        if not message.after:
             counter = next_grid(-(-medium.clocks.read(begun.initiator, begun.start) // SUBTICKS))
+        elif message.timing == "scheduled":
+            counter = scheduled_counter(result.stamps[message.after], medium.scenario.ranging.response_delay_uus)
+        else:
+            counter = reply_counter(result.stamps[message.after], draws.reply_s)
         left = medium.leave(sender, counter + medium.tx_register[sender], draws.transmit[k])
         frames = Frames(sender=sender, receiver=receiver, departure=left)
         received, link = medium.receive(frames, draws.receive[k], draws.excess_m)
@@ -129,14 +130,17 @@ def stamp(medium: Medium, protocol: RangingProtocol, begun: Schedule, draws: Dra
     return result
 
 
-def _transmission(message: ProtocolMessage, reference: Ints, reply_s: Floats, delay_uus: int) -> Ints:
-    """Return the sender's counter, without antenna delay, when a message leaves that replies to `reference`."""
-    if message.timing == "scheduled":
-        due = reference + delay_uus * UUS_TICKS
-        # The chip ignores the low nine bits of the time at which it is told to send.
-        return due // DELAYED_TX_GRID * DELAYED_TX_GRID
-    latency = np.rint(reply_s / TICK_S).astype(np.int64)
-    return next_grid(reference + latency - ANTENNA_DELAY_TICKS)
+def scheduled_counter(reference: Ticks, delay_uus: int) -> Ticks:
+    """Return the sender's counter, without antenna delay, when a message leaves a delay after the stamp `reference`.
+
+    The chip ignores the low nine bits of the time at which it is told to send.
+    """
+    return (reference + delay_uus * UUS_TICKS) // DELAYED_TX_GRID * DELAYED_TX_GRID
+
+
+def reply_counter(reference: Ints | int, reply_s: Floats) -> Ints:
+    """Return the sender's counter, without antenna delay, when replies leave that are sent at once, (n,)."""
+    return next_grid(reference + np.rint(reply_s / TICK_S).astype(np.int64) - ANTENNA_DELAY_TICKS)
 
 
 def next_grid(ticks: Ticks) -> Ticks:
@@ -181,21 +185,19 @@ def _readings(medium: Medium, number: int, kept: Ints, planned: int, stamped: St
 
 def reported_faults(scenario: Scenario, plan: Schedule, outcomes: air.Outcomes) -> list[Fault]:
     """Return the failed exchanges, with their reasons and initiators."""
-    ids = [tag.id for tag in scenario.tags]
-    found = []
-    for k in np.flatnonzero(np.array(outcomes.lost) >= 0):
-        a, b, reason = ids[plan.initiator[k]], ids[plan.target[k]], outcomes.reason[k]
-        found.append(
-            Fault(
-                round(outcomes.start[k] * (NS_PER_S / SUBTICKS_PER_SECOND)),
-                str(a),
-                "lost frame" if reason == air.WEAK else reason,
-                f"{a} ranged with {b}: message {outcomes.lost[k] + 1} {reason}",
-                a,
-                b,
-            )
+    ids, failed = np.array([tag.id for tag in scenario.tags]), np.flatnonzero(np.array(outcomes.lost) >= 0)
+    tags = zip(ids[plan.initiator[failed]].tolist(), ids[plan.target[failed]].tolist(), strict=True)
+    return [
+        Fault(
+            round(outcomes.start[k] * (NS_PER_S / SUBTICKS_PER_SECOND)),
+            str(a),
+            "lost frame" if outcomes.reason[k] == air.WEAK else outcomes.reason[k],
+            f"{a} ranged with {b}: message {outcomes.lost[k] + 1} {outcomes.reason[k]}",
+            a,
+            b,
         )
-    return found
+        for k, (a, b) in zip(failed.tolist(), tags, strict=True)
+    ]
 
 
 def provenance(scenario: Scenario) -> dict[str, Any]:
@@ -245,8 +247,8 @@ def _heard_by(medium: Medium, me: int, rows: Ints, stamped: Stamped, exchanges: 
     columns |= {"time_ns": exchanges.time_ns[rows], "listener": np.full(count, tag.id)}
     columns |= {name: getattr(exchanges, name)[rows] for name in ("initiator", "target")}
     columns |= {f"{name}_n": getattr(exchanges, name)[rows] for name in STAMPS}
-    for name in ("fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm"):
-        columns[name.replace("_", "_n_")] = getattr(exchanges, name)[rows]
+    readings = ("fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")
+    columns |= {name.replace("_", "_n_"): getattr(exchanges, name)[rows] for name in readings}
     return {name: column[heard] for name, column in columns.items()}
 
 

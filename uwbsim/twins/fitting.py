@@ -23,7 +23,6 @@ from uwblink.twr import intervals
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import simulate
-from uwbsim.tables import write_csv
 from uwbsim.twins.clocks import fit_clocks
 from uwbsim.twins.flight import Flight, RecordingSource, effective_size, fit_schedule, lag_one, read_flight, some_rows
 from uwbsim.twins.powers import fit_powers
@@ -129,14 +128,12 @@ QUANTITIES: Final[dict[str, tuple[str, Column]]] = {
 def _compared(name: str, measured: Flight, flights: list[Flight]) -> Compared | None:
     unit, column = QUANTITIES[name]
     mine, group = _finite(column(measured), measured.pair)
-    if len(mine) < 8:
-        return None
     # A seed's pairs are pairs of their own.
     named = {pair: k for k, pair in enumerate(measured.pairs)}
     numbers = [np.array([named.get(pair, -1) for pair in flight.pairs], dtype=np.int64) for flight in flights]
     parts = [_finite(column(flight), number[flight.pair]) for flight, number in zip(flights, numbers, strict=True)]
     theirs, pair = (np.concatenate(values) for values in zip(*parts, strict=True))
-    if not len(theirs):
+    if len(mine) < 8 or not len(theirs):
         return None
     seed = np.repeat(np.arange(len(parts)), [len(values) for values, _ in parts])
     one, other = Side.of(mine, group), Side.of(theirs, pair + seed * len(named))
@@ -242,8 +239,8 @@ class Twin:
             table["bodies"] = [body | {"motion": motions.get(body["name"], body["motion"])} for body in table["bodies"]]
         if "plan" in table["ranging"]:
             plan, slots = path.with_suffix(".plan.csv"), table["ranging"]["plan"]["slots"]
-            rows = [dict(zip(("time_s", "initiator", "target"), slot, strict=True)) for slot in slots]
-            write_csv(plan, rows, force=force)
+            lines = ["time_s,initiator,target", *(",".join(map(str, slot)) for slot in slots)]
+            write_text(plan, "\r\n".join([*lines, ""]), force=force)
             table["ranging"] = table["ranging"] | {"plan": {"file": plan.name}}
         head = (
             f"The twin of {Path(self.recording).name} with {Path(self.calibration).name}: fitted to it by "
@@ -253,9 +250,9 @@ class Twin:
 
     def __repr__(self) -> str:
         """Return what was found, a line each."""
-        lines = [f"Twin of {self.recording}: {len(self.measured)} exchanges of {len(self.measured.pairs)} pairs"]
-        lines += [f"  {name}: {value:.4g}" for name, value in self.found.items() if isinstance(value, float)]
-        return "\n".join(lines)
+        head = f"Twin of {self.recording}: {len(self.measured)} exchanges of {len(self.measured.pairs)} pairs"
+        values = (f"  {name}: {value:.4g}" for name, value in self.found.items() if isinstance(value, float))
+        return "\n".join([head, *values])
 
 
 def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
@@ -290,14 +287,16 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
         # More than 50,000 exchanges would only take longer for clocks and powers.
         rows = flight.some(50_000)
         clocks = fit_clocks(flight[rows])
-        noise = receive_noise(clocks.receive_noise_s, flight.exchanges.fpp2_dbm[rows])
+        noise_dbm, noise_s = receive_noise(clocks.receive_noise_s, flight.exchanges.fpp2_dbm[rows])
         std_s = np.zeros_like(flight.power_dbm)
-        if len(noise.std_s):
-            std_s = np.interp(lifted(flight.power_dbm), lifted(noise.power_dbm), noise.std_s)
+        if len(noise_s):
+            std_s = np.interp(lifted(flight.power_dbm), lifted(noise_dbm), noise_s)
         errors = fit_range_errors(flight, np.sqrt(np.mean(std_s**2, axis=0)))
         powers = fit_powers(flight[rows], errors.reflected[rows])
         schedule = fit_schedule(flight, flown.faults)
-    fitted = Fitted(clocks=clocks, noise=noise, errors=errors, powers=powers, schedule=schedule)
+    fitted = Fitted(
+        clocks=clocks, noise_dbm=noise_dbm, noise_s=noise_s, errors=errors, powers=powers, schedule=schedule
+    )
     name = f"twin of {Path(where).stem}"
     table, paths = tables(flight, known, flown.poses, fitted, name)
     try:
@@ -322,7 +321,7 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
 def summary(flight: Flight, fitted: Fitted) -> dict[str, Any]:
     """Return what was fitted by name, numbers or None, and tables by tag and by pair."""
     clocks, errors, powers, schedule = fitted.clocks, fitted.errors, fitted.powers, fitted.schedule
-    noise = fitted.noise.std_s
+    noise = fitted.noise_s
     return {
         "exchanges": len(flight),
         "duration_s": float(flight.time_s[-1]),

@@ -63,28 +63,28 @@ def _toml(value: Any) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fitted:
-    """All that was fitted to a flight."""
+    """All that was fitted to a flight.
+
+    Receive stamps have the noise `noise_s` at the first-path powers `noise_dbm`: one value where it does not depend on
+    power, none where it is unknown.
+    """
 
     clocks: ClockFit
-    noise: ReceiveNoise
+    noise_dbm: Floats
+    noise_s: Floats
     errors: RangeErrors
     powers: PowerFit
     schedule: ScheduleFit
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReceiveNoise:
-    """The noise of receive stamps in seconds over first-path power in dBm; one value where it does not depend on it."""
+def receive_noise(noise_s: Floats, power_dbm: Floats) -> tuple[Floats, Floats]:
+    """Return powers in dBm, and the noise of receive stamps in seconds at these, as `Fitted` has them.
 
-    power_dbm: Floats
-    std_s: Floats
-
-
-def receive_noise(noise_s: Floats, power_dbm: Floats) -> ReceiveNoise:
-    """Return the noise of receive stamps from values of it (n,), NaN where unknown, by the power at the receiver."""
+    They follow from values of the noise (n,), NaN where unknown, and the powers at the receiver.
+    """
     rows = np.flatnonzero(np.isfinite(noise_s))
     if not len(rows):
-        return ReceiveNoise(power_dbm=np.zeros(0), std_s=np.zeros(0))
+        return np.zeros(0), np.zeros(0)
     rows = rows[np.abs(noise_s[rows]) < 5 * bulk_spread(noise_s[rows])]
     rows = rows[np.argsort(power_dbm[rows], kind="stable")]
     # Six bins at most, of 200 values or more each: their spreads are known to 5 %.
@@ -95,7 +95,7 @@ def receive_noise(noise_s: Floats, power_dbm: Floats) -> ReceiveNoise:
     if chdtrc(len(parts) - 1, misfit) > 0.01:
         parts, std = [rows], together
     middle, first = np.unique([np.round(np.median(power_dbm[own]), 3) for own in parts], return_index=True)
-    return ReceiveNoise(power_dbm=middle, std_s=std[first])
+    return middle, std[first]
 
 
 def tables(
@@ -143,12 +143,12 @@ def _ranging(flight: Flight, schedule: ScheduleFit) -> dict[str, Any]:
 
 
 def _radio(flight: Flight, known: KnownDevices, fitted: Fitted) -> dict[str, Any]:
-    powers, clocks, schedule, noise = fitted.powers, fitted.clocks, fitted.schedule, fitted.noise
+    powers, clocks, schedule, noise_s = fitted.powers, fitted.clocks, fitted.schedule, fitted.noise_s
     sigma, fading, outages = None, None, None
-    if len(noise.std_s) > 1:
-        at = lifted(noise.power_dbm)
+    if len(noise_s) > 1:
+        at = lifted(fitted.noise_dbm)
         # A range whose reply takes no time has c s / sqrt(2).
-        spread = SPEED_OF_LIGHT * noise.std_s / np.sqrt(2)
+        spread = SPEED_OF_LIGHT * noise_s / np.sqrt(2)
         sigma = {"knots": [at[0], *at.tolist(), at[-1]], "coefficients": spread.tolist(), "degree": 1}
     # Less fading moves no first path and hardly a bias.
     if powers.fading_db >= 0.1:
@@ -166,7 +166,7 @@ def _radio(flight: Flight, known: KnownDevices, fitted: Fitted) -> dict[str, Any
         skew_noise_ppm=float(clocks.noise_ppm[1]),
         skew_bias_ppm=float(clocks.bias_ppm[1]),
         bias=known.bias.model_dump(mode="json"),
-        rx_noise_ps=float(noise.std_s[0]) * 1e12 if len(noise.std_s) == 1 else 0.0,
+        rx_noise_ps=float(noise_s[0]) * 1e12 if len(noise_s) == 1 else 0.0,
         sigma=sigma,
         multipath=_multipath(flight, fitted),
         fading=fading,
@@ -282,7 +282,7 @@ NOT_DETERMINED: Final = (
 
 NOT_DETERMINED_IF: Final[tuple[tuple[Callable[[Flight, Fitted], bool], str], ...]] = (
     (
-        lambda flight, fitted: not len(fitted.noise.std_s),
+        lambda flight, fitted: not len(fitted.noise_s),
         "Noise of stamps apart from that of ranges: only a third message from the target shows it. All noise of ranges "
         "is assigned to direct_std_m, which is constant between redraws of a path.",
     ),

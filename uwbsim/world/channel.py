@@ -7,7 +7,7 @@ of `CHANNEL_EFFECTS` applies to all of them alike.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -32,18 +32,17 @@ class Link:
     """n links between two antennas each, (n,).
 
     `distance_m` is the length of the straight line, `excess_m` the apparent additional length of the first detected
-    path; `power_dbm` is that path's power, `total_dbm` that of all paths together. With several paths, `paths_m` and
-    `paths_dbm` are the lengths and powers of all, (n, paths), in any order. With geometric responses, `noise_s` is the
-    standard deviation of the leading edge of the first path by noise.
+    path; `power_dbm` is that path's power, `total_dbm` that of all paths together. `paths_m` and `paths_dbm` are the
+    lengths and powers of all paths, (n, paths), in any order. With geometric responses, whose paths are their own,
+    `noise_s` is the standard deviation of the leading edge of the first path by noise.
     """
 
     distance_m: Floats
     excess_m: Floats
     power_dbm: Floats
     total_dbm: Floats
-    _: KW_ONLY
-    paths_m: Floats | None = None
-    paths_dbm: Floats | None = None
+    paths_m: Floats
+    paths_dbm: Floats
     noise_s: Floats | None = None
 
     @classmethod
@@ -63,8 +62,12 @@ class Link:
 
     def weaker(self, loss_db: Floats) -> Link:
         """Return the links with a loss (n,) on all their paths."""
-        paths = None if self.paths_dbm is None else self.paths_dbm - loss_db[:, None]
-        return replace(self, power_dbm=self.power_dbm - loss_db, total_dbm=self.total_dbm - loss_db, paths_dbm=paths)
+        return replace(
+            self,
+            power_dbm=self.power_dbm - loss_db,
+            total_dbm=self.total_dbm - loss_db,
+            paths_dbm=self.paths_dbm - loss_db[:, None],
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,8 +152,6 @@ def paths_heard(link: Link, ends: Ends, detour_m: Floats) -> list[PathsHeard]:
         # Other effects on a link change all its paths alike.
         amplitude = paths.amplitude * 10 ** ((link.power_dbm - read.power_dbm) / 20)[:, None]
         return [PathsHeard(*path) for path in zip(link.power_dbm.tolist(), later_s, amplitude, strict=True)]
-    if link.paths_m is None or link.paths_dbm is None:
-        return [PathsHeard(power, np.zeros(0), np.zeros(0)) for power in link.power_dbm.tolist()]
     later_m = link.paths_m - first_m[:, None] - detour_m[:, None]
     shares = 10 ** ((link.paths_dbm - link.power_dbm[:, None]) / 20)
     # Echoes within 1 cm of the first path, or 80 dB weaker, change no tap.
@@ -171,7 +172,7 @@ def link_between(ends: Ends) -> Link:
     if ends.world.responses is None:  # geometric responses have the powers, too
         gain = ends.gain_towards_db(ends.towards, -ends.towards)
         power = path_gain_db(ends.scenario.radio, ends.distance_m) + gain
-    link = Link(ends.distance_m, nothing, power, power)
+    link = Link(ends.distance_m, nothing, power, power, ends.distance_m[:, None], power[:, None])
     for name, effect in CHANNEL_EFFECTS.items():
         link = effect(link, ends)
         if name not in OWN_EFFECTS:
@@ -196,7 +197,7 @@ def _obstacles(link: Link, ends: Ends) -> Link:
     if not ends.scenario.obstacles or ends.world.responses is not None:
         return link
     loss, excess = box_loss(ends.scenario.obstacles, *ends.antennas_m)
-    return replace(link.weaker(loss), excess_m=excess)
+    return replace(link.weaker(loss), excess_m=excess, paths_m=(link.distance_m + excess)[:, None])
 
 
 def _shadows(link: Link, ends: Ends) -> Link:
@@ -271,17 +272,14 @@ def _states(link: Link, ends: Ends) -> Link:
     nothing_mw = 1e-30
     rest = np.maximum(10 ** (total / 10) - 10 ** (power / 10), nothing_mw)
     later = np.where(reflected, 10 * np.log10(rest), 10 * np.log10(nothing_mw))
-    lengths, powers = link.paths_m, link.paths_dbm
-    if lengths is None or powers is None:
-        lengths, powers = (link.distance_m + link.excess_m)[:, None], link.power_dbm[:, None]
     last_m = link.distance_m + excess + np.where(reflected, rise_s, 0.0) * SPEED_OF_LIGHT
     return replace(
         link,
         excess_m=excess,
         power_dbm=power,
         total_dbm=total,
-        paths_m=np.column_stack([lengths, last_m]),
-        paths_dbm=np.column_stack([powers, later]),
+        paths_m=np.column_stack([link.paths_m, last_m]),
+        paths_dbm=np.column_stack([link.paths_dbm, later]),
     )
 
 
@@ -307,8 +305,7 @@ def _group_delays(link: Link, ends: Ends) -> Link:
         return link
     for tags, rotation, way in zip(ends.places, ends.rotations, (towards, -towards), strict=True):
         late = late + group_delay_m(scenario, tags, np.einsum("ni,nij->nj", way, rotation))
-    paths = None if link.paths_m is None else link.paths_m + late[:, None]
-    return replace(link, excess_m=link.excess_m + late, paths_m=paths)
+    return replace(link, excess_m=link.excess_m + late, paths_m=link.paths_m + late[:, None])
 
 
 CHANNEL_EFFECTS: Final[dict[str, ChannelEffect]] = {

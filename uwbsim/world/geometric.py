@@ -176,10 +176,7 @@ class GeometricResponses:
     def _paths(self, keys: Ints) -> Paths:
         pair_step, b = np.divmod(keys, len(self.scenario.tags))
         step, a = np.divmod(pair_step, len(self.scenario.tags))
-        return self.paths_between(self.world.ends((a, b), step * (self.model.step_ms * 1e-3)))
-
-    def paths_between(self, ends: Ends) -> Paths:
-        """Return all paths of n links."""
+        ends = self.world.ends((a, b), step * (self.model.step_ms * 1e-3))
         parts = [self._direct(ends), self._mirrored(ends), self._scattered(ends)]
         length, field = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
         stronger = 10 ** (np.array([tag.tx_power_db for tag in self.scenario.tags]) / 20)

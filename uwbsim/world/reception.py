@@ -94,9 +94,8 @@ class Medium:
         """Draw the clocks."""
         self.scenario, self.links = scenario, links
         self.clocks, self.delays = Clocks.of(scenario), AntennaDelays.of(scenario)
-        programmed = [tag.antenna_delay for tag in scenario.tags]
-        self.tx_register = np.array([one.tx for one in programmed], dtype=np.int64)
-        self.reply_constant = np.array([one.reply for one in programmed], dtype=np.int64)
+        self.tx_register = np.array([tag.antenna_delay.tx for tag in scenario.tags], dtype=np.int64)
+        self.reply_constant = np.array([tag.antenna_delay.reply for tag in scenario.tags], dtype=np.int64)
 
     def leave(self, sender: Ints, stamp: Ints, noise: Floats) -> Ints:
         """Return the true sub-ticks (n,) of departure of frames with transmit stamps in whole ticks (n,).

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy.interpolate import BSpline, CubicSpline, PchipInterpolator
@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from uwblink.arrays import Floats
 from uwbsim.random_streams import stream
-from uwbsim.scenario.bodies import Carried, Figure, Imu, RandomFlight, Recorded, Static, Waypoints
-from uwbsim.scenario.devices import Body
+from uwbsim.scenario.bodies import Carried, Figure, Height, Imu, RandomFlight, Recorded, Static, Waypoints
 from uwbsim.scenario.model import Scenario
 from uwbsim.tables import Columns, in_time_order
 from uwbsim.world.clocks import NS_PER_S
@@ -174,38 +173,31 @@ def _random_flight(motion: RandomFlight, duration_s: float, draw: Draw) -> Traje
     )
 
 
-def inertial_readings(scenario: Scenario, trajectories: Mapping[str, Trajectory]) -> Columns:
-    """Return the columns of the table `imu`, in order of time; no columns where no body has the sensor."""
+def sensor_readings(
+    scenario: Scenario, trajectories: Mapping[str, Trajectory], sensor: Literal["imu", "height"]
+) -> Columns:
+    """Return the columns of a sensor's table, in order of time; no columns where no body has the sensor."""
     parts = []
     for body in scenario.bodies:
-        if (imu := body.imu) is not None:
-            time_s, columns = _times(scenario, body, imu.rate_hz)
-            rng = stream(scenario.run.seed, "imu", body.name)
-            gyro, force = true_motion(trajectories[body.name], time_s)
-            gyro = gyro + _errors(rng, imu, "gyro", len(time_s))
-            force = force + _errors(rng, imu, "force", len(time_s)) + imu.vibration_mps2 * rng.normal(size=force.shape)
-            columns |= dict(zip(("wx", "wy", "wz", "ax", "ay", "az"), np.hstack([gyro, force]).T, strict=True))
-            parts.append(columns)
+        if (model := getattr(body, sensor)) is not None:
+            count = int(np.ceil(scenario.run.duration_s * model.rate_hz)) + 1
+            time_ns = np.rint(np.arange(count) * NS_PER_S / model.rate_hz).astype(np.int64)
+            rng, path = stream(scenario.run.seed, sensor, body.name), trajectories[body.name]
+            read = (_inertial if sensor == "imu" else _height)(model, rng, path, time_ns / NS_PER_S)
+            parts.append({"time_ns": time_ns, "body": np.full(count, body.name)} | read)
     return in_time_order(parts)
 
 
-def height_readings(scenario: Scenario, trajectories: Mapping[str, Trajectory]) -> Columns:
-    """Return the columns of the table `height`, in order of time; no columns where no body has the sensor."""
-    parts = []
-    for body in scenario.bodies:
-        if (sensor := body.height) is not None:
-            time_s, columns = _times(scenario, body, sensor.rate_hz)
-            rng = stream(scenario.run.seed, "height", body.name)
-            height = trajectories[body.name].position_m(time_s)[:, 2] + rng.normal(0.0, sensor.bias_m)
-            parts.append(columns | {"height_m": height + rng.normal(0.0, sensor.noise_m, len(time_s))})
-    return in_time_order(parts)
+def _inertial(imu: Imu, rng: np.random.Generator, path: Trajectory, time_s: Floats) -> Columns:
+    gyro, force = true_motion(path, time_s)
+    gyro = gyro + _errors(rng, imu, "gyro", len(time_s))
+    force = force + _errors(rng, imu, "force", len(time_s)) + imu.vibration_mps2 * rng.normal(size=force.shape)
+    return dict(zip(("wx", "wy", "wz", "ax", "ay", "az"), np.hstack([gyro, force]).T, strict=True))
 
 
-def _times(scenario: Scenario, body: Body, rate_hz: float) -> tuple[Floats, Columns]:
-    """Return the times of a sensor's readings in seconds, and the first two columns of its table."""
-    count = int(np.ceil(scenario.run.duration_s * rate_hz)) + 1
-    time_ns = np.rint(np.arange(count) * NS_PER_S / rate_hz).astype(np.int64)
-    return time_ns / NS_PER_S, {"time_ns": time_ns, "body": np.full(len(time_ns), body.name)}
+def _height(sensor: Height, rng: np.random.Generator, path: Trajectory, time_s: Floats) -> Columns:
+    height = path.position_m(time_s)[:, 2] + rng.normal(0.0, sensor.bias_m)
+    return {"height_m": height + rng.normal(0.0, sensor.noise_m, len(time_s))}
 
 
 def true_motion(path: Trajectory, time_s: Floats) -> tuple[Floats, Floats]:

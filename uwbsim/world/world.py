@@ -117,12 +117,10 @@ def reflected_states(scenario: Scenario, model: TwoStateMultipath) -> PairStates
     """
 
     def life(ids: list[int], draw: Draw) -> float:
-        return share_and_life(model, ids, draw("pair"))[1]
+        return pair_reflections(model, ids, draw("pair"))[1]
 
     def states(ids: list[int], draw: Draw, count: int) -> Floats:
-        share, _ = share_and_life(model, ids, draw("pair"))
-        means_m = [pair.mean_excess_m for pair in model.pairs if set(pair.tags) == set(ids) and pair.mean_excess_m]
-        mean_m = means_m[0] if means_m else model.mean_excess_m
+        share, _, mean_m = pair_reflections(model, ids, draw("pair"))
         reflected = draw("state").random(count) < share
         excess = draw("excess").gamma(model.excess_shape, mean_m / model.excess_shape, count)
         about = draw("direct").normal(0, 1, count) * model.direct_std_m
@@ -134,9 +132,12 @@ def reflected_states(scenario: Scenario, model: TwoStateMultipath) -> PairStates
     return PairStates.draw(scenario, "reflected states", life, states)
 
 
-def share_and_life(model: TwoStateMultipath, ids: list[int], rng: np.random.Generator) -> tuple[float, float]:
-    """Return a pair's share of reflections and their life in seconds: from the scenario, or else drawn."""
-    share = model.share
+def pair_reflections(model: TwoStateMultipath, ids: list[int], rng: np.random.Generator) -> tuple[float, float, float]:
+    """Return a pair's share of reflections, their life in seconds and their mean excess length in metres.
+
+    They are what the scenario says of the pair; otherwise the first two are drawn.
+    """
+    share, mean_m = model.share, model.mean_excess_m
     if model.share_std:
         # The beta distribution with the model's mean and standard deviation.
         total = model.share * (1 - model.share) / model.share_std**2 - 1
@@ -145,8 +146,8 @@ def share_and_life(model: TwoStateMultipath, ids: list[int], rng: np.random.Gene
     for known in model.pairs:
         if set(known.tags) == set(ids):
             share = known.share if known.share is not None else share
-            life_s = known.life_s if known.life_s is not None else life_s
-    return float(share), life_s
+            life_s, mean_m = known.life_s or life_s, known.mean_excess_m or mean_m
+    return float(share), life_s, mean_m
 
 
 PIECE: Final = 4096

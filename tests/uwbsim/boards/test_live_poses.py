@@ -9,7 +9,7 @@ import uwbsim
 from tests.boards import bench_scenario, served
 from uwblink.boards.board import Board
 from uwblink.importers.poses import read_poses
-from uwbsim.boards.server import LivePoses
+from uwbsim.boards.server import LivePoses, Server
 from uwbsim.world.world import World
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -72,6 +72,18 @@ def test_served_poses_go_on_after_the_scenario_s_duration(tmp_path):
                 break
             time.sleep(0.05)
         assert served_s > 5.0
+
+
+def test_a_step_ends_though_poses_take_longer_to_write_than_they_last(tmp_path):
+    # A tenth of a second of the boards is 5 us of the wall clock: the next poses are due before these are written.
+    server = Server(flight(rate_hz=0.2), speed=2e4)
+    try:
+        server.write_poses(tmp_path / "p.csv")
+        for _ in range(3):
+            server.step()
+    finally:
+        server.close()
+    assert len((tmp_path / "p.csv").read_text().splitlines()) > 1
 
 
 def test_poses_that_cannot_be_written_end_and_the_serving_goes_on(tmp_path):

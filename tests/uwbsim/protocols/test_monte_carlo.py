@@ -24,7 +24,7 @@ NAMES = list(PROTOCOLS)
 
 def world(count=16_384, **values):
     """Five metres, clocks 10 ppm apart, the boards' delays; `values` change that."""
-    start = {"flight": 5 / SPEED_OF_LIGHT, "rate_initiator": 5e-6, "rate_target": -5e-6, "at_once": 305e-6}
+    start = {"flight": 5 / SPEED_OF_LIGHT, "rate": (5e-6, -5e-6), "at_once": 305e-6}
     plain = {k: values.pop(k) for k in list(values) if k in ("quantize", "multipath", "detour_s", "carrier_std_ppm")}
     one = Conditions.single(**(start | {"scheduled": 1538.7e-6} | values), **plain)
     return one[np.zeros(count, dtype=np.int64)]
@@ -78,8 +78,8 @@ def test_means_and_variances_are_those_of_integer_stamps(name):
         {"rx_std": 100e-12, "tx_std": 60e-12, "quantize": True},
         {"rx_std": 100e-12, "multipath": 0.2, "detour_s": 1e-9},
         {"rx_std": 50e-12, "carrier_std_ppm": 0.2},
-        {"rx_std": 50e-12, "tx_delay_initiator": 0.3e-9, "rx_delay_target": -0.5e-9, "late": 0.2e-9},
-        {"rx_std": 50e-12, "flight_rate": 5e-9, "drift_initiator": 1e-6},
+        {"rx_std": 50e-12, "tx_delay": (0.3e-9, 0.0), "rx_delay": (0.0, -0.5e-9), "late": 0.2e-9},
+        {"rx_std": 50e-12, "flight_rate": 5e-9, "drift": (1e-6, 0.0)},
     ],
     ids=lambda v: "+".join(v),
 )
@@ -95,8 +95,8 @@ def test_the_prediction_holds(name, values):
 @pytest.mark.parametrize("name", NAMES)
 def test_without_noise_the_prediction_is_exact(name):
     c = world(
-        1, tx_delay_initiator=0.3e-9, rx_delay_initiator=-0.2e-9, tx_delay_target=-0.1e-9, late=0.4e-9,
-        flight_rate=4e-9, drift_initiator=2e-6, drift_target=-1e-6,
+        1, tx_delay=(0.3e-9, -0.1e-9), rx_delay=(-0.2e-9, 0.0), late=0.4e-9,
+        flight_rate=4e-9, drift=(2e-6, -1e-6),
     )  # fmt: skip
     (error,) = range_errors_m(PROTOCOLS[name], c, 1, 1)
     # Half a nanometre: what floats of a second lose in a millisecond.
@@ -128,7 +128,7 @@ def test_the_alternative_is_neiryncks():
     c = world(1, rx_std=1e-10, tx_std=1e-10)
     single = (SPEED_OF_LIGHT * 1e-10) ** 2
     assert predict(PROTOCOLS["ds-sym"], c).variance_m2[0] == pytest.approx(0.75 * single, rel=1e-3)
-    skewed = world(1, rate_initiator=12e-6, rate_target=4e-6)
+    skewed = world(1, rate=(12e-6, 4e-6))
     assert predict(PROTOCOLS["ds-sym"], skewed).mean_m[0] == pytest.approx(5 * 8e-6, rel=1e-3)
 
 
