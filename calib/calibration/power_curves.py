@@ -94,7 +94,7 @@ class Curve:
             return away
         step = 0.1 * (high - low)  # the slope at an end is that of a tenth of the range
         ends = self(np.array([low, low + step, high - step, high]))
-        return np.abs(np.where(away < 0, ends[1] - ends[0], ends[3] - ends[2]) / step * away)
+        return np.asarray(np.abs(np.where(away < 0, ends[1] - ends[0], ends[3] - ends[2]) / step * away))
 
 
 def _curve_mistake(curve: Curve) -> str:
