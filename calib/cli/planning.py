@@ -120,10 +120,5 @@ def _finish(
         from calib.report import write_plan
 
         write_plan(found, output, figures, commands=commands, force=force)
-    if as_json:
-        typer.echo(json.dumps(found.to_dict(), indent=1))
-        return
-    typer.echo(str(found))
-    typer.echo("\nCommands, one after the other:")
-    for line in commands:
-        typer.echo(f"  {line}")
+    text = "\n".join([str(found), "", "Commands, one after the other:", *(f"  {line}" for line in commands)])
+    typer.echo(json.dumps(found.to_dict(), indent=1) if as_json else text)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Any, Final
 
 import numpy as np
@@ -267,18 +268,17 @@ def _events(one: _Readings, settings: OnboardSettings, begin_s: float) -> Iterat
     end_s = float(one.time_s[-1])
     grid = np.arange(begin_s + 1 / settings.rate_hz, end_s, 1 / settings.rate_hz)
     ranges = np.flatnonzero(one.time_s >= begin_s)
-    happens = [("step", grid, np.arange(len(grid))), ("range", one.time_s[ranges], ranges)]
-    if settings.height and len(one.height_s):
+    happens = [(time_s, "step", number) for number, time_s in enumerate(grid.tolist())]
+    happens += [(float(one.time_s[row]), "range", row) for row in ranges.tolist()]
+    if settings.height:
         # Ten a second are enough: its offset wanders slowly.
         every = np.unique(np.floor(one.height_s * 10), return_index=True)[1]
         rows = every[(one.height_s[every] >= begin_s) & (one.height_s[every] <= end_s)]
-        happens.append(("height", one.height_s[rows], rows))
-    kinds = np.repeat([kind for kind, _, _ in happens], [len(times) for _, times, _ in happens])
-    when, which = (np.concatenate([event[k] for event in happens]) for k in (1, 2))
-    order = np.argsort(when, kind="stable")
-    between = _means(one, np.concatenate([[begin_s], when[order]]))
-    for k, row in enumerate(order.tolist()):
-        yield float(when[row]), str(kinds[row]), int(which[row]), between[k]
+        happens += [(float(one.height_s[row]), "height", row) for row in rows.tolist()]
+    happens.sort(key=itemgetter(0))
+    between = _means(one, np.array([begin_s, *(time_s for time_s, _, _ in happens)]))
+    for event, inertial in zip(happens, between, strict=True):
+        yield *event, inertial
 
 
 def _means(one: _Readings, edges: Floats) -> Floats:
