@@ -14,7 +14,8 @@ from uwblink.settings import setting
 ROOMS_M: Final = {"line": (5.0,), "plane": (3.0, 2.0), "space": (6.0, 5.0, 2.5)}
 """Where boards may stand, and its default lengths: a string across a room, a large table, a room."""
 
-IMU_GRADES: Final = ("consumer", "industrial", "tactical")
+ACCELEROMETERS: Final = {"consumer": 3e-3, "industrial": 1e-3, "tactical": 3e-4}
+"""Noise of accelerometers by grade, in m/s^2 a root of Hz, orders of magnitude of data sheets."""
 
 MAX_TAGS: Final = 60
 MAX_RANGES: Final = 200_000
@@ -165,7 +166,7 @@ class FlightPlanSettings:
     heading_std_deg: float = setting(
         3.0, "Standard deviation of headings; 0: headings are exact.", flag="--heading-std", metavar="DEGREES"
     )
-    imu: str | None = setting(None, "Grade of the robots' inertial sensors.", names=IMU_GRADES)
+    imu: str | None = setting(None, "Grade of the robots' inertial sensors.", names=tuple(ACCELEROMETERS))
     anchors: Sequence[int] = setting((), _ANCHORS_HELP, **_ANCHORS)
     anchor_places: str = setting(
         "given", "Positions of anchors: given, or sought (estimated).", flag="--anchors", names=("given", "sought")
@@ -184,7 +185,7 @@ class FlightPlanSettings:
         """Check all values, and the robots where there are some."""
         check_choice("anchor_places", self.anchor_places, ("given", "sought"))
         if self.imu is not None:
-            check_choice("imu", self.imu, IMU_GRADES)
+            check_choice("imu", self.imu, ACCELEROMETERS)
         bounds = {
             "seconds": (5.0, 3600.0),
             "rate_hz": (0.5, 2000.0),

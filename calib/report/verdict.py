@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
@@ -67,8 +67,8 @@ def criteria(results: Results) -> Iterator[Criterion]:
         yield from _of_uses(results)
     if made.get("recipe") == "survey":
         yield from _of_survey(results)
-    elif rests_on(made):
-        yield from _of_distances(made.get("distance_std_m"))
+    elif rests_on(made) and isinstance(std_m := made.get("distance_std_m"), int | float):
+        yield _distances(std_m)
     if results.recordings:
         yield _warned(results)
 
@@ -274,14 +274,13 @@ def _of_survey(results: Results) -> Iterator[Criterion]:
         )
 
 
-def _of_distances(std_m: Any) -> Iterator[Criterion]:
-    """Yield how well distances are known that were found together with the delays."""
-    if isinstance(std_m, int | float):
-        most_m = 0.02
-        yield Criterion(
-            "Are the estimated distances known well enough?",
-            f"standard error at most {100 * most_m:g} cm",
-            f"{100 * std_m:.1f} cm",
-            _graded(std_m <= most_m, std_m <= 0.05),
-            f"distances were found to {100 * std_m:.1f} cm",
-        )
+def _distances(std_m: float) -> Criterion:
+    """Return how well distances are known that were found together with the delays."""
+    most_m = 0.02
+    return Criterion(
+        "Are the estimated distances known well enough?",
+        f"standard error at most {100 * most_m:g} cm",
+        f"{100 * std_m:.1f} cm",
+        _graded(std_m <= most_m, std_m <= 0.05),
+        f"distances were found to {100 * std_m:.1f} cm",
+    )
