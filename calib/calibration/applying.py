@@ -112,9 +112,10 @@ def _without_delays(calibration: Calibration, ranges: Ranges) -> Floats:
 
 def _offsets_m(calibration: Calibration, ranges: Ranges) -> Floats:
     """Return the constant of each range's pair (n,), zeros where the calibration has none for pairs."""
-    offsets, pairs = calibration.pair_offsets, pairs_of(ranges.initiator, ranges.target)
+    offsets = calibration.pair_offsets
     if not offsets:
         return np.zeros(len(ranges))
+    pairs = pairs_of(ranges.initiator, ranges.target)
     ends = list(map(tuple, pairs.ends.tolist()))
     missing = [pair_name(pair) for pair in ends if pair not in offsets]
     if missing:
@@ -132,13 +133,16 @@ def _errors(calibration: Calibration, ranges: Ranges, lifted: Floats, error_m: F
         return dict.fromkeys(names, nothing) | {"outlier": np.zeros(len(ranges), dtype=bool)}
     shapes = model.shapes(lifted, ranges.initiator, ranges.target)
     looked_at = np.isfinite(error_m)
-    tail, outlier = model.tail_given(np.where(looked_at, error_m, 0.0), shapes)
+    tail, outlier = shapes.tail_share, looked_at
+    if looked_at.any():
+        tail, likely = model.tail_given(np.where(looked_at, error_m, 0.0), shapes)
+        outlier = looked_at & (likely > 0.5)
     return {
         "sigma_total_m": np.hypot(model.total_m(shapes), calibration.bias_curve.beyond(lifted)),
         "mean_error_m": model.mean_m(shapes),
         "tail_share": shapes.tail_share,
         "tail_probability": np.where(looked_at, tail, shapes.tail_share),
-        "outlier": looked_at & (outlier > 0.5),
+        "outlier": outlier,
     }
 
 

@@ -1,8 +1,9 @@
-"""Write a copy of a recording with corrected ranges, or files in other formats."""
+"""Corrected copies of recordings, as recordings or in other formats, and correction of exchanges as they arrive."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.calibration.applying import CorrectedRanges
-from calib.calibration.model import Calibration, require_calibration
+from calib.calibration.applying import CorrectedRanges, columns_of
+from calib.calibration.model import Calibration, load_calibration, require_calibration
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError
+from uwblink.arrays import Floats
 from uwblink.exporters import check_export, export_recording
 from uwblink.output import check_output
 from uwblink.recording.contents import READING_MB, exchanges_with_poses
@@ -103,3 +105,21 @@ def _append(written: Recording, exchanges: Exchanges, applied: CorrectedRanges) 
         written.append_exchanges(replace(exchanges, range_m=corrected_m))
         written.append("corrected", table)
     return len(exchanges), int(np.count_nonzero(applied.clamped & powered)), int(np.count_nonzero(~powered))
+
+
+def live_correction(path: Path) -> Callable[[Exchanges], dict[str, Floats]]:
+    """Return a function that corrects exchanges (n,) to `corrected_m`, and what else `CorrectedRange` has.
+
+    The numbers are those of `calib.apply`; its attribute `antenna_delays` is what was programmed where the
+    calibration was fitted. The function raises what `Calibration.apply` raises, as for a tag that is not calibrated.
+    Raises what `load_calibration` raises.
+    """
+    calibration = load_calibration(path)
+
+    def correct(exchanges: Exchanges) -> dict[str, Floats]:
+        ranges = Ranges.from_exchanges(exchanges, source=str(path))
+        known = columns_of(calibration.apply(ranges))._asdict()
+        return {"corrected_m": known.pop("range_m"), **known}
+
+    correct.antenna_delays = calibration.antenna_delays  # type: ignore[attr-defined]
+    return correct

@@ -68,7 +68,9 @@ class Curve:
         if self.flat:
             return np.full(np.shape(lifted), self.coefficients[0])
         knots, coefficients = np.array(self.knots), np.array(self.coefficients)
-        return np.asarray(BSpline(knots, coefficients, self.degree)(np.clip(lifted, *self.range)))
+        # `BSpline` would check the knots again at each call, which takes ten times as long as one range needs.
+        spline = BSpline.construct_fast(knots, coefficients, self.degree)
+        return np.asarray(spline(np.clip(lifted, *self.range)))
 
     @property
     def flat(self) -> bool:
@@ -87,11 +89,12 @@ class Curve:
         Zero at powers that it was fitted at. It is what a range there may be off by.
         """
         low, high = self.range
+        away = np.asarray(lifted - np.clip(lifted, low, high))
+        if not away.any():
+            return away
         step = 0.1 * (high - low)  # the slope at an end is that of a tenth of the range
         ends = self(np.array([low, low + step, high - step, high]))
-        below, above = (ends[1] - ends[0]) / step, (ends[3] - ends[2]) / step
-        away = np.abs(below) * np.maximum(low - lifted, 0.0) + np.abs(above) * np.maximum(lifted - high, 0.0)
-        return np.asarray(away)
+        return np.asarray(np.abs(np.where(away < 0, ends[1] - ends[0], ends[3] - ends[2]) / step * away))
 
 
 def _curve_mistake(curve: Curve) -> str:

@@ -63,11 +63,9 @@ def evaluate(
             origin = origin_of([*recordings, calibration], command_line())
             calib.write_report(report, parts, known, figures=figures, evaluation=evaluation, origin=origin, force=force)
     _warn_of_seen(evaluation)
-    if as_json:
-        typer.echo(json.dumps(evaluation.to_dict(), indent=1))
-        return
     written = [f"report: {path}" for path in (report, figures) if path]
-    typer.echo("\n".join([repr(evaluation), *_remarks(evaluation), *written]))
+    text = "\n".join([repr(evaluation), *_remarks(evaluation), *written])
+    typer.echo(json.dumps(evaluation.to_dict(), indent=1) if as_json else text)
 
 
 def _warn_of_seen(evaluation: Evaluation) -> None:
@@ -152,14 +150,13 @@ def doctor(
     from uwblink import Recording
     from uwblink.recording import clock_skews
 
-    def skews_of(path: Path) -> list[Any]:
-        with Recording.open(path) as recording:
-            return clock_skews(recording.exchange_blocks())
-
+    skews: dict[str, list[Any]] = {}
     with waiting("examining"):
         found = calib.examine(recordings)
         parts = {str(path): part for path in recordings if (part := examined_part(path))}
-        skews = {str(path): skews_of(path) for path in recordings}
+        for path in recordings:
+            with Recording.open(path) as recording:
+                skews[str(path)] = clock_skews(recording.exchange_blocks())
     findings = [replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in found]
     if as_json:
         clocks = {path: [asdict(one) for one in some] for path, some in skews.items()}
@@ -192,10 +189,8 @@ def compare(
         from calib.report import write_comparison_figures
 
         write_comparison_figures(found, known, [first.stem, second.stem], figures, force=force)
-    if as_json:
-        typer.echo(json.dumps(found.to_dict(), indent=1))
-        return
-    typer.echo(found.table(str(first), str(second)))
+    text = found.table(str(first), str(second))
+    typer.echo(json.dumps(found.to_dict(), indent=1) if as_json else text)
 
 
 def spread_tests(arguments: Sequence[str]) -> list[str]:

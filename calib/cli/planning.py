@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 import calib
+from calib.cli.shared import check_report
 from calib.errors import BadInputError
 from calib.planning import FlightPlanSettings, SurveyPlanSettings, read_whole
 from uwblink.cli.shared import AsJson, Figures, Force, Group, add, epilog, output, waiting
@@ -60,10 +61,10 @@ def survey(
     force: Force = False,
 ) -> None:
     """Plan arrangements of boards that stand still: the steps, and how well each delay will be known."""
-    _check_places(output, figures, force=force)
+    check_report(output, figures, force=force)
     if boards.endswith(".uwb"):
         raise BadInputError("a recording is planned from with `calib plan flight`", parameter="boards")
-    tags = _ids(boards, "boards")
+    tags = read_whole(boards, "boards")
     with waiting("planning"):
         found = calib.plan(tags if "," in boards else tags[0], settings)
     _finish(found, found.commands(ports), output, figures, as_json=as_json, force=force)
@@ -87,7 +88,7 @@ def flight(
     force: Force = False,
 ) -> None:
     """Plan a flight without true distances: the steps, and how well each delay will be known."""
-    _check_places(output, figures, force=force)
+    check_report(output, figures, force=force)
     who: Any = Path(robots)
     if robots.endswith(".uwb"):
         for name in ("seconds", "rate_hz", "size_m", "speed_m_s", "apart_m", "anchors"):
@@ -95,27 +96,13 @@ def flight(
             if source is not None and source.name != "DEFAULT":
                 raise BadInputError("the recording determines it; leave it out", parameter=name)
     elif "/" not in robots and "," not in robots:
-        who = _ids(robots, "robots")[0]
+        who = read_whole(robots, "robots")[0]
     else:
-        who = [_ids(robot, "robots") for robot in robots.split("/")]
+        who = [read_whole(robot, "robots") for robot in robots.split("/")]
     with waiting("planning"):
         found = calib.plan_flight(who, settings)
     recording = robots if isinstance(who, Path) else ""
     _finish(found, found.commands(ports, recording), output, figures, as_json=as_json, force=force)
-
-
-def _ids(text: str, parameter: str) -> list[int]:
-    try:
-        return read_whole(text)
-    except BadInputError as error:
-        raise BadInputError(str(error), parameter=parameter) from None
-
-
-def _check_places(output: Path | None, figures: Path | None, *, force: bool) -> None:
-    if output or figures:
-        from calib.report import check_places
-
-        check_places(output, None, figures, force=force)
 
 
 def _finish(
@@ -133,10 +120,5 @@ def _finish(
         from calib.report import write_plan
 
         write_plan(found, output, figures, commands=commands, force=force)
-    if as_json:
-        typer.echo(json.dumps(found.to_dict(), indent=1))
-        return
-    typer.echo(str(found))
-    typer.echo("\nCommands, one after the other:")
-    for line in commands:
-        typer.echo(f"  {line}")
+    text = "\n".join([str(found), "", "Commands, one after the other:", *(f"  {line}" for line in commands)])
+    typer.echo(json.dumps(found.to_dict(), indent=1) if as_json else text)

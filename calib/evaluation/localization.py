@@ -130,14 +130,14 @@ def filter_ranges(ranges: Ranges, calibration: Calibration, fixed: FixedStd) -> 
     }
     if model is None:
         return found
-    noise, errors = range_errors(calibration, ranges)
-    found["robust"] = FilterRanges(corrected - model.location_m, noise, errors)
+    measured, noise, errors = range_errors(calibration, ranges, applied)
+    found["robust"] = FilterRanges(measured, noise, errors)
     if lasting := model.lasting:
         own, shared, time_s = np.sqrt(lasting.own_variance), np.sqrt(lasting.lasting_variance), lasting.time_s
         # The mixture contains reflections within the gate, so the total variance is that of the noise.
         unit = noise / np.hypot(own, shared)
         found["variance"] = FilterRanges(corrected - lasting.mean * sigma, own * sigma, None, shared * sigma, time_s)
-        found["robust"] = FilterRanges(corrected - model.location_m, own * unit, errors, shared * unit, time_s)
+        found["robust"] = FilterRanges(measured, own * unit, errors, shared * unit, time_s)
     return found
 
 
@@ -192,6 +192,15 @@ class Summary:
     accepted: float
 
 
+def rmse_rows(found: list[Localization], total: Summary) -> list[list[str]]:
+    """Return a row for each body of the RMSE by filter, and rows of their mean, its spread, and its reduction."""
+    seeds, names = len(found[0].rmse_m["raw"]), list(total.rmse_m)
+    numbers = [(f"{one.source} {one.body}", {name: one.rmse_m[name].mean() for name in names}) for one in found]
+    numbers += [("mean", total.rmse_m), *([(f"its spread over {seeds} seeds", total.spread_m)] if seeds > 1 else [])]
+    rows = [[title, *(f"{row[name]:.3f}" for name in names)] for title, row in numbers]
+    return [*rows, ["against raw", "", *(f"{-100 * less:+.0f} %" for less in total.reduction.values())]]
+
+
 def summarize(found: list[Localization]) -> Summary:
     """Return means over bodies and recordings, with equal weights as in the paper.
 
@@ -223,12 +232,12 @@ def summarize(found: list[Localization]) -> Summary:
 def _mean_bounds(count: float, degrees: int) -> tuple[float, float]:
     """Return the 95 % bounds of the mean of `count` independent chi-squares."""
     some = max(count, 1.0)
-    low, high = (float(chi2.ppf(share, some * degrees)) / some for share in (0.025, 0.975))
-    return low, high
+    low, high = chi2.interval(0.95, some * degrees)
+    return float(low) / some, float(high) / some
 
 
 def _inside(values: Floats, degrees: int) -> float:
-    low, high = (float(chi2.ppf(share, degrees)) for share in (0.025, 0.975))
+    low, high = _mean_bounds(1.0, degrees)
     return float(np.mean((values >= low) & (values <= high)))
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Any, Final
 
 import numpy as np
@@ -23,7 +24,7 @@ from calib.data.sources import Data, opened, require_times
 from calib.errors import BadInputError, UnanswerableError
 from calib.evaluation.inertial_filter import GRAVITY, InertialFilter, Noise, P
 from calib.evaluation.range_updates import Fix, RangeErrors, multilaterate, range_errors
-from calib.evaluation.tracking import Trajectory, nearest_attitude
+from calib.evaluation.tracking import BodyTrack, Trajectory, nearest_attitude
 from calib.settings import CheckedSettings
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import bodies_m
@@ -68,38 +69,22 @@ class OnboardSettings(CheckedSettings):
             raise BadInputError(f"found {self.start_m!r:.60}, expected three numbers", parameter="start_m")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OnboardTrack:
-    """Where a body was (n, 3), with attitudes x y z w (n, 4), from the first fix on, and what to think of it.
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class OnboardTrack(BodyTrack):
+    """The track of a body from its first fix on, by the sensors that are `used`.
 
-    `std_m` (n,) is the root of the sum of the filter's three variances. `truth_m` (n, 3), `true_attitude` (n, 4) and
-    `nees` (n,) are NaN where poses do not say. `nis` (ranges,) are squared innovations over their variance at
-    `range_time_ns`, `believed` those that were; `restarts_s` when the filter began anew, in seconds since the first
-    exchange.
+    `true_attitude` (n, 4) is NaN where poses do not say. `nis` (ranges,) and `believed`, which ranges were accepted,
+    are at `range_time_ns`; `restarts_s` when the filter began anew, in seconds since the first exchange.
     """
 
     source: str
     body: str
     model: str
     used: str
-    time_ns: Ints
-    estimate_m: Floats
-    attitude: Floats
-    std_m: Floats
-    truth_m: Floats
     true_attitude: Floats
-    nees: Floats
     range_time_ns: Ints
-    nis: Floats
     believed: Floats
     restarts_s: tuple[float, ...]
-
-    @property
-    def rmse_m(self) -> float:
-        """RMSE of the position, NaN without truth."""
-        known = np.isfinite(self.truth_m).all(axis=1)
-        wrong = self.estimate_m[known] - self.truth_m[known]
-        return float(np.sqrt(np.mean(np.sum(wrong**2, axis=1)))) if known.any() else float("nan")
 
     @property
     def label(self) -> str:
@@ -194,7 +179,7 @@ def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
             continue
         rows = rows[np.argsort(ranges.time_ns[rows], kind="stable")]
         some = ranges[rows]
-        corrected, noise, errors = _corrected(some, calibration)
+        measured, noise, errors = range_errors(calibration, some, calibration.apply(some))
         imu_s, inertial = _table(imu, body, ("wx", "wy", "wz", "ax", "ay", "az"), began)
         height_s, height = _table(heights, body, ("height_m",), began)
         known = poses.body == body
@@ -203,7 +188,7 @@ def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
                 source=ranges.source,
                 body=body,
                 time_s=np.asarray((some.time_ns - began) * 1e-9, dtype=np.float64),
-                range_m=corrected,
+                range_m=measured,
                 noise_m=noise,
                 errors=errors,
                 arm_m=np.array([arms[tag] for tag in mine[rows].tolist()]),
@@ -219,16 +204,6 @@ def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
     if not found:
         raise UnanswerableError(f"{name}: no moving body ranges with a fixed anchor, so there is nothing to localize")
     return found
-
-
-def _corrected(ranges: Ranges, calibration: Calibration) -> tuple[Floats, Floats, RangeErrors]:
-    """Return corrected ranges (n,), the noise of direct ones (n,), and their error model."""
-    applied = calibration.apply(ranges)
-    if calibration.errors is None:
-        # Default without an error model: a tenth of the ranges reflected, by 30 cm on average.
-        unknown = RangeErrors(share=0.1, least_m=0.0, detour_m=0.3, outlier=0.01, outlier_m=3.0)
-        return applied.corrected_m, applied.sigma_m, unknown.times(len(ranges))
-    return (applied.corrected_m - calibration.errors.location_m, *range_errors(calibration, ranges))
 
 
 def _table(
@@ -293,18 +268,17 @@ def _events(one: _Readings, settings: OnboardSettings, begin_s: float) -> Iterat
     end_s = float(one.time_s[-1])
     grid = np.arange(begin_s + 1 / settings.rate_hz, end_s, 1 / settings.rate_hz)
     ranges = np.flatnonzero(one.time_s >= begin_s)
-    happens = [("step", grid, np.arange(len(grid))), ("range", one.time_s[ranges], ranges)]
-    if settings.height and len(one.height_s):
+    happens = [(time_s, "step", number) for number, time_s in enumerate(grid.tolist())]
+    happens += [(float(one.time_s[row]), "range", row) for row in ranges.tolist()]
+    if settings.height:
         # Ten a second are enough: its offset wanders slowly.
         every = np.unique(np.floor(one.height_s * 10), return_index=True)[1]
         rows = every[(one.height_s[every] >= begin_s) & (one.height_s[every] <= end_s)]
-        happens.append(("height", one.height_s[rows], rows))
-    kinds = np.repeat([kind for kind, _, _ in happens], [len(times) for _, times, _ in happens])
-    when, which = (np.concatenate([event[k] for event in happens]) for k in (1, 2))
-    order = np.argsort(when, kind="stable")
-    between = _means(one, np.concatenate([[begin_s], when[order]]))
-    for k, row in enumerate(order.tolist()):
-        yield float(when[row]), str(kinds[row]), int(which[row]), between[k]
+        happens += [(float(one.height_s[row]), "height", row) for row in rows.tolist()]
+    happens.sort(key=itemgetter(0))
+    between = _means(one, np.array([begin_s, *(time_s for time_s, _, _ in happens)]))
+    for event, inertial in zip(happens, between, strict=True):
+        yield *event, inertial
 
 
 def _means(one: _Readings, edges: Floats) -> Floats:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calib.calibration.document import for_json
-from calib.evaluation.localization import PAPER_RMSE_M, Localization, summarize
+from calib.evaluation.localization import PAPER_RMSE_M, Localization, rmse_rows, summarize
 from calib.evaluation.onboard import OnboardSettings, OnboardTrack
 from calib.evaluation.tracking import Settings
 from uwblink.arrays import Floats, Ints
@@ -21,23 +21,14 @@ from uwblink.output import write_files
 
 def localization_text(found: list[Localization], settings: Settings) -> str:
     """Return the table that `calib localize` prints, a row per body, with the settings below."""
-    summary = summarize(found)
-    filters, width = list(summary.rmse_m), 12
-    first = max(30, *(len(one.source) + len(one.body) + 2 for one in found))
-    lines = [f"{'RMSE of the position (m)':{first}s}" + "".join(f"{name:>{width}s}" for name in filters)]
-    for one in found:
-        figures = "".join(f"{one.rmse_m[name].mean():{width}.3f}" for name in filters)
-        lines.append(f"{printable(f'{one.source} {one.body}'):{first}s}{figures}")
-    lines.append(f"{'mean':{first}s}" + "".join(f"{summary.rmse_m[name]:{width}.3f}" for name in filters))
-    if settings.seeds > 1:
-        spread = "".join(f"{summary.spread_m[name]:{width}.3f}" for name in filters)
-        lines.append(f"{f'its spread over {settings.seeds} seeds':{first}s}{spread}")
-    less = "".join(f"{-100 * summary.reduction[name]:+{width - 2}.0f} %" for name in filters[1:])
-    fixed = found[0].fixed
+    summary, fixed = summarize(found), found[0].fixed
+    rows = [["RMSE of the position (m)", *summary.rmse_m], *rmse_rows(found, summary)]
+    first = max(30, *(len(row[0]) + 1 for row in rows))
+    table = [f"{printable(name):{first}s}" + "".join(f"{cell:>12s}" for cell in cells) for name, *cells in rows]
     paper = ", ".join(f"{value:.3f}" for value in PAPER_RMSE_M.values())
     what = "simulated flights" if all(one.simulated for one in found) else "other flights"
-    lines += [
-        f"{'against raw':{first + width}s}{less}",
+    lines = [
+        *table,
         f"process noise: velocity with {settings.velocity_std_mps:g} m/s an axis at {settings.velocity_rate_hz:g} Hz "
         "(a choice, that of a small drone's optical flow; gains depend on it)",
         f"fixed standard deviations, {fixed.source}: raw {fixed.std_m['raw']:.3f} m, calibrated "

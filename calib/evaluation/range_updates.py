@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
+from calib.calibration.applying import CorrectedRanges
 from calib.calibration.model import Calibration
 from calib.data.ranges import Ranges
-from calib.errors import UnanswerableError
 from calib.range_errors.densities import ONE_KIND, ROOT_2PI, LongDetours, densities
 from uwblink.arrays import Bools, Floats
 
@@ -37,25 +37,24 @@ class RangeErrors:
     outlier_m: float
     long: LongDetours = ONE_KIND
 
-    def times(self, count: int) -> RangeErrors:
-        """Return the model of so many equal ranges."""
-        return replace(self, share=np.full(count, self.share), detour_m=np.full(count, self.detour_m))
-
     def at(self, rows: Any) -> RangeErrors:
         """Return the model of some of several ranges, or of one."""
         return replace(self, share=np.asarray(self.share)[rows], detour_m=np.asarray(self.detour_m)[rows])
 
 
-def range_errors(calibration: Calibration, ranges: Ranges) -> tuple[Floats, RangeErrors]:
-    """Return the noise (n,) of corrected ranges within a flight, and their error model.
+def range_errors(
+    calibration: Calibration, ranges: Ranges, applied: CorrectedRanges
+) -> tuple[Floats, Floats, RangeErrors]:
+    """Return corrected ranges (n,) about the centre of their noise, that noise (n,) within a flight, and their errors.
 
     Outliers have a share of a thousandth at least, of about 3 m, because a filter meets errors that the calibration did
-    not. Raises `UnanswerableError` for a calibration without an error model.
+    not. Without an error model a tenth of the ranges is taken to be reflected, by 30 cm on average.
     """
-    model = calibration.errors
+    model, lifted = calibration.errors, applied.lifted
     if model is None:
-        raise UnanswerableError("the calibration does not say what errors are made of; fit anew from a recording")
-    lifted = calibration.lifted(ranges)
+        share, detour_m = np.repeat([[0.1], [0.3]], len(ranges), axis=1)
+        unknown = RangeErrors(share=share, least_m=0.0, detour_m=detour_m, outlier=0.01, outlier_m=3.0)
+        return applied.corrected_m, applied.sigma_m, unknown
     shapes = model.shapes(lifted, ranges.initiator, ranges.target)
     errors = RangeErrors(
         share=shapes.tail_share,
@@ -65,7 +64,8 @@ def range_errors(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Rang
         outlier_m=max(model.outlier_m, 3.0),
         long=model.long,
     )
-    return np.hypot(model.within_m(shapes.noise_m), calibration.bias_curve.beyond(lifted)), errors
+    noise_m = np.hypot(model.within_m(shapes.noise_m), calibration.bias_curve.beyond(lifted))
+    return applied.corrected_m - model.location_m, noise_m, errors
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

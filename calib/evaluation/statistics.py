@@ -153,17 +153,17 @@ class Evaluation:
         return document | ({"planted": for_json(asdict(self.planted))} if self.planted else {})
 
 
+def stage_cells(group: ErrorStatistics) -> list[str]:
+    """Return the number of ranges, and in cm the mean, median and robust standard deviation of errors by stage."""
+    stages = (group.raw, group.delays, group.full)
+    errors_m = [error for stats in stages for error in (stats.mean_m, stats.median_m, stats.robust_std_m)]
+    return [str(group.raw.n), *(f"{100 * error:.1f}" for error in errors_m)]
+
+
 def _cells(group: ErrorStatistics) -> list[str]:
-    errors = [
-        100 * value
-        for stats in (group.raw, group.delays, group.full)
-        for value in (stats.mean_m, stats.median_m, stats.robust_std_m)
-    ]
-    figures = [*(f"{value:.1f}" for value in (*errors, 100 * group.rejected)), f"{group.total_std:.2f}"]
-    return [
-        str(group.raw.n),
-        *(("-" if "nan" in cell else cell) for cell in (*figures, f"{100 * group.inside_95:.1f}")),
-    ]
+    rejected, inside = (f"{100 * share:.1f}" for share in (group.rejected, group.inside_95))
+    cells = [*stage_cells(group), rejected, f"{group.total_std:.2f}", inside]
+    return ["-" if "nan" in cell else cell for cell in cells]
 
 
 def evaluate(data: Data | Iterable[Data], calibration: Calibration) -> Evaluation:

@@ -32,8 +32,8 @@ Between metal racks (scenarios/hall_with_metal) half of a body's ranges are metr
 a position from these ranges alone is metres off.
 """
 
-MIN_RANGES_PER_FIX: Final = 12
-"""Ranges by which a filter may be found lost: four for each coordinate."""
+RANGES_TO_BE_LOST: Final = 12
+"""Least number of unexplained ranges after which a filter begins anew: four for each coordinate."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,11 +62,12 @@ class Settings(CheckedSettings):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Track:
-    """How one filter did: times (n,), estimates and truth (n, 3), normalised errors, and what was refused.
+class BodyTrack:
+    """Estimated and true positions of a body (n, 3) at times (n,), with attitudes x y z w (n, 4).
 
-    `std_m` (n,) is the filter's own opinion of its error: the root of the sum of its three variances. `attitude`
-    (n, 4), x y z w, is the filter's input.
+    `std_m` (n,) is the standard deviation by the filter itself: the root of the sum of its three variances. `nees` (n,)
+    are the squared errors over their covariance. `truth_m` and `nees` are NaN where poses do not say. `nis` are the
+    squared innovations of ranges over their variance.
     """
 
     time_ns: Ints
@@ -76,16 +77,27 @@ class Track:
     std_m: Floats
     nis: Floats
     nees: Floats
+
+    @property
+    def rmse_m(self) -> float:
+        """Root of the mean squared distance between estimate and truth, NaN without truth."""
+        known = np.isfinite(self.truth_m).all(axis=1)
+        wrong = self.estimate_m[known] - self.truth_m[known]
+        return float(np.sqrt(np.mean(np.sum(wrong**2, axis=1)))) if known.any() else np.nan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Track(BodyTrack):
+    """The track of one filter at each of its ranges: `accepted` (n,) are those within the gate.
+
+    `attitude` is the filter's input.
+    """
+
     accepted: Bools
 
     def __repr__(self) -> str:
         """Return its length and how far off it is, on one line."""
         return f"track of {len(self.time_ns)} ranges, rms error {self.rmse_m:.3f} m"
-
-    @property
-    def rmse_m(self) -> float:
-        """Root of the mean squared distance between estimate and truth."""
-        return float(np.sqrt(np.mean(np.sum((self.estimate_m - self.truth_m) ** 2, axis=1))))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,7 +213,7 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
     x, p = np.zeros((*shape, size)), np.tile(prior, (*shape, 1, 1))
     x[..., :3] = [start for start, _ in noises]
     diagonal = np.einsum("fsii->fsi", p)
-    explained_s, most_s = np.zeros(shape), settings.reopen_s / 2 / MIN_RANGES_PER_FIX
+    explained_s, most_s = np.zeros(shape), settings.reopen_s / 2 / RANGES_TO_BE_LOST
     estimate, (std_m, nis, nees) = np.empty((count, *shape, 3)), np.empty((3, count, *shape))
     accepted = np.empty((count, *shape), dtype=bool)
     for k, pair in enumerate(3 + problem.pair):

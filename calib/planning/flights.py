@@ -16,7 +16,7 @@ from calib.errors import BadInputError
 from calib.planning.flight_information import Errors, Flight, Information, flight_of
 from calib.planning.reference_motion import reference_motion
 from calib.planning.result import FlightPlan, NextBest, mean_std_ns
-from calib.planning.settings import FlightPlanSettings
+from calib.planning.settings import ACCELEROMETERS, FlightPlanSettings
 from calib.settings import FlightSettings
 from calib.spread import TWO_SIDED_95
 from calib.trajectories.attitudes import WINDOW_S
@@ -28,9 +28,6 @@ of error of headings. Each is what a team can do without other equipment."""
 
 DELAY_STD_NS = 0.05
 """Standard error of the delay of one tag from another calibration or a survey."""
-
-ACCELEROMETERS = {"consumer": 3e-3, "industrial": 1e-3, "tactical": 3e-4}
-"""Noise in m/s^2 a root of Hz, orders of magnitude of data sheets."""
 
 VIBRATION_M_S2 = 0.2
 """Vibration that is left in a mean over a tenth of a second."""
@@ -86,9 +83,11 @@ def plan_flight(robots: Robots | Data, settings: FlightPlanSettings | None = Non
 
 def _information(asked: FlightPlanSettings, data: Data | None) -> Information:
     """Return that of a recorded flight, or of robots that fly about a room, with as many tapes as are asked for."""
-    force = None
-    if asked.imu is not None:
-        force = TRUSTED * math.hypot(ACCELEROMETERS[asked.imu] / math.sqrt(WINDOW_S), VIBRATION_M_S2)
+    force_std_m_s2 = (
+        None
+        if asked.imu is None
+        else TRUSTED * math.hypot(ACCELEROMETERS[asked.imu] / math.sqrt(WINDOW_S), VIBRATION_M_S2)
+    )
     flight = flight_of(
         reference_motion(asked) if data is None else data,
         FlightSettings(
@@ -99,7 +98,7 @@ def _information(asked: FlightPlanSettings, data: Data | None) -> Information:
         ),
         Errors(noise_m=asked.noise_m, reflected=asked.reflected),
         curve=not asked.delays_only,
-        force_std_m_s2=force,
+        force_std_m_s2=force_std_m_s2,
     )
     found = Information(flight)
     for count in range(asked.taped):

@@ -9,24 +9,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM
 from calib.information import reduced
-from calib.planning.result import PlannedArrangement
-from calib.planning.settings import SurveyPlanSettings
+from calib.planning.result import PlannedArrangement, Precision
+from calib.planning.settings import ROOMS_M, SurveyPlanSettings
 from calib.surveys.knowledge import KnownPosition
 from calib.surveys.network import Boards, Case, CurvePrior, Network
 from calib.surveys.outcome import verdict_on_delays
 from calib.surveys.recordings import PairMeans
 from uwblink.arrays import Bools, Floats
 from uwblink.recording.schema import KnownDistance
-
-SIZES_M = {"line": (5.0, 0.0, 0.0), "plane": (3.0, 2.0, 0.0), "space": (6.0, 5.0, 2.5)}
-"""Where boards may stand by default: a string across a room, a large table, a room."""
 
 NEAREST_M = 0.4
 """Boards stand no nearer to each other; nearer, powers saturate and fields are not yet waves."""
@@ -48,7 +45,7 @@ def random_arrangements(inputs: SurveyPlanSettings, count: int, tries: int = 400
     them: the corners of a room are as good a guess as any.
     """
     rng, tags, dimensions = np.random.default_rng(inputs.seed), inputs.tags, inputs.dimensions
-    size = np.array(SIZES_M[inputs.on] if inputs.size_m is None else inputs.size_m, dtype=float)[:dimensions]
+    size = np.array(ROOMS_M[inputs.on] if inputs.size_m is None else inputs.size_m, dtype=float)
     if inputs.on == "line" and inputs.size_m is None:
         size = np.maximum(size, 0.8 * (len(tags) - 1))
     found: dict[tuple[int, ...] | int, PlannedArrangement] = {}
@@ -113,19 +110,10 @@ def delay_information(
     return np.array([reduced(network.at(x, case).known[np.ix_(free, free)], free >= 3 * len(boards)) for case in cases])
 
 
-@dataclass(frozen=True, slots=True)
-class Prediction:
-    """Standard deviations in ns, infinite where undetermined: of delays (tags,), each against their mean, that."""
-
-    each: Floats
-    apart: Floats
-    common: float
-
-
 def predict(
     inputs: SurveyPlanSettings, arrangements: Sequence[PlannedArrangement], *, curve: bool = False
-) -> list[Prediction]:
-    """Return what is predicted of the first of the arrangements, of the first two, and so on."""
+) -> list[Precision[Floats]]:
+    """Return the predicted standard deviations after the first of the arrangements, the first two, and so on."""
     places = np.array([list(one.place_m.values()) for one in arrangements])
     first, second = np.array(list(combinations(range(len(inputs.tags)), 2))).T
     powers = POWER_AT_1_M_DBM - 20 * np.log10(np.linalg.norm(places[:, first] - places[:, second], axis=2))
@@ -145,7 +133,7 @@ def predict(
     return [_averaged(np.array([reduced(one, delays) for one in draws]), inputs.tags) for draws in totals]
 
 
-def _averaged(informations: Floats, tags: Sequence[int]) -> Prediction:
+def _averaged(informations: Floats, tags: Sequence[int]) -> Precision[Floats]:
     """Return root mean squares over the draws (k, tags, tags) that determine it; infinite where most do not."""
     verdicts = [verdict_on_delays(one, tags) for one in informations]
     covariance = np.array([one.covariance for one in verdicts])
@@ -156,4 +144,4 @@ def _averaged(informations: Floats, tags: Sequence[int]) -> Prediction:
     good = np.isfinite(variances)
     mean = np.where(good, variances, 0.0).sum(axis=0) / np.maximum(good.sum(axis=0), 1)
     std = np.where(good.mean(axis=0) > 0.5, np.sqrt(mean), math.inf)
-    return Prediction(std[: len(tags)], std[len(tags) : -1], float(std[-1]))
+    return Precision(std[: len(tags)], std[len(tags) : -1], float(std[-1]))

@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from calib.calibration.document import for_json
 from calib.information import Verdict
 from calib.planning.settings import FlightPlanSettings
 from uwblink.arrays import Floats
+
+T = TypeVar("T")
 
 GUESS_NS = 1.5
 """How far a delay is known without any data: means over tags are finite then, though some are not determined."""
@@ -60,14 +63,14 @@ class NextBest:
 
 
 @dataclass(frozen=True, slots=True)
-class Halves:
-    """Half intervals in ns, infinite where undetermined: of a delay, of one against the mean of all, of that mean.
+class Precision(Generic[T]):
+    """Precision of delays in ns, infinite where undetermined: of each, of each against the mean of all, of that mean.
 
-    Of delays the root mean square of all.
+    They are standard deviations or half intervals, of delays as arrays (tags,) or as root mean squares.
     """
 
-    each: float
-    apart: float
+    each: T
+    apart: T
     common: float
 
 
@@ -122,8 +125,8 @@ class _Plan:
     def to_dict(self) -> dict[str, Any]:
         """Return everything as JSON takes it; null where nothing is determined."""
         return {
-            "half_interval_ns": {str(tag): _number(half) for tag, half in self.half_ns.items()},
-            "common_ns": _number(self.common_ns),
+            "half_interval_ns": for_json(self.half_ns),
+            "common_ns": for_json(self.common_ns),
             "undetermined": list(self.undetermined),
             "reflected": self.reflected,
             "next_best": [asdict(best) for best in self.next_best],
@@ -152,7 +155,7 @@ class Plan(_Plan):
     tags: tuple[int, ...]
     arrangements: tuple[PlannedArrangement, ...]
     after_ns: tuple[Mapping[int, float], ...]
-    with_curve_ns: Halves
+    with_curve_ns: Precision[float]
     rate_hz: float
     seconds_each: float
     pair_error_m: float
@@ -202,7 +205,7 @@ class Plan(_Plan):
             "rate_hz": self.rate_hz,
             "seconds_each": self.seconds_each,
             "pair_error_m": self.pair_error_m,
-            "with_curve_ns": {name: _number(half) for name, half in asdict(self.with_curve_ns).items()},
+            "with_curve_ns": for_json(asdict(self.with_curve_ns)),
             "arrangements": [
                 {"name": a.name, "place_m": {str(t): list(p) for t, p in a.place_m.items()}, "taped": list(a.taped)}
                 for a in self.arrangements
@@ -301,10 +304,6 @@ class FlightPlan(_Plan):
             "seconds": self.seconds,
             "noise_m": self.settings.noise_m,
             "taped": [list(pair) for pair in self.taped],
-            "half_interval_all_ns": {str(tag): half for tag, half in self.open_ns.items()},
+            "half_interval_all_ns": for_json(self.open_ns),
             "apart_ns": self.apart_ns,
         }
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None

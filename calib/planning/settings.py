@@ -11,29 +11,30 @@ from calib.errors import BadInputError
 from calib.settings import check_choice
 from uwblink.settings import setting
 
-DIMENSIONS: Final = {"line": 1, "plane": 2, "space": 3}
-"""In how many dimensions boards may stand."""
+ROOMS_M: Final = {"line": (5.0,), "plane": (3.0, 2.0), "space": (6.0, 5.0, 2.5)}
+"""Where boards may stand, and its default lengths: a string across a room, a large table, a room."""
 
-IMU_GRADES: Final = ("consumer", "industrial", "tactical")
+ACCELEROMETERS: Final = {"consumer": 3e-3, "industrial": 1e-3, "tactical": 3e-4}
+"""Noise of accelerometers by grade, in m/s^2 a root of Hz, orders of magnitude of data sheets."""
 
 MAX_TAGS: Final = 60
 MAX_RANGES: Final = 200_000
 """A bound that keeps a mistyped duration from filling the memory."""
 
 
-def read_numbers(text: str) -> list[float]:
-    """Return numbers from a text with commas; raises `BadInputError`."""
+def read_numbers(text: str, parameter: str | None = None) -> list[float]:
+    """Return numbers from a text with commas; raises `BadInputError` that names the `parameter`."""
     try:
         return [float(part) for part in text.split(",")] if text.strip() else []
     except ValueError:
-        raise BadInputError(f"found {text!r:.40}, expected numbers with commas") from None
+        raise BadInputError(f"found {text!r:.40}, expected numbers with commas", parameter=parameter) from None
 
 
-def read_whole(text: str) -> list[int]:
-    """Return ids or a count from a text with commas; raises `BadInputError`."""
-    found = read_numbers(text)
+def read_whole(text: str, parameter: str | None = None) -> list[int]:
+    """Return ids or a count from a text with commas; raises `BadInputError` that names the `parameter`."""
+    found = read_numbers(text, parameter)
     if not found or not all(math.isfinite(value) and value == int(value) for value in found):
-        raise BadInputError(f"found {text!r:.40}, expected whole numbers with commas")
+        raise BadInputError(f"found {text!r:.40}, expected whole numbers with commas", parameter=parameter)
     return [int(value) for value in found]
 
 
@@ -83,7 +84,7 @@ class SurveyPlanSettings:
     on: str = setting(
         "line",
         "Where the boards stand: on a string (line), on a table (plane), or in a room (space).",
-        names=tuple(DIMENSIONS),
+        names=tuple(ROOMS_M),
     )
     arrangements: int | None = setting(None, "Number of arrangements; by default as many as are worth it.")
     size_m: Sequence[float] | None = setting(None, "Length of the line, or sides of plane or room (m).", **_SIZE)
@@ -98,7 +99,7 @@ class SurveyPlanSettings:
 
     def __post_init__(self) -> None:
         """Check all values."""
-        check_choice("on", self.on, DIMENSIONS)
+        check_choice("on", self.on, ROOMS_M)
         sigma, count, tags = (1e-9, 100.0), self.arrangements, self.tags
         bounds = {
             "taped": (0, 1000),
@@ -125,7 +126,7 @@ class SurveyPlanSettings:
     @property
     def dimensions(self) -> int:
         """In how many dimensions boards may stand."""
-        return DIMENSIONS[self.on]
+        return len(ROOMS_M[self.on])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,7 +166,7 @@ class FlightPlanSettings:
     heading_std_deg: float = setting(
         3.0, "Standard deviation of headings; 0: headings are exact.", flag="--heading-std", metavar="DEGREES"
     )
-    imu: str | None = setting(None, "Grade of the robots' inertial sensors.", names=IMU_GRADES)
+    imu: str | None = setting(None, "Grade of the robots' inertial sensors.", names=tuple(ACCELEROMETERS))
     anchors: Sequence[int] = setting((), _ANCHORS_HELP, **_ANCHORS)
     anchor_places: str = setting(
         "given", "Positions of anchors: given, or sought (estimated).", flag="--anchors", names=("given", "sought")
@@ -184,7 +185,7 @@ class FlightPlanSettings:
         """Check all values, and the robots where there are some."""
         check_choice("anchor_places", self.anchor_places, ("given", "sought"))
         if self.imu is not None:
-            check_choice("imu", self.imu, IMU_GRADES)
+            check_choice("imu", self.imu, ACCELEROMETERS)
         bounds = {
             "seconds": (5.0, 3600.0),
             "rate_hz": (0.5, 2000.0),

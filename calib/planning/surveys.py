@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.errors import BadInputError, UnanswerableError
 from calib.planning.predicted import delay_information, predict, random_arrangements
-from calib.planning.result import Halves, NextBest, Plan, PlannedArrangement, mean_std_ns
+from calib.planning.result import NextBest, Plan, PlannedArrangement, Precision, mean_std_ns
 from calib.planning.settings import SurveyPlanSettings
 from calib.spread import TWO_SIDED_95
 from calib.surveys.outcome import students_factor, verdict_on_delays
@@ -81,7 +81,7 @@ def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None
         half_ns=after_ns[-1],
         after_ns=tuple(after_ns),
         common_ns=wide[-1] * predictions[-1].common,
-        with_curve_ns=Halves(each, apart, wide[-1] * curved.common),
+        with_curve_ns=Precision(each, apart, wide[-1] * curved.common),
         verdict=verdict_on_delays(total, tags),
         next_best=tuple(sorted(next_best, key=lambda one: one.mean_ns)),
         rate_hz=inputs.rate_hz,

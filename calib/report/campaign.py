@@ -1,21 +1,25 @@
-"""A campaign: fit, examine, localize and judge, for a report."""
+"""A campaign: fit, examine, localize and judge, for a report; and one flight fitted and judged, for a sweep."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from calib.calibration.model import Calibration
 from calib.checks.examine import examine
 from calib.data.ranges import Ranges, concatenate
-from calib.data.sources import Data, each, held_open, load_each, opened
+from calib.data.sources import Data, each, held_open, load_each, load_ranges, opened
 from calib.errors import UnanswerableError
 from calib.evaluation.localization import Localization, localize, summarize
+from calib.evaluation.statistics import evaluate
 from calib.findings import Finding
 from calib.fitting.fitting import fit
 from calib.fitting.passive_listeners import heard_delays
@@ -161,3 +165,29 @@ def _tracks(data: Data, calibration: Calibration) -> list[Localization]:
         return [] if isinstance(data, Ranges) else localize(data, calibration)
     except UnanswerableError:
         return []
+
+
+def evaluate_flight(flight: Data) -> Mapping[str, Any]:
+    """Fit a flight and evaluate the fit on it; return the figures as one row of a sweep.
+
+    `flight` is what `uwbsim.simulate` gives, or one of whatever else `load_ranges` takes. The row has the number of
+    `exchanges` that could be used; mean, standard deviation and robust spread in metres of the errors of `raw`,
+    `delays` and `full` ranges; `rejected`; and, compared with what was planted, `delays_rms_ns`, `curve_rms_m` and
+    `correction_rms_m`, None where nothing was; and `settled`, 0 where the fit stopped before it did. Raises
+    `UnanswerableError` where the flight cannot be fitted.
+    """
+    ranges = load_ranges(flight)
+    result = fit(ranges)
+    found = evaluate(ranges, result.calibration).to_dict()
+    overall, planted = found["overall"], found.get("planted") or {}
+    delays = list((planted.get("delay_error_ns") or {}).values())
+    errors = product(("raw", "delays", "full"), ("mean_m", "std_m", "robust_std_m"))
+    return {
+        "exchanges": overall["raw"]["n"],
+        **{f"{stage}_{what}": overall[stage][what] for stage, what in errors},
+        "settled": int(result.success),
+        "rejected": overall["rejected"],
+        "delays_rms_ns": float(np.sqrt(np.mean(np.square(delays)))) if delays else None,
+        "curve_rms_m": planted.get("curve_rms_m"),
+        "correction_rms_m": planted.get("correction_rms_m"),
+    }

@@ -10,8 +10,8 @@ import numpy as np
 from calib import figures
 from calib.calibration.model import curve_rows
 from calib.estimator.grouped_errors import fit_grouped_errors
-from calib.evaluation.localization import PAPER_RMSE_M, Localization, summarize
-from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, pair_rows
+from calib.evaluation.localization import PAPER_RMSE_M, Localization, rmse_rows, summarize
+from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, pair_rows, stage_cells
 from calib.evaluation.tracking import Settings
 from calib.report.figures import FILTER_NAMES, rmse_bars, track
 from calib.report.results import Results
@@ -115,12 +115,8 @@ def before_after(results: Results) -> list[Block]:
 
 
 def _error_cells(group: ErrorStatistics) -> list[str]:
-    cells = [str(group.raw.n)]
-    for stage in CORRECTION_STAGES:
-        stats = getattr(group, stage)
-        cells += [f"{100 * v:.1f}" for v in (stats.mean_m, stats.median_m, stats.robust_std_m)]
     shares = ["–" if v != v else f"{100 * v:.1f} %" for v in (1 - group.rejected, group.inside_95, group.clamped)]
-    return [*cells, f"{100 * group.full.abs95_m:.1f}", *shares]
+    return [*stage_cells(group), f"{100 * group.full.abs95_m:.1f}", *shares]
 
 
 def outliers(results: Results) -> list[Block]:
@@ -169,10 +165,7 @@ def localization(results: Results) -> list[Block]:
     total = summarize(found)
     names = list(total.rmse_m)
     rows = [
-        *([f"{one.source} {one.body}", *(f"{one.rmse_m[name].mean():.3f}" for name in names)] for one in found),
-        ["mean", *(f"{total.rmse_m[name]:.3f}" for name in names)],
-        ["its spread over seeds", *(f"{total.spread_m[name]:.3f}" for name in names)],
-        ["against raw", "", *(f"{-100 * less:+.0f} %" for less in total.reduction.values())],
+        *rmse_rows(found, total),
         ["ICRA 2023, its own flights", *(f"{PAPER_RMSE_M[n]:.3f}" if n in PAPER_RMSE_M else "" for n in names)],
     ]
     (nis_low, nis_high), (nees_low, nees_high) = total.nis_bounds, total.nees_bounds

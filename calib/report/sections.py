@@ -24,6 +24,7 @@ from calib.report import error_sections
 from calib.report.results import Results
 from calib.report.verdict import left_open, verdict
 from calib.spread import TWO_SIDED_95
+from calib.surveys.figures import board_figure
 from calib.surveys.result import SurveyedArrangement
 from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text
 
@@ -166,17 +167,12 @@ def _of_survey(made: Any) -> list[Block]:
         tags = ", ".join(str(board.tag) for board in one.boards)
         rows.append([one.name, tags, one.known or "nothing", within, one.frame])
 
-    def draw(width_in: float) -> Any:
-        from calib.surveys.figures import board_figure
-
-        return board_figure(surveyed, width_in)
-
     caption = (
         "Where boards stood, from above, with ellipses that hold them with 95 %; ten times as large and dashed where "
         "they would not be seen."
     )
     header = ["arrangement", "boards", "said to be", "places within (95 %)", "frame"]
-    blocks += [Table(header, rows, words=True), Picture("places", draw, caption)]
+    blocks += [Table(header, rows, words=True), Picture("places", partial(board_figure, surveyed), caption)]
     reflected = [
         [row["arrangement"], pair_name(row["between"]), f"{100 * row['longer_m']:+.0f}", f"{100 * row['chance']:.0f} %"]
         for row in made.get("reflected", [])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
@@ -36,7 +36,7 @@ class Criterion(NamedTuple):
 
 def verdict(results: Results) -> list[Block]:
     """Return a sentence on all criteria, and their table."""
-    found = criteria(results)
+    found = list(criteria(results))
     bad, doubt = ("; ".join(one.told for one in found if one.grade == grade) for grade in (BAD, DOUBT))
     if bad:
         kind, also = BAD, f" Also: {doubt}." if doubt else ""
@@ -51,31 +51,34 @@ def verdict(results: Results) -> list[Block]:
     return [Text(text, kind), Table(["criterion", "met", "found", "asked for"], rows, words=True)]
 
 
-def criteria(results: Results) -> list[Criterion]:
-    """Return the criteria that apply to a calibration and its recordings."""
+def criteria(results: Results) -> Iterator[Criterion]:
+    """Yield the criteria that apply to a calibration and its recordings."""
     made = results.calibration.provenance
-    judged = list(_of_recordings(results)) if results.recordings else []
-    if not judged and not made.get("converged", True):
-        judged = [Criterion("Did the search settle?", "yes", "no", BAD, "the search stopped before it settled")]
-    delays = _settled(results)
-    found = [*judged[:4], *([delays] if delays else []), *judged[4:]]
+    if results.recordings:
+        yield _held_out(results)
+        yield _gain(results)
+        yield _bias(results)
+        yield _interval(results)
+    elif not made.get("converged", True):
+        yield Criterion("Did the search settle?", "yes", "no", BAD, "the search stopped before it settled")
+    if not results.calibration.pair_offsets:
+        yield _settled(results)
+    if results.recordings:
+        yield from _of_uses(results)
     if made.get("recipe") == "survey":
-        found += _of_survey(results)
-    elif rests_on(made):
-        found += _of_distances(made.get("distance_std_m"))
-    return [*found, _warned(results)] if results.recordings else found
+        yield from _of_survey(results)
+    elif rests_on(made) and isinstance(std_m := made.get("distance_std_m"), int | float):
+        yield _distances(std_m)
+    if results.recordings:
+        yield _warned(results)
 
 
 def _graded(good: bool, tolerable: bool) -> str:
     return GOOD if good else DOUBT if tolerable else BAD
 
 
-def _of_recordings(results: Results) -> Iterator[Criterion]:
-    """Yield what the recordings that judge a calibration say of it."""
-    yield _held_out(results)
-    yield _gain(results)
-    yield _bias(results)
-    yield _interval(results)
+def _of_uses(results: Results) -> Iterator[Criterion]:
+    """Yield whether the curves hold for the recordings' powers, and whether positions become better."""
     most, share = 0.05, results.evaluation.overall.clamped
     yield Criterion(
         "Was the curve fitted at such powers?",
@@ -96,17 +99,17 @@ def _of_recordings(results: Results) -> Iterator[Criterion]:
 
 
 def _held_out(results: Results) -> Criterion:
-    judged, asked = results.judged, ("Was it judged on recordings that the fit has not seen?", "yes")
+    judged = results.judged
+    found, told = f"{judged.source}: {len(judged)} ranges", "it was judged on recordings that the fit has not seen"
     if results.part is not None:
         share = len(judged) / (len(judged) + int(results.part.provenance["exchanges"]))
         found = f"in part: a second fit was judged on {100 * share:.0f} % of the same recordings, held out from it"
         told = "it was judged on held-out parts of the recordings it was fitted to, not on another recording"
-        return Criterion(*asked, found, DOUBT, told)
-    if not results.held_out:
+    elif not results.held_out:
+        found = "no: on those it was fitted to"
         told = "it was not judged on recordings that the fit has not seen, so what follows is too good"
-        return Criterion(*asked, "no: on those it was fitted to", DOUBT, told)
-    told = "it was judged on recordings that the fit has not seen"
-    return Criterion(*asked, f"{judged.source}: {len(judged)} ranges", GOOD, told)
+    question = "Was it judged on recordings that the fit has not seen?"
+    return Criterion(question, "yes", found, _graded(results.held_out, True), told)
 
 
 def _gain(results: Results) -> Criterion:
@@ -173,10 +176,8 @@ def _interval(results: Results) -> Criterion:
     )
 
 
-def _settled(results: Results) -> Criterion | None:
+def _settled(results: Results) -> Criterion:
     known = results.calibration
-    if known.pair_offsets:
-        return None
     asked = ("Are the antenna delays known well enough?", f"95 % interval of each within ± {MOST_NS:g} ns (3 cm)")
     if known.provenance.get("undetermined"):
         return Criterion(*asked, left_open(results), BAD, left_open(results))
@@ -273,14 +274,13 @@ def _of_survey(results: Results) -> Iterator[Criterion]:
         )
 
 
-def _of_distances(std_m: Any) -> Iterator[Criterion]:
-    """Yield how well distances are known that were found together with the delays."""
-    if isinstance(std_m, int | float):
-        most_m = 0.02
-        yield Criterion(
-            "Are the estimated distances known well enough?",
-            f"standard error at most {100 * most_m:g} cm",
-            f"{100 * std_m:.1f} cm",
-            _graded(std_m <= most_m, std_m <= 0.05),
-            f"distances were found to {100 * std_m:.1f} cm",
-        )
+def _distances(std_m: float) -> Criterion:
+    """Return how well distances are known that were found together with the delays."""
+    most_m = 0.02
+    return Criterion(
+        "Are the estimated distances known well enough?",
+        f"standard error at most {100 * most_m:g} cm",
+        f"{100 * std_m:.1f} cm",
+        _graded(std_m <= most_m, std_m <= 0.05),
+        f"distances were found to {100 * std_m:.1f} cm",
+    )
