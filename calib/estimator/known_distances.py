@@ -21,6 +21,7 @@ from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import METRES_A_NS, RangeModel
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows, Robust
 from calib.estimator.rows import NormalRows, Rows
+from calib.estimator.score_tests import Slopes
 from calib.estimator.time_blocks import Persistence, TimeBlocks, in_order, time_blocks
 from calib.estimator.unknowns import Layout, Priors, Unknown
 from calib.range_errors.densities import ErrorSlopes
@@ -84,7 +85,8 @@ class KnownDistances:
 
     `values` are unknowns by kind, `covariances` those of "delay", of all curves side by side ("curve") and of the noise
     ("noise"). `residuals` (n,) are fitted less true ranges in the order of the model's ranges, metres. `searches` are
-    the one search, or that of the delays and that of the curves. `persistence` is that of errors of delays.
+    the one search, or that of the delays and that of the curves. `persistence` is that of errors of delays, and
+    `slopes` are those of the first search.
     """
 
     model: RangeModel
@@ -93,6 +95,7 @@ class KnownDistances:
     searches: tuple[Fitted, ...]
     persistence: Persistence
     blocks: TimeBlocks
+    slopes: Slopes
     residuals: Floats
 
     @property
@@ -278,7 +281,8 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDis
         "noise": Kept.curve(layout.indices(noise_kinds(layout))),
     }
     kept = {name: group for name, group in kept.items() if len(group.indices)}
-    found = sandwich(fitted.optimum, fitted.rows, kept, blocks, fitted.beside)
+    slopes = Slopes(fitted.rows, fitted.optimum, blocks)
+    found = sandwich(slopes, kept, fitted.beside)
     covariances = {name: matrix for name, (matrix, _) in found.items()}
     if "offset of pair" in layout.where and "odds of pair" in layout.where:
         covariances["delay"] = covariances["delay"] + _of_another_shape(fitted.optimum)
@@ -289,6 +293,7 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDis
         searches=(fitted,),
         persistence=found[next(iter(kept))][1],
         blocks=blocks,
+        slopes=slopes,
         residuals=fitted.residuals,
     )
 

@@ -155,10 +155,16 @@ class RangeModel:
     @property
     def reference(self) -> float | None:
         """Return the lifted power at which curves are zero, None for no such condition."""
-        power_dbm, alpha_dbm = self.settings.reference_power_dbm, self.settings.alpha_dbm
-        if power_dbm is None:
-            return None if self.settings.sequential else 1.0
-        return float(lift(np.array(power_dbm), alpha_dbm))
+        dbm = self.reference_dbm
+        return None if dbm is None else float(lift(np.array(dbm), self.settings.alpha_dbm))
+
+    @property
+    def reference_dbm(self) -> float | None:
+        """Return the power in dBm at which curves are zero, None for no such condition."""
+        settings = self.settings
+        if settings.reference_power_dbm is None and not settings.sequential:
+            return settings.alpha_dbm
+        return settings.reference_power_dbm
 
     @property
     def pinned(self) -> bool:

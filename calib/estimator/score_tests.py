@@ -147,13 +147,14 @@ class _Sums:
 class Slopes:
     """The slopes of a fit's ranges by the residual and by all unknowns, as sums and products that tests are made of.
 
-    `score` (n,) are the slopes by residuals, `tells` (n,) what residuals know, in the order of the rows. Slopes by
-    unknowns are evaluated anew for tests: those of millions of ranges take gigabytes.
+    `own` (blocks, p) are the slopes by unknowns, summed by block of time. `score` (n,) are the slopes by residuals,
+    `tells` (n,) what residuals know, in the order of the rows. Slopes by unknowns are evaluated anew for tests: those
+    of millions of ranges take gigabytes.
     """
 
-    def __init__(self, rows: RangeRows, optimum: Optimum, blocks: TimeBlocks, delays: Floats) -> None:
-        """Take rows at their optimum; `delays` (tags, p) turns unknowns into delays in ns."""
-        self.rows, self.optimum, self.blocks, self.delays = rows, optimum, blocks, delays
+    def __init__(self, rows: RangeRows, optimum: Optimum, blocks: TimeBlocks) -> None:
+        """Take rows at their optimum."""
+        self.rows, self.optimum, self.blocks = rows, optimum, blocks
         self.order, size = rows.order, optimum.layout.size
         self.score, self.tells = np.empty(len(rows)), np.zeros(len(rows))
         self.own = np.zeros((blocks.count, size))
@@ -226,7 +227,7 @@ class Slopes:
             total=total,
             covariance=lasting.factor * (scatter.T @ scatter),
             information=information,
-            effects=-self.delays @ taken.T,
+            effects=-taken.T[self.optimum.layout.where["delay"]],
             whole=whole,
             lasting=lasting,
             blocks=len(scatter),

@@ -84,17 +84,14 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     stated = {tag: std for tag, std in calibration.delays_std_ns.items() if tag not in given}
     calibration = replace(calibration, delays_std_ns=stated | taken)
     held = _held_out(ranges, settings) if settings.hold_out else None
-    reference = settings.reference_power_dbm
-    if reference is None and not settings.sequential:
-        reference = settings.alpha_dbm
     provenance = {
         **({"undetermined": found.free} if found.free else {}),
-        **({} if reference is None else {"reference_power_dbm": reference}),
+        **({} if found.model.reference_dbm is None else {"reference_power_dbm": found.model.reference_dbm}),
         "recordings": ranges.source.split(", "),
         "recording_ids": [name for _, name in ranges.recordings],
         "recipe": "sequential" if settings.sequential else "joint",
-        "fitted": _fitted(found),
-        "gauge": _gauge(found, reference),
+        "fitted": what_was_fitted(found),
+        "gauge": _gauge(found),
         **({"held_out": _judged(held, settings)} if held else {}),
     }
     result = result_of(
@@ -287,9 +284,8 @@ def _beyond(found: KnownDistances) -> list[str]:
     near = float(np.clip(model.reference, *model.span))
     if near == model.reference:
         return []
-    asked = settings.alpha_dbm if settings.reference_power_dbm is None else settings.reference_power_dbm
     return [
-        f"no ranges at the reference power of {asked:.1f} dBm: delays are stated at "
+        f"no ranges at the reference power of {model.reference_dbm:.1f} dBm: delays are stated at "
         f"{settings.alpha_dbm + 10 * np.log10(near):.1f} dBm, the nearest recorded, and compare only with others "
         "stated there"
     ]
@@ -300,7 +296,7 @@ def _has_gauge(found: KnownDistances) -> bool:
     return any(carrier is not None for carrier in found.model.carriers)
 
 
-def _fitted(found: KnownDistances) -> str:
+def what_was_fitted(found: KnownDistances) -> str:
     """Return what was fitted, in words."""
     model = found.model
     if model.settings.constants == "pair":
@@ -310,13 +306,13 @@ def _fitted(found: KnownDistances) -> str:
     return "curve only" if model.pinned else "delays and curve"
 
 
-def _gauge(found: KnownDistances, reference: float | None) -> str:
+def _gauge(found: KnownDistances) -> str:
     """Return in words how the common constant of delays and curve was chosen."""
     carrier = "constants of pairs" if found.model.settings.constants == "pair" else "delays"
     if found.model.curve is None:
         return f"no curve; the {carrier} carry the constant"
     if not _has_gauge(found):
         return "pinned delays; the curve carries the constant"
-    if reference is None:
+    if found.model.reference is None:
         return "that of the recipe: delays as fitted without a curve, which carries the constant"
-    return f"the bias curve is zero at {reference:g} dBm; the {carrier} carry the constant"
+    return f"the bias curve is zero at {found.model.reference_dbm:g} dBm; the {carrier} carry the constant"
