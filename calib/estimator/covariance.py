@@ -78,11 +78,11 @@ def sandwich(
         lasting = persistence(series @ group.combinations.T, slopes.blocks, group.independent)
         width = max(lasting.quantile95, float(stdtrit(group.freedom, 0.975))) / TWO_SIDED_95
         sampled = inflation * lasting.factor * width**2 * (series.T @ series)
-        found[name] = sampled + reach.T @ (stated @ reach) + _of_weights(optimum, group.indices), lasting
+        found[name] = sampled + reach.T @ (stated @ reach) + of_weights(optimum, group.indices), lasting
     return found
 
 
-def _of_weights(optimum: Optimum, keep: Ints) -> Floats:
+def of_weights(optimum: Optimum, keep: Ints) -> Floats:
     """Return the covariance (k, k) that uncertain weights of priors add to that of some unknowns (k,).
 
     A change of the logarithm of a weight moves the unknowns by covariance times precision times their distance from the

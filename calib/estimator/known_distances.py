@@ -73,11 +73,6 @@ class Fitted:
     steps: int
     beside: tuple[Rows, ...] = ()
 
-    @property
-    def values(self) -> dict[str, Floats]:
-        """Return the unknowns by kind."""
-        return self.optimum.by_kind()
-
 
 @dataclass(frozen=True, kw_only=True)
 class KnownDistances:
@@ -97,11 +92,6 @@ class KnownDistances:
     blocks: TimeBlocks
     slopes: Slopes
     residuals: Floats
-
-    @property
-    def free(self) -> list[list[int]]:
-        """Return groups of tags whose delays the pairs leave free."""
-        return self.model.free
 
     @property
     def delays(self) -> Floats:
@@ -193,7 +183,7 @@ def robust_fit(
     layout, whole = model.build(error, Robust(weights=weights, scale_m=1.0), only=kinds)
     every = whole if weight is None else whole.sample(np.flatnonzero(weight))
     gauge = (*model.gauge_rows(layout), *model.held_rows(layout))
-    rows, x = every, layout.start(start.values if start is not None else None)
+    rows, x = every, layout.start(start.optimum.by_kind() if start is not None else None)
     if sample is not None and sample < len(error):
         # A fixed random choice: a regular one could coincide with the schedule of pairs.
         rows = every.sample(np.sort(np.random.default_rng(0).permutation(len(error))[:sample]))
@@ -207,7 +197,7 @@ def robust_fit(
     if sample is None:
         found = maximize([replace(rows, errors=errors), *gauge], priors, x, steps=200, evidence_steps=0)
         x, steps = found.x, steps + found.steps
-        final = replace(rows, errors=replace(errors.tempered(rows.residuals(x)), reweighted=False))
+        final = replace(rows, errors=replace(errors.tempered(rows.residuals(x)), least=None))
         ended = maximize([final, *gauge], priors, x, steps=20, evidence_steps=0)
         if ended.success and _convex(ended):
             found, rows = ended, final
@@ -247,7 +237,7 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted) -> Fitted:
     layout, rows = model.build(error, errors, unknowns, parts)
     gauge = (*model.gauge_rows(layout), *model.held_rows(layout))
     asked = layout.indices([u.kind for u in model.unknowns])
-    found, steps = _maximize_by_samples(rows, gauge, layout, layout.start(pilot.values), asked)
+    found, steps = _maximize_by_samples(rows, gauge, layout, layout.start(pilot.optimum.by_kind()), asked)
     return Fitted(
         rows=rows,
         gauge=gauge,
@@ -288,7 +278,7 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDis
         covariances["delay"] = covariances["delay"] + _of_another_shape(fitted.optimum)
     return KnownDistances(
         model=model,
-        values=model.at_reference(fitted.values),
+        values=model.at_reference(fitted.optimum.by_kind()),
         covariances=covariances,
         searches=(fitted,),
         persistence=found[next(iter(kept))][1],

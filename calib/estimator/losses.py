@@ -25,10 +25,6 @@ class RobustLoss:
     name: str
     weights: Weights
 
-    def __call__(self, u: Floats) -> tuple[Floats, Floats]:
-        """Return weights and slopes at residuals over scale (n,)."""
-        return self.weights(u)
-
 
 def _cauchy(u: Floats) -> tuple[Floats, Floats]:
     weight = 1 / (1 + u**2)

@@ -130,20 +130,6 @@ class Tested:
     blocks: int
 
 
-@dataclass(slots=True)
-class _Sums:
-    """Sums over ranges for offsets of a family (k).
-
-    By block of time, `plain` (blocks, k) of slopes and `known` (blocks, k) of what residuals know; `square` (k, k) is
-    what offsets know of each other, `link` (k, p) what they share with the unknowns.
-    """
-
-    plain: Floats
-    known: Floats
-    square: Floats
-    link: Floats
-
-
 class Slopes:
     """The slopes of a fit's ranges by the residual and by all unknowns, as sums and products that tests are made of.
 
@@ -174,7 +160,7 @@ class Slopes:
 
     def link(self, derivative: Derivative | sparse.csr_matrix) -> Floats:
         """Return what links offsets, as derivatives (n, k) of given ranges, to all unknowns (k, p)."""
-        return self._sums([derivative])[0].link
+        return self._sums([derivative])[0][3]
 
     def test(self, family: Family) -> Tested:
         """Return a family's efficient slopes."""
@@ -185,12 +171,14 @@ class Slopes:
         sums = self._sums([family.derivative for family in families])
         return [self._tested(family, own) for family, own in zip(families, sums, strict=True)]
 
-    def _sums(self, derivatives: Sequence[Derivative | sparse.csr_matrix]) -> list[_Sums]:
-        """Return sums over all ranges for offsets with derivatives (n, k) of given ranges."""
+    def _sums(self, derivatives: Sequence[Derivative | sparse.csr_matrix]) -> list[list[Floats]]:
+        """Return sums over all ranges for offsets with derivatives (n, k) of given ranges.
+
+        By block of time, those of slopes (blocks, k) and of what residuals know (blocks, k); then what offsets know of
+        each other (k, k), and what they share with the unknowns (k, p).
+        """
         (blocks, size), counts = self.own.shape, [each.shape[1] for each in derivatives]
-        sums = [
-            _Sums(np.zeros((blocks, k)), np.zeros((blocks, k)), np.zeros((k, k)), np.zeros((k, size))) for k in counts
-        ]
+        sums = [[np.zeros(shape) for shape in ((blocks, k), (blocks, k), (k, k), (k, size))] for k in counts]
         for which, terms in self._pieces():
             in_block = self.blocks.summing(self.order[which])
             matrices = [
@@ -200,15 +188,15 @@ class Slopes:
             for own, derivative in zip(sums, derivatives, strict=True):
                 kept = derivative[self.order[which]]
                 told = sparse.diags(self.tells[which])
-                own.plain += (in_block @ sparse.diags(self.score[which]) @ kept).toarray()
-                own.known += (in_block @ told @ kept.power(2)).toarray()
-                own.square += (kept.T @ told @ kept).toarray()
+                own[0] += (in_block @ sparse.diags(self.score[which]) @ kept).toarray()
+                own[1] += (in_block @ told @ kept.power(2)).toarray()
+                own[2] += (kept.T @ told @ kept).toarray()
                 for weight, matrix in matrices:
-                    own.link += (kept.T @ sparse.diags(weight) @ matrix).toarray()
+                    own[3] += (kept.T @ sparse.diags(weight) @ matrix).toarray()
         return sums
 
-    def _tested(self, family: Family, sums: _Sums) -> Tested:
-        plain, known, square, link = sums.plain, sums.known, sums.square, sums.link
+    def _tested(self, family: Family, sums: Sequence[Floats]) -> Tested:
+        plain, known, square, link = sums
         taken = self._taken(link, family.fitted)
         efficient, information = plain - self.own @ taken.T, square - taken @ link.T
         whole = max(float(np.diag(square).max()), 1e-300)

@@ -61,7 +61,7 @@ def calibration_of(found: KnownDistances, delays_ns2: Floats) -> Calibration:
     model, search, settings = found.model, found.searches[0], found.model.settings
     names, fixed = model.unknowns[0].names, settings.fixed_ns
     of_pairs = settings.constants == "pair"
-    free = {tag for group in found.free for tag in group}
+    free = {tag for group in found.model.free for tag in group}
     std = [
         math.inf if not of_pairs and int(name) in free else math.sqrt(max(value, 0.0))
         for name, value in zip(names, np.diag(delays_ns2), strict=True)

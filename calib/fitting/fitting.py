@@ -38,7 +38,7 @@ from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
 from calib.fitting.result import FitResult, HeldOut
 from calib.settings import FitSettings, check_tag
-from uwblink.arrays import Bools, Floats
+from uwblink.arrays import Bools
 from uwblink.recording.antenna_delays import delays_differ, known_delays
 
 INLIER_SIGMAS = 3.0
@@ -85,7 +85,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     calibration = replace(calibration, delays_std_ns=stated | taken)
     held = _held_out(ranges, settings) if settings.hold_out else None
     provenance = {
-        **({"undetermined": found.free} if found.free else {}),
+        **({"undetermined": found.model.free} if found.model.free else {}),
         **({} if found.model.reference_dbm is None else {"reference_power_dbm": found.model.reference_dbm}),
         "recordings": ranges.source.split(", "),
         "recording_ids": [name for _, name in ranges.recordings],
@@ -197,7 +197,11 @@ def result_of(
     `findings` are sentences of the checks of the fit; the warnings of a kind of fit are `first`, or `more` after the
     limits of the ranges.
     """
-    residuals, inliers, over_sigma = _left(calibration, ranges)
+    # The error model is not needed here.
+    applied = replace(calibration, errors=None).apply(ranges)
+    residuals = applied.corrected_m - ranges.truth_m
+    over_sigma = residuals / applied.sigma_m
+    inliers: Bools = np.asarray(np.abs(over_sigma) < INLIER_SIGMAS)
     if calibration.errors is not None:
         known = replace(calibration.errors, lasting=lasting_errors(ranges, over_sigma))
         calibration = replace(calibration, errors=known)
@@ -210,7 +214,7 @@ def result_of(
         *implausible(calibration.delays_ns, residuals),
         *unlike_powers(ranges, calibration),
         *_beyond(found),
-        *warnings_of(ranges, float(np.mean(inliers)), found.free, found.blocks.seconds),
+        *warnings_of(ranges, float(np.mean(inliers)), found.model.free, found.blocks.seconds),
     ]
     provenance: dict[str, Any] = {
         "writer": f"uwbcal {uwblink.__version__}",
@@ -257,15 +261,6 @@ def _judged(held: HeldOut, settings: FitSettings) -> dict[str, Any]:
         "inside_95": found.inside_95,
     }
     return {name: for_json(value) for name, value in judged.items()}
-
-
-def _left(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Bools, Floats]:
-    """Return the corrected errors of ranges (n,), whether they are within three sigmas, and the errors over sigma."""
-    # The error model is not needed here.
-    applied = replace(calibration, errors=None).apply(ranges)
-    left = applied.corrected_m - ranges.truth_m
-    over_sigma = left / applied.sigma_m
-    return left, np.asarray(np.abs(over_sigma) < INLIER_SIGMAS), over_sigma
 
 
 def _stopped(found: KnownDistances, asked_for: str | None) -> list[str]:

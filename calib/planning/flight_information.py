@@ -74,7 +74,7 @@ class Errors:
             "outliers": none,
             "long": none,
         }
-        found = error_slopes(error, {name: np.log([value]) for name, value in sizes.items()}, span_m=1.0)
+        found = error_slopes(error, {name: np.log([value]) for name, value in sizes.items()})
         weight = np.exp(found.log_density)
         return float(weight @ found.by[RESIDUAL] ** 2 / weight.sum())
 

@@ -216,9 +216,9 @@ def _result(
             "regardless, and says so)",
             undetermined=[free],
         )
-    undetermined = found.free
+    undetermined = found.model.free
     # Delays that the pairs leave free are held at the smallest values, so that their covariance says nothing of them.
-    if not {tag for group in found.free for tag in group}.issuperset(free):
+    if not {tag for group in found.model.free for tag in group}.issuperset(free):
         left_open, undetermined = undetermined_text, [free]
     calibration = calibration_of(found, covariance)
     if known is not None:
@@ -279,8 +279,10 @@ def _provenance(found: KnownDistances, top: Search, flight: FlightSettings) -> d
 
 
 def variance_factor(scene: Scene) -> float:
-    """Return the factor on covariances, which is larger where only geometry determines distances."""
-    return GEOMETRY_ALONE_FACTOR**2 if scene.by_geometry_alone else 1.0
+    """Return the factor on covariances: more than 1 where only lever arms determine the scale of distances."""
+    given = sum(place is not None for place in scene.still.values())
+    measured = len(scene.places) or len(scene.heights) or scene.inertial or len(scene.tapes)
+    return 1.0 if given >= 2 or measured else GEOMETRY_ALONE_FACTOR**2
 
 
 def _judge_delays(found: KnownDistances, top: Search) -> tuple[Ints, Verdict]:

@@ -86,7 +86,7 @@ class Motion:
             turns=Grid(begin, TURN_S, max(int(np.ceil(length / TURN_S)), 1) + 1),
             bodies={
                 "path": scene.moving,
-                "turn": [body for body, known in scene.attitudes.items() if not known.exact],
+                "turn": [body for body, one in scene.attitudes.items() if one.std_rad.any() or one.wander_rad.any()],
                 "stand": scene.sought,
                 "bias": list(scene.inertial),
                 "level": [scene.moving[k] for k in np.unique(scene.heights.body)],

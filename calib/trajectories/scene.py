@@ -47,12 +47,6 @@ class Scene:
         """Return the standing bodies whose positions are estimated."""
         return [body for body, place in self.still.items() if place is None]
 
-    @property
-    def by_geometry_alone(self) -> bool:
-        """Whether only the geometry of lever arms determines the scale of distances."""
-        given = sum(place is not None for place in self.still.values())
-        return given < 2 and not (len(self.places) or len(self.heights) or self.inertial or len(self.tapes))
-
     def between(self, begin_s: float, end_s: float) -> Scene:
         """Return the part of the scene within a span of time."""
         rows = np.flatnonzero((self.time_s >= begin_s) & (self.time_s <= end_s))
