@@ -16,7 +16,7 @@ from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, kn
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.grouped_errors import error_unknowns, scattered
-from calib.estimator.identifiability import free_directions, square_of
+from calib.estimator.identifiability import free_directions
 from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Unknown
@@ -251,13 +251,12 @@ class RangeModel:
 
 def _free_directions(ranges: Ranges, tags: list[int], settings: FitSettings) -> tuple[Floats, list[list[int]]]:
     """Return the directions of delays (tags, k) that the pairs leave free, and their tags."""
-    own = [k for k, tag in enumerate(tags) if tag not in settings.fixed_ns]
+    own = [tag for tag in tags if tag not in settings.fixed_ns]
     if not own or settings.constants == "pair":
         return np.zeros((len(tags), 0)), []
-    square, ends = square_of(tags, ranges.initiator, ranges.target, ranges.weight_initiator, ranges.weight_target)
-    directions, free = free_directions(square[np.ix_(own, own)], [tags[k] for k in own], ends)
+    directions, free = free_directions(own, ranges)
     held = np.zeros((len(tags), directions.shape[1]))
-    held[own] = directions
+    held[np.isin(tags, own)] = directions
     return held, free
 
 

@@ -41,8 +41,6 @@ from calib.settings import FitSettings, check_tag
 from uwblink.arrays import Bools
 from uwblink.recording.antenna_delays import delays_differ, known_delays
 
-INLIER_SIGMAS = 3.0
-
 MIN_RANGES = 50
 """With so many ranges one delay has a standard error of a seventh of the noise of a range, 0.03 ns."""
 
@@ -201,7 +199,7 @@ def result_of(
     applied = replace(calibration, errors=None).apply(ranges)
     residuals = applied.corrected_m - ranges.truth_m
     over_sigma = residuals / applied.sigma_m
-    inliers: Bools = np.asarray(np.abs(over_sigma) < INLIER_SIGMAS)
+    inliers: Bools = np.asarray(np.abs(over_sigma) < 3.0)
     if calibration.errors is not None:
         known = replace(calibration.errors, lasting=lasting_errors(ranges, over_sigma))
         calibration = replace(calibration, errors=known)

@@ -31,6 +31,7 @@ from uwblink.ticks import REPORT_BITS, SPEED_OF_LIGHT, TICK_S, elapsed
 MIN_OVERHEARD: Final = 50
 """Of so many, the mean is known to a seventh of the noise of a delay; of fewer it would tell little."""
 PLAUSIBLE_NS: Final = 100.0
+"""Longer delays come of wrong stamps: published ones are below 1 ns, beside those that are programmed."""
 
 
 @dataclass(frozen=True, slots=True)

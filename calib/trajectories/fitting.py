@@ -247,10 +247,9 @@ def _result(
 
 def _with_curve(calibration: Calibration, known: Calibration) -> Calibration:
     """Return a calibration with the curve of another one and the covariance of that curve."""
-    uncertainty, size = calibration.uncertainty, len(known.bias_curve.coefficients)
-    if uncertainty is not None:
-        of_curve = known.uncertainty.bias_m2 if known.uncertainty else ((0.0,) * size,) * size
-        uncertainty = replace(uncertainty, bias_m2=of_curve)
+    size = len(known.bias_curve.coefficients)
+    of_curve = known.uncertainty.bias_m2 if known.uncertainty else ((0.0,) * size,) * size
+    uncertainty = calibration.uncertainty and replace(calibration.uncertainty, bias_m2=of_curve)
     return replace(calibration, bias_curve=known.bias_curve, uncertainty=uncertainty)
 
 
@@ -327,7 +326,7 @@ def with_known_distances(information: Matrix, layout: Layout, own: Ints) -> Floa
 
     `information` (p, p) is that of ranges and priors; the unknowns of motion are held.
     """
-    others = np.setdiff1d(layout.free(), layout.indices(MOTION))
+    others = np.setdiff1d(layout.free(), layout.indices(list(MOTION)))
     some = information[others][:, others]
     dense = some.toarray() if sparse.issparse(some) else some
     place = np.searchsorted(others, own)
