@@ -115,26 +115,16 @@ def read_fixed(texts: Iterable[str]) -> dict[int, float]:
     return fixed
 
 
-def read_groups(path: Path) -> dict[str, tuple[int, ...]]:
-    """Read a design file: a table `groups` that maps names to lists of tags; raises `BadInputError`."""
+def read_groups(path: Path) -> dict[str, Any]:
+    """Read a design file: a table `groups` that maps names to lists of tags, which `FitSettings` checks.
+
+    Raises `BadInputError` for another file.
+    """
     table = TomlReader(path, partial(BadInputError, parameter="groups")).table
     groups = table.get("groups")
     if not isinstance(groups, dict) or not groups or set(table) != {"groups"}:
         raise BadInputError(f"{path}: expected one table [groups], as in: monopole = [1, 2]", parameter="groups")
-    for name, tags in groups.items():
-        if not isinstance(tags, list):
-            raise BadInputError(f"{path}: {name}: expected a list of tag ids, as in [1, 2]", parameter="groups")
-    return {name: tuple(tags) for name, tags in groups.items()}
-
-
-def _checked_delays(fixed_ns: Mapping[int, float] | None) -> dict[int, float]:
-    """Return known delays by tag; raises `BadInputError` for what is no tag or no number."""
-    for tag, delay in (fixed_ns or {}).items():
-        if not (is_tag(tag) and _is_finite(delay)):
-            raise BadInputError(
-                f"found {tag!r}: {delay!r}, expected a tag id and its delay in ns", parameter="fixed_ns"
-            )
-    return {int(tag): float(delay) for tag, delay in (fixed_ns or {}).items()}
+    return groups
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +142,12 @@ class CheckedSettings:
                 if not (_is_finite(value) and least <= value <= most):
                     raise BadInputError(f"found {value!r}, expected {expected}", parameter=name)
             if name == "fixed_ns":
-                object.__setattr__(self, name, _checked_delays(value))
+                for tag, delay in (value or {}).items():
+                    if not (is_tag(tag) and _is_finite(delay)):
+                        raise BadInputError(
+                            f"found {tag!r}: {delay!r}, expected a tag id and its delay in ns", parameter=name
+                        )
+                object.__setattr__(self, name, {int(tag): float(delay) for tag, delay in (value or {}).items()})
 
     def changed(self) -> dict[str, Any]:
         """Return the settings that are not the defaults, as JSON has them: what calibrations and reports repeat."""

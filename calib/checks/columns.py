@@ -11,7 +11,7 @@ import numpy as np
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.checks.recording_view import RecordingView
 from calib.data.clocks import left_skew, pair_ids
-from calib.estimator.identifiability import free_directions, square_of
+from calib.estimator.identifiability import free_directions
 from calib.findings import Candidate, exceeds, more_often
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats
@@ -247,9 +247,7 @@ def undetermined(view: RecordingView) -> Iterator[Candidate]:
     """Pairs that leave antenna delays undetermined."""
     some = view.ranges[np.isfinite(view.ranges.weight_initiator) & np.isfinite(view.ranges.weight_target)]
     if len(some):
-        tags = some.tags()
-        square, ends = square_of(tags, some.initiator, some.target, some.weight_initiator, some.weight_target)
-        _, free = free_directions(square, tags, ends)
+        _, free = free_directions(some.tags(), some)
         if free:
             groups = "; ".join(", ".join(map(str, group)) for group in free)
             yield Candidate("too few pairs", f"the pairs do not determine the delays of tags {groups}")

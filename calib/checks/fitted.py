@@ -41,8 +41,7 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
 
     Returns the covariance (tags, tags) of the stated delays in ns^2 with what does not fit, and what to say of it.
     """
-    slopes = slopes_of(found)
-    louder, alone = change_per_decibel(found), len(found.searches) > 1
+    slopes, louder, alone = found.slopes, change_per_decibel(found), len(found.searches) > 1
     tested = slopes.tests(list(families(found, louder, beside_curve=not alone)))
     findings = _without_repeats(search(tested, OF_A_FIT))
     plain = found.covariances["delay"]
@@ -108,13 +107,6 @@ def of_pairs(found: KnownDistances) -> Family:
         derivative=Derivative(pairs.number[:, None], UNIT, len(pairs.ends)),
         fitted=found.searches[0].optimum.layout.indices(["offset of pair"]),
     )
-
-
-def slopes_of(found: KnownDistances) -> Slopes:
-    """Return the slopes of the fit of the delays."""
-    search = found.searches[0]
-    layout = search.optimum.layout
-    return Slopes(search.rows, search.optimum, found.blocks, np.eye(layout.size)[layout.where["delay"]])
 
 
 def _of_sessions(found: KnownDistances, tags: list[str], ends: Ints) -> Family:

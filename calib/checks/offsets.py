@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from scipy import sparse, special
 
-from calib.checks.fitted import of_pairs, shares_of_pairs, slopes_of
+from calib.checks.fitted import of_pairs, shares_of_pairs
 from calib.checks.geometry import anchors, places_m
 from calib.checks.recording_view import Offsets, QuickFit, RecordingView, quick_fit
 from calib.errors import CalibError
@@ -51,7 +51,7 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
             return
         # The pairs of the fit among all.
         at = np.flatnonzero((pairs.ends[:, None] == found.model.pairs.ends).all(axis=2).any(axis=1))
-        beside, before = slopes_of(found).test(of_pairs(found)), offset_m
+        beside, before = found.slopes.test(of_pairs(found)), offset_m
         spread_m = robust_spread(beside.total / np.maximum(np.diag(beside.information), 1e-300), 0.0)
         tested = replace(beside, total=beside.total - beside.information @ before[at])
         offset_m, names = np.zeros(len(before)), list(tested.family.names)

@@ -267,7 +267,7 @@ def _fitted(model: RangeModel, error: Floats, rows: Ints) -> QuickFit:
         start=start,
         residual=whole.residuals(optimum.x),
         time_s=np.asarray(short.number * (short.seconds / short.count), dtype=np.float64),
-        slopes=Slopes(whole, optimum, replace(short, number=number, bounds=bounds), np.zeros((0, layout.size))),
+        slopes=Slopes(whole, optimum, replace(short, number=number, bounds=bounds)),
     )
 
 

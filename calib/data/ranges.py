@@ -13,7 +13,9 @@ from scipy import ndimage
 
 from calib.data.clocks import ClocksApart, LeftSkew, clocks_apart, left_skew
 from calib.errors import BadInputError, UnanswerableError
+from calib.pairs import pairs_of
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
+from uwblink.errors import raising
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, known_delays
 from uwblink.recording.distances import distances_m
@@ -164,12 +166,10 @@ class Ranges(ColumnTable):
             "weight_target": weights[1],
         }
         ints = {"initiator": initiator, "target": target, "time_ns": time_ns}
-        try:
+        with raising(BadInputError, "arrays of ranges do not fit each other", TypeError, ValueError):
             arrays = [np.asarray(column, dtype=np.float64) for column in floats.values()]
             arrays += [np.asarray(column).astype(np.int64, casting="same_kind") for column in ints.values()]
             rows = np.broadcast_arrays(*np.atleast_1d(*arrays))
-        except (TypeError, ValueError) as error:
-            raise BadInputError(f"arrays of ranges do not fit each other: {error}") from error
         if rows[0].ndim != 1:
             raise BadInputError(f"has shape {np.shape(range_m)}, expected one dimension", parameter="range_m")
         columns: dict[str, Any] = dict(zip([*floats, *ints], rows, strict=True))
@@ -303,8 +303,8 @@ def without_static(ranges: Ranges, *, span_s: float = 2.0, within_m: float = 0.0
     nothing ever moves.
     """
     span = (ranges.time_ns - ranges.time_ns.min()) // int(span_s * 1e9)
-    low, high = np.minimum(ranges.initiator, ranges.target), np.maximum(ranges.initiator, ranges.target)
-    group = np.unique((span * 65_536 + low) * 65_536 + high, return_inverse=True)[1]
+    pairs = pairs_of(ranges.initiator, ranges.target)
+    group = np.unique(span * len(pairs.ends) + pairs.number, return_inverse=True)[1]
     every = np.arange(group.max() + 1)
     reach = ndimage.maximum(ranges.truth_m, group, every) - ndimage.minimum(ranges.truth_m, group, every)
     moves = reach[group] > within_m
@@ -320,8 +320,7 @@ def held_out(ranges: Ranges, share: float, fold: str) -> Bools:
     Raises `UnanswerableError` where that leaves nothing to fit or nothing to judge by.
     """
     if fold == "pair":
-        ends = np.sort(np.column_stack([ranges.initiator, ranges.target]), axis=1)
-        unit = np.unique(ends, axis=0, return_inverse=True)[1].ravel()
+        unit = pairs_of(ranges.initiator, ranges.target).number
     elif fold == "session":
         unit = np.unique(ranges.session, return_inverse=True)[1]
     else:

@@ -52,9 +52,8 @@ def sample_flight(count: int = 900, *, seed: int = 1, anchors: bool = False) -> 
     """
     rng = np.random.default_rng(seed)
     time_ns = 1_000_000_000 + np.arange(count) * 10_000_000
-    pairs: list[tuple[int, int]] = [(1, 2), (2, 3), (3, 1)]
-    if anchors:
-        pairs = [(1, 2), (1, 3), (1, 4), (1, 5), (2, 3), (3, 4), (4, 5), (5, 2)]
+    among_anchors = [(1, 2), (1, 3), (1, 4), (1, 5), (2, 3), (3, 4), (4, 5), (5, 2)]
+    pairs = among_anchors if anchors else [(1, 2), (2, 3), (3, 1)]
     pair, fixed = np.array(pairs)[np.arange(count) % len(pairs)], (2, 3, 4, 5) if anchors else ()
     initiator, target = pair.T
     away = np.linalg.norm(_place(initiator, time_ns, fixed) - _place(target, time_ns, fixed), axis=1)

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final, Protocol, runtime_checkable
@@ -54,42 +54,31 @@ Data = str | os.PathLike[str] | Recording | Source | Exchanges | Ranges
 
 
 READERS: Final[dict[str, Callable[[Recording], Any]]] = {
+    "exchanges": Recording.exchanges,
+    "poses": Recording.poses,
+    "tags": Recording.tags,
     "meta": Recording.meta,
     "faults": Recording.faults,
     **{table: partial(Recording.columns, table=table) for table in ("overheard", "imu", "height")},
     "arrangements": Recording.arrangements,
     "known_distances": Recording.known_distances,
 }
-"""The tables of a recording beside exchanges, poses and tags, and the functions that read them."""
+"""What a recording holds, and the functions that read it."""
 
 
 class RecordedSource:
-    """An open recording as a `Source` with the tables of `READERS`; each is read when it is first used."""
+    """An open recording as a `Source` with all that `READERS` read."""
 
     def __init__(self, recording: Recording) -> None:
         """Take a recording, which must stay open."""
         self.recording = recording
 
-    @cached_property
-    def exchanges(self) -> Exchanges:
-        """Return the exchanges."""
-        return self.recording.exchanges()
-
-    @cached_property
-    def poses(self) -> Poses:
-        """Return the poses."""
-        return self.recording.poses()
-
-    @cached_property
-    def tags(self) -> list[Tag]:
-        """Return the tags."""
-        return self.recording.tags()
-
     def __getattr__(self, name: str) -> Any:
-        """Return what another table holds."""
+        """Read a table when it is first used."""
         if name not in READERS:
             raise AttributeError(name)
-        return READERS[name](self.recording)
+        self.__dict__[name] = READERS[name](self.recording)
+        return self.__dict__[name]
 
 
 @contextmanager

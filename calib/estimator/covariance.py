@@ -16,9 +16,9 @@ from scipy.special import stdtrit
 
 from calib.estimator.inverse import trace_of_product
 from calib.estimator.optimize import Optimum
-from calib.estimator.range_rows import RangeRows
 from calib.estimator.rows import Rows, sum_rows
-from calib.estimator.time_blocks import Persistence, TimeBlocks, persistence
+from calib.estimator.score_tests import Slopes
+from calib.estimator.time_blocks import Persistence, persistence
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 
@@ -55,17 +55,17 @@ class Kept:
 
 
 def sandwich(
-    optimum: Optimum, rows: RangeRows, kept: Mapping[str, Kept], blocks: TimeBlocks, beside: Sequence[Rows] = ()
+    slopes: Slopes, kept: Mapping[str, Kept], beside: Sequence[Rows] = ()
 ) -> dict[str, tuple[Floats, Persistence]]:
     """Return the covariance (k, k) of each group of kept unknowns by its name, and the persistence of its errors.
 
     1.96 standard errors make 95 % intervals: the factor of small samples is included. The standard errors of rows
     `beside` ranges (poses, tapes) are taken as stated.
     """
-    sums, count, found = block_sums(rows, optimum.x, blocks), len(rows), {}
+    optimum, count, found = slopes.optimum, len(slopes.rows), {}
     information, stated = optimum.information, optimum.priors.precision()
     if beside:
-        information, others = (sum_rows(some, optimum.x).information for some in ([rows], beside))
+        information, others = (sum_rows(some, optimum.x).information for some in ([slopes.rows], beside))
         stated = stated + others
     # Slopes at the optimum are smaller than at the truth: with information I and penalty P, the squares of so many
     # ranges are smaller by the share tr((I + P)^-1 I) / n on average, the unknowns that ranges determine by their
@@ -74,8 +74,8 @@ def sandwich(
     inflation = count / max(count - used, 0.2 * count)
     for name, group in kept.items():
         reach = optimum.covariance[:, group.indices]
-        series = sums @ reach
-        lasting = persistence(series @ group.combinations.T, blocks, group.independent)
+        series = slopes.own @ reach
+        lasting = persistence(series @ group.combinations.T, slopes.blocks, group.independent)
         width = max(lasting.quantile95, float(stdtrit(group.freedom, 0.975))) / TWO_SIDED_95
         sampled = inflation * lasting.factor * width**2 * (series.T @ series)
         found[name] = sampled + reach.T @ (stated @ reach) + of_weights(optimum, group.indices), lasting
@@ -98,15 +98,4 @@ def of_weights(optimum: Optimum, keep: Ints) -> Floats:
             pull = (optimum.covariance @ pulled)[keep]
             free = priors.ranks[k] - weight * trace_of_product(optimum.covariance, structure, where)
             found += np.outer(pull, pull) * (2 / max(free, 1.0))
-    return found
-
-
-def block_sums(rows: RangeRows, x: Floats, blocks: TimeBlocks) -> Floats:
-    """Return the slopes of the ranges' log likelihood by all unknowns (p,), summed by block of time: (blocks, p)."""
-    found, at = np.zeros((blocks.count, len(x))), 0
-    for terms in rows.terms(x):
-        slopes = terms.as_matrix(terms.slopes, len(x))
-        given = rows.order[at : at + slopes.shape[0]]
-        found += (blocks.summing(given) @ slopes).toarray()
-        at += len(given)
     return found

@@ -8,7 +8,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from uwblink.arrays import Floats, Ints
+from calib.data.ranges import Ranges
+from uwblink.arrays import Floats
 
 UNDETERMINED: Final = 1e-8
 """Smallest share of the largest eigenvalue at which a direction counts as determined.
@@ -17,26 +18,23 @@ Clock ratios differ from 1 by parts per million, which lifts a free direction to
 """
 
 
-def square_of(tags: list[int], initiator: Ints, target: Ints, first: Floats, second: Floats) -> tuple[Floats, Ints]:
-    """Return the square (tags, tags) of the derivatives of ranges (n,) by the delays of tags, and their pairs (k, 2).
-
-    `first` and `second` are the weights of the delays of initiator and target.
-    """
-    rows = np.arange(len(initiator))
-    columns = [np.searchsorted(tags, ids) for ids in (initiator, target)]
-    place = (np.tile(rows, 2), np.concatenate(columns))
-    design = sparse.csr_matrix((np.concatenate([first, second]), place), shape=(len(rows), len(tags)))
-    square = np.asarray((design.T @ design).toarray())
-    return square, np.array(tags)[np.argwhere(square - np.diag(np.diag(square)))]
-
-
-def free_directions(square: Floats, tags: list[int], pairs: Ints) -> tuple[Floats, list[list[int]]]:
+def free_directions(tags: list[int], ranges: Ranges) -> tuple[Floats, list[list[int]]]:
     """Return the directions that ranges leave free, (tags, k) of length one, and the tags that they shift.
 
-    `square` (tags, tags) is that of the derivatives of ranges by the delays, `pairs` (pairs, 2) are the ids that range.
-    The free tags come in groups that shift together: tags that range only with tags of another group (anchors against
-    robots, a single pair) can shift by +a and -a without a trace in any range.
+    `tags` are those whose delays are not known. The free tags come in groups that shift together: tags that range only
+    with tags of another group (anchors against robots, a single pair) can shift by +a and -a without a trace in any
+    range.
     """
+    ends, weights = (
+        np.concatenate(both)
+        for both in ((ranges.initiator, ranges.target), (ranges.weight_initiator, ranges.weight_target))
+    )
+    rows = np.flatnonzero(np.isin(ends, tags))
+    place = (rows % len(ranges), np.searchsorted(tags, ends[rows]))
+    design = sparse.csr_array((weights[rows], place), shape=(len(ranges), len(tags)))
+    # The square of the derivatives of ranges by the delays: pairs of tags that range have an entry.
+    square = np.asarray((design.T @ design).toarray())
+    pairs = np.array(tags)[np.argwhere(square - np.diag(np.diag(square)))]
     values, vectors = np.linalg.eigh(square)
     loose = vectors[:, values < UNDETERMINED * values[-1]]
     free = np.array(tags)[np.abs(loose).max(axis=1, initial=0.0) > 1e-3]

@@ -21,6 +21,7 @@ from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import METRES_A_NS, RangeModel
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows, Robust
 from calib.estimator.rows import NormalRows, Rows
+from calib.estimator.score_tests import Slopes
 from calib.estimator.time_blocks import Persistence, TimeBlocks, in_order, time_blocks
 from calib.estimator.unknowns import Layout, Priors, Unknown
 from calib.range_errors.densities import ErrorSlopes
@@ -72,11 +73,6 @@ class Fitted:
     steps: int
     beside: tuple[Rows, ...] = ()
 
-    @property
-    def values(self) -> dict[str, Floats]:
-        """Return the unknowns by kind."""
-        return self.optimum.by_kind()
-
 
 @dataclass(frozen=True, kw_only=True)
 class KnownDistances:
@@ -84,7 +80,8 @@ class KnownDistances:
 
     `values` are unknowns by kind, `covariances` those of "delay", of all curves side by side ("curve") and of the noise
     ("noise"). `residuals` (n,) are fitted less true ranges in the order of the model's ranges, metres. `searches` are
-    the one search, or that of the delays and that of the curves. `persistence` is that of errors of delays.
+    the one search, or that of the delays and that of the curves. `persistence` is that of errors of delays, and
+    `slopes` are those of the first search.
     """
 
     model: RangeModel
@@ -93,12 +90,8 @@ class KnownDistances:
     searches: tuple[Fitted, ...]
     persistence: Persistence
     blocks: TimeBlocks
+    slopes: Slopes
     residuals: Floats
-
-    @property
-    def free(self) -> list[list[int]]:
-        """Return groups of tags whose delays the pairs leave free."""
-        return self.model.free
 
     @property
     def delays(self) -> Floats:
@@ -190,7 +183,7 @@ def robust_fit(
     layout, whole = model.build(error, Robust(weights=weights, scale_m=1.0), only=kinds)
     every = whole if weight is None else whole.sample(np.flatnonzero(weight))
     gauge = (*model.gauge_rows(layout), *model.held_rows(layout))
-    rows, x = every, layout.start(start.values if start is not None else None)
+    rows, x = every, layout.start(start.optimum.by_kind() if start is not None else None)
     if sample is not None and sample < len(error):
         # A fixed random choice: a regular one could coincide with the schedule of pairs.
         rows = every.sample(np.sort(np.random.default_rng(0).permutation(len(error))[:sample]))
@@ -204,7 +197,7 @@ def robust_fit(
     if sample is None:
         found = maximize([replace(rows, errors=errors), *gauge], priors, x, steps=200, evidence_steps=0)
         x, steps = found.x, steps + found.steps
-        final = replace(rows, errors=replace(errors.tempered(rows.residuals(x)), reweighted=False))
+        final = replace(rows, errors=replace(errors.tempered(rows.residuals(x)), least=None))
         ended = maximize([final, *gauge], priors, x, steps=20, evidence_steps=0)
         if ended.success and _convex(ended):
             found, rows = ended, final
@@ -244,7 +237,7 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted) -> Fitted:
     layout, rows = model.build(error, errors, unknowns, parts)
     gauge = (*model.gauge_rows(layout), *model.held_rows(layout))
     asked = layout.indices([u.kind for u in model.unknowns])
-    found, steps = _maximize_by_samples(rows, gauge, layout, layout.start(pilot.values), asked)
+    found, steps = _maximize_by_samples(rows, gauge, layout, layout.start(pilot.optimum.by_kind()), asked)
     return Fitted(
         rows=rows,
         gauge=gauge,
@@ -278,17 +271,19 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDis
         "noise": Kept.curve(layout.indices(noise_kinds(layout))),
     }
     kept = {name: group for name, group in kept.items() if len(group.indices)}
-    found = sandwich(fitted.optimum, fitted.rows, kept, blocks, fitted.beside)
+    slopes = Slopes(fitted.rows, fitted.optimum, blocks)
+    found = sandwich(slopes, kept, fitted.beside)
     covariances = {name: matrix for name, (matrix, _) in found.items()}
     if "offset of pair" in layout.where and "odds of pair" in layout.where:
         covariances["delay"] = covariances["delay"] + _of_another_shape(fitted.optimum)
     return KnownDistances(
         model=model,
-        values=model.at_reference(fitted.values),
+        values=model.at_reference(fitted.optimum.by_kind()),
         covariances=covariances,
         searches=(fitted,),
         persistence=found[next(iter(kept))][1],
         blocks=blocks,
+        slopes=slopes,
         residuals=fitted.residuals,
     )
 

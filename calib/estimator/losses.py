@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.errors import BadInputError
 from uwblink.arrays import Floats
-from uwblink.errors import ArgumentError
+from uwblink.errors import ArgumentError, raising
 from uwblink.plugins import Registry
 
 Weights = Callable[[Floats], tuple[Floats, Floats]]
@@ -24,10 +24,6 @@ class RobustLoss:
 
     name: str
     weights: Weights
-
-    def __call__(self, u: Floats) -> tuple[Floats, Floats]:
-        """Return weights and slopes at residuals over scale (n,)."""
-        return self.weights(u)
 
 
 def _cauchy(u: Floats) -> tuple[Floats, Floats]:
@@ -94,12 +90,9 @@ def check_robust_loss(loss: RobustLoss) -> None:
         raise ArgumentError(f"loss {MIXTURE!r}: is one of the project's own; choose another name")
     step = 1e-5
     u = np.concatenate([TRIED_AT - step, TRIED_AT, TRIED_AT + step, np.zeros(1)])
-    try:
+    what = f"loss {loss.name!r}: must return two arrays, weight and slope, as long as its argument"
+    with raising(ArgumentError, what, TypeError, ValueError):
         weight, slope = (np.asarray(part, dtype=np.float64) for part in loss.weights(u))
-    except (TypeError, ValueError) as error:
-        raise ArgumentError(
-            f"loss {loss.name!r}: must return two arrays, weight and slope, as long as its argument ({error})"
-        ) from error
     if weight.shape != u.shape or slope.shape != u.shape or not np.isfinite([weight, slope]).all():
         raise ArgumentError(f"loss {loss.name!r}: weight and slope must be finite, one for each residual")
     count = len(TRIED_AT)
@@ -114,14 +107,17 @@ def check_robust_loss(loss: RobustLoss) -> None:
         raise ArgumentError(f"loss {loss.name!r}: the weight at u = 0 is {weight[-1]:g}, expected 1")
 
 
-_OWN: Final = (
-    RobustLoss("cauchy", _cauchy),
-    RobustLoss("huber", _huber),
-    RobustLoss("soft_l1", _soft_l1),
-    RobustLoss("l2", _l2),
+LOSSES: Final[Registry[RobustLoss]] = Registry(
+    "loss",
+    "uwbcal.losses",
+    (
+        RobustLoss("cauchy", _cauchy),
+        RobustLoss("huber", _huber),
+        RobustLoss("soft_l1", _soft_l1),
+        RobustLoss("l2", _l2),
+    ),
+    check_robust_loss,
 )
-
-LOSSES: Final[Registry[RobustLoss]] = Registry("loss", "uwbcal.losses", _OWN, check_robust_loss)
 """Losses by name: the project's, those of `register_loss`, and those of installed distributions."""
 
 

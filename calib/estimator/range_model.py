@@ -16,7 +16,7 @@ from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, kn
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.grouped_errors import error_unknowns, scattered
-from calib.estimator.identifiability import free_directions, square_of
+from calib.estimator.identifiability import free_directions
 from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Unknown
@@ -155,10 +155,16 @@ class RangeModel:
     @property
     def reference(self) -> float | None:
         """Return the lifted power at which curves are zero, None for no such condition."""
-        power_dbm, alpha_dbm = self.settings.reference_power_dbm, self.settings.alpha_dbm
-        if power_dbm is None:
-            return None if self.settings.sequential else 1.0
-        return float(lift(np.array(power_dbm), alpha_dbm))
+        dbm = self.reference_dbm
+        return None if dbm is None else float(lift(np.array(dbm), self.settings.alpha_dbm))
+
+    @property
+    def reference_dbm(self) -> float | None:
+        """Return the power in dBm at which curves are zero, None for no such condition."""
+        settings = self.settings
+        if settings.reference_power_dbm is None and not settings.sequential:
+            return settings.alpha_dbm
+        return settings.reference_power_dbm
 
     @property
     def pinned(self) -> bool:
@@ -245,13 +251,12 @@ class RangeModel:
 
 def _free_directions(ranges: Ranges, tags: list[int], settings: FitSettings) -> tuple[Floats, list[list[int]]]:
     """Return the directions of delays (tags, k) that the pairs leave free, and their tags."""
-    own = [k for k, tag in enumerate(tags) if tag not in settings.fixed_ns]
+    own = [tag for tag in tags if tag not in settings.fixed_ns]
     if not own or settings.constants == "pair":
         return np.zeros((len(tags), 0)), []
-    square, ends = square_of(tags, ranges.initiator, ranges.target, ranges.weight_initiator, ranges.weight_target)
-    directions, free = free_directions(square[np.ix_(own, own)], [tags[k] for k in own], ends)
+    directions, free = free_directions(own, ranges)
     held = np.zeros((len(tags), directions.shape[1]))
-    held[own] = directions
+    held[np.isin(tags, own)] = directions
     return held, free
 
 

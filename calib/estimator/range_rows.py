@@ -7,15 +7,18 @@ on is one more `Part` of one of them: an unknown for each tag, pair, session, di
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline, PPoly
 
+from calib.estimator.losses import Weights
 from calib.estimator.rows import ROWS_AT_ONCE, Terms
 from calib.estimator.unknowns import Layout
-from calib.range_errors.densities import OUTLIERS_OVER_M, ErrorSlopes, error_slopes
+from calib.range_errors.densities import ErrorSlopes, error_slopes
 from uwblink.arrays import Floats, Ints
 
 RESIDUAL = "residual"
@@ -76,14 +79,13 @@ class Mixture:
     is the share of the ranges that such unknowns use up: noise is estimated as larger by it (restricted likelihood).
     """
 
-    span_m: float = OUTLIERS_OVER_M
     expected: bool = False
     used: float = 0.0
     parameters: tuple[str, ...] = ("noise", "odds", "detour", "least", "outliers", "long")
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
         """Return log densities (n,) and slopes by each parameter (n,)."""
-        found = error_slopes(values[RESIDUAL], values, span_m=self.span_m)
+        found = error_slopes(values[RESIDUAL], values)
         if self.used:
             more = found.by | {"noise": found.by["noise"] + self.used}
             found = replace(found, log_density=found.log_density + self.used * values["noise"], by=more)
@@ -102,7 +104,7 @@ class Mixture:
         sigma = float(np.exp(typical["noise"][0]))
         longest = 8 * sigma + 30 * float(np.exp(typical["detour"][0]))
         residual = np.concatenate([np.linspace(-8 * sigma, 8 * sigma, 321), np.geomspace(8.1 * sigma, longest, 120)])
-        found = error_slopes(residual, typical, span_m=self.span_m)
+        found = error_slopes(residual, typical)
         weight = np.exp(found.log_density) * np.gradient(residual)
         weight /= weight.sum()
         slope, others = found.by[RESIDUAL], np.array([found.by[name] for name in self.parameters])
@@ -115,12 +117,13 @@ class Mixture:
 class Robust:
     """A robust loss of residuals over `scale_m`; `weights` maps residuals over scale to weights and slopes.
 
-    With `reweighted` what a residual tells is its weight, which descends from anywhere; else the loss's curvature.
+    What a residual tells is the loss's curvature, and no less than a share `least` of its weight: with 1 a search
+    descends from anywhere (reweighted least squares). None stands for the curvature itself.
     """
 
-    weights: Callable[[Floats], tuple[Floats, Floats]]
+    weights: Weights
     scale_m: float
-    reweighted: bool = True
+    least: float | None = 1.0
     dispersion: float = 1.0
     parameters: tuple[str, ...] = ()
 
@@ -134,17 +137,17 @@ class Robust:
         """Return minus the loss (n,), its slope by the residual (n,) and what each tells (n,)."""
         u = values[RESIDUAL] / self.scale_m
         weight, slope = self.weights(u)
-        by, tells = -weight * u / self.scale_m, (weight if self.reweighted else slope) / self.scale_m**2
-        # Near zero a loss is half the square, which the table's straight lines are not.
-        value = -np.where(np.abs(u) < 0.05, 0.5 * u * u, np.interp(np.abs(u), *_loss_table(self.weights)))
+        tells = (slope if self.least is None else np.maximum(slope, self.least * weight)) / self.scale_m**2
+        by, value = -weight * u / self.scale_m, -_loss(self.weights)(np.abs(u))
         return value / self.dispersion, {RESIDUAL: by / self.dispersion}, tells / self.dispersion
 
 
-def _loss_table(weights: Callable[[Floats], tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
-    """Return residuals over scale and the loss there: the integral of u times its weight, by the trapezoidal rule."""
-    u = np.concatenate([np.linspace(0, 10, 2001), np.geomspace(10.1, 1e7, 1000)])
-    slope = u * weights(u)[0]
-    return u, np.concatenate([[0.0], np.cumsum(np.diff(u) * (slope[1:] + slope[:-1]) / 2)])
+@cache
+def _loss(weights: Weights) -> PPoly:
+    """Return the loss over residuals over scale: the integral of its score, a cubic spline with the given slopes."""
+    u = np.concatenate([np.linspace(0, 10, 2001), np.geomspace(10.1, 1e9, 1000)])
+    weight, slope = weights(u)
+    return CubicHermiteSpline(u, u * weight, slope).antiderivative()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,10 +180,6 @@ class RangeRows:
         ordered = key[order]
         steps = np.flatnonzero(ordered[1:] != ordered[:-1]) + 1
         starts = np.concatenate([[0], steps, [len(order)]])
-        long = np.diff(starts) > ROWS_AT_ONCE
-        if long.any():
-            more = [np.arange(a, b, ROWS_AT_ONCE) for a, b in zip(starts[:-1][long], starts[1:][long], strict=True)]
-            starts = np.unique(np.concatenate([starts, *more]))
         kept = tuple(_sorted(part, order, starts) for part in parts)
         return cls(
             residual=residual[order],
@@ -227,28 +226,21 @@ class RangeRows:
 
     def residuals(self, x: Floats) -> Floats:
         """Return the residuals (n,) at unknowns (p,), in the order in which rows were given; a sample's in its own."""
-        found = np.concatenate([values[RESIDUAL] for _, _, values, _ in self._pieces(x, (RESIDUAL,))])
-        return found[np.argsort(self.order)]
+        return self.values(x, (RESIDUAL,))[RESIDUAL]
 
-    def values(self, x: Floats) -> dict[str, Floats]:
-        """Return every parameter of every range (n,), in the order in which rows were given."""
-        found = {name: np.empty(len(self)) for name in (RESIDUAL, *self.errors.parameters)}
-        for _, rows, values, _ in self._pieces(x):
-            for name, column in found.items():
-                column[self.order[rows]] = values[name]
-        return found
+    def values(self, x: Floats, names: tuple[str, ...] = ()) -> dict[str, Floats]:
+        """Return some parameters, or all, of every range (n,), in the same order as residuals."""
+        pieces = [values for _, _, values, _ in self._pieces(x, names)]
+        back = np.argsort(self.order)
+        whole = {name: [np.broadcast_to(one[name], len(one[RESIDUAL])) for one in pieces] for name in pieces[0]}
+        return {name: np.concatenate(columns)[back] for name, columns in whole.items()}
 
     def error_slopes(self, x: Floats, names: Sequence[str]) -> ErrorSlopes:
-        """Return the densities of all ranges (n,) with their slopes by some parameters, in the order given.
-
-        Raises `TypeError` where the ranges have a robust loss instead of a `Mixture`.
-        """
-        if not isinstance(self.errors, Mixture):
-            raise TypeError("a robust loss has no parts")
+        """Return the densities of all ranges (n,) of a `Mixture` with their slopes by some parameters, as given."""
         log_density, reflected, inlier = np.empty((3, len(self)))
         by = {name: np.empty(len(self)) for name in names}
         for _, rows, values, _ in self._pieces(x):
-            found, given = error_slopes(values[RESIDUAL], values, span_m=self.errors.span_m), self.order[rows]
+            found, given = error_slopes(values[RESIDUAL], values), self.order[rows]
             log_density[given], reflected[given], inlier[given] = found.log_density, found.reflected, found.inlier
             for name, column in by.items():
                 column[given] = found.by[name]

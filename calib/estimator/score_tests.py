@@ -130,30 +130,17 @@ class Tested:
     blocks: int
 
 
-@dataclass(slots=True)
-class _Sums:
-    """Sums over ranges for offsets of a family (k).
-
-    By block of time, `plain` (blocks, k) of slopes and `known` (blocks, k) of what residuals know; `square` (k, k) is
-    what offsets know of each other, `link` (k, p) what they share with the unknowns.
-    """
-
-    plain: Floats
-    known: Floats
-    square: Floats
-    link: Floats
-
-
 class Slopes:
     """The slopes of a fit's ranges by the residual and by all unknowns, as sums and products that tests are made of.
 
-    `score` (n,) are the slopes by residuals, `tells` (n,) what residuals know, in the order of the rows. Slopes by
-    unknowns are evaluated anew for tests: those of millions of ranges take gigabytes.
+    `own` (blocks, p) are the slopes by unknowns, summed by block of time. `score` (n,) are the slopes by residuals,
+    `tells` (n,) what residuals know, in the order of the rows. Slopes by unknowns are evaluated anew for tests: those
+    of millions of ranges take gigabytes.
     """
 
-    def __init__(self, rows: RangeRows, optimum: Optimum, blocks: TimeBlocks, delays: Floats) -> None:
-        """Take rows at their optimum; `delays` (tags, p) turns unknowns into delays in ns."""
-        self.rows, self.optimum, self.blocks, self.delays = rows, optimum, blocks, delays
+    def __init__(self, rows: RangeRows, optimum: Optimum, blocks: TimeBlocks) -> None:
+        """Take rows at their optimum."""
+        self.rows, self.optimum, self.blocks = rows, optimum, blocks
         self.order, size = rows.order, optimum.layout.size
         self.score, self.tells = np.empty(len(rows)), np.zeros(len(rows))
         self.own = np.zeros((blocks.count, size))
@@ -173,7 +160,7 @@ class Slopes:
 
     def link(self, derivative: Derivative | sparse.csr_matrix) -> Floats:
         """Return what links offsets, as derivatives (n, k) of given ranges, to all unknowns (k, p)."""
-        return self._sums([derivative])[0].link
+        return self._sums([derivative])[0][3]
 
     def test(self, family: Family) -> Tested:
         """Return a family's efficient slopes."""
@@ -184,12 +171,14 @@ class Slopes:
         sums = self._sums([family.derivative for family in families])
         return [self._tested(family, own) for family, own in zip(families, sums, strict=True)]
 
-    def _sums(self, derivatives: Sequence[Derivative | sparse.csr_matrix]) -> list[_Sums]:
-        """Return sums over all ranges for offsets with derivatives (n, k) of given ranges."""
+    def _sums(self, derivatives: Sequence[Derivative | sparse.csr_matrix]) -> list[list[Floats]]:
+        """Return sums over all ranges for offsets with derivatives (n, k) of given ranges.
+
+        By block of time, those of slopes (blocks, k) and of what residuals know (blocks, k); then what offsets know of
+        each other (k, k), and what they share with the unknowns (k, p).
+        """
         (blocks, size), counts = self.own.shape, [each.shape[1] for each in derivatives]
-        sums = [
-            _Sums(np.zeros((blocks, k)), np.zeros((blocks, k)), np.zeros((k, k)), np.zeros((k, size))) for k in counts
-        ]
+        sums = [[np.zeros(shape) for shape in ((blocks, k), (blocks, k), (k, k), (k, size))] for k in counts]
         for which, terms in self._pieces():
             in_block = self.blocks.summing(self.order[which])
             matrices = [
@@ -199,15 +188,15 @@ class Slopes:
             for own, derivative in zip(sums, derivatives, strict=True):
                 kept = derivative[self.order[which]]
                 told = sparse.diags(self.tells[which])
-                own.plain += (in_block @ sparse.diags(self.score[which]) @ kept).toarray()
-                own.known += (in_block @ told @ kept.power(2)).toarray()
-                own.square += (kept.T @ told @ kept).toarray()
+                own[0] += (in_block @ sparse.diags(self.score[which]) @ kept).toarray()
+                own[1] += (in_block @ told @ kept.power(2)).toarray()
+                own[2] += (kept.T @ told @ kept).toarray()
                 for weight, matrix in matrices:
-                    own.link += (kept.T @ sparse.diags(weight) @ matrix).toarray()
+                    own[3] += (kept.T @ sparse.diags(weight) @ matrix).toarray()
         return sums
 
-    def _tested(self, family: Family, sums: _Sums) -> Tested:
-        plain, known, square, link = sums.plain, sums.known, sums.square, sums.link
+    def _tested(self, family: Family, sums: Sequence[Floats]) -> Tested:
+        plain, known, square, link = sums
         taken = self._taken(link, family.fitted)
         efficient, information = plain - self.own @ taken.T, square - taken @ link.T
         whole = max(float(np.diag(square).max()), 1e-300)
@@ -226,7 +215,7 @@ class Slopes:
             total=total,
             covariance=lasting.factor * (scatter.T @ scatter),
             information=information,
-            effects=-self.delays @ taken.T,
+            effects=-taken.T[self.optimum.layout.where["delay"]],
             whole=whole,
             lasting=lasting,
             blocks=len(scatter),

@@ -70,11 +70,8 @@ class TimeBlocks:
 
 def in_order(ranges: Ranges) -> Ranges:
     """Return ranges in order of their sessions, and of time within each."""
-    time, session = ranges.time_ns, ranges.session
-    later, same = session[1:] > session[:-1], session[1:] == session[:-1]
-    if np.all(later | (same & (time[1:] >= time[:-1]))):
-        return ranges
-    return ranges[np.lexsort((time, session))]
+    order = np.lexsort((ranges.time_ns, ranges.session))
+    return ranges if np.all(np.diff(order) == 1) else ranges[order]
 
 
 def time_blocks(time_ns: Ints, session: Ints) -> TimeBlocks:

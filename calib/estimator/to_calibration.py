@@ -61,7 +61,7 @@ def calibration_of(found: KnownDistances, delays_ns2: Floats) -> Calibration:
     model, search, settings = found.model, found.searches[0], found.model.settings
     names, fixed = model.unknowns[0].names, settings.fixed_ns
     of_pairs = settings.constants == "pair"
-    free = {tag for group in found.free for tag in group}
+    free = {tag for group in found.model.free for tag in group}
     std = [
         math.inf if not of_pairs and int(name) in free else math.sqrt(max(value, 0.0))
         for name, value in zip(names, np.diag(delays_ns2), strict=True)
@@ -82,7 +82,7 @@ def calibration_of(found: KnownDistances, delays_ns2: Floats) -> Calibration:
         errors = error_model(model, found.residuals, described, found.blocks)
         between_m = settings.between_m
         if between_m is None:
-            between_m = between_recordings(model, described, found.blocks, _between_pairs(found))
+            between_m = between_recordings(found, described)
         errors = errors.between(between_m, _correction_std(found, delays_ns2, np.array(errors.lifted)))
         sigmas, sigma_m2 = sigma_curves(model, described.values, described.noise)
     return Calibration(
@@ -106,13 +106,6 @@ def calibration_of(found: KnownDistances, delays_ns2: Floats) -> Calibration:
         errors=errors,
         antenna_delays=known_delays(model.ranges.antenna_delays, model.ranges.tags()),
     )
-
-
-def _between_pairs(found: KnownDistances) -> float | None:
-    """Return the standard deviation of offsets of pairs, in a session and from one to the next, in metres."""
-    search = found.searches[0].optimum
-    kinds = [kind for kind in ("offset of pair", "offset of pair in session") if kind in search.layout.where]
-    return math.hypot(*map(search.priors.deviation, kinds)) if kinds else None
 
 
 def bias_curves(found: KnownDistances) -> dict[str, Curve]:
@@ -246,24 +239,25 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
     return _with_quantiles(stated, model, residual)
 
 
-def between_recordings(model: RangeModel, errors: DescribedErrors, blocks: TimeBlocks, pairs_m: float | None) -> float:
+def between_recordings(found: KnownDistances, errors: DescribedErrors) -> float:
     """Return the standard deviation, in metres, of the difference of a pair's offset between this and another
     recording.
 
-    Several sessions show it: by offsets of pairs (`pairs_m`, None if they are not determined), and of pairs in spells.
-    One recording does not, because its delays contain what changes by the next; it shows the least.
+    Several sessions show it: by offsets of pairs, if they are determined, and of pairs in spells. One recording does
+    not, because its delays contain what changes by the next; it shows the least.
     """
-    pair, score = model.pairs.number, errors.slopes.by[RESIDUAL]
-    pairs, cell = len(model.pairs.ends), pair * SPELLS + np.arange(len(pair)) * SPELLS // len(pair)
-    lasting = lasting_in_pairs(score, pair, blocks, SPELLS)
+    optimum, pair, score = found.searches[0].optimum, found.model.pairs.number, errors.slopes.by[RESIDUAL]
+    pairs, cell = len(found.model.pairs.ends), pair * SPELLS + np.arange(len(pair)) * SPELLS // len(pair)
+    lasting = lasting_in_pairs(score, pair, found.blocks, SPELLS)
     slope, known = (
         np.bincount(cell, column, pairs * SPELLS).reshape(pairs, SPELLS) / lasting for column in (score, score**2)
     )
     # The common part of all spells is the offset of the pair.
     slope -= known * slope.sum(axis=1, keepdims=True) / np.maximum(known.sum(axis=1, keepdims=True), 1e-300)
     spells_m = math.sqrt(mean_variance(known.ravel(), slope.ravel(), TYPICAL_OFFSET_M, OFFSETS[1:]))
-    found = math.hypot(spells_m, spells_m if pairs_m is None else pairs_m)
-    return found if np.ptp(model.ranges.session) else max(found, BETWEEN_M)
+    kinds = [kind for kind in ("offset of pair", "offset of pair in session") if kind in optimum.layout.where]
+    between_m = math.hypot(spells_m, *(map(optimum.priors.deviation, kinds) if kinds else [spells_m]))
+    return between_m if np.ptp(found.model.ranges.session) else max(between_m, BETWEEN_M)
 
 
 def mean_variance(information: Floats, slope: Floats, typical: float, bounds: tuple[float, float]) -> float:

@@ -83,14 +83,12 @@ class Layout:
 
     def __post_init__(self) -> None:
         """Lay the blocks out; raises `BadInputError` where two are of one kind."""
-        where: dict[str, slice] = {}
-        at = 0
-        for block in self.blocks:
-            if block.kind in where:
-                raise BadInputError(f"two blocks of unknowns are called {block.kind!r}")
-            where[block.kind] = slice(at, at + len(block.start))
-            at += len(block.start)
-        object.__setattr__(self, "where", where)
+        kinds = [block.kind for block in self.blocks]
+        twice = [kind for kind in kinds if kinds.count(kind) > 1]
+        if twice:
+            raise BadInputError(f"two blocks of unknowns are called {twice[0]!r}")
+        ends = np.cumsum([0, *(len(block.start) for block in self.blocks)]).tolist()
+        object.__setattr__(self, "where", dict(zip(kinds, map(slice, ends[:-1], ends[1:]), strict=True)))
 
     @property
     def size(self) -> int:

@@ -38,10 +38,8 @@ from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
 from calib.fitting.result import FitResult, HeldOut
 from calib.settings import FitSettings, check_tag
-from uwblink.arrays import Bools, Floats
+from uwblink.arrays import Bools
 from uwblink.recording.antenna_delays import delays_differ, known_delays
-
-INLIER_SIGMAS = 3.0
 
 MIN_RANGES = 50
 """With so many ranges one delay has a standard error of a seventh of the noise of a range, 0.03 ns."""
@@ -84,17 +82,14 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     stated = {tag: std for tag, std in calibration.delays_std_ns.items() if tag not in given}
     calibration = replace(calibration, delays_std_ns=stated | taken)
     held = _held_out(ranges, settings) if settings.hold_out else None
-    reference = settings.reference_power_dbm
-    if reference is None and not settings.sequential:
-        reference = settings.alpha_dbm
     provenance = {
-        **({"undetermined": found.free} if found.free else {}),
-        **({} if reference is None else {"reference_power_dbm": reference}),
+        **({"undetermined": found.model.free} if found.model.free else {}),
+        **({} if found.model.reference_dbm is None else {"reference_power_dbm": found.model.reference_dbm}),
         "recordings": ranges.source.split(", "),
         "recording_ids": [name for _, name in ranges.recordings],
         "recipe": "sequential" if settings.sequential else "joint",
-        "fitted": _fitted(found),
-        "gauge": _gauge(found, reference),
+        "fitted": what_was_fitted(found),
+        "gauge": _gauge(found),
         **({"held_out": _judged(held, settings)} if held else {}),
     }
     result = result_of(
@@ -200,7 +195,11 @@ def result_of(
     `findings` are sentences of the checks of the fit; the warnings of a kind of fit are `first`, or `more` after the
     limits of the ranges.
     """
-    residuals, inliers, over_sigma = _left(calibration, ranges)
+    # The error model is not needed here.
+    applied = replace(calibration, errors=None).apply(ranges)
+    residuals = applied.corrected_m - ranges.truth_m
+    over_sigma = residuals / applied.sigma_m
+    inliers: Bools = np.asarray(np.abs(over_sigma) < 3.0)
     if calibration.errors is not None:
         known = replace(calibration.errors, lasting=lasting_errors(ranges, over_sigma))
         calibration = replace(calibration, errors=known)
@@ -213,7 +212,7 @@ def result_of(
         *implausible(calibration.delays_ns, residuals),
         *unlike_powers(ranges, calibration),
         *_beyond(found),
-        *warnings_of(ranges, float(np.mean(inliers)), found.free, found.blocks.seconds),
+        *warnings_of(ranges, float(np.mean(inliers)), found.model.free, found.blocks.seconds),
     ]
     provenance: dict[str, Any] = {
         "writer": f"uwbcal {uwblink.__version__}",
@@ -262,15 +261,6 @@ def _judged(held: HeldOut, settings: FitSettings) -> dict[str, Any]:
     return {name: for_json(value) for name, value in judged.items()}
 
 
-def _left(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Bools, Floats]:
-    """Return the corrected errors of ranges (n,), whether they are within three sigmas, and the errors over sigma."""
-    # The error model is not needed here.
-    applied = replace(calibration, errors=None).apply(ranges)
-    left = applied.corrected_m - ranges.truth_m
-    over_sigma = left / applied.sigma_m
-    return left, np.asarray(np.abs(over_sigma) < INLIER_SIGMAS), over_sigma
-
-
 def _stopped(found: KnownDistances, asked_for: str | None) -> list[str]:
     if asked_for == MIXTURE and found.searches[0].loss != MIXTURE:
         return ["the likelihood left all ranges of a pair out, so a robust loss was fitted: compare with other losses"]
@@ -287,9 +277,8 @@ def _beyond(found: KnownDistances) -> list[str]:
     near = float(np.clip(model.reference, *model.span))
     if near == model.reference:
         return []
-    asked = settings.alpha_dbm if settings.reference_power_dbm is None else settings.reference_power_dbm
     return [
-        f"no ranges at the reference power of {asked:.1f} dBm: delays are stated at "
+        f"no ranges at the reference power of {model.reference_dbm:.1f} dBm: delays are stated at "
         f"{settings.alpha_dbm + 10 * np.log10(near):.1f} dBm, the nearest recorded, and compare only with others "
         "stated there"
     ]
@@ -300,7 +289,7 @@ def _has_gauge(found: KnownDistances) -> bool:
     return any(carrier is not None for carrier in found.model.carriers)
 
 
-def _fitted(found: KnownDistances) -> str:
+def what_was_fitted(found: KnownDistances) -> str:
     """Return what was fitted, in words."""
     model = found.model
     if model.settings.constants == "pair":
@@ -310,13 +299,13 @@ def _fitted(found: KnownDistances) -> str:
     return "curve only" if model.pinned else "delays and curve"
 
 
-def _gauge(found: KnownDistances, reference: float | None) -> str:
+def _gauge(found: KnownDistances) -> str:
     """Return in words how the common constant of delays and curve was chosen."""
     carrier = "constants of pairs" if found.model.settings.constants == "pair" else "delays"
     if found.model.curve is None:
         return f"no curve; the {carrier} carry the constant"
     if not _has_gauge(found):
         return "pinned delays; the curve carries the constant"
-    if reference is None:
+    if found.model.reference is None:
         return "that of the recipe: delays as fitted without a curve, which carries the constant"
-    return f"the bias curve is zero at {reference:g} dBm; the {carrier} carry the constant"
+    return f"the bias curve is zero at {found.model.reference_dbm:g} dBm; the {carrier} carry the constant"

@@ -31,6 +31,7 @@ from uwblink.ticks import REPORT_BITS, SPEED_OF_LIGHT, TICK_S, elapsed
 MIN_OVERHEARD: Final = 50
 """Of so many, the mean is known to a seventh of the noise of a delay; of fewer it would tell little."""
 PLAUSIBLE_NS: Final = 100.0
+"""Longer delays come of wrong stamps: published ones are below 1 ns, beside those that are programmed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,22 +73,14 @@ def heard_delays(data: Data, calibration: Calibration) -> dict[int, OverheardDel
     for tag in np.unique(heard["target"]).tolist():
         values = delay_ns[good & (heard["target"] == tag)]
         if len(values) >= MIN_OVERHEARD:
-            found[int(tag)] = _centre(values)
+            # Reflections lengthen three receptions: two of them shorten the delay, one lengthens it. The balance is a
+            # tail on the short side, which the likelihood of ranges tells from noise when the sign is changed.
+            parts = fit_grouped_errors([-values * METRES_A_NS])
+            centre_ns, std_ns = -float(parts.centre_m[0]) / METRES_A_NS, float(parts.centre_std_m[0]) / METRES_A_NS
+            found[int(tag)] = OverheardDelay(centre_ns, std_ns, len(values))
     return found
 
 
 def _span(heard: dict[str, NDArray[Any]], later: str, earlier: str) -> Floats:
     ticks = elapsed(heard[later].astype(np.int64), heard[earlier].astype(np.int64), REPORT_BITS)
     return ticks.astype(np.float64) * TICK_S
-
-
-def _centre(values: Floats) -> OverheardDelay:
-    """Return the centre of the noise of delays (n,).
-
-    Reflections lengthen three receptions: two of them shorten the delay, one lengthens it. The balance is a tail on the
-    short side, which the likelihood of ranges tells from noise when the sign is changed.
-    """
-    parts = fit_grouped_errors([-values * METRES_A_NS])
-    return OverheardDelay(
-        -float(parts.centre_m[0]) / METRES_A_NS, float(parts.centre_std_m[0]) / METRES_A_NS, len(values)
-    )

@@ -21,8 +21,7 @@ from calib.estimator.rows import sum_rows
 from calib.estimator.unknowns import Layout, Priors
 from calib.range_errors.densities import error_slopes
 from calib.settings import FitSettings, FlightSettings
-from calib.trajectories.fitting import range_model
-from calib.trajectories.judging import GEOMETRY_ALONE_FACTOR, verdict_on, with_known_distances
+from calib.trajectories.fitting import range_model, variance_factor, verdict_on, with_known_distances
 from calib.trajectories.motion import Distances, Motion, known_rows
 from calib.trajectories.samples import tapes_of
 from calib.trajectories.scene import Scene, scene_from
@@ -75,7 +74,7 @@ class Errors:
             "outliers": none,
             "long": none,
         }
-        found = error_slopes(error, {name: np.log([value]) for name, value in sizes.items()}, span_m=1.0)
+        found = error_slopes(error, {name: np.log([value]) for name, value in sizes.items()})
         weight = np.exp(found.log_density)
         return float(weight @ found.by[RESIDUAL] ** 2 / weight.sum())
 
@@ -173,8 +172,7 @@ class Information:
             self.covariance = inverse_of(known, self.layout.free())
             priors.update(self.x, self.covariance)
         with_truth = with_known_distances(of_ranges + priors.precision(), self.layout, self.delays)
-        factor = GEOMETRY_ALONE_FACTOR if scene.by_geometry_alone else 1.0
-        self.covariance_ns2 = self.covariance[:, self.delays][self.delays] * factor**2
+        self.covariance_ns2 = self.covariance[:, self.delays][self.delays] * variance_factor(scene)
         self.verdict = verdict_on(self.covariance_ns2, with_truth, self.tags)
 
     def best_tape(self, still_s: float, sigma_m: float) -> tuple[int, int] | None:

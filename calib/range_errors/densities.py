@@ -159,12 +159,12 @@ class ErrorSlopes:
     inlier: Floats
 
 
-def error_slopes(residual: Floats, parameters: dict[str, Floats], *, span_m: float) -> ErrorSlopes:
+def error_slopes(residual: Floats, parameters: dict[str, Floats]) -> ErrorSlopes:
     """Return the log density of errors (n,) in metres and its slopes.
 
     `parameters` are "noise" (log sigma), "odds" (log odds of a reflection), "detour" (log of the first kind's
     mean), "least" (log of the least detour), "outliers" and "long" (log odds), arrays (n,) or (1,).
-    Outliers have the density 1/`span_m`.
+    Outliers have the density 1/`OUTLIERS_OVER_M`.
     """
     sigma = np.exp(parameters["noise"])
     share = expit(parameters["odds"])
@@ -174,7 +174,7 @@ def error_slopes(residual: Floats, parameters: dict[str, Floats], *, span_m: flo
     found = densities(residual, sigma, float(least[0]), long.mean * detour, long)
     inside = 1 - float(outlying[0])
     core, tail = inside * (1 - share) * found.direct, inside * share
-    total = core + tail * found.reflected + float(outlying[0]) / span_m
+    total = core + tail * found.reflected + float(outlying[0]) / OUTLIERS_OVER_M
     core, tail = core / total, tail / total
     tails = [tail * kind.density for kind in found.kinds]
     reflected = tails[0] + tails[1]

@@ -36,11 +36,6 @@ class Attitude:
         turned = Rotation.from_euler("z", heading_rad) * Rotation.from_quat(self.quaternion)
         return replace(self, quaternion=turned.as_quat())
 
-    @property
-    def exact(self) -> bool:
-        """Whether the attitudes have no errors."""
-        return not (self.std_rad.any() or self.wander_rad.any())
-
     def at(self, time_s: Floats) -> Rotation:
         """Return the rotations at instants (n,), interpolated between quaternions, constant outside."""
         return self._slerp(np.clip(time_s, self.time_s[0], self.time_s[-1]))

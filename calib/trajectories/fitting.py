@@ -3,30 +3,38 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
+from scipy import sparse
 from threadpoolctl import threadpool_limits
 
 from calib.calibration.model import Calibration, given_calibration
+from calib.calibration.power_curves import basis
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import refuse_refuted
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
+from calib.estimator.inverse import Matrix, inverse_of
 from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described, refuse_free
 from calib.estimator.losses import MIXTURE
 from calib.estimator.range_model import RangeModel
+from calib.estimator.rows import sum_rows
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
-from calib.fitting.fitting import result_of
+from calib.estimator.unknowns import Layout
+from calib.fitting.fitting import result_of, what_was_fitted
 from calib.fitting.result import FitResult
+from calib.information import Unknown, Verdict, judge
 from calib.settings import FitSettings, FlightSettings
-from calib.trajectories.judging import curve_uncertainty, judge_delays
+from calib.spread import TWO_SIDED_95
+from calib.trajectories.motion import MOTION, TapeRows
 from calib.trajectories.scene import Scene, scene_from
 from calib.trajectories.search import Search, search
 from calib.trajectories.start import begin
+from uwblink.arrays import Floats, Ints
 
 SHARED = (
     "fixed_ns",
@@ -42,6 +50,26 @@ SHARED = (
 
 SHARE_OF_START = 0.3
 """Share of the work, for the progress bar, that is done when the search has its initial guess."""
+
+PRIOR_NS = 2.0
+"""Prior standard deviation of a delay: delays of boards of one type differ by less."""
+
+SCALE_NS, LOOSEST = 0.2, 0.5
+"""A direction of delays is determined if its standard error is at most LOOSEST * SCALE_NS (3 cm of range).
+
+The value comes from simulations (docs/accuracy.md): wider intervals did not hold.
+"""
+
+GROWTH = 3.0
+"""If a fit with known distances is less certain than that, a direction may be so many times less certain."""
+
+GEOMETRY_ALONE_FACTOR = 3.0
+"""Factor on standard errors where only geometry determines distances: there the problem is not linear, and errors up to
+4.2 linearised standard errors were observed (docs/accuracy.md)."""
+
+TAPE_UNCHECKED, TAPE_MIN_DEVIATION, TAPE_MIN_ERROR_M = 0.999, 4.0, 0.03
+"""A tape that no range checks (leverage above the first) is not tested. Others contradict the fit if their deleted
+residual exceeds so many standard errors and so many metres."""
 
 
 def fit_from_ranges(
@@ -132,10 +160,6 @@ def range_model(scene: Scene, settings: FitSettings, *, curve: bool, offsets: bo
     return model, scene.only(model.ranges.truth_m.astype(np.int64))
 
 
-def _reference_dbm(settings: FitSettings) -> float:
-    return settings.alpha_dbm if settings.reference_power_dbm is None else settings.reference_power_dbm
-
-
 def _described(model: RangeModel, top: Search, known: Calibration | None) -> KnownDistances:
     """Return the fit as one to the estimated distances, whose uncertainty is in its covariance."""
     distances = top.geometry.distances(top.optimum.x)[0]
@@ -153,9 +177,20 @@ def _described(model: RangeModel, top: Search, known: Calibration | None) -> Kno
     # What the pairs leave free is known; the rest is judged later, with the uncertainty of trajectories.
     found = described(model, fitted, time_blocks(model.ranges.time_ns, model.ranges.session))
     if known is not None:
-        more = curve_uncertainty(found, known)
-        found = replace(found, covariances=found.covariances | {"delay": found.covariances["delay"] + more})
+        more = found.covariances["delay"] + _curve_uncertainty(found, known)
+        found = replace(found, covariances=found.covariances | {"delay": more})
     return found
+
+
+def _curve_uncertainty(found: KnownDistances, known: Calibration) -> Floats:
+    """Return the covariance (tags, tags) in ns^2 that the uncertainty of a kept curve adds to the delays."""
+    if known.uncertainty is None or len(known.uncertainty.bias_m2) != len(known.bias_curve.coefficients):
+        return np.zeros_like(found.covariances["delay"])
+    splines = basis(np.clip(found.model.lifted, *known.bias_curve.range), np.array(known.bias_curve.knots))
+    # Derivatives of the unknowns by the coefficients: covariance times information.
+    optimum, linked = found.slopes.optimum, found.slopes.link(sparse.csr_matrix(splines))
+    reach = (optimum.covariance @ linked.T)[optimum.layout.where["delay"]]
+    return np.asarray(reach @ np.array(known.uncertainty.bias_m2) @ reach.T)
 
 
 def _result(
@@ -169,25 +204,26 @@ def _result(
     """Return the result of a fit; raises `UnanswerableError` where no delay is determined, without `minimum_norm`."""
     fixed, model, scene = dict(settings.fixed_ns), found.model, top.motion.scene
     refuse_refuted(dict(zip(model.tags, found.delays.tolist(), strict=False)), found.residuals, model.ranges)
-    judgement = judge_delays(found, top)
     covariance, findings = examine_fit(found)
-    covariance = judgement.variance_factor * covariance
-    free, left_open = judgement.free_tags, ""
-    if free and len(free) == len(judgement.tags) and not settings.minimum_norm:
+    covariance = variance_factor(scene) * covariance
+    own, verdict = _judge_delays(found, top)
+    free, left_open = [int(tag) for tag in verdict.named("delay") if tag], ""
+    undetermined_text = _undetermined_text(free, [model.tags[k] for k in own], covariance[np.ix_(own, own)])
+    if free and len(free) == len(own) and not settings.minimum_norm:
         raise UnanswerableError(
-            f"{scene.source}: {judgement.undetermined_text(covariance)}; let positions be known for some seconds "
+            f"{scene.source}: {undetermined_text}; let positions be known for some seconds "
             "(`poses_until_s`), give the places of anchors, or pin a delay with `fixed_ns` (`minimum_norm` fits "
             "regardless, and says so)",
             undetermined=[free],
         )
-    undetermined = found.free
+    undetermined = found.model.free
     # Delays that the pairs leave free are held at the smallest values, so that their covariance says nothing of them.
-    if not {tag for group in found.free for tag in group}.issuperset(free):
-        left_open, undetermined = judgement.undetermined_text(covariance), [free]
+    if not {tag for group in found.model.free for tag in group}.issuperset(free):
+        left_open, undetermined = undetermined_text, [free]
     calibration = calibration_of(found, covariance)
     if known is not None:
         calibration = _with_curve(calibration, known)
-    provenance = _provenance(found, top, flight, settings) | {"distance_std_m": judgement.distance_std_m}
+    provenance = _provenance(found, top, flight) | {"distance_std_m": _distance_std_m(top)}
     provenance |= {"undetermined": undetermined} if undetermined else {}
     provenance |= {"left_open": left_open} if left_open else {}
     calibration = replace(
@@ -205,28 +241,26 @@ def _result(
         settings=settings,
         fixed=fixed,
         first=[note for note in notes if note],
-        more=judgement.sentences,
+        more=(*_of_motion(top), *_of_tapes(top)),
     )
 
 
 def _with_curve(calibration: Calibration, known: Calibration) -> Calibration:
     """Return a calibration with the curve of another one and the covariance of that curve."""
-    uncertainty, size = calibration.uncertainty, len(known.bias_curve.coefficients)
-    if uncertainty is not None:
-        of_curve = known.uncertainty.bias_m2 if known.uncertainty else ((0.0,) * size,) * size
-        uncertainty = replace(uncertainty, bias_m2=of_curve)
+    size = len(known.bias_curve.coefficients)
+    of_curve = known.uncertainty.bias_m2 if known.uncertainty else ((0.0,) * size,) * size
+    uncertainty = calibration.uncertainty and replace(calibration.uncertainty, bias_m2=of_curve)
     return replace(calibration, bias_curve=known.bias_curve, uncertainty=uncertainty)
 
 
-def _provenance(found: KnownDistances, top: Search, flight: FlightSettings, settings: FitSettings) -> dict[str, Any]:
+def _provenance(found: KnownDistances, top: Search, flight: FlightSettings) -> dict[str, Any]:
     """Return the provenance that only fits of trajectories have."""
-    scene, places_s, reference_dbm = top.motion.scene, top.motion.scene.places.time_s, _reference_dbm(settings)
-    pinned = set(found.model.tags) <= set(settings.fixed_ns)
+    scene, places_s, reference_dbm = top.motion.scene, top.motion.scene.places.time_s, found.model.reference_dbm
     return {
         "recordings": [scene.source],
         "recipe": "trajectories",
         "truth": "ranges",
-        "fitted": "delays only" if found.model.curve is None else "curve only" if pinned else "delays and curve",
+        "fitted": what_was_fitted(found),
         "rests_on": {
             "known_s": float(np.ptp(places_s)) if len(places_s) else 0.0,
             "moving": list(scene.moving),
@@ -241,3 +275,102 @@ def _provenance(found: KnownDistances, top: Search, flight: FlightSettings, sett
         "gauge": f"the bias curve{' was kept, and' if flight.curve_from else ''} is zero at {reference_dbm:g} dBm; the "
         "delays carry the constant",
     }
+
+
+def variance_factor(scene: Scene) -> float:
+    """Return the factor on covariances: more than 1 where only lever arms determine the scale of distances."""
+    given = sum(place is not None for place in scene.still.values())
+    measured = len(scene.places) or len(scene.heights) or scene.inertial or len(scene.tapes)
+    return 1.0 if given >= 2 or measured else GEOMETRY_ALONE_FACTOR**2
+
+
+def _judge_delays(found: KnownDistances, top: Search) -> tuple[Ints, Verdict]:
+    """Return the numbers of the delays that are not pinned (k,), and the verdict on them."""
+    layout, optimum = top.optimum.layout, top.optimum
+    unpinned = np.intersect1d(layout.indices(["delay"]), layout.free())
+    own = unpinned - layout.where["delay"].start
+    information = sum_rows([top.rows, *top.gauge], optimum.x).information + optimum.priors.precision()
+    covariance = variance_factor(top.motion.scene) * found.covariances["delay"][np.ix_(own, own)]
+    tags = [found.model.tags[k] for k in own]
+    return own, verdict_on(covariance, with_known_distances(information, layout, unpinned), tags)
+
+
+def _distance_std_m(top: Search) -> float:
+    """Return the root mean square standard error of the distances of 400 ranges."""
+    some = np.unique(np.linspace(0, len(top.rows) - 1, 400).astype(np.int64))
+    moved = top.geometry.derivatives(top.optimum.x, some)
+    return float(np.sqrt(np.mean(np.einsum("kp,pk->k", moved, top.optimum.covariance @ moved.T))))
+
+
+def _undetermined_text(free: Sequence[int], tags: Sequence[int], covariance_ns2: Floats) -> str:
+    """Return a sentence on the delays of `free` tags, which are not determined; `covariance_ns2` is that of `tags`."""
+    if len(free) < len(tags):
+        worst = np.sqrt(np.max(np.diag(covariance_ns2)[np.isin(tags, free)], initial=0.0))
+        return (
+            f"the ranges do not determine the delays of tags {', '.join(map(str, free))}: known to ± "
+            f"{TWO_SIDED_95 * float(worst):.2f} ns (95 %) at worst"
+        )
+    count = len(tags)
+    rows = np.full((1, count), 1 / max(count, 1)), np.eye(count)[1:] - np.eye(count)[:1]
+    spread, differences = (
+        TWO_SIDED_95 * float(np.sqrt(np.max(np.diag(row @ covariance_ns2 @ row.T), initial=0.0))) for row in rows
+    )
+    return (
+        f"the ranges determine no delay: what all have in common is known to ± {spread:.2f} ns (95 %), and "
+        f"differences to ± {differences:.2f} ns"
+    )
+
+
+def with_known_distances(information: Matrix, layout: Layout, own: Ints) -> Floats:
+    """Return the covariance (k, k) that some unknowns would have if all distances were known.
+
+    `information` (p, p) is that of ranges and priors; the unknowns of motion are held.
+    """
+    others = np.setdiff1d(layout.free(), layout.indices(list(MOTION)))
+    some = information[others][:, others]
+    dense = some.toarray() if sparse.issparse(some) else some
+    place = np.searchsorted(others, own)
+    return np.asarray(inverse_of(dense, np.arange(len(others)))[:, place])[place]
+
+
+def verdict_on(covariance: Floats, with_truth: Floats, tags: Sequence[int]) -> Verdict:
+    """Return the verdict on delays with a covariance (tags, tags), compared with that for known distances."""
+    if not tags:
+        return judge(np.eye(1) * 1e6, [Unknown("delay", "")])
+    guess = np.maximum(SCALE_NS, GROWTH / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
+    information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) + np.eye(len(covariance)) / PRIOR_NS**2
+    unknowns = [Unknown("delay", str(tag), scale) for tag, scale in zip(tags, guess.tolist(), strict=True)]
+    return judge((information + information.T) / 2, unknowns, loosest=LOOSEST)
+
+
+def _of_motion(top: Search) -> Iterator[str]:
+    missed_m = top.missed_motion_m()
+    if missed_m:
+        yield (
+            f"bodies move faster than control points every {top.motion.places.step_s:.1f} s follow: about "
+            f"{100 * missed_m:.0f} cm of their motion is not in the trajectories, and distances are off "
+            "by it; fly more calmly"
+        )
+
+
+def _of_tapes(top: Search) -> Iterator[str]:
+    """Yield a sentence for each tape that the ranges contradict, by deleted residuals (Cook and Weisberg 1982)."""
+    rows, x = top.known.get("tape"), top.optimum.x
+    if not isinstance(rows, TapeRows):
+        return
+    left, tapes = rows.left(x), top.motion.scene.tapes
+    for number, one in enumerate(tapes.stated):
+        mine = np.flatnonzero(tapes.number == number)
+        moved = rows.geometry.derivatives(x, mine).mean(axis=0)
+        share = min(float(moved @ (top.optimum.covariance @ moved)) / one.sigma_m**2, 1.0)
+        if share > TAPE_UNCHECKED:
+            continue
+        without = float(left[mine].mean()) / (1 - share)
+        deviation = abs(without) * math.sqrt(1 - share) / one.sigma_m
+        if deviation < TAPE_MIN_DEVIATION or abs(without) < TAPE_MIN_ERROR_M:
+            continue
+        way = "more" if without > 0 else "less"
+        yield (
+            f"the distance of tags {one.first} and {one.second}, {one.distance_m:.3f} m, is {100 * abs(without):.0f} "
+            f"cm {way} than all else says ({deviation:.0f} standard errors): measure it again"
+        )

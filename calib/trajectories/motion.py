@@ -27,8 +27,8 @@ POINT_S = 0.4
 TURN_S = 1.0
 """Time between points of the errors of attitudes."""
 
-MOTION = ("path", "turn", "stand", "bias", "level")
-"""Kinds of unknowns of motion."""
+MOTION = {"path": 3, "turn": 3, "stand": 3, "bias": 3, "level": 1}
+"""Kinds of unknowns of motion, and how many axes each has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class Motion:
             turns=Grid(begin, TURN_S, max(int(np.ceil(length / TURN_S)), 1) + 1),
             bodies={
                 "path": scene.moving,
-                "turn": [body for body, known in scene.attitudes.items() if not known.exact],
+                "turn": [body for body, one in scene.attitudes.items() if one.std_rad.any() or one.wander_rad.any()],
                 "stand": scene.sought,
                 "bias": list(scene.inertial),
                 "level": [scene.moving[k] for k in np.unique(scene.heights.body)],
@@ -123,7 +123,7 @@ class Motion:
         }
         found = []
         for kind, (points, priors) in blocks.items():
-            names = tuple(np.repeat(self.bodies[kind], _axes(kind)).tolist()) * points
+            names = tuple(np.repeat(self.bodies[kind], MOTION[kind]).tolist()) * points
             if names:
                 values = np.ravel(start.get(kind, np.zeros(len(names))))
                 found.append(Unknown(kind=kind, names=names, start=values, priors=tuple(priors)))
@@ -131,7 +131,7 @@ class Motion:
 
     def numbers(self, layout: Layout, kind: str) -> Ints:
         """Return the indices (points, bodies, axes) of a kind into all unknowns."""
-        return layout.indices([kind]).reshape(-1, max(len(self.bodies[kind]), 1), _axes(kind))
+        return layout.indices([kind]).reshape(-1, max(len(self.bodies[kind]), 1), MOTION[kind])
 
     def state(self, layout: Layout, x: Floats) -> dict[str, Floats]:
         """Return the unknowns of motion by kind, in their shapes."""
@@ -153,10 +153,6 @@ class Motion:
         found[::2] = (points[:-1] + points[1:]) / 2
         found[1::2] = (points[:-2] + 6 * points[1:-1] + points[2:]) / 8
         return finer, {**start, "path": found[: finer.places.count]}
-
-
-def _axes(kind: str) -> int:
-    return 1 if kind == "level" else 3
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calib.errors import BadInputError
 from calib.spread import medians, robust_spread
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import ColumnTable, Floats, Ints
 from uwblink.recording.schema import Arrangement, KnownDistance
 
 TAPE_EVERY_S = 0.4
@@ -36,19 +36,17 @@ HUBER = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Samples:
-    """Columns of one length (k,); `time_s` are the seconds at which they hold, NaN for always."""
+class Samples(ColumnTable):
+    """Columns of one length (k,); `time_s`, in the place of `time_ns`, are the seconds at which they hold.
+
+    NaN stands for always.
+    """
 
     time_s: Floats
 
     def __len__(self) -> int:
         """Return the number of samples."""
         return len(self.time_s)
-
-    def __getitem__(self, rows: Bools | Ints) -> Self:
-        """Return the chosen samples."""
-        columns = {one.name: getattr(self, one.name) for one in fields(self)}
-        return replace(self, **{name: some[rows] for name, some in columns.items() if isinstance(some, np.ndarray)})
 
     def between(self, begin_s: float, end_s: float) -> Self:
         """Return the samples inside a span of time, and those that always hold."""
@@ -62,10 +60,6 @@ class Places(Samples):
     body: Ints
     position_m: Floats
     std_m: Floats
-
-    def __add__(self, other: Places) -> Places:
-        """Return both."""
-        return Places(*(np.concatenate([getattr(self, one.name), getattr(other, one.name)]) for one in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)

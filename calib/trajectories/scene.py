@@ -14,7 +14,7 @@ from calib.errors import UnanswerableError
 from calib.settings import FlightSettings
 from calib.trajectories.attitudes import Attitude, Inertial, Readings, integrated, windows
 from calib.trajectories.samples import Heights, Places, Samples, Tapes, heights_of, tapes_of
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Poses
 from uwblink.recording.summary import single_reports
 from uwblink.twr import middle_ns
@@ -46,12 +46,6 @@ class Scene:
     def sought(self) -> list[str]:
         """Return the standing bodies whose positions are estimated."""
         return [body for body, place in self.still.items() if place is None]
-
-    @property
-    def by_geometry_alone(self) -> bool:
-        """Whether only the geometry of lever arms determines the scale of distances."""
-        given = sum(place is not None for place in self.still.values())
-        return given < 2 and not (len(self.places) or len(self.heights) or self.inertial or len(self.tapes))
 
     def between(self, begin_s: float, end_s: float) -> Scene:
         """Return the part of the scene within a span of time."""
@@ -134,8 +128,8 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     arms = {tag.tag: (tag.body, np.array(tag.lever_arm_m)) for tag in tags if tag.tag in ranging}
     bodies = sorted({body for body, _ in arms.values()})
     tracks = {body: _track(poses, body, began) for body in bodies}
-    placed = {body: track[_finite(track.position_m)] for body, track in tracks.items()}
-    turned = {body: track[_finite(track.quaternion)] for body, track in tracks.items()}
+    placed = {body: track[np.flatnonzero(np.isfinite(track.position_m).all(axis=1))] for body, track in tracks.items()}
+    turned = {body: track[np.flatnonzero(np.isfinite(track.quaternion).all(axis=1))] for body, track in tracks.items()}
     still = {
         body: np.median(track.position_m, axis=0)
         for body, track in placed.items()
@@ -180,10 +174,6 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
 def _track(poses: Poses, body: str, began_ns: int) -> Track:
     own = poses[poses.body == body]
     return Track(np.asarray((own.time_ns - began_ns) * 1e-9, dtype=np.float64), own.position_m, own.quaternion)
-
-
-def _finite(values: Floats) -> Bools:
-    return np.asarray(np.isfinite(values).all(axis=1))
 
 
 def _places(tracks: Sequence[Track], until_s: float) -> Places:

@@ -18,7 +18,7 @@ from calib.estimator.grouped_errors import NOISE_M, NOISE_WORTH
 from calib.estimator.losses import LOSSES
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import RangeModel
-from calib.estimator.range_rows import RESIDUAL, Errors, Part, RangeRows
+from calib.estimator.range_rows import RESIDUAL, Errors, Part, RangeRows, Robust
 from calib.estimator.rows import NormalRows, Rows
 from calib.estimator.unknowns import Layout, Priors, Unknown
 from calib.spread import robust_spread
@@ -54,20 +54,13 @@ FORCE_BOUNDS_M_S2 = (0.02, 5.0)
 """Bounds of the standard error of a mean specific force."""
 
 
-@dataclass(frozen=True, slots=True)
-class Cauchy:
-    """Cauchy's likelihood of residuals, with a curvature that converges from far away (an error density, `Errors`)."""
+def _cauchy(scale_m: float) -> Robust:
+    """Return Cauchy's likelihood of residuals: twice its loss.
 
-    scale_m: float
-    parameters: tuple[str, ...] = ()
-
-    def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
-        """Return log densities (n,), slopes by the residual (n,) and information (n,)."""
-        u = values[RESIDUAL] / self.scale_m
-        weight, slope = LOSSES["cauchy"](u)
-        # Where the curvature is negative, a fifth of the weight of reweighted least squares replaces it.
-        tells = np.maximum(slope, 0.2 * weight) * (2 / self.scale_m**2)
-        return -np.log1p(u**2), {RESIDUAL: -2 * weight * u / self.scale_m}, tells
+    A fifth of the weights of reweighted least squares replaces a negative curvature, so that it converges from far
+    away.
+    """
+    return Robust(weights=LOSSES["cauchy"].weights, scale_m=scale_m, least=0.2, dispersion=0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,10 +85,10 @@ def fit_motion(
     layout = Layout(motion.unknowns(start, jerk_m_s3))
     geometry = Distances.of(motion, layout, (scene.ranges.initiator, scene.ranges.target), scene.time_s)
     key = np.zeros(len(scene.time_s), dtype=np.int64)
-    rows = RangeRows.of(scene.ranges.raw_m, key, [], Cauchy(scales_m[0]), layout, geometry)
+    rows = RangeRows.of(scene.ranges.raw_m, key, [], _cauchy(scales_m[0]), layout, geometry)
     known, priors, x, value = list(known_rows(motion, layout).values()), Priors(layout), layout.start(), 0.0
     for scale in scales_m:
-        these: list[Rows] = [replace(rows, errors=Cauchy(scale)), *known]
+        these: list[Rows] = [replace(rows, errors=_cauchy(scale)), *known]
         found = maximize(these, priors, x, steps=steps, tolerance=1.0, evidence_steps=0)
         x, value = found.x, found.value
     return MotionFit(motion=motion, state=motion.state(layout, x), residuals=rows.residuals(x), value=value)
@@ -129,7 +122,7 @@ class Search:
         self.leverage: Floats = np.zeros(len(error_m))
         self.weights: dict[tuple[str, int], float] = {}
         self.values: dict[str, Floats] = dict(start)
-        self.build(Cauchy(FIRST_SCALE_M))
+        self.build(_cauchy(FIRST_SCALE_M))
 
     def build(
         self,
@@ -164,7 +157,7 @@ class Search:
             asked=self.layout.indices(["delay", *self.model.curve_kinds()]),
         )
         self.x, self.steps = found.x, self.steps + found.steps
-        self.values = {kind: found.x[where] for kind, where in self.layout.where.items()}
+        self.values = found.by_kind()
         self.weights = self.priors.by_key()
         self.leverage = leverages(self.rows, found)
         self.done(1 - 0.97**self.steps)
@@ -175,7 +168,7 @@ class Search:
         scale = FIRST_SCALE_M
         # The scale converges in three rounds.
         for turn in range(3):
-            self.optimize(Cauchy(scale), evidence_steps=12 if turn else 0)
+            self.optimize(_cauchy(scale), evidence_steps=12 if turn else 0)
             # The spread of residuals, combined with the prior of noise by their numbers of ranges.
             spread, free = robust_spread(self.residuals()[self.informative_rows()]), self.free_ranges
             scale = float(np.sqrt((free * spread**2 + NOISE_WORTH * NOISE_M**2) / (free + NOISE_WORTH)))
@@ -233,7 +226,7 @@ class Search:
             priors = Priors(layout)
             priors.recall(self.weights)
             found = maximize([rows.sample(self.informative_rows())], priors, layout.start(self.values), tolerance=0.1)
-            self.values |= {kind: found.x[where] for kind, where in layout.where.items()}
+            self.values |= found.by_kind()
             self.weights |= priors.by_key()
             # The motion, with those.
             self.build(errors, tuple(_as_known(unknown, self.values[unknown.kind]) for unknown in unknowns), parts)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse.csgraph import shortest_path
 
 from calib.trajectories.motion import Motion
-from calib.trajectories.samples import Places
+from calib.trajectories.samples import Places, Samples
 from calib.trajectories.scene import Scene
 from calib.trajectories.search import JERK_M_S3, MotionFit, State, fit_motion
 from uwblink.arrays import Floats
@@ -61,22 +61,15 @@ PASSES, SAMPLED_FLIGHT = 2, 600
 
 
 @dataclass(frozen=True, slots=True)
-class Trajectories:
+class Trajectories(Samples):
     """Positions (k, bodies, 3) of the moving bodies at instants (k,), in metres."""
 
-    time_s: Floats
     position_m: Floats
-
-    def between(self, begin_s: float, end_s: float) -> Trajectories:
-        """Return the positions within a span of time."""
-        inner = (self.time_s >= begin_s - 1e-9) & (self.time_s <= end_s + 1e-9)
-        return Trajectories(self.time_s[inner], self.position_m[inner])
 
     def joined(self, other: Trajectories) -> Trajectories:
         """Return both, in order of time."""
-        time = np.concatenate([self.time_s, other.time_s])
-        order = np.argsort(time, kind="stable")
-        return Trajectories(time[order], np.concatenate([self.position_m, other.position_m])[order])
+        both = Trajectories.concatenate([self, other])
+        return both[np.argsort(both.time_s, kind="stable")]
 
     def state(self, scene: Scene, stand: Floats) -> dict[str, Floats]:
         """Return control points of paths near the positions; before and after, bodies rest."""
@@ -149,12 +142,14 @@ def _extend(
     for sign, last_s in ((1, end_s), (-1, begin_s)):
         edge = float(found.time_s[::sign][-1])
         while sign * (last_s - edge) > 1e-6:
-            near, window = found.between(edge - step, edge + step), scene.between(edge - step, edge + step)
+            window = scene.between(edge - step, edge + step)
+            # Sums of steps are not exact.
+            near = found.between(edge - step - 1e-9, edge + step + 1e-9)
             fresh: Floats = np.asarray(edge + sign * SAMPLE_S * np.arange(1, round(step / SAMPLE_S) + 1))
             fresh = fresh[sign * (fresh - last_s) <= SAMPLE_S]
             new = Trajectories(fresh, _carried_on(near, fresh, sign))
             if len(window.time_s) >= 2:
-                window = replace(window, places=window.places + near.places())
+                window = replace(window, places=Places.concatenate([window.places, near.places()]))
                 fitted = _fit_window(window, near.joined(new), stand)
                 new, stand = Trajectories(fresh, fitted.positions(fresh)), _stand(fitted)
             found, edge = found.joined(new), float(fresh[-1])

@@ -74,7 +74,7 @@ SHAPE = {
 
 def slopes(error, **changed):
     values = {name: np.full(1, value) for name, value in (SHAPE | changed).items()}
-    return error_slopes(np.atleast_1d(np.asarray(error, dtype=float)), values, span_m=10.0)
+    return error_slopes(np.atleast_1d(np.asarray(error, dtype=float)), values)
 
 
 def test_the_density_is_one():

@@ -11,6 +11,7 @@ from benchmarks.worlds import CLEAN, Recipe, make
 from calib.estimator import known_distances
 from calib.estimator.covariance import Kept, sandwich
 from calib.estimator.known_distances import fit_known_distances, model_of, robust_fit
+from calib.estimator.score_tests import Slopes
 from calib.estimator.time_blocks import TimeBlocks, persistence, time_blocks
 from calib.settings import FitSettings
 from tests.calib import synthetic
@@ -31,7 +32,7 @@ def test_few_ranges_of_a_pair_have_students_intervals(squares):
     model, found, delays = squares
     cut = time_blocks(model.ranges.time_ns, model.ranges.session)
     kept = {"few": Kept.delays(delays, 4), "many": Kept.delays(delays, 1e9)}
-    (few, last), (many, _) = sandwich(found.optimum, found.rows, kept, cut).values()
+    (few, last), (many, _) = sandwich(Slopes(found.rows, found.optimum, cut), kept).values()
     assert last.freedom > 3
     assert np.sqrt(np.diag(few) / np.diag(many)) == pytest.approx(student.ppf(0.975, 3) / last.quantile95, rel=1e-6)
 
@@ -39,7 +40,8 @@ def test_few_ranges_of_a_pair_have_students_intervals(squares):
 def test_what_a_fit_uses_of_the_data_is_given_back(squares):
     model, found, delays = squares
     cut = time_blocks(model.ranges.time_ns, model.ranges.session)
-    whole, lasting = sandwich(found.optimum, found.rows, {"delay": Kept.delays(delays, 1e9)}, cut)["delay"]
+    kept = {"delay": Kept.delays(delays, 1e9)}
+    whole, lasting = sandwich(Slopes(found.rows, found.optimum, cut), kept)["delay"]
     # With NumPy alone: scores summed by block, the residual's share of degrees of freedom, and how long errors last.
     tags, ranges = np.array(model.tags), model.ranges
     weights = ((ranges.initiator, ranges.weight_initiator), (ranges.target, ranges.weight_target))
