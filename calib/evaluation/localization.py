@@ -192,11 +192,14 @@ class Summary:
     accepted: float
 
 
-def rmse_rows(found: list[Localization], total: Summary) -> list[list[str]]:
-    """Return a row for each body of the RMSE by filter, and rows of their mean, its spread, and its reduction."""
-    seeds, names = len(found[0].rmse_m["raw"]), list(total.rmse_m)
+def rmse_rows(found: list[Localization], total: Summary, spread: str = "its spread over seeds") -> list[list[str]]:
+    """Return a row for each body of the RMSE by filter, and rows of their mean, its spread, and its reduction.
+
+    `spread` is the title of the spread, which is left out of a single seed.
+    """
+    names, several = list(total.rmse_m), len(found[0].rmse_m["raw"]) > 1
     numbers = [(f"{one.source} {one.body}", {name: one.rmse_m[name].mean() for name in names}) for one in found]
-    numbers += [("mean", total.rmse_m), *([(f"its spread over {seeds} seeds", total.spread_m)] if seeds > 1 else [])]
+    numbers += [("mean", total.rmse_m), *([(spread, total.spread_m)] if several else [])]
     rows = [[title, *(f"{row[name]:.3f}" for name in names)] for title, row in numbers]
     return [*rows, ["against raw", "", *(f"{-100 * less:+.0f} %" for less in total.reduction.values())]]
 

@@ -22,7 +22,8 @@ from uwblink.output import write_files
 def localization_text(found: list[Localization], settings: Settings) -> str:
     """Return the table that `calib localize` prints, a row per body, with the settings below."""
     summary, fixed = summarize(found), found[0].fixed
-    rows = [["RMSE of the position (m)", *summary.rmse_m], *rmse_rows(found, summary)]
+    numbers = rmse_rows(found, summary, f"its spread over {settings.seeds} seeds")
+    rows = [["RMSE of the position (m)", *summary.rmse_m], *numbers]
     first = max(30, *(len(row[0]) + 1 for row in rows))
     table = [f"{printable(name):{first}s}" + "".join(f"{cell:>12s}" for cell in cells) for name, *cells in rows]
     paper = ", ".join(f"{value:.3f}" for value in PAPER_RMSE_M.values())
