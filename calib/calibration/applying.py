@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple
 
 import numpy as np
 
-from calib.calibration.document import pair_name
+from calib.calibration.document import T, pair_name
 from calib.calibration.power_curves import ends, lift
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError
@@ -18,8 +18,6 @@ from uwblink.display import as_text, excerpt, first_few
 
 if TYPE_CHECKING:
     from calib.calibration.model import Calibration
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

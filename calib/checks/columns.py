@@ -10,9 +10,10 @@ import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.checks.recording_view import RecordingView
-from calib.data.clocks import left_skew, pair_ids
+from calib.data.clocks import left_skew
 from calib.estimator.identifiability import free_directions
 from calib.findings import Candidate, exceeds, more_often
+from calib.pairs import pairs_of
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats
 from uwblink.protocols.table import PROTOCOLS, single_sided
@@ -299,7 +300,7 @@ def confounded(view: RecordingView) -> Iterator[Candidate]:
     rows = np.flatnonzero(np.isfinite(lifted) & (view.ranges.truth_m > 0))
     if len(rows) < 300 or np.ptp(view.ranges.truth_m[rows]) < 0.5:
         return
-    pairs = pair_ids(view.exchanges)
+    pairs = pairs_of(view.exchanges.initiator, view.exchanges.target).number
     rows = rows[np.lexsort((view.exchanges.time_ns[rows], pairs[rows]))]
     pair, time_ns, shares, groups = pairs[rows], view.exchanges.time_ns[rows], [0.0], 40
     alone = len(np.unique(np.column_stack([pair, time_ns // 2_000_000_000]), axis=0))

@@ -15,7 +15,6 @@ from typing import Final
 import numpy as np
 from scipy import sparse
 
-from calib.data.clocks import pair_ids
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import RecordedSource, Source
 from calib.estimator.known_distances import FEWEST_RANGES, PILOT, Fitted, likeliest, model_of, robust_fit
@@ -24,6 +23,7 @@ from calib.estimator.range_model import RangeModel
 from calib.estimator.score_tests import REACHED, Family, Slopes, Tested
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.unknowns import Priors
+from calib.pairs import pairs_of
 from calib.settings import FitSettings
 from calib.spread import less_medians
 from uwblink.arrays import Bools, Floats, Ints
@@ -68,7 +68,7 @@ class RecordingView:
         Those are two wavelengths, over which power hardly varies.
         """
         good = np.isfinite(self.ranges.truth_m)
-        pair, truth_m = pair_ids(self.exchanges[good]), self.ranges.truth_m[good]
+        pair, truth_m = pairs_of(self.ranges.initiator, self.ranges.target).number[good], self.ranges.truth_m[good]
         span_m = max((float(np.ptp(truth_m[pair == one])) for one in np.unique(pair)), default=np.inf)
         return span_m if span_m < 0.1 else None
 
@@ -84,9 +84,9 @@ class RecordingView:
     def less_pairs(self, error_m: Floats) -> Floats:
         """Return errors (n,) less the median of their pair, NaN for pairs with ten or fewer."""
         good = np.isfinite(error_m)
-        _, pair, count = np.unique(pair_ids(self.exchanges[good]), return_inverse=True, return_counts=True)
+        pair = pairs_of(self.ranges.initiator[good], self.ranges.target[good]).number
         left = np.full(len(error_m), np.nan)
-        left[good] = np.where(count[pair] > 10, less_medians(error_m[good], pair), np.nan)
+        left[good] = np.where(np.bincount(pair)[pair] > 10, less_medians(error_m[good], pair), np.nan)
         return left
 
 
@@ -275,5 +275,5 @@ def _of_common_pairs(view: RecordingView, ranges_a_pair: int) -> Ints:
     """Return the rows with a true distance of pairs that have enough of them, by time."""
     rows = np.flatnonzero(np.isfinite(view.error_m))
     rows = rows[np.argsort(view.exchanges.time_ns[rows], kind="stable")]
-    _, pair, count = np.unique(pair_ids(view.exchanges)[rows], return_inverse=True, return_counts=True)
-    return np.asarray(rows[count[pair] >= ranges_a_pair])
+    pair = pairs_of(view.ranges.initiator[rows], view.ranges.target[rows]).number
+    return np.asarray(rows[np.bincount(pair)[pair] >= ranges_a_pair])

@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
+from calib.pairs import pairs_of
 from calib.spread import STD_OF_MEDIAN, medians, spreads
-from uwblink.arrays import Ints
 from uwblink.protocols.table import PROTOCOLS, Intervals, is_single_sided
 from uwblink.recording import IMPOSSIBLE_PPM, target_faster_ppm
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
@@ -53,7 +53,8 @@ def clocks_apart(exchanges: Exchanges) -> ClocksApart | None:
     # So many are enough; a regular choice could coincide with the schedule of pairs.
     some = exchanges[np.sort(np.random.default_rng(0).permutation(rows)[:20_000])]
     some = some[np.abs(target_faster_ppm(some)) < IMPOSSIBLE_PPM]
-    _, first, pair, count = np.unique(pair_ids(some), return_index=True, return_inverse=True, return_counts=True)
+    pair = pairs_of(some.initiator, some.target).number
+    _, first, count = np.unique(pair, return_index=True, return_counts=True)
     forth, enough = np.where(some.initiator < some.target, 1.0, -1.0), count >= 20
     stamps, carrier = forth * target_faster_ppm(some), forth * (some.skew1_ppm - some.skew2_ppm) / 2
     by_stamps, by_carrier = medians(stamps, pair), medians(carrier, pair)
@@ -68,12 +69,6 @@ def clocks_apart(exchanges: Exchanges) -> ClocksApart | None:
     k = int(np.argmax(moves_m))
     low, high = sorted((int(some.initiator[first[k]]), int(some.target[first[k]])))
     return ClocksApart((low, high), float(by_stamps[k]), float(by_carrier[k]), float(moves_m[k]))
-
-
-def pair_ids(exchanges: Exchanges) -> Ints:
-    """Return one number for each pair of tags, whoever initiated, shape (n,)."""
-    first, second = exchanges.initiator, exchanges.target
-    return np.asarray(np.minimum(first, second) * 65_536 + np.maximum(first, second))
 
 
 @dataclass(frozen=True, slots=True)

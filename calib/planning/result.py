@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic
 
 import numpy as np
 
-from calib.calibration.document import for_json
+from calib.calibration.document import T, for_json
 from calib.information import Verdict
 from calib.planning.settings import FlightPlanSettings
 from uwblink.arrays import Floats
-
-T = TypeVar("T")
 
 GUESS_NS = 1.5
 """How far a delay is known without any data: means over tags are finite then, though some are not determined."""

@@ -18,19 +18,13 @@ from uwblink.arrays import Floats
 from uwblink.pages.colours import BLUE, GREY, INK, MUTED, VERMILION, WINE, look
 from uwblink.pages.figures import NARROW_IN, label, legend, mark, series, sheet
 
-FILTER_NAMES: Final = {
-    "raw": "raw",
-    "calibrated": "calibrated",
-    "variance": "calibrated, with variance",
-    "robust": "calibrated, with reflections",
+FILTERS: Final[dict[str, tuple[str, str, Any, str]]] = {
+    "raw": ("raw", VERMILION, (0, (1.5, 1.2)), ""),
+    "calibrated": ("calibrated", WINE, (0, (5, 1.5)), "////"),
+    "variance": ("calibrated, with variance", BLUE, "-", ""),
+    "robust": ("calibrated, with reflections", GREY, (0, (6, 1.5, 1.5, 1.5)), "xxxx"),
 }
-FILTER_LINES: Final[dict[str, tuple[str, Any, str]]] = {
-    "raw": (VERMILION, (0, (1.5, 1.2)), ""),
-    "calibrated": (WINE, (0, (5, 1.5)), "////"),
-    "variance": (BLUE, "-", ""),
-    "robust": (GREY, (0, (6, 1.5, 1.5, 1.5)), "xxxx"),
-}
-"""Colour, dashes and hatches of each filter."""
+"""Name, colour, dashes and hatches of each filter."""
 
 SAMPLES: Final = 700
 """Points of a track that are drawn: more than the width of a page shows."""
@@ -44,9 +38,9 @@ def rmse_bars(width_in: float, found: list[Localization]) -> Figure:
     names = [f"{one.source.removesuffix('.uwb')}\n{one.body}" for one in shown] + ["mean"]
     heights = {stage: [float(one.rmse_m[stage].mean()) for one in shown] + [mean[stage]] for stage in mean}
     for k, (stage, own) in enumerate(heights.items()):
-        colour, _, hatch = FILTER_LINES[stage]
+        name, colour, _, hatch = FILTERS[stage]
         place = np.arange(len(names)) + 0.21 * (k - (len(mean) - 1) / 2)
-        axes.bar(place, own, 0.19, color=colour, hatch=hatch, ec="white", lw=0, label=FILTER_NAMES[stage])
+        axes.bar(place, own, 0.19, color=colour, hatch=hatch, ec="white", lw=0, label=name)
     every = np.concatenate(list(heights.values()))
     # A filter that diverged leaves the picture.
     if every.max() > 4 * np.quantile(every, 0.9):
@@ -85,8 +79,8 @@ def track(width_in: float, one: Localization) -> Figure:
     above, height, error = panels["path"], panels["height"], panels["error"]
     usual = []
     for stage, own in one.tracks.items():
-        colour, dashes, _ = FILTER_LINES[stage]
-        line: dict[str, Any] = {"color": colour, "ls": dashes, "lw": 0.9, "label": FILTER_NAMES[stage]}
+        name, colour, dashes, _ = FILTERS[stage]
+        line: dict[str, Any] = {"color": colour, "ls": dashes, "lw": 0.9, "label": name}
         off = np.linalg.norm(own.estimate_m - own.truth_m, axis=1)
         usual.append(float(np.quantile(off, 0.995)))
         series(error, time, off[every], **line)

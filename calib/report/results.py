@@ -33,8 +33,7 @@ class Origin:
     def sentence(self) -> str:
         """Return the origin in a line, for the head of a report."""
         parts = [f"Made {self.made}" if self.made else "", f"by uwbcal {self.version}" if self.version else ""]
-        how = f": {self.command}" if self.command else ""
-        return " ".join(filter(None, parts)) + how
+        return " ".join(filter(None, parts)) + (f": {self.command}" if self.command else "")
 
 
 def origin_of(data: Iterable[Data], command: str = "") -> Origin:

@@ -66,21 +66,13 @@ class Knowledge:
         return tuple(order) if self.shape_of(arrangement) == "line" else ()
 
 
-def _is_name(value: Any) -> bool:
-    return isinstance(value, str) and bool(value) and value.isprintable()
-
-
 def _are_tags(value: Any, count: int | None = None) -> bool:
     good = isinstance(value, list) and all(type(one) is int and 0 <= one <= 254 for one in value)
     return good and len(set(value)) == len(value) and (len(value) == count if count else len(value) > 1)
 
 
-def _is_length(value: Any) -> bool:
-    return is_number(value) and value > 0
-
-
-LENGTH: Final = (_is_length, "a number above 0 (metres)")
-NAME: Final = (_is_name, "a name")
+LENGTH: Final = (lambda value: is_number(value) and value > 0, "a number above 0 (metres)")
+NAME: Final = (lambda value: isinstance(value, str) and value.isprintable() and value != "", "a name")
 SECONDS: Final = (lambda value: is_number(value) and abs(value) <= 1e9, "a number of seconds")  # thirty years
 KEYS: Final[dict[str, dict[str, tuple[Callable[[Any], bool], str]]]] = {
     "arrangements": {

@@ -44,8 +44,7 @@ BY_UNIT: Final = {
 @cache
 def limit_of(key: str) -> tuple[float, str]:
     """Return the limit of a key by the unit that it ends with, and the reason."""
-    fitting = [unit for unit in BY_UNIT if key.endswith(unit)]
-    return BY_UNIT[max(fitting, key=len)]
+    return BY_UNIT[max(filter(key.endswith, BY_UNIT), key=len)]
 
 
 def check_limits(key: str, value: Any) -> None:

@@ -56,8 +56,7 @@ def frame_s(length_bytes: int, preamble_symbols: int) -> float:
 
 def message_bytes(protocol: RangingProtocol) -> tuple[int, ...]:
     """Return the lengths of a protocol's frames: poll, a response where there is one, final."""
-    middle = [RESPONSE_BYTES] * (len(protocol.messages) - 2)
-    return (POLL_BYTES, *middle, FINAL_BYTES)
+    return (POLL_BYTES, *[RESPONSE_BYTES] * (len(protocol.messages) - 2), FINAL_BYTES)
 
 
 def exchange_air_s(protocol: RangingProtocol, preamble_symbols: int) -> float:
