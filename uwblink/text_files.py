@@ -23,8 +23,11 @@ def require_regular(
     FIFOs and devices must not be opened: reading them may never end.
     """
     not_path = raising(error, f"{str(path)!r}: no path of a {what}", ValueError)  # a NUL in the path
-    with not_path, raising(error, f"{path}: no such {what}"):
-        mode = os.stat(path).st_mode
+    with not_path, raising(error, f"{path}: cannot be read"):
+        try:
+            mode = os.stat(path).st_mode
+        except FileNotFoundError as problem:
+            raise error(f"{path}: no such {what}") from problem
     if stat.S_ISDIR(mode):
         if not folders:
             raise error(f"{path}: is a directory, expected a {what}")
