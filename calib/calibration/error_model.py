@@ -111,7 +111,8 @@ class ErrorModel:
         return replace(self, noise_m=tuple(noise_m.tolist()), between_m=between_m, pairs=pairs)
 
     def within_m(self, noise_m: Floats) -> Floats:
-        """Return the part of the noise of ranges (n,) that varies within a recording."""
+        """Return the part of the noise of ranges (n,), metres, that varies within a recording: a tenth of it at least,
+        because other calibrations may state less noise than `between_m`."""
         return np.sqrt(np.maximum(np.square(noise_m) - self.between_m**2, (0.1 * noise_m) ** 2))
 
     @property

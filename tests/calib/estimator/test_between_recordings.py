@@ -55,6 +55,17 @@ def test_what_is_said_of_other_recordings_is_in_the_total_and_what_is_not_is_ref
         calib.fit(ranges, between_m=-1.0)
 
 
+def test_quiet_and_noisy_pairs_differ_between_recordings_by_as_much():
+    ranges = make(CLEAN["unequal noise"], 33).ranges
+    plain, stated = (calib.fit(ranges, between_m=value).calibration for value in (0.0, 0.05))
+    lifted = np.full(len(ranges), np.median(plain.errors.lifted))
+    noise = [one.errors.shapes(lifted, ranges.initiator, ranges.target).noise_m for one in (plain, stated)]
+    assert noise[0].max() > 1.5 * noise[0].min()
+    # Nodes of power stand for their median in the factors of pairs, which costs a few per cent.
+    assert noise[1] ** 2 - noise[0] ** 2 == pytest.approx(np.full(len(ranges), 0.05**2), rel=0.1)
+    assert stated.errors.within_m(noise[1]) == pytest.approx(noise[0], rel=0.1)
+
+
 @pytest.fixture(scope="module")
 def starloc(tmp_path_factory):
     """Ranges of two flights of STAR-loc: two tags on a rig, eight anchors."""
