@@ -183,7 +183,7 @@ def check_length(path: Path) -> None:
     """
     log = log_of(path)
     if not (log.exists() and log.stat().st_size) and path.stat().st_size % 16_384 != 3 * 4096:
-        raise _no_recording(path, "its length is odd")
+        raise _no_recording(path, "its size is not that of whole blocks")
 
 
 class Store:
