@@ -106,7 +106,9 @@ def _work(
     except BaseException:
         traceback.print_exc()
     finally:
+        # A measurement of coverage writes its own file at exit, on a disk that has room.
         _limit(dict.fromkeys(limits, resource.RLIM_INFINITY))
+        atexit._run_exitfuncs()
         for descriptor, stream in enumerate((sys.stdout, sys.stderr), 1):
             stream.flush()
             if isinstance(stream, io.StringIO):
@@ -133,5 +135,4 @@ def _call(argv: list[str]) -> int:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     finally:
         threading._shutdown()  # type: ignore[attr-defined]
-        atexit._run_exitfuncs()
     return 0
