@@ -253,9 +253,9 @@ uwblink import csv A-few.csv --map A.toml -o A-few.uwb
 uwblink poses A.uwb --from A-rig.csv --tags rig.toml
 calib doctor A.uwb
 calib fit A.uwb -o A.json
-calib fit A.uwb -o A.json --minimum-norm
-calib fit A.uwb -o A-same.json --minimum-norm --between 0
-calib fit A-few.uwb -o A-few.json --minimum-norm
+calib fit A.uwb -o A.json
+calib fit A.uwb -o A-same.json --between 0
+calib fit A-few.uwb -o A-few.json
 calib evaluate B.uwb -c A.json
 calib localize B.uwb -c A.json
 calib evaluate B.uwb -c A-same.json

@@ -197,10 +197,11 @@ def delays(
 ) -> Axes:
     """Draw delays in ns with 95 % intervals, and planted delays moved by the common shift.
 
-    A delay far from all others is written at the edge; one without an interval is a circle.
+    A delay far from all others is written at the edge; one without an interval is a circle; tags of undetermined splits
+    are left out.
     """
     axes = axes or new_axes()
-    tags = sorted(calibration.delays_ns)
+    tags = sorted(calibration.delays_ns.keys() - calibration.sides.keys())
     place = np.arange(len(tags), dtype=np.float64)
     values = np.array([calibration.delays_ns[tag] for tag in tags])
     half = TWO_SIDED_95 * np.array([calibration.delays_std_ns.get(tag, np.nan) for tag in tags])

@@ -178,8 +178,7 @@ class FitSettings(CheckedSettings):
     `lift` and `alpha_dbm` make the lifted power of an exchange.
 
     `fixed_ns` are known delays by tag; `groups` are tags that share curves, by name (all do by default); `sequential`
-    fits delays first and then the curve to what they leave (ICRA 2023, sections III and IV). `minimum_norm` fits the
-    smallest delays that agree with the data where the pairs leave delays free. The curve is zero at
+    fits delays first and then the curve to what they leave (ICRA 2023, sections III and IV). The curve is zero at
     `reference_power_dbm`, `alpha_dbm` by default; `delays_only` fits no curve; `delays_from` is a calibration, or its
     path, whose delays are taken over; `constants` "pair" gives each pair a constant instead of each tag a delay. With
     `hold_out` a second fit, to the other ranges, is judged on such a share of them, by `fold`; what was found is in the
@@ -240,11 +239,6 @@ class FitSettings(CheckedSettings):
     sequential: bool = setting(
         False,
         "Fit the delays first, and then the curve to what they leave (ICRA 2023).",
-        rich_help_panel=MODEL_PANEL,
-    )
-    minimum_norm: bool = setting(
-        False,
-        "Fit the smallest delays that agree with the data where the pairs leave delays free.",
         rich_help_panel=MODEL_PANEL,
     )
     reference_power_dbm: float | None = setting(
@@ -383,6 +377,11 @@ class FlightSettings(CheckedSettings):
         None,
         "Calibration whose curve over power is taken over (.json).",
         kind=Path | None,
+        rich_help_panel=FLIGHT_PANEL,
+    )
+    minimum_norm: bool = setting(
+        False,
+        "Write the smallest delays that agree with the ranges also where these determine no delay.",
         rich_help_panel=FLIGHT_PANEL,
     )
 

@@ -53,6 +53,8 @@ def test_the_reference_of_calibrations_has_every_key_of_files_and_no_other():
         received = dataclasses.replace(calibration, power_at="reception")
         for one in (calibration, received):
             found |= set(flat(json.loads(one.to_json())))
+    ranges = calib.load_ranges(flight)
+    found |= set(flat(json.loads(calib.fit(ranges[ranges.initiator == 1]).calibration.to_json())))
     assert found == {key.name for key in CALIBRATION}
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple
 
 import numpy as np
 
-from calib.calibration.document import T, pair_name
+from calib.calibration.document import T, pair_name, split_text
 from calib.calibration.power_curves import ends, lift
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError
@@ -102,10 +102,25 @@ def _without_delays(calibration: Calibration, ranges: Ranges) -> Floats:
             f"{ranges.source}: no delay for tag {', '.join(map(str, missing))} in the calibration, "
             f"which knows {known}; fit one from a recording with all tags"
         )
+    _refuse_within(calibration, ranges)
     size = max(ranges.tags(), default=0) + 1
     delay_s = np.array([calibration.delays_ns.get(t, math.nan) for t in range(size)]) * 1e-9
     flight = ranges.weight_initiator * delay_s[ranges.initiator] + ranges.weight_target * delay_s[ranges.target]
     return ranges.raw_m + calibration.speed_of_light * flight - _offsets_m(calibration, ranges)
+
+
+def _refuse_within(calibration: Calibration, ranges: Ranges) -> None:
+    """Raise `BadInputError` for a pair whose delays the calibration knows only in sums with others."""
+    sides = calibration.sides
+    if not sides:
+        return
+    ends = pairs_of(ranges.initiator, ranges.target).ends.tolist()
+    apart = [pair for pair in ends if sum(sides.get(tag, 0) for tag in pair)]
+    if apart:
+        raise BadInputError(
+            f"{ranges.source}: the calibration does not determine the ranges of {first_few(map(pair_name, apart))}: "
+            f"{split_text(calibration.undetermined_splits)}"
+        )
 
 
 def _offsets_m(calibration: Calibration, ranges: Ranges) -> Floats:

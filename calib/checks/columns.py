@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.calibration.document import split_text
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.checks.recording_view import RecordingView
 from calib.data.clocks import left_skew
@@ -250,8 +251,7 @@ def undetermined(view: RecordingView) -> Iterator[Candidate]:
     if len(some):
         _, free = free_directions(some.tags(), some)
         if free:
-            groups = "; ".join(", ".join(map(str, group)) for group in free)
-            yield Candidate("too few pairs", f"the pairs do not determine the delays of tags {groups}")
+            yield Candidate("too few pairs", split_text(free))
 
 
 def silent(view: RecordingView) -> Iterator[Candidate]:

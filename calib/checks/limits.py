@@ -227,16 +227,11 @@ def implausible(delays_ns: Mapping[int, float], residuals_m: Floats) -> Iterator
         yield f"errors spread by {spread:.2f} m after the fit, those of UWB ranges by 10 cm: check the true distances"
 
 
-def warnings_of(ranges: Ranges, inliers: float, free: list[list[int]], seconds: float) -> Iterator[str]:
+def warnings_of(ranges: Ranges, inliers: float, seconds: float) -> Iterator[str]:
     """Yield sentences on the data of a fit, the gravest first.
 
     `inliers` is the share of ranges within three sigmas, `seconds` the time that ranges cover.
     """
-    if free:
-        groups = "; ".join(", ".join(map(str, group)) for group in free)
-        yield (
-            f"the data leave the delays of tags {groups} free; those written are the smallest that agree with the data"
-        )
     delays = known_delays(ranges.antenna_delays, ranges.tags())
     apart = [f"{tag} ({one})" for tag, one in delays.items() if tag is not None and one.reply != one.tx]
     if apart:

@@ -112,13 +112,11 @@ class KnownDistances:
 def fit_known_distances(ranges: Ranges, settings: FitSettings) -> KnownDistances:
     """Fit delays, curves, offsets and errors.
 
-    Raises `UnanswerableError` if there are too few ranges or if the pairs do not determine the delays, and
-    `BadInputError` for pinned tags or groups that are not in the ranges.
+    Raises `UnanswerableError` if there are too few ranges, and `BadInputError` for pinned tags or groups that are not
+    in the ranges.
     """
     model = model_of(ranges, settings)
     error = model.ranges.raw_m - model.ranges.truth_m
-    if not settings.minimum_norm:
-        refuse_free(model, by_pair=True)
     blocks = time_blocks(model.ranges.time_ns, model.ranges.session)
     loss = settings.loss or (ROBUST_LOSS if settings.sequential or settings.delays_only else MIXTURE)
     scale_m = None if settings.scale_ns is None else settings.scale_ns * METRES_A_NS
@@ -146,22 +144,6 @@ def model_of(ranges: Ranges, settings: FitSettings, *, trimmed: bool = True) -> 
             "every tag is pinned and no curve is fitted, so nothing is left to fit", parameter="fixed_ns"
         )
     return model
-
-
-def refuse_free(model: RangeModel, *, by_pair: bool = False) -> None:
-    """Raise `UnanswerableError` if the pairs leave delays free, whatever the distances.
-
-    The message names the constants of pairs as another answer where they can be had (`by_pair`).
-    """
-    if model.free:
-        named = "; ".join(", ".join(map(str, group)) for group in model.free)
-        raise UnanswerableError(
-            f"the pairs do not determine the antenna delays of tags {named}: some can grow as others shrink without "
-            "changing any range; record three tags that all range with each other, or pin a known delay with "
-            "`fixed_ns` (`minimum_norm` fits regardless, and says so"
-            f"{'; `constants` pair gives each pair its own' if by_pair else ''})",
-            undetermined=model.free,
-        )
 
 
 def robust_fit(

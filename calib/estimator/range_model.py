@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import BSpline
 
+from calib.calibration.document import Split
 from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, knots_for, lift, lifted_power, populated
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
@@ -98,7 +99,7 @@ class RangeModel:
     parts: tuple[Part, ...]
     carriers: tuple[Floats | None, ...]
     held: Floats
-    free: list[list[int]]
+    free: list[Split]
 
     @classmethod
     def of(cls, ranges: Ranges, settings: FitSettings, *, offsets: bool = True, trimmed: bool = True) -> RangeModel:
@@ -249,8 +250,8 @@ class RangeModel:
         return layout, RangeRows.of(residual, self.key(), used, errors, layout, geometry)
 
 
-def _free_directions(ranges: Ranges, tags: list[int], settings: FitSettings) -> tuple[Floats, list[list[int]]]:
-    """Return the directions of delays (tags, k) that the pairs leave free, and their tags."""
+def _free_directions(ranges: Ranges, tags: list[int], settings: FitSettings) -> tuple[Floats, list[Split]]:
+    """Return the directions of delays (tags, k) that the pairs leave free, and their sides."""
     own = [tag for tag in tags if tag not in settings.fixed_ns]
     if not own or settings.constants == "pair":
         return np.zeros((len(tags), 0)), []

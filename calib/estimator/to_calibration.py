@@ -61,7 +61,7 @@ def calibration_of(found: KnownDistances, delays_ns2: Floats) -> Calibration:
     model, search, settings = found.model, found.searches[0], found.model.settings
     names, fixed = model.unknowns[0].names, settings.fixed_ns
     of_pairs = settings.constants == "pair"
-    free = {tag for group in found.model.free for tag in group}
+    free = {tag for sides in found.model.free for tags in sides for tag in tags}
     std = [
         math.inf if not of_pairs and int(name) in free else math.sqrt(max(value, 0.0))
         for name, value in zip(names, np.diag(delays_ns2), strict=True)
@@ -105,6 +105,7 @@ def calibration_of(found: KnownDistances, delays_ns2: Floats) -> Calibration:
         groups={name: TagGroup(tuple(own), biases[name], sigmas[name]) for name, own in settings.groups.items()},
         errors=errors,
         antenna_delays=known_delays(model.ranges.antenna_delays, model.ranges.tags()),
+        undetermined_splits=tuple(model.free),
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from calib.calibration.applying import CorrectedRanges
+from calib.calibration.comparison import loose_shifts
 from calib.calibration.document import for_json, pair_name
 from calib.calibration.model import Calibration, require_calibration
 from calib.data.ranges import Ranges
@@ -82,6 +83,8 @@ class ErrorStatistics:
 @dataclass(frozen=True, slots=True)
 class PlantedComparison:
     """The difference between a calibration and what a simulation planted, less the common constant.
+
+    What undetermined splits of the calibration leave open is taken out of the delays, too.
 
     `delay_error_ns` maps tags to fitted less planted delays, `curve_rms_m` is the rms of the bias curves' difference
     over the ranges inside the fitted power, `correction_rms_m` that of the whole correction of each range; NaN if no
@@ -206,8 +209,9 @@ def compare_with_planted(
     difference = {tag: calibration.delays_ns[tag] - d for tag, d in planted.items() if tag in calibration.delays_ns}
     if not difference:
         return None
-    shift = float(np.mean(list(difference.values())))
-    delays = {tag: d - shift for tag, d in difference.items()}
+    loose, apart = loose_shifts([calibration], list(difference)), np.array(list(difference.values()))
+    taken = np.linalg.lstsq(loose, apart)[0]
+    shift, delays = float(taken[0]), dict(zip(difference, (apart - loose @ taken).tolist(), strict=True))
     inside = ~applied.clamped
     truth = planted_curve(ranges, "bias_curve", applied.lifted[inside])
     curve_rms = correction_rms = float("nan")

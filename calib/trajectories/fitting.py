@@ -11,6 +11,7 @@ import numpy as np
 from scipy import sparse
 from threadpoolctl import threadpool_limits
 
+from calib.calibration.document import Split
 from calib.calibration.model import Calibration, given_calibration
 from calib.calibration.power_curves import basis
 from calib.checks.fitted import examine_fit
@@ -18,9 +19,9 @@ from calib.checks.limits import refuse_refuted
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.inverse import Matrix, inverse_of
-from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described, refuse_free
+from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described
 from calib.estimator.losses import MIXTURE
-from calib.estimator.range_model import RangeModel
+from calib.estimator.range_model import METRES_A_NS, RangeModel
 from calib.estimator.rows import sum_rows
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
@@ -43,7 +44,6 @@ SHARED = (
     "alpha_dbm",
     "reference_power_dbm",
     "delays_only",
-    "minimum_norm",
     "between_m",
 )
 """The settings of `fit` that a fit without known distances has, too."""
@@ -112,8 +112,6 @@ def fit_from_ranges(
     # One thread: the same bytes on any machine.
     with threadpool_limits(limits=1, user_api="blas"):
         model, scene = range_model(scene, settings, curve=not settings.delays_only and known is None)
-        if not settings.minimum_norm:
-            refuse_free(model)
         scene, state, rival = begin(scene, lambda share: report(SHARE_OF_START * share))
         error = model.ranges.raw_m if known is None else model.ranges.raw_m - known.bias_curve(model.lifted)
         top = search(scene, model, error, state, lambda share: report(SHARE_OF_START + (1 - SHARE_OF_START) * share))
@@ -207,25 +205,21 @@ def _result(
     covariance, findings = examine_fit(found)
     covariance = variance_factor(scene) * covariance
     own, verdict = _judge_delays(found, top)
-    free, left_open = [int(tag) for tag in verdict.named("delay") if tag], ""
-    undetermined_text = _undetermined_text(free, [model.tags[k] for k in own], covariance[np.ix_(own, own)])
-    if free and len(free) == len(own) and not settings.minimum_norm:
+    # Splits that the pairs leave undetermined are held, so that the covariance has nothing along them.
+    free = [int(tag) for tag in verdict.named("delay") if tag]
+    left_open = _undetermined_text(free, [model.tags[k] for k in own], covariance[np.ix_(own, own)], model.free)
+    if free and len(free) == len(own) and not flight.minimum_norm:
         raise UnanswerableError(
-            f"{scene.source}: {undetermined_text}; let positions be known for some seconds "
+            f"{scene.source}: {left_open}; let positions be known for some seconds "
             "(`poses_until_s`), give the places of anchors, or pin a delay with `fixed_ns` (`minimum_norm` fits "
             "regardless, and says so)",
             undetermined=[free],
         )
-    undetermined = found.model.free
-    # Delays that the pairs leave free are held at the smallest values, so that their covariance says nothing of them.
-    if not {tag for group in found.model.free for tag in group}.issuperset(free):
-        left_open, undetermined = undetermined_text, [free]
     calibration = calibration_of(found, covariance)
     if known is not None:
         calibration = _with_curve(calibration, known)
     provenance = _provenance(found, top, flight) | {"distance_std_m": _distance_std_m(top)}
-    provenance |= {"undetermined": undetermined} if undetermined else {}
-    provenance |= {"left_open": left_open} if left_open else {}
+    provenance |= {"undetermined": [free], "left_open": left_open} if free else {}
     calibration = replace(
         calibration,
         delays_std_ns=calibration.delays_std_ns | dict.fromkeys(free, math.inf),
@@ -302,8 +296,23 @@ def _distance_std_m(top: Search) -> float:
     return float(np.sqrt(np.mean(np.einsum("kp,pk->k", moved, top.optimum.covariance @ moved.T))))
 
 
-def _undetermined_text(free: Sequence[int], tags: Sequence[int], covariance_ns2: Floats) -> str:
-    """Return a sentence on the delays of `free` tags, which are not determined; `covariance_ns2` is that of `tags`."""
+def _undetermined_text(
+    free: Sequence[int], tags: Sequence[int], covariance_ns2: Floats, splits: Sequence[Split]
+) -> str:
+    """Return a sentence on the delays of `free` tags, which are not determined, "" for none.
+
+    `covariance_ns2` is that of `tags`, held along undetermined `splits`: it describes sums of delays of two sides.
+    """
+    if not free:
+        return ""
+    across = [(a, b) for one, other in splits for a in one for b in other if a in free or b in free]
+    if across:
+        sums = np.array([np.isin(tags, pair) for pair in across]) * 0.5 * METRES_A_NS
+        worst_m = TWO_SIDED_95 * float(np.sqrt(np.max(np.diag(sums @ covariance_ns2 @ sums.T))))
+        return (
+            f"the ranges do not determine the delays of tags {', '.join(map(str, free))}: ranges between two sides are "
+            f"known to ± {100 * worst_m:.0f} cm (95 %) at worst"
+        )
     if len(free) < len(tags):
         worst = np.sqrt(np.max(np.diag(covariance_ns2)[np.isin(tags, free)], initial=0.0))
         return (

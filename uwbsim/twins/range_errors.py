@@ -132,7 +132,7 @@ def fit_range_errors(flight: Flight, receive_noise_s: Floats) -> RangeErrors:
     )
     try:
         # The twin has the errors of this recording: what pairs differ by between recordings is left out.
-        found = fit(ranges, minimum_norm=True, between_m=0.0).calibration
+        found = fit(ranges, between_m=0.0).calibration
     except CalibError as error:
         raise UnanswerableError(str(error)) from error
     if found.errors is None:
