@@ -7,14 +7,15 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.calibration.document import T, pair_name, split_text
 from calib.calibration.power_curves import ends, lift
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError
 from calib.pairs import pairs_of
-from uwblink.arrays import Bools, Floats
-from uwblink.display import as_text, excerpt, first_few
+from uwblink.arrays import Bools, Floats, data_frame
+from uwblink.display import as_html, as_text, excerpt, first_few
 
 if TYPE_CHECKING:
     from calib.calibration.model import Calibration
@@ -51,10 +52,21 @@ class CorrectedRanges:
     tail_probability: Floats
     outlier: Bools
 
+    def to_dict(self) -> dict[str, NDArray[Any]]:
+        """Return the columns by name, as `pandas.DataFrame` and `polars.DataFrame` take them."""
+        return {column.name: getattr(self, column.name) for column in fields(self)}
+
+    def to_pandas(self) -> Any:
+        """Return the columns as a `pandas.DataFrame`; raises `ArgumentError` where pandas is not installed."""
+        return data_frame(self.to_dict())
+
     def __repr__(self) -> str:
         """Return a headline and the first rows, in lines of 79 characters."""
-        columns = {column.name: getattr(self, column.name) for column in fields(self)}
-        return as_text(f"{len(self.raw_m)} corrected ranges", excerpt(columns))
+        return as_text(f"{len(self.raw_m)} corrected ranges", excerpt(self.to_dict()))
+
+    def _repr_html_(self) -> str:
+        """Return the same as HTML, for notebooks."""
+        return as_html(f"{len(self.raw_m)} corrected ranges", excerpt(self.to_dict()))
 
 
 class CorrectedRange(NamedTuple, Generic[T]):

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calib.calibration.document import for_json
-from calib.calibration.model import Calibration, interval, require_calibration
+from calib.calibration.model import Calibration, CalibrationSource, given_calibration, interval
 from calib.errors import UnanswerableError
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -79,7 +79,7 @@ class Comparison:
         return table
 
 
-def compare(first: Calibration, second: Calibration) -> Comparison:
+def compare(first: CalibrationSource, second: CalibrationSource) -> Comparison:
     """Test whether the delays of two calibrations differ by more than their standard errors explain, by chi-square.
 
     Differences in ns are second minus first, less what is common to all delays and what undetermined splits leave open.
@@ -90,8 +90,8 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     >>> calib.compare(first, second).same
     True
     """
-    require_calibration(first, "first")
-    require_calibration(second, "second")
+    first = given_calibration(first, "first")
+    second = given_calibration(second, "second")
     if first.pair_offsets or second.pair_offsets:
         raise UnanswerableError("constants of pairs are no delays, and only delays can be compared")
     both = (first, second)

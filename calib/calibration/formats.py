@@ -16,7 +16,7 @@ from scipy.interpolate import PPoly
 
 from calib.calibration.document import ends_of, finite
 from calib.calibration.error_model import ErrorModel
-from calib.calibration.model import Calibration, require_calibration
+from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.data.ranges import FAINTEST_DBM, LOUDEST_DBM
 from calib.data.sources import antenna_delays_in
@@ -403,7 +403,7 @@ FORMATS: Final[dict[str, Callable[[Calibration, AntennaDelays | None], str]]] = 
 
 
 def export(
-    calibration: Calibration,
+    calibration: CalibrationSource,
     to: str,
     path: str | os.PathLike[str] | None = None,
     *,
@@ -422,7 +422,7 @@ def export(
     >>> print(calib.export(calib.fit(calib.sample_flight()).calibration, "registers").splitlines()[2])
     [antenna_delays.tags.1]
     """
-    require_calibration(calibration)
+    calibration = given_calibration(calibration)
     if to not in FORMATS:
         raise BadInputError(f"found {to!r}, allowed: {', '.join(FORMATS)}", parameter="to")
     if calibration.pair_offsets and to != "json":

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, overload
+from typing import Annotated, Any, Final, Literal, Protocol, overload, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -326,17 +326,6 @@ def _misfit(calibration: Calibration) -> str:
 _ADAPTER: Final[TypeAdapter[Calibration]] = TypeAdapter(Annotated[Calibration, joint(_misfit)])
 
 
-def require_calibration(value: object, parameter: str = "calibration") -> None:
-    """Raise `BadInputError` where an argument is no `Calibration`."""
-    if isinstance(value, Calibration):
-        return
-    # What a fit or a survey returns is easily taken for its calibration, and its repr is a page long.
-    has_one = isinstance(getattr(value, "calibration", None), Calibration)
-    remedy = "give its `.calibration`" if has_one else "`load_calibration` reads one from a file"
-    seen = repr(value) if isinstance(value, str | os.PathLike) else type(value).__name__
-    raise BadInputError(f"found {seen:.60}, expected a Calibration; {remedy}", parameter=parameter)
-
-
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     """Return the calibration in a JSON file; raises `BadInputError` that names the file, and the key that is wrong.
 
@@ -349,11 +338,29 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     return Calibration.from_json(read_text(path, BadInputError, "calibration file (.json)"), str(path))
 
 
-def given_calibration(source: Calibration | str | os.PathLike[str] | None, parameter: str) -> Calibration | None:
-    """Return the calibration that is given as an object or as its path; errors name `parameter`."""
+@runtime_checkable
+class HasCalibration(Protocol):
+    """What a fit or a survey returns."""
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration."""
+
+
+CalibrationSource = Calibration | HasCalibration | str | os.PathLike[str]
+"""A calibration, the result of a fit or a survey, or the path of a calibration's file."""
+
+
+def given_calibration(source: CalibrationSource, parameter: str = "calibration") -> Calibration:
+    """Return the calibration that an argument gives.
+
+    Raises `BadInputError` that names `parameter` where it gives none, and what `load_calibration` raises.
+    """
     known = load_calibration(source) if isinstance(source, str | os.PathLike) else source
-    if known is not None:
-        require_calibration(known, parameter)
+    known = getattr(known, "calibration", known)
+    if not isinstance(known, Calibration):
+        seen = f"found {type(source).__name__}"
+        raise BadInputError(f"{seen}, expected a Calibration, the result of a fit, or a path", parameter=parameter)
     return known
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.signal import correlate
 from scipy.stats import chi2
 
-from calib.calibration.model import Calibration, require_calibration
+from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, Flight, load_flight, require_times
 from calib.errors import UnanswerableError
@@ -73,7 +73,7 @@ class Localization:
 
 def localize(
     data: Data | Flight,
-    calibration: Calibration,
+    calibration: CalibrationSource,
     settings: Settings | None = None,
     *,
     training: Data | Flight | None = None,
@@ -93,7 +93,7 @@ def localize(
     >>> found[0].tracks["calibrated"].rmse_m < 0.1
     True
     """
-    require_calibration(calibration)
+    calibration = given_calibration(calibration)
     chosen = settings or Settings()
     flight = data if isinstance(data, Flight) else load_flight(data, need_power=calibration.needs_power)
     fixed = fixed_std(calibration, chosen, training)

@@ -18,7 +18,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from calib.calibration.error_model import GATE
-from calib.calibration.model import Calibration, require_calibration
+from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, opened, require_times
 from calib.errors import BadInputError, UnanswerableError
@@ -105,7 +105,7 @@ class OnboardTrack(BodyTrack):
 
 
 def localize_onboard(
-    data: Data, calibration: Calibration, settings: OnboardSettings | None = None
+    data: Data, calibration: CalibrationSource, settings: OnboardSettings | None = None
 ) -> list[OnboardTrack]:
     """Track every moving body by its ranges to fixed anchors, its IMU and its height sensor.
 
@@ -120,7 +120,7 @@ def localize_onboard(
     >>> track.body, track.used, track.rmse_m < 0.2
     ('robot1', 'ranges', True)
     """
-    require_calibration(calibration)
+    calibration = given_calibration(calibration)
     chosen = settings or OnboardSettings()
     return [_track(one, chosen) for one in _readings(data, calibration)]
 

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 import uwblink
 from calib.calibration.document import for_json, split_text
 from calib.calibration.error_model import lasting_errors
-from calib.calibration.model import Calibration, given_calibration
+from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import (
     WITHOUT_CURVE,
@@ -70,7 +70,8 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     """
     settings = replace(settings or FitSettings(), **changes)
     check_loss(settings.loss)
-    source = given_calibration(settings.delays_from, "delays_from")
+    given = settings.delays_from
+    source = None if given is None else given_calibration(given, "delays_from")
     ranges = load_ranges(data, need_power=not settings.delays_only)
     fixed = _taken_over(source, ranges, curve=not settings.delays_only) | dict(settings.fixed_ns)
     refuse_impossible(ranges)
@@ -107,7 +108,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     return replace(result, held_out=held)
 
 
-def add_tag(data: Data | Iterable[Data], calibration: Calibration, tag: int, loss: str = MIXTURE) -> FitResult:
+def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: int, loss: str = MIXTURE) -> FitResult:
     """Fit the delay of one more tag; everything else in the calibration stays as it was.
 
     `data` is what `load_ranges` takes. It is the fit of `calib.fit` to all exchanges of the tag with calibrated ones,
@@ -123,6 +124,7 @@ def add_tag(data: Data | Iterable[Data], calibration: Calibration, tag: int, los
     True
     """
     check_tag(tag)
+    calibration = given_calibration(calibration)
     if calibration.pair_offsets:
         raise BadInputError("has constants of pairs, which say nothing of a tag; fit anew", parameter="calibration")
     ranges = load_ranges(data, need_power=calibration.needs_power)

@@ -133,9 +133,9 @@ def _settings(
     for name in settings.changed():
         if name not in SHARED:
             raise BadInputError("goes with known distances only", parameter=name)
-    known = given_calibration(flight.curve_from, "curve_from")
-    if known is None:
+    if flight.curve_from is None:
         return flight, settings, None
+    known = given_calibration(flight.curve_from, "curve_from")
     if other := "delays_only" if settings.delays_only else "groups" if settings.groups else "":
         raise BadInputError(f"gives the curve of all tags, and does not go with `{other}`", parameter="curve_from")
     if known.groups or known.power_at != "exchange":
