@@ -181,12 +181,17 @@ def _tags_text(tags: Tags) -> str:
     return f"tag{'s' * (len(tags) > 1)} {first_few(map(str, tags))}"
 
 
-def split_text(splits: Iterable[Split]) -> str:
-    """Return in words which ranges undetermined splits leave known, and what determines the others."""
+def known_of_splits(splits: Iterable[Split]) -> str:
+    """Return in words which ranges undetermined splits leave known."""
     known = "; ".join(" and ".join(map(_tags_text, sides)) for sides in splits)
+    return f"only ranges between {known} are determined"
+
+
+def split_text(splits: Iterable[Split]) -> str:
+    """Return in words which ranges undetermined splits leave known, why, and what determines the others."""
     return (
-        f"only ranges between {known} are determined, because the delays of one side can grow as those of the other "
-        "shrink; ranges among three of these tags, or a known delay (`fixed_ns`), determine the rest"
+        f"{known_of_splits(splits)}, because the delays of one side can grow as those of the other shrink; ranges "
+        "among three of these tags, or a known delay (`fixed_ns`), determine the rest"
     )
 
 

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from calib.calibration.document import split_text
+from calib.calibration.document import known_of_splits
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.checks.recording_view import RecordingView
 from calib.data.clocks import left_skew
@@ -251,7 +251,7 @@ def undetermined(view: RecordingView) -> Iterator[Candidate]:
     if len(some):
         _, free = free_directions(some.tags(), some)
         if free:
-            yield Candidate("too few pairs", split_text(free))
+            yield Candidate("too few pairs", known_of_splits(free))
 
 
 def silent(view: RecordingView) -> Iterator[Candidate]:
