@@ -267,7 +267,7 @@ class FitSettings(CheckedSettings):
 
     hold_out: float = setting(
         0.0,
-        "Share of the data by which a second fit, to the others, is judged: 0.3, for instance.",
+        "Share of the data to hold out, such as 0.3; a second fit, to the rest, is judged on it.",
         metavar="SHARE",
         rich_help_panel=MODEL_PANEL,
     )

@@ -296,7 +296,7 @@ SECTIONS: Final[dict[str, Section]] = {
 def register_report_section(name: str, section: Section, *, before: str = "provenance") -> None:
     """Add a section to the reports of campaigns and of evaluations, above the one called `before`.
 
-    `section` takes the `Campaign` (of an evaluation, results with as much as is known) and returns blocks
+    `section` takes the `Results` (a `Campaign` is one; of an evaluation, with as much as is known) and returns blocks
     (`calib.report`: `Heading`, `Text`, `Table`, `Picture`, `Listing`), which appear in the HTML page and in the PDF;
     figures are drawn at the width they are asked for. Raises `BadInputError` for a name that is taken and for a
     `before` that is not there.

@@ -1,7 +1,8 @@
 """Import of files in other formats; programs and other distributions can register importers of their own.
 
-A registered reader takes a path and returns `Contents`. This module writes the recording, and never overwrites one
-unless it is told to. It also reads back what `uwblink export --to csv` or `parquet` wrote.
+A registered reader takes a path and a map and returns `Contents`, or tables with a map. This module writes the
+recording, and never overwrites one unless it is told to. It also reads back what `uwblink export --to csv` or
+`parquet` wrote.
 """
 
 from __future__ import annotations
