@@ -16,7 +16,7 @@ from uwblink.ticks import SPEED_OF_LIGHT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Comparison:
+class CalibrationComparison:
     """Differences second minus first, after a shift common to all delays has been taken out.
 
     The shift and a constant of the curve are the same thing, so only together do they mean anything: `offset_m` is
@@ -77,7 +77,7 @@ class Comparison:
         return table
 
 
-def compare(first: Calibration, second: Calibration) -> Comparison:
+def compare(first: Calibration, second: Calibration) -> CalibrationComparison:
     """Test whether the delays of two calibrations differ by more than their standard errors explain, by chi-square.
 
     Differences in ns are second minus first, less the shift common to all delays. Raises `UnanswerableError` where
@@ -117,7 +117,7 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     high = min(first.bias_curve.range[1], second.bias_curve.range[1])
     grid = np.linspace(low, max(high, low + 1e-9), 400)
     curves = second.bias_curve(grid) - first.bias_curve(grid)
-    return Comparison(
+    return CalibrationComparison(
         difference_ns={tag: one - shift for tag, one in delta.items()},
         std_ns=std_ns,
         offset_m=shift * 1e-9 * SPEED_OF_LIGHT - float(curves.mean()),

@@ -49,7 +49,7 @@ SAME_POWER = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Spline:
+class SplineValues:
     """Cubic B-splines at lifted powers (n,): the four that are not zero, `values` (n, 4), from number `first` (n,)."""
 
     knots: Floats
@@ -57,7 +57,7 @@ class Spline:
     first: Ints
 
     @classmethod
-    def at(cls, lifted: Floats, knots: Floats) -> Spline:
+    def at(cls, lifted: Floats, knots: Floats) -> SplineValues:
         """Return the splines of `knots` at lifted powers, clamped to their span."""
         inside = np.clip(lifted, knots[0], knots[-1])
         values = BSpline.design_matrix(inside, knots, DEGREE).data.reshape(-1, DEGREE + 1)
@@ -92,8 +92,8 @@ class RangeModel:
     span: tuple[float, float]
     pairs: Pairs
     tags: list[int]
-    curve: Spline | None
-    noise: Spline | None
+    curve: SplineValues | None
+    noise: SplineValues | None
     unknowns: tuple[Unknown, ...]
     parts: tuple[Part, ...]
     carriers: tuple[Floats | None, ...]
@@ -127,12 +127,12 @@ class RangeModel:
         bias = noise = None
         carriers: list[Floats | None] = []
         if curve:
-            bias = Spline.at(lifted, _knots(ordered, low, high))
+            bias = SplineValues.at(lifted, _knots(ordered, low, high))
             for name, share in _shares(ranges, settings.groups):
                 blocks.append(_curve(f"curve {name}".strip(), bias, share))
                 carriers.append(_carrier(pairs, tags, settings, settings.groups.get(name)))
         if powered.all() and varied:
-            noise = Spline.at(lifted, knots_for(ordered, SIGMA_SEGMENTS, (low, high)))
+            noise = SplineValues.at(lifted, knots_for(ordered, SIGMA_SEGMENTS, (low, high)))
         if offsets:
             blocks += _offsets(ranges, pairs, tags, of_pairs=_offsets_identifiable(pairs, tags, settings, carriers))
         return cls(
@@ -189,7 +189,7 @@ class RangeModel:
         """Return rows that set curves to zero at the reference power, where delays can take the constant."""
         if self.curve is None or self.reference is None:
             return []
-        at, zero, std = Spline.at(np.array([self.reference]), self.curve.knots), np.zeros(1), np.full(1, HELD_M)
+        at, zero, std = SplineValues.at(np.array([self.reference]), self.curve.knots), np.zeros(1), np.full(1, HELD_M)
         return [
             NormalRows(value=zero, std=std, entries=at.values, columns=at.columns + layout.where[kind].start)
             for kind, carrier in zip(self.curve_kinds(), self.carriers, strict=True)
@@ -209,7 +209,7 @@ class RangeModel:
         stated = dict(values)
         if self.curve is None or self.reference is None:
             return stated
-        at = Spline.at(np.array([self.reference]), self.curve.knots)
+        at = SplineValues.at(np.array([self.reference]), self.curve.knots)
         for kind, carrier in zip(self.curve_kinds(), self.carriers, strict=True):
             if carrier is not None:
                 constant_m = float(at.values[0] @ values[kind][at.columns[0]])
@@ -277,7 +277,7 @@ def _constants(ranges: Ranges, pairs: Pairs, tags: list[int], settings: FitSetti
     return block, Part(parameter=RESIDUAL, kind="delay", columns=columns, values=values)
 
 
-def _curve(kind: str, spline: Spline, share: Floats | None) -> tuple[Unknown, Part]:
+def _curve(kind: str, spline: SplineValues, share: Floats | None) -> tuple[Unknown, Part]:
     """Return the coefficients of a curve, of which each range has a `share` (n,), None for all of it."""
     rough = Prior(weight=1e2, structure=curvature(spline.knots), bounds=(1e-3, 1e9))
     block = Unknown(

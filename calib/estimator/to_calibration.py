@@ -18,7 +18,7 @@ from calib.calibration.error_model import ErrorModel, PairErrors
 from calib.calibration.model import Calibration, PairOffset, TagGroup, Uncertainty, matrix_of
 from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, flat_curve
 from calib.estimator.known_distances import LARGEST_SPREAD_M, DescribedErrors, KnownDistances, described_errors
-from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel, Spline
+from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel, SplineValues
 from calib.estimator.range_rows import RESIDUAL
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
 from calib.range_errors.densities import LONG_FACTOR, LongDetours
@@ -132,7 +132,7 @@ def sigma_curves(
         return _flat_sigma(model, math.exp(level), float(covariance[0, 0]))
     knots = model.noise.knots
     lifted = np.linspace(knots[0], knots[-1], 8 * model.noise.size)
-    at = Spline.at(lifted, knots)
+    at = SplineValues.at(lifted, knots)
     splines = np.zeros((len(lifted), model.noise.size))
     np.put_along_axis(splines, at.columns, at.values, axis=1)
     through, names = np.linalg.pinv(splines), list(model.settings.groups) or [""]
@@ -170,7 +170,7 @@ def _correction_std(found: KnownDistances, delays_ns2: Floats, lifted: Floats) -
         of_pairs = np.sum(delays @ delays_ns2 * delays, axis=1)
     variance = np.full(len(lifted), float(np.mean(of_pairs)))
     if model.curve is not None:
-        at = Spline.at(lifted, model.curve.knots)
+        at = SplineValues.at(lifted, model.curve.knots)
         known = _bias_covariance(found)[at.columns[:, :, None], at.columns[:, None, :]]
         variance += np.einsum("ki,kij,kj->k", at.values, known, at.values)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
@@ -284,7 +284,7 @@ def _at_nodes(model: RangeModel, values: dict[str, Floats]) -> tuple[Floats, Flo
     if model.noise is None:
         return np.array([0.999, 1.001]) * np.median(model.lifted), np.full(2, np.exp(level)), np.zeros(2)
     nodes = np.quantile(model.lifted, (np.arange(NODES) + 0.5) / NODES) + 1e-9 * np.arange(NODES)
-    at, several = Spline.at(nodes, model.noise.knots), list(model.settings.groups) or [""]
+    at, several = SplineValues.at(nodes, model.noise.knots), list(model.settings.groups) or [""]
     curves = {}
     for parameter in ("noise", "odds"):
         mean = np.mean([values[f"{parameter} curve {name}".strip()] for name in several], axis=0)

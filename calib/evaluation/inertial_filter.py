@@ -28,7 +28,7 @@ P, V, A, G, F, H = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Noise:
+class ProcessNoise:
     """Process noise of the filter: accelerometer and gyro (per root of Hz), their biases, and motion without an IMU.
 
     The defaults are those of a consumer IMU on a small vibrating drone. `acceleration` (m/s^2 per root of Hz) is the
@@ -47,7 +47,9 @@ class Noise:
 class InertialFilter:
     """Predicts by inertial readings or constant velocity, and updates by ranges and heights."""
 
-    def __init__(self, fix: Fix, attitudes: Floats, noise: Noise, *, inertial: bool, speed_m_s: float = 1.0) -> None:
+    def __init__(
+        self, fix: Fix, attitudes: Floats, noise: ProcessNoise, *, inertial: bool, speed_m_s: float = 1.0
+    ) -> None:
         """Start at a fix with attitudes (headings, 3, 3), body to world."""
         count = len(attitudes)
         self.noise, self.inertial = noise, inertial

@@ -22,7 +22,7 @@ from calib.calibration.model import Calibration, require_calibration
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, opened, require_times
 from calib.errors import BadInputError, UnanswerableError
-from calib.evaluation.inertial_filter import GRAVITY, InertialFilter, Noise, P
+from calib.evaluation.inertial_filter import GRAVITY, InertialFilter, P, ProcessNoise
 from calib.evaluation.range_updates import Fix, RangeErrors, multilaterate, range_errors
 from calib.evaluation.tracking import BodyTrack, Trajectory, nearest_attitude
 from calib.settings import CheckedSettings
@@ -60,7 +60,7 @@ class OnboardSettings(CheckedSettings):
     headings: int = 8
     rate_hz: float = 50.0
     speed_m_s: float = 1.0
-    noise: Noise = field(default_factory=Noise)
+    noise: ProcessNoise = field(default_factory=ProcessNoise)
 
     def __post_init__(self) -> None:
         """Check the settings; raises `BadInputError`."""

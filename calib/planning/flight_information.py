@@ -44,7 +44,7 @@ MIN_JERK_M_S3 = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Errors:
+class ExpectedErrors:
     """The expected errors of ranges: noise, and a share of reflections that are longer by `detour_m` on average.
 
     It is an error density (`calib.estimator.range_rows.Errors`) with residuals of zero and the mean information of a
@@ -80,7 +80,7 @@ class Errors:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Flight:
+class PlannedFlight:
     """A planned flight: the inputs of a fit (`scene`), true positions, and the model of ranges.
 
     `path` has the positions of moving bodies, `stands` those of standing bodies.
@@ -88,7 +88,7 @@ class Flight:
 
     scene: Scene
     model: RangeModel
-    errors: Errors
+    errors: ExpectedErrors
     path: Trajectories
     stands: Mapping[str, Floats]
 
@@ -97,7 +97,7 @@ class Flight:
         """The pairs of tags whose distance is taped."""
         return [(one.first, one.second) for one in self.scene.tapes.stated]
 
-    def taped(self, pairs: Sequence[tuple[int, int]], still_s: float, sigma_m: float) -> Flight:
+    def taped(self, pairs: Sequence[tuple[int, int]], still_s: float, sigma_m: float) -> PlannedFlight:
         """Return the flight with taped distances, of bodies that stand at first or of anchors."""
         when = f"0..{still_s:g}" if still_s else ""
         stated = [KnownDistance(first, second, 1.0, sigma_m, when) for first, second in pairs]
@@ -107,8 +107,8 @@ class Flight:
 
 
 def flight_of(
-    data: Data, settings: FlightSettings, errors: Errors, *, curve: bool, force_std_m_s2: float | None
-) -> Flight:
+    data: Data, settings: FlightSettings, errors: ExpectedErrors, *, curve: bool, force_std_m_s2: float | None
+) -> PlannedFlight:
     """Return a planned flight from a recording with poses over the whole flight.
 
     `force_std_m_s2` is the standard error of an accelerometer's mean over a tenth of a second; None without one. Raises
@@ -129,7 +129,7 @@ def flight_of(
     sensed = {} if force_std_m_s2 is None else truth.inertial
     inertial = {body: replace(some, std_m_s2=float(force_std_m_s2 or 0.0)) for body, some in sensed.items()}
     times = truth.places.time_s
-    return Flight(
+    return PlannedFlight(
         scene=replace(scene, attitudes=attitudes, inertial=inertial),
         model=model,
         errors=errors,
@@ -146,7 +146,7 @@ class Information:
     `covariance_ns2` (tags, tags) is that of the delays of `tags`, `verdict` says which of them are determined.
     """
 
-    def __init__(self, flight: Flight) -> None:
+    def __init__(self, flight: PlannedFlight) -> None:
         """Sum the information of all rows at the planned trajectories."""
         scene, model = flight.scene, flight.model
         self.flight, self.motion, self.tags = flight, Motion.of(scene), tuple(model.tags)

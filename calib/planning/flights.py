@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from calib.data.sources import Data
 from calib.errors import BadInputError
-from calib.planning.flight_information import Errors, Flight, Information, flight_of
+from calib.planning.flight_information import ExpectedErrors, Information, PlannedFlight, flight_of
 from calib.planning.reference_motion import reference_motion
 from calib.planning.result import FlightPlan, NextBest, mean_std_ns
 from calib.planning.settings import ACCELEROMETERS, FlightPlanSettings
@@ -96,7 +96,7 @@ def _information(asked: FlightPlanSettings, data: Data | None) -> Information:
             heading_std_deg=asked.heading_std_deg,
             anchors=asked.anchor_places,
         ),
-        Errors(noise_m=asked.noise_m, reflected=asked.reflected),
+        ExpectedErrors(noise_m=asked.noise_m, reflected=asked.reflected),
         curve=not asked.delays_only,
         force_std_m_s2=force_std_m_s2,
     )
@@ -135,7 +135,7 @@ def _more(asked: FlightPlanSettings, data: Data | None, found: Information) -> I
     yield NextBest(f"the delay of tag {found.tags[best]} from elsewhere, to {DELAY_STD_NS:g} ns", means[best], now)
 
 
-def _changes(asked: FlightPlanSettings, flight: Flight) -> Iterator[tuple[str, dict[str, Any]]]:
+def _changes(asked: FlightPlanSettings, flight: PlannedFlight) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield further measurements in words, with the changes of the settings that they are.
 
     The words have places for both tags of the last taped distance.

@@ -62,7 +62,7 @@ ONE_KIND: Final = LongDetours()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Kind:
+class ReflectionKind:
     """Reflected ranges of one kind: their `density` times the kind's share, 1/m, and the noise in them.
 
     That noise is normal, cut off above: with v = (e - least)/sigma, `ratio` = sigma/detour and u = v - ratio its mean
@@ -82,7 +82,7 @@ class Densities:
     direct: Floats
     reflected: Floats
     sigma_m: Floats
-    kinds: tuple[Kind, ...]
+    kinds: tuple[ReflectionKind, ...]
 
     def noise_m(self) -> Floats:
         """Return the mean of the noise in reflected ranges."""
@@ -98,7 +98,7 @@ class Densities:
             found = found + part * (kind.noise_var - first.noise_var + (1 - part) * apart * apart)
         return found
 
-    def _part(self, kind: Kind) -> Floats:
+    def _part(self, kind: ReflectionKind) -> Floats:
         """Return the probability that a reflected range is of a kind, 0 where both densities vanish."""
         return np.asarray(kind.density / (self.reflected + np.finfo(float).tiny))
 
@@ -121,7 +121,7 @@ def densities(
     )
 
 
-def _kind(v: Floats, normal: Floats, sigma_m: Floats, share: float, detour_m: Any) -> Kind:
+def _kind(v: Floats, normal: Floats, sigma_m: Floats, share: float, detour_m: Any) -> ReflectionKind:
     """Return reflected ranges of a kind at errors `v` (n,) beyond the least detour, in sigmas."""
     ratio = sigma_m / detour_m
     u = v - ratio
@@ -133,7 +133,7 @@ def _kind(v: Floats, normal: Floats, sigma_m: Floats, share: float, detour_m: An
         far = np.exp(np.minimum(ratio * (0.5 * ratio - v), 50.0)) * (share / detour_m)
         density = np.where(near < u, far, density)
     hazard = (2 / ROOT_2PI) / scaled
-    return Kind(
+    return ReflectionKind(
         density=density,
         detour_m=detour_m,
         noise_m=np.asarray(sigma_m * (ratio - hazard)),

@@ -15,7 +15,7 @@ from calib.calibration.model import Calibration, Uncertainty, matrix_of
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis, flat_curve
 from calib.errors import UnanswerableError
 from calib.estimator.range_model import METRES_A_NS
-from calib.information import Unknown, Verdict, judge, reduced
+from calib.information import InformationColumn, Verdict, judge, reduced
 from calib.settings import SurveySettings
 from calib.spread import TWO_SIDED_95
 from calib.surveys.network import Boards
@@ -53,7 +53,7 @@ def students_factor(freedom: float) -> float:
 
 def verdict_on_delays(information: Floats, tags: Sequence[int]) -> Verdict:
     """Return what is determined of delays by their information (tags, tags), 1/ns^2."""
-    return judge(information, [Unknown("delay", str(tag), DELAY_SCALE_NS) for tag in tags])
+    return judge(information, [InformationColumn("delay", str(tag), DELAY_SCALE_NS) for tag in tags])
 
 
 def result_of(

@@ -27,7 +27,7 @@ from calib.estimator.to_calibration import calibration_of
 from calib.estimator.unknowns import Layout
 from calib.fitting.fitting import result_of, what_was_fitted
 from calib.fitting.result import FitResult
-from calib.information import Unknown, Verdict, judge
+from calib.information import InformationColumn, Verdict, judge
 from calib.settings import FitSettings, FlightSettings
 from calib.spread import TWO_SIDED_95
 from calib.trajectories.motion import MOTION, TapeRows
@@ -336,10 +336,10 @@ def with_known_distances(information: Matrix, layout: Layout, own: Ints) -> Floa
 def verdict_on(covariance: Floats, with_truth: Floats, tags: Sequence[int]) -> Verdict:
     """Return the verdict on delays with a covariance (tags, tags), compared with that for known distances."""
     if not tags:
-        return judge(np.eye(1) * 1e6, [Unknown("delay", "")])
+        return judge(np.eye(1) * 1e6, [InformationColumn("delay", "")])
     guess = np.maximum(SCALE_NS, GROWTH / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
     information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) + np.eye(len(covariance)) / PRIOR_NS**2
-    unknowns = [Unknown("delay", str(tag), scale) for tag, scale in zip(tags, guess.tolist(), strict=True)]
+    unknowns = [InformationColumn("delay", str(tag), scale) for tag, scale in zip(tags, guess.tolist(), strict=True)]
     return judge((information + information.T) / 2, unknowns, loosest=LOOSEST)
 
 

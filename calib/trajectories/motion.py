@@ -156,7 +156,7 @@ class Motion:
 
 
 @dataclass(frozen=True, slots=True)
-class Side:
+class RangeEnd:
     """One end of each distance (n,): where its antenna is as a function of the unknowns.
 
     `mover` is the number of the moving body, -1 for another one. Of a moving body, `place` (n, 4, 3) are the control
@@ -174,7 +174,7 @@ class Side:
     turn_share: Floats
 
     @classmethod
-    def of(cls, motion: Motion, layout: Layout, ids: Ints, time_s: Floats) -> Side:
+    def of(cls, motion: Motion, layout: Layout, ids: Ints, time_s: Floats) -> RangeEnd:
         """Return the ends of tags `ids` (n,) at instants (n,)."""
         scene, turning, count = motion.scene, motion.bodies["turn"], len(ids)
         path, turn, stand = (motion.numbers(layout, kind) for kind in ("path", "turn", "stand"))
@@ -211,13 +211,13 @@ class Side:
 class Distances:
     """Distances between antennas of bodies that move or stand, as functions of all unknowns (a `Geometry`)."""
 
-    sides: tuple[Side, Side]
+    sides: tuple[RangeEnd, RangeEnd]
     columns: Ints
 
     @classmethod
     def of(cls, motion: Motion, layout: Layout, ids: tuple[Ints, Ints], time_s: Floats) -> Distances:
         """Return the distances of tags `ids` (n,) each at instants (n,)."""
-        first, second = (Side.of(motion, layout, some, time_s) for some in ids)
+        first, second = (RangeEnd.of(motion, layout, some, time_s) for some in ids)
         blocks = [part.reshape(len(time_s), -1) for side in (first, second) for part in (side.place, side.turn)]
         columns = np.concatenate(blocks, axis=1)
         # Where an end does not depend on an unknown, its entry is zero in a column that the other end uses.

@@ -91,7 +91,7 @@ root second)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Track(Samples):
+class PoseSamples(Samples):
     """Poses of one body in seconds since the first range; NaN where positions or attitudes are unknown."""
 
     position_m: Floats
@@ -171,12 +171,12 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     )
 
 
-def _track(poses: Poses, body: str, began_ns: int) -> Track:
+def _track(poses: Poses, body: str, began_ns: int) -> PoseSamples:
     own = poses[poses.body == body]
-    return Track(np.asarray((own.time_ns - began_ns) * 1e-9, dtype=np.float64), own.position_m, own.quaternion)
+    return PoseSamples(np.asarray((own.time_ns - began_ns) * 1e-9, dtype=np.float64), own.position_m, own.quaternion)
 
 
-def _places(tracks: Sequence[Track], until_s: float) -> Places:
+def _places(tracks: Sequence[PoseSamples], until_s: float) -> Places:
     """Return the positions of each body since the first range, `PLACE_EVERY_S` apart."""
     parts = []
     for number, track in enumerate(tracks):
@@ -187,7 +187,7 @@ def _places(tracks: Sequence[Track], until_s: float) -> Places:
 
 
 def _attitude(
-    body: str, track: Track, sensed: Readings | None, settings: FlightSettings, source: str
+    body: str, track: PoseSamples, sensed: Readings | None, settings: FlightSettings, source: str
 ) -> Attitude | None:
     """Return the attitudes of a moving body; None if there are none."""
     std = np.radians([TILT_STD_DEG, TILT_STD_DEG, settings.heading_std_deg])

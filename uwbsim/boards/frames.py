@@ -115,7 +115,7 @@ class BoardAir:
         self.world = World(scenario)
         self.medium = Medium(scenario, SampledWorld(self.world))
         self.place = {tag.id: k for k, tag in enumerate(scenario.tags)}
-        self.radios: dict[int, Radio] = {}
+        self.radios: dict[int, BoardRadio] = {}
         self._rng = stream(scenario.run.seed, "boards")
         self._frames: list[Frame] = []
         self.before_marker = _ns(before_marker_s(scenario.radio.preamble_symbols))
@@ -221,7 +221,7 @@ class BoardAir:
         )
 
 
-class Radio:
+class BoardRadio:
     """The radio of a board. `since` is the time (ns) at which its receiver was switched on, None while it is off."""
 
     def __init__(self, air: BoardAir, board: int, interrupt: Callable[[Received | None], None]) -> None:

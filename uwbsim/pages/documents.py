@@ -18,13 +18,13 @@ from uwblink.pages.figures import picture
 from uwblink.protocols.table import PROTOCOLS
 from uwbsim.errors import ScenarioError
 from uwbsim.pages import figures
-from uwbsim.protocols.comparison import Comparison, Optimum, ProtocolErrors, over_reply, over_skew, over_state
+from uwbsim.protocols.comparison import BestDelay, ProtocolComparison, ProtocolErrors, over_reply, over_skew, over_state
 from uwbsim.protocols.conditions import conditions_of
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import preview
 from uwbsim.sweep.design import SweepDesign
-from uwbsim.sweep.runner import STORE, Store
+from uwbsim.sweep.runner import STORE, ResultStore
 from uwbsim.tables import write_tables
 from uwbsim.twins import LEVEL, Compared, Twin
 
@@ -109,7 +109,7 @@ FILES: Final = ("compare.html", "compare.csv", "compare.parquet")
 """Names of the files of `write_comparison`."""
 
 
-def write_comparison(found: Comparison, folder: Path, *, force: bool = False) -> None:
+def write_comparison(found: ProtocolComparison, folder: Path, *, force: bool = False) -> None:
     """Write a comparison as page and tables (`FILES`) into a folder, which is made where it is missing.
 
     Raises what `check_folder` raises.
@@ -122,7 +122,7 @@ def write_comparison(found: Comparison, folder: Path, *, force: bool = False) ->
         write_text(html, text, force=force)
 
 
-def comparison(found: Comparison) -> Document:
+def comparison(found: ProtocolComparison) -> Document:
     """Return the page of a comparison: errors, costs, the best protocol by delay, and curves of errors."""
     scenario, outcomes, samples = found.scenario, found.outcomes, found.samples
     protocols = {row.name: row for row in found.protocols}
@@ -204,7 +204,7 @@ def optimum_file(protocol: str) -> str:
     return f"optimum-{protocol}.png"
 
 
-def write_optima(found: Iterable[Optimum], folder: Path, *, force: bool = False) -> None:
+def write_optima(found: Iterable[BestDelay], folder: Path, *, force: bool = False) -> None:
     """Write the curve of each optimum as a picture (.png) into a folder, which is made where it is missing.
 
     Raises what `check_folder` raises.
@@ -238,7 +238,7 @@ def write_sweep_page(plan: SweepDesign, folder: Path) -> Path:
     Raises `TableError` where the folder has no results.
     """
     most = 200_000  # rows of which a page is made; the tables have all
-    with Store.open(folder / STORE) as store:
+    with ResultStore.open(folder / STORE) as store:
         rows = list(islice(store, most + 1))
     path, document = folder / "results.html", _swept(plan, rows)
     if len(rows) > most:

@@ -34,7 +34,7 @@ STORE: Final = "results.duckdb"
 
 
 @dataclass(frozen=True, slots=True)
-class Summary:
+class SweepSummary:
     """Numbers of runs of a sweep: done now, failed among these, and skipped because their results were stored."""
 
     done: int
@@ -51,7 +51,7 @@ def run_sweep(
     resume: bool = False,
     evaluate: Evaluate | None = None,
     progress: Callable[[float], None] | None = None,
-) -> Summary:
+) -> SweepSummary:
     """Do the runs that have no results yet, and write results.csv and results.parquet in the order of the runs.
 
     Runs of kind `compare` compare protocols; those of kind `calibrate` simulate a flight and have `evaluate(flight)`
@@ -94,13 +94,13 @@ def run_sweep(
     team = workers_for(workers, scheduler, work)
     try:
         folder.mkdir(exist_ok=True)
-        with Store.open(folder / STORE, _identity(plan)) as store:
+        with ResultStore.open(folder / STORE, _identity(plan)) as store:
             known = store.done()
             done, failed = _do(plan, store, team, work, known, progress)
             write_tables(folder / "results.csv", folder / "results.parquet", store, force=True)
     finally:
         team.close()
-    return Summary(done, failed, len(known))
+    return SweepSummary(done, failed, len(known))
 
 
 def _identity(plan: SweepDesign) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def _identity(plan: SweepDesign) -> dict[str, Any]:
 def _check(plan: SweepDesign, folder: Path, *, resume: bool) -> None:
     path, own, known, begun = folder / STORE, _identity(plan), {}, False
     if path.exists():
-        with Store.open(path, own) as store:
+        with ResultStore.open(path, own) as store:
             known, begun = store.identity(), bool(store.done())
     elif resume:
         raise ParameterError(f"{folder} holds no sweep to go on with", parameter="resume")
@@ -132,7 +132,7 @@ def _check(plan: SweepDesign, folder: Path, *, resume: bool) -> None:
 
 def _do(
     plan: SweepDesign,
-    store: Store,
+    store: ResultStore,
     team: Workers,
     work: Work,
     known: set[int],
@@ -190,7 +190,7 @@ TABLES: Final = {
 
 
 @dataclass(frozen=True, slots=True)
-class Store:
+class ResultStore:
     """Results by number of run, committed as they come: a killed sweep loses only results not yet committed."""
 
     _db: Any
