@@ -76,7 +76,7 @@ def run_sweep(
     >>> def farthest(flight):
     ...     return {"farthest_m": flight.truth_m.max().round(6).item()}
     >>> uwbsim.run_sweep(uwbsim.load_design("sweep.toml"), "results", workers=1, evaluate=farthest)
-    Summary(done=2, failed=0, skipped=0)
+    SweepSummary(done=2, failed=0, skipped=0)
     >>> Path("results/results.csv").read_text().splitlines()[1].endswith("ds,5.0,0")
     True
     """
