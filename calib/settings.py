@@ -19,9 +19,8 @@ from uwblink.text_files import TomlReader
 if TYPE_CHECKING:
     from uwblink import KnownDistance
 
-LIFTS: Final = ("mean-of-lifted", "lift-of-mean")
 CHOICES: Final = {
-    "lift": LIFTS,
+    "lift": ("mean-of-lifted", "lift-of-mean"),
     "constants": ("tag", "pair"),
     "fold": ("time", "pair", "session"),
     "attitudes": ("poses", "imu", "none"),
@@ -45,9 +44,6 @@ NUMBERS: Final = {
     "seeds": (1, 1000, "1 to 1000"),
 }
 """The least and the largest value of a setting, and what is expected."""
-
-HIGHEST_TAG: Final = 65_535
-"""Ids of tags have 16 bits in recordings."""
 
 OBJECTS: Final = {"Calibration": "a calibration", "Knowledge": "known facts"}
 """What results call settings that were given as objects."""
@@ -76,12 +72,13 @@ def check_choice(parameter: str, value: str, allowed: Iterable[str]) -> None:
 def check_tag(tag: object) -> None:
     """Raise `BadInputError` for what cannot be the id of a tag."""
     if not is_tag(tag):
-        raise BadInputError(f"found {tag!r}, expected the id of a tag, 0 to {HIGHEST_TAG}", parameter="tag")
+        raise BadInputError(f"found {tag!r}, expected the id of a tag, 0 to 65535", parameter="tag")
 
 
 def is_tag(value: object) -> bool:
     """Return whether a value can be the id of a tag."""
-    return isinstance(value, Integral) and not isinstance(value, bool) and 0 <= int(value) <= HIGHEST_TAG
+    # Ids have 16 bits in recordings (`uwblink.twr.LARGEST_ID`, which would load NumPy for the help of commands).
+    return isinstance(value, Integral) and not isinstance(value, bool) and 0 <= int(value) < 2**16
 
 
 def _is_finite(value: object) -> bool:
@@ -218,7 +215,7 @@ class FitSettings(CheckedSettings):
     lift: str = setting(
         "mean-of-lifted",
         "Lifted power of an exchange from the powers of its two ends.",
-        names=LIFTS,
+        names=CHOICES["lift"],
         rich_help_panel=MODEL_PANEL,
     )
     alpha_dbm: float = -82.0

@@ -26,6 +26,10 @@ REPORT_BITS: Final = 32
 ANTENNA_DELAY_TICKS: Final = 16_436
 """Transmit and receive antenna delay configured on every board (firmware wire format, 2.2)."""
 
+TX_SHARE: Final = 0.44
+"""Share of an aggregate antenna delay that is the transmitter's; the receiver has the rest (Decawave APS014, section 2;
+the code of the ICRA 2023 authors)."""
+
 DELAYED_TX_GRID: Final = 512
 """A delayed transmission starts on a multiple of this many raw ticks (User Manual, section 3.3)."""
 

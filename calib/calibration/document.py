@@ -39,7 +39,7 @@ def _curve_keys(name: str, of: str) -> tuple[FileKey, ...]:
     )
 
 
-FILE_KEYS: Final = (
+CALIBRATION_KEYS: Final = (
     FileKey(
         "schema_version", "1 to 4", "needed", "2 with `groups`, 3 with `power_at` reception, 4 with `pair_offsets`."
     ),

@@ -22,7 +22,7 @@ from calib.findings import OF_A_FIT, SMALLEST_NS
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
-SEGMENTS, SPAN_S = 6, 20.0
+OFFSET_SPANS, SPAN_S = 6, 20.0
 """Spans of time in which a tag may have an offset of its own, and how long they are at least: errors that last must be
 known within them."""
 
@@ -73,7 +73,7 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
         return Family(kind=kind, names=tags, derivative=Derivative(ends, derivative, len(tags)))
 
     yield of_pairs(found)
-    several = int(min(max(found.blocks.seconds / SPAN_S, 2), SEGMENTS))
+    several = int(min(max(found.blocks.seconds / SPAN_S, 2), OFFSET_SPANS))
     span = np.arange(count) * several // count
     yield Family(
         kind="time",

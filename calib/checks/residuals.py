@@ -9,15 +9,12 @@ import numpy as np
 
 from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
 from calib.data.clocks import PPM_TO_METRES, corrected
-from calib.estimator.known_distances import FEWEST_RANGES
+from calib.estimator.known_distances import ASTRAY_M, FEWEST_RANGES
 from calib.findings import BUDGET, Candidate, exceeds, more_often, positive, stretches
 from uwblink.arrays import Bools, Floats
 from uwblink.protocols.table import single_sided
 from uwblink.ticks import TICK_S
 from uwblink.twr import intervals, without_stamps
-
-ASTRAY_M: Final = 0.3
-"""Mean absolute error of a pair, about its median, that reflections may explain: half of the ranges by 60 cm."""
 
 ONE_WAY_M: Final = 0.05
 """By how much ranges of a sound pair may differ by who initiates: the powers of both ways are not quite alike."""

@@ -32,7 +32,7 @@ ODDS = -2.2
 LONG_ODDS = -1.1
 """Prior log odds that a reflection is of the longer kind: one in four; 11 to 48 % within one standard deviation."""
 
-LEVELS = {
+SHARED_LEVELS = {
     "noise": ("noise level", np.log(NOISE_M), (2 * NOISE_WORTH) ** -0.5),
     "odds": ("odds level", ODDS, 2.0),
     "detour": ("detour level", np.log(DETOUR_M), DETOUR_WORTH**-0.5),
@@ -54,13 +54,13 @@ def error_unknowns(
     `group` (n,) is the number of each range's group among `names`, `spread_m` a first guess of the noise.
     """
     everyone, own = np.zeros((1, 1), dtype=np.int64), group[:, None]
-    starts = {name: centre for name, (_, centre, _) in LEVELS.items()} | {"noise": np.log(0.9 * spread_m)}
+    starts = {name: centre for name, (_, centre, _) in SHARED_LEVELS.items()} | {"noise": np.log(0.9 * spread_m)}
     unknowns = [
         Unknown(kind=kind, names=("",), start=np.array([starts[name]]), priors=(Prior.of_deviation(deviation, centre),))
-        for name, (kind, centre, deviation) in LEVELS.items()
+        for name, (kind, centre, deviation) in SHARED_LEVELS.items()
     ]
     unknowns += [scattered(f"{name} of {whose}", names, spread) for name, spread in SCATTER.items()]
-    parts = [Part(parameter=name, kind=kind, columns=everyone) for name, (kind, *_) in LEVELS.items()]
+    parts = [Part(parameter=name, kind=kind, columns=everyone) for name, (kind, *_) in SHARED_LEVELS.items()]
     parts += [Part(parameter=name, kind=f"{name} of {whose}", columns=own) for name in SCATTER]
     return unknowns, parts
 

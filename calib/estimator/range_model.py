@@ -31,13 +31,17 @@ DELAY_NS = 600.0
 """Prior standard deviation of a delay: a board without a programmed delay has 514 ns. The prior decides only
 combinations that no range determines, and chooses the smallest delays there."""
 
+BOARD_DELAY_STD_NS = 2.0
+"""Prior standard deviation of a programmed board's delay where distances are not known, and a scale of the places can
+pass for a delay: three times the 0.6 ns by which published ones differ."""
+
 HELD_NS, HELD_M = 1e-3, 1e-5
 """Standard deviations of what is set to zero because no range determines it: far below those of any result."""
 
 CURVE_M = 0.5
 """Prior standard deviation of the bias over power: published curves reach 0.2 m (DW1000 user manual, APS011)."""
 
-SEGMENTS_A_FOLD, SEGMENTS = 4.5, (10, 28)
+SEGMENTS_A_FOLD, CURVE_SEGMENT_BOUNDS = 4.5, (10, 28)
 """Segments of a bias curve per factor e of lifted power, and their bounds. Roughness is estimated, so more segments
 change nothing (the study of `make accuracy`)."""
 
@@ -375,7 +379,7 @@ def _knots(ordered: Floats, low: float, high: float) -> Floats:
 
     Curves are steep at small lifted powers, where roots are dense.
     """
-    segments = int(np.clip(round(SEGMENTS_A_FOLD * np.log(high / low)), *SEGMENTS))
+    segments = int(np.clip(round(SEGMENTS_A_FOLD * np.log(high / low)), *CURVE_SEGMENT_BOUNDS))
     counts = np.interp(np.linspace(0, len(ordered) - 1, segments + 1), np.arange(len(ordered)), ordered)
     roots = np.sqrt(np.clip(counts, low, high)) + np.linspace(np.sqrt(low), np.sqrt(high), segments + 1)
     inner = roots**2 / 4

@@ -33,7 +33,7 @@ LEAST_SPREAD_M = 1e-6
 NODES = 8
 """Number of powers at which noise and share are stated; between them both are linear."""
 
-LEVELS = (0.005, 0.025, 0.05, 0.16, 0.5, 0.84, 0.95, 0.975, 0.995)
+QUANTILE_SHARES = (0.005, 0.025, 0.05, 0.16, 0.5, 0.84, 0.95, 0.975, 0.995)
 """Shares of errors at which the model's quantiles are corrected."""
 
 BEYOND_MEANS = 8.0
@@ -324,9 +324,9 @@ def _with_quantiles(model: ErrorModel, of: RangeModel, residual: Floats) -> Erro
     rows = np.linspace(0, len(residual) - 1, min(20_000, len(residual))).astype(np.int64)
     error = residual[rows]
     shapes = model.shapes(of.lifted[rows], of.ranges.initiator[rows], of.ranges.target[rows])
-    level = np.quantile(model.below(error, shapes), LEVELS)
+    level = np.quantile(model.below(error, shapes), QUANTILE_SHARES)
     away = error - model.mean_m(shapes)
     within = np.abs(away) < BEYOND_MEANS * (model.least_m + model.long.longest * shapes.detour_m)
     z = away[within] / model.total_m(shapes)[within]
-    levels = tuple(zip(LEVELS, np.maximum.accumulate(level).tolist(), strict=True))
+    levels = tuple(zip(QUANTILE_SHARES, np.maximum.accumulate(level).tolist(), strict=True))
     return replace(model, scale=float(np.sqrt(np.mean(z**2))), levels=levels)

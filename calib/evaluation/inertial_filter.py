@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from calib.evaluation.range_updates import Fix, RangeErrors, RangeUpdate, mixture_update
 from uwblink.arrays import Floats
 
-GRAVITY: Final = 9.81
-"""m/s^2."""
+GRAVITY_M_S2: Final = 9.81
+"""Between 9.78 at the equator and 9.83 at the poles; the biases of a consumer accelerometer are larger."""
 
 SIZE: Final = 16
 """Size of the state. The names below slice its parts: position, velocity, attitude, biases, offset of the height
@@ -141,7 +141,7 @@ class InertialFilter:
 
     def _acceleration(self, force: Floats) -> Floats:
         """Return the acceleration in the world (headings, 3) of specific forces (headings, 3) in the body's axes."""
-        return np.asarray(np.einsum("hij,hj->hi", self.attitude, force) - (0.0, 0.0, GRAVITY))
+        return np.asarray(np.einsum("hij,hj->hi", self.attitude, force) - (0.0, 0.0, GRAVITY_M_S2))
 
     def limit_speed(self, speed_m_s: float) -> None:
         """Update by a velocity of zero with standard deviation `speed_m_s`: it bounds the state while there are no

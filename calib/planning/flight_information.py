@@ -15,6 +15,7 @@ import numpy as np
 from calib.data.sources import Data
 from calib.errors import UnanswerableError
 from calib.estimator.inverse import inverse_of
+from calib.estimator.optimize import EVIDENCE_STEPS
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, RangeRows
 from calib.estimator.rows import sum_rows
@@ -29,12 +30,9 @@ from calib.trajectories.start import SAMPLE_S, Trajectories, interpolated
 from uwblink.arrays import Floats
 from uwblink.recording.schema import KnownDistance
 
-CURVE_M, CURVE_BENDS = 0.05, 3.0
+TYPICAL_CURVE_M, CURVE_BENDS = 0.05, 3.0
 """Amplitude (m) and phase over the power range (rad) of a typical bias curve, which sets the smoothness that a fit will
 estimate."""
-
-EVIDENCE_STEPS = 12
-"""Iterations of the smoothness of curves, as in a fit."""
 
 ENDS = 4
 """Control points at either end of a path that planned positions do not determine well."""
@@ -160,7 +158,7 @@ class Information:
         knots = np.zeros(0) if model.curve is None else model.curve.knots
         for kind in model.curve_kinds():
             centres = np.convolve(knots[1:-1], np.full(3, 1 / 3), mode="valid")
-            self.x[self.layout.where[kind]] = CURVE_M * np.sin(CURVE_BENDS * centres)
+            self.x[self.layout.where[kind]] = TYPICAL_CURVE_M * np.sin(CURVE_BENDS * centres)
         geometry = Distances.of(self.motion, self.layout, (model.ranges.initiator, model.ranges.target), scene.time_s)
         raw = np.zeros(len(scene.time_s))
         ranges = RangeRows.of(raw, model.key(), model.parts, flight.errors, self.layout, geometry)

@@ -20,20 +20,18 @@ from calib.planning.settings import ACCELEROMETERS, FlightPlanSettings
 from calib.settings import FlightSettings
 from calib.spread import TWO_SIDED_95
 from calib.trajectories.attitudes import WINDOW_S
+from calib.trajectories.samples import TRUSTED
 from uwblink.arrays import Floats
 
 MORE_KNOWN_S, MORE_ANCHORS, STANDS_S, HEADING_DEG = 10.0, 4, 5.0, 0.5
 """Further measurements that are proposed: so many seconds of known positions, anchors, seconds at a stand, and degrees
 of error of headings. Each is what a team can do without other equipment."""
 
-DELAY_STD_NS = 0.05
+OTHER_DELAY_STD_NS = 0.05
 """Standard error of the delay of one tag from another calibration or a survey."""
 
 VIBRATION_M_S2 = 0.2
 """Vibration that is left in a mean over a tenth of a second."""
-
-TRUSTED = 3.0
-"""Factor on the residuals of an accelerometer in a fit."""
 
 Robots = int | Sequence[Sequence[int]]
 
@@ -130,9 +128,11 @@ def _more(asked: FlightPlanSettings, data: Data | None, found: Information) -> I
             if mean < now:
                 yield NextBest(what.format(*changed.flight.tapes[-1:]), mean, now)
     c = found.covariance_ns2
-    means = [_mean_ns(c - np.outer(c[k], c[k]) / (c[k, k] + DELAY_STD_NS**2)) for k in range(len(c))]
+    means = [_mean_ns(c - np.outer(c[k], c[k]) / (c[k, k] + OTHER_DELAY_STD_NS**2)) for k in range(len(c))]
     best = int(np.argmin(np.round(means, 6)))
-    yield NextBest(f"the delay of tag {found.tags[best]} from elsewhere, to {DELAY_STD_NS:g} ns", means[best], now)
+    yield NextBest(
+        f"the delay of tag {found.tags[best]} from elsewhere, to {OTHER_DELAY_STD_NS:g} ns", means[best], now
+    )
 
 
 def _changes(asked: FlightPlanSettings, flight: PlannedFlight) -> Iterator[tuple[str, dict[str, Any]]]:

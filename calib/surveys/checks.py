@@ -36,7 +36,7 @@ START_BESIDE_M = 0.15
 def likeliest_fault(found: Solution) -> tuple[Contradiction, Solution] | None:
     """Return the likeliest fault that chance does not explain, and the solution without it."""
     best: tuple[Contradiction, Solution] | None = None
-    for name, (hypotheses, remedy) in CHECKS.items():
+    for name, (hypotheses, remedy) in HYPOTHESES.items():
         for text, without in hypotheses(found):
             p_value = math.exp(min(0.5 * (without.unlikely - found.unlikely), 0.0))
             if p_value < FALSE_ALARMS and (best is None or without.unlikely < best[1].unlikely):
@@ -108,7 +108,7 @@ def _exchanged(found: Solution) -> Iterator[tuple[str, Solution]]:
         yield text, adjust(changed, first_start(changed, found.delays))
 
 
-CHECKS = {
+HYPOTHESES = {
     "distance": (_distances, "measure it again or leave it out"),
     "shape": (_shapes, "put the boards as is said, or do not say so"),
     "labels": (_exchanged, "look at the labels of these two boards"),

@@ -72,11 +72,11 @@ def _are_tags(value: Any, count: int | None = None) -> bool:
 
 
 LENGTH: Final = (lambda value: is_number(value) and value > 0, "a number above 0 (metres)")
-NAME: Final = (lambda value: isinstance(value, str) and value.isprintable() and value != "", "a name")
+WORD: Final = (lambda value: isinstance(value, str) and value.isprintable() and value != "", "a name")
 SECONDS: Final = (lambda value: is_number(value) and abs(value) <= 1e9, "a number of seconds")  # thirty years
 KEYS: Final[dict[str, dict[str, tuple[Callable[[Any], bool], str]]]] = {
     "arrangements": {
-        "name": NAME,
+        "name": WORD,
         "known": (SHAPES.__contains__, "line or plane"),
         "order": (_are_tags, "two tags or more, each once, as in [3, 1, 2]"),
         "start_s": SECONDS,
@@ -86,7 +86,7 @@ KEYS: Final[dict[str, dict[str, tuple[Callable[[Any], bool], str]]]] = {
         "between": (lambda value: _are_tags(value, 2), "two different tags, as in [1, 2]"),
         "distance_m": LENGTH,
         "sigma_m": LENGTH,
-        "arrangement": NAME,
+        "arrangement": WORD,
     },
     "positions": {
         "tag": (lambda value: _are_tags([value], 1), "a whole number 0 to 254"),
@@ -95,7 +95,7 @@ KEYS: Final[dict[str, dict[str, tuple[Callable[[Any], bool], str]]]] = {
             "three numbers (metres)",
         ),
         "sigma_m": LENGTH,
-        "arrangement": NAME,
+        "arrangement": WORD,
     },
 }
 """The keys of the tables of a file of what is known: which values are good, and what is expected."""

@@ -39,9 +39,6 @@ DELAY_SCALE_NS = 0.5
 MIN_BELIEVED, MIN_MENTIONED = 0.5, 0.1
 """Probabilities from which a pair is believed to be reflected, and from which it is said that it may be."""
 
-SHAPES = {1: "line", 2: "plane", 3: ""}
-"""What is known of an arrangement by the dimensions in which its boards may stand."""
-
 
 def students_factor(freedom: float) -> float:
     """Return by how much Student's 95 % quantile is more than the normal one: the spread of errors is estimated.
@@ -180,7 +177,7 @@ def _calibration(
         "recipe": "survey",
         "rests_on": {
             "arrangements": [
-                {"name": boards.name, "known": SHAPES[boards.dimensions], "tags": list(boards.tags)}
+                {"name": boards.name, "known": boards.shape, "tags": list(boards.tags)}
                 for boards in network.arrangements
             ],
             "known_distances": len(network.distances),
@@ -272,4 +269,4 @@ def _arrangement(found: Solution, number: int) -> SurveyedArrangement:
         surveyed.append(SurveyedBoard(tag, (x, y, z), spread, bool(np.trace(spread) < 1.0)))
     known = network.known_places.keys() & set(seats.tolist())
     frame = "that of the known positions" if known else _frame(points[seats], boards)[2]
-    return SurveyedArrangement(boards.name, SHAPES[boards.dimensions], tuple(surveyed), frame)
+    return SurveyedArrangement(boards.name, boards.shape, tuple(surveyed), frame)

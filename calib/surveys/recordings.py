@@ -35,7 +35,7 @@ from uwblink.recording.summary import single_reports
 LIFT = "mean-of-lifted"
 """How the powers of both ends become one, as in `calib.fit`."""
 
-MIN_RANGES = 5
+MIN_RANGES_OF_MEAN = 5
 """Ranges that a pair needs in an arrangement."""
 
 PARTS = 10
@@ -242,7 +242,7 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
     pairs = pairs_of(ranges.initiator, ranges.target)
     key = arrangement * len(pairs.ends) + pairs.number
     keys, counts = np.unique(key[arrangement >= 0], return_counts=True)
-    kept = keys[counts >= MIN_RANGES]
+    kept = keys[counts >= MIN_RANGES_OF_MEAN]
     if not len(kept):
         raise UnanswerableError(f"{ranges.source}: no two boards range five times while all stand still")
     rows = np.flatnonzero(np.isin(key, kept))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation, Slerp
 
+from calib.evaluation.inertial_filter import GRAVITY_M_S2
 from calib.trajectories.samples import Samples
 from uwblink.arrays import Bools, Floats
 
@@ -47,7 +48,6 @@ class Attitude:
         return Slerp(instants, Rotation.from_quat(self.quaternion[np.minimum(rows, len(self.time_s) - 1)]))
 
 
-GRAVITY_M_S2 = 9.81
 WINDOW_S = 0.1
 """Specific forces are averaged over this time: vibrations cancel, and the acceleration of a spline hardly changes."""
 

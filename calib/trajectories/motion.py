@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from calib.estimator.rows import NormalRows, Terms, normal_terms
 from calib.estimator.unknowns import Layout, Prior, Unknown
-from calib.trajectories.attitudes import GRAVITY_M_S2, WINDOW_S
+from calib.evaluation.inertial_filter import GRAVITY_M_S2
+from calib.trajectories.attitudes import WINDOW_S
 from calib.trajectories.scene import Scene
 from uwblink.arrays import Floats, Ints
 

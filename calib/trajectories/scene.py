@@ -81,7 +81,7 @@ class Scene:
 STILL_M = 0.1
 """A body whose poses stay within this distance stands still."""
 
-PLACE_STD_M = 0.02
+POSE_STD_M = 0.02
 PLACE_EVERY_S = 0.1
 """Known positions are thinned to this interval and have this standard error: errors of motion capture last."""
 
@@ -182,7 +182,7 @@ def _places(tracks: Sequence[PoseSamples], until_s: float) -> Places:
     for number, track in enumerate(tracks):
         early = track[(track.time_s >= 0) & (track.time_s < until_s)]
         some = early[np.diff(np.floor(early.time_s / PLACE_EVERY_S), prepend=-np.inf) > 0]
-        parts.append((some.time_s, np.full(len(some), number), some.position_m, np.full(len(some), PLACE_STD_M)))
+        parts.append((some.time_s, np.full(len(some), number), some.position_m, np.full(len(some), POSE_STD_M)))
     return Places(*map(np.concatenate, zip(*parts, strict=True)))
 
 

@@ -29,12 +29,12 @@ from typing import Any, Final, Literal
 
 from uwblink.errors import PlanError
 from uwblink.protocols.table import ON_BOARDS
-from uwblink.recording.antenna_delays import FILE_KEYS as DELAY_KEYS
+from uwblink.recording.antenna_delays import PLAN_KEYS as DELAY_KEYS
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, known_delays, read_antenna_delays
 from uwblink.recording.schema import Tag, is_board_id, read_tags
 from uwblink.text_files import FileKey, TomlReader, heads, is_number
 
-FILE_KEYS: Final = (
+PLAN_KEYS: Final = (
     FileKey("pairs", '"all" or [[initiator, target], ...]', '"all"', "Who ranges with whom, in turns."),
     FileKey("rate_hz", "number, Hz, above 0", "as fast as the boards answer", "Exchanges a second in total."),
     FileKey("protocol", '"ds" or "ss"', '"ds"', "Double-sided or single-sided ranging."),
@@ -126,7 +126,7 @@ def load_plan(path: Path) -> RangingPlan:
     """Read a plan; raises `PlanError` that names the key."""
     file = TomlReader(path, PlanError)
     table = file.table
-    file.known(table, (name.removesuffix("[]") for name in heads(FILE_KEYS)))
+    file.known(table, (name.removesuffix("[]") for name in heads(PLAN_KEYS)))
     given = {name: value for name, value in table.items() if name not in ("tags", "antenna_delays")}
     pairs = table.get("pairs", "all")
     listed = isinstance(pairs, list) and pairs and all(isinstance(pair, list) for pair in pairs)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
 from uwblink.errors import PlanError
 from uwblink.recording.antenna_delays import REGISTER_MAX, delay_of, load_antenna_delays
-from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S
+from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S, TX_SHARE
 from uwbsim.errors import ScenarioError
 from uwbsim.scenario.base import Increasing, NotNegative, Positive, Section, TagId, Vector
 from uwbsim.scenario.bodies import Height, Imu, Motion, Shadow
@@ -166,9 +166,6 @@ def check_grid(
         if len(row) != len(elevation_deg):
             raise ValueError(f"{name}[{k}]: found {len(row)} values, the elevations are {len(elevation_deg)}")
 
-
-TX_SHARE: Final = 0.44
-"""Share of an aggregate antenna delay that belongs to transmissions, the rest to receptions (Decawave APS014)."""
 
 Register = Annotated[int, Field(ge=0, le=REGISTER_MAX)]
 

@@ -292,7 +292,7 @@ def fill_in(table: dict[str, Any], scenario: Path, folders: Folders = ()) -> Non
         rows = table.get(name)
         sections |= {f"{name}[{k}]": row for k, row in enumerate(rows if isinstance(rows, list) else ())}
     for place, section in sections.items():
-        for key, (model, read) in READERS.items():
+        for key, (model, read) in READERS_OF_FILES.items():
             named = section.get(key) if isinstance(section, dict) else None
             if isinstance(named, dict) and "file" in named and named.get("model") == model:
                 where = f"{scenario}: {place}.{key}.file"
@@ -403,7 +403,7 @@ def _trajectory(path: Path, _key: str, named: Mapping[str, Any]) -> dict[str, An
     }
 
 
-READERS: Final[dict[str, tuple[str | None, Callable[[Path, str, Mapping[str, Any]], dict[str, Any]]]]] = {
+READERS_OF_FILES: Final[dict[str, tuple[str | None, Callable[[Path, str, Mapping[str, Any]], dict[str, Any]]]]] = {
     "antenna": (None, lambda path, *_: _grid(path, "gain_db")),
     "plan": (None, _plan),
     "group_delay": ("table", lambda path, *_: _grid(path, "delay_cm")),

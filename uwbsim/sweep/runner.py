@@ -183,7 +183,7 @@ class TableError(UwblinkError, ValueError):
     """A table or store that cannot be read or written: what, where, what to do."""
 
 
-TABLES: Final = {
+RESULT_TABLES: Final = {
     "identity": {"key": "VARCHAR", "value": "VARCHAR"},
     "results": {"number": "BIGINT", "part": "BIGINT", "document": "VARCHAR"},
 }
@@ -213,14 +213,14 @@ class ResultStore:
             raise TableError(f"{path}: {other if locked else reason}") from error
         with db:
             with _reading(path):
-                check_tables(lambda query: db.execute(query).fetchall(), path, path.stat().st_size, TABLES)
+                check_tables(lambda query: db.execute(query).fetchall(), path, path.stat().st_size, RESULT_TABLES)
                 asked = "SELECT table_name, column_name FROM system.main.duckdb_columns() WHERE NOT internal"
                 found = set(db.execute(asked).fetchall())
             # A sweep killed at its start leaves a file without tables.
             if identity is not None and not found:
                 with _writing(path):
                     db.execute("BEGIN")
-                    for table, columns in TABLES.items():
+                    for table, columns in RESULT_TABLES.items():
                         db.execute(
                             f"CREATE TABLE {table} ({', '.join(f'{name} {kind}' for name, kind in columns.items())})"
                         )
@@ -228,7 +228,7 @@ class ResultStore:
                         "INSERT INTO identity VALUES (?, ?)", [[k, json.dumps(v)] for k, v in identity.items()]
                     )
                     db.execute("COMMIT")
-            elif not {(table, column) for table, columns in TABLES.items() for column in columns} <= found:
+            elif not {(table, column) for table, columns in RESULT_TABLES.items() for column in columns} <= found:
                 raise TableError(f"{path}: not a store of results")
             yield cls(db, path)
 

@@ -38,7 +38,7 @@ from uwbsim.twins.range_errors import CalibrationSource, KnownDevices, fit_range
 from uwbsim.twins.scenario import FittedFlight, receive_noise, scenario_text, tables, unknowns
 from uwbsim.world.radio import lifted
 
-LEVEL: Final = 0.01
+TWIN_LEVEL: Final = 0.01
 """Significance level of the comparison of a quantity."""
 
 
@@ -94,9 +94,9 @@ class Compared:
         """Return "differ" for a significant difference, else "alike", or "too few" if a large one were not detected.
 
         A large difference of distributions is 0.2, that of two normal ones whose means are half a standard deviation
-        apart; of autocorrelations 0.4. Each of the two tests has half of `LEVEL`.
+        apart; of autocorrelations 0.4. Each of the two tests has half of `TWIN_LEVEL`.
         """
-        if min(self.probability, np.nan_to_num(self.lag1_probability, nan=1.0)) < LEVEL / 2:
+        if min(self.probability, np.nan_to_num(self.lag1_probability, nan=1.0)) < TWIN_LEVEL / 2:
             return "differ"
         return "alike" if self.detectable <= 0.2 and self.lag1_detectable <= 0.4 else "too few"
 
@@ -162,9 +162,9 @@ def _compared(name: str, measured: TwinFlight, flights: list[TwinFlight]) -> Com
         simulated=other,
         distance=distance,
         probability=float(kolmogorov(distance * root)),
-        detectable=float((kolmogi(LEVEL / 2) + tenth / 2) / root),
+        detectable=float((kolmogi(TWIN_LEVEL / 2) + tenth / 2) / root),
         lag1_probability=float(2 * ndtr(-abs(one.lag1 - other.lag1) / max(spread, 1e-9))),
-        lag1_detectable=float((-ndtri(LEVEL / 4) + tenth) * spread),
+        lag1_detectable=float((-ndtri(TWIN_LEVEL / 4) + tenth) * spread),
         drawn=(mine[some_rows(len(mine), 4000)], theirs[some_rows(len(theirs), 4000)]),
         pairs=pairs,
     )

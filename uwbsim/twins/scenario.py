@@ -25,7 +25,7 @@ from uwbsim.twins.range_errors import FittedRangeErrors, KnownDevices
 from uwbsim.world.clocks import NS_PER_S
 from uwbsim.world.radio import lifted
 
-WIDTH: Final = 120
+SCENARIO_COLUMNS: Final = 120
 """Columns of a line of a scenario file."""
 
 AFTER_S: Final = 0.2
@@ -34,7 +34,7 @@ AFTER_S: Final = 0.2
 
 def scenario_text(tables: Mapping[str, Any], head: str) -> str:
     """Return the text of a scenario file: a comment, and tables within tables by their dotted names."""
-    parts = ["\n".join(f"# {line}" for line in textwrap.wrap(head, WIDTH - 2))]
+    parts = ["\n".join(f"# {line}" for line in textwrap.wrap(head, SCENARIO_COLUMNS - 2))]
     for name, table in tables.items():
         rows = table if isinstance(table, list) else [table]
         parts += [_text(f"[[{name}]]" if isinstance(table, list) else f"[{name}]", name, row) for row in rows]
@@ -58,7 +58,7 @@ def _toml(value: Any) -> str:
     items = [_toml(one) for one in value]
     if value and isinstance(value[0], Mapping):
         return "[\n  " + ",\n  ".join(items) + ",\n]"
-    return textwrap.fill(f"[{', '.join(items)}]", WIDTH, subsequent_indent="  ", break_on_hyphens=False)
+    return textwrap.fill(f"[{', '.join(items)}]", SCENARIO_COLUMNS, subsequent_indent="  ", break_on_hyphens=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

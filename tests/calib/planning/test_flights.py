@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import calib
 from calib.cli.commands import app
-from calib.cli.shared import FLAGS
+from calib.cli.shared import CALIB_FLAGS
 from calib.errors import BadInputError
 from calib.planning import FlightPlanSettings, flight_information
 from calib.planning.flight_information import ExpectedErrors, Information, flight_of
@@ -271,7 +271,7 @@ def test_a_flight_whose_poses_lack_is_refused_in_one_line():
 )
 def test_what_cannot_be_planned_is_named_by_its_option(words, named, capsys):
     with pytest.raises(SystemExit) as ended:
-        run(app, BadInputError, arguments=["plan", *words.split()], flags=FLAGS)
+        run(app, BadInputError, arguments=["plan", *words.split()], flags=CALIB_FLAGS)
     assert ended.value.code == 2
     told = capsys.readouterr().err
     assert named in told
