@@ -45,18 +45,14 @@ NUMBERS: Final = {
 }
 """The least and the largest value of a setting, and what is expected."""
 
-OBJECTS: Final = {"Calibration": "a calibration", "Knowledge": "known facts"}
-"""What results call settings that were given as objects."""
-
 FIXED: Any = {
+    "help": "Known delay of a tag, which stays as it is, as in 1=-0.36. May be repeated.",
     "flag": "--fix",
     "kind": list[str] | None,
     "tags": "{}=",
     "metavar": "TAG=NS",
 }
 """The option of known delays."""
-
-FIXED_HELP: Final = "Known delay of a tag, which stays as it is, as in 1=-0.36. May be repeated."
 
 ERRORS_PANEL: Final = "How errors count"
 MODEL_PANEL: Final = "What is fitted"
@@ -159,7 +155,8 @@ def _as_json(value: object) -> object:
         return {str(key): _as_json(one) for key, one in value.items()}
     if isinstance(value, tuple):
         return list(value)
-    return value if isinstance(value, str | int | float) else OBJECTS.get(type(value).__name__, str(value))
+    objects = {"Calibration": "a calibration", "Knowledge": "known facts"}
+    return value if isinstance(value, str | int | float) else objects.get(type(value).__name__, str(value))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -221,7 +218,6 @@ class FitSettings(CheckedSettings):
     alpha_dbm: float = -82.0
     fixed_ns: Mapping[int, float] = setting(
         {},
-        FIXED_HELP,
         parse=read_fixed,
         rich_help_panel=MODEL_PANEL,
         **FIXED,
@@ -411,7 +407,7 @@ class SurveySettings(CheckedSettings):
         kind=str,
         metavar="line|plane|FILE",
     )
-    fixed_ns: Mapping[int, float] = setting({}, FIXED_HELP, parse=read_fixed, **FIXED)
+    fixed_ns: Mapping[int, float] = setting({}, parse=read_fixed, **FIXED)
     pair_error_m: float | None = setting(
         None, "Constant error of a pair in an arrangement (m); by default estimated.", flag="--pair-error"
     )

@@ -5,7 +5,7 @@
 ['simulate', 'through_wire', 'twin']
 """
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from uwblink.lazy import offer
 
@@ -56,7 +56,7 @@ __all__ = [
     "twin",
 ]
 
-_HOMES: Final = {
+_homes = {
     "ParameterError": "uwbsim.errors",
     "Prediction": "uwbsim.protocols.prediction",
     "ProtocolComparison": "uwbsim.protocols.comparison",
@@ -85,4 +85,4 @@ _HOMES: Final = {
 }
 
 if not TYPE_CHECKING:
-    __getattr__, __dir__ = offer(__name__, _HOMES)
+    __getattr__, __dir__ = offer(__name__, _homes)

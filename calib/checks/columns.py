@@ -22,8 +22,6 @@ from uwblink.recording.summary import failures_by_pair
 from uwblink.ticks import SPEED_OF_LIGHT, TICKS_PER_SECOND
 from uwblink.twr import Exchanges, board_range, intervals, raw_range, without_stamps
 
-VACUUM_OVER_AIR: Final = 299_792_458.0 / SPEED_OF_LIGHT
-
 PLAUSIBLE_M: Final = 1000.0
 """Longer than any range of a UWB radio."""
 
@@ -137,7 +135,7 @@ def reported(view: RecordingView) -> Iterator[Candidate]:
     ratio = float(np.median(ratios)) if len(ratios) >= MIN_VALUES_OF_UNIT else 1.0
     evidence = f"reported ranges are {ratio:.5g} times those from the stamps"
     # So many medians of ratios tell the speed of light in air from that in vacuum.
-    if len(ratios) >= 100 and abs(ratio / VACUUM_OVER_AIR - 1) < 5e-5:
+    if len(ratios) >= 100 and abs(ratio * SPEED_OF_LIGHT / 299_792_458.0 - 1) < 5e-5:
         yield Candidate("speed of light in vacuum", f"{evidence}: 299 792 458 m/s instead of 299 702 547")
     for unit, many in UNITS_A_METRE.items():
         # Delays of boards may change a range of some metres by so much.

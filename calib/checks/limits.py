@@ -28,8 +28,6 @@ from uwblink.twr import names_in
 WITHOUT_CURVE: Final = "delays only"
 """How warnings of fits without a curve begin."""
 
-UNITS: Final = {0.001: "millimetres", 0.01: "centimetres", 0.3048: "feet"}
-
 LONGEST_NS: Final = 2.5
 """Boards of one kind differ by less in their antenna delays (published ones by 0.6 ns)."""
 
@@ -148,7 +146,8 @@ def _impossible(ranges: Ranges) -> Iterator[str]:
 def _looks_like(ratio: float) -> str:
     """Return what ranges that are so many times the true distances look like, an empty text where no unit is near."""
     whose, smaller = ("true distances", ratio) if ratio < 1 else ("ranges", 1 / ratio)
-    near = (f"{whose} look like {unit}" for own, unit in UNITS.items() if abs(np.log(max(smaller, 1e-9) / own)) < 0.2)
+    units = {0.001: "millimetres", 0.01: "centimetres", 0.3048: "feet"}
+    near = (f"{whose} look like {unit}" for own, unit in units.items() if abs(np.log(max(smaller, 1e-9) / own)) < 0.2)
     return next(near, "")
 
 

@@ -26,19 +26,13 @@ DETOUR_M, DETOUR_WORTH, LEAST_DETOUR_M = 0.2, 5.0, 0.03
 """Prior of the mean of the shorter kind of exponential detours, the number of reflections that it counts for, and the
 least detour (published detours are 0.1 to 0.5 m: MILUV, STAR-loc)."""
 
-ODDS = -2.2
-"""Prior log odds of a reflection: one range in ten."""
-
-LONG_ODDS = -1.1
-"""Prior log odds that a reflection is of the longer kind: one in four; 11 to 48 % within one standard deviation."""
-
 SHARED_LEVELS = {
     "noise": ("noise level", np.log(NOISE_M), (2 * NOISE_WORTH) ** -0.5),
-    "odds": ("odds level", ODDS, 2.0),
+    "odds": ("odds level", -2.2, 2.0),  # a reflection: one range in ten; 1.5 to 45 % within one standard deviation
     "detour": ("detour level", np.log(DETOUR_M), DETOUR_WORTH**-0.5),
     "least": ("least detour", np.log(LEAST_DETOUR_M), 2**0.5),
     "outliers": ("outliers", -6.0, 3.0),
-    "long": ("long detours", LONG_ODDS, 1.0),
+    "long": ("long detours", -1.1, 1.0),  # of the longer kind: one reflection in four; 11 to 48 %
 }
 """Kind of the unknown that all ranges share, centre and standard deviation of its prior, by parameter."""
 

@@ -23,10 +23,10 @@ from calib.estimator.unknowns import Layout, Priors
 from calib.range_errors.densities import error_slopes
 from calib.settings import FitSettings, FlightSettings
 from calib.trajectories.fitting import range_model, variance_factor, verdict_on, with_known_distances
-from calib.trajectories.motion import Distances, Motion, known_rows
-from calib.trajectories.samples import tapes_of
+from calib.trajectories.motion import LEAST_JERK, Distances, Motion, known_rows
+from calib.trajectories.samples import SAMPLE_S, tapes_of
 from calib.trajectories.scene import Scene, scene_from
-from calib.trajectories.start import SAMPLE_S, Trajectories, interpolated
+from calib.trajectories.start import Trajectories, interpolated
 from uwblink.arrays import Floats
 from uwblink.recording.schema import KnownDistance
 
@@ -36,9 +36,6 @@ estimate."""
 
 ENDS = 4
 """Control points at either end of a path that planned positions do not determine well."""
-
-MIN_JERK_M_S3 = 0.2
-"""Jerk of a body that hardly moves: no real flight is smoother."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -202,4 +199,4 @@ def _jerk(points: Floats, step_s: float) -> float:
     """Return the jerk that paths by control points (k, bodies, 3) have, root mean square, away from their ends."""
     inner = points[ENDS:-ENDS] if len(points) > 3 * ENDS else points
     jerk = np.diff(inner, n=3, axis=0) / step_s**3
-    return max(float(np.sqrt(np.mean(jerk**2))), MIN_JERK_M_S3)
+    return max(float(np.sqrt(np.mean(jerk**2))), LEAST_JERK)

@@ -19,8 +19,7 @@ from calib.planning.result import FlightPlan, NextBest, mean_std_ns
 from calib.planning.settings import ACCELEROMETERS, FlightPlanSettings
 from calib.settings import FlightSettings
 from calib.spread import TWO_SIDED_95
-from calib.trajectories.attitudes import WINDOW_S
-from calib.trajectories.samples import TRUSTED
+from calib.trajectories.samples import SAMPLE_S, TRUSTED
 from uwblink.arrays import Floats
 
 MORE_KNOWN_S, MORE_ANCHORS, STANDS_S, HEADING_DEG = 10.0, 4, 5.0, 0.5
@@ -84,7 +83,7 @@ def _information(asked: FlightPlanSettings, data: Data | None) -> Information:
     force_std_m_s2 = (
         None
         if asked.imu is None
-        else TRUSTED * math.hypot(ACCELEROMETERS[asked.imu] / math.sqrt(WINDOW_S), VIBRATION_M_S2)
+        else TRUSTED * math.hypot(ACCELEROMETERS[asked.imu] / math.sqrt(SAMPLE_S), VIBRATION_M_S2)
     )
     flight = flight_of(
         reference_motion(asked) if data is None else data,

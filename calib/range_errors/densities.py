@@ -7,6 +7,7 @@ outliers, share of the second kind); the likelihood has a slope by each of the s
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -15,7 +16,6 @@ from scipy.special import erfcx, expit
 
 from uwblink.arrays import Floats
 
-ROOT_2: Final = float(np.sqrt(2))
 ROOT_2PI: Final = float(np.sqrt(2 * np.pi))
 LONG_FACTOR: Final = 4.0
 """Mean of the second kind of detour over that of the first, where it is fitted.
@@ -127,7 +127,7 @@ def _kind(v: Floats, normal: Floats, sigma_m: Floats, share: float, detour_m: An
     u = v - ratio
     # Thirty sigmas beyond the least detour erfcx overflows, and the noise in a detour no longer depends on the error.
     near = np.minimum(u, 30.0)
-    scaled = erfcx(near * (-1 / ROOT_2))
+    scaled = erfcx(near * (-1 / math.sqrt(2.0)))
     density = normal * scaled * (0.5 * share / detour_m)
     if np.any(near < u):
         far = np.exp(np.minimum(ratio * (0.5 * ratio - v), 50.0)) * (share / detour_m)

@@ -100,8 +100,6 @@ KEYS: Final[dict[str, dict[str, tuple[Callable[[Any], bool], str]]]] = {
 }
 """The keys of the tables of a file of what is known: which values are good, and what is expected."""
 
-OPTIONAL: Final = {"known", "order", "start_s", "end_s", "sigma_m", "arrangement"}
-
 
 def load_knowledge(path: str | os.PathLike[str]) -> Knowledge:
     """Read a TOML file of `[[arrangements]]`, `[[distances]]` and `[[positions]]`; raises `BadInputError`, one line.
@@ -146,7 +144,7 @@ def _rows(file: TomlReader, name: str) -> Iterator[dict[str, Any]]:
     """Yield the rows of a table of a file, checked key by key."""
     for k, row in enumerate(file.rows(name, KEYS[name])):
         for key, (is_good, expected) in KEYS[name].items():
-            if key in row or key not in OPTIONAL:
+            if key in row or key not in {"known", "order", "start_s", "end_s", "sigma_m", "arrangement"}:
                 file.check(f"{name}[{k}].{key}", row.get(key), is_good(row.get(key)), expected)
         yield row
 

@@ -31,6 +31,7 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.antenna_delays import AntennaDelays
 from uwblink.recording.schema import Arrangement, KnownDistance
 from uwblink.recording.summary import single_reports
+from uwblink.ticks import METRES_PER_TICK
 
 LIFT = "mean-of-lifted"
 """How the powers of both ends become one, as in `calib.fit`."""
@@ -50,9 +51,6 @@ STEP_M = 0.05
 MOVED_M, MOVED_BINS, MIN_SIDE_BINS = 0.03, 60, 8
 """Smallest change of a pair's range that tells of a board that was moved within an arrangement; bins into which the
 arrangement is divided for that, and how many of them either side needs."""
-
-MIN_NOISE_M = 0.005
-"""A tick of the clock."""
 
 SIGMAS = 6.0
 """Standard deviations of noise from which a change is one: one in 5e8 by chance, and there are thousands."""
@@ -213,7 +211,7 @@ def find_motion(name: str, ranges: Ranges) -> list[Contradiction]:
     after = np.isfinite(median).sum(axis=1, keepdims=True) - before
     sides = np.minimum(before, after) >= MIN_SIDE_BINS
     with np.errstate(divide="ignore", invalid="ignore"):
-        std = STD_OF_MEDIAN * np.maximum(noise, MIN_NOISE_M)[:, None] * np.sqrt(1 / before + 1 / after)
+        std = STD_OF_MEDIAN * np.maximum(noise, METRES_PER_TICK)[:, None] * np.sqrt(1 / before + 1 / after)
         size = np.where(sides, np.abs(step) / std, 0.0)
     changed = (size > SIGMAS) & (np.abs(step) > MOVED_M)
     member = (ends[:, :, None] == np.array(ranges.tags())).any(axis=1).T.astype(float)

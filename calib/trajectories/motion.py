@@ -18,12 +18,9 @@ from scipy.spatial.transform import Rotation
 from calib.estimator.rows import NormalRows, Terms, normal_terms
 from calib.estimator.unknowns import Layout, Prior, Unknown
 from calib.evaluation.inertial_filter import GRAVITY_M_S2
-from calib.trajectories.attitudes import WINDOW_S
+from calib.trajectories.samples import POINT_S, SAMPLE_S
 from calib.trajectories.scene import Scene
 from uwblink.arrays import Floats, Ints
-
-POINT_S = 0.4
-"""Time between control points of a path: a multirotor does not change its acceleration faster."""
 
 TURN_S = 1.0
 """Time between points of the errors of attitudes."""
@@ -345,11 +342,11 @@ def _forces(motion: Motion, layout: Layout, body: str) -> NormalRows:
     path = motion.numbers(layout, "path")[:, motion.scene.moving.index(body)]
     bias = motion.numbers(layout, "bias")[0, motion.bodies["bias"].index(body)]
     count, force = len(sensed), sensed.force_m_s2
-    early, begin = motion.places.velocities(sensed.time_s - WINDOW_S / 2)
-    late, end = motion.places.velocities(sensed.time_s + WINDOW_S / 2)
+    early, begin = motion.places.velocities(sensed.time_s - SAMPLE_S / 2)
+    late, end = motion.places.velocities(sensed.time_s + SAMPLE_S / 2)
     # Columns and entries are (n, unknowns, axes).
     columns = [path[late], path[early], np.broadcast_to(bias[:, None], (count, 3, 3))]
-    weights = [share[:, :, None] * np.full(3, 1 / WINDOW_S) for share in (end, -begin)]
+    weights = [share[:, :, None] * np.full(3, 1 / SAMPLE_S) for share in (end, -begin)]
     entries = [*weights, np.swapaxes(sensed.turn, 1, 2)]
     if body in turning:
         # A turn t of the attitude adds t x (R f) to the force: along an axis by t about the next and the last one.

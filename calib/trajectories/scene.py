@@ -13,7 +13,7 @@ from calib.data.sources import Data, antenna_delays_of, opened, planted_of
 from calib.errors import UnanswerableError
 from calib.settings import FlightSettings
 from calib.trajectories.attitudes import Attitude, Inertial, Readings, integrated, windows
-from calib.trajectories.samples import Heights, Places, Samples, Tapes, heights_of, tapes_of
+from calib.trajectories.samples import SAMPLE_S, Heights, Places, Samples, Tapes, heights_of, tapes_of
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Poses
 from uwblink.recording.summary import single_reports
@@ -82,8 +82,7 @@ STILL_M = 0.1
 """A body whose poses stay within this distance stands still."""
 
 POSE_STD_M = 0.02
-PLACE_EVERY_S = 0.1
-"""Known positions are thinned to this interval and have this standard error: errors of motion capture last."""
+"""Standard error of known positions, thinned to `SAMPLE_S`: errors of motion capture last."""
 
 TILT_STD_DEG, TILT_WANDER_DEG, HEADING_WANDER_DEG = 1.0, 0.2, 0.5
 """Standard deviation of the tilt of an attitude reference (degrees), and random walks of tilt and heading (degrees per
@@ -177,11 +176,11 @@ def _track(poses: Poses, body: str, began_ns: int) -> PoseSamples:
 
 
 def _places(tracks: Sequence[PoseSamples], until_s: float) -> Places:
-    """Return the positions of each body since the first range, `PLACE_EVERY_S` apart."""
+    """Return the positions of each body since the first range, `SAMPLE_S` apart."""
     parts = []
     for number, track in enumerate(tracks):
         early = track[(track.time_s >= 0) & (track.time_s < until_s)]
-        some = early[np.diff(np.floor(early.time_s / PLACE_EVERY_S), prepend=-np.inf) > 0]
+        some = early[np.diff(np.floor(early.time_s / SAMPLE_S), prepend=-np.inf) > 0]
         parts.append((some.time_s, np.full(len(some), number), some.position_m, np.full(len(some), POSE_STD_M)))
     return Places(*map(np.concatenate, zip(*parts, strict=True)))
 

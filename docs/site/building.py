@@ -6,12 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from calib.calibration.document import PLAN_KEYS as CALIBRATION
+from calib.calibration.document import CALIBRATION_KEYS as CALIBRATION
 from calib.cli.commands import app as calib_app
 from docs.site import checks, commands, doors, file_keys, schema
 from uwblink.boards.ranging_plan import PLAN_KEYS as PLAN
 from uwblink.cli.commands import app as uwblink_app
-from uwblink.importers.column_map import PLAN_KEYS as COLUMN_MAP
+from uwblink.importers.column_map import MAP_KEYS as COLUMN_MAP
 from uwbsim.boards.server import FaultsFile
 from uwbsim.cli.commands import app as uwbsim_app
 from uwbsim.scenario.model import Scenario

@@ -29,8 +29,13 @@ from typing import Any, Final, Literal
 
 from uwblink.errors import PlanError
 from uwblink.protocols.table import ON_BOARDS
-from uwblink.recording.antenna_delays import PLAN_KEYS as DELAY_KEYS
-from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, known_delays, read_antenna_delays
+from uwblink.recording.antenna_delays import (
+    ANTENNA_DELAY_KEYS,
+    AntennaDelay,
+    AntennaDelays,
+    known_delays,
+    read_antenna_delays,
+)
 from uwblink.recording.schema import Tag, is_board_id, read_tags
 from uwblink.text_files import FileKey, TomlReader, heads, is_number
 
@@ -45,7 +50,7 @@ PLAN_KEYS: Final = (
     FileKey("tags[].id", "whole number, 0 to 254", "needed", "A board with a known place on a body."),
     FileKey("tags[].body", "text", "needed", "Its body, by the name of motion capture."),
     FileKey("tags[].lever_arm_m", "3 numbers, m", "[0.0, 0.0, 0.0]", "Position of its antenna in the body's frame."),
-    *DELAY_KEYS,
+    *ANTENNA_DELAY_KEYS,
 )
 """The keys of a plan's file, for its reader and the reference."""
 
