@@ -21,7 +21,7 @@ GENERATED: Final = Path(__file__).parents[1] / "generated"
 
 PAGES: Final[dict[str, Callable[[], str]]] = {
     "scenario": lambda: schema.reference(Scenario.model_json_schema(), "Scenario"),
-    "faults": lambda: schema.reference(FaultsFile.model_json_schema(), "Faults"),
+    "faults": lambda: schema.reference(FaultsFile.model_json_schema(), "FaultsFile"),
     "column_map": lambda: file_keys.reference(COLUMN_MAP),
     "plan": lambda: file_keys.reference(PLAN),
     "sweep": lambda: schema.reference(SweepFile.model_json_schema(), "SweepFile"),
