@@ -38,7 +38,8 @@ POWER_FACTORS: Final = {
 """Factors that make dBm of powers: firmwares print a loss, or integers. The last that fits is the simplest."""
 
 MIN_VALUES_OF_UNIT: Final = 20
-"""Fewer ranges, or powers, say nothing of a unit."""
+"""Fewer ranges, or powers, say nothing of a unit: the median of so many is known to 0.28 of their spread
+(`calib.spread.STD_OF_MEDIAN` over the root of their number), and units differ by a factor of two or more."""
 
 
 def empty(view: RecordingView) -> Iterator[Candidate]:

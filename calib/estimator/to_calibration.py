@@ -31,7 +31,8 @@ LEAST_SPREAD_M = 1e-6
 """Smallest noise: errors without spread have no distribution."""
 
 NODES = 8
-"""Number of powers at which noise and share are stated; between them both are linear."""
+"""Number of powers at which noise and share are stated; between them both are linear: twice the segments of the curve
+of the noise."""
 
 QUANTILE_SHARES = (0.005, 0.025, 0.05, 0.16, 0.5, 0.84, 0.95, 0.975, 0.995)
 """Shares of errors at which the model's quantiles are corrected."""
@@ -46,7 +47,8 @@ a third and three times the common detour. What a few lasting reflections leave 
 
 
 SPELLS = 8
-"""Number of spells of a recording that are compared."""
+"""Number of spells of a recording that are compared: over the 28 pairs of eight tags their variance is known to a tenth
+(the root of 2/(7 * 28)); over a single pair to half."""
 
 BETWEEN_M = 0.05
 """Standard deviation of a pair's offset between recordings, where only one is fitted.

@@ -17,7 +17,7 @@ from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
 
 STARTING_S = 3.0
-"""Seconds from standstill to full speed."""
+"""Seconds from standstill to full speed: a judgement, gentle at 1 m/s."""
 
 
 def reference_motion(flown: FlightPlanSettings) -> SampleFlight:

@@ -15,7 +15,8 @@ from calib.planning.settings import FlightPlanSettings
 from uwblink.arrays import Floats
 
 GUESS_NS = 1.5
-"""How far a delay is known without any data: means over tags are finite then, though some are not determined."""
+"""How far a delay is known without any data, two and a half times what published ones differ by (0.6 ns): means over
+tags are finite then, though some are not determined."""
 
 
 def mean_std_ns(information: Floats) -> float:

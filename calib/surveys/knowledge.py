@@ -13,7 +13,8 @@ from uwblink.recording.schema import SHAPES, Arrangement, KnownDistance
 from uwblink.text_files import TomlReader, is_number
 
 TAPE_M, PLACE_M = 0.005, 0.01
-"""Standard deviations of a distance by tape, and of each coordinate of a position, where none is stated."""
+"""Standard deviations of a distance by tape, and of each coordinate of a position, where none is stated:
+a tape is read to 5 mm, and both ends of a coordinate are antennas."""
 
 MAX_LENGTH_M, MIN_SIGMA_M = 1e6, 1e-6
 """From a micrometre to a thousand kilometres, squares and weights are numbers that can be computed with."""

@@ -32,7 +32,7 @@ FREE_PLACE_STD_M = 30.0
 """Prior standard deviation of a coordinate that is not known: it holds what no range determines."""
 
 BESIDE_STD_M = 0.5
-"""The same of how far boards stand beside a line, or a plane, that is none."""
+"""The same of how far boards stand beside a line, or a plane, that is none: decimetres, as nobody overlooks a metre."""
 
 EXTRA_M, EXTRA_STD_M = 0.3, 0.25
 """Prior mean and standard deviation of how much longer a reflected path is (published detours are 0.1 to 0.5 m)."""

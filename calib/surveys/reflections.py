@@ -26,10 +26,11 @@ REFLECTED, STRAIGHT = 1.0, 30.0
 """Rows with and without a detour that the prior of their share is worth."""
 
 SHORTER_SHARE = 0.01
-"""Share of rows with a gross error that are shorter than the straight way: no detour is."""
+"""Share of rows with a gross error that are shorter than the straight way: no detour is. It
+keeps logarithms finite."""
 
 MAX_WORSE = 2 * math.log(20.0)
-"""By how much -2 log likelihood a choice may be worse than the best and still count."""
+"""By how much -2 log likelihood a choice may be worse than the best and still count: with a twentieth of its weight."""
 
 MAX_FIRST_CHANGES = 24
 """How many single changes, the best ones, are tried together with a second one."""

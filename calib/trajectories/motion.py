@@ -281,10 +281,10 @@ STANDS_M = 100.0
 """Prior standard deviation of the position of a standing body: any hall."""
 
 BIAS_M_S2 = 0.4
-"""Prior standard deviation of an accelerometer's bias."""
+"""Prior standard deviation of an accelerometer's bias: 40 mg, the order of magnitude in data sheets of MEMS sensors."""
 
 LEVEL_M = 0.15
-"""Prior standard deviation of the constant offset of a height sensor."""
+"""Prior standard deviation of the constant offset of a height sensor, chosen on the MILUV flight (docs/theory.md)."""
 
 CALM_M_S2, CALM_SENSED_M_S2 = 5.0, 50.0
 """Prior standard deviation of accelerations, which holds a path where ranges are missing; the second where an

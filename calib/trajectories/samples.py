@@ -33,7 +33,7 @@ TRUSTED = 3.0
 """Factor on the spread of a sensor's residuals: its errors last for some windows."""
 
 HEIGHT_BOUNDS_M = (0.02, 1.0)
-"""Bounds of the standard error of a height."""
+"""Bounds of the standard error of a height: how level floors are, and nearly half the height of a room."""
 
 HUBER = 2.0
 """Readings beyond so many spreads count less (Huber 1964): the sensor looks at what stands below it."""
