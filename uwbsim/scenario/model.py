@@ -20,6 +20,7 @@ from uwbsim.scenario.radio import GeometricMultipath, Radio, Spline, TwoStateMul
 from uwbsim.scenario.ranging import Ranging
 
 WAVELENGTH_M: Final = SPEED_OF_LIGHT / 3993.6e6
+"""At the centre of channel 2, which the boards use (firmware wire format, 2.2)."""
 
 
 class RunSettings(Section):

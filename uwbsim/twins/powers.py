@@ -14,7 +14,8 @@ from uwbsim.twins.flight import TwinFlight, bulk_spread, effective_size, lasting
 from uwbsim.world.radio import ANTENNAS, before_saturation_dbm, harmonics
 
 MIN_REFLECTED: Final = 5.0
-"""Reflected exchanges, by their probabilities, below which their losses are not determined."""
+"""Reflected exchanges, by their probabilities, below which their losses are not determined: a spread of
+five is known to a third (the root of 1/8)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
