@@ -20,11 +20,13 @@ from uwblink.arrays import Floats, Ints
 
 NOISE_M, NOISE_WORTH = 0.06, 20.0
 """Prior of the noise of a range, and the number of ranges that it counts for. A stamp of a DW1000 has 0.15 ns of noise
-in the open (its user manual, 8.3), which gives 3 to 10 cm."""
+in the open (its user manual, 8.3), which gives 3 to 10 cm. Half or twice the number moves delays of worlds by less
+than 0.01 standard errors (`python -m benchmarks.constants`)."""
 
 DETOUR_M, DETOUR_WORTH, LEAST_DETOUR_M = 0.2, 5.0, 0.03
 """Prior of the mean of the shorter kind of exponential detours, the number of reflections that it counts for, and the
-least detour (published detours are 0.1 to 0.5 m: MILUV, STAR-loc)."""
+least detour (published detours are 0.1 to 0.5 m: MILUV, STAR-loc). Half or twice the number, or the least detour, moves
+delays of worlds by 0.01 standard errors (`python -m benchmarks.constants`)."""
 
 SHARED_LEVELS = {
     "noise": ("noise level", np.log(NOISE_M), (2 * NOISE_WORTH) ** -0.5),
@@ -37,7 +39,10 @@ SHARED_LEVELS = {
 """Kind of the unknown that all ranges share, centre and standard deviation of its prior, by parameter."""
 
 SCATTER = {"noise": (0.1, 0.01, 2.0), "odds": (0.7, 0.03, 2.0), "detour": (0.2, 0.03, 0.7)}
-"""Standard deviation of groups about these: its first value and bounds between which evidence finds it."""
+"""Standard deviation of groups about these: its first value and bounds between which evidence finds it.
+
+Half or twice of all of these moves delays of worlds by 0.11 standard errors (`python -m benchmarks.constants`).
+"""
 
 
 def error_unknowns(

@@ -35,7 +35,8 @@ BESIDE_STD_M = 0.5
 """The same of how far boards stand beside a line, or a plane, that is none: decimetres, as nobody overlooks a metre."""
 
 EXTRA_M, EXTRA_STD_M = 0.3, 0.25
-"""Prior mean and standard deviation of how much longer a reflected path is (published detours are 0.1 to 0.5 m)."""
+"""Prior mean and standard deviation of how much longer a reflected path is (published detours are 0.1 to 0.5 m).
+Half or twice of either moves delays beside reflections by 0.28 standard errors (`python -m benchmarks.constants`)."""
 
 CURVE_LENGTH_DB = 4.0
 """Length of the Gaussian process (Matern 5/2 over decibels) that is the prior of a curve.
