@@ -29,9 +29,6 @@ of error of headings. Each is what a team can do without other equipment."""
 OTHER_DELAY_STD_NS = 0.05
 """Standard error of the delay of one tag from another calibration or a survey (`make surveys`: 41 to 94 ps)."""
 
-VIBRATION_M_S2 = 0.2
-"""Vibration that is left in a mean over a tenth of a second: a judgement; a fit weighs by its residuals."""
-
 Robots = int | Sequence[Sequence[int]]
 
 
@@ -83,7 +80,8 @@ def _information(asked: FlightPlanSettings, data: Data | None) -> Information:
     force_std_m_s2 = (
         None
         if asked.imu is None
-        else TRUSTED * math.hypot(ACCELEROMETERS[asked.imu] / math.sqrt(SAMPLE_S), VIBRATION_M_S2)
+        # The second part is vibration that is left in a mean (m/s^2): a judgement; a fit weighs by its residuals.
+        else TRUSTED * math.hypot(ACCELEROMETERS[asked.imu] / math.sqrt(SAMPLE_S), 0.2)
     )
     flight = flight_of(
         reference_motion(asked) if data is None else data,

@@ -36,9 +36,6 @@ POWER_AT_1_M_DBM = -74.0
 """First-path power at a metre: the upper quartile of power times squared distance in the MILUV flight among obstacles,
 whose median is -77 dBm."""
 
-DRAWS = 100
-"""Draws of which pairs are reflected: a root mean square over them is good to a few per cent."""
-
 
 def random_arrangements(inputs: SurveyPlanSettings, count: int, tries: int = 400) -> list[PlannedArrangement]:
     """Return random arrangements: orders on a line at even steps, random places on a table or in a room.
@@ -126,7 +123,8 @@ def predict(
             # The prior counts once, below.
             design = prior.design.reshape(*powers.shape, -1)[k]
             own = replace(prior, design=design, precision=np.zeros_like(prior.precision))
-        shape = (DRAWS if inputs.reflected else 1, len(first))
+        # A root mean square over a hundred draws of which pairs are reflected is good to a few per cent.
+        shape = (100 if inputs.reflected else 1, len(first))
         drawn = np.random.default_rng([inputs.seed, k]).uniform(size=shape) < inputs.reflected
         parts.append(delay_information(inputs, one, own, drawn))
     totals, delays = np.cumsum(parts, axis=0), np.arange(parts[0].shape[-1]) < len(inputs.tags)
