@@ -23,7 +23,8 @@ from calib.trajectories.scene import Scene
 from uwblink.arrays import Floats, Ints
 
 TURN_S = 1.0
-"""Time between points of the errors of attitudes."""
+"""Time between points of the errors of attitudes. Half or twice of it moves delays by 0.03 standard errors
+(`python -m benchmarks.constants`)."""
 
 MOTION = {"path": 3, "turn": 3, "stand": 3, "bias": 3, "level": 1}
 """Kinds of unknowns of motion, and how many axes each has."""
@@ -275,7 +276,8 @@ LEAST_JERK, MOST_JERK = 0.2, 2000.0
 """Bounds of jerk, m/s^3."""
 
 FAR_M = 30.0
-"""Prior standard deviation of a control point around its initial guess: it holds points without any range."""
+"""Prior standard deviation of a control point around its initial guess: it holds points without any range.
+Half or twice of it moves delays by 0.05 standard errors (`python -m benchmarks.constants`)."""
 
 STANDS_M = 100.0
 """Prior standard deviation of the position of a standing body: any hall."""
@@ -288,10 +290,12 @@ LEVEL_M = 0.15
 
 CALM_M_S2, CALM_SENSED_M_S2 = 5.0, 50.0
 """Prior standard deviation of accelerations, which holds a path where ranges are missing; the second where an
-accelerometer measures them."""
+accelerometer measures them. Half or twice of the first moves delays by 0.03 standard errors
+(`python -m benchmarks.constants`)."""
 
 SLOW_M_S = 3.0
-"""Prior standard deviation of speeds in a room."""
+"""Prior standard deviation of speeds in a room. Half or twice of it moves delays by 0.14 standard errors
+(`python -m benchmarks.constants`)."""
 
 
 def known_rows(motion: Motion, layout: Layout) -> dict[str, NormalRows | TapeRows]:
