@@ -31,7 +31,8 @@ State = Mapping[str, Floats]
 """Unknowns of motion by their kind."""
 
 JERK_M_S3, QUICK_M_S3 = 8.0, 100.0
-"""Standard deviation of jerk before it is estimated; the second for refined control points."""
+"""Standard deviation of jerk before it is estimated; the second for refined control points. Half or twice of the first
+moves delays by 0.1 standard errors (`python -m benchmarks.constants`)."""
 
 FIRST_SCALE_M = 0.15
 """First scale of Cauchy's loss, while delays and curve are unknown."""
