@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from scipy.stats import norm
 
 from calib.calibration.applying import CorrectedRanges
-from calib.calibration.comparison import Comparison
+from calib.calibration.comparison import CalibrationComparison
 from calib.calibration.model import Calibration
 from calib.data.ranges import Ranges
 from calib.estimator.grouped_errors import fit_grouped_errors
@@ -361,7 +361,7 @@ def _reach_cm(error: Floats) -> tuple[float, float]:
     return float(low) - margin, float(high) + margin
 
 
-def differences(width_in: float, found: Comparison) -> Figure:
+def differences(width_in: float, found: CalibrationComparison) -> Figure:
     """Draw the difference of each delay, second less first, with 95 % intervals and without the common shift."""
     figure, (axes,) = sheet(width_in, height_in=2.6)
     tags = sorted(found.difference_ns)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.calibration.document import T, pair_name, split_text
+from calib.calibration.document import Value, pair_name, split_text
 from calib.calibration.power_curves import ends, lift
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError
@@ -69,7 +69,7 @@ class CorrectedRanges:
         return as_html(f"{len(self.raw_m)} corrected ranges", excerpt(self.to_dict()))
 
 
-class CorrectedRange(NamedTuple, Generic[T]):
+class CorrectedRange(NamedTuple, Generic[Value]):
     """A corrected range and its standard deviation, metres; `clamped` where its power is beyond the curves'.
 
     `sigma_m` is the noise of a direct range; `sigma_total_m` includes reflections, which are the share `tail_share` of
@@ -77,11 +77,11 @@ class CorrectedRange(NamedTuple, Generic[T]):
     has the delays' part only, and its standard deviations are NaN. Each is a number, or an array (n,).
     """
 
-    range_m: T
-    sigma_m: T
+    range_m: Value
+    sigma_m: Value
     clamped: Any
-    sigma_total_m: T
-    tail_share: T
+    sigma_total_m: Value
+    tail_share: Value
 
     def __repr__(self) -> str:
         """Return a headline and the first rows, in lines of 79 characters."""

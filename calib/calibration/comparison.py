@@ -17,7 +17,7 @@ from uwblink.ticks import SPEED_OF_LIGHT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Comparison:
+class CalibrationComparison:
     """Differences second minus first, after what delays share with other constants has been taken out.
 
     A shift common to all delays and a constant of the curve are the same thing, so only together do they mean anything:
@@ -79,7 +79,7 @@ class Comparison:
         return table
 
 
-def compare(first: CalibrationSource, second: CalibrationSource) -> Comparison:
+def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationComparison:
     """Test whether the delays of two calibrations differ by more than their standard errors explain, by chi-square.
 
     Differences in ns are second minus first, less what is common to all delays and what undetermined splits leave open.
@@ -126,7 +126,7 @@ def compare(first: CalibrationSource, second: CalibrationSource) -> Comparison:
     high = min(first.bias_curve.range[1], second.bias_curve.range[1])
     grid = np.linspace(low, max(high, low + 1e-9), 400)
     curves = second.bias_curve(grid) - first.bias_curve(grid)
-    return Comparison(
+    return CalibrationComparison(
         difference_ns=dict(zip(common, left.tolist(), strict=True)),
         std_ns=std_ns,
         offset_m=float(taken[0]) * 1e-9 * SPEED_OF_LIGHT - float(curves.mean()),

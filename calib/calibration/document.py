@@ -26,7 +26,7 @@ from uwblink.text_files import FileKey
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import LARGEST_ID
 
-T = TypeVar("T")
+Value = TypeVar("Value")
 
 
 def _curve_keys(name: str, of: str) -> tuple[FileKey, ...]:
@@ -40,7 +40,7 @@ def _curve_keys(name: str, of: str) -> tuple[FileKey, ...]:
     )
 
 
-FILE_KEYS: Final = (
+CALIBRATION_KEYS: Final = (
     FileKey(
         "schema_version",
         "1 to 5",
@@ -238,19 +238,8 @@ PairName = Annotated[str, expect("names of pairs, as in 1-2", is_pair, lambda na
 IN_ORDER: Final = WrapSerializer(lambda table, write: write(dict(sorted(table.items()))))
 """Writes a table in the order of its keys."""
 
-OPTIONAL_KEYS: Final = (
-    "power_at",
-    "groups",
-    "errors",
-    "pair_offsets",
-    "antenna_delays",
-    "uncertainty",
-    "undetermined_splits",
-)
-"""Keys of a file that are left out where there is nothing to say; they stand last, in this order."""
 
-
-def write(calibration: T, adapter: TypeAdapter[T]) -> str:
+def write(calibration: Value, adapter: TypeAdapter[Value]) -> str:
     """Return a calibration as JSON text.
 
     The version is what a program must support to read it: 2 with groups of tags, 3 with a curve that is taken at each
@@ -258,7 +247,9 @@ def write(calibration: T, adapter: TypeAdapter[T]) -> str:
     cannot be corrected.
     """
     table = adapter.dump_python(calibration, mode="json")
-    used = {key: value for key in OPTIONAL_KEYS if (value := table.pop(key)) and value != "exchange"}
+    # These are left out where there is nothing to say; they stand last, in this order.
+    optional = ("power_at", "groups", "errors", "pair_offsets", "antenna_delays", "uncertainty", "undetermined_splits")
+    used = {key: value for key in optional if (value := table.pop(key)) and value != "exchange"}
     needed = (("undetermined_splits", 5), ("pair_offsets", 4), ("power_at", 3), ("groups", 2))
     version = next((version for key, version in needed if key in used), 1)
     text = json.dumps({"schema_version": version} | table | used, indent=1, allow_nan=False)
@@ -269,7 +260,7 @@ def write(calibration: T, adapter: TypeAdapter[T]) -> str:
     return on_lines + "\n"
 
 
-def read(adapter: TypeAdapter[T], text: str, where: str) -> T:
+def read(adapter: TypeAdapter[Value], text: str, where: str) -> Value:
     """Return what an adapter makes of JSON text; raises `BadInputError` that names `where` and the key."""
     try:
         table = json.loads(text, parse_float=finite, parse_constant=finite)

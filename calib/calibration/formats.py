@@ -33,10 +33,7 @@ from uwblink.recording.antenna_delays import (
 )
 from uwblink.recording.file import Recording
 from uwblink.text_files import read_text
-from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
-
-TX_SHARE: Final = 0.44
-"""The transmitter's share of an aggregate delay; the receiver has the rest (APS014, section 2; the authors' code)."""
+from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, TX_SHARE
 
 
 def programmed(path: str | os.PathLike[str]) -> AntennaDelays:

@@ -23,7 +23,8 @@ from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 
 CURVE_SERIES = 5
-"""Number of independent values of a smooth curve."""
+"""Number of independent values of a smooth curve, over which the persistence of its errors is averaged: published ones
+have four coefficients. Half or twice as many move no delay (`python -m benchmarks.constants`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

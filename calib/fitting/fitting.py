@@ -37,13 +37,11 @@ from calib.estimator.known_distances import KnownDistances, fit_known_distances
 from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
+from calib.fitting.passive_listeners import MIN_OF_DELAY
 from calib.fitting.result import FitResult, HeldOut
 from calib.settings import FitSettings, check_tag
 from uwblink.arrays import Bools
 from uwblink.recording.antenna_delays import delays_differ, known_delays
-
-MIN_RANGES = 50
-"""With so many ranges one delay has a standard error of a seventh of the noise of a range, 0.03 ns."""
 
 
 def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **changes: Any) -> FitResult:
@@ -141,10 +139,10 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
     known = list(calibration.delays_ns)
     first, second = (np.isin(ends, known) for ends in (ranges.initiator, ranges.target))
     some = ranges[(first & (ranges.target == tag)) | (second & (ranges.initiator == tag))]
-    if len(some) < MIN_RANGES:
+    if len(some) < MIN_OF_DELAY:
         raise UnanswerableError(
             f"{ranges.source}: {len(some)} exchanges of tag {tag} with calibrated tags are too few, "
-            f"at least {MIN_RANGES} are needed"
+            f"at least {MIN_OF_DELAY} are needed"
         )
     joined = _with_side(replace(calibration, delays_ns=calibration.delays_ns | {tag: 0.0}), tag, some)
     applied = joined.apply(some)

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from calib import figures as drawings
-from calib.calibration.comparison import Comparison
+from calib.calibration.comparison import CalibrationComparison
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.data.sources import Data, each, load_each
 from calib.errors import BadInputError
@@ -105,7 +105,12 @@ def write_track_figures(
 
 
 def write_comparison_figures(
-    found: Comparison, known: Sequence[Calibration], names: Sequence[str], folder: Path, *, force: bool = False
+    found: CalibrationComparison,
+    known: Sequence[Calibration],
+    names: Sequence[str],
+    folder: Path,
+    *,
+    force: bool = False,
 ) -> None:
     """Write the differences of delays and both calibrations' curves into a folder; `names` label the calibrations."""
     pictures = [

@@ -21,14 +21,14 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.inverse import Matrix, inverse_of
 from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described
 from calib.estimator.losses import MIXTURE
-from calib.estimator.range_model import METRES_A_NS, RangeModel
+from calib.estimator.range_model import BOARD_DELAY_STD_NS, METRES_A_NS, RangeModel
 from calib.estimator.rows import sum_rows
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
 from calib.estimator.unknowns import Layout
 from calib.fitting.fitting import result_of, what_was_fitted
 from calib.fitting.result import FitResult
-from calib.information import Unknown, Verdict, judge
+from calib.information import LOOSEST, InformationColumn, Verdict, judge
 from calib.settings import FitSettings, FlightSettings
 from calib.spread import TWO_SIDED_95
 from calib.trajectories.motion import MOTION, TapeRows
@@ -37,7 +37,7 @@ from calib.trajectories.search import Search, search
 from calib.trajectories.start import begin
 from uwblink.arrays import Floats, Ints
 
-SHARED = (
+COMMON_SETTINGS = (
     "fixed_ns",
     "groups",
     "lift",
@@ -51,16 +51,13 @@ SHARED = (
 SHARE_OF_START = 0.3
 """Share of the work, for the progress bar, that is done when the search has its initial guess."""
 
-PRIOR_NS = 2.0
-"""Prior standard deviation of a delay: delays of boards of one type differ by less."""
-
-SCALE_NS, LOOSEST = 0.2, 0.5
-"""A direction of delays is determined if its standard error is at most LOOSEST * SCALE_NS (3 cm of range).
+SCALE_NS = 0.2
+"""A direction of delays is determined if its standard error is at most `LOOSEST` of this: 0.1 ns, 3 cm of range.
 
 The value comes from simulations (docs/accuracy.md): wider intervals did not hold.
 """
 
-GROWTH = 3.0
+LOOSER_WITH_GEOMETRY = 3.0
 """If a fit with known distances is less certain than that, a direction may be so many times less certain."""
 
 GEOMETRY_ALONE_FACTOR = 3.0
@@ -83,7 +80,7 @@ def fit_from_ranges(
     """Fit antenna delays and curves to the ranges of moving bodies whose trajectories are not known.
 
     `data` is one recording with the tags' bodies and lever arms. `flight` says what is known of the flight; `settings`
-    are those of `fit`, of which `SHARED` apply; keyword arguments are named like the fields of either.
+    are those of `fit`, of which `COMMON_SETTINGS` apply; keyword arguments are named like the fields of either.
 
     The bodies' positions are taken from the recording's poses during the first `poses_until_s` seconds (all there are,
     by default). Elsewhere they are estimated from the ranges, together with delays and curve. `attitudes` come from the
@@ -131,7 +128,7 @@ def _settings(
     flight = replace(flight or FlightSettings(), **{name: changes[name] for name in changes if name in names})
     settings = replace(settings or FitSettings(), **{name: changes[name] for name in changes if name not in names})
     for name in settings.changed():
-        if name not in SHARED:
+        if name not in COMMON_SETTINGS:
             raise BadInputError("goes with known distances only", parameter=name)
     if flight.curve_from is None:
         return flight, settings, None
@@ -345,11 +342,12 @@ def with_known_distances(information: Matrix, layout: Layout, own: Ints) -> Floa
 def verdict_on(covariance: Floats, with_truth: Floats, tags: Sequence[int]) -> Verdict:
     """Return the verdict on delays with a covariance (tags, tags), compared with that for known distances."""
     if not tags:
-        return judge(np.eye(1) * 1e6, [Unknown("delay", "")])
-    guess = np.maximum(SCALE_NS, GROWTH / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
-    information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) + np.eye(len(covariance)) / PRIOR_NS**2
-    unknowns = [Unknown("delay", str(tag), scale) for tag, scale in zip(tags, guess.tolist(), strict=True)]
-    return judge((information + information.T) / 2, unknowns, loosest=LOOSEST)
+        return judge(np.eye(1) * 1e6, [InformationColumn("delay", "")])
+    guess = np.maximum(SCALE_NS, LOOSER_WITH_GEOMETRY / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
+    information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True)
+    information += np.eye(len(covariance)) / BOARD_DELAY_STD_NS**2
+    unknowns = [InformationColumn("delay", str(tag), scale) for tag, scale in zip(tags, guess.tolist(), strict=True)]
+    return judge((information + information.T) / 2, unknowns)
 
 
 def _of_motion(top: Search) -> Iterator[str]:

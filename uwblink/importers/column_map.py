@@ -69,7 +69,7 @@ STAMP_UNITS: Final = {
 TIME_UNITS: Final = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 DISTANCE_UNITS: Final = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "in": 0.0254}
 POWERS: Final = ("fpp1", "fpp2", "rxp1", "rxp2", "fpp", "rxp")
-FILE_KEYS: Final = (
+MAP_KEYS: Final = (
     FileKey(
         "layout",
         '"exchanges", "messages", "stamps", "parts" or "ranges"',
@@ -187,7 +187,7 @@ def load_map(path: Path) -> ColumnMap:
     """Read a map; raises `ImportTableError` that names the key."""
     file = TomlReader(path, ImportTableError, "map")
     table = file.table
-    file.known(table, heads(FILE_KEYS))
+    file.known(table, heads(MAP_KEYS))
     columns, units, constants, ids = (file.section(name) for name in ("columns", "units", "constants", "ids"))
     file.known(columns, NAMES, "columns.")
     file.known(units, ("stamps", "time", "distance", "power"), "units.")

@@ -44,7 +44,7 @@ from uwblink.importers.plausibility import (
     truth_m,
     try_reading,
 )
-from uwblink.importers.tables import Columns, Table, open_table
+from uwblink.importers.tables import Columns, SourceTable, open_table
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.twr import STAMPS
 
@@ -174,7 +174,7 @@ def _ends(called: dict[str, str]) -> dict[str, str]:
     return {}
 
 
-def with_stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str]:
+def with_stamp_and_event(table: SourceTable, columns: dict[str, str]) -> dict[str, str]:
     """Return the columns of a table with a stamp and its event in each row; the same columns for another table.
 
     If several columns are times, the stamp is the one whose name mentions a device, or else does not mention the host.
@@ -202,7 +202,7 @@ def with_stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str
     return rest | {"stamp": stamp, "event": event}
 
 
-def _is_event(table: Table, name: str) -> bool:
+def _is_event(table: SourceTable, name: str) -> bool:
     """Return whether a column has words for transmission and reception, about equally often."""
     word = f"lower(trim({table.text(name)}))"
     sent = f"{word} IN ('tx', 't', 'sent', 'send', 'transmit', 'transmitted')"

@@ -23,7 +23,7 @@ import numpy as np
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import DISTANCE_UNITS, DISTANCES, IDS, NAMES, POWERS, TIME_UNITS, ColumnMap
 from uwblink.importers.plausibility import SAMPLE_ROWS, counter_format
-from uwblink.importers.tables import Columns, Table, number, time_ns, whole_number
+from uwblink.importers.tables import Columns, SourceTable, number, time_ns, whole_number
 from uwblink.recording.schema import Fault
 from uwblink.twr import LARGEST_ID, STAMPS
 
@@ -39,7 +39,7 @@ def unwatched(_step: str, _share: float) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Rows:
+class StagedRows:
     """The rows of a table for which an SQL condition is true; `origin` is their number among all rows read.
 
     `from_id` and `to_id` are INTEGER, `time_ns` and stamps in ticks BIGINT, all other `columns` DOUBLE; missing values
@@ -51,7 +51,7 @@ class Rows:
     columns: tuple[str, ...]
     condition: str = "true"
 
-    def where(self, condition: str) -> Rows:
+    def where(self, condition: str) -> StagedRows:
         """Return the rows for which this condition is true, too."""
         return replace(self, condition=f"{self.condition} AND ({condition})")
 
@@ -108,7 +108,7 @@ class Staging:
         Raises `ImportTableError`.
         """
         self.db, self.paths, self.column_map = db, tuple(paths), column_map
-        self.tables: list[Table] = []
+        self.tables: list[SourceTable] = []
         self.names: dict[int, str] = {}
         self.offsets = [0]
         for name, value in column_map.constants.items():
@@ -116,7 +116,7 @@ class Staging:
         columns: Collection[str] = ()
         for k, path in enumerate(paths):
             watch("reading", k / len(paths))
-            table = Table(db, path, column_map.delimiter, column_map.decimal, key=k)
+            table = SourceTable(db, path, column_map.delimiter, column_map.decimal, key=k)
             self.tables.append(table)
             cells = self._cells(table)
             if cells.keys() != (columns or cells.keys()):
@@ -126,7 +126,7 @@ class Staging:
             with table.reading():
                 into = "INSERT INTO staged" if k else "CREATE TABLE staged AS"
                 db.execute(f"{into} SELECT {chosen} FROM {table.source}")
-            self.offsets.append(Rows(db, "staged", ()).count())
+            self.offsets.append(StagedRows(db, "staged", ()).count())
         if not self.offsets[-1]:
             raise ImportTableError(f"{paths[0]}: a header and no rows")
         others = tuple(name for name in columns if name not in IDS)
@@ -134,9 +134,9 @@ class Staging:
         listed = ", ".join(("CAST(rowid AS UINTEGER) AS origin", ids, *others))
         db.execute(f"CREATE TABLE rows AS SELECT {listed} FROM staged")
         db.execute("DROP TABLE staged")
-        self.rows = Rows(db, "rows", ("origin", *IDS, *others))
+        self.rows = StagedRows(db, "rows", ("origin", *IDS, *others))
 
-    def require(self, rows: Rows, names: Iterable[str]) -> None:
+    def require(self, rows: StagedRows, names: Iterable[str]) -> None:
         """Raise the error for the first column that rows lack."""
         for name in names:
             if not rows.has(name):
@@ -151,7 +151,7 @@ class Staging:
         there = ", ".join(names)[:400]
         return ImportTableError(f"{self.paths[0]}: column {header!r} is missing; there are {there}; {remedy}")
 
-    def _cells(self, table: Table) -> dict[str, str]:
+    def _cells(self, table: SourceTable) -> dict[str, str]:
         """Return SQL of the columns to stage, from cells of a table or constants; ids are words at first."""
         column_map, found = self.column_map, dict[str, str]()
         for name in NAMES:
@@ -254,7 +254,7 @@ class Faults:
         self._reasons: list[Condition] = []
         staging.db.execute("CREATE TABLE faulty (origin BIGINT, reason INTEGER)")
 
-    def reject(self, rows: Rows, conditions: Sequence[Condition]) -> Rows:
+    def reject(self, rows: StagedRows, conditions: Sequence[Condition]) -> StagedRows:
         """Record the rows that fulfil a condition as unusable; returns the others."""
         cases = " ".join(f"WHEN {one.wrong} THEN {k}" for k, one in enumerate(conditions, start=len(self._reasons)))
         self._reasons += conditions
@@ -290,7 +290,7 @@ class Faults:
             path = next(path for path in self._staging.paths if path.name == fault.board)
             raise ImportTableError(f"{path}: {fault.detail}")
 
-    def _describe(self, table: Table, found: Sequence[tuple[int, int, int]]) -> list[Fault]:
+    def _describe(self, table: SourceTable, found: Sequence[tuple[int, int, int]]) -> list[Fault]:
         """Return faults of a table: its rows, reasons and times."""
         column_map, faults = self._staging.column_map, []
         headers = {column_map.header(self._reasons[reason].column) for _, reason, _ in found}
@@ -308,12 +308,14 @@ class Faults:
         return faults
 
 
-def time_conditions(rows: Rows) -> list[Condition]:
+def time_conditions(rows: StagedRows) -> list[Condition]:
     """Return the condition that a row has a time, none where there is no column of times."""
     return [Condition("time_s", "a time", "time_ns IS NULL")] if rows.has("time_s") else []
 
 
-def usable_exchanges(staging: Staging, rows: Rows, faults: Faults, stamps: Sequence[str]) -> tuple[Rows, int, int, str]:
+def usable_exchanges(
+    staging: Staging, rows: StagedRows, faults: Faults, stamps: Sequence[str]
+) -> tuple[StagedRows, int, int, str]:
     """Return the rows that have all stamps, without repetitions of an exchange.
 
     Also returns the number of repetitions, and width and format of the counter.
@@ -339,11 +341,11 @@ def usable_exchanges(staging: Staging, rows: Rows, faults: Faults, stamps: Seque
         f"SELECT r.rowid FROM {rows.name} r JOIN ({twice}) ON {code} = code WHERE {some.condition} AND r.rowid > first"
     )
     staging.db.execute(f"CREATE TABLE repeats AS {later}")
-    (repeats,) = Rows(staging.db, "repeats", ()).values("count(*)")
+    (repeats,) = StagedRows(staging.db, "repeats", ()).values("count(*)")
     return good.where("rowid NOT IN (SELECT rowid FROM repeats)") if repeats else good, repeats, bits, counter
 
 
-def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Watch) -> tuple[Rows, str | None]:
+def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Watch) -> tuple[StagedRows, str | None]:
     """Combine rows of "messages", "stamps" or "parts" into exchanges.
 
     Returns complete exchanges, and the protocol, if the rows determine it. Incomplete exchanges are faults. Messages
@@ -399,7 +401,7 @@ def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Wat
     return replace(faults.reject(groups, [incomplete, conflict]), columns=columns), protocol
 
 
-def _group(rows: Rows, values: Mapping[str, str], follows: str, within_s: float) -> Rows:
+def _group(rows: StagedRows, values: Mapping[str, str], follows: str, within_s: float) -> StagedRows:
     """Return a table with one row for each group; `values` are its columns as SQL aggregates over the group's rows.
 
     In these `first` is true for the first row of a group, and `place` counts its rows from 1. Rows are sorted by keys,
@@ -426,4 +428,4 @@ def _group(rows: Rows, values: Mapping[str, str], follows: str, within_s: float)
     listed = ", ".join(f"{value} AS {column}" for column, value in values.items())
     rows.db.execute(f"CREATE TABLE exchanges AS SELECT {listed} FROM ({placed}) GROUP BY start ORDER BY start")
     rows.db.execute("DROP TABLE sorted")
-    return Rows(rows.db, "exchanges", tuple(values))
+    return StagedRows(rows.db, "exchanges", tuple(values))

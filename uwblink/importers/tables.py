@@ -138,10 +138,10 @@ def connected(paths: Sequence[Path]) -> Iterator[duckdb.DuckDBPyConnection]:
 
 
 @contextmanager
-def open_table(path: Path) -> Iterator[Table]:
+def open_table(path: Path) -> Iterator[SourceTable]:
     """Open one table for the duration of the block."""
     with connected([path]) as db:
-        yield Table(db, path)
+        yield SourceTable(db, path)
 
 
 def number(text: str) -> str:
@@ -173,7 +173,7 @@ def time_ns(text: str, unit: str | None, ns_per_unit: float) -> str:
     return f"CASE WHEN {found} BETWEEN -{LATEST_NS} AND {LATEST_NS} THEN {found} END"
 
 
-class Table:
+class SourceTable:
     """One file: `names` are its columns, `source` is what a query reads FROM, `text` returns SQL of a column."""
 
     def __init__(
