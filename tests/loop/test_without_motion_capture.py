@@ -22,6 +22,7 @@ from calib.cli.commands import app as calib_app
 from calib.surveys.knowledge import load_knowledge
 from tests import pages
 from uwblink.cli.commands import app as uwblink_app
+from uwblink.pages import figures
 from uwbsim.boards.server import stays_s
 from uwbsim.scenario.radio import BIAS
 
@@ -76,6 +77,7 @@ def done(tmp_path_factory):
     bench = None
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
+        patch.setattr(figures, "drawn", pages.outline)
         for name, *words in (shlex.split(line.replace(*SHORTER)) for line in COMMANDS):
             if words[0] == "serve":
                 bench = Bench(words[1], words[words.index("--link-dir") + 1])
