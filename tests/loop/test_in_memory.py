@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_memory_and_file_give_the_same_calibration(tmp_path):
-    settings = ["run.duration_s=10", "tags.0.passive=true"]
+    settings = ["run.duration_s=5", "tags.0.passive=true"]
     flight = uwbsim.simulate(uwbsim.load(ROOT / "scenarios/icra2023/train.toml", settings))
     flight.save(tmp_path / "f.uwb")
     in_memory, from_file = calib.fit(flight).calibration, calib.fit(tmp_path / "f.uwb").calibration
