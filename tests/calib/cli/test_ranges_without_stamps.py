@@ -5,14 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from tests import processes
 from tests.calib.plain_tables import DELAYS_NS, Plan, bias_m, write
-
-
-def run(*words):
-    done = processes.run(*words)
-    assert done.returncode == 0, done.stderr
-    return done
+from tests.processes import succeed as run
 
 
 @pytest.fixture(scope="module")
