@@ -171,7 +171,7 @@ def signals_blocked(pid):
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are looked up in /proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_a_sweep_that_ends_early_leaves_no_worker_and_goes_on_where_it_was(tmp_path, number):
-    p, out, words = plan(tmp_path, HEAD + "ranges = 4_000\nseeds = 12\n" + GRID), tmp_path / "out", tmp_path / "words"
+    p, out, words = plan(tmp_path, HEAD + "ranges = 4_000\nseeds = 8\n" + GRID), tmp_path / "out", tmp_path / "words"
     with words.open("w") as stream:
         command = [UWBSIM, "sweep", p.path, "-o", out, "--workers", "2"]
         process = subprocess.Popen(command, stdout=stream, stderr=stream, start_new_session=True)
