@@ -88,8 +88,14 @@ def test_curves_are_held_constant_and_flagged_beyond_their_range():
     assert np.all(c.sigma_curve(np.linspace(-5, 50, 500)) > 0)
 
 
-@pytest.mark.parametrize("lift", ["mean-of-lifted", "lift-of-mean"])
-@pytest.mark.parametrize("loss", ["cauchy", "huber", "soft_l1", "l2", "mixture"])
+@pytest.mark.parametrize(
+    ("loss", "lift"),
+    [
+        *((loss, "mean-of-lifted") for loss in ("cauchy", "huber", "soft_l1", "l2", "mixture")),
+        ("cauchy", "lift-of-mean"),
+        ("mixture", "lift-of-mean"),
+    ],
+)
 def test_every_option_fits(loss, lift):
     c = fit(ranges(600, tail=0.02), loss=loss, lift=lift).calibration
     assert (c.loss, c.lift) == (loss, lift)

@@ -19,10 +19,14 @@ def hardly_moving(seed=1):
 
 
 @pytest.mark.parametrize(
-    ("column", "times", "unit"),
-    [("truth_m", 1000, "millimetres"), ("truth_m", 100, "centimetres"), ("raw_m", 1000, "millimetres")],
+    ("column", "times", "unit", "more"),
+    [
+        ("truth_m", 1000, "millimetres", {}),
+        ("truth_m", 100, "centimetres", {"loss": "l2"}),
+        ("raw_m", 1000, "millimetres", {"delays_only": True}),
+        ("raw_m", 1000, "millimetres", {"sequential": True}),
+    ],
 )
-@pytest.mark.parametrize("more", [{}, {"loss": "l2"}, {"delays_only": True}, {"sequential": True}])
 def test_another_unit_is_refused_and_named(column, times, unit, more):
     some = hardly_moving()
     calib.fit(some, **more)
