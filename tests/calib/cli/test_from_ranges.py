@@ -7,7 +7,7 @@ import pytest
 from calib.settings import read_distances
 from tests import processes
 from tests.calib.trajectories.sines import flight
-from uwblink import KnownDistance
+from uwblink import Contents, KnownDistance
 from uwblink.recording.file import Recording
 
 
@@ -15,10 +15,7 @@ from uwblink.recording.file import Recording
 def recording(tmp_path_factory):
     path = tmp_path_factory.mktemp("flight") / "f.uwb"
     flown = flight(seconds=14.0)
-    with Recording.create(path, meta={}) as made:
-        made.append_tags(flown.tags)
-        made.append_poses(flown.poses)
-        made.append_exchanges(flown.exchanges)
+    Contents(exchanges=flown.exchanges, poses=flown.poses, tags=flown.tags).save(path)
     return path
 
 

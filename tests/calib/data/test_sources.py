@@ -14,15 +14,13 @@ from calib.data.ranges import Ranges
 from calib.data.samples import DELAYS_NS, sample_flight
 from calib.data.sources import load_flight, load_ranges
 from calib.errors import BadInputError, UnanswerableError
+from uwblink import Contents
 from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
 
 
 def written(place, flight, planted):
-    with Recording.create(place, meta={"planted": planted}) as recording:
-        recording.append_tags(flight.tags)
-        recording.append_poses(flight.poses)
-        recording.append_exchanges(flight.exchanges)
+    Contents(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags, meta={"planted": planted}).save(place)
     return place
 
 

@@ -8,7 +8,7 @@ import pytest
 import calib
 from tests.calib import synthetic
 from tests.processes import run
-from uwblink.recording.file import Recording
+from uwblink import Contents
 
 
 def hardly_moving(seed=1):
@@ -50,10 +50,7 @@ def test_the_command_writes_nothing_and_ends_with_1(tmp_path, change):
         poses = replace(poses, position_m=poses.position_m * 1000)
     else:
         exchanges = replace(exchanges, fpp1_dbm=-exchanges.fpp1_dbm, fpp2_dbm=-exchanges.fpp2_dbm)
-    with Recording.create(tmp_path / "flight.uwb") as recording:
-        recording.append_exchanges(exchanges)
-        recording.append_poses(poses)
-        recording.append_tags(flight.tags)
+    Contents(exchanges=exchanges, poses=poses, tags=flight.tags).save(tmp_path / "flight.uwb")
     done = run("calib", "fit", tmp_path / "flight.uwb", "-o", tmp_path / "c.json")
     assert done.returncode == 1
     assert ("millimetres" if change == "poses" else "dBm") in done.stderr
