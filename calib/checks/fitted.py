@@ -14,6 +14,7 @@ from scipy import sparse
 from calib.calibration.power_curves import basis
 from calib.checks.places import of_places
 from calib.estimator.known_distances import KnownDistances
+from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import Mixture
 from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes, search, widening
 from calib.estimator.time_blocks import FEWEST_STRETCHES
@@ -91,7 +92,7 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
         yield of_tags("decibels", louder_m[:, None] / size)
     forth = np.where(ranges.initiator < ranges.target, 1.0, -1.0)
     yield of_tags("skew", forth[:, None] * [1.0, -1.0])
-    shared = _shared(found, louder_m) if beside_curve else _late(found)
+    shared = _shared(found, louder_m) if beside_curve else late(found.model)
     if shared:
         everyone = np.broadcast_to(np.arange(len(shared)), (count, len(shared)))
         values = np.column_stack(list(shared.values()))
@@ -144,7 +145,7 @@ def _shared(found: KnownDistances, louder_m: Floats) -> dict[str, Floats]:
     reach = float(np.ptp(truth_m))
     if reach <= 0:
         return {}
-    shared = {"scale": (truth_m - float(np.median(truth_m))) / reach} | _late(found)
+    shared = {"scale": (truth_m - float(np.median(truth_m))) / reach} | late(found.model)
     if np.any(louder_m):
         decibels = 10 * np.log10(np.maximum(found.model.lifted, 1e-4))
         far = np.log(np.maximum(truth_m, 0.1))
@@ -154,12 +155,12 @@ def _shared(found: KnownDistances, louder_m: Floats) -> dict[str, Floats]:
     return shared
 
 
-def _late(found: KnownDistances) -> dict[str, Floats]:
+def late(model: RangeModel) -> dict[str, Floats]:
     """Return by how many metres a second the true distance of each range (n,) changes, over its root mean square.
 
     Speeds are those by the neighbours of each pair; nothing is returned where no distance changes.
     """
-    ranges, pair = found.model.ranges, found.model.pairs.number
+    ranges, pair = model.ranges, model.pairs.number
     order = np.argsort(pair, kind="stable")
     time_s, truth_m = ranges.time_ns[order] * 1e-9, ranges.truth_m[order]
     same = (np.diff(pair[order]) == 0) & (np.diff(ranges.session[order]) == 0)

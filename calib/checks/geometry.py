@@ -11,8 +11,10 @@ from typing import Final
 import numpy as np
 from scipy import optimize, special
 
+from calib.checks.fitted import late
 from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
-from calib.findings import Candidate, positive, stretches
+from calib.estimator.score_tests import Tested
+from calib.findings import BUDGET, Candidate, exceeds, positive, stretches
 from calib.information import LOOSEST
 from calib.spread import TWO_SIDED_95, less_medians, medians, robust_spread
 from uwblink.arrays import Floats, Ints
@@ -23,8 +25,10 @@ from uwblink.recording.schema import Poses, Tag
 
 def pose_clock(view: RecordingView) -> Iterator[Candidate]:
     """Poses whose clock is off by up to a few seconds."""
-    if not len(view.poses):
+    fit = view.quick_fit
+    if not len(view.poses) or (fit is not None and not _late(fit)):
         return
+    # Ranges are not linear in seconds: a search.
     try:
         offset_ns = find_offset(view.exchanges, view.poses, view.tags, within_s=3.0)
     except ImportTableError:
@@ -35,6 +39,12 @@ def pose_clock(view: RecordingView) -> Iterator[Candidate]:
         moved = distances_m(view.poses, view.tags, e.initiator, e.target, e.time_ns - offset_ns)
         evidence = f"with the poses {shift_s:+.3f} s later"
         yield _undone(view, Candidate("pose time offset", evidence, words={"shift": f"{shift_s:.3f}"}), moved)
+
+
+def _late(fit: QuickFit) -> bool:
+    """Return whether ranges follow the speeds of distances, as they do where poses are late, by less than a turn."""
+    found = [fit.offsets(speeds[:, None]) for speeds in late(fit.model).values()]
+    return any(exceeds(float(one.size[0]), float(one.std[0]), one.dof) < BUDGET for one in found)
 
 
 def _trials(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]:
@@ -143,6 +153,12 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
     here_m = np.linalg.norm(apart, axis=1)
     # Where anchors are metres off, what power does is not known, and small beside that.
     astray = robust_spread(fit.residual[mine]) > 0.3
+    derivative = np.zeros((len(mine), 3))
+    derivative[mine] = apart / here_m[:, None]
+    at_given = fit.test(derivative)
+    # Of places that are metres off, slopes say little: a search, as for those whose slopes are not zero.
+    if not astray and _away(at_given, at_given.total) > BUDGET:
+        return
     measured = here_m + (own.error_m if astray else fit.residual[mine])
 
     def spread_at(away: Floats) -> float:
@@ -161,12 +177,8 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
         return
     at_other = moved.test(((apart + away) / there_m[:, None])[moved.rows])
     slope = at_other.information @ away * (1 - TOLERANCE_M / size)
-    square = float(slope @ np.linalg.lstsq(at_other.covariance, slope, rcond=1e-12)[0])
-    p_value = float(special.fdtrc(3, at_other.blocks - 3.0, square / 3))
+    p_value = _away(at_other, slope)
     if not astray:
-        derivative = np.zeros((len(mine), 3))
-        derivative[mine] = apart / here_m[:, None]
-        at_given = fit.test(derivative)
         direction = np.linalg.lstsq(at_given.information, away / size, rcond=1e-12)[0]
         # Without ranges a place is known to half a metre: a tape misread, a tripod moved.
         if np.sqrt(direction @ at_given.covariance @ direction) > LOOSEST * 0.5:
@@ -186,6 +198,12 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
         {"body": body, "away_m": away, "place": [round(value, 2) for value in (places[body] + away).tolist()]},
         gain,
     )
+
+
+def _away(tested: Tested, slope: Floats) -> float:
+    """Return the p-value of slopes (3,) by a place, whose mean is zero if the place is right (Hotelling)."""
+    square = float(slope @ np.linalg.lstsq(tested.covariance, slope, rcond=1e-12)[0])
+    return float(special.fdtrc(3, tested.blocks - 3.0, square / 3))
 
 
 def _place(apart: Floats, measured: Floats, pair: Ints, start: Floats) -> Floats:

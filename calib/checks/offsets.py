@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 from scipy import sparse, special
 
-from calib.checks.fitted import of_pairs, shares_of_pairs
 from calib.checks.geometry import anchors, places_m
 from calib.checks.recording_view import Offsets, QuickFit, RecordingView, quick_fit
-from calib.errors import CalibError
-from calib.estimator.known_distances import FEWEST_RANGES, fit_known_distances
 from calib.estimator.score_tests import findings
 from calib.findings import BUDGET, Candidate, exceeds
-from calib.pairs import pairs_of
-from calib.settings import FitSettings
 from calib.spread import robust_spread
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -33,43 +28,28 @@ PAIR_M: Final = 0.04
 def closures(view: RecordingView) -> Iterator[Candidate]:
     """Pairs with an offset that the delays of their tags do not explain; those that explain it as well are named.
 
-    Slopes at no offset say too little of a large one, which the error model takes for reflections of all ranges of a
-    pair. So offsets are found by a few fits, each of which begins with those before; a pair that is mostly reflected
-    moves by the median of what it is off.
+    The constants of pairs in a quick fit are what delays and offsets of pairs add up to. So offsets are found as those
+    of the score tests of a fit are, and of any size: what delays take of constants is linear.
     """
-    rows = np.flatnonzero(np.isfinite(view.error_m))
-    if len(rows) < FEWEST_RANGES:
+    # With ten ranges a pair's constant is known to 2 cm, half of the tolerance.
+    fit = view.quick_fit or quick_fit([view], ranges_a_pair=10)
+    if fit is None:
         return
-    ranges = view.ranges[rows]
-    pairs = pairs_of(ranges.initiator, ranges.target)
-    offset_m = np.zeros(len(pairs.ends))
-    for _ in range(5):
-        moved = replace(ranges, truth_m=ranges.truth_m + offset_m[pairs.number])
-        try:
-            found = fit_known_distances(moved, FitSettings(minimum_norm=True))
-        except CalibError:
-            return
-        # The pairs of the fit among all.
-        at = np.flatnonzero((pairs.ends[:, None] == found.model.pairs.ends).all(axis=2).any(axis=1))
-        beside, before = found.slopes.test(of_pairs(found)), offset_m
-        spread_m = robust_spread(beside.total / np.maximum(np.diag(beside.information), 1e-300), 0.0)
-        tested = replace(beside, total=beside.total - beside.information @ before[at])
-        offset_m, names = np.zeros(len(before)), list(tested.family.names)
-        for one in findings(tested, len(names), BUDGET):
-            offset_m[at[names.index(one.names[0])]] = one.offset_m
-        for k in np.flatnonzero(shares_of_pairs(found)[0] > 0.5).tolist():
-            offset_m[at[k]] = before[at[k]] + np.median(found.residuals[found.model.pairs.number == k])
-        if np.max(np.abs(offset_m - before)) < 0.01:
-            break
+    tested = fit.test_constants()
+    total, information = tested.total, tested.information
+    # What offsets that are found leave of the others.
+    top = [fit.names.index(name) for one in findings(tested, len(fit.names), BUDGET, PAIR_M) for name in one.names[:1]]
+    rest = total - information[:, top] @ np.linalg.lstsq(information[np.ix_(top, top)], total[top], rcond=1e-9)[0]
+    spread_m = robust_spread(rest / np.maximum(np.diag(information), 1e-300), 0.0)
     # Where reflections make all pairs differ, one of them has to stand out among these.
-    tolerance = max(PAIR_M, float(special.ndtri(1 - BUDGET / (2 * len(offset_m)))) * spread_m)
+    tolerance = max(PAIR_M, float(special.ndtri(1 - BUDGET / (2 * len(total)))) * spread_m)
     if view.standing_m is not None:
         # Biases by power of two pairs may differ by so much (published curves), where the pairs share no power.
         tolerance += 0.2
-    for one in findings(tested, len(offset_m), BUDGET, tolerance):
+    for one in findings(tested, len(total), BUDGET, tolerance):
         yield Candidate(
             "pairs that do not close",
-            f"ranges of {' or '.join(one.names)} are {100 * abs(one.offset_m):.1f} cm too "
+            f"ranges of pair {' or pair '.join(one.names)} are {100 * abs(one.offset_m):.1f} cm too "
             f"{'long' if one.offset_m > 0 else 'short'} for the delays of their tags, by closed loops of the other "
             "pairs",
             one.p_value,
@@ -136,13 +116,14 @@ def _changes(fit: QuickFit, courses: Floats) -> list[Change]:
         if min(mine.sum(), pairs - mine.sum()) > 0 and (mine.sum() > 1 or pairs - mine.sum() > 2):
             groups.append((tag, mine.astype(float)))
     groups += [(None, row) for row in np.eye(pairs)]
-    among, found = np.kron(np.array([group for _, group in groups]), np.eye(width)), list[Change]()
+    among, found = np.array([group for _, group in groups]), list[Change]()
     while len(found) < 3:
-        offsets = Offsets.of(fit.test(_by_pair(fit, courses)), among)
+        offsets = Offsets.of(fit.test(_by_pair(fit, courses), steps=True), among, width)
         gain = (np.maximum(np.abs(offsets.size) - DELAY_M, 0.0) ** 2 * offsets.known).reshape(len(groups), width)
         # By how much variances exceed those of slopes that are a likelihood's, for most changes.
         excess = float(np.median((offsets.std**2 * offsets.known)[offsets.known > 0]))
-        likely = [k for k in np.argsort(-gain.max(axis=1))[:4].tolist() if gain[k].max() > 4 * excess]
+        # Of these standard errors; a finding needs five of its own, which may be smaller.
+        likely = [k for k in np.argsort(-gain.max(axis=1))[:4].tolist() if gain[k].max() > 3**2 * excess]
         trials = (_change(fit, groups[k], courses, int(np.argmax(gain[k])), len(tags) * width) for k in likely)
         best = next(((change, rest) for change, rest in trials if change.p_value < BUDGET), None)
         if best is None:
@@ -157,14 +138,11 @@ def _change(
 ) -> tuple[Change, QuickFit]:
     """Return the change of a group (a tag, its pairs) in a course, and a fit without it.
 
-    What the change itself leaves in residuals is no noise: its standard error is that without it.
+    Slopes at no offset say too little of a large one, so it is fitted.
     """
-    (tag, pairs), size, rest = group, 0.0, fit
-    whose, by_pair = pairs[fit.pair] * courses[:, course], _by_pair(fit, courses[:, [course]])
-    for _ in range(3):
-        size += float(Offsets.of(rest.test(by_pair), pairs[None]).size[0])
-        rest = fit.less(whose * size)
-    tested = rest.test(by_pair)
+    tag, pairs = group
+    size, rest = fit.without(pairs[fit.pair] * courses[:, course])
+    tested = rest.test(_by_pair(fit, courses[:, [course]]))
     left, alone = Offsets.of(tested, pairs[None]), np.diag(tested.covariance) * pairs
     # Errors of different pairs hardly go together, so that each tells of their variance (Welch and Satterthwaite).
     std = max(float(left.std[0]), float(np.sqrt(alone.sum())) / max(float(left.known[0]), 1e-300))

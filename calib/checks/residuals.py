@@ -81,8 +81,8 @@ def skew(view: RecordingView) -> Iterator[Candidate]:
     # Skew must be expected to change ranges by more, for it to be seen in them.
     if reach < 0.03:
         return
-    found = fit.offsets(expected[:, None])
-    slope = float(found.size[0])
+    slope, rest = fit.without(expected)
+    found = rest.offsets(expected[:, None])
     p_value = exceeds(slope, float(found.std[0]), found.dof, tolerance=0.5)
     evidence = f"errors grow by {slope:.2f} m in a metre of c/2 times carrier's skew times reply, over {reach:.2f} m"
     for at, fault, remedy in SLOPES[taken.pop()]:
@@ -98,13 +98,15 @@ def _by_direction(single: RecordingView) -> Iterator[Candidate]:
         return
     e = single.exchanges[fit.rows]
     of_pairs = np.equal.outer(fit.pair, np.arange(len(fit.ends)))
-    found = fit.offsets(of_pairs * np.where(e.initiator < e.target, 0.5, -0.5)[:, None])
-    worst = int(np.argmax((np.abs(found.size) - ONE_WAY_M) / found.std))
-    size, std = float(found.size[worst]), float(found.std[worst])
+    ways = of_pairs * np.where(e.initiator < e.target, 0.5, -0.5)[:, None]
+    seen = fit.offsets(ways, steps=True)
+    worst = int(np.argmax((np.abs(seen.size) - ONE_WAY_M) / seen.std))
+    size, rest = fit.without(ways[:, worst])
+    found = rest.offsets(ways[:, [worst]])
     yield Candidate(
         LEFT,
         f"ranges of pair {fit.names[worst]} differ by {100 * abs(size):.0f} cm by who initiates, the most of all",
-        exceeds(size, std, found.dof, tolerance=ONE_WAY_M, tried=len(fit.ends)),
+        exceeds(size, float(found.std[0]), found.dof, tolerance=ONE_WAY_M, tried=len(fit.ends)),
         {"more": "record the carrier integrator, or use double-sided ranging; until then take the mean of both ways"},
     )
 
