@@ -119,7 +119,7 @@ def _changes(fit: QuickFit, courses: Floats) -> list[Change]:
     among, found = np.array([group for _, group in groups]), list[Change]()
     while len(found) < 3:
         offsets = Offsets.of(fit.test(_by_pair(fit, courses), steps=True), among, width)
-        gain = (np.maximum(np.abs(offsets.size) - DELAY_M, 0.0) ** 2 * offsets.known).reshape(len(groups), width)
+        gain = (offsets.size**2 * offsets.known).reshape(len(groups), width)
         # By how much variances exceed those of slopes that are a likelihood's, for most changes.
         excess = float(np.median((offsets.std**2 * offsets.known)[offsets.known > 0]))
         # Of these standard errors; a finding needs five of its own, which may be smaller.

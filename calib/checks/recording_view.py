@@ -292,8 +292,12 @@ class QuickFit:
     @cached_property
     def reflected(self) -> Floats:
         """The probability (n,) that each range is reflected, by the likeliest error model beside all else."""
-        found = likeliest(self.model, self.error, self.start)
-        return found.rows.error_slopes(found.optimum.x, ()).reflected
+        return self.likeliest.rows.error_slopes(self.likeliest.optimum.x, ()).reflected
+
+    @cached_property
+    def likeliest(self) -> Fitted:
+        """The fit by the error model of ranges."""
+        return likeliest(self.model, self.error, self.start)
 
     def test(self, derivative: Floats | sparse.csr_matrix, *, steps: bool = False) -> Tested:
         """Return the slopes of the residuals by offsets, of which each range has some (n, k).
@@ -307,11 +311,13 @@ class QuickFit:
     def test_constants(self) -> Tested:
         """Return the slopes by an offset of each pair, in metres, beside the delays of all tags.
 
-        The fit has a constant of each pair, which is what all of these would make of it.
+        The fit has a constant of each pair, which is what all of these would make of it. It is that by the error model,
+        because a third of a pair's ranges that is reflected moves a robust mean by centimetres.
         """
-        fitted = self.slopes.optimum.layout.indices(["delay"])
+        fitted = self.likeliest.optimum.layout.indices(["delay"])
         derivative = Derivative(self.pair[:, None], np.ones((1, 1)), len(fitted))
-        found = self.slopes.test(Family(kind="pair", names=self.names, derivative=derivative, fitted=fitted))
+        slopes = Slopes(self.likeliest.rows, self.likeliest.optimum, self.blocks)
+        found = slopes.test(Family(kind="pair", names=self.names, derivative=derivative, fitted=fitted))
         ends = (self.ends[:, :, None] == self.model.tags).sum(axis=1)
         taken = found.information @ ends
         left = np.eye(len(ends)) - taken @ np.linalg.pinv(ends.T @ taken, rcond=1e-9, hermitian=True) @ ends.T
