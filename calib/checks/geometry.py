@@ -154,7 +154,7 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
     # Where anchors are metres off, what power does is not known, and small beside that.
     astray = robust_spread(fit.residual[mine]) > 0.3
     derivative = np.zeros((len(mine), 3))
-    derivative[mine] = apart / here_m[:, None]
+    derivative[mine] = outward = apart / here_m[:, None]
     at_given = fit.test(derivative)
     # Of places that are metres off, slopes say little: a search, as for those whose slopes are not zero.
     if not astray and _away(at_given, at_given.total) > BUDGET:
@@ -179,6 +179,8 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
     slope = at_other.information @ away * (1 - TOLERANCE_M / size)
     p_value = _away(at_other, slope)
     if not astray:
+        # Ranges at the other place: at the given one they hardly determine anything, so far off are they.
+        at_given = moved.test(outward[moved.rows])
         direction = np.linalg.lstsq(at_given.information, away / size, rcond=1e-12)[0]
         # Without ranges a place is known to half a metre: a tape misread, a tripod moved.
         if np.sqrt(direction @ at_given.covariance @ direction) > LOOSEST * 0.5:
