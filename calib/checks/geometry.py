@@ -147,7 +147,7 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
         antennas_m(view.poses, view.tags, np.where(first[mine], *ids), own.exchanges.time_ns)
         for ids in (ends, ends[::-1])
     )
-    apart, pair = here - there, np.unique(fit.pair[mine], return_inverse=True)[1]
+    apart, pair = here - there, np.unique(fit.pairs.number[mine], return_inverse=True)[1]
     if len(apart) < 200 or not np.isfinite(apart).all():
         return
     here_m = np.linalg.norm(apart, axis=1)

@@ -38,7 +38,11 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
     tested = fit.test_constants()
     total, information = tested.total, tested.information
     # What offsets that are found leave of the others.
-    top = [fit.names.index(name) for one in findings(tested, len(fit.names), BUDGET, PAIR_M) for name in one.names[:1]]
+    top = [
+        fit.pairs.names.index(name)
+        for one in findings(tested, len(fit.pairs.names), BUDGET, PAIR_M)
+        for name in one.names[:1]
+    ]
     rest = total - information[:, top] @ np.linalg.lstsq(information[np.ix_(top, top)], total[top], rcond=1e-9)[0]
     spread_m = robust_spread(rest / np.maximum(np.diag(information), 1e-300), 0.0)
     # Where reflections make all pairs differ, one of them has to stand out among these.
@@ -78,7 +82,7 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
     # No change is looked for within four of the stretches of time of scores at either end: sums over fewer are far from
     # normal where reflections last, and their variance is not known. Times are so close that a step between two loses
     # 1 % of its size; they are fewer for many pairs, for the sake of memory.
-    cuts = fit.time_s[-1] * np.linspace(1 / 8, 7 / 8, min(47, 1500 // len(fit.ends)))
+    cuts = fit.time_s[-1] * np.linspace(1 / 8, 7 / 8, min(47, 1500 // len(fit.pairs.ends)))
     courses = np.column_stack([fit.time_s[:, None] >= cuts, fit.time_s / fit.time_s[-1]])
     time_ns = fit.model.ranges.time_ns
     for one in changes_of_tags(fit, courses):
@@ -108,18 +112,18 @@ def changes_of_tags(fit: QuickFit, courses: Floats) -> Iterator[Change]:
 
 def _changes(fit: QuickFit, courses: Floats) -> list[Change]:
     """Return changes in one of the courses (n, k), each beside those before it: of all tags, of one, or of a pair."""
-    pairs, width, tags = len(fit.ends), courses.shape[1], np.unique(fit.ends).tolist()
+    pairs, width, tags = len(fit.pairs.ends), courses.shape[1], np.unique(fit.pairs.ends).tolist()
     groups: list[tuple[int | None, Floats]] = [(None, np.ones(pairs))]
     for tag in tags:
-        mine = (fit.ends == tag).any(axis=1)
+        mine = (fit.pairs.ends == tag).any(axis=1)
         # A tag with one pair needs others, for the pair to be its own matter.
         if min(mine.sum(), pairs - mine.sum()) > 0 and (mine.sum() > 1 or pairs - mine.sum() > 2):
             groups.append((tag, mine.astype(float)))
     groups += [(None, row) for row in np.eye(pairs)]
     among, found = np.array([group for _, group in groups]), list[Change]()
     while len(found) < 3:
-        offsets = Offsets.of(fit.test(_by_pair(fit, courses), steps=True), among, width)
-        gain = (offsets.size**2 * offsets.known).reshape(len(groups), width)
+        offsets = Offsets.of(fit.test(_by_pair(fit, courses)), among, width)
+        gain = (offsets.size**2 * offsets.known).reshape(width, len(groups)).T
         # By how much variances exceed those of slopes that are a likelihood's, for most changes.
         excess = float(np.median((offsets.std**2 * offsets.known)[offsets.known > 0]))
         # Of these standard errors; a finding needs five of its own, which may be smaller.
@@ -141,7 +145,7 @@ def _change(
     Slopes at no offset say too little of a large one, so it is fitted.
     """
     tag, pairs = group
-    size, rest = fit.without(pairs[fit.pair] * courses[:, course])
+    size, rest = fit.without(pairs[fit.pairs.number] * courses[:, course])
     tested = rest.test(_by_pair(fit, courses[:, [course]]))
     left, alone = Offsets.of(tested, pairs[None]), np.diag(tested.covariance) * pairs
     # Errors of different pairs hardly go together, so that each tells of their variance (Welch and Satterthwaite).
@@ -152,11 +156,9 @@ def _change(
 
 
 def _by_pair(fit: QuickFit, courses: Floats) -> sparse.csr_matrix:
-    """Return courses (n, k) as those of each pair (n, pairs * k)."""
-    rows, course = np.nonzero(courses)
-    columns = fit.pair[rows] * courses.shape[1] + course
-    shape = len(courses), len(fit.ends) * courses.shape[1]
-    return sparse.csr_matrix((courses[rows, course].astype(float), (rows, columns)), shape=shape)
+    """Return courses (n, k) as those of each pair (n, k * pairs)."""
+    whose = sparse.csr_matrix(np.equal.outer(fit.pairs.number, np.arange(len(fit.pairs.ends))).astype(float))
+    return sparse.hstack([whose.multiply(course[:, None]) for course in courses.T], format="csr")
 
 
 def compared(views: Sequence[RecordingView], level: float) -> Iterator[Candidate]:

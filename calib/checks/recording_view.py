@@ -24,7 +24,7 @@ from calib.estimator.range_rows import RESIDUAL, Part, RangeRows
 from calib.estimator.score_tests import REACHED, Derivative, Family, Slopes, Tested
 from calib.estimator.time_blocks import TimeBlocks, time_blocks
 from calib.estimator.unknowns import Priors, Unknown
-from calib.pairs import pairs_of
+from calib.pairs import Pairs, pairs_of
 from calib.settings import FitSettings
 from calib.spread import less_medians
 from uwblink.arrays import Bools, Floats, Ints
@@ -178,21 +178,19 @@ class Offsets:
     def of(cls, tested: Tested, groups: Floats, courses: int = 1) -> Offsets:
         """Return the offsets that all members of a group share, of each of `groups` (k, m) in each course.
 
-        Tested are the m members in each course, those of a member side by side; so are the k groups that are returned.
+        Tested are the m members in each course, those of a course side by side; so are the k groups that are returned.
         """
-        size = groups.shape[1]
+        total = tested.total.reshape(courses, -1)
+        whole = (courses, total.shape[1], courses, total.shape[1])
         known, variance = (
-            np.einsum("km,cmn,kn->kc", groups, np.einsum("mcnc->cmn", square), groups, optimize=True).ravel()
-            for square in (
-                every.reshape(size, courses, size, courses) for every in (tested.information, tested.covariance)
-            )
+            np.einsum("km,cmn,kn->ck", groups, np.einsum("cmcn->cmn", every.reshape(whole)), groups).ravel()
+            for every in (tested.information, tested.covariance)
         )
         known = np.where(known > REACHED * tested.whole, known, 0.0)
         with np.errstate(divide="ignore"):
             std = np.sqrt(np.maximum(variance, 1e-300)) / known
-        total = (groups @ tested.total.reshape(size, courses)).ravel()
         return cls(
-            size=-total / np.where(known > 0, known, np.inf),
+            size=-(total @ groups.T).ravel() / np.where(known > 0, known, np.inf),
             known=known,
             std=std,
             dof=min(tested.lasting.freedom, tested.blocks - 1.0),
@@ -244,11 +242,8 @@ class QuickFit:
 
     @cached_property
     def slopes(self) -> Slopes:
-        """Slopes that test for more unknowns, with the curvature of the loss."""
-        return self._slopes(None)
-
-    def _slopes(self, least: float | None) -> Slopes:
-        ranges = replace(self.ranges, errors=replace(self.start.rows.errors, least=least))
+        """Slopes that test for more unknowns, with the curvature of the loss, which standard errors need."""
+        ranges = replace(self.ranges, errors=replace(self.start.rows.errors, least=None))
         # Long blocks in the place of short ones: sums over them hardly share errors that last.
         short = self.blocks
         count = min(STRETCHES_OF_SCORES, short.count)
@@ -257,19 +252,9 @@ class QuickFit:
         return Slopes(ranges, self._search(ranges, self.x, steps=1), replace(short, number=number, bounds=bounds))
 
     @property
-    def pair(self) -> Ints:
-        """The number of each range's pair (n,)."""
-        return self.model.pairs.number
-
-    @property
-    def ends(self) -> Ints:
-        """The tags of each pair (k, 2)."""
-        return self.model.pairs.ends
-
-    @property
-    def names(self) -> list[str]:
-        """The names of pairs (k,)."""
-        return [f"{a}-{b}" for a, b in self.ends.tolist()]
+    def pairs(self) -> Pairs:
+        """The pairs of the ranges."""
+        return self.model.pairs
 
     def without(self, derivative: Floats) -> tuple[float, QuickFit]:
         """Return an offset of which each range has so much (n,), and a fit to ranges without it.
@@ -299,14 +284,9 @@ class QuickFit:
         """The fit by the error model of ranges."""
         return likeliest(self.model, self.error, self.start)
 
-    def test(self, derivative: Floats | sparse.csr_matrix, *, steps: bool = False) -> Tested:
-        """Return the slopes of the residuals by offsets, of which each range has some (n, k).
-
-        With `steps` what residuals know is their weight, as in a search: far out the curvature of the loss is small, so
-        that a step by it would be too large. Standard errors need the curvature.
-        """
-        slopes = self._slopes(1.0) if steps else self.slopes
-        return slopes.test(Family(kind="", names=(), derivative=sparse.csr_matrix(derivative)))
+    def test(self, derivative: Floats | sparse.csr_matrix) -> Tested:
+        """Return the slopes of the residuals by offsets, of which each range has some (n, k)."""
+        return self.slopes.test(Family(kind="", names=(), derivative=sparse.csr_matrix(derivative)))
 
     def test_constants(self) -> Tested:
         """Return the slopes by an offset of each pair, in metres, beside the delays of all tags.
@@ -315,10 +295,10 @@ class QuickFit:
         because a third of a pair's ranges that is reflected moves a robust mean by centimetres.
         """
         fitted = self.likeliest.optimum.layout.indices(["delay"])
-        derivative = Derivative(self.pair[:, None], np.ones((1, 1)), len(fitted))
+        derivative = Derivative(self.pairs.number[:, None], np.ones((1, 1)), len(fitted))
         slopes = Slopes(self.likeliest.rows, self.likeliest.optimum, self.blocks)
-        found = slopes.test(Family(kind="pair", names=self.names, derivative=derivative, fitted=fitted))
-        ends = (self.ends[:, :, None] == self.model.tags).sum(axis=1)
+        found = slopes.test(Family(kind="pair", names=self.pairs.names, derivative=derivative, fitted=fitted))
+        ends = (self.pairs.ends[:, :, None] == self.model.tags).sum(axis=1)
         taken = found.information @ ends
         left = np.eye(len(ends)) - taken @ np.linalg.pinv(ends.T @ taken, rcond=1e-9, hermitian=True) @ ends.T
         return replace(
@@ -329,9 +309,9 @@ class QuickFit:
             information=left @ found.information,
         )
 
-    def offsets(self, derivative: Floats, *, steps: bool = False) -> Offsets:
+    def offsets(self, derivative: Floats) -> Offsets:
         """Return offsets of which each range has some (n, k)."""
-        return Offsets.of(self.test(derivative, steps=steps), np.eye(derivative.shape[1]))
+        return Offsets.of(self.test(derivative), np.eye(derivative.shape[1]))
 
 
 LOSS: Final = "soft_l1"

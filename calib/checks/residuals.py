@@ -47,10 +47,10 @@ def astray(view: RecordingView) -> Iterator[Candidate]:
     fit, found = view.quick_fit, list[tuple[float, str]]()
     if fit is None:
         return
-    for pair, name in enumerate(fit.names):
-        rest = np.minimum(np.abs(fit.residual[fit.pair == pair]), 10 * ASTRAY_M)
+    for pair, name in enumerate(fit.pairs.names):
+        rest = np.minimum(np.abs(fit.residual[fit.pairs.number == pair]), 10 * ASTRAY_M)
         means = np.array([float(np.mean(rest[s])) for s in stretches(len(rest))])
-        p_value = positive(means - ASTRAY_M, tried=len(fit.ends))
+        p_value = positive(means - ASTRAY_M, tried=len(fit.pairs.ends))
         if p_value < BUDGET:
             found.append((p_value, f"{name} by {np.mean(means):.2f} m"))
     if found:
@@ -97,16 +97,16 @@ def _by_direction(single: RecordingView) -> Iterator[Candidate]:
     if fit is None:
         return
     e = single.exchanges[fit.rows]
-    of_pairs = np.equal.outer(fit.pair, np.arange(len(fit.ends)))
+    of_pairs = np.equal.outer(fit.pairs.number, np.arange(len(fit.pairs.ends)))
     ways = of_pairs * np.where(e.initiator < e.target, 0.5, -0.5)[:, None]
-    seen = fit.offsets(ways, steps=True)
+    seen = fit.offsets(ways)
     worst = int(np.argmax((np.abs(seen.size) - ONE_WAY_M) / seen.std))
     size, rest = fit.without(ways[:, worst])
     found = rest.offsets(ways[:, [worst]])
     yield Candidate(
         LEFT,
-        f"ranges of pair {fit.names[worst]} differ by {100 * abs(size):.0f} cm by who initiates, the most of all",
-        exceeds(size, float(found.std[0]), found.dof, tolerance=ONE_WAY_M, tried=len(fit.ends)),
+        f"ranges of pair {fit.pairs.names[worst]} differ by {100 * abs(size):.0f} cm by who initiates, the most of all",
+        exceeds(size, float(found.std[0]), found.dof, tolerance=ONE_WAY_M, tried=len(fit.pairs.ends)),
         {"more": "record the carrier integrator, or use double-sided ranging; until then take the mean of both ways"},
     )
 
@@ -122,7 +122,7 @@ def reflections(view: RecordingView) -> Iterator[Candidate]:
     if view.quick_fit is None:
         yield from _of_tags(fit, long, evidence)
         return
-    lasting = [one for pair in range(len(fit.ends)) for one in _of_pair(fit, pair, long) if one.p_value < BUDGET]
+    lasting = [one for pair in range(len(fit.pairs.ends)) for one in _of_pair(fit, pair, long) if one.p_value < BUDGET]
     if lasting:
         lasting.sort(key=lambda one: -one.gain)
         more = f"; and {len(lasting) - 4} pairs more" if lasting[4:] else ""
@@ -147,7 +147,7 @@ def _detour_m(fit: QuickFit, long: Bools, mine: Bools | slice) -> float:
 
 def _of_pair(fit: QuickFit, pair: int, every: Bools) -> Iterator[Candidate]:
     """Yield a pair whose reflected ranges follow each other, with how much they lengthen its ranges as its gain."""
-    mine = fit.pair == pair
+    mine = fit.pairs.number == pair
     long, share = every[mine], float(np.mean(every[mine]))
     if len(long) < 60 or not LEAST_SHARE < share < 1:
         return
@@ -156,9 +156,9 @@ def _of_pair(fit: QuickFit, pair: int, every: Bools) -> Iterator[Candidate]:
         after = long[1:][long[:-1]]
         yield Candidate(
             "reflections that last",
-            f"pair {fit.names[pair]}: {_in_words(fit, every, mine)}, for {life_s:.1f} s at a time",
+            f"pair {fit.pairs.names[pair]}: {_in_words(fit, every, mine)}, for {life_s:.1f} s at a time",
             # Antennas turn slowly, so that a range is so much likelier reflected after a reflected one.
-            more_often(int(after.sum()), len(after), share + 0.35 * (1 - share), tried=len(fit.ends)),
+            more_often(int(after.sum()), len(after), share + 0.35 * (1 - share), tried=len(fit.pairs.ends)),
             gain=share * _detour_m(fit, every, mine),
         )
 
@@ -180,9 +180,9 @@ def _life_s(reflected: Floats, step_s: float) -> float:
 
 def _of_tags(fit: QuickFit, long: Bools, evidence: str) -> Iterator[Candidate]:
     """Where pairs have a few ranges each: the tags of whose ranges many more are reflected than of the others'."""
-    p_value, tags = more_often(int(long.sum()), len(long), MANY_SHARE), np.unique(fit.ends).tolist()
+    p_value, tags = more_often(int(long.sum()), len(long), MANY_SHARE), np.unique(fit.pairs.ends).tolist()
     for tag in tags:
-        mine = (fit.ends == tag).any(axis=1)[fit.pair]
+        mine = (fit.pairs.ends == tag).any(axis=1)[fit.pairs.number]
         others = float(np.mean(long[~mine])) if (~mine).any() else float(np.mean(long))
         p_tag = more_often(int(long[mine].sum()), int(mine.sum()), max(others, LEAST_SHARE), tried=len(tags))
         if p_tag < BUDGET:
