@@ -97,12 +97,19 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
 def changes_of_tags(fit: QuickFit, courses: Floats) -> Iterator[Change]:
     """Yield changes of single tags, unless another change that is found says that it was no delay.
 
-    Such are one of a pair, or of all tags, and one back: a body in the way goes again. An antenna, or a voltage, is one
-    tag's, so that other pairs change by 40 % of it at most.
+    Such are one of a pair, or of all tags, at about that time, and one back: a body in the way goes again. An antenna,
+    or a voltage, is one tag's, so that other pairs change by 40 % of it at most.
     """
     named, found = set[int | None]({None}), _changes(fit, courses)
+    # Of two courses that share less than half of their variance neither stands for the other.
+    same = np.atleast_2d(np.corrcoef(courses.T)) ** 2 > 0.5
     for one in found:
-        against = [two for two in found if two.tag is None or (two.tag == one.tag and two.size_m * one.size_m < 0)]
+        against = [
+            two
+            for two in found
+            if (two.tag is None and same[one.course, two.course])
+            or (two.tag == one.tag and two.size_m * one.size_m < 0)
+        ]
         alone = all(abs(two.size_m) <= 0.4 * abs(one.size_m) for two in against)
         # No antenna and no voltage does more than 5 ns.
         if one.tag not in named and alone and abs(one.size_m) < 0.75:
