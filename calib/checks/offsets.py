@@ -77,13 +77,15 @@ class Change:
 def changed_delays(view: RecordingView) -> Iterator[Candidate]:
     """Tags whose delay changes during a recording, at one of many times or steadily."""
     fit = view.quick_fit
-    if fit is None or fit.time_s[-1] < 10.0:
+    # Of a shorter recording the 32 stretches of scores would be shorter than errors last (docs/accuracy.md).
+    if fit is None or fit.blocks.seconds < 10.0:
         return
+    share = fit.blocks.number / fit.blocks.count
     # No change is looked for within four of the stretches of time of scores at either end: sums over fewer are far from
     # normal where reflections last, and their variance is not known. Times are so close that a step between two loses
     # 1 % of its size; they are fewer for many pairs, for the sake of memory.
-    cuts = fit.time_s[-1] * np.linspace(1 / 8, 7 / 8, min(47, 1500 // len(fit.pairs.ends)))
-    courses = np.column_stack([fit.time_s[:, None] >= cuts, fit.time_s / fit.time_s[-1]])
+    cuts = np.linspace(1 / 8, 7 / 8, min(47, 1500 // len(fit.pairs.ends)))
+    courses = np.column_stack([share[:, None] >= cuts, share])
     time_ns = fit.model.ranges.time_ns
     for one in changes_of_tags(fit, courses):
         fault, what, when = "delay drifts", "drift", "over the recording"
@@ -120,38 +122,36 @@ def changes_of_tags(fit: QuickFit, courses: Floats) -> Iterator[Change]:
 def _changes(fit: QuickFit, courses: Floats) -> list[Change]:
     """Return changes in one of the courses (n, k), each beside those before it: of all tags, of one, or of a pair."""
     pairs, width, tags = len(fit.pairs.ends), courses.shape[1], np.unique(fit.pairs.ends).tolist()
-    groups: list[tuple[int | None, Floats]] = [(None, np.ones(pairs))]
-    for tag in tags:
-        mine = (fit.pairs.ends == tag).any(axis=1)
-        # A tag with one pair needs others, for the pair to be its own matter.
-        if min(mine.sum(), pairs - mine.sum()) > 0 and (mine.sum() > 1 or pairs - mine.sum() > 2):
-            groups.append((tag, mine.astype(float)))
-    groups += [(None, row) for row in np.eye(pairs)]
-    among, found = np.array([group for _, group in groups]), list[Change]()
+    own = np.equal.outer(tags, fit.pairs.ends).any(axis=2).astype(float)
+    several = own.sum(axis=1)
+    # A tag with one pair needs others, for the pair to be its own matter.
+    kept = np.flatnonzero((several < pairs) & ((several > 1) | (pairs - several > 2)))
+    whose, found = [None, *(tags[k] for k in kept), *[None] * pairs], list[Change]()
+    groups = np.vstack([np.ones(pairs), own[kept], np.eye(pairs)])
     while len(found) < 3:
-        offsets = Offsets.of(fit.test(_by_pair(fit, courses)), among, width)
+        offsets = Offsets.of(fit.test(_by_pair(fit, courses)), groups, width)
         gain = (offsets.size**2 * offsets.known).reshape(width, len(groups)).T
         # By how much variances exceed those of slopes that are a likelihood's, for most changes.
         excess = float(np.median((offsets.std**2 * offsets.known)[offsets.known > 0]))
         # Of these standard errors; a finding needs five of its own, which may be smaller.
         likely = [k for k in np.argsort(-gain.max(axis=1))[:4].tolist() if gain[k].max() > 3**2 * excess]
-        trials = (_change(fit, groups[k], courses, int(np.argmax(gain[k])), len(tags) * width) for k in likely)
+        trials = (
+            _change(fit, whose[k], groups[k], courses, int(np.argmax(gain[k])), len(tags) * width) for k in likely
+        )
         best = next(((change, rest) for change, rest in trials if change.p_value < BUDGET), None)
         if best is None:
             break
-        found.append(best[0])
-        fit = best[1]
+        found, fit = [*found, best[0]], best[1]
     return found
 
 
 def _change(
-    fit: QuickFit, group: tuple[int | None, Floats], courses: Floats, course: int, tried: int
+    fit: QuickFit, tag: int | None, pairs: Floats, courses: Floats, course: int, tried: int
 ) -> tuple[Change, QuickFit]:
-    """Return the change of a group (a tag, its pairs) in a course, and a fit without it.
+    """Return the change of some pairs (k,), those of a tag or others, in a course, and a fit without it.
 
     Slopes at no offset say too little of a large one, so it is fitted.
     """
-    tag, pairs = group
     size, rest = fit.without(pairs[fit.pairs.number] * courses[:, course])
     tested = rest.test(_by_pair(fit, courses[:, [course]]))
     left, alone = Offsets.of(tested, pairs[None]), np.diag(tested.covariance) * pairs

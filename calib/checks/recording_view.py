@@ -24,6 +24,7 @@ from calib.estimator.range_rows import RESIDUAL, Part, RangeRows
 from calib.estimator.score_tests import REACHED, Derivative, Family, Slopes, Tested
 from calib.estimator.time_blocks import TimeBlocks, time_blocks
 from calib.estimator.unknowns import Priors, Unknown
+from calib.findings import exceeds
 from calib.pairs import Pairs, pairs_of
 from calib.settings import FitSettings
 from calib.spread import less_medians
@@ -235,11 +236,6 @@ class QuickFit:
         """Short blocks of time, of which the sums of scores are made up."""
         return time_blocks(self.model.ranges.time_ns, self.model.ranges.session)
 
-    @property
-    def time_s(self) -> Floats:
-        """The time of each range (n,) from the first one on, without pauses."""
-        return np.asarray(self.blocks.number * (self.blocks.seconds / self.blocks.count), dtype=np.float64)
-
     @cached_property
     def slopes(self) -> Slopes:
         """Slopes that test for more unknowns, with the curvature of the loss, which standard errors need."""
@@ -309,9 +305,14 @@ class QuickFit:
             information=left @ found.information,
         )
 
-    def offsets(self, derivative: Floats) -> Offsets:
-        """Return offsets of which each range has some (n, k)."""
-        return Offsets.of(self.test(derivative), np.eye(derivative.shape[1]))
+    def offset(self, derivative: Floats, *, tolerance: float = 0.0, tried: int = 1) -> tuple[float, float]:
+        """Return an offset of which each range has so much (n,), and the p-value if it is the tolerance at most.
+
+        It is one of so many that were `tried`.
+        """
+        size, rest = self.without(derivative)
+        found = Offsets.of(rest.test(derivative[:, None]), np.ones((1, 1)))
+        return size, exceeds(size, float(found.std[0]), found.dof, tolerance=tolerance, tried=tried)
 
 
 LOSS: Final = "soft_l1"

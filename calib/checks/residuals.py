@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
+from calib.checks.recording_view import Offsets, QuickFit, RecordingView, quick_fit
 from calib.data.clocks import PPM_TO_METRES, corrected
 from calib.estimator.known_distances import FEWEST_RANGES
 from calib.findings import BUDGET, Candidate, exceeds, more_often, positive, stretches
@@ -81,9 +81,7 @@ def skew(view: RecordingView) -> Iterator[Candidate]:
     # Skew must be expected to change ranges by more, for it to be seen in them.
     if reach < 0.03:
         return
-    slope, rest = fit.without(expected)
-    found = rest.offsets(expected[:, None])
-    p_value = exceeds(slope, float(found.std[0]), found.dof, tolerance=0.5)
+    slope, p_value = fit.offset(expected, tolerance=0.5)
     evidence = f"errors grow by {slope:.2f} m in a metre of c/2 times carrier's skew times reply, over {reach:.2f} m"
     for at, fault, remedy in SLOPES[taken.pop()]:
         # Halfway between the slopes of sound and of faulty ranges.
@@ -99,14 +97,13 @@ def _by_direction(single: RecordingView) -> Iterator[Candidate]:
     e = single.exchanges[fit.rows]
     of_pairs = np.equal.outer(fit.pairs.number, np.arange(len(fit.pairs.ends)))
     ways = of_pairs * np.where(e.initiator < e.target, 0.5, -0.5)[:, None]
-    seen = fit.offsets(ways)
+    seen = Offsets.of(fit.test(ways), np.eye(len(fit.pairs.ends)))
     worst = int(np.argmax((np.abs(seen.size) - ONE_WAY_M) / seen.std))
-    size, rest = fit.without(ways[:, worst])
-    found = rest.offsets(ways[:, [worst]])
+    size, p_value = fit.offset(ways[:, worst], tolerance=ONE_WAY_M, tried=len(fit.pairs.ends))
     yield Candidate(
         LEFT,
         f"ranges of pair {fit.pairs.names[worst]} differ by {100 * abs(size):.0f} cm by who initiates, the most of all",
-        exceeds(size, float(found.std[0]), found.dof, tolerance=ONE_WAY_M, tried=len(fit.pairs.ends)),
+        p_value,
         {"more": "record the carrier integrator, or use double-sided ranging; until then take the mean of both ways"},
     )
 
