@@ -24,14 +24,20 @@ from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
 SEGMENTS, SPAN_S = 6, 20.0
-"""Spans of time in which a tag may have an offset of its own, and how long they are at least: errors that last must be
-known within them."""
+"""Spans of time in which a tag may have an offset of its own, and how long they are at least: errors that last, which
+they do for seconds (docs/accuracy.md), must be known within them."""
 
 MATTERS, CLEARLY = 1.0, 4.0
-"""A finding is named that moves some delay by so many of its standard errors, a small one by so many."""
+"""A finding is named that moves some delay by so many of its standard errors, a small one by so many. Judgements: an
+interval still holds most of what is moved by one."""
 
 SMALLEST_M = 0.01
-"""An offset of less is nobody's fault: it widens intervals, and is not named unless it matters clearly."""
+"""An offset of less is nobody's fault: it widens intervals, and is not named unless it matters clearly. A judgement:
+half of what a lever arm by a ruler does."""
+
+HIDDEN, OFTEN, FAR_M = 0.8, 0.45, 0.12
+"""Shares of reflected ranges of a pair that is named, and of a tag's pairs on average, with detours of so much at
+least; shorter ones may as well be an error that wanders. Judgements: delays rest on the direct ranges."""
 
 UNIT = np.ones((1, 1))
 """The derivative of a range by an offset of it."""
@@ -293,9 +299,8 @@ def shares_of_pairs(found: KnownDistances) -> tuple[Floats, Floats]:
 def _reflected(found: KnownDistances) -> Iterator[str]:
     """Name the pairs of which hardly a range is direct, or else a tag about half of whose ranges are not."""
     share, detour_m = shares_of_pairs(found)
-    # Shorter detours may as well be an error that wanders.
-    ends, far = found.model.pairs.ends, detour_m > 0.12
-    hidden, tags = np.flatnonzero((share > 0.8) & far).tolist(), np.unique(ends).tolist()
+    ends, far = found.model.pairs.ends, detour_m > FAR_M
+    hidden, tags = np.flatnonzero((share > HIDDEN) & far).tolist(), np.unique(ends).tolist()
     for number in hidden:
         a, b = ends[number].tolist()
         others = [tag for tag in tags if tag not in (a, b)]
@@ -306,7 +311,7 @@ def _reflected(found: KnownDistances) -> Iterator[str]:
             f"{100 * detour_m[number]:.0f} cm; record it anew, delays rest on the other pairs"
         )
     means = {tag: float(np.where(far, share, 0.0)[np.any(ends == tag, axis=1)].mean()) for tag in tags}
-    often = [tag for tag in tags if means[tag] > 0.45 and not hidden]
+    often = [tag for tag in tags if means[tag] > OFTEN and not hidden]
     for tag in often[:1]:
         yield f"tag {tag}: {100 * means[tag]:.0f} % of its ranges are reflected; what stands near its antenna?"
 
@@ -340,10 +345,8 @@ def _confounded(found: KnownDistances, slopes: Slopes) -> Iterator[str]:
     rows = basis(np.quantile(model.lifted, np.linspace(0.02, 0.98, 25)), model.curve.knots)
     count = len(model.curve_kinds())
     rows = np.tile(rows - rows.mean(axis=0), count) / count
-    own_columns = slopes.optimum.layout.indices(model.curve_kinds())
-    more = float(np.sqrt(np.mean((rows @ taken[own_columns] * slope) ** 2)))
-    variance = np.einsum("ij,jk,ik->i", rows, found.covariances["curve"], rows)
-    band = float(np.sqrt(max(float(np.mean(variance)), 0.0)))
+    more = float(np.sqrt(np.mean((rows @ taken[slopes.optimum.layout.indices(model.curve_kinds())] * slope) ** 2)))
+    band = float(np.sqrt(max(np.mean(np.einsum("ij,jk,ik->i", rows, found.covariances["curve"], rows)), 0.0)))
     if more >= band:
         yield (
             f"power and distance are confounded: true distances 1 % off would pass for "

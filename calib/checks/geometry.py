@@ -13,6 +13,7 @@ from scipy import optimize, special
 
 from calib.checks.fitted import late
 from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
+from calib.checks.residuals import ASTRAY_M
 from calib.estimator.score_tests import Tested
 from calib.findings import BUDGET, Candidate, positive, stretches
 from calib.information import LOOSEST
@@ -48,11 +49,9 @@ def _trials(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]
     for body in sorted({tag.body for tag in view.tags}):
         arms = {tag.tag: np.array(tag.lever_arm_m) for tag in view.tags if tag.body == body}
         longest = max(np.linalg.norm(arm) for arm in arms.values())
-        scales = [("lever arm sign", -1.0)] if longest > 0 else []
-        if longest > 1.0:
-            # Robots that carry these boards are smaller: mm, cm or inches.
-            scales += [("lever arm unit", length) for length in (0.001, 0.01, 0.0254)]
-        for fault, length in scales:
+        # Robots that carry these boards are smaller than a metre: mm, cm or inches.
+        units = [("lever arm unit", length) for length in (0.001, 0.01, 0.0254) if longest > 1.0]
+        for fault, length in [("lever arm sign", -1.0)] * bool(longest > 0) + units:
             seen = Candidate(fault, f"of body {body}: times {length:g}", words={"body": body, "length": length})
             yield seen, view.poses, _with_arms(view.tags, {tag: length * arm for tag, arm in arms.items()})
         for a, b in combinations(arms, 2):
@@ -135,20 +134,23 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
     matrix is judged (`calib.information`), unless ranges are astray there.
     """
     tags = [tag.tag for tag in view.tags if tag.body == body]
-    first, second = (np.isin(view.exchanges[fit.rows].initiator, tags), np.isin(view.exchanges[fit.rows].target, tags))
+    first, second = (np.isin(ends[fit.rows], tags) for ends in (view.exchanges.initiator, view.exchanges.target))
     mine = first != second
     own = view.chosen(fit.rows[mine])
-    ends = own.exchanges.initiator, own.exchanges.target
     here, there = (
-        antennas_m(view.poses, view.tags, np.where(first[mine], *ids), own.exchanges.time_ns)
-        for ids in (ends, ends[::-1])
+        antennas_m(view.poses, view.tags, ids, own.exchanges.time_ns)
+        for ids in (own.exchanges.initiator, own.exchanges.target)
     )
-    apart, pair = here - there, np.unique(fit.pairs.number[mine], return_inverse=True)[1]
+    apart, pair = (
+        np.where(first[mine, None], here - there, there - here),
+        np.unique(fit.model.pairs.number[mine], return_inverse=True)[1],
+    )
+    # With fewer, its slopes in 32 stretches of time would be of some ranges each, and far from normal.
     if len(apart) < 200 or not np.isfinite(apart).all():
         return
     here_m = np.linalg.norm(apart, axis=1)
     # Where anchors are metres off, what power does is not known, and small beside that.
-    astray = robust_spread(fit.residual[mine]) > 0.3
+    astray = robust_spread(fit.residual[mine]) > ASTRAY_M
     derivative = np.zeros((len(mine), 3))
     derivative[mine] = outward = apart / here_m[:, None]
     at_given = fit.test(derivative)

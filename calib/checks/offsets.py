@@ -39,8 +39,8 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
     total, information = tested.total, tested.information
     # What offsets that are found leave of the others.
     top = [
-        fit.pairs.names.index(name)
-        for one in findings(tested, len(fit.pairs.names), BUDGET, PAIR_M)
+        fit.model.pairs.names.index(name)
+        for one in findings(tested, len(fit.model.pairs.names), BUDGET, PAIR_M)
         for name in one.names[:1]
     ]
     rest = total - information[:, top] @ np.linalg.lstsq(information[np.ix_(top, top)], total[top], rcond=1e-9)[0]
@@ -77,20 +77,19 @@ class Change:
 def changed_delays(view: RecordingView) -> Iterator[Candidate]:
     """Tags whose delay changes during a recording, at one of many times or steadily."""
     fit = view.quick_fit
-    # Of a shorter recording the 32 stretches of scores would be shorter than errors last (docs/accuracy.md).
+    # Of a shorter recording the 32 stretches of scores would last for less than errors do.
     if fit is None or fit.blocks.seconds < 10.0:
         return
     share = fit.blocks.number / fit.blocks.count
     # No change is looked for within four of the stretches of time of scores at either end: sums over fewer are far from
     # normal where reflections last, and their variance is not known. Times are so close that a step between two loses
     # 1 % of its size; they are fewer for many pairs, for the sake of memory.
-    cuts = np.linspace(1 / 8, 7 / 8, min(47, 1500 // len(fit.pairs.ends)))
+    cuts = np.linspace(1 / 8, 7 / 8, min(47, 1500 // len(fit.model.pairs.ends)))
     courses = np.column_stack([share[:, None] >= cuts, share])
-    time_ns = fit.model.ranges.time_ns
     for one in changes_of_tags(fit, courses):
         fault, what, when = "delay drifts", "drift", "over the recording"
         if one.course < len(cuts):
-            when_s = (time_ns[np.argmax(courses[:, one.course] > 0)] - time_ns[0]) * 1e-9
+            when_s = np.ptp(fit.model.ranges.time_ns[: np.argmax(courses[:, one.course]) + 1]) * 1e-9
             fault, what, when = "delay changed mid-flight", "shift", f"{when_s:.0f} s after the start"
         evidence = f"ranges of tag {one.tag} {what} by {100 * one.size_m:+.1f} cm {when} {one} do not"
         yield Candidate(fault, evidence, one.p_value, {"tag": one.tag})
@@ -121,8 +120,8 @@ def changes_of_tags(fit: QuickFit, courses: Floats) -> Iterator[Change]:
 
 def _changes(fit: QuickFit, courses: Floats) -> list[Change]:
     """Return changes in one of the courses (n, k), each beside those before it: of all tags, of one, or of a pair."""
-    pairs, width, tags = len(fit.pairs.ends), courses.shape[1], np.unique(fit.pairs.ends).tolist()
-    own = np.equal.outer(tags, fit.pairs.ends).any(axis=2).astype(float)
+    pairs, width, tags = len(fit.model.pairs.ends), courses.shape[1], np.unique(fit.model.pairs.ends).tolist()
+    own = np.equal.outer(tags, fit.model.pairs.ends).any(axis=2).astype(float)
     several = own.sum(axis=1)
     # A tag with one pair needs others, for the pair to be its own matter.
     kept = np.flatnonzero((several < pairs) & ((several > 1) | (pairs - several > 2)))
@@ -152,7 +151,7 @@ def _change(
 
     Slopes at no offset say too little of a large one, so it is fitted.
     """
-    size, rest = fit.without(pairs[fit.pairs.number] * courses[:, course])
+    size, rest = fit.without(pairs[fit.model.pairs.number] * courses[:, course])
     tested = rest.test(_by_pair(fit, courses[:, [course]]))
     left, alone = Offsets.of(tested, pairs[None]), np.diag(tested.covariance) * pairs
     # Errors of different pairs hardly go together, so that each tells of their variance (Welch and Satterthwaite).
@@ -164,7 +163,9 @@ def _change(
 
 def _by_pair(fit: QuickFit, courses: Floats) -> sparse.csr_matrix:
     """Return courses (n, k) as those of each pair (n, k * pairs)."""
-    whose = sparse.csr_matrix(np.equal.outer(fit.pairs.number, np.arange(len(fit.pairs.ends))).astype(float))
+    whose = sparse.csr_matrix(
+        np.equal.outer(fit.model.pairs.number, np.arange(len(fit.model.pairs.ends))).astype(float)
+    )
     return sparse.hstack([whose.multiply(course[:, None]) for course in courses.T], format="csr")
 
 
@@ -175,10 +176,14 @@ def compared(views: Sequence[RecordingView], level: float) -> Iterator[Candidate
         given, bodies = [places_m(view) for view in (first, second)], set().union(*both)
         for body in sorted(bodies.intersection(*given)):
             found = [of.get(body) for of in both]
-            here, there = (
-                places[body] + (one.words["away_m"] if one else 0.0) for places, one in zip(given, found, strict=True)
+            # Where it stands in both, by its ranges.
+            (away,) = np.diff(
+                [
+                    places[body] + (one.words["away_m"] if one else 0.0)
+                    for places, one in zip(given, found, strict=True)
+                ],
+                axis=0,
             )
-            away = there - here
             if np.linalg.norm(away) > 0.08:
                 yield Candidate(
                     "anchor moved between recordings",

@@ -25,7 +25,7 @@ from calib.estimator.score_tests import REACHED, Derivative, Family, Slopes, Tes
 from calib.estimator.time_blocks import TimeBlocks, time_blocks
 from calib.estimator.unknowns import Priors, Unknown
 from calib.findings import exceeds
-from calib.pairs import Pairs, pairs_of
+from calib.pairs import pairs_of
 from calib.settings import FitSettings
 from calib.spread import less_medians
 from uwblink.arrays import Bools, Floats, Ints
@@ -182,9 +182,8 @@ class Offsets:
         Tested are the m members in each course, those of a course side by side; so are the k groups that are returned.
         """
         total = tested.total.reshape(courses, -1)
-        whole = (courses, total.shape[1], courses, total.shape[1])
         known, variance = (
-            np.einsum("km,cmn,kn->ck", groups, np.einsum("cmcn->cmn", every.reshape(whole)), groups).ravel()
+            np.einsum("km,cmn,kn->ck", groups, np.einsum("cmcn->cmn", every.reshape(total.shape * 2)), groups).ravel()
             for every in (tested.information, tested.covariance)
         )
         known = np.where(known > REACHED * tested.whole, known, 0.0)
@@ -247,11 +246,6 @@ class QuickFit:
         bounds = np.unique(np.append(short.bounds[:-1] * count // short.count, count))
         return Slopes(ranges, self._search(ranges, self.x, steps=1), replace(short, number=number, bounds=bounds))
 
-    @property
-    def pairs(self) -> Pairs:
-        """The pairs of the ranges."""
-        return self.model.pairs
-
     def without(self, derivative: Floats) -> tuple[float, QuickFit]:
         """Return an offset of which each range has so much (n,), and a fit to ranges without it.
 
@@ -291,10 +285,10 @@ class QuickFit:
         because a third of a pair's ranges that is reflected moves a robust mean by centimetres.
         """
         fitted = self.likeliest.optimum.layout.indices(["delay"])
-        derivative = Derivative(self.pairs.number[:, None], np.ones((1, 1)), len(fitted))
+        derivative = Derivative(self.model.pairs.number[:, None], np.ones((1, 1)), len(fitted))
         slopes = Slopes(self.likeliest.rows, self.likeliest.optimum, self.blocks)
-        found = slopes.test(Family(kind="pair", names=self.pairs.names, derivative=derivative, fitted=fitted))
-        ends = (self.pairs.ends[:, :, None] == self.model.tags).sum(axis=1)
+        found = slopes.test(Family(kind="pair", names=self.model.pairs.names, derivative=derivative, fitted=fitted))
+        ends = (self.model.pairs.ends[:, :, None] == self.model.tags).sum(axis=1)
         taken = found.information @ ends
         left = np.eye(len(ends)) - taken @ np.linalg.pinv(ends.T @ taken, rcond=1e-9, hermitian=True) @ ends.T
         return replace(
