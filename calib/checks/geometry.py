@@ -131,7 +131,8 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
 
     In a direction that ranges hardly determine, as the height where robots keep theirs, some place far away always fits
     reflections better than the given one. So the direction must be determined at the given place, as an information
-    matrix is judged (`calib.information`), unless ranges are astray there.
+    matrix is judged (`calib.information`), unless ranges are astray there. Where slopes at the given place may be zero
+    no other is searched for: distances are linear in centimetres, not in metres, so that a search cannot be spared.
     """
     tags = [tag.tag for tag in view.tags if tag.body == body]
     first, second = (np.isin(ends[fit.rows], tags) for ends in (view.exchanges.initiator, view.exchanges.target))
@@ -141,10 +142,8 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
         antennas_m(view.poses, view.tags, ids, own.exchanges.time_ns)
         for ids in (own.exchanges.initiator, own.exchanges.target)
     )
-    apart, pair = (
-        np.where(first[mine, None], here - there, there - here),
-        np.unique(fit.model.pairs.number[mine], return_inverse=True)[1],
-    )
+    apart = np.where(first[mine, None], here - there, there - here)
+    pair = np.unique(fit.model.pairs.number[mine], return_inverse=True)[1]
     # With fewer, its slopes in 32 stretches of time would be of some ranges each, and far from normal.
     if len(apart) < 200 or not np.isfinite(apart).all():
         return
@@ -154,8 +153,7 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
     derivative = np.zeros((len(mine), 3))
     derivative[mine] = outward = apart / here_m[:, None]
     at_given = fit.test(derivative)
-    # Of places that are metres off, slopes say little: a search, as for those whose slopes are not zero.
-    if not astray and _away(at_given, at_given.total) > BUDGET:
+    if not astray and _p_of_place(at_given, at_given.total) > BUDGET:
         return
     measured = here_m + (own.error_m if astray else fit.residual[mine])
 
@@ -175,7 +173,7 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
         return
     at_other = moved.test(((apart + away) / there_m[:, None])[moved.rows])
     slope = at_other.information @ away * (1 - TOLERANCE_M / size)
-    p_value = _away(at_other, slope)
+    p_value = _p_of_place(at_other, slope)
     if not astray:
         # Ranges at the other place: at the given one they hardly determine anything, so far off are they.
         at_given = moved.test(outward[moved.rows])
@@ -187,11 +185,11 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
     near = {name: float(np.hypot(*(place - places[body] - away)[:2])) for name, place in places.items()}
     others = " and ".join(name for name in places if name != body and near[name] < 0.3 + 0.1 * size)
     inverse = np.linalg.pinv(at_other.information, rcond=1e-12, hermitian=True)
-    half = TWO_SIDED_95 * np.sqrt(np.diag(inverse @ at_other.covariance @ inverse))
-    axes = ", ".join(f"{name} {one:+.2f} ± {far:.2f}" for name, one, far in zip("xyz", away, half, strict=True))
+    std = np.sqrt(np.diag(inverse @ at_other.covariance @ inverse))
+    axes = [f"{name} {one:+.2f} ± {TWO_SIDED_95 * far:.2f}" for name, one, far in zip("xyz", away, std, strict=True)]
     yield Candidate(
         "anchor stands elsewhere",
-        f"ranges with {body} fit a place {size:.2f} m away ({axes} m, 95 %): their "
+        f"ranges with {body} fit a place {size:.2f} m away ({', '.join(axes)} m, 95 %): their "
         f"spread is {100 * after:.1f} cm there instead of {100 * before:.1f} cm"
         + (f"; there the recording has {others}: are numbers exchanged?" if others else ""),
         min(1.0, p_value * len(places)),
@@ -200,7 +198,7 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
     )
 
 
-def _away(tested: Tested, slope: Floats) -> float:
+def _p_of_place(tested: Tested, slope: Floats) -> float:
     """Return the p-value of slopes (3,) by a place, whose mean is zero if the place is right (Hotelling)."""
     square = float(slope @ np.linalg.lstsq(tested.covariance, slope, rcond=1e-12)[0])
     return float(special.fdtrc(3, tested.blocks - 3.0, square / 3))

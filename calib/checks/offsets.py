@@ -99,7 +99,7 @@ def changes_of_tags(fit: QuickFit, courses: Floats) -> Iterator[Change]:
     """Yield changes of single tags, unless another change that is found says that it was no delay.
 
     Such are one of a pair, or of all tags, at about that time, and one back: a body in the way goes again. An antenna,
-    or a voltage, is one tag's, so that other pairs change by 40 % of it at most.
+    or a voltage, is one tag's, so that other pairs change by 40 % of it at most (a judgement).
     """
     named, found = set[int | None]({None}), _changes(fit, courses)
     # Of two courses that share less than half of their variance neither stands for the other.

@@ -99,8 +99,7 @@ def _by_direction(single: RecordingView) -> Iterator[Candidate]:
     fit = quick_fit([single])
     if fit is None:
         return
-    e = single.exchanges[fit.rows]
-    signs = np.where(e.initiator < e.target, 0.5, -0.5)
+    signs = np.where(single.exchanges.initiator < single.exchanges.target, 0.5, -0.5)[fit.rows]
     ways = np.where(np.equal.outer(fit.model.pairs.number, np.arange(len(fit.model.pairs.ends))), signs[:, None], 0.0)
     seen = Offsets.of(fit.test(ways), np.eye(len(fit.model.pairs.ends)))
     worst = int(np.argmax((np.abs(seen.size) - ONE_WAY_M) / seen.std))
