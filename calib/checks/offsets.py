@@ -166,7 +166,7 @@ def _by_pair(fit: QuickFit, courses: Floats) -> sparse.csr_matrix:
     whose = sparse.csr_matrix(
         np.equal.outer(fit.model.pairs.number, np.arange(len(fit.model.pairs.ends))).astype(float)
     )
-    return sparse.hstack([whose.multiply(course[:, None]) for course in courses.T], format="csr")
+    return sparse.csr_matrix(sparse.hstack([whose.multiply(course[:, None]) for course in courses.T]))
 
 
 def compared(views: Sequence[RecordingView], level: float) -> Iterator[Candidate]:

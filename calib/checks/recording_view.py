@@ -10,7 +10,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 from scipy import sparse
@@ -20,7 +20,7 @@ from calib.data.sources import RecordedSource, Source
 from calib.estimator.known_distances import FEWEST_RANGES, PILOT, Fitted, likeliest, model_of, robust_fit
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import METRES_A_NS, RangeModel
-from calib.estimator.range_rows import RESIDUAL, Part, RangeRows
+from calib.estimator.range_rows import RESIDUAL, Part, RangeRows, Robust
 from calib.estimator.score_tests import REACHED, Derivative, Family, Slopes, Tested
 from calib.estimator.time_blocks import TimeBlocks, time_blocks
 from calib.estimator.unknowns import Priors, Unknown
@@ -238,7 +238,7 @@ class QuickFit:
     @cached_property
     def slopes(self) -> Slopes:
         """Slopes that test for more unknowns, with the curvature of the loss, which standard errors need."""
-        ranges = replace(self.ranges, errors=replace(self.start.rows.errors, least=None))
+        ranges = replace(self.ranges, errors=replace(cast(Robust, self.start.rows.errors), least=None))
         # Long blocks in the place of short ones: sums over them hardly share errors that last.
         short = self.blocks
         count = min(STRETCHES_OF_SCORES, short.count)
