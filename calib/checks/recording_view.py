@@ -238,7 +238,7 @@ class QuickFit:
     @cached_property
     def slopes(self) -> Slopes:
         """Slopes that test for more unknowns, with the curvature of the loss, which standard errors need."""
-        ranges = replace(self.ranges, errors=replace(cast(Robust, self.start.rows.errors), least=None))
+        ranges = replace(self.ranges, errors=replace(cast("Robust", self.start.rows.errors), least=None))
         # Long blocks in the place of short ones: sums over them hardly share errors that last.
         short = self.blocks
         count = min(STRETCHES_OF_SCORES, short.count)
