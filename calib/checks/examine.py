@@ -183,7 +183,7 @@ CHECKS: Final = (
     Check(
         "radio",
         "Are more than a fifth of the ranges reflected, or of one tag more than of others, or do reflections last?",
-        "share of long ranges; long ranges after long ones", f"{OVER_STRETCHES}; binomial, for all tags or pairs",
+        "share of ranges that are longer by 12 cm; long ranges after long ones", f"{OVER_STRETCHES}; binomial, for all tags or pairs",
         {
             "reflections": "{more}",
             "reflections that last": "such ranges do not average out within a spell: record for many spells, move "

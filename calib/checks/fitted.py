@@ -19,7 +19,7 @@ from calib.estimator.range_rows import Mixture
 from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes, search, widening
 from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.estimator.to_calibration import bias_curves
-from calib.findings import OF_A_FIT, SMALLEST_NS
+from calib.findings import FAR_M, OF_A_FIT, SMALLEST_NS
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -35,9 +35,9 @@ SMALLEST_M = 0.01
 """An offset of less is nobody's fault: it widens intervals, and is not named unless it matters clearly. A judgement:
 half of what a lever arm by a ruler does."""
 
-HIDDEN, OFTEN, FAR_M = 0.8, 0.45, 0.12
-"""Shares of reflected ranges of a pair that is named, and of a tag's pairs on average, with detours of so much at
-least; shorter ones may as well be an error that wanders. Judgements: delays rest on the direct ranges."""
+HIDDEN, OFTEN = 0.8, 0.45
+"""Shares of reflected ranges of a pair that is named, and of a tag's pairs on average. Judgements: delays rest on the
+direct ranges."""
 
 UNIT = np.ones((1, 1))
 """The derivative of a range by an offset of it."""

@@ -10,7 +10,7 @@ import numpy as np
 from calib.checks.recording_view import Offsets, QuickFit, RecordingView, quick_fit
 from calib.data.clocks import PPM_TO_METRES, corrected
 from calib.estimator.known_distances import FEWEST_RANGES
-from calib.findings import BUDGET, Candidate, more_often, positive, stretches
+from calib.findings import BUDGET, FAR_M, Candidate, more_often, positive, stretches
 from uwblink.arrays import Bools, Floats
 from uwblink.protocols.table import single_sided
 from uwblink.ticks import TICK_S
@@ -132,7 +132,8 @@ def reflections(view: RecordingView) -> Iterator[Candidate]:
         named = "; ".join(one.evidence for one in lasting[:4]) + more
         yield Candidate("reflections that last", named, min(one.p_value for one in lasting))
     else:
-        p_value = positive(np.array([np.mean(long[s]) - MANY_SHARE for s in stretches(len(long))]))
+        far = long & (fit.residual > FAR_M)
+        p_value = positive(np.array([np.mean(far[s]) - MANY_SHARE for s in stretches(len(long))]))
         yield Candidate("reflections", evidence, p_value, {"more": "move antennas away from bodies and walls"})
 
 
