@@ -182,8 +182,9 @@ CHECKS: Final = (
     ),
     Check(
         "radio",
-        "Are more than a fifth of the ranges reflected, or of one tag more than of others, or do reflections last?",
-        "share of ranges that are longer by 12 cm; long ranges after long ones", f"{OVER_STRETCHES}; binomial, for all tags or pairs",
+        "Are more than 15 % of the ranges reflected, or of one tag more than of others, or do reflections last?",
+        "share of ranges that are 12 cm long; long ranges after long ones",
+        f"{OVER_STRETCHES}; binomial, for all tags or pairs",
         {
             "reflections": "{more}",
             "reflections that last": "such ranges do not average out within a spell: record for many spells, move "

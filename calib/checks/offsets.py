@@ -46,10 +46,10 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
     rest = total - information[:, top] @ np.linalg.lstsq(information[np.ix_(top, top)], total[top], rcond=1e-9)[0]
     spread_m = robust_spread(rest / np.maximum(np.diag(information), 1e-300), 0.0)
     # Where reflections make all pairs differ, one of them has to stand out among these.
-    tolerance = max(PAIR_M, float(special.ndtri(1 - BUDGET / (2 * len(total)))) * spread_m)
-    if view.standing_m is not None:
-        # Biases by power of two pairs may differ by so much (published curves), where the pairs share no power.
-        tolerance += 0.2
+    # Biases by power of two pairs may differ by 0.2 m (published curves), where the pairs share no power.
+    tolerance = max(PAIR_M, float(special.ndtri(1 - BUDGET / (2 * len(total)))) * spread_m) + (
+        0.2 if view.standing_m is not None else 0.0
+    )
     for one in findings(tested, len(total), BUDGET, tolerance):
         yield Candidate(
             "pairs that do not close",
