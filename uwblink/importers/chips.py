@@ -11,7 +11,7 @@ tried. Both count ticks of 15.65 ps on 40 bits.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import log10
 from typing import Final
 
@@ -22,14 +22,14 @@ class Chip:
 
     offset_db: Mapping[int, float]
     """A, by pulse repetition frequency in MHz; none for chips whose registers are not known."""
+    skew_ppm: Mapping[str, float]
+    """Clock skew, positive if the receiver's clock is faster, by the unit of `units.skew`."""
     fraction: float = 1.0
     """Amplitude of the first path per count of its registers."""
     cir_bits: int = 17
     """The power of the impulse response is in units of 2^`cir_bits`."""
     gain_db: float = 0.0
     """Power for each step of the gain register."""
-    skew_ppm: Mapping[str, float] = field(default_factory=lambda: _PPM)
-    """Clock skew, positive if the receiver's clock is faster, by the unit of `units.skew`."""
     power_dbm: tuple[float, float] = (-150.0, 0.0)
     """Limits of received powers."""
 
@@ -44,10 +44,12 @@ _CHANNELS: Final = {
 }
 
 CHIPS: Final = {
-    # The data sheets give sensitivities down to -106 dBm; readings saturate some 20 dB above -80 dBm.
-    "dw1000": Chip({16: 113.77, 64: 121.74}, skew_ppm=_PPM | _CHANNELS, power_dbm=(-125.0, -40.0)),
-    "dw3000": Chip({16: 113.8, 64: 121.7}, 0.25, 21, 6.0, _PPM | _CHANNELS | {"offset": 1e6 / 2**26}, (-125.0, -40.0)),
-    "other": Chip({}, skew_ppm=_PPM),
+    # The data sheets give sensitivities down to -106 dBm.
+    "dw1000": Chip({16: 113.77, 64: 121.74}, _PPM | _CHANNELS, power_dbm=(-125.0, -40.0)),
+    "dw3000": Chip(
+        {16: 113.8, 64: 121.7}, _PPM | _CHANNELS | {"offset": 1e6 / 2**26}, 0.25, 21, 6.0, power_dbm=(-125.0, -40.0)
+    ),
+    "other": Chip({}, _PPM),
 }
 
 REGISTERS: Final = ("f1", "f2", "f3", "n", "c", "d")
@@ -55,7 +57,7 @@ REGISTERS: Final = ("f1", "f2", "f3", "n", "c", "d")
 
 
 def power_sql(chip: Chip, prf_mhz: int, cells: Mapping[str, str]) -> str:
-    """Return SQL of a power in dBm from SQL of registers: of the first path if `f1` is there, of all paths if `c` is."""
+    """Return SQL of a power in dBm from SQL of registers: of the first path if `f1` is there, else of all (`c`)."""
     if "f1" in cells:
         energy = " + ".join(f"pow({cells[name]} * {chip.fraction!r}, 2)" for name in ("f1", "f2", "f3"))
         offset = 0.0

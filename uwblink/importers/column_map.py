@@ -55,6 +55,7 @@ from uwblink.importers.lines import LINES
 from uwblink.importers.templates import Template, places
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import AntennaDelays, read_antenna_delays
+from uwblink.recording.schema import POSE
 from uwblink.text_files import FileKey, TomlReader, heads, is_number
 from uwblink.ticks import TICKS_PER_SECOND
 from uwblink.twr import BITS, LARGEST_ID, STAMPS
@@ -70,6 +71,9 @@ NAMES: Final = (
     "sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "stamp", "event",
 )  # fmt: skip
 """The columns of tables; `event` has words that tell whether a stamp is of transmission or of reception."""
+
+NAMES_OF_POSES: Final = ("body", *POSE)
+"""The columns of files of poses besides `time_s`, for `uwblink poses --map`."""
 
 STAMP_UNITS: Final = {
     "ticks": 1.0,
@@ -150,8 +154,8 @@ FILE_KEYS: Final = (
         "wide.NAME",
         "text with one place; or a table of columns by device",
         "none",
-        "Columns that differ by a device: `r_AN{to_id}` makes a row of each. Families are joined by what differs; `{_}` "
-        "is no id. A column `mask` has a bit for each device with a range.",
+        "Columns that differ by a device: `r_AN{to_id}` makes a row of each. Families are joined by what differs; "
+        "`{_}` is no id. A column `mask` has a bit for each device with a range.",
     ),
     FileKey(
         "units.stamps",
@@ -276,7 +280,7 @@ def load_map(path: Path) -> ColumnMap:
     table = (known.entries() if known else {}) | table | ({"line": known.line} if known else {})
     file.table = table
     columns, units, constants, ids, wide = (file.section(n) for n in ("columns", "units", "constants", "ids", "wide"))
-    file.known(columns, NAMES, "columns.")
+    file.known(columns, (*NAMES, *NAMES_OF_POSES), "columns.")
     file.known(wide, NAMES, "wide.")
     templates = [table[name] for name in ("line", "from_name") if name in table]
     templates += [table["each"]] if "each" in table and "line" in table else []

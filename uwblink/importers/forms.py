@@ -77,7 +77,7 @@ _DEVICE: Final = r"(an|anchor|anker|a|node|beacon|bs|responder|target|to|device|
 _HELD: Final = ("range_m", "gt_range_m", "fpp2", "rxp2", "skew2")
 
 
-def wide_columns(names: Sequence[str], taken: Mapping[str, str]) -> dict[str, str]:
+def wide_columns(names: Sequence[str], taken: Mapping[str, str]) -> dict[str, str | dict[str, str]]:
     """Return the families of columns that differ by the number of a device, as the values of `wide`.
 
     `taken` are recognised columns; a table with ranges or stamps in them is not wide.
@@ -87,17 +87,15 @@ def wide_columns(names: Sequence[str], taken: Mapping[str, str]) -> dict[str, st
     ends = [taken[ours] for ours in ("from_id", "to_id", "time_s") if ours in taken]
     matches = (re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", name) for name in names if name not in ends)
     stems = [(match[1], match[3]) for match in matches if match]
-    found: dict[str, str] = {}
+    found: dict[str, str | dict[str, str]] = {}
     for before, after in dict.fromkeys(stem for stem in stems if stems.count(stem) > 1):
         plain = plain_name(f"{before} {after}")
-        bare = re.sub(rf"(^|_){_DEVICE}(?=_|$)", "", plain, count=1).strip("_")
+        bare = re.sub(rf"(^|_){_DEVICE}(?=_|$)", "", plain)
+        # Without words of devices nothing but a unit may remain.
+        short = r"|(r|d|dis|dis_arr(ay)?|ranges|distances|dists)" + ("|" if bare != plain else "")
         for ours in _HELD:
-            short = (
-                r"|(r|d|dis|dis_arr(ay)?|ranges|distances|dists)" + ("|" if bare != plain else "")
-                if ours == "range_m"
-                else ""
-            )
-            if ours not in found and re.fullmatch(f"({PATTERNS[ours]}{short}){{end}}".format_map(WORDS), bare):
+            pattern = f"_?({PATTERNS[ours]}{short if ours == 'range_m' else ''}){{end}}".format_map(WORDS)
+            if ours not in found and re.fullmatch(pattern, bare):
                 found[ours] = f"{before}{{to_id}}{after}"
                 break
     return found if "range_m" in found else {}

@@ -126,7 +126,7 @@ def guess_map(path: Path) -> Guess:
             return _numbered(path, table)
         columns = {} if form.line else with_stamp_and_event(table, named_columns(table.names))
         wide = form.wide or wide_columns(table.names, columns)
-        if each := None if form.line or wide or "range_m" in columns else table.list_of_objects():
+        if each := None if form.line or wide or "range_m" in columns else next(iter(table.lists), None):
             top["each"] = each, "a line has a list of them"
     given = {name for text in (form.line, form.each) if text for name in places(Template(text)) if name in NAMES}
     given |= {"to_id", *wide} if wide else set()
@@ -135,6 +135,9 @@ def guess_map(path: Path) -> Guess:
         # Fields of the elements of a list are called by their own names.
         short = {name.removeprefix(f"{form.each}."): name for name in table.names}
         found = with_stamp_and_event(table, {ours: short[name] for ours, name in named_columns(short).items()})
+    for ours, letters in (("to_id", ("id", "A", "a", "addr")), ("range_m", ("R", "r", "D", "d"))) if form.each else ():
+        if ours not in found and (letter := next((name for name in letters if name in short), None)):
+            found[ours] = short[letter]
     columns = {name: name for name in given}
     columns |= {
         ours: header
@@ -248,7 +251,7 @@ def _proposal(
 
 
 def _alike(header: str, names: Sequence[str]) -> list[str]:
-    """Return the columns of ranges that differ by how they were made, such as raw and filtered, if there are several."""
+    """Return the columns of ranges that differ by how they were made, such as raw and filtered, if several do."""
     made = re.compile(rf"(^|_){WORDS['made']}(?=_|$)")
     bare = {name: made.sub("", plain_name(name)).strip("_") for name in names}
     found = [name for name in names if bare[name] == bare[header]]

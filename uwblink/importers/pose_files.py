@@ -1,10 +1,10 @@
 """Text files of poses: where each form has times, bodies, positions and attitudes, and a loop that reads them.
 
-The own CSV has the columns `time_s` (or `time_ns`), `body`, `x, y, z` (metres) and `qx, qy, qz, qw` (body to world). TUM
-has `time x y z qx qy qz qw` separated by blanks, and EuRoC `time_ns, x, y, z, qw, qx, qy, qz, ...` below a line that
-begins with `#timestamp`, one body a file. Motive (OptiTrack), Vicon and Qualisys (6D) export a column a number of each
-body, below several lines of header: quaternions; rotation vectors or quaternions; and rotation matrices, column by
-column. Their times begin with the take.
+The own CSV has the columns `time_s` (or `time_ns`), `body`, `x, y, z` (metres) and `qx, qy, qz, qw` (body to world).
+TUM has `time x y z qx qy qz qw` separated by blanks, and EuRoC `time_ns, x, y, z, qw, qx, qy, qz, ...` below a line
+that begins with `#timestamp`, one body a file. Motive (OptiTrack), Vicon and Qualisys (6D) export a column for each
+number of each body, below several lines of header: quaternions; rotation vectors or quaternions; and rotation matrices,
+column by column. Their times begin with the take.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import math
 import re
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from itertools import chain, islice
 from pathlib import Path
@@ -26,10 +26,9 @@ from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import DISTANCE_UNITS, TIME_UNITS
+from uwblink.importers.column_map import DISTANCE_UNITS, TIME_UNITS, ColumnMap
 from uwblink.importers.column_names import plain_name
 from uwblink.recording.schema import POSE
-from uwblink.text_files import TomlReader
 from uwblink.twr import LATEST_NS
 
 Lines = list[list[str]]
@@ -56,22 +55,14 @@ class Layout:
     comments: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class TextPoses:
-    """Poses in the order of a file: times, bodies, positions (n, 3) and quaternions (n, 4), not yet of length one.
+def read_text_poses(
+    path: Path, file: TextIO, body: str | None, stated: ColumnMap
+) -> tuple[Ints, NDArray[np.str_], Floats, bool]:
+    """Return times (n,), bodies (n,), the columns of `POSE` (n, 7), and whether a file has attitudes.
 
-    `turned` is whether the file has attitudes; without them no body is turned.
+    Without them no body is turned. Quaternions need not have length one. `body` names that of a file which does not;
+    `stated` names the columns of a CSV file, and the units of its times and positions. Raises `ImportTableError`.
     """
-
-    time_ns: Ints
-    body: NDArray[np.str_]
-    position_m: Floats
-    quaternion: Floats
-    turned: bool
-
-
-def read_text_poses(path: Path, file: TextIO, body: str | None, stated: PoseMap) -> TextPoses:
-    """Read the poses of a text file; raises `ImportTableError`."""
     first = file.readline()
     lines = chain([first], file)
     mark = max(",;\t", key=first.count)
@@ -109,9 +100,8 @@ def read_text_poses(path: Path, file: TextIO, body: str | None, stated: PoseMap)
             values.extend(found[1:])
     width = len(next(iter(layout.bodies.values()), (0, 0, 0)))
     table = np.array(values).reshape(-1, width)
-    attitude = _quaternions(table[:, 3:] * layout.radians)
-    position_m = table[:, :3] * layout.metres
-    return TextPoses(np.array(times, np.int64), np.array(bodies, np.str_), position_m, attitude, width > 3)
+    found = np.column_stack([table[:, :3] * layout.metres, _quaternions(table[:, 3:] * layout.radians)])
+    return np.array(times, np.int64), np.array(bodies, np.str_), found, width > 3
 
 
 def _quaternions(values: Floats) -> Floats:
@@ -145,28 +135,6 @@ def _single(path: Path, form: str, names: tuple[str, ...], header: int, body: st
     return Layout(form=form, names=names, time=0, ns=ns, bodies=bodies, header=header, gaps=False, comments=True)
 
 
-@dataclass(frozen=True, slots=True)
-class PoseMap:
-    """Names of the columns of a CSV file by ours, and units of its times and lengths; None for what it says itself."""
-
-    columns: Mapping[str, str] = field(default_factory=dict)
-    time: str | None = None
-    distance: str | None = None
-
-
-def load_pose_map(path: Path) -> PoseMap:
-    """Read a map with `[columns]` and `[units]` (time, distance); raises `ImportTableError` that names the key."""
-    file = TomlReader(path, ImportTableError, "map of poses")
-    file.known(file.table, ("columns", "units"))
-    columns, units = file.section("columns"), file.section("units")
-    file.known(columns, ("time_s", "body", *POSE), "columns.")
-    file.known(units, ("time", "distance"), "units.")
-    for name, value in columns.items():
-        file.check(f"columns.{name}", value, isinstance(value, str), "the name of a column")
-    time = file.choice("units.time", units.get("time"), (None, *TIME_UNITS))
-    return PoseMap(columns, time, file.choice("units.distance", units.get("distance"), (None, *DISTANCE_UNITS)))
-
-
 _NAMES: Final = (
     {"time_s": r"(.*_)?(time|timestamp|stamp|t)(_(?P<unit>s|ms|us|ns))?"}
     | {"body": r"(rigid_?)?body(_name)?|object|subject|child_frame_id"}
@@ -176,16 +144,15 @@ _NAMES: Final = (
 """Names of columns as programs write them, in plain words."""
 
 
-def _plain(path: Path, head: Lines, body: str | None, stated: PoseMap) -> Layout:
+def _plain(path: Path, head: Lines, body: str | None, stated: ColumnMap) -> Layout:
     """Return the layout of CSV with the names of its columns in the first line."""
     names = [name.strip() for name in (head[0] if head else ())]
     found: dict[str, tuple[int, str | None]] = {}
     for ours, pattern in _NAMES.items():
-        # An exact name comes before others that match.
-        for k in sorted(range(len(names)), key=lambda k, ours=ours: names[k] != ours):
-            match = re.fullmatch(pattern, plain_name(names[k])) if ours not in stated.columns else None
-            if match or names[k] == stated.columns.get(ours):
-                found.setdefault(ours, (k, match.groupdict().get("unit") if match else None))
+        for k, name in enumerate(names):
+            match = re.fullmatch(pattern, plain_name(name)) if ours not in stated.columns else None
+            if name == stated.columns.get(ours, ours) or (match and ours not in found):
+                found[ours] = k, match.groupdict().get("unit") if match else None
     turned = any(name in found for name in POSE[3:])
     needed = POSE if turned else POSE[:3]
     if missing := [name for name in ("time_s", *needed, "body") if name not in found and not (name == "body" and body)]:
@@ -202,9 +169,9 @@ def _plain(path: Path, head: Lines, body: str | None, stated: PoseMap) -> Layout
         )
     (time, time_unit), unit = found["time_s"], next(iter(units))
     return Layout(
-        form="", names=names, time=time, ns=TIME_UNITS[stated.time or time_unit or "s"],
-        bodies={"": [found[name][0] for name in needed]}, header=1, metres=DISTANCE_UNITS[stated.distance or unit or "m"],
-        gaps=False, body=None if body else found["body"][0],
+        form="", names=names, time=time, ns=TIME_UNITS[stated.time_unit or time_unit or "s"],
+        bodies={"": [found[name][0] for name in needed]}, header=1, gaps=False,
+        metres=DISTANCE_UNITS[stated.distance_unit or unit or "m"], body=None if body else found["body"][0],
     )  # fmt: skip
 
 

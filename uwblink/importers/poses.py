@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError, RecordingExistsError, raising
 from uwblink.importers.bags import open_bag
+from uwblink.importers.column_map import ColumnMap, load_map
 from uwblink.importers.plausibility import other_unit
-from uwblink.importers.pose_files import PoseMap, load_pose_map, read_text_poses
+from uwblink.importers.pose_files import read_text_poses
 from uwblink.importers.tables import reading
 from uwblink.recording.distances import distances_m, find_offset
 from uwblink.recording.file import Recording
@@ -52,10 +53,10 @@ def read_poses(path: Path, body: str | None = None, topics: Mapping[str, str] | 
 
     `body` is the body of files without names of bodies; `topics` are the topics of a bag to read, by body.
     """
-    return _read(path, body, topics, PoseMap())[0]
+    return _read(path, body, topics, ColumnMap())[0]
 
 
-def _read(path: Path, body: str | None, topics: Mapping[str, str] | None, stated: PoseMap) -> tuple[Poses, bool]:
+def _read(path: Path, body: str | None, topics: Mapping[str, str] | None, stated: ColumnMap) -> tuple[Poses, bool]:
     """Return the poses of a file, and whether it has attitudes."""
     require_regular(path, ImportTableError, "file of poses", folders=True)
     kind = "bag" if path.is_dir() else path.suffix.lower().lstrip(".")
@@ -71,9 +72,8 @@ def _read(path: Path, body: str | None, topics: Mapping[str, str] | None, stated
         raise ImportTableError(f"{path}: has no topics; only bags have")
     else:
         with reading(path), path.open(encoding="utf-8-sig", newline="") as file:
-            found = read_text_poses(path, file, body, stated)
-        turned = found.turned
-        poses = _poses(path, found.time_ns, found.body, np.column_stack([found.position_m, found.quaternion]))
+            times, bodies, values, turned = read_text_poses(path, file, body, stated)
+        poses = _poses(path, times, bodies, values)
     if not len(poses):
         raise ImportTableError(f"{path}: holds no poses")
     return poses, turned
@@ -179,14 +179,14 @@ def add_poses(
 ) -> AddedPoses:
     """Add poses from a file, or from files by body, to a recording; `offset` is in seconds, or "auto".
 
-    `tags_from` is a file of TOML or JSON with `[[tags]]`, and `[[anchors]]` that stand still. `topics` are those of a bag to read,
-    by body; `body` names that of a file which does not. `map_file` names the columns of CSV files. Raises `RecordingExistsError` where there are poses already,
-    unless `force` replaces them, `ImportTableError` for poses that cannot be used, what `load_places` and
-    `Recording.open` raise; the recording stays as it was then.
+    `tags_from` is a file of TOML or JSON with `[[tags]]`, and `[[anchors]]` that stand still. `topics` are those of a
+    bag to read, by body; `body` names that of a file which does not. `map_file` names the columns of CSV files. Raises
+    `RecordingExistsError` where there are poses already, unless `force` replaces them, `ImportTableError` for poses
+    that cannot be used, what `load_places` and `Recording.open` raise; the recording stays as it was then.
     """
     shift_ns = None if offset == "auto" else _offset_ns(offset)
     files = source if isinstance(source, Mapping) else {body: source}
-    stated = load_pose_map(map_file) if map_file else PoseMap()
+    stated = load_map(map_file) if map_file else ColumnMap()
     read = [_read(path, name, topics, stated) for name, path in files.items()]
     parts, unturned = [part for part, _ in read], {name for part, turned in read if not turned for name in part.body}
     what = ", ".join(str(path) for path in files.values()) or str(tags_from)
@@ -210,8 +210,8 @@ def add_poses(
             )
         if held := [tag for tag in with_poses if tag.body in unturned and any(tag.lever_arm_m)]:
             raise ImportTableError(
-                f"{what}: has no attitudes (qx, qy, qz, qw) of {held[0].body}, whose tag {held[0].tag} has a lever arm; "
-                "without attitudes lever arms must be zero"
+                f"{what}: has no attitudes (qx, qy, qz, qw) of {held[0].body}, whose tag {held[0].tag} has a lever "
+                "arm; without attitudes lever arms must be zero"
             )
         if shift_ns is None:
             _check_units(what, exchanges, poses, placed, int(exchanges.time_ns.min() - poses.time_ns.min()))

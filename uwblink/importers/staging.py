@@ -157,28 +157,29 @@ class Staging:
 
         Raises `ImportTableError` if half of the cells or more that are not empty are none.
         """
-        there = [name for name in names if self.rows.has(name) and name not in self.column_map.registers]
+        there = [
+            name
+            for name in names
+            if self.rows.has(name) and name not in {*self.column_map.registers, *self.column_map.constants}
+        ]
         lacking = self.rows.values(", ".join(f"count(*) - count({name})" for name in there)) if there else ()
         for name in (name for name, count in zip(there, lacking, strict=True) if count):
-            header, words, total, first = self.column_map.header(name), 0, 0, ""
-            for table in self.tables if name not in self.column_map.constants else ():
+            header, cells = self.column_map.header(name), list[tuple[str, int, bool]]()
+            for table in self.tables:
                 text = table.text(header, numeric=True)
-                filled = f"lower(trim({text})) NOT IN {NO_VALUES} AND NOT {self._is_missing(text)}"
-                is_word = f"{filled} AND TRY_CAST({text} AS DOUBLE) IS NULL"
-                counts = {
-                    "words": f"count(*) FILTER ({is_word})",
-                    "total": f"count(*) FILTER ({filled})",
-                    "first": f"any_value({text}) FILTER ({is_word})",
-                }
-                found = table.read(counts)
-                words, total = words + int(found["words"][0]), total + int(found["total"][0])
-                first = first or (str(found["first"][0])[:40] if found["words"][0] else "")
-            said = f"{words} of {total} cells of column {header[:60]!r} are no numbers, such as {first!r}"
-            if words and 2 * words >= total:
-                remedy = f"name another column for {name} in the map, or state missing = [{json.dumps(first)}]"
-                raise ImportTableError(f"{self.paths[0]}: {said}; {remedy}")
+                kept = f"WHERE lower(trim({text})) NOT IN {NO_VALUES} AND NOT {self._is_missing(text)}"
+                is_word = f"TRY_CAST({text} AS DOUBLE) IS NULL"
+                found = table.read({"first": f"any_value({text})", "n": "count(*)", "w": is_word}, f"{kept} GROUP BY 3")
+                cells += zip(found["first"].tolist(), found["n"].tolist(), found["w"].tolist(), strict=True)
+            words = [cell for cell in cells if cell[2]]
+            count, total = sum(n for _, n, _ in words), sum(n for _, n, _ in cells)
+            said = f"{count} of {total} cells of column {header[:60]!r} are no numbers"
+            if words and 2 * count >= total:
+                first = json.dumps(words[0][0][:40])
+                remedy = f"name another column for {name} in the map, or state missing = [{first}]"
+                raise ImportTableError(f"{self.paths[0]}: {said}, such as {first}; {remedy}")
             if words:
-                yield f"{said}, and are taken as missing"
+                yield f"{said}, such as {words[0][0][:40]!r}, and are taken as missing"
 
     def require(self, rows: Rows, names: Iterable[str]) -> None:
         """Raise the error for the first column that rows lack."""

@@ -206,6 +206,8 @@ class Table:
         self.db, self.path, self._key = db, path, key
         self.column_map = column_map = column_map or ColumnMap()
         self._skip, self._decimal_comma, self._expanded = 0, False, False
+        self.lists: tuple[str, ...] = ()
+        """Fields of JSON lines that are lists of objects."""
         self.blank = ""
         """SQL that is true for rows that hold no range at all, such as an empty cell of a wide table; "" for none."""
         db.execute(f"SET VARIABLE file{key} = ?", [str(path)])
@@ -270,35 +272,33 @@ class Table:
         Elements of a list are fields, too, or rows if the map names the list (`each`).
         """
         check_lines(self.path, "\n")
-        fields, each, of_elements = dict[str, str](), self.column_map.each, dict[str, str]()
+        fields, each, lists = dict[str, str](), self.column_map.each, dict[str, None]()
         with reading(self.path), open_file(self.path) as file:
             lines = [line.decode("utf-8-sig") for line in islice(file, 1000)]
         for line in lines:
             with suppress(ValueError, RecursionError):
                 row = json.loads(line)
-                fields |= dict(_fields(row, "", "")) if isinstance(row, dict) else {}
-                for element in row[each] if each in row and isinstance(row[each], list) else ():
-                    of_elements |= dict(_fields({each: element}, "", "")) if isinstance(element, dict) else {}
+                found = {name: value for name, value in row.items() if isinstance(value, list) and is_objects(value)}
+                lists |= dict.fromkeys(found)
+                for one in [row | {each: one} for one in found.get(each, ())] if each else [row]:
+                    fields |= dict(_fields(one, "", ""))
+        self.lists = tuple(lists)
         if not fields:
-            raise ImportTableError(f"{self.path}: holds no JSON objects, one a line")
-        if each and not of_elements:
-            raise ImportTableError(f"{self.path}: each: no line has a list {each[:60]!r} of objects")
-        fields = {name: pointer for name, pointer in fields.items() if name.split(".")[0] != each} | of_elements
-        # Pointers of elements begin with that of their list.
-        start = len(_pointer(each or ""))
-        inner = [pointer[start:] if name in of_elements else pointer for name, pointer in fields.items()]
+            wanted = f"a list {each[:60]!r} of objects (`each`)" if each else "JSON objects"
+            raise ImportTableError(f"{self.path}: holds no {wanted}, one a line")
         self.names = tuple(fields)
-        self.db.execute(f"SET VARIABLE fields{self._key} = ?", [[*inner, _pointer(each or "")]])
+        self.db.execute(f"SET VARIABLE fields{self._key} = ?", [list(fields.values())])
         listed = f"getvariable('fields{self._key}')"
-        self._cells = [
-            f"json_extract_string({'element' if name in of_elements else 'json'}, {listed}[{k}])"
-            for k, name in enumerate(fields, start=1)
-        ]
+        self._cells = [f"json_extract_string(json, {listed}[{k}])" for k in range(1, len(fields) + 1)]
         self.source = f"read_ndjson_objects(getvariable('file{self._key}'), ignore_errors=true)"
         if each:
-            elements = f"unnest(CAST(json_extract(json, {listed}[{len(inner) + 1}]) AS JSON[])) AS element"
+            # An element stands in place of the list that it is of.
+            self.db.execute(f"SET VARIABLE each{self._key} = ?", [each])
+            name = f"getvariable('each{self._key}')"
+            elements = f"unnest(CAST(json_extract(json, '/' || {_escaped(name)}) AS JSON[])) AS element"
             self.source = f"(SELECT row_number() OVER () AS row, json, {elements} FROM {self.source})"
-            self._expanded = True
+            merged = f"json_merge_patch(json, json_object({name}, element)) AS json"
+            self.source, self._expanded = f"(SELECT row, {merged} FROM {self.source})", True
 
     def _open_parquet(self) -> None:
         read = f"read_parquet(getvariable('file{self._key}'))"
@@ -317,12 +317,10 @@ class Table:
         lists = {
             ours: [self.text(family[n]) if n in family else "''" for n in labels] for ours, family in families.items()
         }
-        named = re.search(r"\{(from_id|to_id)\}", str(list(self.column_map.wide.values())))
-        if named or not {"from_id", "to_id"} & lists.keys():
+        end = "from_id" if "{from_id}" in str(self.column_map.wide) else "to_id"
+        if end not in lists:
             self.db.execute(f"SET VARIABLE labels{self._key} = ?", [labels])
-            lists[named[1] if named else "to_id"] = [
-                f"getvariable('labels{self._key}')[{n + 1}]" for n in range(len(labels))
-            ]
+            lists[end] = [f"getvariable('labels{self._key}')[{n}]" for n in range(1, len(labels) + 1)]
         cells = {ours: f"[{', '.join(cells)}][k]" for ours, cells in lists.items()}
         numbered = "" if self._expanded else ", row_number() OVER () AS row"
         self.source = f"(SELECT *{numbered}, unnest(range(1, {len(labels) + 1})) AS k FROM {self.source})"
@@ -354,14 +352,6 @@ class Table:
         for k, (name, value) in enumerate(values.items()):
             self.db.execute(f"SET VARIABLE name{self._key}_{k} = ?", [value])
             self.names, self._cells = (*self.names, name), [*self._cells, f"getvariable('name{self._key}_{k}')"]
-
-    def list_of_objects(self) -> str | None:
-        """Return the first field of JSON lines that is a list of objects; None if there is none."""
-        for name in self.names if not self._is_csv and not self._is_parquet else ():
-            found = self.read({"text": f"any_value({self.text(name)})"}, f"WHERE {self.text(name)} LIKE '[{{%}}]'")
-            if found["text"][0] is not None and found["text"][0] is not np.ma.masked:
-                return name
-        return None
 
     @contextmanager
     def reading(self) -> Iterator[None]:
@@ -439,16 +429,22 @@ class Table:
             return np.fromiter(filled, np.int64)
 
 
-def _pointer(key: str) -> str:
-    return f"/{key.replace('~', '~0').replace('/', '~1')}"
+def is_objects(values: list[Any]) -> bool:
+    """Return whether a list has objects of JSON."""
+    return any(isinstance(one, dict) for one in values)
+
+
+def _escaped(name: str) -> str:
+    """Return SQL of the part of a JSON pointer for a key, from SQL of it."""
+    return f"replace(replace({name}, '~', '~0'), '/', '~1')"
 
 
 def _fields(row: dict[str, Any], name: str, pointer: str) -> Iterator[tuple[str, str]]:
     """Yield names of fields such as `pose.x` or `ranges.0`, and their JSON pointers."""
     for key, value in row.items():
-        where = f"{pointer}{_pointer(key)}"
+        where = f"{pointer}/{key.replace('~', '~0').replace('/', '~1')}"
         # A list of objects is a column of JSON; long lists are images and the like.
-        of_numbers = isinstance(value, list) and len(value) <= 16 and not any(isinstance(one, dict) for one in value)
+        of_numbers = isinstance(value, list) and len(value) <= 16 and not is_objects(value)
         inner = {str(k): one for k, one in enumerate(value)} if of_numbers else value
         if isinstance(inner, dict) and pointer.count("/") < 5:
             yield from _fields(inner, f"{name}{key}.", where)

@@ -9,7 +9,6 @@ linear in the text, so that a template of a stranger cannot stall an import.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -65,16 +64,14 @@ class Template:
 
     def columns(self, groups: str) -> dict[str, str]:
         """Return SQL of the columns by name; `groups` is a struct as `regexp_extract` returns it."""
-        return dict(self._columns(groups))
-
-    def _columns(self, groups: str) -> Iterator[tuple[str, str]]:
+        found: dict[str, str] = {}
         for k, (name, form, count) in enumerate(self._places):
             group = f"{groups}.g{k}"
-            if count:
-                values = f"string_split_regex(trim({group}), '[,;[:space:]]+')"
-                yield from ((f"{name}.{n}", f"{values}[{n + 1}]") for n in range(count))
-            else:
-                yield name, f"TRY_CAST('0x' || {group} AS BIGINT)" if form == "hex" else group
+            values = f"string_split_regex(trim({group}), '[,;[:space:]]+')"
+            found |= {f"{name}.{n}": f"{values}[{n + 1}]" for n in range(count)}
+            if not count:
+                found[name] = f"TRY_CAST('0x' || {group} AS BIGINT)" if form == "hex" else group
+        return found
 
     def extract(self, text: str, variable: str) -> str:
         """Return SQL of the groups in an SQL text; `variable` of the connection holds the pattern."""

@@ -13,8 +13,6 @@ import duckdb
 import numpy as np
 import pytest
 
-from tests import processes
-from tests.processes import ROOT
 from uwblink.errors import ImportTableError
 from uwblink.importers import read_source
 from uwblink.importers.guess import guess_map
@@ -242,7 +240,7 @@ FORMS = {
     "Arduino prints": Form(prints, TAG, HEXADECIMAL, times=False, powers="rxp"),
     "TREK1000": Form(lambda folder: lines(folder / "trek.log", trek), times=False, kept=lambda r: r.anchor != 2),
     "TREK1000, raw and corrected": Form(
-        lambda folder: lines(folder / "trek.log", lambda some: f"{trek(some, 'mr')}\r\n{trek(some).replace('00', '01')}"),
+        lambda folder: lines(folder / "t.log", lambda some: trek(some, "mr") + "\r\n" + trek(some).replace("00", "01")),
         {"line": "trek-raw"}, times=False, kept=lambda r: r.anchor != 2,
     ),
     "registers of the DW1000": Form(registers, {"chip": "dw1000"}, truth=True, powers="fpp"),
@@ -256,13 +254,11 @@ FORMS = {
     "-1 for no range": Form(lambda folder: with_sentinels(folder, -1), truth=True, noted="16 of 176 rows"),
     "65535 for no range": Form(lambda folder: with_sentinels(folder, 65535), truth=True, noted="16 of 176 rows"),
     "raw and filtered ranges": Form(
-        of(lambda: [{k: v for k, v in row.items() if k != "range_m"} | {"Raw_Range": row["range_m"], "Filtered_Range": 3}
-                    for row in long_rows()]),
+        of(lambda: [row | {"Filtered_Range": 3.0} for row in renamed({"range_m": "Raw_Range"})]),
         {"range_m": "Raw_Range"}, truth=True,
     ),
     "ranges in mm, true distances in m": Form(
-        of(lambda: [renamed({"range_m": "range_mm"}, [row | {"range_m": 1000 * row["range_m"]}])[0]
-                    for row in long_rows()]),
+        of(lambda: renamed({"range_m": "range_mm"}, [r | {"range_m": 1000 * r["range_m"]} for r in long_rows()])),
         truth=True,
     ),
     "decimal commas": Form(

@@ -159,7 +159,10 @@ def test_exports_give_the_planted_distances(tmp_path, name):
 
 
 CSV = "stamp_ms;object;pos_x_mm;pos_y_mm;pos_z_mm"
-MAP = '[columns]\ntime_s = "when"\nbody = "what"\nx = "east"\ny = "north"\nz = "up"\n[units]\ntime = "ms"\ndistance = "mm"\n'
+MAP = """
+columns = {time_s = "when", body = "what", x = "east", y = "north", z = "up"}
+units = {time = "ms", distance = "mm"}
+"""
 
 
 @pytest.mark.parametrize(("head", "text"), [(CSV, None), ("when;what;east;north;up", MAP)])
@@ -204,9 +207,8 @@ def test_anchors_come_from_json_as_from_toml(tmp_path):
     places = {1: (0.0, 0.0, 0.0), 2: (3.0, 4.0, 0.0)}
     rows = [{"id": n, "position_m": list(place)} for n, place in places.items()]
     (tmp_path / "anchors.json").write_text(json.dumps({"anchors": rows}))
-    (tmp_path / "anchors.toml").write_text(
-        "".join(f"[[anchors]]\nid = {n}\nposition_m = {list(p)}\n" for n, p in places.items())
-    )
+    text = "".join(f"[[anchors]]\nid = {n}\nposition_m = {list(place)}\n" for n, place in places.items())
+    (tmp_path / "anchors.toml").write_text(text)
     for name in ("anchors.json", "anchors.toml"):
         Contents(exchanges=ranges(TIMES, np.full(COUNT, 5.1))).save(tmp_path / f"{name}.uwb")
         processes.succeed("uwblink", "poses", tmp_path / f"{name}.uwb", "--tags", tmp_path / name)
