@@ -45,6 +45,7 @@ to_id = 7
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -52,7 +53,7 @@ from typing import Any, Final
 from uwblink.errors import ImportTableError
 from uwblink.importers.chips import CHIPS, REGISTERS
 from uwblink.importers.lines import LINES
-from uwblink.importers.templates import Template, places
+from uwblink.importers.templates import Template, is_template, places
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import AntennaDelays, read_antenna_delays
 from uwblink.recording.schema import POSE
@@ -282,10 +283,15 @@ def load_map(path: Path) -> ColumnMap:
     columns, units, constants, ids, wide = (file.section(n) for n in ("columns", "units", "constants", "ids", "wide"))
     file.known(columns, (*NAMES, *NAMES_OF_POSES), "columns.")
     file.known(wide, NAMES, "wide.")
-    templates = [table[name] for name in ("line", "from_name") if name in table]
-    templates += [table["each"]] if "each" in table and "line" in table else []
-    for place in (place for text in templates for place in places(Template(text))):
-        _place(place, columns, units)
+    templates = [
+        name for name in ("line", "from_name", "each") if name in table and (name != "each" or "line" in table)
+    ]
+    for name in templates:
+        file.check(
+            name, table[name], is_template(table[name]), "text with different places such as {range_m} or {r[8]}"
+        )
+        for place in places(Template(table[name])):
+            _place(place, columns, units)
     file.known(units, ("stamps", "time", "distance", "power", "skew", *DISTANCES, *POWERS), "units.")
     registers = {name: value for name, value in columns.items() if isinstance(value, dict)}
     chip = file.choice("chip", table.get("chip"), (None, *CHIPS))
@@ -305,7 +311,7 @@ def load_map(path: Path) -> ColumnMap:
         )
     for name, value in wide.items():
         by_device = isinstance(value, dict) and value and all(isinstance(one, str) for one in value.values())
-        is_family = isinstance(value, str) and len(places(Template(value))) + value.count("{_}") == 1
+        is_family = isinstance(value, str) and is_template(value) and len(re.findall(r"\{\w+\}", value)) == 1
         file.check(f"wide.{name}", value, by_device or is_family, "a name with one place, such as r_AN{to_id}")
     missing = table.get("missing", [])
     listed = isinstance(missing, list) and all(

@@ -8,29 +8,14 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
-from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import ASKED, ColumnMap
 from uwblink.importers.column_names import PATTERNS, WORDS, plain_name
-from uwblink.importers.exchange_tables import LOG_SUFFIXES, TABLE_SUFFIXES
 from uwblink.importers.lines import LINES
 from uwblink.importers.tables import detect, open_file, reading
 from uwblink.importers.templates import Template
-from uwblink.text_files import require_regular
 
 Entries = dict[str, tuple[Any, str]]
 """Values of a map by key, each with its reason."""
-
-
-def first_file(path: Path) -> Path:
-    """Return a file, or the first table or log of a folder; raises `ImportTableError`."""
-    if path.is_dir():
-        suffixes = (*TABLE_SUFFIXES, *LOG_SUFFIXES)
-        found = min((part for part in path.rglob("*") if part.name.lower().endswith(suffixes)), default=None)
-        if found is None:
-            raise ImportTableError(f"{path}: is a directory without a table or log ({', '.join(suffixes)})")
-        path = found
-    require_regular(path, ImportTableError, "table")
-    return path
 
 
 def form_of(path: Path) -> tuple[ColumnMap, Entries]:

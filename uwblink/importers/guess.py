@@ -32,7 +32,8 @@ from uwblink.importers.column_map import (
     ColumnMap,
 )
 from uwblink.importers.column_names import OF_MESSAGES, WORDS, named_columns, plain_name
-from uwblink.importers.forms import Entries, first_file, form_of, name_template, register_columns, wide_columns
+from uwblink.importers.exchange_tables import tables_in
+from uwblink.importers.forms import Entries, form_of, name_template, register_columns, wide_columns
 from uwblink.importers.plausibility import (
     ACCEPTED_SHARE,
     FITTING_SHARE,
@@ -50,6 +51,7 @@ from uwblink.importers.plausibility import (
 from uwblink.importers.tables import Columns, Table, message_number, open_table
 from uwblink.importers.templates import Template, places
 from uwblink.protocols.table import PROTOCOLS
+from uwblink.text_files import require_regular
 from uwblink.twr import STAMPS
 
 
@@ -119,7 +121,8 @@ def guess_map(path: Path) -> Guess:
     """Return the proposed map of a table, a log, or a folder of them; raises `ImportTableError`."""
     if path.suffix.lower() == ".uwb":
         raise ImportTableError(f"{path}: is a recording already and needs no map; 'uwblink show' prints its contents")
-    file = first_file(path)
+    file = tables_in(path, ColumnMap(line="{*}"))[0] if path.is_dir() else path
+    require_regular(file, ImportTableError, "table")
     form, top = form_of(file)
     with open_table(file, form) as table:
         if form.headerless:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats, Ints
-from uwblink.errors import ImportTableError
+from uwblink.errors import ImportTableError, raising
 from uwblink.importers.column_map import DISTANCE_UNITS, TIME_UNITS, ColumnMap
 from uwblink.importers.column_names import plain_name
 from uwblink.recording.schema import POSE
@@ -100,8 +100,10 @@ def read_text_poses(
             values.extend(found[1:])
     width = len(next(iter(layout.bodies.values()), (0, 0, 0)))
     table = np.array(values).reshape(-1, width)
-    found = np.column_stack([table[:, :3] * layout.metres, _quaternions(table[:, 3:] * layout.radians)])
-    return np.array(times, np.int64), np.array(bodies, np.str_), found, width > 3
+    with raising(ImportTableError, f"{path}: its attitudes are no rotations", ValueError):
+        turned = _quaternions(table[:, 3:] * layout.radians)
+    poses = np.column_stack([table[:, :3] * layout.metres, turned])
+    return np.array(times, np.int64), np.array(bodies, np.str_), poses, width > 3
 
 
 def _quaternions(values: Floats) -> Floats:
@@ -235,7 +237,7 @@ def _qualisys(path: Path, head: Lines) -> Layout:
     # Position, three angles and the residual come before the matrix.
     fields = ("x", "y", "z", *(f"r{k}" for k in range(9)))
     places = [dict(zip(fields, (k - 7, k - 6, k - 5, *range(k, k + 9)), strict=True)) for k in starts]
-    timed, rate = head[first][1:2] == ["Time"], _number(next(iter(said.get("FREQUENCY", ())), ""))
+    timed, rate = head[first][1:2] == ["Time"], _number(next(iter(said.get("FREQUENCY", ())), "")) or math.nan
     layout = Layout(
         form="Qualisys", names=head[first], time=int(timed), ns=1e9 if timed else 1e9 / rate, bodies={},
         header=first + 1, metres=DISTANCE_UNITS["mm"],

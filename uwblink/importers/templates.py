@@ -13,8 +13,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
-from uwblink.errors import ImportTableError
-
 MAX_PLACES: Final = 64
 """Columns of a template; each is a group of the expression."""
 
@@ -32,18 +30,9 @@ _VALUES: Final = {
 
 @dataclass(frozen=True)
 class Template:
-    """A template; `text` is what the user wrote. Raises `ImportTableError` for text that is none."""
+    """A template; `text` is what the user wrote, and `is_template` is true for it."""
 
     text: str
-
-    def __post_init__(self) -> None:
-        """Check the places."""
-        names = [name for name, _, _ in self._places]
-        if re.search(r"[{}]", _PLACE.sub("", self.text)) or len(set(names)) < len(names) or len(names) > MAX_PLACES:
-            raise ImportTableError(
-                f"template {self.text[:80]!r}: expected text with different places such as {{range_m}}, "
-                f"{{mask:hex}} or {{r[8]}}, at most {MAX_PLACES}"
-            )
 
     @property
     def _places(self) -> list[tuple[str, str, int]]:
@@ -82,6 +71,12 @@ class Template:
         """Return the values at the end of a file's path, by place; None if it does not match."""
         found = re.search(f"(?:^|/){self.pattern}$", text)
         return dict(zip((name for name, _, _ in self._places), found.groups(), strict=True)) if found else None
+
+
+def is_template(text: str) -> bool:
+    """Return whether braces are places of different columns, not too many."""
+    named = [place["name"] for place in _PLACE.finditer(text) if place["name"] not in ("_", "*")]
+    return not re.search(r"[{}]", _PLACE.sub("", text)) and len(set(named)) == len(named) <= MAX_PLACES
 
 
 def places(template: Template) -> list[str]:

@@ -13,9 +13,12 @@ import duckdb
 import numpy as np
 import pytest
 
+from tests import processes
+from tests.processes import ROOT
 from uwblink.errors import ImportTableError
 from uwblink.importers import read_source
 from uwblink.importers.guess import guess_map
+from uwblink.recording.contents import load
 
 ANCHORS = ("0", "1", "2", "3")
 HEXADECIMAL = ("1A2B", "0C0D", "9280", "5431")
@@ -292,6 +295,32 @@ def proposed(source, map_file, answers):
     return map_file
 
 
+def test_the_page_has_a_row_a_form():
+    rows = [
+        line.split("|")[1].strip() for line in (ROOT / "docs" / "importing.md").read_text().splitlines() if "|" in line
+    ]
+    assert [row for row in rows if row in FORMS] == list(FORMS)
+
+
+def test_the_commands_do_it_for_a_folder_and_for_a_log(tmp_path):
+    (tmp_path / "anchors").mkdir()
+    named_files(tmp_path / "anchors", "cm", 100)
+    lines(tmp_path / "uart.log", stamped)
+    for source in ("anchors", "uart.log"):
+        words = ["uwblink", "import", "csv", source, "--map", "map.toml", "-o", f"{source}.uwb"]
+        said = processes.succeed("uwblink", "import", "guess", source, "-o", "map.toml", "--force", cwd=tmp_path).stdout
+        assert said.startswith("map.toml: check it, then uwblink import csv")
+        processes.succeed(*words, cwd=tmp_path)
+        assert sorted(load(tmp_path / f"{source}.uwb").exchanges.range_m) == pytest.approx(
+            sorted(r.range_m for r in PLANT)
+        )
+    lines(tmp_path / "lec.log", lec)
+    words[3:] = ["lec.log", "--map", "map.toml", "-o", "lec.uwb"]
+    processes.succeed("uwblink", "import", "guess", "lec.log", "-o", "map.toml", "--force", cwd=tmp_path)
+    processes.refuse(*words, naming=["from_id", "map.toml"], cwd=tmp_path)
+    assert not (tmp_path / "lec.uwb").exists()
+
+
 @pytest.mark.parametrize("name", FORMS)
 def test_a_form_comes_in_by_its_guess(tmp_path, name):
     form = FORMS[name]
@@ -318,3 +347,95 @@ def test_a_form_comes_in_by_its_guess(tmp_path, name):
     assert any("received power serves" in note for note in found.meta["notes"]) == (form.powers == "rxp")
     assert form.noted in " ".join(found.meta["notes"])
     assert found.meta.get("chip") == form.answers.get("chip")
+
+
+LONG = "time_s,from_id,to_id,range_m,gt_range_m\n"
+
+
+def imported(tmp_path, text, map_text="", name="t.csv"):
+    (tmp_path / name).write_text(text)
+    (tmp_path / "map.toml").write_text(map_text)
+    return read_source(tmp_path / name, importer="csv", map_file=tmp_path / "map.toml" if map_text else None)
+
+
+@pytest.mark.parametrize("column", ["gt_range_m", "fpp1", "from_x_m"])
+def test_words_in_a_column_that_is_not_needed_are_named(tmp_path, column):
+    """Half of its cells or more are refused; fewer are counted; empty ones and nan are nothing."""
+    head = LONG.replace("gt_range_m", column)
+    rows = [f"{k},1,2,{3 + k / 7:.3f}," for k in range(30)]
+    with pytest.raises(
+        ImportTableError, match=rf"30 of 30 cells of column '{column}' .* 'wall'|\"wall\"; name another"
+    ):
+        imported(tmp_path, head + "".join(f"{row}wall\n" for row in rows))
+    found = imported(tmp_path, head + "".join(f"{row}{'wall' if k < 5 else -3.5}\n" for k, row in enumerate(rows)))
+    assert any(f"5 of 30 cells of column '{column}' are no numbers" in note for note in found.meta["notes"])
+    found = imported(tmp_path, head + "".join(f"{row}{['nan', '', -3.5][k % 3]}\n" for k, row in enumerate(rows)))
+    assert not found.meta["notes"]
+    with_words = head + "".join(f"{row}wall\n" for row in rows)
+    if column != "from_x_m":
+        assert len(imported(tmp_path, with_words, 'missing = ["WALL"]').exchanges) == 30
+
+
+@pytest.mark.parametrize("value", [0, -1, 65535, 9999.9])
+def test_a_number_that_often_stands_for_no_range_is_refused_until_the_map_states_it(tmp_path, value):
+    text = LONG + "".join(f"{k},1,2,{value if k % 5 == 0 else 3 + k / 7:.6g},\n" for k in range(60))
+    with pytest.raises(ImportTableError, match=rf"20% of its numbers are {value}.* missing = \[{value}"):
+        imported(tmp_path, text)
+    assert len(imported(tmp_path, text, f"missing = [{value}]").exchanges) == 48
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('line = "{from_id} {oops"', "map.toml: line"),
+        ('line = "{range_m} {range_m}"', "different places"),
+        ('[wide]\nrange_m = "zz{to_id}"', "wide.range_m: no column 'zz{to_id}'"),
+        ('[wide]\nrange_m = "zz"', "wide.range_m"),
+        ('from_name = "x{from_id}.csv"', "its name is not 'x{from_id}.csv'"),
+        ('each = "rows"', "`each` is of JSON lines"),
+        ('[columns]\nrange_m = 4\nfrom_id = "from_id"', "for all their numbers"),
+        ("[columns]\nrange_m = 9\nfrom_id = 2\nto_id = 3", "column '9' is missing"),
+        ('[columns]\nfpp2 = {f1 = "a", n = "b"}', "columns of f1, f2, f3 and n"),
+        ('[columns]\nfpp2 = {c = "time_s", n = "to_id"}', "chip"),
+        ('chip = "nrf52"', "allowed: dw1000, dw3000, other"),
+        ('missing = "x"', "a list of numbers and words"),
+        ('[units]\nskew = "offset"', "allowed: ppm, -ppm"),
+        ('[units]\nrange_m = "miles"', "units.range_m"),
+    ],
+)
+def test_maps_that_cannot_be_are_refused_with_the_key(tmp_path, text, said):
+    with pytest.raises(ImportTableError) as caught:
+        imported(tmp_path, LONG + "0,1,2,3.25,\n1,1,2,3.5,\n", text)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_faults_of_logs_and_wide_tables_have_the_line_of_the_file(tmp_path):
+    text = "boot\n\n" + "".join(
+        f"from: {k % 3 + 1} Range: {'x' if k == 7 else 2 + k / 9:.5} m\r\nidle\n" for k in range(30)
+    )
+    found = imported(tmp_path, text, 'line = "from: {to_id} Range: {range_m} m"\n[constants]\nfrom_id = 9\n', "a.log")
+    assert [fault.detail for fault in found.faults] == ["row 17, column 'range_m': found 'x', expected a finite number"]
+    wide = "when,r1,r2,r3\n" + "".join(f"{'soon' if k == 4 else k},{1 + k / 7},{2 + k / 9},\n" for k in range(30))
+    map_text = '[columns]\ntime_s = "when"\n[wide]\nrange_m = "r{to_id}"\n[constants]\nfrom_id = 9\n'
+    found = imported(tmp_path, wide, map_text)
+    assert [fault.detail.split(",")[0] for fault in found.faults] == ["row 6", "row 6"]
+    assert set(found.exchanges.target) == {1, 2}
+
+
+def test_skews_of_registers_and_the_sign_of_both_chips(tmp_path):
+    text = "time_s,from_id,to_id,range_m,skew2\n" + "".join(f"{k},1,2,{3 + k / 7},{100 + k}\n" for k in range(30))
+    for chip, unit, ppm in (
+        ("dw1000", "integrator-5", 998.4e6 / 2 / 1024 / 131072 / 6489.6),
+        ("dw3000", "offset", 1e6 / 2**26),
+    ):
+        found = imported(tmp_path, text, f'chip = "{chip}"\n[units]\nskew = "{unit}"\n').exchanges
+        np.testing.assert_allclose(found.skew2_ppm, (100 + np.arange(30)) * ppm)
+
+
+def test_powers_that_no_chip_reports_are_refused(tmp_path):
+    text = "time_s,from_id,to_id,range_m,fpp2\n" + "".join(f"{k},1,2,{3 + k / 7},{-12 - k % 5}\n" for k in range(30))
+    map_text = 'chip = "dw1000"\n[units]\npower = "dBm"\n'
+    with pytest.raises(ImportTableError, match=r"'fpp2': the median power is -14"):
+        imported(tmp_path, text, map_text)
+    assert len(imported(tmp_path, text, map_text.replace("dw1000", "other")).exchanges) == 30
