@@ -73,7 +73,7 @@ def read_text_poses(
     if blanks or word.lower().startswith("#timestamp"):
         layout = _single(path, *(_TUM if blanks else _EUROC), body)
     else:
-        layout = _FORMS[word](path, head) if word in _FORMS else _plain(path, head, body, stated)
+        layout = _FORMS[word](path, [*head, [], []]) if word in _FORMS else _plain(path, head, body, stated)
     times, bodies, values = array("q"), list[str](), array("d")
     for row, cells in enumerate(chain(head[layout.header :], split), start=1 + layout.header):
         if not cells or (layout.comments and cells[0].startswith("#")):
@@ -89,11 +89,12 @@ def read_text_poses(
             wrong = {k: "a number" for k, value in enumerate(found) if not math.isfinite(value)}
             wrong |= {} if abs(found[0]) * layout.ns <= LATEST_NS else {0: "a time"}
             if wrong or not named:
-                k, expected = min(wrong.items(), default=(None, "a name"))
-                place = layout.body if k is None else (layout.time, *places)[k]
+                k, expected = min(wrong.items(), default=(-1, "a name"))
+                place, cell = (
+                    (layout.body or 0, cells[layout.body or 0]) if k < 0 else ((layout.time, *places)[k], texts[k])
+                )
                 raise ImportTableError(
-                    f"{path}: row {row}: column {layout.names[place or 0]!r}: found {cells[place or 0]!r}, "
-                    f"expected {expected}"
+                    f"{path}: row {row}: column {layout.names[place]!r}: found {cell!r}, expected {expected}"
                 )
             times.append(round(Decimal(texts[0].strip()) * Decimal(layout.ns)))
             bodies.append(named)

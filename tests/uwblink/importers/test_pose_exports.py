@@ -192,6 +192,14 @@ def test_columns_with_other_names_and_without_attitudes(tmp_path, head, text):
         ("take.csv", lambda folder: motive(folder).read_text().replace("Rigid Body", "Marker"), "Rigid Body"),
         ("vicon.csv", lambda folder: vicon(folder).read_text().replace("\n100\n", "\n\n"), "frame rate"),
         ("take_6D.tsv", lambda folder: qualisys(folder).read_text().replace("Rot[0]", "R"), "Rot[0]"),
+        (
+            "take_6D.tsv",
+            lambda folder: qualisys(folder, False).read_text().replace("FREQUENCY\t100", "FREQUENCY\t0"),
+            "rate",
+        ),
+        ("vicon.csv", lambda folder: vicon(folder).read_text()[:-30], "row 35: column 'T"),
+        ("take.csv", lambda folder: motive(folder).read_text()[:900], "rigid bodies"),
+        ("take.csv", lambda folder: motive(folder).read_text()[:300], "Rotation, Position"),
     ],
 )
 def test_exports_that_lack_something_are_refused_with_its_name(tmp_path, name, broken, said):
