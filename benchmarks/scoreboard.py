@@ -253,9 +253,8 @@ uwblink import csv A-few.csv --map A.toml -o A-few.uwb
 uwblink poses A.uwb --from A-rig.csv --tags rig.toml
 calib doctor A.uwb
 calib fit A.uwb -o A.json
-calib fit A.uwb -o A.json --minimum-norm
-calib fit A.uwb -o A-same.json --minimum-norm --between 0
-calib fit A-few.uwb -o A-few.json --minimum-norm
+calib fit A.uwb -o A-same.json --between 0
+calib fit A-few.uwb -o A-few.json
 calib evaluate B.uwb -c A.json
 calib localize B.uwb -c A.json
 calib evaluate B.uwb -c A-same.json
@@ -268,7 +267,7 @@ calib localize B.uwb -c A-few.json
     DataSet(
         "MILUV",
         "decargroup/miluv: a flight's folder with `timeshift.yaml`, `tags.yaml`, `anchors.yaml`; uwb_calib.json is "
-        "`config/uwb/uwb_calib.pickle` at 7d81efd as JSON. With one flight, the last is a share of it held out.",
+        "`config/uwb/uwb_calib.pickle` at 7d81efd as JSON. With one flight, B is the part of it that is held out.",
         "miluv_cirObstacles_3_random_0.tar.xz",
         prepare_miluv,
         """\

@@ -5,7 +5,7 @@
 ['BadInputError', 'CalibError', 'Calibration', 'CorrectedRanges', 'FitResult']
 """
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from uwblink.lazy import offer
 
@@ -82,7 +82,7 @@ __all__ = [
     "write_report",
 ]
 
-_HOMES: Final = {
+_homes = {
     "BadInputError": "calib.errors",
     "CalibError": "calib.errors",
     "Calibration": "calib.calibration.model",
@@ -125,4 +125,4 @@ _HOMES: Final = {
 }
 
 if not TYPE_CHECKING:
-    __getattr__, __dir__ = offer(__name__, _HOMES)
+    __getattr__, __dir__ = offer(__name__, _homes)

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from scipy.stats import norm
 
 from calib.calibration.applying import CorrectedRanges
-from calib.calibration.comparison import Comparison
+from calib.calibration.comparison import CalibrationComparison
 from calib.calibration.model import Calibration
 from calib.data.ranges import Ranges
 from calib.estimator.grouped_errors import fit_grouped_errors
@@ -197,10 +197,11 @@ def delays(
 ) -> Axes:
     """Draw delays in ns with 95 % intervals, and planted delays moved by the common shift.
 
-    A delay far from all others is written at the edge; one without an interval is a circle.
+    A delay far from all others is written at the edge; one without an interval is a circle; tags of undetermined splits
+    are left out.
     """
     axes = axes or new_axes()
-    tags = sorted(calibration.delays_ns)
+    tags = sorted(calibration.delays_ns.keys() - calibration.sides.keys())
     place = np.arange(len(tags), dtype=np.float64)
     values = np.array([calibration.delays_ns[tag] for tag in tags])
     half = TWO_SIDED_95 * np.array([calibration.delays_std_ns.get(tag, np.nan) for tag in tags])
@@ -360,7 +361,7 @@ def _reach_cm(error: Floats) -> tuple[float, float]:
     return float(low) - margin, float(high) + margin
 
 
-def differences(width_in: float, found: Comparison) -> Figure:
+def differences(width_in: float, found: CalibrationComparison) -> Figure:
     """Draw the difference of each delay, second less first, with 95 % intervals and without the common shift."""
     figure, (axes,) = sheet(width_in, height_in=2.6)
     tags = sorted(found.difference_ns)

@@ -4,7 +4,7 @@ A check asks one question of a recording or of a fit. Its statistic has a known 
 gives a p-value; all checks share one budget of false alarms. What a sound recording may show besides chance (the delay
 of a warm board, a lever arm measured with a ruler) is a tolerance: the null hypothesis is "no more than the tolerance"
 (a minimum-effect test, Murphy and Myors 1999), so a small fault does not become a finding because a recording is long.
-Further conditions of a check only withhold findings, which keeps p-values valid.
+Other conditions can only suppress a finding, so p-values stay valid.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ TAKES_PART: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class Unknown:
+class InformationColumn:
     """One column of an information matrix: what it is ("delay"), of what ("3"), and how far it is known without data.
 
     Several columns may be the same thing of the same (the three coordinates of a position), and are named once.
@@ -53,7 +53,7 @@ class Verdict:
     column. `free` are the combinations of unknowns that the data leave free, in words.
     """
 
-    unknowns: tuple[Unknown, ...]
+    unknowns: tuple[InformationColumn, ...]
     std: Floats
     covariance: Floats
     free: tuple[str, ...]
@@ -73,16 +73,16 @@ class Verdict:
         return "\n".join(self.free) or "everything is determined"
 
 
-def judge(information: Floats, unknowns: Sequence[Unknown], *, loosest: float = LOOSEST) -> Verdict:
+def judge(information: Floats, unknowns: Sequence[InformationColumn], *, loosest: float = LOOSEST) -> Verdict:
     """Return what a positive semi-definite information matrix (n, n) says of its unknowns.
 
     A direction, or an unknown, counts as determined where its standard deviation is at most `loosest` times the scale
     (of a direction: of its parts together). Raises `BadInputError` for a matrix that is none.
 
     >>> import numpy as np
-    >>> from calib.information import Unknown, judge
+    >>> from calib.information import InformationColumn, judge
     >>> apart = np.array([[1.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
-    >>> verdict = judge(1e4 * apart.T @ apart, [Unknown("delay", tag) for tag in "123"])
+    >>> verdict = judge(1e4 * apart.T @ apart, [InformationColumn("delay", tag) for tag in "123"])
     >>> print(verdict)
     delay of 1 against delays of 2 and 3
     """
@@ -129,7 +129,7 @@ def reduced(information: Floats, keep: Sequence[int] | Bools) -> Floats:
     return np.asarray((vectors * values) @ vectors.T * unit[:, None] * unit)
 
 
-def _checked(information: Floats, unknowns: Sequence[Unknown], loosest: float) -> Floats:
+def _checked(information: Floats, unknowns: Sequence[InformationColumn], loosest: float) -> Floats:
     count, wrong = len(unknowns), ""
     if not count or np.shape(information) != (count, count):
         wrong = f"has the shape {np.shape(information)}, expected {count} rows and columns, one an unknown"
@@ -156,7 +156,7 @@ def _sparse(free: Floats) -> Iterator[Floats]:
         left = turned[1:]
 
 
-def _in_words(direction: Floats, unknowns: Sequence[Unknown]) -> str:
+def _in_words(direction: Floats, unknowns: Sequence[InformationColumn]) -> str:
     """Return what moves together: "all delays together with all positions" and the like."""
     named = np.abs(direction) > TAKES_PART * np.abs(direction).max()
     return " with ".join(
@@ -165,7 +165,7 @@ def _in_words(direction: Floats, unknowns: Sequence[Unknown]) -> str:
     )
 
 
-def _of_kind(kind: str, direction: Floats, named: Bools, unknowns: Sequence[Unknown]) -> str:
+def _of_kind(kind: str, direction: Floats, named: Bools, unknowns: Sequence[InformationColumn]) -> str:
     """Return the part of one kind: all, or which, and which grow as others shrink."""
     everyone = [k for k, unknown in enumerate(unknowns) if unknown.kind == kind]
     moving = [k for k in everyone if named[k]]

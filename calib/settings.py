@@ -19,9 +19,8 @@ from uwblink.text_files import TomlReader
 if TYPE_CHECKING:
     from uwblink import KnownDistance
 
-LIFTS: Final = ("mean-of-lifted", "lift-of-mean")
 CHOICES: Final = {
-    "lift": LIFTS,
+    "lift": ("mean-of-lifted", "lift-of-mean"),
     "constants": ("tag", "pair"),
     "fold": ("time", "pair", "session"),
     "attitudes": ("poses", "imu", "none"),
@@ -46,21 +45,14 @@ NUMBERS: Final = {
 }
 """The least and the largest value of a setting, and what is expected."""
 
-HIGHEST_TAG: Final = 65_535
-"""Ids of tags have 16 bits in recordings."""
-
-OBJECTS: Final = {"Calibration": "a calibration", "Knowledge": "known facts"}
-"""What results call settings that were given as objects."""
-
 FIXED: Any = {
+    "help": "Known delay of a tag, which stays as it is, as in 1=-0.36. May be repeated.",
     "flag": "--fix",
     "kind": list[str] | None,
     "tags": "{}=",
     "metavar": "TAG=NS",
 }
 """The option of known delays."""
-
-FIXED_HELP: Final = "Known delay of a tag, which stays as it is, as in 1=-0.36. May be repeated."
 
 ERRORS_PANEL: Final = "How errors count"
 MODEL_PANEL: Final = "What is fitted"
@@ -76,12 +68,13 @@ def check_choice(parameter: str, value: str, allowed: Iterable[str]) -> None:
 def check_tag(tag: object) -> None:
     """Raise `BadInputError` for what cannot be the id of a tag."""
     if not is_tag(tag):
-        raise BadInputError(f"found {tag!r}, expected the id of a tag, 0 to {HIGHEST_TAG}", parameter="tag")
+        raise BadInputError(f"found {tag!r}, expected the id of a tag, 0 to 65535", parameter="tag")
 
 
 def is_tag(value: object) -> bool:
     """Return whether a value can be the id of a tag."""
-    return isinstance(value, Integral) and not isinstance(value, bool) and 0 <= int(value) <= HIGHEST_TAG
+    # Ids have 16 bits in recordings (`uwblink.twr.LARGEST_ID`, which would load NumPy for the help of commands).
+    return isinstance(value, Integral) and not isinstance(value, bool) and 0 <= int(value) < 2**16
 
 
 def _is_finite(value: object) -> bool:
@@ -162,7 +155,8 @@ def _as_json(value: object) -> object:
         return {str(key): _as_json(one) for key, one in value.items()}
     if isinstance(value, tuple):
         return list(value)
-    return value if isinstance(value, str | int | float) else OBJECTS.get(type(value).__name__, str(value))
+    objects = {"Calibration": "a calibration", "Knowledge": "known facts"}
+    return value if isinstance(value, str | int | float) else objects.get(type(value).__name__, str(value))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,8 +172,7 @@ class FitSettings(CheckedSettings):
     `lift` and `alpha_dbm` make the lifted power of an exchange.
 
     `fixed_ns` are known delays by tag; `groups` are tags that share curves, by name (all do by default); `sequential`
-    fits delays first and then the curve to what they leave (ICRA 2023, sections III and IV). `minimum_norm` fits the
-    smallest delays that agree with the data where the pairs leave delays free. The curve is zero at
+    fits delays first and then the curve to what they leave (ICRA 2023, sections III and IV). The curve is zero at
     `reference_power_dbm`, `alpha_dbm` by default; `delays_only` fits no curve; `delays_from` is a calibration, or its
     path, whose delays are taken over; `constants` "pair" gives each pair a constant instead of each tag a delay. With
     `hold_out` a second fit, to the other ranges, is judged on such a share of them, by `fold`; what was found is in the
@@ -218,13 +211,12 @@ class FitSettings(CheckedSettings):
     lift: str = setting(
         "mean-of-lifted",
         "Lifted power of an exchange from the powers of its two ends.",
-        names=LIFTS,
+        names=CHOICES["lift"],
         rich_help_panel=MODEL_PANEL,
     )
     alpha_dbm: float = -82.0
     fixed_ns: Mapping[int, float] = setting(
         {},
-        FIXED_HELP,
         parse=read_fixed,
         rich_help_panel=MODEL_PANEL,
         **FIXED,
@@ -240,11 +232,6 @@ class FitSettings(CheckedSettings):
     sequential: bool = setting(
         False,
         "Fit the delays first, and then the curve to what they leave (ICRA 2023).",
-        rich_help_panel=MODEL_PANEL,
-    )
-    minimum_norm: bool = setting(
-        False,
-        "Fit the smallest delays that agree with the data where the pairs leave delays free.",
         rich_help_panel=MODEL_PANEL,
     )
     reference_power_dbm: float | None = setting(
@@ -273,7 +260,7 @@ class FitSettings(CheckedSettings):
 
     hold_out: float = setting(
         0.0,
-        "Share of the data by which a second fit, to the others, is judged: 0.3, for instance.",
+        "Share of the data to hold out, such as 0.3; a second fit, to the rest, is judged on it.",
         metavar="SHARE",
         rich_help_panel=MODEL_PANEL,
     )
@@ -385,6 +372,11 @@ class FlightSettings(CheckedSettings):
         kind=Path | None,
         rich_help_panel=FLIGHT_PANEL,
     )
+    minimum_norm: bool = setting(
+        False,
+        "Write the smallest delays that agree with the ranges also where these determine no delay.",
+        rich_help_panel=FLIGHT_PANEL,
+    )
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -414,7 +406,7 @@ class SurveySettings(CheckedSettings):
         kind=str,
         metavar="line|plane|FILE",
     )
-    fixed_ns: Mapping[int, float] = setting({}, FIXED_HELP, parse=read_fixed, **FIXED)
+    fixed_ns: Mapping[int, float] = setting({}, parse=read_fixed, **FIXED)
     pair_error_m: float | None = setting(
         None, "Constant error of a pair in an arrangement (m); by default estimated.", flag="--pair-error"
     )

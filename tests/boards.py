@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 import pytest
 
 from uwblink.boards.ports import SerialPort
-from uwbsim.boards.server import Faults, Server
+from uwbsim.boards.server import FaultsFile, Server
 from uwbsim.boards.virtual_board import VirtualPorts
 from uwbsim.scenario.model import Scenario
 
@@ -30,7 +30,7 @@ def bench_scenario(seed=1, **radio):
 @contextmanager
 def served(scenario=None, faults=None, link_dir=None, **more):
     """Serve a scenario in a thread; gives the server."""
-    wrong = Faults.model_validate({"faults": faults or []})
+    wrong = FaultsFile.model_validate({"faults": faults or []})
     server = Server(scenario or bench_scenario(), link_dir, wrong, **more)
     stop = threading.Event()
     thread = threading.Thread(target=server.run, args=(stop.is_set,), daemon=True)

@@ -38,9 +38,10 @@ CONFINED = {
     "mcap": lambda path: path in {"uwblink/importers/bags.py", "uwblink/exporters/mcap.py"},
     "rosbags": lambda path: path in {"uwblink/importers/bags.py", "uwblink/exporters/mcap.py"},
     "foxglove": lambda path: path == "uwblink/streaming/senders.py",
+    "pandas": lambda path: path == "uwblink/arrays.py",
     "distributed": lambda path: path == "uwbsim/sweep/executors.py",
 }
-NEVER = {"pickle", "pandas", "pyarrow"}
+NEVER = {"pickle", "pyarrow"}
 
 
 def violations(package: str, path: str, source: str) -> list[str]:

@@ -9,22 +9,22 @@ import typer
 import calib
 import uwblink
 import uwbsim
-from calib.calibration.document import FILE_KEYS as CALIBRATION
+from calib.calibration.document import CALIBRATION_KEYS as CALIBRATION
 from docs.site import commands, doors, file_keys
 from uwblink.boards import ranging_plan
 from uwblink.importers import column_map
 from uwblink.text_files import heads
 
 
-@pytest.mark.parametrize("module", [column_map, ranging_plan], ids=["map", "plan"])
-def test_the_reference_of_a_file_has_every_key_that_its_reader_knows(module):
-    entries = [line for line in file_keys.reference(module.FILE_KEYS).splitlines() if line.startswith("`")]
-    assert entries == [f"`{key.name}`" for key in module.FILE_KEYS]
-    assert all(key.kind and key.default and len(key.meaning) > 10 for key in module.FILE_KEYS)
+@pytest.mark.parametrize("keys", [column_map.MAP_KEYS, ranging_plan.PLAN_KEYS], ids=["map", "plan"])
+def test_the_reference_of_a_file_has_every_key_that_its_reader_knows(keys):
+    entries = [line for line in file_keys.reference(keys).splitlines() if line.startswith("`")]
+    assert entries == [f"`{key.name}`" for key in keys]
+    assert all(key.kind and key.default and len(key.meaning) > 10 for key in keys)
 
 
 def test_a_map_knows_the_tables_that_its_reference_has():
-    assert set(heads(column_map.FILE_KEYS)) == {
+    assert set(heads(column_map.MAP_KEYS)) == {
         *("layout", "bits", "counter", "protocol", "delimiter", "decimal", "within_s", "each", "topics"),
         *("line", "from_name", "missing", "chip", "prf", "wide"),
         *("columns", "units", "constants", "ids", "antenna_delays"),
@@ -54,6 +54,8 @@ def test_the_reference_of_calibrations_has_every_key_of_files_and_no_other():
         received = dataclasses.replace(calibration, power_at="reception")
         for one in (calibration, received):
             found |= set(flat(json.loads(one.to_json())))
+    ranges = calib.load_ranges(flight)
+    found |= set(flat(json.loads(calib.fit(ranges[ranges.initiator == 1]).calibration.to_json())))
     assert found == {key.name for key in CALIBRATION}
 
 

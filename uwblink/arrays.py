@@ -7,7 +7,7 @@ what is expected.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Self
 
@@ -67,6 +67,10 @@ class ColumnTable:
         """
         return self._columns()
 
+    def to_pandas(self) -> Any:
+        """Return the columns as a `pandas.DataFrame`; raises `ArgumentError` where pandas is not installed."""
+        return data_frame(self.to_dict())
+
     def _title(self) -> str:
         raise NotImplementedError
 
@@ -80,6 +84,21 @@ class ColumnTable:
     def _repr_html_(self) -> str:
         """Return the same for a notebook, with every column."""
         return as_html(self._title(), excerpt(self._shown()))
+
+
+def is_frame(value: object) -> bool:
+    """Return whether an object is a data frame, or a table that others can read by Arrow's interface in C."""
+    return hasattr(value, "__arrow_c_stream__") or hasattr(value, "__dataframe__")
+
+
+def data_frame(rows: Mapping[str, NDArray[Any]] | Sequence[Mapping[str, Any]]) -> Any:
+    """Return columns, or rows of which values may be mappings, as a `pandas.DataFrame`.
+
+    Raises `ArgumentError` where pandas is not installed.
+    """
+    with raising(ArgumentError, "a data frame needs pandas: `pip install pandas`, or use `to_dict`", ImportError):
+        import pandas
+    return pandas.DataFrame(rows) if isinstance(rows, Mapping) else pandas.json_normalize(list(rows), sep="_")
 
 
 def length(name: str, values: ArrayLike) -> int:

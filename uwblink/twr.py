@@ -134,7 +134,10 @@ class Exchanges(ColumnTable):
 COLUMNS: Final = tuple(f.name for f in fields(Exchanges) if f.name != "bits")
 BITS: Final = (REPORT_BITS, COUNTER_BITS)
 LARGEST_ID: Final = 65_535
+"""Ids have 16 bits in recordings."""
+
 LATEST_NS: Final = 2**62
+"""In the year 2116; differences of two such times fit into 64 bits."""
 
 
 def names_in(words: NDArray[np.str_]) -> list[str]:

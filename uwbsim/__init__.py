@@ -5,7 +5,7 @@
 ['simulate', 'through_wire', 'twin']
 """
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from uwblink.lazy import offer
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from uwbsim.boards.virtual_board import VirtualPorts
     from uwbsim.errors import ParameterError, ScenarioError, UwbsimError
     from uwbsim.pages.documents import show
-    from uwbsim.protocols.comparison import Comparison, compare, optimum
+    from uwbsim.protocols.comparison import ProtocolComparison, compare, optimum
     from uwbsim.protocols.prediction import Prediction, State, predict_state
     from uwbsim.scenario.loading import load, shipped_scenarios
     from uwbsim.scenario.model import Scenario
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from uwbsim.world.channel import register_channel_effect
 
 __all__ = [
-    "Comparison",
     "ParameterError",
     "Prediction",
+    "ProtocolComparison",
     "Scenario",
     "ScenarioError",
     "Server",
@@ -56,10 +56,10 @@ __all__ = [
     "twin",
 ]
 
-_HOMES: Final = {
-    "Comparison": "uwbsim.protocols.comparison",
+_homes = {
     "ParameterError": "uwbsim.errors",
     "Prediction": "uwbsim.protocols.prediction",
+    "ProtocolComparison": "uwbsim.protocols.comparison",
     "Scenario": "uwbsim.scenario.model",
     "ScenarioError": "uwbsim.errors",
     "Server": "uwbsim.boards.server",
@@ -85,4 +85,4 @@ _HOMES: Final = {
 }
 
 if not TYPE_CHECKING:
-    __getattr__, __dir__ = offer(__name__, _HOMES)
+    __getattr__, __dir__ = offer(__name__, _homes)

@@ -11,7 +11,7 @@ class ScenarioError(UwbsimError, ValueError):
     """A scenario that cannot be run; the text names the file, the key, what was found."""
 
 
-class UnanswerableError(ScenarioError):
+class TooFewDataError(ScenarioError):
     """A sound recording with too little data for a twin: exit status 1."""
 
 

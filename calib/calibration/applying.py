@@ -7,14 +7,15 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calib.calibration.document import T, pair_name
+from calib.calibration.document import Value, pair_name, split_text
 from calib.calibration.power_curves import ends, lift
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError
 from calib.pairs import pairs_of
-from uwblink.arrays import Bools, Floats
-from uwblink.display import as_text, excerpt, first_few
+from uwblink.arrays import Bools, Floats, data_frame
+from uwblink.display import as_html, as_text, excerpt, first_few
 
 if TYPE_CHECKING:
     from calib.calibration.model import Calibration
@@ -51,13 +52,24 @@ class CorrectedRanges:
     tail_probability: Floats
     outlier: Bools
 
+    def to_dict(self) -> dict[str, NDArray[Any]]:
+        """Return the columns by name, as `pandas.DataFrame` and `polars.DataFrame` take them."""
+        return {column.name: getattr(self, column.name) for column in fields(self)}
+
+    def to_pandas(self) -> Any:
+        """Return the columns as a `pandas.DataFrame`; raises `ArgumentError` where pandas is not installed."""
+        return data_frame(self.to_dict())
+
     def __repr__(self) -> str:
         """Return a headline and the first rows, in lines of 79 characters."""
-        columns = {column.name: getattr(self, column.name) for column in fields(self)}
-        return as_text(f"{len(self.raw_m)} corrected ranges", excerpt(columns))
+        return as_text(f"{len(self.raw_m)} corrected ranges", excerpt(self.to_dict()))
+
+    def _repr_html_(self) -> str:
+        """Return the same as HTML, for notebooks."""
+        return as_html(f"{len(self.raw_m)} corrected ranges", excerpt(self.to_dict()))
 
 
-class CorrectedRange(NamedTuple, Generic[T]):
+class CorrectedRange(NamedTuple, Generic[Value]):
     """A corrected range and its standard deviation, metres; `clamped` where its power is beyond the curves'.
 
     `sigma_m` is the noise of a direct range; `sigma_total_m` includes reflections, which are the share `tail_share` of
@@ -65,11 +77,11 @@ class CorrectedRange(NamedTuple, Generic[T]):
     has the delays' part only, and its standard deviations are NaN. Each is a number, or an array (n,).
     """
 
-    range_m: T
-    sigma_m: T
+    range_m: Value
+    sigma_m: Value
     clamped: Any
-    sigma_total_m: T
-    tail_share: T
+    sigma_total_m: Value
+    tail_share: Value
 
     def __repr__(self) -> str:
         """Return a headline and the first rows, in lines of 79 characters."""
@@ -102,10 +114,25 @@ def _without_delays(calibration: Calibration, ranges: Ranges) -> Floats:
             f"{ranges.source}: no delay for tag {', '.join(map(str, missing))} in the calibration, "
             f"which knows {known}; fit one from a recording with all tags"
         )
+    _refuse_within(calibration, ranges)
     size = max(ranges.tags(), default=0) + 1
     delay_s = np.array([calibration.delays_ns.get(t, math.nan) for t in range(size)]) * 1e-9
     flight = ranges.weight_initiator * delay_s[ranges.initiator] + ranges.weight_target * delay_s[ranges.target]
     return ranges.raw_m + calibration.speed_of_light * flight - _offsets_m(calibration, ranges)
+
+
+def _refuse_within(calibration: Calibration, ranges: Ranges) -> None:
+    """Raise `BadInputError` for a pair whose delays the calibration knows only in sums with others."""
+    sides = calibration.sides
+    if not sides:
+        return
+    ends = pairs_of(ranges.initiator, ranges.target).ends.tolist()
+    apart = [pair for pair in ends if sum(sides.get(tag, 0) for tag in pair)]
+    if apart:
+        raise BadInputError(
+            f"{ranges.source}: the calibration does not determine the ranges of {first_few(map(pair_name, apart))}: "
+            f"{split_text(calibration.undetermined_splits)}"
+        )
 
 
 def _offsets_m(calibration: Calibration, ranges: Ranges) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -9,20 +10,21 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calib.calibration.document import for_json
-from calib.calibration.model import Calibration, interval, require_calibration
+from calib.calibration.model import Calibration, CalibrationSource, given_calibration, interval
 from calib.errors import UnanswerableError
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Comparison:
-    """Differences second minus first, after a shift common to all delays has been taken out.
+class CalibrationComparison:
+    """Differences second minus first, after what delays share with other constants has been taken out.
 
-    The shift and a constant of the curve are the same thing, so only together do they mean anything: `offset_m` is
-    what the second calibration adds to every range beyond the first, at equal power. `std_ns` is NaN for tags of which
-    a calibration states no standard error, as published ones; where fewer than two tags have one in both, nothing can
-    be tested, and `chi_square` and `probability` are NaN.
+    A shift common to all delays and a constant of the curve are the same thing, so only together do they mean anything:
+    `offset_m` is what the second calibration adds to every range beyond the first, at equal power. What a calibration's
+    `undetermined_splits` leave open is taken out, too. `std_ns` is NaN for tags of which a calibration states no
+    standard error, as published ones; `chi_square` has `degrees` of freedom, and where there are none, nothing can be
+    tested, and `chi_square` and `probability` are NaN.
     """
 
     difference_ns: dict[int, float]
@@ -30,6 +32,7 @@ class Comparison:
     offset_m: float
     curve_rms_m: float
     chi_square: float
+    degrees: int
     probability: float
     only_first: tuple[int, ...]
     only_second: tuple[int, ...]
@@ -62,12 +65,11 @@ class Comparison:
         )
         sides = (first, self.only_first), (second, self.only_second)
         only = [f"only in {name}: tags {', '.join(map(str, tags))}" for name, tags in sides if tags]
-        tested = sum(np.isfinite(std) for std in self.std_ns.values())
-        verdict = "no verdict: fewer than two tags have a standard error in both calibrations"
+        verdict = "no verdict: too few tags have a standard error in both calibrations"
         if self.verdict != "unknown":
             verdict = (
                 f"the delays are {'the same' if self.same else 'different'}: chi-square {self.chi_square:.1f} with "
-                f"{tested - 1} degrees of freedom, probability {self.probability:.3f}"
+                f"{self.degrees} degrees of freedom, probability {self.probability:.3f}"
             )
         return "\n".join([*lines, shapes, *only, verdict])
 
@@ -77,56 +79,77 @@ class Comparison:
         return table
 
 
-def compare(first: Calibration, second: Calibration) -> Comparison:
+def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationComparison:
     """Test whether the delays of two calibrations differ by more than their standard errors explain, by chi-square.
 
-    Differences in ns are second minus first, less the shift common to all delays. Raises `UnanswerableError` where
-    fewer than two tags have a determined delay in both.
+    Differences in ns are second minus first, less what is common to all delays and what undetermined splits leave open.
+    Raises `UnanswerableError` where fewer than two tags have a determined delay in both.
 
     >>> import calib
     >>> first, second = (calib.fit(calib.sample_flight(seed=seed)).calibration for seed in (1, 2))
     >>> calib.compare(first, second).same
     True
     """
-    require_calibration(first, "first")
-    require_calibration(second, "second")
+    first = given_calibration(first, "first")
+    second = given_calibration(second, "second")
     if first.pair_offsets or second.pair_offsets:
         raise UnanswerableError("constants of pairs are no delays, and only delays can be compared")
-    known = [{t for t in c.delays_ns if not np.isinf(c.delays_std_ns.get(t, np.nan))} for c in (first, second)]
+    both = (first, second)
+    known = [{t for t in c.delays_ns if t in c.sides or not np.isinf(c.delays_std_ns.get(t, np.nan))} for c in both]
     common = sorted(known[0] & known[1])
     if len(common) < 2:
         raise UnanswerableError(
             f"{len(common)} tags have determined delays in both calibrations, at least two are needed to compare"
         )
-    delta = {t: second.delays_ns[t] - first.delays_ns[t] for t in common}
-    stated = [t for t in common if all(t in c.delays_std_ns for c in (first, second))]
-    std_ns = dict.fromkeys(common, np.nan)
-    shift, score, probability = float(np.mean(list(delta.values()))), np.nan, np.nan
+    stated = [t for t in common if all(_is_stated(c, t) for c in both)]
+    tags = stated if len(stated) > 1 else common
+    delta = np.array([second.delays_ns[t] - first.delays_ns[t] for t in common])
+    loose = loose_shifts(both, common)
+    rows = np.isin(common, tags)
+    covariance = np.eye(len(tags))
     if len(stated) > 1:
-        # The shift is the most likely one; what is left has a covariance of one rank less.
-        covariance = sum(_covariance_ns2(c, stated) for c in (first, second)) + 1e-12 * np.eye(len(stated))
-        precision = np.linalg.inv(covariance)
-        weight = precision.sum(axis=0)
-        left = np.array([delta[t] for t in stated])
-        shift = float(weight @ left / weight.sum())
-        score = float((left - shift) @ precision @ (left - shift))
-        probability = float(chdtrc(len(stated) - 1, score))
-        std = np.sqrt(np.maximum(np.diag(covariance - 1 / weight.sum()), 0))
+        covariance = sum(_covariance_ns2(c, stated) for c in both) + 1e-12 * np.eye(len(stated))
+    # Most likely values of what is loose; what is left has a covariance of as many ranks less.
+    precision = np.linalg.inv(covariance)
+    of_loose = np.linalg.pinv(loose[rows].T @ precision @ loose[rows], hermitian=True)
+    taken = of_loose @ loose[rows].T @ precision @ delta[rows]
+    left = delta - loose @ taken
+    degrees = len(stated) - int(np.linalg.matrix_rank(loose[rows]))
+    std_ns = dict.fromkeys(common, np.nan)
+    score = probability = np.nan
+    if degrees > 0:
+        score = float(left[rows] @ precision @ left[rows])
+        probability = float(chdtrc(degrees, score))
+        std = np.sqrt(np.maximum(np.diag(covariance - loose[rows] @ of_loose @ loose[rows].T), 0))
         std_ns |= dict(zip(stated, std.tolist(), strict=True))
     low = max(first.bias_curve.range[0], second.bias_curve.range[0])
     high = min(first.bias_curve.range[1], second.bias_curve.range[1])
     grid = np.linspace(low, max(high, low + 1e-9), 400)
     curves = second.bias_curve(grid) - first.bias_curve(grid)
-    return Comparison(
-        difference_ns={tag: one - shift for tag, one in delta.items()},
+    return CalibrationComparison(
+        difference_ns=dict(zip(common, left.tolist(), strict=True)),
         std_ns=std_ns,
-        offset_m=shift * 1e-9 * SPEED_OF_LIGHT - float(curves.mean()),
+        offset_m=float(taken[0]) * 1e-9 * SPEED_OF_LIGHT - float(curves.mean()),
         curve_rms_m=float(curves.std()),
         chi_square=score,
+        degrees=max(degrees, 0),
         probability=probability,
         only_first=tuple(sorted(set(first.delays_ns) - set(common))),
         only_second=tuple(sorted(set(second.delays_ns) - set(common))),
     )
+
+
+def loose_shifts(calibrations: Iterable[Calibration], tags: list[int]) -> Floats:
+    """Return shifts of delays (tags, k) that say nothing: of all delays, and along each undetermined split."""
+    splits = [sides for calibration in calibrations for sides in calibration.undetermined_splits]
+    along = [np.isin(tags, first) * 1.0 - np.isin(tags, second) for first, second in splits]
+    return np.column_stack([np.ones(len(tags)), *along])
+
+
+def _is_stated(calibration: Calibration, tag: int) -> bool:
+    """Return whether a calibration states how well it knows a delay."""
+    covered = calibration.uncertainty is not None and tag in calibration.uncertainty.tags
+    return covered or np.isfinite(calibration.delays_std_ns.get(tag, np.nan))
 
 
 def _covariance_ns2(calibration: Calibration, tags: list[int]) -> Floats:

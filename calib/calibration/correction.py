@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.calibration.applying import CorrectedRanges, columns_of
-from calib.calibration.model import Calibration, load_calibration, require_calibration
+from calib.calibration.model import Calibration, CalibrationSource, given_calibration, load_calibration
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError
 from uwblink.arrays import Floats
@@ -38,7 +38,7 @@ class Applied:
 
 def apply(
     source: str | os.PathLike[str],
-    calibration: Calibration,
+    calibration: CalibrationSource,
     output: str | os.PathLike[str],
     *,
     to: str | None = None,
@@ -61,7 +61,7 @@ def apply(
     ...     calib.apply(f"{folder}/flight.uwb", known, f"{folder}/corrected.uwb").count
     900
     """
-    require_calibration(calibration)
+    calibration = given_calibration(calibration)
     if to is None:
         return _write(source, calibration, Path(output), force=force)
     check_export(output, to=to, force=force)

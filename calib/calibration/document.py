@@ -21,11 +21,12 @@ from pydantic_core import ErrorDetails
 
 from calib.data.ranges import MAX_RANGE_M
 from calib.errors import BadInputError
+from uwblink.display import first_few
 from uwblink.text_files import FileKey
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import LARGEST_ID
 
-T = TypeVar("T")
+Value = TypeVar("Value")
 
 
 def _curve_keys(name: str, of: str) -> tuple[FileKey, ...]:
@@ -39,9 +40,12 @@ def _curve_keys(name: str, of: str) -> tuple[FileKey, ...]:
     )
 
 
-FILE_KEYS: Final = (
+CALIBRATION_KEYS: Final = (
     FileKey(
-        "schema_version", "1 to 4", "needed", "2 with `groups`, 3 with `power_at` reception, 4 with `pair_offsets`."
+        "schema_version",
+        "1 to 5",
+        "needed",
+        "2 with `groups`, 3 with `power_at` reception, 4 with `pair_offsets`, 5 with `undetermined_splits`.",
     ),
     FileKey("delays_ns.TAG", "number, ns", "needed", "Aggregate antenna delay of a tag, transmit less receive."),
     FileKey("delays_std_ns.TAG", "number, ns, or null", "needed", "Its standard error; null where data leave it free."),
@@ -105,6 +109,12 @@ FILE_KEYS: Final = (
     FileKey("uncertainty.delays_ns2", "matrix, ns²", "needed", "Covariance of the delays."),
     FileKey("uncertainty.bias_m2", "matrix, m²", "needed", "Covariance of the bias curve's coefficients."),
     FileKey("uncertainty.sigma_m2", "matrix, m²", "needed", "Covariance of the other curve's coefficients."),
+    FileKey(
+        "undetermined_splits",
+        "pairs of lists of tags",
+        "none",
+        "Sides that ranged only with each other: only ranges between the two sides can be corrected.",
+    ),
 )
 
 
@@ -167,6 +177,24 @@ def pair_name(pair: Sequence[int]) -> str:
     return "-".join(map(str, pair))
 
 
+def _tags_text(tags: Tags) -> str:
+    return f"tag{'s' * (len(tags) > 1)} {first_few(map(str, tags))}"
+
+
+def known_of_splits(splits: Iterable[Split]) -> str:
+    """Return in words which ranges undetermined splits leave known."""
+    known = "; ".join(" and ".join(map(_tags_text, sides)) for sides in splits)
+    return f"only ranges between {known} are determined"
+
+
+def split_text(splits: Iterable[Split]) -> str:
+    """Return in words which ranges undetermined splits leave known, why, and what determines the others."""
+    return (
+        f"{known_of_splits(splits)}, because the delays of one side can grow as those of the other shrink; ranges "
+        "among three of these tags, or a known delay (`fixed_ns`), determine the rest"
+    )
+
+
 MAX_DELAY_NS: Final = 1e4
 """Largest delay: a register holds 1026 ns and a device has two; ten metres of cable are 50 ns. The rest is margin (3 km
 of range)."""
@@ -200,6 +228,8 @@ FreeStdNs = Annotated[
 ]
 """A standard error, which is infinite (null in files) where data leave a delay free."""
 
+Tags = tuple[Annotated[int, number(0, LARGEST_ID, "the id of a tag", int)], ...]
+Split = tuple[Tags, Tags]
 TagKey = Annotated[int, expect("tag ids as keys", is_tag, int)]
 PairKey = Annotated[
     tuple[int, int], expect("two tag ids as keys, as in 1-2", is_pair, ends_of), PlainSerializer(pair_name)
@@ -208,19 +238,19 @@ PairName = Annotated[str, expect("names of pairs, as in 1-2", is_pair, lambda na
 IN_ORDER: Final = WrapSerializer(lambda table, write: write(dict(sorted(table.items()))))
 """Writes a table in the order of its keys."""
 
-OPTIONAL_KEYS: Final = ("power_at", "groups", "errors", "pair_offsets", "antenna_delays", "uncertainty")
-"""Keys of a file that are left out where there is nothing to say; they stand last, in this order."""
 
-
-def write(calibration: T, adapter: TypeAdapter[T]) -> str:
+def write(calibration: Value, adapter: TypeAdapter[Value]) -> str:
     """Return a calibration as JSON text.
 
     The version is what a program must support to read it: 2 with groups of tags, 3 with a curve that is taken at each
-    reception (taken at the mean power it is wrong by up to a decimetre), 4 with constants of pairs.
+    reception (taken at the mean power it is wrong by up to a decimetre), 4 with constants of pairs, 5 with pairs that
+    cannot be corrected.
     """
     table = adapter.dump_python(calibration, mode="json")
-    used = {key: value for key in OPTIONAL_KEYS if (value := table.pop(key)) and value != "exchange"}
-    needed = (("pair_offsets", 4), ("power_at", 3), ("groups", 2))
+    # These are left out where there is nothing to say; they stand last, in this order.
+    optional = ("power_at", "groups", "errors", "pair_offsets", "antenna_delays", "uncertainty", "undetermined_splits")
+    used = {key: value for key in optional if (value := table.pop(key)) and value != "exchange"}
+    needed = (("undetermined_splits", 5), ("pair_offsets", 4), ("power_at", 3), ("groups", 2))
     version = next((version for key, version in needed if key in used), 1)
     text = json.dumps({"schema_version": version} | table | used, indent=1, allow_nan=False)
     # Lists of numbers stand on one line each: a matrix reads as rows.
@@ -230,7 +260,7 @@ def write(calibration: T, adapter: TypeAdapter[T]) -> str:
     return on_lines + "\n"
 
 
-def read(adapter: TypeAdapter[T], text: str, where: str) -> T:
+def read(adapter: TypeAdapter[Value], text: str, where: str) -> Value:
     """Return what an adapter makes of JSON text; raises `BadInputError` that names `where` and the key."""
     try:
         table = json.loads(text, parse_float=finite, parse_constant=finite)
@@ -238,8 +268,8 @@ def read(adapter: TypeAdapter[T], text: str, where: str) -> T:
         raise BadInputError(f"{where}: not JSON ({error})") from error
     if not isinstance(table, dict) or "schema_version" not in table:
         raise BadInputError(f"{where}: not a calibration (no schema_version)")
-    if table["schema_version"] not in (1, 2, 3, 4):
-        raise BadInputError(f"{where}: schema version {table['schema_version']!r}, this uwbcal reads 1, 2, 3 and 4")
+    if table["schema_version"] not in (1, 2, 3, 4, 5):
+        raise BadInputError(f"{where}: schema version {table['schema_version']!r}, this uwbcal reads 1 to 5")
     try:
         return adapter.validate_python(table)
     except ValidationError as error:

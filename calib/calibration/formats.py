@@ -16,7 +16,7 @@ from scipy.interpolate import PPoly
 
 from calib.calibration.document import ends_of, finite
 from calib.calibration.error_model import ErrorModel
-from calib.calibration.model import Calibration, require_calibration
+from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.data.ranges import FAINTEST_DBM, LOUDEST_DBM
 from calib.data.sources import antenna_delays_in
@@ -33,10 +33,7 @@ from uwblink.recording.antenna_delays import (
 )
 from uwblink.recording.file import Recording
 from uwblink.text_files import read_text
-from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
-
-TX_SHARE: Final = 0.44
-"""The transmitter's share of an aggregate delay; the receiver has the rest (APS014, section 2; the authors' code)."""
+from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, TX_SHARE
 
 
 def programmed(path: str | os.PathLike[str]) -> AntennaDelays:
@@ -152,7 +149,9 @@ def _miluv(calibration: Calibration) -> str:
 
 def _ros_yaml(calibration: Calibration, base: AntennaDelays | None) -> str:
     to_program = {
-        tag: {"tx_antenna_delay": one.tx, "rx_antenna_delay": one.rx} for tag, one in _on_top(calibration, base).items()
+        tag: {"tx_antenna_delay": one.tx, "rx_antenna_delay": one.rx}
+        for tag, one in _on_top(calibration, base).items()
+        if tag not in calibration.sides
     }
     tags = {str(t): {"delay_ns": d} | to_program.get(t, {}) for t, d in sorted(calibration.delays_ns.items())}
     document: dict[str, Any] = {
@@ -163,6 +162,8 @@ def _ros_yaml(calibration: Calibration, base: AntennaDelays | None) -> str:
         "bias_curve": asdict(calibration.bias_curve),
         "sigma_curve": asdict(calibration.sigma_curve),
     }
+    if calibration.undetermined_splits:
+        document["undetermined_splits"] = [list(map(list, sides)) for sides in calibration.undetermined_splits]
     if calibration.errors:
         document["errors"] = _error_tables(calibration.errors)
     text: str = yaml.safe_dump({"uwb_calibration": document}, sort_keys=False, default_flow_style=None, width=math.inf)
@@ -232,17 +233,17 @@ static int uwb_lifted(double *fpp1_dbm, double *fpp2_dbm, double *lifted)
 
 /* Correct a range in metres by the powers of both ends in dBm (0 or NaN: not measured). Returns 0; 1 where the power is
    beyond the fitted ones; 2 where no power was measured (only the delays are corrected, sigma is NaN); -1 for a tag
-   that has no delay (nothing is written). sigma_m may be NULL. */
+   that has no delay and for a pair whose correction is not determined (nothing is written). sigma_m may be NULL. */
 static inline int uwb_correct(double range_m, double fpp1_dbm, double fpp2_dbm, int initiator, int target,
                               double *corrected_m, double *sigma_m)
 {
     double first = 0.0, second = 0.0, lifted, bias;
-    int k, found = 0;
+    int k, found = 0, sides = 0;
     for (k = 0; k < UWB_TAGS; k++) {
-        if (uwb_tag[k] == initiator) { first = uwb_delay_m[k]; found |= 1; }
-        if (uwb_tag[k] == target) { second = uwb_delay_m[k]; found |= 2; }
+        if (uwb_tag[k] == initiator) { first = uwb_delay_m[k]; sides += uwb_side[k]; found |= 1; }
+        if (uwb_tag[k] == target) { second = uwb_delay_m[k]; sides += uwb_side[k]; found |= 2; }
     }
-    if (found != 3)
+    if (found != 3 || sides != 0)
         return -1;
     *corrected_m = range_m + 0.5 * first + 0.5 * second;
     if (sigma_m)
@@ -319,6 +320,8 @@ def c_header(calibration: Calibration) -> str:
         f"#define UWB_FAINTEST_DBM {_number(FAINTEST_DBM)}",
         f"#define UWB_LOUDEST_DBM {_number(LOUDEST_DBM)}",
         f"static const int uwb_tag[UWB_TAGS] = {{{', '.join(map(str, tags))}}};",
+        "/* Where only sums of delays are known: ranges can be corrected if the sides of both tags add to 0. */",
+        f"static const int uwb_side[UWB_TAGS] = {{{', '.join(str(calibration.sides.get(tag, 0)) for tag in tags)}}};",
         f"static const double uwb_delay_m[UWB_TAGS] = {{{_numbers(metres)}}};",
         *_c_curve("bias", bias),
         *_c_curve("sigma", calibration.sigma_curve),
@@ -397,7 +400,7 @@ FORMATS: Final[dict[str, Callable[[Calibration, AntennaDelays | None], str]]] = 
 
 
 def export(
-    calibration: Calibration,
+    calibration: CalibrationSource,
     to: str,
     path: str | os.PathLike[str] | None = None,
     *,
@@ -416,7 +419,7 @@ def export(
     >>> print(calib.export(calib.fit(calib.sample_flight()).calibration, "registers").splitlines()[2])
     [antenna_delays.tags.1]
     """
-    require_calibration(calibration)
+    calibration = given_calibration(calibration)
     if to not in FORMATS:
         raise BadInputError(f"found {to!r}, allowed: {', '.join(FORMATS)}", parameter="to")
     if calibration.pair_offsets and to != "json":

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, overload
+from typing import Annotated, Any, Final, Literal, Protocol, overload, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,12 +24,13 @@ from calib.calibration.document import (
     Number,
     PairKey,
     PowerDbm,
+    Split,
     StdM,
     StdNs,
     TagKey,
+    Tags,
     expect,
     joint,
-    number,
     one_of,
     pair_name,
     read,
@@ -45,9 +46,6 @@ from uwblink.display import as_html, as_text
 from uwblink.output import write_text
 from uwblink.recording.antenna_delays import REGISTER_MAX, AntennaDelay
 from uwblink.text_files import read_text
-from uwblink.twr import LARGEST_ID
-
-Tags = tuple[Annotated[int, number(0, LARGEST_ID, "the id of a tag", int)], ...]
 
 Matrix = tuple[tuple[Number, ...], ...]
 """A matrix as a tuple of rows."""
@@ -116,6 +114,10 @@ class Calibration:
     `pair_offsets`, by pair with the smaller id first, ranges of a pair read longer by its constant, in addition to
     delays and curves, and a pair that has none cannot be corrected. `antenna_delays` is what was programmed into the
     tags when they were recorded, which delays are on top of; empty where that is not known.
+
+    `undetermined_splits` are pairs of sides, as anchors and robots, that ranged only with each other: the delays of one
+    side may be longer and those of the other shorter by as much. Ranges between two sides can be corrected, and no
+    others of their tags.
     """
 
     delays_ns: Annotated[dict[TagKey, DelayNs], IN_ORDER]
@@ -134,6 +136,37 @@ class Calibration:
     pair_offsets: Annotated[dict[PairKey, PairOffset], IN_ORDER] = field(default_factory=dict)
     antenna_delays: Annotated[Mapping[TagKey | None, Registers], IN_ORDER] = field(default_factory=dict)
     uncertainty: Uncertainty | None = None
+    undetermined_splits: tuple[Split, ...] = ()
+
+    @property
+    def sides(self) -> dict[int, int]:
+        """Return the side of each tag in a split, by its number from 1 and by the sign: two opposite ones add to 0."""
+        return {
+            tag: sign * number
+            for number, sides in enumerate(self.undetermined_splits, 1)
+            for sign, tags in zip((1, -1), sides, strict=True)
+            for tag in tags
+        }
+
+    @property
+    def pair_constants(self) -> dict[tuple[int, int], PairOffset]:
+        """Return by how much ranges of a pair are too long, where constants of pairs are known and delays are not.
+
+        Those are `pair_offsets`, and the pairs between the sides of `undetermined_splits`.
+        """
+        found, half_m = dict(self.pair_offsets), 0.5e-9 * self.speed_of_light
+        for one, other in self.undetermined_splits:
+            for pair in sorted((min(a, b), max(a, b)) for a in one for b in other):
+                delay_ns = sum(self.delays_ns[tag] for tag in pair)
+                found[pair] = PairOffset(-half_m * delay_ns, half_m * self._std_of_sum_ns(pair))
+        return found
+
+    def _std_of_sum_ns(self, tags: Collection[int]) -> float:
+        """Return the standard error of the sum of some tags' delays, NaN where it is not known."""
+        if self.uncertainty is None:
+            return math.nan
+        own = np.isin(self.uncertainty.tags, list(tags))
+        return math.sqrt(max(float(own @ np.array(self.uncertainty.delays_ns2) @ own), 0.0))
 
     @property
     def stopped(self) -> bool:
@@ -169,7 +202,8 @@ class Calibration:
     def apply(self, ranges: Ranges) -> CorrectedRanges:
         """Correct ranges: c (w_i d_i + w_j d_j) for the delays (ICRA 2023, section III), then the curve.
 
-        Raises `BadInputError` naming the tags that have no delay in this calibration, or the pair that has no constant.
+        Raises `BadInputError` naming the tags that have no delay in this calibration, the pair that has no constant, or
+        the pair that an undetermined split leaves open.
         """
         return corrected_ranges(self, ranges)
 
@@ -269,7 +303,10 @@ class Calibration:
 
 
 def _misfit(calibration: Calibration) -> str:
-    """Return the mistake in the sizes of covariance matrices, "" if there is none."""
+    """Return the mistake in splits or in the sizes of covariance matrices, "" if there is none."""
+    split = [tag for sides in calibration.undetermined_splits for tags in sides for tag in tags]
+    if len(set(split)) < len(split) or not calibration.delays_ns.keys() >= set(split):
+        return "undetermined_splits: expected sides of calibrated tags, each of which has one side"
     known = calibration.uncertainty
     if known is None:
         return ""
@@ -289,17 +326,6 @@ def _misfit(calibration: Calibration) -> str:
 _ADAPTER: Final[TypeAdapter[Calibration]] = TypeAdapter(Annotated[Calibration, joint(_misfit)])
 
 
-def require_calibration(value: object, parameter: str = "calibration") -> None:
-    """Raise `BadInputError` where an argument is no `Calibration`."""
-    if isinstance(value, Calibration):
-        return
-    # What a fit or a survey returns is easily taken for its calibration, and its repr is a page long.
-    has_one = isinstance(getattr(value, "calibration", None), Calibration)
-    remedy = "give its `.calibration`" if has_one else "`load_calibration` reads one from a file"
-    seen = repr(value) if isinstance(value, str | os.PathLike) else type(value).__name__
-    raise BadInputError(f"found {seen:.60}, expected a Calibration; {remedy}", parameter=parameter)
-
-
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     """Return the calibration in a JSON file; raises `BadInputError` that names the file, and the key that is wrong.
 
@@ -312,11 +338,29 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     return Calibration.from_json(read_text(path, BadInputError, "calibration file (.json)"), str(path))
 
 
-def given_calibration(source: Calibration | str | os.PathLike[str] | None, parameter: str) -> Calibration | None:
-    """Return the calibration that is given as an object or as its path; errors name `parameter`."""
+@runtime_checkable
+class HasCalibration(Protocol):
+    """What a fit or a survey returns."""
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration."""
+
+
+CalibrationSource = Calibration | HasCalibration | str | os.PathLike[str]
+"""A calibration, the result of a fit or a survey, or the path of a calibration's file."""
+
+
+def given_calibration(source: CalibrationSource, parameter: str = "calibration") -> Calibration:
+    """Return the calibration that an argument gives.
+
+    Raises `BadInputError` that names `parameter` where it gives none, and what `load_calibration` raises.
+    """
     known = load_calibration(source) if isinstance(source, str | os.PathLike) else source
-    if known is not None:
-        require_calibration(known, parameter)
+    known = getattr(known, "calibration", known)
+    if not isinstance(known, Calibration):
+        seen = f"found {type(source).__name__}"
+        raise BadInputError(f"{seen}, expected a Calibration, the result of a fit, or a path", parameter=parameter)
     return known
 
 
@@ -344,16 +388,16 @@ def interval(std: float, digits: int = 4) -> str:
 
 def pair_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
     """Return each pair, the constant of its ranges in cm, and its interval in words."""
-    offsets = sorted(calibration.pair_offsets.items())
+    offsets = sorted(calibration.pair_constants.items())
     return [(pair_name(pair), f"{100 * one.offset_m:+.2f}", interval(100 * one.std_m, 2)) for pair, one in offsets]
 
 
 def delay_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """Return tag, delay in ns, and its interval in words; nothing where pairs have constants instead of delays."""
+    """Return tag, delay in ns, and its interval in words, of tags whose delays are not only known as parts of pairs."""
     if calibration.pair_offsets and not any(calibration.delays_ns.values()):
         return []
     std_ns = calibration.delays_std_ns
-    delays = sorted(calibration.delays_ns.items())
+    delays = sorted((tag, delay) for tag, delay in calibration.delays_ns.items() if tag not in calibration.sides)
     return [(str(tag), f"{delay:+.4f}", interval(std_ns.get(tag, math.nan))) for tag, delay in delays]
 
 

@@ -1,4 +1,4 @@
-"""Checks with p-values, of recordings and of fits, in one table with one budget of false alarms."""
+"""Checks with p-values: of recordings in a table, of fits as score tests, with one budget of false alarms."""
 
 from calib.checks.recording_view import examined_part
 

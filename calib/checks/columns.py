@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.calibration.document import known_of_splits
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.checks.recording_view import RecordingView
 from calib.data.clocks import left_skew
@@ -22,15 +23,13 @@ from uwblink.recording.summary import failures_by_pair
 from uwblink.ticks import SPEED_OF_LIGHT, TICKS_PER_SECOND
 from uwblink.twr import Exchanges, board_range, intervals, raw_range, without_stamps
 
-VACUUM_OVER_AIR: Final = 299_792_458.0 / SPEED_OF_LIGHT
-
 PLAUSIBLE_M: Final = 1000.0
 """Longer than any range of a UWB radio."""
 
-LENGTHS: Final = {"mm": 1000.0, "cm": 100.0, "in": 1 / 0.0254, "ft": 1 / 0.3048}
+UNITS_A_METRE: Final = {"mm": 1000.0, "cm": 100.0, "in": 1 / 0.0254, "ft": 1 / 0.3048}
 """Units of length by the names that a map takes: how many are a metre."""
 
-POWERS: Final = {
+POWER_FACTORS: Final = {
     "256 steps a dBm": 1 / 256,
     "tenths of a dBm": 0.1,
     "hundredths of a dBm, and the other sign": -0.01,
@@ -39,8 +38,9 @@ POWERS: Final = {
 }
 """Factors that make dBm of powers: firmwares print a loss, or integers. The last that fits is the simplest."""
 
-MIN_RANGES: Final = 20
-"""Fewer ranges, or powers, say nothing of a unit."""
+MIN_VALUES_OF_UNIT: Final = 20
+"""Fewer ranges, or powers, say nothing of a unit: the median of so many is known to 0.28 of their spread
+(`calib.spread.STD_OF_MEDIAN` over the root of their number), and units differ by a factor of two or more."""
 
 
 def empty(view: RecordingView) -> Iterator[Candidate]:
@@ -134,12 +134,12 @@ def _reported_over_stamps(view: RecordingView) -> Floats:
 def reported(view: RecordingView) -> Iterator[Candidate]:
     """Reported ranges that were computed with the speed of light in vacuum, or are in another unit than metres."""
     ratios = _reported_over_stamps(view)
-    ratio = float(np.median(ratios)) if len(ratios) >= MIN_RANGES else 1.0
+    ratio = float(np.median(ratios)) if len(ratios) >= MIN_VALUES_OF_UNIT else 1.0
     evidence = f"reported ranges are {ratio:.5g} times those from the stamps"
     # So many medians of ratios tell the speed of light in air from that in vacuum.
-    if len(ratios) >= 100 and abs(ratio / VACUUM_OVER_AIR - 1) < 5e-5:
+    if len(ratios) >= 100 and abs(ratio * SPEED_OF_LIGHT / 299_792_458.0 - 1) < 5e-5:
         yield Candidate("speed of light in vacuum", f"{evidence}: 299 792 458 m/s instead of 299 702 547")
-    for unit, many in LENGTHS.items():
+    for unit, many in UNITS_A_METRE.items():
         # Delays of boards may change a range of some metres by so much.
         if abs(ratio / many - 1) < 0.05:
             yield Candidate("unit of the reported ranges", evidence, words={"unit": unit})
@@ -196,7 +196,7 @@ def lengths(view: RecordingView) -> Iterator[Candidate]:
     good = np.isfinite(view.ranges.raw_m) & np.isfinite(view.ranges.truth_m)
     raw, truth = view.ranges.raw_m[good], view.ranges.truth_m[good]
     bare = bool(without_stamps(view.exchanges).mean() > 0.5)
-    if len(raw) < MIN_RANGES:
+    if len(raw) < MIN_VALUES_OF_UNIT:
         if bare and np.nanmedian(np.abs(view.ranges.raw_m)) > PLAUSIBLE_M:
             evidence = f"half of the ranges are longer than {PLAUSIBLE_M:.0f} m, which no UWB radio measures"
             yield Candidate("unit of the ranges", evidence, words={"unit": "mm"})
@@ -206,7 +206,7 @@ def lengths(view: RecordingView) -> Iterator[Candidate]:
             f"true distances have a median of {np.median(truth):.6g}, ranges one of {np.median(raw):.6g} m: they agree "
             f"if {whose} are in {unit}"
         )
-        yield Candidate(f"unit of the {whose}", evidence, words={"unit": unit, "many": f"{LENGTHS[unit]:g}"})
+        yield Candidate(f"unit of the {whose}", evidence, words={"unit": unit, "many": f"{UNITS_A_METRE[unit]:g}"})
     elif bare and (unit := _unit(truth, raw)):
         evidence = f"ranges are in {unit} if true distances are in m: half of them are longer than {np.median(raw):.0f}"
         yield Candidate("unit of the ranges", evidence, words={"unit": unit})
@@ -214,7 +214,7 @@ def lengths(view: RecordingView) -> Iterator[Candidate]:
 
 def _unit(metres: Floats, others: Floats) -> str | None:
     """Return the unit of others (n,) with which they agree best with metres (n,); None where metres are as good."""
-    left = {name: robust_spread(metres - others / many) for name, many in LENGTHS.items()}
+    left = {name: robust_spread(metres - others / many) for name, many in UNITS_A_METRE.items()}
     best = min(left, key=lambda name: left[name])
     # Distances that say nothing are best when they are divided by most.
     # Feet taken for metres leave two thirds of the ranges' own spread, the right unit noise and delays.
@@ -223,7 +223,7 @@ def _unit(metres: Floats, others: Floats) -> str | None:
     # Of one distance, the unit that makes both alike.
     if robust_spread(metres) > 0.5 or np.median(others) < PLAUSIBLE_M:
         return None
-    return min(LENGTHS, key=lambda name: abs(float(np.median(metres - others / LENGTHS[name]))))
+    return min(UNITS_A_METRE, key=lambda name: abs(float(np.median(metres - others / UNITS_A_METRE[name]))))
 
 
 def powers(view: RecordingView) -> Iterator[Candidate]:
@@ -231,11 +231,11 @@ def powers(view: RecordingView) -> Iterator[Candidate]:
     every = np.concatenate([view.exchanges.fpp1_dbm, view.exchanges.fpp2_dbm])
     known = np.isfinite(np.concatenate([view.ranges.fpp1_dbm, view.ranges.fpp2_dbm]))
     given = np.isfinite(every) & (every != 0)
-    if np.count_nonzero(given) < MIN_RANGES or np.mean(known[given]) > 0.5:
+    if np.count_nonzero(given) < MIN_VALUES_OF_UNIT or np.mean(known[given]) > 0.5:
         return
     middle = float(np.median(every[given]))
     guess, factor = "no usual factor makes them so", "give fpp1 and fpp2 in dBm"
-    for name, times in POWERS.items():
+    for name, times in POWER_FACTORS.items():
         # From their sensitivity to a metre apart.
         if -115 < times * middle < -55:
             guess = f"they look like {name}: times {times:g} they would be {times * middle:.0f} dBm"
@@ -250,8 +250,7 @@ def undetermined(view: RecordingView) -> Iterator[Candidate]:
     if len(some):
         _, free = free_directions(some.tags(), some)
         if free:
-            groups = "; ".join(", ".join(map(str, group)) for group in free)
-            yield Candidate("too few pairs", f"the pairs do not determine the delays of tags {groups}")
+            yield Candidate("too few pairs", known_of_splits(free))
 
 
 def silent(view: RecordingView) -> Iterator[Candidate]:

@@ -299,7 +299,7 @@ CHECKS: Final = (
     ),
 )  # fmt: skip
 
-LEVEL: Final = (BUDGET - OF_A_FIT) / sum(not check.certain for check in CHECKS)
+FINDING_LEVEL: Final = (BUDGET - OF_A_FIT) / sum(not check.certain for check in CHECKS)
 """p-value below which a candidate is a finding: checks have equal shares of the budget, beside that of a fit."""
 
 OF_PAIRS: Final = {"pairs that do not close", "reflections", "reflections that last"}
@@ -343,7 +343,7 @@ def examine(data: Data | Iterable[Data]) -> list[Finding]:
         findings += [replace(finding, evidence=prefix + finding.evidence) for finding in found]
         views += [view] if view else []
     if len(views) > 1:
-        between = _run("between", views, LEVEL)
+        between = _run("between", views, FINDING_LEVEL)
         # What moved between two recordings is no fault of either one.
         moved = any(finding.fault == "anchor moved between recordings" for finding in between)
         findings = [one for one in findings if not (moved and one.fault == "anchor stands elsewhere")] + between
@@ -354,14 +354,16 @@ def examine(data: Data | Iterable[Data]) -> list[Finding]:
 
 
 def _run(stage: str, *given: Any) -> list[Finding]:
-    return [found for check in CHECKS if check.stage == stage for found in check.findings(check.look(*given), LEVEL)]
+    return [
+        found for check in CHECKS if check.stage == stage for found in check.findings(check.look(*given), FINDING_LEVEL)
+    ]
 
 
 def _examined(view: RecordingView) -> tuple[list[Finding], RecordingView | None]:
     """Return what is wrong with one recording, and the recording without its impossible rows, if that can be used."""
     for check in CHECKS:
         # With such a fault, the other numbers of a recording mean something else.
-        if check.stage == "reading" and (misread := check.findings(check.look(view), LEVEL)):
+        if check.stage == "reading" and (misread := check.findings(check.look(view), FINDING_LEVEL)):
             return misread, None
     findings = _run("rows", view)
     bad = columns.impossible(view)
@@ -381,6 +383,6 @@ def _examined(view: RecordingView) -> tuple[list[Finding], RecordingView | None]
 def _best(view: RecordingView) -> list[Finding]:
     """Return the fault of poses and lever arms that explains most of the errors."""
     tried = [check for check in CHECKS if check.stage == "geometry"]
-    seen = [(check, [one for one in check.look(view) if one.p_value < LEVEL]) for check in tried]
+    seen = [(check, [one for one in check.look(view) if one.p_value < FINDING_LEVEL]) for check in tried]
     check, best = max(seen, key=lambda one: sum(fault.gain for fault in one[1]))
-    return check.findings(best, LEVEL)
+    return check.findings(best, FINDING_LEVEL)

@@ -22,15 +22,17 @@ from calib.findings import OF_A_FIT, SMALLEST_NS
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
-SEGMENTS, SPAN_S = 6, 20.0
-"""Spans of time in which a tag may have an offset of its own, and how long they are at least: errors that last must be
-known within them."""
+OFFSET_SPANS, SPAN_S = 6, 20.0
+"""Spans of time in which a tag may have an offset of its own, and how long they are at least: twice the longest memory
+of errors in the worlds of `make worlds`, so that it is known within them. Six place a touch to a sixth of the time."""
 
 MATTERS, CLEARLY = 1.0, 4.0
-"""A finding is named that moves some delay by so many of its standard errors, a small one by so many."""
+"""A finding is named that moves some delay by so many of its standard errors (by less, it is within the interval), a
+small one by so many (one in 16 000 by chance)."""
 
 SMALLEST_M = 0.01
-"""An offset of less is nobody's fault: it widens intervals, and is not named unless it matters clearly."""
+"""An offset of less is nobody's fault, as a lever arm by a ruler is no better: it widens intervals, and is not named
+unless it matters clearly."""
 
 UNIT = np.ones((1, 1))
 """The derivative of a range by an offset of it."""
@@ -73,7 +75,7 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
         return Family(kind=kind, names=tags, derivative=Derivative(ends, derivative, len(tags)))
 
     yield of_pairs(found)
-    several = int(min(max(found.blocks.seconds / SPAN_S, 2), SEGMENTS))
+    several = int(min(max(found.blocks.seconds / SPAN_S, 2), OFFSET_SPANS))
     span = np.arange(count) * several // count
     yield Family(
         kind="time",

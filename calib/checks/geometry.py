@@ -102,7 +102,7 @@ def _gain(before_m: Floats, after_m: Floats) -> float:
 
 
 TOLERANCE_M: Final = 0.05
-"""What a place by tape or markers is off by, with the antenna beside the marker."""
+"""What a place by tape or markers is off by, with the antenna beside the marker: the size of a board."""
 
 
 def anchors(view: RecordingView) -> Iterator[Candidate]:

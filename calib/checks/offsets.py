@@ -46,7 +46,7 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
     for _ in range(5):
         moved = replace(ranges, truth_m=ranges.truth_m + offset_m[pairs.number])
         try:
-            found = fit_known_distances(moved, FitSettings(minimum_norm=True))
+            found = fit_known_distances(moved, FitSettings())
         except CalibError:
             return
         # The pairs of the fit among all.

@@ -9,24 +9,23 @@ import numpy as np
 
 from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
 from calib.data.clocks import PPM_TO_METRES, corrected
-from calib.estimator.known_distances import FEWEST_RANGES
+from calib.estimator.known_distances import ASTRAY_M, FEWEST_RANGES
 from calib.findings import BUDGET, Candidate, exceeds, more_often, positive, stretches
 from uwblink.arrays import Bools, Floats
 from uwblink.protocols.table import single_sided
 from uwblink.ticks import TICK_S
 from uwblink.twr import intervals, without_stamps
 
-ASTRAY_M: Final = 0.3
-"""Mean absolute error of a pair, about its median, that reflections may explain: half of the ranges by 60 cm."""
-
 ONE_WAY_M: Final = 0.05
-"""By how much ranges of a sound pair may differ by who initiates: the powers of both ways are not quite alike."""
+"""By how much ranges of a sound pair may differ by who initiates: the powers of both ways are not quite alike, and
+published curves slope by 2 cm a dB (rms over -98 to -78 dBm)."""
 
 MANY_SHARE: Final = 0.15
 """Share of reflected ranges of a sound recording: among obstacles placed for it a MILUV flight has 12 %."""
 
 LEAST_SHARE: Final = 0.02
-"""With a smaller share of reflected ranges, it is not asked how long reflections last."""
+"""With a smaller share of reflected ranges, it is not asked how long reflections last: it is a sixth of what a MILUV
+flight has, and noise passes for it."""
 
 LEFT, WRONG_SIGN = "skew in single-sided ranges", "carrier readings with the wrong sign"
 SLOPES: Final = {

@@ -18,9 +18,9 @@ def _run() -> NoReturn:
 
     from calib.cli.commands import app
     from calib.cli.judging import spread_tests
-    from calib.cli.shared import FLAGS
+    from calib.cli.shared import CALIB_FLAGS
     from calib.errors import CalibError, UnanswerableError
     from uwblink.cli import shared
 
     words = spread_tests(sys.argv[1:])
-    shared.run(app, CalibError, statuses={UnanswerableError: 1}, arguments=words, flags=FLAGS)
+    shared.run(app, CalibError, statuses={UnanswerableError: 1}, arguments=words, flags=CALIB_FLAGS)

@@ -90,8 +90,9 @@ def export(
     registers = programmed(antenna_delays) if antenna_delays else None
     known = known_calibration(calibration)
     text = calib.export(known, to, output, base=registers, force=force)
-    free = free_delays(known)
-    if free and to in ("miluv", "ros-yaml", "c-header"):  # which hold delays without their standard errors
+    # These forms hold delays without their standard errors, and all but MILUV's have the splits.
+    free = [tag for tag in free_delays(known) if to == "miluv" or tag not in known.sides]
+    if free and to in ("miluv", "ros-yaml", "c-header"):
         warn(f"{to} does not say that the data leave the delay of tag {', '.join(map(str, free))} free")
     if output is None:
         typer.echo(text, nl=False)

@@ -19,7 +19,7 @@ from uwblink.settings import flags_of
 STOPPED: Final = 1
 """Exit status of a command whose fit stopped before it converged: its output is marked as not final."""
 
-FLAGS: Final = {
+CALIB_FLAGS: Final = {
     "boards": "COUNT",
     "data": "RECORDINGS",
     "robots": "COUNT",
@@ -46,7 +46,7 @@ TrimStatic = Annotated[
 
 def with_flags(text: str) -> str:
     """Return a text with options for the parameters in backticks: `minimum_norm` becomes --minimum-norm."""
-    return shared.with_flags(text, FLAGS)
+    return shared.with_flags(text, CALIB_FLAGS)
 
 
 def warn(text: str) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
@@ -15,12 +17,15 @@ from calib.data.clocks import ClocksApart, LeftSkew, clocks_apart, left_skew
 from calib.errors import BadInputError, UnanswerableError
 from calib.pairs import pairs_of
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
-from uwblink.errors import raising
+from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, known_delays
+from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import Exchanges, delay_weights, middle_ns, raw_range, without_stamps
+
+MapSource = str | os.PathLike[str] | Mapping[str, Any]
 
 IN_MEMORY: Final = "memory"
 """The source of ranges that come from no file."""
@@ -134,7 +139,7 @@ class Ranges(ColumnTable):
         *,
         initiator: ArrayLike,
         target: ArrayLike,
-        fpp1_dbm: ArrayLike,
+        fpp1_dbm: ArrayLike = math.nan,
         fpp2_dbm: ArrayLike | None = None,
         truth_m: ArrayLike = math.nan,
         time_ns: ArrayLike = 0,
@@ -144,10 +149,10 @@ class Ranges(ColumnTable):
     ) -> Ranges:
         """Return a row for every range of arrays (n,), metres and dBm; a single number serves all rows.
 
-        `truth_m` and `time_ns` are needed to fit, and not to correct. A single power per range is `fpp1_dbm`. `weights`
-        are those of the two delays (`uwblink.twr.delay_weights`): by default halves, as if both clocks ran alike, which
-        changes no range by more than a hundredth of a millimetre. Raises `BadInputError` where the arrays do not fit
-        each other.
+        `truth_m` and `time_ns` are needed to fit, and not to correct; powers where there is a curve. A single power per
+        range is `fpp1_dbm`. `weights` are those of the two delays (`uwblink.twr.delay_weights`): by default halves, as
+        if both clocks ran alike, which changes no range by more than a hundredth of a millimetre. Raises
+        `BadInputError` where the arrays do not fit each other.
 
         >>> from calib import Ranges
         >>> len(Ranges.from_arrays([3.1, 4.2], initiator=1, target=[2, 3], fpp1_dbm=-85.0))
@@ -179,6 +184,25 @@ class Ranges(ColumnTable):
             raise BadInputError(f"row {row} is of tag {columns['target'][row]} with itself", parameter="target")
         columns |= {name: measured_powers(columns[name]) for name in ("fpp1_dbm", "fpp2_dbm")}
         return cls(source=source, protocol=np.full(len(rows[0]), protocol), excluded={}, planted=None, **columns)
+
+    @classmethod
+    def from_dataframe(cls, frame: Any, map: MapSource | None = None) -> Ranges:  # noqa: A002 - what it is called elsewhere
+        """Return the ranges of a data frame, in order of time: of pandas or Polars, or another with Arrow's interface.
+
+        Its rows are exchanges, messages or ranges, as of tables that `uwblink import csv` reads. `map` explains its
+        columns, as a file or a mapping with the keys of a column map, such as `{"columns": {"range_m": "dist"}}`; by
+        default they are guessed. What the import noted (ids that are words, units) is a warning of Python. Raises
+        `BadInputError` for what it does not tell, and what `usable` left out.
+
+        >>> import calib
+        >>> flight = calib.load_ranges(calib.sample_flight())
+        >>> columns = {"initiator": "from_id", "target": "to_id", "raw_m": "range_m", "truth_m": "gt_range_m"}
+        >>> frame = flight.to_pandas().rename(columns=columns)[[*columns.values(), "fpp1_dbm", "time_ns"]]
+        >>> len(calib.Ranges.from_dataframe(frame))
+        900
+        """
+        found = contents_of_frame(frame, map)
+        return cls.from_exchanges(found.exchanges, poses=found.poses, tags=found.tags, source="data frame")
 
     def _title(self) -> str:
         left = "".join(f", {count} left out: {reason}" for reason, count in self.excluded.items())
@@ -226,6 +250,19 @@ class Ranges(ColumnTable):
         most = max(excluded, key=lambda reason: excluded[reason])
         hint = f"; {hints[most]}" if most in hints else ""
         raise UnanswerableError(f"{self.source}: none of its {len(self)} exchanges can be used: {most}{hint}")
+
+
+def contents_of_frame(frame: Any, map_source: MapSource | None = None) -> Contents:
+    """Return what a data frame holds, imported as a table; raises `BadInputError`. Notes are warnings of Python."""
+    from uwblink.importers import read_source
+
+    try:
+        found = read_source(frame, map_file=map_source)
+    except (ImportTableError, ArgumentError) as error:
+        raise BadInputError(str(error)) from error
+    for note in found.meta.get("notes", ()):
+        warnings.warn(note, stacklevel=3)
+    return found
 
 
 def measured_powers(fpp_dbm: Floats) -> Floats:

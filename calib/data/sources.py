@@ -15,9 +15,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline
 
-from calib.data.ranges import FAINTEST_DBM, IN_MEMORY, LOUDEST_DBM, Ranges, concatenate, without_static
+from calib.data.ranges import (
+    FAINTEST_DBM,
+    IN_MEMORY,
+    LOUDEST_DBM,
+    Ranges,
+    concatenate,
+    contents_of_frame,
+    without_static,
+)
 from calib.errors import BadInputError, UnanswerableError
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, is_frame
 from uwblink.display import printable
 from uwblink.recording.antenna_delays import AntennaDelays, delays_in_meta
 from uwblink.recording.contents import Contents
@@ -94,6 +102,8 @@ def opened(data: Data) -> Iterator[tuple[str, Source]]:
             yield Path(data).name, RecordedSource(recording)
     elif isinstance(data, Exchanges):
         yield IN_MEMORY, Contents(exchanges=data)
+    elif is_frame(data):
+        yield "data frame", contents_of_frame(data)
     elif isinstance(data, Ranges):
         raise BadInputError("ranges do not say where bodies are; give the recording they come from", parameter="data")
     elif isinstance(data, Source):
@@ -104,8 +114,8 @@ def opened(data: Data) -> Iterator[tuple[str, Source]]:
 
 def _no_recording(data: object) -> BadInputError:
     return BadInputError(
-        f"found {type(data).__name__}, expected a path, a Recording, Exchanges, Ranges, or an object with exchanges, "
-        "poses and tags",
+        f"found {type(data).__name__}, expected a path, a Recording, Exchanges, Ranges, a data frame, or an object "
+        "with exchanges, poses and tags",
         parameter="data",
     )
 
@@ -113,8 +123,9 @@ def _no_recording(data: object) -> BadInputError:
 def load_ranges(data: Data | Iterable[Data], *, trim_static: bool = False, need_power: bool = True) -> Ranges:
     """Return the ranges of one or more recordings with their true distances, without those that cannot be used.
 
-    `data` is the path of a recording, an open `Recording`, `Exchanges` with their true distances, `Ranges`, any object
-    with `exchanges`, `poses` and `tags` (a simulation in memory), or several of those. `trim_static` leaves out spans
+    `data` is the path of a recording, an open `Recording`, `Exchanges` with their true distances, `Ranges`, a data
+    frame (`Ranges.from_dataframe`), any object with `exchanges`, `poses` and `tags` (a simulation in memory), or
+    several of those. `trim_static` leaves out spans
     of two seconds in which a pair's distance stays within two centimetres. Ranges without any power are left out unless
     `need_power` is False. Raises the errors of `Recording.open`, and `UnanswerableError` where nothing can be used.
 
@@ -148,8 +159,9 @@ def load_each(data: Data | Iterable[Data], *, trim_static: bool = False, need_po
 
 def each(data: Data | Iterable[Data]) -> list[Data]:
     """Return one recording or several as a list; raises `BadInputError` where there is none."""
-    if isinstance(data, str | os.PathLike | Recording | Ranges | Exchanges | Source):
-        return [data]
+    one: Any = data
+    if isinstance(data, str | os.PathLike | Recording | Ranges | Exchanges | Source) or is_frame(data):
+        return [one]
     if not isinstance(data, Iterable):
         raise _no_recording(data)
     found = list(data)

@@ -1,4 +1,4 @@
-"""The one covariance: slopes summed over blocks of time, between the inverses of what rows and priors know.
+"""The one covariance, a sandwich: squared slopes summed by block of time, between inverse information matrices.
 
 Errors that share a cause (a reflection, a pose) come in stretches, and a sum of many blocks then varies more than
 independent blocks would. How much more is read off the variances of sums over 1, 2, 4 ... blocks, all components
@@ -23,7 +23,8 @@ from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 
 CURVE_SERIES = 5
-"""Number of independent values of a smooth curve."""
+"""Number of independent values of a smooth curve, over which the persistence of its errors is averaged: published ones
+have four coefficients. Half or twice as many move no delay (`python -m benchmarks.constants`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -20,30 +20,29 @@ from uwblink.arrays import Floats, Ints
 
 NOISE_M, NOISE_WORTH = 0.06, 20.0
 """Prior of the noise of a range, and the number of ranges that it counts for. A stamp of a DW1000 has 0.15 ns of noise
-in the open (its user manual, 8.3), which gives 3 to 10 cm."""
+in the open (its user manual, 8.3), which gives 3 to 10 cm. Half or twice the number moves delays of worlds by less
+than 0.01 standard errors (`python -m benchmarks.constants`)."""
 
 DETOUR_M, DETOUR_WORTH, LEAST_DETOUR_M = 0.2, 5.0, 0.03
 """Prior of the mean of the shorter kind of exponential detours, the number of reflections that it counts for, and the
-least detour (published detours are 0.1 to 0.5 m: MILUV, STAR-loc)."""
+least detour (published detours are 0.1 to 0.5 m: MILUV, STAR-loc). Half or twice the number, or the least detour, moves
+delays of worlds by 0.01 standard errors (`python -m benchmarks.constants`)."""
 
-ODDS = -2.2
-"""Prior log odds of a reflection: one range in ten."""
-
-LONG_ODDS = -1.1
-"""Prior log odds that a reflection is of the longer kind: one in four; 11 to 48 % within one standard deviation."""
-
-LEVELS = {
+SHARED_LEVELS = {
     "noise": ("noise level", np.log(NOISE_M), (2 * NOISE_WORTH) ** -0.5),
-    "odds": ("odds level", ODDS, 2.0),
+    "odds": ("odds level", -2.2, 2.0),  # a reflection: one range in ten; 1.5 to 45 % within one standard deviation
     "detour": ("detour level", np.log(DETOUR_M), DETOUR_WORTH**-0.5),
     "least": ("least detour", np.log(LEAST_DETOUR_M), 2**0.5),
     "outliers": ("outliers", -6.0, 3.0),
-    "long": ("long detours", LONG_ODDS, 1.0),
+    "long": ("long detours", -1.1, 1.0),  # of the longer kind: one reflection in four; 11 to 48 %
 }
 """Kind of the unknown that all ranges share, centre and standard deviation of its prior, by parameter."""
 
 SCATTER = {"noise": (0.1, 0.01, 2.0), "odds": (0.7, 0.03, 2.0), "detour": (0.2, 0.03, 0.7)}
-"""Standard deviation of groups about these: its first value and bounds between which evidence finds it."""
+"""Standard deviation of groups about these: its first value and bounds between which evidence finds it.
+
+Half or twice of all of these moves delays of worlds by 0.11 standard errors (`python -m benchmarks.constants`).
+"""
 
 
 def error_unknowns(
@@ -54,13 +53,13 @@ def error_unknowns(
     `group` (n,) is the number of each range's group among `names`, `spread_m` a first guess of the noise.
     """
     everyone, own = np.zeros((1, 1), dtype=np.int64), group[:, None]
-    starts = {name: centre for name, (_, centre, _) in LEVELS.items()} | {"noise": np.log(0.9 * spread_m)}
+    starts = {name: centre for name, (_, centre, _) in SHARED_LEVELS.items()} | {"noise": np.log(0.9 * spread_m)}
     unknowns = [
         Unknown(kind=kind, names=("",), start=np.array([starts[name]]), priors=(Prior.of_deviation(deviation, centre),))
-        for name, (kind, centre, deviation) in LEVELS.items()
+        for name, (kind, centre, deviation) in SHARED_LEVELS.items()
     ]
     unknowns += [scattered(f"{name} of {whose}", names, spread) for name, spread in SCATTER.items()]
-    parts = [Part(parameter=name, kind=kind, columns=everyone) for name, (kind, *_) in LEVELS.items()]
+    parts = [Part(parameter=name, kind=kind, columns=everyone) for name, (kind, *_) in SHARED_LEVELS.items()]
     parts += [Part(parameter=name, kind=f"{name} of {whose}", columns=own) for name in SCATTER]
     return unknowns, parts
 

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from calib.calibration.document import Split
 from calib.data.ranges import Ranges
 from uwblink.arrays import Floats
 
@@ -18,12 +19,11 @@ Clock ratios differ from 1 by parts per million, which lifts a free direction to
 """
 
 
-def free_directions(tags: list[int], ranges: Ranges) -> tuple[Floats, list[list[int]]]:
-    """Return the directions that ranges leave free, (tags, k) of length one, and the tags that they shift.
+def free_directions(tags: list[int], ranges: Ranges) -> tuple[Floats, list[Split]]:
+    """Return the directions that ranges leave free, (tags, k) of length one, and the sides that they shift.
 
-    `tags` are those whose delays are not known. The free tags come in groups that shift together: tags that range only
-    with tags of another group (anchors against robots, a single pair) can shift by +a and -a without a trace in any
-    range.
+    `tags` are those whose delays are not known. Where tags range only with tags of another side (anchors against
+    robots, a single pair), the delays of the sides can shift by +a and -a without changing any range.
     """
     ends, weights = (
         np.concatenate(both)
@@ -41,4 +41,6 @@ def free_directions(tags: list[int], ranges: Ranges) -> tuple[Floats, list[list[
     ends = np.searchsorted(free, pairs[np.isin(pairs, free).all(axis=1)])
     graph = sparse.coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(free), len(free)))
     count, group = connected_components(graph, directed=False)
-    return np.asarray(loose), [free[group == k].tolist() for k in range(count)]
+    signs = [np.linalg.svd(loose[np.isin(tags, free[group == k])])[0][:, 0] for k in range(count)]
+    sides = [[tuple(free[group == k][sign > 0].tolist()) for sign in (own, -own)] for k, own in enumerate(signs)]
+    return np.asarray(loose), [(min(both), max(both)) for both in sides]

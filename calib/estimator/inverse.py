@@ -18,10 +18,12 @@ MOST_DENSE = 400
 """Unknowns up to which matrices are dense: a dense factorisation takes as long as a sparse one of a flight there."""
 
 HELD = 1e-13
-"""Share of its own information that each unknown has besides: it holds what neither rows nor priors determine."""
+"""Share of its own information that each unknown has besides: it holds what neither rows nor priors determine, and is
+some hundred times the rounding of numbers."""
 
 PROBES = 24
-"""Random vectors by which traces of large products are estimated (Hutchinson 1990), to some per cent."""
+"""Random vectors by which traces of large products are estimated (Hutchinson 1990). The relative error is the root of
+2 over their number times that of unknowns: 3 % for a hundred unknowns."""
 
 Matrix = Floats | sparse.csc_matrix
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import BSpline
 
+from calib.calibration.document import Split
 from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, knots_for, lift, lifted_power, populated
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
@@ -31,13 +32,17 @@ DELAY_NS = 600.0
 """Prior standard deviation of a delay: a board without a programmed delay has 514 ns. The prior decides only
 combinations that no range determines, and chooses the smallest delays there."""
 
+BOARD_DELAY_STD_NS = 2.0
+"""Prior standard deviation of a programmed board's delay where distances are not known, and a scale of the places can
+pass for a delay: three times the 0.6 ns by which published ones differ."""
+
 HELD_NS, HELD_M = 1e-3, 1e-5
 """Standard deviations of what is set to zero because no range determines it: far below those of any result."""
 
 CURVE_M = 0.5
 """Prior standard deviation of the bias over power: published curves reach 0.2 m (DW1000 user manual, APS011)."""
 
-SEGMENTS_A_FOLD, SEGMENTS = 4.5, (10, 28)
+SEGMENTS_A_FOLD, CURVE_SEGMENT_BOUNDS = 4.5, (10, 28)
 """Segments of a bias curve per factor e of lifted power, and their bounds. Roughness is estimated, so more segments
 change nothing (the study of `make accuracy`)."""
 
@@ -49,7 +54,7 @@ SAME_POWER = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Spline:
+class SplineValues:
     """Cubic B-splines at lifted powers (n,): the four that are not zero, `values` (n, 4), from number `first` (n,)."""
 
     knots: Floats
@@ -57,7 +62,7 @@ class Spline:
     first: Ints
 
     @classmethod
-    def at(cls, lifted: Floats, knots: Floats) -> Spline:
+    def at(cls, lifted: Floats, knots: Floats) -> SplineValues:
         """Return the splines of `knots` at lifted powers, clamped to their span."""
         inside = np.clip(lifted, knots[0], knots[-1])
         values = BSpline.design_matrix(inside, knots, DEGREE).data.reshape(-1, DEGREE + 1)
@@ -92,13 +97,13 @@ class RangeModel:
     span: tuple[float, float]
     pairs: Pairs
     tags: list[int]
-    curve: Spline | None
-    noise: Spline | None
+    curve: SplineValues | None
+    noise: SplineValues | None
     unknowns: tuple[Unknown, ...]
     parts: tuple[Part, ...]
     carriers: tuple[Floats | None, ...]
     held: Floats
-    free: list[list[int]]
+    free: list[Split]
 
     @classmethod
     def of(cls, ranges: Ranges, settings: FitSettings, *, offsets: bool = True, trimmed: bool = True) -> RangeModel:
@@ -127,12 +132,12 @@ class RangeModel:
         bias = noise = None
         carriers: list[Floats | None] = []
         if curve:
-            bias = Spline.at(lifted, _knots(ordered, low, high))
+            bias = SplineValues.at(lifted, _knots(ordered, low, high))
             for name, share in _shares(ranges, settings.groups):
                 blocks.append(_curve(f"curve {name}".strip(), bias, share))
                 carriers.append(_carrier(pairs, tags, settings, settings.groups.get(name)))
         if powered.all() and varied:
-            noise = Spline.at(lifted, knots_for(ordered, SIGMA_SEGMENTS, (low, high)))
+            noise = SplineValues.at(lifted, knots_for(ordered, SIGMA_SEGMENTS, (low, high)))
         if offsets:
             blocks += _offsets(ranges, pairs, tags, of_pairs=_offsets_identifiable(pairs, tags, settings, carriers))
         return cls(
@@ -189,7 +194,7 @@ class RangeModel:
         """Return rows that set curves to zero at the reference power, where delays can take the constant."""
         if self.curve is None or self.reference is None:
             return []
-        at, zero, std = Spline.at(np.array([self.reference]), self.curve.knots), np.zeros(1), np.full(1, HELD_M)
+        at, zero, std = SplineValues.at(np.array([self.reference]), self.curve.knots), np.zeros(1), np.full(1, HELD_M)
         return [
             NormalRows(value=zero, std=std, entries=at.values, columns=at.columns + layout.where[kind].start)
             for kind, carrier in zip(self.curve_kinds(), self.carriers, strict=True)
@@ -209,7 +214,7 @@ class RangeModel:
         stated = dict(values)
         if self.curve is None or self.reference is None:
             return stated
-        at = Spline.at(np.array([self.reference]), self.curve.knots)
+        at = SplineValues.at(np.array([self.reference]), self.curve.knots)
         for kind, carrier in zip(self.curve_kinds(), self.carriers, strict=True):
             if carrier is not None:
                 constant_m = float(at.values[0] @ values[kind][at.columns[0]])
@@ -249,8 +254,8 @@ class RangeModel:
         return layout, RangeRows.of(residual, self.key(), used, errors, layout, geometry)
 
 
-def _free_directions(ranges: Ranges, tags: list[int], settings: FitSettings) -> tuple[Floats, list[list[int]]]:
-    """Return the directions of delays (tags, k) that the pairs leave free, and their tags."""
+def _free_directions(ranges: Ranges, tags: list[int], settings: FitSettings) -> tuple[Floats, list[Split]]:
+    """Return the directions of delays (tags, k) that the pairs leave free, and their sides."""
     own = [tag for tag in tags if tag not in settings.fixed_ns]
     if not own or settings.constants == "pair":
         return np.zeros((len(tags), 0)), []
@@ -277,7 +282,7 @@ def _constants(ranges: Ranges, pairs: Pairs, tags: list[int], settings: FitSetti
     return block, Part(parameter=RESIDUAL, kind="delay", columns=columns, values=values)
 
 
-def _curve(kind: str, spline: Spline, share: Floats | None) -> tuple[Unknown, Part]:
+def _curve(kind: str, spline: SplineValues, share: Floats | None) -> tuple[Unknown, Part]:
     """Return the coefficients of a curve, of which each range has a `share` (n,), None for all of it."""
     rough = Prior(weight=1e2, structure=curvature(spline.knots), bounds=(1e-3, 1e9))
     block = Unknown(
@@ -375,7 +380,7 @@ def _knots(ordered: Floats, low: float, high: float) -> Floats:
 
     Curves are steep at small lifted powers, where roots are dense.
     """
-    segments = int(np.clip(round(SEGMENTS_A_FOLD * np.log(high / low)), *SEGMENTS))
+    segments = int(np.clip(round(SEGMENTS_A_FOLD * np.log(high / low)), *CURVE_SEGMENT_BOUNDS))
     counts = np.interp(np.linspace(0, len(ordered) - 1, segments + 1), np.arange(len(ordered)), ordered)
     roots = np.sqrt(np.clip(counts, low, high)) + np.linspace(np.sqrt(low), np.sqrt(high), segments + 1)
     inner = roots**2 / 4

@@ -29,9 +29,9 @@ class Terms:
     """Some rows (n,) of which each touches K unknowns: blocks of rows that follow each other touch the same ones.
 
     `slopes` (K, n) are derivatives of a row's log likelihood by the unknowns `columns` (blocks, K); `starts`
-    (blocks + 1,) bound the blocks. What rows know of the unknowns is the sum of `weight` (n,) times outer squares of
-    `entries` (K, n); None stands for 1 and the slopes themselves (Berndt, Hall, Hall, Hausman 1974). What rows know
-    `beside` that is added. Where rows have residuals, `score` (n,) are their slopes by the residual, and
+    (blocks + 1,) bound the blocks. The information of the rows is the sum over rows of `weight` (n,) times the outer
+    square of `entries` (K, n); None stands for 1 and the slopes themselves (Berndt, Hall, Hall, Hausman 1974).
+    Information `beside` that is added. Where rows have residuals, `score` (n,) are their slopes by the residual, and
     `residual` (n,) the entries that a unit offset of each row would have.
     """
 

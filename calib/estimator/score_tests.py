@@ -20,14 +20,13 @@ from calib.estimator.rows import Terms
 from calib.estimator.time_blocks import Persistence, TimeBlocks, persistence
 from uwblink.arrays import Floats, Ints
 
-SPANS = 2
-"""Spans of time within which errors are looked at for how long they last, where an alternative does not end."""
-
 REACHED = 1e-3
-"""Share of an alternative's information that must be left beside the fitted unknowns for it to be tested."""
+"""Share of an alternative's information that must be left beside the fitted unknowns for it to be tested: with less,
+its standard error is more than thirty times what its own ranges would give."""
 
 SAME = 0.95
-"""Alternatives whose tests correlate by more than this cannot be told from each other."""
+"""Alternatives whose tests correlate by more than this cannot be told from each other: a fault of ten standard errors
+in one shows as 9.5 in the other, 1.6 standard deviations of their difference apart."""
 
 MOST_NAMED = 3
 """Alternatives of a family that are looked for one after the other: faults are few."""
@@ -58,15 +57,15 @@ class Derivative:
 class Family:
     """Alternatives of one kind: `derivative` (n, k) is that of the residual of each given range by each offset.
 
-    `names` (k,) say whose they are, `spans` are within how many spans of time to look at how long errors last. `fitted`
-    are the indices of the unknowns that are these offsets, where they are in the fit already. Where offsets belong to
-    `sessions`, those of one tag or pair in all of them stand side by side.
+    `names` (k,) say whose they are, `spans` are within how many spans of time to look at how long errors last: two
+    where an alternative does not end. `fitted` are the indices of the unknowns that are these offsets, where they are
+    in the fit already. Where offsets belong to `sessions`, those of one tag or pair in all of them stand side by side.
     """
 
     kind: str
     names: Sequence[str]
     derivative: Derivative | sparse.csr_matrix
-    spans: int = SPANS
+    spans: int = 2
     fitted: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     sessions: tuple[str, ...] = ("",)
 

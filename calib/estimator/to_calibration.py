@@ -18,7 +18,7 @@ from calib.calibration.error_model import ErrorModel, PairErrors
 from calib.calibration.model import Calibration, PairOffset, TagGroup, Uncertainty, matrix_of
 from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, flat_curve
 from calib.estimator.known_distances import LARGEST_SPREAD_M, DescribedErrors, KnownDistances, described_errors
-from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel, Spline
+from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel, SplineValues
 from calib.estimator.range_rows import RESIDUAL
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
 from calib.range_errors.densities import LONG_FACTOR, LongDetours
@@ -31,9 +31,10 @@ LEAST_SPREAD_M = 1e-6
 """Smallest noise: errors without spread have no distribution."""
 
 NODES = 8
-"""Number of powers at which noise and share are stated; between them both are linear."""
+"""Number of powers at which noise and share are stated; between them both are linear: twice the segments of the curve
+of the noise."""
 
-LEVELS = (0.005, 0.025, 0.05, 0.16, 0.5, 0.84, 0.95, 0.975, 0.995)
+QUANTILE_SHARES = (0.005, 0.025, 0.05, 0.16, 0.5, 0.84, 0.95, 0.975, 0.995)
 """Shares of errors at which the model's quantiles are corrected."""
 
 BEYOND_MEANS = 8.0
@@ -46,7 +47,8 @@ a third and three times the common detour. What a few lasting reflections leave 
 
 
 SPELLS = 8
-"""Number of spells of a recording that are compared."""
+"""Number of spells of a recording that are compared: over the 28 pairs of eight tags their variance is known to a tenth
+(the root of 2/(7 * 28)); over a single pair to half."""
 
 BETWEEN_M = 0.05
 """Standard deviation of a pair's offset between recordings, where only one is fitted.
@@ -61,7 +63,7 @@ def calibration_of(found: KnownDistances, delays_ns2: Floats) -> Calibration:
     model, search, settings = found.model, found.searches[0], found.model.settings
     names, fixed = model.unknowns[0].names, settings.fixed_ns
     of_pairs = settings.constants == "pair"
-    free = {tag for group in found.model.free for tag in group}
+    free = {tag for sides in found.model.free for tags in sides for tag in tags}
     std = [
         math.inf if not of_pairs and int(name) in free else math.sqrt(max(value, 0.0))
         for name, value in zip(names, np.diag(delays_ns2), strict=True)
@@ -105,6 +107,7 @@ def calibration_of(found: KnownDistances, delays_ns2: Floats) -> Calibration:
         groups={name: TagGroup(tuple(own), biases[name], sigmas[name]) for name, own in settings.groups.items()},
         errors=errors,
         antenna_delays=known_delays(model.ranges.antenna_delays, model.ranges.tags()),
+        undetermined_splits=tuple(model.free),
     )
 
 
@@ -132,7 +135,7 @@ def sigma_curves(
         return _flat_sigma(model, math.exp(level), float(covariance[0, 0]))
     knots = model.noise.knots
     lifted = np.linspace(knots[0], knots[-1], 8 * model.noise.size)
-    at = Spline.at(lifted, knots)
+    at = SplineValues.at(lifted, knots)
     splines = np.zeros((len(lifted), model.noise.size))
     np.put_along_axis(splines, at.columns, at.values, axis=1)
     through, names = np.linalg.pinv(splines), list(model.settings.groups) or [""]
@@ -170,7 +173,7 @@ def _correction_std(found: KnownDistances, delays_ns2: Floats, lifted: Floats) -
         of_pairs = np.sum(delays @ delays_ns2 * delays, axis=1)
     variance = np.full(len(lifted), float(np.mean(of_pairs)))
     if model.curve is not None:
-        at = Spline.at(lifted, model.curve.knots)
+        at = SplineValues.at(lifted, model.curve.knots)
         known = _bias_covariance(found)[at.columns[:, :, None], at.columns[:, None, :]]
         variance += np.einsum("ki,kij,kj->k", at.values, known, at.values)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
@@ -284,7 +287,7 @@ def _at_nodes(model: RangeModel, values: dict[str, Floats]) -> tuple[Floats, Flo
     if model.noise is None:
         return np.array([0.999, 1.001]) * np.median(model.lifted), np.full(2, np.exp(level)), np.zeros(2)
     nodes = np.quantile(model.lifted, (np.arange(NODES) + 0.5) / NODES) + 1e-9 * np.arange(NODES)
-    at, several = Spline.at(nodes, model.noise.knots), list(model.settings.groups) or [""]
+    at, several = SplineValues.at(nodes, model.noise.knots), list(model.settings.groups) or [""]
     curves = {}
     for parameter in ("noise", "odds"):
         mean = np.mean([values[f"{parameter} curve {name}".strip()] for name in several], axis=0)
@@ -324,9 +327,9 @@ def _with_quantiles(model: ErrorModel, of: RangeModel, residual: Floats) -> Erro
     rows = np.linspace(0, len(residual) - 1, min(20_000, len(residual))).astype(np.int64)
     error = residual[rows]
     shapes = model.shapes(of.lifted[rows], of.ranges.initiator[rows], of.ranges.target[rows])
-    level = np.quantile(model.below(error, shapes), LEVELS)
+    level = np.quantile(model.below(error, shapes), QUANTILE_SHARES)
     away = error - model.mean_m(shapes)
     within = np.abs(away) < BEYOND_MEANS * (model.least_m + model.long.longest * shapes.detour_m)
     z = away[within] / model.total_m(shapes)[within]
-    levels = tuple(zip(LEVELS, np.maximum.accumulate(level).tolist(), strict=True))
+    levels = tuple(zip(QUANTILE_SHARES, np.maximum.accumulate(level).tolist(), strict=True))
     return replace(model, scale=float(np.sqrt(np.mean(z**2))), levels=levels)

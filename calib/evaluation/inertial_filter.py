@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from calib.evaluation.range_updates import Fix, RangeErrors, RangeUpdate, mixture_update
 from uwblink.arrays import Floats
 
-GRAVITY: Final = 9.81
-"""m/s^2."""
+GRAVITY_M_S2: Final = 9.81
+"""Between 9.78 at the equator and 9.83 at the poles; the biases of a consumer accelerometer are larger."""
 
 SIZE: Final = 16
 """Size of the state. The names below slice its parts: position, velocity, attitude, biases, offset of the height
@@ -28,7 +28,7 @@ P, V, A, G, F, H = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Noise:
+class ProcessNoise:
     """Process noise of the filter: accelerometer and gyro (per root of Hz), their biases, and motion without an IMU.
 
     The defaults are those of a consumer IMU on a small vibrating drone. `acceleration` (m/s^2 per root of Hz) is the
@@ -47,7 +47,9 @@ class Noise:
 class InertialFilter:
     """Predicts by inertial readings or constant velocity, and updates by ranges and heights."""
 
-    def __init__(self, fix: Fix, attitudes: Floats, noise: Noise, *, inertial: bool, speed_m_s: float = 1.0) -> None:
+    def __init__(
+        self, fix: Fix, attitudes: Floats, noise: ProcessNoise, *, inertial: bool, speed_m_s: float = 1.0
+    ) -> None:
         """Start at a fix with attitudes (headings, 3, 3), body to world."""
         count = len(attitudes)
         self.noise, self.inertial = noise, inertial
@@ -139,7 +141,7 @@ class InertialFilter:
 
     def _acceleration(self, force: Floats) -> Floats:
         """Return the acceleration in the world (headings, 3) of specific forces (headings, 3) in the body's axes."""
-        return np.asarray(np.einsum("hij,hj->hi", self.attitude, force) - (0.0, 0.0, GRAVITY))
+        return np.asarray(np.einsum("hij,hj->hi", self.attitude, force) - (0.0, 0.0, GRAVITY_M_S2))
 
     def limit_speed(self, speed_m_s: float) -> None:
         """Update by a velocity of zero with standard deviation `speed_m_s`: it bounds the state while there are no

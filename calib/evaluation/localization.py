@@ -14,7 +14,7 @@ import numpy as np
 from scipy.signal import correlate
 from scipy.stats import chi2
 
-from calib.calibration.model import Calibration, require_calibration
+from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, Flight, load_flight, require_times
 from calib.errors import UnanswerableError
@@ -73,7 +73,7 @@ class Localization:
 
 def localize(
     data: Data | Flight,
-    calibration: Calibration,
+    calibration: CalibrationSource,
     settings: Settings | None = None,
     *,
     training: Data | Flight | None = None,
@@ -93,7 +93,7 @@ def localize(
     >>> found[0].tracks["calibrated"].rmse_m < 0.1
     True
     """
-    require_calibration(calibration)
+    calibration = given_calibration(calibration)
     chosen = settings or Settings()
     flight = data if isinstance(data, Flight) else load_flight(data, need_power=calibration.needs_power)
     fixed = fixed_std(calibration, chosen, training)
@@ -170,7 +170,7 @@ def fixed_std(calibration: Calibration, settings: Settings, training: Data | Fli
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Summary:
+class LocalizationSummary:
     """Over all bodies of all recordings: mean RMSE by filter, its reduction, mean NIS and NEES of the variance filter.
 
     `rmse_m` are means over seeds, too, `spread_m` standard deviations over seeds of the mean over bodies (NaN of one
@@ -192,7 +192,9 @@ class Summary:
     accepted: float
 
 
-def rmse_rows(found: list[Localization], total: Summary, spread: str = "its spread over seeds") -> list[list[str]]:
+def rmse_rows(
+    found: list[Localization], total: LocalizationSummary, spread: str = "its spread over seeds"
+) -> list[list[str]]:
     """Return a row for each body of the RMSE by filter, and rows of their mean, its spread, and its reduction.
 
     `spread` is the title of the spread, which is left out of a single seed.
@@ -204,7 +206,7 @@ def rmse_rows(found: list[Localization], total: Summary, spread: str = "its spre
     return [*rows, ["against raw", "", *(f"{-100 * less:+.0f} %" for less in total.reduction.values())]]
 
 
-def summarize(found: list[Localization]) -> Summary:
+def summarize(found: list[Localization]) -> LocalizationSummary:
     """Return means over bodies and recordings, with equal weights as in the paper.
 
     Raises `UnanswerableError` if the filter accepted no range.
@@ -218,7 +220,7 @@ def summarize(found: list[Localization]) -> Summary:
     if not len(nis):
         names = ", ".join(f"{one.source}: {one.body}" for one in found)
         raise UnanswerableError(f"{names}: no range agrees with the track within its gate; look at `calib doctor`")
-    return Summary(
+    return LocalizationSummary(
         rmse_m=rmse,
         spread_m={name: float(np.std(over, ddof=1)) if len(over) > 1 else np.nan for name, over in means.items()},
         reduction={name: 1 - rmse[name] / rmse["raw"] for name in filters[1:]},

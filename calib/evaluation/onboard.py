@@ -18,11 +18,11 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from calib.calibration.error_model import GATE
-from calib.calibration.model import Calibration, require_calibration
+from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, opened, require_times
 from calib.errors import BadInputError, UnanswerableError
-from calib.evaluation.inertial_filter import GRAVITY, InertialFilter, Noise, P
+from calib.evaluation.inertial_filter import GRAVITY_M_S2, InertialFilter, P, ProcessNoise
 from calib.evaluation.range_updates import Fix, RangeErrors, multilaterate, range_errors
 from calib.evaluation.tracking import BodyTrack, Trajectory, nearest_attitude
 from calib.settings import CheckedSettings
@@ -60,7 +60,7 @@ class OnboardSettings(CheckedSettings):
     headings: int = 8
     rate_hz: float = 50.0
     speed_m_s: float = 1.0
-    noise: Noise = field(default_factory=Noise)
+    noise: ProcessNoise = field(default_factory=ProcessNoise)
 
     def __post_init__(self) -> None:
         """Check the settings; raises `BadInputError`."""
@@ -105,7 +105,7 @@ class OnboardTrack(BodyTrack):
 
 
 def localize_onboard(
-    data: Data, calibration: Calibration, settings: OnboardSettings | None = None
+    data: Data, calibration: CalibrationSource, settings: OnboardSettings | None = None
 ) -> list[OnboardTrack]:
     """Track every moving body by its ranges to fixed anchors, its IMU and its height sensor.
 
@@ -120,7 +120,7 @@ def localize_onboard(
     >>> track.body, track.used, track.rmse_m < 0.2
     ('robot1', 'ranges', True)
     """
-    require_calibration(calibration)
+    calibration = given_calibration(calibration)
     chosen = settings or OnboardSettings()
     return [_track(one, chosen) for one in _readings(data, calibration)]
 
@@ -233,7 +233,7 @@ def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilt
             raise UnanswerableError(f"{one.source}: {one.body} ranges with too few anchors for a start; give it one")
         fix = _fix(one, np.arange(first + 1), settings)
     near = np.abs(one.imu_s - float(one.time_s[first])) < 0.25  # s: the first tilt is that of half a second
-    force = one.imu[near, 3:].mean(axis=0) if near.any() else np.array([0.0, 0.0, GRAVITY])
+    force = one.imu[near, 3:].mean(axis=0) if near.any() else np.array([0.0, 0.0, GRAVITY_M_S2])
     turned = _attitudes(force, settings.headings) if inertial else np.eye(3)[None]
     found = InertialFilter(fix, turned, settings.noise, inertial=inertial, speed_m_s=settings.speed_m_s)
     if inertial:

@@ -10,13 +10,14 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from calib.calibration.applying import CorrectedRanges
+from calib.calibration.comparison import loose_shifts
 from calib.calibration.document import for_json, pair_name
-from calib.calibration.model import Calibration, require_calibration
+from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, load_ranges
 from calib.pairs import pairs_of
 from calib.spread import TWO_SIDED_95, medians, robust_spread, spreads
-from uwblink.arrays import Bools, Floats
+from uwblink.arrays import Bools, Floats, data_frame
 from uwblink.display import as_html
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -83,6 +84,8 @@ class ErrorStatistics:
 class PlantedComparison:
     """The difference between a calibration and what a simulation planted, less the common constant.
 
+    What undetermined splits of the calibration leave open is taken out of the delays, too.
+
     `delay_error_ns` maps tags to fitted less planted delays, `curve_rms_m` is the rms of the bias curves' difference
     over the ranges inside the fitted power, `correction_rms_m` that of the whole correction of each range; NaN if no
     curve was planted.
@@ -142,6 +145,12 @@ class Evaluation:
             ["all", *_cells(self.overall)],
         ]
 
+    def to_pandas(self) -> Any:
+        """Return a row a pair, and one of all, as a `pandas.DataFrame`; raises `ArgumentError` without pandas."""
+        return data_frame(
+            [{"pair": name} | asdict(group) for name, group in (self.pairs | {"all": self.overall}).items()]
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """Return what `calib evaluate --json` prints; `planted` only where a simulation planted something."""
         document: dict[str, Any] = {
@@ -166,7 +175,7 @@ def _cells(group: ErrorStatistics) -> list[str]:
     return ["-" if "nan" in cell else cell for cell in cells]
 
 
-def evaluate(data: Data | Iterable[Data], calibration: Calibration) -> Evaluation:
+def evaluate(data: Data | Iterable[Data], calibration: CalibrationSource) -> Evaluation:
     """Compare raw, delay-corrected and fully corrected ranges with the truth, for all ranges and for each pair of tags.
 
     `data` is what `load_ranges` takes: paths of recordings, simulations in memory, `Ranges`, one or several. Errors are
@@ -178,7 +187,7 @@ def evaluate(data: Data | Iterable[Data], calibration: Calibration) -> Evaluatio
     >>> f"{100 * found.raw.std_m:.1f} cm raw, {100 * found.full.std_m:.1f} cm corrected"
     '4.0 cm raw, 3.0 cm corrected'
     """
-    require_calibration(calibration)
+    calibration = given_calibration(calibration)
     ranges = load_ranges(data, need_power=calibration.needs_power)
     applied = calibration.apply(ranges)
     everything = np.ones(len(ranges), dtype=bool)
@@ -206,8 +215,9 @@ def compare_with_planted(
     difference = {tag: calibration.delays_ns[tag] - d for tag, d in planted.items() if tag in calibration.delays_ns}
     if not difference:
         return None
-    shift = float(np.mean(list(difference.values())))
-    delays = {tag: d - shift for tag, d in difference.items()}
+    loose, apart = loose_shifts([calibration], list(difference)), np.array(list(difference.values()))
+    taken = np.linalg.lstsq(loose, apart)[0]
+    shift, delays = float(taken[0]), dict(zip(difference, (apart - loose @ taken).tolist(), strict=True))
     inside = ~applied.clamped
     truth = planted_curve(ranges, "bias_curve", applied.lifted[inside])
     curve_rms = correction_rms = float("nan")

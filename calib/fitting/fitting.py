@@ -7,6 +7,7 @@ recording holds.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -15,9 +16,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import uwblink
-from calib.calibration.document import for_json
+from calib.calibration.document import for_json, split_text
 from calib.calibration.error_model import lasting_errors
-from calib.calibration.model import Calibration, given_calibration
+from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import (
     WITHOUT_CURVE,
@@ -36,13 +37,11 @@ from calib.estimator.known_distances import KnownDistances, fit_known_distances
 from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
+from calib.fitting.passive_listeners import MIN_OF_DELAY
 from calib.fitting.result import FitResult, HeldOut
 from calib.settings import FitSettings, check_tag
 from uwblink.arrays import Bools
 from uwblink.recording.antenna_delays import delays_differ, known_delays
-
-MIN_RANGES = 50
-"""With so many ranges one delay has a standard error of a seventh of the noise of a range, 0.03 ns."""
 
 
 def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **changes: Any) -> FitResult:
@@ -54,9 +53,12 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     `warnings` begin with what a fit of the chosen kind cannot know: without a curve (`delays_only`), with taken delays
     (`delays_from`), with constants by pair (`constants`). Where power never changes the curve is flat.
 
-    Raises `UnanswerableError` when there are too few ranges, when the pairs do not determine the delays, or when what
-    was found is beyond what any radio has (true distances in millimetres, say), and `BadInputError` for pinned tags or
-    groups that are not in the data, and for a parameter that cannot be used.
+    Where tags range only with tags of another side (anchors with robots), a warning says so, and the calibration
+    corrects ranges between the sides only (`Calibration.undetermined_splits`).
+
+    Raises `UnanswerableError` when there are too few ranges, or when what was found is beyond what any radio has (true
+    distances in millimetres, say), and `BadInputError` for pinned tags or groups that are not in the data, and for a
+    parameter that cannot be used.
 
     >>> import calib
     >>> result = calib.fit(calib.sample_flight())
@@ -66,7 +68,8 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     """
     settings = replace(settings or FitSettings(), **changes)
     check_loss(settings.loss)
-    source = given_calibration(settings.delays_from, "delays_from")
+    given = settings.delays_from
+    source = None if given is None else given_calibration(given, "delays_from")
     ranges = load_ranges(data, need_power=not settings.delays_only)
     fixed = _taken_over(source, ranges, curve=not settings.delays_only) | dict(settings.fixed_ns)
     refuse_impossible(ranges)
@@ -83,7 +86,6 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     calibration = replace(calibration, delays_std_ns=stated | taken)
     held = _held_out(ranges, settings) if settings.hold_out else None
     provenance = {
-        **({"undetermined": found.model.free} if found.model.free else {}),
         **({} if found.model.reference_dbm is None else {"reference_power_dbm": found.model.reference_dbm}),
         "recordings": ranges.source.split(", "),
         "recording_ids": [name for _, name in ranges.recordings],
@@ -104,12 +106,13 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     return replace(result, held_out=held)
 
 
-def add_tag(data: Data | Iterable[Data], calibration: Calibration, tag: int, loss: str = MIXTURE) -> FitResult:
+def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: int, loss: str = MIXTURE) -> FitResult:
     """Fit the delay of one more tag; everything else in the calibration stays as it was.
 
     `data` is what `load_ranges` takes. It is the fit of `calib.fit` to all exchanges of the tag with calibrated ones,
-    whose delays and curve are known. Raises `BadInputError` where the tag is known already or not in the data, and what
-    `calib.fit` raises.
+    whose delays and curve are known. A tag that ranges with one side of an undetermined split joins the other side.
+    Raises `BadInputError` where the tag is known already or not in the data, `UnanswerableError` where it ranges with
+    both sides, and what `calib.fit` raises.
 
     >>> import calib, dataclasses
     >>> known = calib.fit(calib.sample_flight()).calibration
@@ -119,6 +122,7 @@ def add_tag(data: Data | Iterable[Data], calibration: Calibration, tag: int, los
     True
     """
     check_tag(tag)
+    calibration = given_calibration(calibration)
     if calibration.pair_offsets:
         raise BadInputError("has constants of pairs, which say nothing of a tag; fit anew", parameter="calibration")
     ranges = load_ranges(data, need_power=calibration.needs_power)
@@ -135,22 +139,25 @@ def add_tag(data: Data | Iterable[Data], calibration: Calibration, tag: int, los
     known = list(calibration.delays_ns)
     first, second = (np.isin(ends, known) for ends in (ranges.initiator, ranges.target))
     some = ranges[(first & (ranges.target == tag)) | (second & (ranges.initiator == tag))]
-    if len(some) < MIN_RANGES:
+    if len(some) < MIN_OF_DELAY:
         raise UnanswerableError(
             f"{ranges.source}: {len(some)} exchanges of tag {tag} with calibrated tags are too few, "
-            f"at least {MIN_RANGES} are needed"
+            f"at least {MIN_OF_DELAY} are needed"
         )
-    applied = replace(calibration, delays_ns=calibration.delays_ns | {tag: 0.0}).apply(some)
+    joined = _with_side(replace(calibration, delays_ns=calibration.delays_ns | {tag: 0.0}), tag, some)
+    applied = joined.apply(some)
     straight = replace(some, raw_m=some.raw_m + applied.corrected_m - applied.delay_corrected_m)
-    settings = FitSettings(loss=loss, delays_from=calibration, delays_only=True, alpha_dbm=calibration.alpha_dbm)
+    partners = replace(calibration, undetermined_splits=())
+    settings = FitSettings(loss=loss, delays_from=partners, delays_only=True, alpha_dbm=calibration.alpha_dbm)
     found = fit(straight, settings, lift=calibration.lift)
     added = {"tag": tag, "recording": ranges.source, "exchanges": len(some)}
     return replace(
         found,
         calibration=replace(
-            calibration,
+            joined,
             delays_ns=calibration.delays_ns | {tag: found.calibration.delays_ns[tag]},
-            delays_std_ns=calibration.delays_std_ns | {tag: found.calibration.delays_std_ns[tag]},
+            delays_std_ns=calibration.delays_std_ns
+            | {tag: math.inf if tag in joined.sides else found.calibration.delays_std_ns[tag]},
             antenna_delays={**calibration.antenna_delays, **known_delays(ranges.antenna_delays, [tag])},
             provenance=calibration.provenance | {"added": [*calibration.provenance.get("added", []), added]},
         ),
@@ -160,6 +167,25 @@ def add_tag(data: Data | Iterable[Data], calibration: Calibration, tag: int, los
     )
 
 
+def _with_side(calibration: Calibration, tag: int, ranges: Ranges) -> Calibration:
+    """Return a calibration in which a tag has the side opposite to its partners', if they have one.
+
+    Raises `UnanswerableError` where they have several.
+    """
+    sides = {calibration.sides.get(partner, 0) for partner in ranges.tags() if partner != tag}
+    if len(sides) > 1:
+        raise UnanswerableError(
+            f"tag {tag} ranges with tags that the calibration holds for several sides, and its ranges may tell what "
+            f"that leaves open; fit all recordings together ({split_text(calibration.undetermined_splits)})"
+        )
+    (side,) = sides
+    splits = list(calibration.undetermined_splits)
+    if side:
+        first, second = splits[abs(side) - 1]
+        splits[abs(side) - 1] = (first, (*second, tag)) if side > 0 else ((*first, tag), second)
+    return replace(calibration, undetermined_splits=tuple(splits))
+
+
 def _taken_over(known: Calibration | None, ranges: Ranges, *, curve: bool) -> dict[int, float]:
     """Return the delays that a calibration has for tags of these ranges.
 
@@ -167,6 +193,9 @@ def _taken_over(known: Calibration | None, ranges: Ranges, *, curve: bool) -> di
     """
     if known is None:
         return {}
+    if known.undetermined_splits:
+        text = f"{split_text(known.undetermined_splits)}; fit its recordings together with these"
+        raise BadInputError(text, parameter="delays_from")
     found = {tag: known.delays_ns[tag] for tag in ranges.tags() if tag in known.delays_ns}
     if not found:
         there, here = (", ".join(map(str, sorted(tags))) for tags in (known.delays_ns, ranges.tags()))
@@ -204,6 +233,7 @@ def result_of(
         known = replace(calibration.errors, lasting=lasting_errors(ranges, over_sigma))
         calibration = replace(calibration, errors=known)
     warnings = [
+        *([split_text(calibration.undetermined_splits)] if calibration.undetermined_splits else []),
         *first,
         *limits(found, ranges, residuals, fixed),
         *more,
@@ -212,7 +242,7 @@ def result_of(
         *implausible(calibration.delays_ns, residuals),
         *unlike_powers(ranges, calibration),
         *_beyond(found),
-        *warnings_of(ranges, float(np.mean(inliers)), found.model.free, found.blocks.seconds),
+        *warnings_of(ranges, float(np.mean(inliers)), found.blocks.seconds),
     ]
     provenance: dict[str, Any] = {
         "writer": f"uwbcal {uwblink.__version__}",
@@ -240,9 +270,17 @@ def result_of(
 
 
 def _held_out(ranges: Ranges, settings: FitSettings) -> HeldOut:
-    """Return the ranges that are held out, and a fit to the others."""
+    """Return the ranges that are held out, and a fit to the others.
+
+    Raises `UnanswerableError` where the others do not determine how to correct them.
+    """
     rows = held_out(ranges, settings.hold_out, settings.fold)
-    return HeldOut(ranges[rows], fit(ranges[~rows], settings, hold_out=0.0).calibration)
+    known = fit(ranges[~rows], settings, hold_out=0.0).calibration
+    try:
+        known.apply(ranges[rows])
+    except BadInputError as error:
+        raise UnanswerableError(f"what is held out cannot be judged: {error}", parameter="hold_out") from error
+    return HeldOut(ranges[rows], known)
 
 
 def _judged(held: HeldOut, settings: FitSettings) -> dict[str, Any]:

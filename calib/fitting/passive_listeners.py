@@ -28,8 +28,8 @@ from uwblink.protocols.table import third_from_target
 from uwblink.recording.distances import distances_m
 from uwblink.ticks import REPORT_BITS, SPEED_OF_LIGHT, TICK_S, elapsed
 
-MIN_OVERHEARD: Final = 50
-"""Of so many, the mean is known to a seventh of the noise of a delay; of fewer it would tell little."""
+MIN_OF_DELAY: Final = 50
+"""Ranges or receptions for the delay of one tag: their mean is known to a seventh of the noise, 0.03 ns."""
 PLAUSIBLE_NS: Final = 100.0
 """Longer delays come of wrong stamps: published ones are below 1 ns, beside those that are programmed."""
 
@@ -72,7 +72,7 @@ def heard_delays(data: Data, calibration: Calibration) -> dict[int, OverheardDel
     found = {}
     for tag in np.unique(heard["target"]).tolist():
         values = delay_ns[good & (heard["target"] == tag)]
-        if len(values) >= MIN_OVERHEARD:
+        if len(values) >= MIN_OF_DELAY:
             # Reflections lengthen three receptions: two of them shorten the delay, one lengthens it. The balance is a
             # tail on the short side, which the likelihood of ranges tells from noise when the sign is changed.
             parts = fit_grouped_errors([-values * METRES_A_NS])

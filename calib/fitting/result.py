@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from html import escape
+from typing import Any
 
 from calib import figures
 from calib.calibration.model import Calibration
@@ -61,6 +62,10 @@ class FitResult:
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write the calibration as JSON, whole or not at all; replaces a file only with `force`."""
         self.calibration.save(path, force=force)
+
+    def correct(self, *columns: Any, **named: Any) -> Any:
+        """Correct one range, or arrays of them, as `Calibration.correct` does."""
+        return self.calibration.correct(*columns, **named)
 
     def plot_bias(self, axes: Axes | None = None) -> Axes:
         """Draw medians of the delay-corrected errors over lifted power, in cm, and the fitted curve with its band."""

@@ -15,6 +15,7 @@ import numpy as np
 from calib.data.sources import Data
 from calib.errors import UnanswerableError
 from calib.estimator.inverse import inverse_of
+from calib.estimator.optimize import EVIDENCE_STEPS
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, RangeRows
 from calib.estimator.rows import sum_rows
@@ -22,29 +23,23 @@ from calib.estimator.unknowns import Layout, Priors
 from calib.range_errors.densities import error_slopes
 from calib.settings import FitSettings, FlightSettings
 from calib.trajectories.fitting import range_model, variance_factor, verdict_on, with_known_distances
-from calib.trajectories.motion import Distances, Motion, known_rows
-from calib.trajectories.samples import tapes_of
+from calib.trajectories.motion import LEAST_JERK, Distances, Motion, known_rows
+from calib.trajectories.samples import SAMPLE_S, tapes_of
 from calib.trajectories.scene import Scene, scene_from
-from calib.trajectories.start import SAMPLE_S, Trajectories, interpolated
+from calib.trajectories.start import Trajectories, interpolated
 from uwblink.arrays import Floats
 from uwblink.recording.schema import KnownDistance
 
-CURVE_M, CURVE_BENDS = 0.05, 3.0
+TYPICAL_CURVE_M, CURVE_BENDS = 0.05, 3.0
 """Amplitude (m) and phase over the power range (rad) of a typical bias curve, which sets the smoothness that a fit will
 estimate."""
-
-EVIDENCE_STEPS = 12
-"""Iterations of the smoothness of curves, as in a fit."""
 
 ENDS = 4
 """Control points at either end of a path that planned positions do not determine well."""
 
-MIN_JERK_M_S3 = 0.2
-"""Jerk of a body that hardly moves: no real flight is smoother."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Errors:
+class ExpectedErrors:
     """The expected errors of ranges: noise, and a share of reflections that are longer by `detour_m` on average.
 
     It is an error density (`calib.estimator.range_rows.Errors`) with residuals of zero and the mean information of a
@@ -80,7 +75,7 @@ class Errors:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Flight:
+class PlannedFlight:
     """A planned flight: the inputs of a fit (`scene`), true positions, and the model of ranges.
 
     `path` has the positions of moving bodies, `stands` those of standing bodies.
@@ -88,7 +83,7 @@ class Flight:
 
     scene: Scene
     model: RangeModel
-    errors: Errors
+    errors: ExpectedErrors
     path: Trajectories
     stands: Mapping[str, Floats]
 
@@ -97,7 +92,7 @@ class Flight:
         """The pairs of tags whose distance is taped."""
         return [(one.first, one.second) for one in self.scene.tapes.stated]
 
-    def taped(self, pairs: Sequence[tuple[int, int]], still_s: float, sigma_m: float) -> Flight:
+    def taped(self, pairs: Sequence[tuple[int, int]], still_s: float, sigma_m: float) -> PlannedFlight:
         """Return the flight with taped distances, of bodies that stand at first or of anchors."""
         when = f"0..{still_s:g}" if still_s else ""
         stated = [KnownDistance(first, second, 1.0, sigma_m, when) for first, second in pairs]
@@ -107,8 +102,8 @@ class Flight:
 
 
 def flight_of(
-    data: Data, settings: FlightSettings, errors: Errors, *, curve: bool, force_std_m_s2: float | None
-) -> Flight:
+    data: Data, settings: FlightSettings, errors: ExpectedErrors, *, curve: bool, force_std_m_s2: float | None
+) -> PlannedFlight:
     """Return a planned flight from a recording with poses over the whole flight.
 
     `force_std_m_s2` is the standard error of an accelerometer's mean over a tenth of a second; None without one. Raises
@@ -129,7 +124,7 @@ def flight_of(
     sensed = {} if force_std_m_s2 is None else truth.inertial
     inertial = {body: replace(some, std_m_s2=float(force_std_m_s2 or 0.0)) for body, some in sensed.items()}
     times = truth.places.time_s
-    return Flight(
+    return PlannedFlight(
         scene=replace(scene, attitudes=attitudes, inertial=inertial),
         model=model,
         errors=errors,
@@ -146,7 +141,7 @@ class Information:
     `covariance_ns2` (tags, tags) is that of the delays of `tags`, `verdict` says which of them are determined.
     """
 
-    def __init__(self, flight: Flight) -> None:
+    def __init__(self, flight: PlannedFlight) -> None:
         """Sum the information of all rows at the planned trajectories."""
         scene, model = flight.scene, flight.model
         self.flight, self.motion, self.tags = flight, Motion.of(scene), tuple(model.tags)
@@ -160,7 +155,7 @@ class Information:
         knots = np.zeros(0) if model.curve is None else model.curve.knots
         for kind in model.curve_kinds():
             centres = np.convolve(knots[1:-1], np.full(3, 1 / 3), mode="valid")
-            self.x[self.layout.where[kind]] = CURVE_M * np.sin(CURVE_BENDS * centres)
+            self.x[self.layout.where[kind]] = TYPICAL_CURVE_M * np.sin(CURVE_BENDS * centres)
         geometry = Distances.of(self.motion, self.layout, (model.ranges.initiator, model.ranges.target), scene.time_s)
         raw = np.zeros(len(scene.time_s))
         ranges = RangeRows.of(raw, model.key(), model.parts, flight.errors, self.layout, geometry)
@@ -204,4 +199,4 @@ def _jerk(points: Floats, step_s: float) -> float:
     """Return the jerk that paths by control points (k, bodies, 3) have, root mean square, away from their ends."""
     inner = points[ENDS:-ENDS] if len(points) > 3 * ENDS else points
     jerk = np.diff(inner, n=3, axis=0) / step_s**3
-    return max(float(np.sqrt(np.mean(jerk**2))), MIN_JERK_M_S3)
+    return max(float(np.sqrt(np.mean(jerk**2))), LEAST_JERK)

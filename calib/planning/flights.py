@@ -13,27 +13,21 @@ from threadpoolctl import threadpool_limits
 
 from calib.data.sources import Data
 from calib.errors import BadInputError
-from calib.planning.flight_information import Errors, Flight, Information, flight_of
+from calib.planning.flight_information import ExpectedErrors, Information, PlannedFlight, flight_of
 from calib.planning.reference_motion import reference_motion
 from calib.planning.result import FlightPlan, NextBest, mean_std_ns
 from calib.planning.settings import ACCELEROMETERS, FlightPlanSettings
 from calib.settings import FlightSettings
 from calib.spread import TWO_SIDED_95
-from calib.trajectories.attitudes import WINDOW_S
+from calib.trajectories.samples import SAMPLE_S, TRUSTED
 from uwblink.arrays import Floats
 
 MORE_KNOWN_S, MORE_ANCHORS, STANDS_S, HEADING_DEG = 10.0, 4, 5.0, 0.5
 """Further measurements that are proposed: so many seconds of known positions, anchors, seconds at a stand, and degrees
 of error of headings. Each is what a team can do without other equipment."""
 
-DELAY_STD_NS = 0.05
-"""Standard error of the delay of one tag from another calibration or a survey."""
-
-VIBRATION_M_S2 = 0.2
-"""Vibration that is left in a mean over a tenth of a second."""
-
-TRUSTED = 3.0
-"""Factor on the residuals of an accelerometer in a fit."""
+OTHER_DELAY_STD_NS = 0.05
+"""Standard error of the delay of one tag from another calibration or a survey (`make surveys`: 41 to 94 ps)."""
 
 Robots = int | Sequence[Sequence[int]]
 
@@ -86,7 +80,8 @@ def _information(asked: FlightPlanSettings, data: Data | None) -> Information:
     force_std_m_s2 = (
         None
         if asked.imu is None
-        else TRUSTED * math.hypot(ACCELEROMETERS[asked.imu] / math.sqrt(WINDOW_S), VIBRATION_M_S2)
+        # The second part is vibration that is left in a mean (m/s^2): a judgement; a fit weighs by its residuals.
+        else TRUSTED * math.hypot(ACCELEROMETERS[asked.imu] / math.sqrt(SAMPLE_S), 0.2)
     )
     flight = flight_of(
         reference_motion(asked) if data is None else data,
@@ -96,7 +91,7 @@ def _information(asked: FlightPlanSettings, data: Data | None) -> Information:
             heading_std_deg=asked.heading_std_deg,
             anchors=asked.anchor_places,
         ),
-        Errors(noise_m=asked.noise_m, reflected=asked.reflected),
+        ExpectedErrors(noise_m=asked.noise_m, reflected=asked.reflected),
         curve=not asked.delays_only,
         force_std_m_s2=force_std_m_s2,
     )
@@ -130,12 +125,14 @@ def _more(asked: FlightPlanSettings, data: Data | None, found: Information) -> I
             if mean < now:
                 yield NextBest(what.format(*changed.flight.tapes[-1:]), mean, now)
     c = found.covariance_ns2
-    means = [_mean_ns(c - np.outer(c[k], c[k]) / (c[k, k] + DELAY_STD_NS**2)) for k in range(len(c))]
+    means = [_mean_ns(c - np.outer(c[k], c[k]) / (c[k, k] + OTHER_DELAY_STD_NS**2)) for k in range(len(c))]
     best = int(np.argmin(np.round(means, 6)))
-    yield NextBest(f"the delay of tag {found.tags[best]} from elsewhere, to {DELAY_STD_NS:g} ns", means[best], now)
+    yield NextBest(
+        f"the delay of tag {found.tags[best]} from elsewhere, to {OTHER_DELAY_STD_NS:g} ns", means[best], now
+    )
 
 
-def _changes(asked: FlightPlanSettings, flight: Flight) -> Iterator[tuple[str, dict[str, Any]]]:
+def _changes(asked: FlightPlanSettings, flight: PlannedFlight) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield further measurements in words, with the changes of the settings that they are.
 
     The words have places for both tags of the last taped distance.

@@ -25,17 +25,16 @@ from calib.surveys.recordings import PairMeans
 from uwblink.arrays import Bools, Floats
 from uwblink.recording.schema import KnownDistance
 
-NEAREST_M = 0.4
-"""Boards stand no nearer to each other; nearer, powers saturate and fields are not yet waves."""
+NEAREST_BOARDS_M = 0.4
+"""Boards stand no nearer to each other; five wavelengths; nearer, powers saturate and fields are not yet waves."""
 
-CURVE_M = 0.05
-"""Standard deviation of a curve over power: that of the published curves (`CURVE_LENGTH_DB`) is 0.1 m."""
+PLANNED_CURVE_STD_M = 0.05
+"""Standard deviation of a curve over power: half that of the published curves (`CURVE_LENGTH_DB`). With all of it plans
+of six boards in five arrangements would promise no delay beside a curve, which surveys do find (`make surveys`)."""
 
 POWER_AT_1_M_DBM = -74.0
-"""Received power at a metre, as DW1000 boards report it."""
-
-DRAWS = 100
-"""Draws of which pairs are reflected: a root mean square over them is good to a few per cent."""
+"""First-path power at a metre: the upper quartile of power times squared distance in the MILUV flight among obstacles,
+whose median is -77 dBm."""
 
 
 def random_arrangements(inputs: SurveyPlanSettings, count: int, tries: int = 400) -> list[PlannedArrangement]:
@@ -61,7 +60,7 @@ def random_arrangements(inputs: SurveyPlanSettings, count: int, tries: int = 400
             place[list(order), 0] = np.round(np.linspace(0, float(size[0]), len(tags)), 1)
         else:
             place[:, :dimensions] = np.round(rng.uniform(0, size, (len(tags), dimensions)), 1)
-            if min(np.linalg.norm(one - other) for one, other in combinations(place, 2)) < NEAREST_M:
+            if min(np.linalg.norm(one - other) for one, other in combinations(place, 2)) < NEAREST_BOARDS_M:
                 continue
         spots = {tag: (x, y, z) for tag, (x, y, z) in zip(tags, place.tolist(), strict=True)}
         first = next(iter(found.values())).place_m if found else spots
@@ -106,7 +105,7 @@ def delay_information(
         network.with_positions(network.layout.start(), np.array(list(one.place_m.values()))),
         network.layout.free(),
     )
-    cases = [Case(none + marks > 0, inputs.pair_error_m, CURVE_M) for marks in reflected]
+    cases = [Case(none + marks > 0, inputs.pair_error_m, PLANNED_CURVE_STD_M) for marks in reflected]
     return np.array([reduced(network.at(x, case).known[np.ix_(free, free)], free >= 3 * len(boards)) for case in cases])
 
 
@@ -124,12 +123,13 @@ def predict(
             # The prior counts once, below.
             design = prior.design.reshape(*powers.shape, -1)[k]
             own = replace(prior, design=design, precision=np.zeros_like(prior.precision))
-        shape = (DRAWS if inputs.reflected else 1, len(first))
+        # A root mean square over a hundred draws of which pairs are reflected is good to a few per cent.
+        shape = (100 if inputs.reflected else 1, len(first))
         drawn = np.random.default_rng([inputs.seed, k]).uniform(size=shape) < inputs.reflected
         parts.append(delay_information(inputs, one, own, drawn))
     totals, delays = np.cumsum(parts, axis=0), np.arange(parts[0].shape[-1]) < len(inputs.tags)
     if prior is not None:
-        totals[..., len(inputs.tags) :, len(inputs.tags) :] += prior.precision / CURVE_M**2
+        totals[..., len(inputs.tags) :, len(inputs.tags) :] += prior.precision / PLANNED_CURVE_STD_M**2
     return [_averaged(np.array([reduced(one, delays) for one in draws]), inputs.tags) for draws in totals]
 
 

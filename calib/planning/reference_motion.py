@@ -10,14 +10,14 @@ import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
 from calib.data.samples import SampleFlight, stamped
+from calib.evaluation.inertial_filter import GRAVITY_M_S2
 from calib.planning.settings import FlightPlanSettings
-from calib.trajectories.attitudes import GRAVITY_M_S2
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
 
 STARTING_S = 3.0
-"""Seconds from standstill to full speed."""
+"""Seconds from standstill to full speed: a judgement, gentle at 1 m/s."""
 
 
 def reference_motion(flown: FlightPlanSettings) -> SampleFlight:

@@ -9,13 +9,14 @@ from typing import Any, Generic
 
 import numpy as np
 
-from calib.calibration.document import T, for_json
+from calib.calibration.document import Value, for_json
 from calib.information import Verdict
 from calib.planning.settings import FlightPlanSettings
 from uwblink.arrays import Floats
 
 GUESS_NS = 1.5
-"""How far a delay is known without any data: means over tags are finite then, though some are not determined."""
+"""How far a delay is known without any data, two and a half times what published ones differ by (0.6 ns): means over
+tags are finite then, though some are not determined."""
 
 
 def mean_std_ns(information: Floats) -> float:
@@ -61,14 +62,14 @@ class NextBest:
 
 
 @dataclass(frozen=True, slots=True)
-class Precision(Generic[T]):
+class Precision(Generic[Value]):
     """Precision of delays in ns, infinite where undetermined: of each, of each against the mean of all, of that mean.
 
     They are standard deviations or half intervals, of delays as arrays (tags,) or as root mean squares.
     """
 
-    each: T
-    apart: T
+    each: Value
+    apart: Value
     common: float
 
 

@@ -19,7 +19,7 @@ ACCELEROMETERS: Final = {"consumer": 3e-3, "industrial": 1e-3, "tactical": 3e-4}
 
 MAX_TAGS: Final = 60
 MAX_RANGES: Final = 200_000
-"""A bound that keeps a mistyped duration from filling the memory."""
+"""Bounds that keep a mistyped number from filling the memory: 1770 pairs, and five training flights' exchanges."""
 
 
 def read_numbers(text: str, parameter: str | None = None) -> list[float]:
@@ -57,11 +57,16 @@ def _are_lengths(size_m: Sequence[float], dimensions: int) -> bool:
 
 
 _SIZE: Any = {"flag": "--size", "kind": str | None, "parse": read_numbers, "metavar": "M,M,M"}
-_ANCHORS: Any = {"flag": "--anchor-tags", "kind": str | None, "parse": read_whole, "metavar": "TAG,TAG..."}
-_ANCHORS_HELP = "Boards at known positions, which stay there."
-_RATE_HELP = "Exchanges per second, all pairs together (Hz)."
-_TAPED_HELP = "Number of distances that will be measured with a tape."
-_TAPE_HELP = "Standard deviation of a distance by tape (m)."
+_ANCHORS: Any = {
+    "help": "Boards at known positions, which stay there.",
+    "flag": "--anchor-tags",
+    "kind": str | None,
+    "parse": read_whole,
+    "metavar": "TAG,TAG...",
+}
+_RATE: Any = {"help": "Exchanges per second, all pairs together (Hz).", "flag": "--rate"}
+_TAPED: Any = {"help": "Number of distances that will be measured with a tape."}
+_TAPE: Any = {"help": "Standard deviation of a distance by tape (m).", "flag": "--tape-sigma"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,13 +93,13 @@ class SurveyPlanSettings:
     )
     arrangements: int | None = setting(None, "Number of arrangements; by default as many as are worth it.")
     size_m: Sequence[float] | None = setting(None, "Length of the line, or sides of plane or room (m).", **_SIZE)
-    taped: int = setting(0, _TAPED_HELP)
-    tape_sigma_m: float = setting(0.005, _TAPE_HELP, flag="--tape-sigma")
-    anchors: Sequence[int] = setting((), _ANCHORS_HELP, **_ANCHORS)
+    taped: int = setting(0, **_TAPED)
+    tape_sigma_m: float = setting(0.005, **_TAPE)
+    anchors: Sequence[int] = setting((), **_ANCHORS)
     anchor_sigma_m: float = setting(0.01, "Standard deviation of known positions (m).", flag="--anchor-sigma")
     pair_error_m: float = setting(0.02, "Constant error of a pair in an arrangement (m).", flag="--pair-error")
     reflected: float = setting(0.0, "Share of pairs that are reflected.")
-    rate_hz: float = setting(50.0, _RATE_HELP, flag="--rate")
+    rate_hz: float = setting(50.0, **_RATE)
     seed: int = 1
 
     def __post_init__(self) -> None:
@@ -151,7 +156,7 @@ class FlightPlanSettings:
 
     robots: Any = None
     seconds: float = setting(60.0, "Duration in seconds.", flag="--duration")
-    rate_hz: float = setting(80.0, _RATE_HELP, flag="--rate")
+    rate_hz: float = setting(80.0, **_RATE)
     size_m: Sequence[float] = setting((6.0, 5.0, 2.5), "Sides of the room (m).", **_SIZE)
     speed_m_s: float = setting(1.0, "Mean speed of the robots (m/s).", flag="--robot-speed")
     apart_m: float = setting(0.5, "Distance between the tags of a robot (m).", flag="--tag-spacing")
@@ -167,15 +172,15 @@ class FlightPlanSettings:
         3.0, "Standard deviation of headings; 0: headings are exact.", flag="--heading-std", metavar="DEGREES"
     )
     imu: str | None = setting(None, "Grade of the robots' inertial sensors.", names=tuple(ACCELEROMETERS))
-    anchors: Sequence[int] = setting((), _ANCHORS_HELP, **_ANCHORS)
+    anchors: Sequence[int] = setting((), **_ANCHORS)
     anchor_places: str = setting(
         "given", "Positions of anchors: given, or sought (estimated).", flag="--anchors", names=("given", "sought")
     )
     still_s: float = setting(
         0.0, "How long the robots stand before they fly, for a tape.", flag="--standstill", metavar="SECONDS"
     )
-    taped: int = setting(0, _TAPED_HELP)
-    tape_sigma_m: float = setting(0.01, _TAPE_HELP, flag="--tape-sigma")
+    taped: int = setting(0, **_TAPED)
+    tape_sigma_m: float = setting(0.01, **_TAPE)
     noise_m: float = setting(0.04, "Noise of a range (m).", flag="--range-noise")
     reflected: float = setting(0.08, "Share of ranges that are reflected.")
     delays_only: bool = setting(False, "Plan for a fit without a curve over power.")

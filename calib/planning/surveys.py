@@ -23,13 +23,14 @@ RANGES_A_PAIR = 20
 """Noise of 4 cm leaves 9 mm in a mean of so many, which adds a tenth to a pair's constant error of 2 cm."""
 
 CANDIDATES = 60
-"""Random arrangements from which each is chosen."""
+"""Random arrangements from which each is chosen: the best of so many is in the best 5 % with a probability of 95 %."""
 
 MOST_ARRANGEMENTS = 12
 """Arrangements after which no more is planned where no number is given: an hour's work."""
 
 WORTH_IT = 0.06
-"""Share by which one arrangement more must narrow the mean interval to be planned, where no number is given."""
+"""Share by which one arrangement more must narrow the mean interval to be planned, where no number is given:
+n arrangements narrow it by the root of n, so that about eight are planned."""
 
 
 def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None, **changes: Any) -> Plan:

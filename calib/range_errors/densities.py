@@ -7,6 +7,7 @@ outliers, share of the second kind); the likelihood has a slope by each of the s
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -15,7 +16,6 @@ from scipy.special import erfcx, expit
 
 from uwblink.arrays import Floats
 
-ROOT_2: Final = float(np.sqrt(2))
 ROOT_2PI: Final = float(np.sqrt(2 * np.pi))
 LONG_FACTOR: Final = 4.0
 """Mean of the second kind of detour over that of the first, where it is fitted.
@@ -62,7 +62,7 @@ ONE_KIND: Final = LongDetours()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Kind:
+class ReflectionKind:
     """Reflected ranges of one kind: their `density` times the kind's share, 1/m, and the noise in them.
 
     That noise is normal, cut off above: with v = (e - least)/sigma, `ratio` = sigma/detour and u = v - ratio its mean
@@ -82,7 +82,7 @@ class Densities:
     direct: Floats
     reflected: Floats
     sigma_m: Floats
-    kinds: tuple[Kind, ...]
+    kinds: tuple[ReflectionKind, ...]
 
     def noise_m(self) -> Floats:
         """Return the mean of the noise in reflected ranges."""
@@ -98,7 +98,7 @@ class Densities:
             found = found + part * (kind.noise_var - first.noise_var + (1 - part) * apart * apart)
         return found
 
-    def _part(self, kind: Kind) -> Floats:
+    def _part(self, kind: ReflectionKind) -> Floats:
         """Return the probability that a reflected range is of a kind, 0 where both densities vanish."""
         return np.asarray(kind.density / (self.reflected + np.finfo(float).tiny))
 
@@ -121,19 +121,19 @@ def densities(
     )
 
 
-def _kind(v: Floats, normal: Floats, sigma_m: Floats, share: float, detour_m: Any) -> Kind:
+def _kind(v: Floats, normal: Floats, sigma_m: Floats, share: float, detour_m: Any) -> ReflectionKind:
     """Return reflected ranges of a kind at errors `v` (n,) beyond the least detour, in sigmas."""
     ratio = sigma_m / detour_m
     u = v - ratio
     # Thirty sigmas beyond the least detour erfcx overflows, and the noise in a detour no longer depends on the error.
     near = np.minimum(u, 30.0)
-    scaled = erfcx(near * (-1 / ROOT_2))
+    scaled = erfcx(near * (-1 / math.sqrt(2.0)))
     density = normal * scaled * (0.5 * share / detour_m)
     if np.any(near < u):
         far = np.exp(np.minimum(ratio * (0.5 * ratio - v), 50.0)) * (share / detour_m)
         density = np.where(near < u, far, density)
     hazard = (2 / ROOT_2PI) / scaled
-    return Kind(
+    return ReflectionKind(
         density=density,
         detour_m=detour_m,
         noise_m=np.asarray(sigma_m * (ratio - hazard)),

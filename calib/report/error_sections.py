@@ -13,7 +13,7 @@ from calib.estimator.grouped_errors import fit_grouped_errors
 from calib.evaluation.localization import PAPER_RMSE_M, Localization, rmse_rows, summarize
 from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, pair_rows, stage_cells
 from calib.evaluation.tracking import Settings
-from calib.report.figures import FILTERS, rmse_bars, track
+from calib.report.figures import FILTER_STYLES, rmse_bars, track
 from calib.report.results import Results
 from uwblink.pages.blocks import Block, Heading, Picture, Table, Text
 from uwblink.pages.figures import Draw
@@ -176,7 +176,7 @@ def localization(results: Results) -> list[Block]:
         )
     elif total.nis < nis_low or total.nees < nees_low:
         meaning = "Below their bounds: the filter is underconfident, for example because a gate rejects the tail."
-    heads = [FILTERS[name][0].removeprefix("calibrated, ") for name in names]
+    heads = [FILTER_STYLES[name][0].removeprefix("calibrated, ") for name in names]
     shown = [
         Picture(
             track_name(one.source, one.body),

@@ -18,7 +18,7 @@ from uwblink.arrays import Floats
 from uwblink.pages.colours import BLUE, GREY, INK, MUTED, VERMILION, WINE, look
 from uwblink.pages.figures import NARROW_IN, label, legend, mark, series, sheet
 
-FILTERS: Final[dict[str, tuple[str, str, Any, str]]] = {
+FILTER_STYLES: Final[dict[str, tuple[str, str, Any, str]]] = {
     "raw": ("raw", VERMILION, (0, (1.5, 1.2)), ""),
     "calibrated": ("calibrated", WINE, (0, (5, 1.5)), "////"),
     "variance": ("calibrated, with variance", BLUE, "-", ""),
@@ -38,7 +38,7 @@ def rmse_bars(width_in: float, found: list[Localization]) -> Figure:
     names = [f"{one.source.removesuffix('.uwb')}\n{one.body}" for one in shown] + ["mean"]
     heights = {stage: [float(one.rmse_m[stage].mean()) for one in shown] + [mean[stage]] for stage in mean}
     for k, (stage, own) in enumerate(heights.items()):
-        name, colour, _, hatch = FILTERS[stage]
+        name, colour, _, hatch = FILTER_STYLES[stage]
         place = np.arange(len(names)) + 0.21 * (k - (len(mean) - 1) / 2)
         axes.bar(place, own, 0.19, color=colour, hatch=hatch, ec="white", lw=0, label=name)
     every = np.concatenate(list(heights.values()))
@@ -79,7 +79,7 @@ def track(width_in: float, one: Localization) -> Figure:
     above, height, error = panels["path"], panels["height"], panels["error"]
     usual = []
     for stage, own in one.tracks.items():
-        name, colour, dashes, _ = FILTERS[stage]
+        name, colour, dashes, _ = FILTER_STYLES[stage]
         line: dict[str, Any] = {"color": colour, "ls": dashes, "lw": 0.9, "label": name}
         off = np.linalg.norm(own.estimate_m - own.truth_m, axis=1)
         usual.append(float(np.quantile(off, 0.995)))

@@ -191,7 +191,7 @@ def _determined(results: Results) -> list[Block]:
         return []
     calibration, pairs = results.calibration, pair_rows(results.trained)
     answer = f"Yes: the {len(pairs)} pairs of {len(results.trained.tags())} tags determine every delay."
-    if calibration.provenance.get("undetermined"):
+    if left_open(results):
         answer = f"No: {left_open(results)}."
     counts = [int(np.count_nonzero(rows)) for rows in pairs.values()]
     changed = calibration.provenance.get("settings", {})
@@ -215,14 +215,17 @@ def _determined(results: Results) -> list[Block]:
 def _delays(results: Results) -> list[Block]:
     """Return delays with intervals, with planted and overheard delays if there are any."""
     calibration, heard = results.calibration, results.heard
-    if calibration.pair_offsets:
+    of_pairs: list[Block] = []
+    if calibration.pair_constants:
         rows = [list(row) for row in offset_rows(calibration)]
-        return [Heading("Antenna delays"), Table(["pair", "ranges too long by (cm)", "95 %"], rows)]
+        of_pairs = [Table(["pair", "ranges too long by (cm)", "95 %"], rows)]
+    if calibration.pair_offsets or len(calibration.sides) == len(calibration.delays_ns):
+        return [Heading("Antenna delays"), *of_pairs]
     planted = results.planted if results.recordings else None
     truth: dict[str, Any] = (results.trained.planted or {}).get("delays_ns", {}) if planted else {}
     known = {int(tag): float(delay) for tag, delay in truth.items()}
     shift = planted.shift_ns if planted else 0.0
-    delays = dict(sorted(calibration.delays_ns.items()))
+    delays = {tag: delay for tag, delay in sorted(calibration.delays_ns.items()) if tag not in calibration.sides}
     half = {tag: TWO_SIDED_95 * calibration.delays_std_ns.get(tag, nan) for tag in delays}
     unknown = {tag: "not stated" if isnan(one) else "undetermined" for tag, one in half.items() if not isfinite(one)}
     columns = {
@@ -247,7 +250,7 @@ def _delays(results: Results) -> list[Block]:
         ", and what was planted, in the same gauge." if known else "."
     )
     draw = partial(figures.alone, partial(figures.delays, calibration, known, shift))
-    blocks: list[Block] = [Heading("Antenna delays"), Table(list(columns), rows), Picture("delays", draw, caption)]
+    blocks = [Heading("Antenna delays"), *of_pairs, Table(list(columns), rows), Picture("delays", draw, caption)]
     if planted:
         text = (
             "A constant of the bias curve and a common shift of all delays cannot be distinguished: planted delays, "
@@ -293,7 +296,7 @@ SECTIONS: Final[dict[str, Section]] = {
 def register_report_section(name: str, section: Section, *, before: str = "provenance") -> None:
     """Add a section to the reports of campaigns and of evaluations, above the one called `before`.
 
-    `section` takes the `Campaign` (of an evaluation, results with as much as is known) and returns blocks
+    `section` takes the `Results` (a `Campaign` is one; of an evaluation, with as much as is known) and returns blocks
     (`calib.report`: `Heading`, `Text`, `Table`, `Picture`, `Listing`), which appear in the HTML page and in the PDF;
     figures are drawn at the width they are asked for. Raises `BadInputError` for a name that is taken and for a
     `before` that is not there.

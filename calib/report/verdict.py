@@ -10,7 +10,9 @@ import numpy as np
 from scipy.special import stdtrit
 from scipy.stats import binomtest
 
+from calib.calibration.document import pair_name, split_text
 from calib.calibration.model import rests_on
+from calib.estimator.range_model import METRES_A_NS
 from calib.evaluation.statistics import Stats
 from calib.report.results import Results
 from calib.spread import STD_OF_MEDIAN, TWO_SIDED_95
@@ -181,23 +183,27 @@ def _settled(results: Results) -> Criterion:
     asked = ("Are the antenna delays known well enough?", f"95 % interval of each within ± {MOST_NS:g} ns (3 cm)")
     if known.provenance.get("undetermined"):
         return Criterion(*asked, left_open(results), BAD, left_open(results))
-    half = {tag: TWO_SIDED_95 * std for tag, std in known.delays_std_ns.items() if np.isfinite(std)}
+    half = {f"tag {t}": TWO_SIDED_95 * std for t, std in known.delays_std_ns.items() if np.isfinite(std)}
+    if known.undetermined_splits:
+        of_pairs = {pair_name(pair): one.std_m for pair, one in known.pair_constants.items()}
+        half |= {f"pair {name}": TWO_SIDED_95 * std / METRES_A_NS for name, std in of_pairs.items() if np.isfinite(std)}
     if not half:
         return Criterion(*asked, "the calibration states no intervals", DOUBT, "delays have no intervals")
-    tag = max(half, key=lambda t: half[t])
-    told = f"delays are known to ± {half[tag]:.3f} ns or better"
-    if half[tag] > MOST_NS:
-        told = f"the delay of tag {tag} is known to ± {half[tag]:.2f} ns only"
-    grade = _graded(half[tag] <= MOST_NS, half[tag] <= 3 * MOST_NS)
-    return Criterion(*asked, f"widest: tag {tag}, ± {half[tag]:.3f} ns", grade, told)
+    widest = max(half, key=lambda name: half[name])
+    told = f"delays are known to ± {half[widest]:.3f} ns or better"
+    if half[widest] > MOST_NS:
+        told = f"the delay of {widest} is known to ± {half[widest]:.2f} ns only"
+    grade = _graded(half[widest] <= MOST_NS, half[widest] <= 3 * MOST_NS)
+    return Criterion(*asked, f"widest: {widest}, ± {half[widest]:.3f} ns", grade, told)
 
 
 def left_open(results: Results) -> str:
-    """Return in words the delays that the pairs do not determine."""
-    made = results.calibration.provenance
+    """Return in words the delays that the pairs do not determine, "" for none."""
+    made, splits = results.calibration.provenance, results.calibration.undetermined_splits
+    if splits and "left_open" not in made:
+        return split_text(splits)
     groups = "; ".join(", ".join(map(str, group)) for group in made.get("undetermined", []))
-    trace = f"the delays of tags {groups} can shift against each other without a trace in any range"
-    return str(made.get("left_open", trace))
+    return str(made.get("left_open", f"the delays of tags {groups} are not determined" if groups else ""))
 
 
 def _warned(results: Results) -> Criterion:

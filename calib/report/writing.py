@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from calib import figures as drawings
-from calib.calibration.comparison import Comparison
-from calib.calibration.model import Calibration, require_calibration
+from calib.calibration.comparison import CalibrationComparison
+from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.data.sources import Data, each, load_each
 from calib.errors import BadInputError
 from calib.evaluation.localization import Localization
@@ -43,7 +43,7 @@ def check_places(output: Path | None, pdf: Path | None, figures: Path | None, *,
 def write_report(
     path: str | os.PathLike[str] | None,
     data: Data | Iterable[Data],
-    calibration: Calibration,
+    calibration: CalibrationSource,
     *,
     figures: str | os.PathLike[str] | None = None,
     evaluation: Evaluation | None = None,
@@ -65,7 +65,7 @@ def write_report(
     ...     "Before and after" in page.read_text()
     True
     """
-    require_calibration(calibration)
+    calibration = given_calibration(calibration)
     output, folder = (None if place is None else Path(place) for place in (path, figures))
     check_places(output, None, folder, force=force)
     recordings = each(data)
@@ -76,13 +76,13 @@ def write_report(
 
 
 def write_survey_report(
-    path: str | os.PathLike[str], calibration: Calibration, *, origin: Origin | None = None, force: bool = False
+    path: str | os.PathLike[str], calibration: CalibrationSource, *, origin: Origin | None = None, force: bool = False
 ) -> None:
     """Write what a calibration without known distances rests on and whether it is fit for use, as HTML or .pdf.
 
     It needs no recording: everything stands in the calibration. Raises what `check_output` raises.
     """
-    require_calibration(calibration)
+    calibration = given_calibration(calibration)
     check_places(Path(path), None, None, force=force)
     results = Results(calibration=calibration, origin=origin or origin_of([]))
     title = "Report of a calibration without motion capture"
@@ -105,7 +105,12 @@ def write_track_figures(
 
 
 def write_comparison_figures(
-    found: Comparison, known: Sequence[Calibration], names: Sequence[str], folder: Path, *, force: bool = False
+    found: CalibrationComparison,
+    known: Sequence[Calibration],
+    names: Sequence[str],
+    folder: Path,
+    *,
+    force: bool = False,
 ) -> None:
     """Write the differences of delays and both calibrations' curves into a folder; `names` label the calibrations."""
     pictures = [

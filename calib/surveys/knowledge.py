@@ -13,7 +13,8 @@ from uwblink.recording.schema import SHAPES, Arrangement, KnownDistance
 from uwblink.text_files import TomlReader, is_number
 
 TAPE_M, PLACE_M = 0.005, 0.01
-"""Standard deviations of a distance by tape, and of each coordinate of a position, where none is stated."""
+"""Standard deviations of a distance by tape, and of each coordinate of a position, where none is stated:
+a tape is read to 5 mm, and both ends of a coordinate are antennas."""
 
 MAX_LENGTH_M, MIN_SIGMA_M = 1e6, 1e-6
 """From a micrometre to a thousand kilometres, squares and weights are numbers that can be computed with."""
@@ -72,11 +73,11 @@ def _are_tags(value: Any, count: int | None = None) -> bool:
 
 
 LENGTH: Final = (lambda value: is_number(value) and value > 0, "a number above 0 (metres)")
-NAME: Final = (lambda value: isinstance(value, str) and value.isprintable() and value != "", "a name")
+WORD: Final = (lambda value: isinstance(value, str) and value.isprintable() and value != "", "a name")
 SECONDS: Final = (lambda value: is_number(value) and abs(value) <= 1e9, "a number of seconds")  # thirty years
 KEYS: Final[dict[str, dict[str, tuple[Callable[[Any], bool], str]]]] = {
     "arrangements": {
-        "name": NAME,
+        "name": WORD,
         "known": (SHAPES.__contains__, "line or plane"),
         "order": (_are_tags, "two tags or more, each once, as in [3, 1, 2]"),
         "start_s": SECONDS,
@@ -86,7 +87,7 @@ KEYS: Final[dict[str, dict[str, tuple[Callable[[Any], bool], str]]]] = {
         "between": (lambda value: _are_tags(value, 2), "two different tags, as in [1, 2]"),
         "distance_m": LENGTH,
         "sigma_m": LENGTH,
-        "arrangement": NAME,
+        "arrangement": WORD,
     },
     "positions": {
         "tag": (lambda value: _are_tags([value], 1), "a whole number 0 to 254"),
@@ -95,12 +96,10 @@ KEYS: Final[dict[str, dict[str, tuple[Callable[[Any], bool], str]]]] = {
             "three numbers (metres)",
         ),
         "sigma_m": LENGTH,
-        "arrangement": NAME,
+        "arrangement": WORD,
     },
 }
 """The keys of the tables of a file of what is known: which values are good, and what is expected."""
-
-OPTIONAL: Final = {"known", "order", "start_s", "end_s", "sigma_m", "arrangement"}
 
 
 def load_knowledge(path: str | os.PathLike[str]) -> Knowledge:
@@ -146,7 +145,7 @@ def _rows(file: TomlReader, name: str) -> Iterator[dict[str, Any]]:
     """Yield the rows of a table of a file, checked key by key."""
     for k, row in enumerate(file.rows(name, KEYS[name])):
         for key, (is_good, expected) in KEYS[name].items():
-            if key in row or key not in OPTIONAL:
+            if key in row or key not in {"known", "order", "start_s", "end_s", "sigma_m", "arrangement"}:
                 file.check(f"{name}[{k}].{key}", row.get(key), is_good(row.get(key)), expected)
         yield row
 

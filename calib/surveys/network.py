@@ -17,7 +17,7 @@ from scipy import sparse
 
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, basis
 from calib.estimator.inverse import inverse_of
-from calib.estimator.range_model import METRES_A_NS
+from calib.estimator.range_model import BOARD_DELAY_STD_NS, METRES_A_NS
 from calib.estimator.rows import Terms, normal_terms
 from calib.estimator.unknowns import Layout, Prior, Priors, Unknown
 from calib.surveys.knowledge import KnownPosition
@@ -28,14 +28,15 @@ from uwblink.recording.schema import KnownDistance
 DIMENSIONS = {"line": 1, "plane": 2, "": 3}
 """In how many dimensions boards may stand, by what is known of an arrangement."""
 
-PLACE_STD_M = 30.0
+FREE_PLACE_STD_M = 30.0
 """Prior standard deviation of a coordinate that is not known: it holds what no range determines."""
 
 BESIDE_STD_M = 0.5
-"""The same of how far boards stand beside a line, or a plane, that is none."""
+"""The same of how far boards stand beside a line, or a plane, that is none: decimetres, as nobody overlooks a metre."""
 
-DETOUR_M, DETOUR_STD_M = 0.3, 0.25
-"""Prior mean and standard deviation of how much longer a reflected path is (published detours are 0.1 to 0.5 m)."""
+EXTRA_M, EXTRA_STD_M = 0.3, 0.25
+"""Prior mean and standard deviation of how much longer a reflected path is (published detours are 0.1 to 0.5 m).
+Half or twice of either moves delays beside reflections by 0.28 standard errors (`python -m benchmarks.constants`)."""
 
 CURVE_LENGTH_DB = 4.0
 """Length of the Gaussian process (Matern 5/2 over decibels) that is the prior of a curve.
@@ -52,9 +53,8 @@ CURVE_SEGMENTS = 12
 NARROWEST_DB = 3.0
 """Span of powers below which no curve is fitted."""
 
-DELAY_STD_NS, FIXED_STD_NS = 2.0, 1e-4
-"""Prior standard deviations of delays: published boards differ by 0.6 ns. Surveys need it: without known distances a
-scale of the places can pass for a delay. The second is that of known delays: 0.03 mm, far below any result."""
+FIXED_STD_NS = 1e-4
+"""Prior standard deviation of known delays: 0.03 mm, far below any result."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +103,11 @@ class Boards:
     tags: tuple[int, ...]
     order: tuple[int, ...] = ()
     freed: bool = False
+
+    @property
+    def shape(self) -> str:
+        """Which of `SHAPES` has as many dimensions."""
+        return {dimensions: shape for shape, dimensions in DIMENSIONS.items()}[self.dimensions]
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,13 +259,13 @@ class Network:
         boards, axis = [self.arrangements[k] for k in self.owner.tolist()], np.arange(3)
         known = axis >= np.array([[one.dimensions] for one in boards])
         beside = axis == np.array([[one.dimensions - 1 if one.freed else -1] for one in boards])
-        std, centre = np.where(beside, BESIDE_STD_M, PLACE_STD_M), np.zeros((len(boards), 3))
+        std, centre = np.where(beside, BESIDE_STD_M, FREE_PLACE_STD_M), np.zeros((len(boards), 3))
         for point, (place, _) in self.known_places.items():
             centre[self.owner == self.owner[point]] = place
         for point, (place, sigma) in self.known_places.items():
             centre[point], std[point] = place, sigma
         delays = np.array([self.fixed_ns.get(tag, 0.0) for tag in self.tags])
-        certain = np.array([FIXED_STD_NS if tag in self.fixed_ns else DELAY_STD_NS for tag in self.tags])
+        certain = np.array([FIXED_STD_NS if tag in self.fixed_ns else BOARD_DELAY_STD_NS for tag in self.tags])
         blocks = [("place", centre.ravel(), np.diag(std.ravel() ** -2)), ("delay", delays, np.diag(certain**-2))]
         if self.curve is not None:
             blocks.append(("curve", np.zeros(len(self.curve.precision)), self.curve.precision))
@@ -329,7 +334,7 @@ class Network:
         place, found = self.positions_m(x), self._of_delays_and_curve.copy()
         apart = place[self.ends[:, 0]] - place[self.ends[:, 1]]
         length = np.linalg.norm(apart, axis=1)
-        measured = np.concatenate([self.means.range_m - DETOUR_M * marks, self.tapes[1][:, 0]])
+        measured = np.concatenate([self.means.range_m - EXTRA_M * marks, self.tapes[1][:, 0]])
         left = measured - length - found @ x
         # Boards on top of each other have no direction: any will do to part them.
         unit = np.where(length[:, None] > 1e-9, apart / np.maximum(length, 1e-9)[:, None], [1.0, 0.0, 0.0])
@@ -339,7 +344,7 @@ class Network:
 
     def std_m(self, case: Case) -> Floats:
         """Return the standard deviation of each row, with the constant errors of pairs."""
-        means = np.sqrt(self.means.std_m**2 + case.pair_m**2 + DETOUR_STD_M**2 * case.marks)
+        means = np.sqrt(self.means.std_m**2 + case.pair_m**2 + EXTRA_STD_M**2 * case.marks)
         return np.concatenate([means, self.tapes[1][:, 1]])
 
     def priors(self, curve_m: float) -> Priors:

@@ -15,7 +15,7 @@ from calib.calibration.model import Calibration, Uncertainty, matrix_of
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis, flat_curve
 from calib.errors import UnanswerableError
 from calib.estimator.range_model import METRES_A_NS
-from calib.information import Unknown, Verdict, judge, reduced
+from calib.information import InformationColumn, Verdict, judge, reduced
 from calib.settings import SurveySettings
 from calib.spread import TWO_SIDED_95
 from calib.surveys.network import Boards
@@ -34,13 +34,12 @@ from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 
 DELAY_SCALE_NS = 0.5
-"""How far a delay is known without any data: devices of one design differ by that."""
+"""How far a delay is known without any data: devices of one design differ by that (published ones by 0.6 ns). A delay
+is determined if its standard error is at most `LOOSEST` of it."""
 
 MIN_BELIEVED, MIN_MENTIONED = 0.5, 0.1
-"""Probabilities from which a pair is believed to be reflected, and from which it is said that it may be."""
-
-SHAPES = {1: "line", 2: "plane", 3: ""}
-"""What is known of an arrangement by the dimensions in which its boards may stand."""
+"""Probabilities from which a pair is believed to be reflected, and from which it is said that it may be: more
+likely than not, and a tenth."""
 
 
 def students_factor(freedom: float) -> float:
@@ -53,7 +52,7 @@ def students_factor(freedom: float) -> float:
 
 def verdict_on_delays(information: Floats, tags: Sequence[int]) -> Verdict:
     """Return what is determined of delays by their information (tags, tags), 1/ns^2."""
-    return judge(information, [Unknown("delay", str(tag), DELAY_SCALE_NS) for tag in tags])
+    return judge(information, [InformationColumn("delay", str(tag), DELAY_SCALE_NS) for tag in tags])
 
 
 def result_of(
@@ -180,7 +179,7 @@ def _calibration(
         "recipe": "survey",
         "rests_on": {
             "arrangements": [
-                {"name": boards.name, "known": SHAPES[boards.dimensions], "tags": list(boards.tags)}
+                {"name": boards.name, "known": boards.shape, "tags": list(boards.tags)}
                 for boards in network.arrangements
             ],
             "known_distances": len(network.distances),
@@ -272,4 +271,4 @@ def _arrangement(found: Solution, number: int) -> SurveyedArrangement:
         surveyed.append(SurveyedBoard(tag, (x, y, z), spread, bool(np.trace(spread) < 1.0)))
     known = network.known_places.keys() & set(seats.tolist())
     frame = "that of the known positions" if known else _frame(points[seats], boards)[2]
-    return SurveyedArrangement(boards.name, SHAPES[boards.dimensions], tuple(surveyed), frame)
+    return SurveyedArrangement(boards.name, boards.shape, tuple(surveyed), frame)

@@ -31,18 +31,20 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.antenna_delays import AntennaDelays
 from uwblink.recording.schema import Arrangement, KnownDistance
 from uwblink.recording.summary import single_reports
+from uwblink.ticks import METRES_PER_TICK
 
 LIFT = "mean-of-lifted"
 """How the powers of both ends become one, as in `calib.fit`."""
 
-MIN_RANGES = 5
-"""Ranges that a pair needs in an arrangement."""
+MIN_RANGES_OF_MEAN = 5
+"""Ranges that a pair needs in an arrangement: their spread is known to a third then (the root of 1/8)."""
 
 PARTS = 10
-"""Stretches of time whose sums say how well the mean of all is known, also where errors last."""
+"""Stretches of time whose sums say how well the mean of all is known, also where errors last: the standard error is
+known to a quarter (the root of 1/18), and those of an arrangement held for 30 s are 3 s long."""
 
 WINDOW_BINS = 5
-"""Bins of a second before and after an instant whose medians are compared."""
+"""Bins of a second before and after an instant whose medians are compared: a hand needs less to move a board."""
 
 STEP_M = 0.05
 """Smallest step of a pair's range that counts as a motion: people who walk past change less, or one pair only."""
@@ -50,9 +52,6 @@ STEP_M = 0.05
 MOVED_M, MOVED_BINS, MIN_SIDE_BINS = 0.03, 60, 8
 """Smallest change of a pair's range that tells of a board that was moved within an arrangement; bins into which the
 arrangement is divided for that, and how many of them either side needs."""
-
-MIN_NOISE_M = 0.005
-"""A tick of the clock."""
 
 SIGMAS = 6.0
 """Standard deviations of noise from which a change is one: one in 5e8 by chance, and there are thousands."""
@@ -213,7 +212,7 @@ def find_motion(name: str, ranges: Ranges) -> list[Contradiction]:
     after = np.isfinite(median).sum(axis=1, keepdims=True) - before
     sides = np.minimum(before, after) >= MIN_SIDE_BINS
     with np.errstate(divide="ignore", invalid="ignore"):
-        std = STD_OF_MEDIAN * np.maximum(noise, MIN_NOISE_M)[:, None] * np.sqrt(1 / before + 1 / after)
+        std = STD_OF_MEDIAN * np.maximum(noise, METRES_PER_TICK)[:, None] * np.sqrt(1 / before + 1 / after)
         size = np.where(sides, np.abs(step) / std, 0.0)
     changed = (size > SIGMAS) & (np.abs(step) > MOVED_M)
     member = (ends[:, :, None] == np.array(ranges.tags())).any(axis=1).T.astype(float)
@@ -242,7 +241,7 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
     pairs = pairs_of(ranges.initiator, ranges.target)
     key = arrangement * len(pairs.ends) + pairs.number
     keys, counts = np.unique(key[arrangement >= 0], return_counts=True)
-    kept = keys[counts >= MIN_RANGES]
+    kept = keys[counts >= MIN_RANGES_OF_MEAN]
     if not len(kept):
         raise UnanswerableError(f"{ranges.source}: no two boards range five times while all stand still")
     rows = np.flatnonzero(np.isin(key, kept))

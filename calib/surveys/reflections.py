@@ -19,20 +19,23 @@ from functools import cached_property
 import numpy as np
 from scipy.special import betaln, ndtr
 
-from calib.surveys.network import DETOUR_M, DETOUR_STD_M, Case, Network
+from calib.surveys.network import EXTRA_M, EXTRA_STD_M, Case, Network
 from uwblink.arrays import Bools, Floats
 
 REFLECTED, STRAIGHT = 1.0, 30.0
-"""Rows with and without a detour that the prior of their share is worth."""
+"""Rows with and without a detour that the prior of their share is worth: 3 % are reflected. Half or twice of either
+moves delays by 0.2 standard errors (`python -m benchmarks.constants`)."""
 
 SHORTER_SHARE = 0.01
-"""Share of rows with a gross error that are shorter than the straight way: no detour is."""
+"""Share of rows with a gross error that are shorter than the straight way: no detour is. It
+keeps logarithms finite."""
 
 MAX_WORSE = 2 * math.log(20.0)
-"""By how much -2 log likelihood a choice may be worse than the best and still count."""
+"""By how much -2 log likelihood a choice may be worse than the best and still count: with a twentieth of its weight."""
 
 MAX_FIRST_CHANGES = 24
-"""How many single changes, the best ones, are tried together with a second one."""
+"""How many single changes, the best ones, are tried together with a second one: half or
+twice as many change nothing (`python -m benchmarks.constants`)."""
 
 
 @dataclass(frozen=True)
@@ -63,20 +66,20 @@ class Marks:
     def penalties(self) -> Floats:
         """Return -2 log of how much less likely each row (n,) is for its detour being positive, if it is marked."""
         own = np.diag(self.inverse)
-        grown = np.where(self.marked, 1.0, 1 + DETOUR_STD_M**2 * own)
-        own, pull = own / grown, (self.pull - np.where(self.marked, 0.0, DETOUR_M) * own) / grown
-        mean, variance = DETOUR_M + DETOUR_STD_M**2 * pull, DETOUR_STD_M**2 - DETOUR_STD_M**4 * own
+        grown = np.where(self.marked, 1.0, 1 + EXTRA_STD_M**2 * own)
+        own, pull = own / grown, (self.pull - np.where(self.marked, 0.0, EXTRA_M) * own) / grown
+        mean, variance = EXTRA_M + EXTRA_STD_M**2 * pull, EXTRA_STD_M**2 - EXTRA_STD_M**4 * own
         longer = ndtr(mean / np.sqrt(np.maximum(variance, 1e-12)))
-        return np.asarray(-2 * np.log((longer + SHORTER_SHARE) / (ndtr(DETOUR_M / DETOUR_STD_M) + SHORTER_SHARE)))
+        return np.asarray(-2 * np.log((longer + SHORTER_SHARE) / (ndtr(EXTRA_M / EXTRA_STD_M) + SHORTER_SHARE)))
 
     @cached_property
     def plain_changes(self) -> Floats:
         """What a change of each mark (n,) adds to -2 log likelihood, without penalties."""
         sign, own = self.sign, np.diag(self.inverse)
-        grown = np.maximum(1 + sign * DETOUR_STD_M**2 * own, 1e-12)
-        away = self.pull - sign * DETOUR_M * own
-        found = np.log(grown) - 2 * sign * DETOUR_M * self.pull + DETOUR_M**2 * own
-        found -= sign * DETOUR_STD_M**2 * away**2 / grown
+        grown = np.maximum(1 + sign * EXTRA_STD_M**2 * own, 1e-12)
+        away = self.pull - sign * EXTRA_M * own
+        found = np.log(grown) - 2 * sign * EXTRA_M * self.pull + EXTRA_M**2 * own
+        found -= sign * EXTRA_STD_M**2 * away**2 / grown
         count, rows = int(self.marked.sum()), len(self.marked)
         share = np.array([unlikely(min(max(count + step, 0), rows), rows) for step in (-1, 0, 1)])
         return np.asarray(found + share[1 + sign.astype(int)] - share[1])
@@ -88,8 +91,8 @@ class Marks:
     def flipped(self, row: int) -> Marks:
         """Return these marks with that of one row changed (by the formula of Sherman and Morrison)."""
         sign, column = self.sign[row], self.inverse[:, row]
-        pull = self.pull - sign * DETOUR_M * column
-        gain = sign * DETOUR_STD_M**2 / (1 + sign * DETOUR_STD_M**2 * column[row])
+        pull = self.pull - sign * EXTRA_M * column
+        gain = sign * EXTRA_STD_M**2 / (1 + sign * EXTRA_STD_M**2 * column[row])
         return Marks(
             np.where(np.arange(len(column)) == row, ~self.marked, self.marked),
             self.inverse - gain * np.outer(column, column),

@@ -20,15 +20,19 @@ from uwblink.output import write_bytes, write_text
 AMBIGUOUS = 9.0
 """By how much -2 log likelihood of a second solution may be worse for it to be as good: three standard deviations."""
 
-YAML = (
-    "# covariance: xx xy xz yy yz zz.\n/**:\n  ros__parameters:\n    anchors:\n      ids: [{}]\n",
-    "      anchor_{}:\n        position: [{}]\n        covariance: [{}]\n",
-)
-TOML = (
-    "# covariance_m2: xx xy xz yy yz zz, m^2.\n",
-    "\n[[anchors]]\nid = {}\nposition_m = [{}]\ncovariance_m2 = [{}]\n",
-)
-ANCHORS = {".toml": TOML, ".yaml": YAML, ".yml": YAML}
+ANCHORS = {
+    ".toml": (
+        "# covariance_m2: xx xy xz yy yz zz, m^2.\n",
+        "\n[[anchors]]\nid = {}\nposition_m = [{}]\ncovariance_m2 = [{}]\n",
+    ),
+    **dict.fromkeys(
+        (".yaml", ".yml"),
+        (
+            "# covariance: xx xy xz yy yz zz.\n/**:\n  ros__parameters:\n    anchors:\n      ids: [{}]\n",
+            "      anchor_{}:\n        position: [{}]\n        covariance: [{}]\n",
+        ),
+    ),
+}
 """Head and rows of files of anchors: of all ids, and of id, position and upper triangle of the covariance."""
 
 

@@ -8,10 +8,11 @@ from typing import Final
 import numpy as np
 
 from calib.data.ranges import Ranges
+from calib.data.samples import ANCHOR_DELAYS_NS
 from uwblink.ticks import SPEED_OF_LIGHT
 
-DELAYS_NS: Final = {1: -0.3, 2: 0.1, 3: -0.1, 4: 0.2}
 ORDERS: Final = ((1, 2, 3, 4), (2, 1, 4, 3), (3, 1, 4, 2), (2, 4, 1, 3), (4, 3, 2, 1), (1, 3, 4, 2))
+"""Tags from left to right; every two tags are neighbours somewhere, and each is somewhere in the middle."""
 
 
 def sample_arrangements(count: int = 6, *, seed: int = 1) -> Ranges:
@@ -25,8 +26,8 @@ def sample_arrangements(count: int = 6, *, seed: int = 1) -> Ranges:
     <Ranges of memory: 1200 of tags 1, 2, 3, 4>
     """
     rng, held = np.random.default_rng(seed), 600
-    pairs = np.array(list(combinations(DELAYS_NS, 2)))
-    delays = np.array([0.0, *DELAYS_NS.values()])[pairs].sum(axis=1)
+    pairs = np.array(list(combinations(sorted(ORDERS[0]), 2)))
+    delays = np.array([0.0, *(ANCHOR_DELAYS_NS[tag] for tag in ORDERS[0])])[pairs].sum(axis=1)
     pair = np.arange(held) % len(pairs)
     raw = []
     for order in ORDERS[:count]:

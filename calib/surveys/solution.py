@@ -25,7 +25,9 @@ from calib.surveys.starts import first_start, is_in_order, other_starts
 from uwblink.arrays import Bools, Floats, Ints
 
 PAIR_STD_M, PAIR_PRIOR_FREEDOM = 0.02, 3.0
-"""Prior standard deviation of the constant error of a pair, and the degrees of freedom that it counts as."""
+"""Prior standard deviation of the constant error of a pair, and the degrees of freedom that it counts as.
+Half or twice of either moves delays beside reflections by 0.29 standard errors, which become 0.93 to 1.3 times as large
+(`python -m benchmarks.constants`)."""
 
 PAIR_STARTS_M = (0.01, 0.015, 0.02, 0.03, 0.045, 0.07)
 """Errors of pairs from which a search begins: with small ones too much looks reflected, with large ones too little."""
@@ -40,7 +42,8 @@ MIN_DIFFERENCE_M = 0.03
 """How far a board must move for a solution to count as another one."""
 
 MAX_WORSE_ALONE = 60.0
-"""By how much -2 log likelihood of one arrangement's other solution may be worse for all to be solved with it."""
+"""By how much -2 log likelihood of one arrangement's other solution may be worse for all to be solved with it:
+half or twice of it changes nothing (`python -m benchmarks.constants`)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,10 +17,11 @@ from calib.surveys.network import Boards, Network
 from uwblink.arrays import Floats, Ints
 
 TOGETHER_M = 0.1
-"""Boards nearer to each other stand side by side."""
+"""Boards nearer to each other stand side by side: they touch, and their order means nothing."""
 
 SHAKEN = 4
-"""Random starts of an arrangement beside those that are mirrored or exchanged."""
+"""Random starts of an arrangement beside those that are mirrored or exchanged: half or twice as many change nothing
+(`python -m benchmarks.constants`)."""
 
 
 def is_in_order(coordinates: Floats) -> bool:

@@ -87,7 +87,7 @@ def _checked_curve(curve_from: Calibration | str | os.PathLike[str] | None) -> C
 
     Raises `BadInputError` for one of another lifting, and for one that has no curve.
     """
-    known = given_calibration(curve_from, "curve_from")
+    known = None if curve_from is None else given_calibration(curve_from, "curve_from")
     if known is not None and (known.lift != LIFT or known.alpha_dbm != ALPHA_DBM):
         text = f"it lifts powers by {known.lift} above {known.alpha_dbm:g} dBm, expected {LIFT} above {ALPHA_DBM:g} dBm"
         raise BadInputError(text, parameter="curve_from")

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation, Slerp
 
-from calib.trajectories.samples import Samples
+from calib.evaluation.inertial_filter import GRAVITY_M_S2
+from calib.trajectories.samples import SAMPLE_S, Samples
 from uwblink.arrays import Bools, Floats
 
 
@@ -47,10 +48,6 @@ class Attitude:
         return Slerp(instants, Rotation.from_quat(self.quaternion[np.minimum(rows, len(self.time_s) - 1)]))
 
 
-GRAVITY_M_S2 = 9.81
-WINDOW_S = 0.1
-"""Specific forces are averaged over this time: vibrations cancel, and the acceleration of a spline hardly changes."""
-
 STRONGEST_M_S2 = 4.0
 """Windows with larger mean accelerations are left out: they are impacts, not flight."""
 
@@ -60,15 +57,10 @@ FORCE_STD_M_S2 = 0.5
 LEVELLING = 0.1
 """Share of the tilt against the specific force that is corrected per second (Mahony, Hamel and Pflimlin 2008)."""
 
-INTEGRATED_STD_RAD = np.radians([2.0, 2.0, np.inf])
-INTEGRATED_WANDER_RAD = np.radians([0.5, 0.5, 0.5])
-"""Standard deviations of integrated attitudes (rad), whose heading is unknown, and of their random walk (rad per root
-second): judgements for MEMS gyroscopes."""
-
 
 @dataclass(frozen=True, slots=True)
 class Inertial(Samples):
-    """Windows of an accelerometer, `WINDOW_S` long, about `time_s` (k,).
+    """Windows of an accelerometer, `SAMPLE_S` long, about `time_s` (k,).
 
     `force_m_s2` (k, 3) is the mean specific force in the world's axes by the given attitudes, `turn` (k, 3, 3) the mean
     rotation, `std_m_s2` the standard error of a mean.
@@ -106,7 +98,7 @@ class Readings(Samples):
     @property
     def per_window(self) -> int:
         """Return the usual number of readings in a window."""
-        return max(round(WINDOW_S / max(float(np.median(np.diff(self.time_s))), 1e-4)), 1)
+        return max(round(SAMPLE_S / max(float(np.median(np.diff(self.time_s))), 1e-4)), 1)
 
 
 def windows(readings: Readings, attitude: Attitude, last_s: float) -> Inertial:
@@ -114,12 +106,12 @@ def windows(readings: Readings, attitude: Attitude, last_s: float) -> Inertial:
     some = readings.between(max(0.0, float(attitude.time_s[0])), min(last_s, float(attitude.time_s[-1])))
     turn = attitude.at(some.time_s).as_matrix()
     force = np.einsum("nij,nj->ni", turn, some.force)
-    slot, starts, count = np.unique(np.floor(some.time_s / WINDOW_S), return_index=True, return_counts=True)
+    slot, starts, count = np.unique(np.floor(some.time_s / SAMPLE_S), return_index=True, return_counts=True)
     mean_force = np.add.reduceat(force, starts) / count[:, None]
     mean_turn = np.add.reduceat(turn, starts) / count[:, None, None]
     kept = count >= 0.7 * readings.per_window
     kept &= np.linalg.norm(mean_force - (0, 0, GRAVITY_M_S2), axis=1) < STRONGEST_M_S2
-    return Inertial((slot[kept] + 0.5) * WINDOW_S, mean_force[kept], mean_turn[kept])
+    return Inertial((slot[kept] + 0.5) * SAMPLE_S, mean_force[kept], mean_turn[kept])
 
 
 def integrated(readings: Readings, known: Attitude | None, until_s: float) -> Attitude:
@@ -138,8 +130,9 @@ def integrated(readings: Readings, known: Attitude | None, until_s: float) -> At
     found = Attitude(
         time_s=readings.time_s[first:],
         quaternion=_carried_on(readings, first, start.as_matrix(), bias),
-        std_rad=INTEGRATED_STD_RAD,
-        wander_rad=INTEGRATED_WANDER_RAD,
+        # Judgements for MEMS gyroscopes; the heading is unknown.
+        std_rad=np.radians([2.0, 2.0, np.inf]),
+        wander_rad=np.radians([0.5, 0.5, 0.5]),
         heading_known=known is not None,
     )
     if known is None:

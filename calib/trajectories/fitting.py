@@ -11,6 +11,7 @@ import numpy as np
 from scipy import sparse
 from threadpoolctl import threadpool_limits
 
+from calib.calibration.document import Split
 from calib.calibration.model import Calibration, given_calibration
 from calib.calibration.power_curves import basis
 from calib.checks.fitted import examine_fit
@@ -18,16 +19,16 @@ from calib.checks.limits import refuse_refuted
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.inverse import Matrix, inverse_of
-from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described, refuse_free
+from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described
 from calib.estimator.losses import MIXTURE
-from calib.estimator.range_model import RangeModel
+from calib.estimator.range_model import BOARD_DELAY_STD_NS, METRES_A_NS, RangeModel
 from calib.estimator.rows import sum_rows
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
 from calib.estimator.unknowns import Layout
 from calib.fitting.fitting import result_of, what_was_fitted
 from calib.fitting.result import FitResult
-from calib.information import Unknown, Verdict, judge
+from calib.information import LOOSEST, InformationColumn, Verdict, judge
 from calib.settings import FitSettings, FlightSettings
 from calib.spread import TWO_SIDED_95
 from calib.trajectories.motion import MOTION, TapeRows
@@ -36,14 +37,13 @@ from calib.trajectories.search import Search, search
 from calib.trajectories.start import begin
 from uwblink.arrays import Floats, Ints
 
-SHARED = (
+COMMON_SETTINGS = (
     "fixed_ns",
     "groups",
     "lift",
     "alpha_dbm",
     "reference_power_dbm",
     "delays_only",
-    "minimum_norm",
     "between_m",
 )
 """The settings of `fit` that a fit without known distances has, too."""
@@ -51,16 +51,13 @@ SHARED = (
 SHARE_OF_START = 0.3
 """Share of the work, for the progress bar, that is done when the search has its initial guess."""
 
-PRIOR_NS = 2.0
-"""Prior standard deviation of a delay: delays of boards of one type differ by less."""
-
-SCALE_NS, LOOSEST = 0.2, 0.5
-"""A direction of delays is determined if its standard error is at most LOOSEST * SCALE_NS (3 cm of range).
+SCALE_NS = 0.2
+"""A direction of delays is determined if its standard error is at most `LOOSEST` of this: 0.1 ns, 3 cm of range.
 
 The value comes from simulations (docs/accuracy.md): wider intervals did not hold.
 """
 
-GROWTH = 3.0
+LOOSER_WITH_GEOMETRY = 3.0
 """If a fit with known distances is less certain than that, a direction may be so many times less certain."""
 
 GEOMETRY_ALONE_FACTOR = 3.0
@@ -83,7 +80,7 @@ def fit_from_ranges(
     """Fit antenna delays and curves to the ranges of moving bodies whose trajectories are not known.
 
     `data` is one recording with the tags' bodies and lever arms. `flight` says what is known of the flight; `settings`
-    are those of `fit`, of which `SHARED` apply; keyword arguments are named like the fields of either.
+    are those of `fit`, of which `COMMON_SETTINGS` apply; keyword arguments are named like the fields of either.
 
     The bodies' positions are taken from the recording's poses during the first `poses_until_s` seconds (all there are,
     by default). Elsewhere they are estimated from the ranges, together with delays and curve. `attitudes` come from the
@@ -112,8 +109,6 @@ def fit_from_ranges(
     # One thread: the same bytes on any machine.
     with threadpool_limits(limits=1, user_api="blas"):
         model, scene = range_model(scene, settings, curve=not settings.delays_only and known is None)
-        if not settings.minimum_norm:
-            refuse_free(model)
         scene, state, rival = begin(scene, lambda share: report(SHARE_OF_START * share))
         error = model.ranges.raw_m if known is None else model.ranges.raw_m - known.bias_curve(model.lifted)
         top = search(scene, model, error, state, lambda share: report(SHARE_OF_START + (1 - SHARE_OF_START) * share))
@@ -133,11 +128,11 @@ def _settings(
     flight = replace(flight or FlightSettings(), **{name: changes[name] for name in changes if name in names})
     settings = replace(settings or FitSettings(), **{name: changes[name] for name in changes if name not in names})
     for name in settings.changed():
-        if name not in SHARED:
+        if name not in COMMON_SETTINGS:
             raise BadInputError("goes with known distances only", parameter=name)
-    known = given_calibration(flight.curve_from, "curve_from")
-    if known is None:
+    if flight.curve_from is None:
         return flight, settings, None
+    known = given_calibration(flight.curve_from, "curve_from")
     if other := "delays_only" if settings.delays_only else "groups" if settings.groups else "":
         raise BadInputError(f"gives the curve of all tags, and does not go with `{other}`", parameter="curve_from")
     if known.groups or known.power_at != "exchange":
@@ -207,25 +202,21 @@ def _result(
     covariance, findings = examine_fit(found)
     covariance = variance_factor(scene) * covariance
     own, verdict = _judge_delays(found, top)
-    free, left_open = [int(tag) for tag in verdict.named("delay") if tag], ""
-    undetermined_text = _undetermined_text(free, [model.tags[k] for k in own], covariance[np.ix_(own, own)])
-    if free and len(free) == len(own) and not settings.minimum_norm:
+    # Splits that the pairs leave undetermined are held, so that the covariance has nothing along them.
+    free = [int(tag) for tag in verdict.named("delay") if tag]
+    left_open = _undetermined_text(free, [model.tags[k] for k in own], covariance[np.ix_(own, own)], model.free)
+    if free and len(free) == len(own) and not flight.minimum_norm:
         raise UnanswerableError(
-            f"{scene.source}: {undetermined_text}; let positions be known for some seconds "
+            f"{scene.source}: {left_open}; let positions be known for some seconds "
             "(`poses_until_s`), give the places of anchors, or pin a delay with `fixed_ns` (`minimum_norm` fits "
             "regardless, and says so)",
             undetermined=[free],
         )
-    undetermined = found.model.free
-    # Delays that the pairs leave free are held at the smallest values, so that their covariance says nothing of them.
-    if not {tag for group in found.model.free for tag in group}.issuperset(free):
-        left_open, undetermined = undetermined_text, [free]
     calibration = calibration_of(found, covariance)
     if known is not None:
         calibration = _with_curve(calibration, known)
     provenance = _provenance(found, top, flight) | {"distance_std_m": _distance_std_m(top)}
-    provenance |= {"undetermined": undetermined} if undetermined else {}
-    provenance |= {"left_open": left_open} if left_open else {}
+    provenance |= {"undetermined": [free], "left_open": left_open} if free else {}
     calibration = replace(
         calibration,
         delays_std_ns=calibration.delays_std_ns | dict.fromkeys(free, math.inf),
@@ -302,8 +293,23 @@ def _distance_std_m(top: Search) -> float:
     return float(np.sqrt(np.mean(np.einsum("kp,pk->k", moved, top.optimum.covariance @ moved.T))))
 
 
-def _undetermined_text(free: Sequence[int], tags: Sequence[int], covariance_ns2: Floats) -> str:
-    """Return a sentence on the delays of `free` tags, which are not determined; `covariance_ns2` is that of `tags`."""
+def _undetermined_text(
+    free: Sequence[int], tags: Sequence[int], covariance_ns2: Floats, splits: Sequence[Split]
+) -> str:
+    """Return a sentence on the delays of `free` tags, which are not determined, "" for none.
+
+    `covariance_ns2` is that of `tags`, held along undetermined `splits`: it describes sums of delays of two sides.
+    """
+    if not free:
+        return ""
+    across = [(a, b) for one, other in splits for a in one for b in other if a in free or b in free]
+    if across:
+        sums = np.array([np.isin(tags, pair) for pair in across]) * 0.5 * METRES_A_NS
+        worst_m = TWO_SIDED_95 * float(np.sqrt(np.max(np.diag(sums @ covariance_ns2 @ sums.T))))
+        return (
+            f"the ranges do not determine the delays of tags {', '.join(map(str, free))}: ranges between two sides are "
+            f"known to ± {100 * worst_m:.0f} cm (95 %) at worst"
+        )
     if len(free) < len(tags):
         worst = np.sqrt(np.max(np.diag(covariance_ns2)[np.isin(tags, free)], initial=0.0))
         return (
@@ -336,11 +342,12 @@ def with_known_distances(information: Matrix, layout: Layout, own: Ints) -> Floa
 def verdict_on(covariance: Floats, with_truth: Floats, tags: Sequence[int]) -> Verdict:
     """Return the verdict on delays with a covariance (tags, tags), compared with that for known distances."""
     if not tags:
-        return judge(np.eye(1) * 1e6, [Unknown("delay", "")])
-    guess = np.maximum(SCALE_NS, GROWTH / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
-    information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) + np.eye(len(covariance)) / PRIOR_NS**2
-    unknowns = [Unknown("delay", str(tag), scale) for tag, scale in zip(tags, guess.tolist(), strict=True)]
-    return judge((information + information.T) / 2, unknowns, loosest=LOOSEST)
+        return judge(np.eye(1) * 1e6, [InformationColumn("delay", "")])
+    guess = np.maximum(SCALE_NS, LOOSER_WITH_GEOMETRY / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
+    information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True)
+    information += np.eye(len(covariance)) / BOARD_DELAY_STD_NS**2
+    unknowns = [InformationColumn("delay", str(tag), scale) for tag, scale in zip(tags, guess.tolist(), strict=True)]
+    return judge((information + information.T) / 2, unknowns)
 
 
 def _of_motion(top: Search) -> Iterator[str]:

@@ -17,15 +17,14 @@ from scipy.spatial.transform import Rotation
 
 from calib.estimator.rows import NormalRows, Terms, normal_terms
 from calib.estimator.unknowns import Layout, Prior, Unknown
-from calib.trajectories.attitudes import GRAVITY_M_S2, WINDOW_S
+from calib.evaluation.inertial_filter import GRAVITY_M_S2
+from calib.trajectories.samples import POINT_S, SAMPLE_S
 from calib.trajectories.scene import Scene
 from uwblink.arrays import Floats, Ints
 
-POINT_S = 0.4
-"""Time between control points of a path: a multirotor does not change its acceleration faster."""
-
 TURN_S = 1.0
-"""Time between points of the errors of attitudes."""
+"""Time between points of the errors of attitudes. Half or twice of it moves delays by 0.03 standard errors
+(`python -m benchmarks.constants`)."""
 
 MOTION = {"path": 3, "turn": 3, "stand": 3, "bias": 3, "level": 1}
 """Kinds of unknowns of motion, and how many axes each has."""
@@ -156,7 +155,7 @@ class Motion:
 
 
 @dataclass(frozen=True, slots=True)
-class Side:
+class RangeEnd:
     """One end of each distance (n,): where its antenna is as a function of the unknowns.
 
     `mover` is the number of the moving body, -1 for another one. Of a moving body, `place` (n, 4, 3) are the control
@@ -174,7 +173,7 @@ class Side:
     turn_share: Floats
 
     @classmethod
-    def of(cls, motion: Motion, layout: Layout, ids: Ints, time_s: Floats) -> Side:
+    def of(cls, motion: Motion, layout: Layout, ids: Ints, time_s: Floats) -> RangeEnd:
         """Return the ends of tags `ids` (n,) at instants (n,)."""
         scene, turning, count = motion.scene, motion.bodies["turn"], len(ids)
         path, turn, stand = (motion.numbers(layout, kind) for kind in ("path", "turn", "stand"))
@@ -211,13 +210,13 @@ class Side:
 class Distances:
     """Distances between antennas of bodies that move or stand, as functions of all unknowns (a `Geometry`)."""
 
-    sides: tuple[Side, Side]
+    sides: tuple[RangeEnd, RangeEnd]
     columns: Ints
 
     @classmethod
     def of(cls, motion: Motion, layout: Layout, ids: tuple[Ints, Ints], time_s: Floats) -> Distances:
         """Return the distances of tags `ids` (n,) each at instants (n,)."""
-        first, second = (Side.of(motion, layout, some, time_s) for some in ids)
+        first, second = (RangeEnd.of(motion, layout, some, time_s) for some in ids)
         blocks = [part.reshape(len(time_s), -1) for side in (first, second) for part in (side.place, side.turn)]
         columns = np.concatenate(blocks, axis=1)
         # Where an end does not depend on an unknown, its entry is zero in a column that the other end uses.
@@ -277,23 +276,26 @@ LEAST_JERK, MOST_JERK = 0.2, 2000.0
 """Bounds of jerk, m/s^3."""
 
 FAR_M = 30.0
-"""Prior standard deviation of a control point around its initial guess: it holds points without any range."""
+"""Prior standard deviation of a control point around its initial guess: it holds points without any range.
+Half or twice of it moves delays by 0.05 standard errors (`python -m benchmarks.constants`)."""
 
 STANDS_M = 100.0
 """Prior standard deviation of the position of a standing body: any hall."""
 
 BIAS_M_S2 = 0.4
-"""Prior standard deviation of an accelerometer's bias."""
+"""Prior standard deviation of an accelerometer's bias: 40 mg, the order of magnitude in data sheets of MEMS sensors."""
 
 LEVEL_M = 0.15
-"""Prior standard deviation of the constant offset of a height sensor."""
+"""Prior standard deviation of the constant offset of a height sensor, chosen on the MILUV flight (docs/theory.md)."""
 
 CALM_M_S2, CALM_SENSED_M_S2 = 5.0, 50.0
 """Prior standard deviation of accelerations, which holds a path where ranges are missing; the second where an
-accelerometer measures them."""
+accelerometer measures them. Half or twice of the first moves delays by 0.03 standard errors
+(`python -m benchmarks.constants`)."""
 
 SLOW_M_S = 3.0
-"""Prior standard deviation of speeds in a room."""
+"""Prior standard deviation of speeds in a room. Half or twice of it moves delays by 0.14 standard errors
+(`python -m benchmarks.constants`)."""
 
 
 def known_rows(motion: Motion, layout: Layout) -> dict[str, NormalRows | TapeRows]:
@@ -344,11 +346,11 @@ def _forces(motion: Motion, layout: Layout, body: str) -> NormalRows:
     path = motion.numbers(layout, "path")[:, motion.scene.moving.index(body)]
     bias = motion.numbers(layout, "bias")[0, motion.bodies["bias"].index(body)]
     count, force = len(sensed), sensed.force_m_s2
-    early, begin = motion.places.velocities(sensed.time_s - WINDOW_S / 2)
-    late, end = motion.places.velocities(sensed.time_s + WINDOW_S / 2)
+    early, begin = motion.places.velocities(sensed.time_s - SAMPLE_S / 2)
+    late, end = motion.places.velocities(sensed.time_s + SAMPLE_S / 2)
     # Columns and entries are (n, unknowns, axes).
     columns = [path[late], path[early], np.broadcast_to(bias[:, None], (count, 3, 3))]
-    weights = [share[:, :, None] * np.full(3, 1 / WINDOW_S) for share in (end, -begin)]
+    weights = [share[:, :, None] * np.full(3, 1 / SAMPLE_S) for share in (end, -begin)]
     entries = [*weights, np.swapaxes(sensed.turn, 1, 2)]
     if body in turning:
         # A turn t of the attitude adds t x (R f) to the force: along an axis by t about the next and the last one.

@@ -15,12 +15,16 @@ from calib.spread import medians, robust_spread
 from uwblink.arrays import ColumnTable, Floats, Ints
 from uwblink.recording.schema import Arrangement, KnownDistance
 
-TAPE_EVERY_S = 0.4
-"""A taped distance is one measurement. While it holds it counts once in so many seconds (the time between control
-points of a path), with a standard error that grows by the square root of the number of instants."""
+POINT_S = 0.4
+"""Time between control points of a path: a multirotor does not change its acceleration faster.
 
-HEIGHT_WINDOW_S = 0.1
-"""Heights are medians over this time, as many as known positions."""
+A taped distance is one measurement. While it holds it counts once in this time, with a standard error that grows by the
+square root of the number of instants.
+"""
+
+SAMPLE_S = POINT_S / 4
+"""Time between known positions, heights (medians over it) and positions of an initial guess, and over which specific
+forces are averaged: vibrations cancel, and the acceleration of a spline hardly changes."""
 
 HEIGHT_STD_M = 0.1
 """Standard error of the mean of a window beside the sensor's constant offset, before residuals are known."""
@@ -29,7 +33,7 @@ TRUSTED = 3.0
 """Factor on the spread of a sensor's residuals: its errors last for some windows."""
 
 HEIGHT_BOUNDS_M = (0.02, 1.0)
-"""Bounds of the standard error of a height."""
+"""Bounds of the standard error of a height: how level floors are, and nearly half the height of a room."""
 
 HUBER = 2.0
 """Readings beyond so many spreads count less (Huber 1964): the sensor looks at what stands below it."""
@@ -86,7 +90,7 @@ def heights_of(table: Mapping[str, NDArray[Any]], moving: Sequence[str], began_n
     time_s, height_m = (table["time_ns"] - began_ns) * 1e-9, np.asarray(table["height_m"], dtype=np.float64)
     number = np.select([table["body"] == body for body in moving], range(len(moving)), -1)
     rows = np.flatnonzero((number >= 0) & np.isfinite(height_m) & (time_s >= 0) & (time_s <= last_s))
-    window = np.column_stack([number, np.floor(time_s / HEIGHT_WINDOW_S)])[rows]
+    window = np.column_stack([number, np.floor(time_s / SAMPLE_S)])[rows]
     group = np.unique(window, axis=0, return_inverse=True)[1].ravel()
     time, body, height = (medians(column[rows], group) for column in (time_s, number, height_m))
     return Heights(time, body.astype(np.int64), height, np.full(len(time), HEIGHT_STD_M))
@@ -178,6 +182,6 @@ def _instants(one: KnownDistance, spans: Mapping[str, tuple[float, float]], last
     for start, end in chosen:
         begin_s, end_s = max(start, 0.0), min(end, last_s)
         if begin_s <= end_s:
-            count = max(int((end_s - begin_s) / TAPE_EVERY_S), 1)
+            count = max(int((end_s - begin_s) / POINT_S), 1)
             found += np.linspace(begin_s, end_s, 2 * count + 1)[1::2].tolist()
     return found

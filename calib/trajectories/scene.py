@@ -13,7 +13,7 @@ from calib.data.sources import Data, antenna_delays_of, opened, planted_of
 from calib.errors import UnanswerableError
 from calib.settings import FlightSettings
 from calib.trajectories.attitudes import Attitude, Inertial, Readings, integrated, windows
-from calib.trajectories.samples import Heights, Places, Samples, Tapes, heights_of, tapes_of
+from calib.trajectories.samples import SAMPLE_S, Heights, Places, Samples, Tapes, heights_of, tapes_of
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Poses
 from uwblink.recording.summary import single_reports
@@ -81,17 +81,18 @@ class Scene:
 STILL_M = 0.1
 """A body whose poses stay within this distance stands still."""
 
-PLACE_STD_M = 0.02
-PLACE_EVERY_S = 0.1
-"""Known positions are thinned to this interval and have this standard error: errors of motion capture last."""
+POSE_STD_M = 0.02
+"""Standard error of known positions, thinned to `SAMPLE_S`: errors of motion capture last. Half or twice of it
+moves delays by 0.24 standard errors, which become 0.85 to 1.46 times as large (`python -m benchmarks.constants`)."""
 
 TILT_STD_DEG, TILT_WANDER_DEG, HEADING_WANDER_DEG = 1.0, 0.2, 0.5
 """Standard deviation of the tilt of an attitude reference (degrees), and random walks of tilt and heading (degrees per
-root second)."""
+root second): judgements for an autopilot. Half or twice of the first moves delays by 0.25 standard errors
+(`python -m benchmarks.constants`)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Track(Samples):
+class PoseSamples(Samples):
     """Poses of one body in seconds since the first range; NaN where positions or attitudes are unknown."""
 
     position_m: Floats
@@ -171,23 +172,23 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     )
 
 
-def _track(poses: Poses, body: str, began_ns: int) -> Track:
+def _track(poses: Poses, body: str, began_ns: int) -> PoseSamples:
     own = poses[poses.body == body]
-    return Track(np.asarray((own.time_ns - began_ns) * 1e-9, dtype=np.float64), own.position_m, own.quaternion)
+    return PoseSamples(np.asarray((own.time_ns - began_ns) * 1e-9, dtype=np.float64), own.position_m, own.quaternion)
 
 
-def _places(tracks: Sequence[Track], until_s: float) -> Places:
-    """Return the positions of each body since the first range, `PLACE_EVERY_S` apart."""
+def _places(tracks: Sequence[PoseSamples], until_s: float) -> Places:
+    """Return the positions of each body since the first range, `SAMPLE_S` apart."""
     parts = []
     for number, track in enumerate(tracks):
         early = track[(track.time_s >= 0) & (track.time_s < until_s)]
-        some = early[np.diff(np.floor(early.time_s / PLACE_EVERY_S), prepend=-np.inf) > 0]
-        parts.append((some.time_s, np.full(len(some), number), some.position_m, np.full(len(some), PLACE_STD_M)))
+        some = early[np.diff(np.floor(early.time_s / SAMPLE_S), prepend=-np.inf) > 0]
+        parts.append((some.time_s, np.full(len(some), number), some.position_m, np.full(len(some), POSE_STD_M)))
     return Places(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _attitude(
-    body: str, track: Track, sensed: Readings | None, settings: FlightSettings, source: str
+    body: str, track: PoseSamples, sensed: Readings | None, settings: FlightSettings, source: str
 ) -> Attitude | None:
     """Return the attitudes of a moving body; None if there are none."""
     std = np.radians([TILT_STD_DEG, TILT_STD_DEG, settings.heading_std_deg])

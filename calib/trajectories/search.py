@@ -31,7 +31,8 @@ State = Mapping[str, Floats]
 """Unknowns of motion by their kind."""
 
 JERK_M_S3, QUICK_M_S3 = 8.0, 100.0
-"""Standard deviation of jerk before it is estimated; the second for refined control points."""
+"""Standard deviation of jerk before it is estimated; the second for refined control points. Half or twice of the first
+moves delays by 0.1 standard errors (`python -m benchmarks.constants`)."""
 
 FIRST_SCALE_M = 0.15
 """First scale of Cauchy's loss, while delays and curve are unknown."""
@@ -296,7 +297,7 @@ def _as_known(unknown: Unknown, values: Floats) -> Unknown:
     return replace(unknown, start=values, known=np.ones(len(values), dtype=bool), priors=priors)
 
 
-PROBES = 48
+LEVERAGE_PROBES = 48
 """Random vectors for leverages (Hutchinson 1990; Bekas, Kokiopoulou and Saad 2007): exact to about 10 %."""
 
 
@@ -318,7 +319,7 @@ def leverages(rows: RangeRows, found: Optimum) -> Floats:
         # The information of a residual is at most that of normal errors (Stam 1959).
         weight = np.minimum(weight, np.exp(-2 * values["noise"][rows.order]))
     reach = sparse.csr_matrix(sparse.diags_array(np.sqrt(weight)) @ sparse.vstack([matrix for matrix, _ in parts]))
-    probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(rows), PROBES))
+    probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(rows), LEVERAGE_PROBES))
     shares = np.empty(len(rows))
     shares[rows.order] = np.mean(probes * (reach @ (found.covariance @ (reach.T @ probes))), axis=1)
     return np.clip(shares, 0.0, MAX_LEVERAGE)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse.csgraph import shortest_path
 
 from calib.trajectories.motion import Motion
-from calib.trajectories.samples import Places, Samples
+from calib.trajectories.samples import SAMPLE_S, Places, Samples
 from calib.trajectories.scene import Scene
 from calib.trajectories.search import JERK_M_S3, MotionFit, State, fit_motion
 from uwblink.arrays import Floats
@@ -24,9 +24,6 @@ RANGES_A_BODY = 24
 
 HEADING_WINDOW_S = 8.0
 """Shortest first window where headings are unknown."""
-
-SAMPLE_S = 0.1
-"""Time between positions of an initial guess: a quarter of that between control points."""
 
 WINDOW_STD_M = 0.1
 """Standard error of positions from the window before."""

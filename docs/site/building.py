@@ -6,13 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from calib.calibration.document import FILE_KEYS as CALIBRATION
+from calib.calibration.document import CALIBRATION_KEYS as CALIBRATION
 from calib.cli.commands import app as calib_app
 from docs.site import checks, commands, doors, file_keys, schema
-from uwblink.boards.ranging_plan import FILE_KEYS as PLAN
+from uwblink.boards.ranging_plan import PLAN_KEYS as PLAN
 from uwblink.cli.commands import app as uwblink_app
-from uwblink.importers.column_map import FILE_KEYS as COLUMN_MAP
-from uwbsim.boards.server import Faults
+from uwblink.importers.column_map import MAP_KEYS as COLUMN_MAP
+from uwbsim.boards.server import FaultsFile
 from uwbsim.cli.commands import app as uwbsim_app
 from uwbsim.scenario.model import Scenario
 from uwbsim.sweep.design import SweepFile
@@ -21,7 +21,7 @@ GENERATED: Final = Path(__file__).parents[1] / "generated"
 
 PAGES: Final[dict[str, Callable[[], str]]] = {
     "scenario": lambda: schema.reference(Scenario.model_json_schema(), "Scenario"),
-    "faults": lambda: schema.reference(Faults.model_json_schema(), "Faults"),
+    "faults": lambda: schema.reference(FaultsFile.model_json_schema(), "FaultsFile"),
     "column_map": lambda: file_keys.reference(COLUMN_MAP),
     "plan": lambda: file_keys.reference(PLAN),
     "sweep": lambda: schema.reference(SweepFile.model_json_schema(), "SweepFile"),

@@ -52,11 +52,17 @@ def test_what_is_no_calibration_is_refused_by_its_parameter(tmp_path):
         "apply": lambda wrong: calib.apply(tmp_path / "f.uwb", wrong, tmp_path / "g.uwb"),
         "write_report": lambda wrong: calib.write_report(tmp_path / "r.html", flight, wrong),
     }
-    no_calibrations: tuple[Any, ...] = (None, "calibration.json", {}, result)
+    no_calibrations: tuple[Any, ...] = (None, 3, {})
     for wrong in no_calibrations:
         for name, call in calls.items():
             with pytest.raises(calib.BadInputError, match="expected a Calibration") as caught:
                 call(wrong)
             assert caught.value.parameter == ("second" if name == "compare" else "calibration")
-            assert (".calibration" in str(caught.value)) == (wrong is result)
     assert list(tmp_path.iterdir()) == []
+    # A result and the path of a calibration are as good as the calibration.
+    result.save(tmp_path / "c.json")
+    for given in (result, tmp_path / "c.json", str(tmp_path / "c.json")):
+        assert calib.evaluate(flight, given).to_dict() == calib.evaluate(flight, result.calibration).to_dict()
+        assert calib.compare(given, result).same
+        assert calib.export(given, "csv") == calib.export(result.calibration, "csv")
+    assert result.correct(3.0, -85.0, -86.0, 1, 2) == result.calibration.correct(3.0, -85.0, -86.0, 1, 2)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from calib.errors import BadInputError
-from calib.information import Unknown, judge, reduced
+from calib.information import InformationColumn, judge, reduced
 
-DELAYS = [Unknown("delay", str(tag)) for tag in range(1, 5)]
+DELAYS = [InformationColumn("delay", str(tag)) for tag in range(1, 5)]
 
 
 def from_rows(rows, weight=1e4):
@@ -29,12 +29,19 @@ def test_a_full_matrix_gives_the_inverse():
     np.testing.assert_allclose(verdict.std, np.sqrt(np.diag(np.linalg.inv(information))), rtol=1e-9)
 
 
-SIDES = [Unknown("delay", t) for t in "123"] + [Unknown("distance", p) for p in ("1-2", "2-3", "1-3")]
+SIDES = [InformationColumn("delay", t) for t in "123"] + [
+    InformationColumn("distance", p) for p in ("1-2", "2-3", "1-3")
+]
 # Ranges are distances less delays, and differences of distances are known.
 TRIANGLE = [
     [-1, -1, 0, 1, 0, 0], [0, -1, -1, 0, 1, 0], [-1, 0, -1, 0, 0, 1], [0, 0, 0, 1, -1, 0], [0, 0, 0, 0, 1, -1]
 ]  # fmt: skip
-BOARDS = [Unknown("position", "3"), Unknown("position", "3"), Unknown("position", "4"), Unknown("delay", "3")]
+BOARDS = [
+    InformationColumn("position", "3"),
+    InformationColumn("position", "3"),
+    InformationColumn("position", "4"),
+    InformationColumn("delay", "3"),
+]
 
 
 @pytest.mark.parametrize(
@@ -63,10 +70,10 @@ def test_free_directions_are_found_and_named(rows, unknowns, free, kind, of):
 
 def test_what_is_hardly_known_counts_as_free_by_the_scale_of_an_unknown():
     information = np.diag([1e4, 1.0])
-    delays = [Unknown("delay", "1"), Unknown("delay", "2")]
+    delays = [InformationColumn("delay", "1"), InformationColumn("delay", "2")]
     assert judge(information, delays).named("delay") == ("2",)
     assert not judge(information, delays, loosest=1.5).free
-    wide = [Unknown("delay", "1"), Unknown("delay", "2", scale=10.0)]
+    wide = [InformationColumn("delay", "1"), InformationColumn("delay", "2", scale=10.0)]
     verdict = judge(information, wide)
     assert not verdict.free
     assert verdict.std[1] == pytest.approx(1.0)

@@ -27,7 +27,7 @@ from uwblink.errors import PortError, raising
 from uwblink.pages.blocks import CSS
 from uwblink.wire.codec import exchanges_of
 
-WIDTH, HEIGHT, MARGIN = 260, 44, 3
+PICTURE_WIDTH, PICTURE_HEIGHT, PICTURE_MARGIN = 260, 44, 3
 """Size of a pair's picture, and of the margin around its lines, in pixels."""
 
 SCRIPT: Final = """
@@ -183,17 +183,20 @@ def picture(time_ns: Sequence[int], series: Mapping[str, Sequence[float]]) -> st
         return ""
     known = [value for values in series.values() for value in values if math.isfinite(value)]
     low, high, first, last = min(known), max(known), time_ns[0], time_ns[-1]
-    across, up = (WIDTH - 2 * MARGIN) / max(last - first, 1), (HEIGHT - 2 * MARGIN) / max(high - low, 1e-3)
+    across, up = (
+        (PICTURE_WIDTH - 2 * PICTURE_MARGIN) / max(last - first, 1),
+        (PICTURE_HEIGHT - 2 * PICTURE_MARGIN) / max(high - low, 1e-3),
+    )
     lines = ""
     for kind, values in series.items():
         points = " ".join(
-            f"{MARGIN + across * (t - first):.1f},{HEIGHT - MARGIN - up * (value - low):.1f}"
+            f"{PICTURE_MARGIN + across * (t - first):.1f},{PICTURE_HEIGHT - PICTURE_MARGIN - up * (value - low):.1f}"
             for t, value in zip(time_ns, values, strict=True)
             if math.isfinite(value)
         )
         lines += f'<polyline class="{kind}" points="{points}"/>'
     label = f"range from {low:.3f} to {high:.3f} m"
     return (
-        f'<svg role="img" aria-label="{label}" viewBox="0 0 {WIDTH} {HEIGHT}" preserveAspectRatio="none">'
-        f"<title>{label}</title>{lines}</svg>"
+        f'<svg role="img" aria-label="{label}" viewBox="0 0 {PICTURE_WIDTH} {PICTURE_HEIGHT}" '
+        f'preserveAspectRatio="none"><title>{label}</title>{lines}</svg>'
     )

@@ -29,12 +29,17 @@ from typing import Any, Final, Literal
 
 from uwblink.errors import PlanError
 from uwblink.protocols.table import ON_BOARDS
-from uwblink.recording.antenna_delays import FILE_KEYS as DELAY_KEYS
-from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, known_delays, read_antenna_delays
+from uwblink.recording.antenna_delays import (
+    ANTENNA_DELAY_KEYS,
+    AntennaDelay,
+    AntennaDelays,
+    known_delays,
+    read_antenna_delays,
+)
 from uwblink.recording.schema import Tag, is_board_id, read_tags
 from uwblink.text_files import FileKey, TomlReader, heads, is_number
 
-FILE_KEYS: Final = (
+PLAN_KEYS: Final = (
     FileKey("pairs", '"all" or [[initiator, target], ...]', '"all"', "Who ranges with whom, in turns."),
     FileKey("rate_hz", "number, Hz, above 0", "as fast as the boards answer", "Exchanges a second in total."),
     FileKey("protocol", '"ds" or "ss"', '"ds"', "Double-sided or single-sided ranging."),
@@ -45,7 +50,7 @@ FILE_KEYS: Final = (
     FileKey("tags[].id", "whole number, 0 to 254", "needed", "A board with a known place on a body."),
     FileKey("tags[].body", "text", "needed", "Its body, by the name of motion capture."),
     FileKey("tags[].lever_arm_m", "3 numbers, m", "[0.0, 0.0, 0.0]", "Position of its antenna in the body's frame."),
-    *DELAY_KEYS,
+    *ANTENNA_DELAY_KEYS,
 )
 """The keys of a plan's file, for its reader and the reference."""
 
@@ -126,7 +131,7 @@ def load_plan(path: Path) -> RangingPlan:
     """Read a plan; raises `PlanError` that names the key."""
     file = TomlReader(path, PlanError)
     table = file.table
-    file.known(table, (name.removesuffix("[]") for name in heads(FILE_KEYS)))
+    file.known(table, (name.removesuffix("[]") for name in heads(PLAN_KEYS)))
     given = {name: value for name, value in table.items() if name not in ("tags", "antenna_delays")}
     pairs = table.get("pairs", "all")
     listed = isinstance(pairs, list) and pairs and all(isinstance(pair, list) for pair in pairs)

@@ -85,7 +85,7 @@ class _PlainFlags:
         return parameters
 
 
-class Command(_PlainFlags, TyperCommand):
+class TerseCommand(_PlainFlags, TyperCommand):
     """A command that shows no type for flags, and rejects old names of its options with the new ones."""
 
     renamed: Mapping[str, str] = {}
@@ -128,7 +128,7 @@ def add(
     A parameter that is a dataclass of settings (`uwblink.settings`) becomes one option for each field, and errors name
     its fields by their options. `renamed` maps old names of options to the new ones for the error "--old is now --new".
     """
-    kind = type("RenamedCommand", (Command,), {"renamed": renamed}) if renamed else Command
+    kind = type("RenamedCommand", (TerseCommand,), {"renamed": renamed}) if renamed else TerseCommand
     app.command(name, cls=kind, rich_help_panel=panel, epilog=epilog(*examples))(apart(with_settings(command)))
 
 

@@ -1,13 +1,14 @@
 """Import of files in other formats; programs and other distributions can register importers of their own.
 
-A registered reader takes a path and returns `Contents`. This module writes the recording, and never overwrites one
-unless it is told to. It also reads back what `uwblink export --to csv` or `parquet` wrote.
+A registered reader takes a path and a map and returns `Contents`, or tables with a map. This module writes the
+recording, and never overwrites one unless it is told to. It also reads back what `uwblink export --to csv` or
+`parquet` wrote.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,10 +16,12 @@ from typing import Any, Final
 
 import duckdb
 
+from uwblink.arrays import is_frame
 from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.importers.bags import BAG_SUFFIXES, bag_to_table
 from uwblink.importers.column_map import ColumnMap
 from uwblink.importers.exchange_tables import TABLE_SUFFIXES, Imported, find_tables, import_tables
+from uwblink.importers.frames import map_of_frame, write_frame
 from uwblink.importers.miluv import read_miluv
 from uwblink.importers.poses import add_poses
 from uwblink.importers.staging import Watch, unwatched
@@ -187,19 +190,24 @@ def register_importer(row: Importer, *, replace: bool = False) -> None:
 Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 """A path, or several of a kind of which several can be one recording."""
 
+MapSource = str | os.PathLike[str] | Mapping[str, Any]
+"""What explains the columns of a table: the path of a map, or for a data frame also its keys."""
+
 
 def import_recording(
-    source: Source,
+    source: Source | Any,
     output: str | os.PathLike[str],
     *,
     importer: str | None = None,
-    map_file: str | os.PathLike[str] | None = None,
+    map_file: MapSource | None = None,
     force: bool = False,
 ) -> int:
-    """Import a file, or several tables as one, into a new recording; returns the number of exchanges.
+    """Import a file, several tables as one, or a data frame into a new recording; returns the number of exchanges.
 
     `importer` names a row of `IMPORTERS`; without it the name of the file decides. `map_file` explains a table's
-    columns. Raises `ArgumentError`, `ImportTableError` and what `Recording.create` raises; nothing is written then.
+    columns. A data frame is one of pandas or Polars, or another object with Arrow's interface in C; without a map, one
+    is guessed as by `uwblink import guess`. Raises `ArgumentError`, `ImportTableError` and what `Recording.create`
+    raises; nothing is written then.
 
     >>> import pathlib, tempfile, uwblink
     >>> folder = pathlib.Path(tempfile.mkdtemp())
@@ -211,11 +219,11 @@ def import_recording(
 
 
 def import_file(
-    source: Source,
+    source: Source | Any,
     output: str | os.PathLike[str],
     *,
     importer: str | None = None,
-    map_file: str | os.PathLike[str] | None = None,
+    map_file: MapSource | None = None,
     force: bool = False,
     watch: Watch = unwatched,
 ) -> Imported:
@@ -225,6 +233,15 @@ def import_file(
     "grouping" where an exchange has several rows) and which share of it is done, by importers that say so.
     """
     check_output(Path(output), force=force, recording=True)
+    if is_frame(source):
+        with TemporaryDirectory(prefix="uwblink-") as folder:
+            table = write_frame(source, Path(folder))
+            map_file = map_of_frame(table, map_file)
+            return import_file(table, output, importer="csv", map_file=map_file, force=force, watch=watch)
+    if isinstance(map_file, Mapping):
+        raise ArgumentError(
+            "found a mapping, which goes with a data frame; give the path of a file", parameter="map_file"
+        )
     sources, row, explained = _choose(source, importer, map_file)
     with IMPORTERS.calling(row.name, ImportTableError), TemporaryDirectory(prefix="uwblink-") as folder:
         if row.tables is not None:
@@ -240,9 +257,7 @@ def import_file(
         return Imported(contents.counts(), list(contents.meta.get("notes", ())))
 
 
-def read_source(
-    source: Source, *, importer: str | None = None, map_file: str | os.PathLike[str] | None = None
-) -> Contents:
+def read_source(source: Source | Any, *, importer: str | None = None, map_file: MapSource | None = None) -> Contents:
     """Read a file without writing anything; parameters and errors are those of `import_recording`.
 
     Importers put notes for the user into `meta["notes"]`, a list of lines.

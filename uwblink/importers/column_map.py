@@ -87,7 +87,7 @@ TIME_UNITS: Final = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 DISTANCE_UNITS: Final = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "in": 0.0254}
 POWERS: Final = ("fpp1", "fpp2", "rxp1", "rxp2", "fpp", "rxp")
 SKEWS: Final = ("skew1", "skew2", "skew")
-FILE_KEYS: Final = (
+MAP_KEYS: Final = (
     FileKey(
         "layout",
         '"exchanges", "messages", "stamps", "parts" or "ranges"',
@@ -274,7 +274,7 @@ def load_map(path: Path) -> ColumnMap:
     """Read a map; raises `ImportTableError` that names the key."""
     file = TomlReader(path, ImportTableError, "map")
     table = file.table
-    file.known(table, heads(FILE_KEYS))
+    file.known(table, heads(MAP_KEYS))
     for name in ("line", "each", "from_name"):
         file.check(name, table.get(name), isinstance(table.get(name, ""), str) and table.get(name) != ASKED, "text")
     known = LINES.get(table.get("line", ""))

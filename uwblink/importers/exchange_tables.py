@@ -34,7 +34,7 @@ from uwblink.importers.staging import (
     SOUND_IDS,
     Condition,
     Faults,
-    Rows,
+    StagedRows,
     Staging,
     Watch,
     assemble_exchanges,
@@ -156,7 +156,7 @@ def _notes(staging: Staging) -> list[str]:
     return notes
 
 
-def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) -> tuple[Rows, Reading | None]:
+def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) -> tuple[StagedRows, Reading | None]:
     """Return the usable exchanges and how to read their stamps, None for ranges without stamps; adds to the notes.
 
     Raises `ImportTableError` if half of the rows or more are unusable.
@@ -212,7 +212,7 @@ def _layout(staging: Staging) -> str:
     raise staging.missing(next(name for name in STAMPS if not has(name)))
 
 
-def _poses(rows: Rows, bodies: Mapping[int, str]) -> Iterator[Poses]:
+def _poses(rows: StagedRows, bodies: Mapping[int, str]) -> Iterator[Poses]:
     """Yield the poses of antennas in order of time; antennas that never move have a single one."""
     if not all(map(rows.has, POSITIONS)):
         return
@@ -232,14 +232,14 @@ def _poses(rows: Rows, bodies: Mapping[int, str]) -> Iterator[Poses]:
         f"SELECT time_ns AS origin, tag, x, y, z FROM places WINDOW tags AS (PARTITION BY tag) "
         f"QUALIFY {moves} OR time_ns = min(time_ns) OVER tags ORDER BY time_ns, tag"
     )
-    for found in Rows(rows.db, "posed", ("origin", "tag", "x", "y", "z")).blocks():
+    for found in StagedRows(rows.db, "posed", ("origin", "tag", "x", "y", "z")).blocks():
         tags, which = np.unique(found["tag"], return_inverse=True)
         position = np.column_stack([found[axis] for axis in "xyz"])
         names = np.array([bodies[int(tag)] for tag in tags])[which]
         yield Poses(found["origin"], names, position, np.tile([0.0, 0.0, 0.0, 1.0], (len(which), 1)))
 
 
-def _without_repeats(rows: Rows) -> tuple[Rows, str]:
+def _without_repeats(rows: StagedRows) -> tuple[StagedRows, str]:
     """Return ranges without stamps less those that the other device of an exchange logged, too, and a note on repeats.
 
     A range may equal the previous one of the same two devices by chance, or because it repeats it. In the first case
@@ -266,6 +266,6 @@ def _without_repeats(rows: Rows) -> tuple[Rows, str]:
     rows.db.execute(
         f"CREATE TABLE repeats AS SELECT row FROM ({gaps}) WHERE equal AND turned AND gap_ms < {others / 2!r}"
     )
-    (merged,) = Rows(rows.db, "repeats", ()).values("count(*)")
+    (merged,) = StagedRows(rows.db, "repeats", ()).values("count(*)")
     kept = rows.where("rowid NOT IN (SELECT row FROM repeats)")
     return kept, f"{merged} {said}, as logged by the other device, and are left out"

@@ -48,14 +48,14 @@ from uwblink.importers.plausibility import (
     truth_m,
     try_reading,
 )
-from uwblink.importers.tables import Columns, Table, message_number, open_table
+from uwblink.importers.tables import Columns, SourceTable, message_number, open_table
 from uwblink.importers.templates import Template, places
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.text_files import require_regular
 from uwblink.twr import STAMPS
 
 
-def with_stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str]:
+def with_stamp_and_event(table: SourceTable, columns: dict[str, str]) -> dict[str, str]:
     """Return the columns of a table with a stamp and its event in each row; the same columns for another table.
 
     If several columns are times, the stamp is the one whose name mentions a device, or else does not mention the host.
@@ -83,7 +83,7 @@ def with_stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str
     return rest | {"stamp": stamp, "event": event}
 
 
-def _is_event(table: Table, name: str) -> bool:
+def _is_event(table: SourceTable, name: str) -> bool:
     """Return whether a column has words for transmission and reception, about equally often."""
     word = f"lower(trim({table.text(name)}))"
     sent = f"{word} IN ('tx', 't', 'sent', 'send', 'transmit', 'transmitted')"
@@ -160,7 +160,7 @@ def guess_map(path: Path) -> Guess:
     return _proposal(path, form, top, given, columns, cells, names)
 
 
-def _numbered(path: Path, table: Table) -> Guess:
+def _numbered(path: Path, table: SourceTable) -> Guess:
     """Return the map of a table without a header, whose columns the user has to number."""
     first = ", ".join(f"{k} = {word[:20]}" for k, word in table.words_at(table.names, [0])[0].items())
     wanted = ("time_s", *IDS, "range_m")

@@ -39,7 +39,7 @@ _IDS: Final = (*_PAIR, "listener", "board")
 
 
 @dataclass(slots=True)
-class Flight:
+class FlightFolder:
     """A folder, its robots' folders, the number of duplicate rows by file, and faults.
 
     Times are nanoseconds on the clock of the folder.
@@ -62,7 +62,7 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
         raise ImportTableError(
             f"{folder}: no such folder; expected one with a folder a robot (ifo001/uwb_range.csv ...)"
         )
-    flight = Flight(folder, tuple(sorted(path.parent for path in folder.glob("*/uwb_range.csv"))))
+    flight = FlightFolder(folder, tuple(sorted(path.parent for path in folder.glob("*/uwb_range.csv"))))
     if not flight.robots:
         raise ImportTableError(f"{folder}: no folder in it holds uwb_range.csv, as those of MILUV's robots do")
     start_ns = _read_yaml(folder / "timeshift.yaml", _start_ns, "whole numbers timeshift_s and timeshift_ns", 0)
@@ -106,7 +106,7 @@ def _constellation(map_file: Path | None) -> str | None:
     return found
 
 
-def _meta(flight: Flight, start_ns: int, constellation: str | None, off_m: float) -> dict[str, Any]:
+def _meta(flight: FlightFolder, start_ns: int, constellation: str | None, off_m: float) -> dict[str, Any]:
     doubled, lost = sum(flight.doubled.values()), len(flight.faults)
     notes = [f"{doubled} rows are in the files of two robots, and are imported once"] if doubled else []
     notes += [f"{lost} rows cannot be used and are kept as faults"] if lost else []
@@ -123,7 +123,7 @@ def _meta(flight: Flight, start_ns: int, constellation: str | None, off_m: float
 
 
 def _read(
-    flight: Flight,
+    flight: FlightFolder,
     name: str,
     needed: Mapping[str, str],
     optional: Mapping[str, str] = {},
@@ -177,7 +177,7 @@ def _cell(name: str, text: str) -> str:
     return f"CASE WHEN {whole} BETWEEN 0 AND {LARGEST_ID} THEN {whole} END" if name in _IDS else number(text)
 
 
-def _read_exchanges(flight: Flight) -> tuple[Exchanges, Floats]:
+def _read_exchanges(flight: FlightFolder) -> tuple[Exchanges, Floats]:
     """Return all exchanges in order of time, without truth, and the distances that the authors measured (n,)."""
     needed = _PAIR | {"range_m": "range{raw}"} | {name: f"{name}{{raw}}" for name in STAMPS}
     optional = {"measured_m": "gt_range"} | {f"fpp{k}_dbm": f"fpp{k}" for k in (1, 2)}
@@ -190,7 +190,7 @@ def _read_exchanges(flight: Flight) -> tuple[Exchanges, Floats]:
     return Exchanges(protocol=protocol, reporter=columns["initiator"], truth_m=unknown, **columns), measured
 
 
-def _read_overheard(flight: Flight) -> Columns:
+def _read_overheard(flight: FlightFolder) -> Columns:
     """Return overheard exchanges: measurements of the listener, and those of the two robots (`_n`)."""
     own = {f"rx{k}": f"rx{k}{{raw}}" for k in (1, 2, 3)}
     neighbours = {f"{name}_n": f"{name}{{raw}}_n" for name in STAMPS}
@@ -206,7 +206,7 @@ def _cir_rows(columns: Columns) -> list[CirRow]:
     return [CirRow(*plain, tuple(taps.tolist())) for *plain, taps in zip(*cells, strict=True)]  # type: ignore[call-arg]
 
 
-def _read_poses(flight: Flight) -> Poses:
+def _read_poses(flight: FlightFolder) -> Poses:
     """Return the poses of the robots; none without motion capture."""
     names = [*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw")]
     columns = _read(flight, "mocap.csv", {name: name for name in names})
@@ -221,7 +221,7 @@ def _read_poses(flight: Flight) -> Poses:
     return Poses(columns["time_ns"], columns["body"], values[:, :3], values[:, 3:] / norm[:, None])[good]
 
 
-def _read_tags(flight: Flight) -> list[Tag]:
+def _read_tags(flight: FlightFolder) -> list[Tag]:
     """Return the robots' tags and lever arms from tags.yaml; none without such a file."""
     arms: Vectors = _read_yaml(flight.folder / "tags.yaml", _vectors, _XYZ, {})
     names = {robot.name for robot in flight.robots}
@@ -229,7 +229,7 @@ def _read_tags(flight: Flight) -> list[Tag]:
 
 
 def _find_anchors(
-    flight: Flight, exchanges: Exchanges, measured_m: Floats, poses: Poses, tags: list[Tag], wanted: str | None
+    flight: FlightFolder, exchanges: Exchanges, measured_m: Floats, poses: Poses, tags: list[Tag], wanted: str | None
 ) -> tuple[str | None, float, dict[int, tuple[float, float, float]]]:
     """Return the constellation `wanted`, or else the one whose distances agree with `gt_range`.
 

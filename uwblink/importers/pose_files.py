@@ -35,7 +35,7 @@ Lines = list[list[str]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Layout:
+class PoseLayout:
     """Where a form has its poses; columns are numbers from 0.
 
     `bodies` are the columns of position and attitude by body, with the name "" if a column says the body. `header` is
@@ -130,12 +130,12 @@ _TUM: Final = "TUM", ("time_s", *POSE), 0
 _EUROC: Final = "EuRoC", ("time_ns", "x", "y", "z", "qw", "qx", "qy", "qz"), 1
 
 
-def _single(path: Path, form: str, names: tuple[str, ...], header: int, body: str | None) -> Layout:
+def _single(path: Path, form: str, names: tuple[str, ...], header: int, body: str | None) -> PoseLayout:
     if not body:
         raise ImportTableError(f"{path}: a {form} file has no names of bodies; name its body with `body`")
     bodies = {body: [names.index(name) for name in POSE]}
     ns = TIME_UNITS[names[0].removeprefix("time_")]
-    return Layout(form=form, names=names, time=0, ns=ns, bodies=bodies, header=header, gaps=False, comments=True)
+    return PoseLayout(form=form, names=names, time=0, ns=ns, bodies=bodies, header=header, gaps=False, comments=True)
 
 
 _NAMES: Final = (
@@ -147,7 +147,7 @@ _NAMES: Final = (
 """Names of columns as programs write them, in plain words."""
 
 
-def _plain(path: Path, head: Lines, body: str | None, stated: ColumnMap) -> Layout:
+def _plain(path: Path, head: Lines, body: str | None, stated: ColumnMap) -> PoseLayout:
     """Return the layout of CSV with the names of its columns in the first line."""
     names = [name.strip() for name in (head[0] if head else ())]
     found: dict[str, tuple[int, str | None]] = {}
@@ -171,7 +171,7 @@ def _plain(path: Path, head: Lines, body: str | None, stated: ColumnMap) -> Layo
             f"{path}: columns {', '.join(names[found[axis][0]] for axis in 'xyz')} have several units"
         )
     (time, time_unit), unit = found["time_s"], next(iter(units))
-    return Layout(
+    return PoseLayout(
         form="", names=names, time=time, ns=TIME_UNITS[stated.time_unit or time_unit or "s"],
         bodies={"": [found[name][0] for name in needed]}, header=1, gaps=False,
         metres=DISTANCE_UNITS[stated.distance_unit or unit or "m"], body=None if body else found["body"][0],
@@ -186,7 +186,7 @@ def _header(path: Path, head: Lines, *words: str) -> int:
     raise ImportTableError(f"{path}: its header has no line with {', '.join(words)}: export it with all lines")
 
 
-def _motive(path: Path, head: Lines) -> Layout:
+def _motive(path: Path, head: Lines) -> PoseLayout:
     """Return the layout of Motive's CSV: lines of kinds, names, Rotation or Position, and axes, in any version."""
     said = dict(zip(head[0][::2], head[0][1::2], strict=False))
     units = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
@@ -201,13 +201,13 @@ def _motive(path: Path, head: Lines) -> Layout:
     for k, (kind, name, what, axis) in enumerate(columns):
         if kind == "Rigid Body" and what in ("Rotation", "Position"):
             bodies.setdefault(name, {})[("q" if what == "Rotation" else "") + axis.lower()] = k
-    layout = Layout(
+    layout = PoseLayout(
         form="Motive", names=head[kinds + 1], time=1, ns=1e9, header=kinds + 2, metres=DISTANCE_UNITS[unit], bodies={}
     )
     return _with_bodies(path, layout, bodies, POSE)
 
 
-def _vicon(path: Path, head: Lines) -> Layout:
+def _vicon(path: Path, head: Lines) -> PoseLayout:
     """Return the layout of Vicon's CSV: names, then axes, then units; RX, RY, RZ are a rotation vector without RW."""
     axes = _header(path, head, "Frame", "RX", "TX")
     rate = next((value for cells in head[:axes] if cells and (value := _number(cells[0])) > 0), math.nan)
@@ -221,14 +221,14 @@ def _vicon(path: Path, head: Lines) -> Layout:
     fields = ("TX", "TY", "TZ", "RX", "RY", "RZ", *(["RW"] if "RW" in head[axes] else []))
     unit = next((one for one in ("mm", "cm", "m") if one in units), "mm")
     radians = math.pi / 180 if units & {"deg", "degrees"} and "RW" not in fields else 1.0
-    layout = Layout(
+    layout = PoseLayout(
         form="Vicon", names=head[axes], time=0, ns=1e9 / rate, bodies={}, header=axes + 2,
         metres=DISTANCE_UNITS[unit], radians=radians,
     )  # fmt: skip
     return _with_bodies(path, layout, bodies, fields)
 
 
-def _qualisys(path: Path, head: Lines) -> Layout:
+def _qualisys(path: Path, head: Lines) -> PoseLayout:
     """Return the layout of Qualisys' 6D TSV: lines of words and values, then a line of columns by body."""
     said = {cells[0]: cells[1:] for cells in head if len(cells) > 1}
     names, first = [name.strip() for name in said.get("BODY_NAMES", ()) if name.strip()], _header(path, head, "Rot[0]")
@@ -239,14 +239,16 @@ def _qualisys(path: Path, head: Lines) -> Layout:
     fields = ("x", "y", "z", *(f"r{k}" for k in range(9)))
     places = [dict(zip(fields, (k - 7, k - 6, k - 5, *range(k, k + 9)), strict=True)) for k in starts]
     timed, rate = head[first][1:2] == ["Time"], _number(next(iter(said.get("FREQUENCY", ())), "")) or math.nan
-    layout = Layout(
+    layout = PoseLayout(
         form="Qualisys", names=head[first], time=int(timed), ns=1e9 if timed else 1e9 / rate, bodies={},
         header=first + 1, metres=DISTANCE_UNITS["mm"],
     )  # fmt: skip
     return _with_bodies(path, layout, dict(zip(names, places, strict=True)), fields)
 
 
-def _with_bodies(path: Path, layout: Layout, bodies: Mapping[str, Mapping[str, int]], fields: Sequence[str]) -> Layout:
+def _with_bodies(
+    path: Path, layout: PoseLayout, bodies: Mapping[str, Mapping[str, int]], fields: Sequence[str]
+) -> PoseLayout:
     """Return a layout with the bodies that have all fields; raises `ImportTableError` without bodies or a rate."""
     whole = {name: [found[one] for one in fields] for name, found in bodies.items() if set(fields) <= found.keys()}
     if not whole or not layout.ns > 0:

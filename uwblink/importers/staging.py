@@ -34,7 +34,7 @@ from uwblink.importers.column_map import (
     ColumnMap,
 )
 from uwblink.importers.plausibility import SAMPLE_ROWS, counter_format
-from uwblink.importers.tables import Columns, Table, message_number, number, time_ns, whole_number
+from uwblink.importers.tables import Columns, SourceTable, message_number, number, time_ns, whole_number
 from uwblink.recording.schema import Fault
 from uwblink.twr import LARGEST_ID, STAMPS
 
@@ -50,7 +50,7 @@ def unwatched(_step: str, _share: float) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Rows:
+class StagedRows:
     """The rows of a table for which an SQL condition is true; `origin` is their number among all rows read.
 
     `from_id` and `to_id` are INTEGER, `time_ns` and stamps in ticks BIGINT, all other `columns` DOUBLE; missing values
@@ -62,7 +62,7 @@ class Rows:
     columns: tuple[str, ...]
     condition: str = "true"
 
-    def where(self, condition: str) -> Rows:
+    def where(self, condition: str) -> StagedRows:
         """Return the rows for which this condition is true, too."""
         return replace(self, condition=f"{self.condition} AND ({condition})")
 
@@ -119,7 +119,7 @@ class Staging:
         Raises `ImportTableError`.
         """
         self.db, self.paths, self.column_map = db, tuple(paths), column_map
-        self.tables: list[Table] = []
+        self.tables: list[SourceTable] = []
         self.names: dict[int, str] = {}
         self.offsets = [0]
         for name, value in column_map.constants.items():
@@ -127,7 +127,7 @@ class Staging:
         columns: Collection[str] = ()
         for k, path in enumerate(paths):
             watch("reading", k / len(paths))
-            table = Table(db, path, column_map, key=k)
+            table = SourceTable(db, path, column_map, key=k)
             self.tables.append(table)
             cells = self._cells(table)
             if cells.keys() != (columns or cells.keys()):
@@ -137,20 +137,20 @@ class Staging:
             with table.reading():
                 into = "INSERT INTO staged" if k else "CREATE TABLE staged AS"
                 db.execute(f"{into} SELECT {chosen} FROM {table.source}")
-            self.offsets.append(Rows(db, "staged", ()).count())
+            self.offsets.append(StagedRows(db, "staged", ()).count())
         if not self.offsets[-1]:
             raise ImportTableError(f"{paths[0]}: a header and no rows")
         self.blanks = 0
         """Rows without a range, such as an empty cell of a wide table, that are left out."""
         if "blank" in columns:
-            (self.blanks,) = Rows(db, "staged", ()).values("count(*) FILTER (blank)")
+            (self.blanks,) = StagedRows(db, "staged", ()).values("count(*) FILTER (blank)")
         self._filled = "NOT blank" if self.blanks else "true"
         others = tuple(name for name in columns if name not in (*IDS, "blank"))
         ids = ", ".join(f"{cell} AS {name}" for name, cell in self._ids().items())
         listed = ", ".join(("CAST(rowid AS UINTEGER) AS origin", ids, *others))
         db.execute(f"CREATE TABLE rows AS SELECT {listed} FROM staged WHERE {self._filled}")
         db.execute("DROP TABLE staged")
-        self.rows = Rows(db, "rows", ("origin", *IDS, *others))
+        self.rows = StagedRows(db, "rows", ("origin", *IDS, *others))
 
     def words_in(self, names: Iterable[str]) -> Iterator[str]:
         """Yield a note for each of some columns that has cells that are no numbers, and are taken as missing.
@@ -181,7 +181,7 @@ class Staging:
             if words:
                 yield f"{said}, such as {words[0][0][:40]!r}, and are taken as missing"
 
-    def require(self, rows: Rows, names: Iterable[str]) -> None:
+    def require(self, rows: StagedRows, names: Iterable[str]) -> None:
         """Raise the error for the first column that rows lack."""
         for name in names:
             if not rows.has(name):
@@ -196,7 +196,7 @@ class Staging:
         there = ", ".join(names)[:400]
         return ImportTableError(f"{self.paths[0]}: column {header!r} is missing; there are {there}; {remedy}")
 
-    def _cells(self, table: Table) -> dict[str, str]:
+    def _cells(self, table: SourceTable) -> dict[str, str]:
         """Return SQL of the columns to stage, from cells of a table or constants; ids are words at first."""
         column_map, found = self.column_map, dict[str, str]()
         blank = table.blank
@@ -306,7 +306,7 @@ def _numbers(words: Iterable[str]) -> dict[str, int]:
     return {word: value for word, value in found.items() if value <= LARGEST_ID}
 
 
-def rows_back(rows: Rows) -> int:
+def rows_back(rows: StagedRows) -> int:
     """Return how many rows are earlier than the one before."""
     if not rows.has("time_s"):
         return 0
@@ -314,13 +314,13 @@ def rows_back(rows: Rows) -> int:
     return int(rows.db.execute(f"SELECT count(*) FROM ({steps}) WHERE back").fetchall()[0][0])
 
 
-def in_time_order(rows: Rows) -> Rows:
+def in_time_order(rows: StagedRows) -> StagedRows:
     """Return the rows in order of time, those of one time in their order."""
     if not rows_back(rows):
         return rows
     listed = f"SELECT {', '.join(rows.columns)} FROM {rows.name} WHERE {rows.condition} ORDER BY time_ns, rowid"
     rows.db.execute(f"CREATE TABLE ordered AS {listed}")
-    return Rows(rows.db, "ordered", rows.columns)
+    return StagedRows(rows.db, "ordered", rows.columns)
 
 
 FAULTS_AT_ONCE: Final = 100_000
@@ -350,7 +350,7 @@ class Faults:
         self._reasons: list[Condition] = []
         staging.db.execute("CREATE TABLE faulty (origin BIGINT, reason INTEGER)")
 
-    def reject(self, rows: Rows, conditions: Sequence[Condition]) -> Rows:
+    def reject(self, rows: StagedRows, conditions: Sequence[Condition]) -> StagedRows:
         """Record the rows that fulfil a condition as unusable; returns the others."""
         cases = " ".join(f"WHEN {one.wrong} THEN {k}" for k, one in enumerate(conditions, start=len(self._reasons)))
         self._reasons += conditions
@@ -386,7 +386,7 @@ class Faults:
             path = next(path for path in self._staging.paths if path.name == fault.board)
             raise ImportTableError(f"{path}: {fault.detail}")
 
-    def _describe(self, table: Table, found: Sequence[tuple[int, int, int]]) -> list[Fault]:
+    def _describe(self, table: SourceTable, found: Sequence[tuple[int, int, int]]) -> list[Fault]:
         """Return faults of a table: its rows, reasons and times."""
         column_map, faults = self._staging.column_map, []
         headers = {column_map.header(self._reasons[reason].column) for _, reason, _ in found}
@@ -404,12 +404,14 @@ class Faults:
         return faults
 
 
-def time_conditions(rows: Rows) -> list[Condition]:
+def time_conditions(rows: StagedRows) -> list[Condition]:
     """Return the condition that a row has a time, none where there is no column of times."""
     return [Condition("time_s", "a time", "time_ns IS NULL")] if rows.has("time_s") else []
 
 
-def usable_exchanges(staging: Staging, rows: Rows, faults: Faults, stamps: Sequence[str]) -> tuple[Rows, int, int, str]:
+def usable_exchanges(
+    staging: Staging, rows: StagedRows, faults: Faults, stamps: Sequence[str]
+) -> tuple[StagedRows, int, int, str]:
     """Return the rows that have all stamps, without repetitions of an exchange.
 
     Also returns the number of repetitions, and width and format of the counter.
@@ -435,11 +437,11 @@ def usable_exchanges(staging: Staging, rows: Rows, faults: Faults, stamps: Seque
         f"SELECT r.rowid FROM {rows.name} r JOIN ({twice}) ON {code} = code WHERE {some.condition} AND r.rowid > first"
     )
     staging.db.execute(f"CREATE TABLE repeats AS {later}")
-    (repeats,) = Rows(staging.db, "repeats", ()).values("count(*)")
+    (repeats,) = StagedRows(staging.db, "repeats", ()).values("count(*)")
     return good.where("rowid NOT IN (SELECT rowid FROM repeats)") if repeats else good, repeats, bits, counter
 
 
-def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Watch) -> tuple[Rows, str | None]:
+def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Watch) -> tuple[StagedRows, str | None]:
     """Combine rows of "messages", "stamps" or "parts" into exchanges.
 
     Returns complete exchanges, and the protocol, if the rows determine it. Incomplete exchanges are faults. Messages
@@ -495,7 +497,7 @@ def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Wat
     return replace(faults.reject(groups, [incomplete, conflict]), columns=columns), protocol
 
 
-def _group(rows: Rows, values: Mapping[str, str], follows: str, within_s: float) -> Rows:
+def _group(rows: StagedRows, values: Mapping[str, str], follows: str, within_s: float) -> StagedRows:
     """Return a table with one row for each group; `values` are its columns as SQL aggregates over the group's rows.
 
     In these `first` is true for the first row of a group, and `place` counts its rows from 1. Rows are sorted by keys,
@@ -522,4 +524,4 @@ def _group(rows: Rows, values: Mapping[str, str], follows: str, within_s: float)
     listed = ", ".join(f"{value} AS {column}" for column, value in values.items())
     rows.db.execute(f"CREATE TABLE exchanges AS SELECT {listed} FROM ({placed}) GROUP BY start ORDER BY start")
     rows.db.execute("DROP TABLE sorted")
-    return Rows(rows.db, "exchanges", tuple(values))
+    return StagedRows(rows.db, "exchanges", tuple(values))

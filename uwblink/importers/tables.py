@@ -146,10 +146,10 @@ def connected(paths: Sequence[Path]) -> Iterator[duckdb.DuckDBPyConnection]:
 
 
 @contextmanager
-def open_table(path: Path, column_map: ColumnMap | None = None) -> Iterator[Table]:
+def open_table(path: Path, column_map: ColumnMap | None = None) -> Iterator[SourceTable]:
     """Open one table for the duration of the block; a map says what its rows are."""
     with connected([path]) as db:
-        yield Table(db, path, column_map)
+        yield SourceTable(db, path, column_map)
 
 
 def number(text: str) -> str:
@@ -188,7 +188,7 @@ def time_ns(text: str, unit: str | None, ns_per_unit: float) -> str:
     return f"CASE WHEN {found} BETWEEN -{LATEST_NS} AND {LATEST_NS} THEN {found} END"
 
 
-class Table:
+class SourceTable:
     """One file: `names` are its columns, `source` is what a query reads FROM, `text` returns SQL of a column."""
 
     def __init__(

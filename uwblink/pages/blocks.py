@@ -61,6 +61,11 @@ def inline(svg: bytes, caption: str) -> str:
     return head.sub(lambda found: f'<svg viewBox="{found[1]}" {attributes}>', text, count=1)
 
 
+def prose(text: str) -> str:
+    """Return text as HTML, names in backticks as code."""
+    return re.sub("`([^`]+)`", r"<code>\1</code>", escape(text))
+
+
 def table_html(
     header: Sequence[str],
     rows: Sequence[Sequence[str]],
@@ -84,7 +89,7 @@ def table_html(
         body += f"<tr{last}>"
         for text, name in zip(row, heads, strict=True):
             named = f" data-head='{escape(name, quote=True)}'" if name and text else ""
-            body += f"<td{named}>{escape(text)}</td>"
+            body += f"<td{named}>{prose(text)}</td>"
         body += "</tr>"
     classes = " ".join(name for name, wanted in (("many", len(header) > 8), ("words", words)) if wanted)
     opening = f"<table class='{classes}'>" if classes else "<table>"
@@ -221,7 +226,7 @@ def to_html(document: Document, drawings: Mapping[str, bytes] | None = None) -> 
                     parts.append(f"<nav aria-label='Contents'><ol>{''.join(entries)}</ol></nav>")
                 parts.append(f"<h2 id='s{number}'>{escape(text)}</h2>")
             case Text(_, kind):
-                large, rest = map(escape, block.parts())
+                large, rest = map(prose, block.parts())
                 parts.append(f"<p class='verdict {kind}'><b>{large}</b> {rest}</p>" if large else
                              f"<p class='{escape(kind, quote=True)}'>{rest}</p>")  # fmt: skip
             case Listing(text, table):

@@ -36,7 +36,7 @@ ALL: Final = "configured_antenna_delay_ticks"
 BY_TAG: Final = "configured_antenna_delay_ticks_by_tag"
 """Keys of a recording's `meta`."""
 
-FILE_KEYS: Final = tuple(
+ANTENNA_DELAY_KEYS: Final = tuple(
     FileKey(f"antenna_delays.{place}{name}", "whole number, ticks", default, meaning.format(whose))
     for place, default, whose in (("", "none", "devices not named"), ("tags.ID.", "as all", "one device"))
     for name, meaning in (

@@ -13,7 +13,7 @@ from uwblink.recording.schema import POSE, Poses, Tag
 from uwblink.twr import Exchanges, names_in, raw_range
 
 
-class Track:
+class PoseTrack:
     """One body's poses in order of time: the columns of `POSE` (7, n) at times (n,) in ns."""
 
     def __init__(self, time_ns: Ints, columns: Sequence[Floats] | Floats) -> None:
@@ -40,7 +40,7 @@ class Track:
         return np.where(known, found[:3] + turned.T, np.nan)
 
 
-Tracks = dict[str, Track]
+Tracks = dict[str, PoseTrack]
 """The tracks of bodies that have poses."""
 
 
@@ -48,7 +48,7 @@ def tracks_of(poses: Poses) -> Tracks:
     """Return the tracks of the bodies that have poses."""
     columns = np.vstack([poses.position_m.T, poses.quaternion.T])
     rows = {body: poses.body == body for body in names_in(poses.body)}
-    return {body: Track(poses.time_ns[some], columns[:, some]) for body, some in rows.items()}
+    return {body: PoseTrack(poses.time_ns[some], columns[:, some]) for body, some in rows.items()}
 
 
 def poses_around(tracks: Tracks, start_ns: int, end_ns: int) -> Poses:

@@ -113,7 +113,7 @@ class Command(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class BufferReading:
     """The result of reading the buffer: commands, error lines, remaining bytes, and whether the board is alive."""
 
     commands: tuple[Command, ...]
@@ -131,7 +131,7 @@ class _Incomplete(Exception):  # noqa: N818 - a signal of the parser, not an err
         self.alive = alive
 
 
-def read_commands(buffer: bytes, known: Container[bytes] = COMMANDS) -> Reading:
+def read_commands(buffer: bytes, known: Container[bytes] = COMMANDS) -> BufferReading:
     """Parse all commands of a buffer, of which the board executes only the last. `known` are the keys it knows."""
     commands: list[Command] = []
     while (at := buffer.find(b"C")) >= 0:
@@ -139,10 +139,10 @@ def read_commands(buffer: bytes, known: Container[bytes] = COMMANDS) -> Reading:
             command, end = _command(buffer, at, known)
         except _Incomplete as problem:
             # The next step of the firmware depends on link addresses; observed boards went on with an empty buffer.
-            return Reading(tuple(commands), problem.lines, b"", problem.alive)
+            return BufferReading(tuple(commands), problem.lines, b"", problem.alive)
         commands.append(command)
         buffer = buffer[end:]
-    return Reading(tuple(commands), (), buffer, alive=True)
+    return BufferReading(tuple(commands), (), buffer, alive=True)
 
 
 def _command(buffer: bytes, at: int, known: Container[bytes]) -> tuple[Command, int]:

@@ -51,7 +51,7 @@ class FinalPayload:
 Payload = RangeCommand | ResponsePayload | FinalPayload | Broadcast
 """What a frame carries. Signal 1 has the command that its sender executes, a broadcast its bytes."""
 
-LENGTHS: Final = {RangeCommand: POLL_BYTES, ResponsePayload: RESPONSE_BYTES, FinalPayload: FINAL_BYTES}
+FRAME_BYTES: Final = {RangeCommand: POLL_BYTES, ResponsePayload: RESPONSE_BYTES, FinalPayload: FINAL_BYTES}
 """Lengths of frames in bytes."""
 
 
@@ -115,7 +115,7 @@ class BoardAir:
         self.world = World(scenario)
         self.medium = Medium(scenario, SampledWorld(self.world))
         self.place = {tag.id: k for k, tag in enumerate(scenario.tags)}
-        self.radios: dict[int, Radio] = {}
+        self.radios: dict[int, BoardRadio] = {}
         self._rng = stream(scenario.run.seed, "boards")
         self._frames: list[Frame] = []
         self.before_marker = _ns(before_marker_s(scenario.radio.preamble_symbols))
@@ -168,7 +168,7 @@ class BoardAir:
         readings = self.medium.readings(frames, link.power_dbm, noise[2], noise[3])
         heard = self.medium.heard(link.power_dbm, noise[0]) & arrives
         marker = departure * NS_PER_S // SUBTICKS_PER_SECOND
-        length = 8 + len(payload.data) if isinstance(payload, Broadcast) else LENGTHS[type(payload)]
+        length = 8 + len(payload.data) if isinstance(payload, Broadcast) else FRAME_BYTES[type(payload)]
         frame = Frame(
             sender=sender,
             receiver=receiver,
@@ -221,7 +221,7 @@ class BoardAir:
         )
 
 
-class Radio:
+class BoardRadio:
     """The radio of a board. `since` is the time (ns) at which its receiver was switched on, None while it is off."""
 
     def __init__(self, air: BoardAir, board: int, interrupt: Callable[[Received | None], None]) -> None:

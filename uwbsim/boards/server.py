@@ -90,13 +90,13 @@ class Unplug(Section):
 Fault = Annotated[Bytes | SplitWrites | LateReplies | LoseFrames | Hang | Unplug, Field(discriminator="kind")]
 
 
-class Faults(Section):
+class FaultsFile(Section):
     """A file of faults."""
 
     faults: tuple[Fault, ...] = Field((), description="The faults, in any order.")
 
 
-def load_faults(path: str | os.PathLike[str], tags: Iterable[int]) -> Faults:
+def load_faults(path: str | os.PathLike[str], tags: Iterable[int]) -> FaultsFile:
     """Read a file of faults of boards with these tags; raises `ScenarioError` that says where it is wrong.
 
     >>> from pathlib import Path
@@ -106,7 +106,7 @@ def load_faults(path: str | os.PathLike[str], tags: Iterable[int]) -> Faults:
     0.5
     """
     tags, path = list(tags), Path(path)
-    faults = validated(Faults, parse_toml(read_text(path, ScenarioError, "file of faults (.toml)"), path), path)
+    faults = validated(FaultsFile, parse_toml(read_text(path, ScenarioError, "file of faults (.toml)"), path), path)
     for number, fault in enumerate(faults.faults):
         tag = getattr(fault, "tag", None)
         if tag is not None and tag not in tags:
@@ -203,7 +203,7 @@ class Server:
         self,
         scenario: Scenario,
         link_dir: Path | None = None,
-        faults: Faults | None = None,
+        faults: FaultsFile | None = None,
         *,
         speed: float = 1.0,
         tell: Callable[[str], object] = lambda text: None,
@@ -214,7 +214,7 @@ class Server:
         failure that does not end the server: a board's own program failed, or poses cannot be written any more.
         """
         self._speed, self._tell = speed, tell
-        self._faults = faults or Faults()
+        self._faults = faults or FaultsFile()
         kept = math.prod(1 - fault.share for fault in self._faults.faults if isinstance(fault, LoseFrames))
         self.bench = Bench(scenario, self._printed, 1 - kept)
         self.bench.crashed = lambda board, error: self._tell(

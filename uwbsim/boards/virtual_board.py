@@ -31,7 +31,7 @@ from uwblink.errors import PortLostError, PortMissingError
 from uwblink.wire.codec import encode
 from uwblink.wire.messages import Message
 from uwbsim.boards.commands import ANSWER, EXECUTORS, Command, read_commands
-from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, Attempt, BoardAir, Radio, Received, Steps
+from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, Attempt, BoardAir, BoardRadio, Received, Steps
 from uwbsim.boards.ranging import received_by
 from uwbsim.errors import ParameterError
 from uwbsim.random_streams import stream
@@ -170,7 +170,7 @@ class VirtualBoard:
         self._tries = 0  # as on the boards, kept if another command replaces one that is retried
         self._released: simpy.Event | None = None
         self.usb = UsbLink(env, lambda data: self.bench.send(int(env.now), self.id, data))
-        self.radio = Radio(self.bench.air, self.id, self._interrupted)
+        self.radio = BoardRadio(self.bench.air, self.id, self._interrupted)
         self.radio.listen()
         self._processes = [env.process(self._guarded(self._usb_task()))]
 

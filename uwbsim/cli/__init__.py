@@ -15,7 +15,7 @@ def main() -> NoReturn:
 def _run() -> NoReturn:
     # Here, so that Ctrl-C is answered while these are loaded.
     from uwblink.cli import shared
-    from uwbsim.cli.commands import FLAGS, app
-    from uwbsim.errors import UnanswerableError, UwbsimError
+    from uwbsim.cli.commands import UWBSIM_FLAGS, app
+    from uwbsim.errors import TooFewDataError, UwbsimError
 
-    shared.run(app, UwbsimError, statuses={UnanswerableError: 1}, flags=FLAGS)
+    shared.run(app, UwbsimError, statuses={TooFewDataError: 1}, flags=UWBSIM_FLAGS)

@@ -214,7 +214,7 @@ def compare(
         print_json(found.to_dict())
         return
     # On its side, because it has few protocols and many quantities.
-    _print_table([[name.strip(), *map(show, found.outcomes)] for name, show in uwbsim.pages.COLUMNS.items()])
+    _print_table([[name.strip(), *map(show, found.outcomes)] for name, show in uwbsim.pages.COMPARISON_COLUMNS.items()])
     typer.echo(f"{output / uwbsim.pages.FILES[0]}, {', '.join(uwbsim.pages.FILES[1:])}")
 
 
@@ -419,5 +419,10 @@ for _panel, _command, *_examples in (
 ):
     add(app, _command, *_examples, panel=_panel)
 
-FLAGS: Final = {"count": "-n/--ranges", "overhead_s": "--overhead-us", "overrides": "--set", "evaluate": "evaluate"}
+UWBSIM_FLAGS: Final = {
+    "count": "-n/--ranges",
+    "overhead_s": "--overhead-us",
+    "overrides": "--set",
+    "evaluate": "evaluate",
+}
 """Of parameters that are spelt otherwise; what evaluates a sweep is a plug-in, which no flag names."""

@@ -1,7 +1,7 @@
 """Pages and figures about scenarios, protocols, sweeps and twins."""
 
 from uwbsim.pages.documents import (
-    COLUMNS,
+    COMPARISON_COLUMNS,
     FILES,
     TWIN_COLUMNS,
     optimum_file,
@@ -12,7 +12,7 @@ from uwbsim.pages.documents import (
 )
 
 __all__ = [
-    "COLUMNS",
+    "COMPARISON_COLUMNS",
     "FILES",
     "TWIN_COLUMNS",
     "optimum_file",

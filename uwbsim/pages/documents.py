@@ -18,15 +18,15 @@ from uwblink.pages.figures import picture
 from uwblink.protocols.table import PROTOCOLS
 from uwbsim.errors import ScenarioError
 from uwbsim.pages import figures
-from uwbsim.protocols.comparison import Comparison, Optimum, ProtocolErrors, over_reply, over_skew, over_state
+from uwbsim.protocols.comparison import BestDelay, ProtocolComparison, ProtocolErrors, over_reply, over_skew, over_state
 from uwbsim.protocols.conditions import conditions_of
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import preview
 from uwbsim.sweep.design import SweepDesign
-from uwbsim.sweep.runner import STORE, Store
+from uwbsim.sweep.runner import STORE, ResultStore
 from uwbsim.tables import write_tables
-from uwbsim.twins import LEVEL, Compared, Twin
+from uwbsim.twins import TWIN_LEVEL, Compared, Twin
 
 
 def show(scenario: Scenario | Source, path: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -89,7 +89,7 @@ def scene(scenario: Scenario) -> Document:
     return Document(scenario.run.name, blocks)
 
 
-COLUMNS: Final[dict[str, Callable[[ProtocolErrors], str]]] = {
+COMPARISON_COLUMNS: Final[dict[str, Callable[[ProtocolErrors], str]]] = {
     "protocol": lambda o: o.protocol,
     "bias (cm)": lambda o: f"{100 * o.bias_m:+.2f}",
     "predicted": lambda o: f"{100 * o.predicted_bias_m:+.2f}",
@@ -109,7 +109,7 @@ FILES: Final = ("compare.html", "compare.csv", "compare.parquet")
 """Names of the files of `write_comparison`."""
 
 
-def write_comparison(found: Comparison, folder: Path, *, force: bool = False) -> None:
+def write_comparison(found: ProtocolComparison, folder: Path, *, force: bool = False) -> None:
     """Write a comparison as page and tables (`FILES`) into a folder, which is made where it is missing.
 
     Raises what `check_folder` raises.
@@ -122,7 +122,7 @@ def write_comparison(found: Comparison, folder: Path, *, force: bool = False) ->
         write_text(html, text, force=force)
 
 
-def comparison(found: Comparison) -> Document:
+def comparison(found: ProtocolComparison) -> Document:
     """Return the page of a comparison: errors, costs, the best protocol by delay, and curves of errors."""
     scenario, outcomes, samples = found.scenario, found.outcomes, found.samples
     protocols = {row.name: row for row in found.protocols}
@@ -151,8 +151,8 @@ def comparison(found: Comparison) -> Document:
         ),
     ]
     # Two tables, errors and costs, each narrow enough for a screen.
-    cut = list(COLUMNS).index("messages")
-    halves = [list(COLUMNS)[:cut], ["protocol", *list(COLUMNS)[cut:]]]
+    cut = list(COMPARISON_COLUMNS).index("messages")
+    halves = [list(COMPARISON_COLUMNS)[:cut], ["protocol", *list(COMPARISON_COLUMNS)[cut:]]]
     winners = [
         [
             str(row["scheduled_us"]),
@@ -167,7 +167,7 @@ def comparison(found: Comparison) -> Document:
             f"{outcomes[0].ranges:,} raw ranges per protocol, in the same world and with the same noise. Errors are "
             "those of raw ranges, with antenna delays, power bias and reflections."
         ),
-        *(Table(names, [[COLUMNS[name](one) for name in names] for one in outcomes]) for names in halves),
+        *(Table(names, [[COMPARISON_COLUMNS[name](one) for name in names] for one in outcomes]) for names in halves),
         Text(
             "Predicted: analytically, without simulation. Air: total duration of the frames; duration: from the start "
             "of the first frame to the end of the last; radio on: time for which the two radios send or listen, a "
@@ -204,7 +204,7 @@ def optimum_file(protocol: str) -> str:
     return f"optimum-{protocol}.png"
 
 
-def write_optima(found: Iterable[Optimum], folder: Path, *, force: bool = False) -> None:
+def write_optima(found: Iterable[BestDelay], folder: Path, *, force: bool = False) -> None:
     """Write the curve of each optimum as a picture (.png) into a folder, which is made where it is missing.
 
     Raises what `check_folder` raises.
@@ -238,7 +238,7 @@ def write_sweep_page(plan: SweepDesign, folder: Path) -> Path:
     Raises `TableError` where the folder has no results.
     """
     most = 200_000  # rows of which a page is made; the tables have all
-    with Store.open(folder / STORE) as store:
+    with ResultStore.open(folder / STORE) as store:
         rows = list(islice(store, most + 1))
     path, document = folder / "results.html", _swept(plan, rows)
     if len(rows) > most:
@@ -330,8 +330,8 @@ def write_twin(found: Twin, compared: Sequence[Compared], path: Path, *, force: 
             "as the measured ones. D is the largest difference of the cumulative distributions. Correlations and D are "
             "followed by the difference that is detected in nine of ten such recordings. p is the smaller p-value of "
             "two tests: of D (Kolmogorov and Smirnov, with effective n) and of the difference of the lag-1 "
-            f"correlations. Below {LEVEL / 2:g} the quantities differ; there are too few values where a D of 0.2 or a "
-            "difference of correlations of 0.4 would not be detected. "
+            f"correlations. Below {TWIN_LEVEL / 2:g} the quantities differ; there are too few values where a D of 0.2 "
+            "or a difference of correlations of 0.4 would not be detected. "
             "The scenario was fitted to the same exchanges, so this tests its form, not its predictions."
         ),
         Table(list(TWIN_COLUMNS), [[show(one) for show in TWIN_COLUMNS.values()] for one in compared]),

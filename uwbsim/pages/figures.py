@@ -19,7 +19,7 @@ from uwblink.pages.colours import BLUE, GRID, INK, MUTED, PALE, SERIES, VERMILIO
 from uwblink.pages.figures import NARROW_IN, label, legend, mark, outlines, series, sheet
 from uwblink.protocols.table import PROTOCOLS, RangingProtocol
 from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S
-from uwbsim.protocols.comparison import ErrorCurve, Optimum
+from uwbsim.protocols.comparison import BestDelay, ErrorCurve
 from uwbsim.protocols.conditions import Conditions, exchange, interval_stamps
 from uwbsim.scenario.bodies import Obstacle, Room
 from uwbsim.scenario.model import Scenario
@@ -82,7 +82,7 @@ def error_over(width_in: float, curves: Mapping[str, ErrorCurve], x: str, *, log
     return figure
 
 
-def optimum_curve(width_in: float, found: Optimum) -> Figure:
+def optimum_curve(width_in: float, found: BestDelay) -> Figure:
     """Draw the root mean squared error of one range, and of the mean of a second full of them, over the delay."""
     figure, panels = sheet(width_in, 2)
     delays, best = 1e6 * found.delays_s, 1e6 * found.delay_s

@@ -60,7 +60,7 @@ class ProtocolErrors:
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class Comparison:
+class ProtocolComparison:
     """A comparison of protocols in a scenario: their outcomes, and samples of their errors in metres, by name.
 
     >>> import uwbsim
@@ -134,7 +134,7 @@ def compare(
     protocols: Protocols | None = None,
     count: int = 1_000_000,
     progress: Callable[[float], None] | None = None,
-) -> Comparison:
+) -> ProtocolComparison:
     """Simulate `count` ranges with each protocol in one random world, with the same noise; return their errors.
 
     `scenario` is whatever `load` takes, or a `Scenario`; `protocols` are names or rows of `PROTOCOLS`, None for all,
@@ -173,7 +173,7 @@ def compare(
         errors = range_errors_m(protocol, conditions, scenario.run.seed, count, report)
         outcomes.append(_outcome(scenario, protocol, conditions, errors))
         samples[protocol.name] = errors[:200_000].copy()
-    return Comparison(scenario=scenario, protocols=tuple(rows), outcomes=outcomes, samples=samples)
+    return ProtocolComparison(scenario=scenario, protocols=tuple(rows), outcomes=outcomes, samples=samples)
 
 
 def _outcome(scenario: Scenario, protocol: RangingProtocol, conditions: Conditions, errors: Floats) -> ProtocolErrors:
@@ -276,7 +276,7 @@ def over_state(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Optimum:
+class BestDelay:
     """The best delay, and the curve: delays in seconds, mean squared error of a range and of a second of them in m^2.
 
     `rms_m` is the error of one range, `second_rms_m` that of the mean of all ranges of a pair in a second: noise
@@ -307,7 +307,7 @@ class Optimum:
         return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
 
 
-def optimum(scenario: Scenario | Source, protocol: str | RangingProtocol = "ds", overhead_s: float = 0.0) -> Optimum:
+def optimum(scenario: Scenario | Source, protocol: str | RangingProtocol = "ds", overhead_s: float = 0.0) -> BestDelay:
     """Minimise the mean squared error of the mean of a second's exchanges over the delay of the scheduled message.
 
     A second holds 1/duration exchanges of a pair, one after the other at the boards' turnaround. The variance of their
@@ -354,7 +354,7 @@ def optimum(scenario: Scenario | Source, protocol: str | RangingProtocol = "ds",
     refined = minimize_scalar(lambda d: errors(d)[1], bounds=(low, high), method="bounded", options={"xatol": 1e-8})
     delay = min((float(refined.x), float(delays[best])), key=lambda d: errors(d)[1])
     one_m2, second_m2 = errors(delay)
-    return Optimum(
+    return BestDelay(
         protocol=protocol.name,
         delay_s=delay,
         rms_m=math.sqrt(one_m2),

@@ -84,7 +84,7 @@ class Conditions:
 
     def __getitem__(self, rows: slice | Ints) -> Conditions:
         """Return the chosen states."""
-        columns: dict[str, Any] = {name: getattr(self, name)[..., rows] for name in COLUMNS}
+        columns: dict[str, Any] = {name: getattr(self, name)[..., rows] for name in STATE_SHAPES}
         return replace(self, **columns)
 
     def with_columns(self, **values: float | Floats) -> Conditions:
@@ -99,12 +99,12 @@ class Conditions:
         """Return one state: zeros, but for what is given; of both boards, a pair is given."""
         # A pair is transposed into a column.
         columns: dict[str, Any] = {
-            name: np.zeros(shape) + np.transpose([values.pop(name, 0.0)]) for name, shape in COLUMNS.items()
+            name: np.zeros(shape) + np.transpose([values.pop(name, 0.0)]) for name, shape in STATE_SHAPES.items()
         }
         return cls(**columns, **values)
 
 
-COLUMNS: Final = {
+STATE_SHAPES: Final = {
     f.name: (2, 1) if f.type == "Both" else (1,) for f in fields(Conditions) if f.type in ("Both", "Floats")
 }
 """The columns, with their shapes for a single state."""

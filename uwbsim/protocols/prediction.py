@@ -15,10 +15,9 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.protocols.table import RangingProtocol
-from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S
+from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S, TX_SHARE
 from uwbsim.errors import ParameterError
 from uwbsim.protocols.conditions import SIDES, Conditions, Stamps, chosen, exchange, intervals_of
-from uwbsim.scenario.devices import TX_SHARE
 from uwbsim.world.clocks import RATE_SPAN_S
 
 

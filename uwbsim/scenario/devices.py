@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
 from uwblink.errors import PlanError
 from uwblink.recording.antenna_delays import REGISTER_MAX, delay_of, load_antenna_delays
-from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S
+from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S, TX_SHARE
 from uwbsim.errors import ScenarioError
 from uwbsim.scenario.base import Increasing, NotNegative, Positive, Section, TagId, Vector
 from uwbsim.scenario.bodies import Height, Imu, Motion, Shadow
@@ -46,7 +46,7 @@ class WarmUp(Section):
     begin_s: float = Field(0.0, description="When it begins; negative: part of it is over when the run begins.")
 
 
-class Table(Section):
+class ProfileTable(Section):
     """Values at times, linear between them and constant beyond: given here, or read from a CSV file.
 
     The file has the columns time_s and the key that it stands at, temperature_c or supply_v.
@@ -73,7 +73,7 @@ def _constant(value: Any) -> Any:
 
 
 Profile = Annotated[
-    Annotated[Constant | Ramp | WarmUp | Table, Field(discriminator="model")], BeforeValidator(_constant)
+    Annotated[Constant | Ramp | WarmUp | ProfileTable, Field(discriminator="model")], BeforeValidator(_constant)
 ]
 """Something over the time of a run."""
 
@@ -167,9 +167,6 @@ def check_grid(
             raise ValueError(f"{name}[{k}]: found {len(row)} values, the elevations are {len(elevation_deg)}")
 
 
-TX_SHARE: Final = 0.44
-"""Share of an aggregate antenna delay that belongs to transmissions, the rest to receptions (Decawave APS014)."""
-
 Register = Annotated[int, Field(ge=0, le=REGISTER_MAX)]
 
 
@@ -206,7 +203,7 @@ class Programmed(Section):
     reply: Register = Field(ANTENNA_DELAY_TICKS, description="Constant in the stamps of delayed replies (TX_ANT_DLY).")
 
 
-class Tag(Section):
+class ScenarioTag(Section):
     """A board: where it sits, its antenna delay and its clock.
 
     Give the aggregate `delay_ns` = transmit - receive, split 0.44 / 0.56, or both parts. What temperature and voltage
@@ -306,7 +303,7 @@ class Tag(Section):
         return transmit + more[0], receive - more[1]
 
 
-def with_antenna_delays(tags: tuple[Tag, ...], path: Path) -> tuple[Tag, ...]:
+def with_antenna_delays(tags: tuple[ScenarioTag, ...], path: Path) -> tuple[ScenarioTag, ...]:
     """Return tags with the antenna delays of a file programmed into them; raises `ScenarioError`."""
     try:
         delays = load_antenna_delays(path)

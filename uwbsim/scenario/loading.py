@@ -275,6 +275,7 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 MOST_POSES: Final = 200_000
+"""Over half an hour at 100 Hz."""
 
 MOST_ROWS: Final = 1_000_000
 """Nearly three hours of slots at 100 Hz; in memory they take 0.2 GB."""
@@ -292,7 +293,7 @@ def fill_in(table: dict[str, Any], scenario: Path, folders: Folders = ()) -> Non
         rows = table.get(name)
         sections |= {f"{name}[{k}]": row for k, row in enumerate(rows if isinstance(rows, list) else ())}
     for place, section in sections.items():
-        for key, (model, read) in READERS.items():
+        for key, (model, read) in READERS_OF_FILES.items():
             named = section.get(key) if isinstance(section, dict) else None
             if isinstance(named, dict) and "file" in named and named.get("model") == model:
                 where = f"{scenario}: {place}.{key}.file"
@@ -403,7 +404,7 @@ def _trajectory(path: Path, _key: str, named: Mapping[str, Any]) -> dict[str, An
     }
 
 
-READERS: Final[dict[str, tuple[str | None, Callable[[Path, str, Mapping[str, Any]], dict[str, Any]]]]] = {
+READERS_OF_FILES: Final[dict[str, tuple[str | None, Callable[[Path, str, Mapping[str, Any]], dict[str, Any]]]]] = {
     "antenna": (None, lambda path, *_: _grid(path, "gain_db")),
     "plan": (None, _plan),
     "group_delay": ("table", lambda path, *_: _grid(path, "delay_cm")),

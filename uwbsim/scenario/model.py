@@ -15,11 +15,12 @@ from pydantic import Field, model_validator
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.base import NotNegative, Positive, Section, Vector
 from uwbsim.scenario.bodies import Motion, Obstacle, Recorded, Room
-from uwbsim.scenario.devices import Body, Devices, Tag
+from uwbsim.scenario.devices import Body, Devices, ScenarioTag
 from uwbsim.scenario.radio import GeometricMultipath, Radio, Spline, TwoStateMultipath
 from uwbsim.scenario.ranging import Ranging
 
 WAVELENGTH_M: Final = SPEED_OF_LIGHT / 3993.6e6
+"""At the centre of channel 2, which the boards use (firmware wire format, 2.2)."""
 
 
 class RunSettings(Section):
@@ -61,7 +62,7 @@ class Scenario(Section):
     bodies: Annotated[tuple[Body, ...], Field(min_length=1)] = Field(
         description="Bodies that carry tags: robots, people, tripods.",
     )
-    tags: Annotated[tuple[Tag, ...], Field(min_length=2)] = Field(description="The boards, two or more.")
+    tags: Annotated[tuple[ScenarioTag, ...], Field(min_length=2)] = Field(description="The boards, two or more.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:

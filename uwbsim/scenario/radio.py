@@ -11,6 +11,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from uwbsim.scenario.base import NotDecreasing, NotNegative, Positive, Section, Share, TagId, look_up
 from uwbsim.scenario.devices import GroupDelay, check_grid
 
+# Knots of the splines published with the paper (campaigns 2022-08 and 2022-07, decargroup/uwb_calibration).
 _AUGUST: Final = [0.014173673264269979] * 4 + [1.599984520527571] * 4
 _JULY: Final = [0.009024434505913748] * 4 + [1.8988661927089594] * 4
 

@@ -33,6 +33,7 @@ PREAMBLE_TIMEOUT_S: Final = 6.521e-3
 POLL_BYTES: Final = 11
 RESPONSE_BYTES: Final = 8
 FINAL_BYTES: Final = 28
+"""Lengths of the boards' frames with checksum (firmware wire format, 2.1)."""
 
 
 def before_marker_s(preamble_symbols: int) -> float:

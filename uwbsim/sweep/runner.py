@@ -34,7 +34,7 @@ STORE: Final = "results.duckdb"
 
 
 @dataclass(frozen=True, slots=True)
-class Summary:
+class SweepSummary:
     """Numbers of runs of a sweep: done now, failed among these, and skipped because their results were stored."""
 
     done: int
@@ -51,7 +51,7 @@ def run_sweep(
     resume: bool = False,
     evaluate: Evaluate | None = None,
     progress: Callable[[float], None] | None = None,
-) -> Summary:
+) -> SweepSummary:
     """Do the runs that have no results yet, and write results.csv and results.parquet in the order of the runs.
 
     Runs of kind `compare` compare protocols; those of kind `calibrate` simulate a flight and have `evaluate(flight)`
@@ -76,7 +76,7 @@ def run_sweep(
     >>> def farthest(flight):
     ...     return {"farthest_m": flight.truth_m.max().round(6).item()}
     >>> uwbsim.run_sweep(uwbsim.load_design("sweep.toml"), "results", workers=1, evaluate=farthest)
-    Summary(done=2, failed=0, skipped=0)
+    SweepSummary(done=2, failed=0, skipped=0)
     >>> Path("results/results.csv").read_text().splitlines()[1].endswith("ds,5.0,0")
     True
     """
@@ -94,13 +94,13 @@ def run_sweep(
     team = workers_for(workers, scheduler, work)
     try:
         folder.mkdir(exist_ok=True)
-        with Store.open(folder / STORE, _identity(plan)) as store:
+        with ResultStore.open(folder / STORE, _identity(plan)) as store:
             known = store.done()
             done, failed = _do(plan, store, team, work, known, progress)
             write_tables(folder / "results.csv", folder / "results.parquet", store, force=True)
     finally:
         team.close()
-    return Summary(done, failed, len(known))
+    return SweepSummary(done, failed, len(known))
 
 
 def _identity(plan: SweepDesign) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def _identity(plan: SweepDesign) -> dict[str, Any]:
 def _check(plan: SweepDesign, folder: Path, *, resume: bool) -> None:
     path, own, known, begun = folder / STORE, _identity(plan), {}, False
     if path.exists():
-        with Store.open(path, own) as store:
+        with ResultStore.open(path, own) as store:
             known, begun = store.identity(), bool(store.done())
     elif resume:
         raise ParameterError(f"{folder} holds no sweep to go on with", parameter="resume")
@@ -132,7 +132,7 @@ def _check(plan: SweepDesign, folder: Path, *, resume: bool) -> None:
 
 def _do(
     plan: SweepDesign,
-    store: Store,
+    store: ResultStore,
     team: Workers,
     work: Work,
     known: set[int],
@@ -183,14 +183,14 @@ class TableError(UwblinkError, ValueError):
     """A table or store that cannot be read or written: what, where, what to do."""
 
 
-TABLES: Final = {
+RESULT_TABLES: Final = {
     "identity": {"key": "VARCHAR", "value": "VARCHAR"},
     "results": {"number": "BIGINT", "part": "BIGINT", "document": "VARCHAR"},
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Store:
+class ResultStore:
     """Results by number of run, committed as they come: a killed sweep loses only results not yet committed."""
 
     _db: Any
@@ -213,14 +213,14 @@ class Store:
             raise TableError(f"{path}: {other if locked else reason}") from error
         with db:
             with _reading(path):
-                check_tables(lambda query: db.execute(query).fetchall(), path, path.stat().st_size, TABLES)
+                check_tables(lambda query: db.execute(query).fetchall(), path, path.stat().st_size, RESULT_TABLES)
                 asked = "SELECT table_name, column_name FROM system.main.duckdb_columns() WHERE NOT internal"
                 found = set(db.execute(asked).fetchall())
             # A sweep killed at its start leaves a file without tables.
             if identity is not None and not found:
                 with _writing(path):
                     db.execute("BEGIN")
-                    for table, columns in TABLES.items():
+                    for table, columns in RESULT_TABLES.items():
                         db.execute(
                             f"CREATE TABLE {table} ({', '.join(f'{name} {kind}' for name, kind in columns.items())})"
                         )
@@ -228,7 +228,7 @@ class Store:
                         "INSERT INTO identity VALUES (?, ?)", [[k, json.dumps(v)] for k, v in identity.items()]
                     )
                     db.execute("COMMIT")
-            elif not {(table, column) for table, columns in TABLES.items() for column in columns} <= found:
+            elif not {(table, column) for table, columns in RESULT_TABLES.items() for column in columns} <= found:
                 raise TableError(f"{path}: not a store of results")
             yield cls(db, path)
 

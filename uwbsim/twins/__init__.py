@@ -1,5 +1,5 @@
 """Scenarios fitted to recordings, and how well they fit."""
 
-from uwbsim.twins.fitting import LEVEL, Compared, Side, Twin, check_name
+from uwbsim.twins.fitting import TWIN_LEVEL, Compared, Side, Twin, check_name
 
-__all__ = ["LEVEL", "Compared", "Side", "Twin", "check_name"]
+__all__ = ["TWIN_LEVEL", "Compared", "Side", "Twin", "check_name"]

@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 from uwblink.arrays import Floats
 from uwblink.ticks import TICK_S
 from uwblink.twr import intervals
-from uwbsim.twins.flight import Flight
+from uwbsim.twins.flight import TwinFlight
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +39,7 @@ class ClockFit:
     receive_noise_s: Floats
 
 
-def fit_clocks(flight: Flight) -> ClockFit:
+def fit_clocks(flight: TwinFlight) -> ClockFit:
     """Fit the clocks of a flight; with warming up where walks would have to be long without."""
     found = _Search(flight, None)
     span = float(flight.time_s[-1])
@@ -61,7 +61,7 @@ class _Search:
     readings: 0 are ratios, 1 carriers.
     """
 
-    def __init__(self, flight: Flight, decay_s: float | None) -> None:
+    def __init__(self, flight: TwinFlight, decay_s: float | None) -> None:
         self.tags, span = len(flight.tags), max(float(flight.time_s[-1]), 1e-3)
         self.flight, self.decay_s = flight, decay_s
         # Knots half a second apart at least, and 300 unknown rates in all at most.

@@ -24,13 +24,21 @@ from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import simulate
 from uwbsim.twins.clocks import fit_clocks
-from uwbsim.twins.flight import Flight, RecordingSource, effective_size, fit_schedule, lag_one, read_flight, some_rows
+from uwbsim.twins.flight import (
+    RecordingSource,
+    TwinFlight,
+    effective_size,
+    fit_schedule,
+    lag_one,
+    read_flight,
+    some_rows,
+)
 from uwbsim.twins.powers import fit_powers
 from uwbsim.twins.range_errors import CalibrationSource, KnownDevices, fit_range_errors, read_calibration
-from uwbsim.twins.scenario import Fitted, receive_noise, scenario_text, tables, unknowns
+from uwbsim.twins.scenario import FittedFlight, receive_noise, scenario_text, tables, unknowns
 from uwbsim.world.radio import lifted
 
-LEVEL: Final = 0.01
+TWIN_LEVEL: Final = 0.01
 """Significance level of the comparison of a quantity."""
 
 
@@ -86,9 +94,9 @@ class Compared:
         """Return "differ" for a significant difference, else "alike", or "too few" if a large one were not detected.
 
         A large difference of distributions is 0.2, that of two normal ones whose means are half a standard deviation
-        apart; of autocorrelations 0.4. Each of the two tests has half of `LEVEL`.
+        apart; of autocorrelations 0.4. Each of the two tests has half of `TWIN_LEVEL`.
         """
-        if min(self.probability, np.nan_to_num(self.lag1_probability, nan=1.0)) < LEVEL / 2:
+        if min(self.probability, np.nan_to_num(self.lag1_probability, nan=1.0)) < TWIN_LEVEL / 2:
             return "differ"
         return "alike" if self.detectable <= 0.2 and self.lag1_detectable <= 0.4 else "too few"
 
@@ -110,7 +118,7 @@ def _finite_or_none(value: Any) -> Any:
     return None if value != value else value
 
 
-Column = Callable[[Flight], Floats]
+Column = Callable[[TwinFlight], Floats]
 QUANTITIES: Final[dict[str, tuple[str, Column]]] = {
     "reply dt32": ("us", lambda f: intervals(f.exchanges).dt32 * TICK_S * 1e6),
     "first-path power at target": ("dBm", lambda f: f.exchanges.fpp1_dbm),
@@ -125,7 +133,7 @@ QUANTITIES: Final[dict[str, tuple[str, Column]]] = {
 """The compared quantities with their units, one value per exchange; those without values are left out."""
 
 
-def _compared(name: str, measured: Flight, flights: list[Flight]) -> Compared | None:
+def _compared(name: str, measured: TwinFlight, flights: list[TwinFlight]) -> Compared | None:
     unit, column = QUANTITIES[name]
     mine, group = _finite(column(measured), measured.pair)
     # A seed's pairs are pairs of their own.
@@ -154,9 +162,9 @@ def _compared(name: str, measured: Flight, flights: list[Flight]) -> Compared | 
         simulated=other,
         distance=distance,
         probability=float(kolmogorov(distance * root)),
-        detectable=float((kolmogi(LEVEL / 2) + tenth / 2) / root),
+        detectable=float((kolmogi(TWIN_LEVEL / 2) + tenth / 2) / root),
         lag1_probability=float(2 * ndtr(-abs(one.lag1 - other.lag1) / max(spread, 1e-9))),
-        lag1_detectable=float((-ndtri(LEVEL / 4) + tenth) * spread),
+        lag1_detectable=float((-ndtri(TWIN_LEVEL / 4) + tenth) * spread),
         drawn=(mine[some_rows(len(mine), 4000)], theirs[some_rows(len(theirs), 4000)]),
         pairs=pairs,
     )
@@ -196,7 +204,7 @@ class Twin:
     unknown: tuple[str, ...]
     recording: str
     calibration: str
-    measured: Flight
+    measured: TwinFlight
     known: KnownDevices
     paths: dict[str, Poses]
     table: dict[str, Any]
@@ -213,7 +221,7 @@ class Twin:
         flights = []
         for k in range(count):
             one = self.scenario.model_copy(update={"run": self.scenario.run.model_copy(update={"seed": k + 1})})
-            flights.append(Flight.of(simulate(one), self.known, "the simulated twin", fewest=2))
+            flights.append(TwinFlight.of(simulate(one), self.known, "the simulated twin", fewest=2))
             if progress:
                 progress((k + 1) / count)
         found = [_compared(name, self.measured, flights) for name in QUANTITIES]
@@ -281,7 +289,7 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
     """
     known = read_calibration(calibration)
     flown, where = read_flight(recording)
-    flight = Flight.of(flown, known, where)
+    flight = TwinFlight.of(flown, known, where)
     # One thread: the same bytes on any machine, and small matrices are quicker so.
     with threadpool_limits(limits=1, user_api="blas"):
         # More than 50,000 exchanges would only take longer for clocks and powers.
@@ -294,7 +302,7 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
         errors = fit_range_errors(flight, np.sqrt(np.mean(std_s**2, axis=0)))
         powers = fit_powers(flight[rows], errors.reflected[rows])
         schedule = fit_schedule(flight, flown.faults)
-    fitted = Fitted(
+    fitted = FittedFlight(
         clocks=clocks, noise_dbm=noise_dbm, noise_s=noise_s, errors=errors, powers=powers, schedule=schedule
     )
     name = f"twin of {Path(where).stem}"
@@ -318,7 +326,7 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
     )
 
 
-def summary(flight: Flight, fitted: Fitted) -> dict[str, Any]:
+def summary(flight: TwinFlight, fitted: FittedFlight) -> dict[str, Any]:
     """Return what was fitted by name, numbers or None, and tables by tag and by pair."""
     clocks, errors, powers, schedule = fitted.clocks, fitted.errors, fitted.powers, fitted.schedule
     noise = fitted.noise_s

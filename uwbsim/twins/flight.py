@@ -23,7 +23,7 @@ from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S, UUS_TICKS
 from uwblink.twr import Exchanges, intervals, without_stamps
-from uwbsim.errors import ScenarioError, UnanswerableError
+from uwbsim.errors import ScenarioError, TooFewDataError
 from uwbsim.random_streams import stream
 from uwbsim.simulation.run import Simulated
 
@@ -152,7 +152,7 @@ def read_flight(source: RecordingSource) -> tuple[Contents | Simulated, str]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Flight:
+class TwinFlight:
     """Exchanges of one protocol between tags whose places are known, as columns of length n in order of time.
 
     `time_s` counts from `origin_ns`; `ends` are places in `tags` of initiator and target, (2, n), `pair` the places of
@@ -228,7 +228,7 @@ class Flight:
 
         def require(met: object, text: str) -> None:
             if not met:
-                raise UnanswerableError(f"{where}: {text}")
+                raise TooFewDataError(f"{where}: {text}")
 
         require(len(flown.exchanges), "holds no exchanges; record or import some first")
         names, counts = np.unique(flown.exchanges.protocol, return_counts=True)
@@ -332,7 +332,7 @@ class ScheduleFit:
     replies_us: tuple[float, ...] | None
 
 
-def fit_schedule(flight: Flight, faults: list[Fault]) -> ScheduleFit:
+def fit_schedule(flight: TwinFlight, faults: list[Fault]) -> ScheduleFit:
     """Return the schedule of a flight, with the exchanges that failed meanwhile."""
     place: dict[int | None, int] = {tag.tag: k for k, tag in enumerate(flight.tags)}
     known = [fault for fault in faults if fault.initiator in place and fault.target in place]
@@ -380,7 +380,7 @@ def _round_robin(time: Floats, ends: Ints) -> tuple[float, Ints, Ints] | None:
     return (beat, slot, turns[:, order]) if np.mean(kept) >= 0.9 and len(set(order.tolist())) == count else None
 
 
-def _scheduled_uus(flight: Flight) -> int | None:
+def _scheduled_uus(flight: TwinFlight) -> int | None:
     """Return the delay of the first scheduled message, within what a scenario takes."""
     spans = intervals(flight.exchanges)
     for message, ticks in zip(flight.row.messages[1:], (spans.dt32, spans.dt53), strict=False):
@@ -390,7 +390,7 @@ def _scheduled_uus(flight: Flight) -> int | None:
     return None
 
 
-def _replies_us(flight: Flight) -> tuple[float, ...] | None:
+def _replies_us(flight: TwinFlight) -> tuple[float, ...] | None:
     """Return quantiles of replies at once, within what a scenario takes."""
     if flight.row.messages[1].timing != "at once":
         return None

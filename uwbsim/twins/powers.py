@@ -10,11 +10,12 @@ import numpy as np
 from scipy.special import expit, logit
 
 from uwblink.arrays import Floats
-from uwbsim.twins.flight import Flight, bulk_spread, effective_size, lasting, some_rows
+from uwbsim.twins.flight import TwinFlight, bulk_spread, effective_size, lasting, some_rows
 from uwbsim.world.radio import ANTENNAS, before_saturation_dbm, harmonics
 
 MIN_REFLECTED: Final = 5.0
-"""Reflected exchanges, by their probabilities, below which their losses are not determined."""
+"""Reflected exchanges, by their probabilities, below which their losses are not determined: a spread of
+five is known to a third (the root of 1/8)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,7 +55,7 @@ class _Solved:
     left_db: Floats
 
 
-def fit_powers(flight: Flight, reflected: Floats) -> PowerFit:
+def fit_powers(flight: TwinFlight, reflected: Floats) -> PowerFit:
     """Fit powers of a flight whose ranges are reflected with known probabilities (n,)."""
     enough = float(reflected.sum()) >= MIN_REFLECTED
     saturation, power = _unsaturated(flight, reflected)
@@ -98,12 +99,12 @@ def fit_powers(flight: Flight, reflected: Floats) -> PowerFit:
     )
 
 
-def _tells_path_loss(flight: Flight) -> bool:
+def _tells_path_loss(flight: TwinFlight) -> bool:
     """Return whether distances differ by more than some 12 %."""
     return bool(np.std(np.log10(flight.distance_m)) >= 0.05)
 
 
-def _unsaturated(flight: Flight, reflected: Floats) -> tuple[float | None, Floats]:
+def _unsaturated(flight: TwinFlight, reflected: Floats) -> tuple[float | None, Floats]:
     """Return where readings of power end, and the powers (2, n) without this saturation.
 
     They end where they would without saturation exceed their maximum so often that chance leaves none there with a
@@ -128,7 +129,7 @@ def _unsaturated(flight: Flight, reflected: Floats) -> tuple[float | None, Float
 
 
 def _solve(
-    flight: Flight, power_dbm: Floats, reflected: Floats, antenna: str, *, rounds: int, scale_db2: float = 100.0
+    flight: TwinFlight, power_dbm: Floats, reflected: Floats, antenna: str, *, rounds: int, scale_db2: float = 100.0
 ) -> _Solved:
     """Solve one penalized least-squares problem: two readings an exchange, weighed anew in each of the rounds.
 
@@ -177,7 +178,7 @@ def _by_power(solved: _Solved, reflected: Floats) -> Floats:
     return np.asarray(expit(logit(reflected) + (above**2 - (above + solved.loss_db) ** 2) / (2 * spread**2)))
 
 
-def _mean_gains(flight: Flight, pattern_db: Floats) -> Floats:
+def _mean_gains(flight: TwinFlight, pattern_db: Floats) -> Floats:
     """Return the mean gain of each tag's pattern towards those that it ranged with, (tags,)."""
     degree = isqrt(pattern_db.shape[1] + 1) - 1
     gains = [

@@ -18,9 +18,9 @@ from pydantic import ValidationError
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import Exchanges, intervals
-from uwbsim.errors import ScenarioError, UnanswerableError
+from uwbsim.errors import ScenarioError, TooFewDataError
 from uwbsim.scenario.radio import Spline, TwoStateMultipath
-from uwbsim.twins.flight import Flight, lasting
+from uwbsim.twins.flight import TwinFlight, lasting
 
 if TYPE_CHECKING:
     from calib import Calibration
@@ -89,7 +89,7 @@ def read_calibration(source: CalibrationSource) -> KnownDevices:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RangeErrors:
+class FittedRangeErrors:
     """The errors of calibrated ranges: all lengths in metres.
 
     `delays_ns` is what the flight adds to the delays of tags, by id. `direct_std_m` is the spread of direct ranges
@@ -112,11 +112,11 @@ class RangeErrors:
     reflected: Floats
 
 
-def fit_range_errors(flight: Flight, receive_noise_s: Floats) -> RangeErrors:
+def fit_range_errors(flight: TwinFlight, receive_noise_s: Floats) -> FittedRangeErrors:
     """Fit a flight whose receive stamps have noises (n,) in seconds, zero where none is known.
 
     Powers are withheld from the fit: reflections are weaker than direct paths, so a second bias curve beside that of
-    the calibration would follow them. Raises `UnanswerableError` where `calib.fit` cannot answer.
+    the calibration would follow them. Raises `TooFewDataError` where `calib.fit` cannot answer.
     """
     from calib import CalibError, Ranges, fit
 
@@ -132,11 +132,11 @@ def fit_range_errors(flight: Flight, receive_noise_s: Floats) -> RangeErrors:
     )
     try:
         # The twin has the errors of this recording: what pairs differ by between recordings is left out.
-        found = fit(ranges, minimum_norm=True, between_m=0.0).calibration
+        found = fit(ranges, between_m=0.0).calibration
     except CalibError as error:
-        raise UnanswerableError(str(error)) from error
+        raise TooFewDataError(str(error)) from error
     if found.errors is None:
-        raise UnanswerableError(f"{flight.where}: the errors of its ranges have no spread")
+        raise TooFewDataError(f"{flight.where}: the errors of its ranges have no spread")
     applied = found.apply(ranges)
     shapes = found.errors.shapes(applied.lifted, x.initiator, x.target)
     excess, reflected = found.errors.least_m + shapes.detour_m, applied.tail_probability
@@ -157,7 +157,7 @@ def fit_range_errors(flight: Flight, receive_noise_s: Floats) -> RangeErrors:
     white = range_noise_m(flight, receive_noise_s)
     # Ranges of two messages err by the skew of the clocks, which the fit takes for delays and the twin simulates.
     from_delays = len(flight.row.messages) > 2
-    return RangeErrors(
+    return FittedRangeErrors(
         delays_ns={tag: delay if from_delays else 0.0 for tag, delay in found.delays_ns.items()},
         direct_std_m=float(np.sqrt(np.maximum(np.mean(shapes.noise_m**2 - white**2), 0.0))),
         share=float(reflected.mean()),
@@ -171,7 +171,7 @@ def fit_range_errors(flight: Flight, receive_noise_s: Floats) -> RangeErrors:
     )
 
 
-def _lives(flight: Flight, reflected: Floats, life_s: float, share: Floats) -> Floats:
+def _lives(flight: TwinFlight, reflected: Floats, life_s: float, share: Floats) -> Floats:
     """Return the lives of pairs (pairs,), shrunk towards the life of all.
 
     The logarithm of a life has the variance 2/spells; the variance between pairs is what is observed beyond it.
@@ -186,7 +186,7 @@ def _lives(flight: Flight, reflected: Floats, life_s: float, share: Floats) -> F
     return np.asarray(life_s * np.exp(off * between / (between + 2 / spells)))
 
 
-def range_noise_m(flight: Flight, receive_noise_s: Floats) -> Floats:
+def range_noise_m(flight: TwinFlight, receive_noise_s: Floats) -> Floats:
     """Return the spread of a range whose stamps have a noise in seconds: c s sqrt((1 + r + r^2)/2) (docs/theory.md)."""
     spans, ratio = intervals(flight.exchanges), np.zeros(len(flight))
     if len(flight.row.messages) > 2:

@@ -19,13 +19,13 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.loading import MOST_POSES
 from uwbsim.scenario.radio import Radio, TwoStateMultipath
 from uwbsim.twins.clocks import ClockFit
-from uwbsim.twins.flight import SHORTEST_LIFE_S, Flight, ScheduleFit, attitude, bulk_spread
+from uwbsim.twins.flight import SHORTEST_LIFE_S, ScheduleFit, TwinFlight, attitude, bulk_spread
 from uwbsim.twins.powers import PowerFit
-from uwbsim.twins.range_errors import KnownDevices, RangeErrors
+from uwbsim.twins.range_errors import FittedRangeErrors, KnownDevices
 from uwbsim.world.clocks import NS_PER_S
 from uwbsim.world.radio import lifted
 
-WIDTH: Final = 120
+SCENARIO_COLUMNS: Final = 120
 """Columns of a line of a scenario file."""
 
 AFTER_S: Final = 0.2
@@ -34,7 +34,7 @@ AFTER_S: Final = 0.2
 
 def scenario_text(tables: Mapping[str, Any], head: str) -> str:
     """Return the text of a scenario file: a comment, and tables within tables by their dotted names."""
-    parts = ["\n".join(f"# {line}" for line in textwrap.wrap(head, WIDTH - 2))]
+    parts = ["\n".join(f"# {line}" for line in textwrap.wrap(head, SCENARIO_COLUMNS - 2))]
     for name, table in tables.items():
         rows = table if isinstance(table, list) else [table]
         parts += [_text(f"[[{name}]]" if isinstance(table, list) else f"[{name}]", name, row) for row in rows]
@@ -58,11 +58,11 @@ def _toml(value: Any) -> str:
     items = [_toml(one) for one in value]
     if value and isinstance(value[0], Mapping):
         return "[\n  " + ",\n  ".join(items) + ",\n]"
-    return textwrap.fill(f"[{', '.join(items)}]", WIDTH, subsequent_indent="  ", break_on_hyphens=False)
+    return textwrap.fill(f"[{', '.join(items)}]", SCENARIO_COLUMNS, subsequent_indent="  ", break_on_hyphens=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fitted:
+class FittedFlight:
     """All that was fitted to a flight.
 
     Receive stamps have the noise `noise_s` at the first-path powers `noise_dbm`: one value where it does not depend on
@@ -72,13 +72,13 @@ class Fitted:
     clocks: ClockFit
     noise_dbm: Floats
     noise_s: Floats
-    errors: RangeErrors
+    errors: FittedRangeErrors
     powers: PowerFit
     schedule: ScheduleFit
 
 
 def receive_noise(noise_s: Floats, power_dbm: Floats) -> tuple[Floats, Floats]:
-    """Return powers in dBm, and the noise of receive stamps in seconds at these, as `Fitted` has them.
+    """Return powers in dBm, and the noise of receive stamps in seconds at these, as `FittedFlight` has them.
 
     They follow from values of the noise (n,), NaN where unknown, and the powers at the receiver.
     """
@@ -99,7 +99,7 @@ def receive_noise(noise_s: Floats, power_dbm: Floats) -> tuple[Floats, Floats]:
 
 
 def tables(
-    flight: Flight, known: KnownDevices, poses: Poses, fitted: Fitted, name: str
+    flight: TwinFlight, known: KnownDevices, poses: Poses, fitted: FittedFlight, name: str
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the scenario's tables, and the poses by body that its `recorded` motions stand for."""
     schedule = fitted.schedule
@@ -125,7 +125,7 @@ def _given(**table: Any) -> dict[str, Any]:
     return {key: value for key, value in table.items() if value is not None}
 
 
-def _ranging(flight: Flight, schedule: ScheduleFit) -> dict[str, Any]:
+def _ranging(flight: TwinFlight, schedule: ScheduleFit) -> dict[str, Any]:
     ids, plan = np.array([tag.tag for tag in flight.tags]), None
     turns = np.unique(schedule.ends, axis=1) if schedule.turns is None else schedule.turns
     if schedule.turns is None:
@@ -142,7 +142,7 @@ def _ranging(flight: Flight, schedule: ScheduleFit) -> dict[str, Any]:
     )
 
 
-def _radio(flight: Flight, known: KnownDevices, fitted: Fitted) -> dict[str, Any]:
+def _radio(flight: TwinFlight, known: KnownDevices, fitted: FittedFlight) -> dict[str, Any]:
     powers, clocks, schedule, noise_s = fitted.powers, fitted.clocks, fitted.schedule, fitted.noise_s
     sigma, fading, outages = None, None, None
     if len(noise_s) > 1:
@@ -174,7 +174,7 @@ def _radio(flight: Flight, known: KnownDevices, fitted: Fitted) -> dict[str, Any
     )
 
 
-def _multipath(flight: Flight, fitted: Fitted) -> dict[str, Any] | None:
+def _multipath(flight: TwinFlight, fitted: FittedFlight) -> dict[str, Any] | None:
     found, loss = fitted.errors, fitted.powers.reflection_loss_db
     if found.share < 0.002 and found.direct_std_m == 0:
         return None
@@ -201,7 +201,7 @@ def _multipath(flight: Flight, fitted: Fitted) -> dict[str, Any] | None:
     )
 
 
-def _tag(flight: Flight, known: KnownDevices, fitted: Fitted, k: int) -> dict[str, Any]:
+def _tag(flight: TwinFlight, known: KnownDevices, fitted: FittedFlight, k: int) -> dict[str, Any]:
     tag, clocks, powers = flight.tags[k], fitted.clocks, fitted.powers
     pattern = powers.pattern_db[k]
     return _given(
@@ -219,7 +219,7 @@ def _tag(flight: Flight, known: KnownDevices, fitted: Fitted, k: int) -> dict[st
     )
 
 
-def _bodies(flight: Flight, poses: Poses, duration_s: float) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def _bodies(flight: TwinFlight, poses: Poses, duration_s: float) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return the bodies' tables, and the poses of those that move, from the origin to after the end."""
     found, paths = [], {}
     for body in dict.fromkeys(tag.body for tag in flight.tags):
@@ -280,7 +280,7 @@ NOT_DETERMINED: Final = (
     "and do not change with other trajectories.",
 )
 
-NOT_DETERMINED_IF: Final[tuple[tuple[Callable[[Flight, Fitted], bool], str], ...]] = (
+NOT_DETERMINED_IF: Final[tuple[tuple[Callable[[TwinFlight, FittedFlight], bool], str], ...]] = (
     (
         lambda flight, fitted: not len(fitted.noise_s),
         "Noise of stamps apart from that of ranges: only a third message from the target shows it. All noise of ranges "
@@ -319,7 +319,7 @@ NOT_DETERMINED_IF: Final[tuple[tuple[Callable[[Flight, Fitted], bool], str], ...
 )
 
 
-def unknowns(flight: Flight, fitted: Fitted) -> Iterator[str]:
+def unknowns(flight: TwinFlight, fitted: FittedFlight) -> Iterator[str]:
     """Yield a sentence for each property that keeps its default, or was chosen without the recording."""
     interval = flight.interval_s
     for applies, text in NOT_DETERMINED_IF:

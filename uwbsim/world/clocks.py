@@ -28,7 +28,7 @@ from scipy.special import ndtri
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import COUNTER_BITS, TICKS_PER_SECOND
 from uwbsim.random_streams import stream
-from uwbsim.scenario.devices import Devices, Profile, Ramp, Table, Tag, WarmUp
+from uwbsim.scenario.devices import Devices, Profile, ProfileTable, Ramp, ScenarioTag, WarmUp
 from uwbsim.scenario.model import Scenario
 from uwbsim.tables import Columns, in_time_order
 
@@ -74,7 +74,7 @@ class ClockNoise:
     knots: Floats
 
     @classmethod
-    def of(cls, seed: int, tags: tuple[Tag, ...], duration_s: float) -> Self | None:
+    def of(cls, seed: int, tags: tuple[ScenarioTag, ...], duration_s: float) -> Self | None:
         """Return the noise of tags' clocks over a duration, None where none of them has any."""
         if not any(tag.white_ppm_sqrt_s or tag.flicker_ppm for tag in tags):
             return None
@@ -114,7 +114,7 @@ class ClockNoise:
         height = _normal(index, self.keys[octaves][:, tag]) * self.peaks[octaves][:, tag]
         return np.asarray(np.sum(height * (1 - np.abs(2 * into - 1)), axis=0))
 
-    def _trend(self, place: int, tag: Tag, rng: np.random.Generator, time: Ints) -> Floats:
+    def _trend(self, place: int, tag: ScenarioTag, rng: np.random.Generator, time: Ints) -> Floats:
         """Return the random walk of white noise over the longest intervals, linear between their ends."""
         at = (time.astype(np.uint64) + self.shift[place]).astype(np.float64) * 2.0**-LONGEST_OCTAVE
         step = (tag.white_ppm_sqrt_s * 1e-6) * np.sqrt(2.0**LONGEST_OCTAVE * SUBTICKS_PER_SECOND)
@@ -122,7 +122,7 @@ class ClockNoise:
         return np.asarray(np.interp(at, np.arange(len(walk)), walk))
 
 
-def _peaks(tag: Tag, octaves: Ints) -> Floats:
+def _peaks(tag: ScenarioTag, octaves: Ints) -> Floats:
     """Return the standard deviations of the pulses' heights by octave, in sub-ticks."""
     length_s = 2.0**octaves / SUBTICKS_PER_SECOND
     white = (tag.white_ppm_sqrt_s * 1e-6) * np.sqrt(length_s) / 2
@@ -230,24 +230,24 @@ def profile_at(profile: Profile, time_s: Floats) -> Floats:
     if isinstance(profile, WarmUp):
         left = np.exp(-np.maximum(time_s - profile.begin_s, 0) / profile.time_constant_s)
         return np.asarray(profile.end + (profile.start - profile.end) * left)
-    if isinstance(profile, Table):
+    if isinstance(profile, ProfileTable):
         return np.asarray(np.interp(time_s, profile.times_s, profile.values))
     return np.full(time_s.shape, profile.value)
 
 
-def profile_of(scenario: Scenario, tag: Tag, key: str) -> Profile | None:
+def profile_of(scenario: Scenario, tag: ScenarioTag, key: str) -> Profile | None:
     """Return the `temperature_c` or `supply_v` of a tag, or of its body; None where it is not known."""
     found: Profile | None = getattr(tag, key)
     return found or next(getattr(body, key) for body in scenario.bodies if body.name == tag.body)
 
 
-def slope_of(tag: Tag, devices: Devices, name: str) -> float:
+def slope_of(tag: ScenarioTag, devices: Devices, name: str) -> float:
     """Return a sensitivity to temperature or voltage: the tag's own, or that of all devices."""
     value = getattr(tag, name)
     return float(getattr(devices, name) if value is None else value)
 
 
-def range_shift_m(scenario: Scenario, tag: Tag, time_s: Floats) -> Floats | None:
+def range_shift_m(scenario: Scenario, tag: ScenarioTag, time_s: Floats) -> Floats | None:
     """Return what a tag's temperature and voltage add to ranges at times (n,); None for a tag without an effect."""
     d = scenario.devices
     effects = (
@@ -258,7 +258,7 @@ def range_shift_m(scenario: Scenario, tag: Tag, time_s: Floats) -> Floats | None
     return np.sum(parts, axis=0) if parts else None
 
 
-def thermal_rate(scenario: Scenario, tag: Tag, time_s: Floats) -> Floats:
+def thermal_rate(scenario: Scenario, tag: ScenarioTag, time_s: Floats) -> Floats:
     """Return what temperature and warm-up add to the rate of a tag's clock at times (n,), as a fraction."""
     rate = tag.warm_up_ppm * 1e-6 * np.exp(-time_s / tag.warm_up_s)
     profile, slope = profile_of(scenario, tag, "temperature_c"), slope_of(tag, scenario.devices, "skew_ppm_per_k")

@@ -28,7 +28,7 @@ STEPS_PER_UNIT: Final = 256
 LIT_NU: Final = -0.78
 """Below this nu an edge has no loss in the approximation of ITU-R P.526."""
 
-NEAREST_M: Final = 1e-3
+LEAST_SIDE_M: Final = 1e-3
 """Least distance between an end and an edge, so that divisions are defined."""
 
 PARALLEL: Final = 1e-9
@@ -112,7 +112,7 @@ def _blocked_table() -> Complexes:
 def fresnel_number(depth_m: Floats, share: Floats, length_m: Floats) -> Floats:
     """Return nu of an edge at a depth, positive in its shadow, and at a fraction `share` of the path."""
     before = np.clip(share, 0, 1) * length_m
-    legs = np.maximum(before, NEAREST_M) * np.maximum(length_m - before, NEAREST_M)
+    legs = np.maximum(before, LEAST_SIDE_M) * np.maximum(length_m - before, LEAST_SIDE_M)
     return np.asarray(depth_m * np.sqrt(2 * length_m / (WAVELENGTH_M * legs)))
 
 
@@ -124,7 +124,7 @@ def boxes_blocked(obstacles: Sequence[Obstacle], a: Floats, b: Floats) -> tuple[
     """
     low, high = (np.array([getattr(box, name) for box in obstacles]) for name in ("min_m", "max_m"))
     way = b - a
-    length = np.maximum(np.linalg.norm(way, axis=1), NEAREST_M)[:, None]
+    length = np.maximum(np.linalg.norm(way, axis=1), LEAST_SIDE_M)[:, None]
     # Coordinates are mirrored so that all components of the path are positive: it enters by the lower faces and leaves
     # by the upper ones.
     turned = way < 0
@@ -168,7 +168,7 @@ def near_body(shadow: Shadow, start: Floats, way: Floats) -> Ints:
 
     Others, most of them, pass at more than the largest radius of a Fresnel zone.
     """
-    squared = np.maximum(_dot(way, way), NEAREST_M**2)
+    squared = np.maximum(_dot(way, way), LEAST_SIDE_M**2)
     share = np.clip(-_dot(start, way) / squared, 0, 1)
     nearest = start + share[:, None] * way
     reach = max(shadow.semi_axes_m) - LIT_NU * np.sqrt(WAVELENGTH_M * np.sqrt(squared) / 8)
@@ -182,7 +182,7 @@ def body_gain(shadow: Shadow, a: Floats, b: Floats) -> Floats:
     field goes through with the loss per metre of the ellipsoid.
     """
     start, way = a - np.array(shadow.centre_m), b - a
-    length_m = np.sqrt(np.maximum(_dot(way, way), NEAREST_M**2))
+    length_m = np.sqrt(np.maximum(_dot(way, way), LEAST_SIDE_M**2))
     axes = np.array(shadow.semi_axes_m)
     # In coordinates in which the ellipsoid is a unit sphere, the nearest point gives the depth.
     begin, along = start / axes, way / axes

@@ -41,7 +41,7 @@ LARGEST_TAP: Final = 32_767
 BEFORE: Final = 6
 """Taps before the leading edge of the direct path: a pulse is shorter."""
 
-TAPS: Final = 64
+SEARCHED_TAPS: Final = 64
 """Taps in which a first path is searched: 17 m."""
 
 REACH: Final = 4
@@ -194,10 +194,10 @@ def detect(paths: Paths, radio: Radio, noise_share: float) -> Detected:
     # From half the height of a pulse alone to its peak.
     arrival = edge + PULSE_TAPS * float(np.sqrt(np.log(2)))
     first = np.floor(arrival - EDGE_TO_PEAK + 1e-6).astype(np.int64)[:, None] + OWN_TAPS
-    own = np.take_along_axis(squares, np.clip(first, 0, TAPS - 1), axis=1).sum(axis=1) / _squares(OWN_TAPS)
+    own = np.take_along_axis(squares, np.clip(first, 0, SEARCHED_TAPS - 1), axis=1).sum(axis=1) / _squares(OWN_TAPS)
     total = squares.sum(axis=1) / _squares(np.arange(-8, 9))
     # Paths after the last tap count for the total power only.
-    late = paths.detour_m >= (TAPS - BEFORE - EDGE_TO_PEAK) * TAP_M
+    late = paths.detour_m >= (SEARCHED_TAPS - BEFORE - EDGE_TO_PEAK) * TAP_M
     if np.any(late):
         total += np.sum(np.abs(np.where(late, paths.amplitude, 0)) ** 2, axis=1)
     noise = noise_share * np.exp(np.minimum(threshold - top, 0)) * 2
@@ -213,13 +213,13 @@ def detect(paths: Paths, radio: Radio, noise_share: float) -> Detected:
 def accumulate(paths: Paths) -> Floats:
     """Return the accumulators of n links around their direct paths: real and imaginary parts in roots of mW.
 
-    Shape (2, n, `TAPS`). A pulse extends over the block of taps where it begins and the next one, so each path adds one
-    row of a table, times its amplitude, to two blocks: a product with a sparse matrix.
+    Shape (2, n, `SEARCHED_TAPS`). A pulse extends over the block of taps where it begins and the next one, so each path
+    adds one row of a table, times its amplitude, to two blocks: a product with a sparse matrix.
     """
-    count, blocks = len(paths.amplitude), TAPS // BLOCK
+    count, blocks = len(paths.amplitude), SEARCHED_TAPS // BLOCK
     place = (BEFORE + EDGE_TO_PEAK + paths.detour_m / TAP_M) * FRACTIONS
-    inside = (paths.detour_m < (TAPS - BEFORE - EDGE_TO_PEAK) * TAP_M) & (place >= 0)
-    nearest = np.clip(np.rint(place), 0, TAPS * FRACTIONS - 1).astype(np.int32)
+    inside = (paths.detour_m < (SEARCHED_TAPS - BEFORE - EDGE_TO_PEAK) * TAP_M) & (place >= 0)
+    nearest = np.clip(np.rint(place), 0, SEARCHED_TAPS * FRACTIONS - 1).astype(np.int32)
     block, within = np.divmod(nearest, BLOCK * FRACTIONS)
     block += np.arange(count, dtype=np.int32)[:, None] * blocks
     amplitude = np.where(inside, paths.amplitude, 0).ravel()
@@ -231,7 +231,7 @@ def accumulate(paths: Paths) -> Floats:
     taps = np.zeros((2, count, blocks + 1, BLOCK))
     taps[:, :, :-1] = pairs[:, :, :, 0]
     taps[:, :, 1:] += pairs[:, :, :, 1]
-    return taps.reshape(2, count, -1)[:, :, REACH - 1 : REACH - 1 + TAPS]
+    return taps.reshape(2, count, -1)[:, :, REACH - 1 : REACH - 1 + SEARCHED_TAPS]
 
 
 def _squares(taps: Ints) -> float:

@@ -12,8 +12,7 @@ from typing import Self
 import numpy as np
 
 from uwblink.arrays import Bools, Floats, Ints
-from uwblink.ticks import SPEED_OF_LIGHT
-from uwbsim.scenario.devices import TX_SHARE
+from uwblink.ticks import SPEED_OF_LIGHT, TX_SHARE
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Radio
 from uwbsim.world.channel import Link

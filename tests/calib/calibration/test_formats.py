@@ -73,7 +73,10 @@ int main(void)
 """
 
 
-@pytest.mark.parametrize("change", [{}, {"lift": "lift-of-mean"}, {"power_at": "reception"}])
+@pytest.mark.parametrize(
+    "change",
+    [{}, {"lift": "lift-of-mean"}, {"power_at": "reception"}, {"undetermined_splits": (((1, 7), (2, 3)),)}],
+)
 def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
@@ -97,6 +100,11 @@ def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
     found = [line.split() for line in done.stdout.splitlines()]
     assert len(found) == len(rows) + 1
     for row, (status, corrected, sigma, total, share, mean) in zip(rows, found, strict=False):
+        if sum(known.sides.get(tag, 0) for tag in row[3:]):
+            assert status == "-1"
+            with pytest.raises(BadInputError, match="does not determine"):
+                known.correct(*row)
+            continue
         expected = known.correct(*row)
         columns = known.apply(
             Ranges.from_arrays(row[0], initiator=row[3], target=row[4], fpp1_dbm=row[1], fpp2_dbm=row[2])

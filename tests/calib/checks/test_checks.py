@@ -12,7 +12,7 @@ import pytest
 import calib
 from benchmarks import doctor as planted
 from benchmarks.flights import Flight, Plan, fly
-from calib.checks.examine import CHECKS, IMPLIED, LEVEL
+from calib.checks.examine import CHECKS, FINDING_LEVEL, IMPLIED
 from calib.findings import BUDGET, OF_A_FIT, exceeds
 from docs.site import checks
 from tests import processes
@@ -39,7 +39,7 @@ def rows_of(tar, name):
 
 
 def test_checks_that_involve_chance_share_one_budget_and_the_page_shows_them_all():
-    assert sum(not check.certain for check in CHECKS) * LEVEL + OF_A_FIT == pytest.approx(BUDGET)
+    assert sum(not check.certain for check in CHECKS) * FINDING_LEVEL + OF_A_FIT == pytest.approx(BUDGET)
     told = Counter(fault for check in CHECKS for fault in check.remedies)
     assert max(told.values()) == 1
     page = checks.reference()
@@ -67,7 +67,7 @@ def test_the_command_prints_findings_clocks_and_p_values(tmp_path):
     told = json.loads(said.stdout)
     found = {one["fault"]: one["p_value"] for one in told["findings"]}
     assert found["doubled exchanges"] == 0
-    assert 0 < found["delay changed mid-flight"] < LEVEL
+    assert 0 < found["delay changed mid-flight"] < FINDING_LEVEL
     assert all("wrong.uwb: " in one["evidence"] for one in told["findings"] if "between" not in one["fault"])
     skews, _ = told["clock_skews"].values()
     assert len(skews) == 12

@@ -120,7 +120,7 @@ UNREAD = "single-sided without carrier readings"
         (SHORT, planted.wxyz, "wxyz quaternion", ""),
         (SHORT, late_poses(400_000_000), "pose time offset", "--offset -0.4|--offset -0.39"),
         (BRIEF, late_poses(LATE_NS), "no true distances", ""),
-        (ANCHORS, some(lambda e: (e.initiator == 10) & (e.target == 100)), "too few pairs", "10, 100"),
+        (ANCHORS, some(lambda e: (e.initiator == 10) & (e.target == 100)), "too few pairs", "tag 10 and tag 100"),
         (SHORT, planted.still, "static data", ""),
         (SHORT, planted.noisy_powers, "power confounded with distance", ""),
         (replace(SHORT, protocol="ss"), planted.nothing, "skew in single-sided ranges", "ss-cfo"),

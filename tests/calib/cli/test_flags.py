@@ -8,11 +8,10 @@ import pytest
 import typer
 
 import calib
-from calib.calibration.power_curves import ALPHA_DBM
-from calib.calibration.power_curves import LIFTS as KNOWN_LIFTS
+from calib.calibration.power_curves import ALPHA_DBM, LIFTS
 from calib.cli.commands import app
 from calib.cli.shared import with_flags
-from calib.settings import LIFTS, FitSettings
+from calib.settings import CHOICES, FitSettings
 from docs.site.commands import leaves
 from tests import processes
 
@@ -44,7 +43,7 @@ def test_other_text_stays_as_it_is():
 
 
 def test_settings_know_what_the_curves_know():
-    assert set(LIFTS) == set(KNOWN_LIFTS)
+    assert set(CHOICES["lift"]) == set(LIFTS)
     assert FitSettings().alpha_dbm == ALPHA_DBM
 
 

@@ -26,7 +26,7 @@ def test_a_real_flight_among_obstacles_agrees_with_the_published_delays(tmp_path
         archive.extractall(tmp_path, filter="data")
     ranges = calib.load_ranges(read_source(tmp_path / "cirObstacles_3_random_0", importer="miluv"))
     published = read_miluv(shared("miluv_published_calibration.json"))
-    known = calib.fit(ranges, minimum_norm=True, loss="cauchy").calibration
+    known = calib.fit(ranges, loss="cauchy").calibration
     tags = list(known.uncertainty.tags)
     centre = np.eye(len(tags)) - 1 / len(tags)
     error = centre @ [known.delays_ns[tag] - published.delays_ns[tag] for tag in tags]

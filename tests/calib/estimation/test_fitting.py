@@ -128,8 +128,7 @@ def test_the_mixture_s_standard_errors_hold():
 def test_a_pinned_delay_stays_and_determines_a_single_pair():
     r = ranges(6000)
     pair = r[(r.initiator == 1) & (r.target == 2)]
-    with pytest.raises(UnanswerableError, match="`fixed_ns`"):
-        fit(pair)
+    assert "`fixed_ns`" in fit(pair).warnings[0]
     # The curve is zero at its reference; the planted one is not, and the other delay makes up for that.
     c = fit(pair, fixed_ns={1: DELAYS_NS[1]}).calibration
     assert c.delays_ns[1] == DELAYS_NS[1]

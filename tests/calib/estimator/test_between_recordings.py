@@ -93,7 +93,7 @@ def starloc(tmp_path_factory):
 
 @pytest.mark.parametrize(("one", "other"), [(0, 1), (1, 0)])
 def test_a_flight_predicts_the_errors_of_another_day(starloc, one, other):
-    found = calib.fit(starloc[one], minimum_norm=True).calibration
+    found = calib.fit(starloc[one]).calibration
     # STAR-loc chose none of the model's constants.
     assert 0.92 < calib.evaluate(starloc[other], found).overall.inside_95 < 0.97
     # The smallest delays: what both tags of the rig have more and all anchors less is not in the data.
@@ -102,14 +102,14 @@ def test_a_flight_predicts_the_errors_of_another_day(starloc, one, other):
 
 
 def test_delays_of_150_ranges_of_a_real_flight_agree_with_those_of_all(starloc):
-    whole = calib.fit(starloc[0], minimum_norm=True).calibration
+    whole = calib.fit(starloc[0]).calibration
     tags, scores = list(whole.delays_ns), []
     # Nothing tells what both tags of the rig have more and all anchors less, nor what all have.
     free = np.array([np.ones(len(tags)), [1.0 if tag in (1, 2) else -1.0 for tag in tags]])
     known = np.linalg.svd(free)[2][2:]
     for seed in range(12):
         rows = np.sort(np.random.default_rng(seed).choice(len(starloc[0]), 150, replace=False))
-        part = calib.fit(starloc[0][rows], minimum_norm=True).calibration
+        part = calib.fit(starloc[0][rows]).calibration
         away = known @ [part.delays_ns[tag] - whole.delays_ns[tag] for tag in tags]
         covariance = known @ np.array(part.uncertainty.delays_ns2) @ known.T
         scores.append(away @ np.linalg.solve(covariance, away))

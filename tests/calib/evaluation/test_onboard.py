@@ -13,7 +13,7 @@ from calib.calibration.model import Calibration
 from calib.calibration.power_curves import Curve
 from calib.data.samples import stamped
 from calib.errors import BadInputError, UnanswerableError
-from calib.evaluation.inertial_filter import Noise
+from calib.evaluation.inertial_filter import ProcessNoise
 from calib.evaluation.onboard import OnboardSettings, localize_onboard
 from calib.evaluation.output import onboard_json, onboard_text, write_tum
 from calib.evaluation.range_updates import multilaterate
@@ -25,7 +25,7 @@ from uwblink.recording.schema import Poses, Tag
 ANCHORS = np.array([[3, 3, 0.3], [-3, 3, 2.2], [-3, -3, 0.4], [3, -3, 2.4], [0, 3.5, 1.2], [3.5, 0, 1.4]])
 ARMS = {10: (0.15, -0.15, -0.05), 11: (-0.15, 0.15, -0.05)}
 NOISE_M = 0.05
-IMU = Noise(force=0.02, gyro=0.002, force_bias=0.001, gyro_bias=0.0001, height_offset=0.001)
+IMU = ProcessNoise(force=0.02, gyro=0.002, force_bias=0.001, gyro_bias=0.0001, height_offset=0.001)
 BIASES = np.array([0.004, -0.006, 0.003]), np.array([0.15, -0.1, 0.08])
 
 
@@ -145,7 +145,7 @@ def test_it_knows_how_good_it_is(seed):
 @pytest.mark.parametrize("away", [(-3.0, 4.0, 0.0), (0.0, -10.0, 0.0)])
 def test_a_wrong_start_is_left_within_two_seconds(model, away):
     start = tuple((place(np.array(0.0)) + away).tolist())
-    settings = OnboardSettings(model=model, noise=IMU if model == "imu" else Noise(), start_m=start)
+    settings = OnboardSettings(model=model, noise=IMU if model == "imu" else ProcessNoise(), start_m=start)
     (track,) = localize_onboard(flight(4.0, reflected=0.1), calibration(0.1), settings)
     first = np.linalg.norm(track.estimate_m[0] - track.truth_m[0])
     assert first > 4

@@ -12,7 +12,7 @@ from benchmarks import surveys
 from benchmarks.standing import places_of, standing_boards
 from calib.cli.commands import app
 from calib.planning import SurveyPlanSettings
-from calib.planning.predicted import CURVE_M, POWER_AT_1_M_DBM, delay_information, predict
+from calib.planning.predicted import PLANNED_CURVE_STD_M, POWER_AT_1_M_DBM, delay_information, predict
 
 C_M_PER_NS = 0.299702547
 
@@ -204,7 +204,7 @@ def test_a_curve_costs_what_a_process_of_its_size_costs(monkeypatch):
     """The benchmark's own formula has the process itself where plan and survey have splines."""
     monkeypatch.setattr(surveys, "power_dbm", lambda length: POWER_AT_1_M_DBM - 20 * math.log10(length))
     world = standing_boards(3, "plane", boards=5, arrangements=5, size_m=6.0, each=5)
-    expected = surveys.promised(world, 2, CURVE_M, 0.0)
+    expected = surveys.promised(world, 2, PLANNED_CURVE_STD_M, 0.0)
     found = predict(given(5, "plane"), surveys.planned(world.places), curve=True)[-1].each
     assert found == pytest.approx(expected, rel=0.1)
 

@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 
 import calib
 from calib.cli.commands import app
-from calib.cli.shared import FLAGS
+from calib.cli.shared import CALIB_FLAGS
 from calib.errors import BadInputError
 from calib.planning import FlightPlanSettings, flight_information
-from calib.planning.flight_information import Errors, Information, flight_of
+from calib.planning.flight_information import ExpectedErrors, Information, flight_of
 from calib.planning.reference_motion import reference_motion
 from calib.settings import FlightSettings
 from tests.calib.trajectories.sines import flight
@@ -30,7 +30,7 @@ def rehearsed(**other):
 
 
 def planned(seen, *, noise_m=0.04, reflected=0.08, curve=True, force=None, **usable):
-    errors = Errors(noise_m=noise_m, reflected=reflected)
+    errors = ExpectedErrors(noise_m=noise_m, reflected=reflected)
     return Information(flight_of(seen, FlightSettings(**usable), errors, curve=curve, force_std_m_s2=force))
 
 
@@ -45,17 +45,17 @@ def half_ns(plan):
 
 
 def test_noise_alone_informs_by_its_inverse_variance_and_reflected_ranges_by_less():
-    plain = Errors(noise_m=0.05, reflected=0.0).informed()
+    plain = ExpectedErrors(noise_m=0.05, reflected=0.0).informed()
     assert plain == pytest.approx(0.05**-2, rel=1e-3)
     # A reflected range says nearly nothing; a few that pass for direct ones blur those.
-    assert 0.6 * 0.7 * plain < Errors(noise_m=0.05, reflected=0.3).informed() < 0.7 * plain
+    assert 0.6 * 0.7 * plain < ExpectedErrors(noise_m=0.05, reflected=0.3).informed() < 0.7 * plain
 
 
 def test_with_everything_known_a_plan_is_a_fit_with_known_distances():
     """Positions known all along, exactly: the covariance is that of least squares on delays alone."""
     given: Any = {"curve": False, "force_std_m_s2": None}
     seen = flight_of(
-        flight(seconds=8.0), FlightSettings(heading_std_deg=0.0), Errors(noise_m=0.04, reflected=0.0), **given
+        flight(seconds=8.0), FlightSettings(heading_std_deg=0.0), ExpectedErrors(noise_m=0.04, reflected=0.0), **given
     )
     object.__setattr__(seen.scene.places, "std_m", np.full(len(seen.scene.places.std_m), 1e-5))
     found = Information(seen)
@@ -271,7 +271,7 @@ def test_a_flight_whose_poses_lack_is_refused_in_one_line():
 )
 def test_what_cannot_be_planned_is_named_by_its_option(words, named, capsys):
     with pytest.raises(SystemExit) as ended:
-        run(app, BadInputError, arguments=["plan", *words.split()], flags=FLAGS)
+        run(app, BadInputError, arguments=["plan", *words.split()], flags=CALIB_FLAGS)
     assert ended.value.code == 2
     told = capsys.readouterr().err
     assert named in told

@@ -92,7 +92,7 @@ def of_other_boards(known, unseen):
     [
         (longer, "Is no pair left with a bias?", "keeps a bias of +1"),
         (noisier, "Does it say rightly how far ranges can be off?", ""),
-        (left_open, "Are the antenna delays known well enough?", "tags 1, 2; 3, 7 can shift against each other"),
+        (left_open, "Are the antenna delays known well enough?", "tags 1, 2; 3, 7 are not determined"),
         (stronger, "Was the curve fitted at such powers?", ""),
         (of_other_boards, "Does it make ranges better?", ""),
     ],

@@ -18,10 +18,10 @@ from typer.testing import CliRunner
 import calib
 from benchmarks.standing import standing_boards
 from calib.cli.commands import app
-from calib.cli.shared import FLAGS
+from calib.cli.shared import CALIB_FLAGS
+from calib.data.samples import ANCHOR_DELAYS_NS
 from calib.errors import BadInputError, UnanswerableError
 from calib.surveys.knowledge import load_knowledge
-from calib.surveys.sample import DELAYS_NS
 from uwblink import Arrangement, Contents, Exchanges
 from uwblink.cli.shared import run
 from uwblink.recording.schema import KnownDistance, load_places
@@ -399,7 +399,7 @@ def test_the_command_takes_a_recording_an_arrangement_and_writes_what_others_rea
     known = calib.load_calibration(out)
     assert known.provenance["recipe"] == "survey"
     assert known.provenance["rests_on"]["arrangements"][1] == {"name": "B", "known": "line", "tags": [1, 2, 3, 4]}
-    assert max(abs(d - DELAYS_NS[t]) for t, d in known.delays_ns.items()) < 0.2
+    assert max(abs(d - ANCHOR_DELAYS_NS[t]) for t, d in known.delays_ns.items()) < 0.2
     rows = tomllib.loads(anchors.read_text())["anchors"]
     assert [row["id"] for row in rows] == [1, 2, 3, 4]
     assert [row["position_m"] for row in rows] == [one["position_m"] for one in told["arrangements"][1]["boards"]]
@@ -440,7 +440,7 @@ def test_the_command_says_what_is_not_determined_and_writes_nothing(recording, t
 
 def test_two_arrangements_of_one_name_are_refused_by_flags_that_the_command_has(recording, capsys):
     with pytest.raises(SystemExit) as ended:
-        run(app, BadInputError, arguments=["survey", recording[0], recording[0], "-o", "c.json"], flags=FLAGS)
+        run(app, BadInputError, arguments=["survey", recording[0], recording[0], "-o", "c.json"], flags=CALIB_FLAGS)
     assert ended.value.code == 2
     commands: Any = typer.main.get_command(app)
     options = {option for one in commands.commands["survey"].params for option in one.opts}

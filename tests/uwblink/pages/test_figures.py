@@ -101,5 +101,7 @@ def test_a_picture_is_on_white():
 def test_cells_of_words_say_what_they_are_where_no_heading_is_above_them():
     words = table_html(["criterion", "met", "asked for"], [["is it <so>?", "yes", ""]], words=True)
     assert "<td>is it &lt;so&gt;?</td><td data-head='met'>yes</td><td></td>" in words
+    assert ">set <code>a&lt;b&gt;</code>, or `</td>" in table_html(["what"], [["set `a<b>`, or `"]])
+    assert "<code>fixed_ns</code> &lt;i&gt;" in to_html(Document("A page", [Text("pin `fixed_ns` <i>")]))
     assert "data-head" not in table_html(["file", "what"], [["a.uwb", "SHA-256"]], words=True)
     assert "data-head" not in table_html(["pair", "mean", "std"], [["1-2", "3.0", "1.0"]])

@@ -6,14 +6,14 @@ import pytest
 
 from docs.site.schema import UNITS, described, reference, unit_of
 from tests import processes
-from uwbsim.boards.server import Faults
+from uwbsim.boards.server import FaultsFile
 from uwbsim.errors import ScenarioError
 from uwbsim.scenario.base import BY_UNIT, check_limits
 from uwbsim.scenario.loading import load
 from uwbsim.scenario.model import Scenario
 from uwbsim.sweep.design import SweepFile
 
-SCHEMAS = {model.__name__: model.model_json_schema() for model in (Scenario, Faults, SweepFile)}
+SCHEMAS = {model.__name__: model.model_json_schema() for model in (Scenario, FaultsFile, SweepFile)}
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from tests.processes import CONTEXT, run
 from tests.uwbsim.sweep.test_sweep import GRID, HEAD, plan, rows
 from uwblink.errors import UwblinkError
 from uwbsim.sweep.executors import ClusterLostError
-from uwbsim.sweep.runner import Store, Summary, TableError, run_sweep
+from uwbsim.sweep.runner import ResultStore, SweepSummary, TableError, run_sweep
 
 UWBSIM = str(Path(sys.executable).parent / "uwbsim")
 SMALL = HEAD + 'ranges = 100\n[vary]\n"radio.rx_noise_ps" = [0.0, 50.0]\n'
@@ -85,7 +85,7 @@ def test_a_damaged_store_is_one_line_and_stays_as_it_is(done, damage):
 
 
 def _hold(path, pipe):
-    with Store.open(path):
+    with ResultStore.open(path):
         pipe.send("open")
         pipe.recv()
 
@@ -138,7 +138,7 @@ def test_a_scheduler_that_goes_away_is_named_and_what_was_done_is_kept(tmp_path)
         # The client tries to come back for so long, half a minute otherwise.
         with dask.config.set({"distributed.comm.timeouts.connect": "1s"}), gone:
             run_sweep(p, tmp_path / "out", scheduler=address, progress=lambda _: cluster.kill())
-    with Store.open(tmp_path / "out" / "results.duckdb") as store:
+    with ResultStore.open(tmp_path / "out" / "results.duckdb") as store:
         before = store.done()
     assert 0 < len(before) < p.total
 
@@ -195,10 +195,10 @@ def test_a_sweep_that_ends_early_leaves_no_worker_and_goes_on_where_it_was(tmp_p
     if number == signal.SIGINT:  # of a kill Python's own tracker of resources may tell
         (said,) = words.read_text().splitlines()
         assert "--resume" in said
-    with Store.open(out / "results.duckdb") as store:
+    with ResultStore.open(out / "results.duckdb") as store:
         before = len(store.done())
     assert 0 < before < p.total
-    assert run_sweep(p, out, workers=1, resume=True) == Summary(p.total - before, 0, before)
+    assert run_sweep(p, out, workers=1, resume=True) == SweepSummary(p.total - before, 0, before)
     assert [int(row["number"]) for row in rows(out)] == [k for k in range(p.total) for _ in range(2)], "nothing twice"
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from uwblink import PROTOCOLS, Exchanges, Tag
-from uwbsim.twins.flight import Flight, effective_size, lag_one, lasting, some_rows
+from uwbsim.twins.flight import TwinFlight, effective_size, lag_one, lasting, some_rows
 from uwbsim.twins.range_errors import fit_range_errors
 
 
@@ -34,7 +34,7 @@ def flight(time_s, pair, error):
     count = len(time_s)
     pairs = tuple((1, 2 + k) for k in range(pair.max() + 1))
     tags = tuple(Tag(k, f"b{k}", (0.0, 0.0, 0.0)) for k in range(1, len(pairs) + 2))
-    return Flight(
+    return TwinFlight(
         where="made",
         tags=tags,
         row=PROTOCOLS["ss"],

@@ -15,7 +15,7 @@ from uwblink import Poses, UwblinkError, load
 from uwbsim.cli.commands import _print_table, app
 from uwbsim.pages import TWIN_COLUMNS
 from uwbsim.scenario.radio import Radio
-from uwbsim.twins import LEVEL
+from uwbsim.twins import TWIN_LEVEL
 from uwbsim.twins.range_errors import read_calibration
 from uwbsim.world.radio import reception_bias_s
 
@@ -102,8 +102,8 @@ def test_what_persists_differently_is_not_alike(found):
     shuffled = np.random.default_rng(4).permutation(len(found.measured))
     moved = replace(found.measured, residual_m=found.measured.residual_m[shuffled])
     one = {c.name: c for c in replace(found, measured=moved).compare(1)}["residual of calibrated ranges"]
-    assert one.probability > LEVEL / 2
-    assert one.lag1_probability < LEVEL / 2
+    assert one.probability > TWIN_LEVEL / 2
+    assert one.lag1_probability < TWIN_LEVEL / 2
     assert one.verdict == "differ"
 
 
