@@ -26,7 +26,7 @@ from uwblink.recording.file import Recording
 from uwblink.recording.schema import Tag
 from uwblink.twr import LARGEST_ID, Exchanges
 
-LONGEST_LINE: Final = 4096
+MAX_PRINTED_BYTES: Final = 4096
 """Bytes after which a line without an end is dropped; a list of 64 ranges takes half of that."""
 
 PATIENCE_LINES: Final = 50
@@ -227,7 +227,7 @@ class _Lines:
     def feed(self, data: bytes) -> list[str]:
         """Take bytes; return the lines that ended in them."""
         *lines, self._rest = re.split(rb"[\r\n]+", self._rest + data)
-        self._rest = self._rest[-LONGEST_LINE:]
+        self._rest = self._rest[-MAX_PRINTED_BYTES:]
         return [line.decode("utf-8", "replace") for line in lines if line.strip()]
 
     def note(self, line: str, found: Sequence[PrintedRange]) -> None:

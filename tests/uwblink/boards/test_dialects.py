@@ -46,6 +46,7 @@ def printing(text, *, asked=b"", banner=""):
                 # In two pieces, as serial lines come.
                 data = text.encode()
                 terminal.write(data[:9])
+                time.sleep(0.03)
                 terminal.write(data[9:])
             time.sleep(0.1)
 
