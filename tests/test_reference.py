@@ -26,6 +26,7 @@ def test_the_reference_of_a_file_has_every_key_that_its_reader_knows(keys):
 def test_a_map_knows_the_tables_that_its_reference_has():
     assert set(heads(column_map.MAP_KEYS)) == {
         *("layout", "bits", "counter", "protocol", "delimiter", "decimal", "within_s", "each", "topics"),
+        *("line", "from_name", "missing", "chip", "prf", "wide"),
         *("columns", "units", "constants", "ids", "antenna_delays"),
     }
 

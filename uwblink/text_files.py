@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 import sys
@@ -61,14 +62,19 @@ def heads(keys: Iterable[FileKey]) -> tuple[str, ...]:
 
 
 class TomlReader:
-    """Reads one file and checks its values; raises `error` with a text that begins with path and key."""
+    """Reads one file of TOML, or JSON by its suffix, and checks its values.
+
+    Raises `error` with a text that begins with path and key.
+    """
 
     def __init__(self, path: Path, error: Callable[[str], Exception], what: str = "file") -> None:
         """Read `path`, which holds a `what`."""
         self.path, self.error = path, error
         self.text = read_text(path, error, what)
-        with raising(error, f"{path}: not valid TOML", tomllib.TOMLDecodeError, RecursionError):
-            self.table: dict[str, Any] = tomllib.loads(self.text)
+        form, parse = ("JSON", json.loads) if path.suffix == ".json" else ("TOML", tomllib.loads)
+        with raising(error, f"{path}: not valid {form}", ValueError, RecursionError):
+            self.table: dict[str, Any] = parse(self.text)
+        self.check(what, self.table, isinstance(self.table, dict), "an object of keys")
 
     def known(self, table: dict[str, Any], names: Iterable[str], prefix: str = "") -> None:
         """Raise for a key that is none of `names`."""

@@ -16,12 +16,17 @@ import calib
 import uwblink
 import uwbsim
 from tests.fuzz.mutations import BINARY, JSON, TEXT, Mutation
+from tests.uwblink.importers import test_forms
+from tests.uwblink.importers import test_pose_exports as poses
 from uwblink.exporters import export_recording
 
 ROOT: Final = Path(__file__).parents[2]
 
 SCENARIO: Final = "scenarios/noiseless.toml"
 NEW_TAG: Final = 6
+
+
+GUESS: Final = "uwblink import guess {} -o {out}"
 
 
 class Kind(NamedTuple):
@@ -154,6 +159,15 @@ KINDS: Final = (
     Kind("map.toml", 4, TEXT, ("uwblink import csv {table.csv} --map {} -o {out}",)),
     Kind("poses.tum", 3, TEXT, ("uwblink poses {live.uwb} --from ifo001={}",)),
     Kind("poses.csv", 2, TEXT, ("uwblink poses {live.uwb} --from {}",)),
+    Kind("form_wide.csv", 2, TEXT, ("uwblink import csv {} --map {form_wide.toml} -o {out}", GUESS)),
+    Kind("form_wide.toml", 3, TEXT, ("uwblink import csv {form_wide.csv} --map {} -o {out}",)),
+    Kind("form_uart.log", 3, (*TEXT, *BINARY), ("uwblink import csv {} --map {form_log.toml} -o {out}", GUESS)),
+    Kind("form_log.toml", 3, TEXT, ("uwblink import csv {form_uart.log} --map {} -o {out}",)),
+    Kind("form_ranges.jsonl", 2, JSON, ("uwblink import csv {} --map {form_list.toml} -o {out}", GUESS)),
+    *(
+        Kind(name, 1, TEXT, ("uwblink poses {live.uwb} --from {}",))
+        for name in ("form_m.csv", "form_v.csv", "form_q.tsv")
+    ),
     Kind(
         "known.toml",
         3,
@@ -214,12 +228,29 @@ def _write_tables(folder: Path) -> None:
     export_recording(live, folder / "mcap", to="mcap")
     shutil.copyfile(next((folder / "mcap").glob("*.mcap")), folder / "flight.mcap")
     export_recording(live, folder / "tum", to="tum")
+    _write_forms(folder)
     for source, name in (
         (next((folder / "tum").glob("ifo001*")), "poses.tum"),
         (folder / "exported/poses.csv", "poses.csv"),
     ):
         first = source.read_text().splitlines(keepends=True)[:300]
         (folder / name).write_text("".join(first))
+
+
+def _write_forms(folder: Path) -> None:
+    """Write files of other forms, and their maps, as the tests of these make them."""
+    constants = "[constants]\nfrom_id = 7\n"
+    test_forms.table(folder / "form_wide.csv", test_forms.wide_rows("r_AN{}"))
+    (folder / "form_wide.toml").write_text('missing = [-1, "x"]\n[columns]\ntime_s = "t_s"\nfrom_id = "tag"\n' + WIDE)
+    test_forms.lines(folder / "form_uart.log", test_forms.lec)
+    (folder / "form_log.toml").write_text(f'line = "dwm1001-lec"\nchip = "dw1000"\n{constants}')
+    elements = [[{"anchor": r.anchor, "range_m": r.range_m} for r in some] for some in test_forms.ROUNDS]
+    (folder / "form_ranges.jsonl").write_text("".join(json.dumps({"t": 1, "rx": some}) + "\n" for some in elements))
+    (folder / "form_list.toml").write_text(
+        f'each = "rx"\n[columns]\nto_id = "rx.anchor"\nrange_m = "rx.range_m"\n{constants}'
+    )
+    for name, write in (("m.csv", poses.motive), ("v.csv", poses.vicon), ("q.tsv", poses.qualisys)):
+        shutil.move(write(folder), folder / f"form_{name}")
 
 
 def _value(cell: str) -> float | str:
@@ -232,6 +263,10 @@ def _value(cell: str) -> float | str:
 def _tag(tag: uwblink.Tag) -> str:
     return f'[[tags]]\nid = {tag.tag}\nbody = "{tag.body}"\nlever_arm_m = {list(tag.lever_arm_m)}\n'
 
+
+WIDE: Final = """[wide]
+range_m = "r_AN{to_id}"
+"""
 
 KNOWN: Final = """known = "plane"
 

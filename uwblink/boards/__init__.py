@@ -12,6 +12,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from uwblink.boards.dialects import DIALECTS, Dialect, PrintedRange, dialect_of, printed_ranges, record_printed
 from uwblink.boards.listeners import Correction, Heard, Progress, delays_warning, load_correction
 from uwblink.boards.live_page import LivePage
 from uwblink.boards.ports import Terminal, boards_ports, serial_number, wait_until
@@ -26,16 +27,22 @@ from uwblink.wire.codec import Decoder, Event, exchanges_of
 from uwblink.wire.messages import REPORTS, Cir, Overheard, RangeReport, TextLine
 
 __all__ = [
+    "DIALECTS",
     "Correction",
+    "Dialect",
     "LivePage",
+    "PrintedRange",
     "Progress",
     "boards_ports",
     "decode_again",
     "delays_warning",
+    "dialect_of",
     "load_correction",
     "load_plan",
     "play",
     "plot_cir",
+    "printed_ranges",
+    "record_printed",
     "rewrite",
     "serial_number",
     "summarize",

@@ -88,10 +88,10 @@ def serial_number(device: str) -> str | None:
 class SerialPort:
     """An open serial port, locked against a second process."""
 
-    def __init__(self, name: str) -> None:
-        """Open a port; raises one of the `PortError`s, which say what to do."""
+    def __init__(self, name: str, baud_rate: int = 19_200) -> None:
+        """Open a port; raises one of the `PortError`s, which say what to do. Boards at USB ignore the rate."""
         self.name = name
-        self._serial = _opened(name)
+        self._serial = _opened(name, baud_rate)
         try:
             self.fileno: int | None = self._serial.fileno()
         except (OSError, AttributeError, NotImplementedError):
@@ -136,15 +136,16 @@ def _since_boot_ns() -> int:
 class SerialPorts:
     """The serial ports of this computer."""
 
-    def __init__(self) -> None:
-        """Start the clock; no port is open."""
+    def __init__(self, baud_rate: int = 19_200) -> None:
+        """Start the clock; no port is open. Ports are opened at a rate."""
+        self._baud_rate = baud_rate
         self._open: list[SerialPort] = []
         # No change of the wall clock moves the times of a recording.
         self._epoch_ns = time.time_ns() - _since_boot_ns()
 
     def open(self, name: str) -> SerialPort:
         """Open a port and watch it; raises one of the `PortError`s."""
-        port = SerialPort(name)
+        port = SerialPort(name, self._baud_rate)
         self._open.append(port)
         return port
 
@@ -175,9 +176,9 @@ class SerialPorts:
         return next((p.device for p in boards_ports() if number and p.serial_number == number), None)
 
 
-def _opened(name: str) -> Any:
+def _opened(name: str, baud_rate: int) -> Any:
     try:
-        port = serial.serial_for_url(name, do_not_open=True, baudrate=19_200)  # the boards ignore the rate
+        port = serial.serial_for_url(name, do_not_open=True, baudrate=baud_rate)
         port.timeout, port.write_timeout = 0, 1.0
         if "://" not in name:
             port.exclusive = True

@@ -24,6 +24,8 @@ from uwblink.cli.shared import (
     INTERRUPTED,
     AntennaDelays,
     AsJson,
+    BoardIds,
+    DialectName,
     Duration,
     Force,
     OptionalCalibration,
@@ -38,6 +40,7 @@ from uwblink.cli.shared import (
     output,
     print_result,
     starting,
+    waiting,
 )
 from uwblink.display import printable
 from uwblink.errors import PlanError, RangingFailedError, RecordingError, RefusedError, UwblinkError
@@ -293,6 +296,8 @@ def record(
     ] = False,
     live_port: Annotated[int, typer.Option(min=0, max=65535, help="Port of that page; 0: a free one.")] = 0,
     calibration: OptionalCalibration = None,
+    dialect: DialectName = None,
+    ids: BoardIds = "",
     force: Force = False,
 ) -> None:
     """Execute a ranging plan on boards and record everything they send.
@@ -302,6 +307,21 @@ def record(
     """
 
     check_output(output, force=force, recording=True)
+    if dialect is not None:
+        _refuse_beside_dialect(plan=plan, pairs=pairs, rate=rate, arrangement=arrangement, passive=passive, cir=cir)
+        with interrupts() as stop, waiting("recording") as report:
+            done = uwblink.boards.record_printed(
+                ports,
+                output,
+                uwblink.boards.dialect_of(dialect),
+                ids=_ids(ids),
+                duration_s=duration or math.inf,
+                force=force,
+                stop=stop,
+                watch=lambda seen: report(str(seen)),
+            )
+        typer.echo(f"{output}: {done}")
+        return
     if (plan is None) == (pairs is None):
         raise PlanError("give either --plan plan.toml or --pairs all")
     if pairs not in (None, "all", "none"):
@@ -354,6 +374,8 @@ def stream(
         typer.Option(metavar="[HOST:]PORT", help="Address of a WebSocket for Foxglove (its default: 8765)."),
     ] = None,
     output: Annotated[Path | None, output("Recording of the boards to write as well (.uwb).")] = None,
+    dialect: DialectName = None,
+    ids: BoardIds = "",
     force: Force = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print no ranges.")] = False,
 ) -> None:
@@ -386,22 +408,35 @@ def stream(
             server = stack.enter_context(uwblink.streaming.FoxgloveServer(foxglove))
             typer.echo(f"foxglove: {server.url}", err=True)
             senders.append(server.send)
-        chosen = _plan(plan, antenna_delays, rate_hz=rate) if of_boards else None
-        correct = _correction(calibration, chosen, None if of_boards else source[0])
+        if dialect is not None:
+            _refuse_beside_dialect(plan=plan, rate=rate, output=output, antenna_delays=antenna_delays)
+        chosen = _plan(plan, antenna_delays, rate_hz=rate) if of_boards and dialect is None else None
+        correct = _correction(calibration, chosen, None if of_boards else source[0]) if dialect is None else None
         duration_s = duration or math.inf
         try:
             if output and chosen:
                 told = [seen, uwblink.streaming.RangeListener(send_on, correct)]
                 uwblink.record(source, output, chosen, duration_s=duration_s, stop=stop, listeners=told, force=force)
             else:
-                ranges = uwblink.stream(
-                    source if of_boards else source[0],
-                    calibration=correct,
-                    plan=chosen,
-                    duration_s=duration_s,
-                    speed=speed,
-                    stop=stop,
-                    listeners=[seen],
+                ranges = (
+                    uwblink.streaming.stream_printed(
+                        source,
+                        uwblink.boards.dialect_of(dialect),
+                        calibration=calibration,
+                        ids=_ids(ids),
+                        duration_s=duration_s,
+                        stop=stop,
+                    )
+                    if dialect is not None
+                    else uwblink.stream(
+                        source if of_boards else source[0],
+                        calibration=correct,
+                        plan=chosen,
+                        duration_s=duration_s,
+                        speed=speed,
+                        stop=stop,
+                        listeners=[seen],
+                    )
                 )
                 stack.callback(ranges.close)
                 for found in ranges:
@@ -410,6 +445,15 @@ def stream(
             # The reader of the lines closed, which ends the stream; Python must not write the rest at its end.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     typer.echo(f"{count} ranges" + (f"; faults: {seen.fault_counts()}" if seen.faults else ""), err=True)
+
+
+def _refuse_beside_dialect(**others: Any) -> None:
+    """Raise `PlanError` for options that plan exchanges: boards of a dialect range by themselves."""
+    for name, value in others.items():
+        if value:
+            raise PlanError(
+                "boards of a dialect range by themselves, so this does not go with --dialect", parameter=name
+            )
 
 
 def _plan(

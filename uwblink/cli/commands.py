@@ -74,7 +74,7 @@ imports = typer.Typer(
 
 
 def guess(
-    table: Annotated[Path, typer.Argument(help="Table (.csv, .csv.gz, .parquet, .jsonl).")],
+    table: Annotated[Path, typer.Argument(help="Table, log, or a folder of them.")],
     output: Annotated[Path | None, output("Map to write (.toml); else printed.")] = None,
     force: Force = False,
 ) -> None:
@@ -179,24 +179,29 @@ def export(
 def poses(
     recording: Annotated[Path, typer.Argument(help="Recording to add poses to (.uwb).")],
     source: Annotated[
-        list[str], typer.Option("--from", help="Poses (.csv, .tum or a ROS bag), or BODY=FILE. May be repeated.")
-    ],
+        list[str] | None,
+        typer.Option("--from", help="Poses (.csv, .tsv, .tum or a ROS bag), or BODY=FILE. May be repeated."),
+    ] = None,
     offset: Annotated[str, typer.Option(help="Seconds to add to the times of the poses, or auto.")] = "0",
-    tags: Annotated[Path | None, typer.Option(help="File with the tags and anchors to use (.toml).")] = None,
+    tags: Annotated[Path | None, typer.Option(help="File with the tags and anchors to use (.toml, .json).")] = None,
     body: Annotated[str | None, typer.Option(help="Body of a TUM or EuRoC file.")] = None,
     topic: Annotated[
         list[str] | None, typer.Option(help="BODY=TOPIC of a bag; else found by name. May be repeated.")
     ] = None,
+    map_file: Annotated[Path | None, typer.Option("--map", help="Names and units of a CSV's columns (.toml).")] = None,
     force: Force = False,
 ) -> None:
     """Add poses of motion capture to a recording; --force replaces its poses."""
-    sources: Any = Path(source[0])
-    if len(source) > 1 or ("=" in source[0] and not sources.exists()):
+    if not source and tags is None:
+        raise ImportTableError("found neither --from with poses nor --tags with anchors")
+    source = source or []
+    sources: Any = Path(source[0]) if source else {}
+    if len(source) > 1 or (source and "=" in source[0] and not sources.exists()):
         sources = {name: Path(file) for name, file in _by_body("from", "FILE", source).items()}
     topics = _by_body("topic", "TOPIC", topic) if topic else None
     with waiting("adding poses"):
         found = uwblink.importers.add_poses(
-            recording, sources, offset=offset, tags_from=tags, body=body, topics=topics, force=force
+            recording, sources, offset=offset, tags_from=tags, body=body, topics=topics, map_file=map_file, force=force
         )
     typer.echo(
         f"{recording}: {found.poses} poses of {', '.join(found.bodies)}, offset {found.offset_s:+.4f} s; "

@@ -51,6 +51,18 @@ AntennaDelays = Annotated[
 ]
 Duration = Annotated[float | None, typer.Option(min=0.001, help="Duration in seconds.")]
 Rate = Annotated[float | None, typer.Option(min=0.001, help="Exchanges per second, all pairs together (Hz).")]
+DialectName = Annotated[
+    str | None,
+    typer.Option(
+        "--dialect",
+        metavar="NAME|MAP",
+        help="Form in which boards of other firmware print ranges: dwm1001-lec, dwm1001-les, at-range, arduino, ..., "
+        "or a column map with a line template (.toml).",
+    ),
+]
+BoardIds = Annotated[
+    str, typer.Option("--ids", metavar="ID,ID...", help="Ids of the boards at the ports, if their lines do not say.")
+]
 PlanFile = Annotated[Path | None, typer.Option("--plan", help="Ranging plan: which pairs range, and how (.toml).")]
 PlaybackSpeed = Annotated[
     float, typer.Option("--speed", min=0.001, help="Playback speed as a factor; inf: as fast as possible.")

@@ -157,7 +157,11 @@ def bag_to_table(sources: Sequence[Path], map_file: Path | None, folder: Path) -
         column_map = _with_topics(bag, column_map)
         wrong = f"{source.name}: cannot be turned into a table in {table.parent}"
         with raising(ImportTableError, wrong, OSError, RecursionError), table.open("w", encoding="utf-8") as file:
-            for row in _rows(bag, column_map):
+            for row in _rows(bag, column_map.topics):
+                if column_map.each and not isinstance(row.get(column_map.each), list):
+                    raise ImportTableError(
+                        f"{source}: each: a message of {row['topic']} has no list {column_map.each[:60]!r}"
+                    )
                 first = first or row
                 file.write(json.dumps(row, allow_nan=False) + "\n")
     if first is None:
@@ -188,19 +192,12 @@ def _with_topics(bag: Bag, column_map: ColumnMap) -> ColumnMap:
     raise ImportTableError(f'{bag.path}: a `map_file` must name the topics, as [topics."/name"]; there are {listed}')
 
 
-def _rows(bag: Bag, column_map: ColumnMap) -> Iterator[dict[str, Any]]:
-    """Yield one row for each message, or for each element of the list that the map names (`each`)."""
-    each = column_map.each
-    for topic, kind, time_ns, message in bag.messages(column_map.topics):
+def _rows(bag: Bag, topics: Mapping[str, dict[str, float | str]]) -> Iterator[dict[str, Any]]:
+    """Yield one row for each message."""
+    for topic, kind, time_ns, message in bag.messages(topics):
         # The project's own messages leave out unknown values.
         fields = (dict.fromkeys(OWN_COLUMNS.values()) if kind == RANGE else {}) | message
-        row: dict[str, Any] = {**fields, "topic": topic, "log_time": time_ns, **column_map.topics[topic]}
-        if each is None:
-            yield row
-        elif isinstance(row.get(each), list):
-            yield from (row | {each: one} for one in row[each])
-        else:
-            raise ImportTableError(f"{bag.path}: each: a message of {topic} has no list {each[:60]!r}")
+        yield {**fields, "topic": topic, "log_time": time_ns, **topics[topic]}
 
 
 def _plain(value: Any) -> Any:

@@ -10,10 +10,19 @@ protocol = "ss"            # a protocol of uwblink.twr
 delimiter = ";"
 decimal = ","
 within_s = 0.5             # rows of one exchange lie no further apart
-each = "measurements"      # of bags: rows are the elements of this field of a message
-[columns]                  # our name = "their name"
+line = "from: {to_id} Range: {range_m} m"   # of logs: the lines that are rows, or a name of LINES
+each = "measurements"      # rows are the elements of this list of a message, or matches of this template in a line
+from_name = "anchor_{to_id}_at_{gt_range_cm}.csv"   # columns from the names of files
+missing = [-1, "---"]      # values of ranges, powers and skews that mean none
+chip = "dw1000"            # or "dw3000", "other"
+prf = 64                   # pulse repetition frequency in MHz, of powers from registers
+[columns]                  # our name = "their name", or the number of the column of a table without a header
 tx1 = "poll_tx_ticks"
+fpp2 = {f1 = "FP_AMPL1", f2 = "FP_AMPL2", f3 = "FP_AMPL3", n = "RXPACC"}   # power from registers
+[wide]                     # a column a device
+range_m = "r_AN{to_id}"    # or {3 = "front", 7 = "back"}
 [units]
+range_m = "mm"             # of one column
 stamps = "ticks"           # or "ns", "us", "s", or the length of a unit in seconds
 time = "s"                 # or "ms", "us", "ns", "iso"
 distance = "m"             # or "cm", "mm", "ft", "in"
@@ -36,13 +45,18 @@ to_id = 7
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from uwblink.errors import ImportTableError
+from uwblink.importers.chips import CHIPS, REGISTERS
+from uwblink.importers.lines import LINES
+from uwblink.importers.templates import Template, is_template, places
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import AntennaDelays, read_antenna_delays
+from uwblink.recording.schema import POSE
 from uwblink.text_files import FileKey, TomlReader, heads, is_number
 from uwblink.ticks import TICKS_PER_SECOND
 from uwblink.twr import BITS, LARGEST_ID, STAMPS
@@ -59,6 +73,9 @@ NAMES: Final = (
 )  # fmt: skip
 """The columns of tables; `event` has words that tell whether a stamp is of transmission or of reception."""
 
+NAMES_OF_POSES: Final = ("body", *POSE)
+"""The columns of files of poses besides `time_s`, for `uwblink poses --map`."""
+
 STAMP_UNITS: Final = {
     "ticks": 1.0,
     "ps": TICKS_PER_SECOND * 1e-12,
@@ -69,6 +86,7 @@ STAMP_UNITS: Final = {
 TIME_UNITS: Final = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 DISTANCE_UNITS: Final = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "in": 0.0254}
 POWERS: Final = ("fpp1", "fpp2", "rxp1", "rxp2", "fpp", "rxp")
+SKEWS: Final = ("skew1", "skew2", "skew")
 MAP_KEYS: Final = (
     FileKey(
         "layout",
@@ -93,7 +111,53 @@ MAP_KEYS: Final = (
     FileKey("delimiter", "one of , ; tab | and blank", "by the first lines", "Separator of cells."),
     FileKey("decimal", '"." or ","', "by the first lines", "Decimal mark of numbers."),
     FileKey("within_s", "number, s", "1", "Longest time between rows of one exchange."),
-    FileKey("columns.NAME", "text", "our name", "The name of the column NAME in the table."),
+    FileKey(
+        "line",
+        f"template, or one of {', '.join(LINES)}",
+        "the file is a table",
+        "Of logs: the lines that are rows. Places in braces are columns; `{x:hex}` and `{x:int}` take digits, `{r[8]}` "
+        "is a list whose values are `r.0` to `r.7`, `{_}` and `{*}` are not used.",
+    ),
+    FileKey(
+        "each",
+        "text; a template of parts of a line",
+        "a message or line is a row",
+        "The list in a message, or the parts of a line, whose elements are the rows.",
+    ),
+    FileKey(
+        "from_name",
+        "template",
+        "none",
+        "Columns that are in the names of files, and of folders before a slash, such as "
+        '"anchor_{to_id}_at_{gt_range_cm}.csv".',
+    ),
+    FileKey(
+        "missing",
+        "list of numbers and words",
+        "none",
+        "Values that mean that there is no range, power, skew or true distance. Rows without a range are left out.",
+    ),
+    FileKey(
+        "chip",
+        f"one of {', '.join(CHIPS)}",
+        "not known",
+        "The chip of the devices: powers from registers, offsets of clocks and limits of powers. It is kept in `meta`.",
+    ),
+    FileKey("prf", "16 or 64, MHz", "64", "Pulse repetition frequency, for powers from registers."),
+    FileKey(
+        "columns.NAME",
+        "text; whole number; table of registers",
+        "our name",
+        "The name of the column NAME in the table, or its number, from 1, where no column has a name. A power can be "
+        "made of registers: f1, f2, f3 (FP_AMPL1 to 3) and n (RXPACC), or c (CIR_PWR) and n, and d (DGC) of a DW3000.",
+    ),
+    FileKey(
+        "wide.NAME",
+        "text with one place; or a table of columns by device",
+        "none",
+        "Columns that differ by a device: `r_AN{to_id}` makes a row of each. Families are joined by what differs; "
+        "`{_}` is no id. A column `mask` has a bit for each device with a range.",
+    ),
     FileKey(
         "units.stamps",
         '"ticks", "ps", "ns", "us", "s", or the length of a unit in seconds',
@@ -119,6 +183,13 @@ MAP_KEYS: Final = (
         "Unit of powers; -dBm: written without their sign.",
     ),
     FileKey(
+        "units.skew",
+        '"ppm", "-ppm", "integrator-2", "integrator-5", "integrator-9" or "offset"',
+        "ppm",
+        "Unit of skews: the carrier integrator on a channel, or the clock offset register of the DW3000, needs `chip`.",
+    ),
+    FileKey("units.NAME", "as for all", "that for all", "Unit of one column of distances or powers."),
+    FileKey(
         "constants.NAME", "number; text for an id", "none", "A value for all rows, for a column that the table lacks."
     ),
     FileKey(
@@ -143,7 +214,6 @@ MAP_KEYS: Final = (
     FileKey(
         "antenna_delays.tags.ID.rx", "number", "as all", "Receive antenna delay that was programmed into one device."
     ),
-    FileKey("each", "text", "a message is a row", "Of bags: the list in a message whose elements are the rows."),
     FileKey(
         'topics."TOPIC"',
         "table of constants",
@@ -176,11 +246,28 @@ class ColumnMap:
     ids: dict[str, int] = field(default_factory=dict)
     antenna_delays: AntennaDelays = field(default_factory=dict)
     each: str | None = None
+    line: str | None = None
+    from_name: str | None = None
+    missing: tuple[float | str, ...] = ()
+    chip: str | None = None
+    prf: int = 64
+    headerless: bool = False
+    registers: dict[str, dict[str, str]] = field(default_factory=dict)
+    wide: dict[str, str | dict[str, str]] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
     topics: dict[str, dict[str, float | str]] = field(default_factory=dict)
 
     def header(self, name: str) -> str:
         """Return the table's name of a column of `NAMES`."""
         return self.columns.get(name, name)
+
+    def distance_of(self, name: str) -> str | None:
+        """Return the unit of a column of `DISTANCES`; None if the map does not state it."""
+        return self.units.get(name, self.distance_unit)
+
+    def power_of(self, name: str) -> str | None:
+        """Return the unit of a column of `POWERS`; None if the map does not state it."""
+        return self.units.get(name, "dBm" if name in self.registers else self.power_unit)
 
 
 def load_map(path: Path) -> ColumnMap:
@@ -188,17 +275,53 @@ def load_map(path: Path) -> ColumnMap:
     file = TomlReader(path, ImportTableError, "map")
     table = file.table
     file.known(table, heads(MAP_KEYS))
-    columns, units, constants, ids = (file.section(name) for name in ("columns", "units", "constants", "ids"))
-    file.known(columns, NAMES, "columns.")
-    file.known(units, ("stamps", "time", "distance", "power"), "units.")
+    for name in ("line", "each", "from_name"):
+        file.check(name, table.get(name), isinstance(table.get(name, ""), str) and table.get(name) != ASKED, "text")
+    known = LINES.get(table.get("line", ""))
+    table = (known.entries() if known else {}) | table | ({"line": known.line} if known else {})
+    file.table = table
+    columns, units, constants, ids, wide = (file.section(n) for n in ("columns", "units", "constants", "ids", "wide"))
+    file.known(columns, (*NAMES, *NAMES_OF_POSES), "columns.")
+    file.known(wide, NAMES, "wide.")
+    templates = [
+        name for name in ("line", "from_name", "each") if name in table and (name != "each" or "line" in table)
+    ]
+    for name in templates:
+        file.check(
+            name, table[name], is_template(table[name]), "text with different places such as {range_m} or {r[8]}"
+        )
+        for place in places(Template(table[name])):
+            _place(place, columns, units)
+    file.known(units, ("stamps", "time", "distance", "power", "skew", *DISTANCES, *POWERS), "units.")
+    registers = {name: value for name, value in columns.items() if isinstance(value, dict)}
+    chip = file.choice("chip", table.get("chip"), (None, *CHIPS))
+    for name, value in registers.items():
+        file.known(value, REGISTERS, f"columns.{name}.")
+        whole = {"n"} < value.keys() and (value.keys() >= {"f1", "f2", "f3"}) != ("c" in value)
+        whole &= name in POWERS and all(isinstance(one, str) for one in value.values())
+        file.check(f"columns.{name}", value, whole, "columns of f1, f2, f3 and n, or of c and n, for a power")
+        file.check(
+            "chip", chip, bool(chip) and bool(CHIPS[chip].offset_db), 'a chip whose registers are known: "dw1000"'
+        )
+    numbered = {type(value) is int for value in columns.values() if not isinstance(value, dict)}
     for name, value in columns.items():
-        file.check(f"columns.{name}", value, isinstance(value, str), "the name of a column")
+        one = (isinstance(value, str) and value != ASKED) or name in registers or (type(value) is int and value > 0)
+        file.check(
+            f"columns.{name}", value, one and len(numbered) < 2, "the name of a column, or for all their numbers"
+        )
+    for name, value in wide.items():
+        by_device = isinstance(value, dict) and value and all(isinstance(one, str) for one in value.values())
+        is_family = isinstance(value, str) and is_template(value) and len(re.findall(r"\{\w+\}", value)) == 1
+        file.check(f"wide.{name}", value, by_device or is_family, "a name with one place, such as r_AN{to_id}")
+    missing = table.get("missing", [])
+    listed = isinstance(missing, list) and all(
+        is_number(one) or (isinstance(one, str) and one != ASKED) for one in missing
+    )
+    file.check("missing", missing, listed, "a list of numbers and words")
     _constants(file, "constants", constants)
     for topic, values in file.section("topics").items():
         file.check(f"topics.{topic}", values, isinstance(values, dict), "a table of constants, which may be empty")
         _constants(file, f"topics.{topic}", values)
-    each = table.get("each")
-    file.check("each", each, each is None or isinstance(each, str), "the name of a field")
     for name, value in ids.items():
         is_id = type(value) is int and 0 <= value <= LARGEST_ID
         file.check(f"ids.{name}", value, is_id, f"a whole number from 0 to {LARGEST_ID}")
@@ -213,7 +336,7 @@ def load_map(path: Path) -> ColumnMap:
         delimiter=file.choice("delimiter", table.get("delimiter"), (None, ",", ";", "\t", "|", " ")),
         decimal=file.choice("decimal", table.get("decimal"), (None, ".", ",")),
         within_s=float(within),
-        columns=columns,
+        columns={name: str(value) for name, value in columns.items() if name not in registers},
         ticks_per_unit=float(stamps * TICKS_PER_SECOND)
         if is_number(stamps) and stamps > 0
         else STAMP_UNITS[file.choice("units.stamps", stamps, STAMP_UNITS)],
@@ -223,9 +346,34 @@ def load_map(path: Path) -> ColumnMap:
         constants={name: v if isinstance(v, str) else float(v) for name, v in constants.items()},
         ids=ids,
         antenna_delays=read_antenna_delays(file, {name: STAMP_UNITS[name] for name in ("ticks", "ns")}),
-        each=each,
+        each=table.get("each"),
+        line=table.get("line"),
+        from_name=table.get("from_name"),
+        missing=tuple(missing),
+        chip=chip,
+        prf=file.choice("prf", table.get("prf", 64), (16, 64)),
+        headerless=True in numbered,
+        registers=registers,
+        wide=wide,
+        units=_units_of_columns(file, units, chip),
         topics=file.section("topics"),
     )
+
+
+def _place(place: str, columns: dict[str, Any], units: dict[str, Any]) -> None:
+    """State which column a place such as `gt_range_cm` is, and its unit."""
+    for name, known in (*((name, DISTANCE_UNITS) for name in DISTANCES), ("time_s", TIME_UNITS)):
+        stem, unit = place.rpartition("_")[::2]
+        if stem == name.rpartition("_")[0] and unit in known:
+            columns.setdefault(name, place)
+            units.setdefault(name if name != "time_s" else "time", unit)
+
+
+def _units_of_columns(file: TomlReader, units: dict[str, Any], chip: str | None) -> dict[str, str]:
+    """Return the units of single columns, and of skews."""
+    allowed: dict[str, Any] = dict.fromkeys(DISTANCES, DISTANCE_UNITS) | dict.fromkeys(POWERS, ("dBm", "-dBm"))
+    allowed["skew"] = CHIPS[chip or "other"].skew_ppm
+    return {name: file.choice(f"units.{name}", unit, allowed[name]) for name, unit in units.items() if name in allowed}
 
 
 def _constants(file: TomlReader, where: str, values: dict[str, Any]) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from uwblink.display import first_few
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import IDS, POSITIONS, ColumnMap, load_map
+from uwblink.importers.column_map import DISTANCES, IDS, POSITIONS, POWERS, SKEWS, ColumnMap, load_map
 from uwblink.importers.plausibility import (
     MIN_ROWS,
     ROW_PERIOD_NS,
@@ -38,15 +38,19 @@ from uwblink.importers.staging import (
     Staging,
     Watch,
     assemble_exchanges,
+    in_time_order,
+    rows_back,
     time_conditions,
     usable_exchanges,
 )
 from uwblink.importers.tables import connected
+from uwblink.importers.templates import Template
 from uwblink.recording.antenna_delays import AntennaDelay, meta_of_delays
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import STAMPS, raw_range
 
+LOG_SUFFIXES: Final = (".txt", ".log", ".dat", ".txt.gz", ".log.gz")
 TABLE_SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".parquet", ".jsonl", ".ndjson", ".jsonl.gz")
 
 
@@ -60,15 +64,27 @@ class Imported:
 
 def find_tables(sources: Sequence[Path], map_file: Path | None, _folder: Path) -> tuple[list[Path], ColumnMap]:
     """Return the tables of a folder, or several files, and the map of their columns; raises `ImportTableError`."""
-    paths = list(sources)
+    paths, column_map = list(sources), load_map(map_file) if map_file else ColumnMap()
     if len(paths) == 1 and paths[0].is_dir():
-        paths = sorted(path for path in paths[0].iterdir() if path.name.lower().endswith(TABLE_SUFFIXES))
-        if not paths:
-            raise ImportTableError(f"{sources[0]}: is a directory without a table ({', '.join(TABLE_SUFFIXES)})")
-    column_map = load_map(map_file) if map_file else ColumnMap()
-    if column_map.topics or column_map.each:
-        raise ImportTableError(f"{map_file}: topics and each are of bags; {paths[0]} is a table")
+        paths = tables_in(paths[0], column_map)
+    if column_map.topics:
+        raise ImportTableError(f"{map_file}: topics are of bags; {paths[0]} is a table")
     return paths, column_map
+
+
+def tables_in(folder: Path, column_map: ColumnMap) -> list[Path]:
+    """Return the files of a folder that are tables or logs by their names, in order; raises `ImportTableError`.
+
+    A template of names (`from_name`) chooses those that match it, in folders within, too.
+    """
+    name = Template(column_map.from_name) if column_map.from_name else None
+    suffixes = (*TABLE_SUFFIXES, *LOG_SUFFIXES) if column_map.line else TABLE_SUFFIXES
+    inner = folder.rglob("*") if name and "/" in name.text else folder.iterdir()
+    paths = sorted(p for p in inner if (name.match(p.as_posix()) if name else p.name.lower().endswith(suffixes)))
+    if not paths:
+        wanted = f"named {column_map.from_name!r}" if name else f"({', '.join(suffixes)})"
+        raise ImportTableError(f"{folder}: is a directory without a table {wanted}")
+    return paths
 
 
 def import_tables(
@@ -95,6 +111,7 @@ def import_tables(
         names = {str(tag): name for tag, name in sorted(staging.names.items())}
         meta = {**meta, "timestamp_bits": reading.bits if reading else 32, **meta_of_delays(delays)}
         meta |= {"tag_names": names} if names else {}
+        meta |= {"chip": column_map.chip} if column_map.chip else {}
         with Recording.create(output, meta=meta, force=force, memory_mb=250) as recording:
             ends = " UNION ".join(f"SELECT {name} AS id FROM {rows.name} WHERE {rows.condition}" for name in IDS)
             tags = [tag for (tag,) in db.execute(f"{ends} ORDER BY id").fetchall()]
@@ -131,6 +148,9 @@ def _notes(staging: Staging) -> list[str]:
         # The first dozen; a recording has all, as its tags' bodies.
         some = first_few((f"{name[:20]} = {number}" for number, name in names.items()), 12)
         notes.append(f"{len(names)} ids are words or too large, and get numbers: {some}")
+    if staging.blanks:
+        total = staging.offsets[-1]
+        notes.append(f"{staging.blanks} of {total} rows or cells hold no range, and are left out")
     if not staging.rows.has("time_s"):
         notes.append("there are no times; rows are taken as a millisecond apart, in their order")
     return notes
@@ -142,6 +162,8 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
     Raises `ImportTableError` if half of the rows or more are unusable.
     """
     column_map, path = staging.column_map, staging.paths[0]
+    if back := rows_back(staging.rows):
+        notes.append(f"{back} rows are earlier than the row before, and are sorted by time")
     layout, protocol = column_map.layout or _layout(staging), column_map.protocol
     if layout in ("messages", "stamps", "parts"):
         rows, found = assemble_exchanges(staging, layout, faults, watch)
@@ -150,12 +172,17 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
         rows = faults.reject(staging.rows, SOUND_IDS)
     total = rows.count() + len(faults)
     watch("checking", 0.0)
+    optional_columns = (name for name in (*DISTANCES, *POWERS, *SKEWS) if layout != "ranges" or name != "range_m")
+    notes += staging.words_in(optional_columns)
+    if not any(map(rows.has, ("fpp1", "fpp2"))) and any(map(rows.has, ("rxp1", "rxp2"))):
+        notes.append("there is no first-path power; the received power serves in its place")
     if layout == "ranges":
         staging.require(rows, ["range_m"])
         rows = faults.reject(rows, [*time_conditions(rows), Condition("range_m", "a finite number", "range_m IS NULL")])
         faults.check(total)
         check_units(column_map, path, rows.sample(SAMPLE_ROWS), None)
-        notes += filter(None, [_note_on_repeats(rows)])
+        rows, note = _without_repeats(in_time_order(rows))
+        notes += filter(None, [note])
         return rows, None
     protocol = protocol or ("ds" if rows.has("tx3") and rows.has("rx3") else "ss")
     staging.require(rows, stamps_of(protocol))
@@ -171,7 +198,7 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
     reading, note = settle_reading(path, column_map, sample, Reading(protocol, bits))
     notes += filter(None, [note])
     check_units(column_map, path, sample, raw_range(exchanges_of(column_map, sample, reading)))
-    return rows, reading
+    return in_time_order(rows), reading
 
 
 def _layout(staging: Staging) -> str:
@@ -212,25 +239,33 @@ def _poses(rows: StagedRows, bodies: Mapping[int, str]) -> Iterator[Poses]:
         yield Poses(found["origin"], names, position, np.tile([0.0, 0.0, 0.0, 1.0], (len(which), 1)))
 
 
-def _note_on_repeats(rows: StagedRows) -> str:
-    """Return a note if ranges without stamps are probably recorded twice; empty text otherwise.
+def _without_repeats(rows: StagedRows) -> tuple[StagedRows, str]:
+    """Return ranges without stamps less those that the other device of an exchange logged, too, and a note on repeats.
 
     A range may equal the previous one of the same two devices by chance, or because it repeats it. In the first case
     the times since the previous range are those of other ranges; a repetition follows sooner.
     """
     if not rows.has("time_s"):
-        return ""
+        return rows, ""
     pair = "PARTITION BY least(from_id, to_id), greatest(from_id, to_id) ORDER BY time_ns, rowid"
     gaps = (
-        "SELECT (time_ns - lag(time_ns) OVER pair) * 1e-6 AS gap_ms, range_m = lag(range_m) OVER pair AS equal "
-        f"FROM {rows.name} WHERE {rows.condition} WINDOW pair AS ({pair})"
+        "SELECT rowid AS row, (time_ns - lag(time_ns) OVER pair) * 1e-6 AS gap_ms, range_m = lag(range_m) OVER pair "
+        f"AS equal, from_id <> lag(from_id) OVER pair AS turned FROM {rows.name} WHERE {rows.condition} "
+        f"WINDOW pair AS ({pair})"
     )
     medians = (f"coalesce(median(gap_ms) FILTER ({which}), 0)" for which in ("equal", "NOT equal"))
-    found = rows.db.execute(f"SELECT count(*) FILTER (equal), {', '.join(medians)} FROM ({gaps})").fetchall()
-    ((count, after, others),) = found
+    counts = "count(*) FILTER (equal), count(*) FILTER (equal AND turned)"
+    ((count, turned, after, others),) = rows.db.execute(
+        f"SELECT {counts}, {', '.join(medians)} FROM ({gaps})"
+    ).fetchall()
     if count < MIN_ROWS or after >= others / 2:
-        return ""
-    return (
-        f"{count} of {rows.count()} ranges are exactly the one before of the same two devices, {after:.3g} ms after "
-        f"it, and others after {others:.3g} ms: the table may hold exchanges twice, from the logs of both; all are kept"
+        return rows, ""
+    said = f"of {rows.count()} ranges repeat the one before of the same two devices, {after:.3g} ms after it"
+    if 2 * turned < count:
+        return rows, f"{count} {said}, and others follow after {others:.3g} ms: are exchanges there twice? All are kept"
+    rows.db.execute(
+        f"CREATE TABLE repeats AS SELECT row FROM ({gaps}) WHERE equal AND turned AND gap_ms < {others / 2!r}"
     )
+    (merged,) = StagedRows(rows.db, "repeats", ()).values("count(*)")
+    kept = rows.where("rowid NOT IN (SELECT row FROM repeats)")
+    return kept, f"{merged} {said}, as logged by the other device, and are left out"

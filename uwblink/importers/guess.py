@@ -1,7 +1,7 @@
-"""Propose a map for a table, with the reason for each line.
+"""Propose a map for a table or a log, with the reason for each line.
 
-Columns are recognised by their names, English and German ones that labs use, or else by their contents. Units are
-determined from suffixes of the names, from the size of the numbers, and by which unit of the stamps makes plausible
+The form of the file is recognised first (`forms`), then its columns by their names, or else by their contents. Units
+are determined from suffixes of the names, from the size of the numbers, and by which unit of the stamps makes plausible
 ranges; the protocol is found by trying all.
 """
 
@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import json
 import re
-import unicodedata
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -25,12 +24,16 @@ from uwblink.importers.column_map import (
     DISTANCE_UNITS,
     DISTANCES,
     IDS,
+    NAMES,
     POSITIONS,
     POWERS,
     STAMP_UNITS,
     TIME_UNITS,
     ColumnMap,
 )
+from uwblink.importers.column_names import OF_MESSAGES, WORDS, named_columns, plain_name
+from uwblink.importers.exchange_tables import tables_in
+from uwblink.importers.forms import Entries, form_of, name_template, register_columns, wide_columns
 from uwblink.importers.plausibility import (
     ACCEPTED_SHARE,
     FITTING_SHARE,
@@ -40,138 +43,16 @@ from uwblink.importers.plausibility import (
     counter_format,
     reason_against_dbm,
     reason_against_metres,
+    sentinels,
     stamps_of,
     truth_m,
     try_reading,
 )
-from uwblink.importers.tables import Columns, SourceTable, open_table
+from uwblink.importers.tables import Columns, SourceTable, message_number, open_table
+from uwblink.importers.templates import Template, places
 from uwblink.protocols.table import PROTOCOLS
+from uwblink.text_files import require_regular
 from uwblink.twr import STAMPS
-
-OF_MESSAGES: Final = ("tx", "rx", "fpp", "rxp", "skew", "sequence", "message")
-
-_WORDS: Final = {
-    "end": (
-        r"(_(raw|ts|stamp|timestamp|time|ticks?|dtu|ps|ns|us|ms|s|sec|m|mm|cm|ft|in|meters?|metres?|"
-        r"dbm|db|ppm))*"
-    ),
-    "id": r"(_?(id|addr|address|mac|name))?",
-    "device": (
-        r"(tag|node|device|dev|board|robot|agent|anchor|module|modul|radio|unit|uwb|id|addr|address|"
-        r"mac|geraet|knoten)"
-    ),
-    "range": r"(range|dist|distance|abstand|distanz|entfernung)",
-    "true": (
-        r"(gt|true|truth|ground_?truth|ref|reference|nominal|mocap|vicon|actual|tape(_?measured?)?|"
-        r"laser|soll|wahr(er)?|referenz)"
-    ),
-    "fpp": r"(fpp?|(fp|first_?path)_?(power|pwr|rssi|level|leistung)|first_?path)",
-    "rxp": r"(rxp|rx_?(power|pwr|level)|rssi|total_?power|pr)",
-    "skew": r"(skew|cfo|carrier|clock_?offset)",
-    "of_time": r"((t|ts|time|stamp|timestamp|zeit)_)?",
-    "from": r"(from|src|source|initiator|tag|my|sender|tx|requester|robot|rover|mobile|node_?a|id_?1)",
-    "to": r"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|beacon|node_?b|id_?2)",
-}
-"""Words that patterns are made of."""
-
-
-def _place(name: str) -> str:
-    """Return the pattern of a column of `POSITIONS`, for names such as `tag_x`, `anchor_pos_x_m`, `x_tag` and `x1`.
-
-    A plain `x` is the initiator's, since the initiator moves if the other devices are called anchors.
-    """
-    end, axis = name.split("_")[:2]
-    words, number = _WORDS[end], 1 if end == "from" else 2
-    true, place = r"((gt|true|truth|ground_?truth|mocap|ref)_?)?", r"(pos(ition)?|loc(ation)?|place|p)?"
-    forms = [rf"{true}{words}_?{place}_?{axis}", rf"{true}{place}_?{axis}_?({words}|{number})", rf"p{number}_?{axis}"]
-    forms += [rf"{true}{place}_?{axis}"] if end == "from" else []
-    return "|".join(forms)
-
-
-_PATTERNS: Final = {
-    "time_s": (
-        r"(ros_?|host_?|unix_?|utc_?|mess_?)?"
-        r"(time|timestamp|stamp|t|datetime|date(_?time)?|epoch|zeit|zeitstempel|uhrzeit|datum)(_(utc|iso))?"
-    ),
-    "from_id": r"(from|src|source|initiator|tag|my|sender|tx|requester|node_?a|quelle|von|id_?(from|von)|id_?1){id}",
-    "to_id": (
-        r"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|node_?b|ziel|an|nach|anker|"
-        r"empf(ae|a)nger|id_?(to|an|nach)|id_?2){id}"
-    ),
-    "tx1": r"{of_time}(tx_?1|t_?1|poll_?(tx|sent)|tx_?poll)",
-    "rx1": r"{of_time}(rx_?1|t_?2|poll_?(rx|received)|rx_?poll)",
-    "tx2": r"{of_time}(tx_?2|t_?3|resp(onse)?_?(tx|sent)|tx_?resp(onse)?)",
-    "rx2": r"{of_time}(rx_?2|t_?4|resp(onse)?_?(rx|received)|rx_?resp(onse)?)",
-    "tx3": r"{of_time}(tx_?3|t_?5|(final|report)_?(tx|sent)|tx_?(final|report))",
-    "rx3": r"{of_time}(rx_?3|t_?6|(final|report)_?(rx|received)|rx_?(final|report))",
-    "fpp1": r"{fpp}_?1",
-    "fpp2": r"{fpp}_?2?",
-    "rxp1": r"{rxp}_?1",
-    "rxp2": r"{rxp}_?2?",
-    "skew1": r"{skew}_?1",
-    "skew2": r"{skew}_?2?",
-    "gt_range_m": r"{true}_?{range}?|{range}_?{true}",
-    "range_m": r"(device_?|measured?_?|uwb_?|est(imated)?_?)?{range}",
-    "sequence": r"(seq|sequence|exchange|laufnummer)(_?(no|num|nr|number|id))?",
-    "message": r"(msg|message|frame|nachricht)(_?(no|num|nr|number|type|id))?",
-    "tx": r"tx",
-    "rx": r"rx",
-    "fpp": r"{fpp}",
-    "rxp": r"{rxp}",
-    "skew": r"{skew}",
-} | {name: _place(name) for name in POSITIONS}
-"""Patterns of the names of columns, in terms of `_WORDS`."""
-
-_OF_MESSAGE: Final = {"poll": 1, "resp": 2, "response": 2}
-_AT_DEVICE: Final = {"resp": 1, "responder": 1, "target": 1, "anchor": 1, "init": 2, "initiator": 2, "tag": 2}
-
-
-def _plain(header: str) -> str:
-    """Return a name in lower case without accents, its words joined by `_`: `first_path_1_dbm`."""
-    bare = unicodedata.normalize("NFKD", header.replace("ß", "ss")).encode("ascii", "ignore").decode()
-    return re.sub(r"[^a-z0-9]+", "_", bare.lower()).strip("_")
-
-
-def _plain_names(headers: Iterable[str]) -> dict[str, str]:
-    """Return plain names by header; powers and skews get the number of their message: `fp_power_init` is `fp_power_2`.
-
-    `resp` means the responding device if another column names the initiator, else the response message.
-    """
-    level = "(?P<level>{fpp}|{rxp}|{skew})".format_map(_WORDS)
-    end, whose = _WORDS["end"], "|".join(sorted({*_OF_MESSAGE, *_AT_DEVICE}, key=len)[::-1])
-    forms = (rf"{level}_(at_|of_)?(?P<whose>{whose})(?P<end>{end})", rf"(?P<whose>{whose})_{level}(?P<end>{end})")
-    names = {header: _plain(header) for header in headers}
-    matches = {h: re.fullmatch(forms[0], name) or re.fullmatch(forms[1], name) for h, name in names.items()}
-    ends = {match["whose"] for match in matches.values() if match}
-    numbers = _AT_DEVICE | _OF_MESSAGE | ({"resp": 1, "response": 1} if ends & {"init", "initiator", "tag"} else {})
-    return names | {h: f"{m['level']}_{numbers[m['whose']]}{m['end']}" for h, m in matches.items() if m}
-
-
-def named_columns(headers: Iterable[str]) -> dict[str, str]:
-    """Return the header of each recognised column; raw columns come before others, then earlier ones first."""
-    listed = sorted(headers, key=lambda header: "raw" not in header.lower())
-    called = _plain_names(listed)
-    found = _ends(called)
-    for ours, pattern in _PATTERNS.items():
-        whole = f"({pattern}){{end}}".format_map(_WORDS)
-        # Each column is used once, but for names of messages, which may repeat those of exchanges at this stage.
-        taken = {header for name, header in found.items() if (name in OF_MESSAGES) == (ours in OF_MESSAGES)}
-        free = (header for header in listed if listed.count(header) == 1 and header not in taken)
-        if header := next((header for header in free if re.fullmatch(whole, called[header])), None):
-            found[ours] = header
-    return found
-
-
-def _ends(called: dict[str, str]) -> dict[str, str]:
-    """Return the columns of the two devices if their names differ by a letter, as `node_i` and `node_j`."""
-    letters = (("a", "b"), ("i", "j"), ("1", "2"), ("0", "1"), ("one", "two"))
-    for both, form in product(letters, ("{0}_?{1}", "{0}{2}_{1}", "{0}_?{1}{2}")):
-        patterns = [form.format(_WORDS["device"], letter, _WORDS["id"]) for letter in both]
-        ends = [[header for header, name in called.items() if re.fullmatch(one, name)] for one in patterns]
-        stems = [{called[header][:2] for header in headers} for headers in ends]
-        if all(len(headers) == 1 for headers in ends) and stems[0] == stems[1]:
-            return {"from_id": ends[0][0], "to_id": ends[1][0]}
-    return {}
 
 
 def with_stamp_and_event(table: SourceTable, columns: dict[str, str]) -> dict[str, str]:
@@ -181,9 +62,9 @@ def with_stamp_and_event(table: SourceTable, columns: dict[str, str]) -> dict[st
     """
     if all(name in columns for name in STAMPS[:4]) or ("tx" in columns and "rx" in columns):
         return columns
-    single = {name: _plain(name) for name in table.names if table.names.count(name) == 1}
+    single = {name: plain_name(name) for name in table.names if table.names.count(name) == 1}
     kinds = r"(event|direction|dir|kind|type|action|edge|what|tx_?or_?rx|tx_?rx)"
-    clock = rf"((device|dw|dw1000|raw|chip|uwb)_?)?(stamp|timestamp|time|ticks?|counter|t){_WORDS['end']}"
+    clock = rf"((device|dw|dw1000|raw|chip|uwb)_?)?(stamp|timestamp|time|ticks?|counter|t){WORDS['end']}"
     event = next(
         (name for name, plain in single.items() if re.fullmatch(kinds, plain) and _is_event(table, name)), None
     )
@@ -223,9 +104,6 @@ _LAYOUTS: Final = {
 }
 """The layouts that are recognised: the columns that each needs, those that it does not have, and the reason."""
 
-Entries = dict[str, tuple[str | int, str]]
-"""Values of a map by key, each with its reason."""
-
 
 @dataclass(frozen=True, slots=True)
 class Guess:
@@ -240,26 +118,94 @@ class Guess:
 
 
 def guess_map(path: Path) -> Guess:
-    """Return the proposed map of a table; raises `ImportTableError`."""
+    """Return the proposed map of a table, a log, or a folder of them; raises `ImportTableError`."""
     if path.suffix.lower() == ".uwb":
         raise ImportTableError(f"{path}: is a recording already and needs no map; 'uwblink show' prints its contents")
-    with open_table(path) as table:
-        columns = with_stamp_and_event(table, named_columns(table.names))
-        numbers = table.numbers({header for name, header in columns.items() if name != "event"}, limit=100_000)
+    file = tables_in(path, ColumnMap(line="{*}"))[0] if path.is_dir() else path
+    require_regular(file, ImportTableError, "table")
+    form, top = form_of(file)
+    with open_table(file, form) as table:
+        if form.headerless:
+            return _numbered(path, table)
+        columns = {} if form.line else with_stamp_and_event(table, named_columns(table.names))
+        wide = form.wide or wide_columns(table.names, columns)
+        if each := None if form.line or wide or "range_m" in columns else next(iter(table.lists), None):
+            top["each"] = each, "a line has a list of them"
+    given = {name for text in (form.line, form.each) if text for name in places(Template(text)) if name in NAMES}
+    given |= {"to_id", *wide} if wide else set()
+    form = replace(form, wide=wide, each=form.each or each)
+    with open_table(file, form) as table:
+        # Fields of the elements of a list are called by their own names.
+        short = {name.removeprefix(f"{form.each}."): name for name in table.names}
+        found = with_stamp_and_event(table, {ours: short[name] for ours, name in named_columns(short).items()})
+    for ours, letters in (("to_id", ("id", "A", "a", "addr")), ("range_m", ("R", "r", "D", "d"))) if form.each else ():
+        if ours not in found and (letter := next((name for name in letters if name in short), None)):
+            found[ours] = short[letter]
+    columns = {name: name for name in given}
+    columns |= {
+        ours: header
+        for ours, header in found.items()
+        if ours not in given and header not in given and not re.match(r"[rap]\.", header)
+    }
+    if template := name_template(file.name, {"from_id", "to_id", "gt_range_m"} - columns.keys()):
+        top["from_name"] = template, "by the names of the files"
+        form = replace(form, from_name=template)
+    with open_table(file, form) as table:
+        columns |= named_columns(places(Template(template))) if template else {}
+        cells = table.numbers({header for name, header in columns.items() if name != "event"}, limit=100_000)
+        if "message" in columns:
+            number = {"message": message_number(table.text(columns["message"]))}
+            cells |= {columns["message"]: np.ma.filled(table.read(number, "LIMIT 100000")["message"], np.nan)}
+        names = table.names
+    return _proposal(path, form, top, given, columns, cells, names)
+
+
+def _numbered(path: Path, table: SourceTable) -> Guess:
+    """Return the map of a table without a header, whose columns the user has to number."""
+    first = ", ".join(f"{k} = {word[:20]}" for k, word in table.words_at(table.names, [0])[0].items())
+    wanted = ("time_s", *IDS, "range_m")
+    why = "write the number of the column, or delete the line; constants are for what the table lacks"
+    lines = _lines({name: (ASKED, why if name == wanted[0] else "") for name in wanted})
+    head = f"# {json.dumps(path.name)} has no header; the columns of its first row are: {json.dumps(first)[1:-1]}"
+    return Guess("\n".join([head, "[columns]", *lines]) + "\n", True, wanted)
+
+
+def _proposal(
+    path: Path,
+    form: ColumnMap,
+    top: Entries,
+    given: Collection[str],
+    columns: dict[str, str],
+    numbers: Mapping[str, Floats],
+    names: Sequence[str],
+) -> Guess:
+    """Return the map of a table of a form; `given` are columns that need no name, `numbers` the cells by header."""
     cells = {name: numbers[header] for name, header in columns.items() if name != "event"}
     if not len(next(iter(cells.values()), np.empty(0))):
-        raise ImportTableError(f"{path}: no column whose name is known, or no rows; there are {', '.join(table.names)}")
+        raise ImportTableError(f"{path}: no column whose name is known, or no rows; there are {', '.join(names)}")
+    missing: dict[float, float] = {}
+    for name in ("range_m", "gt_range_m"):
+        missing |= sentinels(cells[name]) if name in cells else {}
+        cells |= {name: np.where(np.isin(cells[name], list(missing)), np.nan, cells[name])} if name in cells else {}
     words = {name for name, column in cells.items() if not np.isfinite(column).any()}
     fitting = (one for one in ("exchanges", "messages", "ranges") if all(name in cells for name in _LAYOUTS[one][0]))
     layout = "stamps" if "event" in columns else next(fitting, "nothing")
     needed, foreign, why = _LAYOUTS[layout]
     if layout == "messages" and "message" in words and columns["message"] != "message":
         del columns["message"], cells["message"]  # without a column of that name messages are told by their order
-    top: Entries = {} if layout == "nothing" else {"layout": (layout, why)}
-    units, undelayed = _units(columns, cells), False
+    top |= {} if layout == "nothing" else {"layout": (layout, why)}
+    units, undelayed = _units(form, columns, cells), False
     if layout in ("exchanges", "messages", "stamps"):
         counter, unit, undelayed = (_exchange_stamps if layout == "exchanges" else _message_stamps)(columns, cells)
         top, units = top | counter, {"stamps": unit, **units}
+    if missing:
+        shares = ", ".join(f"{share:.0%} are {value:.6g}" for value, share in missing.items())
+        listed = [int(value) if value == int(value) else value for value in missing]
+        top["missing"] = listed, f"of the distances {shares}, which are none"
+    registers = register_columns([name for name in names if name not in columns.values()])
+    registers = {(ours if layout == "messages" else f"{ours}2"): keys for ours, keys in registers.items()}
+    registers = {ours: keys for ours, keys in registers.items() if ours not in columns}
+    top |= {"chip": (ASKED, "powers from registers: write dw1000 or dw3000"), "prf": (64, "MHz")} if registers else {}
     constants: Entries = {
         name: (
             ASKED,
@@ -271,30 +217,58 @@ def guess_map(path: Path) -> Guess:
     lacking = [name for name in needed if name not in cells or name in words]
     lacking += ["message"] if layout == "messages" and "message" in words & cells.keys() else []
     unplaced = [name for name in POSITIONS if name not in columns]
-    left = [json.dumps(name) for name in table.names if name not in columns.values()]
-    mixed = sorted(_distance_units(columns))
+    used = {*columns.values(), *(header for keys in registers.values() for header in keys.values())}
+    left = [json.dumps(name) for name in names if name not in used and not form.line and not form.wide]
     remarks = {
         why: layout == "nothing",
         "without antenna delays that were programmed into the devices: give them in [antenna_delays]": not undelayed,
         f"positions are used where all six columns are there; missing: {', '.join(unplaced)}": 0 < len(unplaced) < 6,
         f"not used: {', '.join(left)[:300]}": left,
         f"a column of numbers is still needed: {', '.join(lacking)}": lacking,
-        f"distances have one unit for all, here they have {', '.join(mixed)}: convert some": len(mixed) > 1,
     }
-    named: Entries = {name: (header, "") for name, header in columns.items() if name not in foreign}
+    named: Entries = {
+        name: (header, "") for name, header in columns.items() if name not in foreign and name not in given
+    }
+    if layout == "ranges" and "range_m" in named and (others := _alike(columns["range_m"], names)):
+        named["range_m"] = (
+            ASKED,
+            f"write {' or '.join(json.dumps(one) for one in others)}: which did the device measure?",
+        )
+    if "gt_range_m" in words and "gt_range_m" in named:
+        named["gt_range_m"] = (
+            ASKED,
+            f"{json.dumps(columns['gt_range_m'])} has no numbers: name a column, or delete the line",
+        )
+    named |= {ours: (keys, "") for ours, keys in registers.items()}
     none: Entries = {"tx": (0, "by the true distances none were programmed into the devices"), "rx": (0, "")}
-    sections = {"columns": named, "units": units, "constants": constants, "antenna_delays": none if undelayed else {}}
+    wide: Entries = {ours: (stated, "") for ours, stated in form.wide.items()}
+    sections = {"columns": named, "wide": wide, "units": units, "constants": constants}
+    sections |= {"antenna_delays": none if undelayed else {}}
     # Names of files can have line breaks, which would end the comment.
     lines = [f"# {json.dumps(path.name)}, as it would be read; every line can be changed", *_lines(top)]
     for title, entries in sections.items():
         lines += ["", f"[{title}]", *_lines(entries)] if entries else []
     lines += ["", *(f"# {text}" for text, is_due in remarks.items() if is_due)]
-    asked = [key for entries in (constants, top, units) for key, (value, _) in entries.items() if value == ASKED]
-    return Guess("\n".join(lines) + "\n", layout != "nothing" and not lacking and len(mixed) < 2, tuple(asked))
+    asked = [key for part in (constants, top, named, units) for key, (value, _) in part.items() if value == ASKED]
+    return Guess("\n".join(lines) + "\n", layout != "nothing" and not lacking, tuple(asked))
+
+
+def _alike(header: str, names: Sequence[str]) -> list[str]:
+    """Return the columns of ranges that differ by how they were made, such as raw and filtered, if several do."""
+    made = re.compile(rf"(^|_){WORDS['made']}(?=_|$)")
+    bare = {name: made.sub("", plain_name(name)).strip("_") for name in names}
+    found = [name for name in names if bare[name] == bare[header]]
+    return found if len(found) > 1 else []
 
 
 def _lines(entries: Entries) -> list[str]:
-    return [f"{key} = {json.dumps(value)}" + (f"  # {why}" if why else "") for key, (value, why) in entries.items()]
+    return [f"{key} = {_toml(value)}" + (f"  # {why}" if why else "") for key, (value, why) in entries.items()]
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key} = {json.dumps(one)}' for key, one in value.items())}}}"
+    return json.dumps(value)
 
 
 StampEntries = tuple[Entries, tuple[str, str], bool]
@@ -327,7 +301,9 @@ def _exchange_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> Stamp
     rows: Columns = {name: column[chosen] for name, column in stamps.items()}
     rows |= dict.fromkeys(("origin", *IDS), np.zeros(len(chosen), np.int64))
     if "gt_range_m" in cells:
-        rows["gt_range_m"] = cells["gt_range_m"][chosen] * DISTANCE_UNITS[min(_distance_units(columns), default="m")]
+        rows["gt_range_m"] = (
+            cells["gt_range_m"][chosen] * DISTANCE_UNITS[_suffix(columns["gt_range_m"], DISTANCE_UNITS) or "m"]
+        )
     protocols = [row.name for row in PROTOCOLS.known() if set(stamps_of(row.name)) == set(stamps)]
     protocols = [name for name in protocols if name not in ("ss-cfo", "ds-sym")] or ["ss"]
     undelayed = (False, True) if np.isfinite(truth_m(rows)).any() else (False,)
@@ -355,24 +331,30 @@ def _are_whole(stamps: dict[str, Floats]) -> bool:
     return all(np.array_equal(column, np.rint(column), equal_nan=True) for column in stamps.values())
 
 
-def _units(columns: dict[str, str], cells: dict[str, Floats]) -> Entries:
+def _units(form: ColumnMap, columns: dict[str, str], cells: dict[str, Floats]) -> Entries:
     """Return the units of times, distances and powers, each with its reason, as far as they are not the default."""
     found: Entries = {}
     if "time_s" in columns:
         found["time"] = _time_unit(columns["time_s"], cells["time_s"])
-    units = _distance_units(columns)
-    if len(units) == 1:
-        found["distance"] = min(units), "by the columns' names"
-    elif not units and "range_m" in cells and (why := reason_against_metres(cells["range_m"])):
+    named = {name: _header(form, name, columns[name]) for name in DISTANCES if name in columns}
+    units = {name: unit for name, header in named.items() if (unit := _suffix(header, DISTANCE_UNITS))}
+    if form.line and form.distance_unit:
+        found["distance"] = form.distance_unit, "as these boards print"
+    elif units and len(set(units.values())) == 1 and ("range_m" in units or "range_m" not in cells):
+        found["distance"] = next(iter(units.values())), "by the columns' names"
+        units = {}
+    elif "range_m" in cells and "range_m" not in units and (why := reason_against_metres(cells["range_m"])):
         found["distance"] = ASKED, f"{why}: write {', '.join(DISTANCE_UNITS)}"
+    found |= {name: (unit, "by the column's name") for name, unit in units.items()}
     if why := next(filter(None, (reason_against_dbm(cells[name]) for name in POWERS if name in cells)), ""):
         found["power"] = ASKED, f"{why}: write -dBm if they lack their sign"
     return found
 
 
-def _distance_units(columns: dict[str, str]) -> set[str]:
-    """Return the units in the names of columns of ranges, true distances and positions."""
-    return _ended(columns, DISTANCES, DISTANCE_UNITS)
+def _header(form: ColumnMap, name: str, header: str) -> str:
+    """Return the name of a column in the file; that of a family is its template."""
+    stated = form.wide.get(name)
+    return re.sub(r"[_ ]*\{\w+\}", "", stated) if isinstance(stated, str) else header
 
 
 def _time_unit(header: str, values: Floats) -> tuple[str, str]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
+from uwblink.importers.chips import CHIPS
 from uwblink.importers.column_map import DISTANCE_UNITS, IDS, POSITIONS, POWERS, ColumnMap
 from uwblink.importers.tables import Columns
 from uwblink.protocols.table import PROTOCOLS
@@ -220,8 +221,10 @@ ROW_PERIOD_NS: Final = 1_000_000
 def exchanges_of(column_map: ColumnMap, rows: Columns, reading: Reading | None, before: int = 0) -> Exchanges:
     """Return rows as exchanges with the reported ranges, NaN where there are none; `before` counts earlier rows.
 
-    Without a reading the rows are ranges without stamps: single-sided exchanges whose stamps are 0.
+    Without a reading the rows are ranges without stamps: single-sided exchanges whose stamps are 0. The total received
+    power serves where there is none of the first path.
     """
+    power = "fpp" if "fpp1" in rows or "fpp2" in rows else "rxp"
     count = len(rows["origin"])
     stamps: dict[str, Any] = dict.fromkeys(STAMPS, np.zeros(count, dtype=np.int64))
     protocol, bits = (reading.protocol, reading.bits) if reading else ("ss", 32)
@@ -230,7 +233,7 @@ def exchanges_of(column_map: ColumnMap, rows: Columns, reading: Reading | None, 
     return Exchanges(
         time_ns=rows.get("time_ns", np.arange(before, before + count) * ROW_PERIOD_NS),
         initiator=rows["from_id"], target=rows["to_id"], reporter=rows["from_id"], protocol=np.full(count, protocol),
-        range_m=optional(rows, "range_m"), fpp1_dbm=optional(rows, "fpp1"), fpp2_dbm=optional(rows, "fpp2"),
+        range_m=optional(rows, "range_m"), fpp1_dbm=optional(rows, power + "1"), fpp2_dbm=optional(rows, power + "2"),
         skew1_ppm=optional(rows, "skew1"), skew2_ppm=optional(rows, "skew2"), truth_m=truth_m(rows), bits=bits,
         **stamps,
     )  # fmt: skip
@@ -283,6 +286,22 @@ def _remaining(errors_m: Floats) -> float:
     return float(np.median(np.abs(finite - constant)))
 
 
+def sentinels(ranges: Floats) -> dict[float, float]:
+    """Return the share of each number that is no range but often stands for none, such as 0, -1 or 65535.
+
+    It is exactly the same in 1 % of the numbers (n,) or more, and zero, negative, or five times beyond all others.
+    """
+    finite = ranges[np.isfinite(ranges)]
+    values, counts = np.unique(finite, return_counts=True)
+    often = counts >= max(3, 0.01 * len(finite))
+    if len(finite) < MIN_ROWS or len(values) < 3:
+        return {}
+    others = finite[~np.isin(finite, values[often])]
+    farthest = float(np.max(others, initial=0.0)) if len(others) else float(np.median(finite))
+    odd = often & ((values <= 0.0) | (values > 5 * farthest))
+    return {float(v): float(n) / len(finite) for v, n in zip(values[odd], counts[odd], strict=True)}
+
+
 def reason_against_metres(ranges: Floats) -> str:
     """Return why numbers (n,) cannot be ranges in metres; empty text if they can."""
     finite = ranges[np.isfinite(ranges)]
@@ -303,6 +322,13 @@ def reason_against_dbm(powers: Floats) -> str:
     return f"the median power is {middle:+.4g}, and received powers are below 0 dBm" if middle > 0 else ""
 
 
+def reason_against_limits(powers: Floats, limits: tuple[float, float]) -> str:
+    """Return why powers (n,) in dBm cannot be a chip's, by its limits; empty text if they can."""
+    finite = powers[np.isfinite(powers) & (powers != 0)]
+    middle = float(np.median(finite)) if len(finite) else limits[0]
+    return "" if limits[0] <= middle <= limits[1] else f"the median power is {middle:+.4g} dBm"
+
+
 def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats | None) -> None:
     """Raise `ImportTableError` if a sample of rows shows that lengths or powers are in another unit.
 
@@ -310,11 +336,19 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
     `raw_m` are the ranges by the stamps (n,), if there are any.
     """
     ranges, true = optional(rows, "range_m"), truth_m(rows)
-    reasons = {}
-    if column_map.power_unit is None:
+    reasons, limits = dict[str, tuple[str, str]](), CHIPS[column_map.chip or "other"].power_dbm
+    for name in POWERS:
         remedy = 'units.power in the map: "-dBm" if they lack their sign'
-        reasons = {name: (reason_against_dbm(optional(rows, name)), remedy) for name in POWERS}
-    if column_map.distance_unit is None:
+        if column_map.power_of(name) is None:
+            reasons[name] = reason_against_dbm(optional(rows, name)), remedy
+        elif column_map.chip and (why := reason_against_limits(optional(rows, name), limits)):
+            reasons[name] = why, f"another unit, chip or prf than {column_map.chip!r} and {column_map.prf} in the map"
+    for name in ("range_m", "gt_range_m") if raw_m is None else ():
+        factor = DISTANCE_UNITS[column_map.distance_of(name) or "m"]
+        for value, share in sentinels(optional(rows, name)).items():
+            why = f"{share:.0%} of its numbers are {value / factor:.6g}, which is no distance"
+            reasons[name] = why, f"missing = [{value / factor:.6g}] in the map"
+    if column_map.distance_of("range_m") is None and "range_m" not in reasons:
         reasons["range_m"] = reason_against_metres(ranges), "units.distance in the map"
     for name, (why, remedy) in reasons.items():
         if why:
@@ -327,5 +361,5 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
         beside = "the others" if raw_m is None else "its stamps"
         raise ImportTableError(
             f"{path}: {found} by {beside}, and in {column_map.distance_unit or 'm'} by the map; "
-            "units.distance is one unit for all ranges, true distances and positions"
+            'units.distance is for all of them, and [units] range_m = "mm" for one column'
         )

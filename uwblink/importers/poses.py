@@ -1,32 +1,28 @@
-"""Motion-capture poses from files: CSV, TUM, EuRoC and ROS bags.
-
-CSV has the columns `time_s` (or `time_ns`), `body`, `x, y, z` (metres, ENU) and `qx, qy, qz, qw` (body to world). TUM
-has `time x y z qx qy qz qw` separated by blanks, and EuRoC `time_ns, x, y, z, qw, qx, qy, qz, ...` below a line that
-begins with `#timestamp`, one body a file. Bags (ROS 1, ROS 2, MCAP) need the extra `uwbcal[bags]`.
-"""
+"""Motion-capture poses from text files (`pose_files`) and from bags of ROS 1, ROS 2 and MCAP (`uwbcal[bags]`)."""
 
 from __future__ import annotations
 
-import csv
 import math
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, Final, TextIO
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
-from uwblink.errors import ImportTableError, RecordingExistsError
+from uwblink.errors import ImportTableError, RecordingExistsError, raising
 from uwblink.importers.bags import open_bag
+from uwblink.importers.column_map import ColumnMap, load_map
 from uwblink.importers.plausibility import other_unit
+from uwblink.importers.pose_files import read_text_poses
 from uwblink.importers.tables import reading
 from uwblink.recording.distances import distances_m, find_offset
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import POSE, Poses, Tag, load_places
+from uwblink.recording.schema import Poses, Tag, load_places
 from uwblink.text_files import require_regular
 from uwblink.twr import LATEST_NS, Exchanges, names_in, raw_range
 
@@ -57,72 +53,30 @@ def read_poses(path: Path, body: str | None = None, topics: Mapping[str, str] | 
 
     `body` is the body of files without names of bodies; `topics` are the topics of a bag to read, by body.
     """
+    return _read(path, body, topics, ColumnMap())[0]
+
+
+def _read(path: Path, body: str | None, topics: Mapping[str, str] | None, stated: ColumnMap) -> tuple[Poses, bool]:
+    """Return the poses of a file, and whether it has attitudes."""
     require_regular(path, ImportTableError, "file of poses", folders=True)
     kind = "bag" if path.is_dir() else path.suffix.lower().lstrip(".")
-    known = ("bag", "csv", "db3", "mcap", "tum", "txt")
+    known = ("bag", "csv", "db3", "mcap", "tsv", "tum", "txt")
     if kind not in known:
         raise ImportTableError(
             f"{path}: found {f'.{kind}' if kind else 'no suffix'}, expected one of .{', .'.join(known)}"
         )
+    turned = True
     if kind in ("bag", "mcap", "db3"):
         poses = _from_bag(path, topics)
     elif topics:
         raise ImportTableError(f"{path}: has no topics; only bags have")
     else:
         with reading(path), path.open(encoding="utf-8-sig", newline="") as file:
-            poses = _from_text(path, file, body)
+            times, bodies, values, turned = read_text_poses(path, file, body, stated)
+        poses = _poses(path, times, bodies, values)
     if not len(poses):
         raise ImportTableError(f"{path}: holds no poses")
-    return poses
-
-
-def _from_text(path: Path, file: TextIO, body: str | None) -> Poses:
-    """Return the poses of a TUM or an EuRoC file, whose columns have no names, or of a CSV file with a header."""
-    lines: Iterator[list[str]] = csv.reader(file)
-    names: tuple[str, ...]
-    if path.suffix.lower() != ".csv":
-        form, names, lines = "TUM", ("time_s", *POSE), (line.split() for line in file)
-    elif file.readline().lower().startswith("#timestamp"):
-        form, names = "EuRoC", ("time_ns", "x", "y", "z", "qw", "qx", "qy", "qz")
-    else:
-        file.seek(0)
-        form, names = "", tuple(name.strip() for name in next(lines, ()))
-    time = next((name for name in ("time_ns", "time_s") if name in names), "time_s")
-    missing = [name for name in (time, *POSE, "body") if name not in names and not (name == "body" and body)]
-    if form and missing:
-        raise ImportTableError(f"{path}: a {form} file has no names of bodies; name its body with `body`")
-    if missing:
-        raise ImportTableError(
-            f"{path}: column {missing[0]!r} is missing; there are {', '.join(names)[:400]}; "
-            "expected a first line of time_s or time_ns, body (or `body` for all rows), x, y, z, qx, qy, qz, qw, "
-            "in metres and between commas"
-        )
-    times, bodies, values = array("q"), list[str](), array("d")
-    scale, places = 1 if time == "time_ns" else 10**9, {name: names.index(name) for name in (time, *POSE)}
-    for row, cells in enumerate(lines, start=1 if form == "TUM" else 2):
-        if not cells or (form and cells[0].startswith("#")):
-            continue
-        if len(cells) < len(names) or (len(cells) > len(names) and form != "EuRoC"):
-            raise ImportTableError(f"{path}: row {row}: found {len(cells)} cells, expected {' '.join(names)}")
-        found = {name: _number(cells[place]) for name, place in places.items()}
-        wrong = {name: "a number" for name, value in found.items() if not math.isfinite(value)}
-        wrong |= {time: "a time"} if not abs(found[time]) * scale <= LATEST_NS else {}
-        bodies.append(body or cells[names.index("body")].strip())
-        wrong |= {} if bodies[-1] else {"body": "a name"}
-        for name, expected in wrong.items():
-            cell = cells[names.index(name)]
-            raise ImportTableError(f"{path}: row {row}: column {name!r}: found {cell!r}, expected {expected}")
-        times.append(round(Decimal(cells[places[time]].strip()) * scale))
-        values.extend(found[name] for name in POSE)
-    return _poses(path, np.array(times), np.array(bodies, np.str_), np.array(values).reshape(-1, 7))
-
-
-def _number(cell: str) -> float:
-    """Return a cell as a number, NaN if it is none."""
-    try:
-        return float(cell)
-    except ValueError:
-        return math.nan
+    return poses, turned
 
 
 def _poses(path: Path, time_ns: Ints, body: NDArray[np.str_], values: Floats) -> Poses:
@@ -220,19 +174,22 @@ def add_poses(
     tags_from: Path | None = None,
     body: str | None = None,
     topics: Mapping[str, str] | None = None,
+    map_file: Path | None = None,
     force: bool = False,
 ) -> AddedPoses:
     """Add poses from a file, or from files by body, to a recording; `offset` is in seconds, or "auto".
 
-    `tags_from` is a TOML file with `[[tags]]`, and `[[anchors]]` that stand still. `topics` are those of a bag to read,
-    by body; `body` names that of a file which does not. Raises `RecordingExistsError` where there are poses already,
-    unless `force` replaces them, `ImportTableError` for poses that cannot be used, what `load_places` and
-    `Recording.open` raise; the recording stays as it was then.
+    `tags_from` is a file of TOML or JSON with `[[tags]]`, and `[[anchors]]` that stand still. `topics` are those of a
+    bag to read, by body; `body` names that of a file which does not. `map_file` names the columns of CSV files. Raises
+    `RecordingExistsError` where there are poses already, unless `force` replaces them, `ImportTableError` for poses
+    that cannot be used, what `load_places` and `Recording.open` raise; the recording stays as it was then.
     """
     shift_ns = None if offset == "auto" else _offset_ns(offset)
     files = source if isinstance(source, Mapping) else {body: source}
-    parts = [read_poses(path, name, topics) for name, path in files.items()]
-    what = ", ".join(str(path) for path in files.values())
+    stated = load_map(map_file) if map_file else ColumnMap()
+    read = [_read(path, name, topics, stated) for name, path in files.items()]
+    parts, unturned = [part for part, _ in read], {name for part, turned in read if not turned for name in part.body}
+    what = ", ".join(str(path) for path in files.values()) or str(tags_from)
     given, anchors = load_places(tags_from) if tags_from else ((), {})
     fixed = [Tag(number, f"anchor{number}", (0.0, 0.0, 0.0)) for number in anchors]
     poses = _in_order([*parts, *(Poses.from_arrays([0], f"anchor{n}", [place]) for n, place in anchors.items())])
@@ -250,6 +207,11 @@ def add_poses(
             raise ImportTableError(
                 f"{what}: its bodies are {', '.join(sorted(bodies))}, those of the tags {found}; "
                 "give the bodies of the tags with `tags_from`"
+            )
+        if held := [tag for tag in with_poses if tag.body in unturned and any(tag.lever_arm_m)]:
+            raise ImportTableError(
+                f"{what}: has no attitudes (qx, qy, qz, qw) of {held[0].body}, whose tag {held[0].tag} has a lever "
+                "arm; without attitudes lever arms must be zero"
             )
         if shift_ns is None:
             _check_units(what, exchanges, poses, placed, int(exchanges.time_ns.min() - poses.time_ns.min()))
@@ -299,9 +261,10 @@ def _in_order(parts: list[Poses]) -> Poses:
 
 
 def _offset_ns(text: str) -> int:
-    if not abs(_number(text)) <= 4e9:
-        raise ImportTableError(f"`offset`: found {text!r}, expected seconds or auto")
-    return round(Decimal(text.strip()) * 10**9)
+    with raising(ImportTableError, f"`offset`: found {text!r}, expected seconds or auto", ArithmeticError):
+        if not abs(seconds := Decimal(text.strip())) <= 4_000_000_000:
+            raise OverflowError
+        return round(seconds * 10**9)
 
 
 def _apart(exchanges_ns: np.ndarray, poses_ns: np.ndarray) -> str:

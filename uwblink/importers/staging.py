@@ -11,6 +11,7 @@ group is contiguous. Only DuckDB's sort holds many rows at once.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,9 +22,19 @@ import duckdb
 import numpy as np
 
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import DISTANCE_UNITS, DISTANCES, IDS, NAMES, POWERS, TIME_UNITS, ColumnMap
+from uwblink.importers.chips import CHIPS, power_sql
+from uwblink.importers.column_map import (
+    DISTANCE_UNITS,
+    DISTANCES,
+    IDS,
+    NAMES,
+    POWERS,
+    SKEWS,
+    TIME_UNITS,
+    ColumnMap,
+)
 from uwblink.importers.plausibility import SAMPLE_ROWS, counter_format
-from uwblink.importers.tables import Columns, SourceTable, number, time_ns, whole_number
+from uwblink.importers.tables import Columns, SourceTable, message_number, number, time_ns, whole_number
 from uwblink.recording.schema import Fault
 from uwblink.twr import LARGEST_ID, STAMPS
 
@@ -116,7 +127,7 @@ class Staging:
         columns: Collection[str] = ()
         for k, path in enumerate(paths):
             watch("reading", k / len(paths))
-            table = SourceTable(db, path, column_map.delimiter, column_map.decimal, key=k)
+            table = SourceTable(db, path, column_map, key=k)
             self.tables.append(table)
             cells = self._cells(table)
             if cells.keys() != (columns or cells.keys()):
@@ -129,12 +140,46 @@ class Staging:
             self.offsets.append(StagedRows(db, "staged", ()).count())
         if not self.offsets[-1]:
             raise ImportTableError(f"{paths[0]}: a header and no rows")
-        others = tuple(name for name in columns if name not in IDS)
+        self.blanks = 0
+        """Rows without a range, such as an empty cell of a wide table, that are left out."""
+        if "blank" in columns:
+            (self.blanks,) = StagedRows(db, "staged", ()).values("count(*) FILTER (blank)")
+        self._filled = "NOT blank" if self.blanks else "true"
+        others = tuple(name for name in columns if name not in (*IDS, "blank"))
         ids = ", ".join(f"{cell} AS {name}" for name, cell in self._ids().items())
         listed = ", ".join(("CAST(rowid AS UINTEGER) AS origin", ids, *others))
-        db.execute(f"CREATE TABLE rows AS SELECT {listed} FROM staged")
+        db.execute(f"CREATE TABLE rows AS SELECT {listed} FROM staged WHERE {self._filled}")
         db.execute("DROP TABLE staged")
         self.rows = StagedRows(db, "rows", ("origin", *IDS, *others))
+
+    def words_in(self, names: Iterable[str]) -> Iterator[str]:
+        """Yield a note for each of some columns that has cells that are no numbers, and are taken as missing.
+
+        Raises `ImportTableError` if half of the cells or more that are not empty are none.
+        """
+        there = [
+            name
+            for name in names
+            if self.rows.has(name) and name not in {*self.column_map.registers, *self.column_map.constants}
+        ]
+        lacking = self.rows.values(", ".join(f"count(*) - count({name})" for name in there)) if there else ()
+        for name in (name for name, count in zip(there, lacking, strict=True) if count):
+            header, cells = self.column_map.header(name), list[tuple[str, int, bool]]()
+            for table in self.tables:
+                text = table.text(header, numeric=True)
+                kept = f"WHERE lower(trim({text})) NOT IN {NO_VALUES} AND NOT {self._is_missing(text)}"
+                is_word = f"TRY_CAST({text} AS DOUBLE) IS NULL"
+                found = table.read({"first": f"any_value({text})", "n": "count(*)", "w": is_word}, f"{kept} GROUP BY 3")
+                cells += zip(found["first"].tolist(), found["n"].tolist(), found["w"].tolist(), strict=True)
+            words = [cell for cell in cells if cell[2]]
+            count, total = sum(n for _, n, _ in words), sum(n for _, n, _ in cells)
+            said = f"{count} of {total} cells of column {header[:60]!r} are no numbers"
+            if words and 2 * count >= total:
+                first = json.dumps(words[0][0][:40])
+                remedy = f"name another column for {name} in the map, or state missing = [{first}]"
+                raise ImportTableError(f"{self.paths[0]}: {said}, such as {first}; {remedy}")
+            if words:
+                yield f"{said}, such as {words[0][0][:40]!r}, and are taken as missing"
 
     def require(self, rows: StagedRows, names: Iterable[str]) -> None:
         """Raise the error for the first column that rows lack."""
@@ -154,8 +199,13 @@ class Staging:
     def _cells(self, table: SourceTable) -> dict[str, str]:
         """Return SQL of the columns to stage, from cells of a table or constants; ids are words at first."""
         column_map, found = self.column_map, dict[str, str]()
+        blank = table.blank
         for name in NAMES:
             header = column_map.header(name)
+            if name in column_map.registers:
+                cells = {key: number(table.text(one, numeric=True)) for key, one in column_map.registers[name].items()}
+                found[name] = power_sql(CHIPS[column_map.chip or "other"], column_map.prf, cells)
+                continue
             if name in column_map.constants:
                 text = f"getvariable('{name}')"
             elif header in table.names:
@@ -165,7 +215,17 @@ class Staging:
             else:
                 continue
             found["time_ns" if name == "time_s" else name] = self._cell(name, text)
-        return found
+            if name == "range_m" and column_map.missing:
+                blank = " OR ".join(filter(None, [blank, self._is_missing(text)]))
+        return found | ({"blank": f"coalesce({blank}, false)"} if blank else {})
+
+    def _is_missing(self, text: str) -> str:
+        """Return SQL that is true for a text that means no value, by the map."""
+        words = [one.strip().lower() for one in self.column_map.missing if isinstance(one, str)]
+        self.db.execute("SET VARIABLE missing = ?", [["", *words]])
+        numbers = ", ".join(repr(float(one)) for one in self.column_map.missing if not isinstance(one, str))
+        is_word = f"list_contains(getvariable('missing'), lower(trim({text})))"
+        return f"({is_word} OR TRY_CAST({text} AS DOUBLE) IN ({numbers}))" if numbers else is_word
 
     def _cell(self, name: str, text: str) -> str:
         """Return SQL of a cell in SI units, from its text."""
@@ -174,28 +234,35 @@ class Staging:
             return f"trim({text})"
         if name == "time_s":
             return time_ns(text, column_map.time_unit, TIME_UNITS.get(column_map.time_unit or "s", 1.0))
+        if name == "message":
+            return message_number(text)
         if name == "event":
             first = f"lower(left(trim({text}), 1))"
             return f"CASE WHEN {first} IN ('t', 's') THEN 1.0 WHEN {first} = 'r' THEN 2.0 END"
         if name in (*STAMPS, "tx", "rx", "stamp") and column_map.ticks_per_unit == 1.0:
             return whole_number(text)
-        factor = DISTANCE_UNITS[column_map.distance_unit or "m"] if name in DISTANCES else 1.0
-        if name in POWERS and column_map.power_unit == "-dBm":
+        factor = DISTANCE_UNITS[column_map.distance_of(name) or "m"] if name in DISTANCES else 1.0
+        if name in POWERS and column_map.power_of(name) == "-dBm":
             factor = -1.0
-        return number(text) + (f" * {factor!r}" if factor != 1.0 else "")
+        if name in SKEWS:
+            factor = CHIPS[column_map.chip or "other"].skew_ppm[column_map.units.get("skew", "ppm")]
+        value = number(text) + (f" * {factor!r}" if factor != 1.0 else "")
+        if column_map.missing and name in ("range_m", "gt_range_m", *POWERS, *SKEWS):
+            return f"CASE WHEN NOT {self._is_missing(text)} THEN {value} END"
+        return value
 
     def _ids(self) -> dict[str, str]:
         """Return SQL of ids as whole numbers, NULL if missing; words get numbers."""
         words: set[str] = set()
         for name in IDS:
-            query = f"SELECT {name}, count(*) FROM staged GROUP BY {name} LIMIT 200000"
+            query = f"SELECT {name}, count(*) FROM staged WHERE {self._filled} GROUP BY {name} LIMIT 200000"
             counts: dict[str, int] = dict(self.db.execute(query).fetchall())
             if len(counts) == 200_000:
                 raise self._too_many_ids()
             # Up to 1 % of ids that are not numbers are faults; with more, ids are words.
             odd = {word for word in counts if word not in _numbers([word])}
             few = sum(counts[word] for word in odd) <= 0.01 * self.offsets[-1]
-            words |= counts.keys() - (odd if few else {""})
+            words |= counts.keys() - (odd if few else {"", *(word for word in odd if word.lower() in SUMMARIES)})
         numbers = self._number_words(sorted(words))
         self.db.execute("SET VARIABLE words = ?", [["", *numbers]])
         self.db.execute("SET VARIABLE numbers = ?", [[None, *numbers.values()]])
@@ -220,11 +287,40 @@ class Staging:
         return ImportTableError(f"{self.paths[0]}: more than {LARGEST_ID} different ids; are from_id and to_id ids?")
 
 
+NO_VALUES: Final = "('', 'nan', 'none', 'null', 'na', 'n/a', '-', '--', 'inf', '-inf')"
+"""SQL of the words that programs write for no number, in small letters."""
+
+SUMMARIES: Final = frozenset(
+    {
+        "mean", "average", "avg", "median", "std", "stdev", "std dev", "min", "max", "sum", "total", "count", "rms",
+        "rmse", "mittelwert", "summe", "anzahl",
+    }
+)  # fmt: skip
+"""Words in place of an id that mark a row as a summary of others."""
+
+
 def _numbers(words: Iterable[str]) -> dict[str, int]:
     """Return the ids that are whole numbers, such as "7" and "7.0"."""
     matches = {word: re.fullmatch(r"([0-9]{1,9})([.,]0*)?", word) for word in words}
     found = {word: int(match[1]) for word, match in matches.items() if match}
     return {word: value for word, value in found.items() if value <= LARGEST_ID}
+
+
+def rows_back(rows: StagedRows) -> int:
+    """Return how many rows are earlier than the one before."""
+    if not rows.has("time_s"):
+        return 0
+    steps = f"SELECT time_ns < lag(time_ns) OVER () AS back FROM {rows.name} WHERE {rows.condition}"
+    return int(rows.db.execute(f"SELECT count(*) FROM ({steps}) WHERE back").fetchall()[0][0])
+
+
+def in_time_order(rows: StagedRows) -> StagedRows:
+    """Return the rows in order of time, those of one time in their order."""
+    if not rows_back(rows):
+        return rows
+    listed = f"SELECT {', '.join(rows.columns)} FROM {rows.name} WHERE {rows.condition} ORDER BY time_ns, rowid"
+    rows.db.execute(f"CREATE TABLE ordered AS {listed}")
+    return StagedRows(rows.db, "ordered", rows.columns)
 
 
 FAULTS_AT_ONCE: Final = 100_000

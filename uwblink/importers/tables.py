@@ -3,6 +3,9 @@
 DuckDB can open the named files only, and text of a file or a map never becomes SQL: columns are named by their number,
 and paths and JSON keys are variables of the connection. Dialect, limits of lines and line numbers of CSV files are
 found here, because DuckDB reports none of them reliably.
+
+Whatever the form of a file, its rows become those of one long table here: lines of a log by a template, elements of a
+list (`each`), and columns that differ by a device (`wide`) become rows, and values in the name of a file columns.
 """
 
 from __future__ import annotations
@@ -28,6 +31,8 @@ from numpy.typing import NDArray
 from uwblink.arrays import Floats, Ints
 from uwblink.database import connect
 from uwblink.errors import ImportTableError, first_line, raising
+from uwblink.importers.column_map import ColumnMap
+from uwblink.importers.templates import Template
 from uwblink.output import is_utf8
 from uwblink.text_files import require_regular
 from uwblink.twr import LATEST_NS
@@ -58,13 +63,14 @@ def reading(path: Path) -> Iterator[None]:
         yield
 
 
-def detect(path: Path, delimiter: str | None, decimal: str | None) -> tuple[tuple[str, ...], str, bool, int]:
-    """Return the dialect of a CSV file by its first 64 KiB; `delimiter` and `decimal` override what is found.
+def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, bool, int]:
+    """Return the dialect of a CSV file by its first 64 KiB, as far as the map does not state it.
 
     It consists of the names of the columns, the delimiter, whether the decimal mark is a comma, and the number of lines
-    before the first row of values. Lines before the header that are empty or begin with "#" are skipped. Raises
-    `ImportTableError` for a file that is not text with a header.
+    before the first row of values. Without a header the names are "1", "2" and so on. Lines before the header that are
+    empty or begin with "#" are skipped. Raises `ImportTableError` for a file that is not text with a header.
     """
+    delimiter, decimal = column_map.delimiter, column_map.decimal
     with reading(path), open_file(path) as file:
         raw = file.read(65_536)
         # A letter of several bytes may be cut in two at the end of what was read.
@@ -77,6 +83,8 @@ def detect(path: Path, delimiter: str | None, decimal: str | None) -> tuple[tupl
         cells = [cell.strip() for row in islice(reader, 200) for cell in row]
     if not any(names):
         raise ImportTableError(f"{path}: empty, expected a header and rows")
+    if column_map.headerless:
+        names, skip = tuple(str(k) for k in range(1, len(names) + 1)), first
     if decimal is None:
         commas, points = (
             sum(bool(re.fullmatch(rf"[+-]?\d{digits}{mark}\d+([eE][+-]?\d+)?", cell)) for cell in cells)
@@ -138,10 +146,10 @@ def connected(paths: Sequence[Path]) -> Iterator[duckdb.DuckDBPyConnection]:
 
 
 @contextmanager
-def open_table(path: Path) -> Iterator[SourceTable]:
-    """Open one table for the duration of the block."""
+def open_table(path: Path, column_map: ColumnMap | None = None) -> Iterator[SourceTable]:
+    """Open one table for the duration of the block; a map says what its rows are."""
     with connected([path]) as db:
-        yield SourceTable(db, path)
+        yield SourceTable(db, path, column_map)
 
 
 def number(text: str) -> str:
@@ -154,6 +162,13 @@ def whole_number(text: str) -> str:
     """Return SQL of a text as BIGINT, exact also beyond the whole numbers of a DOUBLE; NULL if it is none."""
     value = f"TRY_CAST({text} AS DOUBLE)"
     return f"CASE WHEN {value} = trunc({value}) THEN TRY_CAST({text} AS BIGINT) END"
+
+
+def message_number(text: str) -> str:
+    """Return SQL of a message as its number, from a number or a word such as "POLL"; NULL if it is neither."""
+    kinds = {1: "poll|init.*|request|blink", 2: "resp.*|ack.*|answer", 3: "final|report|range_?report"}
+    cases = " ".join(f"WHEN regexp_full_match(lower(trim({text})), '{kind}') THEN {n}" for n, kind in kinds.items())
+    return f"coalesce({number(text)}, CASE {cases} END)"
 
 
 def time_ns(text: str, unit: str | None, ns_per_unit: float) -> str:
@@ -180,32 +195,42 @@ class SourceTable:
         self,
         db: duckdb.DuckDBPyConnection,
         path: Path,
-        delimiter: str | None = None,
-        decimal: str | None = None,
+        column_map: ColumnMap | None = None,
         key: int = 0,
     ) -> None:
-        """Open a CSV file (plain or gzipped), a Parquet file or JSON lines, by its suffix; raises `ImportTableError`.
+        """Open a CSV file (plain or gzipped), a Parquet file or JSON lines, by its suffix, or a log by its template.
 
-        `delimiter` and `decimal` override what is detected in a CSV file. Tables of one connection have different keys.
+        Raises `ImportTableError`. Tables of one connection have different keys.
         """
         require_regular(path, ImportTableError, "table (.csv, .csv.gz, .parquet or .jsonl)")
         self.db, self.path, self._key = db, path, key
-        self._skip, self._decimal_comma = 0, False
+        self.column_map = column_map = column_map or ColumnMap()
+        self._skip, self._decimal_comma, self._expanded = 0, False, False
+        self.lists: tuple[str, ...] = ()
+        """Fields of JSON lines that are lists of objects."""
+        self.blank = ""
+        """SQL that is true for rows that hold no range at all, such as an empty cell of a wide table; "" for none."""
         db.execute(f"SET VARIABLE file{key} = ?", [str(path)])
         ending = path.name.lower().removesuffix(".gz")
         self._is_parquet = ending.endswith(".parquet")
-        self._is_csv = not ending.endswith((".parquet", ".jsonl", ".ndjson", ".json"))
-        if self._is_csv:
-            self._open_csv(delimiter, decimal)
+        self._is_csv = not ending.endswith((".parquet", ".jsonl", ".ndjson", ".json")) and not column_map.line
+        if column_map.line:
+            self._open_log(Template(column_map.line))
+        elif self._is_csv:
+            self._open_csv()
         elif self._is_parquet:
             self._open_parquet()
         else:
             self._open_json()
+        self._unpivot()
+        self._add_names()
         if len(self.names) > MAX_CELLS:
             raise ImportTableError(f"{path}: has {len(self.names)} columns, expected {MAX_CELLS} at most")
 
-    def _open_csv(self, delimiter: str | None, decimal: str | None) -> None:
-        self.names, mark, self._decimal_comma, self._skip = detect(self.path, delimiter, decimal)
+    def _open_csv(self) -> None:
+        if self.column_map.each:
+            raise ImportTableError(f"{self.path}: `each` is of JSON lines, bags and logs (with `line`), not of a table")
+        self.names, mark, self._decimal_comma, self._skip = detect(self.path, self.column_map)
         check_lines(self.path, mark)
         self._cells = [f"c{k}" for k in range(len(self.names))]
         columns = ", ".join(f"'{cell}': 'VARCHAR'" for cell in self._cells)
@@ -217,23 +242,63 @@ class SourceTable:
             f"max_line_size={MAX_LINE_BYTES})"
         )
 
-    def _open_json(self) -> None:
-        """Use the fields of the first lines as columns; nested fields have names such as `pose.x`."""
+    def _open_log(self, line: Template) -> None:
+        """Use the lines that a template matches, and each match of the other (`each`) in them as a row."""
         check_lines(self.path, "\n")
-        fields: dict[str, str] = {}
+        self._decimal_comma = self.column_map.decimal == ","
+        each = Template(self.column_map.each) if self.column_map.each else None
+        self.db.execute(f"SET VARIABLE line{self._key} = ?", [line.pattern])
+        # Whatever noise of a serial port is in it is read as letters.
+        text = (
+            f"read_csv(getvariable('file{self._key}'), auto_detect=false, header=false, delim='\x01', quote='', "
+            f"escape='', columns={{'line': 'VARCHAR'}}, strict_mode=false, encoding='latin-1', "
+            f"max_line_size={MAX_LINE_BYTES})"
+        )
+        matching = f"SELECT line FROM {text} WHERE regexp_matches(line, getvariable('line{self._key}'))"
+        self.source = f"(SELECT row_number() OVER () AS row, {line.extract('line', f'line{self._key}')} AS s"
+        cells = line.columns("s")
+        if each:
+            self.db.execute(f"SET VARIABLE each{self._key} = ?", [each.pattern])
+            self.source += f", unnest(regexp_extract_all(line, getvariable('each{self._key}'))) AS element"
+            cells |= each.columns("e")
+        self.source += f" FROM ({matching}))"
+        if each:
+            self.source = f"(SELECT *, {each.extract('element', f'each{self._key}')} AS e FROM {self.source})"
+        self.names, self._cells, self._expanded = tuple(cells), list(cells.values()), True
+
+    def _open_json(self) -> None:
+        """Use the fields of the first lines as columns; nested fields have names such as `pose.x`.
+
+        Elements of a list are fields, too, or rows if the map names the list (`each`).
+        """
+        check_lines(self.path, "\n")
+        fields, each, lists = dict[str, str](), self.column_map.each, dict[str, None]()
         with reading(self.path), open_file(self.path) as file:
             lines = [line.decode("utf-8-sig") for line in islice(file, 1000)]
         for line in lines:
             with suppress(ValueError, RecursionError):
                 row = json.loads(line)
-                fields |= dict(_fields(row, "", "")) if isinstance(row, dict) else {}
+                found = {name: value for name, value in row.items() if isinstance(value, list) and is_objects(value)}
+                lists |= dict.fromkeys(found)
+                for one in [row | {each: one} for one in found.get(each, ())] if each else [row]:
+                    fields |= dict(_fields(one, "", ""))
+        self.lists = tuple(lists)
         if not fields:
-            raise ImportTableError(f"{self.path}: holds no JSON objects, one a line")
+            wanted = f"a list {each[:60]!r} of objects (`each`)" if each else "JSON objects"
+            raise ImportTableError(f"{self.path}: holds no {wanted}, one a line")
         self.names = tuple(fields)
         self.db.execute(f"SET VARIABLE fields{self._key} = ?", [list(fields.values())])
         listed = f"getvariable('fields{self._key}')"
         self._cells = [f"json_extract_string(json, {listed}[{k}])" for k in range(1, len(fields) + 1)]
         self.source = f"read_ndjson_objects(getvariable('file{self._key}'), ignore_errors=true)"
+        if each:
+            # An element stands in place of the list that it is of.
+            self.db.execute(f"SET VARIABLE each{self._key} = ?", [each])
+            name = f"getvariable('each{self._key}')"
+            elements = f"unnest(CAST(json_extract(json, '/' || {_escaped(name)}) AS JSON[])) AS element"
+            self.source = f"(SELECT row_number() OVER () AS row, json, {elements} FROM {self.source})"
+            merged = f"json_merge_patch(json, json_object({name}, element)) AS json"
+            self.source, self._expanded = f"(SELECT row, {merged} FROM {self.source})", True
 
     def _open_parquet(self) -> None:
         read = f"read_parquet(getvariable('file{self._key}'))"
@@ -242,6 +307,51 @@ class SourceTable:
         self.names = tuple(str(row[0]) for row in rows)
         self._cells = [f"c{k}" for k in range(len(rows))]
         self.source = f"{read} AS t({', '.join(self._cells)})"
+
+    def _unpivot(self) -> None:
+        """Make a row of each column of a family (`wide`), such as `r_AN0` to `r_AN4`; empty ones are blank rows."""
+        families = {ours: self._family(ours, stated) for ours, stated in self.column_map.wide.items()}
+        if not families:
+            return
+        labels = list(dict.fromkeys(label for family in families.values() for label in family))
+        lists = {
+            ours: [self.text(family[n]) if n in family else "''" for n in labels] for ours, family in families.items()
+        }
+        end = "from_id" if "{from_id}" in str(self.column_map.wide) else "to_id"
+        if end not in lists:
+            self.db.execute(f"SET VARIABLE labels{self._key} = ?", [labels])
+            lists[end] = [f"getvariable('labels{self._key}')[{n}]" for n in range(1, len(labels) + 1)]
+        cells = {ours: f"[{', '.join(cells)}][k]" for ours, cells in lists.items()}
+        numbered = "" if self._expanded else ", row_number() OVER () AS row"
+        self.source = f"(SELECT *{numbered}, unnest(range(1, {len(labels) + 1})) AS k FROM {self.source})"
+        value = "range_m" if "range_m" in families else next(iter(families))
+        self.blank = f"trim({cells[value]}) = ''"
+        if "mask" in self.names:  # of bits: which of the devices answered
+            self.blank += f" OR TRY_CAST({self.text('mask')} AS BIGINT) & (1 << (k - 1)) = 0"
+        self.names, self._cells, self._expanded = (*self.names, *cells), [*self._cells, *cells.values()], True
+
+    def _family(self, ours: str, stated: str | dict[str, str]) -> dict[str, str]:
+        """Return the columns of a family by what differs in their names."""
+        if isinstance(stated, dict):
+            return stated
+        before, after = re.split(r"\{\w+\}", stated)
+        pattern = rf"{re.escape(before)}(.+){re.escape(after)}"
+        found = {match[1]: name for name in self.names if (match := re.fullmatch(pattern, name))}
+        if not found:
+            there = ", ".join(self.names)[:400]
+            raise ImportTableError(f"{self.path}: wide.{ours}: no column {stated[:60]!r}; there are {there}")
+        return found
+
+    def _add_names(self) -> None:
+        """Add what the name of the file says (`from_name`) as columns."""
+        if self.column_map.from_name is None:
+            return
+        values = Template(self.column_map.from_name).match(self.path.as_posix())
+        if values is None:
+            raise ImportTableError(f"{self.path}: its name is not {self.column_map.from_name!r}, which the map states")
+        for k, (name, value) in enumerate(values.items()):
+            self.db.execute(f"SET VARIABLE name{self._key}_{k} = ?", [value])
+            self.names, self._cells = (*self.names, name), [*self._cells, f"getvariable('name{self._key}_{k}')"]
 
     @contextmanager
     def reading(self) -> Iterator[None]:
@@ -298,23 +408,45 @@ class SourceTable:
 
     def line(self, row: int) -> int:
         """Return the line of a row (0 is the first), counted from 1, or the number of the row of a Parquet file."""
+        row = int(self._origins[row]) if self._expanded else row
         return row + 1 if self._is_parquet else int(self._lines[row])
+
+    @cached_property
+    def _origins(self) -> Ints:
+        """The row of the file, from 0, that each row comes from."""
+        found = self.db.execute(f"SELECT row - 1 AS row FROM {self.source}").fetchnumpy()
+        return np.asarray(np.ma.getdata(found["row"]), np.int64)
 
     @cached_property
     def _lines(self) -> Ints:
         """The line of each row; DuckDB skips empty lines, and refuses line breaks in quotes."""
         rejected, blank = set(self.rejected()), "\r\n" if self._is_csv else None
-        with io.TextIOWrapper(open_file(self.path), "utf-8-sig", "replace") as file:
+        line = self.column_map.line
+        counts = re.compile(Template(line).pattern).search if line else lambda text: text.strip(blank)
+        with io.TextIOWrapper(open_file(self.path), "latin-1" if line else "utf-8-sig", "replace") as file:
             numbered = enumerate(file, start=1)
-            filled = (n for n, line in numbered if n > self._skip and line.strip(blank) and n not in rejected)
+            filled = (n for n, text in numbered if n > self._skip and counts(text) and n not in rejected)
             return np.fromiter(filled, np.int64)
 
 
+def is_objects(values: list[Any]) -> bool:
+    """Return whether a list has objects of JSON."""
+    return any(isinstance(one, dict) for one in values)
+
+
+def _escaped(name: str) -> str:
+    """Return SQL of the part of a JSON pointer for a key, from SQL of it."""
+    return f"replace(replace({name}, '~', '~0'), '/', '~1')"
+
+
 def _fields(row: dict[str, Any], name: str, pointer: str) -> Iterator[tuple[str, str]]:
-    """Yield names of fields such as `pose.x`, and their JSON pointers."""
+    """Yield names of fields such as `pose.x` or `ranges.0`, and their JSON pointers."""
     for key, value in row.items():
         where = f"{pointer}/{key.replace('~', '~0').replace('/', '~1')}"
-        if isinstance(value, dict) and pointer.count("/") < 5:
-            yield from _fields(value, f"{name}{key}.", where)
+        # A list of objects is a column of JSON; long lists are images and the like.
+        of_numbers = isinstance(value, list) and len(value) <= 16 and not is_objects(value)
+        inner = {str(k): one for k, one in enumerate(value)} if of_numbers else value
+        if isinstance(inner, dict) and pointer.count("/") < 5:
+            yield from _fields(inner, f"{name}{key}.", where)
         else:
             yield f"{name}{key}", where

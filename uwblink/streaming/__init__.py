@@ -1,7 +1,7 @@
 """Streams of ranges, optionally corrected, from boards or a recording; and senders by UDP and WebSocket."""
 
 from uwblink.streaming.senders import FoxgloveServer, UdpSender
-from uwblink.streaming.sources import RangeListener, StreamedRange, stream
+from uwblink.streaming.sources import RangeListener, StreamedRange, stream, stream_printed
 
 __all__ = [
     "FoxgloveServer",
@@ -9,4 +9,5 @@ __all__ = [
     "StreamedRange",
     "UdpSender",
     "stream",
+    "stream_printed",
 ]

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from uwblink.boards.dialects import Dialect, printed_ranges
 from uwblink.boards.listeners import (
     Correction,
     DelayCheck,
@@ -149,6 +150,22 @@ def stream(
             recorder.close()
 
     return live()
+
+
+def stream_printed(
+    ports: Iterable[str],
+    dialect: Dialect,
+    *,
+    calibration: str | os.PathLike[str] | Correction | None = None,
+    **how: Any,
+) -> Stream:
+    """Yield ranges that boards of other firmware print, corrected with a calibration.
+
+    `how` are other parameters of `uwblink.boards.printed_ranges`, which raises.
+    """
+    correct = _correction(calibration)
+    for exchanges in printed_ranges(ports, dialect, **how):
+        yield from streamed(exchanges, correct)
 
 
 def _correction(calibration: str | os.PathLike[str] | Correction | None) -> Correction | None:

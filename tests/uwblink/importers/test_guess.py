@@ -192,9 +192,13 @@ def test_messages_that_are_words_are_told_by_their_order(tmp_path):
     assert len(found) == len(rows)
     for k, row in enumerate(expected[int(tx1)] for tx1 in found.tx1):
         assert [int(getattr(found, n)[k]) for n in HEADER[3:9]] == [row[n] % 2**32 for n in HEADER[3:9]]
-    guess = guess_map(write(tmp_path / "m.csv", words))
-    assert not guess.complete
-    assert "# a column of numbers is still needed: message" in guess.text
+    found = guessed(tmp_path, write(tmp_path / "m.csv", words)).exchanges
+    assert [[int(getattr(found, n)[k]) for n in HEADER[3:9]] for k in range(len(rows))] == [
+        [row[n] % 2**32 for n in HEADER[3:9]] for row in sorted(rows, key=lambda row: row["time_s"])
+    ]
+    other = guess_map(write(tmp_path / "m.csv", [row | {"message": "red"} for row in words]))
+    assert not other.complete
+    assert "# a column of numbers is still needed: message" in other.text
 
 
 @pytest.mark.parametrize(
@@ -274,12 +278,12 @@ DRAWN = np.random.default_rng(0).random((60, 4))
     [
         ([{"tx1": 1, "rx1": 2, "tx2": 3, "colour": 4}] * 3, False, ("from_id", "to_id"), '# not used: "colour"'),
         (
-            [{"ticks": k, "event": ("tx", "rx")[k % 2], "src": 1, "dst": 2, "msg": "poll"} for k in range(40)],
+            [{"ticks": k, "event": ("tx", "rx")[k % 2], "src": 1, "dst": 2, "msg": "red"} for k in range(40)],
             False, ("stamps",), "# a column of numbers is still needed: message",
         ),
         (
             [{"t_s": k, "src": 1, "dst": 2, "range_cm": 300 + k, "gt_m": 3.0} for k in range(30)],
-            False, (), "# distances have one unit for all, here they have cm, m: convert some",
+            True, (), 'range_m = "cm"  # by the column\'s name\ngt_range_m = "m"',
         ),
         (
             [{"src": 1, "dst": 2, "tx1": a, "rx1": b, "tx2": c, "rx2": d} for a, b, c, d in DRAWN],

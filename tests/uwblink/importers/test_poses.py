@@ -61,7 +61,11 @@ def test_every_number_of_every_form_in_order_of_time(tmp_path, name, head, order
         ("a.csv", HEADER + "0,b,1,2,x,0,0,0,1\n", "row 2: column 'z': found 'x'"),
         ("a.csv", HEADER + "0,b,1,2,nan,0,0,0,1\n", "row 2: column 'z'"),
         ("a.csv", HEADER.replace("body,", "") + "0,1,2,3,0,0,0,1\n", "column 'body' is missing"),
-        ("a.csv", "Frame;Time;X\n1;0;2\n", "there are Frame;Time;X; expected a first line of time_s or time_ns, body"),
+        (
+            "a.csv",
+            "Frame;Time;X\n1;0;2\n",
+            "there are Frame, Time, X; expected a first line of time_s or time_ns, body",
+        ),
         ("a.csv", HEADER, "holds no poses"),
         ("a.csv", HEADER + "0,b,1,2,3,0,0,0,0\n", "quaternion has length 0"),
         ("a.tum", "0 1 2 3\n", "name its body with `body`"),

@@ -24,7 +24,8 @@ def test_logs_in_files_of_their_own(tmp_path):
     one, other = write(tmp_path / "a.csv", rows[:60]), write(tmp_path / "b.csv", rows[30:])
     found = read_table([one, other])
     assert found.exchanges.tx1.tolist() == [row["tx1"] for row in rows]
-    assert "30 of 120 rows" in found.meta["notes"][0]
+    assert found.exchanges.time_ns.tolist() == sorted(found.exchanges.time_ns.tolist())
+    assert any("30 of 120 rows" in note for note in found.meta["notes"])
 
 
 def test_unusable_rows_and_rows_without_stamps_are_no_repetition(tmp_path):
@@ -56,13 +57,27 @@ def plain(count, every_s, jitter_s, share, seed, quantum=0.01, noise=0.03):
 
 
 @pytest.mark.parametrize("seed", [0, 2])
-def test_ranges_without_stamps_that_are_likely_there_twice(tmp_path, seed):
+def test_ranges_without_stamps_that_both_devices_logged_are_merged(tmp_path, seed):
     rows = plain(317, 0.05, 0.004, 0.39, seed)
     found = read_table(write(tmp_path / "t.csv", rows))
-    assert len(found.exchanges) == len(rows), "nobody knows, so none is left out"
+    first = [
+        row["range_m"]
+        for k, row in enumerate(rows)
+        if not k or row["from_id"] != rows[k - 1]["to_id"] or row["to_id"] != rows[k - 1]["from_id"]
+    ]
+    assert found.exchanges.range_m.tolist() == first
     (note,) = found.meta["notes"]
-    # Those that are equal by chance, one in ten, cannot be told from them.
-    assert 0.9 * (len(rows) - 317) < int(note.split(" of ")[0]) < len(rows) - 317 + 0.15 * len(rows)
+    assert note.startswith(f"{len(rows) - 317} of {len(rows)} ranges repeat")
+
+
+def test_ranges_that_are_repeated_from_the_same_end_are_told_and_kept(tmp_path):
+    rows = plain(317, 0.05, 0.004, 0.39, 0)
+    rows = [
+        row | {"from_id": min(row["from_id"], row["to_id"]), "to_id": max(row["from_id"], row["to_id"])} for row in rows
+    ]
+    found = read_table(write(tmp_path / "t.csv", rows))
+    assert len(found.exchanges) == len(rows)
+    assert any("exchanges there twice" in note for note in found.meta["notes"])
 
 
 @pytest.mark.parametrize(("quantum", "noise"), [(0.1, 0.03), (0.01, 0.0)])

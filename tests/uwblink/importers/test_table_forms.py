@@ -126,8 +126,8 @@ def test_parquet_and_json_lines(tmp_path):
 def test_several_files_are_one_table(tmp_path):
     rows = flights()
     paths = [write(tmp_path / f"{k}.csv", wrapped(rows[k::2])) for k in (0, 1)]
-    same(read_table(paths), rows[0::2] + rows[1::2])
-    same(read_source(paths), rows[0::2] + rows[1::2])
+    same(read_table(paths), rows)
+    same(read_source(paths[::-1]), rows)
     assert len(read_table(tmp_path).exchanges) == len(rows)
     with pytest.raises(ArgumentError, match="found no files"):
         read_source([])

@@ -1,0 +1,169 @@
+"""Boards of other firmware, which print ranges: fake ones on pseudo-terminals, recorded, streamed, corrected."""
+
+import json
+import threading
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+import calib
+import uwblink
+from tests.processes import refuse, succeed
+from uwblink.boards import DIALECTS, Dialect, PrintedRange, Terminal, dialect_of
+from uwblink.errors import ArgumentError
+
+# What each board prints for a range of one metre to one device and of two metres to another; made from descriptions.
+BOTH = "from: 6018\t Range: 1.00 m\t RX power: -78.50 dBm\r\nfrom: 6019\t Range: 2.00 m\t RX power: -80.00 dBm\r\n"
+LISTED = "DIST,2,AN0,D91B,0.0,0.0,0.0,1.00,AN1,4C1A,3.0,0.0,0.0,2.00,POS,1.0,1.0,0.0,90\r\n"
+FORMS = {
+    "dwm1001-lec": (
+        "DIST,2,AN0,D91B,0.0,0.0,0.0,1.00,AN1,4C1A,3.0,0.0,0.0,2.00,POS,1.0,1.0,0.0,90\r\n",
+        ("D91B", "4C1A"),
+    ),
+    "dwm1001-les": (" D91B[0.00,0.00,0.00]=1.00 4C1A[3.00,0.00,0.00]=2.00 le_us=2563\r\n", ("D91B", "4C1A")),
+    "at-range": ("AT+RANGE=tid:7,mask:03,seq:9,range:(100,200,0,0,0,0,0,0)\r\n", (0, 1)),
+    "arduino": (
+        "from: 6018\t Range: 1.00 m\t RX power: -78.50 dBm\r\nfrom: 6019\t Range: 2.00 m\t RX power: -80.00 dBm\r\n",
+        (6018, 6019),
+    ),
+    "trek-corrected": ("mc 03 000003e8 000007d0 00000000 00000000 095f c1 00024bed a7:0\r\n", (0, 1)),
+}
+
+
+@contextmanager
+def printing(text, *, asked=b"", banner=""):
+    """Serve a board that prints a text ten times a second, after it was asked for it; gives the port's name."""
+    terminal, end = Terminal(), threading.Event()
+
+    def run():
+        heard = b""
+        terminal.write(banner.encode())
+        while not end.is_set():
+            heard += terminal.read()
+            if asked in heard:
+                # In two pieces, as serial lines come.
+                data = text.encode()
+                terminal.write(data[:9])
+                time.sleep(0.03)
+                terminal.write(data[9:])
+            time.sleep(0.1)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield terminal.name
+    finally:
+        end.set()
+        thread.join(10)
+        terminal.unplug()
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_what_a_board_prints_is_recorded(tmp_path, name):
+    text, devices = FORMS[name]
+    start = DIALECTS[name].start
+    with printing(text, asked=start, banner="\r\n DWM1001 TWR Real Time Location System\r\n\r\ndwm> \r\n") as port:
+        done = succeed(
+            "uwblink",
+            "record",
+            port,
+            "--dialect",
+            name,
+            "--ids",
+            "40",
+            "--duration",
+            "1.5",
+            "-o",
+            "r.uwb",
+            cwd=tmp_path,
+        )
+    assert "ranges of" in done.stdout
+    found = uwblink.load(tmp_path / "r.uwb")
+    names = {tag.tag: tag.body for tag in found.tags}
+    ends = found.exchanges.target
+    called = {names[k] if isinstance(devices[0], str) else k for k in ends.tolist()}
+    assert called == set(devices)
+    assert set(found.exchanges.range_m.round(9).tolist()) == {1.0, 2.0}
+    first = [k for k in names if names[k] == devices[0]] if isinstance(devices[0], str) else [devices[0]]
+    assert (found.exchanges.range_m[ends == first[0]] == 1.0).all()
+    # Lines of these forms say who ranged; of the others it is the board at the port.
+    assert set(found.exchanges.initiator.tolist()) == {7 if name in ("at-range", "trek-corrected") else 40}
+    assert len(found.exchanges) >= 10
+    if name == "arduino":
+        assert set(found.exchanges.fpp2_dbm.tolist()) == {-78.5, -80.0}
+    assert found.meta["dialect"] == name
+    # The time is the host's.
+    assert abs(found.exchanges.time_ns[0] * 1e-9 - time.time()) < 120
+    assert np.all(np.diff(found.exchanges.time_ns) >= 0)
+
+
+def test_a_map_of_lines_serves_as_for_logs_and_a_stream_is_corrected(tmp_path):
+    (tmp_path / "m.toml").write_text('line = "{from_id}->{to_id}: {range_m} ({rxp2})"\n[units]\ndistance = "cm"\n')
+    own = calib.Ranges.from_arrays(
+        np.tile([1.25, 2.25, 3.25], 40),
+        initiator=1,
+        target=2,
+        truth_m=np.tile([1.0, 2.0, 3.0], 40),
+        time_ns=np.arange(120) * 10**8,
+    )
+    calib.fit(own, constants="pair", delays_only=True).save(tmp_path / "c.json")
+    with printing("1->2: 150 (-80.5)\n") as port:
+        done = succeed(
+            *("uwblink", "stream", port, "--dialect", "m.toml", "-c", "c.json", "--duration", "1.0"), cwd=tmp_path
+        )
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(rows) >= 5
+    assert {(row["initiator"], row["target"], row["range_m"]) for row in rows} == {(1, 2, 1.5)}
+    assert [row["corrected_m"] for row in rows] == pytest.approx([1.25] * len(rows), abs=1e-6)
+
+
+def test_another_form_ends_with_a_line_and_no_file(tmp_path):
+    with printing("hello 1\r\n" * 20) as port:
+        words = ("uwblink", "record", port, "--duration", "30", "-o", "r.uwb")
+        refuse(*words, "--dialect", "arduino", cwd=tmp_path, naming=[port, "no range in", "hello 1", "dialect"])
+        refuse(*words, "--dialect", "nonsense", cwd=tmp_path, naming=["--dialect", "dwm1001-lec"])
+        refuse(*words, "--dialect", "arduino", "--pairs", "all", cwd=tmp_path, naming=["--pairs", "--dialect"])
+        refuse(*words, "--dialect", "arduino", "--ids", "1,2", cwd=tmp_path, naming=["1 ports and 2 ids"])
+    with printing("") as port:
+        words = ("uwblink", "record", port, "--dialect", "arduino", "--duration", "0.3", "-o", "r.uwb")
+        refuse(*words, cwd=tmp_path, naming=["no range was printed"])
+    (tmp_path / "m.toml").write_text('[columns]\nrange_m = "d"\n')
+    with pytest.raises(ArgumentError, match="line"):
+        dialect_of(str(tmp_path / "m.toml"))
+    assert {path.name for path in tmp_path.iterdir()} == {"m.toml"}
+
+
+def test_a_board_that_is_unplugged_keeps_what_was_recorded(tmp_path):
+    terminal = Terminal()
+
+    def print_and_go():
+        terminal.write(b"from: 5 Range: 1.50 m RX power: -80 dBm\r\n")
+        time.sleep(0.5)
+        terminal.unplug()
+
+    threading.Timer(0.5, print_and_go).start()
+    words = ("--dialect", "arduino", "--duration", "20", "-o", "r.uwb")
+    ended = refuse("uwblink", "record", terminal.name, *words, cwd=tmp_path)
+    assert "gone" in ended
+    found = uwblink.load(tmp_path / "r.uwb")
+    assert found.exchanges.range_m.tolist() == [1.5]
+    assert {tag.tag: tag.body for tag in found.tags} == {1: "tag1", 5: "tag5"}
+
+
+def test_a_dialect_of_ones_own_comes_by_an_entry_point_and_words_get_numbers_of_their_own():
+    def parse(line):
+        who, _, far = line.partition("=")
+        return [PrintedRange(to_id=who, range_m=float(far))] if far else []
+
+    DIALECTS.register(Dialect("mine", "A form of my own.", parse))
+    try:
+        with printing("alpha=1.0\nbeta=2.0\nbad line\n") as port:
+            batches = uwblink.boards.printed_ranges([port], dialect_of("mine"), ids=[1], duration_s=1.0)
+            found = uwblink.Exchanges.concatenate(list(batches))
+        assert {*zip(found.target.tolist(), found.range_m.tolist(), strict=True)} == {(2, 1.0), (3, 2.0)}
+    finally:
+        DIALECTS.remove("mine")
+    with pytest.raises(ArgumentError, match="parse"):
+        DIALECTS.register(Dialect("bad", "No function.", None))

@@ -1,0 +1,441 @@
+"""Files as people have them, each made here from its description, guessed, imported, and compared with the plant.
+
+docs/importing.md lists the forms; a row of `FORMS` is a row there.
+"""
+
+import csv
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pytest
+
+from tests import processes
+from tests.processes import ROOT
+from uwblink.errors import ImportTableError
+from uwblink.importers import read_source
+from uwblink.importers.guess import guess_map
+from uwblink.recording.contents import load
+
+ANCHORS = ("0", "1", "2", "3")
+HEXADECIMAL = ("1A2B", "0C0D", "9280", "5431")
+
+
+@dataclass(frozen=True)
+class Range:
+    """A planted range of tag 7: time in seconds, number of the anchor, range and distance in metres, power in dBm."""
+
+    time_s: float
+    anchor: int
+    range_m: float
+    truth_m: float
+    power_dbm: float
+
+
+def planted(count=40, seed=3):
+    """Ranges to four anchors at each time, in whole millimetres; the distance to each anchor stays."""
+    random = np.random.default_rng(seed)
+    return [
+        Range(10 + k / 4, a, float(np.round(2.0 + a + random.normal(0.15, 0.05), 3)), 2.0 + a, -80.0 - a - k % 8)
+        for k in range(count)
+        for a in range(4)
+    ]
+
+
+PLANT = planted()
+ROUNDS = [PLANT[k : k + 4] for k in range(0, len(PLANT), 4)]
+
+
+def table(path, rows, delimiter=",", header=True, text=str):
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, delimiter=delimiter)
+        writer.writerows([list(rows[0])] if header else [])
+        writer.writerows([[text(value) for value in row.values()] for row in rows])
+    return path
+
+
+def long_rows():
+    return [{"t_s": r.time_s, "tag": 7, "anchor": r.anchor, "range_m": r.range_m, "gt_m": r.truth_m} for r in PLANT]
+
+
+def wide_rows(name, scale=1.0, **more):
+    """A row a round, a column an anchor; `more` are columns of a round by functions of its ranges."""
+    return [
+        {"t_s": some[0].time_s, "tag": 7}
+        | {name.format(r.anchor): round(r.range_m * scale, 6) for r in some}
+        | {key.format(r.anchor): of(r) for key, of in more.items() for r in some}
+        for some in ROUNDS
+    ]
+
+
+def lines(path, of, noise=()):
+    """A log with a line a round, by a function of its ranges, and lines of other kinds between them."""
+    text = [line for some in ROUNDS for line in (*noise, of(some))]
+    path.write_bytes(b"\r\n".join(line if isinstance(line, bytes) else line.encode() for line in text) + b"\r\n")
+    return path
+
+
+def at_range(some, more=""):
+    listed = ",".join([*(f"{100 * r.range_m:.1f}" for r in some), "0", "0", "0", "0"])
+    return f"AT+RANGE=tid:7,mask:0F,seq:{int(4 * some[0].time_s)},range:({listed}){more}"
+
+
+def with_ids(some):
+    return at_range(some, ",ancid:(0,1,2,3,-1,-1,-1,-1)")
+
+
+def with_powers(some):
+    return at_range(some, f",rssi:({','.join(f'{r.power_dbm:.2f}' for r in some)},0.00,0.00,0.00,0.00)")
+
+
+def lec(some):
+    parts = "".join(f",AN{k},{HEXADECIMAL[r.anchor]},1.00,{k}.50,0.00,{r.range_m}" for k, r in enumerate(some))
+    return f"DIST,4{parts},POS,1.00,2.00,3.00,80"
+
+
+def les(some):
+    parts = " ".join(f"{HEXADECIMAL[r.anchor]}[1.00,2.00,0.00]={r.range_m}" for r in some)
+    return f"{parts} le_us=2576 est[6.97,8.17,-1.56,53]"
+
+
+def trek(some, kind="mc"):
+    """The third anchor did not answer in any round: its bit is not set, and an old range stands in its place."""
+    hexadecimal = " ".join(f"{round(1000 * r.range_m) if r.anchor != 2 else 0x999:08x}" for r in some)
+    return f"{kind} 0b {hexadecimal} 095f c1 00024bed a7:0"
+
+
+def stamped(some):
+    return f"[{some[0].time_s:.3f}] {with_ids(some)}"
+
+
+def prints(folder):
+    text = [f"from: {HEXADECIMAL[r.anchor]}\t Range: {r.range_m} m\t RX power: {r.power_dbm:.2f} dBm" for r in PLANT]
+    (folder / "serial.log").write_text("\n".join(["DW1000-arduino", *text]) + "\n")
+    return folder / "serial.log"
+
+
+def json_rows(folder, of):
+    (folder / "ranges.jsonl").write_text("\n".join(json.dumps(of(some)) for some in ROUNDS) + "\n")
+    return folder / "ranges.jsonl"
+
+
+def named_files(folder, unit, scale):
+    """A file an anchor, with its distance in the name; no id and no distance within."""
+    for a in range(4):
+        rows = [{"t_s": r.time_s, "range_m": r.range_m} for r in PLANT if r.anchor == a]
+        table(folder / f"tag7_anchor{a}_{(2 + a) * scale:g}{unit}.csv", rows)
+    return folder
+
+
+def parquet(folder):
+    source = table(folder / "wide.csv", wide_rows("d{}"))
+    with duckdb.connect() as db:
+        db.read_csv(str(source)).write_parquet(str(folder / "wide.parquet"))
+    source.unlink()
+    return folder / "wide.parquet"
+
+
+def registers(folder):
+    """Amplitudes so that the first path has the planted power at 118 symbols, by the manual's formula."""
+    rows = []
+    for row, r in zip(long_rows(), PLANT, strict=True):
+        each = (10 ** ((r.power_dbm + 121.74) / 10) * 118**2 / 3) ** 0.5
+        total = 10 ** ((r.power_dbm + 3 + 121.74) / 10) * 118**2 / 2**17
+        rows.append(row | dict.fromkeys(("FP_AMPL1", "FP_AMPL2", "FP_AMPL3"), each) | {"RXPACC": 118, "CIR_PWR": total})
+    return table(folder / "t.csv", rows)
+
+
+def late_registers(folder):
+    rows = []
+    for row, r in zip(long_rows(), PLANT, strict=True):
+        each = 4 * (10 ** ((r.power_dbm - 6 * 2 + 121.7) / 10) * 128**2 / 3) ** 0.5
+        rows.append(row | {"fp_ampl1": each, "fp_ampl2": each, "fp_ampl3": each, "rxpacc": 128, "dgc": 2})
+    return table(folder / "t.csv", rows)
+
+
+def with_sentinels(folder, value):
+    rows = long_rows()
+    for k in range(5, 160, 10):
+        rows.insert(k, rows[k] | {"range_m": value})
+    return table(folder / "t.csv", rows)
+
+
+def shuffled(folder):
+    rows = long_rows()
+    order = np.random.default_rng(1).permutation(len(rows))
+    return table(folder / "t.csv", [rows[k] for k in order])
+
+
+def by_both(folder):
+    """Each range twice, from the log of the tag and, 2 ms later, from that of the anchor."""
+    rows = []
+    for row in long_rows():
+        rows += [row, row | {"tag": row["anchor"], "anchor": 7, "t_s": row["t_s"] + 0.002}]
+    names = {"tag": "src", "anchor": "dst"}
+    return table(folder / "t.csv", renamed(names, rows))
+
+
+def renamed(names, rows=None):
+    return [{names.get(key, key): value for key, value in row.items()} for row in rows or long_rows()]
+
+
+@dataclass(frozen=True)
+class Form:
+    """A form of files: what writes one into a folder, answers to what its guess asks, and what it does not hold."""
+
+    write: Callable[[Path], Path]
+    answers: Mapping[str, object] = field(default_factory=dict)
+    names: tuple[str, ...] = ANCHORS
+    times: bool = True
+    truth: bool = False
+    powers: str = ""
+    noted: str = ""
+    kept: Callable[[Range], bool] = lambda _: True
+
+
+def of(make, *words, **more):
+    """Return a function that writes rows to a table in a folder."""
+    return lambda folder: table(folder / "t.csv", make(*words, **more))
+
+
+TAG = {"from_id": 7}
+FORMS = {
+    "long, plain": Form(of(long_rows), truth=True),
+    "wide, `Distance 1`": Form(of(wide_rows, "Distance {}")),
+    "wide, `r_AN0`": Form(of(wide_rows, "r_AN{}")),
+    "wide in mm, with powers": Form(
+        of(wide_rows, "range_{}_mm", 1000, **{"rssi_{}": lambda r: r.power_dbm}), powers="rxp"
+    ),
+    "wide, with true distances": Form(of(wide_rows, "d{}", **{"gt_{}": lambda r: r.truth_m}), truth=True),
+    "wide Parquet": Form(parquet),
+    "arrays in JSON lines": Form(
+        lambda folder: json_rows(
+            folder, lambda some: {"t_s": some[0].time_s, "tag": 7, "dis_arr": [r.range_m for r in some]}
+        )
+    ),
+    "lists of objects in JSON lines": Form(
+        lambda folder: json_rows(
+            folder,
+            lambda some: {
+                "t_s": some[0].time_s,
+                "tag": 7,
+                "receptions": [{"anchor": r.anchor, "range_m": r.range_m, "rssi": r.power_dbm} for r in some],
+            },
+        ),
+        powers="rxp",
+    ),
+    "no header": Form(
+        lambda folder: table(folder / "t.csv", long_rows(), header=False),
+        {"time_s": 1, "from_id": 2, "to_id": 3, "range_m": 4},
+    ),
+    "ids and distance in names of files": Form(lambda folder: named_files(folder, "cm", 100), truth=True),
+    "DWM1001 `lec`": Form(
+        lambda folder: lines(folder / "uart.log", lec, ["dwm> lec", b"\xff\xfe\x00"]), TAG, HEXADECIMAL, times=False
+    ),
+    "DWM1001 `les`": Form(lambda folder: lines(folder / "uart.log", les), TAG, HEXADECIMAL, times=False),
+    "AT+RANGE": Form(lambda folder: lines(folder / "uart.log", at_range), times=False),
+    "AT+RANGE with ids": Form(lambda folder: lines(folder / "uart.txt", with_ids, ["OK"]), times=False),
+    "AT+RANGE with powers": Form(lambda folder: lines(folder / "uart.log", with_powers), times=False, powers="rxp"),
+    "a log with times": Form(lambda folder: lines(folder / "uart.log", stamped)),
+    "Arduino prints": Form(prints, TAG, HEXADECIMAL, times=False, powers="rxp"),
+    "TREK1000": Form(lambda folder: lines(folder / "trek.log", trek), times=False, kept=lambda r: r.anchor != 2),
+    "TREK1000, raw and corrected": Form(
+        lambda folder: lines(folder / "t.log", lambda some: trek(some, "mr") + "\r\n" + trek(some).replace("00", "01")),
+        {"line": "trek-raw"}, times=False, kept=lambda r: r.anchor != 2,
+    ),
+    "registers of the DW1000": Form(registers, {"chip": "dw1000"}, truth=True, powers="fpp"),
+    "registers of the DW3000": Form(late_registers, {"chip": "dw3000"}, truth=True, powers="fpp"),
+    "powers named `RSSI_fp`": Form(
+        lambda folder: table(
+            folder / "t.csv", [row | {"RSSI_fp": r.power_dbm} for row, r in zip(long_rows(), PLANT, strict=True)]
+        ),
+        truth=True, powers="fpp",
+    ),
+    "-1 for no range": Form(lambda folder: with_sentinels(folder, -1), truth=True, noted="16 of 176 rows"),
+    "65535 for no range": Form(lambda folder: with_sentinels(folder, 65535), truth=True, noted="16 of 176 rows"),
+    "raw and filtered ranges": Form(
+        of(lambda: [row | {"Filtered_Range": 3.0} for row in renamed({"range_m": "Raw_Range"})]),
+        {"range_m": "Raw_Range"}, truth=True,
+    ),
+    "ranges in mm, true distances in m": Form(
+        of(lambda: renamed({"range_m": "range_mm"}, [r | {"range_m": 1000 * r["range_m"]} for r in long_rows()])),
+        truth=True,
+    ),
+    "decimal commas": Form(
+        lambda folder: table(folder / "t.csv", long_rows(), ";", text=lambda v: str(v).replace(".", ",")), truth=True
+    ),
+    "summary rows at the end": Form(
+        of(lambda: [*long_rows(), {"t_s": "Mean", "tag": "", "anchor": "", "range_m": 3.65, "gt_m": ""}]),
+        truth=True, noted="1 of 161 rows",
+    ),
+    "out of order": Form(shuffled, truth=True, noted="are sorted"),
+    "logs of both ends": Form(by_both, truth=True, noted="160 of 320 ranges repeat"),
+    "ids that are words": Form(
+        of(lambda: [row | {"anchor": HEXADECIMAL[row["anchor"]]} for row in long_rows()]), names=HEXADECIMAL, truth=True
+    ),
+}  # fmt: skip
+
+
+def proposed(source, map_file, answers):
+    """Write the proposed map with the answers in place of "?"; an import asks until they are there."""
+    guess = guess_map(source)
+    assert guess.complete, guess.text
+    assert set(guess.asked) == set(answers)
+    map_file.write_text(guess.text)
+    if answers:
+        with pytest.raises(ImportTableError, match="|".join(answers)):
+            read_source(source, importer="csv", map_file=map_file)
+    text = guess.text
+    for key, answer in answers.items():
+        text = text.replace(f'{key} = "?"', f"{key} = {json.dumps(answer)}")
+    map_file.write_text(text)
+    return map_file
+
+
+def test_the_page_has_a_row_a_form():
+    rows = [
+        line.split("|")[1].strip() for line in (ROOT / "docs" / "importing.md").read_text().splitlines() if "|" in line
+    ]
+    assert [row for row in rows if row in FORMS] == list(FORMS)
+
+
+def test_the_commands_do_it_for_a_folder_and_for_a_log(tmp_path):
+    (tmp_path / "anchors").mkdir()
+    named_files(tmp_path / "anchors", "cm", 100)
+    lines(tmp_path / "uart.log", stamped)
+    for source in ("anchors", "uart.log"):
+        words = ["uwblink", "import", "csv", source, "--map", "map.toml", "-o", f"{source}.uwb"]
+        said = processes.succeed("uwblink", "import", "guess", source, "-o", "map.toml", "--force", cwd=tmp_path).stdout
+        assert said.startswith("map.toml: check it, then uwblink import csv")
+        processes.succeed(*words, cwd=tmp_path)
+        assert sorted(load(tmp_path / f"{source}.uwb").exchanges.range_m) == pytest.approx(
+            sorted(r.range_m for r in PLANT)
+        )
+    lines(tmp_path / "lec.log", lec)
+    words[3:] = ["lec.log", "--map", "map.toml", "-o", "lec.uwb"]
+    processes.succeed("uwblink", "import", "guess", "lec.log", "-o", "map.toml", "--force", cwd=tmp_path)
+    processes.refuse(*words, naming=["from_id", "map.toml"], cwd=tmp_path)
+    assert not (tmp_path / "lec.uwb").exists()
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_a_form_comes_in_by_its_guess(tmp_path, name):
+    form = FORMS[name]
+    (tmp_path / "in").mkdir()
+    source = form.write(tmp_path / "in")
+    found = read_source(source, importer="csv", map_file=proposed(source, tmp_path / "map.toml", form.answers))
+    e, named = found.exchanges, found.meta.get("tag_names", {})
+    expected = [r for r in PLANT if form.kept(r)]
+    anchors, rounds = [named.get(str(n), str(n)) for n in e.target.tolist()], len({r.anchor for r in expected})
+    times = [round(t * 1e-9, 6) if form.times else k // rounds for k, t in enumerate(e.time_ns.tolist())]
+    got = sorted(zip(times, anchors, e.range_m.tolist(), e.truth_m.tolist(), e.fpp2_dbm.tolist(), strict=True))
+    order = {some[0].time_s: some[0].time_s if form.times else k for k, some in enumerate(ROUNDS)}
+    want = sorted((order[r.time_s], form.names[r.anchor], r.range_m, r.truth_m, r.power_dbm) for r in expected)
+    assert [row[:2] for row in got] == [row[:2] for row in want]
+    np.testing.assert_allclose(
+        [row[2] for row in got], [row[2] for row in want], atol=1e-9 if "AT" not in name else 6e-4
+    )
+    assert {named.get(str(n), str(n)) for n in set(e.initiator.tolist())} == {"7"}
+    assert list(e.time_ns) == sorted(e.time_ns)
+    truths, powers = ([row[k] for row in got] for k in (3, 4))
+    np.testing.assert_allclose(truths, [row[3] if form.truth else np.nan for row in want], atol=1e-9)
+    # Powers of registers have the digits of a float; a total power serves where there is none of the first path.
+    np.testing.assert_allclose(powers, [row[4] if form.powers else np.nan for row in want], atol=1e-4)
+    assert any("received power serves" in note for note in found.meta["notes"]) == (form.powers == "rxp")
+    assert form.noted in " ".join(found.meta["notes"])
+    assert found.meta.get("chip") == form.answers.get("chip")
+
+
+LONG = "time_s,from_id,to_id,range_m,gt_range_m\n"
+
+
+def imported(tmp_path, text, map_text="", name="t.csv"):
+    (tmp_path / name).write_text(text)
+    (tmp_path / "map.toml").write_text(map_text)
+    return read_source(tmp_path / name, importer="csv", map_file=tmp_path / "map.toml" if map_text else None)
+
+
+@pytest.mark.parametrize("column", ["gt_range_m", "fpp1", "from_x_m"])
+def test_words_in_a_column_that_is_not_needed_are_named(tmp_path, column):
+    """Half of its cells or more are refused; fewer are counted; empty ones and nan are nothing."""
+    head = LONG.replace("gt_range_m", column)
+    rows = [f"{k},1,2,{3 + k / 7:.3f}," for k in range(30)]
+    with pytest.raises(
+        ImportTableError, match=rf"30 of 30 cells of column '{column}' .* 'wall'|\"wall\"; name another"
+    ):
+        imported(tmp_path, head + "".join(f"{row}wall\n" for row in rows))
+    found = imported(tmp_path, head + "".join(f"{row}{'wall' if k < 5 else -3.5}\n" for k, row in enumerate(rows)))
+    assert any(f"5 of 30 cells of column '{column}' are no numbers" in note for note in found.meta["notes"])
+    found = imported(tmp_path, head + "".join(f"{row}{['nan', '', -3.5][k % 3]}\n" for k, row in enumerate(rows)))
+    assert not found.meta["notes"]
+    with_words = head + "".join(f"{row}wall\n" for row in rows)
+    if column != "from_x_m":
+        assert len(imported(tmp_path, with_words, 'missing = ["WALL"]').exchanges) == 30
+
+
+@pytest.mark.parametrize("value", [0, -1, 65535, 9999.9])
+def test_a_number_that_often_stands_for_no_range_is_refused_until_the_map_states_it(tmp_path, value):
+    text = LONG + "".join(f"{k},1,2,{value if k % 5 == 0 else 3 + k / 7:.6g},\n" for k in range(60))
+    with pytest.raises(ImportTableError, match=rf"20% of its numbers are {value}.* missing = \[{value}"):
+        imported(tmp_path, text)
+    assert len(imported(tmp_path, text, f"missing = [{value}]").exchanges) == 48
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('line = "{from_id} {oops"', "map.toml: line"),
+        ('line = "{range_m} {range_m}"', "different places"),
+        ('[wide]\nrange_m = "zz{to_id}"', "wide.range_m: no column 'zz{to_id}'"),
+        ('[wide]\nrange_m = "zz"', "wide.range_m"),
+        ('from_name = "x{from_id}.csv"', "its name is not 'x{from_id}.csv'"),
+        ('each = "rows"', "`each` is of JSON lines"),
+        ('[columns]\nrange_m = 4\nfrom_id = "from_id"', "for all their numbers"),
+        ("[columns]\nrange_m = 9\nfrom_id = 2\nto_id = 3", "column '9' is missing"),
+        ('[columns]\nfpp2 = {f1 = "a", n = "b"}', "columns of f1, f2, f3 and n"),
+        ('[columns]\nfpp2 = {c = "time_s", n = "to_id"}', "chip"),
+        ('chip = "nrf52"', "allowed: dw1000, dw3000, other"),
+        ('missing = "x"', "a list of numbers and words"),
+        ('[units]\nskew = "offset"', "allowed: ppm, -ppm"),
+        ('[units]\nrange_m = "miles"', "units.range_m"),
+    ],
+)
+def test_maps_that_cannot_be_are_refused_with_the_key(tmp_path, text, said):
+    with pytest.raises(ImportTableError) as caught:
+        imported(tmp_path, LONG + "0,1,2,3.25,\n1,1,2,3.5,\n", text)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_faults_of_logs_and_wide_tables_have_the_line_of_the_file(tmp_path):
+    text = "boot\n\n" + "".join(
+        f"from: {k % 3 + 1} Range: {'x' if k == 7 else 2 + k / 9:.5} m\r\nidle\n" for k in range(30)
+    )
+    found = imported(tmp_path, text, 'line = "from: {to_id} Range: {range_m} m"\n[constants]\nfrom_id = 9\n', "a.log")
+    assert [fault.detail for fault in found.faults] == ["row 17, column 'range_m': found 'x', expected a finite number"]
+    wide = "when,r1,r2,r3\n" + "".join(f"{'soon' if k == 4 else k},{1 + k / 7},{2 + k / 9},\n" for k in range(30))
+    map_text = '[columns]\ntime_s = "when"\n[wide]\nrange_m = "r{to_id}"\n[constants]\nfrom_id = 9\n'
+    found = imported(tmp_path, wide, map_text)
+    assert [fault.detail.split(",")[0] for fault in found.faults] == ["row 6", "row 6"]
+    assert set(found.exchanges.target) == {1, 2}
+
+
+def test_skews_of_registers_and_the_sign_of_both_chips(tmp_path):
+    text = "time_s,from_id,to_id,range_m,skew2\n" + "".join(f"{k},1,2,{3 + k / 7},{100 + k}\n" for k in range(30))
+    for chip, unit, ppm in (
+        ("dw1000", "integrator-5", 998.4e6 / 2 / 1024 / 131072 / 6489.6),
+        ("dw3000", "offset", 1e6 / 2**26),
+    ):
+        found = imported(tmp_path, text, f'chip = "{chip}"\n[units]\nskew = "{unit}"\n').exchanges
+        np.testing.assert_allclose(found.skew2_ppm, (100 + np.arange(30)) * ppm)
+
+
+def test_powers_that_no_chip_reports_are_refused(tmp_path):
+    text = "time_s,from_id,to_id,range_m,fpp2\n" + "".join(f"{k},1,2,{3 + k / 7},{-12 - k % 5}\n" for k in range(30))
+    map_text = 'chip = "dw1000"\n[units]\npower = "dBm"\n'
+    with pytest.raises(ImportTableError, match=r"'fpp2': the median power is -14"):
+        imported(tmp_path, text, map_text)
+    assert len(imported(tmp_path, text, map_text.replace("dw1000", "other")).exchanges) == 30
