@@ -277,9 +277,8 @@ def load_map(path: Path) -> ColumnMap:
     file.known(table, heads(FILE_KEYS))
     for name in ("line", "each", "from_name"):
         file.check(name, table.get(name), isinstance(table.get(name, ""), str) and table.get(name) != ASKED, "text")
-    known = LINES.get(table.get("line", ""))
-    table = (known.entries() if known else {}) | table | ({"line": known.line} if known else {})
-    file.table = table
+    if known := LINES.get(table.get("line", "")):
+        file.table = table = known | table | {"line": known["line"]}
     columns, units, constants, ids, wide = (file.section(n) for n in ("columns", "units", "constants", "ids", "wide"))
     file.known(columns, (*NAMES, *NAMES_OF_POSES), "columns.")
     file.known(wide, NAMES, "wide.")

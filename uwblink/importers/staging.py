@@ -34,7 +34,7 @@ from uwblink.importers.column_map import (
     ColumnMap,
 )
 from uwblink.importers.plausibility import SAMPLE_ROWS, counter_format
-from uwblink.importers.tables import Columns, Table, message_number, number, time_ns, whole_number
+from uwblink.importers.tables import Columns, Table, lacks_header, message_number, number, time_ns, whole_number
 from uwblink.recording.schema import Fault
 from uwblink.twr import LARGEST_ID, STAMPS
 
@@ -191,6 +191,8 @@ class Staging:
         """Return the error for a missing column."""
         names, header = self.tables[0].names, self.column_map.header(name)
         remedy = "a `map_file` can rename columns or give constants, and `uwblink import guess` proposes one"
+        if lacks_header(names):
+            remedy = "its first line is a row: state the numbers of its columns in a map, such as from_id = 2"
         if {"qx", "qy", "qz", "qw"} <= {name.lower() for name in names}:
             remedy = "these are poses, which `uwblink poses` adds to a recording"
         there = ", ".join(names)[:400]

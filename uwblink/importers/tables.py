@@ -94,6 +94,14 @@ def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, boo
     return names, mark, decimal == "," and mark != ",", skip
 
 
+def lacks_header(names: Sequence[str]) -> bool:
+    """Return whether the first line of a table is a row of numbers; 0, 1, 2 ... are names that a program wrote."""
+    numbers = [name for name in names if re.fullmatch(r"[-+]?[0-9]+([.,][0-9]*)?([eE][-+]?[0-9]+)?", name)]
+    if [name for name in names if name] == [str(k) for k in range(len(numbers))]:
+        return False
+    return len(numbers) == len(names) or (2 * len(numbers) >= len(names) and any("." in one for one in numbers))
+
+
 def _delimiter(lines: list[str]) -> str:
     """Return the delimiter that splits header and rows into equal numbers of cells, and into the most."""
 
@@ -295,7 +303,8 @@ class Table:
             # An element stands in place of the list that it is of.
             self.db.execute(f"SET VARIABLE each{self._key} = ?", [each])
             name = f"getvariable('each{self._key}')"
-            elements = f"unnest(CAST(json_extract(json, '/' || {_escaped(name)}) AS JSON[])) AS element"
+            escaped = f"replace(replace({name}, '~', '~0'), '/', '~1')"
+            elements = f"unnest(CAST(json_extract(json, '/' || {escaped}) AS JSON[])) AS element"
             self.source = f"(SELECT row_number() OVER () AS row, json, {elements} FROM {self.source})"
             merged = f"json_merge_patch(json, json_object({name}, element)) AS json"
             self.source, self._expanded = f"(SELECT row, {merged} FROM {self.source})", True
@@ -432,11 +441,6 @@ class Table:
 def is_objects(values: list[Any]) -> bool:
     """Return whether a list has objects of JSON."""
     return any(isinstance(one, dict) for one in values)
-
-
-def _escaped(name: str) -> str:
-    """Return SQL of the part of a JSON pointer for a key, from SQL of it."""
-    return f"replace(replace({name}, '~', '~0'), '/', '~1')"
 
 
 def _fields(row: dict[str, Any], name: str, pointer: str) -> Iterator[tuple[str, str]]:

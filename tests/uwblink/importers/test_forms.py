@@ -439,3 +439,30 @@ def test_powers_that_no_chip_reports_are_refused(tmp_path):
     with pytest.raises(ImportTableError, match=r"'fpp2': the median power is -14"):
         imported(tmp_path, text, map_text)
     assert len(imported(tmp_path, text, map_text.replace("dw1000", "other")).exchanges) == 30
+
+
+def test_places_state_their_units(tmp_path):
+    text = "".join(f"[{500 * k}] AN {k % 3}: {2000 + 7 * k} mm\n" for k in range(30))
+    map_text = 'line = "[{time_ms}] AN {to_id}: {range_mm} mm"\nfrom_name = "tag{from_id}_{gt_range_cm}cm.log"\n'
+    found = imported(tmp_path, text, map_text, "tag7_250cm.log").exchanges
+    assert found.range_m == pytest.approx([2 + 0.007 * k for k in range(30)])
+    assert found.time_ns.tolist() == [k * 500_000_000 for k in range(30)]
+    assert (set(found.initiator), set(found.truth_m)) == ({7}, {2.5})
+
+
+@pytest.mark.parametrize("name", ["dwm1001-lec", "dwm1001-les", "at-range", "arduino", "trek-corrected"])
+def test_a_map_may_name_a_form_of_lines(tmp_path, name):
+    if name == "arduino":
+        text = prints(tmp_path).read_text()
+    else:
+        of = {"dwm1001-lec": lec, "dwm1001-les": les, "at-range": at_range, "trek-corrected": trek}[name]
+        text = lines(tmp_path / "a.log", of).read_text()
+    of_tag = "[constants]\nfrom_id = 7\n" if name[0] in "d" or name == "arduino" else ""
+    found = imported(tmp_path, text, f'line = "{name}"\n{of_tag}', "b.log").exchanges
+    expected = [r.range_m for r in PLANT if name != "trek-corrected" or r.anchor != 2]
+    assert found.range_m == pytest.approx(expected, abs=6e-4)
+
+
+def test_a_table_without_a_header_says_so(tmp_path):
+    with pytest.raises(ImportTableError, match=r"its first line is a row.* from_id = 2"):
+        imported(tmp_path, "".join(f"{k},1,2,{3 + k / 7:.3f}\n" for k in range(30)))
