@@ -40,7 +40,7 @@ def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
     name, matches = next(iter(found.items()))
     known, line = LINES[name], LINES[name]["line"]
     leads = [match.string[: match.start()] for match in matches]
-    time = r"\W*?([0-9]+(?:\.[0-9]+)?|[0-9]{4}-[0-9-]{5}[ T][0-9:.,]+Z?)(\W+)"
+    time = r"\W*?([0-9]+(?:\.[0-9]+)?|[0-9]{4}-[0-9-]{5}[ T][0-9:.,]+Z?|[0-9]+:[0-9]{2}:[0-9.]+)(\W+)"
     times = [re.fullmatch(time, lead) for lead in leads]
     if all(times) and (first := times[0]):
         line = f"{leads[0][: first.start(1)]}{{time_s}}{first[2]}{line}"

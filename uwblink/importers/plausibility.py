@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.importers.chips import CHIPS
-from uwblink.importers.column_map import DISTANCE_UNITS, IDS, POSITIONS, POWERS, ColumnMap
+from uwblink.importers.column_map import DISTANCE_UNITS, IDS, POSITIONS, POWERS, RANGE_UNITS, ColumnMap
 from uwblink.importers.tables import Columns
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import REGISTER_MAX, AntennaDelay, delay_of
@@ -344,7 +344,7 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
         elif column_map.chip and (why := reason_against_limits(optional(rows, name), limits)):
             reasons[name] = why, f"another unit, chip or prf than {column_map.chip!r} and {column_map.prf} in the map"
     for name in ("range_m", "gt_range_m") if raw_m is None else ():
-        factor = DISTANCE_UNITS[column_map.distance_of(name) or "m"]
+        factor = RANGE_UNITS[column_map.distance_of(name) or "m"]
         for value, share in sentinels(optional(rows, name)).items():
             why = f"{share:.0%} of its numbers are {value / factor:.6g}, which is no distance"
             reasons[name] = why, f"missing = [{value / factor:.6g}] in the map"

@@ -24,11 +24,11 @@ import numpy as np
 from uwblink.errors import ImportTableError
 from uwblink.importers.chips import CHIPS, power_sql
 from uwblink.importers.column_map import (
-    DISTANCE_UNITS,
     DISTANCES,
     IDS,
     NAMES,
     POWERS,
+    RANGE_UNITS,
     SKEWS,
     TIME_UNITS,
     ColumnMap,
@@ -243,7 +243,7 @@ class Staging:
             return f"CASE WHEN {first} IN ('t', 's') THEN 1.0 WHEN {first} = 'r' THEN 2.0 END"
         if name in (*STAMPS, "tx", "rx", "stamp") and column_map.ticks_per_unit == 1.0:
             return whole_number(text)
-        factor = DISTANCE_UNITS[column_map.distance_of(name) or "m"] if name in DISTANCES else 1.0
+        factor = RANGE_UNITS[column_map.distance_of(name) or "m"] if name in DISTANCES else 1.0
         if name in POWERS and column_map.power_of(name) == "-dBm":
             factor = -1.0
         if name in SKEWS:

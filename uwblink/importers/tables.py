@@ -182,7 +182,7 @@ def message_number(text: str) -> str:
 def time_ns(text: str, unit: str | None, ns_per_unit: float) -> str:
     """Return SQL of a time as nanoseconds, NULL if it is none: a number in units, or ISO 8601, UTC without a zone.
 
-    Without a unit both are read, with "iso" only the latter.
+    Without a unit both are read, with "iso" only the latter; a time of day counts from midnight.
     """
     scaled = f"TRY_CAST({number(text)} * {ns_per_unit!r} AS BIGINT)"
     scaled = f"coalesce({whole_number(text)}, {scaled})" if unit == "ns" else scaled
@@ -190,7 +190,7 @@ def time_ns(text: str, unit: str | None, ns_per_unit: float) -> str:
     zone = f"regexp_matches({text}, '[T ].*[+-][0-9]{{2}}:?([0-9]{{2}})? *$')"
     iso = (
         f"CASE WHEN {zone} THEN epoch_ns(TRY_CAST({text} AS TIMESTAMPTZ)) "
-        f"ELSE epoch_ns(TRY_CAST({text} AS TIMESTAMP_NS)) END"
+        f"ELSE coalesce(epoch_ns(TRY_CAST({text} AS TIMESTAMP_NS)), epoch_ns(TRY_CAST({text} AS TIME))) END"
     )
     found = {None: f"coalesce({scaled}, {iso})", "iso": iso}.get(unit, scaled)
     return f"CASE WHEN {found} BETWEEN -{LATEST_NS} AND {LATEST_NS} THEN {found} END"

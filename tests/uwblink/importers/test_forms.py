@@ -20,6 +20,7 @@ from uwblink.importers import read_source
 from uwblink.importers.guess import guess_map
 from uwblink.recording.contents import load
 
+AIR_M_PER_NS = 0.299702547
 ANCHORS = ("0", "1", "2", "3")
 HEXADECIMAL = ("1A2B", "0C0D", "9280", "5431")
 
@@ -109,6 +110,12 @@ def trek(some, kind="mc"):
 
 def stamped(some):
     return f"[{some[0].time_s:.3f}] {with_ids(some)}"
+
+
+def monitored(some):
+    """Lines of a serial monitor, each with its time of day."""
+    seconds = f"00:00:{some[0].time_s:06.3f}"
+    return "\r\n".join(f"{seconds} -> from: {r.anchor} Range: {r.range_m} m RX power: {r.power_dbm} dBm" for r in some)
 
 
 def prints(folder):
@@ -241,6 +248,9 @@ FORMS = {
     "AT+RANGE with powers": Form(lambda folder: lines(folder / "uart.log", with_powers), times=False, powers="rxp"),
     "a log with times": Form(lambda folder: lines(folder / "uart.log", stamped)),
     "Arduino prints": Form(prints, TAG, HEXADECIMAL, times=False, powers="rxp"),
+    "Arduino prints with times of day": Form(
+        lambda folder: lines(folder / "monitor.txt", monitored), TAG, powers="rxp"
+    ),
     "TREK1000": Form(lambda folder: lines(folder / "trek.log", trek), times=False, kept=lambda r: r.anchor != 2),
     "TREK1000, raw and corrected": Form(
         lambda folder: lines(folder / "t.log", lambda some: trek(some, "mr") + "\r\n" + trek(some).replace("00", "01")),
@@ -262,6 +272,10 @@ FORMS = {
     ),
     "ranges in mm, true distances in m": Form(
         of(lambda: renamed({"range_m": "range_mm"}, [r | {"range_m": 1000 * r["range_m"]} for r in long_rows()])),
+        truth=True,
+    ),
+    "times of flight in ns": Form(
+        of(lambda: renamed({"range_m": "tof_ns"}, [r | {"range_m": r["range_m"] / AIR_M_PER_NS} for r in long_rows()])),
         truth=True,
     ),
     "decimal commas": Form(
@@ -401,6 +415,7 @@ def test_a_number_that_often_stands_for_no_range_is_refused_until_the_map_states
         ('missing = "x"', "a list of numbers and words"),
         ('[units]\nskew = "offset"', "allowed: ppm, -ppm"),
         ('[units]\nrange_m = "miles"', "units.range_m"),
+        ('[units]\ngt_range_m = "ns"', "units.gt_range_m"),
     ],
 )
 def test_maps_that_cannot_be_are_refused_with_the_key(tmp_path, text, said):
@@ -466,3 +481,10 @@ def test_a_map_may_name_a_form_of_lines(tmp_path, name):
 def test_a_table_without_a_header_says_so(tmp_path):
     with pytest.raises(ImportTableError, match=r"its first line is a row.* from_id = 2"):
         imported(tmp_path, "".join(f"{k},1,2,{3 + k / 7:.3f}\n" for k in range(30)))
+
+
+def test_a_time_of_flight_without_a_unit_is_asked_for(tmp_path):
+    rows = [{"t_s": r.time_s, "tag": 7, "anchor": r.anchor, "ToF": r.range_m / AIR_M_PER_NS} for r in PLANT]
+    source = table(tmp_path / "t.csv", rows)
+    found = read_source(source, importer="csv", map_file=proposed(source, tmp_path / "m.toml", {"range_m": "ns"}))
+    assert found.exchanges.range_m == pytest.approx([r.range_m for r in PLANT])

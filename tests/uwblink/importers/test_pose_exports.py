@@ -1,6 +1,7 @@
 """Exports of motion-capture programs, made here from their descriptions: planted poses and distances come out."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -124,7 +125,7 @@ def test_an_export_of_motion_capture_is_read(tmp_path, name):
 
 def ranges(times, range_m):
     """Ranges from tag 1 to tag 2 without stamps."""
-    none = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(len(times), np.int64))
+    none: Any = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(len(times), np.int64))
     return Exchanges.from_arrays(1, 2, time_ns=np.rint(times * 1e9).astype(np.int64), range_m=range_m, **none)
 
 
