@@ -149,6 +149,9 @@ def guess_map(path: Path) -> Guess:
         for ours, header in found.items()
         if ours not in given and header not in given and not re.match(r"[rap]\.", header)
     }
+    if "range_m" not in columns:
+        # Columns called tx and rx are stamps of messages, unless a row is a range.
+        columns = {n: header for n, header in columns.items() if n not in IDS or header not in ("tx", "rx")}
     if template := name_template(file.name, {"from_id", "to_id", "gt_range_m"} - columns.keys()):
         top["from_name"] = template, "by the names of the files"
         form = replace(form, from_name=template)

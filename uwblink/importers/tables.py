@@ -172,9 +172,18 @@ def whole_number(text: str) -> str:
     return f"CASE WHEN {value} = trunc({value}) THEN TRY_CAST({text} AS BIGINT) END"
 
 
+REPORT: Final = "report|range_?report"
+"""A third message of the target, where a final is of the initiator."""
+
+
+def is_by_target(text: str) -> str:
+    """Return SQL that is true for the word of a message of the target."""
+    return f"regexp_full_match(lower(trim({text})), 'resp.*|ack.*|answer|{REPORT}')"
+
+
 def message_number(text: str) -> str:
     """Return SQL of a message as its number, from a number or a word such as "POLL"; NULL if it is neither."""
-    kinds = {1: "poll|init.*|request|blink", 2: "resp.*|ack.*|answer", 3: "final|report|range_?report"}
+    kinds = {1: "poll|init.*|request|blink", 2: "resp.*|ack.*|answer", 3: f"final|{REPORT}"}
     cases = " ".join(f"WHEN regexp_full_match(lower(trim({text})), '{kind}') THEN {n}" for n, kind in kinds.items())
     return f"coalesce({number(text)}, CASE {cases} END)"
 
@@ -214,6 +223,8 @@ class Table:
         self.db, self.path, self._key = db, path, key
         self.column_map = column_map = column_map or ColumnMap()
         self._skip, self._decimal_comma, self._expanded = 0, False, False
+        self.named: frozenset[str] = frozenset()
+        """Columns that the name of the file says."""
         self.lists: tuple[str, ...] = ()
         """Fields of JSON lines that are lists of objects."""
         self.blank = ""
@@ -358,6 +369,7 @@ class Table:
         values = Template(self.column_map.from_name).match(self.path.as_posix())
         if values is None:
             raise ImportTableError(f"{self.path}: its name is not {self.column_map.from_name!r}, which the map states")
+        self.named = frozenset(values)
         for k, (name, value) in enumerate(values.items()):
             self.db.execute(f"SET VARIABLE name{self._key}_{k} = ?", [value])
             self.names, self._cells = (*self.names, name), [*self._cells, f"getvariable('name{self._key}_{k}')"]

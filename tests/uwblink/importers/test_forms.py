@@ -15,6 +15,7 @@ import pytest
 
 from tests import processes
 from tests.processes import ROOT
+from tests.uwblink.importers.test_table_forms import as_messages, flights, wrapped
 from uwblink.errors import ImportTableError
 from uwblink.importers import read_source
 from uwblink.importers.guess import guess_map
@@ -481,6 +482,24 @@ def test_a_map_may_name_a_form_of_lines(tmp_path, name):
 def test_a_table_without_a_header_says_so(tmp_path):
     with pytest.raises(ImportTableError, match=r"its first line is a row.* from_id = 2"):
         imported(tmp_path, "".join(f"{k},1,2,{3 + k / 7:.3f}\n" for k in range(30)))
+
+
+@pytest.mark.parametrize("third", ["initiator", "target"])
+def test_messages_as_words_with_ids_in_names_of_files(tmp_path, third):
+    """A file a pair; rows have POLL, RESP and FINAL (or REPORT), and no ids."""
+    words = ("POLL", "RESP", "FINAL" if third == "initiator" else "REPORT")
+    rows = flights(60, third=third)
+    (tmp_path / "in").mkdir()
+    for pair in ((1, 2), (2, 3), (3, 1)):
+        own = as_messages(wrapped([row for row in rows if (row["from_id"], row["to_id"]) == pair]), third)
+        own = [row | {"message": words[row["message"] - 1]} for row in own]
+        names = ("time_s", "message", "tx", "rx", "fpp")
+        table(tmp_path / "in" / f"tag{pair[0]}_to{pair[1]}.csv", [{name: row[name] for name in names} for row in own])
+    found = read_source(tmp_path / "in", importer="csv", map_file=proposed(tmp_path / "in", tmp_path / "m.toml", {}))
+    e = found.exchanges
+    expected = sorted((row["time_s"], row["from_id"], row["to_id"], row["truth"]) for row in rows)
+    assert list(zip(e.initiator.tolist(), e.target.tolist(), strict=True)) == [row[1:3] for row in expected]
+    np.testing.assert_allclose(e.range_m, [row[3] for row in expected], atol=1e-9)
 
 
 def test_a_time_of_flight_without_a_unit_is_asked_for(tmp_path):

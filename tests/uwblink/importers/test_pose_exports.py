@@ -166,6 +166,17 @@ units = {time = "ms", distance = "mm"}
 """
 
 
+def test_iso_times(tmp_path):
+    text = "time,body,x,y,z\n" + "".join(
+        f"2024-05-06T07:08:{k:02d}.250{zone},b,{k},0,0\n" for k, zone in enumerate(["", "Z", "+02:00"])
+    )
+    (tmp_path / "p.csv").write_text(text)
+    found = read_poses(tmp_path / "p.csv")
+    hours = 3600 * 10**9
+    start = 1714979280_250_000_000
+    assert found.time_ns.tolist() == [start + 2 * 10**9 - 2 * hours, start, start + 10**9]
+
+
 @pytest.mark.parametrize(("head", "text"), [(CSV, None), ("when;what;east;north;up", MAP)])
 def test_columns_with_other_names_and_without_attitudes(tmp_path, head, text):
     none = dict.fromkeys(BODIES, (0.0, 0.0, 0.0))
