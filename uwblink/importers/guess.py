@@ -204,7 +204,7 @@ def _proposal(
         counter, unit, undelayed = (_exchange_stamps if layout == "exchanges" else _message_stamps)(columns, cells)
         top, units = top | counter, {"stamps": unit, **units}
     if missing:
-        shares = ", ".join(f"{share:.0%} are {value:.6g}" for value, share in missing.items())
+        shares = ", ".join(f"{share:.1%} are {value:.10g}" for value, share in missing.items())
         listed = [int(value) if value == int(value) else value for value in missing]
         top["missing"] = listed, f"of the distances {shares}, which are none"
     registers = register_columns([name for name in names if name not in columns.values()])

@@ -289,11 +289,12 @@ def _remaining(errors_m: Floats) -> float:
 def sentinels(ranges: Floats) -> dict[float, float]:
     """Return the share of each number that is no range but often stands for none, such as 0, -1 or 65535.
 
-    It is exactly the same in 1 % of the numbers (n,) or more, and zero, negative, or five times beyond all others.
+    It is zero, negative, or five times beyond all others, and exactly the same twice and in 0.1 % of the numbers (n,),
+    which are in the unit of the table, or the largest number of 16 or 32 bits.
     """
     finite = ranges[np.isfinite(ranges)]
     values, counts = np.unique(finite, return_counts=True)
-    often = counts >= max(3, 0.01 * len(finite))
+    often = (counts >= max(2, 0.001 * len(finite))) | np.isin(np.round(values, 3), (2.0**16 - 1, 2.0**32 - 1))
     if len(finite) < MIN_ROWS or len(values) < 3:
         return {}
     others = finite[~np.isin(finite, values[often])]
@@ -345,9 +346,9 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
             reasons[name] = why, f"another unit, chip or prf than {column_map.chip!r} and {column_map.prf} in the map"
     for name in ("range_m", "gt_range_m") if raw_m is None else ():
         factor = RANGE_UNITS[column_map.distance_of(name) or "m"]
-        for value, share in sentinels(optional(rows, name)).items():
-            why = f"{share:.0%} of its numbers are {value / factor:.6g}, which is no distance"
-            reasons[name] = why, f"missing = [{value / factor:.6g}] in the map"
+        for value, share in sentinels(np.round(optional(rows, name) / factor, 6)).items():
+            why = f"{share:.1%} of its numbers are {value:.10g}, which is no distance"
+            reasons[name] = why, f"missing = [{value:.10g}] in the map"
     if column_map.distance_of("range_m") is None and "range_m" not in reasons:
         reasons["range_m"] = reason_against_metres(ranges), "units.distance in the map"
     for name, (why, remedy) in reasons.items():
