@@ -290,11 +290,12 @@ def sentinels(ranges: Floats) -> dict[float, float]:
     """Return the share of each number that is no range but often stands for none, such as 0, -1 or 65535.
 
     It is zero, negative, or five times beyond all others, and exactly the same twice and in 0.1 % of the numbers (n,),
-    which are in the unit of the table, or the largest number of 16 or 32 bits.
+    which are in the unit of the table; or the largest number of 16 or 32 bits, or -1 as the only negative number.
     """
     finite = ranges[np.isfinite(ranges)]
     values, counts = np.unique(finite, return_counts=True)
-    often = (counts >= max(2, 0.001 * len(finite))) | np.isin(np.round(values, 3), (2.0**16 - 1, 2.0**32 - 1))
+    known = [2.0**16 - 1, 2.0**32 - 1] + ([-1.0] if np.count_nonzero(values < 0) == 1 else [])
+    often = (counts >= max(2, 0.001 * len(finite))) | np.isin(np.round(values, 3), known)
     if len(finite) < MIN_ROWS or len(values) < 3:
         return {}
     others = finite[~np.isin(finite, values[often])]
