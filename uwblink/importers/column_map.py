@@ -144,7 +144,7 @@ FILE_KEYS: Final = (
         "chip",
         f"one of {', '.join(CHIPS)}",
         "not known",
-        "The chip of the devices: powers from registers, offsets of clocks and limits of powers. It is kept in `meta`.",
+        "The chip of the devices: powers from registers, offsets of clocks and limits of powers. It is kept in the recording.",
     ),
     FileKey("prf", "16 or 64, MHz", "64", "Pulse repetition frequency, for powers from registers."),
     FileKey(
@@ -159,7 +159,7 @@ FILE_KEYS: Final = (
         "text with one place; or a table of columns by device",
         "none",
         "Columns that differ by a device: `r_AN{to_id}` makes a row of each. Families are joined by what differs; "
-        "`{_}` is no id. A column `mask` has a bit for each device with a range.",
+        "`{_}` is no id. A column called mask has a bit for each device with a range.",
     ),
     FileKey(
         "units.stamps",
@@ -189,7 +189,7 @@ FILE_KEYS: Final = (
         "units.skew",
         '"ppm", "-ppm", "integrator-2", "integrator-5", "integrator-9" or "offset"',
         "ppm",
-        "Unit of skews: the carrier integrator on a channel, or the clock offset register of the DW3000, needs `chip`.",
+        "Unit of skews: the carrier integrator on a channel, or the clock offset register of the DW3000, needs a chip.",
     ),
     FileKey(
         "units.NAME",

@@ -248,7 +248,7 @@ class Table:
 
     def _open_csv(self) -> None:
         if self.column_map.each:
-            raise ImportTableError(f"{self.path}: `each` is of JSON lines, bags and logs (with `line`), not of a table")
+            raise ImportTableError(f"{self.path}: each is of JSON lines, bags and logs (with line), not of a table")
         self.names, mark, self._decimal_comma, self._skip = detect(self.path, self.column_map)
         check_lines(self.path, mark)
         self._cells = [f"c{k}" for k in range(len(self.names))]
@@ -303,7 +303,7 @@ class Table:
                     fields |= dict(_fields(one, "", ""))
         self.lists = tuple(lists)
         if not fields:
-            wanted = f"a list {each[:60]!r} of objects (`each`)" if each else "JSON objects"
+            wanted = f"a list {each[:60]!r} of objects (each)" if each else "JSON objects"
             raise ImportTableError(f"{self.path}: holds no {wanted}, one a line")
         self.names = tuple(fields)
         self.db.execute(f"SET VARIABLE fields{self._key} = ?", [list(fields.values())])

@@ -141,7 +141,7 @@ def test_what_a_bag_does_not_hold_is_said(tmp_path):
         read_source(tmp_path / "absent.mcap")
     (tmp_path / "t.csv").write_text("from_id,to_id,range_m\n1,2,3\n")
     (tmp_path / "m.toml").write_text('each = "x"\n')
-    with pytest.raises(ImportTableError, match="`each` is of JSON lines, bags and logs"):
+    with pytest.raises(ImportTableError, match="each is of JSON lines, bags and logs"):
         read_source(tmp_path / "t.csv", map_file=tmp_path / "m.toml")
     with pytest.raises(ArgumentError, match="takes one file, found 2"):
         read_source([bag, bag], importer="bag")

@@ -407,7 +407,7 @@ def test_a_number_that_often_stands_for_no_range_is_refused_until_the_map_states
         ('[wide]\nrange_m = "zz{to_id}"', "wide.range_m: no column 'zz{to_id}'"),
         ('[wide]\nrange_m = "zz"', "wide.range_m"),
         ('from_name = "x{from_id}.csv"', "its name is not 'x{from_id}.csv'"),
-        ('each = "rows"', "`each` is of JSON lines"),
+        ('each = "rows"', "each is of JSON lines"),
         ('[columns]\nrange_m = 4\nfrom_id = "from_id"', "for all their numbers"),
         ("[columns]\nrange_m = 9\nfrom_id = 2\nto_id = 3", "column '9' is missing"),
         ('[columns]\nfpp2 = {f1 = "a", n = "b"}', "columns of f1, f2, f3 and n"),
