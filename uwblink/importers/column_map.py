@@ -144,7 +144,7 @@ FILE_KEYS: Final = (
         "chip",
         f"one of {', '.join(CHIPS)}",
         "not known",
-        "The chip of the devices: powers from registers, offsets of clocks and limits of powers. It is kept in the recording.",
+        "The chip of the devices: powers from registers, offsets of clocks, limits of powers. Kept in the recording.",
     ),
     FileKey("prf", "16 or 64, MHz", "64", "Pulse repetition frequency, for powers from registers."),
     FileKey(
