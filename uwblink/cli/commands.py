@@ -89,8 +89,8 @@ def guess(
         typer.echo(found.text, nl=False)
         return
     write_text(output, found.text, force=force)
-    name = quote(f"{table.name.split('.')[0]}.uwb")
-    then = f"uwblink import {found.importer} {quote(str(table))} --map {quote(str(output))} -o {name}"
+    name = quote(table.name.split(".")[0])
+    then = f"uwblink import {found.importer} {quote(str(table))} --map {quote(str(output))} -o {name}.uwb"
     asked = f"set {' and '.join(found.asked)} in it" if found.asked else "check it"
     typer.echo(f"{output}: {asked if found.complete else 'fill in what is missing'}, then {then}")
     if found.advice:

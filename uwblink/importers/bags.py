@@ -203,7 +203,7 @@ def _with_topics(bag: Bag, column_map: ColumnMap) -> ColumnMap:
     for kind, template, columns in _OWN:
         if own := matching_topics(template, (topic for topic, one in bag.kinds.items() if one == kind)):
             columns, unit = columns | column_map.columns, column_map.distance_unit or "m"
-            return replace(column_map, topics=dict(own), columns=columns, distance_unit=unit)
+            return replace(column_map, topics=own, columns=columns, distance_unit=unit)
     if len(bag.kinds) == 1:
         return replace(column_map, topics={topic: {} for topic in bag.kinds})
     raise ImportTableError(
@@ -212,13 +212,13 @@ def _with_topics(bag: Bag, column_map: ColumnMap) -> ColumnMap:
     )
 
 
-def matching_topics(stated: str, topics: Iterable[str]) -> dict[str, dict[str, str]]:
+def matching_topics(stated: str, topics: Iterable[str]) -> dict[str, dict[str, float | str]]:
     """Return the topics that are called so, or that a template matches, with the values of its places."""
     listed = list(topics)
     if stated in listed or not is_template(stated):
         return {stated: {}} if stated in listed else {}
     found = {topic: Template(stated).match(topic) for topic in listed}
-    return {topic: places for topic, places in found.items() if places is not None}
+    return {topic: {**places} for topic, places in found.items() if places is not None}
 
 
 def _rows(bag: Bag, topics: Mapping[str, dict[str, float | str]]) -> Iterator[dict[str, Any]]:

@@ -1,6 +1,8 @@
 """Bags with topics of ranges: guessed and imported, with nothing but the bag, and what is said of their poses."""
 
 import json
+import sqlite3
+from contextlib import closing, suppress
 
 import numpy as np
 import pytest
@@ -270,13 +272,28 @@ def test_bags_without_ranges_are_refused_with_their_topics(tmp_path):
 
 
 def test_types_that_a_bag_does_not_define_leave_the_others(tmp_path):
-    import sqlite3
-    from contextlib import closing
+    for name, topics in {"both": NUMBERS, "one": {}}.items():
+        more = {"/px4/status": (MINE, of_anchor(None, as_mine))}
+        bag = ros2(tmp_path / name, topics | more, StoragePlugin.SQLITE3)
+        with closing(sqlite3.connect(bag / f"{name}.db3")) as db, db:
+            db.execute("DELETE FROM message_definitions")
+    assert len(by_guess(tmp_path, tmp_path / "both").exchanges) == len(PLANT)
+    with pytest.raises(ImportTableError, match=r"one: .*/px4/status.* has no definition of uwb_msgs/msg/Mine; convert"):
+        guess_map(bag)
 
-    bag = ros2(tmp_path / "b", NUMBERS | {"/px4/status": (MINE, of_anchor(None, as_mine))}, StoragePlugin.SQLITE3)
-    with closing(sqlite3.connect(bag / "b.db3")) as db, db:
-        db.execute("DELETE FROM message_definitions")
-    assert len(by_guess(tmp_path, bag).exchanges) == len(PLANT)
+
+TEXTS = ["[" * 100_000, '{"a":' * 700 + "1" + "}" * 700, "[1, 2]", '{"ranges": [1, {"x": 3}]}', '{"0": {"0": []}}']
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_texts_that_are_no_ranges_are_one_line(tmp_path, text):
+    bag = ros2(tmp_path / "b", {"/a/{b": (TEXT, of_anchor(0, lambda types, *_: types[TEXT](text)))})
+    with pytest.raises(ImportTableError, match="no topic with ranges") as caught:
+        guess_map(bag)
+    assert "\n" not in str(caught.value)
+    (tmp_path / "map.toml").write_text('[topics."/a/{b"]\n[constants]\nfrom_id = 7\nto_id = 8\nrange_m = 3\n')
+    with suppress(ImportTableError):
+        read_source(bag, importer="bag", map_file=tmp_path / "map.toml")
 
 
 def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
