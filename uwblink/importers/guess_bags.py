@@ -22,7 +22,7 @@ from uwblink.importers.bags import Bag, fields_of, matching_topics, open_bag
 from uwblink.importers.column_map import IDS, POSITIONS, POWERS
 from uwblink.importers.column_names import named_columns
 from uwblink.importers.forms import name_template, wide_columns
-from uwblink.importers.poses import MESSAGES, pose_advice
+from uwblink.importers.poses import pose_advice
 from uwblink.twr import STAMPS
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ NO_POSES: Final = (
     "also needs attitudes, and anchors or first positions (`calib fit --truth ranges`); constants of pairs need true "
     "distances (docs/without-motion-capture.md)"
 )
+_PRECIOUS: Final = {*STAMPS, *POWERS}
 MESSAGES_READ: Final = 2000
 """Of each group of topics."""
 
@@ -53,7 +54,7 @@ _WORDS: Final = {
 
 
 def guess_bag(path: Path, guess_table: Callable[..., Guess]) -> Guess:
-    """Return the map of the topics of which most is recognised: stamps, then powers, then ids.
+    """Return the map of the topics of which most is recognised: stamps and powers, then ids.
 
     `guess_table` guesses the map of a table of messages. Raises `ImportTableError` for a bag without ranges.
     """
@@ -61,7 +62,7 @@ def guess_bag(path: Path, guess_table: Callable[..., Guess]) -> Guess:
     why = "write a map with [topics]"
     with open_bag(path) as bag, TemporaryDirectory(prefix="uwblink-") as folder:
         kinds = dict(sorted(bag.kinds.items()))
-        fitting = [t for t, k in kinds.items() if k not in MESSAGES and not re.search(_OTHERS, f"{k} {t.lower()}")]
+        fitting = [t for t, k in kinds.items() if not re.search(_OTHERS, f"{k} {t.lower()}")]
         for kind in dict.fromkeys(kinds[topic] for topic in fitting):
             for pattern, some in _grouped([topic for topic in fitting if kinds[topic] == kind]):
                 try:
@@ -73,7 +74,9 @@ def guess_bag(path: Path, guess_table: Callable[..., Guess]) -> Guess:
     listed = [f"{json.dumps(topic)} ({kind})" for topic, kind in kinds.items()]
     if not found:
         raise ImportTableError(f"{path}: no topic with ranges was recognised in {first_few(listed, 20)}; {why}")
-    best, chosen = max(found, key=lambda one: _recognised(one[0]))
+    best, chosen = max(
+        found, key=lambda one: (len({*STAMPS, *POWERS} & {*one[0].columns}), -len(one[0].asked), len(one[0].columns))
+    )
     advice = pose_advice(kinds, path, Path(f"{path.name.split('.')[0]}.uwb"))
     advice = advice or ("" if {"gt_range_m", *POSITIONS} & {*best.columns} else NO_POSES)
     others = [json.dumps(topic) for _, some in found if some is not chosen for topic in some]
@@ -81,12 +84,6 @@ def guess_bag(path: Path, guess_table: Callable[..., Guess]) -> Guess:
     remarks += [f"also with ranges, for maps of their own: {', '.join(others)}"] if others else []
     text = best.text + "".join(f"# {line}\n" for line in (*remarks, advice) if line)
     return replace(best, text=text, importer="bag", advice=advice)
-
-
-def _recognised(guess: Guess) -> tuple[bool, bool, int, int]:
-    """Return how much of a table a guess recognises, to compare guesses."""
-    with_stamps, with_powers = (any(n in guess.columns for n in names) for names in ((*STAMPS, "tx", "stamp"), POWERS))
-    return with_stamps, with_powers, -len(guess.asked), len(guess.columns)
 
 
 def _guess_topics(bag: Bag, pattern: str, topics: list[str], table: Path, guess_table: Callable[..., Guess]) -> Guess:
