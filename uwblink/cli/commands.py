@@ -114,8 +114,7 @@ def _importing(row: Importer) -> Callable[..., None]:
         for note in done.notes:
             typer.echo(f"  {printable(note)}")
         if row.name == "bag" and "poses" not in done.counts:
-            with uwblink.importers.bags.open_bag(table) as bag:
-                advice = uwblink.importers.poses.pose_advice(bag.kinds, table, output)
+            advice = uwblink.importers.pose_advice(table, output)
             typer.echo(advice + "\n" * bool(advice), nl=False)
 
     def without_map(table: Any, output: Path, force: bool = False) -> None:

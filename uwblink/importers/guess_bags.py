@@ -33,7 +33,6 @@ NO_POSES: Final = (
     "also needs attitudes, and anchors or first positions (`calib fit --truth ranges`); constants of pairs need true "
     "distances (docs/without-motion-capture.md)"
 )
-_PRECIOUS: Final = {*STAMPS, *POWERS}
 MESSAGES_READ: Final = 2000
 """Of each group of topics."""
 
@@ -77,7 +76,7 @@ def guess_bag(path: Path, guess_table: Callable[..., Guess]) -> Guess:
     best, chosen = max(
         found, key=lambda one: (len({*STAMPS, *POWERS} & {*one[0].columns}), -len(one[0].asked), len(one[0].columns))
     )
-    advice = pose_advice(kinds, path, Path(f"{path.name.split('.')[0]}.uwb"))
+    advice = pose_advice(path, Path(f"{path.name.split('.')[0]}.uwb"))
     advice = advice or ("" if {"gt_range_m", *POSITIONS} & {*best.columns} else NO_POSES)
     others = [json.dumps(topic) for _, some in found if some is not chosen for topic in some]
     remarks = ["topics of the bag:", *(f"  {one}" for one in listed)]

@@ -117,9 +117,13 @@ def _body_in(name: str) -> str:
     return next((part for part in name.split("/") if part and part not in DRIVERS), "")
 
 
-def pose_advice(kinds: Mapping[str, str], bag: Path, recording: Path) -> str:
-    """Return the command that adds the poses of a bag to a recording; "" for a bag without poses."""
-    found = first_few(json.dumps(topic) for topic, kind in sorted(kinds.items()) if kind in MESSAGES)
+def pose_advice(bag: Path, recording: Path) -> str:
+    """Return the command that adds the poses of a bag to a recording; "" for a bag without poses.
+
+    Raises `ImportTableError`.
+    """
+    with open_bag(bag) as opened:
+        found = first_few(json.dumps(topic) for topic, kind in sorted(opened.kinds.items()) if kind in MESSAGES)
     command = f"uwblink poses {quote(str(recording))} --from {quote(str(bag))} --tags TAGS.toml"
     return "" if found == "none" else f"poses on {found} become true distances: {command} (where the tags sit)"
 
