@@ -28,6 +28,10 @@ OF_A_FIT: Final = BUDGET / 2
 SMALLEST_NS: Final = 0.02
 """Error of a delay below which no fault is named: 3 mm of a range."""
 
+NAMED_DETOUR_M: Final = 0.12
+"""Detours that are named: shorter ones may as well be noise that is not normal, or an error that wanders. In
+some flights of the simulator's six robots, without a fault, a fifth of the ranges is taken for reflected by 8 cm."""
+
 STRETCHES: Final = 16
 """Stretches of time over which a statistic is averaged: their variance is then known to about a third."""
 

@@ -103,8 +103,10 @@ class Runner:
 
 
 def lines(code: str) -> Iterator[str]:
-    """Yield the commands of a block, without comments; flights are of 30 s at most."""
-    code = re.sub(r"(run\.duration_s=)(\d+)", lambda found: f"{found[1]}{min(30, int(found[2]))}", code)
+    """Yield the commands of a block, without comments; flights are of 12 s at most."""
+    code = re.sub(
+        r"(run\.duration_s=|plan flight .*--duration )(\d+)", lambda found: f"{found[1]}{min(12, int(found[2]))}", code
+    )
     for line in code.replace("\\\n", " ").splitlines():
         bare = line.split(" #")[0].strip()
         if bare and not bare.startswith("#"):

@@ -17,7 +17,7 @@ import calib
 import uwbsim
 from calib.errors import BadInputError
 from tests.boards import served
-from tests.processes import refuse, run, succeed
+from tests.processes import call, refuse, run, succeed
 from uwblink import Contents, Exchanges, Poses
 from uwblink.boards.ports import Terminal
 from uwblink.errors import ImportTableError, PortError
@@ -76,7 +76,7 @@ def refused(seeds, folder, line, naming, text="", status=2, **names):
     for own in {word for word in words if word.startswith("own.")}:
         (folder / own).write_text(text)
     before = listed(folder), listed(seeds)
-    told = refuse(*words, cwd=folder, naming=naming, status=status, timeout=180)
+    told = refuse(*words, cwd=folder, naming=naming, status=status, runner=call)
     assert (listed(folder), listed(seeds)) == before
     return told
 

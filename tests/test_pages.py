@@ -12,8 +12,8 @@ from uwblink.pages import figures
 
 mpl.use("Agg")
 
-FLIGHT = "uwbsim run scenarios/icra2023/train.toml -o train.uwb --set run.duration_s=30"
-TEST = "uwbsim run scenarios/icra2023/test1.toml -o test.uwb --set run.duration_s=20"
+FLIGHT = "uwbsim run scenarios/icra2023/train.toml -o train.uwb --set run.duration_s=12"
+TEST = "uwbsim run scenarios/icra2023/test1.toml -o test.uwb --set run.duration_s=8"
 FIT = "calib fit train.uwb -o calibration.json"
 
 

@@ -30,6 +30,10 @@ broken = "strange_ranging:NOTHING"
 [project.entry-points."uwbcal.importers"]
 strange = "strange_ranging:IMPORTERS"
 
+[project.entry-points."uwbcal.losses"]
+welsch = "strange_ranging.losses:WELSCH"
+bad = "strange_ranging.losses:BAD"
+
 [tool.hatch.build.targets.wheel]
 packages = ["strange_ranging"]
 """
@@ -71,6 +75,19 @@ def read(source, _map):
 
 IMPORTERS = [Importer("eight", (".eight",), read, "Import eight numbers a line.")]
 """
+LOSSES = """
+import numpy as np
+from calib.estimator.losses import RobustLoss
+
+
+def weights(u):
+    weight = np.exp(-(u**2) / 2)
+    return weight, weight * (1 - u**2)
+
+
+WELSCH = RobustLoss("welsch", weights)
+BAD = RobustLoss("bad", lambda u: (u, u))
+"""
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +97,7 @@ def installed(tmp_path_factory):
     (source / "strange_ranging").mkdir()
     (source / "pyproject.toml").write_text(PROJECT)
     (source / "strange_ranging" / "__init__.py").write_text(MODULE)
+    (source / "strange_ranging" / "losses.py").write_text(LOSSES)
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
     pip += ["--disable-pip-version-check", "--target", str(site), str(source)]
     subprocess.run(pip, check=True, capture_output=True, text=True)
@@ -103,14 +121,17 @@ WARNING = (
 )
 
 
-def test_the_protocol_of_another_distribution_is_simulated_and_fitted(run, tmp_path):
+def test_protocol_and_loss_of_another_distribution_are_simulated_and_fitted_with(run, tmp_path):
     flight = tmp_path / "f.uwb"
     settings = ("--set", "ranging.protocol=strange-ds", "--set", "run.duration_s=30")
     done = run("uwbsim", "run", "scenarios/noiseless.toml", "-o", flight, *settings)
     assert (done.returncode, done.stderr) == (0, WARNING)
-    done = run("calib", "fit", flight, "-o", tmp_path / "c.json")
+    done = run("calib", "fit", flight, "-o", tmp_path / "c.json", "--loss", "welsch")
     assert done.returncode == 0, done.stderr
-    found = json.loads((tmp_path / "c.json").read_text())["delays_ns"]
+    assert "'bad' of strange-ranging (group uwbcal.losses) is left out" in done.stderr
+    document = json.loads((tmp_path / "c.json").read_text())
+    assert document["loss"] == "welsch"
+    found = document["delays_ns"]
     planted = {"1": -0.36, "2": -0.01, "3": 0.24, "4": -0.36}
     assert {tag: found[tag] for tag in planted} == pytest.approx(planted, abs=5e-3)
 

@@ -39,8 +39,7 @@ def spread(errors):
 
 def corrected(work, recording, calibration):
     """Raw and corrected errors in metres (n,) of a recording, and their sigma, by what `calib apply` writes."""
-    done = processes.run("calib", "apply", recording, "-c", calibration, "-o", "applied", "--to", "csv", cwd=work)
-    assert done.returncode == 0, done.stderr
+    processes.succeed("calib", "apply", recording, "-c", calibration, "-o", "applied", "--to", "csv", cwd=work)
     columns = []
     for name in ("exchanges", "corrected"):
         with (work / "applied" / f"{name}.csv").open(newline="") as file:

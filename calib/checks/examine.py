@@ -19,8 +19,8 @@ from calib.checks.recording_view import RecordingView, view_of
 from calib.data.sources import Data, each, opened
 from calib.findings import BUDGET, CERTAIN, OF_A_FIT, Check, Finding
 
-ALONE: Final = "Student's t over 16 stretches of time"
-BLOCKS: Final = "Student's t, variances by stretches of time"
+OVER_STRETCHES: Final = "Student's t over 16 stretches of time"
+OVER_BLOCKS: Final = "Student's t, variances by stretches of time"
 
 CHECKS: Final = (
     Check(
@@ -115,14 +115,14 @@ CHECKS: Final = (
     Check(
         "geometry",
         "Do poses fit better more than 30 ms earlier or later?",
-        "log of the spread before over after", ALONE,
+        "log of the spread before over after", OVER_STRETCHES,
         {"pose time offset": "shift the poses: uwblink poses ... --offset {shift}"},
         geometry.pose_clock,
     ),
     Check(
         "geometry",
         "Do other lever arms or quaternions fit better?",
-        "log of the spread before over after, the best trial", f"{ALONE}, for all trials",
+        "log of the spread before over after, the best trial", f"{OVER_STRETCHES}, for all trials",
         {
             "lever arm sign": "change the sign of the lever arms of body {body}",
             "lever arm unit": "multiply the lever arms of body {body} by {length}",
@@ -144,7 +144,7 @@ CHECKS: Final = (
     Check(
         "radio",
         "Do ranges follow the true distances within 30 cm?",
-        "mean absolute error of a pair, its median aside", f"{ALONE}, for all pairs",
+        "mean absolute error of a pair, its median aside", f"{OVER_STRETCHES}, for all pairs",
         {
             "ranges that do not follow the distances": "see whether numbers of anchors belong to other places, and "
             "times to another clock; or whether a wall stands between these tags"
@@ -162,7 +162,7 @@ CHECKS: Final = (
     Check(
         "radio",
         "Do all pairs of a tag shift by more than 2 cm at one time, and no others?",
-        "mean shift at the best of 60 times and all tags", BLOCKS,
+        "mean shift at the best of 47 times, and all tags", OVER_BLOCKS,
         {
             "delay changed mid-flight": "look for a loose antenna or another voltage on tag {tag}; calibrate the "
             "two parts apart",
@@ -173,7 +173,7 @@ CHECKS: Final = (
     Check(
         "radio",
         "Is a pair more than 4 cm off what delays of tags explain?",
-        "a pair's own offset, the largest", f"{BLOCKS}, for all pairs",
+        "a pair's own offset, the largest", f"{OVER_BLOCKS}, for all pairs",
         {
             "pairs that do not close": "look for a wall or a body between these two, and at their lever arms; record "
             "the pair anew, or fit with `constants` pair"
@@ -182,8 +182,9 @@ CHECKS: Final = (
     ),
     Check(
         "radio",
-        "Are more than a fifth of the ranges reflected, or of one tag more than of others, or do reflections last?",
-        "share of long ranges; long ranges after long ones", f"{ALONE}; binomial, for all tags or pairs",
+        "Are more than 15 % of the ranges reflected, or of one tag more than of others, or do reflections last?",
+        "share of ranges that are 12 cm long; long ranges after long ones",
+        f"{OVER_STRETCHES}; binomial, for all tags or pairs",
         {
             "reflections": "{more}",
             "reflections that last": "such ranges do not average out within a spell: record for many spells, move "
@@ -271,7 +272,7 @@ CHECKS: Final = (
     Check(
         "between",
         "Did an anchor or a delay change between recordings?",
-        "displacement of an anchor; mean change of a tag's pairs above 2 cm", f"as above; {BLOCKS}, for all tags",
+        "displacement of an anchor; mean change of a tag's pairs above 2 cm", f"as above; {OVER_BLOCKS}, for all tags",
         {
             "anchor moved between recordings": "measure the place of {body} anew, and fit recordings apart until then",
             "delay changed between recordings": "was the antenna of tag {tag} touched, or its board replaced? "

@@ -14,11 +14,12 @@ from scipy import sparse
 from calib.calibration.power_curves import basis
 from calib.checks.places import of_places
 from calib.estimator.known_distances import KnownDistances
+from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import Mixture
 from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes, search, widening
 from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.estimator.to_calibration import bias_curves
-from calib.findings import OF_A_FIT, SMALLEST_NS
+from calib.findings import NAMED_DETOUR_M, OF_A_FIT, SMALLEST_NS
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -33,6 +34,10 @@ small one by so many (one in 16 000 by chance)."""
 SMALLEST_M = 0.01
 """An offset of less is nobody's fault, as a lever arm by a ruler is no better: it widens intervals, and is not named
 unless it matters clearly."""
+
+HIDDEN, OFTEN = 0.8, 0.45
+"""Shares of reflected ranges of a pair that is named, and of a tag's pairs on average. Judgements: delays rest on the
+direct ranges."""
 
 UNIT = np.ones((1, 1))
 """The derivative of a range by an offset of it."""
@@ -93,7 +98,7 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
         yield of_tags("decibels", louder_m[:, None] / size)
     forth = np.where(ranges.initiator < ranges.target, 1.0, -1.0)
     yield of_tags("skew", forth[:, None] * [1.0, -1.0])
-    shared = _shared(found, louder_m) if beside_curve else _late(found)
+    shared = _shared(found, louder_m) if beside_curve else late(found.model)
     if shared:
         everyone = np.broadcast_to(np.arange(len(shared)), (count, len(shared)))
         values = np.column_stack(list(shared.values()))
@@ -146,7 +151,7 @@ def _shared(found: KnownDistances, louder_m: Floats) -> dict[str, Floats]:
     reach = float(np.ptp(truth_m))
     if reach <= 0:
         return {}
-    shared = {"scale": (truth_m - float(np.median(truth_m))) / reach} | _late(found)
+    shared = {"scale": (truth_m - float(np.median(truth_m))) / reach} | late(found.model)
     if np.any(louder_m):
         decibels = 10 * np.log10(np.maximum(found.model.lifted, 1e-4))
         far = np.log(np.maximum(truth_m, 0.1))
@@ -156,12 +161,12 @@ def _shared(found: KnownDistances, louder_m: Floats) -> dict[str, Floats]:
     return shared
 
 
-def _late(found: KnownDistances) -> dict[str, Floats]:
+def late(model: RangeModel) -> dict[str, Floats]:
     """Return by how many metres a second the true distance of each range (n,) changes, over its root mean square.
 
     Speeds are those by the neighbours of each pair; nothing is returned where no distance changes.
     """
-    ranges, pair = found.model.ranges, found.model.pairs.number
+    ranges, pair = model.ranges, model.pairs.number
     order = np.argsort(pair, kind="stable")
     time_s, truth_m = ranges.time_ns[order] * 1e-9, ranges.truth_m[order]
     same = (np.diff(pair[order]) == 0) & (np.diff(ranges.session[order]) == 0)
@@ -294,9 +299,8 @@ def shares_of_pairs(found: KnownDistances) -> tuple[Floats, Floats]:
 def _reflected(found: KnownDistances) -> Iterator[str]:
     """Name the pairs of which hardly a range is direct, or else a tag about half of whose ranges are not."""
     share, detour_m = shares_of_pairs(found)
-    # Shorter detours may as well be an error that wanders.
-    ends, far = found.model.pairs.ends, detour_m > 0.12
-    hidden, tags = np.flatnonzero((share > 0.8) & far).tolist(), np.unique(ends).tolist()
+    ends, far = found.model.pairs.ends, detour_m > NAMED_DETOUR_M
+    hidden, tags = np.flatnonzero((share > HIDDEN) & far).tolist(), np.unique(ends).tolist()
     for number in hidden:
         a, b = ends[number].tolist()
         others = [tag for tag in tags if tag not in (a, b)]
@@ -307,7 +311,7 @@ def _reflected(found: KnownDistances) -> Iterator[str]:
             f"{100 * detour_m[number]:.0f} cm; record it anew, delays rest on the other pairs"
         )
     means = {tag: float(np.where(far, share, 0.0)[np.any(ends == tag, axis=1)].mean()) for tag in tags}
-    often = [tag for tag in tags if means[tag] > 0.45 and not hidden]
+    often = [tag for tag in tags if means[tag] > OFTEN and not hidden]
     for tag in often[:1]:
         yield f"tag {tag}: {100 * means[tag]:.0f} % of its ranges are reflected; what stands near its antenna?"
 
@@ -341,10 +345,8 @@ def _confounded(found: KnownDistances, slopes: Slopes) -> Iterator[str]:
     rows = basis(np.quantile(model.lifted, np.linspace(0.02, 0.98, 25)), model.curve.knots)
     count = len(model.curve_kinds())
     rows = np.tile(rows - rows.mean(axis=0), count) / count
-    own_columns = slopes.optimum.layout.indices(model.curve_kinds())
-    more = float(np.sqrt(np.mean((rows @ taken[own_columns] * slope) ** 2)))
-    variance = np.einsum("ij,jk,ik->i", rows, found.covariances["curve"], rows)
-    band = float(np.sqrt(max(float(np.mean(variance)), 0.0)))
+    more = float(np.sqrt(np.mean((rows @ taken[slopes.optimum.layout.indices(model.curve_kinds())] * slope) ** 2)))
+    band = float(np.sqrt(max(np.mean(np.einsum("ij,jk,ik->i", rows, found.covariances["curve"], rows)), 0.0)))
     if more >= band:
         yield (
             f"power and distance are confounded: true distances 1 % off would pass for "

@@ -11,8 +11,11 @@ from typing import Final
 import numpy as np
 from scipy import optimize, special
 
+from calib.checks.fitted import late
 from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
-from calib.findings import Candidate, positive, stretches
+from calib.estimator.known_distances import ASTRAY_M
+from calib.estimator.score_tests import Tested
+from calib.findings import BUDGET, Candidate, positive, stretches
 from calib.information import LOOSEST
 from calib.spread import TWO_SIDED_95, less_medians, medians, robust_spread
 from uwblink.arrays import Floats, Ints
@@ -23,8 +26,12 @@ from uwblink.recording.schema import Poses, Tag
 
 def pose_clock(view: RecordingView) -> Iterator[Candidate]:
     """Poses whose clock is off by up to a few seconds."""
-    if not len(view.poses):
+    fit = view.quick_fit
+    # Where poses are late, by less than bodies take for a turn, ranges follow the speeds at which distances change.
+    follow = [fit.offset(speeds)[1] for speeds in late(fit.model).values()] if fit else [0.0]
+    if not len(view.poses) or min(follow, default=1.0) > BUDGET:
         return
+    # By how much is a search: motion over a second is not linear.
     try:
         offset_ns = find_offset(view.exchanges, view.poses, view.tags, within_s=3.0)
     except ImportTableError:
@@ -42,11 +49,9 @@ def _trials(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]
     for body in sorted({tag.body for tag in view.tags}):
         arms = {tag.tag: np.array(tag.lever_arm_m) for tag in view.tags if tag.body == body}
         longest = max(np.linalg.norm(arm) for arm in arms.values())
-        scales = [("lever arm sign", -1.0)] if longest > 0 else []
-        if longest > 1.0:
-            # Robots that carry these boards are smaller: mm, cm or inches.
-            scales += [("lever arm unit", length) for length in (0.001, 0.01, 0.0254)]
-        for fault, length in scales:
+        # Robots that carry these boards are smaller than a metre: mm, cm or inches.
+        units = [("lever arm unit", length) for length in (0.001, 0.01, 0.0254) if longest > 1.0]
+        for fault, length in [("lever arm sign", -1.0)] * bool(longest > 0) + units:
             seen = Candidate(fault, f"of body {body}: times {length:g}", words={"body": body, "length": length})
             yield seen, view.poses, _with_arms(view.tags, {tag: length * arm for tag, arm in arms.items()})
         for a, b in combinations(arms, 2):
@@ -126,23 +131,30 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
 
     In a direction that ranges hardly determine, as the height where robots keep theirs, some place far away always fits
     reflections better than the given one. So the direction must be determined at the given place, as an information
-    matrix is judged (`calib.information`), unless ranges are astray there.
+    matrix is judged (`calib.information`), unless ranges are astray there. Where slopes at the given place may be zero
+    no other is searched for: distances are linear in centimetres, not in metres, so that a search cannot be spared.
     """
     tags = [tag.tag for tag in view.tags if tag.body == body]
-    first, second = (np.isin(view.exchanges[fit.rows].initiator, tags), np.isin(view.exchanges[fit.rows].target, tags))
+    first, second = (np.isin(ends[fit.rows], tags) for ends in (view.exchanges.initiator, view.exchanges.target))
     mine = first != second
     own = view.chosen(fit.rows[mine])
-    ends = own.exchanges.initiator, own.exchanges.target
     here, there = (
-        antennas_m(view.poses, view.tags, np.where(first[mine], *ids), own.exchanges.time_ns)
-        for ids in (ends, ends[::-1])
+        antennas_m(view.poses, view.tags, ids, own.exchanges.time_ns)
+        for ids in (own.exchanges.initiator, own.exchanges.target)
     )
-    apart, pair = here - there, np.unique(fit.pair[mine], return_inverse=True)[1]
+    apart = np.where(first[mine, None], here - there, there - here)
+    pair = np.unique(fit.model.pairs.number[mine], return_inverse=True)[1]
+    # With fewer, its slopes in 32 stretches of time would be of some ranges each, and far from normal.
     if len(apart) < 200 or not np.isfinite(apart).all():
         return
     here_m = np.linalg.norm(apart, axis=1)
     # Where anchors are metres off, what power does is not known, and small beside that.
-    astray = robust_spread(fit.residual[mine]) > 0.3
+    astray = robust_spread(fit.residual[mine]) > ASTRAY_M
+    derivative = np.zeros((len(mine), 3))
+    derivative[mine] = outward = apart / here_m[:, None]
+    at_given = fit.test(derivative)
+    if not astray and _p_of_place(at_given, at_given.total) > BUDGET:
+        return
     measured = here_m + (own.error_m if astray else fit.residual[mine])
 
     def spread_at(away: Floats) -> float:
@@ -161,12 +173,10 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
         return
     at_other = moved.test(((apart + away) / there_m[:, None])[moved.rows])
     slope = at_other.information @ away * (1 - TOLERANCE_M / size)
-    square = float(slope @ np.linalg.lstsq(at_other.covariance, slope, rcond=1e-12)[0])
-    p_value = float(special.fdtrc(3, at_other.blocks - 3.0, square / 3))
+    p_value = _p_of_place(at_other, slope)
     if not astray:
-        derivative = np.zeros((len(mine), 3))
-        derivative[mine] = apart / here_m[:, None]
-        at_given = fit.test(derivative)
+        # Ranges at the other place: at the given one they hardly determine anything, so far off are they.
+        at_given = moved.test(outward[moved.rows])
         direction = np.linalg.lstsq(at_given.information, away / size, rcond=1e-12)[0]
         # Without ranges a place is known to half a metre: a tape misread, a tripod moved.
         if np.sqrt(direction @ at_given.covariance @ direction) > LOOSEST * 0.5:
@@ -175,17 +185,23 @@ def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, 
     near = {name: float(np.hypot(*(place - places[body] - away)[:2])) for name, place in places.items()}
     others = " and ".join(name for name in places if name != body and near[name] < 0.3 + 0.1 * size)
     inverse = np.linalg.pinv(at_other.information, rcond=1e-12, hermitian=True)
-    half = TWO_SIDED_95 * np.sqrt(np.diag(inverse @ at_other.covariance @ inverse))
-    axes = ", ".join(f"{name} {one:+.2f} ± {far:.2f}" for name, one, far in zip("xyz", away, half, strict=True))
+    std = np.sqrt(np.diag(inverse @ at_other.covariance @ inverse))
+    axes = [f"{name} {one:+.2f} ± {TWO_SIDED_95 * far:.2f}" for name, one, far in zip("xyz", away, std, strict=True)]
     yield Candidate(
         "anchor stands elsewhere",
-        f"ranges with {body} fit a place {size:.2f} m away ({axes} m, 95 %): their "
+        f"ranges with {body} fit a place {size:.2f} m away ({', '.join(axes)} m, 95 %): their "
         f"spread is {100 * after:.1f} cm there instead of {100 * before:.1f} cm"
         + (f"; there the recording has {others}: are numbers exchanged?" if others else ""),
         min(1.0, p_value * len(places)),
         {"body": body, "away_m": away, "place": [round(value, 2) for value in (places[body] + away).tolist()]},
         gain,
     )
+
+
+def _p_of_place(tested: Tested, slope: Floats) -> float:
+    """Return the p-value of slopes (3,) by a place, whose mean is zero if the place is right (Hotelling)."""
+    square = float(slope @ np.linalg.lstsq(tested.covariance, slope, rcond=1e-12)[0])
+    return float(special.fdtrc(3, tested.blocks - 3.0, square / 3))
 
 
 def _place(apart: Floats, measured: Floats, pair: Ints, start: Floats) -> Floats:

@@ -12,6 +12,7 @@ import numpy as np
 
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import ALPHA_DBM, equal_bins, lifted_power
+from calib.checks.residuals import ONE_WAY_M
 from calib.data.clocks import as_length, corrected
 from calib.data.ranges import NO_STAMPS, STATIC, Ranges
 from calib.errors import UnanswerableError
@@ -147,6 +148,7 @@ def _impossible(ranges: Ranges) -> Iterator[str]:
 def _looks_like(ratio: float) -> str:
     """Return what ranges that are so many times the true distances look like, an empty text where no unit is near."""
     whose, smaller = ("true distances", ratio) if ratio < 1 else ("ranges", 1 / ratio)
+    # Units are apart by factors of three or more, and delays change a range of metres by less than a fifth.
     units = {0.001: "millimetres", 0.01: "centimetres", 0.3048: "feet"}
     near = (f"{whose} look like {unit}" for own, unit in units.items() if abs(np.log(max(smaller, 1e-9) / own)) < 0.2)
     return next(near, "")
@@ -167,11 +169,12 @@ def one_way(ranges: Ranges) -> Iterator[str]:
     Medians of raw errors show it also where a fit takes such ranges for reflections.
     """
     ways = _medians_by_way(ranges.raw_m - ranges.truth_m, ranges)
-    # The powers of both ways are not quite alike, and errors last: eight standard errors are no chance.
+    # Standard errors are those of independent ranges. In the simulator's room, errors that last make variances of sums
+    # up to 15 times as large, so that eight of them are two, and more is no chance.
     differ_m = {
         (a, b): middle - ways[b, a][0]
         for (a, b), (middle, std) in ways.items()
-        if a < b and (b, a) in ways and abs(middle - ways[b, a][0]) > max(0.05, 8.0 * np.hypot(std, ways[b, a][1]))
+        if a < b and (b, a) in ways and abs(middle - ways[b, a][0]) > max(ONE_WAY_M, 8.0 * np.hypot(std, ways[b, a][1]))
     }
     if differ_m:
         a, b = max(differ_m, key=lambda pair: abs(differ_m[pair]))

@@ -10,7 +10,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 from scipy import sparse
@@ -18,11 +18,13 @@ from scipy import sparse
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import RecordedSource, Source
 from calib.estimator.known_distances import FEWEST_RANGES, PILOT, Fitted, likeliest, model_of, robust_fit
-from calib.estimator.optimize import maximize
-from calib.estimator.range_model import RangeModel
-from calib.estimator.score_tests import REACHED, Family, Slopes, Tested
-from calib.estimator.time_blocks import time_blocks
-from calib.estimator.unknowns import Priors
+from calib.estimator.optimize import Optimum, maximize
+from calib.estimator.range_model import METRES_A_NS, RangeModel
+from calib.estimator.range_rows import RESIDUAL, Part, RangeRows, Robust
+from calib.estimator.score_tests import REACHED, Derivative, Family, Slopes, Tested
+from calib.estimator.time_blocks import TimeBlocks, time_blocks
+from calib.estimator.unknowns import Priors, Unknown
+from calib.findings import exceeds
 from calib.pairs import pairs_of
 from calib.settings import FitSettings
 from calib.spread import less_medians
@@ -163,7 +165,7 @@ for a hundredth of the recording are in one stretch."""
 
 @dataclass(frozen=True, kw_only=True)
 class Offsets:
-    """Offsets (k,) in metres that residuals ask for, with their standard errors (k,) and degrees of freedom.
+    """Offsets (k,) that residuals ask for, with their standard errors (k,) and degrees of freedom.
 
     Standard errors contain errors that last; they are infinite for offsets of which nothing is known. `known` (k,) is
     the information, which does not.
@@ -175,67 +177,142 @@ class Offsets:
     dof: float
 
     @classmethod
-    def of(cls, tested: Tested, groups: Floats) -> Offsets:
-        """Return the offsets of `groups` (k, m) of tested ones (m,), which all members of a group share."""
+    def of(cls, tested: Tested, groups: Floats, courses: int = 1) -> Offsets:
+        """Return the offsets that all members of a group share, of each of `groups` (k, m) in each course.
+
+        Tested are the m members in each course, those of a course side by side; so are the k groups that are returned.
+        """
+        total = tested.total.reshape(courses, -1)
         known, variance = (
-            np.einsum("km,mn,kn->k", groups, square, groups, optimize=True)
-            for square in (tested.information, tested.covariance)
+            np.einsum("km,cmn,kn->ck", groups, np.einsum("cmcn->cmn", every.reshape(total.shape * 2)), groups).ravel()
+            for every in (tested.information, tested.covariance)
         )
         known = np.where(known > REACHED * tested.whole, known, 0.0)
         with np.errstate(divide="ignore"):
             std = np.sqrt(np.maximum(variance, 1e-300)) / known
-        size = -(groups @ tested.total) / np.where(known > 0, known, np.inf)
-        return cls(size=size, known=known, std=std, dof=min(tested.lasting.freedom, tested.blocks - 1.0))
+        return cls(
+            size=-(total @ groups.T).ravel() / np.where(known > 0, known, np.inf),
+            known=known,
+            std=std,
+            dof=min(tested.lasting.freedom, tested.blocks - 1.0),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class QuickFit:
     """A robust fit to the ranges (n,) of all pairs with enough of them, by session and time.
 
-    `rows` (n,) are those of each recording, `error` (n,) is measured less true and `residual` (n,) less fitted, metres.
-    `time_s` (n,) counts from the first range, without pauses. `slopes` test for more unknowns.
+    `rows` (n,) are those of each recording, `error` (n,) is measured less true, metres. `start` is the robust fit of a
+    sample, with the scale of the loss, and `x` (p,) are the unknowns of all.
     """
 
     rows: Ints
     model: RangeModel
     error: Floats
     start: Fitted
-    residual: Floats
-    time_s: Floats
-    slopes: Slopes
+    x: Floats
 
-    @property
-    def pair(self) -> Ints:
-        """The number of each range's pair (n,)."""
-        return self.model.pairs.number
+    @classmethod
+    def of(cls, model: RangeModel, error: Floats, rows: Ints, start: Fitted, x: Floats) -> QuickFit:
+        """Return a fit to errors (n,), searched for from unknowns (p,)."""
+        found = cls(rows=rows, model=model, error=error, start=start, x=x)
+        return replace(found, x=found._search(found.ranges, x, steps=20).x)
 
-    @property
-    def ends(self) -> Ints:
-        """The tags of each pair (k, 2)."""
-        return self.model.pairs.ends
+    def _search(self, ranges: RangeRows, x: Floats, steps: int) -> Optimum:
+        return maximize([ranges, *self.start.gauge], Priors(ranges.layout), x, steps=steps, evidence_steps=0)
 
-    @property
-    def names(self) -> list[str]:
-        """The names of pairs (k,)."""
-        return [f"{a}-{b}" for a, b in self.ends.tolist()]
+    @cached_property
+    def ranges(self) -> RangeRows:
+        """The ranges (n,) as rows."""
+        return self.model.build(self.error, self.start.rows.errors, only=tuple(self.start.optimum.layout.where))[1]
 
-    def less(self, metres: Floats) -> QuickFit:
-        """Return a fit to ranges that are shorter by some metres (n,)."""
-        return _fitted(self.model, self.error - metres, self.rows)
+    @cached_property
+    def residual(self) -> Floats:
+        """Measured less fitted (n,), metres."""
+        return self.ranges.residuals(self.x)
+
+    @cached_property
+    def blocks(self) -> TimeBlocks:
+        """Short blocks of time, of which the sums of scores are made up."""
+        return time_blocks(self.model.ranges.time_ns, self.model.ranges.session)
+
+    @cached_property
+    def slopes(self) -> Slopes:
+        """Slopes that test for more unknowns, with the curvature of the loss, which standard errors need."""
+        ranges = replace(self.ranges, errors=replace(cast("Robust", self.start.rows.errors), least=None))
+        # Long blocks in the place of short ones: sums over them hardly share errors that last.
+        short = self.blocks
+        count = min(STRETCHES_OF_SCORES, short.count)
+        number = short.number.astype(np.int64) * count // short.count
+        bounds = np.unique(np.append(short.bounds[:-1] * count // short.count, count))
+        return Slopes(ranges, self._search(ranges, self.x, steps=1), replace(short, number=number, bounds=bounds))
+
+    def without(self, derivative: Floats) -> tuple[float, QuickFit]:
+        """Return an offset of which each range has so much (n,), and a fit to ranges without it.
+
+        What an offset leaves in residuals is no noise: its standard error is that of the fit without it.
+        """
+        offset = Unknown(kind="offset", names=("",), start=np.zeros(1))
+        part = Part(
+            parameter=RESIDUAL,
+            kind="offset",
+            columns=np.zeros((len(derivative), 1), dtype=np.int64),
+            values=derivative[:, None],
+        )
+        kinds = tuple(self.start.optimum.layout.where)
+        _, ranges = self.model.build(self.error, self.start.rows.errors, [offset], [part], only=kinds)
+        x = self._search(ranges, np.append(self.x, 0.0), steps=20).x
+        size = -float(x[-1])
+        return size, QuickFit.of(self.model, self.error - size * derivative, self.rows, self.start, x[:-1])
 
     @cached_property
     def reflected(self) -> Floats:
         """The probability (n,) that each range is reflected, by the likeliest error model beside all else."""
-        found = likeliest(self.model, self.error, self.start)
-        return found.rows.error_slopes(found.optimum.x, ()).reflected
+        return self.likeliest.rows.error_slopes(self.likeliest.optimum.x, ()).reflected
+
+    @cached_property
+    def likeliest(self) -> Fitted:
+        """The fit by the error model of ranges."""
+        return likeliest(self.model, self.error, self.start)
 
     def test(self, derivative: Floats | sparse.csr_matrix) -> Tested:
         """Return the slopes of the residuals by offsets, of which each range has some (n, k)."""
         return self.slopes.test(Family(kind="", names=(), derivative=sparse.csr_matrix(derivative)))
 
-    def offsets(self, derivative: Floats) -> Offsets:
-        """Return offsets of which each range has some (n, k)."""
-        return Offsets.of(self.test(derivative), np.eye(derivative.shape[1]))
+    def test_constants(self) -> Tested:
+        """Return the slopes by an offset of each pair, in metres, beside the delays of all tags.
+
+        The fit has a constant of each pair, which is what all of these would make of it. It is that by the error model,
+        because a third of a pair's ranges that is reflected moves a robust mean by centimetres.
+        """
+        fitted = self.likeliest.optimum.layout.indices(["delay"])
+        derivative = Derivative(self.model.pairs.number[:, None], np.ones((1, 1)), len(fitted))
+        slopes = Slopes(self.likeliest.rows, self.likeliest.optimum, self.blocks)
+        found = slopes.test(Family(kind="pair", names=self.model.pairs.names, derivative=derivative, fitted=fitted))
+        ends = (self.model.pairs.ends[:, :, None] == self.model.tags).sum(axis=1)
+        taken = found.information @ ends
+        left = np.eye(len(ends)) - taken @ np.linalg.pinv(ends.T @ taken, rcond=1e-9, hermitian=True) @ ends.T
+        return replace(
+            found,
+            # Constants are in ns.
+            total=METRES_A_NS * left @ found.total,
+            covariance=left @ found.covariance @ left.T,
+            information=left @ found.information,
+        )
+
+    def offset(self, derivative: Floats, *, tolerance: float = 0.0, tried: int = 1) -> tuple[float, float]:
+        """Return an offset of which each range has so much (n,), and the p-value if it is the tolerance at most.
+
+        It is one of so many that were `tried`.
+        """
+        size, rest = self.without(derivative)
+        found = Offsets.of(rest.test(derivative[:, None]), np.ones((1, 1)))
+        return size, exceeds(size, float(found.std[0]), found.dof, tolerance=tolerance, tried=tried)
+
+
+LOSS: Final = "soft_l1"
+"""The loss of a quick fit. Convex, so that offsets of any size are found by steps from none; its slope is bounded, so
+that reflections weigh little more than other ranges."""
 
 
 def quick_fit(views: Sequence[RecordingView], constants: str = "pair", ranges_a_pair: int = 40) -> QuickFit | None:
@@ -247,29 +324,10 @@ def quick_fit(views: Sequence[RecordingView], constants: str = "pair", ranges_a_
     if sum(map(len, kept)) < FEWEST_RANGES or not all(map(len, kept)):
         return None
     ranges = concatenate([view.ranges[rows] for view, rows in zip(views, kept, strict=True)])
-    model = model_of(ranges, FitSettings(loss="cauchy", constants=constants), trimmed=False)
-    return _fitted(model, model.ranges.raw_m - model.ranges.truth_m, np.concatenate(kept))
-
-
-def _fitted(model: RangeModel, error: Floats, rows: Ints) -> QuickFit:
-    kinds = ("delay", *model.curve_kinds())
-    start = robust_fit(model, error, "cauchy", None, kinds, sample=PILOT)
-    layout, whole = model.build(error, start.rows.errors, only=kinds)
-    optimum = maximize([whole, *start.gauge], Priors(layout), start.optimum.x, steps=20, evidence_steps=0)
-    # Long blocks in the place of short ones: sums over them hardly share errors that last.
-    short = time_blocks(model.ranges.time_ns, model.ranges.session)
-    count = min(STRETCHES_OF_SCORES, short.count)
-    number = short.number.astype(np.int64) * count // short.count
-    bounds = np.unique(np.append(short.bounds[:-1] * count // short.count, count))
-    return QuickFit(
-        rows=rows,
-        model=model,
-        error=error,
-        start=start,
-        residual=whole.residuals(optimum.x),
-        time_s=np.asarray(short.number * (short.seconds / short.count), dtype=np.float64),
-        slopes=Slopes(whole, optimum, replace(short, number=number, bounds=bounds)),
-    )
+    model = model_of(ranges, FitSettings(constants=constants), trimmed=False)
+    error, kinds = model.ranges.raw_m - model.ranges.truth_m, ("delay", *model.curve_kinds())
+    start = robust_fit(model, error, LOSS, None, kinds, sample=PILOT)
+    return QuickFit.of(model, error, np.concatenate(kept), start, start.optimum.x)
 
 
 def _of_common_pairs(view: RecordingView, ranges_a_pair: int) -> Ints:

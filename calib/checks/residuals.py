@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 
-from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
+from calib.checks.recording_view import Offsets, QuickFit, RecordingView, quick_fit
 from calib.data.clocks import PPM_TO_METRES, corrected
 from calib.estimator.known_distances import ASTRAY_M, FEWEST_RANGES
-from calib.findings import BUDGET, Candidate, exceeds, more_often, positive, stretches
+from calib.findings import BUDGET, NAMED_DETOUR_M, Candidate, more_often, positive, stretches
 from uwblink.arrays import Bools, Floats
 from uwblink.protocols.table import single_sided
 from uwblink.ticks import TICK_S
@@ -26,6 +26,11 @@ MANY_SHARE: Final = 0.15
 LEAST_SHARE: Final = 0.02
 """With a smaller share of reflected ranges, it is not asked how long reflections last: it is a sixth of what a MILUV
 flight has, and noise passes for it."""
+
+LASTING_S, AGAIN = 0.8, 0.35
+"""A reflection that lasts longer is named, if a range after a reflected one is likelier reflected than others by more
+than this share of what is left. Antennas turn by less than their beams are wide within it, in sound recordings too: set
+by seeds below those of `benchmarks.flights.FIRST_REPORTED`."""
 
 LEFT, WRONG_SIGN = "skew in single-sided ranges", "carrier readings with the wrong sign"
 SLOPES: Final = {
@@ -46,16 +51,18 @@ def astray(view: RecordingView) -> Iterator[Candidate]:
     fit, found = view.quick_fit, list[tuple[float, str]]()
     if fit is None:
         return
-    for pair, name in enumerate(fit.names):
-        rest = np.minimum(np.abs(fit.residual[fit.pair == pair]), 10 * ASTRAY_M)
+    for pair, name in enumerate(fit.model.pairs.names):
+        rest = np.minimum(np.abs(fit.residual[fit.model.pairs.number == pair]), 10 * ASTRAY_M)
         means = np.array([float(np.mean(rest[s])) for s in stretches(len(rest))])
-        p_value = positive(means - ASTRAY_M, tried=len(fit.ends))
-        if p_value < BUDGET:
-            found.append((p_value, f"{name} by {np.mean(means):.2f} m"))
-    if found:
-        named = ", ".join(name for _, name in found[:6]) + (f" and {len(found) - 6} pairs more" if found[6:] else "")
-        evidence = f"ranges of pairs {named} differ on average, each pair's median aside"
-        yield Candidate("ranges that do not follow the distances", evidence, min(found)[0])
+        # Logarithms have the mean's logarithm as their mean at most (Jensen), and vary less from stretch to stretch.
+        found.append((positive(np.log(np.maximum(means, 1e-3) / ASTRAY_M)), f"{name} by {np.mean(rest):.2f} m"))
+    found.sort()
+    # What is wrong with an anchor or a tag is wrong with several pairs: of all p-values together (Simes 1986).
+    p_value = min(len(found) * p_value / k for k, (p_value, _) in enumerate(found, 1))
+    wrong = [name for own, name in found if own < BUDGET]
+    more = f" and {len(wrong) - 6} pairs more" if wrong[6:] else ""
+    evidence = f"ranges of pairs {', '.join(wrong[:6])}{more} differ on average, each pair's median aside"
+    yield Candidate("ranges that do not follow the distances", evidence, p_value)
 
 
 def skew(view: RecordingView) -> Iterator[Candidate]:
@@ -80,9 +87,7 @@ def skew(view: RecordingView) -> Iterator[Candidate]:
     # Skew must be expected to change ranges by more, for it to be seen in them.
     if reach < 0.03:
         return
-    found = fit.offsets(expected[:, None])
-    slope = float(found.size[0])
-    p_value = exceeds(slope, float(found.std[0]), found.dof, tolerance=0.5)
+    slope, p_value = fit.offset(expected, tolerance=0.5)
     evidence = f"errors grow by {slope:.2f} m in a metre of c/2 times carrier's skew times reply, over {reach:.2f} m"
     for at, fault, remedy in SLOPES[taken.pop()]:
         # Halfway between the slopes of sound and of faulty ranges.
@@ -95,15 +100,16 @@ def _by_direction(single: RecordingView) -> Iterator[Candidate]:
     fit = quick_fit([single])
     if fit is None:
         return
-    e = single.exchanges[fit.rows]
-    of_pairs = np.equal.outer(fit.pair, np.arange(len(fit.ends)))
-    found = fit.offsets(of_pairs * np.where(e.initiator < e.target, 0.5, -0.5)[:, None])
-    worst = int(np.argmax((np.abs(found.size) - ONE_WAY_M) / found.std))
-    size, std = float(found.size[worst]), float(found.std[worst])
+    signs = np.where(single.exchanges.initiator < single.exchanges.target, 0.5, -0.5)[fit.rows]
+    ways = np.where(np.equal.outer(fit.model.pairs.number, np.arange(len(fit.model.pairs.ends))), signs[:, None], 0.0)
+    seen = Offsets.of(fit.test(ways), np.eye(len(fit.model.pairs.ends)))
+    worst = int(np.argmax((np.abs(seen.size) - ONE_WAY_M) / seen.std))
+    size, p_value = fit.offset(ways[:, worst], tolerance=ONE_WAY_M, tried=len(fit.model.pairs.ends))
     yield Candidate(
         LEFT,
-        f"ranges of pair {fit.names[worst]} differ by {100 * abs(size):.0f} cm by who initiates, the most of all",
-        exceeds(size, std, found.dof, tolerance=ONE_WAY_M, tried=len(fit.ends)),
+        f"ranges of pair {fit.model.pairs.names[worst]} differ by {100 * abs(size):.0f} cm by who initiates, the "
+        "most of all",
+        p_value,
         {"more": "record the carrier integrator, or use double-sided ranging; until then take the mean of both ways"},
     )
 
@@ -114,21 +120,21 @@ def reflections(view: RecordingView) -> Iterator[Candidate]:
     if fit is None or len(fit.rows) < 150:
         return
     long = fit.reflected > 0.5
-    share = float(np.mean(long))
     evidence = f"about {_in_words(fit, long)} on average"
     if view.quick_fit is None:
         yield from _of_tags(fit, long, evidence)
         return
-    lasting = [one for pair in range(len(fit.ends)) for one in _of_pair(fit, pair, long) if one.p_value < BUDGET]
+    lasting = [
+        one for pair in range(len(fit.model.pairs.ends)) for one in _of_pair(fit, pair, long) if one.p_value < BUDGET
+    ]
     if lasting:
         lasting.sort(key=lambda one: -one.gain)
         more = f"; and {len(lasting) - 4} pairs more" if lasting[4:] else ""
         named = "; ".join(one.evidence for one in lasting[:4]) + more
         yield Candidate("reflections that last", named, min(one.p_value for one in lasting))
     else:
-        parts = [float(np.mean(long[s])) for s in stretches(len(long))]
-        std = float(np.std(parts, ddof=1) / np.sqrt(len(parts))) if parts else np.inf
-        p_value = exceeds(share, std, len(parts) - 1, tolerance=MANY_SHARE)
+        far = long & (fit.residual > NAMED_DETOUR_M)
+        p_value = positive(np.array([np.mean(far[s]) - MANY_SHARE for s in stretches(len(long))]))
         yield Candidate("reflections", evidence, p_value, {"more": "move antennas away from bodies and walls"})
 
 
@@ -144,18 +150,17 @@ def _detour_m(fit: QuickFit, long: Bools, mine: Bools | slice) -> float:
 
 def _of_pair(fit: QuickFit, pair: int, every: Bools) -> Iterator[Candidate]:
     """Yield a pair whose reflected ranges follow each other, with how much they lengthen its ranges as its gain."""
-    mine = fit.pair == pair
+    mine = fit.model.pairs.number == pair
     long, share = every[mine], float(np.mean(every[mine]))
     if len(long) < 60 or not LEAST_SHARE < share < 1:
         return
     life_s = _life_s(fit.reflected[mine], 1e-9 * float(np.median(np.diff(fit.model.ranges.time_ns[mine]))))
-    if life_s > 0.8:
+    if life_s > LASTING_S:
         after = long[1:][long[:-1]]
         yield Candidate(
             "reflections that last",
-            f"pair {fit.names[pair]}: {_in_words(fit, every, mine)}, for {life_s:.1f} s at a time",
-            # Antennas turn slowly, so that a range is so much likelier reflected after a reflected one.
-            more_often(int(after.sum()), len(after), share + 0.35 * (1 - share), tried=len(fit.ends)),
+            f"pair {fit.model.pairs.names[pair]}: {_in_words(fit, every, mine)}, for {life_s:.1f} s at a time",
+            more_often(int(after.sum()), len(after), share + AGAIN * (1 - share), tried=len(fit.model.pairs.ends)),
             gain=share * _detour_m(fit, every, mine),
         )
 
@@ -177,9 +182,9 @@ def _life_s(reflected: Floats, step_s: float) -> float:
 
 def _of_tags(fit: QuickFit, long: Bools, evidence: str) -> Iterator[Candidate]:
     """Where pairs have a few ranges each: the tags of whose ranges many more are reflected than of the others'."""
-    p_value, tags = more_often(int(long.sum()), len(long), MANY_SHARE), np.unique(fit.ends).tolist()
+    p_value, tags = more_often(int(long.sum()), len(long), MANY_SHARE), np.unique(fit.model.pairs.ends).tolist()
     for tag in tags:
-        mine = (fit.ends == tag).any(axis=1)[fit.pair]
+        mine = (fit.model.pairs.ends == tag).any(axis=1)[fit.model.pairs.number]
         others = float(np.mean(long[~mine])) if (~mine).any() else float(np.mean(long))
         p_tag = more_often(int(long[mine].sum()), int(mine.sum()), max(others, LEAST_SHARE), tried=len(tags))
         if p_tag < BUDGET:

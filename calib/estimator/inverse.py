@@ -38,8 +38,9 @@ class SparseInverse:
         self._scale = 1 / np.sqrt(np.maximum(own.diagonal(), 1e-300))
         scale = sparse.diags(self._scale)
         unit = sparse.csc_matrix(scale @ own @ scale + HELD * sparse.eye(len(free)))
-        # A positive definite matrix needs no pivots, which would destroy its symmetry.
-        self._factor = splu(unit, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        # A positive definite matrix needs no pivots, which would destroy its symmetry. In the order of least degree of
+        # the matrix itself, factors of a flight have a quarter of the entries that SuperLU's default order leaves.
+        self._factor = splu(unit, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
     def __matmul__(self, right: Floats) -> Floats:
         """Return the inverse times a vector (p,) or columns (p, k)."""

@@ -177,16 +177,15 @@ def robust_fit(
         errors = Robust(weights=weights, scale_m=scale).tempered(residual)
         found = maximize([replace(rows, errors=errors), *gauge], priors, x, steps=15, evidence_steps=15 * (turn > 0))
         x, steps = found.x, steps + found.steps
+    rows = replace(rows, errors=errors)
     if sample is None:
-        found = maximize([replace(rows, errors=errors), *gauge], priors, x, steps=200, evidence_steps=0)
+        found = maximize([rows, *gauge], priors, x, steps=200, evidence_steps=0)
         x, steps = found.x, steps + found.steps
         final = replace(rows, errors=replace(errors.tempered(rows.residuals(x)), least=None))
         ended = maximize([final, *gauge], priors, x, steps=20, evidence_steps=0)
+        # With few ranges most may lie where the loss is concave; weights then stay in the place of the curvature.
         if ended.success and _convex(ended):
             found, rows = ended, final
-        else:
-            # With few ranges most may lie where the loss is concave; weights then replace the curvature.
-            rows = replace(rows, errors=errors)
     return Fitted(
         rows=rows,
         gauge=gauge,

@@ -141,8 +141,12 @@ class Priors:
     def precision(self) -> Matrix:
         """Return the precision of all priors (p, p); a sparse one for many unknowns."""
         size = self.layout.size
-        found = sparse.csc_matrix((np.array(self.weights)[self._which] * self._data, self._place), shape=(size, size))
-        return found if size > MOST_DENSE else found.toarray()
+        data = np.array(self.weights)[self._which] * self._data
+        if size > MOST_DENSE:
+            return sparse.csc_matrix((data, self._place), shape=(size, size))
+        found = np.zeros((size, size))
+        np.add.at(found, self._place, data)
+        return found
 
     def value(self, x: Floats) -> float:
         """Return the log density of the priors at unknowns (p,), less its constant."""

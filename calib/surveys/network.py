@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -347,9 +348,15 @@ class Network:
         means = np.sqrt(self.means.std_m**2 + case.pair_m**2 + EXTRA_STD_M**2 * case.marks)
         return np.concatenate([means, self.tapes[1][:, 1]])
 
+    @cached_property
+    def _priors(self) -> Priors:
+        return Priors(self.layout)
+
     def priors(self, curve_m: float) -> Priors:
         """Return the priors of the unknowns, with the spread of the curve."""
-        return Priors(self.layout, [1.0, 1.0, curve_m**-2][: len(self.layout.blocks)])
+        found = copy(self._priors)
+        found.weights = [1.0, 1.0, curve_m**-2][: len(self.layout.blocks)]
+        return found
 
     def at(self, x: Floats, case: Case) -> Linear:
         """Return the network about unknowns (p,) in a case."""

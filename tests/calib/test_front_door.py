@@ -8,6 +8,8 @@ import pytest
 import calib
 from calib.estimator.losses import LOSSES
 from calib.report.sections import SECTIONS
+from tests import pages
+from uwblink.pages import figures
 
 
 def test_the_names_are_sorted_and_all_there():
@@ -18,7 +20,8 @@ def test_the_names_are_sorted_and_all_there():
 
 
 @pytest.mark.parametrize("name", [name for name in calib.__all__ if not name.endswith("Error")])
-def test_the_examples_run(name):
+def test_the_examples_run(name, monkeypatch):
+    monkeypatch.setattr(figures, "drawn", pages.outline)
     losses, sections = set(LOSSES), dict(SECTIONS)
     runner = doctest.DocTestRunner()
     examples = [test for test in doctest.DocTestFinder().find(getattr(calib, name), name, globs={}) if test.examples]

@@ -138,7 +138,7 @@ def test_what_would_harm_a_board_is_never_sent(pair):
     for length in (58, 80, 92, 93):
         with pytest.raises(RefusedError, match=rf"broadcast of {length} bytes: at most 57 fit.*one USB packet"):
             one.send(bytes(length))
-    for number in (float("nan"), float("inf"), 1e10, -10_000.0):
+    for number in (float("nan"), float("inf"), 9999.1, -9999.1):
         with pytest.raises(RefusedError, match="overwrites the board's memory"):
             one.request(m.DoTests(1, "x", True, number, b""))
     with pytest.raises(RefusedError, match=r"DoTests of 65 bytes: a command must fit one USB packet of 64"):

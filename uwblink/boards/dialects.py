@@ -18,7 +18,7 @@ from typing import Any, Final
 from uwblink.boards.ports import Ports, SerialPorts, Transport
 from uwblink.errors import ArgumentError, BoardError, PlanError
 from uwblink.importers.column_map import DISTANCE_UNITS, load_map
-from uwblink.importers.lines import LINES, Line
+from uwblink.importers.lines import LINES
 from uwblink.importers.templates import Template
 from uwblink.output import check_output
 from uwblink.plugins import Registry, check_row, is_text
@@ -60,25 +60,24 @@ class Dialect:
     baud_rate: int = 115_200
 
 
-def parser_of(form: Line) -> Callable[[str], list[PrintedRange]]:
-    """Return the parser of lines of a form."""
-    whole, each = Template(form.line), Template(form.each) if form.each else None
-    patterns = [re.compile(one.pattern) for one in (whole, each or whole)]
+def parser_of(form: Mapping[str, Any]) -> Callable[[str], list[PrintedRange]]:
+    """Return the parser of lines of a form: `line`, `each`, `wide` and `units` of a column map."""
+    whole, each = (Template(form[key]) if form.get(key) else None for key in ("line", "each"))
+    wide, metres = form.get("wide", {}), DISTANCE_UNITS[form.get("units", {}).get("distance", "m")]
 
     def parse(line: str) -> list[PrintedRange]:
-        if not (found := patterns[0].search(line)):
+        if whole is None or not (found := re.search(whole.pattern, line)):
             return []
         common = whole.values(found.groups())
-        rows = [common | each.values(m.groups()) for m in patterns[1].finditer(line)] if each else [common]
-        rows = [row for one in rows for row in _unpivoted(one, form.wide)]
-        printed = (_printed(row, DISTANCE_UNITS[form.distance]) for row in rows)
+        rows = [common | each.values(m.groups()) for m in re.finditer(each.pattern, line)] if each else [common]
+        printed = (_printed(row, metres) for one in rows for row in _unpivoted(one, wide))
         return [one for one in printed if one is not None]
 
     return parse
 
 
 def _unpivoted(row: Mapping[str, str], wide: Mapping[str, str]) -> list[dict[str, str]]:
-    """Return a row for each device of columns such as r.0, r.1 ... (r.{to_id})."""
+    """Return a row for each device of columns such as r.0, r.1 ... (r.{to_id}), of those in a mask if there is one."""
     if not wide:
         return [dict(row)]
     by_device: dict[str, dict[str, str]] = {}
@@ -89,7 +88,8 @@ def _unpivoted(row: Mapping[str, str], wide: Mapping[str, str]) -> list[dict[str
                 by_device.setdefault(match[1], {})[name] = value
                 if place != "_":
                     by_device[match[1]][place] = match[1]
-    return [dict(row) | own for own in by_device.values()]
+    mask = int(row["mask"]) if "mask" in row else -1
+    return [dict(row) | own for k, own in enumerate(by_device.values()) if mask >> k & 1]
 
 
 def _printed(row: Mapping[str, str], metres: float) -> PrintedRange | None:
@@ -125,7 +125,7 @@ _START: Final = {"dwm1001-lec": b"\r\rlec\r", "dwm1001-les": b"\r\rles\r"}
 DIALECTS: Final[Registry[Dialect]] = Registry(
     "dialect",
     "uwbcal.dialects",
-    tuple(Dialect(name, form.note, parser_of(form), _START.get(name, b"")) for name, form in LINES.items()),
+    tuple(Dialect(name, form["line"], parser_of(form), _START.get(name, b"")) for name, form in LINES.items()),
     check_dialect,
 )
 """Dialects by name: the project's, and those of installed distributions."""
@@ -141,7 +141,8 @@ def dialect_of(name: str) -> Dialect:
         if known.line is None:
             raise ArgumentError(f"{name}: states no `line`, a template of what a board prints", parameter="dialect")
         wide = {ours: family for ours, family in known.wide.items() if isinstance(family, str)}
-        form = Line(known.line, known.each, wide, known.distance_unit or "m")
+        units = {"distance": known.distance_unit or "m"}
+        form = {"line": known.line, "each": known.each, "wide": wide, "units": units}
         return Dialect("lines", "a template", parser_of(form))
     if name not in DIALECTS:
         known_names = ", ".join(DIALECTS)

@@ -58,7 +58,7 @@ from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import AntennaDelays, read_antenna_delays
 from uwblink.recording.schema import POSE
 from uwblink.text_files import FileKey, TomlReader, heads, is_number
-from uwblink.ticks import TICKS_PER_SECOND
+from uwblink.ticks import METRES_PER_TICK, TICKS_PER_SECOND
 from uwblink.twr import BITS, LARGEST_ID, STAMPS
 
 POSITIONS: Final = tuple(f"{end}_{axis}_m" for end in ("from", "to") for axis in "xyz")
@@ -85,6 +85,9 @@ STAMP_UNITS: Final = {
 }
 TIME_UNITS: Final = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 DISTANCE_UNITS: Final = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "in": 0.0254}
+FLIGHT_UNITS: Final = {unit: STAMP_UNITS[unit] * METRES_PER_TICK for unit in ("ticks", "ps", "ns", "us")}
+"""Units of times of flight, which are ranges, too."""
+RANGE_UNITS: Final = DISTANCE_UNITS | FLIGHT_UNITS
 POWERS: Final = ("fpp1", "fpp2", "rxp1", "rxp2", "fpp", "rxp")
 SKEWS: Final = ("skew1", "skew2", "skew")
 MAP_KEYS: Final = (
@@ -141,7 +144,7 @@ MAP_KEYS: Final = (
         "chip",
         f"one of {', '.join(CHIPS)}",
         "not known",
-        "The chip of the devices: powers from registers, offsets of clocks and limits of powers. It is kept in `meta`.",
+        "The chip of the devices: powers from registers, offsets of clocks, limits of powers. Kept in the recording.",
     ),
     FileKey("prf", "16 or 64, MHz", "64", "Pulse repetition frequency, for powers from registers."),
     FileKey(
@@ -156,7 +159,7 @@ MAP_KEYS: Final = (
         "text with one place; or a table of columns by device",
         "none",
         "Columns that differ by a device: `r_AN{to_id}` makes a row of each. Families are joined by what differs; "
-        "`{_}` is no id. A column `mask` has a bit for each device with a range.",
+        "`{_}` is no id. A column called mask has a bit for each device with a range.",
     ),
     FileKey(
         "units.stamps",
@@ -168,7 +171,7 @@ MAP_KEYS: Final = (
         "units.time",
         '"s", "ms", "us", "ns" or "iso"',
         "s, or iso if the column has no numbers",
-        "Unit of `time_s`; iso: 2024-05-06T07:08:09.5+02:00, in UTC without a zone.",
+        "Unit of `time_s`; iso: 2024-05-06T07:08:09.5+02:00, in UTC without a zone, or 07:08:09.",
     ),
     FileKey(
         "units.distance",
@@ -186,9 +189,14 @@ MAP_KEYS: Final = (
         "units.skew",
         '"ppm", "-ppm", "integrator-2", "integrator-5", "integrator-9" or "offset"',
         "ppm",
-        "Unit of skews: the carrier integrator on a channel, or the clock offset register of the DW3000, needs `chip`.",
+        "Unit of skews: the carrier integrator on a channel, or the clock offset register of the DW3000, needs a chip.",
     ),
-    FileKey("units.NAME", "as for all", "that for all", "Unit of one column of distances or powers."),
+    FileKey(
+        "units.NAME",
+        'as for all; for range_m also "ticks", "ps", "ns", "us"',
+        "that for all",
+        "Unit of one column of distances or powers; a range may be a time of flight.",
+    ),
     FileKey(
         "constants.NAME", "number; text for an id", "none", "A value for all rows, for a column that the table lacks."
     ),
@@ -278,9 +286,8 @@ def load_map(path: Path) -> ColumnMap:
     file.known(table, heads(MAP_KEYS))
     for name in ("line", "each", "from_name"):
         file.check(name, table.get(name), isinstance(table.get(name, ""), str) and table.get(name) != ASKED, "text")
-    known = LINES.get(table.get("line", ""))
-    table = (known.entries() if known else {}) | table | ({"line": known.line} if known else {})
-    file.table = table
+    if known := LINES.get(table.get("line", "")):
+        file.table = table = known | table | {"line": known["line"]}
     columns, units, constants, ids, wide = (file.section(n) for n in ("columns", "units", "constants", "ids", "wide"))
     file.known(columns, (*NAMES, *NAMES_OF_POSES), "columns.")
     file.known(wide, NAMES, "wide.")
@@ -364,9 +371,10 @@ def load_map(path: Path) -> ColumnMap:
 
 def _place(place: str, columns: dict[str, Any], units: dict[str, Any]) -> None:
     """State which column a place such as `gt_range_cm` is, and its unit."""
-    for name, known in (*((name, DISTANCE_UNITS) for name in DISTANCES), ("time_s", TIME_UNITS)):
+    known = dict.fromkeys(DISTANCES, DISTANCE_UNITS) | {"range_m": RANGE_UNITS, "time_s": TIME_UNITS}
+    for name, units_of in known.items():
         stem, unit = place.rpartition("_")[::2]
-        if stem == name.rpartition("_")[0] and unit in known:
+        if stem == name.rpartition("_")[0] and unit in units_of:
             columns.setdefault(name, place)
             units.setdefault(name if name != "time_s" else "time", unit)
 
@@ -374,6 +382,7 @@ def _place(place: str, columns: dict[str, Any], units: dict[str, Any]) -> None:
 def _units_of_columns(file: TomlReader, units: dict[str, Any], chip: str | None) -> dict[str, str]:
     """Return the units of single columns, and of skews."""
     allowed: dict[str, Any] = dict.fromkeys(DISTANCES, DISTANCE_UNITS) | dict.fromkeys(POWERS, ("dBm", "-dBm"))
+    allowed["range_m"] = RANGE_UNITS
     allowed["skew"] = CHIPS[chip or "other"].skew_ppm
     return {name: file.choice(f"units.{name}", unit, allowed[name]) for name, unit in units.items() if name in allowed}
 

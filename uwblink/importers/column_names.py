@@ -22,7 +22,7 @@ WORDS: Final = {
         r"(tag|node|device|dev|board|robot|agent|anchor|module|modul|radio|unit|uwb|id|addr|address|"
         r"mac|geraet|knoten)"
     ),
-    "range": r"(range|dist|distance|abstand|distanz|entfernung)",
+    "range": r"(range|dist|distance|abstand|distanz|entfernung|tof|time_?of_?flight)",
     "made": r"(raw|filt(er)?(ered)?|corrected|corr|kalman|smooth(ed)?)",
     "true": (
         r"(gt|true|truth|ground_?truth|ref|reference|nominal|mocap|vicon|actual|tape(_?measured?)?|"

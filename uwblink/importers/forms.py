@@ -11,7 +11,7 @@ from typing import Any, Final
 from uwblink.importers.column_map import ASKED, ColumnMap
 from uwblink.importers.column_names import PATTERNS, WORDS, plain_name
 from uwblink.importers.lines import LINES
-from uwblink.importers.tables import detect, open_file, reading
+from uwblink.importers.tables import detect, lacks_header, open_file, reading
 from uwblink.importers.templates import Template
 
 Entries = dict[str, tuple[Any, str]]
@@ -22,7 +22,7 @@ def form_of(path: Path) -> tuple[ColumnMap, Entries]:
     """Return what a map has to state so that a file is read as a table, and its entries with their reasons."""
     if path.name.lower().removesuffix(".gz").endswith((".parquet", ".jsonl", ".ndjson", ".json")):
         return ColumnMap(), {}
-    return _log(path) or (ColumnMap(headerless=_lacks_header(detect(path, ColumnMap())[0])), {})
+    return _log(path) or (ColumnMap(headerless=lacks_header(detect(path, ColumnMap())[0])), {})
 
 
 def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
@@ -31,31 +31,24 @@ def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
         lines = [line.decode("latin-1").rstrip("\r\n") for line in islice(file, 400)]
     found: dict[str, list[re.Match[str]]] = {}
     for name, known in LINES.items():
-        pattern = re.compile(Template(known.line).pattern)
+        pattern = re.compile(Template(known["line"]).pattern)
         matches = [match for line in lines if (match := pattern.search(line))]
         if matches and len(matches) >= min(3, sum(bool(line.strip()) for line in lines)):
             found[name] = matches
     if not found:
         return None
     name, matches = next(iter(found.items()))
-    known, line = LINES[name], LINES[name].line
+    known, line = LINES[name], LINES[name]["line"]
     leads = [match.string[: match.start()] for match in matches]
-    time = r"\W*?([0-9]+(?:\.[0-9]+)?|[0-9]{4}-[0-9-]{5}[ T][0-9:.,]+Z?)(\W+)"
+    time = r"\W*?([0-9]+(?:\.[0-9]+)?|[0-9]{4}-[0-9-]{5}[ T][0-9:.,]+Z?|[0-9]+:[0-9]{2}:[0-9.]+)(\W+)"
     times = [re.fullmatch(time, lead) for lead in leads]
     if all(times) and (first := times[0]):
         line = f"{leads[0][: first.start(1)]}{{time_s}}{first[2]}{line}"
     both = ASKED, "ranges before and after the board's correction: write trek-raw or trek-corrected"
-    entries: Entries = {"line": both if {"trek-raw", "trek-corrected"} <= found.keys() else (line, known.note)}
-    entries |= {"each": (known.each, "")} if known.each else {}
-    return ColumnMap(line=line, each=known.each, wide=dict(known.wide), distance_unit=known.distance), entries
-
-
-def _lacks_header(names: Sequence[str]) -> bool:
-    """Return whether the first line of a table is a row of numbers; 0, 1, 2 ... are names that a program wrote."""
-    numbers = [name for name in names if re.fullmatch(r"[-+]?[0-9]+([.,][0-9]*)?([eE][-+]?[0-9]+)?", name)]
-    if [name for name in names if name] == [str(k) for k in range(len(numbers))]:
-        return False
-    return len(numbers) == len(names) or (2 * len(numbers) >= len(names) and any("." in one for one in numbers))
+    entries: Entries = {"line": both if {"trek-raw", "trek-corrected"} <= found.keys() else (line, f"as {name}")}
+    entries |= {"each": (known["each"], "")} if "each" in known else {}
+    wide, unit = known.get("wide", {}), known["units"]["distance"]
+    return ColumnMap(line=line, each=known.get("each"), wide=wide, distance_unit=unit), entries
 
 
 _DEVICE: Final = r"(an|anchor|anker|a|node|beacon|bs|responder|target|to|device|dev|uwb|id|ch)"

@@ -24,10 +24,12 @@ from uwblink.importers.column_map import (
     ASKED,
     DISTANCE_UNITS,
     DISTANCES,
+    FLIGHT_UNITS,
     IDS,
     NAMES,
     POSITIONS,
     POWERS,
+    RANGE_UNITS,
     STAMP_UNITS,
     TIME_UNITS,
     ColumnMap,
@@ -163,6 +165,9 @@ def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Map
         for ours, header in found.items()
         if ours not in given and header not in given and not re.match(r"[rap]\.", header)
     }
+    if "range_m" not in columns:
+        # Columns called tx and rx are stamps of messages, unless a row is a range.
+        columns = {n: header for n, header in columns.items() if n not in IDS or header not in ("tx", "rx")}
     if template := name_template(file.name, {"from_id", "to_id", "gt_range_m"} - columns.keys()):
         top["from_name"] = template, "by the names of the files"
         form = replace(form, from_name=template)
@@ -215,7 +220,7 @@ def _proposal(
         counter, unit, undelayed = (_exchange_stamps if layout == "exchanges" else _message_stamps)(columns, cells)
         top, units = top | counter, {"stamps": unit, **units}
     if missing:
-        shares = ", ".join(f"{share:.0%} are {value:.6g}" for value, share in missing.items())
+        shares = ", ".join(f"{share:.1%} are {value:.10g}" for value, share in missing.items())
         listed = [int(value) if value == int(value) else value for value in missing]
         top["missing"] = listed, f"of the distances {shares}, which are none"
     registers = register_columns([name for name in names if name not in columns.values()])
@@ -355,15 +360,22 @@ def _units(form: ColumnMap, columns: dict[str, str], cells: dict[str, Floats]) -
         if found["time"][0] == ASKED and form.time_unit:
             found["time"] = form.time_unit, "as times in bags"
     named = {name: _header(form, name, columns[name]) for name in DISTANCES if name in columns}
-    units = {name: unit for name, header in named.items() if (unit := _suffix(header, DISTANCE_UNITS))}
+    units = {
+        name: unit
+        for name, header in named.items()
+        if (unit := _suffix(header, RANGE_UNITS if name == "range_m" else DISTANCE_UNITS))
+    }
+    alike = set(units.values())
     if form.line and form.distance_unit:
         found["distance"] = form.distance_unit, "as these boards print"
-    elif units and len(set(units.values())) == 1 and ("range_m" in units or "range_m" not in cells):
+    elif len(alike) == 1 and not alike & FLIGHT_UNITS.keys() and ("range_m" in units or "range_m" not in cells):
         found["distance"] = next(iter(units.values())), "by the columns' names"
         units = {}
     elif "range_m" in cells and "range_m" not in units and (why := reason_against_metres(cells["range_m"])):
         found["distance"] = ASKED, f"{why}: write {', '.join(DISTANCE_UNITS)}"
     found |= {name: (unit, "by the column's name") for name, unit in units.items()}
+    if "range_m" in named and "range_m" not in units and re.search("tof|flight", named["range_m"].lower()):
+        found["range_m"] = ASKED, f"a time of flight: write {', '.join(FLIGHT_UNITS)}"
     if why := next(filter(None, (reason_against_dbm(cells[name]) for name in POWERS if name in cells)), ""):
         found["power"] = ASKED, f"{why}: write -dBm if they lack their sign"
     return found

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.importers.chips import CHIPS
-from uwblink.importers.column_map import DISTANCE_UNITS, IDS, POSITIONS, POWERS, ColumnMap
+from uwblink.importers.column_map import DISTANCE_UNITS, IDS, POSITIONS, POWERS, RANGE_UNITS, ColumnMap
 from uwblink.importers.tables import Columns
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import REGISTER_MAX, AntennaDelay, delay_of
@@ -289,11 +289,13 @@ def _remaining(errors_m: Floats) -> float:
 def sentinels(ranges: Floats) -> dict[float, float]:
     """Return the share of each number that is no range but often stands for none, such as 0, -1 or 65535.
 
-    It is exactly the same in 1 % of the numbers (n,) or more, and zero, negative, or five times beyond all others.
+    It is zero, negative, or five times beyond all others, and exactly the same twice and in 0.1 % of the numbers (n,),
+    which are in the unit of the table; or the largest number of 16 or 32 bits, or -1 as the only negative number.
     """
     finite = ranges[np.isfinite(ranges)]
     values, counts = np.unique(finite, return_counts=True)
-    often = counts >= max(3, 0.01 * len(finite))
+    known = [2.0**16 - 1, 2.0**32 - 1] + ([-1.0] if np.count_nonzero(values < 0) == 1 else [])
+    often = (counts >= max(2, 0.001 * len(finite))) | np.isin(np.round(values, 3), known)
     if len(finite) < MIN_ROWS or len(values) < 3:
         return {}
     others = finite[~np.isin(finite, values[often])]
@@ -344,10 +346,10 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
         elif column_map.chip and (why := reason_against_limits(optional(rows, name), limits)):
             reasons[name] = why, f"another unit, chip or prf than {column_map.chip!r} and {column_map.prf} in the map"
     for name in ("range_m", "gt_range_m") if raw_m is None else ():
-        factor = DISTANCE_UNITS[column_map.distance_of(name) or "m"]
-        for value, share in sentinels(optional(rows, name)).items():
-            why = f"{share:.0%} of its numbers are {value / factor:.6g}, which is no distance"
-            reasons[name] = why, f"missing = [{value / factor:.6g}] in the map"
+        factor = RANGE_UNITS[column_map.distance_of(name) or "m"]
+        for value, share in sentinels(np.round(optional(rows, name) / factor, 6)).items():
+            why = f"{share:.1%} of its numbers are {value:.10g}, which is no distance"
+            reasons[name] = why, f"missing = [{value:.10g}] in the map"
     if column_map.distance_of("range_m") is None and "range_m" not in reasons:
         reasons["range_m"] = reason_against_metres(ranges), "units.distance in the map"
     for name, (why, remedy) in reasons.items():

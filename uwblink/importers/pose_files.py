@@ -15,6 +15,7 @@ import re
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 from itertools import chain, islice
 from pathlib import Path
@@ -53,6 +54,7 @@ class PoseLayout:
     gaps: bool = True
     body: int | None = None
     comments: bool = False
+    iso: bool = False
 
 
 def read_text_poses(
@@ -82,6 +84,7 @@ def read_text_poses(
             raise ImportTableError(f"{path}: row {row}: found {len(cells)} cells, expected {' '.join(layout.names)}")
         for name, places in layout.bodies.items():
             texts = [cells[k] if k < len(cells) else "" for k in (layout.time, *places)]
+            texts[0] = _iso_ns(texts[0]) if layout.iso else texts[0]
             found = [_number(text) for text in texts]
             if layout.gaps and (not any(map(math.isfinite, found[1:])) or not any(found[1:])):
                 continue
@@ -116,6 +119,16 @@ def _quaternions(values: Floats) -> Floats:
     if values.shape[1] == 3:
         return np.asarray(Rotation.from_rotvec(values).as_quat())
     return np.asarray(Rotation.from_matrix(values.reshape(-1, 3, 3).transpose(0, 2, 1)).as_quat())
+
+
+def _iso_ns(text: str) -> str:
+    """Return ISO 8601, UTC without a zone, as nanoseconds; other text as it is."""
+    try:
+        moment = datetime.fromisoformat(text.strip())
+    except ValueError:
+        return text
+    since = moment.replace(tzinfo=moment.tzinfo or UTC) - datetime(1970, 1, 1, tzinfo=UTC)
+    return str(since // timedelta(microseconds=1) * 1000)
 
 
 def _number(cell: str) -> float:
@@ -171,8 +184,11 @@ def _plain(path: Path, head: Lines, body: str | None, stated: ColumnMap) -> Pose
             f"{path}: columns {', '.join(names[found[axis][0]] for axis in 'xyz')} have several units"
         )
     (time, time_unit), unit = found["time_s"], next(iter(units))
+    first = head[1][time] if len(head) > 1 and time < len(head[1]) else ""
+    iso = math.isnan(_number(first)) and _iso_ns(first) != first
+    time_unit = "ns" if iso else stated.time_unit or time_unit or "s"
     return PoseLayout(
-        form="", names=names, time=time, ns=TIME_UNITS[stated.time_unit or time_unit or "s"],
+        form="", names=names, time=time, ns=TIME_UNITS[time_unit], iso=iso,
         bodies={"": [found[name][0] for name in needed]}, header=1, gaps=False,
         metres=DISTANCE_UNITS[stated.distance_unit or unit or "m"], body=None if body else found["body"][0],
     )  # fmt: skip

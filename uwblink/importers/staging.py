@@ -24,17 +24,26 @@ import numpy as np
 from uwblink.errors import ImportTableError
 from uwblink.importers.chips import CHIPS, power_sql
 from uwblink.importers.column_map import (
-    DISTANCE_UNITS,
     DISTANCES,
     IDS,
     NAMES,
     POWERS,
+    RANGE_UNITS,
     SKEWS,
     TIME_UNITS,
     ColumnMap,
 )
 from uwblink.importers.plausibility import SAMPLE_ROWS, counter_format
-from uwblink.importers.tables import Columns, SourceTable, message_number, number, time_ns, whole_number
+from uwblink.importers.tables import (
+    Columns,
+    SourceTable,
+    is_by_target,
+    lacks_header,
+    message_number,
+    number,
+    time_ns,
+    whole_number,
+)
 from uwblink.recording.schema import Fault
 from uwblink.twr import LARGEST_ID, STAMPS
 
@@ -191,6 +200,8 @@ class Staging:
         """Return the error for a missing column."""
         names, header = self.tables[0].names, self.column_map.header(name)
         remedy = "a `map_file` can rename columns or give constants, and `uwblink import guess` proposes one"
+        if lacks_header(names):
+            remedy = "its first line is a row: state the numbers of its columns in a map, such as from_id = 2"
         if {"qx", "qy", "qz", "qw"} <= {name.lower() for name in names}:
             remedy = "these are poses, which `uwblink poses` adds to a recording"
         there = ", ".join(names)[:400]
@@ -199,14 +210,14 @@ class Staging:
     def _cells(self, table: SourceTable) -> dict[str, str]:
         """Return SQL of the columns to stage, from cells of a table or constants; ids are words at first."""
         column_map, found = self.column_map, dict[str, str]()
-        blank = table.blank
+        blank, constants = table.blank, column_map.constants
         for name in NAMES:
             header = column_map.header(name)
             if name in column_map.registers:
                 cells = {key: number(table.text(one, numeric=True)) for key, one in column_map.registers[name].items()}
                 found[name] = power_sql(CHIPS[column_map.chip or "other"], column_map.prf, cells)
                 continue
-            if name in column_map.constants:
+            if name in constants:
                 text = f"getvariable('{name}')"
             elif header in table.names:
                 text = table.text(header, numeric=name not in IDS)
@@ -217,6 +228,14 @@ class Staging:
             found["time_ns" if name == "time_s" else name] = self._cell(name, text)
             if name == "range_m" and column_map.missing:
                 blank = " OR ".join(filter(None, [blank, self._is_missing(text)]))
+        message = column_map.header("message")
+        if message in table.names and all(n in constants or column_map.header(n) in table.named for n in IDS):
+            # The ids are of the pair for all messages; words tell which end sent one.
+            turned, (one, two) = is_by_target(table.text(message)), (found[n] for n in IDS)
+            found |= {
+                n: f"CASE WHEN {turned} THEN {a} ELSE {b} END"
+                for n, a, b in zip(IDS, (two, one), (one, two), strict=True)
+            }
         return found | ({"blank": f"coalesce({blank}, false)"} if blank else {})
 
     def _is_missing(self, text: str) -> str:
@@ -241,7 +260,7 @@ class Staging:
             return f"CASE WHEN {first} IN ('t', 's') THEN 1.0 WHEN {first} = 'r' THEN 2.0 END"
         if name in (*STAMPS, "tx", "rx", "stamp") and column_map.ticks_per_unit == 1.0:
             return whole_number(text)
-        factor = DISTANCE_UNITS[column_map.distance_of(name) or "m"] if name in DISTANCES else 1.0
+        factor = RANGE_UNITS[column_map.distance_of(name) or "m"] if name in DISTANCES else 1.0
         if name in POWERS and column_map.power_of(name) == "-dBm":
             factor = -1.0
         if name in SKEWS:

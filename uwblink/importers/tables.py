@@ -94,6 +94,14 @@ def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, boo
     return names, mark, decimal == "," and mark != ",", skip
 
 
+def lacks_header(names: Sequence[str]) -> bool:
+    """Return whether the first line of a table is a row of numbers; 0, 1, 2 ... are names that a program wrote."""
+    numbers = [name for name in names if re.fullmatch(r"[-+]?[0-9]+([.,][0-9]*)?([eE][-+]?[0-9]+)?", name)]
+    if [name for name in names if name] == [str(k) for k in range(len(numbers))]:
+        return False
+    return len(numbers) == len(names) or (2 * len(numbers) >= len(names) and any("." in one for one in numbers))
+
+
 def _delimiter(lines: list[str]) -> str:
     """Return the delimiter that splits header and rows into equal numbers of cells, and into the most."""
 
@@ -164,9 +172,18 @@ def whole_number(text: str) -> str:
     return f"CASE WHEN {value} = trunc({value}) THEN TRY_CAST({text} AS BIGINT) END"
 
 
+REPORT: Final = "report|range_?report"
+"""A third message of the target, where a final is of the initiator."""
+
+
+def is_by_target(text: str) -> str:
+    """Return SQL that is true for the word of a message of the target."""
+    return f"regexp_full_match(lower(trim({text})), 'resp.*|ack.*|answer|{REPORT}')"
+
+
 def message_number(text: str) -> str:
     """Return SQL of a message as its number, from a number or a word such as "POLL"; NULL if it is neither."""
-    kinds = {1: "poll|init.*|request|blink", 2: "resp.*|ack.*|answer", 3: "final|report|range_?report"}
+    kinds = {1: "poll|init.*|request|blink", 2: "resp.*|ack.*|answer", 3: f"final|{REPORT}"}
     cases = " ".join(f"WHEN regexp_full_match(lower(trim({text})), '{kind}') THEN {n}" for n, kind in kinds.items())
     return f"coalesce({number(text)}, CASE {cases} END)"
 
@@ -174,7 +191,7 @@ def message_number(text: str) -> str:
 def time_ns(text: str, unit: str | None, ns_per_unit: float) -> str:
     """Return SQL of a time as nanoseconds, NULL if it is none: a number in units, or ISO 8601, UTC without a zone.
 
-    Without a unit both are read, with "iso" only the latter.
+    Without a unit both are read, with "iso" only the latter; a time of day counts from midnight.
     """
     scaled = f"TRY_CAST({number(text)} * {ns_per_unit!r} AS BIGINT)"
     scaled = f"coalesce({whole_number(text)}, {scaled})" if unit == "ns" else scaled
@@ -182,7 +199,7 @@ def time_ns(text: str, unit: str | None, ns_per_unit: float) -> str:
     zone = f"regexp_matches({text}, '[T ].*[+-][0-9]{{2}}:?([0-9]{{2}})? *$')"
     iso = (
         f"CASE WHEN {zone} THEN epoch_ns(TRY_CAST({text} AS TIMESTAMPTZ)) "
-        f"ELSE epoch_ns(TRY_CAST({text} AS TIMESTAMP_NS)) END"
+        f"ELSE coalesce(epoch_ns(TRY_CAST({text} AS TIMESTAMP_NS)), epoch_ns(TRY_CAST({text} AS TIME))) END"
     )
     found = {None: f"coalesce({scaled}, {iso})", "iso": iso}.get(unit, scaled)
     return f"CASE WHEN {found} BETWEEN -{LATEST_NS} AND {LATEST_NS} THEN {found} END"
@@ -206,6 +223,8 @@ class SourceTable:
         self.db, self.path, self._key = db, path, key
         self.column_map = column_map = column_map or ColumnMap()
         self._skip, self._decimal_comma, self._expanded = 0, False, False
+        self.named: frozenset[str] = frozenset()
+        """Columns that the name of the file says."""
         self.lists: tuple[str, ...] = ()
         """Fields of JSON lines that are lists of objects."""
         self.blank = ""
@@ -229,7 +248,7 @@ class SourceTable:
 
     def _open_csv(self) -> None:
         if self.column_map.each:
-            raise ImportTableError(f"{self.path}: `each` is of JSON lines, bags and logs (with `line`), not of a table")
+            raise ImportTableError(f"{self.path}: each is of JSON lines, bags and logs (with line), not of a table")
         self.names, mark, self._decimal_comma, self._skip = detect(self.path, self.column_map)
         check_lines(self.path, mark)
         self._cells = [f"c{k}" for k in range(len(self.names))]
@@ -284,7 +303,7 @@ class SourceTable:
                     fields |= dict(_fields(one, "", ""))
         self.lists = tuple(lists)
         if not fields:
-            wanted = f"a list {each[:60]!r} of objects (`each`)" if each else "JSON objects"
+            wanted = f"a list {each[:60]!r} of objects (each)" if each else "JSON objects"
             raise ImportTableError(f"{self.path}: holds no {wanted}, one a line")
         self.names = tuple(fields)
         self.db.execute(f"SET VARIABLE fields{self._key} = ?", [list(fields.values())])
@@ -295,7 +314,8 @@ class SourceTable:
             # An element stands in place of the list that it is of.
             self.db.execute(f"SET VARIABLE each{self._key} = ?", [each])
             name = f"getvariable('each{self._key}')"
-            elements = f"unnest(CAST(json_extract(json, '/' || {_escaped(name)}) AS JSON[])) AS element"
+            escaped = f"replace(replace({name}, '~', '~0'), '/', '~1')"
+            elements = f"unnest(CAST(json_extract(json, '/' || {escaped}) AS JSON[])) AS element"
             self.source = f"(SELECT row_number() OVER () AS row, json, {elements} FROM {self.source})"
             merged = f"json_merge_patch(json, json_object({name}, element)) AS json"
             self.source, self._expanded = f"(SELECT row, {merged} FROM {self.source})", True
@@ -349,6 +369,7 @@ class SourceTable:
         values = Template(self.column_map.from_name).match(self.path.as_posix())
         if values is None:
             raise ImportTableError(f"{self.path}: its name is not {self.column_map.from_name!r}, which the map states")
+        self.named = frozenset(values)
         for k, (name, value) in enumerate(values.items()):
             self.db.execute(f"SET VARIABLE name{self._key}_{k} = ?", [value])
             self.names, self._cells = (*self.names, name), [*self._cells, f"getvariable('name{self._key}_{k}')"]
@@ -432,11 +453,6 @@ class SourceTable:
 def is_objects(values: list[Any]) -> bool:
     """Return whether a list has objects of JSON."""
     return any(isinstance(one, dict) for one in values)
-
-
-def _escaped(name: str) -> str:
-    """Return SQL of the part of a JSON pointer for a key, from SQL of it."""
-    return f"replace(replace({name}, '~', '~0'), '/', '~1')"
 
 
 def _fields(row: dict[str, Any], name: str, pointer: str) -> Iterator[tuple[str, str]]:

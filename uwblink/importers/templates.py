@@ -14,9 +14,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
-MAX_PLACES: Final = 64
-"""Columns of a template; each is a group of the expression."""
-
 _PLACE: Final = re.compile(r"\{(?P<name>\w+|\*)(?:\[(?P<count>\d{1,2})\])?(?::(?P<form>hex|int))?\}")
 _VALUES: Final = {
     "": r"(?:[0-9]{4}-[0-9]{2}-[0-9]{2}[ T][0-9:.,]+(?:Z|[+-][0-9:]+)?|[^\s,;()\[\]{}=]*)",
@@ -85,9 +82,9 @@ class Template:
 
 
 def is_template(text: str) -> bool:
-    """Return whether braces are places of different columns, not too many."""
+    """Return whether braces are places of different columns."""
     named = [place["name"] for place in _PLACE.finditer(text) if place["name"] not in ("_", "*")]
-    return not re.search(r"[{}]", _PLACE.sub("", text)) and len(set(named)) == len(named) <= MAX_PLACES
+    return not re.search(r"[{}]", _PLACE.sub("", text)) and len(set(named)) == len(named)
 
 
 def places(template: Template) -> list[str]:

@@ -92,13 +92,6 @@ def test_a_tag_in_no_group_is_named(fitted):
         replace(fitted, groups={"a": TagGroup((1, 2, 3), fitted.bias_curve, fitted.sigma_curve)}).apply(ranges(10))
 
 
-def test_an_unknown_tag_is_named(fitted):
-    r = ranges(10)
-    without = Calibration.from_json(fitted.to_json().replace('"7":', '"8":'))
-    with pytest.raises(BadInputError, match="tag 7"):
-        without.apply(r)
-
-
 @pytest.mark.parametrize(
     ("old", "new"),
     [

@@ -47,27 +47,6 @@ def test_settings_know_what_the_curves_know():
     assert FitSettings().alpha_dbm == ALPHA_DBM
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("lift", "up"),
-        ("constants", "board"),
-        ("scale_ns", 0.0),
-        ("alpha_dbm", float("nan")),
-        ("reference_power_dbm", float("inf")),
-        ("fixed_ns", {-1: 0.1}),
-        ("fixed_ns", {1: float("nan")}),
-        ("groups", {"a": ()}),
-        ("groups", {"a": "12"}),
-        ("groups", {"a": (1,), "b": (1,)}),
-    ],
-)
-def test_a_setting_that_cannot_be_is_named(name, value):
-    with pytest.raises(calib.BadInputError) as caught:
-        FitSettings(**{name: value})
-    assert caught.value.parameter == name
-
-
 def test_settings_and_keywords_make_the_same_fit():
     flight = calib.sample_flight()
     by_name = calib.fit(flight, loss="huber", fixed_ns={1: -0.3}).calibration
@@ -84,6 +63,5 @@ def test_a_fit_repeats_its_settings(tmp_path):
         ["sample", "-o", flight, "-n", 300],
         ["fit", flight, "-o", made, "--loss", "huber", "--fix", "1=-0.3"],
     ):
-        done = processes.run("calib", *line)
-        assert done.returncode == 0, done.stderr
+        processes.succeed("calib", *line)
     assert "settings: loss = huber, fixed_ns = {'1': -0.3}" in processes.run("calib", "show", made).stdout

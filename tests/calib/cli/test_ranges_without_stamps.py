@@ -2,16 +2,11 @@
 
 import json
 
+import numpy as np
 import pytest
 
-from tests import processes
 from tests.calib.plain_tables import DELAYS_NS, Plan, bias_m, write
-
-
-def run(*words):
-    done = processes.run(*words)
-    assert done.returncode == 0, done.stderr
-    return done
+from tests.processes import succeed as run
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +27,11 @@ def test_import_curve_localization(folder):
         assert written["delays_ns"][str(tag)] - middle == pytest.approx(delay, abs=0.05)
     assert any("ranges without stamps" in warning for warning in written["provenance"]["warnings"])
     assert "ranges without stamps" in run("calib", "show", folder / "c.json").stdout
-    run("calib", "localize", folder / "ranges.uwb", "-c", folder / "c.json")
+    located = json.loads(run("calib", "localize", folder / "ranges.uwb", "-c", folder / "c.json", "--json").stdout)
+    assert located["summary"]["rmse_m"]["calibrated"] < 0.7 * located["summary"]["rmse_m"]["raw"]
+    run("calib", "apply", folder / "ranges.uwb", "-c", folder / "c.json", "--to", "csv", "-o", folder / "out")
+    corrected = np.genfromtxt(folder / "out" / "corrected.csv", delimiter=",", names=True, dtype=None, encoding=None)
+    assert np.mean(corrected["sigma_m"]) == pytest.approx(0.04, rel=0.15)
     judged = json.loads(run("calib", "evaluate", folder / "ranges.uwb", "-c", folder / "c.json", "--json").stdout)
     # The planted noise is 4 cm.
     assert judged["overall"]["full"]["robust_std_m"] == pytest.approx(0.041, abs=0.004)

@@ -8,16 +8,13 @@ from typer.testing import CliRunner
 import calib
 from calib.cli.commands import app
 from calib.estimator import optimize
-from uwblink.recording.file import Recording
+from uwblink import Contents
 
 
 @pytest.fixture
 def flight(tmp_path):
     some = calib.sample_flight()
-    with Recording.create(tmp_path / "flight.uwb") as recording:
-        recording.append_exchanges(some.exchanges)
-        recording.append_poses(some.poses)
-        recording.append_tags(some.tags)
+    Contents(exchanges=some.exchanges, poses=some.poses, tags=some.tags).save(tmp_path / "flight.uwb")
     return tmp_path / "flight.uwb"
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from calib.data.ranges import Ranges
 from calib.data.samples import sample_flight
 from calib.data.sources import load_ranges
+from uwblink import Contents
 from uwblink.recording import AntennaDelay
 from uwblink.recording.contents import exchanges_with_poses
 from uwblink.recording.file import Recording
@@ -19,10 +20,7 @@ ROWS = 300
 
 
 def written(path, exchanges, poses, tags):
-    with Recording.create(path, meta={"planted": {"delays_ns": {"1": 0.1}}}) as recording:
-        recording.append_tags(tags)
-        recording.append_poses(poses)
-        recording.append_exchanges(exchanges)
+    Contents(exchanges=exchanges, poses=poses, tags=tags, meta={"planted": {"delays_ns": {"1": 0.1}}}).save(path)
     return path
 
 

@@ -1,20 +1,12 @@
 """Robust losses: their weights and slopes, and losses of one's own."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import calib
-from calib.data.samples import sample_flight
 from calib.errors import BadInputError
 from calib.estimator.losses import LOSSES, register_loss
 from calib.fitting.fitting import fit
 from tests.calib.synthetic import DELAYS_NS, design, ranges
-from uwblink.recording.file import Recording
 from uwblink.ticks import SPEED_OF_LIGHT
 
 
@@ -77,38 +69,3 @@ def test_a_registered_loss_is_replaced_only_when_asked(own_loss):
         register_loss(own_loss, welsch)
     register_loss(own_loss, LOSSES["cauchy"].weights, replace=True)
     np.testing.assert_array_equal(LOSSES[own_loss].weights(np.ones(1)), LOSSES["cauchy"].weights(np.ones(1)))
-
-
-PLUGIN = """
-import numpy as np
-from calib.estimator.losses import RobustLoss
-
-def weights(u):
-    weight = np.exp(-(u**2) / 2)
-    return weight, weight * (1 - u**2)
-
-WELSCH = RobustLoss("welsch", weights)
-BAD = RobustLoss("bad", lambda u: (u, u))
-"""
-
-
-def test_the_command_knows_losses_of_other_distributions(tmp_path):
-    (tmp_path / "my_losses.py").write_text(PLUGIN)
-    (tmp_path / "my_losses-1.0.dist-info").mkdir()
-    (tmp_path / "my_losses-1.0.dist-info" / "METADATA").write_text(
-        "Metadata-Version: 2.1\nName: my-losses\nVersion: 1.0\n"
-    )
-    (tmp_path / "my_losses-1.0.dist-info" / "entry_points.txt").write_text(
-        "[uwbcal.losses]\nwelsch = my_losses:WELSCH\nbad = my_losses:BAD\n"
-    )
-    flight = sample_flight()
-    with Recording.create(tmp_path / "f.uwb") as recording:
-        recording.append_tags(flight.tags)
-        recording.append_poses(flight.poses)
-        recording.append_exchanges(flight.exchanges)
-    fit_it = [str(Path(sys.executable).parent / "calib"), "fit", "f.uwb", "-o", "c.json", "--force", "--loss"]
-    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
-    done = subprocess.run([*fit_it, "welsch"], cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert calib.load_calibration(tmp_path / "c.json").loss == "welsch"
-    assert "'bad' of my-losses (group uwbcal.losses) is left out" in done.stderr

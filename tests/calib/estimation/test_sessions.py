@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 import calib
 from benchmarks.worlds import LIGHT_M_PER_NS, Recipe, make
 from calib.cli.commands import app
-from uwblink.recording.file import Recording
+from uwblink import Contents
 
 HOUR_NS = 3_600_000_000_000
 RECIPE = Recipe(tags=4, seconds=20, per_second=120)
@@ -111,10 +111,11 @@ def test_the_command_fits_recordings_three_days_apart(tmp_path):
     for seed, hours in ((1, 0), (2, 72)):
         flight, later = calib.sample_flight(600, seed=seed), hours * HOUR_NS
         paths.append(tmp_path / f"{hours}.uwb")
-        with Recording.create(paths[-1]) as recording:
-            recording.append_exchanges(replace(flight.exchanges, time_ns=flight.exchanges.time_ns + later))
-            recording.append_poses(replace(flight.poses, time_ns=flight.poses.time_ns + later))
-            recording.append_tags(flight.tags)
+        Contents(
+            exchanges=replace(flight.exchanges, time_ns=flight.exchanges.time_ns + later),
+            poses=replace(flight.poses, time_ns=flight.poses.time_ns + later),
+            tags=flight.tags,
+        ).save(paths[-1])
     done = CliRunner().invoke(app, ["fit", *map(str, paths), "-o", str(tmp_path / "both.json")])
     assert done.exit_code == 0, done.output
     assert "only 12 s of data" in done.stderr

@@ -8,7 +8,7 @@ import pytest
 import calib
 from tests.calib import synthetic
 from tests.processes import run
-from uwblink.recording.file import Recording
+from uwblink import Contents
 
 
 def hardly_moving(seed=1):
@@ -19,10 +19,14 @@ def hardly_moving(seed=1):
 
 
 @pytest.mark.parametrize(
-    ("column", "times", "unit"),
-    [("truth_m", 1000, "millimetres"), ("truth_m", 100, "centimetres"), ("raw_m", 1000, "millimetres")],
+    ("column", "times", "unit", "more"),
+    [
+        ("truth_m", 1000, "millimetres", {}),
+        ("truth_m", 100, "centimetres", {"loss": "l2"}),
+        ("raw_m", 1000, "millimetres", {"delays_only": True}),
+        ("raw_m", 1000, "millimetres", {"sequential": True}),
+    ],
 )
-@pytest.mark.parametrize("more", [{}, {"loss": "l2"}, {"delays_only": True}, {"sequential": True}])
 def test_another_unit_is_refused_and_named(column, times, unit, more):
     some = hardly_moving()
     calib.fit(some, **more)
@@ -46,10 +50,7 @@ def test_the_command_writes_nothing_and_ends_with_1(tmp_path, change):
         poses = replace(poses, position_m=poses.position_m * 1000)
     else:
         exchanges = replace(exchanges, fpp1_dbm=-exchanges.fpp1_dbm, fpp2_dbm=-exchanges.fpp2_dbm)
-    with Recording.create(tmp_path / "flight.uwb") as recording:
-        recording.append_exchanges(exchanges)
-        recording.append_poses(poses)
-        recording.append_tags(flight.tags)
+    Contents(exchanges=exchanges, poses=poses, tags=flight.tags).save(tmp_path / "flight.uwb")
     done = run("calib", "fit", tmp_path / "flight.uwb", "-o", tmp_path / "c.json")
     assert done.returncode == 1
     assert ("millimetres" if change == "poses" else "dBm") in done.stderr

@@ -102,7 +102,7 @@ def test_what_cannot_be_localized_or_summed_up(flights):
 
 
 def test_a_calibration_is_worth_at_least_a_third_of_the_error(flights, fitted):
-    flight = flights["test1"]
+    flight = beginning(flights["test1"], 20)
     found = localize(flight, fitted, Settings(seeds=2))
     assert len(found) == 3
     summary = summarize(found)

@@ -80,8 +80,7 @@ def folder(tmp_path_factory):
 
 
 def run(place, *words):
-    done = processes.run(*words, cwd=place)
-    assert done.returncode == 0, done.stderr
+    done = processes.succeed(*words, cwd=place)
     return done.stdout
 
 

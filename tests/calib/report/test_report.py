@@ -16,21 +16,15 @@ from calib.fitting.fitting import fit
 from calib.report import Table
 from calib.report.results import Results
 from calib.report.sections import SECTIONS
-from tests import processes
 from tests.browser import chromium, lies_well
 from tests.calib.report import page_of_numpy
 from tests.calib.synthetic import ranges
+from tests.processes import succeed as run
 from uwblink.recording.file import Recording
 
 ROOT = Path(__file__).parents[3]
 TEST = "<script>alert(1)<script>"
 """The name of the test flight, which must not become a part of the page."""
-
-
-def run(*arguments, cwd):
-    done = processes.run(*arguments, cwd=cwd)
-    assert done.returncode == 0, done.stderr
-    return done
 
 
 @pytest.fixture(scope="module")

@@ -65,13 +65,6 @@ def test_without_noise_delays_and_places_are_exact():
     assert result.second_best is None
 
 
-@pytest.fixture(scope="module", params=[40, 41])
-def plane(request):
-    """Boards in a plane, and their survey."""
-    world = standing_boards(request.param, "plane", boards=5, arrangements=6)
-    return world, calib.survey(world.ranges, known="plane")
-
-
 def assert_sound(world, result):
     assert len(result.arrangements) == len(world.places)
     assert result.pair_error_m == pytest.approx(0.02, rel=0.4)
@@ -85,8 +78,9 @@ def test_planted_delays_lie_within_their_intervals(shape, boards, count):
     assert_sound(world, calib.survey(world.ranges, known="" if shape == "space" else shape))
 
 
-def test_intervals_of_delays_and_places_hold_in_the_stated_frame(plane):
-    world, result = plane
+def test_intervals_of_delays_and_places_hold_in_the_stated_frame():
+    world = standing_boards(40, "plane", boards=5, arrangements=6)
+    result = calib.survey(world.ranges, known="plane")
     assert_sound(world, result)
     inside = []
     for k, one in enumerate(result.arrangements):
@@ -123,7 +117,7 @@ def test_one_arrangement_in_space_determines_nothing_and_says_of_whom():
 
 
 def test_a_curve_over_power_is_found_along_with_the_delays():
-    world = standing_boards(2, "plane", boards=6, arrangements=8, bias_size_m=0.06, size_m=9.0, pair_error_m=0.01)
+    world = standing_boards(2, "plane", boards=5, arrangements=6, bias_size_m=0.06, size_m=9.0, pair_error_m=0.01)
     result = calib.survey(world.ranges, known="plane")
     curve = result.calibration.bias_curve
     assert float(curve(np.array([1.0]))[0]) == pytest.approx(0.0, abs=2e-3)
@@ -265,10 +259,10 @@ def test_a_board_that_was_moved_is_named(moved):
 
 
 def wrong_labels():
-    """Six boards on a table whose places are known, with the names of two exchanged."""
+    """Six boards on a table, the places of four of which are known, with the names of two exchanged."""
     world = standing_boards(8, "plane", boards=6, arrangements=3, pair_error_m=0.01)
     names, where = {1: 2, 2: 1}, world.places[0]
-    said = tuple(calib.KnownPosition(names.get(t, t), tuple(where[t - 1].tolist()), 0.01, "1") for t in range(1, 7))
+    said = tuple(calib.KnownPosition(names.get(t, t), tuple(where[t - 1].tolist()), 0.01, "1") for t in range(1, 5))
     return world, calib.Knowledge(shape="plane", positions=said), "labels", "if 1 and 2 are exchanged"
 
 
@@ -452,8 +446,8 @@ def test_two_arrangements_of_one_name_are_refused_by_flags_that_the_command_has(
 def test_a_curve_is_taken_over_where_powers_do_not_vary():
     # Boards some 2.5 m apart: powers within 3 dB, and a bias of several cm that delays would swallow.
     corners = np.array([[0.0, 0.0, 0.0], [2.3, 0.0, 0.0], [1.1, 2.1, 0.0], [1.2, 0.7, 1.9]])
-    near = [corners, corners[[1, 2, 3, 0]], corners[[2, 0, 3, 1]]]
-    wide = [0.6 * near[0], 1.5 * near[1], 3.0 * near[2]]
+    near = [corners, corners[[1, 2, 3, 0]]]
+    wide = [0.6 * near[0], 3.0 * near[1]]
 
     def taped(places):
         apart = {

@@ -51,7 +51,7 @@ def test_a_tape_tells_what_delays_have_in_common_and_without_it_the_interval_is_
 
 
 def test_a_tape_that_was_misread_is_named_and_others_are_not():
-    flown = flight(seconds=10.0, standing_s=4.0)
+    flown = flight(seconds=8.0, standing_s=4.0)
     # Nothing says when the bodies of a distance without an arrangement stood still.
     tapes = [by_tape(flown, 1, 3, 0.3), by_tape(flown, 2, 5), KnownDistance(2, 3, 2.0, 0.02)]
     result = calib.fit_from_ranges(flown, distances=tapes, **KNOWN_START)
@@ -132,7 +132,7 @@ def test_heights_tell_on_which_side_of_anchors_in_one_plane_bodies_are():
     ids=["too quick", "a pair reflected all along"],
 )
 def test_what_is_wrong_with_a_flight_is_named_and_saved(wrong, said):
-    result = calib.fit_from_ranges(flight(seconds=12.0, **wrong), **KNOWN_START)
+    result = calib.fit_from_ranges(flight(seconds=9.0, **wrong), **KNOWN_START)
     assert [warning for warning in result.warnings if said in warning]
     assert result.calibration.provenance["warnings"] == result.warnings
     assert np.abs(scores(result)).max() < 3.5
@@ -145,7 +145,7 @@ def test_walls_between_bodies_are_named_and_in_the_intervals(between_m):
     for robot, anchor in product(range(3), range(4)):
         offset = rng.normal(0, between_m)
         late |= {(2 * robot + own, 11 + anchor): offset for own in (1, 2)}
-    flown = flight(seconds=8.0, rate=120, anchors=CORNERS, late_m=late)
+    flown = flight(seconds=6.0, rate=120, anchors=CORNERS, late_m=late)
     result = calib.fit_from_ranges(flown, poses_until_s=4.0, heading_std_deg=0.0)
     assert bool([text for text in result.warnings if text.startswith("errors belong to places")]) == (between_m > 0)
     found = result.calibration

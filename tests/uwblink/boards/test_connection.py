@@ -2,7 +2,7 @@
 
 import pytest
 
-from uwblink.boards.board import ANSWER_S, FENCE, PATIENT_S, Connection, checked
+from uwblink.boards.board import ANSWER_S, FENCE, PATIENT_S, Connection
 from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
 from uwblink.wire import messages as m
 from uwblink.wire.codec import encode
@@ -69,29 +69,6 @@ def test_time_runs_out_once_and_leaves_a_doubt_that_a_fence_settles():
 
 
 CIR = encode(m.Cir(1, 2, 747_015, tuple(range(1016))))
-
-
-@pytest.mark.parametrize(
-    ("command", "refused"),
-    [
-        *((m.SetResponseDelay(n), "280 to 6500" * (not 280 <= n <= 6500)) for n in (279, 280, 6500, 6501)),
-        *((m.DoTests(1, "a", True, n, b""), "" if abs(n) < 9999.1 else "memory") for n in (9999.0, -9999.0, 9999.1)),
-        (m.DoTests(1, "a", True, float("nan"), b""), "memory"),
-        (m.DoTests(1, "a" * 47, True, 1.0, b""), ""),
-        (m.DoTests(1, "a" * 48, True, 1.0, b""), "DoTests of 65 bytes"),
-        (m.Broadcast(bytes(57)), ""),
-        (m.Broadcast(bytes(58)), "at most 57"),
-        (m.IdReport(1), "IdReport is not a command"),
-        (m.RangeCommand(300), "C05 target"),
-    ],
-)
-def test_what_would_harm_a_board_is_not_sent(command, refused):
-    if refused:
-        with pytest.raises(RefusedError, match=refused):
-            checked(command)
-        return
-    assert checked(command) == encode(command)
-    assert len(encode(command)) <= 64
 
 
 def test_a_command_is_waited_for_150_ms_and_a_fence_in_doubt_a_second():

@@ -28,7 +28,7 @@ FORMS = {
         "from: 6018\t Range: 1.00 m\t RX power: -78.50 dBm\r\nfrom: 6019\t Range: 2.00 m\t RX power: -80.00 dBm\r\n",
         (6018, 6019),
     ),
-    "trek-corrected": ("mc 03 000003e8 000007d0 00000000 00000000 095f c1 00024bed a7:0\r\n", (0, 1)),
+    "trek-corrected": ("mc 03 000003e8 000007d0 00000bb8 00000000 095f c1 00024bed a7:0\r\n", (0, 1)),
 }
 
 

@@ -16,6 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 EXCHANGE = "std_msgs/Header header\nuint16 a\nuint16 b\nuint64[6] stamps\nfloat32 power\nfloat64 odd\n"
 RANGE = "string anchor\nfloat64 distance\nfloat32 rssi\n"
+ARRAY = "std_msgs/Header header\nuint16 tag\nfloat32[8] dis_arr\n"
 RANGES = "std_msgs/Header header\nuwb_msgs/Range[] ranges\n"
 TICK_M = 299_702_547.0 / (128 * 499_200_000)
 WHEN = 1_706_822_508_042_560_815
@@ -36,7 +37,7 @@ def truths(count=40):
 
 def store_of(kind):
     store = get_typestore(kind)
-    for name, text in (("Exchange", EXCHANGE), ("Range", RANGE), ("Ranges", RANGES)):
+    for name, text in (("Exchange", EXCHANGE), ("Range", RANGE), ("Ranges", RANGES), ("Array", ARRAY)):
         store.register(get_types_from_msg(text, f"uwb_msgs/msg/{name}"))
     return store
 
@@ -140,7 +141,7 @@ def test_what_a_bag_does_not_hold_is_said(tmp_path):
         read_source(tmp_path / "absent.mcap")
     (tmp_path / "t.csv").write_text("from_id,to_id,range_m\n1,2,3\n")
     (tmp_path / "m.toml").write_text('each = "x"\n')
-    with pytest.raises(ImportTableError, match="`each` is of JSON lines, bags and logs"):
+    with pytest.raises(ImportTableError, match="each is of JSON lines, bags and logs"):
         read_source(tmp_path / "t.csv", map_file=tmp_path / "m.toml")
     with pytest.raises(ArgumentError, match="takes one file, found 2"):
         read_source([bag, bag], importer="bag")
@@ -154,3 +155,18 @@ def test_a_kind_that_the_bag_does_not_define_is_named(tmp_path):
         db.execute("DELETE FROM message_definitions")
     with pytest.raises(ImportTableError, match="has no definition of uwb_msgs/msg/Exchange"):
         read_source(bag, importer="bag")
+
+
+def test_an_array_of_distances_is_a_column_an_anchor(tmp_path):
+    distances = np.round(np.random.default_rng(5).uniform(2, 9, (20, 8)), 2).astype(np.float32)
+    distances[:, 5] = 0.0
+
+    def arrays(store, first):
+        for k, row in enumerate(distances):
+            yield WHEN + k, store.types["uwb_msgs/msg/Array"](header(store, WHEN + k, *first), 17, row)
+
+    ros2(tmp_path / "b", {"/uwb": ("uwb_msgs/msg/Array", arrays)})
+    (tmp_path / "m.toml").write_text('missing = [0]\n[columns]\nfrom_id = "tag"\n[wide]\nrange_m = "dis_arr.{to_id}"\n')
+    found = read_source(tmp_path / "b", importer="bag", map_file=tmp_path / "m.toml").exchanges
+    assert found.range_m == pytest.approx(distances[:, [0, 1, 2, 3, 4, 6, 7]].ravel())
+    assert found.target.tolist() == [0, 1, 2, 3, 4, 6, 7] * 20

@@ -15,11 +15,13 @@ import pytest
 
 from tests import processes
 from tests.processes import ROOT
+from tests.uwblink.importers.test_table_forms import as_messages, flights, wrapped
 from uwblink.errors import ImportTableError
 from uwblink.importers import read_source
 from uwblink.importers.guess import guess_map
 from uwblink.recording.contents import load
 
+AIR_M_PER_NS = 0.299702547
 ANCHORS = ("0", "1", "2", "3")
 HEXADECIMAL = ("1A2B", "0C0D", "9280", "5431")
 
@@ -109,6 +111,12 @@ def trek(some, kind="mc"):
 
 def stamped(some):
     return f"[{some[0].time_s:.3f}] {with_ids(some)}"
+
+
+def monitored(some):
+    """Lines of a serial monitor, each with its time of day."""
+    seconds = f"00:00:{some[0].time_s:06.3f}"
+    return "\r\n".join(f"{seconds} -> from: {r.anchor} Range: {r.range_m} m RX power: {r.power_dbm} dBm" for r in some)
 
 
 def prints(folder):
@@ -241,6 +249,9 @@ FORMS = {
     "AT+RANGE with powers": Form(lambda folder: lines(folder / "uart.log", with_powers), times=False, powers="rxp"),
     "a log with times": Form(lambda folder: lines(folder / "uart.log", stamped)),
     "Arduino prints": Form(prints, TAG, HEXADECIMAL, times=False, powers="rxp"),
+    "Arduino prints with times of day": Form(
+        lambda folder: lines(folder / "monitor.txt", monitored), TAG, powers="rxp"
+    ),
     "TREK1000": Form(lambda folder: lines(folder / "trek.log", trek), times=False, kept=lambda r: r.anchor != 2),
     "TREK1000, raw and corrected": Form(
         lambda folder: lines(folder / "t.log", lambda some: trek(some, "mr") + "\r\n" + trek(some).replace("00", "01")),
@@ -262,6 +273,10 @@ FORMS = {
     ),
     "ranges in mm, true distances in m": Form(
         of(lambda: renamed({"range_m": "range_mm"}, [r | {"range_m": 1000 * r["range_m"]} for r in long_rows()])),
+        truth=True,
+    ),
+    "times of flight in ns": Form(
+        of(lambda: renamed({"range_m": "tof_ns"}, [r | {"range_m": r["range_m"] / AIR_M_PER_NS} for r in long_rows()])),
         truth=True,
     ),
     "decimal commas": Form(
@@ -378,8 +393,8 @@ def test_words_in_a_column_that_is_not_needed_are_named(tmp_path, column):
 
 @pytest.mark.parametrize("value", [0, -1, 65535, 9999.9])
 def test_a_number_that_often_stands_for_no_range_is_refused_until_the_map_states_it(tmp_path, value):
-    text = LONG + "".join(f"{k},1,2,{value if k % 5 == 0 else 3 + k / 7:.6g},\n" for k in range(60))
-    with pytest.raises(ImportTableError, match=rf"20% of its numbers are {value}.* missing = \[{value}"):
+    text = LONG + "".join(f"{k},1,2,{value if k % 5 == 0 else 3 + k / 7},\n" for k in range(60))
+    with pytest.raises(ImportTableError, match=rf"20.0% of its numbers are {value}.* missing = \[{value}"):
         imported(tmp_path, text)
     assert len(imported(tmp_path, text, f"missing = [{value}]").exchanges) == 48
 
@@ -392,7 +407,7 @@ def test_a_number_that_often_stands_for_no_range_is_refused_until_the_map_states
         ('[wide]\nrange_m = "zz{to_id}"', "wide.range_m: no column 'zz{to_id}'"),
         ('[wide]\nrange_m = "zz"', "wide.range_m"),
         ('from_name = "x{from_id}.csv"', "its name is not 'x{from_id}.csv'"),
-        ('each = "rows"', "`each` is of JSON lines"),
+        ('each = "rows"', "each is of JSON lines"),
         ('[columns]\nrange_m = 4\nfrom_id = "from_id"', "for all their numbers"),
         ("[columns]\nrange_m = 9\nfrom_id = 2\nto_id = 3", "column '9' is missing"),
         ('[columns]\nfpp2 = {f1 = "a", n = "b"}', "columns of f1, f2, f3 and n"),
@@ -401,6 +416,7 @@ def test_a_number_that_often_stands_for_no_range_is_refused_until_the_map_states
         ('missing = "x"', "a list of numbers and words"),
         ('[units]\nskew = "offset"', "allowed: ppm, -ppm"),
         ('[units]\nrange_m = "miles"', "units.range_m"),
+        ('[units]\ngt_range_m = "ns"', "units.gt_range_m"),
     ],
 )
 def test_maps_that_cannot_be_are_refused_with_the_key(tmp_path, text, said):
@@ -439,3 +455,55 @@ def test_powers_that_no_chip_reports_are_refused(tmp_path):
     with pytest.raises(ImportTableError, match=r"'fpp2': the median power is -14"):
         imported(tmp_path, text, map_text)
     assert len(imported(tmp_path, text, map_text.replace("dw1000", "other")).exchanges) == 30
+
+
+def test_places_state_their_units(tmp_path):
+    text = "".join(f"[{500 * k}] AN {k % 3}: {2000 + 7 * k} mm\n" for k in range(30))
+    map_text = 'line = "[{time_ms}] AN {to_id}: {range_mm} mm"\nfrom_name = "tag{from_id}_{gt_range_cm}cm.log"\n'
+    found = imported(tmp_path, text, map_text, "tag7_250cm.log").exchanges
+    assert found.range_m == pytest.approx([2 + 0.007 * k for k in range(30)])
+    assert found.time_ns.tolist() == [k * 500_000_000 for k in range(30)]
+    assert (set(found.initiator), set(found.truth_m)) == ({7}, {2.5})
+
+
+@pytest.mark.parametrize("name", ["dwm1001-lec", "dwm1001-les", "at-range", "arduino", "trek-corrected"])
+def test_a_map_may_name_a_form_of_lines(tmp_path, name):
+    if name == "arduino":
+        text = prints(tmp_path).read_text()
+    else:
+        of = {"dwm1001-lec": lec, "dwm1001-les": les, "at-range": at_range, "trek-corrected": trek}[name]
+        text = lines(tmp_path / "a.log", of).read_text()
+    of_tag = "[constants]\nfrom_id = 7\n" if name[0] in "d" or name == "arduino" else ""
+    found = imported(tmp_path, text, f'line = "{name}"\n{of_tag}', "b.log").exchanges
+    expected = [r.range_m for r in PLANT if name != "trek-corrected" or r.anchor != 2]
+    assert found.range_m == pytest.approx(expected, abs=6e-4)
+
+
+def test_a_table_without_a_header_says_so(tmp_path):
+    with pytest.raises(ImportTableError, match=r"its first line is a row.* from_id = 2"):
+        imported(tmp_path, "".join(f"{k},1,2,{3 + k / 7:.3f}\n" for k in range(30)))
+
+
+@pytest.mark.parametrize("third", ["initiator", "target"])
+def test_messages_as_words_with_ids_in_names_of_files(tmp_path, third):
+    """A file a pair; rows have POLL, RESP and FINAL (or REPORT), and no ids."""
+    words = ("POLL", "RESP", "FINAL" if third == "initiator" else "REPORT")
+    rows = flights(60, third=third)
+    (tmp_path / "in").mkdir()
+    for pair in ((1, 2), (2, 3), (3, 1)):
+        own = as_messages(wrapped([row for row in rows if (row["from_id"], row["to_id"]) == pair]), third)
+        own = [row | {"message": words[row["message"] - 1]} for row in own]
+        names = ("time_s", "message", "tx", "rx", "fpp")
+        table(tmp_path / "in" / f"tag{pair[0]}_to{pair[1]}.csv", [{name: row[name] for name in names} for row in own])
+    found = read_source(tmp_path / "in", importer="csv", map_file=proposed(tmp_path / "in", tmp_path / "m.toml", {}))
+    e = found.exchanges
+    expected = sorted((row["time_s"], row["from_id"], row["to_id"], row["truth"]) for row in rows)
+    assert list(zip(e.initiator.tolist(), e.target.tolist(), strict=True)) == [row[1:3] for row in expected]
+    np.testing.assert_allclose(e.range_m, [row[3] for row in expected], atol=1e-9)
+
+
+def test_a_time_of_flight_without_a_unit_is_asked_for(tmp_path):
+    rows = [{"t_s": r.time_s, "tag": 7, "anchor": r.anchor, "ToF": r.range_m / AIR_M_PER_NS} for r in PLANT]
+    source = table(tmp_path / "t.csv", rows)
+    found = read_source(source, importer="csv", map_file=proposed(source, tmp_path / "m.toml", {"range_m": "ns"}))
+    assert found.exchanges.range_m == pytest.approx([r.range_m for r in PLANT])

@@ -1,6 +1,7 @@
 """Exports of motion-capture programs, made here from their descriptions: planted poses and distances come out."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -124,7 +125,7 @@ def test_an_export_of_motion_capture_is_read(tmp_path, name):
 
 def ranges(times, range_m):
     """Ranges from tag 1 to tag 2 without stamps."""
-    none = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(len(times), np.int64))
+    none: Any = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(len(times), np.int64))
     return Exchanges.from_arrays(1, 2, time_ns=np.rint(times * 1e9).astype(np.int64), range_m=range_m, **none)
 
 
@@ -163,6 +164,17 @@ MAP = """
 columns = {time_s = "when", body = "what", x = "east", y = "north", z = "up"}
 units = {time = "ms", distance = "mm"}
 """
+
+
+def test_iso_times(tmp_path):
+    text = "time,body,x,y,z\n" + "".join(
+        f"2024-05-06T07:08:{k:02d}.250{zone},b,{k},0,0\n" for k, zone in enumerate(["", "Z", "+02:00"])
+    )
+    (tmp_path / "p.csv").write_text(text)
+    found = read_poses(tmp_path / "p.csv")
+    hours = 3600 * 10**9
+    start = 1714979280_250_000_000
+    assert found.time_ns.tolist() == [start + 2 * 10**9 - 2 * hours, start, start + 10**9]
 
 
 @pytest.mark.parametrize(("head", "text"), [(CSV, None), ("when;what;east;north;up", MAP)])

@@ -189,8 +189,7 @@ def run(*words, **more):
 
 def test_the_command_prints_a_line_a_range(flown, calibration):
     expected = uwblink.load(flown).exchanges
-    done = run("stream", flown, "-c", calibration, "--speed", "inf")
-    assert done.returncode == 0, done.stderr
+    done = processes.succeed("uwblink", "stream", flown, "-c", calibration, "--speed", "inf")
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert [row["range_m"] for row in rows] == expected.range_m.tolist()
     assert {"corrected_m", "sigma_m", "clamped"} <= set(rows[0])
@@ -228,18 +227,14 @@ def test_mistakes_are_one_line(tmp_path, flown):
         (["--rate", "5"], "for boards"),
         (["-o", tmp_path / "g.uwb"], "for boards"),
     ):
-        done = run("stream", flown, *words)
-        assert (done.returncode, done.stdout) == (2, "")
-        assert done.stderr.startswith("error: ")
-        assert done.stderr.count("\n") == 1
-        assert named in done.stderr
+        processes.refuse("uwblink", "stream", flown, *words, naming=[named])
 
 
 def test_boards_are_streamed_and_recorded_by_the_command_until_the_time_is_over(tmp_path):
     with served() as server:
         out = tmp_path / "f.uwb"
-        done = run("stream", *server.names.values(), "--rate", "50", "--duration", "1", "-o", out)
-    assert done.returncode == 0, done.stderr
+        words = ("stream", *server.names.values(), "--rate", "50", "--duration", "1", "-o", out)
+        done = processes.succeed("uwblink", *words)
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     # How many there are in a second, boards in virtual time say; here it is a matter of the machine.
     assert len(rows) >= 3

@@ -13,7 +13,7 @@ from pathlib import Path
 import duckdb
 import pytest
 
-from tests.processes import CONTEXT, run
+from tests.processes import CONTEXT, refuse, succeed
 from tests.uwbsim.sweep.test_sweep import GRID, HEAD, plan, rows
 from uwblink.errors import UwblinkError
 from uwbsim.sweep.executors import ClusterLostError
@@ -106,13 +106,12 @@ def test_two_sweeps_cannot_have_one_folder(done):
 
 def test_a_full_disk_ends_a_sweep_with_one_line_and_keeps_what_was_done(tmp_path):
     plan(tmp_path, SMALL)
-    ended = run("uwbsim", "sweep", tmp_path / "plan.toml", "-o", tmp_path / "out", "--workers", "1", most_bytes=8000)
-    assert ended.returncode == 2, ended
-    assert ended.stderr.count("\n") == 1
+    words = ("uwbsim", "sweep", tmp_path / "plan.toml", "-o", tmp_path / "out", "--workers", "1")
+    refuse(*words, most_bytes=8000)
     assert not (tmp_path / "out" / "results.csv").exists()
     # Once there is room again, the same command does it.
     (tmp_path / "out" / "results.duckdb").unlink(missing_ok=True)
-    assert run("uwbsim", "sweep", tmp_path / "plan.toml", "-o", tmp_path / "out", "--workers", "1").returncode == 0
+    succeed(*words)
 
 
 SCHEDULER = """
@@ -146,10 +145,7 @@ def test_a_scheduler_that_goes_away_is_named_and_what_was_done_is_kept(tmp_path)
 def test_results_of_another_version_are_not_gone_on_with(done):
     p, out = done
     with_sql("UPDATE identity SET value = '\"0.0.1\"' WHERE key = 'uwbcal'")(out / "results.duckdb")
-    ended = run("uwbsim", "sweep", p.path, "-o", out, "--workers", 1, "--resume")
-    assert ended.returncode == 2, ended
-    assert str(out) in ended.stderr
-    assert "0.0.1" in ended.stderr
+    refuse("uwbsim", "sweep", p.path, "-o", out, "--workers", 1, "--resume", naming=[out, "0.0.1"])
 
 
 ENDLESS = "sweep = { scenario = 'noiseless', protocols = ['ds'], ranges = 20000, seeds = 100000 }\n"
@@ -175,7 +171,7 @@ def signals_blocked(pid):
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are looked up in /proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_a_sweep_that_ends_early_leaves_no_worker_and_goes_on_where_it_was(tmp_path, number):
-    p, out, words = plan(tmp_path, HEAD + "ranges = 4_000\nseeds = 12\n" + GRID), tmp_path / "out", tmp_path / "words"
+    p, out, words = plan(tmp_path, HEAD + "ranges = 4_000\nseeds = 8\n" + GRID), tmp_path / "out", tmp_path / "words"
     with words.open("w") as stream:
         command = [UWBSIM, "sweep", p.path, "-o", out, "--workers", "2"]
         process = subprocess.Popen(command, stdout=stream, stderr=stream, start_new_session=True)

@@ -120,7 +120,7 @@ def test_a_process_that_dies_is_replaced(alone, tmp_path, monkeypatch):
 
 def test_a_dask_cluster_survives_the_death_of_a_worker(tmp_path):
     distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
-    text = HEAD + "ranges = 4_000\nseeds = 4\n" + GRID
+    text = HEAD + "ranges = 2_000\nseeds = 4\n" + GRID
     p = plan(tmp_path, text)
     seen: list[float] = []
 

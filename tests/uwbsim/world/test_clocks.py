@@ -14,7 +14,7 @@ NOMINAL = {
     "drift_ppm_per_sqrt_s": lambda tau: 0.01e-6 * np.sqrt(tau / 3),
 }
 NOISY = dict.fromkeys(NOMINAL, 0.01)
-SHORT, LONG = np.array([1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 1.0]), np.array([2.0, 10.0, 30.0, 100.0, 300.0, 1000.0])
+SHORT, LONG = np.array([1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 1.0]), np.array([2.0, 10.0, 30.0, 100.0, 300.0])
 
 
 def clocks(duration=10.0, skews=(0.0, 0.0), seed=1, ids=(1, 2), **noise):
@@ -107,12 +107,12 @@ def test_the_rate_of_a_noisy_clock_is_what_its_reading_gains_over_a_preamble_or_
     assert np.std(found[which == 0]) > 2 / span, "there is noise in it"
 
 
-# For the long ones two days and a half altogether: 200 independent spans of 1000 s, known to 5 %.
+# For the long ones 20 hours altogether: 240 independent spans of 300 s, known to 5 %.
 @pytest.mark.parametrize(
     ("kinds", "long"), [([kind], long) for kind in NOMINAL for long in (False, True)] + [([*NOMINAL], False)]
 )
 def test_allan_deviations_are_nominal_and_add_up_in_variance(kinds, long):
-    step_s, duration_s, taus, seeds = (2.0, 109_000.0, LONG, 1) if long else (0.5e-3, 30.0, SHORT, 3)
+    step_s, duration_s, taus, seeds = (2.0, 36_000.0, LONG, 1) if long else (0.5e-3, 30.0, SHORT, 3)
     time, squares = subticks(np.arange(0, duration_s, step_s)), []
     for seed in range(seeds):
         c = clocks(duration_s, seed=seed + 1, **dict.fromkeys(kinds, 0.01))
