@@ -74,11 +74,11 @@ imports = typer.Typer(
 
 
 def guess(
-    table: Annotated[Path, typer.Argument(help="Table, log, or a folder of them.")],
+    table: Annotated[Path, typer.Argument(help="Table, log, folder of them, or bag.")],
     output: Annotated[Path | None, output("Map to write (.toml); else printed.")] = None,
     force: Force = False,
 ) -> None:
-    """Propose the map of a table: names and units of its columns, with the reason for each line."""
+    """Propose the map of a table or a bag: topics, names and units of columns, with the reason for each line."""
     from uwblink.importers.guess import guess_map
 
     if output is not None:
@@ -89,9 +89,12 @@ def guess(
         typer.echo(found.text, nl=False)
         return
     write_text(output, found.text, force=force)
-    then = f"uwblink import csv {quote(str(table))} --map {quote(str(output))} -o {quote(table.name.split('.')[0])}.uwb"
+    name = quote(table.name.split(".")[0])
+    then = f"uwblink import {found.importer} {quote(str(table))} --map {quote(str(output))} -o {name}.uwb"
     asked = f"set {' and '.join(found.asked)} in it" if found.asked else "check it"
     typer.echo(f"{output}: {asked if found.complete else 'fill in what is missing'}, then {then}")
+    if found.advice:
+        typer.echo(found.advice)
 
 
 def _importing(row: Importer) -> Callable[..., None]:
@@ -110,6 +113,9 @@ def _importing(row: Importer) -> Callable[..., None]:
         typer.echo(f"{output}: {', '.join(f'{count} {table}' for table, count in done.counts.items())}")
         for note in done.notes:
             typer.echo(f"  {printable(note)}")
+        if row.name == "bag" and "poses" not in done.counts:
+            advice = uwblink.importers.pose_advice(table, output)
+            typer.echo(advice + "\n" * bool(advice), nl=False)
 
     def without_map(table: Any, output: Path, force: bool = False) -> None:
         run(table, output, force=force)

@@ -4,8 +4,9 @@ JSON messages are poses, frames, ranges, readings and faults. Their schemas are 
 WebSocket; poses, frames and logs have those that Foxglove knows.
 
 The bag (Jazzy, stored as MCAP) has standard messages alone: poses as PoseStamped and tf, ranges as sensor_msgs/Range
-with their variance, a topic a pair, inertial readings as Imu, heights as Range, temperatures as Temperature, faults as
-Log. Names become what topics may be called: other letters turn into "_".
+with their variance, a topic a pair, and with their powers and skews as JSON in std_msgs/String, inertial readings as
+Imu, heights as Range, temperatures as Temperature, faults as Log. Names become what topics may be called: other letters
+turn into "_".
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ from uwblink.recording.file import Recording
 
 WORLD: Final = "world"
 RANGE: Final = "uwb.Range"
+STRING: Final = "std_msgs/msg/String"
+EXCHANGES: Final = "/uwb/exchanges"
+"""The topic of a bag with the ranges of all pairs as JSON in texts, which hold what a sensor_msgs/Range does not."""
+
 READINGS: Final = {
     "imu": ("body", "wx", "wy", "wz", "ax", "ay", "az"),
     "height": ("body", "height_m"),
@@ -237,13 +242,16 @@ class _RosMessages:
     def __init__(self, types: Any) -> None:
         self._types = types
 
-    def all(self, _recording: Recording, held: Contents) -> Iterator[Message]:
+    def all(self, recording: Recording, held: Contents) -> Iterator[Message]:
         """Yield the messages of a piece of a recording, in order of time."""
         ranges, variances = held.exchanges.range_m, _variances(held)
+        (by_poses,) = distances_by_poses_m(recording, [held.exchanges])
+        rows = _ranges(held, by_poses)
         encoders: dict[str, Callable[[Any, Any, Any], list[tuple[str, Any]]]] = {
             "poses": self._poses,
             "ranges": lambda stamp, ends, k: [
-                (f"/uwb/range_{ends[0]}_{ends[1]}", self._range(stamp, f"uwb_{ends[0]}", ranges[k], variances[k]))
+                (f"/uwb/range_{ends[0]}_{ends[1]}", self._range(stamp, f"uwb_{ends[0]}", ranges[k], variances[k])),
+                (EXCHANGES, self._new("std_msgs/String", json.dumps(rows(k)))),
             ],
             "imu": self._imu,
             "height": lambda stamp, body, values: [

@@ -2,8 +2,8 @@
 
 Each message becomes a row of a table. Its columns are the fields of the message, such as `header.frame_id`; times
 (`header.stamp`) are whole nanoseconds, and the elements of an array are `stamps.0`, `stamps.1` and so on. `topic` and
-`log_time` are columns, too. The table is then read as JSON lines. The project's own MCAP files need no map: all their
-ranges are imported.
+`log_time` are columns, too, and the places of a topic that is a template; the fields of JSON in a `std_msgs/String` are
+those of the message. The table is then read as JSON lines. The project's own MCAP files and bags need no map.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -21,8 +21,9 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from uwblink.errors import ImportTableError, raising
-from uwblink.exporters.mcap import RANGE
+from uwblink.exporters.mcap import EXCHANGES, RANGE, STRING
 from uwblink.importers.column_map import ColumnMap, load_map
+from uwblink.importers.templates import Template, is_template
 from uwblink.text_files import require_regular
 
 BAG_SUFFIXES: Final = (".bag", ".mcap", ".db3")
@@ -34,6 +35,13 @@ OWN_COLUMNS: Final = {
     "fpp1": "fpp1_dbm", "fpp2": "fpp2_dbm", "skew1": "skew1_ppm", "skew2": "skew2_ppm",
 }  # fmt: skip
 """The fields of the project's own ranges, by the names of a map."""
+
+_OWN: Final = (
+    (RANGE, "{_}", OWN_COLUMNS),
+    (STRING, EXCHANGES, OWN_COLUMNS),
+    ("sensor_msgs/msg/Range", "/uwb/range_{from_id:int}_{to_id:int}", {"range_m": "range"}),
+)
+"""Message types, topics and columns of the project's exports, the most complete first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +55,12 @@ class Bag:
     path: Path
     kinds: Mapping[str, str]
     messages: Callable[[Iterable[str]], Iterator[tuple[str, str, int, dict[str, Any]]]]
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path is a bag by its suffix, or a folder with the files of one."""
+    named = [path] if not path.is_dir() else [part for part in path.iterdir() if part.suffix != ".bag"]
+    return any(part.suffix.lower() in BAG_SUFFIXES for part in named)
 
 
 @contextmanager
@@ -177,27 +191,51 @@ def bag_to_table(sources: Sequence[Path], map_file: Path | None, folder: Path) -
 
 def _with_topics(bag: Bag, column_map: ColumnMap) -> ColumnMap:
     """Return a map that names topics: its own, those of the project's own ranges, or the only one there is."""
-    own = [topic for topic, kind in bag.kinds.items() if kind == RANGE]
     listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.kinds.items()))[:400] or "none"
-    for topic in column_map.topics:
-        if topic not in bag.kinds:
-            raise ImportTableError(f"{bag.path}: no topic {topic[:80]!r}; there are {listed}")
-    if column_map.topics:
-        return column_map
-    if own:
-        columns, unit = OWN_COLUMNS | column_map.columns, column_map.distance_unit or "m"
-        return replace(column_map, topics={topic: {} for topic in own}, columns=columns, distance_unit=unit)
+    topics: dict[str, dict[str, float | str]] = {}
+    for stated, constants in column_map.topics.items():
+        matching = matching_topics(stated, bag.kinds)
+        if not matching:
+            raise ImportTableError(f"{bag.path}: no topic {stated[:80]!r}; there are {listed}")
+        topics |= {topic: {**topics.get(topic, {}), **places, **constants} for topic, places in matching.items()}
+    if topics:
+        return replace(column_map, topics=topics)
+    for kind, template, columns in _OWN:
+        if own := matching_topics(template, (topic for topic, one in bag.kinds.items() if one == kind)):
+            columns, unit = columns | column_map.columns, column_map.distance_unit or "m"
+            return replace(column_map, topics=own, columns=columns, distance_unit=unit)
     if len(bag.kinds) == 1:
         return replace(column_map, topics={topic: {} for topic in bag.kinds})
-    raise ImportTableError(f'{bag.path}: a `map_file` must name the topics, as [topics."/name"]; there are {listed}')
+    raise ImportTableError(
+        f'{bag.path}: a `map_file` must name the topics, as [topics."/name"]; there are {listed}; '
+        "'uwblink import guess' proposes a map"
+    )
+
+
+def matching_topics(stated: str, topics: Iterable[str]) -> dict[str, dict[str, float | str]]:
+    """Return the topics that are called so, or that a template matches, with the values of its places."""
+    listed = list(topics)
+    if stated in listed or not is_template(stated):
+        return {stated: {}} if stated in listed else {}
+    found = {topic: Template(stated).match(topic) for topic in listed}
+    return {topic: {**places} for topic, places in found.items() if places is not None}
 
 
 def _rows(bag: Bag, topics: Mapping[str, dict[str, float | str]]) -> Iterator[dict[str, Any]]:
     """Yield one row for each message."""
     for topic, kind, time_ns, message in bag.messages(topics):
         # The project's own messages leave out unknown values.
-        fields = (dict.fromkeys(OWN_COLUMNS.values()) if kind == RANGE else {}) | message
-        yield {**fields, "topic": topic, "log_time": time_ns, **topics[topic]}
+        own = dict.fromkeys(OWN_COLUMNS.values()) if kind == RANGE or topic == EXCHANGES else {}
+        yield {**own, **fields_of(kind, message), "topic": topic, "log_time": time_ns, **topics[topic]}
+
+
+def fields_of(kind: str, message: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of a message; those of a text that is an object of JSON."""
+    if kind == STRING:
+        with suppress(KeyError, TypeError, ValueError, RecursionError):
+            parsed = _plain(json.loads(message["data"]))
+            return parsed if isinstance(parsed, dict) else message
+    return message
 
 
 def _plain(value: Any) -> Any:

@@ -38,8 +38,8 @@ rx = 16436
 [antenna_delays.tags.7]
 tx = 16400
 rx = 16400
-[topics."/uwb/range"]      # of bags: topics to read, and constants for each
-to_id = 7
+[topics."/uwb/{from_id}/range_{to_id}"]   # of bags: topics to read, or a template of them, and constants for each
+fpp2 = -80
 ```
 """
 
@@ -226,7 +226,8 @@ MAP_KEYS: Final = (
         'topics."TOPIC"',
         "table of constants",
         "the only topic of the bag",
-        "Of bags: a topic to read, and constants that its messages lack.",
+        "Of bags: a topic to read, and constants that its messages lack. Places in braces, as of `line`, match many "
+        "topics and are columns.",
     ),
 )
 
@@ -297,7 +298,8 @@ def load_map(path: Path) -> ColumnMap:
         file.check(
             name, table[name], is_template(table[name]), "text with different places such as {range_m} or {r[8]}"
         )
-        for place in places(Template(table[name])):
+    for text in (*(table[name] for name in templates), *file.section("topics")):
+        for place in places(Template(text)):
             _place(place, columns, units)
     file.known(units, ("stamps", "time", "distance", "power", "skew", *DISTANCES, *POWERS), "units.")
     registers = {name: value for name, value in columns.items() if isinstance(value, dict)}

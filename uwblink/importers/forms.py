@@ -70,7 +70,7 @@ def wide_columns(names: Sequence[str], taken: Mapping[str, str]) -> dict[str, st
         plain = plain_name(f"{before} {after}")
         bare = re.sub(rf"(^|_){_DEVICE}(?=_|$)", "", plain)
         # Without words of devices nothing but a unit may remain.
-        short = r"|(r|d|dis|dis_arr(ay)?|ranges|distances|dists)" + ("|" if bare != plain else "")
+        short = r"|(r|d|dis|dis_arr(ay)?|data|ranges|distances|dists)" + ("|" if bare != plain else "")
         for ours in _HELD:
             pattern = f"_?({PATTERNS[ours]}{short if ours == 'range_m' else ''}){{end}}".format_map(WORDS)
             if ours not in found and re.fullmatch(pattern, bare):

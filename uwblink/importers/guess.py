@@ -19,6 +19,7 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError
+from uwblink.importers.bags import is_bag
 from uwblink.importers.column_map import (
     ASKED,
     DISTANCE_UNITS,
@@ -36,6 +37,7 @@ from uwblink.importers.column_map import (
 from uwblink.importers.column_names import OF_MESSAGES, WORDS, named_columns, plain_name
 from uwblink.importers.exchange_tables import tables_in
 from uwblink.importers.forms import Entries, form_of, name_template, register_columns, wide_columns
+from uwblink.importers.guess_bags import guess_bag
 from uwblink.importers.plausibility import (
     ACCEPTED_SHARE,
     FITTING_SHARE,
@@ -117,13 +119,26 @@ class Guess:
     text: str
     complete: bool
     asked: tuple[str, ...] = ()
+    columns: tuple[str, ...] = ()
+    importer: str = "csv"
+    advice: str = ""
+    """What to do after the import."""
 
 
 def guess_map(path: Path) -> Guess:
-    """Return the proposed map of a table, a log, or a folder of them; raises `ImportTableError`."""
+    """Return the proposed map of a table, a log, a folder of them, or a bag; raises `ImportTableError`."""
     if path.suffix.lower() == ".uwb":
         raise ImportTableError(f"{path}: is a recording already and needs no map; 'uwblink show' prints its contents")
-    file = tables_in(path, ColumnMap(line="{*}"))[0] if path.is_dir() else path
+    if is_bag(path):
+        return guess_bag(path, _of_table)
+    return _of_table(path, tables_in(path, ColumnMap(line="{*}"))[0] if path.is_dir() else path)
+
+
+def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Mapping[str, str] = {}) -> Guess:
+    """Return the map of a table as `path` or a part of it is called.
+
+    `given` are columns that have our names, `meanings` recognisable names of columns.
+    """
     require_regular(file, ImportTableError, "table")
     form, top = form_of(file)
     with open_table(file, form) as table:
@@ -133,12 +148,13 @@ def guess_map(path: Path) -> Guess:
         wide = form.wide or wide_columns(table.names, columns)
         if each := None if form.line or wide or "range_m" in columns else next(iter(table.lists), None):
             top["each"] = each, "a line has a list of them"
-    given = {name for text in (form.line, form.each) if text for name in places(Template(text)) if name in NAMES}
+    given = {*given, *(n for text in (form.line, form.each) if text for n in places(Template(text)) if n in NAMES)}
     given |= {"to_id", *wide} if wide else set()
-    form = replace(form, wide=wide, each=form.each or each)
+    form = replace(form, wide=wide, each=form.each or each, time_unit="ns" if is_bag(path) else None)
     with open_table(file, form) as table:
         # Fields of the elements of a list are called by their own names.
         short = {name.removeprefix(f"{form.each}."): name for name in table.names}
+        short |= {meaning: name for name, meaning in meanings.items() if name in short}
         found = with_stamp_and_event(table, {ours: short[name] for ours, name in named_columns(short).items()})
     for ours, letters in (("to_id", ("id", "A", "a", "addr")), ("range_m", ("R", "r", "D", "d"))) if form.each else ():
         if ours not in found and (letter := next((name for name in letters if name in short), None)):
@@ -255,7 +271,7 @@ def _proposal(
         lines += ["", f"[{title}]", *_lines(entries)] if entries else []
     lines += ["", *(f"# {text}" for text, is_due in remarks.items() if is_due)]
     asked = [key for part in (constants, top, named, units) for key, (value, _) in part.items() if value == ASKED]
-    return Guess("\n".join(lines) + "\n", layout != "nothing" and not lacking, tuple(asked))
+    return Guess("\n".join(lines) + "\n", layout != "nothing" and not lacking, tuple(asked), tuple(columns))
 
 
 def _alike(header: str, names: Sequence[str]) -> list[str]:
@@ -341,6 +357,8 @@ def _units(form: ColumnMap, columns: dict[str, str], cells: dict[str, Floats]) -
     found: Entries = {}
     if "time_s" in columns:
         found["time"] = _time_unit(columns["time_s"], cells["time_s"])
+        if found["time"][0] == ASKED and form.time_unit:
+            found["time"] = form.time_unit, "as times in bags"
     named = {name: _header(form, name, columns[name]) for name in DISTANCES if name in columns}
     units = {
         name: unit

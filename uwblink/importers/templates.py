@@ -76,9 +76,9 @@ class Template:
         return f"regexp_extract({text}, getvariable('{variable}'), [{listed}])"
 
     def match(self, text: str) -> dict[str, str] | None:
-        """Return the values at the end of a file's path, by place; None if it does not match."""
-        found = re.search(f"(?:^|/){self.pattern}$", text)
-        return dict(zip((name for name, _, _ in self._places), found.groups(), strict=True)) if found else None
+        """Return the values at the end of a path or a topic, by place, without slashes; None if it does not match."""
+        found = re.search(f"(?:^|/){self.pattern.replace('[^', '[^/')}$", text)
+        return dict(zip((name for name, _, _ in self._places), found.groups(), strict=False)) if found else None
 
 
 def is_template(text: str) -> bool:
