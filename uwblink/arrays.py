@@ -96,7 +96,7 @@ def data_frame(rows: Mapping[str, NDArray[Any]] | Sequence[Mapping[str, Any]]) -
 
     Raises `ArgumentError` where pandas is not installed.
     """
-    with raising(ArgumentError, "a data frame needs pandas: `pip install pandas`, or use `to_dict`", ImportError):
+    with raising(ArgumentError, "a data frame needs pandas: `pip install pandas`, or use to_dict()", ImportError):
         import pandas
     return pandas.DataFrame(rows) if isinstance(rows, Mapping) else pandas.json_normalize(list(rows), sep="_")
 

@@ -139,7 +139,7 @@ def dialect_of(name: str) -> Dialect:
     if name.endswith(".toml"):
         known = load_map(Path(name))
         if known.line is None:
-            raise ArgumentError(f"{name}: states no `line`, a template of what a board prints", parameter="dialect")
+            raise ArgumentError(f"{name}: states no line, a template of what a board prints", parameter="dialect")
         wide = {ours: family for ours, family in known.wide.items() if isinstance(family, str)}
         units = {"distance": known.distance_unit or "m"}
         form = {"line": known.line, "each": known.each, "wide": wide, "units": units}

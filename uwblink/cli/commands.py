@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
@@ -29,7 +30,7 @@ from uwblink.cli.shared import (
     print_result,
     waiting,
 )
-from uwblink.display import printable
+from uwblink.display import first_few, printable
 from uwblink.errors import ImportTableError
 from uwblink.output import check_output, write_text
 
@@ -93,8 +94,15 @@ def guess(
     then = f"uwblink import {found.importer} {quote(str(table))} --map {quote(str(output))} -o {name}.uwb"
     asked = f"set {' and '.join(found.asked)} in it" if found.asked else "check it"
     typer.echo(f"{output}: {asked if found.complete else 'fill in what is missing'}, then {then}")
-    if found.advice:
-        typer.echo(found.advice)
+    if found.pose_topics or found.advice:
+        typer.echo(found.advice or _pose_command(found.pose_topics, f"{name}.uwb", table))
+
+
+def _pose_command(topics: Sequence[str], recording: str, bag: Path) -> str:
+    """Return the command that adds the poses on some topics of a bag to a recording."""
+    named = first_few(map(json.dumps, topics))
+    command = f"uwblink poses {recording} --from {quote(str(bag))} --tags TAGS.toml"
+    return f"poses on {named} become true distances: {command} (where the tags sit)"
 
 
 def _importing(row: Importer) -> Callable[..., None]:
@@ -113,9 +121,8 @@ def _importing(row: Importer) -> Callable[..., None]:
         typer.echo(f"{output}: {', '.join(f'{count} {table}' for table, count in done.counts.items())}")
         for note in done.notes:
             typer.echo(f"  {printable(note)}")
-        if row.name == "bag" and "poses" not in done.counts:
-            advice = uwblink.importers.pose_advice(table, output)
-            typer.echo(advice + "\n" * bool(advice), nl=False)
+        if row.name == "bag" and "poses" not in done.counts and (found := uwblink.importers.pose_topics(table)):
+            typer.echo(_pose_command(found, quote(str(output)), table))
 
     def without_map(table: Any, output: Path, force: bool = False) -> None:
         run(table, output, force=force)

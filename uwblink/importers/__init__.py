@@ -23,7 +23,7 @@ from uwblink.importers.column_map import ColumnMap
 from uwblink.importers.exchange_tables import TABLE_SUFFIXES, Imported, find_tables, import_tables
 from uwblink.importers.frames import map_of_frame, write_frame
 from uwblink.importers.miluv import read_miluv
-from uwblink.importers.poses import add_poses, pose_advice
+from uwblink.importers.poses import add_poses, pose_topics
 from uwblink.importers.staging import Watch, unwatched
 from uwblink.importers.tables import connected
 from uwblink.output import check_output
@@ -40,7 +40,7 @@ __all__ = [
     "add_poses",
     "import_file",
     "import_recording",
-    "pose_advice",
+    "pose_topics",
     "read_source",
     "register_importer",
 ]

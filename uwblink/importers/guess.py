@@ -121,8 +121,9 @@ class Guess:
     asked: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
     importer: str = "csv"
+    pose_topics: tuple[str, ...] = ()
     advice: str = ""
-    """What to do after the import."""
+    """What can be had without true distances, where there are no poses."""
 
 
 def guess_map(path: Path) -> Guess:

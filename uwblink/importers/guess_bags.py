@@ -22,7 +22,7 @@ from uwblink.importers.bags import Bag, fields_of, matching_topics, open_bag
 from uwblink.importers.column_map import IDS, POSITIONS, POWERS
 from uwblink.importers.column_names import named_columns
 from uwblink.importers.forms import name_template, wide_columns
-from uwblink.importers.poses import pose_advice
+from uwblink.importers.poses import pose_topics
 from uwblink.twr import STAMPS
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 NO_POSES: Final = (
     "no poses and no true distances: ranges alone give delays of boards that stood still (`calib survey`); a flight "
-    "also needs attitudes, and anchors or first positions (`calib fit --truth ranges`); constants of pairs need true "
+    "also needs attitudes, and anchors or first positions (calib.fit_from_ranges); constants of pairs need true "
     "distances (docs/without-motion-capture.md)"
 )
 MESSAGES_READ: Final = 2000
@@ -76,13 +76,14 @@ def guess_bag(path: Path, guess_table: Callable[..., Guess]) -> Guess:
     best, chosen = max(
         found, key=lambda one: (len({*STAMPS, *POWERS} & {*one[0].columns}), -len(one[0].asked), len(one[0].columns))
     )
-    advice = pose_advice(path, Path(f"{path.name.split('.')[0]}.uwb"))
-    advice = advice or ("" if {"gt_range_m", *POSITIONS} & {*best.columns} else NO_POSES)
+    poses = pose_topics(path)
+    advice = "" if poses or {"gt_range_m", *POSITIONS} & {*best.columns} else NO_POSES
     others = [json.dumps(topic) for _, some in found if some is not chosen for topic in some]
     remarks = ["topics of the bag:", *(f"  {one}" for one in listed)]
     remarks += [f"also with ranges, for maps of their own: {', '.join(others)}"] if others else []
+    remarks += [f"poses, for `uwblink poses`: {first_few(map(json.dumps, poses))}"] if poses else []
     text = best.text + "".join(f"# {line}\n" for line in (*remarks, advice) if line)
-    return replace(best, text=text, importer="bag", advice=advice)
+    return replace(best, text=text, importer="bag", pose_topics=tuple(poses), advice=advice)
 
 
 def _guess_topics(bag: Bag, pattern: str, topics: list[str], table: Path, guess_table: Callable[..., Guess]) -> Guess:

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import math
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
-from shlex import quote
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
-from uwblink.display import first_few
 from uwblink.errors import ImportTableError, RecordingExistsError, raising
 from uwblink.importers.bags import open_bag
 from uwblink.importers.column_map import ColumnMap, load_map
@@ -117,15 +114,10 @@ def _body_in(name: str) -> str:
     return next((part for part in name.split("/") if part and part not in DRIVERS), "")
 
 
-def pose_advice(bag: Path, recording: Path) -> str:
-    """Return the command that adds the poses of a bag to a recording; "" for a bag without poses.
-
-    Raises `ImportTableError`.
-    """
+def pose_topics(bag: Path) -> list[str]:
+    """Return the topics of a bag that have poses; raises `ImportTableError`."""
     with open_bag(bag) as opened:
-        found = first_few(json.dumps(topic) for topic, kind in sorted(opened.kinds.items()) if kind in MESSAGES)
-    command = f"uwblink poses {quote(str(recording))} --from {quote(str(bag))} --tags TAGS.toml"
-    return "" if found == "none" else f"poses on {found} become true distances: {command} (where the tags sit)"
+        return sorted(topic for topic, kind in opened.kinds.items() if kind in MESSAGES)
 
 
 def _chosen_topics(path: Path, kinds: Mapping[str, str], topics: Mapping[str, str] | None) -> dict[str, str | None]:

@@ -11,7 +11,9 @@ import pytest
 import calib
 import uwblink
 from tests.processes import refuse, succeed
-from uwblink.boards import DIALECTS, Dialect, PrintedRange, Terminal, dialect_of
+from uwblink.boards import DIALECTS, Dialect, PrintedRange, dialect_of
+from uwblink.boards.dialects import Printed
+from uwblink.boards.ports import Terminal
 from uwblink.errors import ArgumentError
 
 # What each board prints for a range of one metre to one device and of two metres to another; made from descriptions.
@@ -127,8 +129,8 @@ def test_another_form_ends_with_a_line_and_no_file(tmp_path):
         refuse(*words, "--dialect", "arduino", "--pairs", "all", cwd=tmp_path, naming=["--pairs", "--dialect"])
         refuse(*words, "--dialect", "arduino", "--ids", "1,2", cwd=tmp_path, naming=["1 ports and 2 ids"])
     with printing("") as port:
-        words = ("uwblink", "record", port, "--dialect", "arduino", "--duration", "0.3", "-o", "r.uwb")
-        refuse(*words, cwd=tmp_path, naming=["no range was printed"])
+        brief = ("uwblink", "record", port, "--dialect", "arduino", "--duration", "0.3", "-o", "r.uwb")
+        refuse(*brief, cwd=tmp_path, naming=["no range was printed"])
     (tmp_path / "m.toml").write_text('[columns]\nrange_m = "d"\n')
     with pytest.raises(ArgumentError, match="line"):
         dialect_of(str(tmp_path / "m.toml"))
@@ -160,10 +162,15 @@ def test_a_dialect_of_ones_own_comes_by_an_entry_point_and_words_get_numbers_of_
     DIALECTS.register(Dialect("mine", "A form of my own.", parse))
     try:
         with printing("alpha=1.0\nbeta=2.0\nbad line\n") as port:
-            batches = uwblink.boards.printed_ranges([port], dialect_of("mine"), ids=[1], duration_s=1.0)
+            seen = Printed()
+            batches = uwblink.boards.printed_ranges([port], dialect_of("mine"), ids=[1], duration_s=1.0, seen=seen)
             found = uwblink.Exchanges.concatenate(list(batches))
-        assert {*zip(found.target.tolist(), found.range_m.tolist(), strict=True)} == {(2, 1.0), (3, 2.0)}
+        # Words have numbers beside that of the board, in the order in which they are heard.
+        assert sorted(seen.numbers.values()) == [1, 2, 3]
+        named = {number: name for name, number in seen.numbers.items()}
+        told = {(named[k], far) for k, far in zip(found.target.tolist(), found.range_m.tolist(), strict=True)}
+        assert told == {("alpha", 1.0), ("beta", 2.0)}
     finally:
         DIALECTS.remove("mine")
     with pytest.raises(ArgumentError, match="parse"):
-        DIALECTS.register(Dialect("bad", "No function.", None))
+        DIALECTS.register(Dialect("bad", "No function.", None))  # type: ignore[arg-type]
