@@ -308,8 +308,7 @@ calib evaluate half2.uwb -c half1.json
         """\
 uwblink import csv A.csv --map hanyang.toml -o A.uwb
 calib doctor A.uwb
-calib fit A.uwb -o A.json
-calib fit A.uwb -o A.json --constants pair --hold-out 0.3
+calib fit A.uwb -o A.json --hold-out 0.3
 """,
     ),
     DataSet(

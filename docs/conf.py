@@ -55,11 +55,11 @@ nitpick_ignore_regex = [
     ),
     (
         "py:class",
-        r"uwbsim\.scenario\..*|Faults|GeometricMultipath|Shadow|Spline|SweepSettings",
+        r"uwbsim\.scenario\..*|FaultsFile|GeometricMultipath|ScenarioTag|Shadow|Spline|SweepSettings",
     ),  # models of files, which have pages of their own
     (
         "py:class",
-        r"(Mapping|tuple)\[.*|AbstractContextManager|AntennaDelays|Draw|DuckDBPyConnection|OverheardDelay|deque|PathLike|Path|ndarray|dtype|float64|complex128|ArrayLike|Bools|Floats|Ints|NDArray|Axes|Figure|Data|Source|Using|ListPortInfo|PlacedBody|T|World",
+        r"(Mapping|tuple)\[.*|AbstractContextManager|AntennaDelays|Draw|DuckDBPyConnection|OverheardDelay|deque|PathLike|Path|ndarray|dtype|float64|complex128|ArrayLike|Bools|Floats|Ints|NDArray|Axes|Figure|Data|Source|Using|ListPortInfo|PlacedBody|Value|World",
     ),
 ]
 
