@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from uwblink.boards.ports import Ports, SerialPorts, Transport
 from uwblink.errors import ArgumentError, BoardError, PlanError
-from uwblink.importers.column_map import DISTANCE_UNITS, load_map
+from uwblink.importers.column_map import IDS, NAMES, RANGE_UNITS, ColumnMap, load_map
 from uwblink.importers.lines import LINES
 from uwblink.importers.templates import Template
 from uwblink.output import check_output
@@ -30,7 +30,8 @@ MAX_PRINTED_BYTES: Final = 4096
 """Bytes after which a line without an end is dropped; a list of 64 ranges takes half of that."""
 
 PATIENCE_LINES: Final = 50
-"""Lines without a range after which a board is taken to print another form: banners and menus are shorter."""
+"""Lines without a range after which a board is taken to print another form: banners and menus are shorter (a
+judgement)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,23 +61,27 @@ class Dialect:
     baud_rate: int = 115_200
 
 
-def parser_of(form: Mapping[str, Any]) -> Callable[[str], list[PrintedRange]]:
-    """Return the parser of lines of a form: `line`, `each`, `wide` and `units` of a column map."""
-    whole, each = (Template(form[key]) if form.get(key) else None for key in ("line", "each"))
-    wide, metres = form.get("wide", {}), DISTANCE_UNITS[form.get("units", {}).get("distance", "m")]
+def parser_of(known: ColumnMap) -> Callable[[str], list[PrintedRange]]:
+    """Return the parser of lines by a column map with a `line`: they mean what they mean in an imported log.
+
+    Raises `ArgumentError` for what only whole tables have: powers of registers, and columns by device.
+    """
+    if known.registers or any(not isinstance(family, str) for family in known.wide.values()):
+        raise ArgumentError("powers of registers and columns by device are for tables only", parameter="dialect")
+    whole, each = (Template(text) if text else None for text in (known.line, known.each))
 
     def parse(line: str) -> list[PrintedRange]:
         if whole is None or not (found := re.search(whole.pattern, line)):
             return []
         common = whole.values(found.groups())
         rows = [common | each.values(m.groups()) for m in re.finditer(each.pattern, line)] if each else [common]
-        printed = (_printed(row, metres) for one in rows for row in _unpivoted(one, wide))
+        printed = (_printed(row, known) for one in rows for row in _unpivoted(one, known.wide))
         return [one for one in printed if one is not None]
 
     return parse
 
 
-def _unpivoted(row: Mapping[str, str], wide: Mapping[str, str]) -> list[dict[str, str]]:
+def _unpivoted(row: Mapping[str, str], wide: Mapping[str, Any]) -> list[dict[str, str]]:
     """Return a row for each device of columns such as r.0, r.1 ... (r.{to_id}), of those in a mask if there is one."""
     if not wide:
         return [dict(row)]
@@ -92,24 +97,36 @@ def _unpivoted(row: Mapping[str, str], wide: Mapping[str, str]) -> list[dict[str
     return [dict(row) | own for k, own in enumerate(by_device.values()) if mask >> k & 1]
 
 
-def _printed(row: Mapping[str, str], metres: float) -> PrintedRange | None:
+def _printed(row: Mapping[str, str], known: ColumnMap) -> PrintedRange | None:
     """Return a range from texts by column, None where there is none: boards print 0 for a device that is not there."""
-    try:
-        distance, power = float(row["range_m"]), float(row.get("fpp2", row.get("rxp2", "nan")))
-    except (KeyError, ValueError):
+    texts = {name: row[known.header(name)] for name in NAMES if known.header(name) in row}
+    ids = {name: _id(str(one), known) for name in IDS if (one := known.constants.get(name, texts.get(name, "")))}
+    distance = _number(texts, "range_m", known) * RANGE_UNITS[known.distance_of("range_m") or "m"]
+    if not (distance > 0 and "to_id" in ids):
         return None
-    if not (math.isfinite(distance) and distance > 0 and row.get("to_id")):
-        return None
+    power = next((name for name in ("fpp2", "rxp2") if name in texts), "fpp2")
+    sign = -1.0 if known.power_of(power) == "-dBm" else 1.0
     return PrintedRange(
-        to_id=_id(row["to_id"]),
-        range_m=distance * metres,
-        from_id=_id(row["from_id"]) if "from_id" in row else None,
-        power_dbm=power,
+        to_id=ids["to_id"], range_m=distance, from_id=ids.get("from_id"), power_dbm=sign * _number(texts, power, known)
     )
 
 
-def _id(text: str) -> int | str:
-    return int(text) if text.isascii() and text.isdecimal() and int(text) <= LARGEST_ID else text
+def _number(texts: Mapping[str, str], name: str, known: ColumnMap) -> float:
+    """Return a text as a number, NaN where it is none or means that there is none."""
+    text = texts.get(name, "").strip()
+    try:
+        value = float(text)
+    except ValueError:
+        return math.nan
+    return value if math.isfinite(value) and not {text, value} & {*known.missing} else math.nan
+
+
+def _id(text: str, known: ColumnMap) -> int | str:
+    """Return an id as a number, by the map if it has one, or as a word."""
+    if text in known.ids:
+        return known.ids[text]
+    number = re.fullmatch(r"([0-9]{1,9})(\.0*)?", text)
+    return int(number[1]) if number and int(number[1]) <= LARGEST_ID else text
 
 
 def check_dialect(row: Any) -> None:
@@ -119,13 +136,19 @@ def check_dialect(row: Any) -> None:
     check_row("dialect", row, Dialect, {"help": (is_text, "a line of text"), "parse": parse, "start": start})
 
 
+def _map_of(form: Mapping[str, Any]) -> ColumnMap:
+    return ColumnMap(
+        line=form["line"], each=form.get("each"), wide=form.get("wide", {}), distance_unit=form["units"]["distance"]
+    )
+
+
 # The shell of the DWM1001 opens on two carriage returns; `lec` prints distances as comma-separated lines.
 _START: Final = {"dwm1001-lec": b"\r\rlec\r", "dwm1001-les": b"\r\rles\r"}
 
 DIALECTS: Final[Registry[Dialect]] = Registry(
     "dialect",
     "uwbcal.dialects",
-    tuple(Dialect(name, form["line"], parser_of(form), _START.get(name, b"")) for name, form in LINES.items()),
+    tuple(Dialect(name, form["line"], parser_of(_map_of(form)), _START.get(name, b"")) for name, form in LINES.items()),
     check_dialect,
 )
 """Dialects by name: the project's, and those of installed distributions."""
@@ -140,10 +163,7 @@ def dialect_of(name: str) -> Dialect:
         known = load_map(Path(name))
         if known.line is None:
             raise ArgumentError(f"{name}: states no line, a template of what a board prints", parameter="dialect")
-        wide = {ours: family for ours, family in known.wide.items() if isinstance(family, str)}
-        units = {"distance": known.distance_unit or "m"}
-        form = {"line": known.line, "each": known.each, "wide": wide, "units": units}
-        return Dialect("lines", "a template", parser_of(form))
+        return Dialect("lines", "a template", parser_of(known))
     if name not in DIALECTS:
         known_names = ", ".join(DIALECTS)
         raise ArgumentError(f"found {name!r:.60}, allowed: {known_names}, or a map (.toml)", parameter="dialect")

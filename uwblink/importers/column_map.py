@@ -376,6 +376,8 @@ def _place(place: str, columns: dict[str, Any], units: dict[str, Any]) -> None:
         stem, unit = place.rpartition("_")[::2]
         if stem == name.rpartition("_")[0] and unit in units_of:
             columns.setdefault(name, place)
+            if place == "range_m" and "distance" in units:
+                continue  # our own name, whose unit is stated
             units.setdefault(name if name != "time_s" else "time", unit)
 
 

@@ -111,6 +111,9 @@ def test_a_map_of_lines_serves_as_for_logs_and_a_stream_is_corrected(tmp_path):
         time_ns=np.arange(120) * 10**8,
     )
     calib.fit(own, constants="pair", delays_only=True).save(tmp_path / "c.json")
+    (tmp_path / "board.log").write_text("1->2: 150 (-80.5)\n" * 5)
+    uwblink.import_recording(tmp_path / "board.log", tmp_path / "log.uwb", importer="csv", map_file=tmp_path / "m.toml")
+    assert set(uwblink.load(tmp_path / "log.uwb").exchanges.range_m.tolist()) == {1.5}
     with printing("1->2: 150 (-80.5)\n") as port:
         done = succeed(
             *("uwblink", "stream", port, "--dialect", "m.toml", "-c", "c.json", "--duration", "1.0"), cwd=tmp_path
@@ -119,6 +122,31 @@ def test_a_map_of_lines_serves_as_for_logs_and_a_stream_is_corrected(tmp_path):
     assert len(rows) >= 5
     assert {(row["initiator"], row["target"], row["range_m"]) for row in rows} == {(1, 2, 1.5)}
     assert [row["corrected_m"] for row in rows] == pytest.approx([1.25] * len(rows), abs=1e-6)
+
+
+def test_a_map_means_for_boards_what_it_means_for_their_log(tmp_path):
+    """Units of a place, a constant initiator, numbers of words, values without a range, and the sign of powers."""
+    keys = 'line = "{to_id} {range_mm} {rxp2}"\nmissing = [65535]\n[units]\npower = "-dBm"\n[constants]\nfrom_id = 9\n'
+    (tmp_path / "m.toml").write_text(f"{keys}[ids]\nleft = 40\nright = 41\n")
+    lines = "left 1500 80.5\nright 2500 81.5\nright 65535 99.0\n"
+    (tmp_path / "board.log").write_text(lines)
+    uwblink.import_recording(tmp_path / "board.log", tmp_path / "log.uwb", importer="csv", map_file=tmp_path / "m.toml")
+    with printing(lines) as port:
+        words = ("--dialect", "m.toml", "--duration", "1.0", "-o", "r.uwb")
+        succeed("uwblink", "record", port, *words, cwd=tmp_path)
+    told = []
+    for name in ("log.uwb", "r.uwb"):
+        x = uwblink.load(tmp_path / name).exchanges
+        told.append({*zip(x.initiator.tolist(), x.target.tolist(), x.range_m.round(6).tolist(), strict=True)})
+    assert told[0] == {(9, 40, 1.5), (9, 41, 2.5)}
+    assert told[1] == told[0]
+    assert set(uwblink.load(tmp_path / "r.uwb").exchanges.fpp2_dbm.tolist()) == {-80.5, -81.5}
+    (tmp_path / "by_register.toml").write_text(
+        'line = "{to_id} {range_m} {a} {b} {c} {n}"\nchip = "dw1000"\n[columns]\n'
+        'fpp2 = { f1 = "a", f2 = "b", f3 = "c", n = "n" }\n'
+    )
+    with pytest.raises(ArgumentError, match="registers"):
+        dialect_of(str(tmp_path / "by_register.toml"))
 
 
 def test_another_form_ends_with_a_line_and_no_file(tmp_path):
