@@ -397,7 +397,8 @@ def delay_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
     if calibration.pair_offsets and not any(calibration.delays_ns.values()):
         return []
     std_ns = calibration.delays_std_ns
-    delays = sorted((tag, delay) for tag, delay in calibration.delays_ns.items() if tag not in calibration.sides)
+    sides = calibration.sides
+    delays = sorted((tag, delay) for tag, delay in calibration.delays_ns.items() if tag not in sides)
     return [(str(tag), f"{delay:+.4f}", interval(std_ns.get(tag, math.nan))) for tag, delay in delays]
 
 

@@ -34,7 +34,7 @@ NO_POSES: Final = (
     "distances (docs/without-motion-capture.md)"
 )
 MESSAGES_READ: Final = 2000
-"""Of each group of topics."""
+"""Messages of each group of topics that are looked at (a judgement)."""
 
 _NUMBERS: Final = r"std_msgs/msg/(Float|U?Int)[0-9]+(MultiArray)?"
 _OTHERS: Final = (
