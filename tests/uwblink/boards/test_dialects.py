@@ -15,6 +15,7 @@ from uwblink.boards import DIALECTS, Dialect, PrintedRange, dialect_of
 from uwblink.boards.dialects import Printed
 from uwblink.boards.ports import Terminal
 from uwblink.errors import ArgumentError
+from uwblink.importers.lines import LINES
 
 # What each board prints for a range of one metre to one device and of two metres to another; made from descriptions.
 BOTH = "from: 6018\t Range: 1.00 m\t RX power: -78.50 dBm\r\nfrom: 6019\t Range: 2.00 m\t RX power: -80.00 dBm\r\n"
@@ -88,6 +89,14 @@ def test_what_a_board_prints_is_recorded(tmp_path, name):
     called = {names[k] if isinstance(devices[0], str) else k for k in ends.tolist()}
     assert called == set(devices)
     assert set(found.exchanges.range_m.round(9).tolist()) == {1.0, 2.0}
+    # The import of the same lines as a log, which another program reads (DuckDB), says the same.
+    (tmp_path / "board.log").write_text(text * 3)
+    constant = "" if "from_id" in LINES[name]["line"] else "[constants]\nfrom_id = 40\n"
+    (tmp_path / "m.toml").write_text(f'line = "{name}"\n{constant}')
+    uwblink.import_recording(tmp_path / "board.log", tmp_path / "log.uwb", importer="csv", map_file=tmp_path / "m.toml")
+    logged = uwblink.load(tmp_path / "log.uwb").exchanges
+    for column in ("initiator", "range_m"):
+        assert {*getattr(logged, column).tolist()} == {*getattr(found.exchanges, column).tolist()}
     first = [k for k in names if names[k] == devices[0]] if isinstance(devices[0], str) else [devices[0]]
     assert (found.exchanges.range_m[ends == first[0]] == 1.0).all()
     # Lines of these forms say who ranged; of the others it is the board at the port.
