@@ -319,8 +319,8 @@ class FlightSettings(CheckedSettings):
     Raises `BadInputError` that names the setting.
 
     >>> import calib
-    >>> flight = calib.FlightSettings(poses_until_s=5.0, heading_std_deg=1.0)
-    >>> calib.fit_from_ranges(calib.sample_flight(), flight).success
+    >>> flight = calib.FlightSettings(poses_until_s=3.0, heading_std_deg=1.0)
+    >>> calib.fit_from_ranges(calib.sample_flight(450), flight).success
     True
     """
 

@@ -98,7 +98,7 @@ def fit_from_ranges(
     `BadInputError` for a setting that cannot be used.
 
     >>> import calib
-    >>> result = calib.fit_from_ranges(calib.sample_flight(), poses_until_s=5.0)
+    >>> result = calib.fit_from_ranges(calib.sample_flight(450), poses_until_s=3.0)
     >>> delays = result.calibration.delays_ns
     >>> f"{delays[2] - delays[1]:.1f} ns, planted 0.4 ns"
     '0.4 ns, planted 0.4 ns'

@@ -36,7 +36,8 @@ NAMED = {
 """What the first sentences must name; the others need only be right, or doubted."""
 
 
-def planted(name, seconds=120.0):
+def planted(name):
+    seconds = 120.0 if name in NAMED else 60.0
     tags = next((count for word, count in TAGS.items() if word in name), 5)
     return PLANTED[name](make(Recipe(tags=tags, seconds=seconds), 3))
 

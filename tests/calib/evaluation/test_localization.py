@@ -156,13 +156,14 @@ def test_a_wrong_start_is_left_within_two_seconds(flights, fitted, offset):
             assert wrong[track.time_ns > track.time_ns[0] + 2_000_000_000].max() < 0.8
 
 
-@pytest.mark.parametrize("far_m", [3.0, 10.0])
-def test_wrong_ranges_do_not_lock_the_filter_out(flights, far_m):
+@pytest.mark.parametrize(("far_m", "offset"), [(3.0, (0.0, -10.0, 0.0)), (10.0, (0.0, 0.0, 5.0))])
+def test_wrong_ranges_do_not_lock_the_filter_out(flights, far_m, offset):
     flight, calibration = clean(beginning(flights["test1"], 12))
-    # Metres wrong, with a stated decimetre: the gate refuses nearly everything until it reopens.
+    # Metres wrong, with a stated decimetre, and a start that no range agrees with: the gate refuses everything until
+    # the filter begins anew, first where the wrong ranges put it, then where the right ones do.
     early = flight.ranges.time_ns < flight.ranges.time_ns.min() + 2_000_000_000
     flight.ranges.raw_m[early] += far_m
-    for one in localize(flight, calibration, Settings(seed=3, seeds=1)):
+    for one in localize(flight, calibration, Settings(seed=3, seeds=1, initial_offset_m=offset)):
         track = one.tracks["variance"]
         wrong = np.linalg.norm(track.estimate_m - track.truth_m, axis=1)
         wrong = wrong[track.time_ns > track.time_ns.min() + 4_000_000_000]

@@ -18,7 +18,7 @@ def distance_errors(result, flown):
 
 @pytest.fixture(scope="module")
 def flown():
-    return flight(wander_deg=3.0)
+    return flight(seconds=14.0, wander_deg=3.0)
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +32,8 @@ def test_planted_delays_are_found_from_a_known_start(flown, fitted):
     std = np.array(list(result.calibration.delays_std_ns.values()))
     assert result.success
     # A sound flight has no warning but that it is short.
-    assert [warning[:12] for warning in result.warnings] == ["only 24 s of"]
-    # One flight of 24 s: a fit with all distances known leaves 18 ps.
+    assert [warning[:12] for warning in result.warnings] == ["only 14 s of"]
+    # One flight of 14 s: a fit with all distances known leaves 18 ps.
     assert np.abs(scores(result)).max() < 3.5
     assert 0.015 < std.max() < 0.06
     away = distance_errors(result, flown)

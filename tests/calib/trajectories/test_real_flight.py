@@ -51,10 +51,10 @@ def test_anchors_alone_leave_the_delays_open_and_intervals_say_how_far(flown):
 
 
 def test_tags_that_range_with_anchors_only_leave_delays_open_whatever_the_skews_of_clocks():
-    flown = uwbsim.simulate(uwbsim.load("anchors_and_tag/bipartite", {"run.duration_s": 20.0}))
-    given: dict[str, Any] = {"poses_until_s": 8.0, "delays_only": True}
+    flown = uwbsim.simulate(uwbsim.load("anchors_and_tag/bipartite", {"run.duration_s": 10.0}))
+    given: dict[str, Any] = {"poses_until_s": 6.0, "delays_only": True}
     # What all delays have in common is not determined, either, and no number is given for it.
-    words = r"ranges between two sides are known to ± [12][0-9] cm"
+    words = r"ranges between two sides are known to ± [4-6] cm"
     with pytest.raises(calib.UnanswerableError, match=words) as raised:
         calib.fit_from_ranges(flown, **given)
     assert raised.value.undetermined == [[0, 1, 2, 3, 4, 5, 10, 11]]
