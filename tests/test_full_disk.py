@@ -40,7 +40,8 @@ def seeds(tmp_path_factory):
     shutil.copyfile(ROOT / "docs" / "examples" / "exchanges.csv", folder / "t.csv")
     ports = uwbsim.VirtualPorts(uwbsim.load(folder / "s.toml"))
     uwblink.record([*ports.names.values()], folder / "boards.uwb", uwblink.RangingPlan(), using=ports, duration_s=2.0)
-    uwbsim.simulate(ROOT / "scenarios/string/string.toml").save(folder / "string.uwb")
+    string = (ROOT / "scenarios/string/string.toml").read_text().replace("stay_s = 140.0", "stay_s = 10.0")
+    uwbsim.simulate(string.replace("duration_s = 1200.0", "duration_s = 160.0")).save(folder / "string.uwb")
     calib.export(calib.load_calibration(folder / "c.json"), "miluv", folder / "miluv.json")
     for form in ("csv", "mcap", "tum"):
         export_recording(folder / "f.uwb", folder / form, to=form)
