@@ -44,7 +44,7 @@ def served(scenario=None, faults=None, link_dir=None, **more):
 
 
 @contextmanager
-def two_ports(kind, **served_how):
+def two_ports(kind):
     """Give the ports of two boards: "virtual" in process, "terminal" served, or "real", of which UWB_PORTS names two.
 
     Gives the bench of the boards, too, where they are ours.
@@ -54,7 +54,7 @@ def two_ports(kind, **served_how):
         yield [ports.port(1), ports.port(2)], ports.bench
         return
     with ExitStack() as stack:
-        server = stack.enter_context(served(**served_how)) if kind == "terminal" else None
+        server = stack.enter_context(served()) if kind == "terminal" else None
         names = [server.names[1], server.names[2]] if server else os.environ.get("UWB_PORTS", "").split(",")
         if len(names) != 2:
             pytest.skip("no real boards: UWB_PORTS does not name two ports")
