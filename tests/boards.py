@@ -7,9 +7,8 @@ from contextlib import ExitStack, contextmanager
 import pytest
 
 from uwblink.boards.ports import SerialPort
+from uwbsim import Scenario, VirtualPorts
 from uwbsim.boards.server import FaultsFile, Server
-from uwbsim.boards.virtual_board import VirtualPorts
-from uwbsim.scenario.model import Scenario
 
 
 def bench_scenario(seed=1, **radio):

@@ -498,8 +498,7 @@ def test_a_recording_is_no_table_to_guess_at(seeds):
 
 
 def test_nothing_is_something_to_begin_with():
-    assert len(Poses.from_arrays([], [], [])) == 0
-    assert len(Poses.from_arrays([], "drone", np.zeros((0, 3)))) == 0
+    assert (len(Poses.from_arrays([], [], [])), len(Poses.from_arrays([], "drone", np.zeros((0, 3))))) == (0, 0)
     assert len(Exchanges.from_arrays([], [], tx1=[], rx1=[], tx2=[], rx2=[])) == 0
 
 

@@ -8,14 +8,11 @@ import pytest
 
 from tests import pages
 from tests.uwblink.test_register_protocol import SYMMETRIC, TARGETS
-from uwblink.protocols.table import PROTOCOLS, register_protocol
-from uwblink.recording.file import Recording
-from uwblink.ticks import SPEED_OF_LIGHT
+from uwblink import PROTOCOLS, SPEED_OF_LIGHT, Recording, register_protocol
 from uwblink.twr import delay_weights, raw_range
-from uwbsim import simulate
+from uwbsim import Scenario, simulate
 from uwbsim.protocols.conditions import Conditions, range_errors_m
 from uwbsim.protocols.prediction import predict
-from uwbsim.scenario.model import Scenario
 
 SCENARIO = "scenarios/noiseless.toml"
 
@@ -76,8 +73,7 @@ def test_run_show_and_fit(row, tmp_path):
     flight, fitted = tmp_path / "flight.uwb", tmp_path / "c.json"
     settings = ["--set", f"ranging.protocol={row.name}", "--set", "run.duration_s=60"]
     command("uwbsim", "run", SCENARIO, "-o", flight, *settings)
-    shown = json.loads(command("uwblink", "show", flight, "--json"))
-    assert set(shown["protocols"]) == {row.name}
+    assert set(json.loads(command("uwblink", "show", flight, "--json"))["protocols"]) == {row.name}
     command("calib", "fit", flight, "-o", fitted)
     with Recording.open(flight) as recording:
         planted = {int(k): v for k, v in recording.meta()["planted"]["delays_ns"].items()}

@@ -198,9 +198,7 @@ ENTRIES = ("ONE", "MANY", "TWICE", "MINE", "STRANGE", "ABSENT")
 
 def test_entry_points_are_loaded_once_and_only_when_they_are_needed(table):
     registry, asked = table
-    assert registry["own"].value == 0
-    assert [row.name for row in registry.known()] == ["own"]
-    assert asked == []
+    assert (registry["own"].value, [row.name for row in registry.known()], asked) == (0, ["own"], [])
     with pytest.warns(PluginWarning) as caught:
         assert list(registry) == ["own", "one", "two", "three"]
     texts = [str(w.message) for w in caught]

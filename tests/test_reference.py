@@ -78,8 +78,7 @@ def test_what_doors_return_is_in_the_reference():
 @pytest.mark.parametrize("package", [uwblink, uwbsim, calib], ids=lambda p: p.__name__)
 def test_the_pages_of_commands_have_every_option(package):
     app = __import__(f"{package.__name__}.cli.commands", fromlist=["app"]).app
-    group = typer.main.get_command(app)
-    every = list(commands.leaves(group, (package.__name__,)))
+    every = list(commands.leaves(typer.main.get_command(app), (package.__name__,)))
     if not hasattr(every[0][1].params[0], "type_descriptor"):
         pytest.skip("this typer does not say what type an option has; the pages are made with the locked one")
     page = commands.reference(app, package.__name__)

@@ -13,8 +13,7 @@ from uwbsim import shipped_scenarios
 
 @pytest.fixture(scope="module")
 def archives(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("dist")
-    return built(folder)
+    return built(tmp_path_factory.mktemp("dist"))
 
 
 def test_the_wheel_has_the_scenarios_and_what_they_name(archives):

@@ -15,8 +15,7 @@ def bias_m(lifted):
 
 def ranges(n=6000, noise_m=0.05, tail=0.1, seed=1, k=1.00001, bias=bias_m):
     rng = np.random.default_rng(seed)
-    pair = np.array(PAIRS)[np.arange(n) % len(PAIRS)]
-    initiator, target = pair.T
+    initiator, target = np.array(PAIRS)[np.arange(n) % len(PAIRS)].T
     fpp = rng.uniform(-95, -80, (2, n))
     lifted = np.mean(10 ** ((fpp + 82) / 10), axis=0)
     truth = rng.uniform(1, 6, n)

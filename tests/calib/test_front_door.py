@@ -1,15 +1,22 @@
 """The front door of calib: its names, what importing it costs, and its examples."""
 
 import doctest
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import calib
 from calib.estimator.losses import LOSSES
+from calib.figures import binned, cumulative, delays, histogram, within_fence
+from calib.fitting.fitting import fit
 from calib.report.sections import SECTIONS
 from tests import pages
+from tests.calib.synthetic import bias_m, ranges
 from uwblink.pages import figures
+from uwblink.pages.figures import style
 
 
 def test_the_names_are_sorted_and_all_there():
@@ -69,3 +76,115 @@ def test_what_is_no_calibration_is_refused_by_its_parameter(tmp_path):
         assert calib.compare(given, result).same
         assert calib.export(given, "csv") == calib.export(result.calibration, "csv")
     assert result.correct(3.0, -85.0, -86.0, 1, 2) == result.calibration.correct(3.0, -85.0, -86.0, 1, 2)
+
+
+# What the figures of a calibration draw: the centre that a curve follows, and axes that one stray does not flatten.
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return fit(ranges(12_000, tail=0.2))
+
+
+def axes_of(draw):
+    with style():
+        figure = Figure(figsize=(7.16, 3), layout="constrained")
+        axes = draw(figure.subplots())
+        figure.draw_without_rendering()
+    return axes
+
+
+def labelled(axes, text):
+    return next(line for line in axes.lines if line.get_label() == text)
+
+
+def test_points_are_the_core_that_the_curve_follows_and_medians_lie_above():
+    # Planted: a core of 5 cm about nothing, a fifth of it lengthened by 40 cm in the mean.
+    rng = np.random.default_rng(5)
+    error = rng.normal(0, 0.05, 40_000) + np.where(rng.random(40_000) < 0.2, rng.exponential(0.4, 40_000), 0)
+    everything = {"": (np.arange(40_000), 20)}
+    found = binned(rng.uniform(0, 1.5, 40_000), error, everything, "mixture")[""]
+    # Of 2000 in a bin the centre is known to 1.5 mm, and its spread, told with the tail's, to 2 mm.
+    assert np.abs(found.centre_m).max() < 0.006
+    assert np.abs(found.centre_m.mean()) < 0.001
+    assert found.std_m == pytest.approx(0.05, abs=0.008)
+    assert found.median_m.mean() == pytest.approx(0.0145, abs=0.003)
+    squares = binned(np.arange(40_000.0), error, everything, "l2")[""]
+    assert squares.centre_m.mean() == pytest.approx(error.mean(), abs=1e-9)
+
+
+def test_the_drawn_curve_goes_through_the_drawn_points(fitted):
+    axes = axes_of(fitted.plot_bias)
+    points, curve = labelled(axes, "core of all pairs"), labelled(axes, "fitted")
+    at = np.interp(points.get_xdata(), curve.get_xdata(), curve.get_ydata())
+    # 600 a bin: the centre of a core of 5 cm beside a fifth of reflections is known to 3 mm; medians lie 1.5 cm above.
+    assert np.abs(points.get_ydata() - at).max() < 1.2
+    assert np.sqrt(np.mean((points.get_ydata() - at) ** 2)) < 0.5
+    assert np.mean(labelled(axes, "medians, reflections included").get_ydata() - at) > 1.0
+    away = points.get_ydata() - (100 * bias_m(points.get_xdata()))
+    assert np.abs(away - away.mean()).max() < 1.2, "and both follow what was planted"
+    (top,) = axes.child_axes  # first-path powers in dBm
+    for place, text in zip(top.get_xticks(), top.get_xticklabels(), strict=True):
+        assert 10 ** ((float(text.get_text().replace("−", "-")) + 82) / 10) == pytest.approx(place)
+
+
+def test_the_sigma_curve_goes_through_its_points(fitted):
+    axes = axes_of(fitted.plot_sigma)
+    points, curve = labelled(axes, "core of all pairs"), labelled(axes, "fitted")
+    at = np.interp(points.get_xdata(), curve.get_xdata(), curve.get_ydata())
+    assert np.mean(points.get_ydata() / at) == pytest.approx(1, abs=0.06)
+
+
+def test_one_stray_delay_does_not_flatten_the_others(fitted):
+    known = fitted.calibration
+    wild = replace(
+        known,
+        delays_ns={**known.delays_ns, 9: 1000.0},
+        delays_std_ns={**known.delays_std_ns, 9: 300.0, 1: 40.0},
+    )
+    axes = axes_of(lambda a: delays(wild, axes=a))
+    assert np.ptp(axes.get_ylim()) < 3
+    assert "+1000.0 ns" in [text.get_text() for text in axes.texts]
+    assert within_fence(np.array([0.1, 0.2, 0.15, 1000.0])).tolist() == [True, True, True, False]
+    assert within_fence(np.array([0.1, 1000.0])).all(), "of two nobody knows which is the stray"
+
+
+@pytest.mark.parametrize("offset_m", [0.0, 300.0])
+def test_a_histogram_shows_corrected_errors_whatever_raw_ones_are(fitted, offset_m):
+    some, known = fitted.ranges, fitted.calibration
+    applied = known.apply(some)
+    applied = replace(applied, raw_m=applied.raw_m + offset_m)
+    axes = axes_of(lambda a: histogram(some, applied, a))
+    assert np.ptp(axes.get_xlim()) < 400
+    heights = {one.get_label(): one.get_data() for one in axes.patches}
+    assert sum(heights["fully corrected"].values) == pytest.approx(100), "the last bins hold what lies beyond"
+    assert sum(heights["raw"].values) == pytest.approx(100)
+
+
+def test_the_distribution_says_how_many_errors_are_smaller(fitted):
+    some = fitted.ranges
+    applied = fitted.calibration.apply(some)
+    line = labelled(axes_of(lambda a: cumulative(some, applied, a)), "fully corrected")
+    size = 100 * np.abs(applied.corrected_m - some.truth_m)
+    for x, y in zip(line.get_xdata()[::20], line.get_ydata()[::20], strict=True):
+        assert 100 * np.mean(size <= x) == pytest.approx(y, abs=0.1)
+
+
+def test_a_delay_that_nothing_determines_is_a_circle_without_an_interval(fitted):
+    known = fitted.calibration
+    tag = min(known.delays_ns)
+    open_one = replace(known, delays_std_ns=known.delays_std_ns | {tag: np.inf})
+    axes = axes_of(lambda axes: delays(open_one, axes=axes))
+    circle = labelled(axes, "without an interval: pinned or undetermined")
+    assert circle.get_ydata() == pytest.approx([known.delays_ns[tag]])
+    (bars,) = axes.containers
+    assert len(bars.lines[0].get_ydata()) == len(known.delays_ns) - 1
+    assert (
+        "without an interval: pinned or undetermined"
+        not in axes_of(lambda axes: delays(known, axes=axes)).get_legend_handles_labels()[1]
+    )
+
+
+def test_planted_delays_are_drawn_moved_by_the_common_shift(fitted):
+    axes = axes_of(lambda axes: delays(fitted.calibration, {1: 0.1, 2: -0.2, 3: 0.0, 7: 0.3}, 0.05, axes))
+    assert labelled(axes, "planted, same gauge").get_ydata() == pytest.approx([0.15, -0.15, 0.05, 0.35])

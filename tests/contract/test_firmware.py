@@ -6,9 +6,8 @@ import pytest
 
 from tests.boards import bench_scenario
 from uwblink.wire.messages import RangeCommand
+from uwbsim import Scenario, VirtualPorts
 from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, FinalPayload, Received
-from uwbsim.boards.virtual_board import VirtualPorts
-from uwbsim.scenario.model import Scenario
 
 EVERY = 70 * NS_PER_MS
 """Six failing tries take 43 ms."""
@@ -59,8 +58,7 @@ def test_a_target_answers_its_host_after_the_exchange():
     ports.bench.boards[2].write(b"C01\r")
     ports.bench.advance(20 * NS_PER_MS)
     kinds = [data[:3] for _, data in said(ports, 2)]
-    assert kinds == [b"S05", b"R01"]
-    assert [data[:3] for _, data in said(ports, 1)] == [b"R05"]
+    assert (kinds, [data[:3] for _, data in said(ports, 1)]) == ([b"S05", b"R01"], [b"R05"])
 
 
 def sent_frames(ports):
@@ -101,8 +99,7 @@ def test_a_report_is_lost_while_the_bus_is_busy():
         board.usb.send(b"%d" % delay + bytes(100), delay)
     ports.bench.advance(NS_PER_MS)
     # Two packets of 64 bytes take 110 us; what comes 50 us after the first finds the bus busy.
-    assert [data.rstrip(b"\0") for _, data in said(ports, 1)] == [b"1000", b"200000"]
-    assert board.usb.lost == 1
+    assert ([data.rstrip(b"\0") for _, data in said(ports, 1)], board.usb.lost) == ([b"1000", b"200000"], 1)
 
 
 def test_impulse_responses_follow_reports_by_four_to_six_milliseconds():
@@ -121,8 +118,7 @@ def test_passive_boards_print_zeros_for_tries_that_fail_and_others_warn():
     range_often(ports, b"C05|9|0|1|0\r", 5, listening=[3])
     assert len(said(ports, 1, b"COMMANDED")) == 5
     zeros = said(ports, 3, b"S01|1|9|0|")
-    assert len(zeros) == 5 * 6
-    assert {data.count(b"|") for _, data in zeros} == {26}
+    assert (len(zeros), {data.count(b"|") for _, data in zeros}) == (5 * 6, {26})
     assert said(ports, 2) == [], "polls alone make nobody warn"
     single = VirtualPorts(bench_scenario())
     range_often(single, b"C05|9|0|0|0\r", 5, listening=[3])
@@ -216,8 +212,7 @@ def test_of_two_frames_at_once_the_first_is_received_where_it_is_stronger_by_the
     other_m, lag_us, received
 ):
     """Board 1 polls board 2, two metres away, and board 3 polls board 4 a little later or earlier."""
-    ports = VirtualPorts(places([0.0, 2.0, other_m, other_m + 2]))
-    bench = ports.bench
+    bench = VirtualPorts(places([0.0, 2.0, other_m, other_m + 2])).bench
     came: list[Received | None] = []
     bench.boards[2].radio._interrupt = came.append
     starts = {1: 0, 3: lag_us * NS_PER_US}

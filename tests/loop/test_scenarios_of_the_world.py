@@ -5,12 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.data.sources import load_ranges
+from benchmarks.nlos import DETOUR_M, FLIGHT, auc, classifier, of_real_flight, of_rooms
+from calib import fit, load_ranges
 from calib.evaluation.statistics import evaluate, pair_rows
-from calib.fitting.fitting import fit
+from tests.processes import succeed
+from tests.shared_data import shared
+from uwblink.recording.file import Recording
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwbsim import simulate
-from uwbsim.scenario.loading import load
+from uwbsim import load, simulate
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
@@ -74,8 +76,7 @@ def test_calibrated_is_never_worse_than_raw(tmp_path, name, settings):
     """Fitted on one half of a flight and judged on the other, powers beyond the fitted range included."""
     r = ranges(tmp_path, name, *settings)
     half = np.median(r.time_ns)
-    fitted = fit(r[r.time_ns < half]).calibration
-    overall = evaluate(r[r.time_ns >= half], fitted).overall
+    overall = evaluate(r[r.time_ns >= half], fit(r[r.time_ns < half]).calibration).overall
     # What is known to 2 mm cannot be told apart where nothing is wrong with raw ranges.
     assert abs(overall.full.mean_m) < abs(overall.raw.mean_m) + 0.002
     assert overall.full.std_m < overall.raw.std_m + 0.002
@@ -97,8 +98,7 @@ def test_the_true_delays_leave_nothing_at_either_reply(tmp_path, reply_uus):
 def test_a_fit_of_boards_that_warm_up_says_that_delays_moved(tmp_path):
     """Ranges grow by 2.15 mm/K for each of two tags, and shrink by 5.35 cm/V as batteries sag."""
     path = tmp_path / "warm.uwb"
-    flight = simulate(load(SCENARIOS / "warm_up" / "warm_up.toml"), contention=False)
-    flight.save(path)
+    simulate(load(SCENARIOS / "warm_up" / "warm_up.toml"), contention=False).save(path)
     r = load_ranges(path)
     error, time_s = r.raw_m - r.truth_m, r.time_ns * 1e-9
     grown = np.mean(error[time_s > 220]) - np.mean(error[time_s < 20])
@@ -113,3 +113,56 @@ def test_a_calibration_holds_less_where_boards_are_mounted_differently(tmp_path)
     off = [max(abs(pair.accepted.mean_m) for pair in evaluate(r, calibration).pairs.values()) for r in (before, after)]
     # 800 ranges with 3 cm of noise know a pair's mean to 1 mm; antennas differ by 2 cm over direction.
     assert off[0] < 0.004 < off[1] < 0.03
+
+
+# Ranges that went by a detour: a classifier of ten lines learns them in simulated rooms, and knows them elsewhere.
+
+
+@pytest.fixture(scope="module")
+def trained():
+    found, detours = of_rooms(range(8), 8.0)
+    assert 0.03 < detours.mean() < 0.3
+    return classifier().fit(found, detours)
+
+
+def test_it_separates_simulated_rooms_that_it_has_not_seen(trained):
+    found, detours = of_rooms(range(12, 20), 8.0)
+    assert 0.03 < detours.mean() < 0.3
+    assert auc(trained, found, detours) >= 0.85
+
+
+def test_both_features_weigh_for_a_detour(trained):
+    assert np.all(trained[-1].coef_ > 0)
+
+
+def test_it_says_something_of_a_real_flight(trained):
+    """Better than chance: with 27 detours of 265 ranges, 0.5 has a standard error of 0.06."""
+    shared("miluv_published_calibration.json")
+    found, residual = of_real_flight(shared(FLIGHT).parent)
+    detours = residual > DETOUR_M
+    assert 20 < detours.sum() < 40
+    assert auc(trained, found, detours) > 0.7
+
+
+# The loop through the wire: bytes change nothing. tests/test_readme.py calibrates served boards.
+
+
+ROOT = Path(__file__).parents[2]
+TRAIN = ROOT / "scenarios" / "icra2023" / "train.toml"
+
+
+def test_a_flight_through_encode_and_decode_calibrates_to_the_same_bytes(tmp_path):
+    for name, more in (("direct", []), ("wire", ["--through-wire"])):
+        (tmp_path / name).mkdir()
+        flight = tmp_path / name / "flight.uwb"
+        succeed("uwbsim", "run", TRAIN, "-o", flight, "--set", "run.duration_s=20", *more)
+        succeed("calib", "fit", flight, "-o", tmp_path / name / "c.json")
+    assert (tmp_path / "direct" / "c.json").read_bytes() == (tmp_path / "wire" / "c.json").read_bytes()
+    succeed("uwblink", "replay", tmp_path / "wire" / "flight.uwb", "-o", tmp_path / "wire" / "again.uwb")
+
+
+def test_a_flight_in_which_nothing_is_received_goes_through_the_wire(tmp_path):
+    short = ["--set", "run.duration_s=1", "--set", "radio.sensitivity_dbm=0"]
+    succeed("uwbsim", "run", TRAIN, "-o", tmp_path / "f.uwb", "--through-wire", *short)
+    with Recording.open(tmp_path / "f.uwb") as recording:
+        assert recording.count("exchanges") == 0 < recording.count("faults")

@@ -152,6 +152,5 @@ def test_the_file_of_what_is_known_is_read_as_it_stands_there(tmp_path):
     known = load_knowledge(tmp_path / "known.toml")
     spans = {"A": (0.0, 60.0), "B": (70.0, 130.0)}
     assert (known.shape, dict(known.shapes), dict(known.spans_s)) == ("line", {"A": "plane"}, spans)
-    assert dict(known.orders) == {"B": (3, 1, 4, 2)}
-    assert known.distances[0].distance_m == 3.06
+    assert (dict(known.orders), known.distances[0].distance_m) == ({"B": (3, 1, 4, 2)}, 3.06)
     assert known.positions[0].tag == 4

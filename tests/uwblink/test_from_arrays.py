@@ -41,15 +41,12 @@ def test_every_column_goes_to_its_place_and_comes_back():
 def test_one_value_stands_for_all_rows_and_floats_of_whole_numbers_will_do():
     floats: Any = {k: np.array(v, dtype=float) for k, v in DS.items()}
     x = Exchanges.from_arrays(1, 2, **floats, protocol="ds-alt")
-    assert x.target.tolist() == [2, 2]
-    assert x.tx3.dtype == np.int64
-    assert set(x.protocol.tolist()) == {"ds-alt"}
+    assert (x.target.tolist(), x.tx3.dtype, set(x.protocol.tolist())) == ([2, 2], np.int64, {"ds-alt"})
 
 
 def test_stamps_that_a_protocol_has_not_are_zero_and_mixed_protocols_keep_theirs():
     x = Exchanges.from_arrays(1, 2, **DS, protocol=["ss", "ds"])
-    assert x.tx3.tolist() == [0, 99_003]
-    assert Exchanges.from_arrays(1, 2, **DS).protocol.tolist() == ["ds", "ds"]
+    assert (x.tx3.tolist(), Exchanges.from_arrays(1, 2, **DS).protocol.tolist()) == ([0, 99_003], ["ds", "ds"])
 
 
 @pytest.mark.parametrize(
@@ -114,12 +111,10 @@ def test_what_is_printed_fits_on_a_screen(count):
 
 def test_poses_are_put_in_order_and_turned_to_length_one():
     poses = Poses.from_arrays([2, 1], ["b", "a"], [[1, 2, 3], [4, 5, 6]], [[0, 0, 0, 1.05], [0, 0, -0.95, 0]])
-    assert poses.body.tolist() == ["a", "b"]
-    assert poses.position_m.tolist() == [[4, 5, 6], [1, 2, 3]]
+    assert (poses.body.tolist(), poses.position_m.tolist()) == (["a", "b"], [[4, 5, 6], [1, 2, 3]])
     assert poses.quaternion.tolist() == [[0, 0, -1, 0], [0, 0, 0, 1]]
     columns = poses.to_dict()
-    assert columns["x"].tolist() == [4, 1]
-    assert columns["qz"].tolist() == [-1, 0]
+    assert (columns["x"].tolist(), columns["qz"].tolist()) == ([4, 1], [-1, 0])
     assert {np.shape(column) for column in columns.values()} == {(2,)}
 
 

@@ -53,8 +53,7 @@ def test_twr_that_is_not_interrupted_has_status_0_and_a_summary():
     with served() as server:
         done = processes.run("uwblink", "twr", server.names[1], "2", "-n", "5", "--json")
     rows = [json.loads(line) for line in done.stdout.splitlines()]
-    assert done.returncode == 0
-    assert [set(row) == {"summary"} for row in rows] == [False] * 5 + [True]
+    assert (done.returncode, [set(row) == {"summary"} for row in rows]) == (0, [False] * 5 + [True])
     assert rows[-1]["summary"]["exchanges"] == 5
 
 
@@ -127,8 +126,7 @@ def test_a_writer_that_is_ended_leaves_nothing(long, tmp_path, words, number):
         assert process.poll() is None, process.communicate()
         time.sleep(0.002)
     _, err = ended(process, number)
-    assert (process.returncode, err) == (130, "interrupted\n")
-    assert list(folder.iterdir()) == []
+    assert ((process.returncode, err), list(folder.iterdir())) == ((130, "interrupted\n"), [])
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,9 @@
 
 import pytest
 
-from uwblink.errors import ArgumentError, OutputError, RecordingError, RecordingExistsError
+from uwblink.errors import ArgumentError, ImportTableError, OutputError, RecordingError, RecordingExistsError
 from uwblink.output import check_apart, write_bytes, write_files, write_text
+from uwblink.text_files import read_text
 
 
 def test_text_is_utf8_and_nothing_is_left_beside_it(tmp_path):
@@ -32,8 +33,7 @@ def test_what_was_there_stays_where_the_disk_is_full(tmp_path, monkeypatch):
     monkeypatch.setattr(type(tmp_path), "write_bytes", full)
     with pytest.raises(OutputError, match=r"a: cannot be written \(No space left"):
         write_bytes(tmp_path / "a", b"second", force=True)
-    assert (tmp_path / "a").read_bytes() == b"first"
-    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+    assert ((tmp_path / "a").read_bytes(), [path.name for path in tmp_path.iterdir()]) == (b"first", ["a"])
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path):
@@ -72,3 +72,31 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(OutputError, match=r"er: cannot be made \(Not a directory\)"):
         write_files(tmp_path / "file" / "er", {"a": b""}, force=False)
+
+
+# Files that cannot be read as text: one line each, in the caller's error.
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("nowhere", "no such map"),
+        ("folder", "is a directory, expected a map"),
+        ("latin1", "not a text file in UTF-8"),
+        ("nowhere\0", "no path of a map"),
+        ("n" * 300, "(File name too long)"),
+    ],
+)
+def test_what_cannot_be_read_is_one_line(tmp_path, name, line):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "latin1").write_bytes("abcé".encode("latin-1"))
+    with pytest.raises(ImportTableError) as found:
+        read_text(str(tmp_path / name), ImportTableError, "map")
+    assert line in str(found.value)
+    assert "\n" not in str(found.value)
+    assert "\0" not in str(found.value)
+
+
+def test_text_comes_back_as_it_is(tmp_path):
+    (tmp_path / "text").write_text("µ\n", encoding="utf-8")
+    assert read_text(tmp_path / "text", ValueError) == "µ\n"

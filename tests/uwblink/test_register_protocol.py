@@ -81,8 +81,7 @@ def test_skew_and_delays_go_through_the_registered_formula():
         e = exchange("targets-clock", 1000, 20_000_000, 98_320_384, 7, -4)
         # Six stamps cut to whole ticks, weighted by up to 1.2, halved.
         assert time_of_flight(e)[0] / TICK_S == pytest.approx(1000, abs=2.5)
-        late = replace(e, rx1=e.rx1 + 4000)
-        moved = (time_of_flight(late) - time_of_flight(e))[0] / TICK_S
+        moved = (time_of_flight(replace(e, rx1=e.rx1 + 4000)) - time_of_flight(e))[0] / TICK_S
         assert moved == pytest.approx(4000 * delay_weights(e)[1][0], abs=1e-3)
     finally:
         PROTOCOLS.remove("targets-clock")
@@ -114,8 +113,7 @@ def test_exchanges_of_an_unknown_protocol_are_refused_by_name():
 def test_names_are_taken_once(registered):
     with pytest.raises(ArgumentError, match=r"registered already; choose another name, or replace=True"):
         register_protocol(registered)
-    better = replace(registered, title="better")
-    register_protocol(better, replace=True)
+    register_protocol(replace(registered, title="better"), replace=True)
     assert PROTOCOLS[registered.name].title == "better"
     with pytest.raises(ArgumentError, match="'ds': is one of the project's own"):
         register_protocol(replace(registered, name="ds"), replace=True)

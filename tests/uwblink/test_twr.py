@@ -116,8 +116,7 @@ def test_stamps_belong_to_the_clocks_of_the_paper():
 def test_degenerate_stamps_make_no_range_and_no_warning(protocol):
     # Neither reply nor third leg lasted by the target: K is infinite, and zero times K is nothing.
     none = Exchanges.from_arrays([1], [2], tx1=[0], rx1=[9], tx2=[9], rx2=[50], tx3=[9], rx3=[70], protocol=protocol)
-    found = time_of_flight(none)
-    assert protocol != "ds" or not np.isfinite(found[0])
+    assert protocol != "ds" or not np.isfinite(time_of_flight(none)[0])
 
 
 def test_boards_print_single_sided_ranges_of_whole_ticks_and_cut_all_of_them():
@@ -126,12 +125,10 @@ def test_boards_print_single_sided_ranges_of_whole_ticks_and_cut_all_of_them():
         return board_range(Exchanges.from_arrays(1, 2, **stamps, **third, protocol=protocol))[0]
 
     # (102 001 - 100 000)/2 = 1000.5 ticks: 1000 of 4.690357 mm are 4.69035..., and half a tick more of ds is kept.
-    assert printed(102_001, "ss") == 4.6903
-    assert printed(102_000, "ss") == 4.6903
+    assert (printed(102_001, "ss"), printed(102_000, "ss")) == (4.6903, 4.6903)
     assert printed(102_001, "ds", tx3=[201_000], rx3=[202_001]) == 4.6927
     # Towards zero from below, too: -0.5 ticks are none, -1.5 are one.
-    assert printed(99_999, "ss") == 0.0
-    assert printed(99_997, "ss") == -0.0046
+    assert (printed(99_999, "ss"), printed(99_997, "ss")) == (0.0, -0.0046)
 
 
 def test_a_row_without_any_stamp_has_the_range_that_was_reported():

@@ -1,13 +1,19 @@
 import doctest
+import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import typer
 
 import uwbsim
 from uwblink import Recording
+from uwblink.cli.shared import with_flags
 from uwblink.twr import COLUMNS
+from uwbsim.cli.commands import UWBSIM_FLAGS, app
+from uwbsim.tables import write_tables
 
 NOISELESS = Path(__file__).parents[2] / "scenarios" / "noiseless.toml"
 SHORT = {"run.duration_s": 2.0}
@@ -27,8 +33,7 @@ def test_a_scenario_is_a_file_a_text_tables_or_itself():
     before = tomllib.loads(text)
     loaded = uwbsim.load(NOISELESS, SHORT)
     flights = [uwbsim.simulate(source) for source in (loaded, text, tables)]
-    assert tables == before
-    assert len(flights[0].exchanges) == 320
+    assert (tables, len(flights[0].exchanges)) == (before, 320)
     for flight in flights[1:]:
         for name in COLUMNS:
             np.testing.assert_array_equal(getattr(flight.exchanges, name), getattr(flights[0].exchanges, name))
@@ -62,3 +67,55 @@ def test_what_a_flight_prints_and_saves_is_true(tmp_path):
     with pytest.raises(FileExistsError):
         flight.save(tmp_path / "f.uwb")
     flight.save(tmp_path / "f.uwb", force=True)
+
+
+# Tables that are whole or not there at all; what they hold is tested by sweeps and comparisons.
+
+
+ROWS = [{"name": "a", "n": 1, "x": 0.5}, {"name": "b", "n": 2, "x": None}]
+
+
+class Failing:
+    """Rows that can be read once, and then only in part."""
+
+    def __init__(self):
+        self.left = 3
+
+    def __iter__(self):
+        for row in ROWS:
+            self.left -= 1
+            if self.left < 0:
+                raise KeyboardInterrupt
+            yield row
+
+
+def test_tables_that_fail_half_way_leave_what_was_there(tmp_path):
+    table, parquet = tmp_path / "t.csv", tmp_path / "t.parquet"
+    write_tables(table, parquet, ROWS, force=False)
+    before = table.read_bytes(), parquet.read_bytes()
+    with pytest.raises(KeyboardInterrupt):
+        write_tables(table, parquet, Failing(), force=True)
+    assert (table.read_bytes(), parquet.read_bytes()) == before
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["t.csv", "t.parquet"]
+
+
+# Errors of uwbsim name parameters, and its command line the flags that stand for them.
+
+
+ROOT = Path(__file__).parents[3]
+COMMANDS: Any = typer.main.get_command(app)
+OPTIONS = {"/".join(p.opts) for command in COMMANDS.commands.values() for p in command.params}
+# Of functions that no command calls with what a user typed.
+ONLY_FROM_PYTHON = {"effect", "source", "name", "evaluate", "lost_share"}
+
+
+def test_every_parameter_that_an_error_names_has_its_flag():
+    named = set()
+    for path in (ROOT / "uwbsim").rglob("*.py"):
+        named |= set(re.findall(r'parameter="([a-z_0-9]+)"', path.read_text()))
+    assert {"count", "overrides", "overhead_s", "workers"} <= named
+    assert {with_flags(f"`{name}`", UWBSIM_FLAGS) for name in named - ONLY_FROM_PYTHON} <= OPTIONS
+
+
+def test_every_number_of_a_state_has_its_flag():
+    assert {with_flags(f"`{name}`", UWBSIM_FLAGS) for name in uwbsim.State.__dataclass_fields__} <= OPTIONS

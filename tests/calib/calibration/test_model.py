@@ -1,17 +1,23 @@
 """The calibration file, and what applying it does."""
 
+import itertools
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.interpolate import BSpline
+from scipy.signal import lfilter
+from scipy.stats import exponnorm, norm
 
-from calib.calibration.error_model import PairErrors
+import calib
+from calib import BadInputError, UnanswerableError, compare, fit
+from calib.calibration.error_model import ErrorModel, PairErrors
 from calib.calibration.model import Calibration, TagGroup, load_calibration
-from calib.errors import BadInputError
-from calib.fitting.fitting import fit
+from calib.data.samples import sample_flight
 from tests.calib.synthetic import ranges
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import TABLES, CirRow, Fault, FrameRow
 from uwblink.ticks import SPEED_OF_LIGHT
 
 
@@ -25,8 +31,7 @@ def test_json_both_ways_without_loss(fitted, tmp_path, changes, version):
     known = replace(fitted, **changes)
     known.save(tmp_path / "c.json")
     again = load_calibration(tmp_path / "c.json")
-    assert again == known
-    assert again.to_json() == known.to_json()
+    assert (again, again.to_json()) == (known, known.to_json())
     assert json.loads(known.to_json())["schema_version"] == version
 
 
@@ -83,8 +88,7 @@ def test_factors_of_a_pair_hold_in_both_directions(fitted, name):
     errors = replace(fitted.errors, pairs={name: PairErrors(1.0, 3.0, 1.0)})
     known = Calibration.from_json(replace(fitted, errors=errors).to_json())
     there, back, other = (known.correct(3.0, -85.0, -86.0, *ends).tail_share for ends in ((1, 2), (2, 1), (1, 3)))
-    assert there == back
-    assert there / (1 - there) == pytest.approx(3 * other / (1 - other))
+    assert (there, there / (1 - there)) == (back, pytest.approx(3 * other / (1 - other)))
 
 
 def test_a_tag_in_no_group_is_named(fitted):
@@ -112,3 +116,290 @@ def test_a_damaged_file_is_one_clear_error(fitted, old, new):
     assert old in text
     with pytest.raises(BadInputError, match=r"^here"):
         Calibration.from_json(text.replace(old, new), "here")
+
+
+# A corrected recording: the ranges that `evaluate` sees, and every other row of every table as it was.
+
+
+def full_recording(path):
+    """Write a recording with rows in every table, in which a board printed 0.0000 dBm now and then."""
+    flight = sample_flight(600)
+    power = flight.exchanges.fpp1_dbm.copy()
+    power[::9] = 0.0
+    both = flight.exchanges.fpp2_dbm.copy()
+    both[::90] = 0.0
+    exchanges = replace(flight.exchanges, fpp1_dbm=power, fpp2_dbm=both)
+    with Recording.create(path, meta={"note": "kept"}) as recording:
+        recording.append_tags(flight.tags)
+        recording.append_poses(flight.poses)
+        recording.append_exchanges(exchanges)
+        recording.append("faults", [Fault(5, "1", "time-out", "no answer")])
+        recording.append("frames", [FrameRow(7, "1", "in", b"\x00\xff raw"), FrameRow(8, "1", "out", b"C05")])
+        recording.append("cirs", [CirRow(9, 1, 1, 2, 741.25, tuple(range(1016)))])
+        recording.append("overheard", [{name: float(k) for k, name in enumerate(TABLES["overheard"])}])
+        # And not "corrected", which is what is made.
+        for table in ("imu", "height", "powers", "temperature", "arrangements", "distances"):
+            kinds = {"BIGINT": np.array([11]), "VARCHAR": np.array(["b1"]), "DOUBLE": np.array([0.5])}
+            kinds |= {"USMALLINT": np.array([3])}
+            recording.append(table, {name: kinds[kind] for name, kind in TABLES[table].items()})
+    return exchanges
+
+
+def rows(path, table):
+    import duckdb
+
+    with duckdb.connect(str(path), read_only=True) as db:
+        found = db.execute(f"SELECT * FROM {table}").fetchall()
+        names = [column[0] for column in db.description]
+    return names, found
+
+
+@pytest.fixture(scope="module")
+def corrected(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("corrected")
+    exchanges = full_recording(folder / "f.uwb")
+    known = calib.fit(folder / "f.uwb").calibration
+    return folder, exchanges, known, calib.apply(folder / "f.uwb", known, folder / "c.uwb")
+
+
+@pytest.mark.parametrize("table", sorted(TABLES.keys() - {"corrected"}))
+def test_every_table_is_there(corrected, table):
+    folder, *_ = corrected
+    names, before = rows(folder / "f.uwb", table)
+    also, after = rows(folder / "c.uwb", table)
+    assert names == also
+    assert before, "a table without rows shows nothing"
+    if table == "exchanges":
+        place = names.index("range_m")
+        before, after = ([row[:place] + row[place + 1 :] for row in part] for part in (before, after))
+    if table == "meta":
+        after = [row for row in after if row[0] != "calibration"]
+        before, after = sorted(before), sorted(after)
+    assert repr(after) == repr(before)
+
+
+def test_apply_and_evaluate_correct_the_same_range_alike(corrected):
+    folder, exchanges, known, done = corrected
+    with Recording.open(folder / "c.uwb") as recording:
+        written = recording.exchanges().range_m
+    judged = calib.load_ranges(folder / "f.uwb")
+    kept = (exchanges.fpp1_dbm < 0) | (exchanges.fpp2_dbm < 0)
+    assert (judged.excluded, done.count) == ({"no power": np.count_nonzero(~kept)}, len(exchanges))
+    np.testing.assert_array_equal(written[kept], known.apply(judged).corrected_m)
+    # And neither takes the 0 for a power: that would be 8 orders of magnitude of lifted power too much.
+    assert np.abs(written - exchanges.range_m)[kept].max() < 1
+
+
+def test_a_corrected_recording_is_not_corrected_again(corrected):
+    folder, _, known, _ = corrected
+    with pytest.raises(calib.BadInputError, match="corrected already"):
+        calib.apply(folder / "c.uwb", known, folder / "again.uwb")
+    assert not (folder / "again.uwb").exists()
+
+
+def test_a_recording_without_exchanges_is_corrected_to_one_without(tmp_path):
+    flight = sample_flight(600)
+    with Recording.create(tmp_path / "f.uwb") as recording:
+        recording.append_tags(flight.tags)
+    done = calib.apply(tmp_path / "f.uwb", calib.fit(flight).calibration, tmp_path / "c.uwb")
+    assert (done.count, done.clamped) == (0, 0)
+
+
+def test_ranges_without_power_are_counted_apart(corrected):
+    folder, _, _, done = corrected
+    names, table = rows(folder / "c.uwb", "corrected")
+    beyond, unpowered = (np.array([row[names.index(n)] for row in table], float) for n in ("clamped", "sigma_m"))
+    assert ((done.count, done.unpowered), done.unpowered) == ((600, 7), np.count_nonzero(np.isnan(unpowered)))
+    assert done.clamped == np.count_nonzero(beyond[np.isfinite(unpowered)])
+
+
+@pytest.mark.parametrize("size", [37, 599])
+def test_blocks_of_any_size_are_corrected_alike(corrected, tmp_path, monkeypatch, size):
+    folder, _, known, done = corrected
+    blocks = Recording.exchange_blocks
+    monkeypatch.setattr(Recording, "exchange_blocks", lambda recording: blocks(recording, size))
+    assert calib.apply(folder / "f.uwb", known, tmp_path / "c.uwb") == done
+    for table in ("exchanges", "corrected", "poses", "cirs"):
+        assert repr(rows(tmp_path / "c.uwb", table)) == repr(rows(folder / "c.uwb", table))
+
+
+# What errors are made of, against draws of core, tail and outliers, and in files.
+
+
+MODEL = ErrorModel(
+    lifted=(0.1, 0.5, 1.5),
+    noise_m=(0.08, 0.05, 0.03),
+    tail_share=(0.3, 0.2, 0.1),
+    least_m=0.05,
+    detour_m=0.3,
+    outlier_share=0.002,
+    outlier_m=0.9,
+    location_m=0.02,
+    pairs={"1-2": PairErrors(1.5, 3.0, 0.5)},
+)
+COUNT = 400_000
+
+
+TWO_KINDS = replace(MODEL, long_share=0.4, long_factor=4.0)
+
+
+def drawn(model, lifted, known, seed=0):
+    """Draw errors of one kind of range, and which were reflected, straight from the definition."""
+    rng = np.random.default_rng(seed)
+    noise = np.exp(np.interp(lifted, MODEL.lifted, np.log(MODEL.noise_m))) * (1.5 if known else 1)
+    odds = np.exp(np.interp(lifted, MODEL.lifted, [np.log(t / (1 - t)) for t in MODEL.tail_share]))
+    share = 1 / (1 + 1 / (odds * (3.0 if known else 1.0)))
+    mean = 0.3 * (0.5 if known else 1) / (0.6 + 0.4 * 4 if model is TWO_KINDS else 1)
+    longer = np.where((rng.random(COUNT) < 0.4) & (model is TWO_KINDS), 4.0, 1.0)
+    kind, error = rng.random(COUNT), rng.normal(0, noise, COUNT)
+    reflected, wild = kind < 0.998 * share, kind > 0.998
+    error += reflected * (0.05 + rng.exponential(mean * longer))
+    error = np.where(wild, rng.normal(0, 0.9, COUNT), error)
+    return error + 0.02, reflected
+
+
+@pytest.mark.parametrize("model", [MODEL, TWO_KINDS], ids=["one kind", "two kinds"])
+@pytest.mark.parametrize(("lifted", "first", "second"), [(0.1, 1, 2), (0.7, 2, 1), (0.7, 1, 3), (4.0, 7, 3)])
+def test_mean_spread_quantiles_and_shares_are_those_of_draws(model, lifted, first, second):
+    error, reflected = drawn(model, lifted, {first, second} == {1, 2})
+    ends = np.full(1, first), np.full(1, second)
+    shapes = model.shapes(np.full(1, lifted), *ends)
+    # Four standard errors of each figure, from 400 000 draws.
+    assert model.mean_m(shapes)[0] == pytest.approx(error.mean(), abs=4 * error.std() / np.sqrt(COUNT))
+    assert model.total_m(shapes)[0] == pytest.approx(error.std(), rel=0.015)
+    assert shapes.tail_share[0] == pytest.approx(np.mean(reflected) / 0.998, abs=0.003)
+    shares = [0.01, 0.025, 0.3, 0.9, 0.975]
+    if lifted == 0.1 or lifted > 1.5:
+        found = model.quantiles(shares, np.full(1, lifted), *ends)[0]
+        np.testing.assert_allclose([np.mean(error < q) for q in found], shares, atol=0.002)
+    for value in (-0.1, 0.05, 0.15, 0.6):
+        assert model.below(np.full(1, value), shapes)[0] == pytest.approx(np.mean(error < value), abs=0.0032)
+
+
+def test_errors_beyond_everything_are_outliers():
+    shapes = MODEL.shapes(np.full(3, 0.5), np.full(3, 1), np.full(3, 2))
+    tail, outlier = MODEL.tail_given(np.array([-3.0, 80.0, 1e6]), shapes)
+    assert outlier[0] > 0.999
+    assert outlier[2] == 1.0
+    assert np.isfinite(tail).all()
+
+
+def test_what_an_error_was_follows_from_the_densities_of_scipy():
+    model = replace(MODEL, outlier_share=0.05, outlier_m=3.0)
+    error = np.linspace(-1, 4, 101)
+    shapes = model.shapes(np.full(101, 0.5), np.full(101, 3), np.full(101, 7))
+    core = 0.95 * 0.8 * norm.pdf(error - 0.02, scale=0.05)
+    tail = 0.95 * 0.2 * exponnorm.pdf(error - 0.02, 0.3 / 0.05, loc=0.05, scale=0.05)
+    wild = 0.05 * norm.pdf(error - 0.02, scale=3.0)
+    found = model.tail_given(error, shapes)
+    np.testing.assert_allclose(found, [tail / (core + tail + wild), wild / (core + tail + wild)], atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def error_fitted():
+    return calib.fit(calib.sample_flight()).calibration
+
+
+def test_a_file_gives_it_back_and_files_without_it_open(error_fitted):
+    assert error_fitted.errors is not None
+    again = Calibration.from_json(error_fitted.to_json())
+    assert again.errors == error_fitted.errors
+    flight = calib.load_ranges(calib.sample_flight(seed=2))
+    np.testing.assert_array_equal(again.quantiles(flight), error_fitted.quantiles(flight))
+    document = json.loads(error_fitted.to_json())
+    del document["errors"]
+    old = Calibration.from_json(json.dumps(document))
+    applied = old.apply(flight)
+    assert np.isnan(applied.sigma_total_m).all()
+    assert np.isnan(applied.tail_share).all()
+    assert not applied.outlier.any()
+    np.testing.assert_array_equal(applied.corrected_m, error_fitted.apply(flight).corrected_m)
+    assert json.loads(json.dumps(calib.evaluate(flight, old).to_dict()))["overall"]["total_std"] is None
+    assert "-" in repr(calib.evaluate(flight, old))
+    with pytest.raises(calib.UnanswerableError, match="does not say what errors are made of"):
+        old.quantiles(flight)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("lifted", [0.1], "errors: lifted"),
+        ("noise_m", [0.0] * 8, "errors: noise_m: 0: .*above 0"),
+        ("noise_m", [1.0] * 7, "errors: lifted"),
+        ("tail_share", [1.5] * 8, "errors: tail_share: 0"),
+        ("pairs", {"one-two": {}}, "names of pairs"),
+        ("pairs", {"1-2": {"noise": 1.0, "odds": 0.0, "detour": 1.0}}, "1-2: odds"),
+        ("levels", [[0.1]], "levels"),
+        ("scale", "wide", "scale"),
+    ],
+)
+def test_a_damaged_model_is_one_clear_error(error_fitted, key, value, said):
+    document = json.loads(error_fitted.to_json())
+    document["errors"][key] = value
+    with pytest.raises(calib.BadInputError, match=said):
+        Calibration.from_json(json.dumps(document), "here")
+
+
+def test_a_fit_says_how_long_errors_of_a_pair_last():
+    """Half of the variance is a Gauss-Markov process of each pair that forgets in half a second."""
+    flight = calib.load_ranges(calib.sample_flight(9000))
+    rng, shared = np.random.default_rng(5), np.zeros(len(flight))
+    for pair in range(3):
+        keep = np.exp(-0.03 / 0.5)
+        steps = rng.normal(0, 0.03 * np.sqrt(1 - keep**2), len(flight) // 3)
+        shared[pair::3] = lfilter([1.0], [1.0, -keep], steps)
+    found = calib.fit(replace(flight, raw_m=flight.raw_m + shared)).calibration
+    lasting = found.errors.lasting
+    assert lasting.lasting_variance == pytest.approx(0.5, abs=0.1)
+    assert (lasting.own_variance, lasting.time_s) == (pytest.approx(0.5, abs=0.1), pytest.approx(0.5, rel=0.4))
+    assert abs(lasting.mean) < 0.1
+    assert Calibration.from_json(found.to_json()) == found
+    assert calib.fit(flight).calibration.errors.lasting.lasting_variance < 0.05
+
+
+@pytest.mark.parametrize("shares", [[], [0.0], [1.2], [[0.5]]])
+def test_shares_that_are_none(error_fitted, shares):
+    with pytest.raises(calib.BadInputError, match=r"`shares`: .*between 0 and 1"):
+        error_fitted.quantiles(calib.load_ranges(calib.sample_flight()), shares)
+
+
+# Two calibrations side by side.
+
+
+def test_fits_of_the_same_tags_are_the_same_nineteen_times_in_twenty():
+    fits = [fit(ranges(3000, seed=seed)).calibration for seed in range(9)]
+    found = [compare(a, b) for a, b in itertools.pairwise(fits)]
+    # 8 comparisons, 0.4 expected to differ; more than three come by chance less than once in a thousand.
+    assert sum(one.same for one in found) >= 5
+    # Four delays less a shift: chi-square with 3 degrees of freedom, whose mean over 8 is known to 0.9 or so;
+    # intervals allow for small samples and for reflections of unknown shape, and are a little wide for it.
+    assert 0.9 < np.mean([one.chi_square for one in found]) < 5.0
+    scores = [d / one.std_ns[t] for one in found for t, d in one.difference_ns.items()]
+    assert 0.55 < np.std(scores) < 1.3
+
+
+def test_a_delay_that_moved_is_seen():
+    a = fit(ranges(6000)).calibration
+    found = compare(a, replace(a, delays_ns=a.delays_ns | {3: a.delays_ns[3] + 0.1}))
+    assert not found.same
+    assert max(found.difference_ns, key=lambda t: abs(found.difference_ns[t])) == 3
+    assert f"{found.difference_ns[3]:+.4f} ns" in str(found)
+    assert "the delays are different" in str(found)
+
+
+def test_a_shift_of_delays_against_the_curve_is_no_difference():
+    a = fit(ranges(6000)).calibration
+    shift_m = 0.05
+    shift_ns = shift_m / SPEED_OF_LIGHT * 1e9
+    curve = replace(a.bias_curve, coefficients=tuple(c + shift_m for c in a.bias_curve.coefficients))
+    other = replace(a, delays_ns={t: d + shift_ns for t, d in a.delays_ns.items()}, bias_curve=curve)
+    found = compare(a, other)
+    assert found.same
+    assert (found.offset_m, found.curve_rms_m) == (pytest.approx(0, abs=1e-9), pytest.approx(0, abs=1e-9))
+    assert np.abs(list(found.difference_ns.values())).max() < 1e-9
+
+
+def test_nothing_in_common_cannot_be_compared():
+    a = fit(ranges(2000)).calibration
+    with pytest.raises(UnanswerableError, match="0 tags have determined delays in both"):
+        compare(a, replace(a, delays_ns={99: 0.0}))

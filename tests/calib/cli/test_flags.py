@@ -1,19 +1,27 @@
 """The command line names options where the library names parameters, and makes the fit's options of its settings."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
+from typer.testing import CliRunner
 
 import calib
 from calib.calibration.power_curves import ALPHA_DBM, LIFTS
 from calib.cli.commands import app
 from calib.cli.shared import with_flags
-from calib.settings import CHOICES, FitSettings
+from calib.estimator import optimize
+from calib.settings import CHOICES, FitSettings, read_distances
 from docs.site.commands import leaves
 from tests import processes
+from tests.calib.plain_tables import DELAYS_NS, Plan, bias_m, write
+from tests.calib.trajectories.sines import flight
+from tests.processes import succeed as run
+from uwblink import Contents, KnownDistance, Recording
 
 ROOT = Path(__file__).parents[3]
 COMMANDS: Any = typer.main.get_command(app)
@@ -43,8 +51,7 @@ def test_other_text_stays_as_it_is():
 
 
 def test_settings_know_what_the_curves_know():
-    assert set(CHOICES["lift"]) == set(LIFTS)
-    assert FitSettings().alpha_dbm == ALPHA_DBM
+    assert (set(CHOICES["lift"]), FitSettings().alpha_dbm) == (set(LIFTS), ALPHA_DBM)
 
 
 def test_settings_and_keywords_make_the_same_fit():
@@ -65,3 +72,163 @@ def test_a_fit_repeats_its_settings(tmp_path):
     ):
         processes.succeed("calib", *line)
     assert "settings: loss = huber, fixed_ns = {'1': -0.3}" in processes.run("calib", "show", made).stdout
+
+
+# `calib fit --truth ranges`, as one types it.
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    path = tmp_path_factory.mktemp("flight") / "f.uwb"
+    flown = flight(seconds=14.0)
+    Contents(exchanges=flown.exchanges, poses=flown.poses, tags=flown.tags).save(path)
+    return path
+
+
+def test_a_known_start_is_enough(recording, tmp_path):
+    words = ("--truth", "ranges", "--poses-until", 6, "-o", tmp_path / "c.json")
+    assert processes.succeed("calib", "fit", recording, *words).stdout.count(" delay ") == 6
+    written = json.loads((tmp_path / "c.json").read_text())
+    assert written["provenance"]["truth"] == "ranges"
+    with Recording.open(recording) as opened:
+        assert written["provenance"]["exchanges"] <= len(opened.exchanges())
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("11-12=3.06", KnownDistance(11, 12, 3.06, 0.01)),
+        (" 1 - 3 = 1.5 +- .005 @ desk", KnownDistance(1, 3, 1.5, 0.005, "desk")),
+        ("1-3=2±0.02@2..8", KnownDistance(1, 3, 2.0, 0.02, "2..8")),
+    ],
+)
+def test_a_distance_is_read_as_one_types_it(text, found):
+    assert read_distances([text]) == (found,)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--truth", "tape"), "--truth: found 'tape', allowed: recorded, ranges"),
+        (("--poses-until", "6"), "--poses-until: goes with a fit whose --truth is ranges"),
+        (("--truth", "ranges", "--loss", "huber"), "--loss: goes with known distances only"),
+        (("--truth", "ranges", "--trim-static"), "--trim-static: goes with known distances only"),
+        (("--truth", "ranges", "--anchors", "lost"), "--anchors: found 'lost', allowed: given, sought"),
+        (("--truth", "ranges", "--distance", "1:3=2"), "--distance: found '1:3=2', expected TAG-TAG=METRES"),
+        (("--truth", "ranges", "--distance", "1-9=2"), "--distance: found tag 9, the tags that range are 1, 2, 3"),
+        (("--truth", "ranges", "--heights", "guess"), "--heights: found 'guess', allowed: used, ignored"),
+    ],
+)
+def test_what_does_not_go_together_is_one_line(recording, tmp_path, words, said):
+    processes.refuse("calib", "fit", recording, *words, "-o", tmp_path / "c.json", naming=[said])
+    assert not (tmp_path / "c.json").exists()
+
+
+# A table of ranges with power and places, no stamps, robots and anchors: import, curve, localization, by commands.
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("ranges")
+    write(place / "ranges.csv", Plan(bias=bias_m))
+    run("uwblink", "import", "csv", place / "ranges.csv", "-o", place / "ranges.uwb")
+    return place
+
+
+def test_import_curve_localization(folder):
+    done = run("calib", "fit", folder / "ranges.uwb", "-o", folder / "c.json")
+    assert "ranges without stamps" in done.stderr
+    written = json.loads((folder / "c.json").read_text())
+    middle = sum(written["delays_ns"][str(tag)] - delay for tag, delay in DELAYS_NS.items()) / len(DELAYS_NS)
+    for tag, delay in DELAYS_NS.items():
+        # Delays are stated for a curve that is zero at -82 dBm, so all are moved alike.
+        assert written["delays_ns"][str(tag)] - middle == pytest.approx(delay, abs=0.05)
+    assert any("ranges without stamps" in warning for warning in written["provenance"]["warnings"])
+    assert "ranges without stamps" in run("calib", "show", folder / "c.json").stdout
+    located = json.loads(run("calib", "localize", folder / "ranges.uwb", "-c", folder / "c.json", "--json").stdout)
+    assert located["summary"]["rmse_m"]["calibrated"] < 0.7 * located["summary"]["rmse_m"]["raw"]
+    run("calib", "apply", folder / "ranges.uwb", "-c", folder / "c.json", "--to", "csv", "-o", folder / "out")
+    corrected = np.genfromtxt(folder / "out" / "corrected.csv", delimiter=",", names=True, dtype=None, encoding=None)
+    assert np.mean(corrected["sigma_m"]) == pytest.approx(0.04, rel=0.15)
+    judged = json.loads(run("calib", "evaluate", folder / "ranges.uwb", "-c", folder / "c.json", "--json").stdout)
+    # The planted noise is 4 cm.
+    assert judged["overall"]["full"]["robust_std_m"] == pytest.approx(0.041, abs=0.004)
+
+
+def test_constants_of_pairs_by_commands(folder):
+    done = run("calib", "fit", folder / "ranges.uwb", "-o", folder / "p.json", "--constants", "pair", "--delays-only")
+    assert "pair    1-11" in done.stdout
+    assert "delays only" in done.stderr
+    assert "constants of 12 pairs" in run("calib", "show", folder / "p.json").stdout
+    run("calib", "fit", folder / "ranges.uwb", "-o", folder / "q.json", "--delays-from", folder / "c.json")
+    shown = run("calib", "show", folder / "q.json").stdout
+    assert "fitted: curve only" in shown
+    assert "warning: curve only" in shown
+
+
+def test_one_pair_is_evaluated_without_a_number_between_pairs(folder):
+    head, *rows = (folder / "ranges.csv").read_text().splitlines()
+    kept = [row for row in rows if sorted(row.split(",")[1:3], key=int) == ["1", "11"]]
+    (folder / "one.csv").write_text("\n".join([head, *kept]) + "\n")
+    run("uwblink", "import", "csv", folder / "one.csv", "-o", folder / "one.uwb")
+    run("calib", "fit", folder / "one.uwb", "-o", folder / "one.json", "--constants", "pair", "--delays-only")
+    told = run("calib", "evaluate", folder / "one.uwb", "-c", folder / "one.json").stdout
+    assert "are within pairs" in told
+    assert "nan" not in told
+    assert "between pairs" in run("calib", "evaluate", folder / "ranges.uwb", "-c", folder / "p.json").stdout
+
+
+# A fit that stopped before it settled says so wherever its calibration goes, and does not end as if all were well.
+
+
+@pytest.fixture
+def stopped_flight(tmp_path):
+    some = calib.sample_flight()
+    Contents(exchanges=some.exchanges, poses=some.poses, tags=some.tags).save(tmp_path / "flight.uwb")
+    return tmp_path / "flight.uwb"
+
+
+def run_stopped(*words):
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+@pytest.fixture
+def stopped(stopped_flight, monkeypatch, tmp_path):
+    monkeypatch.setattr(optimize, "MOST_STEPS", 2)
+    return run_stopped("fit", stopped_flight, "-o", tmp_path / "c.json"), tmp_path / "c.json"
+
+
+def test_the_command_writes_it_marks_it_and_ends_with_1(stopped, stopped_flight, tmp_path):
+    done, path = stopped
+    assert done.exit_code == 1
+    assert "stopped after" in done.stdout
+    assert "before it settled" in done.stderr
+    assert json.loads(path.read_text())["provenance"]["converged"] is False
+    assert "NOT SETTLED" in repr(calib.load_calibration(path))
+    as_json = run_stopped("fit", stopped_flight, "-o", tmp_path / "d.json", "--json")
+    assert as_json.exit_code == 1
+    assert json.loads(as_json.stdout)["provenance"]["converged"] is False
+
+
+def test_commands_that_use_it_warn(stopped, stopped_flight, tmp_path):
+    path = stopped[1]
+    for words in (
+        ("apply", stopped_flight, "-c", path, "-o", tmp_path / "corrected.uwb"),
+        ("evaluate", stopped_flight, "-c", path),
+        ("export", path, "--to", "csv"),
+        ("compare", path, path),
+    ):
+        done = run_stopped(*words)
+        assert done.exit_code == 0, done.output
+        assert "stopped before it settled" in done.stderr, words[0]
+    assert "NOT SETTLED" in run_stopped("show", path).stdout
+
+
+def test_a_fit_that_settled_is_quiet(stopped_flight, tmp_path):
+    done = run_stopped("fit", stopped_flight, "-o", tmp_path / "c.json")
+    assert done.exit_code == 0
+    assert (
+        "settled"
+        not in done.stderr
+        + run_stopped("apply", stopped_flight, "-c", tmp_path / "c.json", "-o", tmp_path / "d.uwb").stderr
+    )

@@ -1,22 +1,30 @@
 """Ranges from files, open recordings, objects in memory and arrays: all the same, and mistakes are named."""
 
+import builtins
 import math
 from dataclasses import replace
+from hashlib import sha256
 from types import SimpleNamespace
 from typing import Any
 
 import duckdb
 import numpy as np
+import pandas as pd
+import pyarrow as pa
 import pytest
 
 import calib
-from calib.data.ranges import Ranges
+import uwblink
+from calib import BadInputError, Ranges, UnanswerableError
+from calib.data.clocks import clocks_apart
 from calib.data.samples import DELAYS_NS, sample_flight
 from calib.data.sources import load_flight, load_ranges
-from calib.errors import BadInputError, UnanswerableError
-from uwblink import Contents
-from uwblink.errors import RecordingError
-from uwblink.recording.file import Recording
+from uwblink import Contents, Exchanges, Poses, Recording, Tag
+from uwblink.errors import ArgumentError, RecordingError
+from uwblink.recording import AntennaDelay
+from uwblink.recording.contents import exchanges_with_poses
+from uwblink.recording.summary import single_reports
+from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 
 
 def written(place, flight, planted):
@@ -47,21 +55,18 @@ def test_a_file_an_open_recording_and_an_object_are_the_same(path):
     assert_same(in_memory, from_file)
     assert load_ranges(from_file) is from_file
     both = load_ranges([path, sample_flight(300, seed=2)])
-    assert len(both) == 1200
-    assert both.source == "sample.uwb, memory"
+    assert (len(both), both.source) == (1200, "sample.uwb, memory")
     assert_same(both[:900], from_file)
 
 
 def test_every_function_takes_what_a_fit_takes(path):
     in_memory, from_file = sample_flight(), calib.fit([path])
-    result = calib.fit(in_memory)
-    known = result.calibration
+    known = calib.fit(in_memory).calibration
     named = {"recordings": [path.name]}
     assert replace(known, provenance=known.provenance | named).to_json() == from_file.calibration.to_json()
     judged = {name: calib.evaluate(data, known).to_dict() for name, data in (("memory", in_memory), (path.name, path))}
     assert [(name, found.pop("seen_by_fit")) for name, found in judged.items()] == [(name, [name]) for name in judged]
-    assert judged["memory"] == judged[path.name]
-    assert calib.examine(in_memory) == calib.examine(path)
+    assert (judged["memory"], calib.examine(in_memory)) == (judged[path.name], calib.examine(path))
     ours, theirs = calib.localize(in_memory, known), calib.localize(path, known)
     assert [one.tracks["raw"].rmse_m for one in ours] == [one.tracks["raw"].rmse_m for one in theirs]
     # Delays differ from the planted ones by a common shift, which is a constant of the curve.
@@ -84,8 +89,7 @@ def test_a_strangers_object_will_do():
 def test_exchanges_with_their_distances_need_no_poses():
     flight = sample_flight()
     truth = load_ranges(flight).truth_m
-    carried = replace(flight.exchanges, truth_m=truth)
-    assert_same(load_ranges(carried), load_ranges(flight))
+    assert_same(load_ranges(replace(flight.exchanges, truth_m=truth)), load_ranges(flight))
     assert_same(Ranges.from_exchanges(flight.exchanges, truth), load_ranges(flight))
     with pytest.raises(BadInputError, match=r"`truth_m`: has shape \(3,\)"):
         Ranges.from_exchanges(flight.exchanges, np.zeros(3))
@@ -110,8 +114,7 @@ def test_ranges_are_not_enough_to_localize_or_examine():
 
 def test_arrays_become_ranges():
     r = Ranges.from_arrays([3, 4], initiator=1, target=[2, 3], fpp1_dbm=[-85.0, 0.0], truth_m=[2.9, 3.9])
-    assert r.tags() == [1, 2, 3]
-    assert repr(r) == "<Ranges of memory: 2 of tags 1, 2, 3>"
+    assert (r.tags(), repr(r)) == ([1, 2, 3], "<Ranges of memory: 2 of tags 1, 2, 3>")
     np.testing.assert_array_equal(r.fpp1_dbm, [-85.0, math.nan])
     assert repr(r.usable()) == "<Ranges of memory: 1 of tags 1, 2, 1 left out: no power>"
     assert load_ranges(r.usable()).excluded == {"no power": 1}
@@ -187,3 +190,239 @@ def test_poses_without_time_or_body_are_refused(tmp_path):
             db.execute(f"UPDATE poses SET {column} = NULL WHERE body = ?", [flight.tags[0].body])
         with pytest.raises(RecordingError, match="table poses"):
             load_ranges(place)
+
+
+# Ranges of a recording are those of its exchanges and poses, of two reports of an exchange one.
+
+
+ROWS = 300
+
+
+def recorded_written(path, exchanges, poses, tags):
+    Contents(exchanges=exchanges, poses=poses, tags=tags, meta={"planted": {"delays_ns": {"1": 0.1}}}).save(path)
+    return path
+
+
+def awkward():
+    """A flight with everything that makes a difference between all poses and some of them."""
+    flight = sample_flight(ROWS, seed=3)
+    rng = np.random.default_rng(5)
+    first, last = int(flight.poses.time_ns[0]), int(flight.poses.time_ns[-1])
+    time_s = (flight.poses.time_ns - first) * 1e-9
+    body = np.array(sorted(set(flight.poses.body.tolist())))
+    gap = (flight.poses.body == body[0]) & (time_s > 0.2 * time_s[-1]) & (time_s < 0.5 * time_s[-1])
+    poses = flight.poses[~gap & ~((flight.poses.body == body[1]) & (time_s > 0.6 * time_s[-1]))]
+    still = Poses(
+        np.array([last + 10**12]), np.array(["post"]), np.array([[3.0, 2.0, 1.0]]), np.array([[0.0, 0, 0, 1]])
+    )
+    poses = Poses.concatenate([poses, still])
+    tags = [tag if tag.tag != 3 else Tag(3, "post", (0.1, 0.0, 0.0)) for tag in flight.tags]
+    exchanges = flight.exchanges[np.argsort(rng.random(ROWS) + np.arange(ROWS) / 20)]
+    fpp1 = exchanges.fpp1_dbm.copy()
+    fpp2 = exchanges.fpp2_dbm.copy()
+    fpp1[::7], fpp2[::14] = np.nan, np.nan
+    truth = np.where(np.arange(ROWS) % 11 == 0, 2.5, np.nan)
+    protocol = np.where(np.arange(ROWS) < ROWS // 2, exchanges.protocol, "ss")
+    return replace(exchanges, fpp1_dbm=fpp1, fpp2_dbm=fpp2, truth_m=truth, protocol=protocol), poses, tags
+
+
+def test_bodies_with_one_pose_do_not_split_what_is_read(tmp_path):
+    """A hundred anchors have a pose each: thousands of exchanges are read in one part, not one by one."""
+    flight = sample_flight(3000)
+    path = recorded_written(tmp_path / "it.uwb", flight.exchanges, flight.poses, flight.tags)
+    with Recording.open(path, update=True) as recording:
+        time_ns, names = np.full(100, int(flight.poses.time_ns[0])), np.array([f"anchor{k}" for k in range(100)])
+        recording.append_poses(Poses(time_ns, names, np.ones((100, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (100, 1))))
+    with Recording.open(path) as recording:
+        parts = [len(part) for part, _ in exchanges_with_poses(recording)]
+    assert parts == [3000]
+
+
+def both_ends(exchanges, poses, tags):
+    """The same with a second report, some time later, of two in three, in no order of time; some of them alone."""
+    rng = np.random.default_rng(8)
+    again = exchanges[np.flatnonzero(rng.random(ROWS) < 0.67)]
+    second = replace(
+        again, time_ns=again.time_ns + rng.integers(0, 50_000_000, len(again)), reporter=again.target.copy()
+    )
+    whole = Exchanges.concatenate([exchanges[np.flatnonzero(np.arange(ROWS) % 10 > 0)], second])
+    return whole[np.argsort(whole.time_ns + rng.integers(0, 10**9, len(whole)))], poses, tags
+
+
+def test_of_two_reports_one_counts(tmp_path):
+    path = recorded_written(tmp_path / "it.uwb", *both_ends(*awkward()))
+    with Recording.open(path) as recording:
+        reports = single_reports(recording.exchanges())
+        alone = reports.exchanges
+        whole = Ranges.from_exchanges(alone, poses=recording.poses(), tags=recording.tags()).usable()
+    found = load_ranges(path)
+    assert reports.repeated > ROWS / 3
+    assert found.excluded["no true distance"] > 5
+    assert found.excluded["no power"] > 5
+    assert (found.excluded, found.left_skew) == (whole.excluded, whole.left_skew)
+    for name, column in whole.to_dict().items():
+        np.testing.assert_array_equal(getattr(found, name), column, err_msg=name)
+    assert (found.planted, found.antenna_delays) == ({"delays_ns": {"1": 0.1}}, {None: AntennaDelay()})
+    fingerprint = sha256(alone.time_ns.tobytes() + alone.range_m.tobytes()).hexdigest()[:32]
+    assert found.recordings == (("it.uwb", fingerprint),)
+
+
+# Data frames in and out: of pandas, of Arrow, and of anything with Arrow's interface in C, as Polars has it.
+
+
+N = 600
+TAGS = {"AN0": -0.3, "AN1": 0.2, "drone": 0.1}
+C = 0.299792458  # m/ns, written out
+
+
+def frame(**changes):
+    """Return ranges of three tags with planted delays, in words and units of their owner."""
+    rng = np.random.default_rng(4)
+    pair = np.array([("drone", "AN0"), ("drone", "AN1"), ("AN0", "AN1")])[np.arange(N) % 3]
+    truth = rng.uniform(1, 6, N)
+    delay = np.array([[TAGS[name] for name in ends] for ends in pair]).sum(axis=1)
+    columns = {
+        "stamp": pd.date_range("2026-03-01", periods=N, freq="50ms"),
+        "from_id": pair[:, 0],
+        "to_id": pair[:, 1],
+        "distance_mm": 1000 * (truth - C * delay / 2 + rng.normal(0, 0.02, N)),
+        "gt_range_m": truth,
+        "fpp_dbm": rng.uniform(-95, -80, N),
+    }
+    return pd.DataFrame(columns | changes)
+
+
+MAP = {"columns": {"range_m": "distance_mm", "fpp2": "fpp_dbm", "time_s": "stamp"}, "units": {"distance": "mm"}}
+
+
+class OfAnotherLibrary:
+    """A table whose library is known by Arrow's interface only."""
+
+    def __init__(self, table):
+        self.table = table
+
+    def __arrow_c_stream__(self, requested_schema=None):
+        return self.table.__arrow_c_stream__(requested_schema)
+
+
+def planted_difference(result, loaded):
+    """Return the error of the difference of two delays, in ns; names of tags come from the import."""
+    tag = {body: number for number, body in loaded.bodies}
+    delays = result.calibration.delays_ns
+    return delays[tag["AN1"]] - delays[tag["AN0"]] - (TAGS["AN1"] - TAGS["AN0"])
+
+
+@pytest.mark.parametrize("form", [lambda f: f, pa.table, lambda f: OfAnotherLibrary(pa.table(f))])
+@pytest.mark.filterwarnings("ignore:.*ids are words")
+def test_a_frame_is_fitted_with_its_columns_in_words_of_their_owner(form):
+    whole = frame(gt_range_m=1000 * frame().gt_range_m)
+    loaded = calib.Ranges.from_dataframe(form(whole), MAP)
+    assert (len(loaded), loaded.truth_m) == (N, pytest.approx(whole.gt_range_m / 1000))
+    assert loaded.raw_m == pytest.approx(whole.distance_mm / 1000)
+    assert loaded.fpp2_dbm == pytest.approx(whole.fpp_dbm)
+    assert np.diff(loaded.time_ns) == pytest.approx(50_000_000)
+    result = calib.fit(loaded, delays_only=True)
+    # 200 ranges a pair of 2 cm: 1.4 mm, or 9 ps of a sum of delays.
+    assert abs(planted_difference(result, loaded)) < 0.04
+
+
+def test_a_frame_with_plain_names_needs_no_map_and_says_what_it_assumed():
+    plain = frame().rename(columns={"distance_mm": "range_m"})
+    plain["range_m"] /= 1000
+    with pytest.warns(UserWarning, match="3 ids are words"):
+        result = calib.fit(plain)
+    assert len(result.ranges) == N
+    with pytest.warns(UserWarning, match="3 ids are words"):
+        assert calib.fit(plain.set_index("stamp")).calibration.delays_ns == result.calibration.delays_ns
+
+
+def test_a_frame_that_does_not_tell_everything_is_refused_with_what_is_missing(tmp_path):
+    with pytest.raises(calib.BadInputError, match=r"data frame: state to_id in `map`.*\n(.*\n)*.*\[columns\]"):
+        calib.Ranges.from_dataframe(frame().drop(columns="to_id"))
+    with pytest.raises(calib.BadInputError, match="no column whose name is known"):
+        calib.fit(pd.DataFrame({"a": [1.0], "b": [2.0]}))
+    with pytest.raises(calib.BadInputError, match=r"columns\.nonsense"):
+        calib.Ranges.from_dataframe(frame(), {"columns": {"nonsense": "a"}})
+    with pytest.raises(ArgumentError, match="map_file"):
+        uwblink.import_recording(tmp_path / "t.csv", tmp_path / "t.uwb", map_file=MAP)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_results_become_frames():
+    flight = calib.sample_flight()
+    ranges = calib.load_ranges(flight)
+    result = calib.fit(ranges)
+    assert ranges.to_pandas().raw_m.to_numpy() == pytest.approx(ranges.raw_m)
+    corrected = result.calibration.apply(ranges)
+    assert corrected.to_pandas().corrected_m.to_numpy() == pytest.approx(corrected.corrected_m)
+    assert "corrected_m" in corrected._repr_html_()
+    judged = calib.evaluate(flight, result)
+    rows = judged.to_pandas().set_index("pair")
+    assert rows.loc["1-2", "full_median_m"] == judged.pairs["1-2"].full.median_m
+    assert rows.loc["all", "raw_n"] == len(ranges)
+    assert flight.exchanges.to_pandas().range_m.to_numpy() == pytest.approx(flight.exchanges.range_m)
+
+
+def test_without_pandas_one_line_says_what_to_do(monkeypatch):
+    real = builtins.__import__
+
+    def missing(name, *args, **kwargs):
+        if name == "pandas":
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    with pytest.raises(ArgumentError, match="pip install pandas"):
+        calib.load_ranges(calib.sample_flight()).to_pandas()
+
+
+# Clock ratios by third messages against carriers' readings: what is planted is named, and nothing else.
+
+
+PPM = np.array([0.0, 4.0, -3.0, 1.5])
+"""By how much the clock of a tag is fast."""
+
+
+def exchanges(stamps_ppm=None, sign=1.0, noise_ppm=0.3):
+    """Return a sample flight whose third messages and carriers tell of the clocks; `stamps_ppm` is of tags 1 to 3."""
+    flight = calib.sample_flight(900).exchanges
+    rng = np.random.default_rng(4)
+    fast = PPM if stamps_ppm is None else np.array([0.0, *stamps_ppm])
+    # The third message leaves the target 15 ms after its second, in its own ticks; the initiator counts in others.
+    span = 0.015 / TICK_S
+    target, initiator = (span * (1 + 1e-6 * fast[ids]) for ids in (flight.target, flight.initiator))
+    carrier = sign * (PPM[flight.target] - PPM[flight.initiator])
+    return replace(
+        flight,
+        tx3=(flight.tx2 + np.rint(target).astype(np.int64)) % 2**32,
+        rx3=(flight.rx2 + np.rint(initiator).astype(np.int64)) % 2**32,
+        skew1_ppm=carrier + noise_ppm * rng.normal(size=900),
+        skew2_ppm=-carrier + noise_ppm * rng.normal(size=900),
+    )
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_clocks_that_agree_are_left_alone_whichever_sign_readings_have(sign):
+    assert clocks_apart(exchanges(sign=sign)) is None
+
+
+def test_a_clock_that_only_the_stamps_find_fast_is_named_with_what_it_does():
+    # Tag 3 is 3 ppm slow; its stamps say 2 ppm fast.
+    some = exchanges(stamps_ppm=(4.0, -3.0, 6.5))
+    found = clocks_apart(some)
+    assert found is not None
+    assert 3 in found.pair
+    assert abs(found.stamps_ppm - found.carrier_ppm) == pytest.approx(5.0, abs=0.2)
+    reply_s = float(np.median((some.tx2 - some.rx1) % 2**32)) * TICK_S
+    assert found.moves_m == pytest.approx(0.5 * SPEED_OF_LIGHT * 5e-6 * reply_s, rel=0.05)
+    assert str(found) in calib.fit(replace(calib.sample_flight(900), exchanges=some)).warnings
+
+
+def test_readings_of_zero_are_none():
+    some = exchanges(stamps_ppm=(9.0, -9.0, 0.0))
+    nothing = np.zeros(900)
+    assert clocks_apart(replace(some, skew1_ppm=nothing, skew2_ppm=nothing)) is None
+
+
+def test_readings_that_scatter_widely_prove_nothing():
+    assert clocks_apart(exchanges(stamps_ppm=(4.0, -3.0, 3.0), noise_ppm=30.0)) is None

@@ -7,19 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.calibration.model import Calibration
+from calib import BadInputError, Calibration, UnanswerableError, fit, sample_flight
 from calib.calibration.power_curves import Curve
-from calib.data.samples import sample_flight
 from calib.data.sources import Flight, load_flight
-from calib.errors import BadInputError, UnanswerableError
 from calib.evaluation.localization import fixed_std, localize, summarize
 from calib.evaluation.output import localization_json, localization_text, write_tum
+from calib.evaluation.range_updates import RangeErrors, gated_update, mixture_update
 from calib.evaluation.tracking import Settings
-from calib.fitting.fitting import fit
 from calib.report.figures import rmse_bars
 from uwblink.pages.figures import style
-from uwbsim import simulate
-from uwbsim.scenario.loading import load
+from uwbsim import load, simulate
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios" / "icra2023"
 
@@ -79,8 +76,7 @@ def test_a_body_that_ranges_only_where_its_place_is_unknown_is_left_out(flights)
     # One body's poses come after all ranges.
     late = flight.poses.body == bodies[0]
     time = np.where(late, flight.poses.time_ns + last, flight.poses.time_ns)
-    order = np.argsort(time, kind="stable")
-    poses = replace(flight.poses, time_ns=time)[order]
+    poses = replace(flight.poses, time_ns=time)[np.argsort(time, kind="stable")]
     found = localize(replace(flight, poses=poses), calibration, Settings(seeds=1))
     assert {one.body for one in found} == set(bodies[1:])
 
@@ -211,8 +207,7 @@ def test_trajectories_are_written_in_tum_form_with_their_attitudes(flights, tmp_
 def test_recordings_of_one_name_keep_their_own_trajectories(tmp_path):
     samples = [sample_flight(60, seed=seed) for seed in (1, 2)]
     known = fit(sample_flight()).calibration
-    found = [one for flight in samples for one in localize(flight, known)]
-    write_tum(found, tmp_path)
+    write_tum([one for flight in samples for one in localize(flight, known)], tmp_path)
     raw = sorted(path.name for path in tmp_path.glob("*-raw.tum"))
     assert raw == sorted(f"memory-robot{k}{end}-raw.tum" for k in (1, 2, 3) for end in ("", "_2"))
     assert (tmp_path / raw[0]).read_text() != (tmp_path / raw[1]).read_text()
@@ -224,3 +219,53 @@ def test_bars_say_where_they_leave_bodies_out(flights, fitted):
         (few,), (most,) = (rmse_bars(3.5, some).axes for some in (found, 2 * found))
     assert (few.get_xlabel(), len(few.get_xticks()), len(most.get_xticks())) == ("", 4, 6)
     assert most.get_xlabel().startswith("5 of 6 bodies")
+
+
+# What a range tells a filter, against draws of noise, detours and outliers.
+
+
+STD = 0.1
+ERRORS = RangeErrors(share=0.3, least_m=0.05, detour_m=0.3, outlier=0.02, outlier_m=2.0)
+COUNT = 2_000_000
+
+
+@pytest.fixture(scope="module")
+def draws():
+    rng = np.random.default_rng(3)
+    noise = rng.normal(0, STD, COUNT)
+    kind = rng.random(COUNT)
+    innovation = noise.copy()
+    reflected = kind < 0.98 * 0.3
+    innovation[reflected] += 0.05 + rng.exponential(0.3, np.count_nonzero(reflected))
+    wild = kind > 0.98
+    # An outlier's innovation has the filter's own uncertainty in it, and says nothing of the noise.
+    innovation[wild] = np.hypot(2.0, STD) * rng.normal(size=np.count_nonzero(wild))
+    return innovation, noise, wild
+
+
+@pytest.mark.parametrize("value", [-0.3, -0.1, 0.0, 0.1, 0.2, 0.35, 0.7, 1.2, -1.0])
+def test_mean_and_variance_of_the_noise_are_those_of_draws(draws, value):
+    innovation, noise, wild = draws
+    near = np.abs(innovation - value) < 0.01
+    update = mixture_update(np.array([value]), np.array([STD**2]), ERRORS)
+    count = np.count_nonzero(near)
+    spread = noise[near].std()
+    # Four standard errors, and what the width of the bin does.
+    assert update.noise_m[0] == pytest.approx(noise[near].mean(), abs=4 * spread / np.sqrt(count) + 0.004)
+    assert update.variance_m2[0] == pytest.approx(noise[near].var(), rel=6 / np.sqrt(count) + 0.05, abs=1e-4)
+    assert update.believed[0] == (np.mean(wild[near]) < 0.5)
+    assert np.exp(update.log_density[0]) == pytest.approx(count / COUNT / 0.02, rel=4 / np.sqrt(count) + 0.03)
+
+
+def test_innovations_out_of_reach_are_finite_and_not_believed():
+    update = mixture_update(np.array([-50.0, 1e3, 1e5]), np.full(3, STD**2), ERRORS)
+    assert not update.believed.any()
+    assert np.isfinite(update.noise_m).all()
+    np.testing.assert_allclose(update.noise_m, 0, atol=1e-6)
+    np.testing.assert_allclose(update.variance_m2, STD**2, rtol=1e-6)
+
+
+def test_a_gate_takes_all_or_nothing():
+    update = gated_update(np.array([0.2, 0.4]), np.full(2, 0.01), 9.0)
+    assert (update.believed.tolist(), update.noise_m.tolist()) == ([True, False], [0.2, 0.0])
+    assert update.variance_m2.tolist() == [0.0, 0.01]

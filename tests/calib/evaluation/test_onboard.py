@@ -7,20 +7,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calib import BadInputError, Calibration, OnboardSettings, UnanswerableError, localize_onboard
 from calib.calibration.error_model import ErrorModel
 from calib.calibration.formats import read_miluv
-from calib.calibration.model import Calibration
 from calib.calibration.power_curves import Curve
 from calib.data.samples import stamped
-from calib.errors import BadInputError, UnanswerableError
 from calib.evaluation.inertial_filter import ProcessNoise
-from calib.evaluation.onboard import OnboardSettings, localize_onboard
 from calib.evaluation.output import onboard_json, onboard_text, write_tum
 from calib.evaluation.range_updates import multilaterate
 from tests.shared_data import shared
+from uwblink import Contents, Poses, Tag
 from uwblink.importers import read_source
-from uwblink.recording.contents import Contents
-from uwblink.recording.schema import Poses, Tag
 
 ANCHORS = np.array([[3, 3, 0.3], [-3, 3, 2.2], [-3, -3, 0.4], [3, -3, 2.4], [0, 3.5, 1.2], [3.5, 0, 1.4]])
 ARMS = {10: (0.15, -0.15, -0.05), 11: (-0.15, 0.15, -0.05)}
@@ -116,8 +113,7 @@ def test_imu_height_and_ranges_find_place_and_heading():
     (track,) = localize_onboard(flight(reflected=0.1), calibration(0.1), OnboardSettings(noise=IMU))
     assert track.used == "ranges, imu, height"
     assert len(track.nis) > 980, "all 1000 ranges but those of the start, by whichever end they were initiated"
-    wrong = errors_of(track, 3.0)
-    assert np.sqrt(np.mean(wrong**2)) < 0.08
+    assert np.sqrt(np.mean(errors_of(track, 3.0) ** 2)) < 0.08
     assert track.rmse_m == pytest.approx(np.sqrt(np.mean(errors_of(track) ** 2)))
     t = (track.time_ns - 10**12) * 1e-9
     off = (attitude(t).inv() * Rotation.from_quat(track.attitude)).magnitude()
@@ -147,8 +143,7 @@ def test_a_wrong_start_is_left_within_two_seconds(model, away):
     start = tuple((place(np.array(0.0)) + away).tolist())
     settings = OnboardSettings(model=model, noise=IMU if model == "imu" else ProcessNoise(), start_m=start)
     (track,) = localize_onboard(flight(4.0, reflected=0.1), calibration(0.1), settings)
-    first = np.linalg.norm(track.estimate_m[0] - track.truth_m[0])
-    assert first > 4
+    assert np.linalg.norm(track.estimate_m[0] - track.truth_m[0]) > 4
     assert track.restarts_s
     assert errors_of(track, 2.0).max() < (0.5 if model == "imu" else 0.7)
 
@@ -216,8 +211,7 @@ def test_a_real_flight_by_imu_height_and_ranges_alone(tmp_path):
     with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
         archive.extractall(tmp_path, filter="data")
     contents = read_source(tmp_path / "cirObstacles_3_random_0", importer="miluv")
-    known = read_miluv(shared("miluv_published_calibration.json"))
-    tracks = localize_onboard(contents, known)
+    tracks = localize_onboard(contents, read_miluv(shared("miluv_published_calibration.json")))
     rmse = {track.body: track.rmse_m for track in tracks}
     assert sorted(rmse) == ["ifo001", "ifo002", "ifo003"]
     # Measured: 0.78, 0.94 and 1.94 m.

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+import calib
 from calib.data.ranges import Ranges, concatenate
 from calib.evaluation.statistics import evaluate, split_error
 from calib.fitting.fitting import fit
+from tests import processes
 from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
+from uwblink import Contents
 from uwblink.ticks import SPEED_OF_LIGHT
 
 
@@ -33,8 +36,7 @@ def test_errors_are_split_into_within_and_between_pairs_and_sessions(pairs_m, se
         )  # fmt: skip
     joined = concatenate(parts)
     found = split_error(joined, joined.raw_m - joined.truth_m)
-    assert found.sessions == 4
-    assert found.within_m == pytest.approx(0.04, rel=0.15)
+    assert (found.sessions, found.within_m) == (4, pytest.approx(0.04, rel=0.15))
     assert found.between_pairs_m == pytest.approx(pairs_m, abs=0.015)
     assert found.between_sessions_m == pytest.approx(sessions_m, abs=0.008)
 
@@ -83,3 +85,65 @@ def test_an_evaluation_prints_on_a_screen():
     assert cells[:2] == ["all", "2000"]
     assert cells[8:11] == [f"{100 * value:.1f}" for value in (full.mean_m, full.median_m, full.robust_std_m)]
     assert found._repr_html_().count("<tr>") == 3 + 6
+
+
+# A fit judged on a part of its own ranges, which a second fit has not seen.
+
+
+def test_a_part_that_is_held_out_judges_a_fit_to_the_others():
+    flight = calib.load_ranges(calib.sample_flight(3000))
+    plain = calib.fit(flight).calibration
+    found = calib.fit(flight, hold_out=0.3).calibration
+    assert found.delays_ns == plain.delays_ns, "what is returned is fitted to all"
+    told = found.provenance["held_out"]
+    assert 0.25 * len(flight) < told["ranges"] < 0.35 * len(flight)
+    assert abs(told["median_m"]) < 0.01 < abs(told["raw_median_m"])
+    assert told["robust_std_m"] == pytest.approx(0.03, rel=0.1)
+    assert told["inside_95"] > 0.9
+    assert "held_out" not in plain.provenance
+
+
+def test_what_is_held_out_was_not_fitted():
+    """A constant of 20 cm in the last tenth of the time is seen whole by a fit that did not have it."""
+    flight = calib.load_ranges(calib.sample_flight(3000))
+    late = flight.time_ns > np.quantile(flight.time_ns, 0.9)
+    moved = calib.Ranges.from_arrays(
+        flight.raw_m + 0.2 * late, initiator=flight.initiator, target=flight.target, fpp1_dbm=flight.fpp1_dbm,
+        fpp2_dbm=flight.fpp2_dbm, truth_m=flight.truth_m, time_ns=flight.time_ns,
+    )  # fmt: skip
+    told = calib.fit(moved, hold_out=0.1).calibration.provenance["held_out"]
+    assert told["median_m"] == pytest.approx(0.2, abs=0.02)
+
+
+@pytest.mark.parametrize("changes", [{"hold_out": 1.0}, {"hold_out": float("nan")}, {"hold_out": 0.3, "fold": "week"}])
+def test_settings_that_hold_nothing_out(changes):
+    with pytest.raises(calib.BadInputError):
+        calib.fit(calib.sample_flight(), **changes)
+
+
+def test_one_session_cannot_be_held_out():
+    with pytest.raises(calib.UnanswerableError, match="session"):
+        calib.fit(calib.sample_flight(), hold_out=0.3, fold="session")
+
+
+# Whoever judges a calibration on what it was fitted to is told so.
+
+
+def saved(path, flight):
+    Contents(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags).save(path)
+
+
+def test_the_recording_is_known_by_what_it_holds_and_not_by_its_name(tmp_path):
+    train, test = calib.sample_flight(), calib.sample_flight(seed=2)
+    for folder, flight in (("a", train), ("b", test), ("c", train)):
+        (tmp_path / folder).mkdir()
+        saved(tmp_path / folder / "flight.uwb", flight)
+    found = calib.fit(tmp_path / "a" / "flight.uwb")
+    assert calib.evaluate(tmp_path / "c" / "flight.uwb", found.calibration).seen == ("flight.uwb",)
+    assert calib.evaluate(tmp_path / "b" / "flight.uwb", found.calibration).seen == ()
+    assert calib.evaluate([train, test], found.calibration).seen == ("memory",)
+
+    found.save(tmp_path / "c.json")
+    for folder, warned in (("c", "warning: the calibration was fitted to flight.uwb: "), ("b", "")):
+        done = processes.run("calib", "evaluate", tmp_path / folder / "flight.uwb", "-c", tmp_path / "c.json")
+        assert (done.returncode, done.stderr[: len(warned) or None]) == (0, warned)

@@ -101,8 +101,7 @@ class Corrected:
         shape = (len(self.pair),)
         self.mean_error, self.total, self.tail_share = np.zeros(shape), np.zeros(shape), np.zeros(shape)
         self.low95, self.high95 = np.zeros(shape), np.zeros(shape)
-        levels = np.array([[0.0, 0.0], *model["levels"], [1.0, 1.0]]).T
-        own = np.interp([0.025, 0.975], *levels)
+        own = np.interp([0.025, 0.975], *np.array([[0.0, 0.0], *model["levels"], [1.0, 1.0]]).T)
         odds = np.log(np.array(model["tail_share"]) / (1 - np.array(model["tail_share"])))
         for name in np.unique(self.pair):
             rows = self.pair == name

@@ -19,13 +19,11 @@ from calib.report import Heading, Picture, Table, Text, check_places
 from calib.report.figures import arrangement
 from calib.report.sections import SECTIONS
 from tests import pages, processes
-from uwblink.errors import UwblinkError
+from uwblink import Contents, Recording, UwblinkError
 from uwblink.pages import figures
 from uwblink.pages.blocks import Document, write_document
 from uwblink.pages.figures import picture, sheet
 from uwblink.pages.pdf import to_pdf
-from uwblink.recording.contents import Contents
-from uwblink.recording.file import Recording
 
 FORMS = {f"{width}.{kind}" for width in ("column", "page") for kind in ("pdf", "svg")}
 
@@ -66,8 +64,7 @@ def test_a_campaign_is_what_the_command_makes(folder, tmp_path, monkeypatch, sec
     told: list[str] = []
     campaign = calib.run_campaign(folder / "a.uwb", folder / "b.uwb", loss="huber", progress=told.append)
     assert opened == ["a.uwb", "b.uwb"], "each is opened once, and looked at whole whenever it is opened"
-    assert told == ["loading", "fitting", "examining", "localizing"]
-    assert len(campaign.tracks) == 3
+    assert (told, len(campaign.tracks)) == (["loading", "fitting", "examining", "localizing"], 3)
     assert repr(campaign).splitlines()[-1] == "judged on b.uwb"
     campaign = replace(campaign, origin=replace(campaign.origin, files={}))
     campaign.write(tmp_path / "python.html")
@@ -87,8 +84,7 @@ def campaign(folder):
 
 
 def test_ranges_alone_are_fitted_and_judged(campaign, tmp_path):
-    assert campaign.findings == []
-    assert campaign.tracks == []
+    assert (campaign.findings, campaign.tracks) == ([], [])
     assert (len(campaign.training[0]), campaign.evaluation.overall.full.n) == (900, 270)
     (tmp_path / "mine.html").write_text("mine")
     with pytest.raises(FileExistsError):
@@ -213,8 +209,7 @@ def test_a_plan_has_a_picture_of_each_arrangement_with_tapes_and_intervals(tmp_p
     assert {"Step 2: arrangement B", "before it"} <= set(drawn[1])
     assert "Step 2: arrangement B" in page
     assert "calib survey A.uwb B.uwb --known known.toml" in page
-    done = run(tmp_path, *words, "-o", "plan.html", status=2)
-    assert "plan.html" in done.stderr
+    assert "plan.html" in run(tmp_path, *words, "-o", "plan.html", status=2).stderr
     assert (tmp_path / "plan.html").read_text() == page
     in_space = words_of(
         picture(partial(arrangement, plan=calib.plan(5, on="space", arrangements=1), number=0), "svg").decode()

@@ -2,9 +2,10 @@
 
 import pytest
 
-from uwblink.boards.board import Board
-from uwblink.errors import NoAnswerError
+from uwblink.boards.board import ANSWER_S, FENCE, PATIENT_S, Board, Connection
+from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
 from uwblink.wire import messages as m
+from uwblink.wire.codec import encode
 
 
 class Deaf:
@@ -38,8 +39,7 @@ ANSWERS = {b"C00\r": b"R00\r\n", b"C01\r": b"R01|7\r\n", b"C06|\x01\x00x\r": b"R
 
 
 def test_a_board_that_is_deaf_for_300_ms_is_asked_once_more():
-    board = Board(Deaf(0.3, ANSWERS))
-    assert board.id == 7
+    assert Board(Deaf(0.3, ANSWERS)).id == 7
 
 
 def test_a_broadcast_is_not_sent_twice():
@@ -72,3 +72,162 @@ def test_the_answer_to_the_second_asking_may_fail_too():
     board = Board(Once(0.0, ANSWERS))
     with pytest.raises(NoAnswerError, match="b'C01"):
         board.request(m.GetId())
+
+
+# The driver's side of a conversation, without ports: outcomes, late replies, fences, times, what may be sent.
+
+
+REPORT = (
+    b"R05|2|3.0550|2334148660|1211574983|1233803316|2356378373|1332123700|2454699099"
+    b"|-87.4977|-87.5239|-3.4971|3.5222\r\n"
+)
+OTHER = REPORT.replace(b"R05|2|", b"R05|3|")
+
+
+def asked(command=None):
+    connection = Connection("port")
+    assert connection.send(command or m.RangeCommand(2), 0.0) == encode(command or m.RangeCommand(2))
+    return connection
+
+
+@pytest.mark.parametrize("size", [1, 7, 1000])
+def test_a_reply_in_any_pieces_ends_the_command(size):
+    connection, outcome = asked(), None
+    for k in range(0, len(REPORT), size):
+        assert outcome is None
+        _, outcome = connection.receive(REPORT[k : k + size], 0.003)
+    assert outcome.reply.neighbour == 2
+    assert not connection.busy
+
+
+def test_only_one_command_is_outstanding():
+    with pytest.raises(RefusedError, match="still waiting"):
+        asked().send(m.GetId(), 0.001)
+
+
+def test_lines_of_bystanders_and_other_reports_do_not_end_it():
+    connection = asked()
+    noise = b"WARNING 0xC: TWR message is firing an interrupt when it shouldn't be.\r\nR01|7\r\nS06|\x02\x00hi\r\n"
+    events, outcome = connection.receive(noise, 0.001)
+    assert len(events) == 3
+    assert outcome is None
+    assert connection.receive(REPORT, 0.003)[1].reply is not None
+
+
+def test_a_line_of_failure_does_not_end_a_command_that_cannot_fail():
+    connection = asked(m.GetId())
+    assert connection.receive(b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n", 0.001)[1] is None
+    # The first of two replies is the outcome.
+    assert connection.receive(b"R01|4\r\nR01|5\r\n", 0.002)[1].reply == m.IdReport(4)
+
+
+def test_time_runs_out_once_and_leaves_a_doubt_that_a_fence_settles():
+    connection = asked()
+    connection.receive(b"junk", 0.01)
+    assert connection.receive(b"", 0.1499)[1] is None
+    outcome = connection.receive(b"", 0.15)[1]
+    assert isinstance(outcome.error, NoAnswerError)
+    assert "b'C05|2|0|1|0\\r'" in str(outcome.error)
+    assert "'junk'" in str(outcome.error)
+    assert connection.doubtful
+    connection.send(FENCE, 0.2)
+    # The late reply comes before the fence's and is nobody's.
+    events, outcome = connection.receive(b"\r\n" + REPORT + b"R00\r\n", 0.21)
+    assert outcome.reply == m.IdleSet()
+    assert any(isinstance(e, m.RangeReport) for e in events)
+    assert not connection.doubtful
+
+
+CIR = encode(m.Cir(1, 2, 747_015, tuple(range(1016))))
+
+
+def test_a_command_is_waited_for_150_ms_and_a_fence_in_doubt_a_second():
+    connection = Connection("port")
+    assert (connection.busy, connection.deadline_s()) == (False, None)
+    connection.send(FENCE, 5.0)
+    assert (connection.busy, connection.deadline_s()) == (True, 5.0 + ANSWER_S)
+    assert connection.receive(b"", 5.0 + ANSWER_S - 1e-9)[1] is None
+    assert connection.receive(b"", 5.0 + ANSWER_S)[1].reply is None
+    assert connection.doubtful
+    assert connection.receive(b"", 9.0)[1] is None
+    connection.send(FENCE, 10.0)
+    assert connection.deadline_s() == 10.0 + PATIENT_S
+    silent = connection.receive(b"", 11.0)[1]
+    assert "within 1000 ms; heard nothing; " in str(silent.error)
+    assert str(silent.error).endswith("must be unplugged")
+    connection.send(m.GetId(), 12.0)
+    assert connection.deadline_s() == 12.0 + ANSWER_S
+    assert "must be unplugged" not in str(connection.receive(b"", 13.0)[1].error)
+
+
+def test_a_patient_connection_stays_patient():
+    connection = Connection("port", answer_s=2.0)
+    connection.send(FENCE, 0.0)
+    assert connection.deadline_s() == 2.0
+    connection.receive(b"", 2.0)
+    connection.send(FENCE, 3.0)
+    assert connection.deadline_s() == 5.0
+    connection.receive(b"R00\r\n", 3.1)
+    assert not connection.doubtful
+
+
+def test_the_last_60_bytes_are_quoted():
+    connection = asked()
+    connection.receive(b"\xff" + b"a" * 40, 0.01)
+    connection.receive(b"b" * 21, 0.02)
+    error = connection.receive(b"", 1.0)[1].error
+    assert isinstance(error, NoAnswerError)
+    assert str(error).endswith("heard '" + "a" * 39 + "b" * 21 + "'")
+
+
+def test_only_an_impulse_response_that_was_asked_for_keeps_the_board_quiet():
+    connection = asked(m.RangeCommand(2))
+    connection.receive(REPORT, 1.0)
+    assert connection.ready_s(1.0) == 0.0
+    with_cir = asked(m.RangeCommand(2, get_cir=True))
+    with_cir.receive(REPORT, 1.0)
+    assert (with_cir.ready_s(1.0), with_cir.ready_s(1.02)) == (pytest.approx(0.030), pytest.approx(0.010))
+    # Once it is there, the report of a target may follow within 3 ms.
+    with_cir.receive(CIR, 1.028)
+    assert (with_cir.ready_s(1.03), with_cir.ready_s(1.04)) == (pytest.approx(0.003), 0.0)
+
+
+def test_an_impulse_response_of_others_is_waited_out_piece_by_piece():
+    connection = Connection("port")
+    connection.receive(CIR[:400], 2.0)
+    assert (connection.ready_s(2.0), connection.ready_s(2.004)) == (pytest.approx(0.005), pytest.approx(0.001))
+    connection.receive(b"", 2.004)
+    assert connection.ready_s(2.004) == pytest.approx(0.001), "nothing came"
+    connection.receive(CIR[400:800], 2.004)
+    assert connection.ready_s(2.004) == pytest.approx(0.005)
+    connection.keep_quiet(2.5)
+    connection.keep_quiet(2.4)  # which does not cut it short
+    assert connection.ready_s(2.4) == pytest.approx(0.1)
+    connection.receive(CIR[800:], 2.41)
+    assert connection.ready_s(2.5) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("command", "what"),
+    [(m.RangeCommand(2), "ranging with 2"), (m.Broadcast(b"x"), "the broadcast")],
+)
+def test_what_failed_is_named_and_each_line_quoted_once(command, what):
+    connection = asked(command)
+    warned = b"WARNING 0xC: TWR message is firing an interrupt when it shouldn't be.\r\n"
+    assert connection.receive(warned + warned, 0.01)[1] is None
+    outcome = connection.receive(b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n", 0.02)[1]
+    assert isinstance(outcome.error, RangingFailedError)
+    assert str(outcome.error).startswith(f"port: {what} failed; the board says: WARNING")
+    assert (str(outcome.error).count("WARNING"), (outcome.reply, connection.busy)) == (1, (None, False))
+    assert not connection.doubtful
+
+
+def test_a_report_answers_only_who_asked_for_that_target_and_that_protocol():
+    single = REPORT.replace(b"|1332123700|2454699099|", b"|0|0|")
+    connection = asked(m.RangeCommand(2, double_sided=False))
+    assert connection.receive(OTHER.replace(b"|1332123700|2454699099|", b"|0|0|"), 0.01)[1] is None
+    assert connection.receive(single, 0.02)[1].reply.tx3 == 0
+    both = asked(m.RangeCommand(2))
+    assert both.receive(single, 0.01)[1] is None
+    assert both.receive(REPORT, 0.02)[1].reply.tx3 != 0
+    assert asked(m.GetId()).receive(REPORT, 0.01)[1] is None

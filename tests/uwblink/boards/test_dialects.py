@@ -87,8 +87,7 @@ def test_what_a_board_prints_is_recorded(tmp_path, name):
     names = {tag.tag: tag.body for tag in found.tags}
     ends = found.exchanges.target
     called = {names[k] if isinstance(devices[0], str) else k for k in ends.tolist()}
-    assert called == set(devices)
-    assert set(found.exchanges.range_m.round(9).tolist()) == {1.0, 2.0}
+    assert (called, set(found.exchanges.range_m.round(9).tolist())) == (set(devices), {1.0, 2.0})
     # The import of the same lines as a log, which another program reads (DuckDB), says the same.
     (tmp_path / "board.log").write_text(text * 3)
     constant = "" if "from_id" in LINES[name]["line"] else "[constants]\nfrom_id = 40\n"
@@ -147,8 +146,7 @@ def test_a_map_means_for_boards_what_it_means_for_their_log(tmp_path):
     for name in ("log.uwb", "r.uwb"):
         x = uwblink.load(tmp_path / name).exchanges
         told.append({*zip(x.initiator.tolist(), x.target.tolist(), x.range_m.round(6).tolist(), strict=True)})
-    assert told[0] == {(9, 40, 1.5), (9, 41, 2.5)}
-    assert told[1] == told[0]
+    assert (told[0], told[1]) == ({(9, 40, 1.5), (9, 41, 2.5)}, told[0])
     assert set(uwblink.load(tmp_path / "r.uwb").exchanges.fpp2_dbm.tolist()) == {-80.5, -81.5}
     (tmp_path / "by_register.toml").write_text(
         'line = "{to_id} {range_m} {a} {b} {c} {n}"\nchip = "dw1000"\n[columns]\n'
@@ -184,8 +182,7 @@ def test_a_board_that_is_unplugged_keeps_what_was_recorded(tmp_path):
 
     threading.Timer(0.5, print_and_go).start()
     words = ("--dialect", "arduino", "--duration", "20", "-o", "r.uwb")
-    ended = refuse("uwblink", "record", terminal.name, *words, cwd=tmp_path)
-    assert "gone" in ended
+    assert "gone" in refuse("uwblink", "record", terminal.name, *words, cwd=tmp_path)
     found = uwblink.load(tmp_path / "r.uwb")
     assert found.exchanges.range_m.tolist() == [1.5]
     assert {tag.tag: tag.body for tag in found.tags} == {1: "tag1", 5: "tag5"}

@@ -1,12 +1,23 @@
 """Listeners of a recorder, in virtual time: they hear what the file gets."""
 
+import gc
+import sys
+import threading
+import time
+from pathlib import Path
+
 import pytest
 
 import uwblink
+from benchmarks.hours import RATE_HZ, AnsweringPorts
 from tests.boards import bench_scenario
-from uwblink.boards.record import identify
+from uwblink import Listener, RangingPlan
+from uwblink.boards import record as writing
+from uwblink.boards.record import RecordingWriter, append_rows, identify, record
 from uwblink.boards.recorder import Recorder
+from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
+from uwblink.recording.schema import FrameRow
 from uwblink.wire.messages import RangeReport
 from uwbsim.boards.virtual_board import VirtualPorts
 
@@ -123,3 +134,164 @@ def test_one_damaged_line_is_one_fault(tmp_path):
     done = uwblink.record(ports.names.values(), tmp_path / "f.uwb", plan, duration_s=4.0, using=ports)
     assert done.exchanges == done.tried == 20
     assert done.faults == {"garbage": 20}
+
+
+# The writer of a live recording: what cannot be written is known at the start, or within a second.
+
+
+@pytest.fixture
+def live(tmp_path):
+    with Recording.create(tmp_path / "live.uwb", live=True) as recording:
+        yield recording
+
+
+def size(path):
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return 0
+
+
+def until(true):
+    """Wait for something that another thread does."""
+    end_s = time.monotonic() + 60.0
+    while not true():
+        assert time.monotonic() < end_s
+        time.sleep(0.005)
+
+
+def test_rows_are_committed_while_a_long_log_is_put_into_the_file(live, monkeypatch):
+    """DuckDB does that within a commit where nobody did it before, and what comes meanwhile is not in the file."""
+    begun, over = threading.Event(), threading.Event()
+    monkeypatch.setattr(writing, "LONG_LOG", 20_000)
+
+    def shorten_log(_):
+        begun.set()
+        over.wait(60)
+
+    monkeypatch.setattr(Recording, "shorten_log", shorten_log)
+    log, written = Path(f"{live.path}.wal"), []
+    with RecordingWriter(live) as writer:
+        writer.on_bytes(1, "port", "in", bytes(30_000))
+        assert begun.wait(60)
+        for k in range(3):
+            before = size(log)
+            writer.on_bytes(2 + k, "port", "in", bytes(100))
+            until(lambda least=before: size(log) > least)
+            written.append(k)
+        over.set()
+    assert written == [0, 1, 2]
+
+
+def test_a_log_stays_short_and_everything_is_in_the_file(live, monkeypatch):
+    monkeypatch.setattr(writing, "LONG_LOG", 20_000)
+    log, before = Path(f"{live.path}.wal"), live.path.stat().st_size
+    with RecordingWriter(live) as writer:
+        writer.on_bytes(1, "port", "in", bytes(range(256)) * 100)
+        until(lambda: size(live.path) > before and size(log) < 20_000)
+        writer.on_bytes(2, "port", "in", b"later")
+    assert [frame.data for frame in live.frames()] == [bytes(range(256)) * 100, b"later"]
+
+
+@pytest.mark.parametrize("error", [MemoryError("no more"), RuntimeError("a bug"), RecordingError("disk full")])
+def test_whatever_ends_the_writing_is_told_within_a_second(live, monkeypatch, error):
+    writer = RecordingWriter(live)
+
+    def failing(_recording, _table, _rows):
+        raise error
+
+    monkeypatch.setattr(Recording, "append", failing)
+    writer.on_bytes(5, "port", "in", b"x")
+    begun = time.monotonic()
+    with pytest.raises(RecordingError, match=str(error)):
+        while time.monotonic() < begun + 10.0:  # ten for a busy machine; it takes one period of the writer
+            writer.check()
+            time.sleep(0.01)
+    with pytest.raises(RecordingError, match=str(error)):
+        writer.close()
+
+
+# A recorder that runs for hours holds no more than one that runs for seconds, and each commit does the same work.
+
+
+WARM, LATER, LONG = 1_100, 2_300, 2_400
+EVERY = 100
+
+
+class Committing(Listener):
+    """Commits after every so many exchanges, in the loop itself, and notes what each commit asked of the database."""
+
+    def __init__(self, recording, every=EVERY):
+        self.recording, self.every, self.batch, self.exchanges = recording, every, [], 0
+        self.asked, self.rows = [], []
+
+    def on_bytes(self, time_ns, port, direction, data):
+        self.batch.append(FrameRow(time_ns, port, direction, data))
+
+    def on_message(self, heard):
+        self.batch.append(heard)
+
+    def on_turn(self, turn):
+        self.exchanges += 1
+        if self.exchanges % self.every == 0:
+            self.commit()
+
+    def commit(self):
+        before = len(STATEMENTS)
+        self.rows.append(len(self.batch))
+        with self.recording.transaction():
+            append_rows(self.recording, self.batch)
+        self.asked.append(STATEMENTS[before:])
+        self.batch = []
+
+
+STATEMENTS: list[str] = []
+
+
+@pytest.fixture
+def statements(monkeypatch):
+    from uwblink.recording.store import Store
+
+    execute = Store._execute
+
+    def noted(store, statement, values=None):
+        STATEMENTS.append(statement)
+        execute(store, statement, values)
+
+    monkeypatch.setattr(Store, "_execute", noted)
+    yield STATEMENTS
+    STATEMENTS.clear()
+
+
+def test_nothing_grows_with_the_recording(tmp_path, statements):
+    ports, held = AnsweringPorts(), {}
+    with Recording.create(tmp_path / "long.uwb", live=True) as recording:
+        committing = Committing(recording)
+        found = identify(ports.names, ports)
+        plan = RangingPlan(ports.pairs[:1], rate_hz=RATE_HZ)
+        recorder = Recorder(found, plan, plan.turns(sorted(found)), [committing], ports=ports)
+        for _ in recorder.steps(stop=lambda: committing.exchanges >= LONG):
+            if committing.exchanges in (WARM, LATER) and committing.exchanges not in held:
+                statements.clear()
+                committing.asked, committing.rows = committing.asked[-5:], committing.rows[-5:]
+                gc.collect()
+                held[committing.exchanges] = len(gc.get_objects()), sys.getallocatedblocks()
+        recorder.finish()
+        assert recorder.progress.exchanges >= LONG
+        assert recording.count("exchanges") == LONG
+    (objects, blocks), (objects_later, blocks_later) = held.values()
+    # Each exchange that stayed would be some objects and blocks of memory more, and there were 1,200 in between; of a
+    # pair the last 1,000 are kept.
+    assert objects_later - objects < 200
+    assert blocks_later - blocks < 1_000
+    assert (len(set(committing.rows)), len({tuple(asked) for asked in committing.asked})) == (1, 1)
+
+
+def test_the_time_of_a_recording_is_that_of_its_boards(tmp_path):
+    ports = AnsweringPorts()
+    plan = RangingPlan(ports.pairs, rate_hz=RATE_HZ)
+    done = record(ports.names, tmp_path / "r.uwb", plan, duration_s=3.0, using=ports)
+    with Recording.open(tmp_path / "r.uwb") as recording:
+        x = recording.exchanges()
+    assert len(x) == done.exchanges == pytest.approx(3.0 * RATE_HZ, abs=2)
+    assert not done.faults

@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 from tests.boards import bench_scenario, served
+from uwblink import RangingPlan, Recording, record
 from uwblink.boards import decode_again
 from uwblink.boards.listeners import Listener, Progress
-from uwblink.boards.ranging_plan import RangingPlan
-from uwblink.boards.record import record
 from uwblink.errors import PlanError, PortMissingError, RecordingError, RecordingExistsError
-from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, FrameRow, Tag
 from uwblink.wire.messages import IdReport, Skipped
 from uwbsim.boards.virtual_board import VirtualPorts
@@ -82,11 +80,9 @@ def test_what_the_boards_said_is_in_the_file_and_decodes_to_the_same(tmp_path):
     exchanges, faults, frames, meta = stored(path)
     assert len(exchanges) == done.exchanges == done.tried
     assert 145 <= len(exchanges) <= 151
-    assert faults == []
-    assert meta["ports"] == {str(k): ports.names[k] for k in ports.names}
+    assert (faults, meta["ports"]) == ([], {str(k): ports.names[k] for k in ports.names})
     ends = set(zip(exchanges.initiator.tolist(), exchanges.target.tolist(), strict=True))
-    assert ends == {(1, 2), (1, 3), (2, 3)}
-    assert sum(frame.direction == "out" for frame in frames) == done.tried
+    assert (ends, sum(frame.direction == "out" for frame in frames)) == ({(1, 2), (1, 3), (2, 3)}, done.tried)
     with Recording.open(path) as recording:
         again = decode_again(recording)
     assert again.skipped_bytes == 0
@@ -108,8 +104,7 @@ def test_overheard_exchanges_impulse_responses_and_target_reports(tmp_path):
         assert 19 <= done.tried <= 20
         assert recording.count("cirs") == done.cirs == 3 * done.tried
         reporters = set(recording.exchanges().reporter.tolist())
-    assert reporters == {1, 2}
-    assert done.faults == {}
+    assert (reporters, done.faults) == ({1, 2}, {})
 
 
 class Unplugging(Listener):
@@ -144,13 +139,11 @@ def test_an_unplugged_board_leaves_the_others_running_and_resumes(tmp_path):
         )
     exchanges, faults, _, _ = stored(path)
     kinds = [fault.kind for fault in faults]
-    assert kinds.count("unplugged") == 1
-    assert kinds.count("replugged") == 1
+    assert (kinds.count("unplugged"), kinds.count("replugged")) == (1, 1)
     out, back = (next(f.time_ns for f in faults if f.kind == k) for k in ("unplugged", "replugged"))
     others = exchanges.time_ns[(exchanges.initiator == 1) & (exchanges.target == 2)]
     assert np.count_nonzero((others > out) & (others < back)) >= 15
-    with_3 = exchanges.time_ns[(exchanges.initiator == 3) | (exchanges.target == 3)]
-    assert np.any(with_3 > back)
+    assert np.any(exchanges.time_ns[(exchanges.initiator == 3) | (exchanges.target == 3)] > back)
     with Recording.open(path) as recording:
         heard = recording.columns("overheard")
         heard = heard["time_ns"][heard["listener"] == 3]
@@ -317,5 +310,4 @@ def test_damage_other_messages_and_the_bytes_of_an_unfinished_one_are_decoded_ag
     assert [(one.board, one.message) for one in again.others if not isinstance(one.message, Skipped)] == [
         (7, IdReport(7))
     ]
-    assert again.messages == 3
-    assert again.skipped_bytes == len(b"\xff" + b"\xff\r\n" + b"R05|2|3.0")
+    assert (again.messages, again.skipped_bytes) == (3, len(b"\xff" + b"\xff\r\n" + b"R05|2|3.0"))

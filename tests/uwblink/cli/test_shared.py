@@ -1,8 +1,12 @@
 """What the three commands share: errors as one line, statuses, warnings of plug-ins, flags for parameters."""
 
+import io
+import os
 import re
+import signal
 import subprocess
 import sys
+import time
 import warnings
 from pathlib import Path
 
@@ -12,6 +16,7 @@ import typer
 
 from uwblink.cli import shared
 from uwblink.cli.commands import app
+from uwblink.cli.shared import waiting
 from uwblink.errors import PluginWarning, RecordingError
 
 ROOT = Path(__file__).parents[3]
@@ -47,8 +52,7 @@ def test_an_error_is_one_line_and_a_status(error, code, line, capsys):
 
     with pytest.raises(SystemExit) as end:
         shared.run(app, MineError, statuses={WorseError: 1}, arguments=["fail"])
-    assert end.value.code == code
-    assert capsys.readouterr().err == line
+    assert (end.value.code, capsys.readouterr().err) == (code, line)
 
 
 def test_numbers_beyond_numbers_are_an_error_and_not_a_result(capsys):
@@ -90,8 +94,7 @@ def test_only_warnings_of_plug_ins_become_lines(capsys):
 
     with pytest.warns(UserWarning, match="other") as caught, pytest.raises(SystemExit):
         shared.run(app, arguments=["warn"])
-    assert [str(w.message) for w in caught] == ["other"]
-    assert capsys.readouterr().err == "warning: left out\n"
+    assert ([str(w.message) for w in caught], capsys.readouterr().err) == (["other"], "warning: left out\n")
 
 
 @pytest.mark.parametrize("package", ["uwblink", "uwbsim", "calib"])
@@ -120,3 +123,132 @@ def test_the_library_speaks_of_parameters_and_each_has_its_flag():
         "line",
     }  # columns of tables and keys of maps, of which the descriptions of map keys speak
     assert {shared.with_flags(f"`{name}`") for name in named} <= options
+
+
+# What a command does before anything is imported for it.
+
+
+THREADS = """
+from uwblink.cli import start
+
+def command():
+    import numpy
+    from threadpoolctl import threadpool_info
+    print(*(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"))
+
+start(command)
+"""
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="on one core linear algebra has one thread anyway")
+@pytest.mark.parametrize(("asked", "threads"), [(None, "1"), ("2", "2")])
+def test_linear_algebra_takes_one_thread_unless_asked_for_more(asked, threads):
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    if asked:
+        environment |= {"OPENBLAS_NUM_THREADS": asked, "MKL_NUM_THREADS": asked}
+    done = subprocess.run([sys.executable, "-c", THREADS], capture_output=True, text=True, env=environment, check=True)
+    assert set(done.stdout.split()) == {threads}
+
+
+INTERRUPTED_AT_THE_END = """
+import atexit, os, signal
+from uwblink.cli import start
+
+def command():
+    # Registered first, so called last: when the command has ended and its files are written.
+    atexit.register(os.kill, os.getpid(), signal.SIGINT)
+
+start(command)
+"""
+
+
+def test_a_command_that_is_done_keeps_its_status_when_it_is_interrupted():
+    done = subprocess.run([sys.executable, "-c", INTERRUPTED_AT_THE_END], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+STUCK = """
+import os, signal, sys, time
+import typer
+from uwblink.cli.shared import run
+
+app = typer.Typer()
+
+@app.command()
+def wait():
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(10)
+    finally:  # cleaning up, which the second signal leaves alone and the third one ends
+        os.kill(os.getpid(), signal.SIGINT)
+        print("cleaned", flush=True)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(10)
+
+run(app, arguments=[])
+"""
+
+
+def test_a_third_interrupt_ends_a_command_that_hangs():
+    done = subprocess.run([sys.executable, "-c", STUCK], capture_output=True, text=True, timeout=9)
+    assert (done.returncode, done.stdout) == (-signal.SIGINT, "cleaned\n")
+
+
+IMPORTED = """
+import os, signal, weakref
+
+class Lock:
+    pass
+
+# As the import system has it: an exception in a weak reference's callback is printed and dropped.
+lock = Lock()
+reference = weakref.ref(lock, lambda _: os.kill(os.getpid(), signal.SIGINT))
+del lock
+"""
+
+
+def test_an_interrupt_during_an_import_is_not_dropped(tmp_path):
+    (tmp_path / "imported.py").write_text(IMPORTED)
+    command = (
+        STUCK.split("app =")[0]
+        + """
+app = typer.Typer()
+
+@app.command()
+def work():
+    import imported
+    time.sleep(10)
+    print("went on")
+
+run(app, arguments=[])
+"""
+    )
+    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, timeout=9, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
+# The line that a command shows while it works.
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_on_a_terminal_it_shows_text_and_share_and_goes(monkeypatch):
+    screen = Terminal()
+    monkeypatch.setattr(sys, "stderr", screen)
+    with waiting("fitting [1]") as update:
+        update("drawing")
+        update(0.25)
+        begun = time.monotonic()
+        while not all(shown in screen.getvalue() for shown in ("fitting [1]", "drawing", "25%")):
+            assert time.monotonic() - begun < 20
+            time.sleep(0.01)
+    assert screen.getvalue().endswith("\x1b[2K")
+
+
+def test_elsewhere_it_shows_nothing(capsys):
+    with waiting("fitting") as update:
+        update(0.5)
+    assert capsys.readouterr() == ("", "")

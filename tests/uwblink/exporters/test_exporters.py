@@ -1,23 +1,23 @@
 """What leaves the project: every column of every table comes back, and other readers read it."""
 
+import json
+from typing import Any
+
 import duckdb
 import numpy as np
+import pandas as pd
 import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
 
+import calib
 from tests.uwblink.recording.test_copy import full, rows  # noqa: F401 - full is a fixture
-from uwblink.errors import (
-    ArgumentError,
-    ImportTableError,
-    RecordingError,
-    RecordingExistsError,
-    RecordingMissingError,
-)
+from uwblink import Contents, Exchanges, Recording, import_recording, load
+from uwblink.errors import ArgumentError, ImportTableError, RecordingError, RecordingExistsError, RecordingMissingError
 from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
-from uwblink.importers import import_recording
-from uwblink.recording.contents import Contents
-from uwblink.recording.file import Recording
+from uwblink.importers.poses import read_poses
 from uwblink.recording.schema import TABLES, Fault, Poses, Tag
-from uwblink.twr import Exchanges
 
 
 @pytest.fixture
@@ -148,8 +148,7 @@ def test_true_distances_are_those_of_the_poses_where_none_was_measured(flown, tm
         rows = db.execute(
             f"SELECT truth_m, truth_from FROM read_{to}(?)", [str(tmp_path / "out" / f"exchanges.{to}")]
         ).fetchall()
-    assert [row[0] for row in rows[:2]] == pytest.approx(BY_HAND, abs=1e-9)
-    assert rows[2] == (None, None)
+    assert ([row[0] for row in rows[:2]], rows[2]) == (pytest.approx(BY_HAND, abs=1e-9), (None, None))
     assert [row[1] for row in rows] == ["poses", "measured", None]
     import_recording(tmp_path / "out", tmp_path / "back.uwb", importer="exported")
     assert in_order(tmp_path / "back.uwb") == in_order(flown), "what the poses say is not taken for measured"
@@ -160,3 +159,219 @@ def test_messages_have_true_distances_by_the_poses(flown, tmp_path):
     import_recording(tmp_path / "out" / "recording.mcap", tmp_path / "back.uwb")
     with Recording.open(tmp_path / "back.uwb") as recording:
         assert recording.exchanges().truth_m == pytest.approx([*BY_HAND, np.nan], abs=1e-9, nan_ok=True)
+
+
+# What was exported, read by the readers that others use: mcap, rosbags and pandas.
+
+
+WHEN = 1_706_822_508_042_560_815
+
+
+@pytest.fixture
+def recording(tmp_path):
+    random = np.random.default_rng(3)
+    n = 50
+    stamps: dict[str, Any] = {name: random.integers(0, 2**32, n) for name in ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")}
+    e = Exchanges.from_arrays(
+        random.integers(1, 4, n), random.integers(4, 7, n), time_ns=WHEN + random.permutation(n) * 10**7,
+        fpp1_dbm=random.uniform(-100, -80, n), **stamps,
+    )  # fmt: skip
+    turned = random.normal(size=(n, 4))
+    poses = Poses.from_arrays(
+        WHEN + np.arange(n) * 10**7, np.where(np.arange(n) % 2, "drone", "rover 1"), random.normal(size=(n, 3)),
+        turned / np.linalg.norm(turned, axis=1)[:, None],
+    )  # fmt: skip
+    readings = {"time_ns": WHEN + np.arange(n), "body": np.full(n, "drone")}
+    held = Contents(
+        exchanges=e,
+        poses=poses,
+        imu=readings | {name: random.normal(size=n) for name in ("wx", "wy", "wz", "ax", "ay", "az")},
+        height=readings | {"height_m": random.uniform(0, 3, n)},
+        temperature={
+            "time_ns": WHEN + np.arange(2),
+            "tag": np.array([2, 2]),
+            "temperature_c": np.array([31.5, 32.0]),
+            "supply_v": np.array([3.25, np.nan]),
+        },
+        faults=[Fault(WHEN + 4, "7", "time-out", 'no "answer"')],
+    )
+    held.save(tmp_path / "r.uwb")
+    return tmp_path / "r.uwb"
+
+
+def test_rosbags_reads_standard_messages(recording, tmp_path):
+    held = load(recording)
+    count = export_recording(recording, tmp_path / "out", to="rosbag2")["rosbag2"]
+    by_topic: dict[str, list[tuple[int, str, Any]]] = {}
+    with AnyReader([tmp_path / "out" / "rosbag2"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        for connection, time_ns, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            by_topic.setdefault(connection.topic, []).append((time_ns, connection.msgtype, message))
+    assert sum(len(found) for found in by_topic.values()) == count
+    e = held.exchanges
+    chosen = (e.initiator == 2) & (e.target == 5)
+    found = by_topic["/uwb/range_2_5"]
+    assert {kind for _, kind, _ in found} == {"sensor_msgs/msg/Range"}
+    assert [t for t, *_ in found] == sorted(e.time_ns[chosen].tolist())
+    # The message holds floats of 32 bits.
+    expected = e.range_m[chosen][np.argsort(e.time_ns[chosen])]
+    assert [m.range for *_, m in found] == pytest.approx(expected.tolist(), rel=1e-6)
+    stamp = found[0][2].header.stamp
+    assert (stamp.sec * 10**9 + stamp.nanosec, len(by_topic["/tf"])) == (found[0][0], len(held.poses))
+    assert by_topic["/tf"][0][2].transforms[0].child_frame_id == "rover 1"
+    imu = by_topic["/imu/drone"][3][2]
+    assert [imu.angular_velocity.x, imu.linear_acceleration.z] == [held.imu["wx"][3], held.imu["az"][3]]
+    assert imu.orientation_covariance[0] == -1, "by its definition: the attitude is not measured"
+    assert len(by_topic["/height/drone"]) == 50
+    assert [m.temperature for *_, m in by_topic["/temperature/uwb_2"]] == [31.5, 32.0]
+    assert by_topic["/faults"][0][2].msg == 'time-out: no "answer"'
+
+
+def test_every_message_is_there_in_order_of_time(recording, tmp_path):
+    held, messages = load(recording), []
+    # 50 poses are two messages each.
+    assert export_recording(recording, tmp_path / "out", to="mcap") == {"recording.mcap": 50 + 100 + 50 + 50 + 2 + 1}
+    with (tmp_path / "out" / "recording.mcap").open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            content = json.loads(message.data)
+            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            assert set(content) <= set(json.loads(schema.data)["properties"])
+            messages.append((message.log_time, channel.topic, schema.name, content))
+    times = [logged for logged, *_ in messages]
+    assert times == sorted(times)
+    first = {topic: (name, content) for _, topic, name, content in reversed(messages)}
+    name, content = first["/poses/drone"]
+    assert name == "foxglove.PoseInFrame"
+    assert [content["pose"]["position"][axis] for axis in "xyz"] == held.poses.position_m[1].tolist()
+    assert [content["pose"]["orientation"][axis] for axis in "xyzw"] == held.poses.quaternion[1].tolist()
+    assert content["timestamp"] == {"sec": 1_706_822_508, "nsec": 52_560_815}
+    name, content = first["/tf"]
+    ends = content["parent_frame_id"], content["child_frame_id"]
+    assert (name, *ends) == ("foxglove.FrameTransform", "world", "rover 1")
+    earliest = int(np.argmin(held.exchanges.time_ns))
+    name, content = next(first[topic] for _, topic, _, _ in messages if topic.startswith("/ranges/"))
+    for column in ("initiator", "target", "range_m", "fpp1_dbm"):
+        assert content[column] == getattr(held.exchanges, column)[earliest]
+    assert "fpp2_dbm" not in content, "JSON has no word for what was not measured"
+    pulls = {axis: held.imu[f"a{axis}"][0] for axis in "xyz"}
+    assert first["/imu/drone"][1]["linear_acceleration"] == pulls
+    assert first["/height/drone"][1]["height_m"] == held.height["height_m"][0]
+    celsius = [content for _, topic, _, content in messages if topic == "/temperature/2"]
+    assert [set(content) for content in celsius] == [
+        {"timestamp", "temperature_c", "supply_v"},
+        {"timestamp", "temperature_c"},
+    ]
+    assert first["/faults"][1]["message"] == 'time-out: no "answer"'
+
+
+@pytest.mark.parametrize(
+    ("time_ns", "x", "said"), [(-5, 1.0, "before 1970"), (5, np.nan, "a number that is not finite")]
+)
+def test_what_json_cannot_say_is_one_line(tmp_path, time_ns, x, said):
+    sample = Exchanges.from_arrays([1], [2], time_ns=[time_ns], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
+    poses = Poses(np.array([9]), np.array(["drone"]), np.array([[x, 1.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))
+    Contents(exchanges=sample, poses=poses).save(tmp_path / "r.uwb")
+    with pytest.raises(RecordingError, match=said):
+        export_recording(tmp_path / "r.uwb", tmp_path / "out", to="mcap")
+    assert not (tmp_path / "out").exists()
+
+
+def test_poses_of_an_exported_bag_come_in_again(recording, tmp_path):
+    export_recording(recording, tmp_path / "out", to="rosbag2")
+    held = load(recording).poses
+    found = read_poses(tmp_path / "out" / "rosbag2")
+    assert found.body.tolist() == [body.replace(" ", "_") for body in held.body]
+    for name in ("time_ns", "position_m"):
+        assert getattr(found, name).tolist() == getattr(held, name).tolist()
+    np.testing.assert_allclose(found.quaternion, held.quaternion, atol=1e-15)
+
+
+def test_ranges_beyond_what_a_message_of_ros_holds_are_refused(tmp_path):
+    far = Exchanges.from_arrays([1], [2], time_ns=[5], range_m=[1e39], tx1=[0], rx1=[5], tx2=[9], rx2=[30])
+    Contents(exchanges=far).save(tmp_path / "far.uwb")
+    with pytest.raises(RecordingError, match=r"far\.uwb: /uwb/range_1_2: has a number that is .*too large"):
+        export_recording(tmp_path / "far.uwb", tmp_path / "out", to="rosbag2")
+    assert not (tmp_path / "out").exists()
+
+
+def test_bags_without_the_extra_and_times_before_1970_are_refused(recording, tmp_path, monkeypatch):
+    Contents(exchanges=Exchanges.from_arrays([1], [2], time_ns=[-5], tx1=[0], rx1=[5], tx2=[9], rx2=[30])).save(
+        tmp_path / "old.uwb"
+    )
+    with pytest.raises(RecordingError, match="before 1970"):
+        export_recording(tmp_path / "old.uwb", tmp_path / "out", to="rosbag2")
+    monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag2", None)
+    with pytest.raises(RecordingError, match=r"pip install 'uwbcal\[bags\]'"):
+        export_recording(recording, tmp_path / "out", to="rosbag2")
+    assert not (tmp_path / "out").exists()
+
+
+def test_pandas_reads_the_tables(recording, tmp_path):
+    held = load(recording)
+    export_recording(recording, tmp_path / "parquet", to="parquet")
+    export_recording(recording, tmp_path / "csv", to="csv")
+    for frame in (
+        pd.read_parquet(tmp_path / "parquet" / "exchanges.parquet"),
+        pd.read_csv(tmp_path / "csv" / "exchanges.csv"),
+    ):
+        for name in ("time_ns", "initiator", "tx1", "rx3", "range_m", "fpp1_dbm"):
+            assert frame[name].tolist() == pytest.approx(getattr(held.exchanges, name).tolist(), rel=1e-15, abs=0)
+        assert frame["fpp2_dbm"].isna().all()
+    poses = pd.read_parquet(tmp_path / "parquet" / "poses.parquet")
+    assert poses["body"].tolist() == held.poses.body.tolist()
+    assert poses[["qx", "qy", "qz", "qw"]].to_numpy().tolist() == held.poses.quaternion.tolist()
+
+
+@pytest.fixture(scope="module")
+def corrected(tmp_path_factory):
+    """A flight of three tags, before and after a calibration, and what that says of each range."""
+    folder = tmp_path_factory.mktemp("corrected")
+    flight = calib.sample_flight()
+    Contents(exchanges=flight.exchanges, tags=flight.tags, poses=flight.poses).save(folder / "f.uwb")
+    known = calib.fit(flight).calibration
+    calib.apply(folder / "f.uwb", known, folder / "c.uwb")
+    return folder, flight.exchanges, known.apply(calib.load_ranges(folder / "f.uwb"))
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+def test_corrected_ranges_leave_with_what_is_known_of_each(corrected, tmp_path, form):
+    folder, exchanges, applied = corrected
+    calib.apply(folder / "f.uwb", calib.fit(folder / "f.uwb").calibration, tmp_path / "out", to=form)
+    read = {"csv": pd.read_csv, "parquet": pd.read_parquet}[form]
+    frame = read(tmp_path / "out" / f"corrected.{form}")
+    assert frame["time_ns"].tolist() == exchanges.time_ns.tolist()
+    for name in ("raw_m", "corrected_m", "sigma_m", "sigma_total_m", "tail_share", "tail_probability", "clamped"):
+        # Pandas before 3 reads floats to 3e-14; that every digit is in the file shows when it comes in again, below.
+        assert frame[name].tolist() == pytest.approx(getattr(applied, name).tolist(), rel=1e-13, abs=0)
+    assert frame["clamped"].dtype == frame["outlier"].dtype == bool
+    assert frame["outlier"].tolist() == applied.outlier.tolist()
+    export_recording(folder / "c.uwb", tmp_path / "again", to=form)
+    import_recording(tmp_path / "again", tmp_path / "again.uwb", importer="exported")
+    for table in ("exchanges", "corrected"):
+        assert rows(tmp_path / "again.uwb")[table] == rows(folder / "c.uwb")[table]
+
+
+def test_corrected_ranges_in_messages(corrected, tmp_path):
+    folder, exchanges, applied = corrected
+    export_recording(folder / "c.uwb", tmp_path / "mcap", to="mcap")
+    with (tmp_path / "mcap" / "recording.mcap").open("rb") as file:
+        found = {
+            (m.log_time, d["initiator"], d["target"]): d
+            for s, _, m, d in ((s, c, m, json.loads(m.data)) for s, c, m in make_reader(file).iter_messages())
+            if s.name == "uwb.Range"
+        }
+    for k in range(0, len(exchanges), 50):
+        one = found[int(exchanges.time_ns[k]), int(exchanges.initiator[k]), int(exchanges.target[k])]
+        assert (one["range_m"], one["corrected_m"]) == (applied.raw_m[k], applied.corrected_m[k])
+        assert (one["sigma_m"], one["sigma_total_m"]) == (applied.sigma_m[k], applied.sigma_total_m[k])
+        assert one["tail_probability"] == applied.tail_probability[k]
+        assert one["outlier"] is bool(applied.outlier[k])
+        assert one["clamped"] is bool(applied.clamped[k])
+    export_recording(folder / "c.uwb", tmp_path / "bag", to="rosbag2")
+    with AnyReader([tmp_path / "bag" / "rosbag2"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        messages: list[Any] = [
+            reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages() if c.topic == "/uwb/range_1_2"
+        ]
+    mine = (exchanges.initiator == 1) & (exchanges.target == 2)
+    assert [m.range for m in messages] == pytest.approx(applied.corrected_m[mine].tolist(), rel=1e-6)
+    assert [m.variance for m in messages] == pytest.approx((applied.sigma_total_m[mine] ** 2).tolist(), rel=1e-6)

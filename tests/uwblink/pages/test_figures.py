@@ -1,5 +1,6 @@
 """Figures at paper size, and drawings as parts of pages."""
 
+import itertools
 import json
 import re
 from html import unescape
@@ -8,9 +9,21 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from tests.browser import lies_well
-from uwblink.pages.blocks import VARIABLES, Block, Document, Listing, Picture, Table, Text, inline, table_html, to_html
-from uwblink.pages.colours import BLUE, DARK, INK, look
+from tests.browser import chromium, lies_well
+from uwblink.pages.blocks import (
+    CSS,
+    VARIABLES,
+    Block,
+    Document,
+    Listing,
+    Picture,
+    Table,
+    Text,
+    inline,
+    table_html,
+    to_html,
+)
+from uwblink.pages.colours import BLUE, DARK, GRID, INK, MUTED, PALE, SERIES, look
 from uwblink.pages.figures import WIDTHS, drawn, label, legend, mark, picture, sheet
 
 
@@ -105,3 +118,209 @@ def test_cells_of_words_say_what_they_are_where_no_heading_is_above_them():
     assert "<code>fixed_ns</code> &lt;i&gt;" in to_html(Document("A page", [Text("pin `fixed_ns` <i>")]))
     assert "data-head" not in table_html(["file", "what"], [["a.uwb", "SHA-256"]], words=True)
     assert "data-head" not in table_html(["pair", "mean", "std"], [["1-2", "3.0", "1.0"]])
+
+
+# Colours for all eyes: how far apart they are, seen with and without all cones, and how they stand out.
+
+
+# Machado, Oliveira and Fernandes 2009, severity 1, on linear RGB.
+EYES = {
+    "all": np.eye(3),
+    "no long cones": np.array(
+        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+    ),
+    "no middle cones": np.array(
+        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+    ),
+    "no short cones": np.array(
+        [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]
+    ),
+}
+
+
+TO_XYZ = np.array(
+    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.119192, 0.9503041]]
+)
+
+
+def linear(colour):
+    part = np.array([int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)])
+    return np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
+
+
+def lab(rgb):
+    t = TO_XYZ @ np.clip(rgb, 0, 1) / np.array([0.95047, 1.0, 1.08883])
+    f = np.where(t > 0.008856, np.cbrt(t), 7.787 * t + 16 / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+def ciede2000(one, two):
+    (l1, a1, b1), (l2, a2, b2) = one, two
+    mean = (np.hypot(a1, b1) + np.hypot(a2, b2)) / 2
+    g = 0.5 * (1 - np.sqrt(mean**7 / (mean**7 + 25**7)))
+    a1, a2 = (1 + g) * a1, (1 + g) * a2
+    c1, c2 = np.hypot(a1, b1), np.hypot(a2, b2)
+    h1, h2 = np.degrees(np.arctan2(b1, a1)) % 360, np.degrees(np.arctan2(b2, a2)) % 360
+    turn = (h2 - h1 + 180) % 360 - 180
+    dl, dc, dh = l2 - l1, c2 - c1, 2 * np.sqrt(c1 * c2) * np.sin(np.radians(turn / 2))
+    h, lightness, c = (h1 + turn / 2) % 360, (l1 + l2) / 2, (c1 + c2) / 2
+    t = (
+        1 - 0.17 * np.cos(np.radians(h - 30)) + 0.24 * np.cos(np.radians(2 * h))
+        + 0.32 * np.cos(np.radians(3 * h + 6)) - 0.2 * np.cos(np.radians(4 * h - 63))
+    )  # fmt: skip
+    sl = 1 + 0.015 * (lightness - 50) ** 2 / np.sqrt(20 + (lightness - 50) ** 2)
+    sc, sh = 1 + 0.045 * c, 1 + 0.015 * c * t
+    rt = -np.sin(np.radians(60 * np.exp(-(((h - 275) / 25) ** 2)))) * 2 * np.sqrt(c**7 / (c**7 + 25**7))
+    return np.sqrt((dl / sl) ** 2 + (dc / sc) ** 2 + (dh / sh) ** 2 + rt * dc / sc * dh / sh)
+
+
+GROUND = {"light": "#ffffff", "dark": "#16181b"}
+
+
+def contrast(one, two):
+    """WCAG 2.2, relative luminance."""
+    bright, dim = sorted((float(linear(c) @ [0.2126, 0.7152, 0.0722]) for c in (one, two)), reverse=True)
+    return (bright + 0.05) / (dim + 0.05)
+
+
+@pytest.mark.parametrize(
+    ("one", "two", "apart"),
+    [
+        ((50.0, 2.6772, -79.7751), (50.0, 0.0, -82.7485), 2.0425),
+        ((50.0, 2.5, 0.0), (73.0, 25.0, -18.0), 27.1492),
+        ((2.0776, 0.0795, -1.1350), (0.9033, -0.0636, -0.5514), 0.9082),
+    ],
+)
+def test_the_measure_is_the_published_one(one, two, apart):
+    # Sharma, Wu and Dalal 2005, pairs 1, 17 and 34.
+    assert ciede2000(one, two) == pytest.approx(apart, abs=1e-4)
+
+
+@pytest.mark.parametrize("eyes", list(EYES))
+@pytest.mark.parametrize("ground", ["light", "dark"])
+def test_colours_of_a_kind_are_told_apart(eyes, ground):
+    shown = [colour if ground == "light" else DARK[colour] for colour in SERIES]
+    seen = [lab(EYES[eyes] @ linear(colour)) for colour in shown]
+    apart = {(a, b): ciede2000(seen[a], seen[b]) for a, b in itertools.combinations(range(len(seen)), 2)}
+    assert min(apart.values()) >= 15, apart
+
+
+@pytest.mark.parametrize("ground", ["light", "dark"])
+def test_lines_and_words_of_figures_stand_out(ground):
+    def shown(colour):
+        return colour if ground == "light" else DARK[colour]
+
+    for colour in SERIES:
+        assert contrast(shown(colour), GROUND[ground]) >= 3
+    for colour in (INK, MUTED):
+        assert contrast(shown(colour), GROUND[ground]) >= 4.5
+    # What must not stand out still shows.
+    assert contrast(shown(GRID), GROUND[ground]) >= 1.3
+    assert contrast(shown(PALE), GROUND[ground]) >= 1.8
+
+
+@pytest.mark.parametrize("ground", ["light", "dark"])
+def test_words_of_pages_stand_out(ground):
+    light, dark = CSS[: CSS.index("* {")].split("@media screen and (prefers-color-scheme: dark)")
+    colours = dict(re.findall(r"(--[a-z-]+):\s*(#[0-9a-f]{3,6})", light if ground == "light" else dark))
+    full = {name: c if len(c) == 7 else "#" + "".join(2 * x for x in c[1:]) for name, c in colours.items()}
+    assert full["--page"] == GROUND[ground]
+    for word in ("--ink", "--quiet", "--link"):
+        for under in ("--page", "--soft", "--good", "--doubt", "--bad"):
+            assert contrast(full[word], full[under]) >= 4.5, (word, under)
+
+
+def test_many_are_told_apart_by_more_than_colour():
+    found = [look(k) for k in range(40)]
+    assert len({(one.colour, one.marker, str(one.dashes)) for one in found}) == 40
+    assert len({(one.marker, str(one.dashes)) for one in found[:12]}) == 12, "without any colour"
+
+
+# What a page does when pointed at, in a browser: values under the pointer, one line alone, a closer look.
+
+
+POINTED_AT = """<script>
+const told = {}, wide = document.querySelector('figure .wide svg'), tip = document.getElementById('tip');
+const panel = JSON.parse(wide.dataset.panels)[0];
+const at = (x, y) => { const [left, top, right, bottom] = panel.box;
+  const u = (x - panel.x[0]) / (panel.x[1] - panel.x[0]), v = (y - panel.y[0]) / (panel.y[1] - panel.y[0]);
+  return new DOMPoint(left + u * (right - left), bottom - v * (bottom - top)).matrixTransform(wide.getScreenCTM()); };
+const send = (kind, target, point, more) => target.dispatchEvent(
+  new (kind === 'wheel' ? WheelEvent : PointerEvent)(kind,
+    {bubbles: true, cancelable: true, clientX: point.x, clientY: point.y, ...more}));
+const lines = () => [...tip.children].map(one => one.textContent);
+const half = at(30, 3);
+told.before = getComputedStyle(tip).display;
+send('pointermove', wide, half);
+told.reading = [getComputedStyle(tip).display, lines()];
+const series = [...wide.querySelectorAll('.series')], path = series[1].querySelector('path');
+send('pointermove', path, half);
+told.series = [lines()[0], wide.classList.contains('one'), series.map(one => one.classList.contains('here'))];
+send('pointermove', document.querySelector('h1'), half);
+told.away = [getComputedStyle(tip).display, wide.classList.contains('one')];
+wide.dispatchEvent(new MouseEvent('click', {bubbles: true}));
+const zoom = document.getElementById('zoom'), copy = zoom.querySelector('svg');
+const box = () => { const {x, y, width, height} = copy.viewBox.baseVal; return [x, y, width, height]; };
+told.whole = box();
+const middle = copy.getBoundingClientRect(), spot = {x: middle.x + middle.width / 2, y: middle.y + middle.height / 2};
+send('wheel', copy, spot, {deltaY: -400});
+told.closer = box();
+send('pointermove', copy, spot, {buttons: 1, movementX: 50, movementY: 0});
+told.moved = box();
+send('dblclick', copy, spot);
+told.again = box();
+told.open = zoom.open;
+zoom.querySelector('button').click();
+told.closed = !zoom.open;
+setTimeout(() => { const found = document.createElement('output'); found.textContent = JSON.stringify(told);
+  document.body.replaceChildren(found); }, 300);
+</script></body>"""
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    """What the page did, one pointer after the other."""
+
+    def two_lines(width_in):
+        figure, (axes,) = sheet(width_in)
+        for k in range(2):
+            (line,) = axes.plot([0, 60], [k, 6 - k], label=f"tag {k}", **look(k).line())
+            mark(line, f"tag {k}")
+        axes.set(xlim=(0, 60), ylim=(0, 6))
+        label(axes, "time (s)", "error (cm)")
+        legend(figure)
+        return figure
+
+    page = to_html(Document("A page", [Picture("two", two_lines, "Two lines.")]))
+    folder = tmp_path_factory.mktemp("page")
+    path = folder / "page.html"
+    path.write_text(page.replace("</body>", POINTED_AT))
+    words = ("--virtual-time-budget=4000", "--window-size=1280,900", "--dump-dom", path.as_uri())
+    found = re.search("<output>(.*?)</output>", chromium(*words, profile=folder / "profile"), re.DOTALL)
+    assert found, "the script did not come to its end"
+    return json.loads(unescape(found[1]))
+
+
+def test_it_says_the_values_under_the_pointer(told):
+    assert told["before"] == "none"
+    shown, (x, y) = told["reading"]
+    assert shown == "block"
+    # A step of a reading is a two-hundredth of the axis.
+    assert float(x.removeprefix("time (s): ")) == pytest.approx(30, abs=0.5)
+    assert float(y.removeprefix("error (cm): ")) == pytest.approx(3, abs=0.05)
+
+
+def test_a_line_that_is_pointed_at_is_named_and_stands_alone(told):
+    assert told["series"] == ["tag 1", True, [False, True]]
+    assert told["away"] == ["none", False], "and nothing of it stays"
+
+
+def test_a_click_shows_a_figure_closer(told):
+    assert told["open"]
+    assert told["closed"]
+    whole, closer, moved = told["whole"], told["closer"], told["moved"]
+    assert closer[2] < 0.6 * whole[2]
+    assert closer[2] / closer[3] == pytest.approx(whole[2] / whole[3])
+    assert closer[0] > whole[0]
+    assert moved[0] < closer[0], "dragged to the right, what is at the left comes"
+    assert (moved[1:], told["again"]) == (pytest.approx(closer[1:]), pytest.approx(whole))

@@ -69,8 +69,7 @@ def test_sending_to_nobody_is_no_error(ear):
 def test_a_viewer_gets_a_topic_a_pair_with_its_schema():
     with FoxgloveServer("0") as server:
         viewer = FoxgloveClient(server.url)
-        assert viewer.status == 101
-        assert viewer.text()["op"] == "serverInfo"
+        assert (viewer.status, viewer.text()["op"]) == (101, "serverInfo")
         server.send(ONE)
         (channel,) = viewer.text()["channels"]
         assert (channel["topic"], channel["encoding"], channel["schemaName"]) == ("/ranges/10_20", "json", "uwb.Range")

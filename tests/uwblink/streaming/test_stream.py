@@ -78,8 +78,7 @@ def test_ranges_come_one_at_a_time_and_closing_closes_the_ports():
     first = next(ranges)
     assert ports.now_s() < 1.0, "the first range comes before the second is made"
     ranges.close()
-    again = next(uwblink.stream(list(ports.names.values()), using=ports))
-    assert again.time_ns > first.time_ns
+    assert next(uwblink.stream(list(ports.names.values()), using=ports)).time_ns > first.time_ns
 
 
 @pytest.mark.parametrize("protocol", ["ss", "ds"])

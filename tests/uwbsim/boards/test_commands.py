@@ -1,18 +1,26 @@
 """What boards read and do: C's numbers, floats that are none, and commands that a stranger adds."""
 
+import math
+import random
+import struct
+import time
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
-from tests.boards import bench_scenario
+import uwbsim
+from tests.boards import bench_scenario, served
 from uwblink.boards.board import Board
 from uwblink.errors import RefusedError
+from uwblink.importers.poses import read_poses
 from uwblink.wire import messages as m
 from uwblink.wire.fields import INT, PRINTED, TEXT
+from uwbsim import UwbsimError, VirtualPorts
 from uwbsim.boards.commands import EXECUTORS, atoi, printed_float, read_commands, register_command
 from uwbsim.boards.frames import NS_PER_MS
-from uwbsim.boards.virtual_board import VirtualPorts
-from uwbsim.errors import UwbsimError
+from uwbsim.boards.server import LivePoses, Server, stays_s
+from uwbsim.world.world import World
 
 
 @m.message(b"C10")
@@ -110,8 +118,7 @@ def test_numbers_are_read_as_c_reads_them(text, number):
 def test_what_boards_take_otherwise_than_the_firmware_is_what_the_page_says(data, kinds, alive):
     """docs/boards.md says it; the last of them has 255 bytes."""
     reading = read_commands(data)
-    assert [command.kind for command in reading.commands] == kinds
-    assert reading.alive == alive
+    assert ([command.kind for command in reading.commands], reading.alive) == (kinds, alive)
 
 
 @pytest.mark.parametrize("text", ["a\0b", "a|b", "a\rb"])
@@ -155,3 +162,188 @@ def test_a_number_that_is_none_does_not_stop_the_bench(raw):
     ports.bench.advance(5 * NS_PER_MS)
     assert ports.transfers[0][2].startswith(b"R03|0|1|a|1|")
     assert Board(ports.port(2)).id == 2
+
+
+# No byte from a client ends the bench or another board: six thousand commands, right, wrong and mangled.
+
+
+COMMANDS = 6_000
+NUMBERS = [*(b"%d" % n for n in (0, 1, 2, 9, 255, 258, -1, 65536, 2**31)), b"9" * 40, b"", b"two", b"1.5", b"\xff"]
+FLOATS = (0.0, -0.0, 1.5, 1e10, -1e30, 3.4e38, 1e-40, float("nan"), float("inf"), -float("inf"))
+RANDOM_SHARE, MANGLED_SHARE, RANGE_SHARE = 0.1, 0.2, 0.03
+
+
+def command(rng):
+    """A command whose fields are of the right kinds, with values that nobody asked for."""
+    numbers = [rng.choice(NUMBERS) for _ in range(4)]
+    data = rng.randbytes(rng.choice((0, 1, 5, 40, 92, 93, 200)))
+    counted = struct.pack("<H", len(data) if rng.random() < 0.9 else rng.randrange(65_536)) + data
+    tests = (numbers[0], rng.randbytes(rng.randrange(8)), numbers[1], struct.pack("<f", rng.choice(FLOATS)), counted)
+    fields = {0: (), 1: (), 2: (), 3: tests, 4: numbers[:1], 6: (counted,), 7: (), 8: numbers[:1], 9: ()}
+    key = rng.choice([*fields, rng.randrange(10, 100)])
+    parts = fields.get(key, numbers[:1])
+    if rng.random() < RANGE_SHARE:
+        key, parts = 5, numbers
+    if rng.random() < 0.1:
+        parts = parts[: rng.randrange(len(parts) + 1)]
+    return b"C%02d" % key + b"".join(b"|" + part for part in parts) + b"\r"
+
+
+def mangled(rng, data):
+    """The same with bytes replaced, left out, or doubled."""
+    data = bytearray(data)
+    for _ in range(rng.randrange(1, 4)):
+        at = rng.randrange(len(data))
+        data[at : at + 1] = rng.choice((b"", rng.randbytes(1), data[at : at + 1] * 2, b"|", b"\r", b"C"))
+        if not data:
+            break
+    return bytes(data)
+
+
+def test_no_byte_ends_the_bench_or_another_board():
+    rng = random.Random(20261121)
+    ports = VirtualPorts(bench_scenario(), lost_share=0.1)
+    bench, victim = ports.bench, ports.bench.boards[1]
+    deaths = answers = 0
+    for number in range(COMMANDS):
+        kind = rng.random()
+        data = rng.randbytes(rng.randrange(1, 90)) if kind < RANDOM_SHARE else command(rng)
+        victim.write(mangled(rng, data) if kind > 1 - MANGLED_SHARE else data)
+        bench.advance(int(bench.env.now) + rng.choice((NS_PER_MS // 10, NS_PER_MS, NS_PER_MS, 2 * NS_PER_MS)))
+        if not (victim.alive and victim.powered):
+            deaths += 1
+            victim.power_cycle()
+        if number % 1000 == 999:
+            answers += len(ports.transfers)
+            ports.transfers.clear()
+            assert Board(ports.port(2)).id == 2
+            assert all(bench.boards[k].alive for k in (2, 3))
+    victim.power_cycle()
+    assert Board(ports.port(1)).request(m.GetId()) == m.IdReport(1)
+    # Much of this kills a board, as it does a real one, and much is answered: the test reaches both.
+    assert deaths > 60
+    assert answers > 600
+
+
+# Poses in step with the boards' time, as long as they are served.
+
+
+EPOCH_NS = 1_700_000_000_000_000_000
+
+
+def flight(**mocap):
+    """Boards of which one flies."""
+    box = {"box_min_m": [-2.0, -2.0, 0.5], "box_max_m": [2.0, 2.0, 2.0]}
+    motion = {"model": "random-flight", "speed_mps": 1.0} | box
+    tables = bench_scenario().model_dump(mode="json") | {"mocap": {"rate_hz": 120.0, **mocap}}
+    return uwbsim.load(tables, {"bodies.0.motion": motion})
+
+
+def written(world, path, steps):
+    poses = LivePoses(world, path, EPOCH_NS)
+    for step in steps:
+        poses.write_until(round(step * 1e9))
+    poses.close()
+    return read_poses(path, None)
+
+
+def test_the_file_holds_every_pose_up_to_now_and_none_after(tmp_path):
+    poses = LivePoses(World(flight(latency_ms=20.0)), tmp_path / "p.csv", EPOCH_NS)
+    for now_s in (0.5, 0.5, 0.7031, 7.0):
+        poses.write_until(round(now_s * 1e9))
+        found = read_poses(tmp_path / "p.csv", None)
+        late = (found.time_ns - EPOCH_NS) * 1e-9
+        # Three bodies; what is seen at t is told at t + 20 ms.
+        assert len(found) == 3 * (int((now_s - 0.02) * 120) + 1)
+        assert now_s - 1 / 120 < late.max() <= now_s
+    poses.close()
+
+
+def test_poses_are_those_of_the_world_and_do_not_depend_on_the_pieces(tmp_path):
+    world = World(flight(position_noise_m=0.001, attitude_noise_rad=0.01, gaps_per_min=20.0))
+    one = written(world, tmp_path / "one.csv", [30.0])
+    many = written(world, tmp_path / "many.csv", np.arange(0.1, 30.01, 0.1))
+    np.testing.assert_array_equal(one.time_ns, many.time_ns)
+    mine = one.body == "b1"
+    true = world.trajectories["b1"].position_m((one.time_ns[mine] - EPOCH_NS) * 1e-9)
+    assert (one.position_m[mine] - true).std() == pytest.approx(0.001, rel=0.05)
+    # 20 gaps a minute of half a second each: a seventh of the time between them is blind.
+    assert 0.6 < (np.count_nonzero(mine) / (30 * 120)) < 0.95
+    assert np.diff(one.time_ns[mine]).max() == pytest.approx(0.5e9, rel=0.1)
+
+
+def test_served_poses_go_on_after_the_scenario_s_duration(tmp_path):
+    scenario = flight(rate_hz=20.0)  # few enough that a busy machine keeps up with twenty times the boards' time
+    short = scenario.model_copy(update={"run": scenario.run.model_copy(update={"duration_s": 1.0})})
+    with served(short, speed=20.0) as server:
+        server.write_poses(tmp_path / "p.csv")
+        for _ in range(200):
+            # The file may grow between two looks at it, so only its complete lines count.
+            complete = (tmp_path / "p.csv").read_text().rpartition("\n")[0].splitlines()[1:]
+            served_s = (int(complete[-1].partition(",")[0]) - server.epoch_ns) * 1e-9
+            if served_s > 5.0:
+                break
+            time.sleep(0.05)
+        assert served_s > 5.0
+
+
+def test_a_step_ends_though_poses_take_longer_to_write_than_they_last(tmp_path):
+    # A tenth of a second of the boards is 5 us of the wall clock: the next poses are due before these are written.
+    server = Server(flight(rate_hz=0.2), speed=2e4)
+    try:
+        server.write_poses(tmp_path / "p.csv")
+        for _ in range(3):
+            server.step()
+    finally:
+        server.close()
+    assert len((tmp_path / "p.csv").read_text().splitlines()) > 1
+
+
+def test_poses_that_cannot_be_written_end_and_the_serving_goes_on(tmp_path):
+    told: list[str] = []
+    with served(flight(), tell=told.append) as server:
+        server.write_poses(tmp_path / "p.csv")
+        # The first file is closed after the serving, which may be writing to it now.
+        first, server._poses._file = server._poses._file, open("/dev/full", "w", encoding="utf-8")  # noqa: SIM115 - closed by the server
+        for _ in range(100):
+            with Board.open(server.names[2]) as board:
+                assert board.id == 2
+            if told:
+                break
+    first.close()
+    assert told == ["the poses end here: No space left on device"]
+
+
+# When carried boards stand, and that a server says so.
+
+
+def scenario(stays=((0.2, 0.1),), places=3):
+    bodies = [
+        {"name": f"b{k}", "motion": {"model": "carried", "stay_s": stay, "carry_s": carry, "places_m": [[k, p, 1.0]
+         for p in range(places)]}}
+        for k, (stay, carry) in enumerate(stays)
+    ]  # fmt: skip
+    bodies += [{"name": f"w{k}", "motion": {"model": "static", "position_m": [9.0, k, 1.0]}} for k in (0, 1)]
+    tags = [{"id": k + 1, "body": body["name"]} for k, body in enumerate(bodies)]
+    return uwbsim.load({"run": {"duration_s": 9.0}, "ranging": {"rate_hz": 20.0}, "bodies": bodies, "tags": tags})
+
+
+def test_boards_stand_while_nobody_is_carried():
+    found = stays_s(scenario(((10.0, 2.0), (5.0, 4.0)), places=2))
+    assert (found, stays_s(scenario(()))) == ([(0.0, 5.0), (9.0, 10.0), (12.0, math.inf)], [])
+    assert stays_s(scenario(((10.0, 2.0),), places=1)) == [(0.0, math.inf)]
+
+
+def test_a_server_says_when_boards_stand():
+    told: list[str] = []
+    server = uwbsim.Server(scenario())
+    try:
+        server.announce(told.append)
+        server.run(lambda: len(told) == 3, 20.0)
+    finally:
+        server.close()
+    assert told == [
+        "    0 s  place 1 of 3: boards stand until 0.2 s",
+        "  0.3 s  place 2 of 3: boards stand until 0.5 s",
+        "  0.6 s  place 3 of 3: boards stay there",
+    ]

@@ -121,16 +121,14 @@ def test_bands_over_seeds_reach_from_the_least_to_the_largest():
 def test_two_keys_make_a_map_of_medians_over_seeds():
     keys: dict[str, list[object]] = {"a": [1.0, 1.0, 2.0, 2.0] * 2, "b": [10.0, 20.0] * 4}
     result = np.array([1.0, 2.0, 3.0, 4.0, 3.0, 4.0, 5.0, 6.0])
-    figure = result_over_keys(7.16, keys, ["ds"] * 8, result, "figure")
-    (mesh,) = figure.axes[0].collections
+    (mesh,) = result_over_keys(7.16, keys, ["ds"] * 8, result, "figure").axes[0].collections
     assert mesh.get_array().tolist() == [[2.0, 4.0], [3.0, 5.0]]
 
 
 def test_words_and_many_keys_are_drawn_key_by_key():
     keys: dict[str, list[object]] = {"a": [1.0, 2.0] * 4, "b": ["x", "y", "y", "x"] * 2, "c": list(range(8))}
     figure = result_over_keys(3.5, keys, ["ds", "ss"] * 4, np.arange(8.0), "figure")
-    assert len(figure.axes) == 3
-    assert [t.get_text() for t in figure.axes[1].get_xticklabels()] == ["x", "y"]
+    assert (len(figure.axes), [t.get_text() for t in figure.axes[1].get_xticklabels()]) == (3, ["x", "y"])
 
 
 @pytest.mark.parametrize("x", [np.linspace(-90.1, -69.7, 12), np.linspace(-20.0, 20.0, 12)])

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 
 from tests import processes
-from uwblink.protocols.table import PROTOCOLS
-from uwblink.ticks import SPEED_OF_LIGHT
-from uwbsim import simulate
+from uwblink import PROTOCOLS, SPEED_OF_LIGHT
+from uwbsim import load, simulate
 from uwbsim.protocols.comparison import compare, costs, optimum, over_reply, over_skew
 from uwbsim.protocols.conditions import calibrated, conditions_of, range_errors_m
 from uwbsim.protocols.prediction import predict
-from uwbsim.scenario.loading import load
 from uwbsim.scenario.ranging import TURNAROUND_S
 
 ROOT = Path(__file__).parents[3]
@@ -97,8 +95,7 @@ def test_a_bias_does_not_average_away(scenario, name):
     simulated = np.sqrt(np.mean(errors.mean(axis=0) ** 2))
     assert np.sqrt(predicted.mean_of(count)) == pytest.approx(simulated, rel=0.02 if name == "ss" else 0.25)
     assert np.sqrt(predicted.mean_of(1)) == pytest.approx(np.sqrt(np.mean(errors**2)), rel=0.03)
-    alone = np.sqrt(predicted.mean_of(1) / count)
-    assert (simulated > 10 * alone) == (name == "ss")
+    assert (simulated > 10 * np.sqrt(predicted.mean_of(1) / count)) == (name == "ss")
 
 
 @pytest.mark.parametrize("name", ["ss", "ds", "ds-sym"])
@@ -117,8 +114,7 @@ def test_compare_counts_as_many_exchanges_a_second_as_a_run_has(name):
 def test_compare_writes_a_page_and_tables(tmp_path):
     out = tmp_path / "out"
     words = ("compare", TEST1, "-o", out, "--protocols", "ss, ds", "-n", "20000", "--json")
-    done = processes.succeed("uwbsim", *words)
-    document = json.loads(done.stdout)
+    document = json.loads(processes.succeed("uwbsim", *words).stdout)
     assert [row["protocol"] for row in document["protocols"]] == ["ss", "ds"]
     assert {p.name for p in out.iterdir()} == {"compare.html", "compare.csv", "compare.parquet"}
     with (out / "compare.csv").open(newline="") as stream:

@@ -1,17 +1,25 @@
 """Keys of files of scenarios, faults and sweeps: limits, overrides, descriptions, and the schema that is printed."""
 
 import json
+import re
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+import uwbsim
 from docs.site.schema import UNITS, described, reference, unit_of
 from tests import processes
+from uwblink.recording.file import Recording
+from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT
+from uwblink.twr import delay_weights, raw_range
+from uwbsim import Scenario, ScenarioError, load, simulate
 from uwbsim.boards.server import FaultsFile
-from uwbsim.errors import ScenarioError
+from uwbsim.scenario import copy_scenarios, listed, shipped_scenarios
 from uwbsim.scenario.base import BY_UNIT, check_limits
-from uwbsim.scenario.loading import load
-from uwbsim.scenario.model import Scenario
 from uwbsim.sweep.design import SweepFile
+from uwbsim.world.world import World
 
 SCHEMAS = {model.__name__: model.model_json_schema() for model in (Scenario, FaultsFile, SweepFile)}
 
@@ -74,3 +82,229 @@ def test_the_reference_says_unit_default_and_range():
     assert "*3 × number; m; default `[0.0, 0.0, 0.0]`*" in page
     assert [suffix for suffix in BY_UNIT if not any(ours.endswith(suffix) for ours in UNITS)] == []
     assert [unit_of(key) for key in ("skew_ppm_per_sqrt_s", "duration_s", "antenna")] == ["ppm/√s", "s", ""]
+
+
+# Scenarios of the world: what cannot be is one clear line, and what is named is read.
+
+
+ROOT = Path(__file__).parents[3]
+OFFICE = ROOT / "scenarios" / "nlos_office" / "office.toml"
+NOISELESS = ROOT / "scenarios" / "noiseless.toml"
+
+
+def changed(tmp_path, old, new):
+    folder = tmp_path / "nlos_office"
+    folder.mkdir()
+    (folder / "monopole.csv").write_text((OFFICE.parent / "monopole.csv").read_text())
+    text = OFFICE.read_text()
+    assert old in text
+    (folder / "office.toml").write_text(text.replace(old, new, 1))
+    return folder / "office.toml"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fragments"),
+    [
+        (
+            "position_m = [0.3, 0.3, 2.6]",
+            "position_m = [0.3, 9.3, 2.6]",
+            ["bodies[0].motion.position_m", "outside"],
+        ),
+        ("[10.5, 1.0, 0.4]", "[10.5, 1.0, -0.4]", ["bodies[2].motion.points_m[3]", "outside the room"]),
+        ("box_max_m = [6.5, 7.2, 2.4]", "box_max_m = [6.5, 7.2, 3.4]", ["box_max_m", "outside the room"]),
+        (
+            'body = "drone"\nlever_arm_m = [0.15, 0.0, -0.05]',
+            'body = "robot"\nlever_arm_m = [0.02, 0.0, 0.35]',
+            ["tags 3 and 4", "closer than a wavelength"],
+        ),
+        ("rate_hz = 120.0", "rate_hz = 400.0", ["ranging.rate_hz", "400", "at most 329"]),
+        ('material = "brick"', "", ["obstacles[1].material", "missing"]),
+        ('material = "brick"', 'material = "cheese"', ["obstacles[1].material", "cheese", "concrete"]),
+        (
+            'bias = "aps011"',
+            'bias = "magic"',
+            ["radio.bias: found 'magic'", "none, icra2023, icra2023-july, miluv, aps011"],
+        ),
+        ("monopole.csv", "nothing.csv", ["radio.antenna.file", "no such file"]),
+        ("min_separation_m = 0.3", "min_separation_m = 9.0", ["min_separation_m", "robot"]),
+        ("speed_mps = 0.8\nacceleration", "times_s = [1, 2]\nspeed_mps = 0.8\nacceleration", ["times_s", "either"]),
+    ],
+)
+def test_worlds_that_cannot_be(tmp_path, old, new, fragments):
+    with pytest.raises(ScenarioError) as caught:
+        simulate(load(changed(tmp_path, old, new)))
+    assert "\n" not in str(caught.value)
+    assert [fragment for fragment in fragments if fragment not in str(caught.value)] == []
+
+
+@pytest.mark.parametrize(
+    ("damaged", "fragment"),
+    [
+        (lambda lines: [*lines[:20], *lines[21:]], "a hole in the table: no gain_db at azimuth -150, elevation"),
+        (lambda lines: [*lines, lines[-1]], r"monopole\.csv: two rows"),
+    ],
+)
+def test_a_damaged_antenna_table_is_named(tmp_path, damaged, fragment):
+    scenario = changed(tmp_path, "reflection_loss_db = 9.0", "reflection_loss_db = 9.0")
+    table = tmp_path / "nlos_office" / "monopole.csv"
+    table.write_text("\n".join(damaged(table.read_text().splitlines())) + "\n")
+    with pytest.raises(ScenarioError, match=fragment):
+        load(scenario)
+
+
+def trajectory(tmp_path, seconds, begin_s=0):
+    rows = [f"{begin_s + t / 10},b,{np.sin(t / 30)},{t / 50},1,0,0,0,1" for t in range(int(seconds * 10) + 1)]
+    (tmp_path / "path.csv").write_text("time_s,body,x,y,z,qx,qy,qz,qw\n" + "\n".join(rows) + "\n")
+    moved = re.sub("motion = {.*", 'motion = { model = "recorded", file = "path.csv" }', NOISELESS.read_text(), count=1)
+    (tmp_path / "s.toml").write_text(moved.replace("duration_s = 60.0", "duration_s = 10.0"))
+    return tmp_path / "s.toml"
+
+
+@pytest.mark.parametrize("begin_s", [0, 1000])
+def test_a_recorded_trajectory_is_flown_from_its_begin_whatever_its_clock(tmp_path, begin_s):
+    path = next(iter(World(load(trajectory(tmp_path, 12, begin_s))).trajectories.values()))
+    np.testing.assert_allclose(path.position_m(np.array([3.0]))[0], [np.sin(1.0), 0.6, 1.0], atol=1e-6)
+
+
+def test_a_trajectory_that_is_too_short_is_refused(tmp_path):
+    with pytest.raises(ScenarioError, match=r"lasts 8\.0 s and does not cover the run of 10 s"):
+        load(trajectory(tmp_path, 8))
+
+
+def planned(tmp_path, slots):
+    (tmp_path / "plan.csv").write_text("time_s,initiator,target\n" + slots)
+    text = NOISELESS.read_text().replace("rate_hz = 160.0", 'rate_hz = 160.0\nplan = { file = "plan.csv" }')
+    (tmp_path / "s.toml").write_text(text)
+    return tmp_path / "s.toml"
+
+
+@pytest.mark.parametrize(
+    ("slots", "message"),
+    [
+        ("0.1,1,99\n", "slot 1 names tag 99"),
+        ("0.1,1,3\n0.2,1,1\n", "slot 2 is of tag 1 with itself"),
+        ("-0.1,1,3\n", r"slot 1 is at -0.1 s, before the start"),
+        ("9,1,3\n7,3,1\n", r"first slot is at 7 s, after the end of the run \(run.duration_s = 6\)"),
+    ],
+)
+def test_a_plan_file_that_cannot_be_is_refused(tmp_path, slots, message):
+    with pytest.raises(ScenarioError, match=message):
+        load(planned(tmp_path, slots), ["run.duration_s=6"])
+
+
+def test_of_a_long_plan_what_the_run_lasts_is_flown(tmp_path):
+    found = simulate(load(planned(tmp_path, "5.9,1,3\n6.1,3,1\n0.1,4,1\n"), ["run.duration_s=6"])).exchanges
+    assert found.initiator.tolist() == [4, 1]
+
+
+def test_common_random_numbers():
+    base = ["run.duration_s=10", "radio.rx_noise_ps=100", "radio.power_noise_db=0.5", "radio.skew_noise_ppm=0.2"]
+    one = simulate(load(NOISELESS, base))
+    other = simulate(load(NOISELESS, [*base, "tags.0.skew_ppm=5.5", "tags.0.delay_ns=0.9"]))
+    # Another clock moves when exchanges happen by microseconds, and nothing else of what chance decides.
+    np.testing.assert_array_equal(one.poses.position_m, other.poses.position_m)
+    np.testing.assert_allclose(one.exchanges.fpp1_dbm, other.exchanges.fpp1_dbm, atol=1e-2)
+    without = (one.exchanges.initiator != 1) & (one.exchanges.target != 1)
+    np.testing.assert_array_equal(one.exchanges.rx2[without], other.exchanges.rx2[without])
+    single = simulate(load(NOISELESS, [*base, "ranging.protocol=ss"]))
+    np.testing.assert_array_equal(one.poses.quaternion, single.poses.quaternion)
+    np.testing.assert_allclose(one.exchanges.fpp1_dbm, single.exchanges.fpp1_dbm, atol=1e-2)
+
+
+def test_thirty_hours_are_as_exact_as_a_second():
+    scenario = load(ROOT / "scenarios" / "wrap" / "wrap.toml")
+    result = simulate(scenario)
+    planted = {int(k): d * 1e-9 for k, d in scenario.planted()["delays_ns"].items()}
+    e = result.exchanges
+    first, second = delay_weights(e)
+    delay = np.array([planted.get(k, 0.0) for k in range(4)])
+    error = raw_range(e) + SPEED_OF_LIGHT * (first * delay[e.initiator] + second * delay[e.target]) - result.truth_m
+    assert len(error) == 5400
+    assert np.abs(error).max() < METRES_PER_TICK
+
+
+def test_motion_capture_has_gaps_and_latency():
+    base = simulate(load(NOISELESS, ["run.duration_s=30"]))
+    late = simulate(load(NOISELESS, ["run.duration_s=30", "mocap.latency_ms=8", "mocap.gaps_per_min=6"]))
+    assert late.poses.time_ns.min() == base.poses.time_ns.min() + 8_000_000
+    assert 0.7 * len(base.poses) < len(late.poses) < 0.99 * len(base.poses)
+
+
+def test_show_and_validate(tmp_path):
+    shown = [processes.run("uwbsim", "show", OFFICE, "-o", tmp_path / f"s.{kind}") for kind in ("html", "png", "xyz")]
+    assert [done.returncode for done in shown] == [0, 0, 2]
+    assert "expected .html" in shown[2].stderr
+    page = (tmp_path / "s.html").read_text()
+    assert (page.count("<figure>"), page.count("src='http")) == (5, 0)
+    assert (tmp_path / "s.png").stat().st_size > 20_000
+    bipartite = ROOT / "scenarios" / "anchors_and_tag" / "bipartite.toml"
+    words = (OFFICE,), (bipartite,), (OFFICE, "--json")
+    told = ("7200 exchanges planned among 6 pairs", "will not be determined", '"air_share"')
+    for own, text in zip(words, told, strict=True):
+        assert text in processes.run("uwbsim", "validate", *own).stdout
+
+
+def test_listed_success_counts_failures(tmp_path):
+    flight = tmp_path / "f.uwb"
+    aloha = ROOT / "scenarios" / "collisions" / "aloha.toml"
+    assert processes.run("uwbsim", "run", aloha, "-o", flight, "--set", "run.duration_s=5").returncode == 0
+    shown = json.loads(processes.run("uwblink", "show", flight, "--json").stdout)
+    with Recording.open(flight) as recording:
+        assert sum(p["failed"] for p in shown["pairs"]) == recording.count("faults") > 0
+        assert sum(p["exchanges"] for p in shown["pairs"]) == recording.count("exchanges")
+
+
+# Scenarios that come along, by name: found, listed, copied.
+
+
+def test_every_one_is_told_of():
+    told = listed()
+    assert list(told) == list(shipped_scenarios()) == sorted(told)
+    assert all(4 < len(text) < 200 for text in told.values())
+    assert len(set(told.values())) == len(told), "two are told of alike"
+
+
+def test_a_name_does_for_a_file_where_there_is_none(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    by_name = uwbsim.load("nlos_office/office")
+    assert by_name == uwbsim.load(shipped_scenarios()["nlos_office/office"])
+    assert uwbsim.load("noiseless.toml") == uwbsim.load("noiseless")
+    own = (shipped_scenarios()["noiseless"]).read_text().replace("seed = ", "seed = 7")
+    Path("noiseless.toml").write_text(own)
+    assert uwbsim.load("noiseless.toml").run.seed != uwbsim.load("noiseless").run.seed
+    with pytest.raises(uwbsim.ScenarioError, match=r"no such scenario file \(\.toml\) or name"):
+        uwbsim.load("icra2024/train")
+    for wrong, near in (("icra2023/tset1", "icra2023/test1 or"), ("hall.toml", "hall_with_metal/hall or lasting")):
+        with pytest.raises(uwbsim.ScenarioError, match=f"or name, did you mean {near}"):
+            uwbsim.load(wrong)
+    with pytest.raises(uwbsim.ScenarioError, match=r"or name \(see uwbsim scenarios\)"):
+        uwbsim.load("flight.uwb")
+    number: Any = 3
+    with pytest.raises(uwbsim.UwbsimError, match="`source`: found int, expected a path, a name"):
+        uwbsim.simulate(number)
+
+
+def test_copies_run_on_their_own(tmp_path):
+    written = copy_scenarios(["nlos_office"], tmp_path / "mine")
+    assert {path.relative_to(tmp_path).as_posix() for path in written} == {
+        "mine/nlos_office/office.toml",
+        "mine/nlos_office/monopole.csv",
+    }
+    assert uwbsim.load(written[0]) == uwbsim.load("nlos_office/office")
+    assert len(copy_scenarios([], tmp_path / "all")) == len(shipped_scenarios()) + 2
+    with pytest.raises(uwbsim.ScenarioError, match="nonsense: no such scenario; known are anchors"):
+        copy_scenarios(["icra2023", "nonsense"], tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_command_copies_and_replaces_only_when_told(tmp_path):
+    def run(*words):
+        return processes.run("uwbsim", "scenarios", *words, cwd=tmp_path)
+
+    assert "icra2023/train" in run().stdout
+    assert run("icra2023", "-o", "s").stdout.splitlines() == [
+        f"s/icra2023/{n}.toml" for n in ("test1", "test2", "train")
+    ]
+    again = ("uwbsim", "scenarios", "icra2023", "-o", "s")
+    processes.refuse(*again, cwd=tmp_path, naming=["s/icra2023/test1.toml: exists already", "--force"])
+    assert run("icra2023", "-o", "s", "--force").returncode == 0

@@ -163,8 +163,7 @@ def session(leader):
 
 
 def signals_blocked(pid):
-    status = Path(f"/proc/{pid}/status").read_text()
-    bits = int(re.search(r"SigBlk:\s*(\w+)", status)[1], 16)
+    bits = int(re.search(r"SigBlk:\s*(\w+)", Path(f"/proc/{pid}/status").read_text())[1], 16)
     return {number for number in signal.Signals if bits >> (number - 1) & 1}
 
 

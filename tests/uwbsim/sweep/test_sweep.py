@@ -13,10 +13,8 @@ import numpy as np
 import pytest
 
 from uwblink.protocols.table import PROTOCOLS, register_protocol
-from uwbsim.errors import ParameterError, ScenarioError, UwbsimError
-from uwbsim.sweep.design import load_design
+from uwbsim import ParameterError, ScenarioError, UwbsimError, load_design, run_sweep
 from uwbsim.sweep.executors import Cluster, Processes
-from uwbsim.sweep.runner import run_sweep
 from uwbsim.world.channel import CHANNEL_EFFECTS, register_channel_effect
 
 ROOT = Path(__file__).parents[3]
@@ -89,8 +87,7 @@ def test_what_fails_is_a_row_and_the_rest_goes_on(tmp_path):
     summary = run_sweep(plan(tmp_path, text), tmp_path / "out", workers=1)
     assert (summary.done, summary.failed) == (2, 1)
     good, bad = [r for r in rows(tmp_path / "out") if r["protocol"] != "ss-cfo"]
-    assert good["status"] == "ok"
-    assert bad["status"] == "failed"
+    assert (good["status"], bad["status"]) == ("ok", "failed")
     assert "rate_hz" in bad["error"]
 
 
@@ -114,8 +111,7 @@ def test_a_process_that_dies_is_replaced_and_several_give_the_same_bytes(alone, 
 
 def test_a_dask_cluster_survives_the_death_of_a_worker(tmp_path):
     distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
-    text = HEAD + "ranges = 2_000\nseeds = 4\n" + GRID
-    p = plan(tmp_path, text)
+    p = plan(tmp_path, (HEAD + "ranges = 2_000\nseeds = 4\n" + GRID))
     seen: list[float] = []
 
     def kill_one(fraction):
@@ -193,8 +189,7 @@ def test_functions_of_a_stranger_reach_other_processes(tmp_path, stranger):
     counts = {
         name: [int(row["count"]) for row in rows(tmp_path / "2") if row["protocol"] == name] for name in ("ss", "mine")
     }
-    assert counts["ss"] == counts["mine"]
-    assert counts["ss"][1] == pytest.approx(2 * counts["ss"][0], abs=2)
+    assert (counts["ss"], counts["ss"][1]) == (counts["mine"], pytest.approx(2 * counts["ss"][0], abs=2))
     before, after = ([float(row["weakest_dbm"]) for row in rows(tmp_path / name)] for name in ("without", "2"))
     # Boards print powers of whole counts: at -97 dBm a step is 0.015 dB.
     np.testing.assert_allclose(np.subtract(before, after), 3.0, atol=0.03)

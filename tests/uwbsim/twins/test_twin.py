@@ -10,13 +10,14 @@ from typer.testing import CliRunner
 import uwbsim
 from calib import Calibration
 from tests import processes
-from tests.uwbsim.twins.worlds import known, world
-from uwblink import Poses, UwblinkError, load
+from tests.uwbsim.twins.worlds import box, known, world
+from uwblink import PROTOCOLS, Exchanges, Poses, Tag, UwblinkError, load
 from uwbsim.cli.commands import _print_table, app
 from uwbsim.pages import TWIN_COLUMNS
 from uwbsim.scenario.radio import Radio
 from uwbsim.twins import TWIN_LEVEL
-from uwbsim.twins.range_errors import read_calibration
+from uwbsim.twins.flight import TwinFlight, effective_size, lag_one, lasting, some_rows
+from uwbsim.twins.range_errors import fit_range_errors, read_calibration
 from uwbsim.world.radio import reception_bias_s
 
 
@@ -65,19 +66,15 @@ def test_of_a_long_flight_blocks_all_over_it_are_taken(found):
     whole = found.measured
     rows = whole.some(4000)
     part = whole[rows]
-    assert len(part) == 4000
-    assert np.count_nonzero(np.diff(rows) > 1) == 1
-    assert part.time_s[-1] == whole.time_s[-1]
+    assert (len(part), np.count_nonzero(np.diff(rows) > 1), part.time_s[-1]) == (4000, 1, whole.time_s[-1])
     assert part.exchanges.rx2.tolist() == whole.exchanges.rx2[rows].tolist()
     assert np.array_equal(whole.some(9000), np.arange(9000))
 
 
 def test_the_schedule_is_found(found):
     ranging = found.scenario.ranging
-    assert ranging.plan == "round-robin"
-    assert ranging.rate_hz == pytest.approx(150.0, rel=1e-3)
-    assert ranging.response_delay_uus == 1500
-    assert list(ranging.pairs) == [(11, 12), (11, 13), (12, 13)]
+    assert (ranging.plan, ranging.rate_hz) == ("round-robin", pytest.approx(150.0, rel=1e-3))
+    assert (ranging.response_delay_uus, list(ranging.pairs)) == (1500, [(11, 12), (11, 13), (12, 13)])
 
 
 def test_a_saved_twin_flies_the_same_ways(found, flight, tmp_path):
@@ -191,8 +188,7 @@ def test_nothing_is_written_where_something_is_wrong(flight, tmp_path):
     (tmp_path / "t.html").write_text("mine")
     for output, message in (("t.toml", "exists already"), ("u.txt", "found .txt"), ("u.toml", "no schema_version")):
         command = ["twin", str(tmp_path / "f.uwb"), "-c", str(tmp_path / "c.json"), "-o", str(tmp_path / output)]
-        done = CliRunner().invoke(app, command)
-        assert message in str(done.exception)
+        assert message in str(CliRunner().invoke(app, command).exception)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c.json", "f.uwb", "t.html"]
     assert len(load(tmp_path / "f.uwb").poses) > 0
 
@@ -205,3 +201,240 @@ def test_a_terminal_of_80_columns_loses_no_figure(found, capsys, monkeypatch):
     printed = set(capsys.readouterr().out.split())
     words = {word for row in rows[1:] for cell in row for word in cell.split()}
     assert {word for word in words if word[-1].isdigit() and "/" not in word} <= printed
+
+
+# Share, length and life of reflections, on residuals by a generator of this file, which shares nothing with any model.
+#
+# States alternate: a pair is direct for a while and reflected for a while, whiles are drawn from gamma distributions of
+# shape two (nobody draws anything anew at random instants), and within a while the detour is not constant but breathes.
+
+
+def alternating(rng, time_s, direct_s, reflected_s):
+    """Return which times are reflected, and how far into which spell they are."""
+    begins, reflected, at = [], [], -10 * (direct_s + reflected_s)
+    while at < time_s[-1]:
+        begins.append(at)
+        reflected.append(len(begins) % 2 == 0)
+        at += rng.gamma(2.0, (reflected_s if reflected[-1] else direct_s) / 2)
+    spell = np.searchsorted(begins, time_s, side="right") - 1
+    return np.array(reflected)[spell], spell, time_s - np.array(begins)[spell]
+
+
+def residuals(rng, time_s, direct_s, reflected_s, core_m=0.04, mean_m=0.4):
+    reflected, spell, into = alternating(rng, time_s, direct_s, reflected_s)
+    detours = rng.exponential(mean_m, spell.max() + 1)[spell]
+    breath = 1 + 0.2 * np.sin(7 * into + spell)
+    return np.where(reflected, detours * breath, 0.0) + rng.normal(0, core_m, len(time_s)), reflected
+
+
+def reflected_flight(time_s, pair, error):
+    count = len(time_s)
+    pairs = tuple((1, 2 + k) for k in range(pair.max() + 1))
+    tags = tuple(Tag(k, f"b{k}", (0.0, 0.0, 0.0)) for k in range(1, len(pairs) + 2))
+    return TwinFlight(
+        where="made",
+        tags=tags,
+        row=PROTOCOLS["ss"],
+        exchanges=Exchanges.from_arrays(
+            np.full(count, 1), 2 + pair, tx1=np.zeros(count, int), rx1=1, tx2=2, rx2=3, time_ns=np.rint(1e9 * time_s)
+        ),
+        origin_ns=0,
+        time_s=time_s,
+        ends=np.array([np.zeros(count, int), 1 + pair]),
+        pair=pair,
+        pairs=pairs,
+        distance_m=np.full(count, 5.0),
+        towards=np.zeros((2, count, 3)),
+        residual_m=error,
+        ratio_ppm=np.full(count, np.nan),
+    )
+
+
+@pytest.fixture(scope="module")
+def made():
+    """Six pairs: two that are reflected often, and four that are less."""
+    return several(77, [(1.2, 0.6), (1.2, 0.6), (3.0, 0.5), (3.0, 0.5), (4.0, 0.4), (4.0, 0.4)])
+
+
+def several(seed, whiles):
+    """Return a flight of pairs at 20 Hz each for 300 s, which ranges are reflected, and the mean shares of pairs."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0, 300, 0.05)
+    parts = [residuals(rng, time_s + 0.005 * k, *pair) for k, pair in enumerate(whiles)]
+    times = np.concatenate([time_s + 0.005 * k for k in range(len(whiles))])
+    pair = np.repeat(np.arange(len(whiles)), len(time_s))
+    order = np.argsort(times, kind="stable")
+    error, state = (np.concatenate([part[k] for part in parts])[order] for k in (0, 1))
+    return reflected_flight(times[order], pair[order], error), state, [r / (d + r) for d, r in whiles]
+
+
+@pytest.fixture(scope="module")
+def reflected_found(made):
+    return fit_range_errors(made[0], np.zeros(len(made[0])))
+
+
+def test_shares_are_found_of_all_and_of_pairs(made, reflected_found):
+    """The flight's own shares, which a pair's 60 to 170 spells leave 3 points from those that were asked for."""
+    whole, state, asked = made
+    assert reflected_found.share == pytest.approx(np.mean(state), abs=0.02)
+    own = [np.mean(state[whole.pair == k]) for k in range(6)]
+    assert reflected_found.pair_share == pytest.approx(own, abs=0.03)
+    assert np.corrcoef(reflected_found.pair_share, asked)[0, 1] > 0.95
+    assert np.std(reflected_found.pair_share) > 0.04
+
+
+def test_the_tail_and_the_core_are_found(reflected_found):
+    assert reflected_found.mean_excess_m == pytest.approx(0.4, rel=0.1)
+    assert reflected_found.direct_std_m == pytest.approx(0.04, rel=0.05)
+    assert np.mean(list(reflected_found.delays_ns.values())) == pytest.approx(0.0, abs=0.02)
+
+
+def test_the_life_is_that_of_the_states(made, reflected_found):
+    """The states' own integral of the autocorrelation, which no fit and no drawing at random instants is in."""
+    whole, state, _ = made
+    pairs = [state[whole.pair == k].astype(float) for k in range(6)]
+    lives = [integral_s(one - one.mean(), 0.05) for one in pairs]
+    assert reflected_found.life_s == pytest.approx(np.average(lives, weights=list(map(np.var, pairs))), rel=0.2)
+
+
+def integral_s(centred, step_s, longest_s=3.0):
+    lags = range(1, round(longest_s / step_s))
+    correlation = [np.mean(centred[k:] * centred[:-k]) / np.mean(centred**2) for k in lags]
+    first = next((k for k, value in enumerate(correlation) if value < 0.02), len(correlation))
+    return step_s * (0.5 + sum(correlation[:first]))
+
+
+def test_pairs_whose_reflections_last_longer_are_told_from_others():
+    lives = fit_range_errors(several(78, [(0.6, 0.3)] * 2 + [(4.0, 2.0)] * 2)[0], np.zeros(24_000)).pair_life_s
+    assert min(lives[2:]) > 3 * max(lives[:2])
+
+
+def test_independent_reflections_have_no_life(made):
+    rng = np.random.default_rng(5)
+    whole = made[0]
+    shuffled = reflected_flight(whole.time_s, whole.pair, rng.permutation(whole.residual_m))
+    assert fit_range_errors(shuffled, np.zeros(len(shuffled))).life_s is None
+
+
+def test_some_rows_are_of_all_pairs_that_take_turns():
+    rows = some_rows(24_000, 4000)
+    assert len(np.unique(rows)) == 4000
+    assert np.bincount(rows % 12).min() > 4000 / 12 * 0.8
+    assert np.array_equal(some_rows(10, 10), np.arange(10))
+
+
+def autoregressive(steps, keep):
+    """Each value is the share `keep` of the one before it, and a step that leaves the variance at one."""
+    values, now = np.empty(len(steps)), 0.0
+    for k, (share, step) in enumerate(zip(keep, steps, strict=True)):
+        values[k] = now = share * now + np.sqrt(1 - share**2) * step
+    return values
+
+
+def test_values_are_worth_what_their_dependence_leaves():
+    """An autoregressive sequence of coefficient a is worth (1 - a)/(1 + a) of its length."""
+    value, group = autoregressive(np.random.default_rng(3).normal(size=60_000), [0.8] * 60_000), np.zeros(60_000, int)
+    assert effective_size(value, group) / 60_000 == pytest.approx(0.2 / 1.8, rel=0.1)
+    r, error = lag_one(value, group)
+    assert r == pytest.approx(0.8, abs=0.02)
+    # Bartlett: the error of the coefficient of such a sequence is sqrt((1 - a^2)/n).
+    assert error == pytest.approx(np.sqrt((1 - 0.8**2) / 60_000), rel=0.15)
+
+
+def test_a_life_is_found_below_noise_and_between_uneven_times():
+    rng = np.random.default_rng(9)
+    time_s = np.sort(rng.uniform(0, 2000, 40_000))
+    value = autoregressive(rng.normal(size=len(time_s)), np.exp(-np.diff(time_s, prepend=0.0) / 0.7))
+    noisy = value + rng.normal(0, 1.5, len(value))
+    variance, life_s = lasting(time_s, np.zeros(len(time_s), dtype=np.int64), noisy)
+    assert (life_s, variance) == (pytest.approx(0.7, rel=0.1), pytest.approx(1.0, rel=0.1))
+
+
+# Twins of worlds with anchors, antennas of tags, fading, losses in bursts, plans of other kinds and two messages.
+
+
+def antennas():
+    """Two robots and an anchor; along x one tag has more gain, another sends weak, and a third reads strong."""
+    bodies = [
+        {"name": "a", "motion": box(-2.0, -2.0)},
+        {"name": "b", "motion": box(2.0, 1.5)},
+        {"name": "mast", "motion": {"model": "static", "position_m": [-1.5, 3.0, 2.5], "yaw_deg": 40.0}},
+    ]
+    tags = [
+        {"id": 1, "body": "a", "lever_arm_m": [0.2, 0.0, 0.0], "pattern_db": [0.0, 0.0, 0.0, 2.0]},
+        {"id": 2, "body": "a", "lever_arm_m": [-0.2, 0.0, 0.0], "tx_power_db": -4.0},
+        {"id": 3, "body": "b", "lever_arm_m": [0.2, 0.0, 0.0], "power_offset_db": 3.0},
+        {"id": 4, "body": "b", "lever_arm_m": [-0.2, 0.0, 0.0]},
+        {"id": 5, "body": "mast"},
+    ]
+    radio = {
+        "multipath": None,
+        "power_noise_db": 0.5,
+        "fading": {"std_db": 1.5, "life_s": 0.1},
+        "outages": {"share": 0.1, "life_s": 0.2},
+    }
+    tables = world(40.0, seed=8, rate_hz=240.0, radio=radio, bodies=bodies, tags=tags)
+    return tables | {"radio": {key: value for key, value in tables["radio"].items() if value is not None}}
+
+
+@pytest.fixture(scope="module")
+def other_found():
+    return uwbsim.twin(uwbsim.simulate(antennas(), contention=False), known(antennas()))
+
+
+def test_antennas_and_offsets_are_told_apart(other_found):
+    """Differences of directions are told by every exchange; of an antenna, fading leaves half a decibel open."""
+    tags = {tag.id: tag for tag in other_found.scenario.tags}
+    own = np.array(tags[1].pattern_db[1:])
+    assert (own[2], np.argmax(np.abs(own))) == (pytest.approx(2.0, abs=0.6), 2)
+    assert [tags[k].tx_power_db for k in (1, 2, 3, 4)] == pytest.approx([0.0, -4.0, 0.0, 0.0], abs=0.05)
+    assert [tags[k].power_offset_db for k in (1, 2, 3, 4)] == pytest.approx([0.0, 0.0, 3.0, 0.0], abs=0.05)
+
+
+def test_fading_is_no_noise_of_readings(other_found):
+    assert other_found.found["fading_db"] == pytest.approx(1.5, rel=0.1)
+    assert other_found.found["fading_life_s"] == pytest.approx(0.1, rel=0.25)
+    assert other_found.found["power_noise_db"] == pytest.approx(0.5, rel=0.05)
+    assert other_found.found["path_loss_exponent"] == pytest.approx(2.4, abs=0.1)
+
+
+def test_losses_come_in_bursts(other_found):
+    outages = other_found.scenario.radio.outages
+    assert (outages.share, outages.life_s) == (pytest.approx(0.1, abs=0.02), pytest.approx(0.2, rel=0.3))
+    assert other_found.found["reflected_share"] == 0.0
+
+
+def test_readings_that_saturate_are_told_from_powers_that_end():
+    tables = antennas()
+    tables["radio"] |= {"saturation_dbm": -82.0}
+    saturated = uwbsim.twin(uwbsim.simulate(tables, contention=False), known(tables))
+    assert saturated.found["saturation_dbm"] == pytest.approx(-82.0, abs=0.3)
+    assert saturated.found["path_loss_exponent"] == pytest.approx(2.4, abs=0.2)
+
+
+def test_powers_without_saturation_have_none(other_found):
+    assert other_found.found["saturation_dbm"] is None
+
+
+def test_a_mast_stands_and_robots_fly_as_recorded(other_found):
+    motions = {body.name: body.motion for body in other_found.scenario.bodies}
+    assert [motion.model for motion in motions.values()] == ["recorded", "recorded", "static"]
+    assert motions["mast"].position_m == pytest.approx((-1.5, 3.0, 2.5))
+    assert motions["mast"].yaw_deg == pytest.approx(40.0)
+
+
+def test_two_messages_at_random_times_have_a_plan_and_no_noise_of_stamps(tmp_path):
+    tables = world(20.0, rate_hz=100.0)
+    tables["ranging"] |= {"protocol": "ss", "plan": "aloha"}
+    tables["radio"] = {"rx_noise_ps": 150.0, "first_path_at_1m_dbm": -72.0}
+    flight = uwbsim.simulate(tables, contention=False)
+    twin = uwbsim.twin(flight, known(tables))
+    assert twin.found["receive_noise_ps"] is None
+    assert any("Noise of stamps apart from that of ranges" in text for text in twin.unknown)
+    assert twin.scenario.ranging.response_delay_uus == 1500
+    twin.save(tmp_path / "t.toml")
+    again = uwbsim.simulate(tmp_path / "t.toml", contention=False).exchanges
+    assert len(again) == len(flight.exchanges)
+    assert np.array_equal(again.target, flight.exchanges.target)
+    # Slots begin where messages left: a preamble later.
+    assert np.max(np.abs(np.diff(again.time_ns) - np.diff(flight.exchanges.time_ns))) < 2_000

@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 
 import uwbsim
-from tests.uwbsim.world.helpers import autocorrelation
-from uwblink import Board, raw_range
-from uwblink.ticks import SPEED_OF_LIGHT
-from uwbsim.world.impulse_response import EDGE_TO_PEAK, TAP_S, peak_amplitude
+from tests.uwbsim.world.helpers import autocorrelation, served
+from uwblink import PROTOCOLS, SPEED_OF_LIGHT, Board, raw_range
+from uwbsim.protocols.conditions import conditions_of
+from uwbsim.protocols.prediction import predict
+from uwbsim.scenario.radio import Radio
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND
+from uwbsim.world.impulse_response import BEFORE, EDGE_TO_PEAK, TAP_M, TAP_S, Paths, accumulate, detect, peak_amplitude
 from uwbsim.world.world import SampledWorld, World
 
 ROOM = {"min_m": [-4.0, -4.0, 0.0], "max_m": [8.0, 4.0, 3.0], "reflection_loss_db": 6.0}
@@ -56,8 +59,7 @@ def test_a_body_in_the_way_lets_the_chip_take_a_reflection_for_the_first_path():
         link(scenario(room=ROOM, **more)) for more in ({}, {"bodies": [post(LOSS_DB / 0.6)]}, {"obstacles": [BOX]})
     )
     # The floor is a metre below: 4.47 m instead of 4 m.
-    assert free.excess_m[0] == 0
-    assert shadowed.excess_m[0] == pytest.approx(np.hypot(4, 2) - 4, abs=1e-9)
+    assert (free.excess_m[0], shadowed.excess_m[0]) == (0, pytest.approx(np.hypot(4, 2) - 4, abs=1e-9))
     assert shadowed.excess_m[0] == pytest.approx(blocked.excess_m[0], abs=1e-9)
     assert shadowed.power_dbm[0] == pytest.approx(blocked.power_dbm[0], abs=1e-9)
     extra = [float(x.total_dbm[0] - x.power_dbm[0]) for x in (free, shadowed, blocked)]
@@ -238,8 +240,7 @@ def test_replies_follow_the_quantiles_that_are_given():
 def test_direct_paths_scatter_and_a_pair_has_its_own_excess():
     model = {"model": "two-state", "share": 0.0, "life_s": 0.1, "direct_std_m": 0.05}
     run = still_flight({"multipath": model})
-    error = error_of(run)
-    assert np.std(error) == pytest.approx(0.05, rel=0.05)
+    assert np.std(error_of(run)) == pytest.approx(0.05, rel=0.05)
     known = {"tags": [1, 2], "mean_excess_m": 1.0}
     run = still_flight({"multipath": model | {"share": 1.0, "pairs": [known]}})
     assert np.mean(error_of(run)) == pytest.approx(1.0, rel=0.1)
@@ -247,3 +248,274 @@ def test_direct_paths_scatter_and_a_pair_has_its_own_excess():
 
 def error_of(run):
     return raw_range(run.exchanges) - run.truth_m
+
+
+# What a chip reads off a response: against paths summed here, and geometry by hand.
+
+
+SENSING = (Radio(dynamic_range_db=15.0, sensitivity_dbm=-105.0), 1 / 12)
+WIDTH_TAPS, EDGE_TAPS = 1.2, 1.5
+
+
+def arrivals(*ways):
+    """One link with ways (detour in metres, power in dBm, phase)."""
+    detour, power, phase = np.array(ways).T
+    return Paths(detour_m=detour[None], amplitude=(10 ** (power / 20) * np.exp(1j * phase))[None])
+
+
+def test_responses_are_sums_of_pulses():
+    rng = np.random.default_rng(2)
+    detour, amplitude = rng.uniform(0, 14, (3, 40)), rng.normal(size=(3, 40, 2)) @ np.array([1, 1j])
+    taps = np.arange(64)
+    expected = [
+        sum(
+            a * np.exp(-(((taps - BEFORE - EDGE_TAPS - d / TAP_M) / WIDTH_TAPS) ** 2))
+            for d, a in zip(*link, strict=True)
+        )
+        for link in zip(detour, amplitude, strict=True)
+    ]
+    real, imaginary = accumulate(Paths(detour_m=detour, amplitude=amplitude))
+    # Paths lie on a 128th of a tap.
+    np.testing.assert_allclose(real + 1j * imaginary, expected, atol=0.04)
+
+
+@pytest.mark.parametrize("power_dbm", [-70.0, -85.0, -95.0, -104.0])
+def test_a_path_alone_is_found_where_it_is_with_the_power_that_it_has(power_dbm):
+    found = detect(arrivals((0.0, power_dbm, 0.3)), *SENSING)
+    assert found.excess_m[0] == pytest.approx(0.0, abs=1e-12)
+    assert found.power_dbm[0] == pytest.approx(power_dbm, abs=1e-9)
+    assert found.total_dbm[0] == pytest.approx(power_dbm, abs=1e-9)
+
+
+@pytest.mark.parametrize(("below_db", "first"), [(10.0, True), (13.0, True), (17.0, False), (40.0, False)])
+def test_a_direct_path_counts_down_to_the_threshold_and_no_further(below_db, first):
+    """The reflection by a wall 3 m beside two antennas 4 m apart takes 7.2 m.
+
+    Taps lie up to half a tap beside a peak, where it has 1.5 dB less: so near to the threshold either may be.
+    """
+    detour = np.hypot(4.0, 6.0) - 4.0
+    found = detect(arrivals((0.0, -80.0 - below_db, 0.0), (detour, -80.0, 1.0)), *SENSING)
+    assert found.excess_m[0] == pytest.approx(0.0 if first else detour, abs=0.003)
+    if below_db == 10:
+        assert found.power_dbm[0] == pytest.approx(-90.0, abs=0.3)
+    assert found.total_dbm[0] == pytest.approx(-80.0 + 10 * np.log10(1 + 10 ** (-below_db / 10)), abs=0.05)
+
+
+def test_what_is_below_sensitivity_is_no_first_path():
+    weak = arrivals((0.0, -106.0, 0.0), (2.0, -98.0, 0.0))
+    assert detect(weak, *SENSING).excess_m[0] == pytest.approx(2.0, abs=0.005)
+    keener = Radio(dynamic_range_db=15.0, sensitivity_dbm=-108.0)
+    assert detect(weak, keener, 0.1).excess_m[0] == pytest.approx(0.0, abs=0.02)
+
+
+def test_paths_nearer_than_the_pulse_fade_by_their_phase():
+    """Half a wavelength apart they cancel, in phase they add; the edge moves by less than the path."""
+    near = 0.01
+    powers = [detect(arrivals((0.0, -80.0, 0.0), (near, -86.02, p)), *SENSING).power_dbm[0] for p in (0.0, np.pi)]
+    np.testing.assert_allclose(powers, -80 + 20 * np.log10([1.5, 0.5]), atol=0.2)
+    moved = [detect(arrivals((0.0, -80.0, 0.0), (0.3, -86.0, p)), *SENSING).excess_m[0] for p in np.linspace(0, 6, 13)]
+    assert np.ptp(moved) > 0.02
+    assert np.all(np.abs(moved) < 0.3)
+
+
+def test_noise_of_the_edge_is_that_of_a_crossing_at_half_height():
+    """Draw noise on the edge, find the crossing again: its spread is what was said. The peak's height is known."""
+    rng = np.random.default_rng(4)
+    for power_dbm in (-85.0, -97.0):
+        said = detect(arrivals((0.0, power_dbm, 0.0)), *SENSING).noise_s[0]
+        peak = 10 ** (power_dbm / 20)
+        # The strongest taps lie half a tap beside the peak.
+        strongest = peak * np.exp(-((0.5 / WIDTH_TAPS) ** 2))
+        threshold = max(strongest * 10 ** (-15 / 20), 10 ** (-105 / 20))
+        taps = np.linspace(-4, 0, 4001)
+        # The noise hardly changes along the edge: in phase with the pulse it moves it up and down.
+        noise = rng.normal(0, threshold / 12, 4000)
+        crossing = np.interp(peak / 2 - noise, (peak * np.exp(-((taps / WIDTH_TAPS) ** 2))), taps)
+        assert said == pytest.approx(np.std(crossing) * 1.0016e-9, rel=0.05)
+
+
+def test_the_edge_is_at_half_the_height_of_the_first_peak():
+    """A weaker path runs into a stronger one: the half height is found here on a fine grid."""
+    ways = arrivals((0.0, -84.0, 0.0), (0.35, -80.0, 0.6))
+    detour, amplitude = ways.detour_m[0] / TAP_M, ways.amplitude[0]
+    taps = np.linspace(-4, 6, 100_001)
+    height = np.abs(np.exp(-(((taps[:, None] - detour) / WIDTH_TAPS) ** 2)) @ amplitude)
+    half = taps[np.argmax(height >= height.max() / 2)]
+    expected = (half + WIDTH_TAPS * np.sqrt(np.log(2))) * TAP_M
+    # The taps sample it a nanosecond apart.
+    assert detect(ways, *SENSING).excess_m[0] == pytest.approx(expected, abs=0.02)
+    assert 0.05 < expected < 0.35
+
+
+# Reflections that last: planted shares and lives by pair, and their trace, wherever frames are received.
+
+
+PLACES = {"a": (0.0, 0.0, 1.0), "b": (4.0, 0.5, 1.2), "c": (1.5, 3.0, 0.8)}
+EXPECTED = {(1, 2): (0.1, 0.3), (1, 3): (0.5, 1.0), (2, 3): (0.3, 0.5)}
+"""Share and life in seconds of each pair; those of the last are the model's."""
+
+FIRST_DB, TOTAL_DB = 9.0, 2.5
+# A gamma of shape 8 has no excess so small that it could be taken for none.
+MODEL = {
+    "model": "two-state",
+    "share": 0.3,
+    "life_s": 0.5,
+    "mean_excess_m": 0.8,
+    "excess_shape": 8.0,
+    "first_path_loss_db": FIRST_DB,
+    "loss_std_db": 0.0,
+    "total_loss_db": TOTAL_DB,
+    "rise_ns": 20.0,
+}
+
+
+def states_world(duration_s=10.0, rate_hz=150.0, get_cir=False, passive=(), who=tuple(EXPECTED), **model):
+    quiet = {"rx_noise_ps": 0.0, "skew_noise_ppm": 0.0, "quantize": False, "first_path_at_1m_dbm": -72.0}
+    return uwbsim.load(
+        {
+            "run": {"duration_s": duration_s, "seed": 8},
+            "ranging": {"rate_hz": rate_hz, "pairs": [list(p) for p in who], "get_cir": get_cir},
+            "radio": quiet | {"multipath": MODEL | model},
+            "mocap": {"rate_hz": 2.0},
+            "bodies": [{"name": n, "motion": {"model": "static", "position_m": p}} for n, p in PLACES.items()],
+            "tags": [{"id": k + 1, "body": n, "passive": k + 1 in passive} for k, n in enumerate(PLACES)],
+        }
+    )
+
+
+def by_pair(flight, pair):
+    rows = (flight.exchanges.initiator == pair[0]) & (flight.exchanges.target == pair[1])
+    return rows, (raw_range(flight.exchanges) - flight.truth_m)[rows]
+
+
+@pytest.fixture(scope="module")
+def long_flight():
+    """Each pair 20 times a second for an hour."""
+    known = [{"tags": [1, 2], "share": 0.1, "life_s": 0.3}, {"tags": [3, 1], "share": 0.5, "life_s": 1.0}]
+    return uwbsim.simulate(states_world(3600.0, 60.0, pairs=known), contention=False)
+
+
+@pytest.mark.parametrize("pair", EXPECTED)
+def test_pairs_have_their_own_shares(long_flight, pair):
+    share, life_s = EXPECTED[pair]
+    reflected = by_pair(long_flight, pair)[1] > 0.1
+    # An hour holds 3600/(2 life) independent looks.
+    error = np.sqrt(share * (1 - share) * 2 * life_s / 3600)
+    assert np.mean(reflected) == pytest.approx(share, abs=3 * error)
+
+
+@pytest.mark.parametrize("pair", EXPECTED)
+def test_residuals_and_states_forget_with_their_life(long_flight, pair):
+    life_s, residual = EXPECTED[pair][1], by_pair(long_flight, pair)[1]
+    for lag in (1, 4, 10, 20):
+        expected = np.exp(-lag * 0.05 / life_s)
+        # A thousandth of the hour each: autocorrelations are known to 0.03.
+        assert autocorrelation(residual, lag) == pytest.approx(expected, abs=0.08), lag
+        assert autocorrelation((residual > 0.1).astype(float), lag) == pytest.approx(expected, abs=0.08), lag
+
+
+def test_reflections_show_in_first_path_power(long_flight):
+    rows, residual = by_pair(long_flight, (2, 3))
+    reflected = residual > 0.1
+    for name in ("fpp1_dbm", "fpp2_dbm"):
+        power = getattr(long_flight.exchanges, name)[rows]
+        assert np.ptp(power[~reflected]) < 1e-9
+        # An exchange in the middle of which the path changes has one power of each.
+        assert np.median(power[~reflected]) - np.median(power[reflected]) == pytest.approx(FIRST_DB, abs=1e-9)
+
+
+def test_excess_is_that_of_the_scenario(long_flight):
+    residual = by_pair(long_flight, (2, 3))[1]
+    excess = residual[residual > 0.1]
+    # 2000 reflections of a shape of 8 know their mean to 1 %.
+    assert excess.mean() == pytest.approx(0.8, rel=0.04)
+    assert excess.std() == pytest.approx(0.8 / np.sqrt(8), rel=0.08)
+
+
+def test_reflections_show_in_total_less_first_path_power():
+    world = World(states_world(300.0))
+    time = (np.linspace(0, 300, 2000) * SUBTICKS_PER_SECOND).astype(np.int64)
+    link = world.link(np.zeros(2000, dtype=np.int64), np.ones(2000, dtype=np.int64), time)
+    reflected = link.excess_m > 0
+    assert 0.1 < reflected.mean() < 0.6
+    np.testing.assert_allclose((link.total_dbm - link.power_dbm)[reflected], FIRST_DB - TOTAL_DB, atol=1e-9)
+    np.testing.assert_allclose((link.total_dbm - link.power_dbm)[~reflected], 0.0, atol=1e-9)
+
+
+def test_the_rise_of_a_response_is_the_later_paths():
+    world = World(states_world(share=1.0))
+    ends = np.array([0]), np.array([1])
+    (paths,) = world.paths(*ends, np.array([SUBTICKS_PER_SECOND]), np.zeros(1))
+    delay_s, share = paths.delay_s[-1], paths.amplitude[-1]
+    (expected,) = world.states.at(ends, np.array([1.0]))[3]
+    assert delay_s == pytest.approx(expected, rel=1e-6)
+    later_db = 10 * np.log10(10 ** ((FIRST_DB - TOTAL_DB) / 10) - 1)
+    assert 20 * np.log10(share) == pytest.approx(later_db, abs=1e-6)
+    assert TAP_S < 1e-8
+
+
+def test_served_boards_and_listeners_meet_the_same_paths_as_flights():
+    """One path for the whole run: what differs from a world without is the same wherever one looks."""
+    always, never = (states_world(1.0, 20.0, who=((1, 2),), passive=(3,), share=s, life_s=1e4) for s in (1.0, 0.0))
+    flights = [uwbsim.simulate(world) for world in (always, never)]
+    (excess,) = World(always).states.at((np.array([0]), np.array([1])), np.array([0.5]))[1]
+    lengths = [np.mean(raw_range(flight.exchanges)) for flight in flights]
+    assert lengths[0] - lengths[1] == pytest.approx(excess, abs=0.005)
+    heard = [flight.overheard for flight in flights]
+    for name in ("fpp1_dbm", "fpp2_dbm"):
+        np.testing.assert_allclose(heard[1][name] - heard[0][name], FIRST_DB, atol=1e-9)
+    reports, passive = zip(*(served(world) for world in (always, never)), strict=True)
+    assert reports[0].range_m - reports[1].range_m == pytest.approx(excess, abs=0.01)
+    assert reports[1].fpp1_dbm - reports[0].fpp1_dbm == pytest.approx(FIRST_DB, abs=2e-4)
+    assert passive[1].fpp2_dbm - passive[0].fpp2_dbm == pytest.approx(FIRST_DB, abs=2e-4)
+
+
+def test_the_workbench_counts_them_as_errors():
+    world = states_world(200.0, 60.0, who=((1, 2),))
+    found = predict(PROTOCOLS["ds"], conditions_of(world))
+    flight = uwbsim.simulate(world)
+    assert found.pooled()[0] == pytest.approx(np.mean(raw_range(flight.exchanges) - flight.truth_m), abs=0.002)
+
+
+def test_pairs_shares_and_lives_spread_as_asked_for():
+    count = 40
+    tags = [{"id": k, "body": "ab"[k % 2], "lever_arm_m": [0.1 * k, 0, 0]} for k in range(count)]
+    bodies = [{"name": n, "motion": {"model": "static", "position_m": PLACES[n]}} for n in "ab"]
+    model = MODEL | {"share": 0.2, "share_std": 0.1, "life_s": 0.05}
+    world = uwbsim.load(
+        {
+            "run": {"duration_s": 10.0},
+            "ranging": {"rate_hz": 10.0},
+            "radio": {"multipath": model},
+            "bodies": bodies,
+            "tags": tags,
+        }
+    )
+    states = World(world).states
+    which = np.searchsorted(np.arange(1, 780) * states.span_s, states.begin, side="right")
+    shares = np.bincount(which, weights=states.values[0]) / np.bincount(which)
+    # 780 pairs with 1400 paths each.
+    assert (shares.mean(), shares.std()) == (pytest.approx(0.2, abs=0.015), pytest.approx(0.1, rel=0.12))
+
+
+def test_a_longer_run_continues_the_same_reflections():
+    places, time = (np.zeros(100, dtype=np.int64), np.ones(100, dtype=np.int64)), np.linspace(0, 9, 100)
+    short, long = (World(states_world(duration)).states.at(places, time) for duration in (10.0, 1000.0))
+    np.testing.assert_array_equal(short, long)
+
+
+@pytest.mark.parametrize(
+    ("change", "fragment"),
+    [
+        ({"share_std": 0.5}, "share_std: found 0.5, with a mean of 0.3 it is below 0.458"),
+        ({"total_loss_db": 20.0}, "total_loss_db: found 20, at most first_path_loss_db"),
+        ({"pairs": [{"tags": [1, 1]}]}, "tags: found .1, 1., give two tags"),
+        ({"pairs": [{"tags": [1, 2]}, {"tags": [2, 1]}]}, "each pair once"),
+        ({"pairs": [{"tags": [1, 9]}]}, "found tag 9, the tags are 1, 2, 3"),
+        ({"model": "three-state"}, "model"),
+        ({"life_s": 0.0}, "life_s"),
+    ],
+)
+def test_models_that_cannot_be_are_refused(change, fragment):
+    with pytest.raises(uwbsim.ScenarioError, match=fragment):
+        states_world(**change)
