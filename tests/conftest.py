@@ -26,7 +26,8 @@ LONGEST: Final = (
     "tests/loop/test_without_motion_capture.py",
     "tests/test_plugins.py",
     "tests/calib/trajectories/test_inertial.py",
-    "tests/contract/test_habits.py",
+    "tests/loop/test_scenarios_of_the_world.py",
+    "tests/calib/evaluation/test_onboard.py",
 )
 
 

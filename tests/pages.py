@@ -105,7 +105,7 @@ class Runner:
 def lines(code: str) -> Iterator[str]:
     """Yield the commands of a block, without comments; flights are of 12 s at most, comparisons of 2000 ranges."""
     for most, number in ((12, r"(run\.duration_s=|plan flight .*--duration )(\d+)"), (2000, r"(compare .* -n )(\d+)")):
-        code = re.sub(number, lambda found, most=most: f"{found[1]}{min(most, int(found[2]))}", code)
+        code = re.sub(number, lambda found: f"{found[1]}{min(most, int(found[2]))}", code)  # noqa: B023 - called at once
     for line in code.replace("\\\n", " ").splitlines():
         bare = line.split(" #")[0].strip()
         if bare and not bare.startswith("#"):

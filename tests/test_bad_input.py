@@ -7,7 +7,6 @@ import gzip
 import json
 import os
 from dataclasses import replace
-from pathlib import Path
 
 import duckdb
 import numpy as np
@@ -18,12 +17,12 @@ import uwbsim
 from calib.errors import BadInputError
 from tests.boards import served
 from tests.processes import call, refuse, run, succeed
+from tests.shared_data import ROOT
 from uwblink import Contents, Exchanges, Poses
 from uwblink.boards.ports import Terminal
 from uwblink.errors import ImportTableError, PortError
 from uwblink.importers.guess import guess_map
 
-ROOT = Path(__file__).parents[1]
 NOISELESS = (ROOT / "scenarios" / "noiseless.toml").read_text()
 BENCH = ROOT / "scenarios" / "two_boards_on_a_bench" / "bench.toml"
 HEADER = "time_s,from_id,to_id,tx1,rx1,tx2,rx2"

@@ -19,10 +19,10 @@ import uwbsim
 from docs.site.commands import leaves
 from tests.boards import served
 from tests.processes import refuse, run
+from tests.shared_data import ROOT
 from uwblink.cli.shared import WRITTEN
 from uwblink.exporters import export_recording
 
-ROOT = Path(__file__).parents[1]
 NOISELESS = ROOT / "scenarios" / "noiseless.toml"
 
 

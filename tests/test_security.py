@@ -8,7 +8,6 @@ import os
 import shutil
 import struct
 from dataclasses import replace
-from pathlib import Path
 
 import duckdb
 import numpy as np
@@ -19,10 +18,10 @@ import uwblink
 import uwbsim
 from tests.boards import served
 from tests.processes import call, refuse, run, succeed
+from tests.shared_data import ROOT
 from uwblink.database import STORAGE_VERSION
 from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
 
-ROOT = Path(__file__).parents[1]
 PACKAGES = ("uwblink", "uwbsim", "calib")
 SECRET = "what nobody else may read"  # noqa: S105 - of this test
 STORAGE_OF_1_5 = 68

@@ -8,6 +8,7 @@ import re
 import time
 from contextlib import contextmanager
 from types import SimpleNamespace
+from typing import Any
 from unittest.mock import patch
 
 import pytest
@@ -59,7 +60,7 @@ class SteppedPort(SerialPort):
 @contextmanager
 def stepped_ports():
     """Give the ports of two boards behind pseudo-terminals, in time that passes step by step."""
-    clock = SimpleNamespace(
+    clock: Any = SimpleNamespace(
         ns=0, monotonic_ns=lambda: clock.ns, time_ns=time.time_ns, printed=dict.fromkeys((1, 2, 3), 0)
     )
     with patch("uwbsim.boards.server.time", clock):

@@ -1,7 +1,5 @@
 """Scenarios whose outcome is known beforehand: a month later, anchors, two tags, an office."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -9,12 +7,12 @@ from benchmarks.nlos import DETOUR_M, FLIGHT, auc, classifier, of_real_flight, o
 from calib import fit, load_ranges
 from calib.evaluation.statistics import evaluate, pair_rows
 from tests.processes import succeed
-from tests.shared_data import shared
+from tests.shared_data import ROOT, shared
 from uwblink.recording.file import Recording
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim import load, simulate
 
-SCENARIOS = Path(__file__).parents[2] / "scenarios"
+SCENARIOS = ROOT / "scenarios"
 
 
 def ranges(tmp_path, name, *settings):
@@ -147,7 +145,6 @@ def test_it_says_something_of_a_real_flight(trained):
 # The loop through the wire: bytes change nothing. tests/test_readme.py calibrates served boards.
 
 
-ROOT = Path(__file__).parents[2]
 TRAIN = ROOT / "scenarios" / "icra2023" / "train.toml"
 
 

@@ -7,7 +7,6 @@ import re
 import shlex
 import shutil
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,12 +20,12 @@ from calib.calibration.model import load_calibration
 from calib.cli.commands import app as calib_app
 from calib.surveys.knowledge import load_knowledge
 from tests import pages
+from tests.shared_data import ROOT
 from uwblink.cli.commands import app as uwblink_app
 from uwblink.pages import figures
 from uwbsim.boards.server import stays_s
 from uwbsim.scenario.radio import BIAS
 
-ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "without-motion-capture.md").read_text(encoding="utf-8")
 SCENARIO = ROOT / "scenarios" / "string" / "string.toml"
 SHORTER = ("--duration 30", "--duration 9")

@@ -5,7 +5,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -14,9 +13,8 @@ import pytest
 import uwbsim
 from tests import processes
 from tests.boards import served
-
-ROOT = Path(__file__).parents[2]
-BIN = Path(sys.executable).parent
+from tests.processes import BIN
+from tests.shared_data import ROOT
 
 
 def started(*words):

@@ -88,7 +88,8 @@ def test_factors_of_a_pair_hold_in_both_directions(fitted, name):
     errors = replace(fitted.errors, pairs={name: PairErrors(1.0, 3.0, 1.0)})
     known = Calibration.from_json(replace(fitted, errors=errors).to_json())
     there, back, other = (known.correct(3.0, -85.0, -86.0, *ends).tail_share for ends in ((1, 2), (2, 1), (1, 3)))
-    assert (there, there / (1 - there)) == (back, pytest.approx(3 * other / (1 - other)))
+    assert there == back
+    assert there / (1 - there) == pytest.approx(3 * other / (1 - other))
 
 
 def test_a_tag_in_no_group_is_named(fitted):
@@ -184,7 +185,8 @@ def test_apply_and_evaluate_correct_the_same_range_alike(corrected):
         written = recording.exchanges().range_m
     judged = calib.load_ranges(folder / "f.uwb")
     kept = (exchanges.fpp1_dbm < 0) | (exchanges.fpp2_dbm < 0)
-    assert (judged.excluded, done.count) == ({"no power": np.count_nonzero(~kept)}, len(exchanges))
+    assert judged.excluded == {"no power": np.count_nonzero(~kept)}
+    assert done.count == len(exchanges)
     np.testing.assert_array_equal(written[kept], known.apply(judged).corrected_m)
     # And neither takes the 0 for a power: that would be 8 orders of magnitude of lifted power too much.
     assert np.abs(written - exchanges.range_m)[kept].max() < 1
@@ -395,7 +397,8 @@ def test_a_shift_of_delays_against_the_curve_is_no_difference():
     other = replace(a, delays_ns={t: d + shift_ns for t, d in a.delays_ns.items()}, bias_curve=curve)
     found = compare(a, other)
     assert found.same
-    assert (found.offset_m, found.curve_rms_m) == (pytest.approx(0, abs=1e-9), pytest.approx(0, abs=1e-9))
+    assert found.offset_m == pytest.approx(0, abs=1e-9)
+    assert found.curve_rms_m == pytest.approx(0, abs=1e-9)
     assert np.abs(list(found.difference_ns.values())).max() < 1e-9
 
 

@@ -2,7 +2,6 @@
 
 import json
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,9 +20,9 @@ from tests import processes
 from tests.calib.plain_tables import DELAYS_NS, Plan, bias_m, write
 from tests.calib.trajectories.sines import flight
 from tests.processes import succeed as run
+from tests.shared_data import ROOT
 from uwblink import Contents, KnownDistance, Recording
 
-ROOT = Path(__file__).parents[3]
 COMMANDS: Any = typer.main.get_command(app)
 OPTIONS = {o for _, command in leaves(COMMANDS, ("calib",)) for parameter in command.params for o in parameter.opts}
 # Not options: the power of the lifting, which all calibrations share, and what only functions take.

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,10 +14,11 @@ from calib.evaluation.output import localization_json, localization_text, write_
 from calib.evaluation.range_updates import RangeErrors, gated_update, mixture_update
 from calib.evaluation.tracking import Settings
 from calib.report.figures import rmse_bars
+from tests.shared_data import ROOT
 from uwblink.pages.figures import style
 from uwbsim import load, simulate
 
-SCENARIOS = Path(__file__).parents[3] / "scenarios" / "icra2023"
+SCENARIOS = ROOT / "scenarios" / "icra2023"
 
 
 @pytest.fixture(scope="module")

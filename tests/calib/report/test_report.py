@@ -3,7 +3,6 @@
 import hashlib
 import json
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,9 +19,9 @@ from tests.browser import chromium, lies_well
 from tests.calib.report import page_of_numpy
 from tests.calib.synthetic import ranges
 from tests.processes import succeed as run
+from tests.shared_data import ROOT
 from uwblink.recording.file import Recording
 
-ROOT = Path(__file__).parents[3]
 TEST = "<script>alert(1)<script>"
 """The name of the test flight, which must not become a part of the page."""
 

@@ -6,18 +6,17 @@ import signal
 import socket
 import struct
 import subprocess
-import sys
 import threading
 import time
 import urllib.error
 import urllib.request
-from pathlib import Path
 
 import pytest
 
 import uwblink
 from tests.boards import bench_scenario, served
 from tests.browser import chromium
+from tests.processes import BIN
 from uwblink.boards import live_page
 from uwblink.boards.listeners import PairState, Progress, Turn, load_correction
 from uwblink.boards.live_page import LivePage
@@ -25,8 +24,6 @@ from uwblink.errors import PlanError, PortError
 from uwblink.recording.schema import Fault
 from uwblink.wire.messages import RangeReport
 from uwbsim.boards.virtual_board import VirtualPorts
-
-BIN = Path(sys.executable).parent
 
 
 def fetch(page, path="", **headers):
@@ -95,7 +92,8 @@ def test_the_picture_is_the_last_minute(tmp_path):
     drawn = re.findall(r"([\d.]+),([\d.]+)", re.search(r'points="([^"]*)"', text)[1])
     across, down = ([float(place[k]) for place in drawn] for k in (0, 1))
     # 61 ranges of a minute, a second apart, over 254 of 260 units; longer and longer, so higher and higher.
-    assert (len(drawn), across) == (61, pytest.approx([3 + 254 * k / 60 for k in range(61)], abs=0.06))
+    assert len(drawn) == 61
+    assert across == pytest.approx([3 + 254 * k / 60 for k in range(61)], abs=0.06)
     assert down == pytest.approx([41 - 38 * k / 60 for k in range(61)], abs=0.06)
     assert "range from 3.290 to 3.890 m" in text
     assert "class='silent'" in text, "the last range came six seconds ago"

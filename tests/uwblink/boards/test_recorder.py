@@ -2,7 +2,6 @@
 
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.boards import bench_scenario, served
+from tests.processes import BIN
 from uwblink import RangingPlan, Recording, record
 from uwblink.boards import decode_again
 from uwblink.boards.listeners import Listener, Progress
@@ -17,8 +17,6 @@ from uwblink.errors import PlanError, PortMissingError, RecordingError, Recordin
 from uwblink.recording.schema import Arrangement, FrameRow, Tag
 from uwblink.wire.messages import IdReport, Skipped
 from uwbsim.boards.virtual_board import VirtualPorts
-
-BIN = Path(sys.executable).parent
 
 
 def stored(path):

@@ -8,18 +8,16 @@ import subprocess
 import sys
 import time
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
 import typer
 
+from tests.shared_data import ROOT
 from uwblink.cli import shared
 from uwblink.cli.commands import app
 from uwblink.cli.shared import waiting
 from uwblink.errors import PluginWarning, RecordingError
-
-ROOT = Path(__file__).parents[3]
 
 
 class MineError(Exception):

@@ -13,12 +13,12 @@ import pytest
 
 import uwblink
 from tests.boards import bench_scenario, served
+from tests.processes import BIN
 from tests.uwblink.streaming.clients import FoxgloveClient
 from uwblink.errors import PortError
 from uwblink.streaming import FoxgloveServer, StreamedRange, UdpSender
 from uwbsim.boards.virtual_board import VirtualPorts
 
-BIN = Path(sys.executable).parent
 LISTENING = Path("/proc/net/tcp")
 
 ONE = StreamedRange(

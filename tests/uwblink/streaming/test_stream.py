@@ -4,9 +4,7 @@ import doctest
 import json
 import math
 import subprocess
-import sys
 import time
-from pathlib import Path
 
 import duckdb
 import pytest
@@ -15,12 +13,11 @@ import calib
 import uwblink
 from tests import processes
 from tests.boards import bench_scenario, served
+from tests.processes import BIN
 from uwblink.boards import LivePage, Progress, load_correction
 from uwblink.errors import ArgumentError, PlanError, PortError
 from uwblink.streaming import RangeListener
 from uwbsim.boards.virtual_board import VirtualPorts
-
-BIN = Path(sys.executable).parent
 
 
 def flight(path, protocol="ds", **more):

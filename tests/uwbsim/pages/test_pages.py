@@ -2,13 +2,13 @@
 
 import re
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import uwbsim
 from tests.browser import lies_well
+from tests.shared_data import ROOT
 from uwblink import PROTOCOLS
 from uwblink.pages.blocks import to_html
 from uwblink.pages.figures import picture, style
@@ -17,7 +17,7 @@ from uwbsim.pages.documents import comparison, scene
 from uwbsim.pages.figures import error_over, result_over_keys, room, timing
 from uwbsim.protocols.comparison import ErrorCurve
 
-SCENARIOS = Path(__file__).parents[3] / "scenarios"
+SCENARIOS = ROOT / "scenarios"
 BENCH, OFFICE = SCENARIOS / "two_boards_on_a_bench/bench.toml", SCENARIOS / "office/office.toml"
 
 

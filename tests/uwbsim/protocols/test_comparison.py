@@ -2,12 +2,12 @@
 
 import csv
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests import processes
+from tests.shared_data import ROOT
 from uwblink import PROTOCOLS, SPEED_OF_LIGHT
 from uwbsim import load, simulate
 from uwbsim.protocols.comparison import compare, costs, optimum, over_reply, over_skew
@@ -15,7 +15,6 @@ from uwbsim.protocols.conditions import calibrated, conditions_of, range_errors_
 from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.ranging import TURNAROUND_S
 
-ROOT = Path(__file__).parents[3]
 TEST1 = ROOT / "scenarios" / "icra2023" / "test1.toml"
 ROWS = list(PROTOCOLS.values())
 

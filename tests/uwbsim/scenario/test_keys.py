@@ -11,6 +11,7 @@ import pytest
 import uwbsim
 from docs.site.schema import UNITS, described, reference, unit_of
 from tests import processes
+from tests.shared_data import ROOT
 from uwblink.recording.file import Recording
 from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT
 from uwblink.twr import delay_weights, raw_range
@@ -87,7 +88,6 @@ def test_the_reference_says_unit_default_and_range():
 # Scenarios of the world: what cannot be is one clear line, and what is named is read.
 
 
-ROOT = Path(__file__).parents[3]
 OFFICE = ROOT / "scenarios" / "nlos_office" / "office.toml"
 NOISELESS = ROOT / "scenarios" / "noiseless.toml"
 
