@@ -54,6 +54,8 @@ def test_lost_frames_cost_their_exchanges_and_no_others_become_wrong():
     assert np.abs(raw_range(exchanges) - distance).max() < 0.01
     assert len(everything) - 6 <= len(exchanges) < len(everything)
     assert len(overheard["time_ns"]) < 2 * len(exchanges)
+    polls = np.column_stack([ends, exchanges.tx1])
+    assert len(np.unique(polls, axis=0)) == len(exchanges), "a poll counts once, though the next one was lost"
 
 
 def test_a_counter_that_restarts_makes_no_range():
