@@ -33,10 +33,10 @@ from uwblink.wire.messages import Message
 from uwbsim.boards.commands import ANSWER, EXECUTORS, Command, read_commands
 from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, Attempt, BoardAir, BoardRadio, Received, Steps
 from uwbsim.boards.ranging import received_by
-from uwbsim.errors import ParameterError
+from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import Source, as_scenario
-from uwbsim.scenario.model import Scenario
+from uwbsim.scenario.model import NO_BROADCASTS, Scenario
 from uwbsim.world.clocks import NS_PER_S
 
 PACKET_BYTES: Final = 64
@@ -116,7 +116,12 @@ class Bench:
     """The boards of a scenario on one medium; `send` is called with their output."""
 
     def __init__(self, scenario: Scenario, send: Sender, lost_share: float = 0.0) -> None:
-        """Power all boards at time zero; `lost_share` of all receptions fail in addition to weak ones."""
+        """Power all boards at time zero; `lost_share` of all receptions fail in addition to weak ones.
+
+        Raises `ScenarioError` for a scenario of broadcasts.
+        """
+        if scenario.ranging.plan == "broadcast":
+            raise ScenarioError(NO_BROADCASTS)
         self.env = simpy.Environment(initial_time=0)
         self.scenario = scenario
         self.send = send

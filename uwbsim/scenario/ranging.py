@@ -50,6 +50,13 @@ def after_marker_s(length_bytes: int) -> float:
     return 21 * UUS_S + (bits + 48 * math.ceil(bits / 330)) * (64 / 499.2e6)
 
 
+BROADCAST_BYTES: Final = 17
+HEARD_BYTES: Final = 6
+LONGEST_FRAME_BYTES: Final = 127
+"""Of a broadcast with its number and its own stamp of 40 bits; of each tag that it heard, with its id and such a stamp;
+and of the longest standard frame (User Manual, section 3.4): what it has no room for waits for the next one."""
+
+
 def frame_s(length_bytes: int, preamble_symbols: int) -> float:
     """Return the whole duration of a frame in seconds."""
     return before_marker_s(preamble_symbols) + after_marker_s(length_bytes)
@@ -63,6 +70,12 @@ def message_bytes(protocol: RangingProtocol) -> tuple[int, ...]:
 def exchange_air_s(protocol: RangingProtocol, preamble_symbols: int) -> float:
     """Return how long one exchange occupies the air, all its frames together."""
     return sum(frame_s(length, preamble_symbols) for length in message_bytes(protocol))
+
+
+def broadcast_s(tags: int, preamble_symbols: int) -> float:
+    """Return the duration of a broadcast that reports what its sender heard of all other of so many tags."""
+    length = BROADCAST_BYTES + HEARD_BYTES * (tags - 1)
+    return frame_s(min(length, LONGEST_FRAME_BYTES), preamble_symbols)
 
 
 def exchange_s(protocol: RangingProtocol, preamble_symbols: int, scheduled_s: float, at_once_s: float) -> float:
@@ -81,7 +94,7 @@ ProtocolName = Annotated[
 ]
 
 
-PlanName = Literal["round-robin", "tdma", "aloha", "common-list"]
+PlanName = Literal["round-robin", "tdma", "aloha", "common-list", "broadcast"]
 
 
 class BoardReply(Section):
@@ -133,7 +146,10 @@ class Ranging(Section):
         "ds",
         description="Ranging protocol.",
     )
-    rate_hz: Positive = Field(description="Exchanges per second, all pairs together.")
+    rate_hz: Positive = Field(
+        description="Exchanges per second, all pairs together; with plan broadcast, frames per second, all tags "
+        "together.",
+    )
     pairs: Literal["between-bodies"] | tuple[tuple[TagId, TagId], ...] = Field(
         "between-bodies",
         description="Pairs, as [initiator, target]; or all pairs of tags on different bodies.",
@@ -141,9 +157,13 @@ class Ranging(Section):
     plan: PlanName | PlanFile = Field(
         "round-robin",
         description="Order of exchanges: in turns, in slots of synchronized hosts (tdma), at random (aloha), by a list "
-        "that all robots share (common-list), or by a file.",
+        "that all robots share (common-list), or by a file. With broadcast, each tag that is not passive sends one "
+        "frame in its slot, and all others hear it: a frame of one tag and two of another make an exchange.",
     )
-    sync_error_ms: NotNegative = Field(0.1, description="Standard deviation of the hosts' clocks, with plan tdma.")
+    sync_error_ms: NotNegative = Field(
+        0.1,
+        description="Standard deviation of the hosts' clocks, with plan tdma, or of the slots, with plan broadcast.",
+    )
     list_timeout_ms: NotNegative = Field(
         10.0,
         description="Time for which a robot waits for an exchange that it cannot hear, with plan common-list.",
@@ -180,7 +200,18 @@ class Ranging(Section):
         median_s = 305e-6  # of boards (firmware wire format, 3.4)
         return float(self.reply.at_s(np.array(0.5))) if self.reply.model == "quantiles" else median_s
 
-    def fastest_hz(self, preamble_symbols: int) -> float:
-        """Return how many exchanges a second one after the other allow."""
+    def air_s(self, preamble_symbols: int, tags: int) -> float:
+        """Return the air time of an exchange; of a broadcast by one of so many tags."""
+        if self.plan == "broadcast":
+            return broadcast_s(tags, preamble_symbols)
+        return exchange_air_s(PROTOCOLS[self.protocol], preamble_symbols)
+
+    def fastest_hz(self, preamble_symbols: int, tags: int = 2) -> float:
+        """Return how many exchanges a second one after the other allow, or broadcasts by so many tags.
+
+        A tag sends its broadcast as soon after the one before as it sends a reply.
+        """
+        if self.plan == "broadcast":
+            return 1 / (self.air_s(preamble_symbols, tags) + self.at_once_s)
         row = PROTOCOLS[self.protocol]
         return 1 / (exchange_s(row, preamble_symbols, self.scheduled_s, self.at_once_s) + TURNAROUND_S)
