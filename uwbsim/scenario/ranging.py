@@ -84,6 +84,25 @@ def exchange_s(protocol: RangingProtocol, preamble_symbols: int, scheduled_s: fl
     return before_marker_s(preamble_symbols) + replies + after_marker_s(message_bytes(protocol)[-1])
 
 
+def exchange_costs(
+    protocol: RangingProtocol, preamble_symbols: int, scheduled_s: float, at_once_s: float
+) -> dict[str, float]:
+    """Return the durations of an exchange: `air_s`, `duration_s`, and `radio_on_s` of both radios together."""
+    lengths, marker = message_bytes(protocol), 0.0
+    end, radio = after_marker_s(lengths[0]), 2 * frame_s(lengths[0], preamble_symbols)
+    for message, length in zip(protocol.messages[1:], lengths[1:], strict=True):
+        marker += scheduled_s if message.timing == "scheduled" else at_once_s
+        # The receiver listens from the end of the frame before, as soon as it is on again.
+        listening = marker + after_marker_s(length) - end - RECEIVER_ON_S
+        radio += frame_s(length, preamble_symbols) + max(listening, 0.0)
+        end = marker + after_marker_s(length)
+    return {
+        "air_s": exchange_air_s(protocol, preamble_symbols),
+        "duration_s": exchange_s(protocol, preamble_symbols, scheduled_s, at_once_s),
+        "radio_on_s": radio,
+    }
+
+
 def _known(name: str) -> str:
     look_up(PROTOCOLS, name)
     return name
@@ -162,7 +181,7 @@ class Ranging(Section):
     )
     sync_error_ms: NotNegative = Field(
         0.1,
-        description="Standard deviation of the hosts' clocks, with plan tdma, or of the slots, with plan broadcast.",
+        description="Standard deviation of the hosts' clocks, with plan tdma, or of each frame's time, with broadcast.",
     )
     list_timeout_ms: NotNegative = Field(
         10.0,

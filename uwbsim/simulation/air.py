@@ -78,9 +78,10 @@ def schedule(scenario: Scenario) -> Schedule:
     start, turns = np.arange(count) / rate_hz, pairs[np.arange(count) % len(pairs)]
     if plan not in ("tdma", "broadcast"):
         return _in_order(start, turns, np.zeros(count, dtype=np.int64))
-    error_s = stream(scenario.run.seed, "sync error").normal(size=len(scenario.tags))
-    late = error_s * (scenario.ranging.sync_error_ms * 1e-3)
-    found = _in_order(np.maximum(start + late[turns[:, 0]], 0), turns, turns[:, 0])
+    # With "broadcast" the tags keep their slots by the frames that they hear, with another error each time.
+    rng, which = stream(scenario.run.seed, "sync error"), np.arange(count) if plan == "broadcast" else turns[:, 0]
+    late = rng.normal(size=max(count, len(place))) * (scenario.ranging.sync_error_ms * 1e-3)
+    found = _in_order(np.maximum(start + late[which], 0), turns, turns[:, 0])
     return _to_all_others(found, len(place)) if plan == "broadcast" else found
 
 
