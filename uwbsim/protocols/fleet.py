@@ -30,6 +30,10 @@ class FleetFigures:
     and motion. `air_s` and `radio_on_s` are the durations per range for which frames are on the air, and for which all
     radios send or receive; of "tdoa" per difference, and for a listener, of which there may be any number. `update_hz`
     is how often a second every pair ranges, or a listener has the differences of all anchors.
+
+    >>> import uwbsim
+    >>> [one.method for one in uwbsim.predict_fleet(uwbsim.State(), 4)]
+    ['ss', 'ss-cfo', 'ds', 'ds-alt', 'ds-sym', 'broadcast', 'tdoa']
     """
 
     method: str
@@ -55,7 +59,7 @@ def predict_fleet(q: State, tags: int) -> list[FleetFigures]:
     >>> import uwbsim
     >>> found = {one.method: one for one in uwbsim.predict_fleet(uwbsim.State(), 10)}
     >>> round(found["broadcast"].update_hz / found["ds"].update_hz)
-    22
+    25
     """
     if not 2 <= tags <= 254:
         raise ParameterError(f"found {tags}, expected 2 to 254", parameter="tags")

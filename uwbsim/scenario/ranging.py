@@ -166,8 +166,7 @@ class Ranging(Section):
         description="Ranging protocol.",
     )
     rate_hz: Positive = Field(
-        description="Exchanges per second, all pairs together; with plan broadcast, frames per second, all tags "
-        "together.",
+        description="Exchanges per second, all pairs together; frames of all tags with plan broadcast.",
     )
     pairs: Literal["between-bodies"] | tuple[tuple[TagId, TagId], ...] = Field(
         "between-bodies",
