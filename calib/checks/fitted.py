@@ -50,6 +50,8 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
     """
     slopes, louder, alone = found.slopes, change_per_decibel(found), len(found.searches) > 1
     tested = slopes.tests(list(families(found, louder, beside_curve=not alone)))
+    if found.slopes_of_heard is not None:
+        tested += found.slopes_of_heard.tests(list(_of_heard(found)))
     findings = _without_repeats(search(tested, OF_A_FIT))
     plain = found.covariances["delay"]
     for one in tested:
@@ -103,6 +105,18 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
         everyone = np.broadcast_to(np.arange(len(shared)), (count, len(shared)))
         values = np.column_stack(list(shared.values()))
         yield Family(kind="shared", names=list(shared), derivative=Derivative(everyone, values, len(shared)))
+
+
+def _of_heard(found: KnownDistances) -> Iterator[Family]:
+    """Yield offsets of differences of arrival: of a target, which its ranges contradict, and of a listener."""
+    arrivals = found.searches[0].arrivals
+    if arrivals is not None:
+        tags, target = found.model.tags, arrivals.targets
+        for kind, names, number in (
+            ("heard", [f"tag {tag}" for tag in tags], np.searchsorted(tags, target)),
+            ("listener", [f"listener {name}" for name in arrivals.listeners], arrivals.listener),
+        ):
+            yield Family(kind=kind, names=names, derivative=Derivative(number[:, None], UNIT, len(names)))
 
 
 def of_pairs(found: KnownDistances) -> Family:
@@ -262,6 +276,9 @@ SENTENCES = {
     "{worst}; does it stand at another gain, or have another antenna?",
     "skew": "{whose}: ranges read {size} too {way} as initiator and as much the other way as target, which moves "
     "{worst}: clock skew is not corrected, or with the wrong sign",
+    "heard": "{whose}: what listeners overheard contradicts its ranges by {size}, which moves {worst}; see to the "
+    "places of the listeners, or fit with `use` exchanges",
+    "listener": "{whose}: what it overheard is off by {size}, which moves {worst}; see to its place and lever arm",
     "scale": "ranges grow with the distance by {size} too {way} over the recorded distances, which moves {worst}; see "
     "to the unit and the lever arms of the true distances",
     "late": "ranges change by {size} with the speed at which true distances change (root mean square): motion capture "

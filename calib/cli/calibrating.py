@@ -104,8 +104,15 @@ def fit(
             result = _fit_from_ranges(recordings, flight, settings, trim_static=trim_static)
         else:
             with waiting("fitting"):
-                ranges = calib.load_ranges(recordings, trim_static=trim_static, need_power=not settings.delays_only)
-                result = calib.fit(ranges, settings)
+                result = calib.fit(
+                    calib.load_ranges(
+                        recordings,
+                        trim_static=trim_static,
+                        need_power=not settings.delays_only,
+                        overheard=settings.use == "receptions",
+                    ),
+                    settings,
+                )
     result.save(output, force=force)
     _print_fit(result, output, as_json=as_json)
 
@@ -118,7 +125,9 @@ def _print_fit(result: calib.FitResult, output: Path, *, as_json: bool) -> None:
     if as_json:
         typer.echo(found.to_json(), nl=False)
     else:
-        typer.echo(f"{output}: {len(result.ranges)} exchanges, {result.message}, scale {found.scale_ns:.3f} ns")
+        heard = found.provenance.get("arrivals")
+        also = f", {heard} differences of arrival" if heard else ""
+        typer.echo(f"{output}: {len(result.ranges)} exchanges{also}, {result.message}, scale {found.scale_ns:.3f} ns")
         lines = [*delay_lines(found), *(f"  left out: {number} exchanges, {reason}" for reason, number in left_out)]
         typer.echo("\n".join(filter(str.strip, [*lines, f"  {held_out_line(found)}"])))
         for warning in result.warnings:

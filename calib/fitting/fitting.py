@@ -70,7 +70,11 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     check_loss(settings.loss)
     given = settings.delays_from
     source = None if given is None else given_calibration(given, "delays_from")
-    ranges = load_ranges(data, need_power=not settings.delays_only)
+    ranges = load_ranges(data, need_power=not settings.delays_only, overheard=settings.use == "receptions")
+    if settings.use == "receptions" and not (ranges.arrivals is not None and len(ranges.arrivals)):
+        raise UnanswerableError(
+            f"{ranges.source}: no listener overheard an exchange between tags with known distances", parameter="use"
+        )
     fixed = _taken_over(source, ranges, curve=not settings.delays_only) | dict(settings.fixed_ns)
     refuse_impossible(ranges)
     # One thread: sums of several threads differ in the last digits, and threads slow small matrices down.
@@ -91,6 +95,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         "recording_ids": [name for _, name in ranges.recordings],
         "recipe": "sequential" if settings.sequential else "joint",
         "fitted": what_was_fitted(found),
+        **({"arrivals": len(heard.residual)} if (heard := found.searches[0].arrivals) else {}),
         "gauge": _gauge(found),
         **({"held_out": _judged(held, settings)} if held else {}),
     }
