@@ -177,7 +177,7 @@ def reported_exchanges(medium: Medium, kept: Ints, planned: int, rows: Schedule,
 
 def time_ns(departure: Ints) -> Ints:
     """Return true times (n,) in nanoseconds."""
-    return np.rint(departure * (NS_PER_S / SUBTICKS_PER_SECOND)).astype(np.int64)
+    return np.asarray(np.rint(departure * (NS_PER_S / SUBTICKS_PER_SECOND)).astype(np.int64))
 
 
 def printed_readings(medium: Medium, number: int, kept: Ints, planned: int, stamped: Stamped) -> tuple[Floats, Floats]:

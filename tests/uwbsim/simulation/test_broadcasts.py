@@ -1,5 +1,7 @@
 """Tags that broadcast in turn and tags that only listen, by geometry, planted delays, and loops over frames."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -30,6 +32,12 @@ def world(duration_s=4.0, rate_hz=200.0, places=PLACES, tags=None, radio=None, m
             for k in places
         ],
     }
+
+
+def table(flown):
+    """Return the receptions of a flight, or of a recording."""
+    columns: Any = flown.receptions
+    return Receptions(**columns)
 
 
 def apart_s(a, b):
@@ -75,7 +83,7 @@ def test_a_listener_has_differences_of_arrival_with_the_delay_of_the_second_send
 
 
 def test_every_frame_is_a_reception_of_each_other_tag(still):
-    r = Receptions(**still.receptions)
+    r = table(still)
     assert len(r) == 4.0 * 200 * 4
     assert np.unique(r.frame).tolist() == list(range(800))
     assert set(r.sender.tolist()) == {1, 2, 3, 4}
@@ -91,7 +99,7 @@ def test_every_frame_is_a_reception_of_each_other_tag(still):
 
 def test_noise_is_of_the_stamps_and_the_departure_is_one_for_all(still):
     """With transmit noise alone all listeners share it: their differences have only rounding, 4.5 ps each."""
-    r = Receptions(**uwbsim.simulate(world(radio={"tx_noise_ps": 500.0}, tags={"skew_ppm": 0.0})).receptions)
+    r = table(uwbsim.simulate(world(radio={"tx_noise_ps": 500.0}, tags={"skew_ppm": 0.0})))
     first = r[(r.sender == 1) & (r.listener == 2)], r[(r.sender == 1) & (r.listener == 9)]
     late = [elapsed(one.rx, one.tx, 40) * TICK_S for one in first]
     assert np.std(late[0] - late[0].mean()) == pytest.approx(500 * PS, rel=0.2)
@@ -128,7 +136,7 @@ def test_frames_that_overlap_are_lost_as_powers_and_times_say():
     """By loops over all pairs of frames: the first of two is received if it is 3 dB stronger, none while sending."""
     crowded = world(rate_hz=1000.0, sync_error_ms=0.5, duration_s=2.0, radio={"capture_db": 3.0})
     calm, found = (uwbsim.simulate(crowded, contention=contention) for contention in (False, True))
-    every, received = Receptions(**calm.receptions), Receptions(**found.receptions)
+    every, received = table(calm), table(found)
     assert len(every) == 2000 * 4
     begin = dict(zip(every.frame.tolist(), every.time_ns.tolist(), strict=True))
     sender = dict(zip(every.frame.tolist(), every.sender.tolist(), strict=True))
@@ -157,7 +165,7 @@ def test_frames_that_overlap_are_lost_as_powers_and_times_say():
 
 def test_who_is_out_of_range_hears_nothing_and_ranges_with_nobody():
     far = uwbsim.simulate(world(places=PLACES | {4: (900.0, 0.0, 0.0)}))
-    r = Receptions(**far.receptions)
+    r = table(far)
     assert 4 not in r.sender
     assert 4 not in r.listener
     assert {fault.kind for fault in far.faults} == {"lost frame"}
@@ -171,7 +179,7 @@ def test_the_recording_holds_receptions_and_the_exchanges_that_they_make(tmp_pat
     held = load(out)
     assert held.meta["timestamp_bits"] == held.exchanges.bits == 40
     assert held.counts()["receptions"] == 2 * 200 * 9
-    again, overheard = exchanges_in(Receptions(**held.receptions))
+    again, overheard = exchanges_in(table(held))
     assert again.rx3.tolist() == held.exchanges.rx3.tolist()
     assert len(overheard["rx3"]) == len(held.overheard["rx3"]) > 0
     assert {10, 11} <= set(held.overheard["listener"].tolist())
