@@ -78,16 +78,13 @@ def broadcast_s(tags: int, preamble_symbols: int) -> float:
     return frame_s(min(length, LONGEST_FRAME_BYTES), preamble_symbols)
 
 
-def exchange_s(protocol: RangingProtocol, preamble_symbols: int, scheduled_s: float, at_once_s: float) -> float:
-    """Return how long an exchange takes, from its first preamble to the end of its last frame."""
-    replies = sum(scheduled_s if message.timing == "scheduled" else at_once_s for message in protocol.messages[1:])
-    return before_marker_s(preamble_symbols) + replies + after_marker_s(message_bytes(protocol)[-1])
-
-
 def exchange_costs(
     protocol: RangingProtocol, preamble_symbols: int, scheduled_s: float, at_once_s: float
 ) -> dict[str, float]:
-    """Return the durations of an exchange: `air_s`, `duration_s`, and `radio_on_s` of both radios together."""
+    """Return the durations of an exchange: `air_s`, `duration_s`, and `radio_on_s` of both radios together.
+
+    `duration_s` is from the first preamble to the end of the last frame.
+    """
     lengths, marker = message_bytes(protocol), 0.0
     end, radio = after_marker_s(lengths[0]), 2 * frame_s(lengths[0], preamble_symbols)
     for message, length in zip(protocol.messages[1:], lengths[1:], strict=True):
@@ -98,7 +95,7 @@ def exchange_costs(
         end = marker + after_marker_s(length)
     return {
         "air_s": exchange_air_s(protocol, preamble_symbols),
-        "duration_s": exchange_s(protocol, preamble_symbols, scheduled_s, at_once_s),
+        "duration_s": before_marker_s(preamble_symbols) + end,
         "radio_on_s": radio,
     }
 
@@ -232,4 +229,5 @@ class Ranging(Section):
         if self.plan == "broadcast":
             return 1 / (self.air_s(preamble_symbols, tags) + self.at_once_s)
         row = PROTOCOLS[self.protocol]
-        return 1 / (exchange_s(row, preamble_symbols, self.scheduled_s, self.at_once_s) + TURNAROUND_S)
+        cost = exchange_costs(row, preamble_symbols, self.scheduled_s, self.at_once_s)
+        return 1 / (cost["duration_s"] + TURNAROUND_S)
