@@ -202,7 +202,7 @@ def comparison(found: ProtocolComparison) -> Document:
             "Predicted, after calibration and without reflections. Protocols: the pairs range in turn. broadcast: each "
             "tag sends a frame in turn, which all others hear. tdoa: the tags are anchors that do so; any number of "
             "listeners have the differences of arrival. Air and radio on: per range, or per difference at a listener. "
-            "Updates: how often a second all pairs range, or a listener has all differences."
+            "Updates: how often a second, at most, all pairs range, or a listener has all differences."
         ),
         Table([*FLEET_COLUMNS], [[show(one) for show in FLEET_COLUMNS.values()] for one in found.fleet]),
         Heading("Errors over skew, delay, distance and power"),

@@ -29,7 +29,8 @@ class FleetFigures:
     Errors are those of a calibrated range, or difference of arrival: `std_m` by noise, `rmse_m` with the bias by skew
     and motion. `air_s` and `radio_on_s` are the durations per range for which frames are on the air, and for which all
     radios send or receive; of "tdoa" per difference, and for a listener, of which there may be any number. `update_hz`
-    is how often a second every pair ranges, or a listener has the differences of all anchors.
+    is how often a second every pair ranges, or a listener has the differences of all anchors: as frames and replies
+    allow, one after the other.
 
     >>> import uwbsim
     >>> [one.method for one in uwbsim.predict_fleet(uwbsim.State(), 4)]
