@@ -7,13 +7,14 @@ frame follow each other. Slots depend on nothing that is received: there is no e
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from uwblink.arrays import Floats, Ints
-from uwblink.receptions import Receptions
+from uwblink.arrays import Ints
+from uwblink.receptions import Receptions, exchanges_in
 from uwblink.ticks import COUNTER_BITS
-from uwblink.twr import Exchanges, intervals
+from uwblink.twr import intervals
 from uwbsim.scenario.ranging import broadcast_s
 from uwbsim.simulation.air import BUSY, COLLIDED, Outcomes, Schedule
 from uwbsim.simulation.timestamps import Draws, Stamped, printed_readings, time_ns
@@ -47,12 +48,15 @@ def with_collisions(medium: Medium, plan: Schedule, alone: Outcomes) -> Outcomes
     return Outcomes(alone.start, [0 if text else -1 for text in reason], reason)
 
 
-def reported_receptions(medium: Medium, kept: Ints, planned: int, rows: Schedule, stamped: Stamped) -> Receptions:
-    """Return the receptions of the `kept` rows (n,), of all `planned`, with the chip's whole stamps."""
+def reported(medium: Medium, kept: Ints, planned: int, rows: Schedule, stamped: Stamped) -> dict[str, Any]:
+    """Return what tags report of the `kept` rows (n,), of all `planned`: receptions, and the exchanges that they make.
+
+    Stamps are the chip's whole ones. `truth_m` are the mean distances at the first two messages of exchanges.
+    """
     ids = np.array([tag.id for tag in medium.scenario.tags], dtype=np.int64)
     fpp, skew = printed_readings(medium, 1, kept, planned, stamped)
     tx, rx = (stamped.stamps[name] & ((1 << COUNTER_BITS) - 1) for name in ("tx1", "rx1"))
-    return Receptions(
+    receptions = Receptions(
         time_ns=time_ns(stamped.frames[0].departure),
         frame=kept // (len(ids) - 1),
         sender=ids[rows.initiator],
@@ -63,12 +67,9 @@ def reported_receptions(medium: Medium, kept: Ints, planned: int, rows: Schedule
         rxp_dbm=np.full(len(kept), np.nan),
         skew_ppm=skew,
     )
-
-
-def distances_m(medium: Medium, exchanges: Exchanges) -> Floats:
-    """Return the mean distances (n,) at the first two messages of exchanges."""
-    ids = [tag.id for tag in medium.scenario.tags]
-    i, j = (np.array([ids.index(tag) for tag in ends.tolist()]) for ends in (exchanges.initiator, exchanges.target))
+    exchanges, overheard = exchanges_in(receptions)
+    i, j = (np.argmax(ends[:, None] == ids, axis=1) for ends in (exchanges.initiator, exchanges.target))
     poll = np.rint(exchanges.time_ns * (SUBTICKS_PER_SECOND / NS_PER_S)).astype(np.int64)
     response = poll + np.rint(intervals(exchanges).dt41).astype(np.int64) * SUBTICKS
-    return np.asarray(np.mean([medium.links.link(i, j, time).distance_m for time in (poll, response)], axis=0))
+    truth_m = np.mean([medium.links.link(i, j, time).distance_m for time in (poll, response)], axis=0)
+    return {"exchanges": exchanges, "overheard": overheard, "receptions": receptions.to_dict(), "truth_m": truth_m}

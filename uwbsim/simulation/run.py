@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, Ints
 from uwblink.protocols.table import ON_BOARDS, PROTOCOLS, RangingProtocol
-from uwblink.receptions import exchanges_in
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import CirRow, Fault, FrameRow, Poses, Tag
-from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, UUS_TICKS, elapsed
+from uwblink.ticks import COUNTER_BITS, SPEED_OF_LIGHT, TICK_S, UUS_TICKS, elapsed
 from uwblink.twr import Exchanges, raw_range
 from uwblink.wire.codec import Decoder, encode, exchanges_of
 from uwblink.wire.messages import REPORTS, RangeReport
@@ -29,6 +28,7 @@ from uwbsim.simulation import air, broadcasts
 from uwbsim.simulation.air import Schedule, schedule
 from uwbsim.simulation.timestamps import (
     Draws,
+    Stamped,
     draw,
     overhear,
     provenance,
@@ -161,17 +161,15 @@ def simulate(
     scenario = as_scenario(scenario)
     if scenario.run.duration_s > LONGEST_RUN_S:
         raise ScenarioError(f"run.duration_s: at most {LONGEST_RUN_S:g} (36 h)")
-    protocol, world, plan = PROTOCOLS[scenario.ranging.protocol], World(scenario), schedule(scenario)
-    medium, listeners = Medium(scenario, world), 0
-    if scenario.ranging.plan == "broadcast":
-        protocol, listeners = replace(protocol, messages=protocol.messages[:1]), len(scenario.tags) - 1
-    draws = draw(scenario, len(plan.start), len(protocol.messages))
+    broadcast, protocol = scenario.ranging.plan == "broadcast", PROTOCOLS[scenario.ranging.protocol]
+    if broadcast:  # every row of the plan is a message to one listener
+        protocol = replace(protocol, messages=protocol.messages[:1])
+    world, plan = World(scenario), schedule(scenario)
+    medium, draws = Medium(scenario, world), draw(scenario, len(plan.start), len(protocol.messages))
+    if broadcast:
+        draws = broadcasts.one_departure(draws, len(scenario.tags) - 1)
     slots = _slots(medium, world, protocol, plan, draws)
-    if listeners:
-        draws, outcomes = broadcasts.one_departure(draws, listeners), _undisturbed(scenario, slots)
-        if contention:
-            outcomes = broadcasts.with_collisions(medium, plan, outcomes)
-    elif contention:
+    if contention and not broadcast:
         sampled = SampledWorld(world)
         execution = air.Air(
             protocol, slots, lambda tag, time: sampled.from_sender(tag, max(time, 0)).power_dbm, scenario.radio
@@ -179,35 +177,33 @@ def simulate(
         outcomes = execution.execute(progress)
     else:
         outcomes = _undisturbed(scenario, slots)
+        if contention:
+            outcomes = broadcasts.with_collisions(medium, plan, outcomes)
     begun, lost = np.array(outcomes.start, dtype=np.int64), np.array(outcomes.lost)
     kept = np.flatnonzero(lost < 0)
     kept = kept[np.argsort(begun[kept], kind="stable")]
     rows = replace(plan[kept], start=begun[kept])
-    stamped, receptions = stamp(medium, protocol, rows, draws[kept]), {}
-    meta = provenance(scenario)
-    if listeners:
-        received = broadcasts.reported_receptions(medium, kept, len(plan.start), rows, stamped)
-        exchanges, overheard = exchanges_in(received)
-        truth_m, receptions = broadcasts.distances_m(medium, exchanges), received.to_dict()
-        meta |= {"timestamp_bits": exchanges.bits}
-    else:
-        exchanges = reported_exchanges(medium, kept, len(plan.start), rows, stamped)
-        overheard = overhear(medium, stamped, exchanges)
-        truth_m = (stamped.links[0].distance_m + stamped.links[1].distance_m) / 2
+    stamped = stamp(medium, protocol, rows, draws[kept])
+    reported = broadcasts.reported if broadcast else _reported
+    found = reported(medium, kept, len(plan.start), rows, stamped)
     return Simulated(
-        exchanges=exchanges,
+        **found,
         poses=world.motion_capture(),
         tags=[Tag(t.id, t.body, t.lever_arm_m) for t in scenario.tags],
         faults=reported_faults(scenario, plan, outcomes),
-        overheard=overheard,
-        cirs=responses(scenario, world, protocol, exchanges, stamped) if scenario.ranging.get_cir else [],
-        truth_m=truth_m,
-        meta=meta,
+        cirs=responses(scenario, world, protocol, found["exchanges"], stamped) if scenario.ranging.get_cir else [],
+        meta=provenance(scenario) | ({"timestamp_bits": COUNTER_BITS} if broadcast else {}),
         temperature=readings(scenario),
         imu=sensor_readings(scenario, world.trajectories, "imu"),
         height=sensor_readings(scenario, world.trajectories, "height"),
-        receptions=receptions,
     )
+
+
+def _reported(medium: Medium, kept: Ints, planned: int, rows: Schedule, stamped: Stamped) -> dict[str, Any]:
+    """Return what boards report of the `kept` exchanges (n,), of all `planned`, and their true distances."""
+    exchanges = reported_exchanges(medium, kept, planned, rows, stamped)
+    truth_m = (stamped.links[0].distance_m + stamped.links[1].distance_m) / 2
+    return {"exchanges": exchanges, "overheard": overhear(medium, stamped, exchanges), "truth_m": truth_m}
 
 
 def _slots(medium: Medium, world: World, protocol: RangingProtocol, plan: Schedule, draws: Draws) -> air.Slots:
