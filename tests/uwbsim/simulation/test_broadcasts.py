@@ -1,5 +1,6 @@
 """Tags that broadcast in turn and tags that only listen, by geometry, planted delays, and loops over frames."""
 
+import json
 from typing import Any
 
 import numpy as np
@@ -175,7 +176,8 @@ def test_who_is_out_of_range_hears_nothing_and_ranges_with_nobody():
 
 def test_the_recording_holds_receptions_and_the_exchanges_that_they_make(tmp_path):
     out = tmp_path / "tdoa.uwb"
-    processes.succeed("uwbsim", "run", "tdoa", "-o", out, "--set", "run.duration_s=2")
+    words = ("--set", "run.duration_s=2", "--set", "radio.bias=none")
+    processes.succeed("uwbsim", "run", "tdoa", "-o", out, *words)
     held = load(out)
     assert held.meta["timestamp_bits"] == held.exchanges.bits == 40
     assert held.counts()["receptions"] == 2 * 200 * 9
@@ -184,9 +186,13 @@ def test_the_recording_holds_receptions_and_the_exchanges_that_they_make(tmp_pat
     assert len(overheard["rx3"]) == len(held.overheard["rx3"]) > 0
     assert {10, 11} <= set(held.overheard["listener"].tolist())
     assert {10, 11}.isdisjoint(held.exchanges.initiator.tolist() + held.exchanges.target.tolist())
-    # Delays of eight anchors from their own broadcasts: within the intervals, relative to their mean.
+    # Seven pairs of 49 ranges with 85 ps of noise, in which a delay counts half, tell it to 10 ps; four of these.
     fitted = processes.succeed("calib", "fit", out, "-o", tmp_path / "c.json", "--delays-only", "--json")
-    assert '"7"' in fitted.stdout
+    found = json.loads(fitted.stdout)["delays_ns"]
+    assert found == pytest.approx(
+        {k: ns for k, ns in held.meta["planted"]["delays_ns"].items() if k in found}, abs=0.04
+    )
+    assert len(found) == 8
 
 
 def test_a_preview_counts_frames():
