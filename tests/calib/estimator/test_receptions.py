@@ -98,24 +98,24 @@ def test_recordings_are_fitted_together_with_what_each_overheard():
 def test_a_listener_that_stands_elsewhere_is_named():
     data, _ = flight(7400)
     heard = data.overheard
-    # Tag 9 only listens, where tag 2 is, and is said to stand there or 30 cm beside it.
+    # Tag 9 only listens, where tag 2 is, and is said to stand there or 10 cm beside it.
     only = {name: column[heard["listener"] == 2] for name, column in heard.items()}
     joined = {name: np.concatenate([heard[name], only[name]]) for name in heard}
     joined["listener"] = np.append(heard["listener"], np.full(len(only["listener"]), 9))
-    for where, named in (((0.0, 0.0, 0.0), False), ((0.0, 0.3, 0.0), True)):
+    for where, named in (((0.0, 0.0, 0.0), False), ((0.0, 0.1, 0.0), True)):
         told = replace(data, tags=[*data.tags, Tag(9, "mast 2", where)], overheard=joined)
-        said = [w for w in calib.fit(told, use="receptions", delays_only=True).warnings if "overheard" in w]
+        said = [w for w in calib.fit(told, use="receptions").warnings if "overheard" in w]
         assert any("-9" in warning for warning in said) == named, said
         assert all("-9" in warning for warning in said), said
 
 
 def test_a_target_whose_ranges_contradict_what_is_overheard_is_named():
     data, _ = flight(7401)
-    # Five ticks are 2.3 cm.
-    late = np.where(data.overheard["target"] == 3, 5, 0)
+    # Ten ticks are 4.7 cm.
+    late = np.where(data.overheard["target"] == 3, 10, 0)
     told = replace(data, overheard=dict(data.overheard) | {"rx2": data.overheard["rx2"] + late})
     told.overheard["rx3"] += late
-    said = [w for w in calib.fit(told, use="receptions", delays_only=True).warnings if "overheard" in w]
+    said = [w for w in calib.fit(told, use="receptions").warnings if "overheard" in w]
     assert [w for w in said if w.startswith("tag 3: what listeners overheard contradicts its ranges")], said
 
 
