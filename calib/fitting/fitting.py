@@ -70,8 +70,10 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     check_loss(settings.loss)
     given = settings.delays_from
     source = None if given is None else given_calibration(given, "delays_from")
-    ranges = load_ranges(data, need_power=not settings.delays_only, overheard=settings.use == "receptions")
-    if settings.use == "receptions" and not (ranges.arrivals is not None and len(ranges.arrivals)):
+    ranges = load_ranges(data, need_power=not settings.delays_only)
+    if settings.use == "exchanges":
+        ranges = replace(ranges, arrivals=None)
+    elif ranges.arrivals is None or not len(ranges.arrivals):
         raise UnanswerableError(
             f"{ranges.source}: no listener overheard an exchange between tags with known distances", parameter="use"
         )

@@ -1,5 +1,6 @@
 """What listeners overhear, fitted beside ranges: by worlds of NumPy alone, and by the simulator without noise."""
 
+import tarfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,9 @@ import calib
 from calib.errors import BadInputError, UnanswerableError
 from tests.calib.overhearing import bound_ns2, flight, least_squares_ns
 from tests.processes import call
+from tests.shared_data import shared
 from uwblink import Tag
+from uwblink.importers import read_source
 from uwbsim import simulate
 from uwbsim.scenario.loading import load
 
@@ -28,7 +31,7 @@ def fitted(data, use, **settings):
 def test_each_listener_alone_finds_each_targets_delay_without_noise():
     world = load(SCENARIOS / "noiseless.toml", ["run.duration_s=20", *(f"tags.{k}.passive=true" for k in range(6))])
     found = simulate(world)
-    ranges = calib.load_ranges(found, overheard=True, need_power=False)
+    ranges = calib.load_ranges(found, need_power=False)
     heard, target = ranges.arrivals, ranges.target[ranges.arrivals.exchange]
     several = {(tag, k) for tag, k in zip(target.tolist(), heard.listener.tolist(), strict=True)}
     assert len(several) == 20
@@ -87,10 +90,10 @@ def test_recordings_are_fitted_together_with_what_each_overheard():
     (one, _), (other, _) = flight(7300, count=800), flight(7301, count=800)
     found = calib.fit([one, other], use="receptions", delays_only=True)
     assert found.calibration.provenance["arrivals"] == 2 * 800 * 4
-    half = calib.load_ranges([one, other], overheard=True)
+    half = calib.load_ranges([one, other])
     kept = half[half.session == 1]
     assert len(kept.arrivals) == 800 * 4
-    alone = calib.load_ranges(other, overheard=True)
+    alone = calib.load_ranges(other)
     assert kept.arrivals.error_m == pytest.approx(alone.arrivals.error_m)
     assert kept.raw_m[kept.arrivals.exchange] == pytest.approx(alone.raw_m[alone.arrivals.exchange])
 
@@ -125,7 +128,7 @@ def test_two_messages_take_the_rate_from_the_carrier():
         ["run.duration_s=20", "ranging.protocol=ss", *(f"tags.{k}.passive=true" for k in range(6))],
     )
     found = simulate(world)
-    ranges = calib.load_ranges(found, overheard=True, need_power=False)
+    ranges = calib.load_ranges(found, need_power=False)
     heard, target = ranges.arrivals, ranges.target[ranges.arrivals.exchange]
     for tag in np.unique(target).tolist():
         delay_ns = -np.mean(heard.error_m[target == tag]) / METRES_A_NS
@@ -152,3 +155,24 @@ def test_the_command_says_how_many_were_fitted(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "400 exchanges, 1600 differences of arrival" in done.stdout
     assert calib.load_calibration(tmp_path / "c.json").provenance["settings"]["use"] == "receptions"
+
+
+def test_a_real_flight_has_narrower_intervals_and_the_same_delays(tmp_path):
+    with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
+        archive.extractall(tmp_path, filter="data")
+    flown = read_source(tmp_path / "cirObstacles_3_random_0", importer="miluv")
+    (delays, std), (heard, narrow) = (fitted(flown, use) for use in ("exchanges", "receptions"))
+    # 317 ranges, and some 700 differences of arrival at the five other tags.
+    assert (narrow < 0.85 * std).all()
+    # What the receptions add is independent, so the change has the difference of both variances (Hausman 1978).
+    change = (heard - delays) / np.sqrt(std**2 - narrow**2)
+    assert np.abs(change).max() < 3
+    # The doctor says what contradicts: two tags of one robot, a lever arm apart, hear each other's frames too early.
+    said = [w for w in calib.fit(flown, use="receptions").warnings if "overheard" in w]
+    assert all(w.startswith(("path 10-11", "path 20-21", "path 30-31")) for w in said), said
+
+
+def test_a_report_fits_receptions_as_well(tmp_path):
+    data, _ = flight(7700, count=600)
+    campaign = calib.run_campaign(data, use="receptions")
+    assert campaign.calibration.provenance["arrivals"] > 1900
