@@ -103,11 +103,14 @@ class ArrivalModel:
             [replace(one, kind=HEARD + one.kind) for one in parts],
         )
 
-    def rows(self, layout: Layout, errors: Errors, more: Sequence[Part] = (), chosen: Ints | None = None) -> RangeRows:
-        """Return the rows of all differences of arrival, or of some exchanges, with the parts that a layout has."""
+    def rows(self, layout: Layout, errors: Errors, more: Sequence[Part] = ()) -> RangeRows:
+        """Return the rows of all differences of arrival, with the parts whose unknowns a layout has."""
         used = [part for part in (*self.parts, *more) if part.kind in layout.where]
-        found = replace(RangeRows.of(self.residual, self.key, used, errors, layout), alike=self.alike)
-        return found if chosen is None else found.sample(np.flatnonzero(np.isin(self.exchange, chosen)))
+        return replace(RangeRows.of(self.residual, self.key, used, errors, layout), alike=self.alike)
+
+    def sample(self, rows: RangeRows, chosen: Ints | None) -> RangeRows:
+        """Return those rows that belong to some exchanges, all for None."""
+        return rows if chosen is None else rows.sample(np.flatnonzero(np.isin(self.exchange, chosen)))
 
     def weighed(self, own: Floats, of_ranges: Floats, pairs: Ints, blocks: TimeBlocks) -> ArrivalModel:
         """Return the model with the weight of a difference of arrival beside a range.
