@@ -104,15 +104,8 @@ def fit(
             result = _fit_from_ranges(recordings, flight, settings, trim_static=trim_static)
         else:
             with waiting("fitting"):
-                result = calib.fit(
-                    calib.load_ranges(
-                        recordings,
-                        trim_static=trim_static,
-                        need_power=not settings.delays_only,
-                        overheard=settings.use == "receptions",
-                    ),
-                    settings,
-                )
+                ranges = calib.load_ranges(recordings, trim_static=trim_static, need_power=not settings.delays_only)
+                result = calib.fit(ranges, settings)
     result.save(output, force=force)
     _print_fit(result, output, as_json=as_json)
 

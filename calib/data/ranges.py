@@ -57,7 +57,7 @@ class Ranges(ColumnTable):
     `recordings` are names and fingerprints of the recordings, empty for ranges of arrays; `left_skew` is what clock
     skew may have left in single-sided ranges, None without any; `bodies` are tags with the body that carries each;
     `antenna_delays` are those programmed into the tags, as far as known; `arrivals` is what other tags overheard of
-    these exchanges, None where that is not asked for.
+    these exchanges, None without any.
     """
 
     source: str
