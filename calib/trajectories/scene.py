@@ -17,7 +17,7 @@ from calib.trajectories.samples import SAMPLE_S, Heights, Places, Samples, Tapes
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Poses
 from uwblink.recording.summary import single_reports
-from uwblink.twr import middle_ns
+from uwblink.twr import range_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +113,7 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     # The truth is not known. In its place stands the time to which a range belongs.
     ranges = Ranges.from_exchanges(
         exchanges,
-        np.asarray(middle_ns(exchanges) * 1e-9, dtype=np.float64),
+        np.asarray(range_ns(exchanges) * 1e-9, dtype=np.float64),
         tags=tags,
         planted=planted,
         source=name,
