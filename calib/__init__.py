@@ -30,9 +30,8 @@ if TYPE_CHECKING:
     from calib.planning.result import FlightPlan, Plan
     from calib.planning.settings import FlightPlanSettings, SurveyPlanSettings
     from calib.planning.surveys import plan
-    from calib.report.campaign import run_campaign
+    from calib.report.campaign import run_campaign, write_report
     from calib.report.sections import register_report_section
-    from calib.report.writing import write_report
     from calib.settings import FitSettings, FlightSettings, SurveySettings
     from calib.surveys.knowledge import Knowledge, KnownPosition
     from calib.surveys.result import SurveyResult
@@ -121,7 +120,7 @@ _homes = {
     "sample_arrangements": "calib.surveys.sample",
     "sample_flight": "calib.data.samples",
     "survey": "calib.surveys.survey",
-    "write_report": "calib.report.writing",
+    "write_report": "calib.report.campaign",
 }
 
 if not TYPE_CHECKING:

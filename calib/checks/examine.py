@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from calib.checks import columns, geometry, offsets, residuals, surveys
+from calib.checks import columns, geometry, residuals, surveys
 from calib.checks.recording_view import RecordingView, view_of
 from calib.data.sources import Data, each, opened
 from calib.findings import BUDGET, CERTAIN, OF_A_FIT, Check, Finding
@@ -168,7 +168,7 @@ CHECKS: Final = (
             "two parts apart",
             "delay drifts": "let tag {tag} warm up, see to its supply; calibrate short parts apart",
         },
-        offsets.changed_delays,
+        residuals.changed_delays,
     ),
     Check(
         "radio",
@@ -178,7 +178,7 @@ CHECKS: Final = (
             "pairs that do not close": "look for a wall or a body between these two, and at their lever arms; record "
             "the pair anew, or fit with `constants` pair"
         },
-        offsets.closures,
+        residuals.closures,
     ),
     Check(
         "radio",
@@ -278,7 +278,7 @@ CHECKS: Final = (
             "delay changed between recordings": "was the antenna of tag {tag} touched, or its board replaced? "
             "calibrate the recordings apart",
         },
-        offsets.compared,
+        residuals.compared,
     ),
     Check(
         "survey",

@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from calib.planning.result import FlightPlan, Plan
+from calib.report.campaign import check_places
 from calib.report.figures import arrangement, flight, more, planned_delays
-from calib.report.writing import check_places
 from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text, write_document
 
 

@@ -1,10 +1,20 @@
-"""The survey: delays, power curve and places of boards that stood still, from the ranges among them alone."""
+"""The survey: delays, power curve and places of boards that stood still, and what contradicts the ranges among them.
+
+Each check (wrong known distances, wrong shapes, exchanged labels) compares hypotheses of a fault with the survey as
+described, each with the reflections that fit it best: a few reflected pairs can look like a string that is not
+straight. The statistic is the ratio of the likelihoods, integrated over the unknowns; by Markov's inequality it exceeds
+1/p with a probability of at most p where nothing is wrong. The likeliest hypothesis is taken first, because a wrong
+tape makes other things look wrong, too.
+"""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -15,14 +25,139 @@ from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.settings import SurveySettings
-from calib.surveys.checks import likeliest_fault, wrong_orders
 from calib.surveys.knowledge import Knowledge, check_knowledge, load_knowledge
 from calib.surveys.network import DIMENSIONS, Boards, CurvePrior, Network
 from calib.surveys.outcome import in_frames, result_of, widened_by
 from calib.surveys.recordings import LIFT, SurveyData, read_surveys
-from calib.surveys.result import SurveyResult
-from calib.surveys.solution import averaged, solve
+from calib.surveys.result import Contradiction, SurveyResult
+from calib.surveys.solution import Solution, adjust, averaged, exchanged_boards, first_start, out_of_order, solve
 from uwblink.recording.schema import SHAPES
+
+FALSE_ALARMS = 0.01
+"""Share of sound surveys in which a check may find something."""
+
+MIN_LABEL_SIGMAS = 3.0
+"""Standard deviations by which a known distance or position must be off for labels to be tested: 0.3 % are by chance,
+and cost time only, because the test has its own level."""
+
+TAPE_ERROR_M = 0.5
+"""Prior standard deviation of the error of a wrong tape, which is misread by decimetres."""
+
+START_BESIDE_M = 0.15
+"""How far boards are put beside a line, or plane, at the start of a search: on it a derivative would be zero."""
+
+
+def likeliest_fault(found: Solution) -> tuple[Contradiction, Solution] | None:
+    """Return the likeliest fault that chance does not explain, and the solution without it."""
+    best: tuple[Contradiction, Solution] | None = None
+    for name, (hypotheses, remedy) in HYPOTHESES.items():
+        for text, without in hypotheses(found):
+            p_value = math.exp(min(0.5 * (without.unlikely - found.unlikely), 0.0))
+            if p_value < FALSE_ALARMS and (best is None or without.unlikely < best[1].unlikely):
+                best = Contradiction(name, f"{text}; {remedy}", p_value), without
+    return best
+
+
+def _distances(found: Solution) -> Iterator[tuple[str, Solution]]:
+    """Yield the solution with each of the known distances wrong by about half a metre."""
+    network = found.network
+    for k, one in enumerate(network.distances):
+        loose = list(network.distances)
+        loose[k] = replace(one, sigma_m=math.hypot(one.sigma_m, TAPE_ERROR_M))
+        without = adjust(replace(network, distances=tuple(loose)), found.x, start_m=found.case.pair_m)
+        left = network.linear(without.x)[0][len(network.means.range_m) :]
+        where = f" in {one.arrangement}" if one.arrangement else ""
+        off = 100 * float(np.mean(left[network.tapes[1][:, 2] == k]))
+        yield (
+            f"the known distance of {one.first} and {one.second}{where} is {off:+.0f} cm off what the ranges say",
+            without,
+        )
+
+
+def _shapes(found: Solution) -> Iterator[tuple[str, Solution]]:
+    """Yield the solution with each arrangement beside the line, or plane, that it is said to be on."""
+    network = found.network
+    for k, boards in enumerate(network.arrangements):
+        if boards.dimensions == 3 or len(boards.tags) < boards.dimensions + 2 or boards.freed:
+            continue
+        arrangements = list(network.arrangements)
+        arrangements[k] = replace(boards, dimensions=boards.dimensions + 1, freed=True)
+        freed = replace(network, arrangements=tuple(arrangements))
+        seats, beside = network.seats(k), boards.dimensions
+        place = freed.positions_m(first_start(freed, found.delays))[seats]
+        # Where scaling finds nothing beside the line, a derivative there would be zero.
+        if np.ptp(place[:, beside]) < START_BESIDE_M:
+            place[:, beside] += START_BESIDE_M * np.where(np.arange(len(seats)) % 2, 1.0, -1.0)
+        marks = found.case.marks & (network.means.arrangement != k)
+        without = adjust(freed, freed.with_positions(found.x, place, seats), marks=marks, start_m=found.case.pair_m)
+        away = freed.positions_m(without.x)[seats, beside]
+        odd = boards.tags[int(np.argmax(np.abs(away - np.median(away))))]
+        text = (
+            f"{boards.name} is said to be a {'line' if beside == 1 else 'plane'} and is none: its ranges fit if "
+            f"boards, {odd} first of all, stand up to {100 * np.ptp(away):.0f} cm beside it"
+        )
+        yield text, without
+
+
+def _exchanged(found: Solution) -> Iterator[tuple[str, Solution]]:
+    """Yield the solution with two tags exchanged in what is known, where something known is off or reflected."""
+    network, here, count = found.network, found.linear, len(found.network.means.range_m)
+    rows = here.jacobian[count:]
+    # Residuals of what is known vary less than it does by what the fit makes of it.
+    off = list(here.left[count:] / np.sqrt(np.maximum(1 - np.diag(rows @ here.covariance @ rows.T), 1e-6)))
+    for point, (place, sigma) in network.known_places.items():
+        own = np.arange(3 * point, 3 * point + 3)
+        off += list((found.x[own] - place) / np.sqrt(np.maximum(sigma**2 - here.covariance[own, own], 1e-12)))
+    if not (np.abs(off).max(initial=0.0) > MIN_LABEL_SIGMAS or (off and found.case.marks.any())):
+        return
+    involved = {tag for one in network.distances for tag in (one.first, one.second)}
+    for one, other in combinations(sorted(involved | {place.tag for place in network.positions}), 2):
+        swap = {one: other, other: one}
+        distances = tuple(
+            replace(d, first=swap.get(d.first, d.first), second=swap.get(d.second, d.second)) for d in network.distances
+        )
+        positions = tuple(replace(p, tag=swap.get(p.tag, p.tag)) for p in network.positions)
+        changed = replace(network, distances=distances, positions=positions)
+        text = f"what is known fits if {one} and {other} are exchanged"
+        yield text, adjust(changed, first_start(changed, found.delays))
+
+
+HYPOTHESES = {
+    "distance": (_distances, "measure it again or leave it out"),
+    "shape": (_shapes, "put the boards as is said, or do not say so"),
+    "labels": (_exchanged, "look at the labels of these two boards"),
+}
+"""The checks by what may be wrong: the hypotheses, and what to do where one is true."""
+
+
+def wrong_orders(found: Solution) -> Iterator[Contradiction]:
+    """Yield the contradictions between the stated orders of boards on a line and the ranges.
+
+    What several arrangements have in common is one contradiction.
+    """
+    network, points = found.network, found.network.positions_m(found.x)
+    spots = {}
+    for k in out_of_order(network, found.x):
+        order = network.arrangements[k].order
+        along = points[[network.points[k, tag] for tag in order], 0]
+        spots[k] = along if np.corrcoef(np.arange(len(along)), along)[0, 1] > 0 else -along
+    pairs = {k: exchanged_boards(network.arrangements[k].order, along) for k, along in spots.items()}
+    while pairs:
+        common = Counter(pair for some in pairs.values() for pair in sorted(some))
+        pair = max(common, key=common.__getitem__, default=None)
+        same = [k for k, some in pairs.items() if pair in some] or list(pairs)[:1]
+        both = set.intersection(*(pairs.pop(k) for k in same))
+        said = network.arrangements[same[0]].order
+        seen = [said[n] for n in np.argsort(spots[same[0]]).tolist()]
+        where = ", ".join(network.arrangements[k].name for k in same)
+        words = ", or ".join(f"{i} and {j}" for i, j in sorted(both))
+        what = f"boards {words} stand in each other's place" if both else "boards stand in another order than said"
+        text = (
+            f"{where}: {what}: said was {'-'.join(map(str, said))}, the ranges of "
+            f"{network.arrangements[same[0]].name} say {'-'.join(map(str, seen))}; look at their labels"
+        )
+        yield Contradiction("labels", text, FALSE_ALARMS)
+
 
 MOST_FINDINGS = 0.15
 """Share of the means, as a number of findings, after which no more is looked for."""

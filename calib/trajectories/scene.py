@@ -12,8 +12,20 @@ from calib.data.ranges import Ranges
 from calib.data.sources import Data, antenna_delays_of, opened, planted_of
 from calib.errors import UnanswerableError
 from calib.settings import FlightSettings
-from calib.trajectories.attitudes import Attitude, Inertial, Readings, integrated, windows
-from calib.trajectories.samples import SAMPLE_S, Heights, Places, Samples, Tapes, heights_of, tapes_of
+from calib.trajectories.samples import (
+    SAMPLE_S,
+    Attitude,
+    Heights,
+    Inertial,
+    Places,
+    Readings,
+    Samples,
+    Tapes,
+    heights_of,
+    integrated,
+    tapes_of,
+    windows,
+)
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Poses
 from uwblink.recording.summary import single_reports

@@ -9,7 +9,7 @@ import calib
 from benchmarks.standing import standing_boards
 from benchmarks.surveys import orders_of
 from calib.errors import BadInputError
-from calib.surveys.starts import exchanged_boards, is_in_order
+from calib.surveys.solution import exchanged_boards, is_in_order
 
 FIVE = standing_boards(4, boards=5, arrangements=5, reflected=0.05, each=20)
 
