@@ -158,11 +158,6 @@ def examined_part(recording: str | os.PathLike[str]) -> str:
     )
 
 
-STRETCHES_OF_SCORES: Final = 32
-"""Stretches of time over which scores are summed: variances of sums are then known to a quarter, and errors that last
-for a hundredth of the recording are in one stretch."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Offsets:
     """Offsets (k,) that residuals ask for, with their standard errors (k,) and degrees of freedom.
@@ -242,7 +237,8 @@ class QuickFit:
         ranges = replace(self.ranges, errors=replace(cast("Robust", self.start.rows.errors), least=None))
         # Long blocks in the place of short ones: sums over them hardly share errors that last.
         short = self.blocks
-        count = min(STRETCHES_OF_SCORES, short.count)
+        # Variances of 32 sums are known to a quarter, and errors that last for a hundredth of the recording are in one.
+        count = min(32, short.count)
         number = short.number.astype(np.int64) * count // short.count
         bounds = np.unique(np.append(short.bounds[:-1] * count // short.count, count))
         return Slopes(ranges, self._search(ranges, self.x, steps=1), replace(short, number=number, bounds=bounds))
@@ -310,11 +306,6 @@ class QuickFit:
         return size, exceeds(size, float(found.std[0]), found.dof, tolerance=tolerance, tried=tried)
 
 
-LOSS: Final = "soft_l1"
-"""The loss of a quick fit. Convex, so that offsets of any size are found by steps from none; its slope is bounded, so
-that reflections weigh little more than other ranges."""
-
-
 def quick_fit(views: Sequence[RecordingView], constants: str = "pair", ranges_a_pair: int = 40) -> QuickFit | None:
     """Fit a curve over power and constants by "pair" or "tag" to recordings, a session each; None if ranges are few.
 
@@ -326,7 +317,9 @@ def quick_fit(views: Sequence[RecordingView], constants: str = "pair", ranges_a_
     ranges = concatenate([view.ranges[rows] for view, rows in zip(views, kept, strict=True)])
     model = model_of(ranges, FitSettings(constants=constants), trimmed=False)
     error, kinds = model.ranges.raw_m - model.ranges.truth_m, ("delay", *model.curve_kinds())
-    start = robust_fit(model, error, LOSS, None, kinds, sample=PILOT)
+    # Convex, so that offsets of any size are found by steps from none; its slope is bounded, so that reflections weigh
+    # little more than other ranges.
+    start = robust_fit(model, error, "soft_l1", None, kinds, sample=PILOT)
     return QuickFit.of(model, error, np.concatenate(kept), start, start.optimum.x)
 
 

@@ -203,9 +203,6 @@ def _of_tags(fit: QuickFit, long: Bools, evidence: str) -> Iterator[Candidate]:
     yield Candidate("reflections", evidence, p_value, {"more": remedy})
 
 
-DELAY_M: Final = 0.02
-"""What temperature does to the delay of a sound board: 2.15 mm a degree (DW1000 user manual), ten degrees."""
-
 PAIR_M: Final = 0.04
 """What lever arms by a ruler and phase centres of antennas do to a pair: 2 cm at either end."""
 
@@ -342,7 +339,8 @@ def _change(
     # Errors of different pairs hardly go together, so that each tells of their variance (Welch and Satterthwaite).
     std = max(float(left.std[0]), float(np.sqrt(alone.sum())) / max(float(left.known[0]), 1e-300))
     dof = left.dof * alone.sum() ** 2 / max(float(np.sum(alone**2)), 1e-300)
-    p_value = exceeds(size, std, dof, tolerance=DELAY_M, tried=tried)
+    # What temperature does to the delay of a sound board: 2.15 mm a degree (DW1000 user manual), ten degrees.
+    p_value = exceeds(size, std, dof, tolerance=0.02, tried=tried)
     return Change(tag=tag, course=course, size_m=size, p_value=p_value), rest
 
 

@@ -35,9 +35,6 @@ PAPER_RMSE_M: Final = {"raw": 0.804, "calibrated": 0.500, "variance": 0.431}
 TUNED_OVER: Final = (0.04, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.6, 1.0)
 """Candidates for fixed standard deviations on a training flight, in metres, about two per octave."""
 
-TUNED_RANGES: Final = 7500
-"""Ranges of a training flight that are used, about a minute of three bodies: neighbouring candidates differ little."""
-
 
 @dataclass(frozen=True, slots=True)
 class FixedStd:
@@ -164,7 +161,8 @@ def fixed_std(calibration: Calibration, settings: Settings, training: Data | Fli
         middle = float(calibration.sigma_curve(np.array([np.mean(calibration.sigma_curve.range)]))[0])
         return FixedStd(dict.fromkeys(("raw", "calibrated"), middle), "the sigma curve's middle")
     flight = training if isinstance(training, Flight) else load_flight(training)
-    flight = replace(flight, ranges=flight.ranges[:TUNED_RANGES])
+    # About a minute of three bodies is enough: neighbouring candidates differ little.
+    flight = replace(flight, ranges=flight.ranges[:7500])
     applied = calibration.apply(flight.ranges)
     squares = np.zeros((2, len(TUNED_OVER)))
     for problem in problems(flight):

@@ -14,17 +14,15 @@ from calib.information import Verdict
 from calib.planning.settings import FlightPlanSettings
 from uwblink.arrays import Floats
 
-GUESS_NS = 1.5
-"""How far a delay is known without any data, two and a half times what published ones differ by (0.6 ns): means over
-tags are finite then, though some are not determined."""
-
 
 def mean_std_ns(information: Floats) -> float:
     """Return the root mean variance of delays, ns, from what data tell of them (tags, tags), 1/ns^2, beside the guess.
 
     Rounded, so that mirror images are equally good on every machine and the first of them is taken.
     """
-    whole = information + np.eye(len(information)) / GUESS_NS**2
+    # The guess is two and a half times what published delays differ by (0.6 ns): means are finite then, though some
+    # delays are not determined.
+    whole = information + np.eye(len(information)) / 1.5**2
     return round(float(np.sqrt(np.trace(np.linalg.inv(whole)) / len(whole))), 8)
 
 

@@ -30,9 +30,6 @@ from calib.surveys.recordings import PairMeans
 from uwblink.arrays import Bools, Floats
 from uwblink.recording.schema import KnownDistance
 
-NEAREST_BOARDS_M = 0.4
-"""Boards stand no nearer to each other; five wavelengths; nearer, powers saturate and fields are not yet waves."""
-
 PLANNED_CURVE_STD_M = 0.05
 """Standard deviation of a curve over power: half that of the published curves (`CURVE_LENGTH_DB`). With all of it plans
 of six boards in five arrangements would promise no delay beside a curve, which surveys do find (`make surveys`)."""
@@ -65,7 +62,8 @@ def random_arrangements(inputs: SurveyPlanSettings, count: int, tries: int = 400
             place[list(order), 0] = np.round(np.linspace(0, float(size[0]), len(tags)), 1)
         else:
             place[:, :dimensions] = np.round(rng.uniform(0, size, (len(tags), dimensions)), 1)
-            if min(np.linalg.norm(one - other) for one, other in combinations(place, 2)) < NEAREST_BOARDS_M:
+            # Five wavelengths: nearer, powers saturate and fields are not yet waves.
+            if min(np.linalg.norm(one - other) for one, other in combinations(place, 2)) < 0.4:
                 continue
         spots = {tag: (x, y, z) for tag, (x, y, z) in zip(tags, place.tolist(), strict=True)}
         first = next(iter(found.values())).place_m if found else spots
@@ -152,20 +150,6 @@ def _averaged(informations: Floats, tags: Sequence[int]) -> Precision[Floats]:
     return Precision(std[: len(tags)], std[len(tags) : -1], float(std[-1]))
 
 
-RANGES_A_PAIR = 20
-"""Noise of 4 cm leaves 9 mm in a mean of so many, which adds a tenth to a pair's constant error of 2 cm."""
-
-CANDIDATES = 60
-"""Random arrangements from which each is chosen: the best of so many is in the best 5 % with a probability of 95 %."""
-
-MOST_ARRANGEMENTS = 12
-"""Arrangements after which no more is planned where no number is given: an hour's work."""
-
-WORTH_IT = 0.06
-"""Share by which one arrangement more must narrow the mean interval to be planned, where no number is given:
-n arrangements narrow it by the root of n, so that about eight are planned."""
-
-
 def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None, **changes: Any) -> Plan:
     """Return how to calibrate boards without true distances: which arrangements to make, and what comes of them.
 
@@ -182,7 +166,8 @@ def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None
     if len(tags) < 2:
         raise BadInputError(f"found {boards!r:.60}, expected 2 to 30 boards, each once", parameter="boards")
     inputs = replace(settings or SurveyPlanSettings(), tags=tags, **changes)
-    candidates = random_arrangements(inputs, CANDIDATES)
+    # The best of sixty is in the best 5 % with a probability of 95 %.
+    candidates = random_arrangements(inputs, 60)
     if not candidates:
         raise UnanswerableError(f"{len(tags)} boards find no room: they must stand 0.4 m from each other")
     informations = [delay_information(inputs, one)[0] for one in candidates]
@@ -219,7 +204,8 @@ def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None
         verdict=verdict_on_delays(total, tags),
         next_best=tuple(sorted(next_best, key=lambda one: one.mean_ns)),
         rate_hz=inputs.rate_hz,
-        seconds_each=max(30.0, math.ceil(RANGES_A_PAIR * math.comb(len(tags), 2) / inputs.rate_hz / 10) * 10.0),
+        # In a mean of 20 ranges noise of 4 cm leaves 9 mm, which adds a tenth to a pair's constant error of 2 cm.
+        seconds_each=max(30.0, math.ceil(20 * math.comb(len(tags), 2) / inputs.rate_hz / 10) * 10.0),
         pair_error_m=inputs.pair_error_m,
         reflected=inputs.reflected,
         known_beside=bool(inputs.anchors or inputs.taped),
@@ -230,12 +216,14 @@ def _choose(informations: list[Floats], count: int | None) -> list[int]:
     """Return `count` arrangements, or as many as are worth it: each the best after those before it."""
     total = np.zeros_like(informations[0])
     found: list[int] = []
-    while len(found) < (count or MOST_ARRANGEMENTS):
+    # Twelve are an hour's work.
+    while len(found) < (count or 12):
         # The same once more would have the same errors, unless boards were taken away in between.
         left = [k for k in range(len(informations)) if k not in found] or list(range(len(informations)))
         best = min(left, key=lambda k: mean_std_ns(total + informations[k]))
         before, after = mean_std_ns(total), mean_std_ns(total + informations[best])
-        if count is None and len(found) >= 2 and after > (1 - WORTH_IT) * before:
+        # By the root of their number arrangements narrow the mean interval, so that about eight are worth 6 % each.
+        if count is None and len(found) >= 2 and after > 0.94 * before:
             break
         found.append(best)
         total = total + informations[best]

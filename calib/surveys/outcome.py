@@ -33,10 +33,6 @@ from uwblink.arrays import Floats
 from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 
-DELAY_SCALE_NS = 0.5
-"""How far a delay is known without any data: devices of one design differ by that (published ones by 0.6 ns). A delay
-is determined if its standard error is at most `LOOSEST` of it."""
-
 MIN_BELIEVED, MIN_MENTIONED = 0.5, 0.1
 """Probabilities from which a pair is believed to be reflected, and from which it is said that it may be: more
 likely than not, and a tenth."""
@@ -52,7 +48,9 @@ def students_factor(freedom: float) -> float:
 
 def verdict_on_delays(information: Floats, tags: Sequence[int]) -> Verdict:
     """Return what is determined of delays by their information (tags, tags), 1/ns^2."""
-    return judge(information, [InformationColumn("delay", str(tag), DELAY_SCALE_NS) for tag in tags])
+    # Devices of one design differ by half a nanosecond (published ones by 0.6 ns); a delay is determined if its
+    # standard error is at most `LOOSEST` of it.
+    return judge(information, [InformationColumn("delay", str(tag), 0.5) for tag in tags])
 
 
 def result_of(

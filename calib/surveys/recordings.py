@@ -36,8 +36,6 @@ from uwblink.ticks import METRES_PER_TICK
 LIFT = "mean-of-lifted"
 """How the powers of both ends become one, as in `calib.fit`."""
 
-MIN_RANGES_OF_MEAN = 5
-"""Ranges that a pair needs in an arrangement: their spread is known to a third then (the root of 1/8)."""
 
 PARTS = 10
 """Stretches of time whose sums say how well the mean of all is known, also where errors last: the standard error is
@@ -46,8 +44,6 @@ known to a quarter (the root of 1/18), and those of an arrangement held for 30 s
 WINDOW_BINS = 5
 """Bins of a second before and after an instant whose medians are compared: a hand needs less to move a board."""
 
-STEP_M = 0.05
-"""Smallest step of a pair's range that counts as a motion: people who walk past change less, or one pair only."""
 
 MOVED_M, MOVED_BINS, MIN_SIDE_BINS = 0.03, 60, 8
 """Smallest change of a pair's range that tells of a board that was moved within an arrangement; bins into which the
@@ -55,9 +51,6 @@ arrangement is divided for that, and how many of them either side needs."""
 
 SIGMAS = 6.0
 """Standard deviations of noise from which a change is one: one in 5e8 by chance, and there are thousands."""
-
-MIN_STILL_S = 15.0
-"""Shorter stretches between two motions are part of the motion."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -188,13 +181,15 @@ def still_stretches(ranges: Ranges, bin_ns: int = 1_000_000_000) -> list[tuple[i
     or between two less than 15 s apart, belongs to none.
     """
     _, starts, median, noise = _binned(ranges, bin_ns)
-    threshold = np.maximum(STEP_M, SIGMAS * noise * np.sqrt(2 / WINDOW_BINS))
+    # People who walk past change ranges by less than 5 cm, or those of one pair only.
+    threshold = np.maximum(0.05, SIGMAS * noise * np.sqrt(2 / WINDOW_BINS))
     moving = (np.abs(_steps(median, WINDOW_BINS)) > threshold[:, None]).sum(axis=0) >= min(2, len(median))
     # An edge that sees a step within its window is not the step itself: only a bin that stands free of all is still.
     still = np.concatenate([[False], ~(moving[:-1] | moving[1:]), [False]]).astype(np.int8)
     first, last = np.flatnonzero(np.diff(still) == 1), np.flatnonzero(np.diff(still) == -1) - 1
     found = zip(starts[first].tolist(), (starts[last] + bin_ns).tolist(), strict=True)
-    return [(a, b) for a, b in found if b - a >= MIN_STILL_S * 1e9]
+    # Shorter stretches between two motions are part of the motion.
+    return [(a, b) for a, b in found if b - a >= 15e9]
 
 
 def find_motion(name: str, ranges: Ranges) -> list[Contradiction]:
@@ -241,7 +236,8 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
     pairs = pairs_of(ranges.initiator, ranges.target)
     key = arrangement * len(pairs.ends) + pairs.number
     keys, counts = np.unique(key[arrangement >= 0], return_counts=True)
-    kept = keys[counts >= MIN_RANGES_OF_MEAN]
+    # Of five ranges the spread is known to a third (the root of 1/8).
+    kept = keys[counts >= 5]
     if not len(kept):
         raise UnanswerableError(f"{ranges.source}: no two boards range five times while all stand still")
     rows = np.flatnonzero(np.isin(key, kept))

@@ -17,9 +17,6 @@ from calib.information import Verdict
 from uwblink.arrays import Floats
 from uwblink.output import write_bytes, write_text
 
-AMBIGUOUS = 9.0
-"""By how much -2 log likelihood of a second solution may be worse for it to be as good: three standard deviations."""
-
 ANCHORS = {
     ".toml": (
         "# covariance_m2: xx xy xz yy yz zz, m^2.\n",
@@ -93,7 +90,8 @@ class SecondBest:
     @property
     def ambiguous(self) -> bool:
         """Whether the ranges can hardly tell it from the best one."""
-        return self.worse < AMBIGUOUS
+        # Three standard deviations of one value, in -2 log likelihood.
+        return self.worse < 9.0
 
 
 @dataclass(frozen=True, slots=True)

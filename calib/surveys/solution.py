@@ -30,9 +30,6 @@ from calib.surveys.reflections import Marks, unlikely
 from calib.surveys.result import SecondBest
 from uwblink.arrays import Bools, Floats, Ints
 
-TOGETHER_M = 0.1
-"""Boards nearer to each other stand side by side: they touch, and their order means nothing."""
-
 SHAKEN = 4
 """Random starts of an arrangement beside those that are mirrored or exchanged: half or twice as many change nothing
 (`python -m benchmarks.constants`)."""
@@ -41,7 +38,8 @@ SHAKEN = 4
 def is_in_order(coordinates: Floats) -> bool:
     """Return whether coordinates (n,), those of boards in the order that is said, rise or fall."""
     ways = coordinates, coordinates[::-1]
-    return any(float(np.max(np.maximum.accumulate(v) - v)) <= TOGETHER_M for v in ways)
+    # Boards nearer to each other than 10 cm stand side by side: they touch, and their order means nothing.
+    return any(float(np.max(np.maximum.accumulate(v) - v)) <= 0.1 for v in ways)
 
 
 def exchanged_boards(said: Sequence[int], coordinates: Floats) -> set[tuple[int, int]]:
@@ -127,14 +125,10 @@ PAIR_STD_M, PAIR_PRIOR_FREEDOM = 0.02, 3.0
 Half or twice of either moves delays beside reflections by 0.29 standard errors, which become 0.93 to 1.3 times as large
 (`python -m benchmarks.constants`)."""
 
-PAIR_STARTS_M = (0.01, 0.015, 0.02, 0.03, 0.045, 0.07)
-"""Errors of pairs from which a search begins: with small ones too much looks reflected, with large ones too little."""
 
 CURVE_STD_M, CURVE_FACTOR = 0.1, 1.7
 """Prior standard deviation of a curve, and the factor by which that may be wrong (`CURVE_LENGTH_DB`)."""
 
-WRONG_ORDER_PENALTY = 2 * math.log(100.0)
-"""-2 log of the chance that boards stand in another order than somebody said who put them so: one in a hundred."""
 
 MIN_DIFFERENCE_M = 0.03
 """How far a board must move for a solution to count as another one."""
@@ -213,7 +207,8 @@ def unlikelihood(network: Network, x: Floats, case: Case) -> float:
     value = of_spreads(network, x, case) + unlikely(int(case.marks.sum()), len(case.marks))
     if case.marks.any():
         value += float(Marks.at(network, x, case).penalties()[case.marks].sum())
-    return value + WRONG_ORDER_PENALTY * len(out_of_order(network, x))
+    # One in a hundred stands in another order than somebody said who put the boards so.
+    return value + 2 * math.log(100.0) * len(out_of_order(network, x))
 
 
 def out_of_order(network: Network, x: Floats) -> list[int]:
@@ -313,7 +308,8 @@ def _mixed(found: Solution, cases: Sequence[Case], weight: Floats) -> tuple[Floa
 def solve(network: Network, *, moves: int = 6) -> tuple[Solution, SecondBest | None]:
     """Return the best solution that any start leads to, and the second-best."""
     start, least = first_start(network), attrgetter("unlikely")
-    spreads = PAIR_STARTS_M if network.pair_m is None else (network.pair_m,)
+    # With small errors of pairs too much looks reflected at first, with large ones too little.
+    spreads = (0.01, 0.015, 0.02, 0.03, 0.045, 0.07) if network.pair_m is None else (network.pair_m,)
     found = min((adjust(network, start, start_m=spread) for spread in spreads), key=least)
     # Once more with the delays that came out: the first guess of places was made without any.
     found = min(found, adjust(network, first_start(network, found.delays)), key=least)

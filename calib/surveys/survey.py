@@ -36,12 +36,6 @@ from uwblink.recording.schema import SHAPES
 FALSE_ALARMS = 0.01
 """Share of sound surveys in which a check may find something."""
 
-MIN_LABEL_SIGMAS = 3.0
-"""Standard deviations by which a known distance or position must be off for labels to be tested: 0.3 % are by chance,
-and cost time only, because the test has its own level."""
-
-TAPE_ERROR_M = 0.5
-"""Prior standard deviation of the error of a wrong tape, which is misread by decimetres."""
 
 START_BESIDE_M = 0.15
 """How far boards are put beside a line, or plane, at the start of a search: on it a derivative would be zero."""
@@ -63,7 +57,8 @@ def _distances(found: Solution) -> Iterator[tuple[str, Solution]]:
     network = found.network
     for k, one in enumerate(network.distances):
         loose = list(network.distances)
-        loose[k] = replace(one, sigma_m=math.hypot(one.sigma_m, TAPE_ERROR_M))
+        # A wrong tape is misread by decimetres.
+        loose[k] = replace(one, sigma_m=math.hypot(one.sigma_m, 0.5))
         without = adjust(replace(network, distances=tuple(loose)), found.x, start_m=found.case.pair_m)
         left = network.linear(without.x)[0][len(network.means.range_m) :]
         where = f" in {one.arrangement}" if one.arrangement else ""
@@ -108,7 +103,9 @@ def _exchanged(found: Solution) -> Iterator[tuple[str, Solution]]:
     for point, (place, sigma) in network.known_places.items():
         own = np.arange(3 * point, 3 * point + 3)
         off += list((found.x[own] - place) / np.sqrt(np.maximum(sigma**2 - here.covariance[own, own], 1e-12)))
-    if not (np.abs(off).max(initial=0.0) > MIN_LABEL_SIGMAS or (off and found.case.marks.any())):
+    # Labels are tested where something known is off by three standard deviations. By chance 0.3 % are, which cost time
+    # only, because the test of labels has its own level.
+    if not (np.abs(off).max(initial=0.0) > 3.0 or (off and found.case.marks.any())):
         return
     involved = {tag for one in network.distances for tag in (one.first, one.second)}
     for one, other in combinations(sorted(involved | {place.tag for place in network.positions}), 2):
@@ -159,10 +156,6 @@ def wrong_orders(found: Solution) -> Iterator[Contradiction]:
         yield Contradiction("labels", text, FALSE_ALARMS)
 
 
-MOST_FINDINGS = 0.15
-"""Share of the means, as a number of findings, after which no more is looked for."""
-
-
 def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, **changes: Any) -> SurveyResult:
     """Return the delays, the power curve and the places of boards that stood still, from their ranges alone.
 
@@ -191,7 +184,8 @@ def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, 
         network = network_of(gathered, knowledge, asked.fixed_ns, curve=not asked.delays_only and taken is None)
         found, second = solve(replace(network, pair_m=asked.pair_error_m))
         findings = list(gathered.findings)
-        most = len(findings) + max(1, int(MOST_FINDINGS * len(network.means.range_m)))
+        # After findings of 15 % of the means no more is looked for.
+        most = len(findings) + max(1, int(0.15 * len(network.means.range_m)))
         while len(findings) < most and (fault := likeliest_fault(found)):
             finding, found = fault
             findings.append(finding)

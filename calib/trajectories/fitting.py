@@ -51,18 +51,6 @@ COMMON_SETTINGS = (
 SHARE_OF_START = 0.3
 """Share of the work, for the progress bar, that is done when the search has its initial guess."""
 
-SCALE_NS = 0.2
-"""A direction of delays is determined if its standard error is at most `LOOSEST` of this: 0.1 ns, 3 cm of range.
-
-The value comes from simulations (docs/accuracy.md): wider intervals did not hold.
-"""
-
-LOOSER_WITH_GEOMETRY = 3.0
-"""If a fit with known distances is less certain than that, a direction may be so many times less certain."""
-
-GEOMETRY_ALONE_FACTOR = 3.0
-"""Factor on standard errors where only geometry determines distances: there the problem is not linear, and errors up to
-4.2 linearised standard errors were observed (docs/accuracy.md)."""
 
 TAPE_UNCHECKED, TAPE_MIN_DEVIATION, TAPE_MIN_ERROR_M = 0.999, 4.0, 0.03
 """A tape that no range checks (leverage above the first) is not tested. Others contradict the fit if their deleted
@@ -272,7 +260,9 @@ def variance_factor(scene: Scene) -> float:
     """Return the factor on covariances: more than 1 where only lever arms determine the scale of distances."""
     given = sum(place is not None for place in scene.still.values())
     measured = len(scene.places) or len(scene.heights) or scene.inertial or len(scene.tapes)
-    return 1.0 if given >= 2 or measured else GEOMETRY_ALONE_FACTOR**2
+    # Where only geometry determines distances the problem is not linear: errors up to 4.2 linearised standard errors
+    # were observed (docs/accuracy.md), so that these are multiplied by three.
+    return 1.0 if given >= 2 or measured else 9.0
 
 
 def _judge_delays(found: KnownDistances, top: Search) -> tuple[Ints, Verdict]:
@@ -343,7 +333,9 @@ def verdict_on(covariance: Floats, with_truth: Floats, tags: Sequence[int]) -> V
     """Return the verdict on delays with a covariance (tags, tags), compared with that for known distances."""
     if not tags:
         return judge(np.eye(1) * 1e6, [InformationColumn("delay", "")])
-    guess = np.maximum(SCALE_NS, LOOSER_WITH_GEOMETRY / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
+    # `LOOSEST` of 0.2 ns is 3 cm of range; from simulations (docs/accuracy.md): wider intervals did not hold. If a fit
+    # with known distances is less certain, a direction may be three times less certain than that.
+    guess = np.maximum(0.2, 3.0 / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
     information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True)
     information += np.eye(len(covariance)) / BOARD_DELAY_STD_NS**2
     unknowns = [InformationColumn("delay", str(tag), scale) for tag, scale in zip(tags, guess.tolist(), strict=True)]

@@ -33,17 +33,9 @@ SAMPLE_S = POINT_S / 4
 """Time between known positions, heights (medians over it) and positions of an initial guess, and over which specific
 forces are averaged: vibrations cancel, and the acceleration of a spline hardly changes."""
 
-HEIGHT_STD_M = 0.1
-"""Standard error of the mean of a window beside the sensor's constant offset, before residuals are known."""
 
 TRUSTED = 3.0
 """Factor on the spread of a sensor's residuals: its errors last for some windows."""
-
-HEIGHT_BOUNDS_M = (0.02, 1.0)
-"""Bounds of the standard error of a height: how level floors are, and nearly half the height of a room."""
-
-HUBER = 2.0
-"""Readings beyond so many spreads count less (Huber 1964): the sensor looks at what stands below it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +77,10 @@ class Heights(Samples):
         """Return the readings with standard errors from their residuals (k,)."""
         if not len(self):
             return self
-        std_m = float(np.clip(TRUSTED * robust_spread(residual_m, 0.0), *HEIGHT_BOUNDS_M))
-        weight = np.minimum(1.0, HUBER * std_m / TRUSTED / np.maximum(np.abs(residual_m), 1e-9))
+        # How level floors are, and nearly half the height of a room.
+        std_m = float(np.clip(TRUSTED * robust_spread(residual_m, 0.0), 0.02, 1.0))
+        # Readings beyond two spreads count less (Huber 1964): the sensor looks at what stands below it.
+        weight = np.minimum(1.0, 2.0 * std_m / TRUSTED / np.maximum(np.abs(residual_m), 1e-9))
         return replace(self, std_m=std_m / np.sqrt(weight))
 
 
@@ -100,7 +94,8 @@ def heights_of(table: Mapping[str, NDArray[Any]], moving: Sequence[str], began_n
     window = np.column_stack([number, np.floor(time_s / SAMPLE_S)])[rows]
     group = np.unique(window, axis=0, return_inverse=True)[1].ravel()
     time, body, height = (medians(column[rows], group) for column in (time_s, number, height_m))
-    return Heights(time, body.astype(np.int64), height, np.full(len(time), HEIGHT_STD_M))
+    # A decimetre beside the sensor's constant offset, before residuals are known.
+    return Heights(time, body.astype(np.int64), height, np.full(len(time), 0.1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,16 +220,6 @@ class Attitude:
         return Slerp(instants, Rotation.from_quat(self.quaternion[np.minimum(rows, len(self.time_s) - 1)]))
 
 
-STRONGEST_M_S2 = 4.0
-"""Windows with larger mean accelerations are left out: they are impacts, not flight."""
-
-FORCE_STD_M_S2 = 0.5
-"""Standard error of a mean specific force before residuals are known."""
-
-LEVELLING = 0.1
-"""Share of the tilt against the specific force that is corrected per second (Mahony, Hamel and Pflimlin 2008)."""
-
-
 @dataclass(frozen=True, slots=True)
 class Inertial(Samples):
     """Windows of an accelerometer, `SAMPLE_S` long, about `time_s` (k,).
@@ -245,7 +230,7 @@ class Inertial(Samples):
 
     force_m_s2: Floats
     turn: Floats
-    std_m_s2: float = FORCE_STD_M_S2
+    std_m_s2: float = 0.5  # before residuals are known
 
     def turned_by(self, heading_rad: float) -> Inertial:
         """Return a copy that is rotated about the world's vertical."""
@@ -287,7 +272,8 @@ def windows(readings: Readings, attitude: Attitude, last_s: float) -> Inertial:
     mean_force = np.add.reduceat(force, starts) / count[:, None]
     mean_turn = np.add.reduceat(turn, starts) / count[:, None, None]
     kept = count >= 0.7 * readings.per_window
-    kept &= np.linalg.norm(mean_force - (0, 0, GRAVITY_M_S2), axis=1) < STRONGEST_M_S2
+    # Larger mean accelerations are impacts, not flight.
+    kept &= np.linalg.norm(mean_force - (0, 0, GRAVITY_M_S2), axis=1) < 4.0
     return Inertial((slot[kept] + 0.5) * SAMPLE_S, mean_force[kept], mean_turn[kept])
 
 
@@ -329,7 +315,8 @@ def _carried_on(readings: Readings, first: int, attitude: Floats, bias: Floats) 
     pulls = ndimage.uniform_filter1d(readings.force, readings.per_window, axis=0, mode="constant")[first:]
     sizes = np.linalg.norm(pulls, axis=1)
     pulls /= np.maximum(sizes, 1e-9)[:, None]
-    shares = np.where((sizes > 0.8 * GRAVITY_M_S2) & (sizes < 1.2 * GRAVITY_M_S2), LEVELLING * steps, 0.0)
+    # A tenth of the tilt against the specific force is corrected per second (Mahony, Hamel and Pflimlin 2008).
+    shares = np.where((sizes > 0.8 * GRAVITY_M_S2) & (sizes < 1.2 * GRAVITY_M_S2), 0.1 * steps, 0.0)
     found, up = np.empty((len(steps), 3, 3)), np.array([0.0, 0.0, 1.0])
     for k, share in enumerate(shares.tolist()):
         found[k] = attitude

@@ -90,9 +90,6 @@ class Scene:
         return self.only(np.arange(0, len(self.time_s), max(len(self.time_s) // count, 1)))
 
 
-STILL_M = 0.1
-"""A body whose poses stay within this distance stands still."""
-
 POSE_STD_M = 0.02
 """Standard error of known positions, thinned to `SAMPLE_S`: errors of motion capture last. Half or twice of it
 moves delays by 0.24 standard errors, which become 0.85 to 1.46 times as large (`python -m benchmarks.constants`)."""
@@ -146,7 +143,8 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     still = {
         body: np.median(track.position_m, axis=0)
         for body, track in placed.items()
-        if len(track) and np.ptp(track.position_m, axis=0).max() <= STILL_M
+        # A body whose poses stay within a decimetre stands still.
+        if len(track) and np.ptp(track.position_m, axis=0).max() <= 0.1
     }
     moving = tuple(body for body in bodies if body not in still)
     if not moving:
