@@ -35,8 +35,7 @@ if TYPE_CHECKING:
     from calib.settings import FitSettings, FlightSettings, SurveySettings
     from calib.surveys.knowledge import Knowledge, KnownPosition
     from calib.surveys.result import SurveyResult
-    from calib.surveys.sample import sample_arrangements
-    from calib.surveys.survey import survey
+    from calib.surveys.survey import sample_arrangements, survey
     from calib.trajectories.fitting import fit_from_ranges
 
 __all__ = [
@@ -117,7 +116,7 @@ _homes = {
     "register_loss": "calib.estimator.losses",
     "register_report_section": "calib.report.sections",
     "run_campaign": "calib.report.campaign",
-    "sample_arrangements": "calib.surveys.sample",
+    "sample_arrangements": "calib.surveys.survey",
     "sample_flight": "calib.data.samples",
     "survey": "calib.surveys.survey",
     "write_report": "calib.report.campaign",

@@ -22,8 +22,8 @@ from calib.calibration.model import Calibration, CalibrationSource, given_calibr
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, Flight, load_flight, require_times
 from calib.errors import UnanswerableError
+from calib.evaluation.filters import range_errors
 from calib.evaluation.onboard import OnboardTrack
-from calib.evaluation.range_updates import range_errors
 from calib.evaluation.tracking import FILTERS, FilterRanges, Settings, Track, Trajectory, problems, run_filters
 from uwblink.arrays import Floats, Ints
 from uwblink.display import printable

@@ -23,8 +23,16 @@ from calib.calibration.model import Calibration, CalibrationSource, given_calibr
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, opened, require_times
 from calib.errors import BadInputError, UnanswerableError
-from calib.evaluation.inertial_filter import GRAVITY_M_S2, InertialFilter, P, ProcessNoise
-from calib.evaluation.range_updates import Fix, RangeErrors, multilaterate, range_errors
+from calib.evaluation.filters import (
+    GRAVITY_M_S2,
+    Fix,
+    InertialFilter,
+    P,
+    ProcessNoise,
+    RangeErrors,
+    multilaterate,
+    range_errors,
+)
 from calib.evaluation.tracking import BodyTrack, Trajectory, nearest_attitude
 from calib.settings import CheckedSettings
 from uwblink.arrays import Floats, Ints

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from calib.data.sources import Flight
-from calib.evaluation.range_updates import RangeErrors, gated_update, mixture_update, multilaterate
+from calib.evaluation.filters import RangeErrors, gated_update, mixture_update, multilaterate
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
 from calib.data.samples import SampleFlight, stamped
-from calib.evaluation.inertial_filter import GRAVITY_M_S2
+from calib.evaluation.filters import GRAVITY_M_S2
 from calib.planning.settings import FlightPlanSettings
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import distances_m

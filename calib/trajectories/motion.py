@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.estimator.rows import NormalRows, Terms, normal_terms
 from calib.estimator.unknowns import Layout, Prior, Unknown
-from calib.evaluation.inertial_filter import GRAVITY_M_S2
+from calib.evaluation.filters import GRAVITY_M_S2
 from calib.trajectories.samples import POINT_S, SAMPLE_S
 from calib.trajectories.scene import Scene
 from uwblink.arrays import Floats, Ints

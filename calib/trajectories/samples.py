@@ -17,7 +17,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation, Slerp
 
 from calib.errors import BadInputError
-from calib.evaluation.inertial_filter import GRAVITY_M_S2
+from calib.evaluation.filters import GRAVITY_M_S2
 from calib.spread import medians, robust_spread
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.recording.schema import Arrangement, KnownDistance
