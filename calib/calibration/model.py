@@ -176,9 +176,7 @@ class Calibration:
     @property
     def needs_power(self) -> bool:
         """Whether ranges without any power cannot be corrected whole."""
-        curves = [self.bias_curve, self.sigma_curve]
-        curves += [curve for group in self.groups.values() for curve in (group.bias_curve, group.sigma_curve)]
-        return not all(curve.flat for curve in curves)
+        return not all(one.bias_curve.flat and one.sigma_curve.flat for one in (self, *self.groups.values()))
 
     def lifted(self, ranges: Ranges) -> Floats:
         """Return the lifted power of each range, as this calibration defines it."""
@@ -283,12 +281,18 @@ class Calibration:
             return found
         return CorrectedRange(*(column.item() for column in found))
 
+    @property
+    def curve_covariance_m2(self) -> Floats:
+        """The covariance (m, m) of the coefficients of the bias curve, zero where it is not stated."""
+        size = len(self.bias_curve.coefficients)
+        return np.zeros((size, size)) if self.uncertainty is None else np.array(self.uncertainty.bias_m2)
+
     def band(self, lifted: Floats, which: Literal["bias", "sigma"]) -> Floats | None:
         """Return the standard error of a curve at lifted powers (n,), in metres; None where it is not known."""
         if self.uncertainty is None:
             return None
         curve = self.bias_curve if which == "bias" else self.sigma_curve
-        covariance = np.array(self.uncertainty.bias_m2 if which == "bias" else self.uncertainty.sigma_m2)
+        covariance = self.curve_covariance_m2 if which == "bias" else np.array(self.uncertainty.sigma_m2)
         splines = basis(np.clip(lifted, *curve.range), np.array(curve.knots))
         return np.asarray(np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", splines, covariance, splines), 0)))
 

@@ -160,7 +160,7 @@ def _calibration(
     curve, curve_covariance = flat_curve(0.0, span), np.zeros((DEGREE + 1,) * 2)
     gauge = "no curve; the delays carry the constant"
     if taken is not None:
-        curve, curve_covariance, span = taken.bias_curve, _of_curve(taken), taken.bias_curve.range
+        curve, curve_covariance, span = taken.bias_curve, taken.curve_covariance_m2, taken.bias_curve.range
         gauge = "that of the calibration whose curve was taken over"
     elif network.curve is not None:
         where, knots = network.layout.where["curve"], network.curve.knots
@@ -208,19 +208,13 @@ def _calibration(
     )
 
 
-def _of_curve(taken: Calibration) -> Floats:
-    """Return the covariance (m, m) of a curve that was taken over, m^2; zero where it is not stated."""
-    size = len(taken.bias_curve.coefficients)
-    return np.zeros((size, size)) if taken.uncertainty is None else np.array(taken.uncertainty.bias_m2)
-
-
 def widened_by(found: Solution, curve: Calibration) -> Solution:
     """Return a solution whose covariance has what the errors of a curve that was taken over do to delays and places."""
     here, means = found.linear, found.network.means
     splines = basis(np.clip(means.lifted, *curve.bias_curve.range), np.array(curve.bias_curve.knots))
     count = len(splines)
     gain = here.covariance @ (here.jacobian[:count].T @ (splines / here.std[:count, None]))
-    return replace(found, more=found.more + gain @ _of_curve(curve) @ gain.T)
+    return replace(found, more=found.more + gain @ curve.curve_covariance_m2 @ gain.T)
 
 
 def in_frames(found: Solution) -> Solution:

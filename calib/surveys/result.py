@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -202,14 +201,12 @@ class SurveyResult:
         Raises `BadInputError` for another suffix.
         """
         from calib.surveys.figures import board_figure
+        from uwblink.pages.figures import picture
 
         place = Path(path)
         if place.suffix.lower() not in (".svg", ".png", ".pdf"):
             raise BadInputError(f"found {place.suffix or 'no suffix'}, expected .svg, .png or .pdf", parameter="plot")
-        form, out = place.suffix.lower()[1:], BytesIO()
-        metadata = {"Date": None} if form == "svg" else None
-        board_figure(self.arrangements).savefig(out, format=form, dpi=150, metadata=metadata)
-        write_bytes(place, out.getvalue(), force=force)
+        write_bytes(place, picture(lambda _: board_figure(self.arrangements), place.suffix.lower()[1:]), force=force)
 
     def arrangement(self, name: str | None = None) -> SurveyedArrangement:
         """Return an arrangement by name, the only one where none is given; raises `BadInputError`."""

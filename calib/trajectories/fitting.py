@@ -12,7 +12,7 @@ from scipy import sparse
 from threadpoolctl import threadpool_limits
 
 from calib.calibration.document import Split
-from calib.calibration.model import Calibration, given_calibration
+from calib.calibration.model import Calibration, given_calibration, matrix_of
 from calib.calibration.power_curves import basis
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import refuse_refuted
@@ -167,13 +167,11 @@ def _described(model: RangeModel, top: Search, known: Calibration | None) -> Kno
 
 def _curve_uncertainty(found: KnownDistances, known: Calibration) -> Floats:
     """Return the covariance (tags, tags) in ns^2 that the uncertainty of a kept curve adds to the delays."""
-    if known.uncertainty is None or len(known.uncertainty.bias_m2) != len(known.bias_curve.coefficients):
-        return np.zeros_like(found.covariances["delay"])
     splines = basis(np.clip(found.model.lifted, *known.bias_curve.range), np.array(known.bias_curve.knots))
     # Derivatives of the unknowns by the coefficients: covariance times information.
     optimum, linked = found.slopes.optimum, found.slopes.link(sparse.csr_matrix(splines))
     reach = (optimum.covariance @ linked.T)[optimum.layout.where["delay"]]
-    return np.asarray(reach @ np.array(known.uncertainty.bias_m2) @ reach.T)
+    return np.asarray(reach @ known.curve_covariance_m2 @ reach.T)
 
 
 def _result(
@@ -226,8 +224,7 @@ def _result(
 
 def _with_curve(calibration: Calibration, known: Calibration) -> Calibration:
     """Return a calibration with the curve of another one and the covariance of that curve."""
-    size = len(known.bias_curve.coefficients)
-    of_curve = known.uncertainty.bias_m2 if known.uncertainty else ((0.0,) * size,) * size
+    of_curve = matrix_of(known.curve_covariance_m2)
     uncertainty = calibration.uncertainty and replace(calibration.uncertainty, bias_m2=of_curve)
     return replace(calibration, bias_curve=known.bias_curve, uncertainty=uncertainty)
 
