@@ -99,11 +99,8 @@ def write_survey_report(
 
     It needs no recording: everything stands in the calibration. Raises what `check_output` raises.
     """
-    calibration = given_calibration(calibration)
-    check_places(Path(path), None, None, force=force)
-    results = Results(calibration=calibration, origin=origin or origin_of([]))
-    title = "Report of a calibration without motion capture"
-    write_document(document(results, title), Path(path), force=force)
+    results = Results(calibration=given_calibration(calibration), origin=origin or origin_of([]))
+    write_checked(document(results, "Report of a calibration without motion capture"), Path(path), force=force)
 
 
 def write_track_figures(
@@ -114,11 +111,11 @@ def write_track_figures(
     Raises what `check_places` raises.
     """
     compared = [one for one in found if isinstance(one, Localization)]
-    pictures = [Picture("rmse", partial(rmse_bars, found=compared), "RMSE")] if compared else []
+    pictures: list[Block] = [Picture("rmse", partial(rmse_bars, found=compared), "RMSE")] if compared else []
     for one in found:
         draw = partial(track, one=one) if isinstance(one, Localization) else partial(onboard, one=one)
         pictures.append(Picture(track_name(one.source, one.body), draw, one.body))
-    _write_figures(pictures, folder, force)
+    write_checked(Document("", pictures), None, folder, force=force)
 
 
 def write_comparison_figures(
@@ -130,16 +127,17 @@ def write_comparison_figures(
     force: bool = False,
 ) -> None:
     """Write the differences of delays and both calibrations' curves into a folder; `names` label the calibrations."""
-    pictures = [
+    pictures: list[Block] = [
         Picture("differences", partial(drawings.differences, found=found), "Delays"),
         Picture("curves", partial(drawings.both_curves, known=known, names=names), "Curves"),
     ]
-    _write_figures(pictures, folder, force)
+    write_checked(Document("", pictures), None, folder, force=force)
 
 
-def _write_figures(pictures: Sequence[Block], folder: Path, force: bool) -> None:
-    check_places(None, None, folder, force=force)
-    write_document(Document("", list(pictures)), None, None, folder, force=force)
+def write_checked(made: Document, output: Path | None, figures: Path | None = None, *, force: bool) -> None:
+    """Write a document and its figures where `check_places` allows it, and raise what that raises elsewhere."""
+    check_places(output, None, figures, force=force)
+    write_document(made, output, None, figures, force=force)
 
 
 Progress = Callable[[str], None]

@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 
 from calib.planning.result import FlightPlan, Plan
-from calib.report.campaign import check_places
+from calib.report.campaign import write_checked
 from calib.report.figures import arrangement, flight, more, planned_delays
-from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text, write_document
+from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text
 
 
 def write_plan(
@@ -32,8 +32,7 @@ def write_plan(
     if isinstance(plan, Plan):
         places = {"line": "on a line", "plane": "in a plane", "": "in space"}[plan.on]
         title = f"Plan: {len(plan.half_ns)} boards {places}, {len(plan.arrangements)} arrangements"
-    check_places(output, None, figures, force=force)
-    write_document(Document(title, blocks), output, None, figures, force=force)
+    write_checked(Document(title, blocks), output, figures, force=force)
 
 
 def _of_boards(plan: Plan) -> Iterator[Block]:

@@ -18,9 +18,7 @@ from calib.report.results import Results
 from calib.spread import STD_OF_MEDIAN, TWO_SIDED_95
 from uwblink.pages.blocks import Block, Table, Text
 
-GOOD: Final = "good"
-DOUBT: Final = "doubt"
-BAD: Final = "bad"
+GOOD, DOUBT, BAD = "good", "doubt", "bad"
 
 MOST_NS: Final = 0.1
 """Half of an interval of a delay, 3 cm of range: as much as DW1000s of one kind differ by chance."""
@@ -39,18 +37,22 @@ class Criterion(NamedTuple):
 def verdict(results: Results) -> list[Block]:
     """Return a sentence on all criteria, and their table."""
     found = list(criteria(results))
-    bad, doubt = ("; ".join(one.told for one in found if one.grade == grade) for grade in (BAD, DOUBT))
-    if bad:
-        kind, also = BAD, f" Also: {doubt}." if doubt else ""
-        text = f"Not fit for use. {bad[0].upper()}{bad[1:]}.{also}"
-    elif doubt:
-        kind, text = DOUBT, f"Fit for use, with reservations. {doubt[0].upper()}{doubt[1:]}."
-    else:
-        listed = "; ".join(one.told for one in found)
-        kind, text = GOOD, f"Fit for use. All {len(found)} criteria are met: {listed}."
+    bad, doubt, good = ("; ".join(one.told for one in found if one.grade == grade) for grade in (BAD, DOUBT, GOOD))
+    also = f" Also: {doubt}." if doubt else ""
+    sentences = (
+        (bad, BAD, f"Not fit for use. {started(bad)}.{also}"),
+        (doubt, DOUBT, f"Fit for use, with reservations. {started(doubt)}."),
+        (True, GOOD, f"Fit for use. All {len(found)} criteria are met: {good}."),
+    )
+    kind, text = next((kind, text) for applies, kind, text in sentences if applies)
     marks = {GOOD: "✓ yes", DOUBT: "! in part", BAD: "✗ no"}
     rows = [[one.question, marks[one.grade], one.found, one.asked] for one in found]
     return [Text(text, kind), Table(["criterion", "met", "found", "asked for"], rows, words=True)]
+
+
+def started(text: str) -> str:
+    """Return a text as a sentence begins."""
+    return text[:1].upper() + text[1:]
 
 
 def criteria(results: Results) -> Iterator[Criterion]:
