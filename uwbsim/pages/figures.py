@@ -108,9 +108,10 @@ def room(width_in: float, scenario: Scenario) -> Figure:
     paths = {body.name: world.trajectories[body.name].position_m(time) for body in scenario.bodies}
     spots, _ = world.antennas(np.arange(len(scenario.tags)), np.zeros(len(scenario.tags)))
     tags = {tag.id: spot for tag, spot in zip(scenario.tags, spots, strict=True)}
-    boxes: list[tuple[Obstacle | Room, str, dict[str, Any]]] = []
-    boxes += [(box, box.name, {"fc": GRID, "ec": MUTED, "lw": 0.6}) for box in scenario.obstacles]
-    boxes += [(scenario.room, "", {"fill": False, "ec": INK, "lw": 1.2, "zorder": 1})] if scenario.room else []
+    boxes: list[tuple[Obstacle | Room, str, dict[str, Any]]] = [
+        *((box, box.name, {"fc": GRID, "ec": MUTED, "lw": 0.6}) for box in scenario.obstacles),
+        *((box, "", {"fill": False, "ec": INK, "lw": 1.2, "zorder": 1}) for box in [scenario.room] if box),
+    ]
     corners = [np.array([box.min_m, box.max_m]) for box, _, _ in boxes]
     points = np.concatenate([*paths.values(), spots, *corners])
     # What is drawn is at least a metre large, with a margin.

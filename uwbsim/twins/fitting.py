@@ -202,8 +202,6 @@ class Twin:
     scenario: Scenario
     found: dict[str, Any]
     unknown: tuple[str, ...]
-    recording: str
-    calibration: str
     measured: TwinFlight
     known: KnownDevices
     paths: dict[str, Poses]
@@ -251,14 +249,14 @@ class Twin:
             write_text(plan, "\r\n".join([*lines, ""]), force=force)
             table["ranging"] = table["ranging"] | {"plan": {"file": plan.name}}
         head = (
-            f"The twin of {Path(self.recording).name} with {Path(self.calibration).name}: fitted to it by "
+            f"The twin of {Path(self.measured.where).name} with {Path(self.known.where).name}: fitted to it by "
             "`uwbsim twin`, which also wrote the files that it names. Keys that are left out have their defaults."
         )
         write_text(path, scenario_text(table, head), force=force)
 
     def __repr__(self) -> str:
         """Return what was found, a line each."""
-        head = f"Twin of {self.recording}: {len(self.measured)} exchanges of {len(self.measured.pairs)} pairs"
+        head = f"Twin of {self.measured.where}: {len(self.measured)} exchanges of {len(self.measured.pairs)} pairs"
         values = (f"  {name}: {value:.4g}" for name, value in self.found.items() if isinstance(value, float))
         return "\n".join([head, *values])
 
@@ -317,8 +315,6 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
         scenario=scenario,
         found=summary(flight, fitted),
         unknown=tuple(unknowns(flight, fitted)),
-        recording=where,
-        calibration=known.where,
         measured=flight,
         known=known,
         paths=paths,
