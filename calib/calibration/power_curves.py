@@ -114,9 +114,7 @@ SigmaCurve = Annotated[BiasCurve, joint(_negative)]
 
 def flat_curve(value_m: float, span: tuple[float, float]) -> Curve:
     """Return a curve of one value, with the two lifted powers of `span` as its range."""
-    low, high = span
-    if not high > low:
-        low, high = 0.999 * low, 1.001 * high
+    low, high = span if span[1] > span[0] else (0.999 * span[0], 1.001 * span[1])
     return Curve((low,) * (DEGREE + 1) + (high,) * (DEGREE + 1), (value_m,) * (DEGREE + 1), DEGREE, (low, high))
 
 

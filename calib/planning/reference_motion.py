@@ -25,11 +25,13 @@ def reference_motion(flown: FlightPlanSettings) -> SampleFlight:
     rng = np.random.default_rng(flown.seed)
     bodies = {f"robot{k + 1}": _motion(flown, k, rng) for k in range(len(flown.robots))}
     tags = [
-        Tag(tag, body, tuple(arm))
-        for body, robot in zip(bodies, flown.robots, strict=True)
-        for tag, arm in zip(robot, _arms(len(robot), flown.apart_m).tolist(), strict=True)
+        *(
+            Tag(tag, body, tuple(arm))
+            for body, robot in zip(bodies, flown.robots, strict=True)
+            for tag, arm in zip(robot, _arms(len(robot), flown.apart_m).tolist(), strict=True)
+        ),
+        *(Tag(tag, f"anchor{tag}", (0.0, 0.0, 0.0)) for tag in flown.anchors),
     ]
-    tags += [Tag(tag, f"anchor{tag}", (0.0, 0.0, 0.0)) for tag in flown.anchors]
     poses = _poses(flown, bodies)
     time_ns = _ns(np.arange(int(flown.seconds * flown.rate_hz)) / flown.rate_hz)
     pair = _in_turn(flown, len(time_ns), rng)

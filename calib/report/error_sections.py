@@ -25,15 +25,14 @@ def curves(results: Results) -> list[Block]:
     if not results.recordings:
         power, *curves = curve_rows(calibration)
         return [Heading("Bias and spread over power"), Table(list(power), [list(row) for row in curves])]
-    if calibration.loss == "l2":
-        follows = "The curve follows the mean of the errors, as least squares do; points are means, bin by bin."
-    else:
-        follows = (
-            "The curve follows the core of the errors: noise, without reflections, which can only lengthen a range. "
-            "Points are the centre of that core (below: its spread), told from the tail bin by bin, without the curve. "
-            "Medians are drawn, too, and lie above: with a share s of reflected ranges about the quantile "
-            "0.5 / (1 − s) of the core."
-        )
+    follows = (
+        "The curve follows the mean of the errors, as least squares do; points are means, bin by bin."
+        if calibration.loss == "l2"
+        else "The curve follows the core of the errors: noise, without reflections, which can only lengthen a range. "
+        "Points are the centre of that core (below: its spread), told from the tail bin by bin, without the curve. "
+        "Medians are drawn, too, and lie above: with a share s of reflected ranges about the quantile "
+        "0.5 / (1 − s) of the core."
+    )
     mean_of_lifted = "the mean over both ends." if calibration.lift == "mean-of-lifted" else ""
     lifted = (
         "Lifted power is the first-path power p on a scale that stretches where ranges are good and the bias "

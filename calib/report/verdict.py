@@ -192,9 +192,11 @@ def _settled(results: Results) -> Criterion:
     if not half:
         return Criterion(*asked, "the calibration states no intervals", DOUBT, "delays have no intervals")
     widest = max(half, key=lambda name: half[name])
-    told = f"delays are known to ± {half[widest]:.3f} ns or better"
-    if half[widest] > MOST_NS:
-        told = f"the delay of {widest} is known to ± {half[widest]:.2f} ns only"
+    told = (
+        f"the delay of {widest} is known to ± {half[widest]:.2f} ns only"
+        if half[widest] > MOST_NS
+        else f"delays are known to ± {half[widest]:.3f} ns or better"
+    )
     grade = _graded(half[widest] <= MOST_NS, half[widest] <= 3 * MOST_NS)
     return Criterion(*asked, f"widest: {widest}, ± {half[widest]:.3f} ns", grade, told)
 

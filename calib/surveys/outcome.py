@@ -256,11 +256,11 @@ def _arrangement(found: Solution, number: int) -> SurveyedArrangement:
     """Return where boards stood in an arrangement, in the frame of known positions or that of its first boards."""
     network, boards, seats = found.network, found.network.arrangements[number], found.network.seats(number)
     points, covariance = network.positions_m(found.x), found.covariance() * students_factor(found.freedom) ** 2
-    surveyed = []
-    for tag, seat in zip(boards.tags, seats.tolist(), strict=True):
-        own, (x, y, z) = slice(3 * seat, 3 * seat + 3), points[seat].tolist()
-        spread = covariance[own, own]
-        surveyed.append(SurveyedBoard(tag, (x, y, z), spread, bool(np.trace(spread) < 1.0)))
+    own = [slice(3 * seat, 3 * seat + 3) for seat in seats.tolist()]
+    surveyed = tuple(
+        SurveyedBoard(tag, (x, y, z), covariance[one, one], bool(np.trace(covariance[one, one]) < 1.0))
+        for tag, one, (x, y, z) in zip(boards.tags, own, points[seats].tolist(), strict=True)
+    )
     known = network.known_places.keys() & set(seats.tolist())
     frame = "that of the known positions" if known else _frame(points[seats], boards)[2]
-    return SurveyedArrangement(boards.name, boards.shape, tuple(surveyed), frame)
+    return SurveyedArrangement(boards.name, boards.shape, surveyed, frame)

@@ -70,12 +70,14 @@ class SurveyedArrangement:
     @classmethod
     def from_dict(cls, row: Mapping[str, Any]) -> SurveyedArrangement:
         """Return the arrangement that `to_dict` wrote."""
-        boards = []
-        for one in row["boards"]:
-            x, y, z = map(float, one["position_m"])
-            covariance = np.array(one["covariance_m2"], dtype=float)
-            boards.append(SurveyedBoard(int(one["tag"]), (x, y, z), covariance, bool(one["determined"])))
-        return cls(str(row["name"]), str(row["known"]), tuple(boards), str(row["frame"]))
+        boards = tuple(
+            SurveyedBoard(
+                int(one["tag"]), (x, y, z), np.array(one["covariance_m2"], dtype=float), bool(one["determined"])
+            )
+            for one in row["boards"]
+            for x, y, z in [map(float, one["position_m"])]
+        )
+        return cls(str(row["name"]), str(row["known"]), boards, str(row["frame"]))
 
 
 @dataclass(frozen=True, slots=True)

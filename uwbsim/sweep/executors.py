@@ -100,10 +100,11 @@ class Work:
             if run.error:
                 raise UwbsimError(run.error)
             scenario = Scenario.model_validate_json(run.scenario)
-            if self.evaluate is None:
-                rows = [one.to_dict() for one in compare(scenario, self.protocols, self.ranges).outcomes]
-            else:
-                rows = [self._evaluated(scenario, row.name, self.evaluate) for row in self.protocols]
+            rows = (
+                [one.to_dict() for one in compare(scenario, self.protocols, self.ranges).outcomes]
+                if self.evaluate is None
+                else [self._evaluated(scenario, row.name, self.evaluate) for row in self.protocols]
+            )
         except (UwbsimError, UwblinkError, ArithmeticError, ValueError, MemoryError) as error:
             return self.failed(run, str(error) or type(error).__name__)
         return run.number, [self._head(run) | {"status": "ok", "error": None} | row for row in rows]

@@ -294,9 +294,8 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
         rows = flight.some(50_000)
         clocks = fit_clocks(flight[rows])
         noise_dbm, noise_s = receive_noise(clocks.receive_noise_s, flight.exchanges.fpp2_dbm[rows])
-        std_s = np.zeros_like(flight.power_dbm)
-        if len(noise_s):
-            std_s = np.interp(lifted(flight.power_dbm), lifted(noise_dbm), noise_s)
+        power = flight.power_dbm
+        std_s = np.interp(lifted(power), lifted(noise_dbm), noise_s) if len(noise_s) else np.zeros_like(power)
         errors = fit_range_errors(flight, np.sqrt(np.mean(std_s**2, axis=0)))
         powers = fit_powers(flight[rows], errors.reflected[rows])
         schedule = fit_schedule(flight, flown.faults)
