@@ -368,18 +368,18 @@ def given_calibration(source: CalibrationSource, parameter: str = "calibration")
     return known
 
 
-MAX_ROWS: Final = 40
-"""Maximum number of tags or pairs that are printed, about a screen."""
-
-
 def _tables(calibration: Calibration) -> dict[str, list[tuple[str, ...]]]:
     """Return the tables of a calibration by title: delays, constants of pairs, and curves."""
-    heads = {"Antenna delays": ("tag", "delay (ns)", "interval"), "Constants": ("pair", "constant (cm)", "interval")}
-    bodies = delay_rows(calibration), pair_rows(calibration)
-    tables: dict[str, list[tuple[str, ...]]] = {}
-    for (title, head), rows in zip(heads.items(), bodies, strict=True):
-        more = [("...", "", f"{len(rows) - MAX_ROWS} more")] if len(rows) > MAX_ROWS else []
-        tables |= {title: [head, *rows[:MAX_ROWS], *more]} if rows else {}
+    bodies = {
+        "Antenna delays": [("tag", "delay (ns)", "interval"), *delay_rows(calibration)],
+        "Constants": [("pair", "constant (cm)", "interval"), *pair_rows(calibration)],
+    }
+    most = 40  # tags or pairs that are printed, about a screen
+    tables: dict[str, list[tuple[str, ...]]] = {
+        title: [*rows[: most + 1], *[("...", "", f"{len(rows) - 1 - most} more")] * (len(rows) > most + 1)]
+        for title, rows in bodies.items()
+        if len(rows) > 1
+    }
     return tables | {"Curves": curve_rows(calibration)}
 
 

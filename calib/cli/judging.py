@@ -163,14 +163,15 @@ def doctor(
         found_all = {"findings": [asdict(f) for f in findings], "clock_skews": clocks}
         typer.echo(json.dumps(found_all | ({"examined": parts} if parts else {}), indent=1))
         return
-    lines = [f"{name}: {part}" for name, part in parts.items()]
-    lines += [] if findings else [f"{', '.join(map(str, recordings))}: nothing found"]
+    nothing = [] if findings else [f"{', '.join(map(str, recordings))}: nothing found"]
+    lines = [*(f"{name}: {part}" for name, part in parts.items()), *nothing]
     for finding in findings:
         by_chance = f" (p = {finding.p_value:.1g})" if finding.p_value else ""
         lines += [f"{finding.fault}{by_chance}", f"  evidence: {finding.evidence}", f"  remedy:   {finding.remedy}"]
     for name, some in skews.items():
-        lines += [f"clock skew in {name}, the second tag against the first"] if some else []
-        lines += [f"  {one}" for one in some]
+        lines += (
+            [f"clock skew in {name}, the second tag against the first", *(f"  {one}" for one in some)] if some else []
+        )
     typer.echo("\n".join(lines))
 
 

@@ -215,7 +215,7 @@ class InertialFilter:
             step[:, V, F] = -self.attitude * dt
             step[:, A, A] = -_cross(turn) * dt
             step[:, A, G] = -np.eye(3) * dt
-            self.attitude = self.attitude @ _rotation(turn * dt)
+            self.attitude = self.attitude @ Rotation.from_rotvec(turn * dt).as_matrix()
             added[V], added[A] = noise.force**2 * dt, noise.gyro**2 * dt
             added[G], added[F] = noise.gyro_bias**2 * dt, noise.force_bias**2 * dt
         else:
@@ -307,15 +307,10 @@ class InertialFilter:
     def _move(self, by: Floats) -> None:
         self.state = self.state + by
         if self.inertial:
-            self.attitude = self.attitude @ _rotation(by[:, A])
+            self.attitude = self.attitude @ Rotation.from_rotvec(by[:, A]).as_matrix()
         self.state[:, A] = 0.0
 
 
 def _cross(vectors: Floats) -> Floats:
     """Return the cross-product matrices (n, 3, 3) of vectors (n, 3)."""
     return np.asarray(np.cross(np.eye(3), vectors[:, None, :]))
-
-
-def _rotation(vectors: Floats) -> Floats:
-    """Return rotations (n, 3, 3) by vectors (n, 3) in radians."""
-    return np.asarray(Rotation.from_rotvec(vectors).as_matrix())
