@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final
 
 import numpy as np
 
 from calib.data.sources import Data
 from calib.errors import UnanswerableError
-from calib.findings import Candidate
+from calib.findings import Candidate, Finding
 from calib.surveys.knowledge import Knowledge
 from calib.surveys.network import NARROWEST_DB, in_dbm
 from calib.surveys.recordings import read_surveys
-from calib.surveys.result import Contradiction, SurveyResult
+from calib.surveys.result import SurveyResult
 from calib.surveys.survey import survey
-
-FAULTS: Final = {
-    "moved": "board moved within an arrangement",
-    "shape": "arrangement not as it is said to be",
-    "distance": "wrong known distance",
-    "labels": "exchanged labels",
-}
-"""Faults by kind of contradiction."""
 
 
 def surveyed(recordings: list[Data]) -> Iterator[Candidate]:
@@ -30,7 +21,7 @@ def surveyed(recordings: list[Data]) -> Iterator[Candidate]:
 
     The survey itself has judged: what it says is not tested again.
     """
-    contradictions: tuple[Contradiction, ...] = ()
+    contradictions: tuple[Finding, ...] = ()
     found: SurveyResult | None = None
     try:
         given = read_surveys(recordings, Knowledge())
@@ -45,7 +36,7 @@ def surveyed(recordings: list[Data]) -> Iterator[Candidate]:
     except UnanswerableError as error:
         yield Candidate("survey determines nothing", str(error))
     for one in found.contradictions if found else contradictions:
-        yield Candidate(FAULTS[one.kind], one.text.partition("; ")[0])
+        yield Candidate(one.fault, one.evidence)
     if found:
         yield from _weak(found)
 

@@ -15,13 +15,13 @@ from calib.calibration.model import Calibration, Uncertainty, matrix_of
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis, flat_curve
 from calib.errors import UnanswerableError
 from calib.estimator.range_model import METRES_A_NS
+from calib.findings import Finding
 from calib.information import InformationColumn, Verdict, judge, reduced
 from calib.settings import SurveySettings
 from calib.spread import TWO_SIDED_95
 from calib.surveys.network import Boards
 from calib.surveys.recordings import LIFT, SurveyData
 from calib.surveys.result import (
-    Contradiction,
     ReflectedPair,
     SecondBest,
     SurveyedArrangement,
@@ -57,7 +57,7 @@ def result_of(
     data: SurveyData,
     found: Solution,
     second: SecondBest | None,
-    findings: tuple[Contradiction, ...],
+    findings: tuple[Finding, ...],
     taken: Calibration | None,
     asked: SurveySettings,
 ) -> SurveyResult:
@@ -74,12 +74,12 @@ def result_of(
             undetermined=[[int(tag) for tag in free]],
         )
     reflected = tuple(_reflected_pairs(found))
-    warnings = (*data.warnings, *(one.text for one in findings), *_notes(found, second, verdict, reflected))
+    warnings = (*data.warnings, *map(str, findings), *_notes(found, second, verdict, reflected))
     arrangements = tuple(_arrangement(found, k) for k in range(len(network.arrangements)))
     more = ({"settings": asked.changed()} if asked.changed() else {}) | {
         "surveyed": [one.to_dict() for one in arrangements],
         "reflected": [one.to_dict() for one in reflected],
-        "findings": [one.text for one in findings],
+        "findings": list(map(str, findings)),
         "second_best": None if second is None else round(second.worse, 2),
         "warnings": list(warnings),
     }

@@ -22,11 +22,11 @@ from calib.estimator.optimize import maximize
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, Part
 from calib.estimator.unknowns import Prior, Priors, Unknown
+from calib.findings import Finding
 from calib.pairs import Pairs, pairs_of
 from calib.settings import FitSettings
 from calib.spread import STD_OF_MEDIAN, medians, robust_spread
 from calib.surveys.knowledge import Knowledge
-from calib.surveys.result import Contradiction
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.antenna_delays import AntennaDelays
 from uwblink.recording.schema import Arrangement, KnownDistance
@@ -83,7 +83,7 @@ class SurveyData:
     arrangements: tuple[Arrangement, ...]
     distances: tuple[KnownDistance, ...]
     sources: tuple[str, ...]
-    findings: tuple[Contradiction, ...]
+    findings: tuple[Finding, ...]
     warnings: tuple[str, ...]
     antenna_delays: AntennaDelays
 
@@ -96,7 +96,7 @@ def read_surveys(data: Data | Iterable[Data], knowledge: Knowledge) -> SurveyDat
     recordings = [_load(one) for one in each(data)]
     if knowledge.spans_s and len(recordings) > 1:
         raise BadInputError("gives times of arrangements, which is for one recording only", parameter="known")
-    arrangements, numbers, findings = dict[str, Arrangement](), list[Ints](), list[Contradiction]()
+    arrangements, numbers, findings = dict[str, Arrangement](), list[Ints](), list[Finding]()
     for ranges, marked, _ in recordings:
         numbers.append(np.full(len(ranges), -1))
         for one in _arrangements(ranges, marked, knowledge, several=len(recordings) > 1):
@@ -192,7 +192,7 @@ def still_stretches(ranges: Ranges, bin_ns: int = 1_000_000_000) -> list[tuple[i
     return [(a, b) for a, b in found if b - a >= 15e9]
 
 
-def find_motion(name: str, ranges: Ranges) -> list[Contradiction]:
+def find_motion(name: str, ranges: Ranges) -> list[Finding]:
     """Return the board that was moved within an arrangement that should be still, if there is one.
 
     A motion is an instant after which two of a board's pairs range otherwise, by more than noise and by 3 cm: a single
@@ -222,9 +222,9 @@ def find_motion(name: str, ranges: Ranges) -> list[Contradiction]:
     edge = np.argmax(np.nan_to_num(np.abs(_steps(median, WINDOW_BINS)[mine, 1:-1])).sum(axis=0))
     text = (
         f"{name}: board {tag} was moved {(starts[edge + 1] - begin) * 1e-9:.0f} s after its beginning (ranges changed "
-        f"by up to {100 * by_m:.0f} cm); record that arrangement again, or end it before"
+        f"by up to {100 * by_m:.0f} cm)"
     )
-    return [Contradiction("moved", text)]
+    return [Finding("board moved within an arrangement", text, "record that arrangement again, or end it before", 0.0)]
 
 
 def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:

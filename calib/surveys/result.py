@@ -12,6 +12,7 @@ import numpy as np
 
 from calib.calibration.model import Calibration
 from calib.errors import BadInputError
+from calib.findings import Finding
 from calib.information import Verdict
 from uwblink.arrays import Floats
 from uwblink.output import write_bytes, write_text
@@ -96,18 +97,6 @@ class SecondBest:
 
 
 @dataclass(frozen=True, slots=True)
-class Contradiction:
-    """What contradicts the ranges: "shape" (a line that is none), "distance", "labels" or "moved", and it in words.
-
-    `p_value` is how probable it is at most that sound ranges look like this.
-    """
-
-    kind: str
-    text: str
-    p_value: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
 class ReflectedPair:
     """A pair that is believed to be reflected in an arrangement: by how much its range is off, and how probable it is.
 
@@ -150,14 +139,14 @@ class SurveyResult:
     verdict: Verdict
     pair_error_m: float
     second_best: SecondBest | None
-    contradictions: tuple[Contradiction, ...]
+    contradictions: tuple[Finding, ...]
     warnings: tuple[str, ...]
     reflected: tuple[ReflectedPair, ...] = ()
 
     @property
     def findings(self) -> tuple[str, ...]:
         """The contradictions in words."""
-        return tuple(one.text for one in self.contradictions)
+        return tuple(map(str, self.contradictions))
 
     def __repr__(self) -> str:
         """Return the calibration as a table, below what it rests on, above the warnings."""

@@ -26,12 +26,13 @@ from calib.data.ranges import Ranges
 from calib.data.samples import ANCHOR_DELAYS_NS
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
+from calib.findings import Finding
 from calib.settings import SurveySettings
 from calib.surveys.knowledge import Knowledge, check_knowledge, load_knowledge
 from calib.surveys.network import DIMENSIONS, Boards, CurvePrior, Network
 from calib.surveys.outcome import in_frames, result_of, widened_by
 from calib.surveys.recordings import LIFT, SurveyData, read_surveys
-from calib.surveys.result import Contradiction, SurveyResult
+from calib.surveys.result import SurveyResult
 from calib.surveys.solution import Solution, adjust, averaged, exchanged_boards, first_start, out_of_order, solve
 from uwblink.recording.schema import SHAPES
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -44,15 +45,15 @@ START_BESIDE_M = 0.15
 """How far boards are put beside a line, or plane, at the start of a search: on it a derivative would be zero."""
 
 
-def likeliest_fault(found: Solution) -> tuple[Contradiction, Solution] | None:
+def likeliest_fault(found: Solution) -> tuple[Finding, Solution] | None:
     """Return the likeliest fault that chance does not explain, and the solution without it."""
-    best: tuple[Contradiction, Solution] | None = None
-    for name, (hypotheses, remedy) in HYPOTHESES.items():
-        for text, without in hypotheses(found):
-            p_value = math.exp(min(0.5 * (without.unlikely - found.unlikely), 0.0))
-            if p_value < FALSE_ALARMS and (best is None or without.unlikely < best[1].unlikely):
-                best = Contradiction(name, f"{text}; {remedy}", p_value), without
-    return best
+    tried = [
+        (Finding(fault, text, remedy, math.exp(min(0.5 * (without.unlikely - found.unlikely), 0.0))), without)
+        for fault, (hypotheses, remedy) in HYPOTHESES.items()
+        for text, without in hypotheses(found)
+    ]
+    likely = (one for one in tried if one[0].p_value < FALSE_ALARMS)
+    return min(likely, key=lambda one: one[1].unlikely, default=None)
 
 
 def _distances(found: Solution) -> Iterator[tuple[str, Solution]]:
@@ -123,14 +124,14 @@ def _exchanged(found: Solution) -> Iterator[tuple[str, Solution]]:
 
 
 HYPOTHESES = {
-    "distance": (_distances, "measure it again or leave it out"),
-    "shape": (_shapes, "put the boards as is said, or do not say so"),
-    "labels": (_exchanged, "look at the labels of these two boards"),
+    "wrong known distance": (_distances, "measure it again or leave it out"),
+    "arrangement not as it is said to be": (_shapes, "put the boards as is said, or do not say so"),
+    "exchanged labels": (_exchanged, "look at the labels of these two boards"),
 }
-"""The checks by what may be wrong: the hypotheses, and what to do where one is true."""
+"""The checks by the fault: the hypotheses, and what to do where one is true."""
 
 
-def wrong_orders(found: Solution) -> Iterator[Contradiction]:
+def wrong_orders(found: Solution) -> Iterator[Finding]:
     """Yield the contradictions between the stated orders of boards on a line and the ranges.
 
     What several arrangements have in common is one contradiction.
@@ -154,9 +155,9 @@ def wrong_orders(found: Solution) -> Iterator[Contradiction]:
         what = f"boards {words} stand in each other's place" if both else "boards stand in another order than said"
         text = (
             f"{where}: {what}: said was {'-'.join(map(str, said))}, the ranges of "
-            f"{network.arrangements[same[0]].name} say {'-'.join(map(str, seen))}; look at their labels"
+            f"{network.arrangements[same[0]].name} say {'-'.join(map(str, seen))}"
         )
-        yield Contradiction("labels", text, FALSE_ALARMS)
+        yield Finding("exchanged labels", text, "look at their labels", FALSE_ALARMS)
 
 
 def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, **changes: Any) -> SurveyResult:
@@ -196,7 +197,7 @@ def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, 
             found, second = solve(found.network)
         findings += wrong_orders(found)
         if findings and not asked.regardless:
-            text = "; ".join(one.text for one in findings)
+            text = "; ".join(map(str, findings))
             raise UnanswerableError(f"{text} (`regardless` surveys all the same)")
         found = averaged(in_frames(found))
         if taken is not None:
