@@ -48,11 +48,10 @@ def _draw_boards(axes: Axes, one: SurveyedArrangement) -> None:
         axes.add_patch(
             Ellipse((x, y), factor * long, factor * short, angle=turn, fill=False, ec=colour, lw=1.0, ls=style)
         )
+    axes.set(title=one.name)
+    axes.margins(0.15)
+    label(axes, "m", "")
     if one.known == "line":
-        axes.set_xlim(place[:, 0].min() - 0.12 * width, place[:, 0].max() + 0.12 * width)
         axes.set(ylim=(-0.5, 0.8), yticks=[])
     else:
         axes.set_aspect("equal", adjustable="datalim")
-        axes.margins(0.15)
-    axes.set_title(one.name, loc="left")
-    label(axes, "m", "")
