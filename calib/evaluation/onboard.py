@@ -39,6 +39,7 @@ from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import bodies_m
 from uwblink.recording.schema import Poses
 from uwblink.recording.summary import single_reports
+from uwblink.settings import setting
 
 MIN_ANCHORS: Final = 3
 """Anchors of a fix: fewer leave the position ambiguous; a start needs one more, because three leave its mirror image.
@@ -61,7 +62,7 @@ class OnboardSettings(CheckedSettings):
     'imu'
     """
 
-    model: str = "imu"
+    model: str = setting("imu", "Motion between ranges.", names=("imu", "constant-velocity"))
     height: bool = True
     start_m: tuple[float, float, float] | None = None
     start_std_m: float = 0.3
