@@ -176,7 +176,8 @@ class Calibration:
     @property
     def needs_power(self) -> bool:
         """Whether ranges without any power cannot be corrected whole."""
-        return not all(one.bias_curve.flat and one.sigma_curve.flat for one in (self, *self.groups.values()))
+        curves: tuple[Calibration | TagGroup, ...] = (self, *self.groups.values())
+        return not all(one.bias_curve.flat and one.sigma_curve.flat for one in curves)
 
     def lifted(self, ranges: Ranges) -> Floats:
         """Return the lifted power of each range, as this calibration defines it."""

@@ -70,8 +70,11 @@ def astray(view: RecordingView) -> Iterator[Candidate]:
     p_value = min(len(found) * p_value / k for k, (p_value, _) in enumerate(found, 1))
     wrong = [name for own, name in found if own < BUDGET]
     more = f" and {len(wrong) - 6} pairs more" if wrong[6:] else ""
-    evidence = f"ranges of pairs {', '.join(wrong[:6])}{more} differ on average, each pair's median aside"
-    yield Candidate("ranges that do not follow the distances", evidence, p_value)
+    yield Candidate(
+        "ranges that do not follow the distances",
+        f"ranges of pairs {', '.join(wrong[:6])}{more} differ on average, each pair's median aside",
+        p_value,
+    )
 
 
 def skew(view: RecordingView) -> Iterator[Candidate]:
@@ -199,8 +202,12 @@ def _of_tags(fit: QuickFit, long: Bools, evidence: str) -> Iterator[Candidate]:
         if p_tag < BUDGET:
             p_value = min(p_value, p_tag)
             evidence += f"; tag {tag}: {_in_words(fit, long, mine)}"
-    remedy = "see what stands near these antennas; pairs have too few ranges to say more: record for longer"
-    yield Candidate("reflections", evidence, p_value, {"more": remedy})
+    yield Candidate(
+        "reflections",
+        evidence,
+        p_value,
+        {"more": "see what stands near these antennas; pairs have too few ranges to say more: record for longer"},
+    )
 
 
 PAIR_M: Final = 0.04
@@ -273,8 +280,12 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
         if one.course < len(cuts):
             when_s = np.ptp(fit.model.ranges.time_ns[: np.argmax(courses[:, one.course]) + 1]) * 1e-9
             fault, what, when = "delay changed mid-flight", "shift", f"{when_s:.0f} s after the start"
-        evidence = f"ranges of tag {one.tag} {what} by {100 * one.size_m:+.1f} cm {when} {one} do not"
-        yield Candidate(fault, evidence, one.p_value, {"tag": one.tag})
+        yield Candidate(
+            fault,
+            f"ranges of tag {one.tag} {what} by {100 * one.size_m:+.1f} cm {when} {one} do not",
+            one.p_value,
+            {"tag": one.tag},
+        )
 
 
 def changes_of_tags(fit: QuickFit, courses: Floats) -> Iterator[Change]:

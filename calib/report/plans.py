@@ -82,8 +82,11 @@ def _promise(plan: Plan | FlightPlan) -> Iterator[Block]:
         yield Text(f"Not determined: {'; '.join(plan.verdict.free)}.", "warning")
     if plan.next_best:
         yield Heading("What one thing more would bring")
-        caption = "The mean interval with each; 1.5 ns are taken for known of a delay that nothing determines."
-        yield Picture("more", partial(more, next_best=plan.next_best), caption)
+        yield Picture(
+            "more",
+            partial(more, next_best=plan.next_best),
+            "The mean interval with each; 1.5 ns are taken for known of a delay that nothing determines.",
+        )
 
 
 def _known(plan: Plan | FlightPlan) -> str:

@@ -112,8 +112,9 @@ def _held_out(results: Results) -> Criterion:
     elif not results.held_out:
         found = "no: on those it was fitted to"
         told = "it was not judged on recordings that the fit has not seen, so what follows is too good"
-    question = "Was it judged on recordings that the fit has not seen?"
-    return Criterion(question, "yes", found, _graded(results.held_out, True), told)
+    return Criterion(
+        "Was it judged on recordings that the fit has not seen?", "yes", found, _graded(results.held_out, True), told
+    )
 
 
 def _gain(results: Results) -> Criterion:

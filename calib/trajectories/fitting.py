@@ -358,15 +358,14 @@ def _of_tapes(top: Search) -> Iterator[str]:
     for number, one in enumerate(tapes.stated):
         mine = np.flatnonzero(tapes.number == number)
         moved = rows.geometry.derivatives(x, mine).mean(axis=0)
-        share = min(float(moved @ (top.optimum.covariance @ moved)) / one.sigma_m**2, 1.0)
-        if share > TAPE_UNCHECKED:
-            continue
-        without = float(left[mine].mean()) / (1 - share)
-        deviation = abs(without) * math.sqrt(1 - share) / one.sigma_m
-        if deviation < TAPE_MIN_DEVIATION or abs(without) < TAPE_MIN_ERROR_M:
-            continue
-        way = "more" if without > 0 else "less"
-        yield (
-            f"the distance of tags {one.first} and {one.second}, {one.distance_m:.3f} m, is {100 * abs(without):.0f} "
-            f"cm {way} than all else says ({deviation:.0f} standard errors): measure it again"
-        )
+        free = 1 - min(float(moved @ (top.optimum.covariance @ moved)) / one.sigma_m**2, TAPE_UNCHECKED)
+        without = float(left[mine].mean()) / free
+        deviation = abs(without) * math.sqrt(free) / one.sigma_m
+        # A tape that no range checks is at its bound.
+        checked = free > 1 - TAPE_UNCHECKED
+        if checked and deviation >= TAPE_MIN_DEVIATION and abs(without) >= TAPE_MIN_ERROR_M:
+            yield (
+                f"the distance of tags {one.first} and {one.second}, {one.distance_m:.3f} m, is "
+                f"{100 * abs(without):.0f} cm {'more' if without > 0 else 'less'} than all else says ({deviation:.0f} "
+                "standard errors): measure it again"
+            )
