@@ -79,9 +79,7 @@ class Curve:
 
     def inside(self, lifted: Floats) -> Bools:
         """Return which lifted powers (n,) the curve was fitted at; a flat one holds at all, measured or not."""
-        if self.flat:
-            return np.ones(np.shape(lifted), dtype=bool)
-        return (lifted >= self.range[0]) & (lifted <= self.range[1])
+        return np.asarray(self.flat | ((lifted >= self.range[0]) & (lifted <= self.range[1])))
 
     def beyond(self, lifted: Floats | float) -> Floats:
         """Return by how much the curve would go on (n,) where it is held constant, straight on from its ends, metres.

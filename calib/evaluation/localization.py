@@ -205,8 +205,11 @@ def rmse_rows(
     `spread` is the title of the spread, which is left out of a single seed.
     """
     names, several = list(total.rmse_m), len(found[0].rmse_m["raw"]) > 1
-    numbers = [(f"{one.source} {one.body}", {name: one.rmse_m[name].mean() for name in names}) for one in found]
-    numbers += [("mean", total.rmse_m), *([(spread, total.spread_m)] if several else [])]
+    numbers = [
+        *((f"{one.source} {one.body}", {name: one.rmse_m[name].mean() for name in names}) for one in found),
+        ("mean", total.rmse_m),
+        *([(spread, total.spread_m)] if several else []),
+    ]
     rows = [[title, *(f"{row[name]:.3f}" for name in names)] for title, row in numbers]
     return [*rows, ["against raw", "", *(f"{-100 * less:+.0f} %" for less in total.reduction.values())]]
 
@@ -306,10 +309,11 @@ def localization_json(found: list[Localization]) -> dict[str, Any]:
 
 def write_tum(found: Sequence[Localization | OnboardTrack], folder: Path, *, force: bool = False) -> None:
     """Write the trajectories of each body, the true one among them, into a folder, which is made if it is missing."""
-    files: dict[str, bytes] = {}
-    for name, one in zip(_names(f"{one.source}-{one.label}" for one in found), found, strict=True):
-        texts = {kind: _tum(*columns).encode() for kind, columns in one.trajectories().items()}
-        files |= {f"{name}{'-' if kind else ''}{kind}.tum": text for kind, text in texts.items()}
+    files = {
+        f"{name}{'-' if kind else ''}{kind}.tum": _tum(*columns).encode()
+        for name, one in zip(_names(f"{one.source}-{one.label}" for one in found), found, strict=True)
+        for kind, columns in one.trajectories().items()
+    }
     write_files(folder, files, force=force)
 
 

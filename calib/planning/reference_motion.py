@@ -90,8 +90,10 @@ def _corners(flown: FlightPlanSettings) -> Floats:
 def _in_turn(flown: FlightPlanSettings, count: int, rng: np.random.Generator) -> Ints:
     """Return who ranges with whom (n, 2): all pairs of bodies but two anchors, each round in another order."""
     body = {tag: k for k, robot in enumerate(flown.robots) for tag in robot}
-    pairs = [(a, b) for a, b in combinations(body, 2) if body[a] != body[b]]
-    pairs += [(tag, anchor) for tag in body for anchor in flown.anchors]
+    pairs = [
+        *((a, b) for a, b in combinations(body, 2) if body[a] != body[b]),
+        *((tag, anchor) for tag in body for anchor in flown.anchors),
+    ]
     rounds = [rng.permutation(pairs) for _ in range(-(-count // len(pairs)))]
     return np.concatenate(rounds)[:count].astype(np.int64)
 
@@ -99,10 +101,12 @@ def _in_turn(flown: FlightPlanSettings, count: int, rng: np.random.Generator) ->
 def _poses(flown: FlightPlanSettings, bodies: Mapping[str, BSpline]) -> Poses:
     """Return the poses of all bodies, those of anchors at the first and the last instant."""
     time = np.arange(-1.0, flown.seconds + 1.0, 0.05)
-    rows = [(name, time, motion(time)) for name, motion in bodies.items()]
-    rows += [
-        (f"anchor{tag}", time[[0, -1]], np.tile([*place, 0.0], (2, 1)))
-        for tag, place in zip(flown.anchors, _corners(flown), strict=True)
+    rows = [
+        *((name, time, motion(time)) for name, motion in bodies.items()),
+        *(
+            (f"anchor{tag}", time[[0, -1]], np.tile([*place, 0.0], (2, 1)))
+            for tag, place in zip(flown.anchors, _corners(flown), strict=True)
+        ),
     ]
     names, times, where = zip(*rows, strict=True)
     x, y, z, yaw = np.concatenate(where).T

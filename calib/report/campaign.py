@@ -111,10 +111,11 @@ def write_track_figures(
     Raises what `check_places` raises.
     """
     compared = [one for one in found if isinstance(one, Localization)]
-    pictures: list[Block] = [Picture("rmse", partial(rmse_bars, found=compared), "RMSE")] if compared else []
-    for one in found:
-        draw = partial(track, one=one) if isinstance(one, Localization) else partial(onboard, one=one)
-        pictures.append(Picture(track_name(one.source, one.body), draw, one.body))
+    draws: dict[type, Any] = {Localization: track, OnboardTrack: onboard}
+    pictures: list[Block] = [
+        *([Picture("rmse", partial(rmse_bars, found=compared), "RMSE")] if compared else []),
+        *(Picture(track_name(one.source, one.body), partial(draws[type(one)], one=one), one.body) for one in found),
+    ]
     write_checked(Document("", pictures), None, folder, force=force)
 
 

@@ -166,8 +166,10 @@ def check_knowledge(knowledge: Knowledge, tags: Mapping[str, set[int]]) -> None:
     named = {*knowledge.shapes, *knowledge.orders, *(one.arrangement for one in known)}
     strangers = sorted(named - {"", *tags})
     bad = sorted({shape for shape in (knowledge.shape, *knowledge.shapes.values()) if shape not in SHAPES})
-    wrong = [f"names an arrangement {name!r:.40}; there are {', '.join(sorted(tags))}" for name in strangers]
-    wrong += [f"found {shape!r:.40}, allowed: line, plane" for shape in bad]
+    wrong = [
+        *(f"names an arrangement {name!r:.40}; there are {', '.join(sorted(tags))}" for name in strangers),
+        *(f"found {shape!r:.40}, allowed: line, plane" for shape in bad),
+    ]
     for one in known:
         if isinstance(one, KnownDistance):
             who, good = {one.first, one.second}, 0 < one.distance_m <= MAX_LENGTH_M

@@ -262,9 +262,12 @@ class Network:
         delays = np.array([self.fixed_ns.get(tag, 0.0) for tag in self.tags])
         # A known delay is held to 0.03 mm, far below any result.
         certain = np.array([1e-4 if tag in self.fixed_ns else BOARD_DELAY_STD_NS for tag in self.tags])
-        blocks = [("place", centre.ravel(), np.diag(std.ravel() ** -2)), ("delay", delays, np.diag(certain**-2))]
-        if self.curve is not None:
-            blocks.append(("curve", np.zeros(len(self.curve.precision)), self.curve.precision))
+        curves = [] if self.curve is None else [self.curve.precision]
+        blocks = [
+            ("place", centre.ravel(), np.diag(std.ravel() ** -2)),
+            ("delay", delays, np.diag(certain**-2)),
+            *(("curve", np.zeros(len(precision)), precision) for precision in curves),
+        ]
         every = np.append(known, np.zeros(sum(len(start) for _, start, _ in blocks[1:]), dtype=bool))
         every[list(self.held)] = True
         parts = np.split(every, np.cumsum([len(start) for _, start, _ in blocks])[:-1])

@@ -271,9 +271,9 @@ def windows(readings: Readings, attitude: Attitude, last_s: float) -> Inertial:
     slot, starts, count = np.unique(np.floor(some.time_s / SAMPLE_S), return_index=True, return_counts=True)
     mean_force = np.add.reduceat(force, starts) / count[:, None]
     mean_turn = np.add.reduceat(turn, starts) / count[:, None, None]
-    kept = count >= 0.7 * readings.per_window
     # Larger mean accelerations are impacts, not flight.
-    kept &= np.linalg.norm(mean_force - (0, 0, GRAVITY_M_S2), axis=1) < 4.0
+    flown = np.linalg.norm(mean_force - (0, 0, GRAVITY_M_S2), axis=1) < 4.0
+    kept = flown & (count >= 0.7 * readings.per_window)
     return Inertial((slot[kept] + 0.5) * SAMPLE_S, mean_force[kept], mean_turn[kept])
 
 

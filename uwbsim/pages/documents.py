@@ -366,6 +366,4 @@ def write_twin(found: Twin, compared: Sequence[Compared], path: Path, *, force: 
 
 
 def _shown(value: object) -> str:
-    if value is None:
-        return "not determined"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return "not determined" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -81,10 +81,12 @@ class Work:
 
     def check(self) -> None:
         """Raise `ParameterError` for a function that another process cannot import by its name."""
-        named: dict[str, object] = {f"channel effect {name!r}": effect for name, effect in self.effects}
         parts = ("flight_ticks", "delay_weights")
-        named |= {f"{part} of protocol {row.name!r}": getattr(row, part) for row in self.protocols for part in parts}
-        named |= {} if self.evaluate is None else {"evaluate": self.evaluate}
+        named: dict[str, object] = {
+            **{f"channel effect {name!r}": effect for name, effect in self.effects},
+            **{f"{part} of protocol {row.name!r}": getattr(row, part) for row in self.protocols for part in parts},
+            **({} if self.evaluate is None else {"evaluate": self.evaluate}),
+        }
         for what, function in named.items():
             module = sys.modules.get(getattr(function, "__module__", None) or "")
             if getattr(module, getattr(function, "__qualname__", ""), None) is not function:
