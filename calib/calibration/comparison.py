@@ -88,11 +88,9 @@ def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationC
     >>> calib.compare(first, second).same
     True
     """
-    first = given_calibration(first, "first")
-    second = given_calibration(second, "second")
+    first, second = both = given_calibration(first, "first"), given_calibration(second, "second")
     if first.pair_offsets or second.pair_offsets:
         raise UnanswerableError("constants of pairs are no delays, and only delays can be compared")
-    both = (first, second)
     known = [{t for t in c.delays_ns if t in c.sides or not np.isinf(c.delays_std_ns.get(t, np.nan))} for c in both]
     common = sorted(known[0] & known[1])
     if len(common) < 2:

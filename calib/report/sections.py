@@ -224,39 +224,36 @@ def _delays(results: Results) -> list[Block]:
     delays = {tag: delay for tag, delay in sorted(calibration.delays_ns.items()) if tag not in calibration.sides}
     half = {tag: TWO_SIDED_95 * calibration.delays_std_ns.get(tag, nan) for tag in delays}
     unknown = {tag: "not stated" if isnan(one) else "undetermined" for tag, one in half.items() if not isfinite(one)}
+    errors_ns = planted.delay_error_ns if planted else {}
     columns = {
         "tag": list(map(str, delays)),
         "delay (ns)": [f"{delay:+.4f}" for delay in delays.values()],
         "95 % from": [unknown.get(tag, f"{delay - half[tag]:+.4f}") for tag, delay in delays.items()],
         "to": ["" if tag in unknown else f"{delay + half[tag]:+.4f}" for tag, delay in delays.items()],
+        "planted, same gauge (ns)": [f"{known[tag] + shift:+.4f}" if tag in known else "" for tag in delays],
+        "difference (ps)": [f"{1e3 * errors_ns[tag]:+.1f}" if tag in errors_ns else "" for tag in delays],
+        "heard by others (ns)": [f"{heard[tag].delay_ns:+.4f}" if tag in heard else "" for tag in delays],
+        "± 1 std": [f"{heard[tag].std_ns:.4f}" if tag in heard else "" for tag in delays],
     }
-    if known and planted:
-        errors_ns = planted.delay_error_ns
-        columns |= {
-            "planted, same gauge (ns)": [f"{known[tag] + shift:+.4f}" if tag in known else "" for tag in delays],
-            "difference (ps)": [f"{1e3 * errors_ns[tag]:+.1f}" if tag in errors_ns else "" for tag in delays],
-        }
-    if heard:
-        columns |= {
-            "heard by others (ns)": [f"{heard[tag].delay_ns:+.4f}" if tag in heard else "" for tag in delays],
-            "± 1 std": [f"{heard[tag].std_ns:.4f}" if tag in heard else "" for tag in delays],
-        }
-    rows = list(map(list, zip(*columns.values(), strict=True)))
+    columns = {name: cells for name, cells in columns.items() if any(cells)}
+    table = Table(list(columns), list(map(list, zip(*columns.values(), strict=True))))
     caption = "Antenna delays with their 95 % intervals" + (
         ", and what was planted, in the same gauge." if known else "."
     )
     draw = partial(figures.alone, partial(figures.delays, calibration, known, shift))
-    blocks = [Heading("Antenna delays"), *of_pairs, Table(list(columns), rows), Picture("delays", draw, caption)]
+    blocks = [Heading("Antenna delays"), *of_pairs, table, Picture("delays", draw, caption)]
     if planted:
+        differs = (
+            f" The bias curve differs from the planted one by {1e3 * planted.curve_rms_m:.1f} mm rms over these "
+            f"ranges, the whole correction of a range by {1e3 * planted.correction_rms_m:.1f} mm."
+            if isfinite(planted.curve_rms_m)
+            else ""
+        )
         text = (
             "A constant of the bias curve and a common shift of all delays cannot be distinguished: planted delays, "
             f"and the planted curve below, are shown after moving {shift:+.4f} ns from the curve to the delays."
+            f"{differs}"
         )
-        if isfinite(planted.curve_rms_m):
-            text += (
-                f" The bias curve differs from the planted one by {1e3 * planted.curve_rms_m:.1f} mm rms over these "
-                f"ranges, the whole correction of a range by {1e3 * planted.correction_rms_m:.1f} mm."
-            )
         blocks.append(Text(text, "note"))
     return blocks
 
