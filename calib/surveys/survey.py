@@ -206,13 +206,10 @@ def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, 
 
 
 def _knowledge(known: Knowledge | str | os.PathLike[str]) -> Knowledge:
-    if isinstance(known, Knowledge):
-        return known
-    if isinstance(known, str) and known in SHAPES:
-        return Knowledge(shape=known)
-    if isinstance(known, str | os.PathLike):
-        return load_knowledge(known)
-    raise BadInputError(f"found {known!r:.40}, expected line, plane, a path or a Knowledge", parameter="known")
+    if not isinstance(known, Knowledge | str | os.PathLike):
+        raise BadInputError(f"found {known!r:.40}, expected line, plane, a path or a Knowledge", parameter="known")
+    given = Knowledge(shape=known) if isinstance(known, str) and known in SHAPES else known
+    return given if isinstance(given, Knowledge) else load_knowledge(given)
 
 
 def _checked_curve(curve_from: Calibration | str | os.PathLike[str] | None) -> Calibration | None:

@@ -118,8 +118,7 @@ def _finite_or_none(value: Any) -> Any:
     return None if value != value else value
 
 
-Column = Callable[[TwinFlight], Floats]
-QUANTITIES: Final[dict[str, tuple[str, Column]]] = {
+QUANTITIES: Final[dict[str, tuple[str, Callable[[TwinFlight], Floats]]]] = {
     "reply dt32": ("us", lambda f: intervals(f.exchanges).dt32 * TICK_S * 1e6),
     "first-path power at target": ("dBm", lambda f: f.exchanges.fpp1_dbm),
     "first-path power at initiator": ("dBm", lambda f: f.exchanges.fpp2_dbm),
