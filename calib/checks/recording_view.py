@@ -6,7 +6,6 @@ thousand exchanges. Stretches are taken, and not single exchanges, because error
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -31,7 +30,6 @@ from calib.spread import less_medians
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
-from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.recording.summary import differences, repeated_rows, single_reports
 from uwblink.twr import Exchanges
@@ -143,18 +141,13 @@ def looked_at(source: Source) -> Source:
     return Contents(exchanges=Exchanges.concatenate(parts), poses=source.poses, tags=source.tags, faults=source.faults)
 
 
-def examined_part(recording: str | os.PathLike[str]) -> str:
-    """Return how much of a recording `examine` looks at, in words; nothing where that is all of it.
-
-    Raises what `Recording.open` raises.
-    """
-    with Recording.open(recording) as opened:
-        count = opened.count("exchanges")
-    if count <= EXAMINED_EXCHANGES:
-        return ""
+def examined_part(count: int) -> str:
+    """Return how much `examine` looks at of a recording with `count` exchanges, in words; nothing where that is all."""
     return (
         f"about {EXAMINED_EXCHANGES} of its {count} exchanges were looked at, in {EXAMINED_STRETCHES} stretches over "
         "all of its time"
+        if count > EXAMINED_EXCHANGES
+        else ""
     )
 
 

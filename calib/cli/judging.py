@@ -150,13 +150,14 @@ def doctor(
     from uwblink import Recording
     from uwblink.recording import clock_skews
 
-    skews: dict[str, list[Any]] = {}
+    skews, looked_at = dict[str, list[Any]](), dict[str, str]()
     with waiting("examining"):
         found = calib.examine(recordings)
-        parts = {str(path): part for path in recordings if (part := examined_part(path))}
         for path in recordings:
             with Recording.open(path) as recording:
                 skews[str(path)] = clock_skews(recording.exchange_blocks())
+                looked_at[str(path)] = examined_part(recording.count("exchanges"))
+    parts = {name: part for name, part in looked_at.items() if part}
     findings = [replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in found]
     if as_json:
         clocks = {path: [asdict(one) for one in some] for path, some in skews.items()}
