@@ -213,17 +213,15 @@ def survey(
     if as_json:
         typer.echo(json.dumps(_survey_figures(result), indent=1))
         return
+    contents = {
+        output: result.headline(),
+        anchors: f"boards of {result.arrangement(arrangement).name}" if anchors else "",
+        plot: "where boards stood, with ellipses of 95 %",
+        report: "whether it is fit for use",
+    }
+    headline, *others = [f"{file}: {what}" for file, what in contents.items() if file]
     lines = [*delay_lines(result.calibration), *_arrangement_lines(result)]
-    typer.echo("\n".join([f"{output}: {result.headline()}", *lines]))
-    boards = f"boards of {result.arrangement(arrangement).name}" if anchors else ""
-    contents = (
-        (anchors, boards),
-        (plot, "where boards stood, with ellipses of 95 %"),
-        (report, "whether it is fit for use"),
-    )
-    for file, what in contents:
-        if file:
-            typer.echo(f"{file}: {what}")
+    typer.echo("\n".join([headline, *lines, *others]))
     for warning in result.warnings:
         warn(warning)
 

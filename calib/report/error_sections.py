@@ -168,13 +168,13 @@ def localization(results: Results) -> list[Block]:
         ["ICRA 2023, its own flights", *(f"{PAPER_RMSE_M[n]:.3f}" if n in PAPER_RMSE_M else "" for n in names)],
     ]
     (nis_low, nis_high), (nees_low, nees_high) = total.nis_bounds, total.nees_bounds
-    meaning = "Both lie within: the filter is consistent."
-    if total.nis > nis_high or total.nees > nees_high:
-        meaning = (
-            "Above their bounds: the filter is overconfident, for example because sigma does not include reflections."
-        )
-    elif total.nis < nis_low or total.nees < nees_low:
-        meaning = "Below their bounds: the filter is underconfident, for example because a gate rejects the tail."
+    meaning = (
+        "Above their bounds: the filter is overconfident, for example because sigma does not include reflections."
+        if total.nis > nis_high or total.nees > nees_high
+        else "Below their bounds: the filter is underconfident, for example because a gate rejects the tail."
+        if total.nis < nis_low or total.nees < nees_low
+        else "Both lie within: the filter is consistent."
+    )
     heads = [FILTER_STYLES[name][0].removeprefix("calibrated, ") for name in names]
     shown = [
         Picture(

@@ -156,14 +156,10 @@ def _of_survey(made: Any) -> list[Block]:
     surveyed = [SurveyedArrangement.from_dict(row) for row in made.get("surveyed", [])]
     if not surveyed:
         return blocks
-    rows = []
-    for one in surveyed:
-        known = [board for board in one.boards if board.determined]
-        far = [TWO_SIDED_95 * sqrt(max(float(board.covariance_m2.trace()), 0.0)) for board in known]
-        within = f"± {100 * max(far):.1f} cm" if far else "undetermined"
-        tags = ", ".join(str(board.tag) for board in one.boards)
-        rows.append([one.name, tags, one.known or "nothing", within, one.frame])
-
+    rows = [
+        [one.name, ", ".join(str(board.tag) for board in one.boards), one.known or "nothing", _within(one), one.frame]
+        for one in surveyed
+    ]
     caption = (
         "Where boards stood, from above, with ellipses that hold them with 95 %; ten times as large and dashed where "
         "they would not be seen."
@@ -180,6 +176,13 @@ def _of_survey(made: Any) -> list[Block]:
             Table(["arrangement", "pair", "longer by (cm)", "probability"], reflected),
         ]
     return blocks
+
+
+def _within(one: SurveyedArrangement) -> str:
+    """Return in words how well the places of an arrangement's boards are known, that of the worst."""
+    known = [board for board in one.boards if board.determined]
+    far = [TWO_SIDED_95 * sqrt(max(float(board.covariance_m2.trace()), 0.0)) for board in known]
+    return f"± {100 * max(far):.1f} cm" if far else "undetermined"
 
 
 def _determined(results: Results) -> list[Block]:
