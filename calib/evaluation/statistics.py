@@ -192,19 +192,15 @@ def evaluate(data: Data | Iterable[Data], calibration: CalibrationSource) -> Eva
     applied = calibration.apply(ranges)
     everything = np.ones(len(ranges), dtype=bool)
     inside = _between_quantiles(ranges, applied, calibration)
+    # Older calibrations do not say what they were fitted to.
+    known = calibration.provenance.get("recording_ids")
     return Evaluation(
         _group(ranges, applied, everything, inside),
         {name: _group(ranges, applied, rows, inside) for name, rows in pair_rows(ranges).items()},
         split_error(ranges, applied.corrected_m - ranges.truth_m),
         compare_with_planted(ranges, applied, calibration),
-        _seen(ranges, calibration),
+        tuple(name for name, found in ranges.recordings if isinstance(known, list) and found in known),
     )
-
-
-def _seen(ranges: Ranges, calibration: Calibration) -> tuple[str, ...]:
-    """Return the names of the recordings that the calibration was fitted to; older calibrations do not say."""
-    known = calibration.provenance.get("recording_ids")
-    return tuple(name for name, found in ranges.recordings if isinstance(known, list) and found in known)
 
 
 def compare_with_planted(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -115,13 +116,15 @@ def load_knowledge(path: str | os.PathLike[str]) -> Knowledge:
     arrangements = list(_rows(file, "arrangements"))
     names = [row["name"] for row in arrangements]
     for k, row in enumerate(arrangements):
-        where = f"arrangements[{k}]"
-        file.check(f"{where}.name", row["name"], names.count(row["name"]) == 1, "each name once")
-        good = "order" not in row or row.get("known", "line") == "line"
-        file.check(f"{where}.order", row.get("order"), good, 'an order of boards on a line, known = "line"')
-        file.check(where, row, ("start_s" in row) == ("end_s" in row), "start_s and end_s, both or neither")
-        good = "end_s" not in row or row["start_s"] < row["end_s"]
-        file.check(f"{where}.end_s", row.get("end_s"), good, f"a number above start_s, {row.get('start_s')}")
+        on_line = "order" not in row or row.get("known", "line") == "line"
+        paired, start_s = ("start_s" in row) == ("end_s" in row), row.get("start_s", -math.inf)
+        for key, value, good, expected in (
+            (".name", row["name"], names.count(row["name"]) == 1, "each name once"),
+            (".order", row.get("order"), on_line, 'an order of boards on a line, known = "line"'),
+            ("", row, paired, "start_s and end_s, both or neither"),
+            (".end_s", row.get("end_s"), start_s < row.get("end_s", math.inf), f"a number above start_s, {start_s}"),
+        ):
+            file.check(f"arrangements[{k}]{key}", value, good, expected)
     return Knowledge(
         shape=str(file.choice("known", file.table.get("known", ""), SHAPES)),
         shapes={row["name"]: row["known"] for row in arrangements if "known" in row},
@@ -163,8 +166,10 @@ def check_knowledge(knowledge: Knowledge, tags: Mapping[str, set[int]]) -> None:
     named = {*knowledge.shapes, *knowledge.orders, *(one.arrangement for one in known)}
     strangers = sorted(named - {"", *tags})
     bad = sorted({shape for shape in (knowledge.shape, *knowledge.shapes.values()) if shape not in SHAPES})
-    wrong = [f"names an arrangement {name!r:.40}; there are {', '.join(sorted(tags))}" for name in strangers]
-    wrong += [f"found {shape!r:.40}, allowed: line, plane" for shape in bad]
+    wrong = [
+        *(f"names an arrangement {name!r:.40}; there are {', '.join(sorted(tags))}" for name in strangers),
+        *(f"found {shape!r:.40}, allowed: line, plane" for shape in bad),
+    ]
     for one in known:
         if isinstance(one, KnownDistance):
             who, good = {one.first, one.second}, 0 < one.distance_m <= MAX_LENGTH_M

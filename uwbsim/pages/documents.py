@@ -84,9 +84,10 @@ def scene(scenario: Scenario) -> Document:
             "its sender and of its receiver."
         ),
     ]
-    for name in distinct.values():
-        draw = partial(figures.timing, scenario=scenario, name=name)
-        blocks.append(Picture(f"timing-{name}", draw, f"{PROTOCOLS[name].title}."))
+    blocks += [
+        Picture(f"timing-{name}", partial(figures.timing, scenario=scenario, name=name), f"{PROTOCOLS[name].title}.")
+        for name in distinct.values()
+    ]
     return Document(scenario.run.name, blocks)
 
 
@@ -212,9 +213,12 @@ def comparison(found: ProtocolComparison) -> Document:
             "to ± 1 cm and logarithmic beyond."
         ),
     ]
-    for curves, x, caption in over:
-        draw = partial(figures.error_over, curves=curves, x=x, logarithmic=x.startswith("delay"))
-        blocks.append(Picture(f"over {x}", draw, caption))
+    blocks += [
+        Picture(
+            f"over {x}", partial(figures.error_over, curves=curves, x=x, logarithmic=x.startswith("delay")), caption
+        )
+        for curves, x, caption in over
+    ]
     return Document(f"Protocols in {scenario.run.name}", blocks)
 
 
@@ -339,7 +343,7 @@ def write_twin(found: Twin, compared: Sequence[Compared], path: Path, *, force: 
     blocks: list[Block] = [
         Text(
             f"A scenario fitted to {len(found.measured):,} exchanges of {len(found.measured.pairs)} pairs, with the "
-            f"delays and the bias curve of {Path(found.calibration).name} as truth, and a comparison of its "
+            f"delays and the bias curve of {Path(found.known.where).name} as truth, and a comparison of its "
             f"simulation with the measurements. {alike} of {len(compared)} quantities are alike."
         ),
         Heading("Measured and simulated"),
@@ -377,10 +381,8 @@ def write_twin(found: Twin, compared: Sequence[Compared], path: Path, *, force: 
         Heading("What the recording does not determine"),
         Table(["kept at its default, or chosen without the recording"], [[text] for text in found.unknown], words=True),
     ]
-    write_text(path, to_html(Document(f"The twin of {Path(found.recording).name}", blocks)), force=force)
+    write_text(path, to_html(Document(f"The twin of {Path(found.measured.where).name}", blocks)), force=force)
 
 
 def _shown(value: object) -> str:
-    if value is None:
-        return "not determined"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return "not determined" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)

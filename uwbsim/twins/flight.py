@@ -107,9 +107,8 @@ def effective_size(value: Floats, group: Ints) -> float:
 
 def some_rows(count: int, most: int) -> Ints:
     """Return `most` of `count` rows, chosen at random, in order: every k-th would leave out pairs that take turns."""
-    if count <= most:
-        return np.arange(count)
-    return np.sort(stream(0, "some rows", count).choice(count, most, replace=False))
+    chosen = range(count) if count <= most else stream(0, "some rows", count).choice(count, most, replace=False)
+    return np.sort(chosen)
 
 
 def bulk_spread(value: Floats) -> float:
