@@ -206,7 +206,9 @@ class Progress(Listener):
             reports = [*state.reports]  # copied at once: a page asks in a thread of its own, while the recorder goes on
             rate_hz = sum(time_ns > since_ns for time_ns, *_ in reports) / over_s
             success = f"{100 * state.good / state.tried:.0f} %" if state.tried else ""
-            last = [(f"{report.range_m:.3f}", f"{report.fpp1_dbm:.1f}") for *_, report in reports[-1:]]
+            last = [
+                (f"{report.range_m:.3f}", f"{report.fpp1_dbm:.1f}".replace("nan", "")) for *_, report in reports[-1:]
+            ]
             rows.append((pair, [f"{rate_hz:.1f}", success, *(last or [("", "")])[0]]))
         return rows
 

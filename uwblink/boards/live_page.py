@@ -112,7 +112,7 @@ class LivePage(Closing, Listener):
             last = (f"{series[k][-1]:.3f}" if shown else "" for k in kinds)
             image = picture([time_ns for time_ns, *_ in shown], series)
             cells = (f"{pair[0]}&nbsp;&rarr;&nbsp;{pair[1]}", rate, success, power, *last, image)
-            silent = " class='silent'" if success and rate == "0.0" else ""
+            silent = " class='silent'" if (success or shown) and rate == "0.0" else ""
             rows += f"<tr{silent}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
         head = "".join(f"<th>{name}</th>" for name in names)
         return f"<div class='wide live'><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>"

@@ -5,7 +5,9 @@ total, 10 log10(C 2^17 / N^2) - A, with A = 113.77 dB or 121.74 dB at a pulse re
 DW3000: User Manual, section 4.7: 6 D dB are added for the decision D of the digital gain control, amplitudes have two
 fractional bits, C is multiplied by 2^21, and A = 113.8 dB or 121.7 dB. These were taken from the vendor's driver, whose
 comments refer to the manual; 2^21 holds for the DW3000, 2^17 for later chips of the family. No board with a DW3000 was
-tried. Both count ticks of 15.65 ps on 40 bits.
+tried. The vendor's examples contradict each other on the sign of its clock offset: positive if the receiver's clock is
+faster by that of crystal trimming ("offset"), slower by that of single-sided ranging ("-offset"). Both chips count
+ticks of 15.65 ps on 40 bits.
 """
 
 from __future__ import annotations
@@ -47,7 +49,12 @@ CHIPS: Final = {
     # The data sheets give sensitivities down to -106 dBm.
     "dw1000": Chip({16: 113.77, 64: 121.74}, _PPM | _CHANNELS, power_dbm=(-125.0, -40.0)),
     "dw3000": Chip(
-        {16: 113.8, 64: 121.7}, _PPM | _CHANNELS | {"offset": 1e6 / 2**26}, 0.25, 21, 6.0, power_dbm=(-125.0, -40.0)
+        {16: 113.8, 64: 121.7},
+        _PPM | _CHANNELS | {"offset": 1e6 / 2**26, "-offset": -1e6 / 2**26},
+        0.25,
+        21,
+        6.0,
+        power_dbm=(-125.0, -40.0),
     ),
     "other": Chip({}, _PPM),
 }

@@ -68,8 +68,8 @@ ASKED: Final = "?"
 """Placeholder of `uwblink import guess` for a value that the user must give."""
 
 NAMES: Final = (
-    "time_s", *IDS, *STAMPS, "fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2", *DISTANCES,
-    "sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "stamp", "event",
+    "time_s", *IDS, *STAMPS, "fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2", "sts1", "sts2", *DISTANCES,
+    "sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "sts", "stamp", "event",
 )  # fmt: skip
 """The columns of tables; `event` has words that tell whether a stamp is of transmission or of reception."""
 
@@ -187,9 +187,11 @@ MAP_KEYS: Final = (
     ),
     FileKey(
         "units.skew",
-        '"ppm", "-ppm", "integrator-2", "integrator-5", "integrator-9" or "offset"',
+        '"ppm", "-ppm", "integrator-2", "integrator-5", "integrator-9", "offset" or "-offset"',
         "ppm",
-        "Unit of skews: the carrier integrator on a channel, or the clock offset register of the DW3000, needs a chip.",
+        "Unit of skews: the carrier integrator on a channel, or the clock offset register of the DW3000, needs a chip. "
+        "offset is positive if the receiver's clock is faster; sources contradict each other, and -offset is the "
+        "opposite.",
     ),
     FileKey(
         "units.NAME",
@@ -277,6 +279,14 @@ class ColumnMap:
     def power_of(self, name: str) -> str | None:
         """Return the unit of a column of `POWERS`; None if the map does not state it."""
         return self.units.get(name, "dBm" if name in self.registers else self.power_unit)
+
+
+def map_of_lines(name: str) -> ColumnMap:
+    """Return the map of a form of `LINES`."""
+    known = LINES[name]
+    return ColumnMap(
+        line=known["line"], each=known.get("each"), wide=known.get("wide", {}), distance_unit=known["units"]["distance"]
+    )
 
 
 def load_map(path: Path) -> ColumnMap:

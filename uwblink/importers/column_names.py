@@ -10,7 +10,7 @@ from typing import Final
 
 from uwblink.importers.column_map import POSITIONS
 
-OF_MESSAGES: Final = ("tx", "rx", "fpp", "rxp", "skew", "sequence", "message")
+OF_MESSAGES: Final = ("tx", "rx", "fpp", "rxp", "skew", "sts", "sequence", "message")
 
 WORDS: Final = {
     "end": (
@@ -31,6 +31,7 @@ WORDS: Final = {
     "fpp": r"(fpp?|(fp|first_?path)_?(power|pwr|rssi|level|leistung)|first_?path|(rssi|power)_?(fp|first_?path))",
     "rxp": r"(rxp|rx_?(power|pwr|level)|rssi|total_?power|pr)",
     "skew": r"(skew|cfo|carrier|clock_?offset)",
+    "sts": r"sts(_?(q|qual|quality))?(_?(idx|index))?",
     "of_time": r"((t|ts|time|stamp|timestamp|zeit)_)?",
     "from": r"(from|src|source|initiator|tag|my|sender|tx|requester|robot|rover|mobile|node_?a|id_?1)",
     "to": r"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|beacon|node_?b|id_?2)",
@@ -73,6 +74,8 @@ PATTERNS: Final = {
     "rxp2": r"{rxp}_?2?",
     "skew1": r"{skew}_?1",
     "skew2": r"{skew}_?2?",
+    "sts1": r"{sts}_?1",
+    "sts2": r"{sts}_?2?",
     "gt_range_m": r"{true}_?{range}?|{range}_?{true}",
     "range_m": r"({made}_?|device_?|measured?_?|uwb_?|est(imated)?_?)?{range}(_?{made})?",
     "sequence": r"(seq|sequence|exchange|laufnummer)(_?(no|num|nr|number|id))?",
@@ -82,6 +85,7 @@ PATTERNS: Final = {
     "fpp": r"{fpp}",
     "rxp": r"{rxp}",
     "skew": r"{skew}",
+    "sts": r"{sts}",
 } | {name: _place(name) for name in POSITIONS}
 """Patterns of the names of columns, in terms of `WORDS`."""
 
@@ -100,7 +104,7 @@ def _plain_names(headers: Iterable[str]) -> dict[str, str]:
 
     `resp` means the responding device if another column names the initiator, else the response message.
     """
-    level = "(?P<level>{fpp}|{rxp}|{skew})".format_map(WORDS)
+    level = "(?P<level>{fpp}|{rxp}|{skew}|{sts})".format_map(WORDS)
     end, whose = WORDS["end"], "|".join(sorted({*_OF_MESSAGE, *_AT_DEVICE}, key=len)[::-1])
     forms = (rf"{level}_(at_|of_)?(?P<whose>{whose})(?P<end>{end})", rf"(?P<whose>{whose})_{level}(?P<end>{end})")
     names = {header: plain_name(header) for header in headers}

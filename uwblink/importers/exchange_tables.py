@@ -53,6 +53,12 @@ from uwblink.twr import STAMPS, raw_range
 LOG_SUFFIXES: Final = (".txt", ".log", ".dat", ".txt.gz", ".log.gz")
 TABLE_SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".parquet", ".jsonl", ".ndjson", ".jsonl.gz")
 
+_BESIDE: Final = {
+    "powers": {"rxp1": "rxp1_dbm", "rxp2": "rxp2_dbm"},
+    "quality": {"sts1": "sts1", "sts2": "sts2"},
+}
+"""Tables with a row an exchange, and their columns by those of maps."""
+
 
 @dataclass(frozen=True, slots=True)
 class Imported:
@@ -125,16 +131,17 @@ def import_tables(
                     raw, reported = raw_range(exchanges), exchanges.range_m
                     exchanges = replace(exchanges, range_m=np.where(np.isfinite(reported), reported, raw))
                 recording.append_exchanges(exchanges)
-                if "rxp1" in block or "rxp2" in block:
-                    powers = {name: getattr(exchanges, name) for name in ("time_ns", "initiator", "target")}
-                    recording.append("powers", powers | {f"{n}_dbm": optional(block, n) for n in ("rxp1", "rxp2")})
+                for table, columns in _BESIDE.items():
+                    if columns.keys() & block.keys():
+                        beside = {name: getattr(exchanges, name) for name in ("time_ns", "initiator", "target")}
+                        recording.append(table, beside | {kept: optional(block, n) for n, kept in columns.items()})
             for poses in _poses(rows, bodies):
                 recording.append_poses(poses)
             first = ""
             for some in faults:
                 first = first or some[0].detail
                 recording.append("faults", some)
-            counts = {name: recording.count(name) for name in ("exchanges", "poses", "powers", "faults")}
+            counts = {name: recording.count(name) for name in ("exchanges", "poses", *_BESIDE, "faults")}
             if first:
                 lost = counts["faults"]
                 notes.append(f"{lost} of {total + lost} rows cannot be used and are kept as faults; the first: {first}")
@@ -209,7 +216,7 @@ def _layout(staging: Staging) -> str:
             return layout
     if has("range_m") and not any(map(has, STAMPS)):
         return "ranges"
-    raise staging.missing(next(name for name in STAMPS if not has(name)))
+    raise staging.tables[0].missing(staging.column_map.header(next(name for name in STAMPS if not has(name))))
 
 
 def _poses(rows: StagedRows, bodies: Mapping[int, str]) -> Iterator[Poses]:

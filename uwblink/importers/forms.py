@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
-from uwblink.importers.column_map import ASKED, ColumnMap
+from uwblink.importers.column_map import ASKED, ColumnMap, map_of_lines
 from uwblink.importers.column_names import PATTERNS, WORDS, plain_name
 from uwblink.importers.lines import LINES
 from uwblink.importers.tables import detect, lacks_header, open_file, reading
@@ -38,7 +39,7 @@ def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
     if not found:
         return None
     name, matches = next(iter(found.items()))
-    known, line = LINES[name], LINES[name]["line"]
+    form, line = map_of_lines(name), LINES[name]["line"]
     leads = [match.string[: match.start()] for match in matches]
     time = r"\W*?([0-9]+(?:\.[0-9]+)?|[0-9]{4}-[0-9-]{5}[ T][0-9:.,]+Z?|[0-9]+:[0-9]{2}:[0-9.]+)(\W+)"
     times = [re.fullmatch(time, lead) for lead in leads]
@@ -46,9 +47,8 @@ def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
         line = f"{leads[0][: first.start(1)]}{{time_s}}{first[2]}{line}"
     both = ASKED, "ranges before and after the board's correction: write trek-raw or trek-corrected"
     entries: Entries = {"line": both if {"trek-raw", "trek-corrected"} <= found.keys() else (line, f"as {name}")}
-    entries |= {"each": (known["each"], "")} if "each" in known else {}
-    wide, unit = known.get("wide", {}), known["units"]["distance"]
-    return ColumnMap(line=line, each=known.get("each"), wide=wide, distance_unit=unit), entries
+    entries |= {"each": (form.each, "")} if form.each else {}
+    return replace(form, line=line), entries
 
 
 _DEVICE: Final = r"(an|anchor|anker|a|node|beacon|bs|responder|target|to|device|dev|uwb|id|ch)"

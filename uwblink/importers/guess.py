@@ -97,7 +97,7 @@ def _is_event(table: SourceTable, name: str) -> bool:
     return sending + receiving > 0.9 and 0.25 < sending < 0.75
 
 
-_OF_EXCHANGES: Final = (*STAMPS, "fpp1", "fpp2", "rxp1", "rxp2", "skew1", "skew2")
+_OF_EXCHANGES: Final = (*STAMPS, "fpp1", "fpp2", "rxp1", "rxp2", "skew1", "skew2", "sts1", "sts2")
 
 _LAYOUTS: Final = {
     "exchanges": (STAMPS[:4], OF_MESSAGES, "a row has the stamps of a whole exchange"),

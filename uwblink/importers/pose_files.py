@@ -3,8 +3,8 @@
 The own CSV has the columns `time_s` (or `time_ns`), `body`, `x, y, z` (metres) and `qx, qy, qz, qw` (body to world).
 TUM has `time x y z qx qy qz qw` separated by blanks, and EuRoC `time_ns, x, y, z, qw, qx, qy, qz, ...` below a line
 that begins with `#timestamp`, one body a file. Motive (OptiTrack), Vicon and Qualisys (6D) export a column for each
-number of each body, below several lines of header: quaternions; rotation vectors or quaternions; and rotation matrices,
-column by column. Their times begin with the take.
+number of each body, below several lines of header: quaternions or Euler angles; rotation vectors or quaternions; and
+rotation matrices, column by column. Their times begin with the take.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ class PoseLayout:
     """Where a form has its poses; columns are numbers from 0.
 
     `bodies` are the columns of position and attitude by body, with the name "" if a column says the body. `header` is
-    the number of lines before the first pose. Poses of programs that lose sight of a body have `gaps`.
+    the number of lines before the first pose. Poses of programs that lose sight of a body have `gaps`. `euler` is the
+    order of attitudes that are Euler angles about the body's own axes, such as "XYZ".
     """
 
     form: str
@@ -51,6 +52,7 @@ class PoseLayout:
     header: int = 0
     metres: float = 1.0
     radians: float = 1.0
+    euler: str = ""
     gaps: bool = True
     body: int | None = None
     comments: bool = False
@@ -105,19 +107,20 @@ def read_text_poses(
     width = len(next(iter(layout.bodies.values()), (0, 0, 0)))
     table = np.array(values).reshape(-1, width)
     with raising(ImportTableError, f"{path}: its attitudes are no rotations", ValueError):
-        turned = _quaternions(table[:, 3:] * layout.radians)
+        turned = _quaternions(table[:, 3:] * layout.radians, layout.euler)
     poses = np.column_stack([table[:, :3] * layout.metres, turned])
     return np.array(times, np.int64), np.array(bodies, np.str_), poses, width > 3
 
 
-def _quaternions(values: Floats) -> Floats:
-    """Return quaternions (n, 4) from none, rotation vectors (n, 3), quaternions, or matrices by column (n, 9)."""
+def _quaternions(values: Floats, euler: str) -> Floats:
+    """Return quaternions (n, 4) from none, rotation vectors or Euler angles (n, 3), quaternions, or matrices by column
+    (n, 9)."""
     if values.shape[1] == 0:
         return np.tile([0.0, 0.0, 0.0, 1.0], (len(values), 1))
     if values.shape[1] == 4 or not len(values):
         return values.reshape(-1, 4)
     if values.shape[1] == 3:
-        return np.asarray(Rotation.from_rotvec(values).as_quat())
+        return np.asarray((Rotation.from_euler(euler, values) if euler else Rotation.from_rotvec(values)).as_quat())
     return np.asarray(Rotation.from_matrix(values.reshape(-1, 3, 3).transpose(0, 2, 1)).as_quat())
 
 
@@ -203,11 +206,16 @@ def _header(path: Path, head: Lines, *words: str) -> int:
 
 
 def _motive(path: Path, head: Lines) -> PoseLayout:
-    """Return the layout of Motive's CSV: lines of kinds, names, Rotation or Position, and axes, in any version."""
+    """Return the layout of Motive's CSV: lines of kinds, names, Rotation or Position, and axes, in any version.
+
+    Euler angles are about the axes as turned so far (NaturalPoint's knowledge base, "Changes in Motive's reported Euler
+    angles"), in degrees, in the order that the header names.
+    """
     said = dict(zip(head[0][::2], head[0][1::2], strict=False))
     units = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
     unit, rotation = units.get(said.get("Length Units", "Meters").lower()), said.get("Rotation Type", "Quaternion")
-    if unit is None or rotation != "Quaternion":
+    euler = rotation if sorted(rotation) == ["X", "Y", "Z"] else ""
+    if unit is None or not (euler or rotation == "Quaternion"):
         raise ImportTableError(
             f"{path}: found {rotation} and {said.get('Length Units')}, export quaternions and metres"
         )
@@ -218,9 +226,10 @@ def _motive(path: Path, head: Lines) -> PoseLayout:
         if kind == "Rigid Body" and what in ("Rotation", "Position"):
             bodies.setdefault(name, {})[("q" if what == "Rotation" else "") + axis.lower()] = k
     layout = PoseLayout(
-        form="Motive", names=head[kinds + 1], time=1, ns=1e9, header=kinds + 2, metres=DISTANCE_UNITS[unit], bodies={}
-    )
-    return _with_bodies(path, layout, bodies, POSE)
+        form="Motive", names=head[kinds + 1], time=1, ns=1e9, header=kinds + 2, metres=DISTANCE_UNITS[unit],
+        bodies={}, euler=euler, radians=math.pi / 180 if euler else 1.0,
+    )  # fmt: skip
+    return _with_bodies(path, layout, bodies, (*POSE[:3], *(f"q{axis}" for axis in euler.lower())) if euler else POSE)
 
 
 def _vicon(path: Path, head: Lines) -> PoseLayout:

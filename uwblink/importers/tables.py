@@ -214,12 +214,17 @@ class SourceTable:
         path: Path,
         column_map: ColumnMap | None = None,
         key: int = 0,
+        *,
+        live: bool = False,
     ) -> None:
         """Open a CSV file (plain or gzipped), a Parquet file or JSON lines, by its suffix, or a log by its template.
 
-        Raises `ImportTableError`. Tables of one connection have different keys.
+        A `live` log has the lines of the variable `lines` of the connection, in place of those of a file. Raises
+        `ImportTableError`. Tables of one connection have different keys.
         """
-        require_regular(path, ImportTableError, "table (.csv, .csv.gz, .parquet or .jsonl)")
+        self.live = live
+        if not live:
+            require_regular(path, ImportTableError, "table (.csv, .csv.gz, .parquet or .jsonl)")
         self.db, self.path, self._key = db, path, key
         self.column_map = column_map = column_map or ColumnMap()
         self._skip, self._decimal_comma, self._expanded = 0, False, False
@@ -263,15 +268,20 @@ class SourceTable:
 
     def _open_log(self, line: Template) -> None:
         """Use the lines that a template matches, and each match of the other (`each`) in them as a row."""
-        check_lines(self.path, "\n")
         self._decimal_comma = self.column_map.decimal == ","
         each = Template(self.column_map.each) if self.column_map.each else None
         self.db.execute(f"SET VARIABLE line{self._key} = ?", [line.pattern])
         # Whatever noise of a serial port is in it is read as letters.
+        if not self.live:
+            check_lines(self.path, "\n")
         text = (
-            f"read_csv(getvariable('file{self._key}'), auto_detect=false, header=false, delim='\x01', quote='', "
-            f"escape='', columns={{'line': 'VARCHAR'}}, strict_mode=false, encoding='latin-1', "
-            f"max_line_size={MAX_LINE_BYTES})"
+            "(SELECT unnest(getvariable('lines')) AS line)"
+            if self.live
+            else (
+                f"read_csv(getvariable('file{self._key}'), auto_detect=false, header=false, delim='\x01', quote='', "
+                f"escape='', columns={{'line': 'VARCHAR'}}, strict_mode=false, encoding='latin-1', "
+                f"max_line_size={MAX_LINE_BYTES})"
+            )
         )
         matching = f"SELECT line FROM {text} WHERE regexp_matches(line, getvariable('line{self._key}'))"
         self.source = f"(SELECT row_number() OVER () AS row, {line.extract('line', f'line{self._key}')} AS s"
@@ -390,12 +400,21 @@ class SourceTable:
         if self.names.count(name) > 1:
             raise ImportTableError(f"{self.path}: row 1: two columns are called {name[:60]!r}")
         if name not in self.names:
-            there = ", ".join(self.names)[:400]
-            raise ImportTableError(f"{self.path}: column {name[:60]!r} is missing; there are {there}")
+            raise self.missing(name)
         # DuckDB would cast a bare column while it reads the file, and would reject the whole row for a cell that is not
         # a number.
         text = f"coalesce(CAST({self._cells[self.names.index(name)]} AS VARCHAR), '')"
         return f"replace({text}, ',', '.')" if numeric and self._decimal_comma else text
+
+    def missing(self, header: str) -> ImportTableError:
+        """Return the error for a column that is not there."""
+        remedy = "a `map_file` can rename columns or give constants, and `uwblink import guess` proposes one"
+        if lacks_header(self.names):
+            remedy = "its first line is a row: state the numbers of its columns in a map, such as from_id = 2"
+        if {"qx", "qy", "qz", "qw"} <= {name.lower() for name in self.names}:
+            remedy = "these are poses, which `uwblink poses` adds to a recording"
+        there = ", ".join(self.names)[:400]
+        return ImportTableError(f"{self.path}: column {header[:60]!r} is missing; there are {there}; {remedy}")
 
     def read(self, cells: Mapping[str, str], more: str = "") -> Columns:
         """Return SQL expressions as arrays (n,) by name, masked where values are missing.

@@ -1,6 +1,7 @@
 """Boards of other firmware, which print ranges: fake ones on pseudo-terminals, recorded, streamed, corrected."""
 
 import json
+import math
 import threading
 import time
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ from tests.processes import refuse, succeed
 from uwblink.boards import DIALECTS, Dialect, PrintedRange, dialect_of
 from uwblink.boards.dialects import Printed
 from uwblink.boards.ports import Terminal
-from uwblink.errors import ArgumentError
+from uwblink.errors import ArgumentError, ImportTableError
 from uwblink.importers.lines import LINES
 
 # What each board prints for a range of one metre to one device and of two metres to another; made from descriptions.
@@ -154,8 +155,14 @@ def test_a_map_means_for_boards_what_it_means_for_their_log(tmp_path):
         'line = "{to_id} {range_m} {a} {b} {c} {n}"\nchip = "dw1000"\n[columns]\n'
         'fpp2 = { f1 = "a", f2 = "b", f3 = "c", n = "n" }\n'
     )
-    with pytest.raises(ArgumentError, match="registers"):
-        dialect_of(str(tmp_path / "by_register.toml"))
+    # DW1000 User Manual, 4.7.1: 10 log10((F1^2 + F2^2 + F3^2) / N^2) - A, A = 121.74 dB at 64 MHz.
+    (one,) = dialect_of(str(tmp_path / "by_register.toml")).parse(["65535 1.25 9000 8000 7000 118", "noise"])
+    power_dbm = 10 * math.log10((9000**2 + 8000**2 + 7000**2) / 118**2) - 121.74
+    assert (one.from_id, one.to_id, one.range_m) == (None, 65535, 1.25)
+    assert one.power_dbm == pytest.approx(power_dbm)
+    (tmp_path / "no_target.toml").write_text('line = "{from_id} {range_m}"\n')
+    with pytest.raises(ImportTableError, match="to_id"):
+        dialect_of(str(tmp_path / "no_target.toml"))
 
 
 def test_another_form_ends_with_a_line_and_no_file(tmp_path):
@@ -192,20 +199,20 @@ def test_a_board_that_is_unplugged_keeps_what_was_recorded(tmp_path):
 
 
 def test_a_dialect_of_ones_own_comes_by_an_entry_point_and_words_get_numbers_of_their_own():
-    def parse(line):
-        who, _, far = line.partition("=")
-        return [PrintedRange(to_id=who, range_m=float(far))] if far else []
+    def parse(lines):
+        cells = (line.partition("=") for line in lines)
+        return [PrintedRange(to_id=who, range_m=float(far)) for who, _, far in cells if far]
 
     DIALECTS.register(Dialect("mine", "A form of my own.", parse))
     try:
         with printing("alpha=1.0\nbeta=2.0\nbad line\n") as port:
             seen = Printed()
             batches = uwblink.boards.printed_ranges([port], dialect_of("mine"), ids=[1], duration_s=1.0, seen=seen)
-            found = uwblink.Exchanges.concatenate(list(batches))
+            found = [turn for turns in batches for turn in turns]
         # Words have numbers beside that of the board, in the order in which they are heard.
         assert sorted(seen.numbers.values()) == [1, 2, 3]
         named = {number: name for name, number in seen.numbers.items()}
-        told = {(named[k], far) for k, far in zip(found.target.tolist(), found.range_m.tolist(), strict=True)}
+        told = {(named[turn.pair[1]], turn.report.range_m) for turn in found}
         assert told == {("alpha", 1.0), ("beta", 2.0)}
     finally:
         DIALECTS.remove("mine")
