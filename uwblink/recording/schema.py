@@ -77,6 +77,11 @@ TABLES: Final[dict[str, dict[str, str]]] = {
         "tag": "USMALLINT",
         **dict.fromkeys(("temperature_c", "supply_v"), "DOUBLE"),
     },
+    "receptions": {
+        **dict.fromkeys(("time_ns", "frame", "tx", "rx"), "BIGINT"),
+        **dict.fromkeys(("sender", "listener"), "USMALLINT"),
+        **dict.fromkeys(("fpp_dbm", "rxp_dbm", "skew_ppm"), "DOUBLE"),
+    },
     "arrangements": {"start_ns": "BIGINT", "end_ns": "BIGINT", **dict.fromkeys(("name", "known"), "VARCHAR")},
     "distances": {
         **dict.fromkeys(("first", "second"), "USMALLINT"),
@@ -100,7 +105,17 @@ ADDED_LATER: Final = {
     "faults": frozenset({"initiator", "target"}),
     **{
         table: frozenset(TABLES[table])
-        for table in ("imu", "height", "powers", "quality", "temperature", "corrected", "arrangements", "distances")
+        for table in (
+            "imu",
+            "height",
+            "powers",
+            "quality",
+            "temperature",
+            "receptions",
+            "corrected",
+            "arrangements",
+            "distances",
+        )
     },
 }
 """Columns that older recordings may lack; if these are all columns of a table, the table."""
