@@ -3,7 +3,7 @@
 Every key is optional; docs/importing.md explains each.
 
 ```toml
-layout = "exchanges"       # or "messages", "stamps" (a row a stamp), "parts" (some rows an exchange), "ranges"
+layout = "exchanges"       # or "messages", "stamps" (a row a stamp), "parts" (some rows an exchange), "ranges", "broadcasts"
 bits = 32                  # of the counter that the stamps come from, 32 or 40
 counter = "wrapped"        # or "signed", "unwrapped"
 protocol = "ss"            # a protocol of uwblink.twr
@@ -69,7 +69,7 @@ ASKED: Final = "?"
 
 NAMES: Final = (
     "time_s", *IDS, *STAMPS, "fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2", "sts1", "sts2", *DISTANCES,
-    "sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "sts", "stamp", "event",
+    "sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "sts", "stamp", "event", "heard",
 )  # fmt: skip
 """The columns of tables; `event` has words that tell whether a stamp is of transmission or of reception."""
 
@@ -93,10 +93,11 @@ SKEWS: Final = ("skew1", "skew2", "skew")
 MAP_KEYS: Final = (
     FileKey(
         "layout",
-        '"exchanges", "messages", "stamps", "parts" or "ranges"',
-        "by the columns; parts must be stated",
+        '"exchanges", "messages", "stamps", "parts", "ranges" or "broadcasts"',
+        "by the columns; parts and broadcasts must be stated",
         "What a row is: an exchange; a message; a stamp with `message`, as devices log their own; a part of an "
-        "exchange, for example if both devices report; a range without stamps.",
+        "exchange, for example if both devices report; a range without stamps; what a broadcast (`sequence`, `tx`) of "
+        "`from_id` says of an earlier one (`heard`) of `to_id`: when `from_id` received it (`rx`).",
     ),
     FileKey("bits", "32 or 40", "32 if the stamps fit, else 40", "Width of the counter of the stamps, in bits."),
     FileKey(
@@ -119,7 +120,8 @@ MAP_KEYS: Final = (
         f"template, or one of {', '.join(LINES)}",
         "the file is a table",
         "Of logs: the lines that are rows. Places in braces are columns; `{x:hex}` and `{x:int}` take digits, `{r[8]}` "
-        "is a list whose values are `r.0` to `r.7`, `{_}` and `{*}` are not used.",
+        "is a list whose values are `r.0` to `r.7`, `{_}` and `{*}` are not used. `{json}` alone: lines that end with an "
+        "object of JSON.",
     ),
     FileKey(
         "each",
@@ -281,6 +283,10 @@ class ColumnMap:
         return self.units.get(name, "dBm" if name in self.registers else self.power_unit)
 
 
+JSON_LINE: Final = "{json}"
+"""The `line` of logs whose lines end with an object of JSON."""
+
+
 def map_of_lines(name: str) -> ColumnMap:
     """Return the map of a form of `LINES`."""
     known = LINES[name]
@@ -348,7 +354,9 @@ def load_map(path: Path) -> ColumnMap:
     file.check("within_s", within, is_number(within) and within > 0, "seconds")
     stamps = units.get("stamps", "ticks")
     return ColumnMap(
-        layout=file.choice("layout", table.get("layout"), (None, "exchanges", "messages", "stamps", "parts", "ranges")),
+        layout=file.choice(
+            "layout", table.get("layout"), (None, "exchanges", "messages", "stamps", "parts", "ranges", "broadcasts")
+        ),
         bits=file.choice("bits", table.get("bits"), (None, *BITS)),
         counter=file.choice("counter", table.get("counter"), (None, "wrapped", "signed", "unwrapped")),
         protocol=file.choice("protocol", table.get("protocol"), (None, *PROTOCOLS)),

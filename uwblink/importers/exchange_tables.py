@@ -38,6 +38,7 @@ from uwblink.importers.staging import (
     Staging,
     Watch,
     assemble_exchanges,
+    broadcast_exchanges,
     in_time_order,
     rows_back,
     time_conditions,
@@ -137,11 +138,15 @@ def import_tables(
                         recording.append(table, beside | {kept: optional(block, n) for n, kept in columns.items()})
             for poses in _poses(rows, bodies):
                 recording.append_poses(poses)
+            for table, columns in staging.beside.items():
+                recording.append(table, columns)
             first = ""
             for some in faults:
                 first = first or some[0].detail
                 recording.append("faults", some)
-            counts = {name: recording.count(name) for name in ("exchanges", "poses", *_BESIDE, "faults")}
+            counts = {
+                name: recording.count(name) for name in ("exchanges", "poses", *_BESIDE, *staging.beside, "faults")
+            }
             if first:
                 lost = counts["faults"]
                 notes.append(f"{lost} of {total + lost} rows cannot be used and are kept as faults; the first: {first}")
@@ -172,7 +177,9 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
     if back := rows_back(staging.rows):
         notes.append(f"{back} rows are earlier than the row before, and are sorted by time")
     layout, protocol = column_map.layout or _layout(staging), column_map.protocol
-    if layout in ("messages", "stamps", "parts"):
+    if layout == "broadcasts":
+        rows, protocol = broadcast_exchanges(staging, faults)
+    elif layout in ("messages", "stamps", "parts"):
         rows, found = assemble_exchanges(staging, layout, faults, watch)
         protocol = protocol or found
     else:

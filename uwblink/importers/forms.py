@@ -9,10 +9,10 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
-from uwblink.importers.column_map import ASKED, ColumnMap, map_of_lines
+from uwblink.importers.column_map import ASKED, JSON_LINE, ColumnMap, map_of_lines
 from uwblink.importers.column_names import PATTERNS, WORDS, plain_name
 from uwblink.importers.lines import LINES
-from uwblink.importers.tables import detect, lacks_header, open_file, reading
+from uwblink.importers.tables import detect, lacks_header, object_in, open_file, reading
 from uwblink.importers.templates import Template
 
 Entries = dict[str, tuple[Any, str]]
@@ -30,6 +30,9 @@ def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
     """Return the form of a log by the templates of its first lines, with a time before them if there is one."""
     with reading(path), open_file(path) as file:
         lines = [line.decode("latin-1").rstrip("\r\n") for line in islice(file, 400)]
+    # Boards begin to print at different times, and in the middle of lines.
+    if 5 * sum(map(bool, map(object_in, lines))) > sum(map(bool, lines)):
+        return ColumnMap(line=JSON_LINE), {"line": (JSON_LINE, "lines that end with an object of JSON")}
     found: dict[str, list[re.Match[str]]] = {}
     for name, known in LINES.items():
         pattern = re.compile(Template(known["line"]).pattern)

@@ -26,6 +26,7 @@ from uwblink.importers.column_map import (
     DISTANCES,
     FLIGHT_UNITS,
     IDS,
+    JSON_LINE,
     NAMES,
     POSITIONS,
     POWERS,
@@ -97,10 +98,34 @@ def _is_event(table: SourceTable, name: str) -> bool:
     return sending + receiving > 0.9 and 0.25 < sending < 0.75
 
 
+def _receptions(short: Mapping[str, str], each: str, found: Mapping[str, str]) -> dict[str, str]:
+    """Return further columns of broadcasts whose senders list what they heard before; none for other tables.
+
+    `short` are the columns by their names, those of the elements of the list `each` by their own.
+    """
+    if found.get("tx", f"{each}.").startswith(f"{each}."):
+        return {}
+    number, stamp = r"(.*_)?(sn|seq|sequence|number|nr|no)", r"(.*_)?(ts|rx|stamp|timestamp|ticks?)"
+    inner = {name: plain_name(name) for name, header in short.items() if header.startswith(f"{each}.")}
+    outer = {name: plain_name(name) for name in short if name not in inner}
+    wanted = {"sequence": (number, outer), "heard": (number, inner), "rx": (stamp, inner)}
+    columns = {
+        ours: short[name]
+        for ours, (pattern, names) in wanted.items()
+        if (name := next((n for n, plain in names.items() if re.fullmatch(pattern, plain)), None))
+    }
+    return columns if columns.keys() == wanted.keys() else {}
+
+
 _OF_EXCHANGES: Final = (*STAMPS, "fpp1", "fpp2", "rxp1", "rxp2", "skew1", "skew2", "sts1", "sts2")
 
 _LAYOUTS: Final = {
     "exchanges": (STAMPS[:4], OF_MESSAGES, "a row has the stamps of a whole exchange"),
+    "broadcasts": (
+        ("tx", "rx", "sequence", "heard"),
+        (*_OF_EXCHANGES, "fpp", "rxp", "skew", "sts"),
+        "broadcasts have lists of what their senders heard",
+    ),
     "messages": (("tx", "rx"), _OF_EXCHANGES, "a row has one stamp of a sender and one of a receiver"),
     "stamps": (("message",), _OF_EXCHANGES, "a row has one stamp, and says whether it is of sending or of receiving"),
     "ranges": (("range_m",), (*OF_MESSAGES, *STAMPS), "there are ranges and no stamps"),
@@ -145,9 +170,10 @@ def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Map
     with open_table(file, form) as table:
         if form.headerless:
             return _numbered(path, table)
-        columns = {} if form.line else with_stamp_and_event(table, named_columns(table.names))
-        wide = form.wide or wide_columns(table.names, columns)
-        if each := None if form.line or wide or "range_m" in columns else next(iter(table.lists), None):
+        is_log = form.line not in (None, JSON_LINE)
+        columns = {} if is_log else with_stamp_and_event(table, named_columns(table.names))
+        wide = form.wide or ({} if table.lists else wide_columns(table.names, columns))
+        if each := None if is_log or wide or "range_m" in columns else next(iter(table.lists), None):
             top["each"] = each, "a line has a list of them"
     given = {*given, *(n for text in (form.line, form.each) if text for n in places(Template(text)) if n in NAMES)}
     given |= {"to_id", *wide} if wide else set()
@@ -160,6 +186,7 @@ def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Map
     for ours, letters in (("to_id", ("id", "A", "a", "addr")), ("range_m", ("R", "r", "D", "d"))) if form.each else ():
         if ours not in found and (letter := next((name for name in letters if name in short), None)):
             found[ours] = short[letter]
+    found |= _receptions(short, form.each, found) if form.each else {}
     columns = {name: name for name in given}
     columns |= {
         ours: header
@@ -210,14 +237,18 @@ def _proposal(
         missing |= sentinels(cells[name]) if name in cells else {}
         cells |= {name: np.where(np.isin(cells[name], list(missing)), np.nan, cells[name])} if name in cells else {}
     words = {name for name, column in cells.items() if not np.isfinite(column).any()}
-    fitting = (one for one in ("exchanges", "messages", "ranges") if all(name in cells for name in _LAYOUTS[one][0]))
+    fitting = (
+        one
+        for one in ("exchanges", "broadcasts", "messages", "ranges")
+        if all(name in cells for name in _LAYOUTS[one][0])
+    )
     layout = "stamps" if "event" in columns else next(fitting, "nothing")
     needed, foreign, why = _LAYOUTS[layout]
     if layout == "messages" and "message" in words and columns["message"] != "message":
         del columns["message"], cells["message"]  # without a column of that name messages are told by their order
     top |= {} if layout == "nothing" else {"layout": (layout, why)}
     units, undelayed = _units(form, columns, cells), False
-    if layout in ("exchanges", "messages", "stamps"):
+    if layout not in ("ranges", "nothing"):
         counter, unit, undelayed = (_exchange_stamps if layout == "exchanges" else _message_stamps)(columns, cells)
         top, units = top | counter, {"stamps": unit, **units}
     if missing:

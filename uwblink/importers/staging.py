@@ -21,7 +21,7 @@ from typing import Final, NamedTuple
 import duckdb
 import numpy as np
 
-from uwblink.errors import ImportTableError
+from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.importers.chips import CHIPS, power_sql
 from uwblink.importers.column_map import (
     DISTANCES,
@@ -33,7 +33,7 @@ from uwblink.importers.column_map import (
     TIME_UNITS,
     ColumnMap,
 )
-from uwblink.importers.plausibility import SAMPLE_ROWS, counter_format
+from uwblink.importers.plausibility import ROW_PERIOD_NS, SAMPLE_ROWS, counter_format
 from uwblink.importers.tables import (
     Columns,
     SourceTable,
@@ -43,6 +43,7 @@ from uwblink.importers.tables import (
     time_ns,
     whole_number,
 )
+from uwblink.receptions import Receptions, exchanges_in
 from uwblink.recording.schema import Fault
 from uwblink.twr import LARGEST_ID, STAMPS
 
@@ -150,6 +151,8 @@ class Staging:
         """Rows without a range, such as an empty cell of a wide table, that are left out."""
         if "blank" in columns:
             (self.blanks,) = StagedRows(db, "staged", ()).values("count(*) FILTER (blank)")
+        self.beside: dict[str, Columns] = {}
+        """Rows of other tables of a recording that were found on the way, by table."""
         self._filled = "NOT blank" if self.blanks else "true"
         others = tuple(name for name in columns if name not in (*IDS, "blank"))
         ids = ", ".join(f"{cell} AS {name}" for name, cell in self._ids().items())
@@ -506,6 +509,43 @@ def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Wat
     incomplete = Condition("message", "messages 1, 2 (and 3) of one exchange", f"NOT ({whole})")
     columns = tuple(name for name in columns if protocol != "ss" or name not in ("tx3", "rx3"))
     return replace(faults.reject(groups, [incomplete, conflict]), columns=columns), protocol
+
+
+def broadcast_exchanges(staging: Staging, faults: Faults) -> tuple[StagedRows, str]:
+    """Return the exchanges that broadcasts make whose senders list what they heard, and their protocol.
+
+    The receptions, and what third tags overheard of the exchanges, are put beside. Raises `ImportTableError`.
+    """
+    staging.require(staging.rows, ("tx", "rx", "sequence", "heard"))
+    if staging.column_map.ticks_per_unit != 1.0:
+        raise ImportTableError(f"{staging.paths[0]}: units.stamps: broadcasts need ticks")
+    values = ("tx", "rx", "sequence", "heard")
+    whole = [Condition(name, "a whole number", f"{name} IS NULL") for name in values]
+    rows = faults.reject(staging.rows, [*SOUND_IDS, *time_conditions(staging.rows), *whole])
+    sample, db = rows.sample(SAMPLE_ROWS), staging.db
+    bits, _ = counter_format((sample[name] for name in ("tx", "rx")), staging.column_map.bits, "wrapped")
+    time = "min(time_ns)" if rows.has("time_s") else f"(row_number() OVER (ORDER BY min(origin)) - 1) * {ROW_PERIOD_NS}"
+    db.execute(
+        f"CREATE TABLE frames AS SELECT from_id, sequence, tx, min(origin) AS first, {time} AS time_ns FROM {rows.name} "
+        f"WHERE {rows.condition} GROUP BY ALL ORDER BY first"
+    )
+    # Numbers of frames begin anew where a board restarts. A broadcast may be logged after those that list it.
+    heard = (
+        "SELECT f.time_ns, f.rowid AS frame, f.from_id AS sender, r.from_id AS listener, f.tx, min(r.rx) AS rx "
+        f"FROM (SELECT *, origin + 1000 AS until FROM {rows.name} WHERE {rows.condition}) r ASOF JOIN frames f "
+        "ON r.to_id = f.from_id AND r.heard = f.sequence AND r.until >= f.first GROUP BY ALL ORDER BY frame, listener"
+    )
+    with raising(ImportTableError, str(staging.paths[0]), ArgumentError):
+        receptions = Receptions.from_arrays(**dict(db.execute(heard).fetchnumpy()), bits=bits)
+        exchanges, overheard = exchanges_in(receptions)
+    staging.beside = {"receptions": receptions.to_dict(), "overheard": overheard}
+    db.register(
+        "found",
+        {"from_id": exchanges.initiator, "to_id": exchanges.target, "time_ns": exchanges.time_ns}
+        | {n: getattr(exchanges, n) for n in STAMPS},
+    )
+    db.execute("CREATE TABLE exchanges AS SELECT row_number() OVER () - 1 AS origin, * FROM found")
+    return StagedRows(db, "exchanges", ("origin", *IDS, "time_ns", *STAMPS)), "ds"
 
 
 def _group(rows: StagedRows, values: Mapping[str, str], follows: str, within_s: float) -> StagedRows:

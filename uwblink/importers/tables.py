@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from uwblink.arrays import Floats, Ints
 from uwblink.database import connect
 from uwblink.errors import ImportTableError, first_line, raising
-from uwblink.importers.column_map import ColumnMap
+from uwblink.importers.column_map import JSON_LINE, ColumnMap
 from uwblink.importers.templates import Template
 from uwblink.output import is_utf8
 from uwblink.text_files import require_regular
@@ -238,7 +238,7 @@ class SourceTable:
         ending = path.name.lower().removesuffix(".gz")
         self._is_parquet = ending.endswith(".parquet")
         self._is_csv = not ending.endswith((".parquet", ".jsonl", ".ndjson", ".json")) and not column_map.line
-        if column_map.line:
+        if column_map.line and column_map.line != JSON_LINE:
             self._open_log(Template(column_map.line))
         elif self._is_csv:
             self._open_csv()
@@ -271,19 +271,9 @@ class SourceTable:
         self._decimal_comma = self.column_map.decimal == ","
         each = Template(self.column_map.each) if self.column_map.each else None
         self.db.execute(f"SET VARIABLE line{self._key} = ?", [line.pattern])
-        # Whatever noise of a serial port is in it is read as letters.
-        if not self.live:
-            check_lines(self.path, "\n")
-        text = (
-            "(SELECT unnest(getvariable('lines')) AS line)"
-            if self.live
-            else (
-                f"read_csv(getvariable('file{self._key}'), auto_detect=false, header=false, delim='\x01', quote='', "
-                f"escape='', columns={{'line': 'VARCHAR'}}, strict_mode=false, encoding='latin-1', "
-                f"max_line_size={MAX_LINE_BYTES})"
-            )
+        matching = (
+            f"SELECT line FROM {self._source_of_lines()} WHERE regexp_matches(line, getvariable('line{self._key}'))"
         )
-        matching = f"SELECT line FROM {text} WHERE regexp_matches(line, getvariable('line{self._key}'))"
         self.source = f"(SELECT row_number() OVER () AS row, {line.extract('line', f'line{self._key}')} AS s"
         cells = line.columns("s")
         if each:
@@ -295,6 +285,17 @@ class SourceTable:
             self.source = f"(SELECT *, {each.extract('element', f'each{self._key}')} AS e FROM {self.source})"
         self.names, self._cells, self._expanded = tuple(cells), list(cells.values()), True
 
+    def _source_of_lines(self) -> str:
+        """Return SQL of the lines of a log; whatever noise of a serial port is in it is read as letters."""
+        if self.live:
+            return "(SELECT unnest(getvariable('lines')) AS line)"
+        check_lines(self.path, "\n")
+        return (
+            f"read_csv(getvariable('file{self._key}'), auto_detect=false, header=false, delim='\x01', quote='', "
+            f"escape='', columns={{'line': 'VARCHAR'}}, strict_mode=false, encoding='latin-1', "
+            f"max_line_size={MAX_LINE_BYTES})"
+        )
+
     def _open_json(self) -> None:
         """Use the fields of the first lines as columns; nested fields have names such as `pose.x`.
 
@@ -303,14 +304,14 @@ class SourceTable:
         check_lines(self.path, "\n")
         fields, each, lists = dict[str, str](), self.column_map.each, dict[str, None]()
         with reading(self.path), open_file(self.path) as file:
-            lines = [line.decode("utf-8-sig") for line in islice(file, 1000)]
-        for line in lines:
-            with suppress(ValueError, RecursionError):
-                row = json.loads(line)
-                found = {name: value for name, value in row.items() if isinstance(value, list) and is_objects(value)}
-                lists |= dict.fromkeys(found)
-                for one in [row | {each: one} for one in found.get(each, ())] if each else [row]:
-                    fields |= dict(_fields(one, "", ""))
+            lines = [
+                line.decode("utf-8-sig", "replace" if self.column_map.line else "strict") for line in islice(file, 1000)
+            ]
+        for row in filter(None, map(object_in, lines)):
+            found = {name: value for name, value in row.items() if isinstance(value, list) and is_objects(value)}
+            lists |= dict.fromkeys(found)
+            for one in [row | {each: one} for one in found.get(each, ())] if each else [row]:
+                fields |= dict(_fields(one, "", ""))
         self.lists = tuple(lists)
         if not fields:
             wanted = f"a list {each[:60]!r} of objects (each)" if each else "JSON objects"
@@ -320,6 +321,9 @@ class SourceTable:
         listed = f"getvariable('fields{self._key}')"
         self._cells = [f"json_extract_string(json, {listed}[{k}])" for k in range(1, len(fields) + 1)]
         self.source = f"read_ndjson_objects(getvariable('file{self._key}'), ignore_errors=true)"
+        if self.column_map.line:
+            ends = f"SELECT TRY_CAST(regexp_extract(line, '[{{].*') AS JSON) AS json FROM {self._source_of_lines()}"
+            self.source = f"(SELECT json FROM ({ends}) WHERE json_type(json) = 'OBJECT')"
         if each:
             # An element stands in place of the list that it is of.
             self.db.execute(f"SET VARIABLE each{self._key} = ?", [each])
@@ -463,10 +467,19 @@ class SourceTable:
         rejected, blank = set(self.rejected()), "\r\n" if self._is_csv else None
         line = self.column_map.line
         counts = re.compile(Template(line).pattern).search if line else lambda text: text.strip(blank)
+        counts = object_in if line == JSON_LINE else counts
         with io.TextIOWrapper(open_file(self.path), "latin-1" if line else "utf-8-sig", "replace") as file:
             numbered = enumerate(file, start=1)
             filled = (n for n, text in numbered if n > self._skip and counts(text) and n not in rejected)
             return np.fromiter(filled, np.int64)
+
+
+def object_in(line: str) -> dict[str, Any]:
+    """Return the object of JSON at the end of a line, an empty one where there is none."""
+    with suppress(ValueError, RecursionError):
+        found = json.loads(line[max(line.find("{"), 0) :])
+        return found if isinstance(found, dict) else {}
+    return {}
 
 
 def is_objects(values: list[Any]) -> bool:
