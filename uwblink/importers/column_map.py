@@ -3,7 +3,7 @@
 Every key is optional; docs/importing.md explains each.
 
 ```toml
-layout = "exchanges"       # or "messages", "stamps" (a row a stamp), "parts" (some rows an exchange), "ranges", "broadcasts"
+layout = "exchanges"       # or "messages", "stamps" (a row a stamp), "parts" (of an exchange), "ranges", "broadcasts"
 bits = 32                  # of the counter that the stamps come from, 32 or 40
 counter = "wrapped"        # or "signed", "unwrapped"
 protocol = "ss"            # a protocol of uwblink.twr
@@ -120,8 +120,8 @@ MAP_KEYS: Final = (
         f"template, or one of {', '.join(LINES)}",
         "the file is a table",
         "Of logs: the lines that are rows. Places in braces are columns; `{x:hex}` and `{x:int}` take digits, `{r[8]}` "
-        "is a list whose values are `r.0` to `r.7`, `{_}` and `{*}` are not used. `{json}` alone: lines that end with an "
-        "object of JSON.",
+        "is a list whose values are `r.0` to `r.7`, `{_}` and `{*}` are not used. `{json}` alone: lines that end with "
+        "an object of JSON.",
     ),
     FileKey(
         "each",

@@ -45,6 +45,7 @@ from uwblink.importers.tables import (
 )
 from uwblink.receptions import Receptions, exchanges_in
 from uwblink.recording.schema import Fault
+from uwblink.ticks import TICK_S
 from uwblink.twr import LARGEST_ID, STAMPS
 
 ROWS_PER_BLOCK: Final = 245_760
@@ -524,10 +525,16 @@ def broadcast_exchanges(staging: Staging, faults: Faults) -> tuple[StagedRows, s
     rows = faults.reject(staging.rows, [*SOUND_IDS, *time_conditions(staging.rows), *whole])
     sample, db = rows.sample(SAMPLE_ROWS), staging.db
     bits, _ = counter_format((sample[name] for name in ("tx", "rx")), staging.column_map.bits, "wrapped")
-    time = "min(time_ns)" if rows.has("time_s") else f"(row_number() OVER (ORDER BY min(origin)) - 1) * {ROW_PERIOD_NS}"
+    named = "from_id, sequence, tx, min(origin) AS first" + (", min(time_ns) AS time_ns" if rows.has("time_s") else "")
+    # Without times, a restart (numbers begin anew) lasts as long as a counter takes to wrap, so that nothing spans it.
+    again = "sum(coalesce((sequence < before)::INT, 0)) OVER (ORDER BY first)"
+    time = (
+        f"row_number() OVER (ORDER BY first) * {ROW_PERIOD_NS} + {again} * {round(2**bits * TICK_S * 1e9)} AS time_ns"
+    )
     db.execute(
-        f"CREATE TABLE frames AS SELECT from_id, sequence, tx, min(origin) AS first, {time} AS time_ns FROM {rows.name} "
-        f"WHERE {rows.condition} GROUP BY ALL ORDER BY first"
+        f"CREATE TABLE frames AS SELECT * EXCLUDE (before){'' if rows.has('time_s') else f', {time}'} FROM (SELECT *, "
+        f"lag(sequence) OVER (PARTITION BY from_id ORDER BY first) AS before FROM (SELECT {named} FROM {rows.name} "
+        f"WHERE {rows.condition} GROUP BY from_id, sequence, tx)) ORDER BY first"
     )
     # Numbers of frames begin anew where a board restarts. A broadcast may be logged after those that list it.
     heard = (
