@@ -297,8 +297,7 @@ class ReportCheck:
 
     def add(self, board: int, report: RangeReport) -> str | None:
         """Add a report; returns its differences from the report of the other board, None without any."""
-        mine = isinstance(report, TargetRangeReport)
-        pair = (report.neighbour, board) if mine else (board, report.neighbour)
+        pair = (report.neighbour, board) if isinstance(report, TargetRangeReport) else (board, report.neighbour)
         before = self._last.pop(pair, None)
         # Two reports of different exchanges have no stamp in common, but by chance.
         same = before and any(getattr(before[1], name) == getattr(report, name) != 0 for name in STAMPS)

@@ -276,22 +276,16 @@ def _choose(
     sources = [Path(source)] if isinstance(source, str | os.PathLike) else [Path(one) for one in source]
     if not sources:
         raise ArgumentError("found no files, expected a path or several", parameter="source")
-    row = _importer(sources[0], importer)
+    if importer is not None and importer not in IMPORTERS:
+        raise ArgumentError(f"importer: found {importer!r:.40}, allowed: {', '.join(IMPORTERS)}")
+    rows, ending = (IMPORTERS.values() if importer is None else [IMPORTERS[importer]]), sources[0].name.lower()
+    if (row := next((row for row in rows if importer or ending.endswith(row.suffixes)), None)) is None:
+        known = ", ".join(suffix for row in rows for suffix in row.suffixes)
+        raise ImportTableError(
+            f"{sources[0]}: no importer for such a file; known are {known}; or name one with importer="
+        )
     if map_file is not None and row.map_help is None:
         raise ArgumentError(f"map_file: importer {row.name!r} takes none")
     if len(sources) > 1 and not row.several:
         raise ArgumentError(f"importer {row.name!r} takes one file, found {len(sources)}", parameter="source")
     return sources, row, None if map_file is None else Path(map_file)
-
-
-def _importer(source: Path, name: str | None) -> Importer:
-    if name is not None:
-        if name not in IMPORTERS:
-            raise ArgumentError(f"importer: found {name!r:.40}, allowed: {', '.join(IMPORTERS)}")
-        return IMPORTERS[name]
-    ending = source.name.lower()
-    for row in IMPORTERS.values():
-        if ending.endswith(row.suffixes):
-            return row
-    known = ", ".join(suffix for row in IMPORTERS.values() for suffix in row.suffixes)
-    raise ImportTableError(f"{source}: no importer for such a file; known are {known}; or name one with importer=")

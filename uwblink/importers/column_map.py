@@ -96,8 +96,8 @@ MAP_KEYS: Final = (
         '"exchanges", "messages", "stamps", "parts", "ranges" or "broadcasts"',
         "by the columns; parts and broadcasts must be stated",
         "What a row is: an exchange; a message; a stamp with `message`, as devices log their own; a part of an "
-        "exchange, for example if both devices report; a range without stamps; what a broadcast (`sequence`, `tx`) of "
-        "`from_id` says of an earlier one (`heard`) of `to_id`: when `from_id` received it (`rx`).",
+        "exchange, for example if both devices report; a range without stamps; what a broadcast (sequence, tx) of "
+        "from_id says of an earlier one (heard) of to_id: when from_id received it (rx).",
     ),
     FileKey("bits", "32 or 40", "32 if the stamps fit, else 40", "Width of the counter of the stamps, in bits."),
     FileKey(

@@ -40,26 +40,14 @@ def map_of_frame(table: Path, given: str | os.PathLike[str] | Mapping[str, Any] 
     """
     if isinstance(given, str | os.PathLike):
         return Path(given)
-    path = table.with_suffix(".toml")
     if given is not None:
-        path.write_text(_as_toml(given), "utf-8")
+        path = table.with_suffix(".json")
+        path.write_text(json.dumps(given, default=dict), "utf-8")
         return path
-    found = guess_map(table)
+    found, path = guess_map(table), table.with_suffix(".toml")
     if found.asked or not found.complete:
         what = f"state {' and '.join(found.asked)}" if found.asked else "name its columns"
         proposed = "\n".join(line for line in found.text.splitlines()[1:] if line)
         raise ImportTableError(f"{DATA_FRAME}: {what} in `map`, a mapping or a file such as\n{proposed}")
     path.write_text(found.text, "utf-8")
     return path
-
-
-def _as_toml(table: Mapping[str, Any], above: str = "") -> str:
-    """Return a mapping of mappings as TOML; JSON's strings, numbers and lists are TOML's."""
-    lines = [
-        f"{json.dumps(key)} = {json.dumps(value)}" for key, value in table.items() if not isinstance(value, Mapping)
-    ]
-    text = "\n".join([f"[{above}]" if above else "", *lines, ""])
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            text += _as_toml(value, f"{above}.{json.dumps(key)}".strip("."))
-    return text

@@ -102,8 +102,7 @@ def _guess_topics(bag: Bag, pattern: str, topics: list[str], table: Path, guess_
     with raising(ImportTableError, f"{bag.path}: cannot be turned into a table", OSError, RecursionError):
         lines = (json.dumps(_unstamped(row) | ids[topic], allow_nan=False) for topic, row in rows)
         table.write_text("".join(f"{line}\n" for line in lines), "utf-8")
-    meanings = {"data": "range"} if re.fullmatch(_NUMBERS, kind) else {}
-    guess = guess_table(bag.path, table, ids[topics[0]], meanings)
+    guess = guess_table(bag.path, table, ids[topics[0]], {"data": "range"} if re.fullmatch(_NUMBERS, kind) else {})
     sections = [
         "\n".join([f"[topics.{json.dumps(topic)}]", *(f"{name} = {json.dumps(v)}" for name, v in values.items()), ""])
         for topic, values in stated.items()

@@ -160,8 +160,7 @@ def _read(
     order = np.argsort(joined["time_ns"], kind="stable")
     if ids:
         key = ["time_ns", *ids, *(n for n in ("tx1", "rx1") if n in joined)]
-        rows = np.column_stack([joined[n][order] for n in key])
-        first = np.sort(np.unique(rows, axis=0, return_index=True)[1])
+        first = np.sort(np.unique(np.column_stack([joined[n][order] for n in key]), axis=0, return_index=True)[1])
         flight.doubled[name] = len(order) - len(first)
         order = order[first]
     return {n: column[order] for n, column in joined.items()}

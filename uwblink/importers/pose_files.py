@@ -172,8 +172,7 @@ def _plain(path: Path, head: Lines, body: str | None, stated: ColumnMap) -> Pose
             match = re.fullmatch(pattern, plain_name(name)) if ours not in stated.columns else None
             if name == stated.columns.get(ours, ours) or (match and ours not in found):
                 found[ours] = k, match.groupdict().get("unit") if match else None
-    turned = any(name in found for name in POSE[3:])
-    needed = POSE if turned else POSE[:3]
+    needed = POSE if any(name in found for name in POSE[3:]) else POSE[:3]
     if missing := [name for name in ("time_s", *needed, "body") if name not in found and not (name == "body" and body)]:
         name = stated.columns.get(missing[0], missing[0])
         raise ImportTableError(

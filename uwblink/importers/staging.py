@@ -520,8 +520,7 @@ def broadcast_exchanges(staging: Staging, faults: Faults) -> tuple[StagedRows, s
     staging.require(staging.rows, ("tx", "rx", "sequence", "heard"))
     if staging.column_map.ticks_per_unit != 1.0:
         raise ImportTableError(f"{staging.paths[0]}: units.stamps: broadcasts need ticks")
-    values = ("tx", "rx", "sequence", "heard")
-    whole = [Condition(name, "a whole number", f"{name} IS NULL") for name in values]
+    whole = [Condition(name, "a whole number", f"{name} IS NULL") for name in ("tx", "rx", "sequence", "heard")]
     rows = faults.reject(staging.rows, [*SOUND_IDS, *time_conditions(staging.rows), *whole])
     sample, db = rows.sample(SAMPLE_ROWS), staging.db
     bits, _ = counter_format((sample[name] for name in ("tx", "rx")), staging.column_map.bits, "wrapped")
