@@ -12,10 +12,10 @@ import pytest
 import calib
 import uwblink
 from tests.processes import refuse, succeed
-from uwblink.boards import DIALECTS, Dialect, PrintedRange, dialect_of
+from uwblink.boards import DIALECTS, Dialect, LivePage, PrintedRange, dialect_of, load_correction
 from uwblink.boards.dialects import Printed
 from uwblink.boards.ports import Terminal
-from uwblink.errors import ArgumentError, ImportTableError
+from uwblink.errors import ArgumentError, ImportTableError, PlanError
 from uwblink.importers.lines import LINES
 
 # What each board prints for a range of one metre to one device and of two metres to another; made from descriptions.
@@ -218,3 +218,67 @@ def test_a_dialect_of_ones_own_comes_by_an_entry_point_and_words_get_numbers_of_
         DIALECTS.remove("mine")
     with pytest.raises(ArgumentError, match="parse"):
         DIALECTS.register(Dialect("bad", "No function.", None))  # type: ignore[arg-type]
+
+
+def calibrated(folder, target):
+    """Write a calibration that takes 25 cm off ranges of 40 and a target."""
+    own = calib.Ranges.from_arrays(
+        np.tile([1.25, 2.25, 3.25], 40),
+        initiator=40,
+        target=target,
+        truth_m=np.tile([1.0, 2.0, 3.0], 40),
+        time_ns=np.arange(120) * 10**8,
+    )
+    calib.fit(own, constants="pair", delays_only=True).save(folder / "c.json")
+    return folder / "c.json"
+
+
+def test_the_page_shows_printed_ranges_and_their_corrections(tmp_path):
+    correct = load_correction(calibrated(tmp_path, 6018))
+    one, other = BOTH.splitlines(keepends=True)
+    with printing(one) as port, LivePage(tmp_path / "r.uwb", correct=correct) as page:
+        how = {"ids": [40], "duration_s": 1.5, "watch": page.watch, "listeners": [page]}
+        done = uwblink.boards.record_printed([port], tmp_path / "r.uwb", dialect_of("arduino"), **how)
+        body = page.body()
+    assert f"{done.exchanges} ranges of 2 devices" in str(done)
+    for text in (
+        "40&nbsp;&rarr;&nbsp;6018",
+        "<td>1.000</td><td>0.750</td>",
+        "polyline class='corrected'".replace("'", '"'),
+    ):
+        assert text in body
+    # No share of exchanges succeeded: of those that failed nothing is printed.
+    assert "%" not in body
+    with printing(other) as port, LivePage(tmp_path / "s.uwb", correct=correct) as page:
+        how = {"ids": [40], "duration_s": 30, "watch": page.watch, "listeners": [page]}
+        with pytest.raises(PlanError, match="6019"):
+            uwblink.boards.record_printed([port], tmp_path / "s.uwb", dialect_of("arduino"), **how)
+
+
+def test_a_stream_is_recorded_as_well_and_the_command_serves_the_page(tmp_path):
+    calibrated(tmp_path, 6018)
+    with printing(BOTH.splitlines(keepends=True)[0]) as port:
+        words = ("--dialect", "arduino", "--ids", "40", "-c", "c.json", "--duration", "1.5", "-o")
+        streamed = succeed("uwblink", "stream", port, *words, "s.uwb", cwd=tmp_path)
+        recorded = succeed("uwblink", "record", port, *words, "r.uwb", "--live", cwd=tmp_path)
+        refuse("uwblink", "record", port, *words, "q.uwb", cwd=tmp_path, naming=["--calibration", "--live"])
+        refuse("uwblink", "stream", port, "--ids", "40", cwd=tmp_path, naming=["--ids", "--dialect"])
+        refuse("uwblink", "stream", "r.uwb", "--dialect", "arduino", cwd=tmp_path, naming=["r.uwb", "--dialect"])
+        refuse(
+            "uwblink",
+            "record",
+            port,
+            *words[:2],
+            "--ids",
+            "a",
+            "-o",
+            "q.uwb",
+            cwd=tmp_path,
+            naming=["--ids: found 'a'"],
+        )
+    rows = [json.loads(line) for line in streamed.stdout.splitlines()]
+    found = uwblink.load(tmp_path / "s.uwb").exchanges
+    assert len(found) == len(rows) >= 5
+    assert [row["corrected_m"] for row in rows] == pytest.approx([0.75] * len(rows))
+    assert "live page: http://127.0.0.1:" in recorded.stderr
+    assert set(uwblink.load(tmp_path / "r.uwb").exchanges.range_m.tolist()) == {1.0}
