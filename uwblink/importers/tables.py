@@ -85,7 +85,7 @@ def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, boo
         raise ImportTableError(f"{path}: empty, expected a header and rows")
     if column_map.headerless:
         names, skip = tuple(str(k) for k in range(1, len(names) + 1)), first
-    if decimal is None:
+    if decimal is None and mark != ",":
         commas, points = (
             sum(bool(re.fullmatch(rf"[+-]?\d{digits}{mark}\d+([eE][+-]?\d+)?", cell)) for cell in cells)
             for digits, mark in (("+", ","), ("*", r"\."))
@@ -119,7 +119,7 @@ def check_lines(path: Path, delimiter: str) -> None:
     """
     line, length, cells = 1, 0, 0
     with reading(path), open_file(path) as file:
-        while piece := file.read(4096):
+        while piece := file.read(8192):
             ends = piece.count(b"\n")
             line += ends
             # Only lines that fill whole pieces are measured, so that short ones take no time.
