@@ -313,8 +313,7 @@ calib fit A.uwb -o A.json --hold-out 0.3
     ),
     DataSet(
         "swarm broadcasts",
-        "prathje/uwb-swarm-ranging at 0d023d2, `scripts/out`: serial logs of boards that range by broadcast; no true "
-        "distances.",
+        "prathje/uwb-swarm-ranging at 0d023d2, `scripts/out`: serial logs of boards that range by broadcast.",
         "swarm_broadcast_logs.tar.xz",
         prepare_swarm,
         """\
