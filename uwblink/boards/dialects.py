@@ -1,7 +1,7 @@
 """Boards of other firmware, which print ranges as lines of text: dialects, and their ranges as they arrive.
 
 A dialect is a function from lines to ranges. The project's own are the forms of logs that `uwblink import guess` knows
-(`uwblink.importers.lines`), read as logs are: by the same column map, templates and SQL.
+(`uwblink.importers.devices`), read as logs are: by the same column map, templates and SQL.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from uwblink.boards.record import RecordingWriter
 from uwblink.database import connect
 from uwblink.errors import ArgumentError, BoardError, PlanError
 from uwblink.importers.column_map import ColumnMap, load_map, map_of_lines
-from uwblink.importers.lines import LINES
+from uwblink.importers.devices import LINES
 from uwblink.importers.staging import numbers_of, staged_cells
 from uwblink.importers.tables import SourceTable
 from uwblink.output import check_output
@@ -103,9 +103,12 @@ def parser_of(known: ColumnMap) -> Callable[[Sequence[str]], list[PrintedRange]]
 
 def check_dialect(row: Any) -> None:
     """Raise `ArgumentError` for a row that cannot be a dialect."""
-    parse = callable, "a function from lines to ranges"
-    start = lambda found: isinstance(found, bytes), "bytes"
-    check_row("dialect", row, Dialect, {"help": (is_text, "a line of text"), "parse": parse, "start": start})
+    fields = {
+        "help": (is_text, "a line of text"),
+        "parse": (callable, "a function from lines to ranges"),
+        "start": (lambda found: isinstance(found, bytes), "bytes"),
+    }
+    check_row("dialect", row, Dialect, fields)
 
 
 # The shell of the DWM1001 opens on two carriage returns; `lec` prints distances as comma-separated lines.

@@ -88,14 +88,9 @@ class LivePage(Closing, Listener):
         progress = self._progress
         faults = reversed([*progress.last_faults])
         items = "".join(f"<li>board {escape(f.board)}: {escape(f.kind)}: {escape(f.detail)}</li>" for f in faults)
-        parts = (
-            f"<h1>recording {escape(self._path.name)}</h1>",
-            f"<p>{escape(str(progress))}</p>",
-            self._table(progress),
-            f"<ul>{items}</ul>" if items else "",
-            self._disk(),
-        )
-        return "".join(parts)
+        listed = f"<ul>{items}</ul>" if items else ""
+        head = f"<h1>recording {escape(self._path.name)}</h1><p>{escape(str(progress))}</p>"
+        return f"{head}{self._table(progress)}{listed}{self._disk()}"
 
     def _table(self, progress: Progress) -> str:
         """Return a table with one row for each pair; pairs without ranges for two seconds are highlighted."""

@@ -220,8 +220,8 @@ def apart(command: Callable[..., None]) -> Callable[..., None]:
 
 def epilog(*examples: str) -> str | None:
     """Return examples as an epilog, a line each; None without any."""
-    heads = ["Example:" if len(examples) == 1 else "Examples:"]
-    return "\n".join([*heads, *(f"  {escape(one)}" for one in examples)]) if examples else None
+    head = "Example:" if len(examples) == 1 else "Examples:"
+    return "\n".join([head, *(f"  {escape(one)}" for one in examples)]) if examples else None
 
 
 def choice(*names: str, more: Callable[[], Iterable[str]] | None = None) -> dict[str, Any]:

@@ -51,12 +51,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from uwblink.errors import ImportTableError
-from uwblink.importers.chips import CHIPS, REGISTERS
-from uwblink.importers.lines import LINES
+from uwblink.importers.devices import CHIPS, LINES, REGISTERS
 from uwblink.importers.templates import Template, is_template, places
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import AntennaDelays, read_antenna_delays
-from uwblink.recording.schema import POSE
+from uwblink.recording.schema import POSE, is_id
 from uwblink.text_files import FileKey, TomlReader, heads, is_number
 from uwblink.ticks import METRES_PER_TICK, TICKS_PER_SECOND
 from uwblink.twr import BITS, LARGEST_ID, STAMPS
@@ -348,8 +347,7 @@ def load_map(path: Path) -> ColumnMap:
         file.check(f"topics.{topic}", values, isinstance(values, dict), "a table of constants, which may be empty")
         _constants(file, f"topics.{topic}", values)
     for name, value in ids.items():
-        is_id = type(value) is int and 0 <= value <= LARGEST_ID
-        file.check(f"ids.{name}", value, is_id, f"a whole number from 0 to {LARGEST_ID}")
+        file.check(f"ids.{name}", value, is_id(value), f"a whole number from 0 to {LARGEST_ID}")
     within = table.get("within_s", 1.0)
     file.check("within_s", within, is_number(within) and within > 0, "seconds")
     stamps = units.get("stamps", "ticks")
@@ -412,5 +410,4 @@ def _constants(file: TomlReader, where: str, values: dict[str, Any]) -> None:
     for name, value in values.items():
         is_word = name in IDS and isinstance(value, str) and value != ASKED
         of_id = f"{IDS.get(name)}: a number or a word; or name its column in [columns]"
-        expected = of_id if name in IDS else "a finite number"
-        file.check(f"{where}.{name}", value, is_number(value) or is_word, expected)
+        file.check(f"{where}.{name}", value, is_number(value) or is_word, of_id if name in IDS else "a finite number")

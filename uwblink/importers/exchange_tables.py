@@ -121,8 +121,8 @@ def import_tables(
         meta |= {"chip": column_map.chip} if column_map.chip else {}
         with Recording.create(output, meta=meta, force=force, memory_mb=250) as recording:
             ends = " UNION ".join(f"SELECT {name} AS id FROM {rows.name} WHERE {rows.condition}" for name in IDS)
-            tags = [tag for (tag,) in db.execute(f"{ends} ORDER BY id").fetchall()]
-            bodies = {tag: staging.names.get(tag, f"tag{tag}") for tag in tags}
+            tags = db.execute(f"{ends} ORDER BY id").fetchall()
+            bodies = {tag: staging.names.get(tag, f"tag{tag}") for (tag,) in tags}
             recording.append_tags(Tag(tag, body, (0.0, 0.0, 0.0)) for tag, body in bodies.items())
             for block in rows.blocks():
                 watch("writing", done / total)

@@ -35,9 +35,18 @@ from uwblink.importers.column_map import (
     TIME_UNITS,
     ColumnMap,
 )
-from uwblink.importers.column_names import OF_MESSAGES, WORDS, named_columns, plain_name
 from uwblink.importers.exchange_tables import tables_in
-from uwblink.importers.forms import Entries, form_of, name_template, register_columns, wide_columns
+from uwblink.importers.forms import (
+    OF_MESSAGES,
+    WORDS,
+    Entries,
+    form_of,
+    name_template,
+    named_columns,
+    plain_name,
+    register_columns,
+    wide_columns,
+)
 from uwblink.importers.guess_bags import guess_bag
 from uwblink.importers.plausibility import (
     ACCEPTED_SHARE,
@@ -155,9 +164,8 @@ def guess_map(path: Path) -> Guess:
     """Return the proposed map of a table, a log, a folder of them, or a bag; raises `ImportTableError`."""
     if path.suffix.lower() == ".uwb":
         raise ImportTableError(f"{path}: is a recording already and needs no map; 'uwblink show' prints its contents")
-    if is_bag(path):
-        return guess_bag(path, _of_table)
-    return _of_table(path, tables_in(path, ColumnMap(line="{*}"))[0] if path.is_dir() else path)
+    file = tables_in(path, ColumnMap(line="{*}"))[0] if path.is_dir() and not is_bag(path) else path
+    return guess_bag(path, _of_table) if is_bag(path) else _of_table(path, file)
 
 
 def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Mapping[str, str] = {}) -> Guess:
@@ -339,9 +347,8 @@ def _message_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> StampE
     # Of 22 stamps in ticks one at least is in the last tenth of the counter in nine tables of ten.
     full = _are_whole(stamps) and 0.9 * 2.0**bits < largest < 2.0**bits
     counter: Entries = {"bits": (bits, ""), "counter": (kind, "")}
-    if named:
-        return counter, (named, "by the columns' names"), False
-    return counter, ("ticks", f"whole numbers up to 2^{bits}") if full else (ASKED, _ANY_UNIT), False
+    unit = ("ticks", f"whole numbers up to 2^{bits}") if full else (ASKED, _ANY_UNIT)
+    return counter, (named, "by the columns' names") if named else unit, False
 
 
 def _exchange_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> StampEntries:

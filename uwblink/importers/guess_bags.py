@@ -20,8 +20,7 @@ from uwblink.display import first_few
 from uwblink.errors import ImportTableError, raising
 from uwblink.importers.bags import Bag, fields_of, matching_topics, open_bag
 from uwblink.importers.column_map import IDS, POSITIONS, POWERS
-from uwblink.importers.column_names import named_columns
-from uwblink.importers.forms import name_template, wide_columns
+from uwblink.importers.forms import name_template, named_columns, wide_columns
 from uwblink.importers.poses import pose_topics
 from uwblink.twr import STAMPS
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
-from uwblink.importers.chips import CHIPS
 from uwblink.importers.column_map import DISTANCE_UNITS, IDS, POSITIONS, POWERS, RANGE_UNITS, ColumnMap
+from uwblink.importers.devices import CHIPS
 from uwblink.importers.tables import Columns
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import REGISTER_MAX, AntennaDelay, delay_of

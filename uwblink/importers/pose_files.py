@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError, raising
 from uwblink.importers.column_map import DISTANCE_UNITS, TIME_UNITS, ColumnMap
-from uwblink.importers.column_names import plain_name
+from uwblink.importers.forms import plain_name
 from uwblink.recording.schema import POSE
 from uwblink.twr import LATEST_NS
 

@@ -22,7 +22,6 @@ import duckdb
 import numpy as np
 
 from uwblink.errors import ArgumentError, ImportTableError, raising
-from uwblink.importers.chips import CHIPS, power_sql
 from uwblink.importers.column_map import (
     DISTANCES,
     IDS,
@@ -33,6 +32,7 @@ from uwblink.importers.column_map import (
     TIME_UNITS,
     ColumnMap,
 )
+from uwblink.importers.devices import CHIPS, power_sql
 from uwblink.importers.plausibility import ROW_PERIOD_NS, SAMPLE_ROWS, counter_format
 from uwblink.importers.tables import (
     Columns,
@@ -82,8 +82,7 @@ class StagedRows:
 
     def values(self, expressions: str) -> tuple[int, ...]:
         """Return SQL aggregates over the rows."""
-        ((*found,),) = self.db.execute(f"SELECT {expressions} FROM {self.name} WHERE {self.condition}").fetchall()
-        return tuple(found)
+        return tuple(self.db.execute(f"SELECT {expressions} FROM {self.name} WHERE {self.condition}").fetchall()[0])
 
     def count(self) -> int:
         """Return the number of rows."""
@@ -315,8 +314,7 @@ SUMMARIES: Final = frozenset(
 def numbers_of(words: Iterable[str]) -> dict[str, int]:
     """Return the ids that are whole numbers, such as "7" and "7.0"."""
     matches = {word: re.fullmatch(r"([0-9]{1,9})([.,]0*)?", word) for word in words}
-    found = {word: int(match[1]) for word, match in matches.items() if match}
-    return {word: value for word, value in found.items() if value <= LARGEST_ID}
+    return {word: int(match[1]) for word, match in matches.items() if match and int(match[1]) <= LARGEST_ID}
 
 
 def rows_back(rows: StagedRows) -> int:

@@ -469,8 +469,8 @@ class SourceTable:
         counts = re.compile(Template(line).pattern).search if line else lambda text: text.strip(blank)
         counts = object_in if line == JSON_LINE else counts
         with io.TextIOWrapper(open_file(self.path), "latin-1" if line else "utf-8-sig", "replace") as file:
-            numbered = enumerate(file, start=1)
-            filled = (n for n, text in numbered if n > self._skip and counts(text) and n not in rejected)
+            lines = enumerate(file, start=1)
+            filled = (n for n, text in lines if n > self._skip and counts(text) and n not in rejected)
             return np.fromiter(filled, np.int64)
 
 

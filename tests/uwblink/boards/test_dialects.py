@@ -16,7 +16,7 @@ from uwblink.boards import DIALECTS, Dialect, LivePage, PrintedRange, dialect_of
 from uwblink.boards.dialects import Printed
 from uwblink.boards.ports import Terminal
 from uwblink.errors import ArgumentError, ImportTableError, PlanError
-from uwblink.importers.lines import LINES
+from uwblink.importers.devices import LINES
 
 # What each board prints for a range of one metre to one device and of two metres to another; made from descriptions.
 BOTH = "from: 6018\t Range: 1.00 m\t RX power: -78.50 dBm\r\nfrom: 6019\t Range: 2.00 m\t RX power: -80.00 dBm\r\n"
