@@ -317,8 +317,48 @@ def load_map(path: Path) -> ColumnMap:
         for place in places(Template(text)):
             _place(place, columns, units)
     file.known(units, ("stamps", "time", "distance", "power", "skew", *DISTANCES, *POWERS), "units.")
-    registers = {name: value for name, value in columns.items() if isinstance(value, dict)}
     chip = file.choice("chip", table.get("chip"), (None, *CHIPS))
+    _check_columns(file, columns, wide, chip)
+    _check_values(file, ids)
+    registers = {name: value for name, value in columns.items() if isinstance(value, dict)}
+    stamps = units.get("stamps", "ticks")
+    return ColumnMap(
+        layout=file.choice(
+            "layout", table.get("layout"), (None, "exchanges", "messages", "stamps", "parts", "ranges", "broadcasts")
+        ),
+        bits=file.choice("bits", table.get("bits"), (None, *BITS)),
+        counter=file.choice("counter", table.get("counter"), (None, "wrapped", "signed", "unwrapped")),
+        protocol=file.choice("protocol", table.get("protocol"), (None, *PROTOCOLS)),
+        delimiter=file.choice("delimiter", table.get("delimiter"), (None, ",", ";", "\t", "|", " ")),
+        decimal=file.choice("decimal", table.get("decimal"), (None, ".", ",")),
+        within_s=float(table.get("within_s", 1.0)),
+        columns={name: str(value) for name, value in columns.items() if name not in registers},
+        ticks_per_unit=float(stamps * TICKS_PER_SECOND)
+        if is_number(stamps) and stamps > 0
+        else STAMP_UNITS[file.choice("units.stamps", stamps, STAMP_UNITS)],
+        time_unit=file.choice("units.time", units.get("time"), (None, "iso", *TIME_UNITS)),
+        distance_unit=file.choice("units.distance", units.get("distance"), (None, *DISTANCE_UNITS)),
+        power_unit=file.choice("units.power", units.get("power"), (None, "dBm", "-dBm")),
+        constants={name: v if isinstance(v, str) else float(v) for name, v in constants.items()},
+        ids=ids,
+        antenna_delays=read_antenna_delays(file, {name: STAMP_UNITS[name] for name in ("ticks", "ns")}),
+        each=table.get("each"),
+        line=table.get("line"),
+        from_name=table.get("from_name"),
+        missing=tuple(table.get("missing", [])),
+        chip=chip,
+        prf=file.choice("prf", table.get("prf", 64), (16, 64)),
+        headerless=any(type(value) is int for value in columns.values()),
+        registers=registers,
+        wide=wide,
+        units=_units_of_columns(file, units, chip),
+        topics=file.section("topics"),
+    )
+
+
+def _check_columns(file: TomlReader, columns: dict[str, Any], wide: dict[str, Any], chip: str | None) -> None:
+    """Raise the file's error for names of columns, registers and families that cannot be."""
+    registers = {name: value for name, value in columns.items() if isinstance(value, dict)}
     for name, value in registers.items():
         file.known(value, REGISTERS, f"columns.{name}.")
         whole = {"n"} < value.keys() and (value.keys() >= {"f1", "f2", "f3"}) != ("c" in value)
@@ -337,52 +377,22 @@ def load_map(path: Path) -> ColumnMap:
         by_device = isinstance(value, dict) and value and all(isinstance(one, str) for one in value.values())
         is_family = isinstance(value, str) and is_template(value) and len(re.findall(r"\{\w+\}", value)) == 1
         file.check(f"wide.{name}", value, by_device or is_family, "a name with one place, such as r_AN{to_id}")
-    missing = table.get("missing", [])
+
+
+def _check_values(file: TomlReader, ids: dict[str, Any]) -> None:
+    """Raise the file's error for values that mean none, constants, topics and numbers of ids that cannot be."""
+    missing, within = file.table.get("missing", []), file.table.get("within_s", 1.0)
     listed = isinstance(missing, list) and all(
         is_number(one) or (isinstance(one, str) and one != ASKED) for one in missing
     )
     file.check("missing", missing, listed, "a list of numbers and words")
-    _constants(file, "constants", constants)
+    _constants(file, "constants", file.section("constants"))
     for topic, values in file.section("topics").items():
         file.check(f"topics.{topic}", values, isinstance(values, dict), "a table of constants, which may be empty")
         _constants(file, f"topics.{topic}", values)
     for name, value in ids.items():
         file.check(f"ids.{name}", value, is_id(value), f"a whole number from 0 to {LARGEST_ID}")
-    within = table.get("within_s", 1.0)
     file.check("within_s", within, is_number(within) and within > 0, "seconds")
-    stamps = units.get("stamps", "ticks")
-    return ColumnMap(
-        layout=file.choice(
-            "layout", table.get("layout"), (None, "exchanges", "messages", "stamps", "parts", "ranges", "broadcasts")
-        ),
-        bits=file.choice("bits", table.get("bits"), (None, *BITS)),
-        counter=file.choice("counter", table.get("counter"), (None, "wrapped", "signed", "unwrapped")),
-        protocol=file.choice("protocol", table.get("protocol"), (None, *PROTOCOLS)),
-        delimiter=file.choice("delimiter", table.get("delimiter"), (None, ",", ";", "\t", "|", " ")),
-        decimal=file.choice("decimal", table.get("decimal"), (None, ".", ",")),
-        within_s=float(within),
-        columns={name: str(value) for name, value in columns.items() if name not in registers},
-        ticks_per_unit=float(stamps * TICKS_PER_SECOND)
-        if is_number(stamps) and stamps > 0
-        else STAMP_UNITS[file.choice("units.stamps", stamps, STAMP_UNITS)],
-        time_unit=file.choice("units.time", units.get("time"), (None, "iso", *TIME_UNITS)),
-        distance_unit=file.choice("units.distance", units.get("distance"), (None, *DISTANCE_UNITS)),
-        power_unit=file.choice("units.power", units.get("power"), (None, "dBm", "-dBm")),
-        constants={name: v if isinstance(v, str) else float(v) for name, v in constants.items()},
-        ids=ids,
-        antenna_delays=read_antenna_delays(file, {name: STAMP_UNITS[name] for name in ("ticks", "ns")}),
-        each=table.get("each"),
-        line=table.get("line"),
-        from_name=table.get("from_name"),
-        missing=tuple(missing),
-        chip=chip,
-        prf=file.choice("prf", table.get("prf", 64), (16, 64)),
-        headerless=True in numbered,
-        registers=registers,
-        wide=wide,
-        units=_units_of_columns(file, units, chip),
-        topics=file.section("topics"),
-    )
 
 
 def _place(place: str, columns: dict[str, Any], units: dict[str, Any]) -> None:

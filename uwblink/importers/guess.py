@@ -180,7 +180,7 @@ def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Map
             return _numbered(path, table)
         is_log = form.line not in (None, JSON_LINE)
         columns = {} if is_log else with_stamp_and_event(table, named_columns(table.names))
-        wide = form.wide or ({} if table.lists else wide_columns(table.names, columns))
+        wide = form.wide or wide_columns(table.names, columns)
         if each := None if is_log or wide or "range_m" in columns else next(iter(table.lists), None):
             top["each"] = each, "a line has a list of them"
     given = {*given, *(n for text in (form.line, form.each) if text for n in places(Template(text)) if n in NAMES)}
@@ -245,12 +245,8 @@ def _proposal(
         missing |= sentinels(cells[name]) if name in cells else {}
         cells |= {name: np.where(np.isin(cells[name], list(missing)), np.nan, cells[name])} if name in cells else {}
     words = {name for name, column in cells.items() if not np.isfinite(column).any()}
-    fitting = (
-        one
-        for one in ("exchanges", "broadcasts", "messages", "ranges")
-        if all(name in cells for name in _LAYOUTS[one][0])
-    )
-    layout = "stamps" if "event" in columns else next(fitting, "nothing")
+    known = (one for one, (needed, *_) in _LAYOUTS.items() if one != "stamps" and {*needed} <= cells.keys())
+    layout = "stamps" if "event" in columns else next(known)
     needed, foreign, why = _LAYOUTS[layout]
     if layout == "messages" and "message" in words and columns["message"] != "message":
         del columns["message"], cells["message"]  # without a column of that name messages are told by their order
@@ -305,13 +301,18 @@ def _proposal(
     wide: Entries = {ours: (stated, "") for ours, stated in form.wide.items()}
     sections = {"columns": named, "wide": wide, "units": units, "constants": constants}
     sections |= {"antenna_delays": none if undelayed else {}}
-    # Names of files can have line breaks, which would end the comment.
-    lines = [f"# {json.dumps(path.name)}, as it would be read; every line can be changed", *_lines(top)]
-    for title, entries in sections.items():
-        lines += ["", f"[{title}]", *_lines(entries)] if entries else []
-    lines += ["", *(f"# {text}" for text, is_due in remarks.items() if is_due)]
     asked = [key for part in (constants, top, named, units) for key, (value, _) in part.items() if value == ASKED]
-    return Guess("\n".join(lines) + "\n", layout != "nothing" and not lacking, tuple(asked), tuple(columns))
+    text = _text(path, {"": top, **sections}, [text for text, is_due in remarks.items() if is_due])
+    return Guess(text, layout != "nothing" and not lacking, tuple(asked), tuple(columns))
+
+
+def _text(path: Path, sections: Mapping[str, Entries], remarks: Iterable[str]) -> str:
+    """Return a map as TOML, a section without a title first, and remarks below it."""
+    # Names of files can have line breaks, which would end the comment.
+    lines = [f"# {json.dumps(path.name)}, as it would be read; every line can be changed"]
+    for title, entries in sections.items():
+        lines += [*(["", f"[{title}]"] if title else []), *_lines(entries)] if entries else []
+    return "\n".join([*lines, "", *(f"# {text}" for text in remarks), ""])
 
 
 def _alike(header: str, names: Sequence[str]) -> list[str]:

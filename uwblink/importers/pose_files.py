@@ -91,13 +91,11 @@ def read_text_poses(
             if layout.gaps and (not any(map(math.isfinite, found[1:])) or not any(found[1:])):
                 continue
             named = name or (body or cells[layout.body or 0].strip())
-            wrong = {k: "a number" for k, value in enumerate(found) if not math.isfinite(value)}
-            wrong |= {} if abs(found[0]) * layout.ns <= LATEST_NS else {0: "a time"}
-            if wrong or not named:
-                k, expected = min(wrong.items(), default=(-1, "a name"))
-                place, cell = (
-                    (layout.body or 0, cells[layout.body or 0]) if k < 0 else ((layout.time, *places)[k], texts[k])
-                )
+            columns = zip((layout.time, *places), texts, found, strict=True)
+            wrong = [(k, text, "a number") for k, text, value in columns if not math.isfinite(value)]
+            wrong += [] if abs(found[0]) * layout.ns <= LATEST_NS else [(layout.time, texts[0], "a time")]
+            wrong += [] if named else [(layout.body or 0, cells[layout.body or 0], "a name")]
+            for place, cell, expected in wrong:
                 raise ImportTableError(
                     f"{path}: row {row}: column {layout.names[place]!r}: found {cell!r}, expected {expected}"
                 )

@@ -238,14 +238,9 @@ class SourceTable:
         ending = path.name.lower().removesuffix(".gz")
         self._is_parquet = ending.endswith(".parquet")
         self._is_csv = not ending.endswith((".parquet", ".jsonl", ".ndjson", ".json")) and not column_map.line
-        if column_map.line and column_map.line != JSON_LINE:
-            self._open_log(Template(column_map.line))
-        elif self._is_csv:
-            self._open_csv()
-        elif self._is_parquet:
-            self._open_parquet()
-        else:
-            self._open_json()
+        open_log = self._open_log if column_map.line not in (None, JSON_LINE) else None
+        open_table = self._open_csv if self._is_csv else self._open_parquet if self._is_parquet else self._open_json
+        (open_log or open_table)()
         self._unpivot()
         self._add_names()
         if len(self.names) > MAX_CELLS:
@@ -266,8 +261,9 @@ class SourceTable:
             f"max_line_size={MAX_LINE_BYTES})"
         )
 
-    def _open_log(self, line: Template) -> None:
+    def _open_log(self) -> None:
         """Use the lines that a template matches, and each match of the other (`each`) in them as a row."""
+        line = Template(self.column_map.line or "")
         self._decimal_comma = self.column_map.decimal == ","
         each = Template(self.column_map.each) if self.column_map.each else None
         self.db.execute(f"SET VARIABLE line{self._key} = ?", [line.pattern])
