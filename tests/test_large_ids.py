@@ -1,6 +1,7 @@
 """Ids of 16 bits, as other boards have them, from a scenario to corrected ranges; only this project's boards have 8."""
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ def test_flights_fits_and_corrections_take_them(folder):
 
 
 def test_places_of_boards_take_them_and_plans_of_our_boards_do_not(folder):
-    stamps = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(40, dtype=np.int64))
+    stamps: Any = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(40, dtype=np.int64))
     exchanges = uwblink.Exchanges.from_arrays(300, LARGEST, time_ns=np.arange(40) * 10**8, range_m=5.1, **stamps)
     uwblink.Contents(exchanges=exchanges).save(folder / "bare.uwb")
     places = {300: [0.0, 0.0, 0.0], LARGEST: [3.0, 4.0, 0.0]}

@@ -86,7 +86,7 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
                 ranges = Ranges.from_exchanges(exchanges, poses=poses, tags=tags, source=Path(source).name)
                 good = determined(calibration, ranges)
                 if not good.all():
-                    left_out, why = left_out + np.count_nonzero(~good), within_text(calibration, ranges, good)
+                    left_out, why = left_out + int(np.count_nonzero(~good)), within_text(calibration, ranges, good)
                 if good.any():
                     counts += _append(written, exchanges[good], calibration.apply(ranges[good]))
             if left_out and not counts[0]:

@@ -11,7 +11,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import chain, product
 from pathlib import Path
@@ -30,7 +30,7 @@ from uwblink.output import check_output
 from uwblink.plugins import Registry, check_row, is_text
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Tag
-from uwblink.twr import LARGEST_ID
+from uwblink.twr import LARGEST_ID, STAMPS
 from uwblink.wire.messages import RangeReport
 
 MAX_PRINTED_BYTES: Final = 4096
@@ -208,14 +208,22 @@ def printed_ranges(
                 found = list(dialect.parse(came)) if came else []
                 lines.note(came, found)
                 seen.lines += len(came)
-                for one in found:
-                    pair = seen.number(board if one.from_id is None else one.from_id), seen.number(one.to_id)
-                    report = RangeReport(pair[1], one.range_m, *[0] * 6, math.nan, one.power_dbm, math.nan, math.nan)
+                for printed in found:
+                    whose = board if printed.from_id is None else printed.from_id
+                    pair = seen.number(whose), seen.number(printed.to_id)
+                    report = replace(_REPORT, neighbour=pair[1], range_m=printed.range_m, fpp2_dbm=printed.power_dbm)
                     turns += [Turn(using.host_ns(), pair, report)] if pair[0] != pair[1] else []
             seen.time_s = using.now_s() - start_s
             for turn in turns:
                 seen.on_turn(turn)
             yield turns
+
+
+_REPORT: Final = RangeReport(
+    neighbour=0, range_m=math.nan, fpp1_dbm=math.nan, fpp2_dbm=math.nan, skew1_ppm=math.nan, skew2_ppm=math.nan,
+    **dict.fromkeys(STAMPS, 0),
+)  # fmt: skip
+"""A report of what boards that print ranges do not say."""
 
 
 class _Lines:
@@ -271,7 +279,8 @@ def record_printed(
                         listener.on_start(sorted({turn.pair for turn in turns} - begun))
                     begun |= {turn.pair for turn in turns}
                     for listener, turn in product([writer, *others], turns):
-                        listener.on_message(Heard(turn.time_ns, turn.pair[0], turn.report))
+                        if turn.report is not None:
+                            listener.on_message(Heard(turn.time_ns, turn.pair[0], turn.report))
                         listener.on_turn(turn)
                     writer.check()
                     if seen.time_s - watched_s > 0.25:

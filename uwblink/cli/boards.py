@@ -342,7 +342,7 @@ def record(
         how |= {"watch": watch_all, "listeners": pages}
         if dialect is not None:
             spoken = uwblink.boards.dialect_of(dialect)
-            progress = uwblink.boards.record_printed(ports, output, spoken, ids=_ids(ids, "ids"), **how)
+            progress: Progress = uwblink.boards.record_printed(ports, output, spoken, ids=_ids(ids, "ids"), **how)
         else:
             arranged: dict[str, Any] = {"arrangement": arrangement, "known": known, "order": _ids(order, "order")}
             progress = uwblink.record(ports, output, chosen, passive=passive, **arranged, **how)
@@ -406,7 +406,7 @@ def stream(
         correct = _correction(calibration, chosen, None if of_boards else source[0])
         how: dict[str, Any] = {"duration_s": duration or math.inf, "stop": stop}
         how |= {"ids": _ids(ids, "ids")} if spoken else {}
-        told = {"listeners": [seen, uwblink.streaming.RangeListener(send_on, correct)], "force": force}
+        told: dict[str, Any] = {"listeners": [seen, uwblink.streaming.RangeListener(send_on, correct)], "force": force}
         try:
             if output and spoken:
                 uwblink.boards.record_printed(source, output, spoken, **how, **told)

@@ -364,9 +364,7 @@ def _check_columns(file: TomlReader, columns: dict[str, Any], wide: dict[str, An
         whole = {"n"} < value.keys() and (value.keys() >= {"f1", "f2", "f3"}) != ("c" in value)
         whole &= name in POWERS and all(isinstance(one, str) for one in value.values())
         file.check(f"columns.{name}", value, whole, "columns of f1, f2, f3 and n, or of c and n, for a power")
-        file.check(
-            "chip", chip, bool(chip) and bool(CHIPS[chip].offset_db), 'a chip whose registers are known: "dw1000"'
-        )
+        file.check("chip", chip, bool(CHIPS[chip or "other"].offset_db), 'a chip whose registers are known: "dw1000"')
     numbered = {type(value) is int for value in columns.values() if not isinstance(value, dict)}
     for name, value in columns.items():
         one = (isinstance(value, str) and value != ASKED) or name in registers or (type(value) is int and value > 0)

@@ -138,8 +138,8 @@ def import_tables(
                         recording.append(table, beside | {kept: optional(block, n) for n, kept in columns.items()})
             for poses in _poses(rows, bodies):
                 recording.append_poses(poses)
-            for table, columns in staging.beside.items():
-                recording.append(table, columns)
+            for table, found in staging.beside.items():
+                recording.append(table, found)
             first = ""
             for some in faults:
                 first = first or some[0].detail

@@ -5,6 +5,7 @@ import math
 import threading
 import time
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import pytest
@@ -237,7 +238,7 @@ def test_the_page_shows_printed_ranges_and_their_corrections(tmp_path):
     correct = load_correction(calibrated(tmp_path, 6018))
     one, other = BOTH.splitlines(keepends=True)
     with printing(one) as port, LivePage(tmp_path / "r.uwb", correct=correct) as page:
-        how = {"ids": [40], "duration_s": 1.5, "watch": page.watch, "listeners": [page]}
+        how: dict[str, Any] = {"ids": [40], "duration_s": 1.5, "watch": page.watch, "listeners": [page]}
         done = uwblink.boards.record_printed([port], tmp_path / "r.uwb", dialect_of("arduino"), **how)
         body = page.body()
     assert f"{done.exchanges} ranges of 2 devices" in str(done)

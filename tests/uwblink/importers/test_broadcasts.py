@@ -23,11 +23,8 @@ def printed(receptions, remembered=6):
 
     `ts` of a listed frame is when the sender of the list received it.
     """
-    lines, memory, numbers = (
-        ["/dev/port1\tTrying to connect..."],
-        {k: [] for k in range(4)},
-        dict.fromkeys(range(4), 90),
-    )
+    memory: dict[int, list[dict[str, object]]] = {k: [] for k in range(4)}
+    lines, numbers = ["/dev/port1\tTrying to connect..."], dict.fromkeys(range(4), 90)
     for frame in np.unique(receptions.frame):
         rows = np.flatnonzero(receptions.frame == frame)
         sender, tx = int(receptions.sender[rows[0]]) - 10, int(receptions.tx[rows[0]])

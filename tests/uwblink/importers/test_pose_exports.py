@@ -57,8 +57,8 @@ def motive(folder, version="1.23", unit="Millimeters", labelled=True, rotation="
 
     def numbers(name, k):
         place, turned = BODIES[name][0][k] * scale, BODIES[name][1][k]
-        turned = angles(turned, rotation) if turns == "XYZ" else turned.as_quat()
-        return [*turned, *place, 0.001, *place]  # a marker of the body follows
+        written = angles(turned, rotation) if turns == "XYZ" else turned.as_quat()
+        return [*written, *place, 0.001, *place]  # a marker of the body follows
 
     kinds = ["Rotation"] * len(turns) + ["Position"] * 3 + ["Mean Marker Error"] + ["Position"] * 3
     axes = [*turns, *"XYZ", "", *"XYZ"]
