@@ -1,4 +1,4 @@
-"""Recognise forms of files for `uwblink import guess`: logs, tables without a header, wide ones, names of files.
+"""Recognise forms and units for `uwblink import guess`: logs, tables without a header, wide ones, names of files.
 
 Names of columns are those that labs write, English and German; `PATTERNS` says which of `NAMES` they are.
 """
@@ -13,8 +13,24 @@ from itertools import islice, product
 from pathlib import Path
 from typing import Any, Final
 
-from uwblink.importers.column_map import ASKED, JSON_LINE, POSITIONS, ColumnMap, map_of_lines
+import numpy as np
+
+from uwblink.arrays import Floats
+from uwblink.importers.column_map import (
+    ASKED,
+    DISTANCE_UNITS,
+    DISTANCES,
+    FLIGHT_UNITS,
+    JSON_LINE,
+    POSITIONS,
+    POWERS,
+    RANGE_UNITS,
+    TIME_UNITS,
+    ColumnMap,
+    map_of_lines,
+)
 from uwblink.importers.devices import LINES
+from uwblink.importers.plausibility import MIN_ROWS, reason_against_dbm, reason_against_metres
 from uwblink.importers.tables import detect, lacks_header, object_in, open_file, reading
 from uwblink.importers.templates import Template
 
@@ -258,3 +274,64 @@ def name_template(name: str, lacking: Collection[str]) -> str | None:
             text = f"{text[:start]}{{{place.format(match.groupdict().get('unit'))}}}{text[end:]}"
             found.add(ours)
     return text if found else None
+
+
+def units_of(form: ColumnMap, columns: dict[str, str], cells: dict[str, Floats]) -> Entries:
+    """Return the units of times, distances and powers, each with its reason, as far as they are not the default."""
+    found: Entries = {}
+    if "time_s" in columns:
+        found["time"] = _time_unit(columns["time_s"], cells["time_s"])
+        if found["time"][0] == ASKED and form.time_unit:
+            found["time"] = form.time_unit, "as times in bags"
+    named = {name: _header(form, name, columns[name]) for name in DISTANCES if name in columns}
+    units = {
+        name: unit
+        for name, header in named.items()
+        if (unit := unit_in(header, RANGE_UNITS if name == "range_m" else DISTANCE_UNITS))
+    }
+    alike = set(units.values())
+    if form.line and form.distance_unit:
+        found["distance"] = form.distance_unit, "as these boards print"
+    elif len(alike) == 1 and not alike & FLIGHT_UNITS.keys() and ("range_m" in units or "range_m" not in cells):
+        found["distance"] = next(iter(units.values())), "by the columns' names"
+        units = {}
+    elif "range_m" in cells and "range_m" not in units and (why := reason_against_metres(cells["range_m"])):
+        found["distance"] = ASKED, f"{why}: write {', '.join(DISTANCE_UNITS)}"
+    found |= {name: (unit, "by the column's name") for name, unit in units.items()}
+    if "range_m" in named and "range_m" not in units and re.search("tof|flight", named["range_m"].lower()):
+        found["range_m"] = ASKED, f"a time of flight: write {', '.join(FLIGHT_UNITS)}"
+    if why := next(filter(None, (reason_against_dbm(cells[name]) for name in POWERS if name in cells)), ""):
+        found["power"] = ASKED, f"{why}: write -dBm if they lack their sign"
+    return found
+
+
+def _header(form: ColumnMap, name: str, header: str) -> str:
+    """Return the name of a column in the file; that of a family is its template."""
+    stated = form.wide.get(name)
+    return re.sub(r"[_ ]*\{\w+\}", "", stated) if isinstance(stated, str) else header
+
+
+def _time_unit(header: str, values: Floats) -> tuple[str, str]:
+    if not np.isfinite(values).any():
+        return "iso", "no numbers"
+    if ended := unit_in(header, ("ns", "us", "ms", "s")):
+        return ended, "by the column's name"
+    largest = float(np.nanmax(np.abs(values)))
+    for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)):
+        if largest > least:
+            return unit, f"{largest:.3g} would be no date in seconds"
+    if len(values) < MIN_ROWS or not np.array_equal(values, np.rint(values), equal_nan=True):
+        return "s", f"numbers up to {largest:.6g}"
+    return ASKED, f"whole numbers up to {largest:.6g}, unit unknown: write {', '.join(TIME_UNITS)}"
+
+
+def units_in(columns: dict[str, str], names: Iterable[str], units: Iterable[str]) -> set[str]:
+    """Return the units at the ends of the headers of some columns."""
+    return {unit for name in names if name in columns and (unit := unit_in(columns[name], units))}
+
+
+def unit_in(header: str, units: Iterable[str]) -> str | None:
+    """Return the unit at the end of a name such as `range_mm` or `time [ns]`, None without one."""
+    last = re.split(r"[^a-z0-9]+", header.lower().strip(")] "))[-1]
+    last = {"tick": "ticks", "dtu": "ticks", "sec": "s"}.get(last, last)
+    return last if last in units and last != header.lower() else None

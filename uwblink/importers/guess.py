@@ -1,38 +1,40 @@
-"""Propose a map for a table or a log, with the reason for each line.
+"""Propose a map for a table, a log or a bag, with the reason for each line.
 
 The form of the file is recognised first (`forms`), then its columns by their names, or else by their contents. Units
 are determined from suffixes of the names, from the size of the numbers, and by which unit of the stamps makes plausible
 ranges; the protocol is found by trying all.
+
+Topics of a bag of one message type that differ by one or two numbers or words, such as `/uwb/1/range_2` and
+`/uwb/1/range_3`, are a template; what differs is the id of an initiator or a target. Which it is, the words before it
+tell, and which of both the messages have themselves. Their first messages are a table.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
 
 from uwblink.arrays import Floats
-from uwblink.errors import ImportTableError
-from uwblink.importers.bags import is_bag
+from uwblink.display import first_few
+from uwblink.errors import ImportTableError, raising
+from uwblink.importers.bags import Bag, fields_of, is_bag, matching_topics, open_bag
 from uwblink.importers.column_map import (
     ASKED,
     DISTANCE_UNITS,
-    DISTANCES,
-    FLIGHT_UNITS,
     IDS,
     JSON_LINE,
     NAMES,
     POSITIONS,
     POWERS,
-    RANGE_UNITS,
     STAMP_UNITS,
-    TIME_UNITS,
     ColumnMap,
 )
 from uwblink.importers.exchange_tables import tables_in
@@ -45,23 +47,23 @@ from uwblink.importers.forms import (
     named_columns,
     plain_name,
     register_columns,
+    unit_in,
+    units_in,
+    units_of,
     wide_columns,
 )
-from uwblink.importers.guess_bags import guess_bag
 from uwblink.importers.plausibility import (
     ACCEPTED_SHARE,
     FITTING_SHARE,
-    MIN_ROWS,
     SAMPLE_ROWS,
     Reading,
     counter_format,
-    reason_against_dbm,
-    reason_against_metres,
     sentinels,
     stamps_of,
     truth_m,
     try_reading,
 )
+from uwblink.importers.poses import pose_topics
 from uwblink.importers.tables import Columns, SourceTable, message_number, open_table
 from uwblink.importers.templates import Template, places
 from uwblink.protocols.table import PROTOCOLS
@@ -165,7 +167,7 @@ def guess_map(path: Path) -> Guess:
     if path.suffix.lower() == ".uwb":
         raise ImportTableError(f"{path}: is a recording already and needs no map; 'uwblink show' prints its contents")
     file = tables_in(path, ColumnMap(line="{*}"))[0] if path.is_dir() and not is_bag(path) else path
-    return guess_bag(path, _of_table) if is_bag(path) else _of_table(path, file)
+    return _of_bag(path) if is_bag(path) else _of_table(path, file)
 
 
 def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Mapping[str, str] = {}) -> Guess:
@@ -251,7 +253,7 @@ def _proposal(
     if layout == "messages" and "message" in words and columns["message"] != "message":
         del columns["message"], cells["message"]  # without a column of that name messages are told by their order
     top |= {} if layout == "nothing" else {"layout": (layout, why)}
-    units, undelayed = _units(form, columns, cells), False
+    units, undelayed = units_of(form, columns, cells), False
     if layout not in ("ranges", "nothing"):
         counter, unit, undelayed = (_exchange_stamps if layout == "exchanges" else _message_stamps)(columns, cells)
         top, units = top | counter, {"stamps": unit, **units}
@@ -342,7 +344,7 @@ _ANY_UNIT: Final = f"unit unknown: write {', '.join(STAMP_UNITS)}"
 def _message_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> StampEntries:
     """Return how to read the stamps of a table of messages or of single stamps."""
     stamps: dict[str, Floats] = {name: cells[name] for name in ("tx", "rx", "stamp") if name in cells}
-    named = next(iter(_ended(columns, stamps, STAMP_UNITS)), None)
+    named = next(iter(units_in(columns, stamps, STAMP_UNITS)), None)
     bits, kind = counter_format(column * STAMP_UNITS[named or "ticks"] for column in stamps.values())
     largest = max(float(np.nanmax(column, initial=0.0)) for column in stamps.values())
     # Of 22 stamps in ticks one at least is in the last tenth of the counter in nine tables of ten.
@@ -355,7 +357,7 @@ def _message_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> StampE
 def _exchange_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> StampEntries:
     """Return how to read the stamps of a table of exchanges: by which protocol and unit their ranges are plausible."""
     stamps: dict[str, Floats] = {name: cells[name] for name in STAMPS if name in cells}
-    whole, named = _are_whole(stamps), _ended(columns, stamps, STAMP_UNITS)
+    whole, named = _are_whole(stamps), units_in(columns, stamps, STAMP_UNITS)
     chosen = np.flatnonzero(np.all([np.isfinite(column) for column in stamps.values()], axis=0))[:SAMPLE_ROWS]
     if not len(chosen):
         raise ImportTableError("its stamps are no numbers in any row")
@@ -363,7 +365,7 @@ def _exchange_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> Stamp
     rows |= dict.fromkeys(("origin", *IDS), np.zeros(len(chosen), np.int64))
     if "gt_range_m" in cells:
         rows["gt_range_m"] = (
-            cells["gt_range_m"][chosen] * DISTANCE_UNITS[_suffix(columns["gt_range_m"], DISTANCE_UNITS) or "m"]
+            cells["gt_range_m"][chosen] * DISTANCE_UNITS[unit_in(columns["gt_range_m"], DISTANCE_UNITS) or "m"]
         )
     protocols = [row.name for row in PROTOCOLS.known() if set(stamps_of(row.name)) == set(stamps)]
     protocols = [name for name in protocols if name not in ("ss-cfo", "ds-sym")] or ["ss"]
@@ -392,62 +394,141 @@ def _are_whole(stamps: dict[str, Floats]) -> bool:
     return all(np.array_equal(column, np.rint(column), equal_nan=True) for column in stamps.values())
 
 
-def _units(form: ColumnMap, columns: dict[str, str], cells: dict[str, Floats]) -> Entries:
-    """Return the units of times, distances and powers, each with its reason, as far as they are not the default."""
-    found: Entries = {}
-    if "time_s" in columns:
-        found["time"] = _time_unit(columns["time_s"], cells["time_s"])
-        if found["time"][0] == ASKED and form.time_unit:
-            found["time"] = form.time_unit, "as times in bags"
-    named = {name: _header(form, name, columns[name]) for name in DISTANCES if name in columns}
-    units = {
-        name: unit
-        for name, header in named.items()
-        if (unit := _suffix(header, RANGE_UNITS if name == "range_m" else DISTANCE_UNITS))
-    }
-    alike = set(units.values())
-    if form.line and form.distance_unit:
-        found["distance"] = form.distance_unit, "as these boards print"
-    elif len(alike) == 1 and not alike & FLIGHT_UNITS.keys() and ("range_m" in units or "range_m" not in cells):
-        found["distance"] = next(iter(units.values())), "by the columns' names"
-        units = {}
-    elif "range_m" in cells and "range_m" not in units and (why := reason_against_metres(cells["range_m"])):
-        found["distance"] = ASKED, f"{why}: write {', '.join(DISTANCE_UNITS)}"
-    found |= {name: (unit, "by the column's name") for name, unit in units.items()}
-    if "range_m" in named and "range_m" not in units and re.search("tof|flight", named["range_m"].lower()):
-        found["range_m"] = ASKED, f"a time of flight: write {', '.join(FLIGHT_UNITS)}"
-    if why := next(filter(None, (reason_against_dbm(cells[name]) for name in POWERS if name in cells)), ""):
-        found["power"] = ASKED, f"{why}: write -dBm if they lack their sign"
-    return found
+NO_POSES: Final = (
+    "no poses and no true distances: ranges alone give delays of boards that stood still (`calib survey`); a flight "
+    "also needs attitudes, and anchors or first positions (calib.fit_from_ranges); constants of pairs need true "
+    "distances (docs/without-motion-capture.md)"
+)
+MESSAGES_READ: Final = 2000
+"""Messages of each group of topics that are looked at (a judgement)."""
+
+_NUMBERS: Final = r"std_msgs/msg/(Float|U?Int)[0-9]+(MultiArray)?"
+_OTHERS: Final = (
+    r"^((geometry|nav|tf2|rosgraph|diagnostic|visualization|actionlib)_msgs|rcl_interfaces)/|"
+    r"^sensor_msgs/msg/(?!Range )|"
+    rf"^{_NUMBERS} (?!.*(uwb|rang(e|ing)|dist|dwm?[0-9]|twr))|"
+    r" .*(height|altitude|lidar|laser|sonar|sonic|infrared|rangefinder|distance_sensor)"
+)
+"""Types and topics, with a blank between, that are of other things, and of numbers that are not called ranges."""
+
+_WORD: Final = "([^/_]+)"
+_WORDS: Final = {
+    "from_id": r"tag|drone|uav|robot|rover|mobile|initiator|agent|from|src|source",
+    "to_id": r"anchor|anker|target|responder|beacon|dst",
+}
 
 
-def _header(form: ColumnMap, name: str, header: str) -> str:
-    """Return the name of a column in the file; that of a family is its template."""
-    stated = form.wide.get(name)
-    return re.sub(r"[_ ]*\{\w+\}", "", stated) if isinstance(stated, str) else header
+def _of_bag(path: Path) -> Guess:
+    """Return the map of the topics of which most is recognised: stamps and powers, then ids.
+
+    Raises `ImportTableError` for a bag without ranges.
+    """
+    found: list[tuple[Guess, list[str]]] = []
+    why = "write a map with [topics]"
+    with open_bag(path) as bag, TemporaryDirectory(prefix="uwblink-") as folder:
+        kinds = dict(sorted(bag.kinds.items()))
+        fitting = [t for t, k in kinds.items() if not re.search(_OTHERS, f"{k} {t.lower()}")]
+        for kind in dict.fromkeys(kinds[topic] for topic in fitting):
+            for pattern, some in _grouped([topic for topic in fitting if kinds[topic] == kind]):
+                try:
+                    guess = _guess_topics(bag, pattern, some, Path(folder) / "messages.jsonl")
+                    found += [(guess, some)] if guess.complete else []
+                except ImportTableError as error:
+                    # Most topics are of something else; only a type without definition may hide ranges.
+                    why = str(error) if "has no definition" in str(error) else why
+    listed = [f"{json.dumps(topic)} ({kind})" for topic, kind in kinds.items()]
+    if not found:
+        raise ImportTableError(f"{path}: no topic with ranges was recognised in {first_few(listed, 20)}; {why}")
+    best, chosen = max(
+        found, key=lambda one: (len({*STAMPS, *POWERS} & {*one[0].columns}), -len(one[0].asked), len(one[0].columns))
+    )
+    poses = pose_topics(path)
+    advice = "" if poses or {"gt_range_m", *POSITIONS} & {*best.columns} else NO_POSES
+    others = [json.dumps(topic) for _, some in found if some is not chosen for topic in some]
+    remarks = ["topics of the bag:", *(f"  {one}" for one in listed)]
+    remarks += [f"also with ranges, for maps of their own: {', '.join(others)}"] if others else []
+    remarks += [f"poses, for `uwblink poses`: {first_few(map(json.dumps, poses))}"] if poses else []
+    text = best.text + "".join(f"# {line}\n" for line in (*remarks, advice) if line)
+    return replace(best, text=text, importer="bag", pose_topics=tuple(poses), advice=advice)
 
 
-def _time_unit(header: str, values: Floats) -> tuple[str, str]:
-    if not np.isfinite(values).any():
-        return "iso", "no numbers"
-    if ended := _suffix(header, ("ns", "us", "ms", "s")):
-        return ended, "by the column's name"
-    largest = float(np.nanmax(np.abs(values)))
-    for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)):
-        if largest > least:
-            return unit, f"{largest:.3g} would be no date in seconds"
-    if len(values) < MIN_ROWS or not np.array_equal(values, np.rint(values), equal_nan=True):
-        return "s", f"numbers up to {largest:.6g}"
-    return ASKED, f"whole numbers up to {largest:.6g}, unit unknown: write {', '.join(TIME_UNITS)}"
+def _guess_topics(bag: Bag, pattern: str, topics: list[str], table: Path) -> Guess:
+    """Return the map of topics of one type by their first messages, which are written as a table."""
+    kind, read = bag.kinds[topics[0]], islice(bag.messages(topics), MESSAGES_READ)
+    rows = [(topic, fields_of(kind, message)) for topic, _, _, message in read]
+    free = _ends_without_field(rows[0][1] if rows else {})
+    key = _with_places(pattern, topics[0], free)
+    ids = matching_topics(key, topics)
+    # One id may be in the names of all topics.
+    whole = name_template(topics[0], set(free) - ids[topics[0]].keys()) or topics[0]
+    constants = matching_topics(whole, topics[:1]).get(topics[0], {})
+    ids = {topic: {**places, **constants} for topic, places in ids.items()}
+    # A template that also matches topics of other types is no key.
+    stated = {key: constants} if len(matching_topics(key, bag.kinds)) == len(topics) else ids
+    with raising(ImportTableError, f"{bag.path}: cannot be turned into a table", OSError, RecursionError):
+        lines = (json.dumps(_unstamped(row) | ids[topic], allow_nan=False) for topic, row in rows)
+        table.write_text("".join(f"{line}\n" for line in lines), "utf-8")
+    guess = _of_table(bag.path, table, ids[topics[0]], {"data": "range"} if re.fullmatch(_NUMBERS, kind) else {})
+    sections = [
+        "\n".join([f"[topics.{json.dumps(topic)}]", *(f"{name} = {json.dumps(v)}" for name, v in values.items()), ""])
+        for topic, values in stated.items()
+    ]
+    return replace(guess, text=f"{guess.text}\n# {len(topics)} topics of {kind}\n{''.join(sections)}\n")
 
 
-def _ended(columns: dict[str, str], names: Iterable[str], units: Iterable[str]) -> set[str]:
-    """Return the units at the ends of the headers of some columns."""
-    return {unit for name in names if name in columns and (unit := _suffix(columns[name], units))}
+def _unstamped(row: dict[str, Any]) -> dict[str, Any]:
+    """Return a message without the stamp of its header, which is its time without a map."""
+    header = row.get("header")
+    return row | {"header": {**header, "stamp": {}}} if isinstance(header, dict) else row
 
 
-def _suffix(header: str, units: Iterable[str]) -> str | None:
-    """Return the unit at the end of a name such as `range_mm` or `time [ns]`, None without one."""
-    last = re.split(r"[^a-z0-9]+", header.lower().strip(")] "))[-1]
-    last = {"tick": "ticks", "dtu": "ticks", "sec": "s"}.get(last, last)
-    return last if last in units and last != header.lower() else None
+def _grouped(topics: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
+    """Yield topics that differ by one or two numbers, or else words, and a format of their names; then the others."""
+    braces, left = ([topic for topic in topics if ("{" in topic) == has] for has in (True, False))
+    for value in (r"([0-9]+)", _WORD):
+        alike: dict[tuple[str, ...], list[str]] = {}
+        for topic in left:
+            alike.setdefault(tuple(re.split(value, topic)[::2]), []).append(topic)
+        for literals, some in alike.items():
+            columns = [set(column) for column in zip(*(re.findall(value, topic) for topic in some), strict=True)]
+            varying = [k for k, column in enumerate(columns) if len(column) > 1]
+            both, words = [columns[k] for k in varying], {re.split("[^A-Za-z]", literals[k])[-1] for k in varying}
+            # Number 1 of a tag is not number 1 of an anchor; among pairs of words some have a word in common.
+            mixed = len(words) > 1 and both[0] & both[-1]
+            apart = len(both) == 2 and value == _WORD and all(len(column) == len(some) for column in both)
+            if not 1 <= len(varying) <= 2 or mixed or apart:
+                continue
+            parts = re.split(value, some[0])
+            for n, k in enumerate(varying):
+                parts[2 * k + 1] = f"{{{n}}}"
+            left = [topic for topic in left if topic not in some]
+            yield "".join(parts), some
+    yield from ((topic, [topic]) for topic in (*left, *braces))
+
+
+def _ends_without_field(row: Mapping[str, Any]) -> list[str]:
+    """Return which of the two ids a message does not have itself; lists and arrays have a target in each element."""
+    lists = [value for value in row.values() if isinstance(value, list)]
+    elements = [one for value in lists for one in value[:1] if isinstance(one, dict)]
+    named = {*named_columns(row), *(name for one in elements for name in named_columns(one))}
+    arrays = [f"{name}.{k}" for name, value in row.items() if isinstance(value, dict) for k in value]
+    if wide_columns(arrays, {}) or any({"id", "A", "a", "addr"} & one.keys() for one in elements):
+        named.add("to_id")
+    return [end for end in IDS if end not in named]
+
+
+def _with_places(pattern: str, topic: str, free: Sequence[str]) -> str:
+    """Return the template of topics, whose places are ids in `free`; `topic` is one of them."""
+    parts = re.split(r"\{[01]\}", pattern)
+    values = re.fullmatch("([^/]+?)".join(map(re.escape, parts)), topic)
+    if len(parts) == 1 or values is None:
+        return topic
+    contexts = [part.rstrip("/").split("/")[-1] + value for part, value in zip(parts, values.groups(), strict=False)]
+    ends = [next((end for end in IDS if re.search(_WORDS[end], text.lower())), "") for text in contexts]
+    if len(ends) == 2:
+        ends = list(IDS)[::-1] if ends[0] == "to_id" or ends[1] == "from_id" else list(IDS)
+    elif ends[0] not in free:
+        ends = list(free[-1:])
+    if len(free) == 1:  # number 1 of a tag is not number 1 of the anchors in the messages
+        pattern = re.sub(r"[A-Za-z]+\{", "{", pattern)
+    return pattern.format(*(f"{{{end if end in free else '_'}}}" for end in [*ends, "_"]))
