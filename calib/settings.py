@@ -23,6 +23,7 @@ CHOICES: Final = {
     "lift": ("mean-of-lifted", "lift-of-mean"),
     "constants": ("tag", "pair"),
     "fold": ("time", "pair", "session"),
+    "use": ("exchanges", "receptions"),
     "attitudes": ("poses", "imu", "none"),
     "anchors": ("given", "sought"),
     "heights": ("used", "ignored"),
@@ -174,9 +175,10 @@ class FitSettings(CheckedSettings):
     `fixed_ns` are known delays by tag; `groups` are tags that share curves, by name (all do by default); `sequential`
     fits delays first and then the curve to what they leave (ICRA 2023, sections III and IV). The curve is zero at
     `reference_power_dbm`, `alpha_dbm` by default; `delays_only` fits no curve; `delays_from` is a calibration, or its
-    path, whose delays are taken over; `constants` "pair" gives each pair a constant instead of each tag a delay. With
-    `hold_out` a second fit, to the other ranges, is judged on such a share of them, by `fold`; what was found is in the
-    provenance of the calibration, which is fitted to all.
+    path, whose delays are taken over; `constants` "pair" gives each pair a constant instead of each tag a delay. `use`
+    "receptions" also fits what third tags overheard of the exchanges, which determines the delay of each target alone.
+    With `hold_out` a second fit, to the other ranges, is judged on such a share of them, by `fold`; what was found is
+    in the provenance of the calibration, which is fitted to all.
 
     >>> import calib
     >>> settings = calib.FitSettings(loss="huber", fixed_ns={1: -0.3})
@@ -257,7 +259,12 @@ class FitSettings(CheckedSettings):
         names=CHOICES["constants"],
         rich_help_panel=MODEL_PANEL,
     )
-
+    use: str = setting(
+        "exchanges",
+        "What is fitted: exchanges, by their two ends; or receptions, with what other tags overheard of them.",
+        names=CHOICES["use"],
+        rich_help_panel=MODEL_PANEL,
+    )
     hold_out: float = setting(
         0.0,
         "Share of the data to hold out, such as 0.3; a second fit, to the rest, is judged on it.",
@@ -277,6 +284,11 @@ class FitSettings(CheckedSettings):
         if self.sequential and self.loss == "mixture":
             raise BadInputError(
                 "goes with a loss, not with the mixture; leave one of the two away", parameter="sequential"
+            )
+        if self.use == "receptions" and (self.sequential or self.constants == "pair"):
+            other = "sequential" if self.sequential else "constants"
+            raise BadInputError(
+                f"receptions go with delays of tags that are fitted at once, not with `{other}`", parameter="use"
             )
         seen: dict[int, str] = {}
         for name, tags in (self.groups or {}).items():

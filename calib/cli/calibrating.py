@@ -118,7 +118,9 @@ def _print_fit(result: calib.FitResult, output: Path, *, as_json: bool) -> None:
     if as_json:
         typer.echo(found.to_json(), nl=False)
     else:
-        typer.echo(f"{output}: {len(result.ranges)} exchanges, {result.message}, scale {found.scale_ns:.3f} ns")
+        heard = found.provenance.get("arrivals")
+        also = f", {heard} differences of arrival" if heard else ""
+        typer.echo(f"{output}: {len(result.ranges)} exchanges{also}, {result.message}, scale {found.scale_ns:.3f} ns")
         lines = [*delay_lines(found), *(f"  left out: {number} exchanges, {reason}" for reason, number in left_out)]
         typer.echo("\n".join(filter(str.strip, [*lines, f"  {held_out_line(found)}"])))
         for warning in result.warnings:

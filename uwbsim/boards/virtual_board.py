@@ -37,7 +37,7 @@ from uwbsim.boards.ranging import received_by
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import Source, as_scenario
-from uwbsim.scenario.model import Scenario
+from uwbsim.scenario.model import NO_BROADCASTS, Scenario
 from uwbsim.world.clocks import NS_PER_S
 
 PACKET_BYTES: Final = 64
@@ -117,7 +117,12 @@ class Bench:
     """The boards of a scenario on one medium; `send` is called with their output."""
 
     def __init__(self, scenario: Scenario, send: Sender, lost_share: float = 0.0) -> None:
-        """Power all boards at time zero; `lost_share` of all receptions fail in addition to weak ones."""
+        """Power all boards at time zero; `lost_share` of all receptions fail in addition to weak ones.
+
+        Raises `ScenarioError` for a scenario of broadcasts, and for ids that the firmware does not have.
+        """
+        if scenario.ranging.plan == "broadcast":
+            raise ScenarioError(NO_BROADCASTS)
         if too_large := [tag.id for tag in scenario.tags if not is_id(tag.id, LARGEST_BOARD_ID)]:
             raise ScenarioError(
                 f"tags: found id {too_large[0]}; boards have ids 0 to {LARGEST_BOARD_ID} by their firmware, and only "

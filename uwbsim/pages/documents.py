@@ -20,6 +20,7 @@ from uwbsim.errors import ScenarioError
 from uwbsim.pages import figures
 from uwbsim.protocols.comparison import BestDelay, ProtocolComparison, ProtocolErrors, over_reply, over_skew, over_state
 from uwbsim.protocols.conditions import conditions_of
+from uwbsim.protocols.fleet import FleetFigures
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import preview
@@ -105,6 +106,16 @@ COMPARISON_COLUMNS: Final[dict[str, Callable[[ProtocolErrors], str]]] = {
 }
 """Columns of tables of protocols, on the page and on the terminal."""
 
+FLEET_COLUMNS: Final[dict[str, Callable[[FleetFigures], str]]] = {
+    "of a fleet": lambda o: o.method,
+    "std (cm)": lambda o: f"{100 * o.std_m:.2f}",
+    "RMSE (cm)": lambda o: f"{100 * o.rmse_m:.2f}",
+    "air (µs)": lambda o: f"{1e6 * o.air_s:.0f}",
+    "radio on (µs)": lambda o: f"{1e6 * o.radio_on_s:.0f}",
+    "updates (1/s)": lambda o: f"{o.update_hz:.3g}",
+}
+"""Columns of tables of ways of ranging in a fleet; air and radio are per range, or difference of arrival."""
+
 FILES: Final = ("compare.html", "compare.csv", "compare.parquet")
 """Names of the files of `write_comparison`."""
 
@@ -186,6 +197,14 @@ def comparison(found: ProtocolComparison) -> Document:
             "second."
         ),
         Table(["scheduled delay (µs)", "one range", "per second", *(f"{name} (cm)" for name in protocols)], winners),
+        Heading(f"A fleet of {found.fleet[0].tags} tags"),
+        Text(
+            "Predicted, after calibration and without reflections. Protocols: the pairs range in turn. broadcast: each "
+            "tag sends a frame in turn, which all others hear. tdoa: the tags are anchors that do so; any number of "
+            "listeners have the differences of arrival. Air and radio on: per range, or per difference at a listener. "
+            "Updates: how often a second, at most, all pairs range, or a listener has all differences."
+        ),
+        Table([*FLEET_COLUMNS], [[show(one) for show in FLEET_COLUMNS.values()] for one in found.fleet]),
         Heading("Errors over skew, delay, distance and power"),
         Text(
             "Points are simulated, lines predicted; the first two figures are without antenna delays, power bias and "
