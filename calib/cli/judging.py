@@ -50,12 +50,13 @@ def evaluate(
     force: Force = False,
 ) -> None:
     """Compare raw, delay-corrected and fully corrected ranges with the true distances, in cm, pair by pair."""
+    from calib.calibration import keep_determined
     from calib.data import load_each
 
     check_report(report, figures, force=force)
     known = known_calibration(calibration, recordings)
     with waiting("evaluating"):
-        parts = load_each(recordings, need_power=known.needs_power)
+        parts = [keep_determined(known, part) for part in load_each(recordings, need_power=known.needs_power)]
         evaluation = calib.evaluate(parts, known)
         if report or figures:
             from calib.report import origin_of

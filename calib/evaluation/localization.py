@@ -17,6 +17,7 @@ import numpy as np
 from scipy.signal import correlate
 from scipy.stats import chi2
 
+from calib.calibration.applying import keep_determined
 from calib.calibration.document import for_json
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
@@ -100,6 +101,7 @@ def localize(
     calibration = given_calibration(calibration)
     chosen = settings or Settings()
     flight = data if isinstance(data, Flight) else load_flight(data, need_power=calibration.needs_power)
+    flight = replace(flight, ranges=keep_determined(calibration, flight.ranges))
     fixed = fixed_std(calibration, chosen, training)
     require_times(flight.ranges)
     bodies = problems(flight)

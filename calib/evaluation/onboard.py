@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
+from calib.calibration.applying import keep_determined
 from calib.calibration.document import for_json
 from calib.calibration.error_model import GATE
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
@@ -166,7 +167,7 @@ def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
         poses, tags = source.poses, list(source.tags)
         imu, heights = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))
     ranges = Ranges.from_exchanges(exchanges, source=name)
-    ranges = ranges.usable(need_power=calibration.needs_power, need_truth=False)
+    ranges = keep_determined(calibration, ranges.usable(need_power=calibration.needs_power, need_truth=False))
     places = {body: poses.position_m[poses.body == body] for body in np.unique(poses.body).tolist()}
     still_m = 0.1  # poses of a body that stands still have some noise
     anchors = {body: np.median(some, axis=0) for body, some in places.items() if np.ptp(some, axis=0).max() <= still_m}

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.interpolate import BSpline
 
-from calib.calibration.applying import CorrectedRanges
+from calib.calibration.applying import CorrectedRanges, keep_determined
 from calib.calibration.comparison import loose_shifts
 from calib.calibration.document import for_json, pair_name
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
@@ -179,7 +179,8 @@ def evaluate(data: Data | Iterable[Data], calibration: CalibrationSource) -> Eva
     """Compare raw, delay-corrected and fully corrected ranges with the truth, for all ranges and for each pair of tags.
 
     `data` is what `load_ranges` takes: paths of recordings, simulations in memory, `Ranges`, one or several. Errors are
-    in metres. Raises what `load_ranges` and `Calibration.apply` raise.
+    in metres. Ranges of pairs that the calibration does not determine are left out, with a `LeftOutWarning`. Raises
+    what `load_ranges` and `Calibration.apply` raise.
 
     >>> import calib
     >>> known = calib.fit(calib.sample_flight()).calibration
@@ -188,7 +189,7 @@ def evaluate(data: Data | Iterable[Data], calibration: CalibrationSource) -> Eva
     '4.0 cm raw, 3.0 cm corrected'
     """
     calibration = given_calibration(calibration)
-    ranges = load_ranges(data, need_power=calibration.needs_power)
+    ranges = keep_determined(calibration, load_ranges(data, need_power=calibration.needs_power))
     applied = calibration.apply(ranges)
     everything = np.ones(len(ranges), dtype=bool)
     inside = _between_quantiles(ranges, applied, calibration)

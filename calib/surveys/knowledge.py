@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from calib.errors import BadInputError
-from uwblink.recording.schema import SHAPES, Arrangement, KnownDistance
+from uwblink.recording.schema import SHAPES, Arrangement, KnownDistance, is_id
 from uwblink.text_files import TomlReader, is_number
 
 TAPE_M, PLACE_M = 0.005, 0.01
@@ -69,7 +69,7 @@ class Knowledge:
 
 
 def _are_tags(value: Any, count: int | None = None) -> bool:
-    good = isinstance(value, list) and all(type(one) is int and 0 <= one <= 254 for one in value)
+    good = isinstance(value, list) and all(map(is_id, value))
     return good and len(set(value)) == len(value) and (len(value) == count if count else len(value) > 1)
 
 
@@ -91,7 +91,7 @@ KEYS: Final[dict[str, dict[str, tuple[Callable[[Any], bool], str]]]] = {
         "arrangement": WORD,
     },
     "positions": {
-        "tag": (lambda value: _are_tags([value], 1), "a whole number 0 to 254"),
+        "tag": (lambda value: _are_tags([value], 1), "a whole number 0 to 65535"),
         "position_m": (
             lambda value: isinstance(value, list) and len(value) == 3 and all(map(is_number, value)),
             "three numbers (metres)",

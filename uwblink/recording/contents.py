@@ -33,8 +33,8 @@ READING_MB: Final = 300
 class Contents:
     """The contents of a recording; all fields but the exchanges are optional.
 
-    `overheard`, `imu`, `height`, `powers`, `temperature`, `receptions` and `corrected` have the columns of the tables
-    of these names, or none; `meta` are the entries of the table `meta`.
+    `overheard`, `imu`, `height`, `powers`, `quality`, `temperature`, `receptions` and `corrected` have the columns of
+    the tables of these names, or none; `meta` are the entries of the table `meta`.
 
     >>> from uwblink import Contents, Exchanges, Tag
     >>> x = Exchanges.from_arrays([1, 2], [2, 3], tx1=[0, 9], rx1=[5, 3], tx2=[1005, 1003], rx2=[3000, 3009])
@@ -50,6 +50,7 @@ class Contents:
     imu: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     height: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     powers: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    quality: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     temperature: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     receptions: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     corrected: Mapping[str, NDArray[Any]] = field(default_factory=dict)
@@ -161,7 +162,7 @@ class Contents:
 _LISTS: Final = ("cirs", "frames", "faults", "arrangements", "known_distances")
 """The tables that are held as lists of rows."""
 
-_COLUMNS: Final = ("overheard", "imu", "height", "powers", "temperature", "receptions", "corrected")
+_COLUMNS: Final = ("overheard", "imu", "height", "powers", "quality", "temperature", "receptions", "corrected")
 """The tables that are held as columns by name."""
 
 
