@@ -19,15 +19,6 @@ from uwblink.text_files import TomlReader
 if TYPE_CHECKING:
     from uwblink import KnownDistance
 
-CHOICES: Final = {
-    "lift": ("mean-of-lifted", "lift-of-mean"),
-    "constants": ("tag", "pair"),
-    "fold": ("time", "pair", "session"),
-    "attitudes": ("poses", "imu", "none"),
-    "anchors": ("given", "sought"),
-    "heights": ("used", "ignored"),
-    "model": ("imu", "constant-velocity"),
-}
 POSITIVE: Final = sys.float_info.min
 ABOVE_ZERO: Final = (POSITIVE, math.inf, "a number above 0")
 NUMBERS: Final = {
@@ -43,7 +34,7 @@ NUMBERS: Final = {
     **dict.fromkeys(("start_std_m", "rate_hz", "speed_m_s"), ABOVE_ZERO),
     "seeds": (1, 1000, "1 to 1000"),
 }
-"""The least and the largest value of a setting, and what is expected."""
+"""The least and the largest value of settings that state no `bounds` themselves, and what is expected."""
 
 FIXED: Any = {
     "help": "Known delay of a tag, which stays as it is, as in 1=-0.36. May be repeated.",
@@ -125,13 +116,17 @@ class CheckedSettings:
     """Settings that results repeat."""
 
     def __post_init__(self) -> None:
-        """Check choices, numbers and known delays; a number may be None if it is by default."""
+        """Check choices, numbers and known delays; a number may be None if it is by default.
+
+        A setting that is no word by default may be another than its names, as a loss that was registered.
+        """
         for one in fields(self):
-            name, value = one.name, getattr(self, one.name)
-            if name in CHOICES:
-                check_choice(name, value, CHOICES[name])
-            if name in NUMBERS and (value is not None or one.default is not None):
-                least, most, expected = NUMBERS[name]
+            name, value, bounds = one.name, getattr(self, one.name), one.metadata.get("bounds")
+            if one.metadata.get("names") and isinstance(one.default, str):
+                check_choice(name, value, one.metadata["names"])
+            stated = NUMBERS.get(name) if bounds is None else (*bounds, "{:g} to {:g}".format(*bounds))
+            if stated and (value is not None or one.default is not None):
+                least, most, expected = stated
                 if not (_is_finite(value) and least <= value <= most):
                     raise BadInputError(f"found {value!r}, expected {expected}", parameter=name)
             if name == "fixed_ns":
@@ -174,9 +169,10 @@ class FitSettings(CheckedSettings):
     `fixed_ns` are known delays by tag; `groups` are tags that share curves, by name (all do by default); `sequential`
     fits delays first and then the curve to what they leave (ICRA 2023, sections III and IV). The curve is zero at
     `reference_power_dbm`, `alpha_dbm` by default; `delays_only` fits no curve; `delays_from` is a calibration, or its
-    path, whose delays are taken over; `constants` "pair" gives each pair a constant instead of each tag a delay. With
-    `hold_out` a second fit, to the other ranges, is judged on such a share of them, by `fold`; what was found is in the
-    provenance of the calibration, which is fitted to all.
+    path, whose delays are taken over; `constants` "pair" gives each pair a constant instead of each tag a delay. `use`
+    "receptions" also fits what third tags overheard of the exchanges, which determines the delay of each target alone.
+    With `hold_out` a second fit, to the other ranges, is judged on such a share of them, by `fold`; what was found is
+    in the provenance of the calibration, which is fitted to all.
 
     >>> import calib
     >>> settings = calib.FitSettings(loss="huber", fixed_ns={1: -0.3})
@@ -211,7 +207,7 @@ class FitSettings(CheckedSettings):
     lift: str = setting(
         "mean-of-lifted",
         "Lifted power of an exchange from the powers of its two ends.",
-        names=CHOICES["lift"],
+        names=("mean-of-lifted", "lift-of-mean"),
         rich_help_panel=MODEL_PANEL,
     )
     alpha_dbm: float = -82.0
@@ -254,10 +250,15 @@ class FitSettings(CheckedSettings):
     constants: str = setting(
         "tag",
         "What has a constant error: each tag (antenna delays), or each pair.",
-        names=CHOICES["constants"],
+        names=("tag", "pair"),
         rich_help_panel=MODEL_PANEL,
     )
-
+    use: str = setting(
+        "exchanges",
+        "What is fitted: exchanges, by their two ends; or receptions, with what other tags overheard of them.",
+        names=("exchanges", "receptions"),
+        rich_help_panel=MODEL_PANEL,
+    )
     hold_out: float = setting(
         0.0,
         "Share of the data to hold out, such as 0.3; a second fit, to the rest, is judged on it.",
@@ -267,7 +268,7 @@ class FitSettings(CheckedSettings):
     fold: str = setting(
         "time",
         "What is held out: tenths of each session's time, pairs, or sessions.",
-        names=CHOICES["fold"],
+        names=("time", "pair", "session"),
         rich_help_panel=MODEL_PANEL,
     )
 
@@ -277,6 +278,11 @@ class FitSettings(CheckedSettings):
         if self.sequential and self.loss == "mixture":
             raise BadInputError(
                 "goes with a loss, not with the mixture; leave one of the two away", parameter="sequential"
+            )
+        if self.use == "receptions" and (self.sequential or self.constants == "pair"):
+            other = "sequential" if self.sequential else "constants"
+            raise BadInputError(
+                f"receptions go with delays of tags that are fitted at once, not with `{other}`", parameter="use"
             )
         seen: dict[int, str] = {}
         for name, tags in (self.groups or {}).items():
@@ -334,7 +340,7 @@ class FlightSettings(CheckedSettings):
     attitudes: str = setting(
         "poses",
         "Source of attitudes: the poses, all along; the IMU; or none.",
-        names=CHOICES["attitudes"],
+        names=("poses", "imu", "none"),
         rich_help_panel=FLIGHT_PANEL,
     )
     heading_std_deg: float = setting(
@@ -347,7 +353,7 @@ class FlightSettings(CheckedSettings):
     anchors: str = setting(
         "given",
         "Positions of bodies that stand still: given by the poses, or sought (estimated).",
-        names=CHOICES["anchors"],
+        names=("given", "sought"),
         rich_help_panel=FLIGHT_PANEL,
     )
     distances: tuple[Any, ...] = setting(
@@ -363,7 +369,7 @@ class FlightSettings(CheckedSettings):
     heights: str = setting(
         "used",
         "Readings of height sensors in the recording: used or ignored.",
-        names=CHOICES["heights"],
+        names=("used", "ignored"),
         rich_help_panel=FLIGHT_PANEL,
     )
     curve_from: Any = setting(  # a Calibration or its path

@@ -13,6 +13,7 @@ from scipy import sparse
 
 from calib.calibration.power_curves import basis
 from calib.checks.places import of_places
+from calib.estimator.arrival_rows import OFFSET_OF_PATH, PATH_SIGNS
 from calib.estimator.known_distances import KnownDistances
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import Mixture
@@ -50,6 +51,8 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
     """
     slopes, louder, alone = found.slopes, change_per_decibel(found), len(found.searches) > 1
     tested = slopes.tests(list(families(found, louder, beside_curve=not alone)))
+    if found.slopes_of_heard is not None:
+        tested += found.slopes_of_heard.tests(list(_of_heard(found)))
     findings = _without_repeats(search(tested, OF_A_FIT))
     plain = found.covariances["delay"]
     for one in tested:
@@ -103,6 +106,19 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
         everyone = np.broadcast_to(np.arange(len(shared)), (count, len(shared)))
         values = np.column_stack(list(shared.values()))
         yield Family(kind="shared", names=list(shared), derivative=Derivative(everyone, values, len(shared)))
+
+
+def _of_heard(found: KnownDistances) -> Iterator[Family]:
+    """Yield offsets of differences of arrival: of targets, which their ranges contradict, and of paths to listeners."""
+    search = found.searches[0]
+    arrivals = search.arrivals
+    if arrivals is not None:
+        tags = found.model.tags
+        target = Derivative(np.searchsorted(tags, arrivals.targets)[:, None], UNIT, len(tags))
+        yield Family(kind="heard", names=[f"tag {tag}" for tag in tags], derivative=target)
+        path = Derivative(arrivals.path, PATH_SIGNS[None], len(arrivals.paths))
+        fitted = search.optimum.layout.indices([OFFSET_OF_PATH])
+        yield Family(kind="path", names=arrivals.paths, derivative=path, fitted=fitted)
 
 
 def of_pairs(found: KnownDistances) -> Family:
@@ -262,6 +278,9 @@ SENTENCES = {
     "{worst}; does it stand at another gain, or have another antenna?",
     "skew": "{whose}: ranges read {size} too {way} as initiator and as much the other way as target, which moves "
     "{worst}: clock skew is not corrected, or with the wrong sign",
+    "heard": "{whose}: what listeners overheard contradicts its ranges by {size}, which moves {worst}; see to the "
+    "places of the listeners, or fit with `use` exchanges",
+    "path": "{whose}: overheard frames travel {size} too {way}, which moves {worst}; see to the places of both tags",
     "scale": "ranges grow with the distance by {size} too {way} over the recorded distances, which moves {worst}; see "
     "to the unit and the lever arms of the true distances",
     "late": "ranges change by {size} with the speed at which true distances change (root mean square): motion capture "

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from calib.data.arrivals import Arrivals
 from calib.data.clocks import ClocksApart, LeftSkew, clocks_apart, left_skew
 from calib.errors import BadInputError, UnanswerableError
 from calib.pairs import pairs_of
@@ -23,7 +24,7 @@ from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, known_
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
-from uwblink.twr import Exchanges, delay_weights, middle_ns, raw_range, without_stamps
+from uwblink.twr import Exchanges, delay_weights, range_ns, raw_range, without_stamps
 
 MapSource = str | os.PathLike[str] | Mapping[str, Any]
 
@@ -55,7 +56,8 @@ class Ranges(ColumnTable):
     `excluded` counts by reason the ranges that were left out; `planted` is what a simulation put in, for display only;
     `recordings` are names and fingerprints of the recordings, empty for ranges of arrays; `left_skew` is what clock
     skew may have left in single-sided ranges, None without any; `bodies` are tags with the body that carries each;
-    `antenna_delays` are those programmed into the tags, as far as known.
+    `antenna_delays` are those programmed into the tags, as far as known; `arrivals` is what other tags overheard of
+    these exchanges, None without any.
     """
 
     source: str
@@ -78,6 +80,7 @@ class Ranges(ColumnTable):
     session: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int32))
     sessions: tuple[str, ...] = ()
     antenna_delays: AntennaDelays = field(default_factory=dict)
+    arrivals: Arrivals | None = None
 
     def __post_init__(self) -> None:
         """Put all ranges into one session where none are given."""
@@ -107,8 +110,7 @@ class Ranges(ColumnTable):
             raise BadInputError(f"has shape {truth.shape}, expected ({len(exchanges)},)", parameter="truth_m")
         known = np.isfinite(truth)
         if not known.all() and poses is not None and len(poses):
-            # A range belongs to the middle of its first two messages.
-            ends = exchanges.initiator, exchanges.target, middle_ns(exchanges)
+            ends = exchanges.initiator, exchanges.target, range_ns(exchanges)
             truth = np.where(known, truth, distances_m(poses, tags, *ends))
         of_initiator, of_target = delay_weights(exchanges)
         bare = without_stamps(exchanges)
@@ -204,6 +206,11 @@ class Ranges(ColumnTable):
         found = contents_of_frame(frame, map)
         return cls.from_exchanges(found.exchanges, poses=found.poses, tags=found.tags, source="data frame")
 
+    def __getitem__(self, rows: int | slice | Bools | Ints) -> Ranges:
+        """Return the chosen ranges, in their order, with their arrivals."""
+        found = ColumnTable.__getitem__(self, rows)
+        return found if self.arrivals is None else replace(found, arrivals=self.arrivals.of_exchanges(rows, len(self)))
+
     def _title(self) -> str:
         left = "".join(f", {count} left out: {reason}" for reason, count in self.excluded.items())
         return f"Ranges of {self.source}: {len(self)} of tags {', '.join(map(str, self.tags()))}{left}"
@@ -293,7 +300,19 @@ def concatenate(parts: Sequence[Ranges]) -> Ranges:
         session=session,
         sessions=names,
         antenna_delays=_antenna_delays_of_all(parts),
+        arrivals=_arrivals_of_all(parts),
     )
+
+
+def _arrivals_of_all(parts: Sequence[Ranges]) -> Arrivals | None:
+    """Return the differences of arrival of recordings that are joined, None where no recording has any."""
+    first = np.cumsum([0, *map(len, parts)]).tolist()
+    found = [
+        replace(part.arrivals, exchange=part.arrivals.exchange + start)
+        for part, start in zip(parts, first, strict=False)
+        if part.arrivals is not None
+    ]
+    return Arrivals.concatenate(found) if found else None
 
 
 def _antenna_delays_of_all(parts: Sequence[Ranges]) -> AntennaDelays:

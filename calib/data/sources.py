@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline
 
+from calib.data.arrivals import arrivals_of
 from calib.data.ranges import (
     FAINTEST_DBM,
     IN_MEMORY,
@@ -127,7 +128,8 @@ def load_ranges(data: Data | Iterable[Data], *, trim_static: bool = False, need_
     frame (`Ranges.from_dataframe`), any object with `exchanges`, `poses` and `tags` (a simulation in memory), or
     several of those. `trim_static` leaves out spans
     of two seconds in which a pair's distance stays within two centimetres. Ranges without any power are left out unless
-    `need_power` is False. Raises the errors of `Recording.open`, and `UnanswerableError` where nothing can be used.
+    `need_power` is False. What other tags overheard of them is in `arrivals`. Raises the errors of `Recording.open`,
+    and `UnanswerableError` where nothing can be used.
 
     >>> import calib
     >>> own = calib.Ranges.from_arrays([3.1, 4.2], initiator=1, target=2, fpp1_dbm=-85.0, truth_m=[3.0, 4.0])
@@ -302,6 +304,9 @@ def load_flight(data: Data, *, need_power: bool = True) -> Flight:
             source=name,
             antenna_delays=antenna_delays_of(source, name),
         )
+        heard = getattr(source, "overheard", None)
+        if heard and len(heard["time_ns"]):
+            found = replace(found, arrivals=arrivals_of(exchanges, found.truth_m, heard, source.poses, source.tags))
         fingerprint = sha256(exchanges.time_ns.tobytes() + exchanges.range_m.tobytes()).hexdigest()[:32]
         usable = found.usable(_why_no_truth(source), _why_no_power(exchanges), need_power=need_power)
         ranges = replace(usable, recordings=((name, fingerprint),))

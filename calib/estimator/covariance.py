@@ -63,7 +63,7 @@ def sandwich(
     1.96 standard errors make 95 % intervals: the factor of small samples is included. The standard errors of rows
     `beside` ranges (poses, tapes) are taken as stated.
     """
-    optimum, count, found = slopes.optimum, len(slopes.rows), {}
+    optimum, count, found = slopes.optimum, slopes.count, {}
     information, stated = optimum.information, optimum.priors.precision()
     if beside:
         information, others = (sum_rows(some, optimum.x).information for some in ([slopes.rows], beside))

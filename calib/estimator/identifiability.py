@@ -32,6 +32,13 @@ def free_directions(tags: list[int], ranges: Ranges) -> tuple[Floats, list[Split
     rows = np.flatnonzero(np.isin(ends, tags))
     place = (rows % len(ranges), np.searchsorted(tags, ends[rows]))
     design = sparse.csr_array((weights[rows], place), shape=(len(ranges), len(tags)))
+    if ranges.arrivals is not None:
+        # A difference of arrival has the delay of the target alone.
+        heard = np.intersect1d(ranges.target[ranges.arrivals.exchange], tags)
+        alone = sparse.csr_array(
+            (np.ones(len(heard)), (np.arange(len(heard)), np.searchsorted(tags, heard))), shape=(len(heard), len(tags))
+        )
+        design = sparse.vstack([design, alone], format="csr")
     # The square of the derivatives of ranges by the delays: pairs of tags that range have an entry.
     square = np.asarray((design.T @ design).toarray())
     pairs = np.array(tags)[np.argwhere(square - np.diag(np.diag(square)))]

@@ -6,7 +6,7 @@ Delays, curves, offsets of pairs and sessions, and the parameters of errors are 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from scipy.special import expit
 
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
+from calib.estimator.arrival_rows import ArrivalModel
 from calib.estimator.covariance import Kept, sandwich
 from calib.estimator.losses import LOSSES, MIXTURE
 from calib.estimator.optimize import Optimum, maximize
@@ -62,7 +63,8 @@ the likelihood of range errors does not apply."""
 class Fitted:
     """The end of a search and its rows; `residuals` (n,) are in the order of the model's ranges.
 
-    `beside` are the rows of other measurements than ranges.
+    `heard` are the rows of differences of arrival, if there are any, and `arrivals` their model.
+    `beside` are the rows of other measurements, whose standard errors are known.
     """
 
     rows: RangeRows
@@ -72,7 +74,16 @@ class Fitted:
     loss: str
     scale_m: float
     steps: int
+    heard: RangeRows | None = None
+    arrivals: ArrivalModel | None = None
     beside: tuple[Rows, ...] = ()
+
+    def slopes(self, blocks: TimeBlocks) -> list[Slopes]:
+        """Return the slopes of ranges and of differences of arrival, each with those of both by block of time."""
+        kinds = [(self.rows, blocks)]
+        if self.heard is not None and self.arrivals is not None:
+            kinds.append((self.heard, replace(blocks, number=blocks.number[self.arrivals.exchange])))
+        return [Slopes(own, self.optimum, when, *(k for k in kinds if k[0] is not own)) for own, when in kinds]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +93,7 @@ class KnownDistances:
     `values` are unknowns by kind, `covariances` those of "delay", of all curves side by side ("curve") and of the noise
     ("noise"). `residuals` (n,) are fitted less true ranges in the order of the model's ranges, metres. `searches` are
     the one search, or that of the delays and that of the curves. `persistence` is that of errors of delays, and
-    `slopes` are those of the first search.
+    `slopes` and `slopes_of_heard` are those of the first search.
     """
 
     model: RangeModel
@@ -93,6 +104,7 @@ class KnownDistances:
     blocks: TimeBlocks
     slopes: Slopes
     residuals: Floats
+    slopes_of_heard: Slopes | None = None
 
     @property
     def delays(self) -> Floats:
@@ -123,14 +135,29 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> KnownDistances
     scale_m = None if settings.scale_ns is None else settings.scale_ns * METRES_A_NS
     if settings.sequential and model.curve is not None and not model.pinned:
         return _in_sequence(model, error, loss, scale_m, blocks)
-    robust = loss if loss != MIXTURE else ROBUST_LOSS
-    pilot = robust_fit(model, error, robust, scale_m, ("delay", *model.curve_kinds()), sample=PILOT)
+    robust, heard = loss if loss != MIXTURE else ROBUST_LOSS, ArrivalModel.of(model)
+    pilot = robust_fit(model, error, robust, scale_m, ("delay", *model.curve_kinds()), sample=PILOT, heard=heard)
+    if heard is not None and pilot.heard is not None:
+        heard = _weighed(heard, model, pilot.heard, pilot, blocks)
     if loss == MIXTURE and LEAST_SCALE_M < robust_spread(pilot.residuals) < LARGEST_SPREAD_M:
-        likely = likeliest(model, error, pilot)
+        likely = likeliest(model, error, pilot, heard)
         if _farthest_pair(model, likely.residuals) <= ASTRAY_M + 3 * _farthest_pair(model, pilot.residuals):
             return described(model, likely, blocks)
-    fitted = robust_fit(model, error, robust, scale_m, [u.kind for u in model.unknowns], start=pilot)
+    kinds = [u.kind for u in model.unknowns]
+    fitted = robust_fit(model, error, robust, scale_m, kinds, start=pilot, heard=heard)
     return described(model, fitted, blocks)
+
+
+def _weighed(
+    heard: ArrivalModel, model: RangeModel, rows: RangeRows, pilot: Fitted, blocks: TimeBlocks
+) -> ArrivalModel:
+    """Return differences of arrival with their weight beside ranges, by their slopes at the end of a first search."""
+    own = heard.rows(pilot.optimum.layout, rows.errors).residuals(pilot.optimum.x)
+    of_heard, of_ranges = (
+        errors.slopes({RESIDUAL: residual})[1][RESIDUAL]
+        for errors, residual in ((rows.errors, own), (pilot.rows.errors, pilot.residuals))
+    )
+    return heard.weighed(of_heard, of_ranges, model.pairs.number, blocks)
 
 
 def model_of(ranges: Ranges, settings: FitSettings, *, trimmed: bool = True) -> RangeModel:
@@ -147,7 +174,7 @@ def model_of(ranges: Ranges, settings: FitSettings, *, trimmed: bool = True) -> 
     return model
 
 
-def robust_fit(
+def robust_fit(  # noqa: PLR0913 - a search has that many sides
     model: RangeModel,
     error: Floats,
     loss: str,
@@ -156,8 +183,9 @@ def robust_fit(
     sample: int | None = None,
     start: Fitted | None = None,
     weight: Bools | None = None,
+    heard: ArrivalModel | None = None,
 ) -> Fitted:
-    """Return the optimum of a robust loss of errors (n,) by some kinds of unknowns.
+    """Return the optimum of a robust loss of errors (n,), and of differences of arrival, by some kinds of unknowns.
 
     The scale follows the residuals of a few steps, unless it is given, and then stands. Slopes are divided by their
     dispersion, so that priors weigh against them as against a likelihood.
@@ -166,33 +194,42 @@ def robust_fit(
     layout, whole = model.build(error, Robust(weights=weights, scale_m=1.0), only=kinds)
     every = whole if weight is None else whole.sample(np.flatnonzero(weight))
     gauge = (*model.gauge_rows(layout), *model.held_rows(layout))
-    rows, x = every, layout.start(start.optimum.by_kind() if start is not None else None)
+    x = layout.start(start.optimum.by_kind() if start is not None else None)
+    chosen = None
     if sample is not None and sample < len(error):
         # A fixed random choice: a regular one could coincide with the schedule of pairs.
-        rows = every.sample(np.sort(np.random.default_rng(0).permutation(len(error))[:sample]))
+        chosen = np.sort(np.random.default_rng(0).permutation(len(error))[:sample])
+    rows = [every if chosen is None else every.sample(chosen)]
+    if heard is not None:
+        rows.append(heard.sample(heard.rows(layout, every.errors), chosen))
     priors, steps = Priors(layout), 0
     for turn in range(2 if start is not None else 4):
-        residual = rows.residuals(x)
-        scale = scale_m or max(SCALE_OF_SPREAD * robust_spread(residual), LEAST_SCALE_M)
-        errors = Robust(weights=weights, scale_m=scale).tempered(residual)
-        found = maximize([replace(rows, errors=errors), *gauge], priors, x, steps=15, evidence_steps=15 * (turn > 0))
+        residuals = [each.residuals(x) for each in rows]
+        scales = [scale_m or max(SCALE_OF_SPREAD * robust_spread(r), LEAST_SCALE_M) for r in residuals]
+        errors = [Robust(weights=weights, scale_m=s).tempered(r) for s, r in zip(scales, residuals, strict=True)]
+        rows = [replace(each, errors=own) for each, own in zip(rows, errors, strict=True)]
+        found = maximize([*rows, *gauge], priors, x, steps=15, evidence_steps=15 * (turn > 0))
         x, steps = found.x, steps + found.steps
-    rows = replace(rows, errors=errors)
     if sample is None:
-        found = maximize([rows, *gauge], priors, x, steps=200, evidence_steps=0)
+        found = maximize([*rows, *gauge], priors, x, steps=200, evidence_steps=0)
         x, steps = found.x, steps + found.steps
-        final = replace(rows, errors=replace(errors.tempered(rows.residuals(x)), least=None))
-        ended = maximize([final, *gauge], priors, x, steps=20, evidence_steps=0)
+        final = [
+            replace(each, errors=replace(own.tempered(each.residuals(x)), least=None))
+            for each, own in zip(rows, errors, strict=True)
+        ]
+        ended = maximize([*final, *gauge], priors, x, steps=20, evidence_steps=0)
         # With few ranges most may lie where the loss is concave; weights then stay in the place of the curvature.
         if ended.success and _convex(ended):
             found, rows = ended, final
     return Fitted(
-        rows=rows,
+        rows=rows[0],
+        heard=rows[1] if heard else None,
+        arrivals=heard,
         gauge=gauge,
         optimum=found,
         residuals=whole.residuals(found.x),
         loss=loss,
-        scale_m=scale,
+        scale_m=scales[0],
         steps=steps + found.steps,
     )
 
@@ -212,16 +249,28 @@ def _convex(optimum: Optimum) -> bool:
     return bool(np.linalg.eigvalsh(own * scale[:, None] * scale)[0] > 1e-10)
 
 
-def likeliest(model: RangeModel, error: Floats, pilot: Fitted) -> Fitted:
+def likeliest(model: RangeModel, error: Floats, pilot: Fitted, heard: ArrivalModel | None = None) -> Fitted:
     """Return the maximum of the likelihood, found from a robust start on samples of growing size and then on all
     ranges."""
     errors, unknowns, parts = model.error_model(pilot.residuals)
+    if heard is not None:
+        straight = heard.rows(pilot.optimum.layout, errors).residuals(pilot.optimum.x)
+        of_heard, own, own_parts = heard.error_model(straight)
+        unknowns = (*unknowns, *heard.unknowns, *own)
     layout, rows = model.build(error, errors, unknowns, parts)
     gauge = (*model.gauge_rows(layout), *model.held_rows(layout))
     asked = layout.indices([u.kind for u in model.unknowns])
-    found, steps = _maximize_by_samples(rows, gauge, layout, layout.start(pilot.optimum.by_kind()), asked)
+
+    whole = None if heard is None else heard.rows(layout, of_heard, own_parts)
+
+    def beside(chosen: Ints | None) -> list[RangeRows]:
+        return [] if heard is None or whole is None else [heard.sample(whole, chosen)]
+
+    found, steps = _maximize_by_samples(rows, gauge, layout, layout.start(pilot.optimum.by_kind()), asked, beside)
     return Fitted(
         rows=rows,
+        heard=whole,
+        arrivals=heard,
         gauge=gauge,
         optimum=found,
         residuals=rows.residuals(found.x),
@@ -232,15 +281,25 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted) -> Fitted:
 
 
 def _maximize_by_samples(
-    rows: RangeRows, gauge: Sequence[NormalRows], layout: Layout, x: Floats, asked: Ints | None = None
+    rows: RangeRows,
+    gauge: Sequence[NormalRows],
+    layout: Layout,
+    x: Floats,
+    asked: Ints | None = None,
+    beside: Callable[[Ints | None], Sequence[Rows]] = lambda chosen: (),
 ) -> tuple[Optimum, int]:
-    """Return the optimum of rows, found on samples of growing size and then on all of them, and the steps taken."""
+    """Return the optimum of rows, found on samples of growing size and then on all of them, and the steps taken.
+
+    `beside` returns the rows that belong to some ranges, or to all.
+    """
     order, priors = np.random.default_rng(0).permutation(len(rows)), Priors(layout)
     size, steps = FIRST_SAMPLE, 0
     while 2 * size < len(rows):
-        found = maximize([rows.sample(np.sort(order[:size])), *gauge], priors, x, tolerance=1.0, asked=asked)
+        chosen = np.sort(order[:size])
+        some = [rows.sample(chosen), *beside(chosen), *gauge]
+        found = maximize(some, priors, x, tolerance=1.0, asked=asked)
         x, size, steps = found.x, size * SAMPLE_GROWTH, steps + found.steps
-    found = maximize([rows, *gauge], priors, x, asked=asked)
+    found = maximize([rows, *beside(None), *gauge], priors, x, asked=asked)
     return found, steps + found.steps
 
 
@@ -253,7 +312,7 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDis
         "noise": Kept.curve(layout.indices(noise_kinds(layout))),
     }
     kept = {name: group for name, group in kept.items() if len(group.indices)}
-    slopes = Slopes(fitted.rows, fitted.optimum, blocks)
+    slopes, *of_heard = fitted.slopes(blocks)
     found = sandwich(slopes, kept, fitted.beside)
     covariances = {name: matrix for name, (matrix, _) in found.items()}
     if "offset of pair" in layout.where and "odds of pair" in layout.where:
@@ -266,6 +325,7 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDis
         persistence=found[next(iter(kept))][1],
         blocks=blocks,
         slopes=slopes,
+        slopes_of_heard=next(iter(of_heard), None),
         residuals=fitted.residuals,
     )
 

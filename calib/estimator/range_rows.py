@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, PPoly
+from scipy.special import expit
 
 from calib.estimator.losses import Weights
 from calib.estimator.rows import ROWS_AT_ONCE, Terms
@@ -23,6 +24,9 @@ from uwblink.arrays import Floats, Ints
 
 RESIDUAL = "residual"
 """The parameter that delays, curves and offsets add to."""
+
+OF_ERRORS = ("noise", "odds", "detour", "least", "outliers", "long")
+"""The other parameters of an error's density."""
 
 SHARED = "shared"
 """Name of the part of a residual's slope that the other parameters have, too."""
@@ -81,7 +85,7 @@ class Mixture:
 
     expected: bool = False
     used: float = 0.0
-    parameters: tuple[str, ...] = ("noise", "odds", "detour", "least", "outliers", "long")
+    parameters: tuple[str, ...] = OF_ERRORS
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
         """Return log densities (n,) and slopes by each parameter (n,)."""
@@ -111,6 +115,27 @@ class Mixture:
         square, across = (others * weight) @ others.T, (others * weight) @ slope
         shared = np.linalg.lstsq(square + 1e-9 * np.eye(len(square)), across, rcond=1e-8)[0]
         return float(weight @ slope**2 - shared @ across), shared
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TwoSidedMixture:
+    """The same density for errors that reflections lengthen or shorten: differences of times of arrival.
+
+    A share, whose log odds are the parameter "side", is as `Mixture` has it, the others are with the opposite sign.
+    """
+
+    parameters: tuple[str, ...] = (*OF_ERRORS, "side")
+
+    def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
+        """Return log densities (n,) and slopes by each parameter (n,)."""
+        late, early = (error_slopes(sign * values[RESIDUAL], values) for sign in (1.0, -1.0))
+        share = expit(values["side"])
+        of_late, of_early = np.log(share) + late.log_density, np.log1p(-share) + early.log_density
+        log_density = np.logaddexp(of_late, of_early)
+        part = np.exp(of_late - log_density)
+        by = {name: part * late.by[name] + (1 - part) * early.by[name] for name in late.by}
+        by[RESIDUAL] = part * late.by[RESIDUAL] - (1 - part) * early.by[RESIDUAL]
+        return log_density, by | {"side": part - share}, None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,7 +179,8 @@ def _loss(weights: Weights) -> PPoly:
 class RangeRows:
     """Ranges whose residuals are `residual` (n,) plus the parts of the unknowns, less what `geometry` makes of them.
 
-    Rows are kept sorted by `key`; `order` (n,) says which of the given rows each is.
+    Rows are kept sorted by `key`; `order` (n,) says which of the given rows each is. Rows that correlate count for a
+    share 1/`alike` of as many independent ones.
     """
 
     residual: Floats
@@ -164,6 +190,7 @@ class RangeRows:
     starts: Ints
     parts: tuple[Part, ...]
     geometry: Geometry | None = None
+    alike: float = 1.0
 
     @classmethod
     def of(
@@ -222,7 +249,8 @@ class RangeRows:
         """Yield all ranges, some blocks at a time."""
         for blocks, rows, values, moved in self._pieces(x):
             log_density, by, tells = self.errors.slopes(values)
-            yield self._as_terms(blocks, rows, float(np.sum(log_density)), by, tells, moved)
+            found = self._as_terms(blocks, rows, float(np.sum(log_density)), by, tells, moved)
+            yield found if self.alike == 1 else found.tempered(self.alike)
 
     def residuals(self, x: Floats) -> Floats:
         """Return the residuals (n,) at unknowns (p,), in the order in which rows were given; a sample's in its own."""

@@ -8,7 +8,7 @@ measurements with normal errors (tapes, anchors, poses, heights) are the other, 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -44,6 +44,21 @@ class Terms:
     score: Floats | None = None
     residual: Floats | None = None
     beside: Terms | None = None
+
+    def tempered(self, by: float) -> Terms:
+        """Return rows that count for a share 1/by of as many independent ones."""
+        root, weighed = by**0.5, self.weight is not None
+        entries = self.slopes if self.entries is None else self.entries
+        return replace(
+            self,
+            value=self.value / by,
+            slopes=self.slopes / by,
+            weight=None if self.weight is None else self.weight / by,
+            entries=entries if weighed else entries / root,
+            score=None if self.score is None else self.score / by,
+            residual=self.residual if weighed or self.residual is None else self.residual / root,
+            beside=None if self.beside is None else self.beside.tempered(by),
+        )
 
     def as_matrix(self, values: Floats, size: int) -> sparse.csr_matrix:
         """Return values (K, n) at the rows' columns as a sparse matrix (n, size)."""

@@ -132,12 +132,15 @@ class Tested:
 class Slopes:
     """The slopes of a fit's ranges by the residual and by all unknowns, as sums and products that tests are made of.
 
-    `own` (blocks, p) are the slopes by unknowns, summed by block of time. `score` (n,) are the slopes by residuals,
+    `own` (blocks, p) are the slopes by unknowns, summed by block of time, `count` rows with those `beside`: rows of
+    another kind in the same search with their blocks of time. `score` (n,) are the slopes by residuals,
     `tells` (n,) what residuals know, in the order of the rows. Slopes by unknowns are evaluated anew for tests: those
     of millions of ranges take gigabytes.
     """
 
-    def __init__(self, rows: RangeRows, optimum: Optimum, blocks: TimeBlocks) -> None:
+    def __init__(
+        self, rows: RangeRows, optimum: Optimum, blocks: TimeBlocks, *beside: tuple[RangeRows, TimeBlocks]
+    ) -> None:
         """Take rows at their optimum."""
         self.rows, self.optimum, self.blocks = rows, optimum, blocks
         self.order, size = rows.order, optimum.layout.size
@@ -148,6 +151,9 @@ class Slopes:
             self.score[which] = terms.score
             for part, weight in _weighed(terms):
                 self.tells[which] += weight if part.residual is None else weight * part.residual
+        self.count = len(rows) + sum(len(others) for others, _ in beside)
+        for others, their in beside:
+            self.own += Slopes(others, optimum, their).own
 
     def _pieces(self) -> Iterator[tuple[slice, Terms]]:
         """Yield which rows, and their terms."""

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from calib.data.sources import Flight
-from calib.evaluation.range_updates import RangeErrors, gated_update, mixture_update, multilaterate
+from calib.evaluation.filters import RangeErrors, gated_update, mixture_update, multilaterate
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
@@ -31,9 +31,6 @@ PATIENCE_S: Final = 10.0
 Between metal racks (scenarios/hall_with_metal) half of a body's ranges are metres too long for up to nine seconds, and
 a position from these ranges alone is metres off.
 """
-
-RANGES_TO_BE_LOST: Final = 12
-"""Least number of unexplained ranges after which a filter begins anew: four for each coordinate."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,7 +210,8 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
     x, p = np.zeros((*shape, size)), np.tile(prior, (*shape, 1, 1))
     x[..., :3] = [start for start, _ in noises]
     diagonal = np.einsum("fsii->fsi", p)
-    explained_s, most_s = np.zeros(shape), settings.reopen_s / 2 / RANGES_TO_BE_LOST
+    # Twelve unexplained ranges at least, four for each coordinate, before a filter begins anew.
+    explained_s, most_s = np.zeros(shape), settings.reopen_s / 2 / 12
     estimate, (std_m, nis, nees) = np.empty((count, *shape, 3)), np.empty((3, count, *shape))
     accepted = np.empty((count, *shape), dtype=bool)
     for k, pair in enumerate(3 + problem.pair):

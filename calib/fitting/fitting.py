@@ -71,6 +71,13 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     given = settings.delays_from
     source = None if given is None else given_calibration(given, "delays_from")
     ranges = load_ranges(data, need_power=not settings.delays_only)
+    heard = 0 if ranges.arrivals is None else len(ranges.arrivals)
+    if settings.use == "exchanges":
+        ranges = replace(ranges, arrivals=None)
+    elif not heard:
+        raise UnanswerableError(
+            f"{ranges.source}: no listener overheard an exchange between tags with known distances", parameter="use"
+        )
     fixed = _taken_over(source, ranges, curve=not settings.delays_only) | dict(settings.fixed_ns)
     refuse_impossible(ranges)
     # One thread: sums of several threads differ in the last digits, and threads slow small matrices down.
@@ -91,6 +98,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         "recording_ids": [name for _, name in ranges.recordings],
         "recipe": "sequential" if settings.sequential else "joint",
         "fitted": what_was_fitted(found),
+        **({"arrivals": len(arrivals.residual)} if (arrivals := found.searches[0].arrivals) else {}),
         "gauge": _gauge(found),
         **({"held_out": _judged(held, settings)} if held else {}),
     }
@@ -101,6 +109,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         findings,
         settings=settings,
         fixed=fixed,
+        first=_hints(calibration, heard if settings.use == "exchanges" else 0),
         more=_stopped(found, settings.loss),
     )
     return replace(result, held_out=held)
@@ -297,6 +306,13 @@ def _judged(held: HeldOut, settings: FitSettings) -> dict[str, Any]:
         "inside_95": found.inside_95,
     }
     return {name: for_json(value) for name, value in judged.items()}
+
+
+def _hints(calibration: Calibration, unused: int) -> list[str]:
+    """Return what determines the delays that a fit leaves open, where so many differences of arrival were not used."""
+    if not (calibration.undetermined_splits and unused):
+        return []
+    return [f"{unused} differences of arrival at other tags determine the delays of targets: fit with `use` receptions"]
 
 
 def _stopped(found: KnownDistances, asked_for: str | None) -> list[str]:

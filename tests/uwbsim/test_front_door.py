@@ -102,7 +102,7 @@ def test_tables_that_fail_half_way_leave_what_was_there(tmp_path):
 # Errors of uwbsim name parameters, and its command line the flags that stand for them.
 
 
-ROOT = Path(__file__).parents[3]
+ROOT = NOISELESS.parents[1]
 COMMANDS: Any = typer.main.get_command(app)
 OPTIONS = {"/".join(p.opts) for command in COMMANDS.commands.values() for p in command.params}
 # Of functions that no command calls with what a user typed.

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from calib.calibration.power_curves import ALPHA_DBM, LIFTS
 from calib.cli.commands import app
 from calib.cli.shared import with_flags
 from calib.estimator import optimize
-from calib.settings import CHOICES, FitSettings, read_distances
+from calib.settings import FitSettings, read_distances
 from docs.site.commands import leaves
 from tests import processes
 from tests.calib.plain_tables import DELAYS_NS, Plan, bias_m, write
@@ -50,7 +51,8 @@ def test_other_text_stays_as_it_is():
 
 
 def test_settings_know_what_the_curves_know():
-    assert (set(CHOICES["lift"]), FitSettings().alpha_dbm) == (set(LIFTS), ALPHA_DBM)
+    assert {one.name: set(one.metadata.get("names", ())) for one in fields(FitSettings)}["lift"] == set(LIFTS)
+    assert FitSettings().alpha_dbm == ALPHA_DBM
 
 
 def test_settings_and_keywords_make_the_same_fit():

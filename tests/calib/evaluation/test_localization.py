@@ -9,9 +9,15 @@ import pytest
 from calib import BadInputError, Calibration, UnanswerableError, fit, sample_flight
 from calib.calibration.power_curves import Curve
 from calib.data.sources import Flight, load_flight
-from calib.evaluation.localization import fixed_std, localize, summarize
-from calib.evaluation.output import localization_json, localization_text, write_tum
-from calib.evaluation.range_updates import RangeErrors, gated_update, mixture_update
+from calib.evaluation.filters import RangeErrors, gated_update, mixture_update
+from calib.evaluation.localization import (
+    fixed_std,
+    localization_json,
+    localization_text,
+    localize,
+    summarize,
+    write_tum,
+)
 from calib.evaluation.tracking import Settings
 from calib.report.figures import rmse_bars
 from tests.shared_data import ROOT

@@ -12,9 +12,9 @@ from calib.calibration.error_model import ErrorModel
 from calib.calibration.formats import read_miluv
 from calib.calibration.power_curves import Curve
 from calib.data.samples import stamped
-from calib.evaluation.inertial_filter import ProcessNoise
-from calib.evaluation.output import onboard_json, onboard_text, write_tum
-from calib.evaluation.range_updates import multilaterate
+from calib.evaluation.filters import ProcessNoise, multilaterate
+from calib.evaluation.localization import write_tum
+from calib.evaluation.onboard import onboard_json, onboard_text
 from tests.shared_data import shared
 from uwblink import Contents, Poses, Tag
 from uwblink.importers import read_source

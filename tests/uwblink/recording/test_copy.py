@@ -29,7 +29,9 @@ INSTEAD = {
         **{n: np.ones(1) for n in TABLES["imu"] if n[0] in "wa"},
     },
     "powers": {name: np.array([1.0]) for name in TABLES["powers"]},
+    "quality": {name: np.array([1.0]) for name in TABLES["quality"]},
     "temperature": {name: np.array([2.0]) for name in TABLES["temperature"]},
+    "receptions": {name: np.array([3.0]) for name in TABLES["receptions"]},
     "corrected": {name: np.array([1.0]) for name in TABLES["corrected"]},
     "height": {"time_ns": np.array([3]), "body": np.array(["z"]), "height_m": np.array([np.nan])},
     "arrangements": [Arrangement("Z", 1, 2, "plane")],
@@ -51,9 +53,11 @@ def full(tmp_path_factory):
         readings = {"time_ns": np.array([7, 6]), "body": np.array(["a", "b"])}
         r.append("imu", {name: np.array([1.5, 2.5]) for name in TABLES["imu"]} | readings)
         r.append("powers", {name: np.array([2, 1]) for name in TABLES["powers"]})
+        r.append("quality", {name: np.array([2, 1]) for name in TABLES["quality"]})
         celsius = {"temperature_c": np.array([25.5, 26.0]), "supply_v": np.array([3.3, np.nan])}
         r.append("temperature", {"time_ns": np.array([4, 3]), "tag": np.array([1, 3])} | celsius)
         r.append("corrected", {name: np.array([1, 0]) for name in TABLES["corrected"] if name != "sigma_m"})
+        r.append("receptions", {name: np.array([2, 1]) for name in TABLES["receptions"]})
         r.append("height", {"height_m": np.array([0.5, 0.25])} | readings)
         r.append("arrangements", [Arrangement("B", 5, 9, "line"), Arrangement("A", 1, 4)])
         r.append("distances", [KnownDistance(1, 2, 3.06, 0.005, "A"), KnownDistance(1, 3, 2.5, 0.01)])

@@ -1,0 +1,155 @@
+"""Differences of arrival as rows of a fit, beside the ranges of the same exchanges.
+
+An exchange and its listeners share the reception of the poll at the target, so their errors correlate. The difference
+of arrival less the error of the range does not: with the errors e of receptions at i, j and k, a range has
+(e2_i + e1_j)/2, a difference of arrival e1_j + e2_k - e1_k, and what is left of it (e1_j - e2_i)/2 + e2_k - e1_k. A
+range depends on half the sum of both delays, and this on half their difference: rows of both kinds know different
+things.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.calibration.power_curves import lift
+from calib.data.arrivals import Arrivals
+from calib.estimator.grouped_errors import error_unknowns, scattered
+from calib.estimator.range_model import METRES_A_NS, OFFSETS, RangeModel, SplineValues
+from calib.estimator.range_rows import RESIDUAL, Errors, Part, RangeRows, TwoSidedMixture
+from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
+from calib.estimator.unknowns import Layout, Prior, Unknown
+from calib.spread import robust_spread
+from uwblink.arrays import Floats, Ints
+
+HEARD = "heard "
+"""Prefix of the kinds of unknowns that only differences of arrival have."""
+
+OFFSET_OF_PATH, PATH_SIGNS = f"{HEARD}offset of path", np.array([-1.0, 1.0])
+"""Constants of the paths from initiator and target to a listener, and how they enter a difference of arrival."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArrivalModel:
+    """Unknowns and parts of differences of arrival (n,); `residual` (n,) is with all unknowns zero, metres.
+
+    `exchange` (n,) is the row of each one's range, `listener` (n,) a number among `listeners`, `targets` (n,) the tags
+    that respond, `path` (n, 2) the numbers among `paths` of those from initiator and target to the listener. Rows count
+    for a share 1/`alike` of as many independent ones.
+    """
+
+    residual: Floats
+    exchange: Ints
+    listener: Ints
+    listeners: tuple[str, ...]
+    key: Ints
+    unknowns: tuple[Unknown, ...]
+    parts: tuple[Part, ...]
+    targets: Ints
+    paths: tuple[str, ...]
+    path: Ints
+    alike: float = 1.0
+
+    @classmethod
+    def of(cls, model: RangeModel) -> ArrivalModel | None:
+        """Return the model of the arrivals of a model's ranges, None where there are none."""
+        ranges, arrivals = model.ranges, model.ranges.arrivals
+        if arrivals is None or not len(arrivals):
+            return None
+        parts = list[Part]()
+        if model.curve is not None:
+            powers = (ranges.fpp1_dbm[arrivals.exchange], arrivals.response_dbm, arrivals.poll_dbm)
+            lifted = [lift(power, model.settings.alpha_dbm) for power in powers]
+            low, high = model.span
+            good = np.logical_and.reduce([(one >= low) & (one <= high) for one in lifted])
+            arrivals, lifted = arrivals[good], [one[good] for one in lifted]
+            if not len(arrivals):
+                return None
+            parts += _curve_parts(model, model.curve, arrivals, lifted)
+        row = arrivals.exchange
+        ends = np.column_stack([ranges.initiator[row], ranges.target[row]])
+        weights = np.column_stack([-ranges.weight_initiator[row], 1 - ranges.weight_target[row]])
+        parts.append(_delays(model, ends, weights))
+        listeners, listener = np.unique(arrivals.listener, return_inverse=True)
+        paths, number = _paths(ends, arrivals.listener)
+        signs = np.broadcast_to(PATH_SIGNS, number.shape)
+        parts.append(Part(parameter=RESIDUAL, kind=OFFSET_OF_PATH, columns=number, values=signs))
+        key = np.unique(np.column_stack([ends, arrivals.listener]), axis=0, return_inverse=True)[1]
+        return cls(
+            residual=arrivals.error_m - (ranges.raw_m - ranges.truth_m)[row],
+            exchange=row,
+            listener=listener,
+            listeners=tuple(map(str, listeners.tolist())),
+            key=key.ravel(),
+            unknowns=(scattered(OFFSET_OF_PATH, paths, OFFSETS),),
+            parts=tuple(parts),
+            targets=ends[:, 1],
+            paths=paths,
+            path=number,
+        )
+
+    def error_model(self, residual: Floats) -> tuple[TwoSidedMixture, list[Unknown], list[Part]]:
+        """Return the error model with its unknowns and parts, started from robust spreads of residuals (n,)."""
+        spread = max(robust_spread(residual), 1e-3)
+        unknowns, parts = error_unknowns(spread, self.listeners, self.listener, whose="listener")
+        side = Unknown(kind="late share", names=("",), start=np.zeros(1), priors=(Prior.of_deviation(1.0),))
+        everyone = np.zeros((1, 1), dtype=np.int64)
+        parts.append(Part(parameter="side", kind="late share", columns=everyone))
+        return (
+            TwoSidedMixture(),
+            [replace(one, kind=HEARD + one.kind) for one in (*unknowns, side)],
+            [replace(one, kind=HEARD + one.kind) for one in parts],
+        )
+
+    def rows(self, layout: Layout, errors: Errors, more: Sequence[Part] = ()) -> RangeRows:
+        """Return the rows of all differences of arrival, with the parts whose unknowns a layout has."""
+        used = [part for part in (*self.parts, *more) if part.kind in layout.where]
+        return replace(RangeRows.of(self.residual, self.key, used, errors, layout), alike=self.alike)
+
+    def sample(self, rows: RangeRows, chosen: Ints | None) -> RangeRows:
+        """Return those rows that belong to some exchanges, all for None."""
+        return rows if chosen is None else rows.sample(np.flatnonzero(np.isin(self.exchange, chosen)))
+
+    def weighed(self, own: Floats, of_ranges: Floats, pairs: Ints, blocks: TimeBlocks) -> ArrivalModel:
+        """Return the model with the weight of a difference of arrival beside a range.
+
+        `own` (n,) and `of_ranges` (m,) are slopes by residuals, `pairs` (m,) the numbers of the ranges' pairs. Sums of
+        slopes vary more than those of independent rows: by target, because listeners share receptions and hear a
+        reflection in every exchange while it lasts, more than by pair. Rows count for less by the ratio of both (Kish's
+        design effects).
+        """
+        target = np.unique(self.targets, return_inverse=True)[1]
+        lasting = lasting_in_pairs(own, target, replace(blocks, number=blocks.number[self.exchange]))
+        return replace(self, alike=max(lasting / lasting_in_pairs(of_ranges, pairs, blocks), 1.0))
+
+
+def _delays(model: RangeModel, ends: Ints, weights: Floats) -> Part:
+    """Return the part of the delays of both ends (n, 2), in metres."""
+    columns = np.searchsorted(model.tags, ends)
+    return Part(parameter=RESIDUAL, kind="delay", columns=columns, values=METRES_A_NS * weights)
+
+
+def _paths(ends: Ints, listener: Ints) -> tuple[tuple[str, ...], Ints]:
+    """Return the names of the paths to listeners, and the numbers (n, 2) of those from the initiator and the target."""
+    pairs = np.stack([np.sort(np.column_stack([end, listener]), axis=1) for end in ends.T], axis=1)
+    names, number = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
+    return tuple(f"path {a}-{b}" for a, b in names.tolist()), number.reshape(-1, 2)
+
+
+def _curve_parts(model: RangeModel, spline: SplineValues, arrivals: Arrivals, lifted: list[Floats]) -> Iterator[Part]:
+    """Yield the bias over power of three receptions, less that of the range: weights of all splines of each curve."""
+    ranges, row = model.ranges, arrivals.exchange
+    i, j, k = ranges.initiator[row], ranges.target[row], arrivals.listener
+    of_range = SplineValues(knots=spline.knots, values=spline.values[row], first=spline.first[row])
+    at_target, response, poll = (SplineValues.at(one, spline.knots) for one in lifted)
+    received = [(1.0, at_target, (i, j)), (1.0, response, (j, k)), (-1.0, poll, (i, k)), (-1.0, of_range, (i, j))]
+    groups: list[tuple[int, ...] | None] = [*model.settings.groups.values()] or [None]
+    for kind, group in zip(model.curve_kinds(), groups, strict=True):
+        whole = np.zeros((len(row), spline.size))
+        for sign, one, ends in received:
+            share = sign if group is None else sign * 0.5 * sum(np.isin(end, group).astype(float) for end in ends)
+            np.add.at(whole, (np.arange(len(row))[:, None], one.columns), one.values * np.reshape(share, (-1, 1)))
+        columns = np.broadcast_to(np.arange(spline.size), whole.shape)
+        yield Part(parameter=RESIDUAL, kind=kind, columns=columns, values=-whole)

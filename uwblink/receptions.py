@@ -1,0 +1,277 @@
+"""Receptions: one frame on the air as one listener received it, and what exchanges and receptions say of each other.
+
+The reception stamp of a frame is its transmission stamp, moved to the listener's clock, plus the distance and both
+antenna delays. Three such rows make an exchange, and two more what a third tag overhears of it. Tags that broadcast in
+turn therefore make double-sided exchanges of every pair that hears each other: a frame of the initiator, the next frame
+of the target, and the one after that, from which the initiator has the rate of the target's clock (ICRA 2023, Fig. 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from uwblink import arrays
+from uwblink.arrays import Bools, ColumnTable, Floats, Ints
+from uwblink.errors import ArgumentError
+from uwblink.protocols.table import PROTOCOLS
+from uwblink.ticks import ANTENNA_DELAY_TICKS, COUNTER_BITS, METRES_PER_TICK, TICK_S, elapsed
+from uwblink.twr import BITS, LARGEST_ID, LATEST_NS, STAMPS, Exchanges
+
+Columns = Mapping[str, NDArray[Any]]
+
+MAX_SKEW: Final = 100e-6
+"""Two clocks differ by 40 ppm at most (IEEE 802.15.4: 20 ppm each); more is a counter that restarted."""
+
+_MOST_FRAMES: Final = 1 << 31
+"""Frames are numbered with 31 bits, so that a link of two ids and a frame are one number of 63."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Receptions(ColumnTable):
+    """Received frames as columns of length n: a frame that three tags hear is three rows.
+
+    `frame` (n,) numbers frames in the order in which they were sent. `tx` is the stamp of its `sender`, `rx` that of
+    the `listener`, in ticks modulo 2**`bits` of their own clocks. `fpp_dbm` is the first-path power, `rxp_dbm` the
+    total received power, `skew_ppm` how much faster the listener's clock runs by its carrier integrator; NaN if
+    unknown.
+    """
+
+    time_ns: Ints
+    frame: Ints
+    sender: Ints
+    listener: Ints
+    tx: Ints
+    rx: Ints
+    fpp_dbm: Floats
+    rxp_dbm: Floats
+    skew_ppm: Floats
+    bits: int = COUNTER_BITS
+
+    @classmethod
+    def from_arrays(  # noqa: PLR0913 - one parameter for each column, most of them optional
+        cls,
+        frame: ArrayLike,
+        sender: ArrayLike,
+        listener: ArrayLike,
+        *,
+        tx: ArrayLike,
+        rx: ArrayLike,
+        time_ns: ArrayLike = 0,
+        fpp_dbm: ArrayLike | None = None,
+        rxp_dbm: ArrayLike | None = None,
+        skew_ppm: ArrayLike | None = None,
+        bits: int = COUNTER_BITS,
+    ) -> Receptions:
+        """Return receptions from columns, each a list, an array, or one value for all rows.
+
+        Raises `ArgumentError`, which names the column and the row, for ids and stamps that cannot be.
+
+        >>> from uwblink.receptions import Receptions
+        >>> len(Receptions.from_arrays([0, 0, 1], [1, 1, 2], [2, 3, 3], tx=[0, 0, 900], rx=[5, 7, 1000]))
+        3
+        """
+        count = arrays.length("frame", frame)
+        if bits not in BITS:
+            raise ArgumentError(f"bits: found {bits!r:.40}, allowed: {', '.join(map(str, BITS))}")
+        ends = {name: arrays.whole_numbers(name, given, count, 0, LARGEST_ID) for name, given in
+                (("sender", sender), ("listener", listener))}  # fmt: skip
+        arrays.reject("listener", ends["listener"], ends["listener"] == ends["sender"], "another tag than the sender")
+        most = (1 << bits) - 1
+        return cls(
+            time_ns=arrays.whole_numbers("time_ns", time_ns, count, -LATEST_NS, LATEST_NS),
+            frame=arrays.whole_numbers("frame", frame, count, 0, _MOST_FRAMES - 1),
+            tx=arrays.whole_numbers("tx", tx, count, 0, most),
+            rx=arrays.whole_numbers("rx", rx, count, 0, most),
+            fpp_dbm=arrays.numbers("fpp_dbm", fpp_dbm, count),
+            rxp_dbm=arrays.numbers("rxp_dbm", rxp_dbm, count),
+            skew_ppm=arrays.numbers("skew_ppm", skew_ppm, count),
+            bits=bits,
+            **ends,
+        )
+
+    def _title(self) -> str:
+        tags = np.unique(np.append(self.sender, self.listener))
+        return f"{len(self)} receptions of {len(np.unique(self.frame))} frames by {len(tags)} tags"
+
+
+class _Links:
+    """Receptions by link (sender and listener) and frame, for looking rows up."""
+
+    def __init__(self, receptions: Receptions) -> None:
+        keys = self.keys(receptions.sender, receptions.listener, receptions.frame)
+        self.keys_in_order, self.row = np.unique(keys, return_index=True)
+        self.link = self.keys_in_order // _MOST_FRAMES
+
+    @staticmethod
+    def keys(sender: Ints, listener: Ints, frame: Ints) -> Ints:
+        """Return a number (n,) for each link and frame; those of a link follow each other in order of frames."""
+        return np.asarray(((sender << 16) | listener) * _MOST_FRAMES + frame)
+
+    def find(self, sender: Ints, listener: Ints, frame: Ints, step: int = 0) -> tuple[Ints, Bools]:
+        """Return the rows (n,) of frames by links, and whether there are such.
+
+        With `step` -1 those of the last frame before, with 1 those of the first frame after, the given ones.
+        """
+        wanted = self.keys(sender, listener, frame)
+        at = np.searchsorted(self.keys_in_order, wanted, side="right" if step > 0 else "left") + min(step, 0)
+        inside = np.clip(at, 0, len(self.keys_in_order) - 1)
+        if not len(self.row):
+            return at, at < 0
+        there = (at == inside) & (self.link[inside] == wanted // _MOST_FRAMES)
+        if not step:
+            there &= self.keys_in_order[inside] == wanted
+        return self.row[inside], there
+
+
+def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[Any]]]:
+    """Return the exchanges that broadcasts make, and what third tags overheard of them, in order of time.
+
+    A frame of i that j hears is a poll, j's first frame after it the response, j's next frame the final: an exchange of
+    protocol `ds`. Of both roles a pair gets the one with the shorter replies, so that
+    no stamp of a poll or response counts twice. The second result has the columns of the table `overheard`. Frames
+    between which a clock restarted, or its counter wrapped, make no exchange. Raises `ArgumentError` where there
+    is none.
+
+    >>> from uwblink.receptions import Receptions, exchanges_in
+    >>> frames, tags = [0, 1, 2], ([1, 2, 2], [2, 1, 1])
+    >>> heard = Receptions.from_arrays(frames, *tags, tx=[0, 2000, 9000], rx=[100, 2100, 9100])
+    >>> found, overheard = exchanges_in(heard)
+    >>> found.initiator.tolist(), found.range_m.round(3).tolist()
+    ([1], [0.469])
+    """
+    r, links = receptions, _Links(receptions)
+    poll, polled = links.find(r.listener, r.sender, r.frame, -1)
+    first, _ = links.find(r.sender, r.listener, r.frame[poll], 1)
+    final, ended = links.find(r.sender, r.listener, r.frame, 1)
+    found = np.flatnonzero(polled & ended & (first == np.arange(len(r))))
+    rows = np.column_stack([poll[found], found, final[found]])
+    reply = elapsed(r.tx[rows[:, 1]], r.rx[rows[:, 0]], r.bits)
+    sent, heard = (elapsed(stamp[rows[:, 2]], stamp[rows[:, 1]], r.bits) for stamp in (r.tx, r.rx))
+    round_trip = elapsed(r.rx[rows[:, 1]], r.tx[rows[:, 0]], r.bits)
+    within = r.time_ns[rows[:, 2]] - r.time_ns[rows[:, 0]] < 2**r.bits * TICK_S * 1e9
+    steady = (
+        within
+        & (np.abs(heard - sent) <= MAX_SKEW * sent)
+        & (np.abs(round_trip - reply) <= MAX_SKEW * reply + _FARTHEST)
+    )
+    rows, reply = rows[steady], reply[steady]
+    rows = rows[_shorter_replies(r.sender[rows[:, 0]], r.sender[rows[:, 1]], reply)]
+    if not len(rows):
+        raise ArgumentError(
+            f"{len(r)} receptions make no exchange: two tags must hear each other, and one of them twice in a row"
+        )
+    rows = rows[np.argsort(r.time_ns[rows[:, 0]], kind="stable")]
+    p, s, f = rows.T
+    stamps = {"tx1": r.tx[p], "rx1": r.rx[p], "tx2": r.tx[s], "rx2": r.rx[s], "tx3": r.tx[f], "rx3": r.rx[f]}
+    exchanges = Exchanges.from_arrays(
+        r.sender[p],
+        r.sender[s],
+        time_ns=r.time_ns[p],
+        protocol="ds",
+        fpp1_dbm=r.fpp_dbm[p],
+        fpp2_dbm=r.fpp_dbm[s],
+        skew1_ppm=r.skew_ppm[p],
+        skew2_ppm=r.skew_ppm[s],
+        bits=r.bits,
+        **stamps,
+    )
+    parts = [_heard_by(k, receptions, links, rows, exchanges) for k in np.unique(r.listener).tolist()]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    order = np.argsort(columns["time_ns"], kind="stable")
+    return exchanges, {name: column[order] for name, column in columns.items()}
+
+
+_FARTHEST: Final = 2 * (150 / METRES_PER_TICK + 2 * ANTENNA_DELAY_TICKS)
+"""A round trip in ticks of 150 m, farther than these radios reach, with antenna delays that were not programmed."""
+
+
+def _shorter_replies(initiator: Ints, target: Ints, reply: Ints) -> Bools:
+    """Return which exchanges (n,) have the roles with which their pair has the shorter replies."""
+    key = (initiator << 16) | target
+    ends, number = np.unique(key, return_inverse=True)
+    order = np.argsort(reply)
+    counts = np.bincount(number)
+    middle = np.zeros(len(ends))
+    for own in range(len(ends)):
+        middle[own] = reply[order[number[order] == own][counts[own] // 2]]
+    other = ((ends & 0xFFFF) << 16) | (ends >> 16)
+    place = np.clip(np.searchsorted(ends, other), 0, max(len(ends) - 1, 0))
+    of_other = np.where(ends[place] == other, middle[place], np.inf)
+    return np.asarray(((middle < of_other) | ((middle == of_other) & (ends < other)))[number])
+
+
+def _heard_by(listener: int, r: Receptions, links: _Links, rows: Ints, exchanges: Exchanges) -> dict[str, NDArray[Any]]:
+    """Return the rows of the table `overheard` of one listener, from the frames of exchanges, as `rows` (n, 3)."""
+    me = np.full(len(rows), listener)
+    found = [links.find(r.sender[row], me, r.frame[row]) for row in rows.T]
+    good = np.logical_and.reduce([there for _, there in found]) & (r.listener[rows[:, :2]] != listener).all(axis=1)
+    e = exchanges[good]
+    columns: dict[str, NDArray[Any]] = {"time_ns": e.time_ns, "listener": me[good]}
+    columns |= {"initiator": e.initiator, "target": e.target} | {f"{name}_n": getattr(e, name) for name in STAMPS}
+    for k, (row, _) in enumerate(found, 1):
+        own = row[good]
+        columns |= {f"rx{k}": r.rx[own], f"fpp{k}_dbm": r.fpp_dbm[own], f"skew{k}_ppm": r.skew_ppm[own]}
+    return columns | {
+        f"{w}{k}_n_{u}": getattr(e, f"{w}{k}_{u}") for w, u in (("fpp", "dbm"), ("skew", "ppm")) for k in (1, 2)
+    }
+
+
+def exchange_of(exchanges: Exchanges, overheard: Columns) -> Ints:
+    """Return the row of the exchange that each overheard one (n,) belongs to, -1 where it is not there.
+
+    Both have the initiator's first stamp and the target's second.
+    """
+    e, h = exchanges, overheard
+    there, here = (
+        np.column_stack(
+            [ends[0].astype(np.int64), ends[1], *(stamp & ((1 << exchanges.bits) - 1) for stamp in ends[2:])]
+        )
+        for ends in (
+            (e.initiator, e.target, e.tx1, e.tx2),
+            (h["initiator"], h["target"], h["tx1_n"], h["tx2_n"]),
+        )
+    )
+    number = np.unique(np.concatenate([there, here]), axis=0, return_inverse=True)[1].ravel()
+    row = np.full(int(number.max(initial=-1)) + 1, -1)
+    row[number[: len(there)]] = np.arange(len(there))
+    return row[number[len(there) :]]
+
+
+def receptions_of(exchanges: Exchanges, overheard: Columns | None = None) -> Receptions:
+    """Return every reception of exchanges with stamps, and of what listeners overheard, in order of frames.
+
+    Frame k of the exchange in row n has the number 3 n + k, from 0.
+    """
+    h: Columns = overheard or {}
+    whose = exchange_of(exchanges, h) if h and len(h["time_ns"]) else np.zeros(0, dtype=np.int64)
+    heard = np.flatnonzero(whose >= 0)
+    third = {name: PROTOCOLS[name].third_sender for name in np.unique(exchanges.protocol).tolist()}
+    sender3 = np.array([third[name] or "" for name in exchanges.protocol.tolist()], dtype="U9")
+    parts = []
+    for k in range(3):
+        target_sends = (sender3 == "target") if k == 2 else np.full(len(exchanges), k == 1)
+        there = (sender3 != "") if k == 2 else (exchanges.tx1 | exchanges.rx1 | exchanges.tx2 | exchanges.rx2) != 0
+        ends = exchanges.initiator, exchanges.target
+        sender, listener = np.where(target_sends, ends[::-1], ends)
+        tx = getattr(exchanges, f"tx{k + 1}")
+        nothing = np.full(len(exchanges), np.nan)
+        power, skew = (
+            getattr(exchanges, f"{name}{k + 1}_{u}", nothing) for name, u in (("fpp", "dbm"), ("skew", "ppm"))
+        )
+        of_frame = [exchanges.time_ns, 3 * np.arange(len(exchanges)) + k, sender]
+        own = [*of_frame, listener, tx, getattr(exchanges, f"rx{k + 1}"), power, skew]
+        parts.append([column[there] for column in own])
+        if len(heard):
+            rows = whose[heard]
+            more = [*(c[rows] for c in of_frame), h["listener"][heard], tx[rows], h[f"rx{k + 1}"][heard]]
+            more += [h[f"fpp{k + 1}_dbm"][heard], h[f"skew{k + 1}_ppm"][heard]]
+            parts.append([column[there[rows]] for column in more])
+    names = ("time_ns", "frame", "sender", "listener", "tx", "rx", "fpp_dbm", "skew_ppm")
+    columns: dict[str, Any] = {n: np.concatenate([p[k] for p in parts]) for k, n in enumerate(names)}
+    found = Receptions(rxp_dbm=np.full(len(columns["tx"]), np.nan), bits=exchanges.bits, **columns)
+    return found[np.argsort(found.frame, kind="stable")]
