@@ -234,7 +234,7 @@ class TwinFlight:
         row = PROTOCOLS[str(names[np.argmax(counts)])]
         x = flown.exchanges[np.flatnonzero(flown.exchanges.protocol == row.name)]
         require(len(x) >= fewest, f"holds {len(x)} exchanges, a twin needs {fewest} or more; record longer")
-        longest_ms = max(np.median(span) for span in (intervals(x).dt32, intervals(x).dt53)) * TICK_S * 1e3
+        longest_ms = float(np.median(intervals(x).dt41)) * TICK_S * 1e3
         require(
             longest_ms < 6.7, f"waits {longest_ms:.1f} ms in its exchanges, boards 6.7 at most; broadcasts have no twin"
         )

@@ -93,6 +93,7 @@ def test_recordings_are_fitted_together_with_what_each_overheard():
     assert found.calibration.provenance["arrivals"] == 2 * 800 * 4
     half = calib.load_ranges([one, other])
     kept = half[half.session == 1]
+    assert kept.arrivals is not None
     assert len(kept.arrivals) == 800 * 4
     alone = calib.load_ranges(other)
     assert kept.arrivals.error_m == pytest.approx(alone.arrivals.error_m)
