@@ -234,7 +234,9 @@ class TwinFlight:
         row = PROTOCOLS[str(names[np.argmax(counts)])]
         x = flown.exchanges[np.flatnonzero(flown.exchanges.protocol == row.name)]
         require(len(x) >= fewest, f"holds {len(x)} exchanges, a twin needs {fewest} or more; record longer")
-        longest_ms = float(np.median(intervals(x).dt41)) * TICK_S * 1e3
+        spans = intervals(x)
+        legs = (spans.dt32, spans.dt53) if row.third_sender else (spans.dt32,)
+        longest_ms = max(float(np.median(leg)) for leg in legs) * TICK_S * 1e3
         require(
             longest_ms < 6.7, f"waits {longest_ms:.1f} ms in its exchanges, boards 6.7 at most; broadcasts have no twin"
         )
