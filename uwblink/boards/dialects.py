@@ -213,6 +213,10 @@ def printed_ranges(
                     pair = seen.number(whose), seen.number(printed.to_id)
                     report = replace(_REPORT, neighbour=pair[1], range_m=printed.range_m, fpp2_dbm=printed.power_dbm)
                     turns += [Turn(using.host_ns(), pair, report)] if pair[0] != pair[1] else []
+                    if pair[0] == pair[1] and printed.from_id is None:
+                        raise BoardError(
+                            f"{port.name}: prints a range to {pair[1]}, its own id; give it another by `ids`"
+                        )
             seen.time_s = using.now_s() - start_s
             for turn in turns:
                 seen.on_turn(turn)

@@ -148,6 +148,13 @@ def try_reading(rows: Columns, column_map: ColumnMap, reading: Reading) -> Trial
         if not single:
             good &= (spans.dt53 < half) & (spans.dt64 < half) & (spans.dt53 > 0)
         good &= ~np.isfinite(true) | (np.abs(ranges - true) < 50.0 + allowance)
+        # With the columns of its stamps exchanged, a third message of the initiator looks like one of the target by a
+        # clock whose rate follows the range: dt64 - dt53 = -(dt41 - dt32).
+        there_and_back, apart = spans.dt41 - spans.dt32, spans.dt64 - spans.dt53
+        with_third, without = (
+            np.subtract(*np.percentile(x, [75, 25])) for x in (there_and_back + apart, there_and_back)
+        )
+        good &= not (with_third < 0.05 * without and PROTOCOLS[reading.protocol].third_sender == "target")
     limits = [
         np.percentile(some, [5, 95]) if len(some := values[np.isfinite(values)]) else (np.nan, np.nan)
         for values in (ranges, ranges - np.nan_to_num(true))

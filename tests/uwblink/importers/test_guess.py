@@ -315,3 +315,22 @@ def test_hanyang_comes_in_whole_and_makes_sense(tmp_path):
     # Uncorrected for skew, the ranges are off by metres, but all by about the same.
     error = raw_range(e) - e.truth_m
     assert np.median(np.abs(error - np.median(error))) < 2.0
+
+
+def test_third_stamps_of_the_initiator_in_exchanged_columns_are_not_those_of_the_target(tmp_path):
+    """They look so, by a clock whose rate follows the range, and every range would be plausible and wrong."""
+    random = np.random.default_rng(4)
+    noisy = [
+        {n: v + int(random.integers(-6, 7)) if n in HEADER[3:9] else v for n, v in row.items()}
+        for row in wrapped(flights(120, third="initiator"))
+    ]
+    exchanged = [row | {"tx3": row["rx3"], "rx3": row["tx3"]} for row in noisy]
+    guess = guess_map(write(tmp_path / "exchanged.csv", exchanged))
+    assert "protocol" in guess.asked
+    # Those of the target, by a clock that is 20 ppm off, and of the initiator in their columns are read as ever.
+    skewed = [
+        {n: (round(v * (1 + 20e-6)) if n in ("rx1", "tx2", "tx3") else v) for n, v in row.items()}
+        for row in flights(120, third="target")
+    ]
+    assert 'protocol = "ds"' in guess_map(write(tmp_path / "plain.csv", wrapped(skewed))).text
+    assert 'protocol = "ds-alt"' in guess_map(write(tmp_path / "alternative.csv", noisy)).text
