@@ -172,8 +172,8 @@ def test_another_form_ends_with_a_line_and_no_file(tmp_path):
         refuse(*words, "--dialect", "arduino", "--pairs", "all", cwd=tmp_path, naming=["--pairs", "--dialect"])
         refuse(*words, "--dialect", "arduino", "--ids", "1,2", cwd=tmp_path, naming=["1 ports and 2 ids"])
     with printing(BOTH) as port:
-        words = ("uwblink", "record", port, "--duration", "30", "-o", "r.uwb", "--dialect", "arduino")
-        refuse(*words, "--ids", "6018", cwd=tmp_path, naming=[port, "6018", "own id", "--ids"])
+        same = ("uwblink", "record", port, "--duration", "30", "-o", "r.uwb", "--dialect", "arduino")
+        refuse(*same, "--ids", "6018", cwd=tmp_path, naming=[port, "6018", "own id", "--ids"])
     with printing("") as port:
         brief = ("uwblink", "record", port, "--dialect", "arduino", "--duration", "0.3", "-o", "r.uwb")
         refuse(*brief, cwd=tmp_path, naming=["no range was printed"])
