@@ -31,7 +31,7 @@ from calib.checks.limits import (
     warnings_of,
 )
 from calib.data.ranges import Ranges, held_out
-from calib.data.sources import Data, load_ranges
+from calib.data.sources import Data, load_ranges, require_arrivals
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.known_distances import KnownDistances, fit_known_distances
 from calib.estimator.losses import MIXTURE, check_loss
@@ -71,10 +71,8 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     given = settings.delays_from
     source = None if given is None else given_calibration(given, "delays_from")
     ranges = load_ranges(data, need_power=not settings.delays_only, overheard=settings.use == "receptions")
-    if settings.use == "receptions" and not (ranges.arrivals is not None and len(ranges.arrivals)):
-        raise UnanswerableError(
-            f"{ranges.source}: no listener overheard an exchange between tags with known distances", parameter="use"
-        )
+    if settings.use == "receptions":
+        require_arrivals(ranges)
     fixed = _taken_over(source, ranges, curve=not settings.delays_only) | dict(settings.fixed_ns)
     refuse_impossible(ranges)
     # One thread: sums of several threads differ in the last digits, and threads slow small matrices down.
