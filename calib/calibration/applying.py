@@ -139,7 +139,9 @@ def corrected_arrivals(calibration: Calibration, ranges: Ranges) -> CorrectedArr
     """Return what `Calibration.correct_arrivals` returns, and raise what that raises."""
     heard, receptions = arrivals_in(ranges), heard_receptions(ranges)
     exchange = replace(ranges, arrivals=None)[heard.exchange]
-    summed = sorted(set(exchange.tags()) & {*calibration.sides, *(t for pair in calibration.pair_offsets for t in pair)})
+    summed = sorted(
+        set(exchange.tags()) & {*calibration.sides, *(t for pair in calibration.pair_offsets for t in pair)}
+    )
     if summed:
         raise BadInputError(
             f"{ranges.source}: the calibration knows the delays of tags {first_few(map(str, summed))} in sums only, "
@@ -202,11 +204,13 @@ def reception_bias_m(calibration: Calibration, receptions: tuple[Ranges, Ranges,
 def reception_gains(heard: Arrivals) -> Floats:
     """Return the variances of differences of arrival (n, 2) by response and poll, in variances of a range.
 
-    A range is the mean of two receptions, so that one has twice its variance. With clocks compared over a duration from
-    one of them, its error e counts 1 + s, and that of the reception at the other end s (`Arrivals.stretch`).
+    A range is the mean of two receptions, so that one has twice its variance. With clocks compared over a duration that
+    begins with one of them, its error counts 1 + s, and that of the reception at the end s (`Arrivals.stretch`): in the
+    range, too, which then has the variance (1 + (1 + s)^2 + s^2)/4 of a reception's.
     """
-    stretch = np.column_stack([np.maximum(heard.stretch, 0.0), np.minimum(heard.stretch, 0.0)])
-    return np.asarray(2 * ((1 + stretch) ** 2 + stretch**2))
+    twice = (1 + heard.stretch) ** 2 + heard.stretch**2
+    gains = 4 / (1 + twice)[:, None] * np.column_stack([twice, np.ones_like(twice)])
+    return np.where(heard.stretch[:, None] < 0, gains[:, ::-1], gains)
 
 
 def noise_m(calibration: Calibration, ranges: Ranges) -> Floats:

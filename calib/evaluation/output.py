@@ -40,6 +40,9 @@ def localization_text(found: list[Localization], settings: Settings) -> str:
         f"{summary.nis_bounds[1]:.2f}), NEES {summary.nees:.2f} (3 expected, {summary.nees_bounds[0]:.2f} to "
         f"{summary.nees_bounds[1]:.2f}), {100 * summary.accepted:.1f} % of the ranges pass the gate",
     ]
+    if arrivals := sum(one.arrivals for one in found):
+        every = sum(len(one.tracks["raw"].time_ns) for one in found)
+        lines.append(f"by {every - arrivals} ranges and {arrivals} differences of arrival")
     return "\n".join(lines)
 
 
@@ -54,6 +57,7 @@ def localization_json(found: list[Localization]) -> dict[str, Any]:
             "fixed_std_m": one.fixed.std_m,
             "fixed_std_source": one.fixed.source,
             "simulated": one.simulated,
+            "arrivals": one.arrivals,
         }
         for one in found
     ]
