@@ -109,7 +109,7 @@ def arrivals_of(
         return found[np.abs(found.error_m) < LARGEST_ERROR_M]
 
 
-def _rates(e: Exchanges, heard: Mapping[str, NDArray[Any]], between_s: Floats) -> tuple[Floats, Floats]:
+def _rates(e: Exchanges, heard: Mapping[str, NDArray[Any]], between_s: Any) -> tuple[Floats, Floats]:
     """Return how fast the target's clock runs by the listener's (n,), and the stretch of `Arrivals`.
 
     Where the target sends twice, from both transmissions; where the initiator does, from both receptions at the target

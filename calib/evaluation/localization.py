@@ -21,7 +21,16 @@ from calib.data.ranges import Ranges
 from calib.data.sources import Data, Flight, load_flight, require_arrivals, require_times
 from calib.errors import UnanswerableError
 from calib.evaluation.range_updates import range_errors
-from calib.evaluation.tracking import FILTERS, FilterRanges, Settings, Track, Trajectory, problems, run_filters
+from calib.evaluation.tracking import (
+    FILTERS,
+    FilterRanges,
+    Settings,
+    Track,
+    Trajectory,
+    distances_in,
+    problems,
+    run_filters,
+)
 from uwblink.arrays import Floats
 
 PAPER_RMSE_M: Final = {"raw": 0.804, "calibrated": 0.500, "variance": 0.431}
@@ -137,7 +146,7 @@ def _flight_for(data: Data | Flight, calibration: Calibration, settings: Setting
     return load_flight(data, need_power=calibration.needs_power, overheard=settings.use == "receptions")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class _Receptions:
     """What errors of n measurements are made of, raw and corrected, in metres.
 
@@ -156,41 +165,39 @@ class _Receptions:
     @classmethod
     def of(cls, ranges: Ranges, calibration: Calibration) -> _Receptions:
         """Return those of ranges, and then of their arrivals."""
-        applied, count = calibration.apply(ranges), len(ranges)
+        applied, sign, none = calibration.apply(ranges), distances_in(ranges)[1], np.zeros(len(ranges))
         if ranges.arrivals is None:
-            one, none = np.ones((count, 1)), np.zeros(count)
-            return cls(
-                raw_m=applied.raw_m, corrected_m=applied.corrected_m, parts=[ranges], sign=one, gain=one, common_m=none
-            )
+            return cls(applied.raw_m, applied.corrected_m, [ranges], sign, sign, none)
         heard = calibration.correct_arrivals(ranges)
-        one = np.repeat([[1.0, 0.0]], count, axis=0)
         return cls(
-            raw_m=np.append(applied.raw_m, heard.raw_m),
-            corrected_m=np.append(applied.corrected_m, heard.corrected_m),
-            parts=[Ranges.concatenate([ranges, part]) for part in heard_receptions(ranges)[:2]],
-            sign=np.concatenate([one, np.repeat([[1.0, -1.0]], len(heard.raw_m), axis=0)]),
-            gain=np.concatenate([one, reception_gains(ranges.arrivals)]),
-            common_m=np.append(np.zeros(count), heard.shared_m),
+            np.append(applied.raw_m, heard.raw_m),
+            np.append(applied.corrected_m, heard.corrected_m),
+            [Ranges.concatenate([ranges, part]) for part in heard_receptions(ranges)[:2]],
+            sign,
+            np.concatenate([sign[: len(ranges)], reception_gains(ranges.arrivals)]),
+            np.append(none, heard.shared_m),
         )
 
     def own_m(self, std_m: Floats | float) -> Floats:
         """Return the standard deviation of own errors (n,), where those of ranges (n, k) like the parts have this."""
-        return np.sqrt(np.sum(self.gain * np.square(std_m), axis=1))
+        return np.asarray(np.sqrt(np.sum(self.gain * np.square(std_m), axis=1)))
 
     def fixed(self, measured_m: Floats, std_m: float) -> FilterRanges:
         """Return what a filter measures that takes all ranges to have the same standard deviation."""
-        return FilterRanges(measured_m, self.own_m(std_m), common_m=std_m * (self.common_m > 0))
+        common_m = np.where(self.common_m > 0, std_m, 0.0)
+        return FilterRanges(measured_m, self.own_m(std_m), common_m, np.zeros_like(self.sign))
 
 
 def filter_ranges(ranges: Ranges, calibration: Calibration, fixed: FixedStd) -> dict[str, FilterRanges]:
     """Return what each of `FILTERS` measures by ranges and then by arrivals; the robust one needs an error model."""
     known, model = _Receptions.of(ranges, calibration), calibration.errors
     corrected, sign, common = known.corrected_m, known.sign, known.common_m
+    nothing = np.zeros_like(sign)
     sigma = np.column_stack([noise_m(calibration, part) for part in known.parts])
     found = {
         "raw": known.fixed(known.raw_m, fixed.std_m["raw"]),
         "calibrated": known.fixed(corrected, fixed.std_m["calibrated"]),
-        "variance": FilterRanges(corrected, known.own_m(sigma), common_m=common),
+        "variance": FilterRanges(corrected, known.own_m(sigma), common, nothing),
     }
     if model is None:
         return found
@@ -200,7 +207,7 @@ def filter_ranges(ranges: Ranges, calibration: Calibration, fixed: FixedStd) -> 
     )
     errors = replace(kinds[0], share=np.abs(sign) * shares, detour_m=detours)
     measured = corrected - model.location_m * sign.sum(axis=1)
-    found["robust"] = FilterRanges(measured, known.own_m(noise), errors, common_m=common)
+    found["robust"] = FilterRanges(measured, known.own_m(noise), common, nothing, errors=errors)
     if lasting := model.lasting:
         own, shared, time_s = np.sqrt(lasting.own_variance), np.sqrt(lasting.lasting_variance), lasting.time_s
         centred = corrected - lasting.mean * np.sum(sign * sigma, axis=1)

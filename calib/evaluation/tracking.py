@@ -18,7 +18,7 @@ from calib.data.ranges import Ranges
 from calib.data.sources import Flight
 from calib.evaluation.range_updates import RangeErrors, gated_update, mixture_update, multilaterate
 from calib.settings import CheckedSettings
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
 from uwblink.recording.schema import Poses
 
@@ -104,8 +104,8 @@ class Track(BodyTrack):
         return f"track of {len(self.time_ns)} measurements, rms error {self.rmse_m:.3f} m"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Problem:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Problem(ColumnTable):
     """What is known of one body at each of its measurements (n,).
 
     `ranges` are all that it needs, `rows` the measurements among these and their arrivals, in order of time. `place` is
@@ -126,11 +126,6 @@ class Problem:
     other: Floats
     pair: Ints
     known_m: Floats
-
-    def __getitem__(self, rows: Bools) -> Problem:
-        """Return the problem with some measurements."""
-        columns = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return replace(self, **{k: one[rows] for k, one in columns.items() if isinstance(one, np.ndarray)})
 
     @property
     def elapsed_s(self) -> Floats:
@@ -160,7 +155,7 @@ def problems(flight: Flight) -> list[Problem]:
     for body in flight.moving_bodies():
         mine = [tag.tag for tag in flight.tags if tag.body == body]
         ranges = _ranges_about(flight.ranges, mine)
-        ends, sign, exchange = _distances_in(ranges)
+        ends, sign, exchange = distances_in(ranges)
         time, inside = ranges.time_ns[exchange], np.isin(ends, mine)
         free = inside[..., 0] ^ inside[..., 1]
         rows = np.flatnonzero((free & (sign != 0)).any(axis=1))
@@ -187,8 +182,8 @@ def problems(flight: Flight) -> list[Problem]:
             pair=np.unique(ends.min(axis=2) * 2**16 + ends.max(axis=2), return_inverse=True)[1].reshape(sign.shape),
             known_m=np.sum(np.where(free, 0.0, sign * np.linalg.norm(antenna - away, axis=2)), axis=1),
         )
-        known = np.isfinite(problem.arm + problem.other).all(axis=(1, 2))
-        if known.any():
+        known = np.flatnonzero(np.isfinite(problem.arm + problem.other).all(axis=(1, 2)))
+        if len(known):
             found.append(problem[known])
     return found
 
@@ -202,7 +197,7 @@ def _ranges_about(ranges: Ranges, tags: list[int]) -> Ranges:
     return replace(ranges, arrivals=heard)[needed]
 
 
-def _distances_in(ranges: Ranges) -> tuple[Ints, Floats, Ints]:
+def distances_in(ranges: Ranges) -> tuple[Ints, Floats, Ints]:
     """Return the tags (n, k, 2) and signs (n, k) of the distances in ranges and arrivals, and exchanges (n,)."""
     ends, exchange, heard = np.column_stack([ranges.initiator, ranges.target]), np.arange(len(ranges)), ranges.arrivals
     if heard is None:
@@ -231,17 +226,17 @@ class FilterRanges:
     """
 
     measured_m: Floats
-    std_m: Floats | float
-    errors: RangeErrors | None = None
-    shared_m: Floats | float = 0.0
+    std_m: Floats
+    common_m: Floats
+    shared_m: Floats
     lasting_s: float = np.inf
-    common_m: Floats | float = 0.0
+    errors: RangeErrors | None = None
 
     def at(self, rows: Ints) -> FilterRanges:
         """Return some measurements."""
-        columns = {name: np.asarray(getattr(self, name)) for name in ("measured_m", "std_m", "shared_m", "common_m")}
+        measured, std, common, shared = (x[rows] for x in (self.measured_m, self.std_m, self.common_m, self.shared_m))
         errors = None if self.errors is None else self.errors.at(rows)
-        return replace(self, errors=errors, **{k: one[rows] if one.ndim else one for k, one in columns.items()})
+        return FilterRanges(measured, std, common, shared, self.lasting_s, errors)
 
 
 def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: Settings) -> dict[str, list[Track]]:
@@ -251,12 +246,12 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
     order in units of `shared_m` (Bar-Shalom, Li and Kirubarajan 2001, section 8.2), and the error that measurements of
     one exchange share, in units of `common_m`. Arrays are (filters, seeds, ...).
     """
-    count, known = len(problem.time_ns), list(ranges.values())
+    count, known = len(problem), list(ranges.values())
     measured, std, common = (
-        np.stack([np.broadcast_to(getattr(one, name), count) for one in known], axis=1)[..., None]
+        np.stack([getattr(one, name) for one in known], axis=1)[..., None]
         for name in ("measured_m", "std_m", "common_m")
     )
-    shared = np.stack([np.broadcast_to(one.shared_m, problem.sign.shape) for one in known], axis=1)[:, :, None]
+    shared = np.stack([one.shared_m for one in known], axis=1)[:, :, None]
     noises = [problem.noisy(settings, settings.seed + k) for k in range(settings.seeds)]
     moves = np.stack([moves for _, moves in noises], axis=1)
     moved = moves.cumsum(axis=0)
@@ -285,8 +280,8 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
         distance = np.linalg.norm(towards, axis=-1)
         h = np.zeros_like(x)
         h[..., :3] = np.sum(towards * (problem.sign[k] / np.maximum(distance, 1e-6))[..., None], axis=-2)
-        for one, pair in enumerate(pairs):
-            h[..., pair] += shared[k, ..., one]
+        for which, pair in enumerate(pairs):
+            h[..., pair] += shared[k, ..., which]
         h[..., -1] = common[k]
         ph = np.matmul(p, h[..., None])[..., 0]
         variance = np.sum(h * ph, axis=-1) + std[k] ** 2
