@@ -209,24 +209,24 @@ def filter_ranges(ranges: Ranges, calibration: Calibration, fixed: FixedStd) -> 
     measured = corrected - model.location_m * sign.sum(axis=1)
     found["robust"] = FilterRanges(measured, known.own_m(noise), common, nothing, errors=errors)
     if lasting := model.lasting:
-        own, shared, time_s = np.sqrt(lasting.own_variance), np.sqrt(lasting.lasting_variance), lasting.time_s
-        centred = corrected - lasting.mean * np.sum(sign * sigma, axis=1)
-        # A gate lets longer reflections pass in differences of arrival, which have five times the variance of ranges.
-        gate_m = np.sqrt(GATE) * np.hypot(known.own_m(sigma), common) * (common > 0)
+        # Receptions have independent noise: only reflections last in differences of arrival. A gate lets longer ones
+        # pass there, because these have five times the variance of ranges.
+        heard = common > 0
+        own, shared = np.where(heard, [[1.0], [0.0]], np.sqrt([[lasting.own_variance], [lasting.lasting_variance]]))
+        gate_m = np.sqrt(GATE) * np.hypot(known.own_m(sigma), common) * heard
         detours_m2 = shares * model.square_below_m2(detours, gate_m[:, None])
-        # What lasts is the same in both receptions of a range, and so in each. The mixture contains reflections within
-        # the gate, so the total variance is that of the noise.
-        for name, one, std, unit in (
-            ("variance", centred, sigma, 1.0),
-            ("robust", measured, noise, np.hypot(own, shared)),
+        centred = corrected - lasting.mean * np.sum(sign * sigma, axis=1)
+        # The mixture contains reflections within the gate, so the total variance is that of the noise.
+        units = np.ones(len(sign)), np.hypot(own, shared)
+        for name, one, std, unit in zip(
+            ("variance", "robust"), (centred, measured), (sigma, noise), units, strict=True
         ):
             found[name] = replace(
                 found[name],
                 measured_m=one,
                 std_m=own / unit * known.own_m(std),
-                shared_m=sign * np.sqrt((shared / unit * std) ** 2 + detours_m2),
-                lasting_s=time_s,
-                common_m=own / unit * common,
+                shared_m=sign * np.sqrt((shared / unit)[:, None] ** 2 * std**2 + detours_m2),
+                lasting_s=lasting.time_s,
             )
     return found
 
