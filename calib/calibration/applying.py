@@ -150,15 +150,11 @@ def corrected_arrivals(calibration: Calibration, ranges: Ranges) -> CorrectedArr
     applied = corrected_ranges(calibration, exchange)
     delay_ns = np.array([calibration.delays_ns[tag] for tag in exchange.target.tolist()])
     late_m = 1e-9 * calibration.speed_of_light * delay_ns - reception_bias_m(calibration, receptions)
-    response, poll = receptions[:2]
-    sigma = np.column_stack([noise_m(calibration, one) for one in (response, poll)])
-    shares = (
-        np.full(len(heard), np.nan)
-        if calibration.errors is None
-        else calibration.errors.shapes(calibration.lifted(one), one.initiator, one.target).tail_share
-        for one in (response, poll)
-    )
-    late_share, early_share = shares
+    sigma, model = np.column_stack([noise_m(calibration, one) for one in receptions[:2]]), calibration.errors
+    late_share, early_share = np.full((2, len(heard)), np.nan)
+    if model is not None:
+        shapes = (model.shapes(calibration.lifted(one), one.initiator, one.target) for one in receptions[:2])
+        late_share, early_share = (one.tail_share for one in shapes)
     return CorrectedArrivals(
         raw_m=heard.raw_m,
         corrected_m=heard.raw_m + late_m - (applied.corrected_m - exchange.raw_m),

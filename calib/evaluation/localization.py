@@ -111,8 +111,6 @@ def localize(
     calibration = given_calibration(calibration)
     chosen = settings or Settings()
     flight = _flight_for(data, calibration, chosen)
-    if chosen.use == "receptions":
-        require_arrivals(flight.ranges)
     fixed = fixed_std(calibration, chosen, training)
     require_times(flight.ranges)
     bodies = problems(flight)
@@ -141,9 +139,14 @@ def localize(
 
 def _flight_for(data: Data | Flight, calibration: Calibration, settings: Settings) -> Flight:
     """Return a flight with what `settings` use of it."""
-    if isinstance(data, Flight):
-        return data
-    return load_flight(data, need_power=calibration.needs_power, overheard=settings.use == "receptions")
+    heard = settings.use == "receptions"
+    flight = data
+    if not isinstance(flight, Flight):
+        flight = load_flight(flight, need_power=calibration.needs_power, overheard=heard)
+    if heard:
+        require_arrivals(flight.ranges)
+        return flight
+    return replace(flight, ranges=replace(flight.ranges, arrivals=None))
 
 
 @dataclass(frozen=True, slots=True)

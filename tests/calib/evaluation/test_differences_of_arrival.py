@@ -9,7 +9,9 @@ from scipy.interpolate import BSpline
 
 import calib
 from calib.calibration.power_curves import Curve
+from calib.data.sources import load_flight
 from calib.evaluation import Settings, localization_json, localization_text, summarize
+from calib.evaluation.tracking import FilterRanges, problems, run_filters
 from tests import processes
 from uwbsim import simulate
 from uwbsim.scenario.model import Scenario
@@ -151,6 +153,21 @@ def test_a_robot_that_never_sends_is_localized(known, heard):
     assert total.nees_bounds[1] - total.nees_bounds[0] < 1
     assert localization_text(found, LISTEN).splitlines()[-1] == f"by 0 ranges and {3 * 9600} differences of arrival"
     assert [one["arrivals"] for one in localization_json(found)["scenarios"]] == [9600] * 3
+
+
+def test_the_filter_knows_what_listeners_of_an_exchange_share(heard):
+    (problem,), rng = problems(load_flight(heard[0], overheard=True)), np.random.default_rng(5)
+    true_m = problem.ranges.arrivals.truth_m[problem.rows - len(problem.ranges)]
+    drawn = 0.3 * rng.normal(size=len(problem.ranges))[problem.exchange] + 0.05 * rng.normal(size=len(true_m))
+    own, common = np.full(len(true_m), 0.05), np.full(len(true_m), 0.3)
+    means = list[float]()
+    for std, shared in ((own, common), (np.hypot(own, common), 0 * common)):
+        measured = {"variance": FilterRanges(true_m + drawn, std, shared, np.zeros_like(problem.sign))}
+        tracks = run_filters(problem, measured, replace(LISTEN, gate=1e9))["variance"]
+        means.append(np.mean([track.nees for track in tracks]))
+    # Taken for independent, two listeners count as two exchanges, and the filter believes them too much.
+    assert 2.5 < means[0] < 3.5
+    assert means[1] > 1.3 * means[0]
 
 
 def test_a_wrong_start_is_left_by_differences_alone(known, heard):
