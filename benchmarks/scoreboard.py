@@ -313,11 +313,14 @@ calib fit A.uwb -o A.json --hold-out 0.3
     ),
     DataSet(
         "swarm broadcasts",
-        "prathje/uwb-swarm-ranging at 0d023d2, `scripts/out`: serial logs of boards that range by broadcast; no true "
-        "distances.",
+        "prathje/uwb-swarm-ranging at 0d023d2, `scripts/out`: serial logs of boards that range by broadcast.",
         "swarm_broadcast_logs.tar.xz",
         prepare_swarm,
-        "uwblink import guess A.log -o A.toml\n",
+        """\
+uwblink import guess A.log -o A.toml
+uwblink import csv A.log --map A.toml -o A.uwb
+calib doctor A.uwb
+""",
     ),
 )
 
@@ -425,9 +428,8 @@ def write(folder: Path, page: Path, work: Path) -> int:
             continue
         print(data.name, flush=True)
         lines, notes = judge(data, folder, work)
-        rows += "".join(
-            f"{line}\n" for line in [f"| **{data.name}** | {'' if lines else 'refused'} | | | | | |", *lines]
-        )
+        none = "refused" if "fit" in data.commands else "no true distances"
+        rows += "".join(f"{line}\n" for line in [f"| **{data.name}** | {'' if lines else none} | | | | | |", *lines])
         doubted += f"\n**{data.name}**\n\n" + "".join(f"{note}\n" for note in notes or ["- nothing"])
     page.write_text(HEAD + rows + DOUBTED + doubted + RECIPES + recipes, encoding="utf-8")
     print(page)

@@ -24,8 +24,8 @@ import numpy as np
 import calib
 from benchmarks.standing import DIMENSIONS, Standing, power_dbm, standing_boards
 from calib.planning import SurveyPlanSettings
-from calib.planning.predicted import predict
 from calib.planning.result import PlannedArrangement
+from calib.planning.surveys import predict
 from uwblink.arrays import Floats
 
 PAGE = Path(__file__).parents[1] / "docs" / "accuracy.md"

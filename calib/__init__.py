@@ -30,14 +30,12 @@ if TYPE_CHECKING:
     from calib.planning.result import FlightPlan, Plan
     from calib.planning.settings import FlightPlanSettings, SurveyPlanSettings
     from calib.planning.surveys import plan
-    from calib.report.campaign import run_campaign
+    from calib.report.campaign import run_campaign, write_report
     from calib.report.sections import register_report_section
-    from calib.report.writing import write_report
     from calib.settings import FitSettings, FlightSettings, SurveySettings
     from calib.surveys.knowledge import Knowledge, KnownPosition
     from calib.surveys.result import SurveyResult
-    from calib.surveys.sample import sample_arrangements
-    from calib.surveys.survey import survey
+    from calib.surveys.survey import sample_arrangements, survey
     from calib.trajectories.fitting import fit_from_ranges
 
 __all__ = [
@@ -118,10 +116,10 @@ _homes = {
     "register_loss": "calib.estimator.losses",
     "register_report_section": "calib.report.sections",
     "run_campaign": "calib.report.campaign",
-    "sample_arrangements": "calib.surveys.sample",
+    "sample_arrangements": "calib.surveys.survey",
     "sample_flight": "calib.data.samples",
     "survey": "calib.surveys.survey",
-    "write_report": "calib.report.writing",
+    "write_report": "calib.report.campaign",
 }
 
 if not TYPE_CHECKING:

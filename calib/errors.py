@@ -1,6 +1,6 @@
 """The errors of `calib`, of two kinds with different exit status."""
 
-from uwblink.errors import OfParameter
+from uwblink.errors import OfParameter, PlainWarning
 
 
 class CalibError(OfParameter):
@@ -21,3 +21,7 @@ class UnanswerableError(CalibError, ValueError):
         """Say what, where and what to do."""
         super().__init__(text, parameter=parameter)
         self.undetermined = undetermined or []
+
+
+class LeftOutWarning(PlainWarning):
+    """Ranges of pairs that a calibration does not determine are left out; names the pairs."""

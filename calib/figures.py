@@ -346,7 +346,7 @@ def over_time(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figu
         shown, some = order[:: max(1, len(order) // 800)], order[:: max(1, len(order) // 120)]
         panel.plot(time[shown], error[shown], ".", ms=1.3, color=BLUE, alpha=0.6, rasterized=True)
         panel.plot(time[some], applied.sigma_m[some, None] * [-196, 196], color=INK, lw=0.6)
-        panel.set_title(f"tags {name}", loc="left", pad=2)
+        panel.set_title(f"tags {name}", pad=2)
         label(panel, "", "")
     panels[0].set_ylim(*_reach_cm(error))
     figure.supxlabel("time (s)", fontsize="medium")

@@ -50,6 +50,10 @@ class Finding:
     remedy: str
     p_value: float
 
+    def __str__(self) -> str:
+        """Return the evidence and the remedy."""
+        return f"{self.evidence}; {self.remedy}"
+
 
 @dataclass(frozen=True, slots=True)
 class Candidate:

@@ -19,16 +19,6 @@ from uwblink.text_files import TomlReader
 if TYPE_CHECKING:
     from uwblink import KnownDistance
 
-CHOICES: Final = {
-    "lift": ("mean-of-lifted", "lift-of-mean"),
-    "constants": ("tag", "pair"),
-    "fold": ("time", "pair", "session"),
-    "use": ("exchanges", "receptions"),
-    "attitudes": ("poses", "imu", "none"),
-    "anchors": ("given", "sought"),
-    "heights": ("used", "ignored"),
-    "model": ("imu", "constant-velocity"),
-}
 POSITIVE: Final = sys.float_info.min
 ABOVE_ZERO: Final = (POSITIVE, math.inf, "a number above 0")
 NUMBERS: Final = {
@@ -44,7 +34,7 @@ NUMBERS: Final = {
     **dict.fromkeys(("start_std_m", "rate_hz", "speed_m_s"), ABOVE_ZERO),
     "seeds": (1, 1000, "1 to 1000"),
 }
-"""The least and the largest value of a setting, and what is expected."""
+"""The least and the largest value of settings that state no `bounds` themselves, and what is expected."""
 
 FIXED: Any = {
     "help": "Known delay of a tag, which stays as it is, as in 1=-0.36. May be repeated.",
@@ -126,13 +116,17 @@ class CheckedSettings:
     """Settings that results repeat."""
 
     def __post_init__(self) -> None:
-        """Check choices, numbers and known delays; a number may be None if it is by default."""
+        """Check choices, numbers and known delays; a number may be None if it is by default.
+
+        A setting that is no word by default may be another than its names, as a loss that was registered.
+        """
         for one in fields(self):
-            name, value = one.name, getattr(self, one.name)
-            if name in CHOICES:
-                check_choice(name, value, CHOICES[name])
-            if name in NUMBERS and (value is not None or one.default is not None):
-                least, most, expected = NUMBERS[name]
+            name, value, bounds = one.name, getattr(self, one.name), one.metadata.get("bounds")
+            if one.metadata.get("names") and isinstance(one.default, str):
+                check_choice(name, value, one.metadata["names"])
+            stated = NUMBERS.get(name) if bounds is None else (*bounds, "{:g} to {:g}".format(*bounds))
+            if stated and (value is not None or one.default is not None):
+                least, most, expected = stated
                 if not (_is_finite(value) and least <= value <= most):
                     raise BadInputError(f"found {value!r}, expected {expected}", parameter=name)
             if name == "fixed_ns":
@@ -213,7 +207,7 @@ class FitSettings(CheckedSettings):
     lift: str = setting(
         "mean-of-lifted",
         "Lifted power of an exchange from the powers of its two ends.",
-        names=CHOICES["lift"],
+        names=("mean-of-lifted", "lift-of-mean"),
         rich_help_panel=MODEL_PANEL,
     )
     alpha_dbm: float = -82.0
@@ -256,13 +250,13 @@ class FitSettings(CheckedSettings):
     constants: str = setting(
         "tag",
         "What has a constant error: each tag (antenna delays), or each pair.",
-        names=CHOICES["constants"],
+        names=("tag", "pair"),
         rich_help_panel=MODEL_PANEL,
     )
     use: str = setting(
         "exchanges",
         "What is fitted: exchanges, by their two ends; or receptions, with what other tags overheard of them.",
-        names=CHOICES["use"],
+        names=("exchanges", "receptions"),
         rich_help_panel=MODEL_PANEL,
     )
     hold_out: float = setting(
@@ -274,7 +268,7 @@ class FitSettings(CheckedSettings):
     fold: str = setting(
         "time",
         "What is held out: tenths of each session's time, pairs, or sessions.",
-        names=CHOICES["fold"],
+        names=("time", "pair", "session"),
         rich_help_panel=MODEL_PANEL,
     )
 
@@ -346,7 +340,7 @@ class FlightSettings(CheckedSettings):
     attitudes: str = setting(
         "poses",
         "Source of attitudes: the poses, all along; the IMU; or none.",
-        names=CHOICES["attitudes"],
+        names=("poses", "imu", "none"),
         rich_help_panel=FLIGHT_PANEL,
     )
     heading_std_deg: float = setting(
@@ -359,7 +353,7 @@ class FlightSettings(CheckedSettings):
     anchors: str = setting(
         "given",
         "Positions of bodies that stand still: given by the poses, or sought (estimated).",
-        names=CHOICES["anchors"],
+        names=("given", "sought"),
         rich_help_panel=FLIGHT_PANEL,
     )
     distances: tuple[Any, ...] = setting(
@@ -375,7 +369,7 @@ class FlightSettings(CheckedSettings):
     heights: str = setting(
         "used",
         "Readings of height sensors in the recording: used or ignored.",
-        names=CHOICES["heights"],
+        names=("used", "ignored"),
         rich_help_panel=FLIGHT_PANEL,
     )
     curve_from: Any = setting(  # a Calibration or its path

@@ -9,7 +9,8 @@ from uwblink.recording.file import Recording
 
 FOLDER = processes.ROOT / "scenarios"
 SCENARIOS = {path.relative_to(FOLDER).as_posix(): path for path in sorted(FOLDER.rglob("*.toml"))}
-PROMISED = """noiseless.toml room/room.toml icra2023/train.toml icra2023/test1.toml icra2023/test2.toml
+PROMISED = """noiseless.toml broadcast.toml tdoa.toml
+room/room.toml icra2023/train.toml icra2023/test1.toml icra2023/test2.toml
 anchors_and_tag/anchors_and_tag.toml anchors_and_tag/bipartite.toml new_tag/new_tag.toml day30/train.toml
 collisions/aloha.toml nlos_office/office.toml wrap/wrap.toml two_boards_on_a_bench/bench.toml
 lasting_reflections/hall.toml warm_up/warm_up.toml bench/bench.toml mounted_differently/before.toml

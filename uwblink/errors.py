@@ -30,7 +30,11 @@ class ArgumentError(UwblinkError, ValueError):
     """An argument that cannot be used; names the parameter, what was found, and what is expected."""
 
 
-class PluginWarning(UserWarning):
+class PlainWarning(UserWarning):
+    """Base of the warnings of all three packages, which commands print as a line."""
+
+
+class PluginWarning(PlainWarning):
     """A plug-in of another distribution cannot be used, with the reason."""
 
 

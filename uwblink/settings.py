@@ -24,11 +24,12 @@ def setting(
     `help` is the help text of the option. `flag` is the option if it differs from the field's name with dashes. `kind`
     is the type of the option if it differs from the field's, and `parse` converts it. `names` are the possible values,
     to which `more` adds some for completion; `tags` is the format ("{}=") in which a shell completes tags of the
-    recordings on the command line. `shown` is passed to `typer.Option`: `metavar`, `min`, `max`, `rich_help_panel`.
+    recordings on the command line. `shown` is passed to `typer.Option`: `metavar`, `min`, `max`, `rich_help_panel`; but
+    for `bounds`, the least and the largest value that checks of settings allow.
     """
     metadata = {
         "help": help, "flag": flag, "kind": kind, "parse": parse, "names": names, "more": more, "tags": tags,
-        "shown": shown,
+        "bounds": shown.pop("bounds", None), "shown": shown,
     }  # fmt: skip
     if isinstance(default, dict):
         return field(default_factory=default.copy, metadata=metadata)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from uwbsim.errors import ParameterError, ScenarioError, UwbsimError
     from uwbsim.pages.documents import show
     from uwbsim.protocols.comparison import ProtocolComparison, compare, optimum
+    from uwbsim.protocols.fleet import FleetFigures, predict_fleet
     from uwbsim.protocols.prediction import Prediction, State, predict_state
     from uwbsim.scenario.loading import load, shipped_scenarios
     from uwbsim.scenario.model import Scenario
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from uwbsim.world.channel import register_channel_effect
 
 __all__ = [
+    "FleetFigures",
     "ParameterError",
     "Prediction",
     "ProtocolComparison",
@@ -45,6 +47,7 @@ __all__ = [
     "load_design",
     "load_faults",
     "optimum",
+    "predict_fleet",
     "predict_state",
     "preview",
     "register_channel_effect",
@@ -57,6 +60,7 @@ __all__ = [
 ]
 
 _homes = {
+    "FleetFigures": "uwbsim.protocols.fleet",
     "ParameterError": "uwbsim.errors",
     "Prediction": "uwbsim.protocols.prediction",
     "ProtocolComparison": "uwbsim.protocols.comparison",
@@ -73,6 +77,7 @@ _homes = {
     "load_design": "uwbsim.sweep.design",
     "load_faults": "uwbsim.boards.server",
     "optimum": "uwbsim.protocols.comparison",
+    "predict_fleet": "uwbsim.protocols.fleet",
     "predict_state": "uwbsim.protocols.prediction",
     "preview": "uwbsim.simulation.run",
     "register_channel_effect": "uwbsim.world.channel",

@@ -1,5 +1,6 @@
 """Calibrations: the model, its file, other formats, corrections, comparison."""
 
+from calib.calibration.applying import keep_determined
 from calib.calibration.formats import antenna_delays_warning, free_delays, programmed, read_miluv
 from calib.calibration.model import delay_rows, held_out_line, pair_rows, rests_on
 
@@ -8,6 +9,7 @@ __all__ = [
     "delay_rows",
     "free_delays",
     "held_out_line",
+    "keep_determined",
     "pair_rows",
     "programmed",
     "read_miluv",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NamedTuple
 
@@ -13,7 +14,7 @@ from calib.calibration.document import Value, pair_name, split_text
 from calib.calibration.power_curves import ends, lift
 from calib.data.arrivals import Arrivals
 from calib.data.ranges import Ranges
-from calib.errors import BadInputError
+from calib.errors import BadInputError, LeftOutWarning
 from calib.pairs import pairs_of
 from uwblink.arrays import Bools, Floats, data_frame
 from uwblink.display import as_html, as_text, excerpt, first_few
@@ -166,9 +167,9 @@ def corrected_arrivals(calibration: Calibration, ranges: Ranges) -> CorrectedArr
 
 
 def arrivals_in(ranges: Ranges) -> Arrivals:
-    """Return the differences of arrival of ranges; raises `BadInputError` where they were not loaded."""
+    """Return the differences of arrival of ranges; raises `BadInputError` where nothing was overheard."""
     if ranges.arrivals is None:
-        raise BadInputError(f"{ranges.source}: has no differences of arrival; load it with overheard=True")
+        raise BadInputError(f"{ranges.source}: has no differences of arrival, because no tag overheard its ranges")
     return ranges.arrivals
 
 
@@ -223,25 +224,36 @@ def _without_delays(calibration: Calibration, ranges: Ranges) -> Floats:
             f"{ranges.source}: no delay for tag {', '.join(map(str, missing))} in the calibration, "
             f"which knows {known}; fit one from a recording with all tags"
         )
-    _refuse_within(calibration, ranges)
+    if not (good := determined(calibration, ranges)).all():
+        raise BadInputError(within_text(calibration, ranges, good))
     size = max(ranges.tags(), default=0) + 1
     delay_s = np.array([calibration.delays_ns.get(t, math.nan) for t in range(size)]) * 1e-9
     flight = ranges.weight_initiator * delay_s[ranges.initiator] + ranges.weight_target * delay_s[ranges.target]
     return ranges.raw_m + calibration.speed_of_light * flight - _offsets_m(calibration, ranges)
 
 
-def _refuse_within(calibration: Calibration, ranges: Ranges) -> None:
-    """Raise `BadInputError` for a pair whose delays the calibration knows only in sums with others."""
-    sides = calibration.sides
-    if not sides:
-        return
-    ends = pairs_of(ranges.initiator, ranges.target).ends.tolist()
-    apart = [pair for pair in ends if sum(sides.get(tag, 0) for tag in pair)]
-    if apart:
-        raise BadInputError(
-            f"{ranges.source}: the calibration does not determine the ranges of {first_few(map(pair_name, apart))}: "
-            f"{split_text(calibration.undetermined_splits)}"
-        )
+def determined(calibration: Calibration, ranges: Ranges) -> Bools:
+    """Return of which ranges (n,) a calibration knows the delays, and not only in sums with those of other tags."""
+    sides, pairs = calibration.sides, pairs_of(ranges.initiator, ranges.target)
+    good = [not sum(sides.get(tag, 0) for tag in pair) for pair in pairs.ends.tolist()]
+    return np.array(good, dtype=bool)[pairs.number]
+
+
+def keep_determined(calibration: Calibration, ranges: Ranges) -> Ranges:
+    """Return the ranges that a calibration determines, all if it determines none; a `LeftOutWarning` names others."""
+    good = determined(calibration, ranges)
+    if good.all() or not good.any():
+        return ranges
+    text = f"{within_text(calibration, ranges, good)}; {np.count_nonzero(~good)} of {len(good)} ranges are left out"
+    warnings.warn(text, LeftOutWarning, stacklevel=3)
+    return ranges[good]
+
+
+def within_text(calibration: Calibration, ranges: Ranges, good: Bools) -> str:
+    """Return in words of which pairs a calibration does not determine the ranges, those that are not `good` (n,)."""
+    names = first_few(pairs_of(ranges.initiator[~good], ranges.target[~good]).names)
+    why = split_text(calibration.undetermined_splits)
+    return f"{ranges.source}: the calibration does not determine the ranges of {names}: {why}"
 
 
 def _offsets_m(calibration: Calibration, ranges: Ranges) -> Floats:

@@ -45,9 +45,7 @@ class CalibrationComparison:
     @property
     def verdict(self) -> str:
         """Return "same", "different", or "unknown" where no differences could be tested."""
-        if np.isnan(self.probability):
-            return "unknown"
-        return "same" if self.same else "different"
+        return "unknown" if np.isnan(self.probability) else "same" if self.same else "different"
 
     def __repr__(self) -> str:
         """Return the table."""
@@ -65,12 +63,12 @@ class CalibrationComparison:
         )
         sides = (first, self.only_first), (second, self.only_second)
         only = [f"only in {name}: tags {', '.join(map(str, tags))}" for name, tags in sides if tags]
-        verdict = "no verdict: too few tags have a standard error in both calibrations"
-        if self.verdict != "unknown":
-            verdict = (
-                f"the delays are {'the same' if self.same else 'different'}: chi-square {self.chi_square:.1f} with "
-                f"{self.degrees} degrees of freedom, probability {self.probability:.3f}"
-            )
+        verdict = (
+            "no verdict: too few tags have a standard error in both calibrations"
+            if self.verdict == "unknown"
+            else f"the delays are {'the same' if self.same else 'different'}: chi-square {self.chi_square:.1f} with "
+            f"{self.degrees} degrees of freedom, probability {self.probability:.3f}"
+        )
         return "\n".join([*lines, shapes, *only, verdict])
 
     def to_dict(self) -> dict[str, Any]:
@@ -90,11 +88,9 @@ def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationC
     >>> calib.compare(first, second).same
     True
     """
-    first = given_calibration(first, "first")
-    second = given_calibration(second, "second")
+    first, second = both = given_calibration(first, "first"), given_calibration(second, "second")
     if first.pair_offsets or second.pair_offsets:
         raise UnanswerableError("constants of pairs are no delays, and only delays can be compared")
-    both = (first, second)
     known = [{t for t in c.delays_ns if t in c.sides or not np.isinf(c.delays_std_ns.get(t, np.nan))} for c in both]
     common = sorted(known[0] & known[1])
     if len(common) < 2:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.calibration.applying import CorrectedRanges, columns_of
+from calib.calibration.applying import CorrectedRanges, columns_of, determined, within_text
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration, load_calibration
 from calib.data.ranges import Ranges
-from calib.errors import BadInputError
+from calib.errors import BadInputError, LeftOutWarning
 from uwblink.arrays import Floats
 from uwblink.exporters import check_export, export_recording
 from uwblink.output import check_output
@@ -48,7 +49,8 @@ def apply(
 
     The table `corrected` has the raw range of each exchange, its standard deviation and its flags. `to` writes a
     folder in a form of `uwblink.exporters` instead ("csv", "parquet", "mcap", "rosbag2"). Stamps stay as they were
-    recorded. An exchange without any power gets the delays' part only. Raises `BadInputError` for a recording that is
+    recorded. An exchange without any power gets the delays' part only. Exchanges of pairs that the calibration does not
+    determine are left out, with a `LeftOutWarning`. Raises `BadInputError` for a recording that is
     corrected already, and what `Recording.open`, `check_output` and `export_recording` raise.
 
     >>> import calib, tempfile
@@ -77,12 +79,20 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
     with Recording.open(source, memory_mb=READING_MB) as recording:
         if "calibration" in recording.meta():
             raise BadInputError(f"{source}: its ranges are corrected already; apply to the original")
-        tags, counts = recording.tags(), np.zeros(3, dtype=np.int64)
+        tags, counts, left_out, why = recording.tags(), np.zeros(3, dtype=np.int64), 0, ""
         meta = {"calibration": calibration.provenance}
         with recording.copying(output, without=("exchanges", "corrected"), meta=meta, force=force) as written:
             for exchanges, poses in exchanges_with_poses(recording):
                 ranges = Ranges.from_exchanges(exchanges, poses=poses, tags=tags, source=Path(source).name)
-                counts += _append(written, exchanges, calibration.apply(ranges))
+                good = determined(calibration, ranges)
+                if not good.all():
+                    left_out, why = left_out + int(np.count_nonzero(~good)), within_text(calibration, ranges, good)
+                if good.any():
+                    counts += _append(written, exchanges[good], calibration.apply(ranges[good]))
+            if left_out and not counts[0]:
+                raise BadInputError(why)
+    if left_out:
+        warnings.warn(f"{why}; {left_out} ranges are left out", LeftOutWarning, stacklevel=3)
     return Applied(*counts.tolist())
 
 

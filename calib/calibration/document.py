@@ -177,14 +177,12 @@ def pair_name(pair: Sequence[int]) -> str:
     return "-".join(map(str, pair))
 
 
-def _tags_text(tags: Tags) -> str:
-    return f"tag{'s' * (len(tags) > 1)} {first_few(map(str, tags))}"
-
-
 def known_of_splits(splits: Iterable[Split]) -> str:
     """Return in words which ranges undetermined splits leave known."""
-    known = "; ".join(" and ".join(map(_tags_text, sides)) for sides in splits)
-    return f"only ranges between {known} are determined"
+    known = (
+        " and ".join(f"tag{'s' * (len(tags) > 1)} {first_few(map(str, tags))}" for tags in sides) for sides in splits
+    )
+    return f"only ranges between {'; '.join(known)} are determined"
 
 
 def split_text(splits: Iterable[Split]) -> str:

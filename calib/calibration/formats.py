@@ -78,9 +78,7 @@ def registers(
             "calibration was fitted are unknown; give the recording that it was fitted to, or a file of antenna delays",
             parameter="base",
         )
-    if firmware:
-        return {tag: one._replace(reply=one.tx) for tag, one in found.items()}
-    return found
+    return {tag: one._replace(reply=one.tx) for tag, one in found.items()} if firmware else found
 
 
 def antenna_delays_warning(calibration: Calibration, path: str | os.PathLike[str]) -> str:

@@ -183,9 +183,8 @@ class Calibration:
     @property
     def needs_power(self) -> bool:
         """Whether ranges without any power cannot be corrected whole."""
-        curves = [self.bias_curve, self.sigma_curve]
-        curves += [curve for group in self.groups.values() for curve in (group.bias_curve, group.sigma_curve)]
-        return not all(curve.flat for curve in curves)
+        curves: tuple[Calibration | TagGroup, ...] = (self, *self.groups.values())
+        return not all(one.bias_curve.flat and one.sigma_curve.flat for one in curves)
 
     def lifted(self, ranges: Ranges) -> Floats:
         """Return the lifted power of each range, as this calibration defines it."""
@@ -217,20 +216,20 @@ class Calibration:
     def correct_arrivals(self, ranges: Ranges) -> CorrectedArrivals:
         """Correct what listeners overheard of ranges: the target's delay, the bias of each reception, the range.
 
-        `ranges` were loaded with `overheard`; the result has a row for each of their `arrivals`. With initiator i,
-        target j, listener k, and bias b and noise e of receptions of poll (1) and response (2), a difference of arrival
-        is d_jk - d_ik - c d_j + b1_j + b2_k - b1_k; the corrected range in place of d_ij leaves (e1_j - e2_i)/2 + e2_k
-        - e1_k. With sigma of the curve at the powers of exchange, response and poll its variance is sigma_ij^2 +
-        2 sigma_jk^2 + 2 sigma_ik^2, because a reception has twice the variance of a range; where the rate of the clocks
-        comes from a third message, one factor is above 2 and one below (`applying.reception_gains`). The listener's
-        delay has no part. Raises `BadInputError` where a delay is not known, or only in a sum with others.
+        The result has a row for each of the ranges' `arrivals`. With initiator i, target j, listener k, and bias b and
+        noise e of receptions of poll (1) and response (2), a difference of arrival is d_jk - d_ik - c d_j + b1_j + b2_k
+        - b1_k; the corrected range in place of d_ij leaves (e1_j - e2_i)/2 + e2_k - e1_k. With sigma of the curve at
+        the powers of exchange, response and poll its variance is sigma_ij^2 + 2 sigma_jk^2 + 2 sigma_ik^2, because
+        a reception has twice the variance of a range; where the rate of the clocks comes from a third message, one
+        factor is above 2 and one below (`applying.reception_gains`). The listener's delay has no part. Raises `BadInputError`
+        where a delay is not known, or only in a sum with others.
 
         >>> import calib
         >>> ranges = calib.load_ranges(calib.sample_flight())
         >>> calib.fit(ranges).calibration.correct_arrivals(ranges)
         Traceback (most recent call last):
         ...
-        calib.errors.BadInputError: memory: has no differences of arrival; load it with overheard=True
+        calib.errors.BadInputError: memory: has no differences of arrival, because no tag overheard its ranges
         """
         return corrected_arrivals(self, ranges)
 
@@ -310,12 +309,18 @@ class Calibration:
             return found
         return CorrectedRange(*(column.item() for column in found))
 
+    @property
+    def curve_covariance_m2(self) -> Floats:
+        """The covariance (m, m) of the coefficients of the bias curve, zero where it is not stated."""
+        size = len(self.bias_curve.coefficients)
+        return np.zeros((size, size)) if self.uncertainty is None else np.array(self.uncertainty.bias_m2)
+
     def band(self, lifted: Floats, which: Literal["bias", "sigma"]) -> Floats | None:
         """Return the standard error of a curve at lifted powers (n,), in metres; None where it is not known."""
         if self.uncertainty is None:
             return None
         curve = self.bias_curve if which == "bias" else self.sigma_curve
-        covariance = np.array(self.uncertainty.bias_m2 if which == "bias" else self.uncertainty.sigma_m2)
+        covariance = self.curve_covariance_m2 if which == "bias" else np.array(self.uncertainty.sigma_m2)
         splines = basis(np.clip(lifted, *curve.range), np.array(curve.knots))
         return np.asarray(np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", splines, covariance, splines), 0)))
 
@@ -391,18 +396,18 @@ def given_calibration(source: CalibrationSource, parameter: str = "calibration")
     return known
 
 
-MAX_ROWS: Final = 40
-"""Maximum number of tags or pairs that are printed, about a screen."""
-
-
 def _tables(calibration: Calibration) -> dict[str, list[tuple[str, ...]]]:
     """Return the tables of a calibration by title: delays, constants of pairs, and curves."""
-    heads = {"Antenna delays": ("tag", "delay (ns)", "interval"), "Constants": ("pair", "constant (cm)", "interval")}
-    bodies = delay_rows(calibration), pair_rows(calibration)
-    tables: dict[str, list[tuple[str, ...]]] = {}
-    for (title, head), rows in zip(heads.items(), bodies, strict=True):
-        more = [("...", "", f"{len(rows) - MAX_ROWS} more")] if len(rows) > MAX_ROWS else []
-        tables |= {title: [head, *rows[:MAX_ROWS], *more]} if rows else {}
+    bodies = {
+        "Antenna delays": [("tag", "delay (ns)", "interval"), *delay_rows(calibration)],
+        "Constants": [("pair", "constant (cm)", "interval"), *pair_rows(calibration)],
+    }
+    most = 40  # tags or pairs that are printed, about a screen
+    tables: dict[str, list[tuple[str, ...]]] = {
+        title: [*rows[: most + 1], *[("...", "", f"{len(rows) - 1 - most} more")] * (len(rows) > most + 1)]
+        for title, rows in bodies.items()
+        if len(rows) > 1
+    }
     return tables | {"Curves": curve_rows(calibration)}
 
 

@@ -79,9 +79,7 @@ class Curve:
 
     def inside(self, lifted: Floats) -> Bools:
         """Return which lifted powers (n,) the curve was fitted at; a flat one holds at all, measured or not."""
-        if self.flat:
-            return np.ones(np.shape(lifted), dtype=bool)
-        return (lifted >= self.range[0]) & (lifted <= self.range[1])
+        return np.asarray(self.flat | ((lifted >= self.range[0]) & (lifted <= self.range[1])))
 
     def beyond(self, lifted: Floats | float) -> Floats:
         """Return by how much the curve would go on (n,) where it is held constant, straight on from its ends, metres.
@@ -114,9 +112,7 @@ SigmaCurve = Annotated[BiasCurve, joint(_negative)]
 
 def flat_curve(value_m: float, span: tuple[float, float]) -> Curve:
     """Return a curve of one value, with the two lifted powers of `span` as its range."""
-    low, high = span
-    if not high > low:
-        low, high = 0.999 * low, 1.001 * high
+    low, high = span if span[1] > span[0] else (0.999 * span[0], 1.001 * span[1])
     return Curve((low,) * (DEGREE + 1) + (high,) * (DEGREE + 1), (value_m,) * (DEGREE + 1), DEGREE, (low, high))
 
 

@@ -67,8 +67,10 @@ def single_as_double(view: RecordingView) -> Iterator[Candidate]:
     e = view.exchanges
     empty = 100 * float(np.mean(~np.isin(e.protocol, single_sided()) & (e.tx3 == 0) & (e.rx3 == 0)))
     if empty > 50:
-        evidence = f"{empty:.0f} % of the double-sided exchanges have no third message"
-        yield Candidate("single-sided data taken for double-sided", evidence)
+        yield Candidate(
+            "single-sided data taken for double-sided",
+            f"{empty:.0f} % of the double-sided exchanges have no third message",
+        )
 
 
 def impossible(view: RecordingView) -> Bools:
@@ -90,15 +92,17 @@ def with_itself(view: RecordingView) -> Iterator[Candidate]:
     same = e.initiator == e.target
     if same.any():
         tags = ", ".join(map(str, np.unique(e.initiator[same])[:6].tolist()))
-        evidence = f"{np.count_nonzero(same)} of {len(e)} exchanges have one tag at both ends ({tags})"
-        yield Candidate("a tag with itself", evidence)
+        yield Candidate(
+            "a tag with itself", f"{np.count_nonzero(same)} of {len(e)} exchanges have one tag at both ends ({tags})"
+        )
 
 
 def doubled(view: RecordingView) -> Iterator[Candidate]:
     """Rows that repeat another one: two robots log an exchange, and both logs were imported."""
     if view.doubled:
-        evidence = f"{view.doubled} of {view.doubled + len(view.exchanges)} rows repeat another one"
-        yield Candidate("doubled exchanges", evidence)
+        yield Candidate(
+            "doubled exchanges", f"{view.doubled} of {view.doubled + len(view.exchanges)} rows repeat another one"
+        )
 
 
 def corrupted(view: RecordingView) -> Iterator[Candidate]:
@@ -172,8 +176,11 @@ def another(view: RecordingView) -> Iterator[Candidate]:
         alike = [n for n in PROTOCOLS if tried.get((n, bits), 0.0) > share - 0.01 and n not in (said, name)]
         also = f" (or {' or '.join(alike)})" if alike else ""
         width, setting = (f" with {bits} bits", f", bits = {bits}") if bits != e.bits else ("", "")
-        evidence = f"read as {name}{also}{width} {numbers} ({said})"
-        yield Candidate("another protocol", evidence, words={"settings": f'protocol = "{name}"{setting}'})
+        yield Candidate(
+            "another protocol",
+            f"read as {name}{also}{width} {numbers} ({said})",
+            words={"settings": f'protocol = "{name}"{setting}'},
+        )
 
 
 def _possible_share(e: Exchanges) -> float:
@@ -240,8 +247,11 @@ def powers(view: RecordingView) -> Iterator[Candidate]:
         if -115 < times * middle < -55:
             guess = f"they look like {name}: times {times:g} they would be {times * middle:.0f} dBm"
             factor = f"multiply fpp1 and fpp2 by {times:g}"
-    evidence = f"the median power is {middle:+.5g} dBm, where these radios receive -115 to -55; {guess}"
-    yield Candidate("unit of the powers", evidence, words={"factor": factor})
+    yield Candidate(
+        "unit of the powers",
+        f"the median power is {middle:+.5g} dBm, where these radios receive -115 to -55; {guess}",
+        words={"factor": factor},
+    )
 
 
 def undetermined(view: RecordingView) -> Iterator[Candidate]:
@@ -284,8 +294,10 @@ def missing(view: RecordingView) -> Iterator[Candidate]:
     if powered < 50:
         yield Candidate("no powers", f"{powered:.0f} % of the exchanges have a first-path power")
     if true < 50 and not view.standing:
-        evidence = f"{true:.0f} % of the exchanges have one: poses are missing or do not cover the recording"
-        yield Candidate("no true distances", evidence)
+        yield Candidate(
+            "no true distances",
+            f"{true:.0f} % of the exchanges have one: poses are missing or do not cover the recording",
+        )
 
 
 def confounded(view: RecordingView) -> Iterator[Candidate]:
@@ -314,8 +326,9 @@ def confounded(view: RecordingView) -> Iterator[Candidate]:
             shares.append(1 - (1 - share) * (alone - 1) / max(alone - groups, 1))
     # Beyond, what is fitted over power has ten times its own variance (variance inflation, Marquardt 1970).
     if max(shares) > 0.9:
-        evidence = f"distance explains {100 * max(shares):.0f} % of the power's variance"
-        yield Candidate("power confounded with distance", evidence)
+        yield Candidate(
+            "power confounded with distance", f"distance explains {100 * max(shares):.0f} % of the power's variance"
+        )
 
 
 def swapped_roles(view: RecordingView) -> Iterator[Candidate]:

@@ -13,6 +13,7 @@ from scipy import sparse
 
 from calib.calibration.power_curves import basis
 from calib.checks.places import of_places
+from calib.estimator.arrival_rows import OFFSET_OF_PATH, PATH_SIGNS
 from calib.estimator.known_distances import KnownDistances
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import Mixture
@@ -108,15 +109,16 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
 
 
 def _of_heard(found: KnownDistances) -> Iterator[Family]:
-    """Yield offsets of differences of arrival: of a target, which its ranges contradict, and of a listener."""
-    arrivals = found.searches[0].arrivals
+    """Yield offsets of differences of arrival: of targets, which their ranges contradict, and of paths to listeners."""
+    search = found.searches[0]
+    arrivals = search.arrivals
     if arrivals is not None:
-        tags, target = found.model.tags, arrivals.targets
-        for kind, names, number in (
-            ("heard", [f"tag {tag}" for tag in tags], np.searchsorted(tags, target)),
-            ("listener", [f"listener {name}" for name in arrivals.listeners], arrivals.listener),
-        ):
-            yield Family(kind=kind, names=names, derivative=Derivative(number[:, None], UNIT, len(names)))
+        tags = found.model.tags
+        target = Derivative(np.searchsorted(tags, arrivals.targets)[:, None], UNIT, len(tags))
+        yield Family(kind="heard", names=[f"tag {tag}" for tag in tags], derivative=target)
+        path = Derivative(arrivals.path, PATH_SIGNS[None], len(arrivals.paths))
+        fitted = search.optimum.layout.indices([OFFSET_OF_PATH])
+        yield Family(kind="path", names=arrivals.paths, derivative=path, fitted=fitted)
 
 
 def of_pairs(found: KnownDistances) -> Family:
@@ -278,7 +280,7 @@ SENTENCES = {
     "{worst}: clock skew is not corrected, or with the wrong sign",
     "heard": "{whose}: what listeners overheard contradicts its ranges by {size}, which moves {worst}; see to the "
     "places of the listeners, or fit with `use` exchanges",
-    "listener": "{whose}: what it overheard is off by {size}, which moves {worst}; see to its place and lever arm",
+    "path": "{whose}: overheard frames travel {size} too {way}, which moves {worst}; see to the places of both tags",
     "scale": "ranges grow with the distance by {size} too {way} over the recorded distances, which moves {worst}; see "
     "to the unit and the lever arms of the true distances",
     "late": "ranges change by {size} with the speed at which true distances change (root mean square): motion capture "

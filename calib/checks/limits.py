@@ -29,9 +29,6 @@ from uwblink.twr import names_in
 WITHOUT_CURVE: Final = "delays only"
 """How warnings of fits without a curve begin."""
 
-LONGEST_NS: Final = 2.5
-"""Boards of one kind differ by less in their antenna delays: four times what published ones differ by (0.6 ns)."""
-
 LOUD_M: Final = 0.5
 """Errors that spread by more are not those of a UWB range: noise is 3 to 10 cm, and mean detours of published flights
 are 0.1 to 0.5 m (MILUV, STAR-loc)."""
@@ -43,46 +40,44 @@ REGISTER_NS: Final = 65_536 * TICK_S * 1e9
 
 def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Mapping[int, float]) -> Iterator[str]:
     """Yield what cannot be known, in sentences; `residuals_m` (n,) are fully corrected errors of the ranges."""
-    model, pairs = found.model, found.model.settings.constants == "pair"
+    model, pairs, count = found.model, found.model.settings.constants == "pair", len(found.model.pairs.ends)
     bare = int(np.count_nonzero(ranges.protocol == NO_STAMPS))
-    if bare:
-        yield (
-            f"{'' if bare == len(ranges) else f'{bare} of {len(ranges)} '}ranges without stamps: clock skew, and what "
-            f"the device added or took off itself, are not known and are in the {'constants' if pairs else 'delays'}; "
-            "a damaged range cannot be told from a reflected one"
-        )
-    if ranges.left_skew is not None:
-        yield str(ranges.left_skew)
-    elif any(is_single_sided(name) and not corrected(name) for name in names_in(ranges.protocol)):
-        yield (
-            "single-sided ranges without their reply times and carrier readings: what clock skew has left in them "
-            "cannot be said, and looks like antenna delays"
-        )
-    if ranges.clocks_apart is not None:
-        yield str(ranges.clocks_apart)
-    if pairs:
-        count = len(model.pairs.ends)
-        yield (
-            f"{'the constant of one pair' if count == 1 else f'constants of {count} pairs'}: antenna delays stay "
-            "unknown, other pairs cannot be corrected, and what else is constant in the ranges of a pair (an obstacle, "
-            "a wrong lever arm) is in its constant"
-        )
-    if model.curve is None and not model.settings.delays_only and model.powered.any():
-        yield (
+    unread = any(is_single_sided(name) and not corrected(name) for name in names_in(ranges.protocol))
+    notes = (
+        f"{'' if bare == len(ranges) else f'{bare} of {len(ranges)} '}ranges without stamps: clock skew, and what "
+        f"the device added or took off itself, are not known and are in the {'constants' if pairs else 'delays'}; "
+        "a damaged range cannot be told from a reflected one"
+        if bare
+        else "",
+        "single-sided ranges without their reply times and carrier readings: what clock skew has left in them "
+        "cannot be said, and looks like antenna delays"
+        if ranges.left_skew is None and unread
+        else str(ranges.left_skew or ""),
+        str(ranges.clocks_apart or ""),
+        f"{'the constant of one pair' if count == 1 else f'constants of {count} pairs'}: antenna delays stay "
+        "unknown, other pairs cannot be corrected, and what else is constant in the ranges of a pair (an obstacle, "
+        "a wrong lever arm) is in its constant"
+        if pairs
+        else "",
+        _without_curve(found, ranges, residuals_m) if model.curve is None else "",
+        "curve only: the delays are those that were given; what they have in common that is wrong is in the curve, "
+        f"where they differ it stays in the ranges (medians of pairs lie within {_apart(ranges, residuals_m)})"
+        if fixed and set(model.tags) <= set(fixed)
+        else "",
+    )
+    yield from filter(None, notes)
+
+
+def _apart(ranges: Ranges, residuals_m: Floats) -> str:
+    return as_length(float(np.ptp(medians(residuals_m, pairs_of(ranges.initiator, ranges.target).number))))
+
+
+def _without_curve(found: KnownDistances, ranges: Ranges, residuals_m: Floats) -> str:
+    if not found.model.settings.delays_only and found.model.powered.any():
+        return (
             f"the first-path power never changes ({np.median(_mean_dbm(ranges)):.1f} dBm): the curve is flat, and "
             "delays hold at this power only"
         )
-    elif model.curve is None:
-        yield _without_curve(ranges, residuals_m)
-    if fixed and set(model.tags) <= set(fixed):
-        own = medians(residuals_m, pairs_of(ranges.initiator, ranges.target).number)
-        yield (
-            "curve only: the delays are those that were given; what they have in common that is wrong is in the curve, "
-            f"where they differ it stays in the ranges (medians of pairs lie within {as_length(float(np.ptp(own)))})"
-        )
-
-
-def _without_curve(ranges: Ranges, residuals_m: Floats) -> str:
     lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, "mean-of-lifted", ALPHA_DBM)
     known = np.isfinite(lifted)
     if not known.any():
@@ -94,11 +89,10 @@ def _without_curve(ranges: Ranges, residuals_m: Floats) -> str:
     number = equal_bins(lifted[known])
     middle = medians(residuals_m[known], number)[np.bincount(number) >= 20]
     reach = float(np.ptp(np.percentile(middle, (5, 95)))) if len(middle) else 0.0
-    differ_ns = reach / SPEED_OF_LIGHT * 1e9
     return (
         f"{WITHOUT_CURVE}: errors that change with power stay in the ranges, here {as_length(reach)} between "
-        f"{low:.0f} and {high:.0f} dBm; delays hold for the recorded powers, and differ by up to {differ_ns:.2f} ns "
-        "at others among them"
+        f"{low:.0f} and {high:.0f} dBm; delays hold for the recorded powers, and differ by up to "
+        f"{reach / SPEED_OF_LIGHT * 1e9:.2f} ns at others among them"
     )
 
 
@@ -218,14 +212,13 @@ def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: 
 
 def implausible(delays_ns: Mapping[int, float], residuals_m: Floats) -> Iterator[str]:
     """Yield sentences on fitted values that hardware does not have."""
-    large = {tag: delay for tag, delay in delays_ns.items() if abs(delay) > LONGEST_NS}
-    if large:
-        tag = max(large, key=lambda tag: abs(large[tag]))
+    spread, worst = robust_spread(residuals_m), max(delays_ns, key=lambda tag: abs(delays_ns[tag]), default=-1)
+    # Boards of one kind differ by less than 2.5 ns: four times what published ones differ by (0.6 ns).
+    if abs(delays_ns.get(worst, 0.0)) > 2.5:
         yield (
-            f"tag {tag}: a delay of {large[tag]:+.1f} ns is more than boards differ by ({LONGEST_NS} ns); see to the "
+            f"tag {worst}: a delay of {delays_ns[worst]:+.1f} ns is more than boards differ by (2.5 ns); see to the "
             "unit of true distances, the order of stamps, the carrier's sign and the configured antenna delays"
         )
-    spread = robust_spread(residuals_m)
     if spread > LOUD_M:
         yield f"errors spread by {spread:.2f} m after the fit, those of UWB ranges by 10 cm: check the true distances"
 
@@ -237,20 +230,26 @@ def warnings_of(ranges: Ranges, inliers: float, seconds: float) -> Iterator[str]
     """
     delays = known_delays(ranges.antenna_delays, ranges.tags())
     apart = [f"{tag} ({one})" for tag, one in delays.items() if tag is not None and one.reply != one.tx]
-    if apart:
-        yield (
-            f"the stamps of tag{'s' * (len(apart) > 1)} {', '.join(apart)} carry two antenna delays, the register's "
-            "and another constant in those of delayed replies: no delay of a tag fits both; program the firmware's "
-            "constants, too (`calib export --to firmware`), and record anew"
-        )
     everything = len(ranges) + sum(ranges.excluded.values())
-    for reason, count in ranges.excluded.items():
-        if reason != STATIC and count > 0.05 * everything:
-            yield f"{100 * count / everything:.0f} % of the exchanges were left out: {reason}"
-    if 1 - inliers > 0.4:
-        yield f"{100 * (1 - inliers):.0f} % of the ranges lie beyond three sigmas of the calibrated errors"
-    if seconds < 25.0:
-        yield f"only {seconds:.0f} s of data: errors that persist are few, so intervals may be too narrow"
+    notes = (
+        f"the stamps of tag{'s' * (len(apart) > 1)} {', '.join(apart)} carry two antenna delays, the register's "
+        "and another constant in those of delayed replies: no delay of a tag fits both; program the firmware's "
+        "constants, too (`calib export --to firmware`), and record anew"
+        if apart
+        else "",
+        *(
+            f"{100 * count / everything:.0f} % of the exchanges were left out: {reason}"
+            for reason, count in ranges.excluded.items()
+            if reason != STATIC and count > 0.05 * everything
+        ),
+        f"{100 * (1 - inliers):.0f} % of the ranges lie beyond three sigmas of the calibrated errors"
+        if inliers < 0.6
+        else "",
+        f"only {seconds:.0f} s of data: errors that persist are few, so intervals may be too narrow"
+        if seconds < 25.0
+        else "",
+    )
+    yield from filter(None, notes)
 
 
 SAME_LEVEL_DB: Final = 0.5

@@ -20,14 +20,6 @@ from uwblink.arrays import Floats, Ints
 WIDENING_DEVIATION, CERTAIN_DEVIATION = 2.3, 3.1
 """Deviations that no more than 1 % and 0.1 % of sound flights show: the first widens intervals, the second is said."""
 
-SIZE_FOLDS = 0.8
-"""What stays is as large as what comes and goes, to so many logarithms (a factor of 2.2): a judgement.
-
-In rooms of the simulator it was 1.2 to 4 times as large, in smooth fields of errors a sixth to two thirds.
-"""
-
-WALLS_M = 0.02
-"""What stays, to a factor of e, where nothing comes and goes: a partition or two that are always in between."""
 
 INFORMATION_LEFT = 0.03
 """Share of an offset's information that delays must leave: of less, slopes say nothing of its size."""
@@ -56,7 +48,10 @@ def of_places(found: KnownDistances, slopes: Slopes, pairs: Tested, before_ns2: 
         return nothing
     spread = 1 + reach[:, None] * SIZES_M**2
     likely = -0.5 * np.sum(np.log(spread) + values[:, None] ** 2 / spread, axis=0)
-    middle, width = (np.sqrt(variance), SIZE_FOLDS) if moves else (WALLS_M, 1.0)
+    # A partition or two that are always in between add 2 cm, to a factor of e.
+    # What stays is as large as what comes and goes, to 0.8 logarithms (a factor of 2.2, a judgement): in rooms of the
+    # simulator it was 1.2 to 4 times as large, in smooth fields of errors a sixth to two thirds.
+    middle, width = (np.sqrt(variance), 0.8) if moves else (0.02, 1.0)
     effects = _as_one(likely - 0.5 * (np.log(SIZES_M / middle) / width) ** 2) * pairs.effects @ sums.T
     widening = effects @ effects.T
     # What all delays have in common hangs on the curve as well, and is less known by far.

@@ -6,7 +6,6 @@ thousand exchanges. Stretches are taken, and not single exchanges, because error
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -31,7 +30,6 @@ from calib.spread import less_medians
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
-from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.recording.summary import differences, repeated_rows, single_reports
 from uwblink.twr import Exchanges
@@ -143,24 +141,14 @@ def looked_at(source: Source) -> Source:
     return Contents(exchanges=Exchanges.concatenate(parts), poses=source.poses, tags=source.tags, faults=source.faults)
 
 
-def examined_part(recording: str | os.PathLike[str]) -> str:
-    """Return how much of a recording `examine` looks at, in words; nothing where that is all of it.
-
-    Raises what `Recording.open` raises.
-    """
-    with Recording.open(recording) as opened:
-        count = opened.count("exchanges")
-    if count <= EXAMINED_EXCHANGES:
-        return ""
+def examined_part(count: int) -> str:
+    """Return how much `examine` looks at of a recording with `count` exchanges, in words; nothing where that is all."""
     return (
         f"about {EXAMINED_EXCHANGES} of its {count} exchanges were looked at, in {EXAMINED_STRETCHES} stretches over "
         "all of its time"
+        if count > EXAMINED_EXCHANGES
+        else ""
     )
-
-
-STRETCHES_OF_SCORES: Final = 32
-"""Stretches of time over which scores are summed: variances of sums are then known to a quarter, and errors that last
-for a hundredth of the recording are in one stretch."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,7 +230,8 @@ class QuickFit:
         ranges = replace(self.ranges, errors=replace(cast("Robust", self.start.rows.errors), least=None))
         # Long blocks in the place of short ones: sums over them hardly share errors that last.
         short = self.blocks
-        count = min(STRETCHES_OF_SCORES, short.count)
+        # Variances of 32 sums are known to a quarter, and errors that last for a hundredth of the recording are in one.
+        count = min(32, short.count)
         number = short.number.astype(np.int64) * count // short.count
         bounds = np.unique(np.append(short.bounds[:-1] * count // short.count, count))
         return Slopes(ranges, self._search(ranges, self.x, steps=1), replace(short, number=number, bounds=bounds))
@@ -310,11 +299,6 @@ class QuickFit:
         return size, exceeds(size, float(found.std[0]), found.dof, tolerance=tolerance, tried=tried)
 
 
-LOSS: Final = "soft_l1"
-"""The loss of a quick fit. Convex, so that offsets of any size are found by steps from none; its slope is bounded, so
-that reflections weigh little more than other ranges."""
-
-
 def quick_fit(views: Sequence[RecordingView], constants: str = "pair", ranges_a_pair: int = 40) -> QuickFit | None:
     """Fit a curve over power and constants by "pair" or "tag" to recordings, a session each; None if ranges are few.
 
@@ -326,7 +310,9 @@ def quick_fit(views: Sequence[RecordingView], constants: str = "pair", ranges_a_
     ranges = concatenate([view.ranges[rows] for view, rows in zip(views, kept, strict=True)])
     model = model_of(ranges, FitSettings(constants=constants), trimmed=False)
     error, kinds = model.ranges.raw_m - model.ranges.truth_m, ("delay", *model.curve_kinds())
-    start = robust_fit(model, error, LOSS, None, kinds, sample=PILOT)
+    # Convex, so that offsets of any size are found by steps from none; its slope is bounded, so that reflections weigh
+    # little more than other ranges.
+    start = robust_fit(model, error, "soft_l1", None, kinds, sample=PILOT)
     return QuickFit.of(model, error, np.concatenate(kept), start, start.optimum.x)
 
 

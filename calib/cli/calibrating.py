@@ -104,15 +104,8 @@ def fit(
             result = _fit_from_ranges(recordings, flight, settings, trim_static=trim_static)
         else:
             with waiting("fitting"):
-                result = calib.fit(
-                    calib.load_ranges(
-                        recordings,
-                        trim_static=trim_static,
-                        need_power=not settings.delays_only,
-                        overheard=settings.use == "receptions",
-                    ),
-                    settings,
-                )
+                ranges = calib.load_ranges(recordings, trim_static=trim_static, need_power=not settings.delays_only)
+                result = calib.fit(ranges, settings)
     result.save(output, force=force)
     _print_fit(result, output, as_json=as_json)
 
@@ -222,17 +215,15 @@ def survey(
     if as_json:
         typer.echo(json.dumps(_survey_figures(result), indent=1))
         return
+    contents = {
+        output: result.headline(),
+        anchors: f"boards of {result.arrangement(arrangement).name}" if anchors else "",
+        plot: "where boards stood, with ellipses of 95 %",
+        report: "whether it is fit for use",
+    }
+    headline, *others = [f"{file}: {what}" for file, what in contents.items() if file]
     lines = [*delay_lines(result.calibration), *_arrangement_lines(result)]
-    typer.echo("\n".join([f"{output}: {result.headline()}", *lines]))
-    boards = f"boards of {result.arrangement(arrangement).name}" if anchors else ""
-    contents = (
-        (anchors, boards),
-        (plot, "where boards stood, with ellipses of 95 %"),
-        (report, "whether it is fit for use"),
-    )
-    for file, what in contents:
-        if file:
-            typer.echo(f"{file}: {what}")
+    typer.echo("\n".join([headline, *lines, *others]))
     for warning in result.warnings:
         warn(warning)
 
@@ -275,16 +266,20 @@ def show(
     if as_json:
         typer.echo(known.to_json(), nl=False)
         return
-    made, lines = known.provenance, [repr(known)]
-    for name in ("fitted", "gauge", "recordings"):
-        value = made.get(name)
-        lines += [f"  {name}: {', '.join(map(str, value)) if isinstance(value, list) else value}"] if value else []
-    if isinstance(settings := made.get("settings"), dict):
-        lines.append(f"  settings: {', '.join(f'{name} = {value}' for name, value in settings.items())}")
-    distances = rests_on(made)
-    rests = [f"distances: {distances}"] if distances else _survey_lines(made.get("rests_on"))
-    lines += [*(f"  {line}" for line in rests), *(f"warning: {with_flags(str(w))}" for w in made.get("warnings", []))]
-    typer.echo("\n".join(lines))
+    made, distances = known.provenance, rests_on(known.provenance)
+    told = {name: made.get(name) for name in ("fitted", "gauge", "recordings", "settings")}
+    lines = [
+        *(f"{name}: {_listed(value)}" for name, value in told.items() if value),
+        *([f"distances: {distances}"] if distances else _survey_lines(made.get("rests_on"))),
+    ]
+    warnings = (f"warning: {with_flags(str(text))}" for text in made.get("warnings", []))
+    typer.echo("\n".join([repr(known), *(f"  {line}" for line in lines), *warnings]))
+
+
+def _listed(value: object) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} = {one}" for name, one in value.items())
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def _survey_lines(rests: object) -> Iterator[str]:

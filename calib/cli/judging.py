@@ -21,7 +21,7 @@ from calib.cli.shared import (
     warn,
     with_flags,
 )
-from calib.settings import CHOICES, FitSettings
+from calib.settings import FitSettings
 from uwblink.cli.shared import AsJson, CalibrationFile, Figures, Force, ReportFile, Seeds, add, choice, output, waiting
 
 if TYPE_CHECKING:
@@ -50,12 +50,13 @@ def evaluate(
     force: Force = False,
 ) -> None:
     """Compare raw, delay-corrected and fully corrected ranges with the true distances, in cm, pair by pair."""
+    from calib.calibration import keep_determined
     from calib.data import load_each
 
     check_report(report, figures, force=force)
     known = known_calibration(calibration, recordings)
     with waiting("evaluating"):
-        parts = load_each(recordings, need_power=known.needs_power)
+        parts = [keep_determined(known, part) for part in load_each(recordings, need_power=known.needs_power)]
         evaluation = calib.evaluate(parts, known)
         if report or figures:
             from calib.report import origin_of
@@ -93,7 +94,7 @@ def localize(
         typer.Option(
             help="What is used: exchanges, a body's ranges; or receptions, with what tags overheard, which also "
             "localizes a body that only listens.",
-            **choice(*CHOICES["use"]),
+            **choice("exchanges", "receptions"),
         ),
     ] = "exchanges",
     training: Annotated[
@@ -160,27 +161,29 @@ def doctor(
     from uwblink import Recording
     from uwblink.recording import clock_skews
 
-    skews: dict[str, list[Any]] = {}
+    skews, looked_at = dict[str, list[Any]](), dict[str, str]()
     with waiting("examining"):
         found = calib.examine(recordings)
-        parts = {str(path): part for path in recordings if (part := examined_part(path))}
         for path in recordings:
             with Recording.open(path) as recording:
                 skews[str(path)] = clock_skews(recording.exchange_blocks())
+                looked_at[str(path)] = examined_part(recording.count("exchanges"))
+    parts = {name: part for name, part in looked_at.items() if part}
     findings = [replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in found]
     if as_json:
         clocks = {path: [asdict(one) for one in some] for path, some in skews.items()}
         found_all = {"findings": [asdict(f) for f in findings], "clock_skews": clocks}
         typer.echo(json.dumps(found_all | ({"examined": parts} if parts else {}), indent=1))
         return
-    lines = [f"{name}: {part}" for name, part in parts.items()]
-    lines += [] if findings else [f"{', '.join(map(str, recordings))}: nothing found"]
+    nothing = [] if findings else [f"{', '.join(map(str, recordings))}: nothing found"]
+    lines = [*(f"{name}: {part}" for name, part in parts.items()), *nothing]
     for finding in findings:
         by_chance = f" (p = {finding.p_value:.1g})" if finding.p_value else ""
         lines += [f"{finding.fault}{by_chance}", f"  evidence: {finding.evidence}", f"  remedy:   {finding.remedy}"]
     for name, some in skews.items():
-        lines += [f"clock skew in {name}, the second tag against the first"] if some else []
-        lines += [f"  {one}" for one in some]
+        lines += (
+            [f"clock skew in {name}, the second tag against the first", *(f"  {one}" for one in some)] if some else []
+        )
     typer.echo("\n".join(lines))
 
 

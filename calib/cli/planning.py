@@ -32,8 +32,6 @@ def add_to(app: typer.Typer) -> None:
         no_args_is_help=True,
     )
     app.add_typer(plans, name="plan", rich_help_panel="Calibrate")
-    renamed = {"--seconds": "--duration", "--speed": "--robot-speed", "--apart": "--tag-spacing"}
-    renamed |= {"--still": "--standstill", "--noise": "--range-noise", "--anchor-places": "--anchors"}
     add(
         plans,
         survey,
@@ -47,7 +45,14 @@ def add_to(app: typer.Typer) -> None:
         flight,
         "calib plan flight 1,2/3,4/5,6 --duration 60 --poses-until 10",
         "calib plan flight simulated.uwb --poses-until 0 --imu consumer",
-        renamed=renamed,
+        renamed={
+            "--seconds": "--duration",
+            "--speed": "--robot-speed",
+            "--apart": "--tag-spacing",
+            "--still": "--standstill",
+            "--noise": "--range-noise",
+            "--anchor-places": "--anchors",
+        },
     )
 
 
@@ -95,10 +100,9 @@ def flight(
             source = context.get_parameter_source(name)
             if source is not None and source.name != "DEFAULT":
                 raise BadInputError("the recording determines it; leave it out", parameter=name)
-    elif "/" not in robots and "," not in robots:
-        who = read_whole(robots, "robots")[0]
     else:
-        who = [read_whole(robot, "robots") for robot in robots.split("/")]
+        tags = [read_whole(robot, "robots") for robot in robots.split("/")]
+        who = tags if "/" in robots or "," in robots else tags[0][0]
     with waiting("planning"):
         found = calib.plan_flight(who, settings)
     recording = robots if isinstance(who, Path) else ""

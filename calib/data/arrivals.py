@@ -30,7 +30,7 @@ from uwblink.receptions import exchange_of
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, elapsed
-from uwblink.twr import Exchanges, middle_ns
+from uwblink.twr import Exchanges, range_ns
 
 LARGEST_ERROR_M: Final = 30.0
 """Errors beyond 100 ns come from wrong stamps: published delays are below 1 ns, beside those that are programmed."""
@@ -88,7 +88,7 @@ def arrivals_of(
     row = exchange_of(exchanges, overheard)
     heard = {name: column[row >= 0] for name, column in overheard.items()}
     row = row[row >= 0]
-    e, listener, time_ns = exchanges[row], heard["listener"], middle_ns(exchanges)[row]
+    e, listener, time_ns = exchanges[row], heard["listener"], range_ns(exchanges)[row]
     away, across = (distances_m(poses, tags, ends, listener, time_ns) for ends in (e.target, e.initiator))
     between = elapsed(heard["rx2"], heard["rx1"], e.bits) * TICK_S
     reply = elapsed(e.tx2, e.rx1, e.bits) * TICK_S

@@ -24,7 +24,7 @@ from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, known_
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
-from uwblink.twr import Exchanges, delay_weights, middle_ns, raw_range, without_stamps
+from uwblink.twr import Exchanges, delay_weights, range_ns, raw_range, without_stamps
 
 MapSource = str | os.PathLike[str] | Mapping[str, Any]
 
@@ -57,7 +57,7 @@ class Ranges(ColumnTable):
     `recordings` are names and fingerprints of the recordings, empty for ranges of arrays; `left_skew` is what clock
     skew may have left in single-sided ranges, None without any; `bodies` are tags with the body that carries each;
     `antenna_delays` are those programmed into the tags, as far as known; `arrivals` is what other tags overheard of
-    these exchanges, None where that is not asked for.
+    these exchanges, None without any.
     """
 
     source: str
@@ -110,8 +110,7 @@ class Ranges(ColumnTable):
             raise BadInputError(f"has shape {truth.shape}, expected ({len(exchanges)},)", parameter="truth_m")
         known = np.isfinite(truth)
         if not known.all() and poses is not None and len(poses):
-            # A range belongs to the middle of its first two messages.
-            ends = exchanges.initiator, exchanges.target, middle_ns(exchanges)
+            ends = exchanges.initiator, exchanges.target, range_ns(exchanges)
             truth = np.where(known, truth, distances_m(poses, tags, *ends))
         of_initiator, of_target = delay_weights(exchanges)
         bare = without_stamps(exchanges)

@@ -122,39 +122,33 @@ def _no_recording(data: object) -> BadInputError:
     )
 
 
-def load_ranges(
-    data: Data | Iterable[Data], *, trim_static: bool = False, need_power: bool = True, overheard: bool = False
-) -> Ranges:
+def load_ranges(data: Data | Iterable[Data], *, trim_static: bool = False, need_power: bool = True) -> Ranges:
     """Return the ranges of one or more recordings with their true distances, without those that cannot be used.
 
     `data` is the path of a recording, an open `Recording`, `Exchanges` with their true distances, `Ranges`, a data
     frame (`Ranges.from_dataframe`), any object with `exchanges`, `poses` and `tags` (a simulation in memory), or
     several of those. `trim_static` leaves out spans
     of two seconds in which a pair's distance stays within two centimetres. Ranges without any power are left out unless
-    `need_power` is False. With `overheard` they have what other tags overheard of them (`arrivals`). Raises the errors
-    of `Recording.open`, and `UnanswerableError` where nothing can be used.
+    `need_power` is False. What other tags overheard of them is in `arrivals`. Raises the errors of `Recording.open`,
+    and `UnanswerableError` where nothing can be used.
 
     >>> import calib
     >>> own = calib.Ranges.from_arrays([3.1, 4.2], initiator=1, target=2, fpp1_dbm=-85.0, truth_m=[3.0, 4.0])
     >>> calib.load_ranges(own)
     <Ranges of memory: 2 of tags 1, 2>
     """
-    parts = load_each(data, trim_static=trim_static, need_power=need_power, overheard=overheard)
+    parts = load_each(data, trim_static=trim_static, need_power=need_power)
     return parts[0] if len(parts) == 1 else concatenate(parts)
 
 
-def load_each(
-    data: Data | Iterable[Data], *, trim_static: bool = False, need_power: bool = True, overheard: bool = False
-) -> list[Ranges]:
+def load_each(data: Data | Iterable[Data], *, trim_static: bool = False, need_power: bool = True) -> list[Ranges]:
     """Return the ranges of each recording; raises what `load_ranges` raises.
 
     Raises `BadInputError` where two recordings hold the same exchanges: counted twice, they would seem to tell more.
     """
     given = each(data)
     parts = [
-        one.usable(need_power=need_power)
-        if isinstance(one, Ranges)
-        else load_flight(one, need_power=need_power, overheard=overheard).ranges
+        one.usable(need_power=need_power) if isinstance(one, Ranges) else load_flight(one, need_power=need_power).ranges
         for one in given
     ]
     seen: dict[str, str] = {}
@@ -303,10 +297,8 @@ def require_arrivals(ranges: Ranges) -> None:
         )
 
 
-def load_flight(data: Data, *, need_power: bool = True, overheard: bool = False) -> Flight:
+def load_flight(data: Data, *, need_power: bool = True) -> Flight:
     """Return a recording's usable ranges with its poses; of an exchange that both ends reported one report counts.
-
-    With `overheard` the ranges have what other tags overheard of them.
 
     Raises what `opened` raises, `BadInputError` for planted values or antenna delays that cannot be read, and
     `UnanswerableError` where no range can be used.
@@ -321,7 +313,7 @@ def load_flight(data: Data, *, need_power: bool = True, overheard: bool = False)
             source=name,
             antenna_delays=antenna_delays_of(source, name),
         )
-        heard = getattr(source, "overheard", None) if overheard else None
+        heard = getattr(source, "overheard", None)
         if heard and len(heard["time_ns"]):
             arrivals = arrivals_of(exchanges, found.raw_m, heard, source.poses, source.tags)
             powered = np.isfinite(measured_powers(arrivals.poll_dbm) + measured_powers(arrivals.response_dbm))

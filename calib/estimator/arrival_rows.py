@@ -24,13 +24,17 @@ from uwblink.arrays import Floats, Ints
 HEARD = "heard "
 """Prefix of the kinds of unknowns that only differences of arrival have."""
 
+OFFSET_OF_PATH, PATH_SIGNS = f"{HEARD}offset of path", np.array([-1.0, 1.0])
+"""Constants of the paths from initiator and target to a listener, and how they enter a difference of arrival."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ArrivalModel:
     """Unknowns and parts of differences of arrival (n,); `residual` (n,) is with all unknowns zero, metres.
 
     `exchange` (n,) is the row of each one's range, `listener` (n,) a number among `listeners`, `targets` (n,) the tags
-    that respond. Rows count for a share 1/`alike` of as many independent ones.
+    that respond, `path` (n, 2) the numbers among `paths` of those from initiator and target to the listener. Rows count
+    for a share 1/`alike` of as many independent ones.
     """
 
     residual: Floats
@@ -41,6 +45,8 @@ class ArrivalModel:
     unknowns: tuple[Unknown, ...]
     parts: tuple[Part, ...]
     targets: Ints
+    paths: tuple[str, ...]
+    path: Ints
     alike: float = 1.0
 
     @classmethod
@@ -65,8 +71,8 @@ class ArrivalModel:
         parts.append(_delays(model, ends, weights))
         listeners, listener = np.unique(arrivals.listener, return_inverse=True)
         paths, number = _paths(ends, arrivals.listener)
-        signs = np.broadcast_to(np.array([-1.0, 1.0]), number.shape)
-        parts.append(Part(parameter=RESIDUAL, kind=f"{HEARD}offset of path", columns=number, values=signs))
+        signs = np.broadcast_to(PATH_SIGNS, number.shape)
+        parts.append(Part(parameter=RESIDUAL, kind=OFFSET_OF_PATH, columns=number, values=signs))
         key = np.unique(np.column_stack([ends, arrivals.listener]), axis=0, return_inverse=True)[1]
         return cls(
             residual=arrivals.error_m,
@@ -74,9 +80,11 @@ class ArrivalModel:
             listener=listener,
             listeners=tuple(map(str, listeners.tolist())),
             key=key.ravel(),
-            unknowns=(scattered(f"{HEARD}offset of path", paths, OFFSETS),),
+            unknowns=(scattered(OFFSET_OF_PATH, paths, OFFSETS),),
             parts=tuple(parts),
             targets=ends[:, 1],
+            paths=paths,
+            path=number,
         )
 
     def error_model(self, residual: Floats) -> tuple[TwoSidedMixture, list[Unknown], list[Part]]:
@@ -92,11 +100,14 @@ class ArrivalModel:
             [replace(one, kind=HEARD + one.kind) for one in parts],
         )
 
-    def rows(self, layout: Layout, errors: Errors, more: Sequence[Part] = (), chosen: Ints | None = None) -> RangeRows:
-        """Return the rows of all differences of arrival, or of some exchanges, with the parts that a layout has."""
+    def rows(self, layout: Layout, errors: Errors, more: Sequence[Part] = ()) -> RangeRows:
+        """Return the rows of all differences of arrival, with the parts whose unknowns a layout has."""
         used = [part for part in (*self.parts, *more) if part.kind in layout.where]
-        found = replace(RangeRows.of(self.residual, self.key, used, errors, layout), alike=self.alike)
-        return found if chosen is None else found.sample(np.flatnonzero(np.isin(self.exchange, chosen)))
+        return replace(RangeRows.of(self.residual, self.key, used, errors, layout), alike=self.alike)
+
+    def sample(self, rows: RangeRows, chosen: Ints | None) -> RangeRows:
+        """Return those rows that belong to some exchanges, all for None."""
+        return rows if chosen is None else rows.sample(np.flatnonzero(np.isin(self.exchange, chosen)))
 
     def weighed(self, own: Floats, of_ranges: Floats, pairs: Ints, blocks: TimeBlocks) -> ArrivalModel:
         """Return the model with the weight of a difference of arrival beside a range.

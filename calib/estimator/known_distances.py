@@ -20,7 +20,7 @@ from calib.estimator.covariance import Kept, sandwich
 from calib.estimator.losses import LOSSES, MIXTURE
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import METRES_A_NS, RangeModel
-from calib.estimator.range_rows import RESIDUAL, Errors, Mixture, Part, RangeRows, Robust
+from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows, Robust
 from calib.estimator.rows import NormalRows, Rows
 from calib.estimator.score_tests import Slopes
 from calib.estimator.time_blocks import Persistence, TimeBlocks, in_order, time_blocks
@@ -199,7 +199,9 @@ def robust_fit(  # noqa: PLR0913 - a search has that many sides
     if sample is not None and sample < len(error):
         # A fixed random choice: a regular one could coincide with the schedule of pairs.
         chosen = np.sort(np.random.default_rng(0).permutation(len(error))[:sample])
-    rows = [every if chosen is None else every.sample(chosen), *_rows_of(heard, layout, every.errors, chosen)]
+    rows = [every if chosen is None else every.sample(chosen)]
+    if heard is not None:
+        rows.append(heard.sample(heard.rows(layout, every.errors), chosen))
     priors, steps = Priors(layout), 0
     for turn in range(2 if start is not None else 4):
         residuals = [each.residuals(x) for each in rows]
@@ -232,19 +234,6 @@ def robust_fit(  # noqa: PLR0913 - a search has that many sides
     )
 
 
-def _rows_of(
-    heard: ArrivalModel | None,
-    layout: Layout,
-    errors: Errors,
-    chosen: Ints | None = None,
-    more: Sequence[Part] = (),
-) -> list[RangeRows]:
-    """Return the rows of differences of arrival, if there are any: all of them, or those of the chosen exchanges."""
-    if heard is None:
-        return []
-    return [heard.rows(layout, errors, more, chosen)]
-
-
 def _farthest_pair(model: RangeModel, residual: Floats) -> float:
     """Return the largest absolute median residual of a pair, in metres."""
     return float(np.max(np.abs(medians(residual, model.pairs.number))))
@@ -264,22 +253,23 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted, heard: ArrivalMod
     """Return the maximum of the likelihood, found from a robust start on samples of growing size and then on all
     ranges."""
     errors, unknowns, parts = model.error_model(pilot.residuals)
-    of_heard: tuple[Errors, Sequence[Unknown], Sequence[Part]] = (errors, (), ())
     if heard is not None:
         straight = heard.rows(pilot.optimum.layout, errors).residuals(pilot.optimum.x)
-        of_heard = heard.error_model(straight)
-        unknowns = (*unknowns, *heard.unknowns, *of_heard[1])
+        of_heard, own, own_parts = heard.error_model(straight)
+        unknowns = (*unknowns, *heard.unknowns, *own)
     layout, rows = model.build(error, errors, unknowns, parts)
     gauge = (*model.gauge_rows(layout), *model.held_rows(layout))
     asked = layout.indices([u.kind for u in model.unknowns])
 
+    whole = None if heard is None else heard.rows(layout, of_heard, own_parts)
+
     def beside(chosen: Ints | None) -> list[RangeRows]:
-        return _rows_of(heard, layout, of_heard[0], chosen, of_heard[2])
+        return [] if heard is None or whole is None else [heard.sample(whole, chosen)]
 
     found, steps = _maximize_by_samples(rows, gauge, layout, layout.start(pilot.optimum.by_kind()), asked, beside)
     return Fitted(
         rows=rows,
-        heard=next(iter(beside(None)), None),
+        heard=whole,
         arrivals=heard,
         gauge=gauge,
         optimum=found,

@@ -7,20 +7,25 @@ ranges with the variance of the sigma curve, and calibrated ranges with the whol
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Final
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import count
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from scipy.signal import correlate
 from scipy.stats import chi2
 
-from calib.calibration.applying import heard_receptions, noise_m, reception_gains
+from calib.calibration.applying import heard_receptions, keep_determined, noise_m, reception_gains
+from calib.calibration.document import for_json
 from calib.calibration.error_model import GATE
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, Flight, load_flight, require_arrivals, require_times
 from calib.errors import UnanswerableError
-from calib.evaluation.range_updates import range_errors
+from calib.evaluation.filters import range_errors
+from calib.evaluation.onboard import OnboardTrack
 from calib.evaluation.tracking import (
     FILTERS,
     FilterRanges,
@@ -31,16 +36,15 @@ from calib.evaluation.tracking import (
     problems,
     run_filters,
 )
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, Ints
+from uwblink.display import printable
+from uwblink.output import write_files
 
 PAPER_RMSE_M: Final = {"raw": 0.804, "calibrated": 0.500, "variance": 0.431}
 """Mean RMSE over six scenarios (ICRA 2023, its only table), with other flights and another process noise."""
 
 TUNED_OVER: Final = (0.04, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.6, 1.0)
 """Candidates for fixed standard deviations on a training flight, in metres, about two per octave."""
-
-TUNED_RANGES: Final = 7500
-"""Ranges of a training flight that are used, about a minute of three bodies: neighbouring candidates differ little."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +115,7 @@ def localize(
     calibration = given_calibration(calibration)
     chosen = settings or Settings()
     flight = _flight_for(data, calibration, chosen)
+    flight = replace(flight, ranges=keep_determined(calibration, flight.ranges))
     fixed = fixed_std(calibration, chosen, training)
     require_times(flight.ranges)
     bodies = problems(flight)
@@ -139,11 +144,8 @@ def localize(
 
 def _flight_for(data: Data | Flight, calibration: Calibration, settings: Settings) -> Flight:
     """Return a flight with what `settings` use of it."""
-    heard = settings.use == "receptions"
-    flight = data
-    if not isinstance(flight, Flight):
-        flight = load_flight(flight, need_power=calibration.needs_power, overheard=heard)
-    if heard:
+    flight = data if isinstance(data, Flight) else load_flight(data, need_power=calibration.needs_power)
+    if settings.use == "receptions":
         require_arrivals(flight.ranges)
         return flight
     return replace(flight, ranges=replace(flight.ranges, arrivals=None))
@@ -250,7 +252,8 @@ def fixed_std(calibration: Calibration, settings: Settings, training: Data | Fli
         middle = float(calibration.sigma_curve(np.array([np.mean(calibration.sigma_curve.range)]))[0])
         return FixedStd(dict.fromkeys(("raw", "calibrated"), middle), "the sigma curve's middle")
     flight = _flight_for(training, calibration, settings)
-    flight = replace(flight, ranges=flight.ranges[:TUNED_RANGES])
+    # About a minute of three bodies is enough: neighbouring candidates differ little.
+    flight = replace(flight, ranges=flight.ranges[:7500])
     squares = np.zeros((2, len(TUNED_OVER)))
     for problem in problems(flight):
         known = _Receptions.of(problem.ranges, calibration)
@@ -293,8 +296,11 @@ def rmse_rows(
     `spread` is the title of the spread, which is left out of a single seed.
     """
     names, several = list(total.rmse_m), len(found[0].rmse_m["raw"]) > 1
-    numbers = [(f"{one.source} {one.body}", {name: one.rmse_m[name].mean() for name in names}) for one in found]
-    numbers += [("mean", total.rmse_m), *([(spread, total.spread_m)] if several else [])]
+    numbers = [
+        *((f"{one.source} {one.body}", {name: one.rmse_m[name].mean() for name in names}) for one in found),
+        ("mean", total.rmse_m),
+        *([(spread, total.spread_m)] if several else []),
+    ]
     rows = [[title, *(f"{row[name]:.3f}" for name in names)] for title, row in numbers]
     return [*rows, ["against raw", "", *(f"{-100 * less:+.0f} %" for less in total.reduction.values())]]
 
@@ -349,3 +355,76 @@ def _independent(values: Floats) -> float:
     correlation = correlation / max(float(correlation[0]), 1e-300)
     end = int(np.argmax(np.append(correlation, 0.0) < 0.05))
     return len(centred) / (1 + 2 * float(correlation[1:end].sum()))
+
+
+def localization_text(found: list[Localization], settings: Settings) -> str:
+    """Return the table that `calib localize` prints, a row per body, with the settings below."""
+    summary, fixed = summarize(found), found[0].fixed
+    numbers = rmse_rows(found, summary, f"its spread over {settings.seeds} seeds")
+    rows = [["RMSE of the position (m)", *summary.rmse_m], *numbers]
+    first = max(30, *(len(row[0]) + 1 for row in rows))
+    table = [f"{printable(name):{first}s}" + "".join(f"{cell:>12s}" for cell in cells) for name, *cells in rows]
+    paper = ", ".join(f"{value:.3f}" for value in PAPER_RMSE_M.values())
+    what = "simulated flights" if all(one.simulated for one in found) else "other flights"
+    lines = [
+        *table,
+        f"process noise: velocity with {settings.velocity_std_mps:g} m/s an axis at {settings.velocity_rate_hz:g} Hz "
+        "(a choice, that of a small drone's optical flow; gains depend on it)",
+        f"fixed standard deviations, {fixed.source}: raw {fixed.std_m['raw']:.3f} m, calibrated "
+        f"{fixed.std_m['calibrated']:.3f} m",
+        f"ICRA 2023 has {paper} m for real flights of its own and another filter's noise; these are {what}: metres do "
+        "not compare",
+        f"with the calibrated variance: NIS {summary.nis:.2f} (1 expected, 95 % bounds {summary.nis_bounds[0]:.2f} to "
+        f"{summary.nis_bounds[1]:.2f}), NEES {summary.nees:.2f} (3 expected, {summary.nees_bounds[0]:.2f} to "
+        f"{summary.nees_bounds[1]:.2f}), {100 * summary.accepted:.1f} % of the ranges pass the gate",
+    ]
+    if arrivals := sum(one.arrivals for one in found):
+        every = sum(len(one.tracks["raw"].time_ns) for one in found)
+        lines.append(f"by {every - arrivals} ranges and {arrivals} differences of arrival")
+    return "\n".join(lines)
+
+
+def localization_json(found: list[Localization]) -> dict[str, Any]:
+    """Return what `calib localize --json` prints: RMSE by body, filter and seed in metres, and the summary."""
+    rows = [
+        {
+            "recording": one.source,
+            "body": one.body,
+            "rmse_m": {name: float(rmse.mean()) for name, rmse in one.rmse_m.items()},
+            "rmse_by_seed_m": {name: rmse.tolist() for name, rmse in one.rmse_m.items()},
+            "fixed_std_m": one.fixed.std_m,
+            "fixed_std_source": one.fixed.source,
+            "simulated": one.simulated,
+            "arrivals": one.arrivals,
+        }
+        for one in found
+    ]
+    return {"scenarios": rows, "summary": for_json(asdict(summarize(found)))}
+
+
+def write_tum(found: Sequence[Localization | OnboardTrack], folder: Path, *, force: bool = False) -> None:
+    """Write the trajectories of each body, the true one among them, into a folder, which is made if it is missing."""
+    files = {
+        f"{name}{'-' if kind else ''}{kind}.tum": _tum(*columns).encode()
+        for name, one in zip(_names(f"{one.source}-{one.label}" for one in found), found, strict=True)
+        for kind, columns in one.trajectories().items()
+    }
+    write_files(folder, files, force=force)
+
+
+def _names(texts: Iterable[str]) -> list[str]:
+    """Return file names; equal names of recordings in different folders are numbered."""
+    found: list[str] = []
+    for text in texts:
+        plain = "".join(c if c.isalnum() or c in "-_" else "_" for c in text)
+        numbered = (f"{plain}_{k}" for k in count(2))
+        found.append(plain if plain not in found else next(name for name in numbered if name not in found))
+    return found
+
+
+def _tum(time_ns: Ints, place_m: Floats, attitude: Floats) -> str:
+    rows = [
+        f"{time * 1e-9:.9f} {x:.6f} {y:.6f} {z:.6f} {qx:.6f} {qy:.6f} {qz:.6f} {qw:.6f}"
+        for time, (x, y, z), (qx, qy, qz, qw) in zip(time_ns.tolist(), place_m.tolist(), attitude.tolist(), strict=True)
+    ]
+    return "# time x y z qx qy qz qw\n" + "\n".join(rows) + "\n"

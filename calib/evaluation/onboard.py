@@ -17,19 +17,30 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
+from calib.calibration.applying import keep_determined
+from calib.calibration.document import for_json
 from calib.calibration.error_model import GATE
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, opened, require_times
 from calib.errors import BadInputError, UnanswerableError
-from calib.evaluation.inertial_filter import GRAVITY_M_S2, InertialFilter, P, ProcessNoise
-from calib.evaluation.range_updates import Fix, RangeErrors, multilaterate, range_errors
+from calib.evaluation.filters import (
+    GRAVITY_M_S2,
+    Fix,
+    InertialFilter,
+    P,
+    ProcessNoise,
+    RangeErrors,
+    multilaterate,
+    range_errors,
+)
 from calib.evaluation.tracking import BodyTrack, Trajectory, nearest_attitude
 from calib.settings import CheckedSettings
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import bodies_m
 from uwblink.recording.schema import Poses
 from uwblink.recording.summary import single_reports
+from uwblink.settings import setting
 
 MIN_ANCHORS: Final = 3
 """Anchors of a fix: fewer leave the position ambiguous; a start needs one more, because three leave its mirror image.
@@ -52,7 +63,7 @@ class OnboardSettings(CheckedSettings):
     'imu'
     """
 
-    model: str = "imu"
+    model: str = setting("imu", "Motion between ranges.", names=("imu", "constant-velocity"))
     height: bool = True
     start_m: tuple[float, float, float] | None = None
     start_std_m: float = 0.3
@@ -156,7 +167,7 @@ def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
         poses, tags = source.poses, list(source.tags)
         imu, heights = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))
     ranges = Ranges.from_exchanges(exchanges, source=name)
-    ranges = ranges.usable(need_power=calibration.needs_power, need_truth=False)
+    ranges = keep_determined(calibration, ranges.usable(need_power=calibration.needs_power, need_truth=False))
     places = {body: poses.position_m[poses.body == body] for body in np.unique(poses.body).tolist()}
     still_m = 0.1  # poses of a body that stands still have some noise
     anchors = {body: np.median(some, axis=0) for body, some in places.items() if np.ptp(some, axis=0).max() <= still_m}
@@ -364,3 +375,40 @@ def _latest(one: _Readings, last: int, settings: OnboardSettings) -> Ints:
     """Return the ranges of the last `reopen_s`, or as many as a fix needs."""
     first = int(np.searchsorted(one.time_s, one.time_s[last] - settings.reopen_s))
     return np.arange(max(min(first, last + 1 - MIN_RANGES_PER_FIX), 0), last + 1)
+
+
+def onboard_text(found: list[OnboardTrack], settings: OnboardSettings) -> str:
+    """Return a line per body: its RMSE where truth is known."""
+    lines = [f"{'by ranges to fixed anchors':33s}{'RMSE (m)':>10s}{'median':>9s}{'95 %':>9s}{'own std':>9s}  restarts"]
+    for one in found:
+        off = np.linalg.norm(one.estimate_m - one.truth_m, axis=1)
+        off = off[np.isfinite(off)]
+        figures = (one.rmse_m, *np.quantile(off, (0.5, 0.95))) if len(off) else (np.nan,) * 3
+        cells = "".join(f"{'-':>9s}" if value != value else f"{value:9.3f}" for value in figures)
+        own = float(np.sqrt(np.mean(one.std_m**2)))
+        lines.append(f"{one.source + ' ' + one.body:33s} {cells}{own:9.3f}  {len(one.restarts_s)}")
+    noise = settings.noise
+    moves = (
+        f"accelerometer {noise.force:g} m/s^2 and gyro {noise.gyro:g} rad/s a root of Hz"
+        if settings.model == "imu"
+        else f"velocity wanders by {noise.acceleration:g} m/s^2 a root of Hz"
+    )
+    return "\n".join([*lines, f"used: {found[0].used}; process noise: {moves}, speed about {settings.speed_m_s:g} m/s"])
+
+
+def onboard_json(found: list[OnboardTrack]) -> list[dict[str, Any]]:
+    """Return a table per body for JSON; unknown values are None."""
+    return [
+        {
+            "recording": one.source,
+            "body": one.body,
+            "model": one.model,
+            "used": one.used,
+            "rmse_m": for_json(one.rmse_m),
+            "std_m": float(np.sqrt(np.mean(one.std_m**2))),
+            "nis": float(np.mean(one.nis)),
+            "believed": float(np.mean(one.believed)),
+            "restarts_s": list(one.restarts_s),
+        }
+        for one in found
+    ]

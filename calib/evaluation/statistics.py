@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.interpolate import BSpline
 
-from calib.calibration.applying import CorrectedRanges
+from calib.calibration.applying import CorrectedRanges, keep_determined
 from calib.calibration.comparison import loose_shifts
 from calib.calibration.document import for_json, pair_name
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
@@ -179,7 +179,8 @@ def evaluate(data: Data | Iterable[Data], calibration: CalibrationSource) -> Eva
     """Compare raw, delay-corrected and fully corrected ranges with the truth, for all ranges and for each pair of tags.
 
     `data` is what `load_ranges` takes: paths of recordings, simulations in memory, `Ranges`, one or several. Errors are
-    in metres. Raises what `load_ranges` and `Calibration.apply` raise.
+    in metres. Ranges of pairs that the calibration does not determine are left out, with a `LeftOutWarning`. Raises
+    what `load_ranges` and `Calibration.apply` raise.
 
     >>> import calib
     >>> known = calib.fit(calib.sample_flight()).calibration
@@ -188,23 +189,19 @@ def evaluate(data: Data | Iterable[Data], calibration: CalibrationSource) -> Eva
     '4.0 cm raw, 3.0 cm corrected'
     """
     calibration = given_calibration(calibration)
-    ranges = load_ranges(data, need_power=calibration.needs_power)
+    ranges = keep_determined(calibration, load_ranges(data, need_power=calibration.needs_power))
     applied = calibration.apply(ranges)
     everything = np.ones(len(ranges), dtype=bool)
     inside = _between_quantiles(ranges, applied, calibration)
+    # Older calibrations do not say what they were fitted to.
+    known = calibration.provenance.get("recording_ids")
     return Evaluation(
         _group(ranges, applied, everything, inside),
         {name: _group(ranges, applied, rows, inside) for name, rows in pair_rows(ranges).items()},
         split_error(ranges, applied.corrected_m - ranges.truth_m),
         compare_with_planted(ranges, applied, calibration),
-        _seen(ranges, calibration),
+        tuple(name for name, found in ranges.recordings if isinstance(known, list) and found in known),
     )
-
-
-def _seen(ranges: Ranges, calibration: Calibration) -> tuple[str, ...]:
-    """Return the names of the recordings that the calibration was fitted to; older calibrations do not say."""
-    known = calibration.provenance.get("recording_ids")
-    return tuple(name for name, found in ranges.recordings if isinstance(known, list) and found in known)
 
 
 def compare_with_planted(

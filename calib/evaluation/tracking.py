@@ -16,11 +16,12 @@ import numpy as np
 
 from calib.data.ranges import Ranges
 from calib.data.sources import Flight
-from calib.evaluation.range_updates import RangeErrors, gated_update, mixture_update, multilaterate
+from calib.evaluation.filters import RangeErrors, gated_update, mixture_update, multilaterate
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
 from uwblink.recording.schema import Poses
+from uwblink.settings import setting
 
 Trajectory = tuple[Ints, Floats, Floats]
 """Times in ns (n,), positions in metres (n, 3), attitudes x y z w (n, 4)."""
@@ -33,9 +34,6 @@ PATIENCE_S: Final = 10.0
 Between metal racks (scenarios/hall_with_metal) half of a body's ranges are metres too long for up to nine seconds, and
 a position from these ranges alone is metres off.
 """
-
-RANGES_TO_BE_LOST: Final = 12
-"""Least number of unexplained ranges after which a filter begins anew: four for each coordinate."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,7 +60,7 @@ class Settings(CheckedSettings):
     reopen_s: float = 1.0
     seed: int = 0
     seeds: int = 3
-    use: str = "exchanges"
+    use: str = setting("exchanges", "What is used.", names=("exchanges", "receptions"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -268,7 +266,8 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
     x, p = np.zeros((*shape, size)), np.tile(prior, (*shape, 1, 1))
     x[..., :3] = [start for start, _ in noises]
     diagonal = np.einsum("fsii->fsi", p)
-    explained_s, most_s = np.zeros(shape), settings.reopen_s / 2 / RANGES_TO_BE_LOST
+    # Twelve unexplained ranges at least, four for each coordinate, before a filter begins anew.
+    explained_s, most_s = np.zeros(shape), settings.reopen_s / 2 / 12
     estimate, (std_m, nis, nees) = np.empty((count, *shape, 3)), np.empty((3, count, *shape))
     accepted = np.empty((count, *shape), dtype=bool)
     for k, pairs in enumerate((3 + problem.pair).tolist()):

@@ -70,8 +70,11 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     check_loss(settings.loss)
     given = settings.delays_from
     source = None if given is None else given_calibration(given, "delays_from")
-    ranges = load_ranges(data, need_power=not settings.delays_only, overheard=settings.use == "receptions")
-    if settings.use == "receptions":
+    ranges = load_ranges(data, need_power=not settings.delays_only)
+    heard = 0 if ranges.arrivals is None else len(ranges.arrivals)
+    if settings.use == "exchanges":
+        ranges = replace(ranges, arrivals=None)
+    else:
         require_arrivals(ranges)
     fixed = _taken_over(source, ranges, curve=not settings.delays_only) | dict(settings.fixed_ns)
     refuse_impossible(ranges)
@@ -93,7 +96,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         "recording_ids": [name for _, name in ranges.recordings],
         "recipe": "sequential" if settings.sequential else "joint",
         "fitted": what_was_fitted(found),
-        **({"arrivals": len(heard.residual)} if (heard := found.searches[0].arrivals) else {}),
+        **({"arrivals": len(arrivals.residual)} if (arrivals := found.searches[0].arrivals) else {}),
         "gauge": _gauge(found),
         **({"held_out": _judged(held, settings)} if held else {}),
     }
@@ -104,6 +107,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         findings,
         settings=settings,
         fixed=fixed,
+        first=_hints(calibration, heard if settings.use == "exchanges" else 0),
         more=_stopped(found, settings.loss),
     )
     return replace(result, held_out=held)
@@ -300,6 +304,13 @@ def _judged(held: HeldOut, settings: FitSettings) -> dict[str, Any]:
         "inside_95": found.inside_95,
     }
     return {name: for_json(value) for name, value in judged.items()}
+
+
+def _hints(calibration: Calibration, unused: int) -> list[str]:
+    """Return what determines the delays that a fit leaves open, where so many differences of arrival were not used."""
+    if not (calibration.undetermined_splits and unused):
+        return []
+    return [f"{unused} differences of arrival at other tags determine the delays of targets: fit with `use` receptions"]
 
 
 def _stopped(found: KnownDistances, asked_for: str | None) -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
 from calib.data.samples import SampleFlight, stamped
-from calib.evaluation.inertial_filter import GRAVITY_M_S2
+from calib.evaluation.filters import GRAVITY_M_S2
 from calib.planning.settings import FlightPlanSettings
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import distances_m
@@ -25,11 +25,13 @@ def reference_motion(flown: FlightPlanSettings) -> SampleFlight:
     rng = np.random.default_rng(flown.seed)
     bodies = {f"robot{k + 1}": _motion(flown, k, rng) for k in range(len(flown.robots))}
     tags = [
-        Tag(tag, body, tuple(arm))
-        for body, robot in zip(bodies, flown.robots, strict=True)
-        for tag, arm in zip(robot, _arms(len(robot), flown.apart_m).tolist(), strict=True)
+        *(
+            Tag(tag, body, tuple(arm))
+            for body, robot in zip(bodies, flown.robots, strict=True)
+            for tag, arm in zip(robot, _arms(len(robot), flown.apart_m).tolist(), strict=True)
+        ),
+        *(Tag(tag, f"anchor{tag}", (0.0, 0.0, 0.0)) for tag in flown.anchors),
     ]
-    tags += [Tag(tag, f"anchor{tag}", (0.0, 0.0, 0.0)) for tag in flown.anchors]
     poses = _poses(flown, bodies)
     time_ns = _ns(np.arange(int(flown.seconds * flown.rate_hz)) / flown.rate_hz)
     pair = _in_turn(flown, len(time_ns), rng)
@@ -88,8 +90,10 @@ def _corners(flown: FlightPlanSettings) -> Floats:
 def _in_turn(flown: FlightPlanSettings, count: int, rng: np.random.Generator) -> Ints:
     """Return who ranges with whom (n, 2): all pairs of bodies but two anchors, each round in another order."""
     body = {tag: k for k, robot in enumerate(flown.robots) for tag in robot}
-    pairs = [(a, b) for a, b in combinations(body, 2) if body[a] != body[b]]
-    pairs += [(tag, anchor) for tag in body for anchor in flown.anchors]
+    pairs = [
+        *((a, b) for a, b in combinations(body, 2) if body[a] != body[b]),
+        *((tag, anchor) for tag in body for anchor in flown.anchors),
+    ]
     rounds = [rng.permutation(pairs) for _ in range(-(-count // len(pairs)))]
     return np.concatenate(rounds)[:count].astype(np.int64)
 
@@ -97,10 +101,12 @@ def _in_turn(flown: FlightPlanSettings, count: int, rng: np.random.Generator) ->
 def _poses(flown: FlightPlanSettings, bodies: Mapping[str, BSpline]) -> Poses:
     """Return the poses of all bodies, those of anchors at the first and the last instant."""
     time = np.arange(-1.0, flown.seconds + 1.0, 0.05)
-    rows = [(name, time, motion(time)) for name, motion in bodies.items()]
-    rows += [
-        (f"anchor{tag}", time[[0, -1]], np.tile([*place, 0.0], (2, 1)))
-        for tag, place in zip(flown.anchors, _corners(flown), strict=True)
+    rows = [
+        *((name, time, motion(time)) for name, motion in bodies.items()),
+        *(
+            (f"anchor{tag}", time[[0, -1]], np.tile([*place, 0.0], (2, 1)))
+            for tag, place in zip(flown.anchors, _corners(flown), strict=True)
+        ),
     ]
     names, times, where = zip(*rows, strict=True)
     x, y, z, yaw = np.concatenate(where).T

@@ -14,17 +14,15 @@ from calib.information import Verdict
 from calib.planning.settings import FlightPlanSettings
 from uwblink.arrays import Floats
 
-GUESS_NS = 1.5
-"""How far a delay is known without any data, two and a half times what published ones differ by (0.6 ns): means over
-tags are finite then, though some are not determined."""
-
 
 def mean_std_ns(information: Floats) -> float:
     """Return the root mean variance of delays, ns, from what data tell of them (tags, tags), 1/ns^2, beside the guess.
 
     Rounded, so that mirror images are equally good on every machine and the first of them is taken.
     """
-    whole = information + np.eye(len(information)) / GUESS_NS**2
+    # The guess is two and a half times what published delays differ by (0.6 ns): means are finite then, though some
+    # delays are not determined.
+    whole = information + np.eye(len(information)) / 1.5**2
     return round(float(np.sqrt(np.trace(np.linalg.inv(whole)) / len(whole))), 8)
 
 
@@ -107,14 +105,22 @@ class _Plan:
     def __str__(self) -> str:
         """Return the steps and the intervals."""
         assumed, shared = self._promise()
-        lines = [*self.steps, "", f"Promised, if {assumed}:"]
-        for tag, half in self.half_ns.items():
-            lines.append(f"  tag {tag:3d}  " + (f"± {half:.3f} ns (95 %)" if math.isfinite(half) else self._open(tag)))
-        lines += shared
-        lines += [f"not determined: {words}" for words in self.verdict.free if self.undetermined]
-        for k, best in enumerate(self.next_best):
-            first = "or" if k else "next best"
-            lines.append(f"{first}: {best.what}: ± {best.mean_ns:.3f} ns on average, not {best.instead_of_ns:.3f}")
+        lines = [
+            *self.steps,
+            "",
+            f"Promised, if {assumed}:",
+            *(
+                f"  tag {tag:3d}  " + (f"± {half:.3f} ns (95 %)" if math.isfinite(half) else self._open(tag))
+                for tag, half in self.half_ns.items()
+            ),
+            *shared,
+            *(f"not determined: {words}" for words in self.verdict.free if self.undetermined),
+            *(
+                f"{'or' if k else 'next best'}: {best.what}: ± {best.mean_ns:.3f} ns on average, not "
+                f"{best.instead_of_ns:.3f}"
+                for k, best in enumerate(self.next_best)
+            ),
+        ]
         return "\n".join(lines)
 
     def _open(self, tag: int) -> str:
@@ -190,8 +196,8 @@ class Plan(_Plan):
     def commands(self, ports: str) -> Iterator[str]:
         """Yield the commands that carry it out; `ports` names the boards' serial ports."""
         for one in self.arrangements:
-            shape = f" --known {self.on}" if self.on else ""
-            shape += f" --order {','.join(map(str, one.order()))}" if self.on == "line" else ""
+            order = f" --order {','.join(map(str, one.order()))}" if self.on == "line" else ""
+            shape = f" --known {self.on}{order}" if self.on else ""
             words = f"--pairs all --rate {self.rate_hz:g} --duration {self.seconds_each:.0f} -o {one.name}.uwb"
             yield f"uwblink record {ports} --arrangement {one.name}{shape} {words}"
         beside = " --known known.toml" if self.known_beside else ""
@@ -284,15 +290,15 @@ class FlightPlan(_Plan):
             yield f"uwblink record {ports} --pairs all --duration {self.seconds:.0f} -o {name}"
             yield f"uwblink poses {name} --from poses.csv --tags robots.toml"
         until = flown.poses_until_s
+        when = f"@0..{flown.still_s:g}" if flown.still_s else ""
         options = [
             ("" if until is None else f"--poses-until {until:g}", until is not None),
             (f"--attitudes {flown.attitudes}", flown.attitudes != "poses"),
             (f"--heading-std {flown.heading_std_deg:g}", flown.heading_std_deg != 3),
             (f"--anchors {flown.anchor_places}", bool(self.stands)),
+            *((f"--distance {first}-{second}=METRES{when}", True) for first, second in self.taped),
         ]
-        when = f"@0..{flown.still_s:g}" if flown.still_s else ""
         words = [option for option, needed in options if needed]
-        words += [f"--distance {first}-{second}=METRES{when}" for first, second in self.taped]
         yield f"calib fit {name} --truth ranges {' '.join(words)} -o calibration.json"
 
     def to_dict(self) -> dict[str, Any]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 from calib.errors import BadInputError
-from calib.settings import check_choice
+from calib.settings import CheckedSettings, check_choice
 from uwblink.settings import setting
 
 ROOMS_M: Final = {"line": (5.0,), "plane": (3.0, 2.0), "space": (6.0, 5.0, 2.5)}
@@ -38,15 +38,11 @@ def read_whole(text: str, parameter: str | None = None) -> list[int]:
     return [int(value) for value in found]
 
 
-def _check(settings: Any, bounds: Mapping[str, tuple[float, float]], refused: Iterable[tuple[str, Any, str]]) -> None:
-    """Raise `BadInputError` for a setting that is not within its bounds, and for the first that is refused.
+def _refuse(settings: CheckedSettings, refused: Iterable[tuple[str, Any, str]]) -> None:
+    """Raise `BadInputError` for the first that is refused.
 
     `refused` has the name of a setting, whether (or what of it) is wrong, and a text, which may name that.
     """
-    for name, (least, most) in bounds.items():
-        value = getattr(settings, name)
-        if not (math.isfinite(value) and least <= value <= most):
-            raise BadInputError(f"found {value}, expected {least:g} to {most:g}", parameter=name)
     for name, wrong, text in refused:
         if wrong:
             raise BadInputError(text.format(getattr(settings, name, ""), wrong), parameter=name)
@@ -66,11 +62,12 @@ _ANCHORS: Any = {
 }
 _RATE: Any = {"help": "Exchanges per second, all pairs together (Hz).", "flag": "--rate"}
 _TAPED: Any = {"help": "Number of distances that will be measured with a tape."}
+_SIGMA: Any = {"bounds": (1e-9, 100.0)}
 _TAPE: Any = {"help": "Standard deviation of a distance by tape (m).", "flag": "--tape-sigma"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SurveyPlanSettings:
+class SurveyPlanSettings(CheckedSettings):
     """The settings of `calib.plan`, which it takes as keyword arguments, too; raises `BadInputError`.
 
     `on` is "line" (a string), "plane" (a table) or "space" (a room), of `size_m` (up to three lengths). `taped`
@@ -91,42 +88,37 @@ class SurveyPlanSettings:
         "Where the boards stand: on a string (line), on a table (plane), or in a room (space).",
         names=tuple(ROOMS_M),
     )
-    arrangements: int | None = setting(None, "Number of arrangements; by default as many as are worth it.")
+    arrangements: int | None = setting(
+        None, "Number of arrangements; by default as many as are worth it.", bounds=(1, 26)
+    )
     size_m: Sequence[float] | None = setting(None, "Length of the line, or sides of plane or room (m).", **_SIZE)
-    taped: int = setting(0, **_TAPED)
-    tape_sigma_m: float = setting(0.005, **_TAPE)
+    taped: int = setting(0, **_TAPED, bounds=(0, 1000))
+    tape_sigma_m: float = setting(0.005, **_TAPE, **_SIGMA)
     anchors: Sequence[int] = setting((), **_ANCHORS)
-    anchor_sigma_m: float = setting(0.01, "Standard deviation of known positions (m).", flag="--anchor-sigma")
-    pair_error_m: float = setting(0.02, "Constant error of a pair in an arrangement (m).", flag="--pair-error")
-    reflected: float = setting(0.0, "Share of pairs that are reflected.")
-    rate_hz: float = setting(50.0, **_RATE)
+    anchor_sigma_m: float = setting(0.01, "Standard deviation of known positions (m).", flag="--anchor-sigma", **_SIGMA)
+    pair_error_m: float = setting(
+        0.02, "Constant error of a pair in an arrangement (m).", flag="--pair-error", **_SIGMA
+    )
+    # Of more pairs nobody could tell which are reflected.
+    reflected: float = setting(0.0, "Share of pairs that are reflected.", bounds=(0.0, 0.3))
+    rate_hz: float = setting(50.0, **_RATE, bounds=(1e-3, 1e5))
     seed: int = 1
 
     def __post_init__(self) -> None:
         """Check all values."""
-        check_choice("on", self.on, ROOMS_M)
-        sigma, count, tags = (1e-9, 100.0), self.arrangements, self.tags
-        bounds = {
-            "taped": (0, 1000),
-            "tape_sigma_m": sigma,
-            "anchor_sigma_m": sigma,
-            "pair_error_m": sigma,
-            # Of more pairs nobody could tell which are reflected.
-            "reflected": (0.0, 0.3),
-            "rate_hz": (1e-3, 1e5),
-        }
+        CheckedSettings.__post_init__(self)
+        tags = self.tags
         on_line = "stand in a plane or in space; on a line say how many distances are taped"
         wrong_size = self.size_m is not None and not _are_lengths(self.size_m, self.dimensions)
         several = 2 <= len(tags) <= 30 and len(set(tags)) == len(tags)
         strangers = [tag for tag in sorted(self.anchors) if tags and tag not in tags]
         refused = [
-            ("arrangements", count is not None and not 1 <= count <= 26, "found {}, expected 1 to 26"),
             ("boards", tags and not several, f"found {tags!r:.60}, expected 2 to 30 boards, each once"),
             ("anchors", strangers, "{1[0]} is none of the boards"),
             ("anchors", self.anchors and self.on == "line", on_line),
             ("size_m", wrong_size, f"found {{}}, expected as many lengths in metres as dimensions, {self.dimensions}"),
         ]
-        _check(self, bounds, refused)
+        _refuse(self, refused)
 
     @property
     def dimensions(self) -> int:
@@ -135,7 +127,7 @@ class SurveyPlanSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlightPlanSettings:
+class FlightPlanSettings(CheckedSettings):
     """The settings of `calib.plan_flight`, which it takes as keyword arguments, too; raises `BadInputError`.
 
     Without a recording robots fly for `seconds` about a room of `size_m` at about `speed_m_s`, tags of a robot are
@@ -155,11 +147,11 @@ class FlightPlanSettings:
     """
 
     robots: Any = None
-    seconds: float = setting(60.0, "Duration in seconds.", flag="--duration")
-    rate_hz: float = setting(80.0, **_RATE)
+    seconds: float = setting(60.0, "Duration in seconds.", flag="--duration", bounds=(5.0, 3600.0))
+    rate_hz: float = setting(80.0, **_RATE, bounds=(0.5, 2000.0))
     size_m: Sequence[float] = setting((6.0, 5.0, 2.5), "Sides of the room (m).", **_SIZE)
-    speed_m_s: float = setting(1.0, "Mean speed of the robots (m/s).", flag="--robot-speed")
-    apart_m: float = setting(0.5, "Distance between the tags of a robot (m).", flag="--tag-spacing")
+    speed_m_s: float = setting(1.0, "Mean speed of the robots (m/s).", flag="--robot-speed", bounds=(0.05, 10.0))
+    apart_m: float = setting(0.5, "Distance between the tags of a robot (m).", flag="--tag-spacing", bounds=(0.0, 3.0))
     poses_until_s: float | None = setting(
         10.0, "How long positions are known at first.", flag="--poses-until", metavar="SECONDS"
     )
@@ -177,40 +169,27 @@ class FlightPlanSettings:
         "given", "Positions of anchors: given, or sought (estimated).", flag="--anchors", names=("given", "sought")
     )
     still_s: float = setting(
-        0.0, "How long the robots stand before they fly, for a tape.", flag="--standstill", metavar="SECONDS"
+        0.0,
+        "How long the robots stand before they fly, for a tape.",
+        flag="--standstill",
+        metavar="SECONDS",
+        bounds=(0.0, 600.0),
     )
-    taped: int = setting(0, **_TAPED)
-    tape_sigma_m: float = setting(0.01, **_TAPE)
-    noise_m: float = setting(0.04, "Noise of a range (m).", flag="--range-noise")
-    reflected: float = setting(0.08, "Share of ranges that are reflected.")
+    taped: int = setting(0, **_TAPED, bounds=(0, 10))
+    tape_sigma_m: float = setting(0.01, **_TAPE, bounds=(1e-4, 1.0))
+    noise_m: float = setting(0.04, "Noise of a range (m).", flag="--range-noise", bounds=(1e-4, 10.0))
+    reflected: float = setting(0.08, "Share of ranges that are reflected.", bounds=(0.0, 0.9))
     delays_only: bool = setting(False, "Plan for a fit without a curve over power.")
     seed: int = 1
 
     def __post_init__(self) -> None:
         """Check all values, and the robots where there are some."""
-        check_choice("anchor_places", self.anchor_places, ("given", "sought"))
+        CheckedSettings.__post_init__(self)
         if self.imu is not None:
             check_choice("imu", self.imu, ACCELEROMETERS)
-        bounds = {
-            "seconds": (5.0, 3600.0),
-            "rate_hz": (0.5, 2000.0),
-            "speed_m_s": (0.05, 10.0),
-            "apart_m": (0.0, 3.0),
-            "noise_m": (1e-4, 10.0),
-            "reflected": (0.0, 0.9),
-            "still_s": (0.0, 600.0),
-            "taped": (0, 10),
-            "tape_sigma_m": (1e-4, 1.0),
-        }
-        _check(
-            self, bounds, [("size_m", not _are_lengths(self.size_m, 3), "found {}, expected three lengths in metres")]
-        )
-        if self.robots is None:
-            return
-        robots = self.robots
-        if isinstance(robots, int):
-            robots = [(2 * k + 1, 2 * k + 2) for k in range(robots)]
-        robots = tuple(tuple(map(int, tags)) for tags in robots)
+        asked, known = self.robots, self.robots is not None
+        listed = [(2 * k + 1, 2 * k + 2) for k in range(asked)] if isinstance(asked, int) else asked or ()
+        robots = tuple(tuple(map(int, tags)) for tags in listed)
         tags, anchors, ranges = [tag for robot in robots for tag in robot], self.anchors, self.seconds * self.rate_hz
         once = len(set(tags)) == len(tags) and len(tags) + len(anchors) <= MAX_TAGS
         among = (
@@ -218,13 +197,14 @@ class FlightPlanSettings:
         )
         others = len(set(anchors)) == len(anchors) and not set(anchors) & set(tags)
         refused = [
-            ("seconds", ranges > MAX_RANGES, f"{ranges:.0f} ranges are more than a plan takes, {MAX_RANGES}"),
+            ("size_m", not _are_lengths(self.size_m, 3), "found {}, expected three lengths in metres"),
+            ("seconds", known and ranges > MAX_RANGES, f"{ranges:.0f} ranges are more than a plan takes, {MAX_RANGES}"),
             (
                 "still_s",
-                self.still_s > self.seconds / 2,
+                known and self.still_s > self.seconds / 2,
                 f"found {{}}, expected at most half of the {self.seconds:g} s",
             ),
-            ("robots", not (robots and all(robots) and once), among),
+            ("robots", known and not (robots and all(robots) and once), among),
             ("anchors", not others, "found {}, expected other tags than those of robots"),
             ("robots", len(robots) == 1 and not anchors, "a single robot without anchors ranges with nobody"),
             (
@@ -233,8 +213,8 @@ class FlightPlanSettings:
                 "found a tag that is none, expected ids of 1 or more",
             ),
         ]
-        _check(self, {}, refused)
-        object.__setattr__(self, "robots", robots)
+        _refuse(self, refused)
+        object.__setattr__(self, "robots", robots if known else None)
 
     @property
     def inertial(self) -> bool:

@@ -1,4 +1,10 @@
-"""Plans of boards that stand still: which arrangements to make with what one has, and what comes of them."""
+"""Plans of boards that stand still: which arrangements to make with what one has, and what comes of them.
+
+What comes of them is Fisher's information of a survey's own rows, without data. Places are unknown. With reflections,
+which pairs are reflected is drawn, and the prediction is the root mean square over the draws: a reflected pair has
+nearly no information on the delays. A curve over power is what a survey takes it for, a smooth function of the power,
+which falls with distance as in free space, of 5 cm.
+"""
 
 from __future__ import annotations
 
@@ -11,26 +17,137 @@ from typing import Any
 
 import numpy as np
 
+from calib.calibration.power_curves import ALPHA_DBM
 from calib.errors import BadInputError, UnanswerableError
-from calib.planning.predicted import delay_information, predict, random_arrangements
+from calib.information import reduced
 from calib.planning.result import NextBest, Plan, PlannedArrangement, Precision, mean_std_ns
-from calib.planning.settings import SurveyPlanSettings
+from calib.planning.settings import ROOMS_M, SurveyPlanSettings
 from calib.spread import TWO_SIDED_95
+from calib.surveys.knowledge import KnownPosition
+from calib.surveys.network import Boards, Case, CurvePrior, Network
 from calib.surveys.outcome import students_factor, verdict_on_delays
-from uwblink.arrays import Floats
+from calib.surveys.recordings import PairMeans
+from uwblink.arrays import Bools, Floats
+from uwblink.recording.schema import KnownDistance
 
-RANGES_A_PAIR = 20
-"""Noise of 4 cm leaves 9 mm in a mean of so many, which adds a tenth to a pair's constant error of 2 cm."""
+PLANNED_CURVE_STD_M = 0.05
+"""Standard deviation of a curve over power: half that of the published curves (`CURVE_LENGTH_DB`). With all of it plans
+of six boards in five arrangements would promise no delay beside a curve, which surveys do find (`make surveys`)."""
 
-CANDIDATES = 60
-"""Random arrangements from which each is chosen: the best of so many is in the best 5 % with a probability of 95 %."""
+POWER_AT_1_M_DBM = -74.0
+"""First-path power at a metre: the upper quartile of power times squared distance in the MILUV flight among obstacles,
+whose median is -77 dBm."""
 
-MOST_ARRANGEMENTS = 12
-"""Arrangements after which no more is planned where no number is given: an hour's work."""
 
-WORTH_IT = 0.06
-"""Share by which one arrangement more must narrow the mean interval to be planned, where no number is given:
-n arrangements narrow it by the root of n, so that about eight are planned."""
+def random_arrangements(inputs: SurveyPlanSettings, count: int, tries: int = 400) -> list[PlannedArrangement]:
+    """Return random arrangements: orders on a line at even steps, random places on a table or in a room.
+
+    Fewer than `count` where a line has fewer orders, or a room too little space. Anchors stay where the first one has
+    them: the corners of a room are as good a guess as any.
+    """
+    rng, tags, dimensions = np.random.default_rng(inputs.seed), inputs.tags, inputs.dimensions
+    size = np.array(ROOMS_M[inputs.on] if inputs.size_m is None else inputs.size_m, dtype=float)
+    if inputs.on == "line" and inputs.size_m is None:
+        size = np.maximum(size, 0.8 * (len(tags) - 1))
+    found: dict[tuple[int, ...] | int, PlannedArrangement] = {}
+    for number in range(tries):
+        if len(found) == count:
+            break
+        key: tuple[int, ...] | int = number
+        place = np.zeros((len(tags), 3))
+        if inputs.on == "line":
+            order = tuple(rng.permutation(len(tags)).tolist())
+            # A line may be read from either end.
+            key = min(order, order[::-1])
+            place[list(order), 0] = np.round(np.linspace(0, float(size[0]), len(tags)), 1)
+        else:
+            place[:, :dimensions] = np.round(rng.uniform(0, size, (len(tags), dimensions)), 1)
+            # Five wavelengths: nearer, powers saturate and fields are not yet waves.
+            if min(np.linalg.norm(one - other) for one, other in combinations(place, 2)) < 0.4:
+                continue
+        spots = {tag: (x, y, z) for tag, (x, y, z) in zip(tags, place.tolist(), strict=True)}
+        first = next(iter(found.values())).place_m if found else spots
+        found.setdefault(key, PlannedArrangement("", spots | {tag: first[tag] for tag in inputs.anchors}, ()))
+    return list(found.values())
+
+
+def delay_information(
+    inputs: SurveyPlanSettings,
+    one: PlannedArrangement,
+    curve: CurvePrior | None = None,
+    reflected: Bools | Sequence[float] = (0.0,),
+) -> Floats:
+    """Return the information on delays, 1/ns^2, and on a curve, that an arrangement gives, whatever its places.
+
+    It is (draws, k, k): `reflected` tells for each draw which pairs are reflected.
+    """
+    # A network has its tags in order, a plan as they are given: boards are numbered.
+    boards, number = tuple(range(len(inputs.tags))), inputs.tags.index
+    pairs = np.array(list(combinations(boards, 2)))
+    none = np.zeros(len(pairs))
+    means = PairMeans(
+        arrangement=none.astype(int),
+        ends=pairs,
+        weights=np.full((len(pairs), 2), 0.5),
+        range_m=none,
+        std_m=none,
+        noise_m=none,
+        count=none.astype(int),
+        lifted=none,
+    )
+    network = Network(
+        means=means,
+        arrangements=(Boards("", inputs.dimensions, boards),),
+        tags=boards,
+        distances=tuple(KnownDistance(number(i), number(j), 1.0, inputs.tape_sigma_m) for i, j in one.taped),
+        positions=tuple(KnownPosition(number(tag), one.place_m[tag], inputs.anchor_sigma_m) for tag in inputs.anchors),
+        fixed_ns={},
+        curve=curve,
+    )
+    x, free = (
+        network.with_positions(network.layout.start(), np.array(list(one.place_m.values()))),
+        network.layout.free(),
+    )
+    cases = [Case(none + marks > 0, inputs.pair_error_m, PLANNED_CURVE_STD_M) for marks in reflected]
+    return np.array([reduced(network.at(x, case).known[np.ix_(free, free)], free >= 3 * len(boards)) for case in cases])
+
+
+def predict(
+    inputs: SurveyPlanSettings, arrangements: Sequence[PlannedArrangement], *, curve: bool = False
+) -> list[Precision[Floats]]:
+    """Return the predicted standard deviations after the first of the arrangements, the first two, and so on."""
+    places = np.array([list(one.place_m.values()) for one in arrangements])
+    first, second = np.array(list(combinations(range(len(inputs.tags)), 2))).T
+    powers = POWER_AT_1_M_DBM - 20 * np.log10(np.linalg.norm(places[:, first] - places[:, second], axis=2))
+    prior = CurvePrior.at(10 ** ((powers.ravel() - ALPHA_DBM) / 10)) if curve else None
+    own, parts = None, []
+    for k, one in enumerate(arrangements):
+        if prior is not None:
+            # The prior counts once, below.
+            design = prior.design.reshape(*powers.shape, -1)[k]
+            own = replace(prior, design=design, precision=np.zeros_like(prior.precision))
+        # A root mean square over a hundred draws of which pairs are reflected is good to a few per cent.
+        shape = (100 if inputs.reflected else 1, len(first))
+        drawn = np.random.default_rng([inputs.seed, k]).uniform(size=shape) < inputs.reflected
+        parts.append(delay_information(inputs, one, own, drawn))
+    totals, delays = np.cumsum(parts, axis=0), np.arange(parts[0].shape[-1]) < len(inputs.tags)
+    if prior is not None:
+        totals[..., len(inputs.tags) :, len(inputs.tags) :] += prior.precision / PLANNED_CURVE_STD_M**2
+    return [_averaged(np.array([reduced(one, delays) for one in draws]), inputs.tags) for draws in totals]
+
+
+def _averaged(informations: Floats, tags: Sequence[int]) -> Precision[Floats]:
+    """Return root mean squares over the draws (k, tags, tags) that determine it; infinite where most do not."""
+    verdicts = [verdict_on_delays(one, tags) for one in informations]
+    covariance = np.array([one.covariance for one in verdicts])
+    centre = np.eye(len(tags)) - 1 / len(tags)
+    apart = np.diagonal(centre @ covariance @ centre, axis1=1, axis2=2)
+    common = covariance.mean(axis=(1, 2))[:, None]
+    variances = np.hstack([np.array([one.std for one in verdicts]) ** 2, apart, common])
+    good = np.isfinite(variances)
+    mean = np.where(good, variances, 0.0).sum(axis=0) / np.maximum(good.sum(axis=0), 1)
+    std = np.where(good.mean(axis=0) > 0.5, np.sqrt(mean), math.inf)
+    return Precision(std[: len(tags)], std[len(tags) : -1], float(std[-1]))
 
 
 def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None, **changes: Any) -> Plan:
@@ -49,7 +166,8 @@ def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None
     if len(tags) < 2:
         raise BadInputError(f"found {boards!r:.60}, expected 2 to 30 boards, each once", parameter="boards")
     inputs = replace(settings or SurveyPlanSettings(), tags=tags, **changes)
-    candidates = random_arrangements(inputs, CANDIDATES)
+    # The best of sixty is in the best 5 % with a probability of 95 %.
+    candidates = random_arrangements(inputs, 60)
     if not candidates:
         raise UnanswerableError(f"{len(tags)} boards find no room: they must stand 0.4 m from each other")
     informations = [delay_information(inputs, one)[0] for one in candidates]
@@ -86,7 +204,8 @@ def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None
         verdict=verdict_on_delays(total, tags),
         next_best=tuple(sorted(next_best, key=lambda one: one.mean_ns)),
         rate_hz=inputs.rate_hz,
-        seconds_each=max(30.0, math.ceil(RANGES_A_PAIR * math.comb(len(tags), 2) / inputs.rate_hz / 10) * 10.0),
+        # In a mean of 20 ranges noise of 4 cm leaves 9 mm, which adds a tenth to a pair's constant error of 2 cm.
+        seconds_each=max(30.0, math.ceil(20 * math.comb(len(tags), 2) / inputs.rate_hz / 10) * 10.0),
         pair_error_m=inputs.pair_error_m,
         reflected=inputs.reflected,
         known_beside=bool(inputs.anchors or inputs.taped),
@@ -97,12 +216,14 @@ def _choose(informations: list[Floats], count: int | None) -> list[int]:
     """Return `count` arrangements, or as many as are worth it: each the best after those before it."""
     total = np.zeros_like(informations[0])
     found: list[int] = []
-    while len(found) < (count or MOST_ARRANGEMENTS):
+    # Twelve are an hour's work.
+    while len(found) < (count or 12):
         # The same once more would have the same errors, unless boards were taken away in between.
         left = [k for k in range(len(informations)) if k not in found] or list(range(len(informations)))
         best = min(left, key=lambda k: mean_std_ns(total + informations[k]))
         before, after = mean_std_ns(total), mean_std_ns(total + informations[best])
-        if count is None and len(found) >= 2 and after > (1 - WORTH_IT) * before:
+        # By the root of their number arrangements narrow the mean interval, so that about eight are worth 6 % each.
+        if count is None and len(found) >= 2 and after > 0.94 * before:
             break
         found.append(best)
         total = total + informations[best]

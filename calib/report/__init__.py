@@ -1,13 +1,13 @@
 """Reports as HTML and PDF, made of `Heading`, `Text`, `Table`, `Picture` and `Listing`; and figures as files."""
 
-from calib.report.plans import write_plan
-from calib.report.results import origin_of
-from calib.report.writing import (
+from calib.report.campaign import (
     check_places,
     write_comparison_figures,
     write_survey_report,
     write_track_figures,
 )
+from calib.report.plans import write_plan
+from calib.report.results import origin_of
 from uwblink.pages.blocks import Heading, Listing, Picture, Table, Text
 
 __all__ = [

@@ -1,34 +1,145 @@
-"""A campaign: fit, examine, localize and judge, for a report; and one flight fitted and judged, for a sweep."""
+"""Reports and figures as files: of evaluations, of surveys, of tracks, of comparisons, and of whole campaigns.
+
+A campaign fits, examines, localizes and judges; one flight is fitted and judged for a sweep, too.
+"""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calib.calibration.model import Calibration
+from calib import figures as drawings
+from calib.calibration.comparison import CalibrationComparison
+from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.checks.examine import examine
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data, each, held_open, load_each, load_ranges, opened
-from calib.errors import UnanswerableError
+from calib.errors import BadInputError, UnanswerableError
 from calib.evaluation.localization import Localization, localize, summarize
-from calib.evaluation.statistics import evaluate
+from calib.evaluation.onboard import OnboardTrack
+from calib.evaluation.statistics import Evaluation, evaluate
 from calib.findings import Finding
 from calib.fitting.fitting import fit
 from calib.fitting.passive_listeners import heard_delays
 from calib.fitting.result import FitResult
-from calib.report.results import Results, origin_of
+from calib.report.error_sections import track_name
+from calib.report.figures import onboard, rmse_bars, track
+from calib.report.results import Origin, Results, origin_of
 from calib.report.sections import document
-from calib.report.writing import check_places
 from calib.settings import FitSettings
-from uwblink.pages.blocks import write_document
+from uwblink.output import check_folder, check_output
+from uwblink.pages.blocks import Block, Document, Picture, write_document
+
+
+def check_places(output: Path | None, pdf: Path | None, figures: Path | None, *, force: bool) -> None:
+    """Check the output files of a report before anything is computed.
+
+    Raises what `check_output` and, for a folder of `figures`, `check_folder` raise, and `BadInputError` for a `pdf`
+    that is the `output` and for a folder that holds figures already.
+    """
+    for path in filter(None, (output, pdf)):
+        check_output(path, force=force)
+    if pdf is not None and output is not None and output.resolve() == pdf.resolve():
+        raise BadInputError(f"{output} is the page already; give the PDF another name", parameter="pdf")
+    if figures is not None:
+        check_folder(figures)
+        if not force and any(path.suffix in (".pdf", ".svg") for path in figures.glob("*.*")):
+            text = "holds figures already; give another folder, or `force` to replace them"
+            raise BadInputError(f"{figures} {text}", parameter="figures")
+
+
+def write_report(
+    path: str | os.PathLike[str] | None,
+    data: Data | Iterable[Data],
+    calibration: CalibrationSource,
+    *,
+    figures: str | os.PathLike[str] | None = None,
+    evaluation: Evaluation | None = None,
+    origin: Origin | None = None,
+    force: bool = False,
+) -> None:
+    """Evaluate a calibration on recordings and write what came out as one HTML file, or as PDF where it ends so.
+
+    `data` is what `load_ranges` takes. `figures` is a folder for the figures at paper size (PDF and SVG); without a
+    `path` they are all that is written. An `evaluation` of the same recordings is taken instead of another one, and
+    `origin` as what the report says of where it comes from. Raises what `Calibration.apply`, `load_ranges` and
+    `check_output` raise; nothing is written then. The report of a whole campaign is `run_campaign(...).write(path)`.
+
+    >>> import calib, pathlib, tempfile
+    >>> flight = calib.sample_flight(300)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     page = pathlib.Path(folder) / "report.html"
+    ...     calib.write_report(page, flight, calib.fit(flight).calibration)
+    ...     "Before and after" in page.read_text()
+    True
+    """
+    calibration = given_calibration(calibration)
+    output, folder = (None if place is None else Path(place) for place in (path, figures))
+    check_places(output, None, folder, force=force)
+    recordings = each(data)
+    loaded = load_each(recordings, need_power=calibration.needs_power)
+    made = origin or origin_of(recordings)
+    results = Results(calibration=calibration, tests=loaded, evaluated=evaluation, origin=made)
+    write_document(document(results, "Calibration report"), output, None, folder, force=force)
+
+
+def write_survey_report(
+    path: str | os.PathLike[str], calibration: CalibrationSource, *, origin: Origin | None = None, force: bool = False
+) -> None:
+    """Write what a calibration without known distances rests on and whether it is fit for use, as HTML or .pdf.
+
+    It needs no recording: everything stands in the calibration. Raises what `check_output` raises.
+    """
+    results = Results(calibration=given_calibration(calibration), origin=origin or origin_of([]))
+    write_checked(document(results, "Report of a calibration without motion capture"), Path(path), force=force)
+
+
+def write_track_figures(
+    found: Sequence[Localization] | Sequence[OnboardTrack], folder: Path, *, force: bool = False
+) -> None:
+    """Write each body's track into a folder, as PDF and SVG at two widths; of filters also bars of their RMSE.
+
+    Raises what `check_places` raises.
+    """
+    compared = [one for one in found if isinstance(one, Localization)]
+    draws: dict[type, Any] = {Localization: track, OnboardTrack: onboard}
+    pictures: list[Block] = [
+        *([Picture("rmse", partial(rmse_bars, found=compared), "RMSE")] if compared else []),
+        *(Picture(track_name(one.source, one.body), partial(draws[type(one)], one=one), one.body) for one in found),
+    ]
+    write_checked(Document("", pictures), None, folder, force=force)
+
+
+def write_comparison_figures(
+    found: CalibrationComparison,
+    known: Sequence[Calibration],
+    names: Sequence[str],
+    folder: Path,
+    *,
+    force: bool = False,
+) -> None:
+    """Write the differences of delays and both calibrations' curves into a folder; `names` label the calibrations."""
+    pictures: list[Block] = [
+        Picture("differences", partial(drawings.differences, found=found), "Delays"),
+        Picture("curves", partial(drawings.both_curves, known=known, names=names), "Curves"),
+    ]
+    write_checked(Document("", pictures), None, folder, force=force)
+
+
+def write_checked(made: Document, output: Path | None, figures: Path | None = None, *, force: bool) -> None:
+    """Write a document and its figures where `check_places` allows it, and raise what that raises elsewhere."""
+    check_places(output, None, figures, force=force)
+    write_document(made, output, None, figures, force=force)
+
 
 Progress = Callable[[str], None]
 

@@ -25,15 +25,14 @@ def curves(results: Results) -> list[Block]:
     if not results.recordings:
         power, *curves = curve_rows(calibration)
         return [Heading("Bias and spread over power"), Table(list(power), [list(row) for row in curves])]
-    if calibration.loss == "l2":
-        follows = "The curve follows the mean of the errors, as least squares do; points are means, bin by bin."
-    else:
-        follows = (
-            "The curve follows the core of the errors: noise, without reflections, which can only lengthen a range. "
-            "Points are the centre of that core (below: its spread), told from the tail bin by bin, without the curve. "
-            "Medians are drawn, too, and lie above: with a share s of reflected ranges about the quantile "
-            "0.5 / (1 − s) of the core."
-        )
+    follows = (
+        "The curve follows the mean of the errors, as least squares do; points are means, bin by bin."
+        if calibration.loss == "l2"
+        else "The curve follows the core of the errors: noise, without reflections, which can only lengthen a range. "
+        "Points are the centre of that core (below: its spread), told from the tail bin by bin, without the curve. "
+        "Medians are drawn, too, and lie above: with a share s of reflected ranges about the quantile "
+        "0.5 / (1 − s) of the core."
+    )
     mean_of_lifted = "the mean over both ends." if calibration.lift == "mean-of-lifted" else ""
     lifted = (
         "Lifted power is the first-path power p on a scale that stretches where ranges are good and the bias "
@@ -169,13 +168,13 @@ def localization(results: Results) -> list[Block]:
         ["ICRA 2023, its own flights", *(f"{PAPER_RMSE_M[n]:.3f}" if n in PAPER_RMSE_M else "" for n in names)],
     ]
     (nis_low, nis_high), (nees_low, nees_high) = total.nis_bounds, total.nees_bounds
-    meaning = "Both lie within: the filter is consistent."
-    if total.nis > nis_high or total.nees > nees_high:
-        meaning = (
-            "Above their bounds: the filter is overconfident, for example because sigma does not include reflections."
-        )
-    elif total.nis < nis_low or total.nees < nees_low:
-        meaning = "Below their bounds: the filter is underconfident, for example because a gate rejects the tail."
+    meaning = (
+        "Above their bounds: the filter is overconfident, for example because sigma does not include reflections."
+        if total.nis > nis_high or total.nees > nees_high
+        else "Below their bounds: the filter is underconfident, for example because a gate rejects the tail."
+        if total.nis < nis_low or total.nees < nees_low
+        else "Both lie within: the filter is consistent."
+    )
     heads = [FILTER_STYLES[name][0].removeprefix("calibrated, ") for name in names]
     shown = [
         Picture(

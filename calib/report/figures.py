@@ -119,7 +119,7 @@ def arrangement(width_in: float, plan: Plan, number: int) -> Figure:
     figure, panels = sheet(width_in, 3 if plan.on == "" else 2, height_in=1.5 if on_line else 2.7)
     for axes, height in zip(panels[:-1], (1, 2), strict=False):
         _boards(axes, one, height, on_line=on_line)
-    panels[0].set_title(f"Step {number + 1}: arrangement {one.name}", loc="left")
+    panels[0].set_title(f"Step {number + 1}: arrangement {one.name}")
     _intervals(panels[-1], plan.after_ns[number], plan.after_ns[number - 1] if number else {})
     if one.taped:
         panels[-1].plot([], [], "--", color=VERMILION, label="distance to tape")

@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 
 from calib.planning.result import FlightPlan, Plan
+from calib.report.campaign import write_checked
 from calib.report.figures import arrangement, flight, more, planned_delays
-from calib.report.writing import check_places
-from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text, write_document
+from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text
 
 
 def write_plan(
@@ -32,8 +32,7 @@ def write_plan(
     if isinstance(plan, Plan):
         places = {"line": "on a line", "plane": "in a plane", "": "in space"}[plan.on]
         title = f"Plan: {len(plan.half_ns)} boards {places}, {len(plan.arrangements)} arrangements"
-    check_places(output, None, figures, force=force)
-    write_document(Document(title, blocks), output, None, figures, force=force)
+    write_checked(Document(title, blocks), output, figures, force=force)
 
 
 def _of_boards(plan: Plan) -> Iterator[Block]:
@@ -83,8 +82,11 @@ def _promise(plan: Plan | FlightPlan) -> Iterator[Block]:
         yield Text(f"Not determined: {'; '.join(plan.verdict.free)}.", "warning")
     if plan.next_best:
         yield Heading("What one thing more would bring")
-        caption = "The mean interval with each; 1.5 ns are taken for known of a delay that nothing determines."
-        yield Picture("more", partial(more, next_best=plan.next_best), caption)
+        yield Picture(
+            "more",
+            partial(more, next_best=plan.next_best),
+            "The mean interval with each; 1.5 ns are taken for known of a delay that nothing determines.",
+        )
 
 
 def _known(plan: Plan | FlightPlan) -> str:

@@ -22,7 +22,7 @@ from calib.errors import BadInputError
 from calib.evaluation.statistics import CORRECTION_STAGES, pair_rows
 from calib.report import error_sections
 from calib.report.results import Results
-from calib.report.verdict import left_open, verdict
+from calib.report.verdict import left_open, started, verdict
 from calib.spread import TWO_SIDED_95
 from calib.surveys.figures import board_figure
 from calib.surveys.result import SurveyedArrangement
@@ -65,18 +65,18 @@ def _summary(results: Results) -> str:
 
 
 def _warnings(results: Results) -> list[Block]:
-    told = results.warnings
-    if results.fit is not None and not results.tests:
-        told.append("no tests were given: the figures below are of the recordings that the fit has seen")
-    if results.part is not None:
-        told.append(
-            "no tests were given: errors below are those of a second fit on a part of the recordings that it has not "
-            "seen; on another day they are larger"
-        )
-    for name, finding in results.findings:
-        evidence, remedy = (text[:1].upper() + text[1:] for text in (finding.evidence, finding.remedy))
-        told.append(f"{name}: {finding.fault}. {evidence}. {remedy}.")
-    return [Text(f"Warning: {sentence}", "warning") for sentence in told]
+    told = [
+        *results.warnings,
+        "no tests were given: the figures below are of the recordings that the fit has seen"
+        if results.fit is not None and not results.tests
+        else "",
+        "no tests were given: errors below are those of a second fit on a part of the recordings that it has not seen; "
+        "on another day they are larger"
+        if results.part is not None
+        else "",
+        *(f"{name}: {one.fault}. {started(one.evidence)}. {started(one.remedy)}." for name, one in results.findings),
+    ]
+    return [Text(f"Warning: {sentence}", "warning") for sentence in told if sentence]
 
 
 def _recordings(results: Results) -> list[Block]:
@@ -112,7 +112,7 @@ def _foundations(results: Results) -> list[Block]:
     told = rests_on(made)
     if not told:
         return []
-    rests = made["rests_on"]
+    rests, off = made["rests_on"], made.get("distance_std_m")
 
     def names(key: str) -> str:
         return ", ".join(map(str, rests.get(key) or [])) or "none"
@@ -125,12 +125,9 @@ def _foundations(results: Results) -> list[Block]:
         ["attitudes from", str(rests.get("attitudes", "nowhere"))],
         ["distances by tape", str(rests.get("distances", 0))],
         ["heights of", names("heights")],
+        ["distances found to (standard error)", f"{100 * off:.1f} cm" if isinstance(off, int | float) else ""],
+        ["left open", str(made.get("left_open", ""))],
     ]
-    off = made.get("distance_std_m")
-    if isinstance(off, int | float):
-        rows.append(["distances found to (standard error)", f"{100 * off:.1f} cm"])
-    if made.get("left_open"):
-        rows.append(["left open", str(made["left_open"])])
     return [
         Heading("What it rests on"),
         Text(f"No true distance was known: {told}. Trajectories were found together with the delays."),
@@ -159,14 +156,10 @@ def _of_survey(made: Any) -> list[Block]:
     surveyed = [SurveyedArrangement.from_dict(row) for row in made.get("surveyed", [])]
     if not surveyed:
         return blocks
-    rows = []
-    for one in surveyed:
-        known = [board for board in one.boards if board.determined]
-        far = [TWO_SIDED_95 * sqrt(max(float(board.covariance_m2.trace()), 0.0)) for board in known]
-        within = f"± {100 * max(far):.1f} cm" if far else "undetermined"
-        tags = ", ".join(str(board.tag) for board in one.boards)
-        rows.append([one.name, tags, one.known or "nothing", within, one.frame])
-
+    rows = [
+        [one.name, ", ".join(str(board.tag) for board in one.boards), one.known or "nothing", _within(one), one.frame]
+        for one in surveyed
+    ]
     caption = (
         "Where boards stood, from above, with ellipses that hold them with 95 %; ten times as large and dashed where "
         "they would not be seen."
@@ -185,14 +178,20 @@ def _of_survey(made: Any) -> list[Block]:
     return blocks
 
 
+def _within(one: SurveyedArrangement) -> str:
+    """Return in words how well the places of an arrangement's boards are known, that of the worst."""
+    known = [board for board in one.boards if board.determined]
+    far = [TWO_SIDED_95 * sqrt(max(float(board.covariance_m2.trace()), 0.0)) for board in known]
+    return f"± {100 * max(far):.1f} cm" if far else "undetermined"
+
+
 def _determined(results: Results) -> list[Block]:
     """Return whether the pairs determine the delays, and the assumptions of the fit."""
     if results.fit is None:
         return []
     calibration, pairs = results.calibration, pair_rows(results.trained)
-    answer = f"Yes: the {len(pairs)} pairs of {len(results.trained.tags())} tags determine every delay."
-    if left_open(results):
-        answer = f"No: {left_open(results)}."
+    good = f"Yes: the {len(pairs)} pairs of {len(results.trained.tags())} tags determine every delay."
+    answer = f"No: {left_open(results)}." if left_open(results) else good
     counts = [int(np.count_nonzero(rows)) for rows in pairs.values()]
     changed = calibration.provenance.get("settings", {})
     settings = f" Settings: {', '.join(f'{name} = {value}' for name, value in changed.items())}." if changed else ""
@@ -228,39 +227,36 @@ def _delays(results: Results) -> list[Block]:
     delays = {tag: delay for tag, delay in sorted(calibration.delays_ns.items()) if tag not in calibration.sides}
     half = {tag: TWO_SIDED_95 * calibration.delays_std_ns.get(tag, nan) for tag in delays}
     unknown = {tag: "not stated" if isnan(one) else "undetermined" for tag, one in half.items() if not isfinite(one)}
+    errors_ns = planted.delay_error_ns if planted else {}
     columns = {
         "tag": list(map(str, delays)),
         "delay (ns)": [f"{delay:+.4f}" for delay in delays.values()],
         "95 % from": [unknown.get(tag, f"{delay - half[tag]:+.4f}") for tag, delay in delays.items()],
         "to": ["" if tag in unknown else f"{delay + half[tag]:+.4f}" for tag, delay in delays.items()],
+        "planted, same gauge (ns)": [f"{known[tag] + shift:+.4f}" if tag in known else "" for tag in delays],
+        "difference (ps)": [f"{1e3 * errors_ns[tag]:+.1f}" if tag in errors_ns else "" for tag in delays],
+        "heard by others (ns)": [f"{heard[tag].delay_ns:+.4f}" if tag in heard else "" for tag in delays],
+        "± 1 std": [f"{heard[tag].std_ns:.4f}" if tag in heard else "" for tag in delays],
     }
-    if known and planted:
-        errors_ns = planted.delay_error_ns
-        columns |= {
-            "planted, same gauge (ns)": [f"{known[tag] + shift:+.4f}" if tag in known else "" for tag in delays],
-            "difference (ps)": [f"{1e3 * errors_ns[tag]:+.1f}" if tag in errors_ns else "" for tag in delays],
-        }
-    if heard:
-        columns |= {
-            "heard by others (ns)": [f"{heard[tag].delay_ns:+.4f}" if tag in heard else "" for tag in delays],
-            "± 1 std": [f"{heard[tag].std_ns:.4f}" if tag in heard else "" for tag in delays],
-        }
-    rows = list(map(list, zip(*columns.values(), strict=True)))
+    columns = {name: cells for name, cells in columns.items() if any(cells)}
+    table = Table(list(columns), list(map(list, zip(*columns.values(), strict=True))))
     caption = "Antenna delays with their 95 % intervals" + (
         ", and what was planted, in the same gauge." if known else "."
     )
     draw = partial(figures.alone, partial(figures.delays, calibration, known, shift))
-    blocks = [Heading("Antenna delays"), *of_pairs, Table(list(columns), rows), Picture("delays", draw, caption)]
+    blocks = [Heading("Antenna delays"), *of_pairs, table, Picture("delays", draw, caption)]
     if planted:
+        differs = (
+            f" The bias curve differs from the planted one by {1e3 * planted.curve_rms_m:.1f} mm rms over these "
+            f"ranges, the whole correction of a range by {1e3 * planted.correction_rms_m:.1f} mm."
+            if isfinite(planted.curve_rms_m)
+            else ""
+        )
         text = (
             "A constant of the bias curve and a common shift of all delays cannot be distinguished: planted delays, "
             f"and the planted curve below, are shown after moving {shift:+.4f} ns from the curve to the delays."
+            f"{differs}"
         )
-        if isfinite(planted.curve_rms_m):
-            text += (
-                f" The bias curve differs from the planted one by {1e3 * planted.curve_rms_m:.1f} mm rms over these "
-                f"ranges, the whole correction of a range by {1e3 * planted.correction_rms_m:.1f} mm."
-            )
         blocks.append(Text(text, "note"))
     return blocks
 
@@ -268,9 +264,9 @@ def _delays(results: Results) -> list[Block]:
 def _provenance(results: Results) -> list[Block]:
     """Return the origin of a report and its calibration."""
     origin, made = results.origin, results.calibration.provenance
-    rows = [["report", origin.made], ["version", origin.version], ["command", origin.command]]
-    rows = [row for row in [*rows, ["distances", rests_on(made)]] if row[1]]
-    rows += [[path, f"SHA-256 {digest}"] for path, digest in origin.files.items()]
+    known = {"report": origin.made, "version": origin.version, "command": origin.command, "distances": rests_on(made)}
+    known |= {path: f"SHA-256 {digest}" for path, digest in origin.files.items()}
+    rows = [[name, text] for name, text in known.items() if text]
     # Sections show the rest as tables and figures.
     rest = {key: value for key, value in made.items() if key not in ("surveyed", "reflected")}
     return [Heading("Provenance"), Table(["of", "what"], rows, words=True), Listing(json.dumps(rest, indent=1))]
@@ -322,10 +318,10 @@ def register_report_section(name: str, section: Section, *, before: str = "prove
     def of_recordings(results: Results) -> list[Block]:
         return section(results) if results.recordings else []
 
-    rows = list(SECTIONS.items())
-    rows.insert(list(SECTIONS).index(before), (name, of_recordings))
-    SECTIONS.clear()
-    SECTIONS.update(rows)
+    below = list(SECTIONS)[list(SECTIONS).index(before) :]
+    SECTIONS[name] = of_recordings
+    for one in below:
+        SECTIONS[one] = SECTIONS.pop(one)
 
 
 def document(results: Results, title: str) -> Document:

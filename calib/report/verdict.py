@@ -18,9 +18,7 @@ from calib.report.results import Results
 from calib.spread import STD_OF_MEDIAN, TWO_SIDED_95
 from uwblink.pages.blocks import Block, Table, Text
 
-GOOD: Final = "good"
-DOUBT: Final = "doubt"
-BAD: Final = "bad"
+GOOD, DOUBT, BAD = "good", "doubt", "bad"
 
 MOST_NS: Final = 0.1
 """Half of an interval of a delay, 3 cm of range: as much as DW1000s of one kind differ by chance."""
@@ -39,18 +37,22 @@ class Criterion(NamedTuple):
 def verdict(results: Results) -> list[Block]:
     """Return a sentence on all criteria, and their table."""
     found = list(criteria(results))
-    bad, doubt = ("; ".join(one.told for one in found if one.grade == grade) for grade in (BAD, DOUBT))
-    if bad:
-        kind, also = BAD, f" Also: {doubt}." if doubt else ""
-        text = f"Not fit for use. {bad[0].upper()}{bad[1:]}.{also}"
-    elif doubt:
-        kind, text = DOUBT, f"Fit for use, with reservations. {doubt[0].upper()}{doubt[1:]}."
-    else:
-        listed = "; ".join(one.told for one in found)
-        kind, text = GOOD, f"Fit for use. All {len(found)} criteria are met: {listed}."
+    bad, doubt, good = ("; ".join(one.told for one in found if one.grade == grade) for grade in (BAD, DOUBT, GOOD))
+    also = f" Also: {doubt}." if doubt else ""
+    sentences = (
+        (bad, BAD, f"Not fit for use. {started(bad)}.{also}"),
+        (doubt, DOUBT, f"Fit for use, with reservations. {started(doubt)}."),
+        (True, GOOD, f"Fit for use. All {len(found)} criteria are met: {good}."),
+    )
+    kind, text = next((kind, text) for applies, kind, text in sentences if applies)
     marks = {GOOD: "✓ yes", DOUBT: "! in part", BAD: "✗ no"}
     rows = [[one.question, marks[one.grade], one.found, one.asked] for one in found]
     return [Text(text, kind), Table(["criterion", "met", "found", "asked for"], rows, words=True)]
+
+
+def started(text: str) -> str:
+    """Return a text as a sentence begins."""
+    return text[:1].upper() + text[1:]
 
 
 def criteria(results: Results) -> Iterator[Criterion]:
@@ -110,8 +112,9 @@ def _held_out(results: Results) -> Criterion:
     elif not results.held_out:
         found = "no: on those it was fitted to"
         told = "it was not judged on recordings that the fit has not seen, so what follows is too good"
-    question = "Was it judged on recordings that the fit has not seen?"
-    return Criterion(question, "yes", found, _graded(results.held_out, True), told)
+    return Criterion(
+        "Was it judged on recordings that the fit has not seen?", "yes", found, _graded(results.held_out, True), told
+    )
 
 
 def _gain(results: Results) -> Criterion:
@@ -190,9 +193,11 @@ def _settled(results: Results) -> Criterion:
     if not half:
         return Criterion(*asked, "the calibration states no intervals", DOUBT, "delays have no intervals")
     widest = max(half, key=lambda name: half[name])
-    told = f"delays are known to ± {half[widest]:.3f} ns or better"
-    if half[widest] > MOST_NS:
-        told = f"the delay of {widest} is known to ± {half[widest]:.2f} ns only"
+    told = (
+        f"the delay of {widest} is known to ± {half[widest]:.2f} ns only"
+        if half[widest] > MOST_NS
+        else f"delays are known to ± {half[widest]:.3f} ns or better"
+    )
     grade = _graded(half[widest] <= MOST_NS, half[widest] <= 3 * MOST_NS)
     return Criterion(*asked, f"widest: {widest}, ± {half[widest]:.3f} ns", grade, told)
 

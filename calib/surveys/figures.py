@@ -12,7 +12,7 @@ from matplotlib.patches import Ellipse
 
 from calib.surveys.result import SurveyedArrangement
 from uwblink.pages.colours import BLUE, VERMILION
-from uwblink.pages.figures import sheet
+from uwblink.pages.figures import label, sheet
 
 
 def board_figure(arrangements: Sequence[SurveyedArrangement], width_in: float | None = None) -> Figure:
@@ -39,7 +39,7 @@ def _draw_boards(axes: Axes, one: SurveyedArrangement) -> None:
         colour = BLUE if board.determined else VERMILION
         axes.plot(x, y, "o", ms=3, color=colour)
         high = f" ({z:+.2f})" if one.known == "" else ""
-        axes.annotate(f"{board.tag}{high}", (x, y), xytext=(0, 7), textcoords="offset points", ha="center", fontsize=8)
+        axes.annotate(f"{board.tag}{high}", (x, y), xytext=(0, 7), textcoords="offset points", ha="center")
         values, vectors = np.linalg.eigh(board.covariance_m2[:2, :2])
         # 5.991 is the 95 % quantile of chi-square with two degrees of freedom.
         long, short = 2 * np.sqrt(5.991 * np.maximum(values[::-1], 0.0))
@@ -48,13 +48,10 @@ def _draw_boards(axes: Axes, one: SurveyedArrangement) -> None:
         axes.add_patch(
             Ellipse((x, y), factor * long, factor * short, angle=turn, fill=False, ec=colour, lw=1.0, ls=style)
         )
+    axes.set(title=one.name)
+    axes.margins(0.15)
+    label(axes, "m", "")
     if one.known == "line":
-        axes.set_xlim(place[:, 0].min() - 0.12 * width, place[:, 0].max() + 0.12 * width)
         axes.set(ylim=(-0.5, 0.8), yticks=[])
     else:
         axes.set_aspect("equal", adjustable="datalim")
-        axes.margins(0.15)
-    axes.set_title(one.name, loc="left", fontsize="medium")
-    axes.set_xlabel("m", fontsize=8)
-    axes.tick_params(labelsize=8)
-    axes.spines[["top", "right"]].set_visible(False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from calib.errors import BadInputError
-from uwblink.recording.schema import SHAPES, Arrangement, KnownDistance
+from uwblink.recording.schema import SHAPES, Arrangement, KnownDistance, is_id
 from uwblink.text_files import TomlReader, is_number
 
 TAPE_M, PLACE_M = 0.005, 0.01
@@ -68,7 +69,7 @@ class Knowledge:
 
 
 def _are_tags(value: Any, count: int | None = None) -> bool:
-    good = isinstance(value, list) and all(type(one) is int and 0 <= one <= 254 for one in value)
+    good = isinstance(value, list) and all(map(is_id, value))
     return good and len(set(value)) == len(value) and (len(value) == count if count else len(value) > 1)
 
 
@@ -90,7 +91,7 @@ KEYS: Final[dict[str, dict[str, tuple[Callable[[Any], bool], str]]]] = {
         "arrangement": WORD,
     },
     "positions": {
-        "tag": (lambda value: _are_tags([value], 1), "a whole number 0 to 254"),
+        "tag": (lambda value: _are_tags([value], 1), "a whole number 0 to 65535"),
         "position_m": (
             lambda value: isinstance(value, list) and len(value) == 3 and all(map(is_number, value)),
             "three numbers (metres)",
@@ -115,13 +116,15 @@ def load_knowledge(path: str | os.PathLike[str]) -> Knowledge:
     arrangements = list(_rows(file, "arrangements"))
     names = [row["name"] for row in arrangements]
     for k, row in enumerate(arrangements):
-        where = f"arrangements[{k}]"
-        file.check(f"{where}.name", row["name"], names.count(row["name"]) == 1, "each name once")
-        good = "order" not in row or row.get("known", "line") == "line"
-        file.check(f"{where}.order", row.get("order"), good, 'an order of boards on a line, known = "line"')
-        file.check(where, row, ("start_s" in row) == ("end_s" in row), "start_s and end_s, both or neither")
-        good = "end_s" not in row or row["start_s"] < row["end_s"]
-        file.check(f"{where}.end_s", row.get("end_s"), good, f"a number above start_s, {row.get('start_s')}")
+        on_line = "order" not in row or row.get("known", "line") == "line"
+        paired, start_s = ("start_s" in row) == ("end_s" in row), row.get("start_s", -math.inf)
+        for key, value, good, expected in (
+            (".name", row["name"], names.count(row["name"]) == 1, "each name once"),
+            (".order", row.get("order"), on_line, 'an order of boards on a line, known = "line"'),
+            ("", row, paired, "start_s and end_s, both or neither"),
+            (".end_s", row.get("end_s"), start_s < row.get("end_s", math.inf), f"a number above start_s, {start_s}"),
+        ):
+            file.check(f"arrangements[{k}]{key}", value, good, expected)
     return Knowledge(
         shape=str(file.choice("known", file.table.get("known", ""), SHAPES)),
         shapes={row["name"]: row["known"] for row in arrangements if "known" in row},
@@ -163,8 +166,10 @@ def check_knowledge(knowledge: Knowledge, tags: Mapping[str, set[int]]) -> None:
     named = {*knowledge.shapes, *knowledge.orders, *(one.arrangement for one in known)}
     strangers = sorted(named - {"", *tags})
     bad = sorted({shape for shape in (knowledge.shape, *knowledge.shapes.values()) if shape not in SHAPES})
-    wrong = [f"names an arrangement {name!r:.40}; there are {', '.join(sorted(tags))}" for name in strangers]
-    wrong += [f"found {shape!r:.40}, allowed: line, plane" for shape in bad]
+    wrong = [
+        *(f"names an arrangement {name!r:.40}; there are {', '.join(sorted(tags))}" for name in strangers),
+        *(f"found {shape!r:.40}, allowed: line, plane" for shape in bad),
+    ]
     for one in known:
         if isinstance(one, KnownDistance):
             who, good = {one.first, one.second}, 0 < one.distance_m <= MAX_LENGTH_M

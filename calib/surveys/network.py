@@ -29,11 +29,6 @@ from uwblink.recording.schema import KnownDistance
 DIMENSIONS = {"line": 1, "plane": 2, "": 3}
 """In how many dimensions boards may stand, by what is known of an arrangement."""
 
-FREE_PLACE_STD_M = 30.0
-"""Prior standard deviation of a coordinate that is not known: it holds what no range determines."""
-
-BESIDE_STD_M = 0.5
-"""The same of how far boards stand beside a line, or a plane, that is none: decimetres, as nobody overlooks a metre."""
 
 EXTRA_M, EXTRA_STD_M = 0.3, 0.25
 """Prior mean and standard deviation of how much longer a reflected path is (published detours are 0.1 to 0.5 m).
@@ -48,14 +43,9 @@ From the three published curves of boards (`icra2023`, `icra2023-july`, `miluv` 
 bend for an error of pairs, and what all delays share for what it is not.
 """
 
-CURVE_SEGMENTS = 12
-"""Enough that splines follow a process of this length over 25 dB; the prior, not their number, makes them smooth."""
 
 NARROWEST_DB = 3.0
 """Span of powers below which no curve is fitted."""
-
-FIXED_STD_NS = 1e-4
-"""Prior standard deviation of known delays: 0.03 mm, far below any result."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +63,9 @@ class CurvePrior:
         if not np.isfinite(power).all() or np.ptp(power) < NARROWEST_DB:
             return None
         low, high = float(power.min()), float(power.max())
-        inner = 10 ** ((np.linspace(low, high, CURVE_SEGMENTS + 1) - ALPHA_DBM) / 10)
+        # Twelve segments are enough that splines follow a process of this length over 25 dB; the prior, not their
+        # number, makes them smooth.
+        inner = 10 ** ((np.linspace(low, high, 13) - ALPHA_DBM) / 10)
         knots = np.concatenate([[inner[0]] * DEGREE, inner, [inner[-1]] * DEGREE])
         dense = np.linspace(low, high, 60)
         back = np.linalg.pinv(basis(10 ** ((dense - ALPHA_DBM) / 10), knots))
@@ -260,16 +252,22 @@ class Network:
         boards, axis = [self.arrangements[k] for k in self.owner.tolist()], np.arange(3)
         known = axis >= np.array([[one.dimensions] for one in boards])
         beside = axis == np.array([[one.dimensions - 1 if one.freed else -1] for one in boards])
-        std, centre = np.where(beside, BESIDE_STD_M, FREE_PLACE_STD_M), np.zeros((len(boards), 3))
+        # A coordinate that is not known is held to 30 m; how far boards stand beside a line, or a plane, that is none
+        # to decimetres, as nobody overlooks a metre.
+        std, centre = np.where(beside, 0.5, 30.0), np.zeros((len(boards), 3))
         for point, (place, _) in self.known_places.items():
             centre[self.owner == self.owner[point]] = place
         for point, (place, sigma) in self.known_places.items():
             centre[point], std[point] = place, sigma
         delays = np.array([self.fixed_ns.get(tag, 0.0) for tag in self.tags])
-        certain = np.array([FIXED_STD_NS if tag in self.fixed_ns else BOARD_DELAY_STD_NS for tag in self.tags])
-        blocks = [("place", centre.ravel(), np.diag(std.ravel() ** -2)), ("delay", delays, np.diag(certain**-2))]
-        if self.curve is not None:
-            blocks.append(("curve", np.zeros(len(self.curve.precision)), self.curve.precision))
+        # A known delay is held to 0.03 mm, far below any result.
+        certain = np.array([1e-4 if tag in self.fixed_ns else BOARD_DELAY_STD_NS for tag in self.tags])
+        curves = [] if self.curve is None else [self.curve.precision]
+        blocks = [
+            ("place", centre.ravel(), np.diag(std.ravel() ** -2)),
+            ("delay", delays, np.diag(certain**-2)),
+            *(("curve", np.zeros(len(precision)), precision) for precision in curves),
+        ]
         every = np.append(known, np.zeros(sum(len(start) for _, start, _ in blocks[1:]), dtype=bool))
         every[list(self.held)] = True
         parts = np.split(every, np.cumsum([len(start) for _, start, _ in blocks])[:-1])

@@ -15,13 +15,13 @@ from calib.calibration.model import Calibration, Uncertainty, matrix_of
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis, flat_curve
 from calib.errors import UnanswerableError
 from calib.estimator.range_model import METRES_A_NS
+from calib.findings import Finding
 from calib.information import InformationColumn, Verdict, judge, reduced
 from calib.settings import SurveySettings
 from calib.spread import TWO_SIDED_95
 from calib.surveys.network import Boards
 from calib.surveys.recordings import LIFT, SurveyData
 from calib.surveys.result import (
-    Contradiction,
     ReflectedPair,
     SecondBest,
     SurveyedArrangement,
@@ -32,10 +32,6 @@ from calib.surveys.solution import PAIR_PRIOR_FREEDOM, Solution
 from uwblink.arrays import Floats
 from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
-
-DELAY_SCALE_NS = 0.5
-"""How far a delay is known without any data: devices of one design differ by that (published ones by 0.6 ns). A delay
-is determined if its standard error is at most `LOOSEST` of it."""
 
 MIN_BELIEVED, MIN_MENTIONED = 0.5, 0.1
 """Probabilities from which a pair is believed to be reflected, and from which it is said that it may be: more
@@ -52,14 +48,16 @@ def students_factor(freedom: float) -> float:
 
 def verdict_on_delays(information: Floats, tags: Sequence[int]) -> Verdict:
     """Return what is determined of delays by their information (tags, tags), 1/ns^2."""
-    return judge(information, [InformationColumn("delay", str(tag), DELAY_SCALE_NS) for tag in tags])
+    # Devices of one design differ by half a nanosecond (published ones by 0.6 ns); a delay is determined if its
+    # standard error is at most `LOOSEST` of it.
+    return judge(information, [InformationColumn("delay", str(tag), 0.5) for tag in tags])
 
 
 def result_of(
     data: SurveyData,
     found: Solution,
     second: SecondBest | None,
-    findings: tuple[Contradiction, ...],
+    findings: tuple[Finding, ...],
     taken: Calibration | None,
     asked: SurveySettings,
 ) -> SurveyResult:
@@ -76,12 +74,12 @@ def result_of(
             undetermined=[[int(tag) for tag in free]],
         )
     reflected = tuple(_reflected_pairs(found))
-    warnings = (*data.warnings, *(one.text for one in findings), *_notes(found, second, verdict, reflected))
+    warnings = (*data.warnings, *map(str, findings), *_notes(found, second, verdict, reflected))
     arrangements = tuple(_arrangement(found, k) for k in range(len(network.arrangements)))
     more = ({"settings": asked.changed()} if asked.changed() else {}) | {
         "surveyed": [one.to_dict() for one in arrangements],
         "reflected": [one.to_dict() for one in reflected],
-        "findings": [one.text for one in findings],
+        "findings": list(map(str, findings)),
         "second_best": None if second is None else round(second.worse, 2),
         "warnings": list(warnings),
     }
@@ -162,7 +160,7 @@ def _calibration(
     curve, curve_covariance = flat_curve(0.0, span), np.zeros((DEGREE + 1,) * 2)
     gauge = "no curve; the delays carry the constant"
     if taken is not None:
-        curve, curve_covariance, span = taken.bias_curve, _of_curve(taken), taken.bias_curve.range
+        curve, curve_covariance, span = taken.bias_curve, taken.curve_covariance_m2, taken.bias_curve.range
         gauge = "that of the calibration whose curve was taken over"
     elif network.curve is not None:
         where, knots = network.layout.where["curve"], network.curve.knots
@@ -210,19 +208,13 @@ def _calibration(
     )
 
 
-def _of_curve(taken: Calibration) -> Floats:
-    """Return the covariance (m, m) of a curve that was taken over, m^2; zero where it is not stated."""
-    size = len(taken.bias_curve.coefficients)
-    return np.zeros((size, size)) if taken.uncertainty is None else np.array(taken.uncertainty.bias_m2)
-
-
 def widened_by(found: Solution, curve: Calibration) -> Solution:
     """Return a solution whose covariance has what the errors of a curve that was taken over do to delays and places."""
     here, means = found.linear, found.network.means
     splines = basis(np.clip(means.lifted, *curve.bias_curve.range), np.array(curve.bias_curve.knots))
     count = len(splines)
     gain = here.covariance @ (here.jacobian[:count].T @ (splines / here.std[:count, None]))
-    return replace(found, more=found.more + gain @ _of_curve(curve) @ gain.T)
+    return replace(found, more=found.more + gain @ curve.curve_covariance_m2 @ gain.T)
 
 
 def in_frames(found: Solution) -> Solution:
@@ -264,11 +256,11 @@ def _arrangement(found: Solution, number: int) -> SurveyedArrangement:
     """Return where boards stood in an arrangement, in the frame of known positions or that of its first boards."""
     network, boards, seats = found.network, found.network.arrangements[number], found.network.seats(number)
     points, covariance = network.positions_m(found.x), found.covariance() * students_factor(found.freedom) ** 2
-    surveyed = []
-    for tag, seat in zip(boards.tags, seats.tolist(), strict=True):
-        own, (x, y, z) = slice(3 * seat, 3 * seat + 3), points[seat].tolist()
-        spread = covariance[own, own]
-        surveyed.append(SurveyedBoard(tag, (x, y, z), spread, bool(np.trace(spread) < 1.0)))
+    own = [slice(3 * seat, 3 * seat + 3) for seat in seats.tolist()]
+    surveyed = tuple(
+        SurveyedBoard(tag, (x, y, z), covariance[one, one], bool(np.trace(covariance[one, one]) < 1.0))
+        for tag, one, (x, y, z) in zip(boards.tags, own, points[seats].tolist(), strict=True)
+    )
     known = network.known_places.keys() & set(seats.tolist())
     frame = "that of the known positions" if known else _frame(points[seats], boards)[2]
-    return SurveyedArrangement(boards.name, boards.shape, tuple(surveyed), frame)
+    return SurveyedArrangement(boards.name, boards.shape, surveyed, frame)

@@ -22,11 +22,11 @@ from calib.estimator.optimize import maximize
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, Part
 from calib.estimator.unknowns import Prior, Priors, Unknown
+from calib.findings import Finding
 from calib.pairs import Pairs, pairs_of
 from calib.settings import FitSettings
 from calib.spread import STD_OF_MEDIAN, medians, robust_spread
 from calib.surveys.knowledge import Knowledge
-from calib.surveys.result import Contradiction
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.antenna_delays import AntennaDelays
 from uwblink.recording.schema import Arrangement, KnownDistance
@@ -36,8 +36,6 @@ from uwblink.ticks import METRES_PER_TICK
 LIFT = "mean-of-lifted"
 """How the powers of both ends become one, as in `calib.fit`."""
 
-MIN_RANGES_OF_MEAN = 5
-"""Ranges that a pair needs in an arrangement: their spread is known to a third then (the root of 1/8)."""
 
 PARTS = 10
 """Stretches of time whose sums say how well the mean of all is known, also where errors last: the standard error is
@@ -46,8 +44,6 @@ known to a quarter (the root of 1/18), and those of an arrangement held for 30 s
 WINDOW_BINS = 5
 """Bins of a second before and after an instant whose medians are compared: a hand needs less to move a board."""
 
-STEP_M = 0.05
-"""Smallest step of a pair's range that counts as a motion: people who walk past change less, or one pair only."""
 
 MOVED_M, MOVED_BINS, MIN_SIDE_BINS = 0.03, 60, 8
 """Smallest change of a pair's range that tells of a board that was moved within an arrangement; bins into which the
@@ -55,9 +51,6 @@ arrangement is divided for that, and how many of them either side needs."""
 
 SIGMAS = 6.0
 """Standard deviations of noise from which a change is one: one in 5e8 by chance, and there are thousands."""
-
-MIN_STILL_S = 15.0
-"""Shorter stretches between two motions are part of the motion."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,7 +83,7 @@ class SurveyData:
     arrangements: tuple[Arrangement, ...]
     distances: tuple[KnownDistance, ...]
     sources: tuple[str, ...]
-    findings: tuple[Contradiction, ...]
+    findings: tuple[Finding, ...]
     warnings: tuple[str, ...]
     antenna_delays: AntennaDelays
 
@@ -103,7 +96,7 @@ def read_surveys(data: Data | Iterable[Data], knowledge: Knowledge) -> SurveyDat
     recordings = [_load(one) for one in each(data)]
     if knowledge.spans_s and len(recordings) > 1:
         raise BadInputError("gives times of arrangements, which is for one recording only", parameter="known")
-    arrangements, numbers, findings = dict[str, Arrangement](), list[Ints](), list[Contradiction]()
+    arrangements, numbers, findings = dict[str, Arrangement](), list[Ints](), list[Finding]()
     for ranges, marked, _ in recordings:
         numbers.append(np.full(len(ranges), -1))
         for one in _arrangements(ranges, marked, knowledge, several=len(recordings) > 1):
@@ -188,16 +181,18 @@ def still_stretches(ranges: Ranges, bin_ns: int = 1_000_000_000) -> list[tuple[i
     or between two less than 15 s apart, belongs to none.
     """
     _, starts, median, noise = _binned(ranges, bin_ns)
-    threshold = np.maximum(STEP_M, SIGMAS * noise * np.sqrt(2 / WINDOW_BINS))
+    # People who walk past change ranges by less than 5 cm, or those of one pair only.
+    threshold = np.maximum(0.05, SIGMAS * noise * np.sqrt(2 / WINDOW_BINS))
     moving = (np.abs(_steps(median, WINDOW_BINS)) > threshold[:, None]).sum(axis=0) >= min(2, len(median))
     # An edge that sees a step within its window is not the step itself: only a bin that stands free of all is still.
     still = np.concatenate([[False], ~(moving[:-1] | moving[1:]), [False]]).astype(np.int8)
     first, last = np.flatnonzero(np.diff(still) == 1), np.flatnonzero(np.diff(still) == -1) - 1
     found = zip(starts[first].tolist(), (starts[last] + bin_ns).tolist(), strict=True)
-    return [(a, b) for a, b in found if b - a >= MIN_STILL_S * 1e9]
+    # Shorter stretches between two motions are part of the motion.
+    return [(a, b) for a, b in found if b - a >= 15e9]
 
 
-def find_motion(name: str, ranges: Ranges) -> list[Contradiction]:
+def find_motion(name: str, ranges: Ranges) -> list[Finding]:
     """Return the board that was moved within an arrangement that should be still, if there is one.
 
     A motion is an instant after which two of a board's pairs range otherwise, by more than noise and by 3 cm: a single
@@ -227,9 +222,9 @@ def find_motion(name: str, ranges: Ranges) -> list[Contradiction]:
     edge = np.argmax(np.nan_to_num(np.abs(_steps(median, WINDOW_BINS)[mine, 1:-1])).sum(axis=0))
     text = (
         f"{name}: board {tag} was moved {(starts[edge + 1] - begin) * 1e-9:.0f} s after its beginning (ranges changed "
-        f"by up to {100 * by_m:.0f} cm); record that arrangement again, or end it before"
+        f"by up to {100 * by_m:.0f} cm)"
     )
-    return [Contradiction("moved", text)]
+    return [Finding("board moved within an arrangement", text, "record that arrangement again, or end it before", 0.0)]
 
 
 def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
@@ -241,7 +236,8 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
     pairs = pairs_of(ranges.initiator, ranges.target)
     key = arrangement * len(pairs.ends) + pairs.number
     keys, counts = np.unique(key[arrangement >= 0], return_counts=True)
-    kept = keys[counts >= MIN_RANGES_OF_MEAN]
+    # Of five ranges the spread is known to a third (the root of 1/8).
+    kept = keys[counts >= 5]
     if not len(kept):
         raise UnanswerableError(f"{ranges.source}: no two boards range five times while all stand still")
     rows = np.flatnonzero(np.isin(key, kept))

@@ -30,8 +30,6 @@ SHORTER_SHARE = 0.01
 """Share of rows with a gross error that are shorter than the straight way: no detour is. It
 keeps logarithms finite."""
 
-MAX_WORSE = 2 * math.log(20.0)
-"""By how much -2 log likelihood a choice may be worse than the best and still count: with a twentieth of its weight."""
 
 MAX_FIRST_CHANGES = 24
 """How many single changes, the best ones, are tried together with a second one: half or
@@ -124,7 +122,8 @@ class Marks:
         """Return these marks and those, one or two rows away, that lie in the window, with weights that sum to 1."""
         near = {self.marked.tobytes(): self}
         for after, more in self._near():
-            for row in np.flatnonzero(more < MAX_WORSE).tolist():
+            # A choice counts with a twentieth of the weight of the best, or more.
+            for row in np.flatnonzero(more < 2 * math.log(20.0)).tolist():
                 last = after.flipped(row)
                 near[last.marked.tobytes()] = last
         kept = list(near.values())

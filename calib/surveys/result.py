@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,10 @@ import numpy as np
 
 from calib.calibration.model import Calibration
 from calib.errors import BadInputError
+from calib.findings import Finding
 from calib.information import Verdict
 from uwblink.arrays import Floats
 from uwblink.output import write_bytes, write_text
-
-AMBIGUOUS = 9.0
-"""By how much -2 log likelihood of a second solution may be worse for it to be as good: three standard deviations."""
 
 ANCHORS = {
     ".toml": (
@@ -74,12 +71,14 @@ class SurveyedArrangement:
     @classmethod
     def from_dict(cls, row: Mapping[str, Any]) -> SurveyedArrangement:
         """Return the arrangement that `to_dict` wrote."""
-        boards = []
-        for one in row["boards"]:
-            x, y, z = map(float, one["position_m"])
-            covariance = np.array(one["covariance_m2"], dtype=float)
-            boards.append(SurveyedBoard(int(one["tag"]), (x, y, z), covariance, bool(one["determined"])))
-        return cls(str(row["name"]), str(row["known"]), tuple(boards), str(row["frame"]))
+        boards = tuple(
+            SurveyedBoard(
+                int(one["tag"]), (x, y, z), np.array(one["covariance_m2"], dtype=float), bool(one["determined"])
+            )
+            for one in row["boards"]
+            for x, y, z in [map(float, one["position_m"])]
+        )
+        return cls(str(row["name"]), str(row["known"]), boards, str(row["frame"]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,19 +92,8 @@ class SecondBest:
     @property
     def ambiguous(self) -> bool:
         """Whether the ranges can hardly tell it from the best one."""
-        return self.worse < AMBIGUOUS
-
-
-@dataclass(frozen=True, slots=True)
-class Contradiction:
-    """What contradicts the ranges: "shape" (a line that is none), "distance", "labels" or "moved", and it in words.
-
-    `p_value` is how probable it is at most that sound ranges look like this.
-    """
-
-    kind: str
-    text: str
-    p_value: float = 0.0
+        # Three standard deviations of one value, in -2 log likelihood.
+        return self.worse < 9.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,14 +139,14 @@ class SurveyResult:
     verdict: Verdict
     pair_error_m: float
     second_best: SecondBest | None
-    contradictions: tuple[Contradiction, ...]
+    contradictions: tuple[Finding, ...]
     warnings: tuple[str, ...]
     reflected: tuple[ReflectedPair, ...] = ()
 
     @property
     def findings(self) -> tuple[str, ...]:
         """The contradictions in words."""
-        return tuple(one.text for one in self.contradictions)
+        return tuple(map(str, self.contradictions))
 
     def __repr__(self) -> str:
         """Return the calibration as a table, below what it rests on, above the warnings."""
@@ -204,14 +192,12 @@ class SurveyResult:
         Raises `BadInputError` for another suffix.
         """
         from calib.surveys.figures import board_figure
+        from uwblink.pages.figures import picture
 
         place = Path(path)
         if place.suffix.lower() not in (".svg", ".png", ".pdf"):
             raise BadInputError(f"found {place.suffix or 'no suffix'}, expected .svg, .png or .pdf", parameter="plot")
-        form, out = place.suffix.lower()[1:], BytesIO()
-        metadata = {"Date": None} if form == "svg" else None
-        board_figure(self.arrangements).savefig(out, format=form, dpi=150, metadata=metadata)
-        write_bytes(place, out.getvalue(), force=force)
+        write_bytes(place, picture(lambda _: board_figure(self.arrangements), place.suffix.lower()[1:]), force=force)
 
     def arrangement(self, name: str | None = None) -> SurveyedArrangement:
         """Return an arrangement by name, the only one where none is given; raises `BadInputError`."""

@@ -1,4 +1,8 @@
-"""The solution of a network: the likeliest unknowns, the sizes of errors, and other solutions that fit as well.
+"""The solution of a network: where a search begins, the likeliest unknowns, the sizes of errors, and other solutions.
+
+A search begins at a multidimensional scaling of the ranges. Boards may be said to stand in an order on a line: a line
+has no beginning, so an order and its reverse are the same, and boards nearer to each other than 10 cm may stand in
+either order, because nobody can say who is first of two side by side.
 
 For given errors `calib.estimator.optimize` finds the unknowns. The constant error of pairs and the spread of the curve
 maximise the likelihood integrated over the unknowns (restricted maximum likelihood: Patterson and Thompson, Biometrika,
@@ -12,31 +16,119 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations, pairwise
 from operator import attrgetter, itemgetter
 
 import numpy as np
+from scipy.linalg import orthogonal_procrustes
 from scipy.optimize import minimize_scalar
+from scipy.sparse.csgraph import floyd_warshall
 
 from calib.estimator.optimize import maximize
-from calib.surveys.network import Case, Lengths, Linear, Network
+from calib.surveys.network import Boards, Case, Lengths, Linear, Network
 from calib.surveys.reflections import Marks, unlikely
 from calib.surveys.result import SecondBest
-from calib.surveys.starts import first_start, is_in_order, other_starts
 from uwblink.arrays import Bools, Floats, Ints
+
+SHAKEN = 4
+"""Random starts of an arrangement beside those that are mirrored or exchanged: half or twice as many change nothing
+(`python -m benchmarks.constants`)."""
+
+
+def is_in_order(coordinates: Floats) -> bool:
+    """Return whether coordinates (n,), those of boards in the order that is said, rise or fall."""
+    ways = coordinates, coordinates[::-1]
+    # Boards nearer to each other than 10 cm stand side by side: they touch, and their order means nothing.
+    return any(float(np.max(np.maximum.accumulate(v) - v)) <= 0.1 for v in ways)
+
+
+def exchanged_boards(said: Sequence[int], coordinates: Floats) -> set[tuple[int, int]]:
+    """Return which two boards must change places for those `said`, at coordinates (n,), to be in order; or nothing.
+
+    More than one pair where the ranges cannot tell: 1-2-3-4 with the inner two exchanged is the same with the outer two
+    exchanged, from the other end.
+    """
+    fitting = set()
+    for i, j in combinations(range(len(said)), 2):
+        changed = coordinates.copy()
+        changed[[i, j]] = coordinates[[j, i]]
+        if is_in_order(changed):
+            fitting.add((min(said[i], said[j]), max(said[i], said[j])))
+    return fitting
+
+
+def first_start(network: Network, delays: Floats | None = None) -> Floats:
+    """Return unknowns from the ranges alone, with delays (tags,) in ns, or none: by classical scaling."""
+    x = network.layout.start()
+    if delays is not None:
+        x[network.layout.where["delay"]] = delays
+    place = np.zeros((len(network.points), 3))
+    measured = network.linear(np.where(np.arange(len(x)) < place.size, 0.0, x))[0]  # with all points at the origin
+    for k, boards in enumerate(network.arrangements):
+        here = network.seats(k)
+        apart = _distances(network, measured, here)
+        centring = np.eye(len(here)) - 1 / len(here)
+        values, vectors = np.linalg.eigh(-0.5 * centring @ apart**2 @ centring)
+        top = np.argsort(values)[::-1][: boards.dimensions]
+        found = np.zeros((len(here), 3))
+        found[:, : len(top)] = vectors[:, top] * np.sqrt(np.maximum(values[top], 1e-6))
+        known = [n for n, point in enumerate(here.tolist()) if point in network.known_places]
+        if known:
+            goal, mine = np.array([network.known_places[here[n]][0] for n in known]), found[known]
+            turn = orthogonal_procrustes(mine - mine.mean(axis=0), goal - goal.mean(axis=0))[0]
+            found = (found - mine.mean(axis=0)) @ turn + goal.mean(axis=0)
+        place[here] = found
+    return network.with_positions(x, place)
+
+
+def other_starts(points: Floats, boards: Boards, seed: int) -> Iterator[Floats]:
+    """Yield other places (n, 3) of boards: neighbours exchanged, in the order that is said, mirrored, or shaken."""
+    if boards.order:
+        rows = [boards.tags.index(tag) for tag in boards.order]
+        upward = points[sorted(rows, key=lambda row: float(points[row, 0]))]
+        for places in (upward, upward[::-1]):
+            yield _replaced(points, rows, places)
+    if boards.dimensions == 1:
+        for a, b in pairwise(np.argsort(points[:, 0]).tolist()):
+            yield _replaced(points, [a, b], points[[b, a]])
+    middle = points - points.mean(axis=0)
+    _, size, axes = np.linalg.svd(middle)
+    if boards.dimensions > 1:
+        # Through the plane in which boards nearly lie: what is on its one side might be on its other.
+        normal = axes[boards.dimensions - 1]
+        yield points - 2 * np.outer(middle @ normal, normal)
+    rng, spread = np.random.default_rng(seed), max(float(size[0]) / np.sqrt(len(points)), 0.1)
+    for _ in range(SHAKEN):
+        yield points + 0.5 * spread * rng.normal(size=points.shape)
+
+
+def _replaced(points: Floats, rows: list[int], places: Floats) -> Floats:
+    found = points.copy()
+    found[rows] = places
+    return found
+
+
+def _distances(network: Network, measured: Floats, here: Ints) -> Floats:
+    """Return the distances (n, n) of the points of an arrangement; by way of others where they were not measured."""
+    apart = np.full((len(here), len(here)), np.inf)
+    np.fill_diagonal(apart, 0.0)
+    rows = np.flatnonzero(np.isin(network.ends[: len(network.means.range_m), 0], here))
+    ends = np.searchsorted(here, network.ends[rows])
+    apart[ends[:, 0], ends[:, 1]] = apart[ends[:, 1], ends[:, 0]] = np.maximum(measured[rows], 0.01)
+    apart = floyd_warshall(apart)
+    longest = float(apart[np.isfinite(apart)].max(initial=1.0))
+    return np.where(np.isfinite(apart), apart, longest)
+
 
 PAIR_STD_M, PAIR_PRIOR_FREEDOM = 0.02, 3.0
 """Prior standard deviation of the constant error of a pair, and the degrees of freedom that it counts as.
 Half or twice of either moves delays beside reflections by 0.29 standard errors, which become 0.93 to 1.3 times as large
 (`python -m benchmarks.constants`)."""
 
-PAIR_STARTS_M = (0.01, 0.015, 0.02, 0.03, 0.045, 0.07)
-"""Errors of pairs from which a search begins: with small ones too much looks reflected, with large ones too little."""
 
 CURVE_STD_M, CURVE_FACTOR = 0.1, 1.7
 """Prior standard deviation of a curve, and the factor by which that may be wrong (`CURVE_LENGTH_DB`)."""
 
-WRONG_ORDER_PENALTY = 2 * math.log(100.0)
-"""-2 log of the chance that boards stand in another order than somebody said who put them so: one in a hundred."""
 
 MIN_DIFFERENCE_M = 0.03
 """How far a board must move for a solution to count as another one."""
@@ -115,7 +207,8 @@ def unlikelihood(network: Network, x: Floats, case: Case) -> float:
     value = of_spreads(network, x, case) + unlikely(int(case.marks.sum()), len(case.marks))
     if case.marks.any():
         value += float(Marks.at(network, x, case).penalties()[case.marks].sum())
-    return value + WRONG_ORDER_PENALTY * len(out_of_order(network, x))
+    # One in a hundred stands in another order than somebody said who put the boards so.
+    return value + 2 * math.log(100.0) * len(out_of_order(network, x))
 
 
 def out_of_order(network: Network, x: Floats) -> list[int]:
@@ -215,7 +308,8 @@ def _mixed(found: Solution, cases: Sequence[Case], weight: Floats) -> tuple[Floa
 def solve(network: Network, *, moves: int = 6) -> tuple[Solution, SecondBest | None]:
     """Return the best solution that any start leads to, and the second-best."""
     start, least = first_start(network), attrgetter("unlikely")
-    spreads = PAIR_STARTS_M if network.pair_m is None else (network.pair_m,)
+    # With small errors of pairs too much looks reflected at first, with large ones too little.
+    spreads = (0.01, 0.015, 0.02, 0.03, 0.045, 0.07) if network.pair_m is None else (network.pair_m,)
     found = min((adjust(network, start, start_m=spread) for spread in spreads), key=least)
     # Once more with the delays that came out: the first guess of places was made without any.
     found = min(found, adjust(network, first_start(network, found.delays)), key=least)

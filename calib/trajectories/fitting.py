@@ -12,7 +12,7 @@ from scipy import sparse
 from threadpoolctl import threadpool_limits
 
 from calib.calibration.document import Split
-from calib.calibration.model import Calibration, given_calibration
+from calib.calibration.model import Calibration, given_calibration, matrix_of
 from calib.calibration.power_curves import basis
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import refuse_refuted
@@ -51,18 +51,6 @@ COMMON_SETTINGS = (
 SHARE_OF_START = 0.3
 """Share of the work, for the progress bar, that is done when the search has its initial guess."""
 
-SCALE_NS = 0.2
-"""A direction of delays is determined if its standard error is at most `LOOSEST` of this: 0.1 ns, 3 cm of range.
-
-The value comes from simulations (docs/accuracy.md): wider intervals did not hold.
-"""
-
-LOOSER_WITH_GEOMETRY = 3.0
-"""If a fit with known distances is less certain than that, a direction may be so many times less certain."""
-
-GEOMETRY_ALONE_FACTOR = 3.0
-"""Factor on standard errors where only geometry determines distances: there the problem is not linear, and errors up to
-4.2 linearised standard errors were observed (docs/accuracy.md)."""
 
 TAPE_UNCHECKED, TAPE_MIN_DEVIATION, TAPE_MIN_ERROR_M = 0.999, 4.0, 0.03
 """A tape that no range checks (leverage above the first) is not tested. Others contradict the fit if their deleted
@@ -179,13 +167,11 @@ def _described(model: RangeModel, top: Search, known: Calibration | None) -> Kno
 
 def _curve_uncertainty(found: KnownDistances, known: Calibration) -> Floats:
     """Return the covariance (tags, tags) in ns^2 that the uncertainty of a kept curve adds to the delays."""
-    if known.uncertainty is None or len(known.uncertainty.bias_m2) != len(known.bias_curve.coefficients):
-        return np.zeros_like(found.covariances["delay"])
     splines = basis(np.clip(found.model.lifted, *known.bias_curve.range), np.array(known.bias_curve.knots))
     # Derivatives of the unknowns by the coefficients: covariance times information.
     optimum, linked = found.slopes.optimum, found.slopes.link(sparse.csr_matrix(splines))
     reach = (optimum.covariance @ linked.T)[optimum.layout.where["delay"]]
-    return np.asarray(reach @ np.array(known.uncertainty.bias_m2) @ reach.T)
+    return np.asarray(reach @ known.curve_covariance_m2 @ reach.T)
 
 
 def _result(
@@ -238,8 +224,7 @@ def _result(
 
 def _with_curve(calibration: Calibration, known: Calibration) -> Calibration:
     """Return a calibration with the curve of another one and the covariance of that curve."""
-    size = len(known.bias_curve.coefficients)
-    of_curve = known.uncertainty.bias_m2 if known.uncertainty else ((0.0,) * size,) * size
+    of_curve = matrix_of(known.curve_covariance_m2)
     uncertainty = calibration.uncertainty and replace(calibration.uncertainty, bias_m2=of_curve)
     return replace(calibration, bias_curve=known.bias_curve, uncertainty=uncertainty)
 
@@ -272,7 +257,9 @@ def variance_factor(scene: Scene) -> float:
     """Return the factor on covariances: more than 1 where only lever arms determine the scale of distances."""
     given = sum(place is not None for place in scene.still.values())
     measured = len(scene.places) or len(scene.heights) or scene.inertial or len(scene.tapes)
-    return 1.0 if given >= 2 or measured else GEOMETRY_ALONE_FACTOR**2
+    # Where only geometry determines distances the problem is not linear: errors up to 4.2 linearised standard errors
+    # were observed (docs/accuracy.md), so that these are multiplied by three.
+    return 1.0 if given >= 2 or measured else 9.0
 
 
 def _judge_delays(found: KnownDistances, top: Search) -> tuple[Ints, Verdict]:
@@ -343,7 +330,9 @@ def verdict_on(covariance: Floats, with_truth: Floats, tags: Sequence[int]) -> V
     """Return the verdict on delays with a covariance (tags, tags), compared with that for known distances."""
     if not tags:
         return judge(np.eye(1) * 1e6, [InformationColumn("delay", "")])
-    guess = np.maximum(SCALE_NS, LOOSER_WITH_GEOMETRY / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
+    # `LOOSEST` of 0.2 ns is 3 cm of range; from simulations (docs/accuracy.md): wider intervals did not hold. If a fit
+    # with known distances is less certain, a direction may be three times less certain than that.
+    guess = np.maximum(0.2, 3.0 / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
     information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True)
     information += np.eye(len(covariance)) / BOARD_DELAY_STD_NS**2
     unknowns = [InformationColumn("delay", str(tag), scale) for tag, scale in zip(tags, guess.tolist(), strict=True)]
@@ -369,15 +358,14 @@ def _of_tapes(top: Search) -> Iterator[str]:
     for number, one in enumerate(tapes.stated):
         mine = np.flatnonzero(tapes.number == number)
         moved = rows.geometry.derivatives(x, mine).mean(axis=0)
-        share = min(float(moved @ (top.optimum.covariance @ moved)) / one.sigma_m**2, 1.0)
-        if share > TAPE_UNCHECKED:
-            continue
-        without = float(left[mine].mean()) / (1 - share)
-        deviation = abs(without) * math.sqrt(1 - share) / one.sigma_m
-        if deviation < TAPE_MIN_DEVIATION or abs(without) < TAPE_MIN_ERROR_M:
-            continue
-        way = "more" if without > 0 else "less"
-        yield (
-            f"the distance of tags {one.first} and {one.second}, {one.distance_m:.3f} m, is {100 * abs(without):.0f} "
-            f"cm {way} than all else says ({deviation:.0f} standard errors): measure it again"
-        )
+        free = 1 - min(float(moved @ (top.optimum.covariance @ moved)) / one.sigma_m**2, TAPE_UNCHECKED)
+        without = float(left[mine].mean()) / free
+        deviation = abs(without) * math.sqrt(free) / one.sigma_m
+        # A tape that no range checks is at its bound.
+        checked = free > 1 - TAPE_UNCHECKED
+        if checked and deviation >= TAPE_MIN_DEVIATION and abs(without) >= TAPE_MIN_ERROR_M:
+            yield (
+                f"the distance of tags {one.first} and {one.second}, {one.distance_m:.3f} m, is "
+                f"{100 * abs(without):.0f} cm {'more' if without > 0 else 'less'} than all else says ({deviation:.0f} "
+                "standard errors): measure it again"
+            )

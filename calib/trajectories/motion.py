@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.estimator.rows import NormalRows, Terms, normal_terms
 from calib.estimator.unknowns import Layout, Prior, Unknown
-from calib.evaluation.inertial_filter import GRAVITY_M_S2
+from calib.evaluation.filters import GRAVITY_M_S2
 from calib.trajectories.samples import POINT_S, SAMPLE_S
 from calib.trajectories.scene import Scene
 from uwblink.arrays import Floats, Ints
@@ -116,9 +116,12 @@ class Motion:
                 self.turns.count,
                 [_differences(self.turns.count, k, one) for k, one in enumerate((std, wander))],
             ),
-            "stand": (1, [Prior.of_deviation(STANDS_M)]),
-            "bias": (1, [Prior.of_deviation(BIAS_M_S2)]),
-            "level": (1, [Prior.of_deviation(LEVEL_M)]),
+            # any hall
+            "stand": (1, [Prior.of_deviation(100.0)]),
+            # 40 mg, the order of magnitude in data sheets of MEMS sensors
+            "bias": (1, [Prior.of_deviation(0.4)]),
+            # the constant offset of a height sensor, chosen on the MILUV flight (docs/theory.md)
+            "level": (1, [Prior.of_deviation(0.15)]),
         }
         found = []
         for kind, (points, priors) in blocks.items():
@@ -279,14 +282,6 @@ FAR_M = 30.0
 """Prior standard deviation of a control point around its initial guess: it holds points without any range.
 Half or twice of it moves delays by 0.05 standard errors (`python -m benchmarks.constants`)."""
 
-STANDS_M = 100.0
-"""Prior standard deviation of the position of a standing body: any hall."""
-
-BIAS_M_S2 = 0.4
-"""Prior standard deviation of an accelerometer's bias: 40 mg, the order of magnitude in data sheets of MEMS sensors."""
-
-LEVEL_M = 0.15
-"""Prior standard deviation of the constant offset of a height sensor, chosen on the MILUV flight (docs/theory.md)."""
 
 CALM_M_S2, CALM_SENSED_M_S2 = 5.0, 50.0
 """Prior standard deviation of accelerations, which holds a path where ranges are missing; the second where an

@@ -12,12 +12,23 @@ from calib.data.ranges import Ranges
 from calib.data.sources import Data, antenna_delays_of, opened, planted_of
 from calib.errors import UnanswerableError
 from calib.settings import FlightSettings
-from calib.trajectories.attitudes import Attitude, Inertial, Readings, integrated, windows
-from calib.trajectories.samples import SAMPLE_S, Heights, Places, Samples, Tapes, heights_of, tapes_of
+from calib.trajectories.samples import (
+    SAMPLE_S,
+    Attitude,
+    Heights,
+    Inertial,
+    Places,
+    Readings,
+    Tapes,
+    heights_of,
+    integrated,
+    tapes_of,
+    windows,
+)
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Poses
 from uwblink.recording.summary import single_reports
-from uwblink.twr import middle_ns
+from uwblink.twr import range_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,9 +89,6 @@ class Scene:
         return self.only(np.arange(0, len(self.time_s), max(len(self.time_s) // count, 1)))
 
 
-STILL_M = 0.1
-"""A body whose poses stay within this distance stands still."""
-
 POSE_STD_M = 0.02
 """Standard error of known positions, thinned to `SAMPLE_S`: errors of motion capture last. Half or twice of it
 moves delays by 0.24 standard errors, which become 0.85 to 1.46 times as large (`python -m benchmarks.constants`)."""
@@ -89,14 +97,6 @@ TILT_STD_DEG, TILT_WANDER_DEG, HEADING_WANDER_DEG = 1.0, 0.2, 0.5
 """Standard deviation of the tilt of an attitude reference (degrees), and random walks of tilt and heading (degrees per
 root second): judgements for an autopilot. Half or twice of the first moves delays by 0.25 standard errors
 (`python -m benchmarks.constants`)."""
-
-
-@dataclass(frozen=True, slots=True)
-class PoseSamples(Samples):
-    """Poses of one body in seconds since the first range; NaN where positions or attitudes are unknown."""
-
-    position_m: Floats
-    quaternion: Floats
 
 
 def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True) -> Scene:
@@ -113,7 +113,7 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     # The truth is not known. In its place stands the time to which a range belongs.
     ranges = Ranges.from_exchanges(
         exchanges,
-        np.asarray(middle_ns(exchanges) * 1e-9, dtype=np.float64),
+        np.asarray(range_ns(exchanges) * 1e-9, dtype=np.float64),
         tags=tags,
         planted=planted,
         source=name,
@@ -128,13 +128,15 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     ranging = set(ranges.tags())
     arms = {tag.tag: (tag.body, np.array(tag.lever_arm_m)) for tag in tags if tag.tag in ranging}
     bodies = sorted({body for body, _ in arms.values()})
-    tracks = {body: _track(poses, body, began) for body in bodies}
-    placed = {body: track[np.flatnonzero(np.isfinite(track.position_m).all(axis=1))] for body, track in tracks.items()}
-    turned = {body: track[np.flatnonzero(np.isfinite(track.quaternion).all(axis=1))] for body, track in tracks.items()}
+    placed, turned = (
+        {body: poses[(poses.body == body) & np.isfinite(values).all(axis=1)] for body in bodies}
+        for values in (poses.position_m, poses.quaternion)
+    )
     still = {
         body: np.median(track.position_m, axis=0)
         for body, track in placed.items()
-        if len(track) and np.ptp(track.position_m, axis=0).max() <= STILL_M
+        # A body whose poses stay within a decimetre stands still.
+        if len(track) and np.ptp(track.position_m, axis=0).max() <= 0.1
     }
     moving = tuple(body for body in bodies if body not in still)
     if not moving:
@@ -145,7 +147,7 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     last = float(time[-1])
     until = last if settings.poses_until_s is None else min(settings.poses_until_s, last)
     sensed = {body: Readings.of(imu, body, began) for body in moving}
-    found = {body: _attitude(body, turned[body], sensed[body], settings, ranges.source) for body in moving}
+    found = {body: _attitude(body, turned[body], began, sensed[body], settings, name) for body in moving}
     attitudes = {body: attitude for body, attitude in found.items() if attitude is not None}
     inertial = {
         body: windows(some, attitudes[body], last) for body, some in sensed.items() if some and body in attitudes
@@ -159,7 +161,7 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
         arms=arms,
         attitudes=attitudes,
         inertial={body: some for body, some in inertial.items() if len(some)},
-        places=_places([placed[body] for body in moving], until),
+        places=_places([placed[body] for body in moving], began, until),
         heights=heights_of(height if settings.heights == "used" else {}, moving, began, last),
         tapes=tapes_of(
             (*stated, *settings.distances),
@@ -172,34 +174,36 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     )
 
 
-def _track(poses: Poses, body: str, began_ns: int) -> PoseSamples:
-    own = poses[poses.body == body]
-    return PoseSamples(np.asarray((own.time_ns - began_ns) * 1e-9, dtype=np.float64), own.position_m, own.quaternion)
+def _seconds(track: Poses, began_ns: int) -> Floats:
+    """Return the times of poses in seconds since the first range."""
+    return np.asarray((track.time_ns - began_ns) * 1e-9, dtype=np.float64)
 
 
-def _places(tracks: Sequence[PoseSamples], until_s: float) -> Places:
+def _places(tracks: Sequence[Poses], began_ns: int, until_s: float) -> Places:
     """Return the positions of each body since the first range, `SAMPLE_S` apart."""
     parts = []
     for number, track in enumerate(tracks):
-        early = track[(track.time_s >= 0) & (track.time_s < until_s)]
-        some = early[np.diff(np.floor(early.time_s / SAMPLE_S), prepend=-np.inf) > 0]
-        parts.append((some.time_s, np.full(len(some), number), some.position_m, np.full(len(some), POSE_STD_M)))
+        time_s = _seconds(track, began_ns)
+        early = np.flatnonzero((time_s >= 0) & (time_s < until_s))
+        rows = early[np.diff(np.floor(time_s[early] / SAMPLE_S), prepend=-np.inf) > 0]
+        parts.append((time_s[rows], np.full(len(rows), number), track.position_m[rows], np.full(len(rows), POSE_STD_M)))
     return Places(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _attitude(
-    body: str, track: PoseSamples, sensed: Readings | None, settings: FlightSettings, source: str
+    body: str, track: Poses, began_ns: int, sensed: Readings | None, settings: FlightSettings, source: str
 ) -> Attitude | None:
     """Return the attitudes of a moving body; None if there are none."""
     std = np.radians([TILT_STD_DEG, TILT_STD_DEG, settings.heading_std_deg])
     wander = np.radians([TILT_WANDER_DEG, TILT_WANDER_DEG, HEADING_WANDER_DEG])
     if settings.heading_std_deg == 0:
         std, wander = np.zeros((2, 3))
-    given = Attitude(time_s=track.time_s, quaternion=track.quaternion, std_rad=std, wander_rad=wander)
+    time_s = _seconds(track, began_ns)
+    given = Attitude(time_s=time_s, quaternion=track.quaternion, std_rad=std, wander_rad=wander)
     if settings.attitudes != "imu":
         return given if settings.attitudes == "poses" and len(track) else None
     if sensed is None:
         raise UnanswerableError(f"{source}: no inertial readings of body {body}; take `attitudes` from poses")
     until_s = settings.poses_until_s or 0.0
-    early = until_s > 0 and bool(np.any(track.time_s < until_s))
+    early = until_s > 0 and bool(np.any(time_s < until_s))
     return integrated(sensed, given if early else None, until_s)

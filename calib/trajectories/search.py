@@ -48,12 +48,6 @@ MAX_TURNS, STILL = 8, 0.1
 """Maximum number of alternations of motion and errors. They end when no delay moves by more than this share of its
 standard error."""
 
-MIN_POINT_S = 0.11
-"""Control points are not refined below this interval."""
-
-FORCE_BOUNDS_M_S2 = (0.02, 5.0)
-"""Bounds of the standard error of a mean specific force."""
-
 
 def _cauchy(scale_m: float) -> Robust:
     """Return Cauchy's likelihood of residuals: twice its loss.
@@ -99,7 +93,8 @@ def search(scene: Scene, model: RangeModel, error_m: Floats, start: State, done:
     """Return the likeliest unknowns; `error_m` (n,) are the ranges of the scene, less a known curve."""
     state = Search(scene, model, error_m, start, done)
     state.fit_robustly()
-    while state.missed_motion_m() and state.motion.places.step_s > MIN_POINT_S:
+    # Control points are not refined below 0.11 s.
+    while state.missed_motion_m() and state.motion.places.step_s > 0.11:
         state.refine()
         state.fit_robustly()
     state.fit_likelihood()
@@ -195,7 +190,7 @@ class Search:
         inertial = {}
         for body, some in scene.inertial.items():
             std = TRUSTED * robust_spread(left[f"force {body}"], 0.0)
-            inertial[body] = replace(some, std_m_s2=float(np.clip(std, *FORCE_BOUNDS_M_S2)))
+            inertial[body] = replace(some, std_m_s2=float(np.clip(std, 0.02, 5.0)))
         heights = scene.heights.reweighted(left.get("height", np.zeros(0)))
         self.motion = replace(self.motion, scene=replace(scene, inertial=inertial, heights=heights))
         self.known = known_rows(self.motion, self.layout)
@@ -271,7 +266,8 @@ class Search:
                 found.append(np.array(products)[:, pair[a] != pair[b]])
         product, of_a_metre, apart = np.concatenate(found, axis=1)
         spans = []
-        for begin, end in pairwise([-1.0, *(part * self.motion.places.step_s for part in NEAR)]):
+        # Time differences of neighbours, as shares of the time between control points.
+        for begin, end in pairwise([-1.0, *(part * self.motion.places.step_s for part in (0.08, 0.16, 0.3))]):
             some = (apart > begin) & (apart <= end)
             if np.count_nonzero(some) >= FEWEST:
                 total = float(np.sum(product[some]))
@@ -280,9 +276,6 @@ class Search:
         deviation, motion_m = max(spans, default=(0.0, 0.0))
         return motion_m if deviation > MIN_DEVIATION and motion_m > MIN_MOTION_M else 0.0
 
-
-NEAR = (0.08, 0.16, 0.3)
-"""Time differences of neighbouring ranges, as shares of the time between control points."""
 
 NEIGHBOURS, FEWEST = 8, 50
 """Previous ranges of the body that each range is compared with, and the minimum number of products."""

@@ -22,11 +22,6 @@ LENGTHS_S = (2.0, 20.0)
 RANGES_A_BODY = 24
 """A window has so many ranges per moving body, within these bounds in seconds; the next begins half a window later."""
 
-HEADING_WINDOW_S = 8.0
-"""Shortest first window where headings are unknown."""
-
-WINDOW_STD_M = 0.1
-"""Standard error of positions from the window before."""
 
 SCALES_M = (3.0, 1.0, 0.3)
 """Scales of Cauchy's likelihood while delays and curve are unknown: wide ones make the problem nearly convex."""
@@ -50,8 +45,6 @@ ROOM_M = 20.0
 OTHER_PLACE_M, OTHER_DISTANCE_M = 0.5, 0.1
 """Solutions differ if positions among given anchors, or distances, differ by more in the median."""
 
-OTHER_HEADING_RAD = np.radians(50.0)
-"""Headings that differ by less converge to one solution."""
 
 PASSES, SAMPLED_FLIGHT = 2, 600
 """Passes over all headings, and the number of ranges of the flight that are used."""
@@ -75,7 +68,8 @@ class Trajectories(Samples):
     def places(self) -> Places:
         """Return the positions as known ones."""
         count, bodies = self.position_m.shape[:2]
-        body, std = np.tile(np.arange(bodies), count), np.full(count * bodies, WINDOW_STD_M)
+        # A decimetre is the standard error of positions from the window before.
+        body, std = np.tile(np.arange(bodies), count), np.full(count * bodies, 0.1)
         return Places(np.repeat(self.time_s, bodies), body, self.position_m.reshape(-1, 3), std)
 
 
@@ -169,7 +163,8 @@ def _carried_on(near: Trajectories, time_s: Floats, sign: int) -> Floats:
 def _fit_first_window(scene: Scene) -> tuple[Scene, Trajectories, Floats, str]:
     """Return the best of many starts of the first window: scene, positions, standing bodies and a second solution."""
     headless = scene.without_heading
-    length = max(_window_s(scene), HEADING_WINDOW_S if headless else 0.0)
+    # Where headings are unknown the first window lasts 8 s at least.
+    length = max(_window_s(scene), 8.0 if headless else 0.0)
     time = np.arange(float(scene.time_s[0]), float(scene.time_s[0]) + length + SAMPLE_S / 2, SAMPLE_S)
     window = scene.between(float(time[0]), float(time[-1])).thinned(SAMPLED_RANGES)
 
@@ -281,7 +276,8 @@ def resolve_headings(scene: Scene, state: State) -> tuple[Scene, State, str]:
             heading[body] = max(tried, key=lambda angle: tried[angle].value)
             best = tried[heading[body]]
             rivals = [angle for angle, one in tried.items() if best.value - one.value < EQUAL_LIKELIHOOD]
-            if any(abs(np.angle(np.exp(1j * (angle - heading[body])))) > OTHER_HEADING_RAD for angle in rivals):
+            # Headings that differ by less than 50 degrees converge to one solution.
+            if any(abs(np.angle(np.exp(1j * (angle - heading[body])))) > np.radians(50.0) for angle in rivals):
                 unsure.append(body)
         if heading == before:
             break

@@ -12,7 +12,16 @@ from hypothesis import strategies as st
 from uwblink.errors import ArgumentError
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S, elapsed
-from uwblink.twr import Exchanges, board_range, delay_weights, raw_range, time_of_flight, truncate4, without_stamps
+from uwblink.twr import (
+    Exchanges,
+    board_range,
+    delay_weights,
+    range_ns,
+    raw_range,
+    time_of_flight,
+    truncate4,
+    without_stamps,
+)
 
 
 def initiator_stamps(protocol):
@@ -154,3 +163,28 @@ def test_a_stamp_that_is_too_long_says_that_wider_ones_need_bits():
     with pytest.raises(ArgumentError) as caught:
         Exchanges.from_arrays(1, 2, **stamps | {"tx1": [2**40]}, bits=40)
     assert "need bits" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("protocol", "after"), [("ss", 0.5), ("ds", 0.0), ("ds-alt", 1.0), ("ds-sym", 1.0)])
+def test_the_time_of_a_range_is_that_of_the_distance_it_measures(protocol, after):
+    """While a distance grows at a constant speed, by messages whose flights are solved one by one."""
+    speed, start, reply, third = 50.0, 10.0, 0.02, 0.031
+
+    def arrival(sent):
+        return sent + (start + speed * sent) / (SPEED_OF_LIGHT - speed)
+
+    times = [0.0]
+    times.append(arrival(times[0]))
+    times.append(times[1] + reply)
+    times.append(arrival(times[2]))
+    of_target = PROTOCOLS[protocol].third_sender == "target"
+    if PROTOCOLS[protocol].third_sender:
+        times.append((times[2] if of_target else times[3]) + third)
+        times.append(arrival(times[4]))
+    ticks = [round(t / TICK_S) for t in times] + [0] * (6 - len(times))
+    stamps = {name: [stamp] for name, stamp in zip(("tx1", "rx1", "tx2", "rx2", "tx3", "rx3"), ticks, strict=True)}
+    x = Exchanges.from_arrays([1], [2], protocol=protocol, bits=40, **stamps)
+    when_s = range_ns(x)[0] * 1e-9
+    assert when_s == pytest.approx(after * times[3], abs=2e-9)
+    # A metre lies between poll and response; rounded stamps are 4.7 mm, flights of 10 m last 33 ns.
+    assert raw_range(x)[0] == pytest.approx(start + speed * when_s, abs=0.01)

@@ -1,7 +1,7 @@
 """Boards of other firmware, which print ranges as lines of text: dialects, and their ranges as they arrive.
 
-A dialect is a function from a line to ranges. The project's own are the forms of logs that `uwblink import guess` knows
-(`uwblink.importers.lines`), read by the same templates.
+A dialect is a function from lines to ranges. The project's own are the forms of logs that `uwblink import guess` knows
+(`uwblink.importers.devices`), read as logs are: by the same column map, templates and SQL.
 """
 
 from __future__ import annotations
@@ -9,22 +9,29 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cache
+from itertools import chain, product
 from pathlib import Path
 from typing import Any, Final
 
+from uwblink.boards.listeners import Heard, Listener, Pair, Progress, Turn, as_listeners
 from uwblink.boards.ports import Ports, SerialPorts, Transport
+from uwblink.boards.record import RecordingWriter
+from uwblink.database import connect
 from uwblink.errors import ArgumentError, BoardError, PlanError
-from uwblink.importers.column_map import IDS, NAMES, RANGE_UNITS, ColumnMap, load_map
-from uwblink.importers.lines import LINES
-from uwblink.importers.templates import Template
+from uwblink.importers.column_map import ColumnMap, load_map, map_of_lines
+from uwblink.importers.devices import LINES
+from uwblink.importers.staging import numbers_of, staged_cells
+from uwblink.importers.tables import SourceTable
 from uwblink.output import check_output
 from uwblink.plugins import Registry, check_row, is_text
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Tag
-from uwblink.twr import LARGEST_ID, Exchanges
+from uwblink.twr import LARGEST_ID, STAMPS
+from uwblink.wire.messages import RangeReport
 
 MAX_PRINTED_BYTES: Final = 4096
 """Bytes after which a line without an end is dropped; a list of 64 ranges takes half of that."""
@@ -49,97 +56,59 @@ class PrintedRange:
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """What boards of some firmware print: `parse` returns the ranges of a line, none for any other line.
+    """What boards of some firmware print: `parse` returns the ranges in some lines, none of any other lines.
 
     `start` is sent to a board once its port is open, so that it begins to print; `baud_rate` is that of the port.
     """
 
     name: str
     help: str
-    parse: Callable[[str], Iterable[PrintedRange]]
+    parse: Callable[[Sequence[str]], Iterable[PrintedRange]]
     start: bytes = b""
     baud_rate: int = 115_200
 
 
-def parser_of(known: ColumnMap) -> Callable[[str], list[PrintedRange]]:
+def parser_of(known: ColumnMap) -> Callable[[Sequence[str]], list[PrintedRange]]:
     """Return the parser of lines by a column map with a `line`: they mean what they mean in an imported log.
 
-    Raises `ArgumentError` for what only whole tables have: powers of registers, and columns by device.
+    It raises `ImportTableError` for a map that does not say which device a range is to.
     """
-    if known.registers or any(not isinstance(family, str) for family in known.wide.values()):
-        raise ArgumentError("powers of registers and columns by device are for tables only", parameter="dialect")
-    whole, each = (Template(text) if text else None for text in (known.line, known.each))
 
-    def parse(line: str) -> list[PrintedRange]:
-        if whole is None or not (found := re.search(whole.pattern, line)):
-            return []
-        common = whole.values(found.groups())
-        rows = [common | each.values(m.groups()) for m in re.finditer(each.pattern, line)] if each else [common]
-        printed = (_printed(row, known) for one in rows for row in _unpivoted(one, known.wide))
-        return [one for one in printed if one is not None]
+    @cache
+    def prepared() -> tuple[SourceTable, dict[str, str], str]:
+        table = SourceTable(connect(threads=1), Path("lines"), known, live=True)
+        cells = {"from_id": "''", "blank": "false"} | staged_cells(table)
+        if "range_m" not in cells:
+            raise table.missing("range_m")
+        power = next((cells[name] for name in ("fpp2", "rxp2", "fpp1", "rxp1") if name in cells), "NULL")
+        found = {name: cells[name] for name in ("from_id", "to_id", "range_m")}
+        # Boards print 0 for a device that is not there.
+        kept = f"WHERE {cells['range_m']} > 0 AND {cells['to_id']} <> '' AND NOT {cells['blank']}"
+        return table, found | {"power_dbm": f"coalesce({power}, 'nan'::DOUBLE)"}, kept
+
+    def parse(lines: Sequence[str]) -> list[PrintedRange]:
+        table, cells, kept = prepared()
+        table.db.execute("SET VARIABLE lines = ?", [list(lines)])
+        rows = zip(*(column.tolist() for column in table.read(cells, kept).values()), strict=True)
+        return [
+            PrintedRange(from_id=number(one) if one else None, to_id=number(other), range_m=far, power_dbm=power)
+            for one, other, far, power in rows
+        ]
+
+    def number(text: str) -> int | str:
+        return (known.ids | numbers_of([text])).get(text, text)
 
     return parse
 
 
-def _unpivoted(row: Mapping[str, str], wide: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return a row for each device of columns such as r.0, r.1 ... (r.{to_id}), of those in a mask if there is one."""
-    if not wide:
-        return [dict(row)]
-    by_device: dict[str, dict[str, str]] = {}
-    for name, family in wide.items():
-        before, place, after = re.split(r"\{(\w+)\}", family)
-        for column, value in row.items():
-            if match := re.fullmatch(rf"{re.escape(before)}(\w+){re.escape(after)}", column):
-                by_device.setdefault(match[1], {})[name] = value
-                if place != "_":
-                    by_device[match[1]][place] = match[1]
-    mask = int(row["mask"]) if "mask" in row else -1
-    return [dict(row) | own for k, own in enumerate(by_device.values()) if mask >> k & 1]
-
-
-def _printed(row: Mapping[str, str], known: ColumnMap) -> PrintedRange | None:
-    """Return a range from texts by column, None where there is none: boards print 0 for a device that is not there."""
-    texts = {name: row[known.header(name)] for name in NAMES if known.header(name) in row}
-    ids = {name: _id(str(one), known) for name in IDS if (one := known.constants.get(name, texts.get(name, "")))}
-    distance = _number(texts, "range_m", known) * RANGE_UNITS[known.distance_of("range_m") or "m"]
-    if not (distance > 0 and "to_id" in ids):
-        return None
-    power = next((name for name in ("fpp2", "rxp2") if name in texts), "fpp2")
-    sign = -1.0 if known.power_of(power) == "-dBm" else 1.0
-    return PrintedRange(
-        to_id=ids["to_id"], range_m=distance, from_id=ids.get("from_id"), power_dbm=sign * _number(texts, power, known)
-    )
-
-
-def _number(texts: Mapping[str, str], name: str, known: ColumnMap) -> float:
-    """Return a text as a number, NaN where it is none or means that there is none."""
-    text = texts.get(name, "").strip()
-    try:
-        value = float(text)
-    except ValueError:
-        return math.nan
-    return value if math.isfinite(value) and not {text, value} & {*known.missing} else math.nan
-
-
-def _id(text: str, known: ColumnMap) -> int | str:
-    """Return an id as a number, by the map if it has one, or as a word."""
-    if text in known.ids:
-        return known.ids[text]
-    number = re.fullmatch(r"([0-9]{1,9})(\.0*)?", text)
-    return int(number[1]) if number and int(number[1]) <= LARGEST_ID else text
-
-
 def check_dialect(row: Any) -> None:
     """Raise `ArgumentError` for a row that cannot be a dialect."""
-    parse = callable, "a function from a line to ranges"
-    start = lambda found: isinstance(found, bytes), "bytes"
-    check_row("dialect", row, Dialect, {"help": (is_text, "a line of text"), "parse": parse, "start": start})
-
-
-def _map_of(form: Mapping[str, Any]) -> ColumnMap:
-    return ColumnMap(
-        line=form["line"], each=form.get("each"), wide=form.get("wide", {}), distance_unit=form["units"]["distance"]
-    )
+    fields = {
+        "help": (is_text, "a line of text"),
+        "parse": (callable, "a function from lines to ranges"),
+        "start": (lambda found: isinstance(found, bytes), "bytes"),
+    }
+    check_row("dialect", row, Dialect, fields)
 
 
 # The shell of the DWM1001 opens on two carriage returns; `lec` prints distances as comma-separated lines.
@@ -148,7 +117,7 @@ _START: Final = {"dwm1001-lec": b"\r\rlec\r", "dwm1001-les": b"\r\rles\r"}
 DIALECTS: Final[Registry[Dialect]] = Registry(
     "dialect",
     "uwbcal.dialects",
-    tuple(Dialect(name, form["line"], parser_of(_map_of(form)), _START.get(name, b"")) for name, form in LINES.items()),
+    tuple(Dialect(name, LINES[name]["line"], parser_of(map_of_lines(name)), _START.get(name, b"")) for name in LINES),
     check_dialect,
 )
 """Dialects by name: the project's, and those of installed distributions."""
@@ -163,20 +132,20 @@ def dialect_of(name: str) -> Dialect:
         known = load_map(Path(name))
         if known.line is None:
             raise ArgumentError(f"{name}: states no line, a template of what a board prints", parameter="dialect")
-        return Dialect("lines", "a template", parser_of(known))
+        parse = parser_of(known)
+        parse([])  # for the errors of the map
+        return Dialect("lines", "a template", parse)
     if name not in DIALECTS:
         known_names = ", ".join(DIALECTS)
         raise ArgumentError(f"found {name!r:.60}, allowed: {known_names}, or a map (.toml)", parameter="dialect")
     return DIALECTS[name]
 
 
-@dataclass
-class Printed:
+@dataclass(slots=True, kw_only=True)
+class Printed(Progress):
     """Counts of what boards printed, and the numbers of devices by what boards call them."""
 
-    ranges: int = 0
     lines: int = 0
-    others: int = 0
     numbers: dict[int | str, int] = field(default_factory=dict)
 
     def number(self, name: int | str) -> int:
@@ -189,9 +158,14 @@ class Printed:
             self.numbers[name] = free
         return self.numbers[name]
 
+    def on_turn(self, turn: Turn) -> None:
+        """Count a range; of exchanges that failed nothing is printed, so there is no share of them."""
+        Progress.on_turn(self, turn)
+        self.pairs[turn.pair].tried = 0
+
     def __str__(self) -> str:
         """Return the counts in words."""
-        return f"{self.ranges} ranges of {len(self.numbers)} devices in {self.lines} lines, {self.others} other lines"
+        return f"{self.exchanges} ranges of {len(self.numbers)} devices in {self.lines} lines, {self.time_s:.1f} s"
 
 
 def printed_ranges(
@@ -203,12 +177,12 @@ def printed_ranges(
     stop: Callable[[], bool] = lambda: False,
     using: Ports | None = None,
     seen: Printed | None = None,
-) -> Iterator[Exchanges]:
-    """Yield ranges that boards print as exchanges without stamps (n,), at the host's time at which they arrive.
+) -> Iterator[list[Turn]]:
+    """Yield ranges that boards print as they arrive, as turns with reports without stamps; none for a while of silence.
 
-    `ids` are those of the boards at `ports`, for lines that do not say who ranged; 1, 2 ... by default. `seen` counts.
-    Raises the errors of opening ports, `BoardError` where a board prints lines and no range in them, and `PlanError`
-    for ids that do not fit the ports.
+    Their time is the host's. `ids` are those of the boards at `ports`, for lines that do not say who ranged; 1, 2 ...
+    by default. `seen` counts. Raises the errors of opening ports, `BoardError` where a board prints lines and no range
+    in them, and `PlanError` for ids that do not fit the ports.
     """
     names, using, seen = list(ports), using or SerialPorts(dialect.baud_rate), seen or Printed()
     own = list(ids) or list(range(1, len(names) + 1))
@@ -225,18 +199,31 @@ def printed_ranges(
         for port in opened:
             if dialect.start:
                 port.write(dialect.start)
-        until_s = using.now_s() + duration_s
-        while not stop() and using.now_s() < until_s:
-            rows = []
-            for port in using.wait(min(0.1, until_s - using.now_s())):
+        start_s, seen.start_ns = using.now_s(), using.host_ns()
+        while not stop() and seen.time_s < duration_s:
+            turns = []
+            for port in using.wait(min(0.1, duration_s - seen.time_s)):
                 board, lines = begun[id(port)]
-                for line in lines.feed(port.read(0.0)):
-                    found = list(dialect.parse(line))
-                    lines.note(line, found)
-                    seen.lines, seen.others = seen.lines + bool(found), seen.others + (not found)
-                    rows += [(board if one.from_id is None else one.from_id, one) for one in found]
-            if rows:
-                yield _exchanges(rows, seen, using.host_ns())
+                came = lines.feed(port.read(0.0))
+                found = list(dialect.parse(came)) if came else []
+                lines.note(came, found)
+                seen.lines += len(came)
+                for printed in found:
+                    whose = board if printed.from_id is None else printed.from_id
+                    pair = seen.number(whose), seen.number(printed.to_id)
+                    report = replace(_REPORT, neighbour=pair[1], range_m=printed.range_m, fpp2_dbm=printed.power_dbm)
+                    turns += [Turn(using.host_ns(), pair, report)] if pair[0] != pair[1] else []
+            seen.time_s = using.now_s() - start_s
+            for turn in turns:
+                seen.on_turn(turn)
+            yield turns
+
+
+_REPORT: Final = RangeReport(
+    neighbour=0, range_m=math.nan, fpp1_dbm=math.nan, fpp2_dbm=math.nan, skew1_ppm=math.nan, skew2_ppm=math.nan,
+    **dict.fromkeys(STAMPS, 0),
+)  # fmt: skip
+"""A report of what boards that print ranges do not say."""
 
 
 class _Lines:
@@ -249,32 +236,16 @@ class _Lines:
         """Take bytes; return the lines that ended in them."""
         *lines, self._rest = re.split(rb"[\r\n]+", self._rest + data)
         self._rest = self._rest[-MAX_PRINTED_BYTES:]
-        return [line.decode("utf-8", "replace") for line in lines if line.strip()]
+        return [line.decode("latin-1") for line in lines if line.strip()]
 
-    def note(self, line: str, found: Sequence[PrintedRange]) -> None:
-        """Note a line and its ranges; raises `BoardError` where the board prints another form."""
-        self._good, self._others = self._good or bool(found), self._others + 1
+    def note(self, lines: Sequence[str], found: Sequence[PrintedRange]) -> None:
+        """Note lines and their ranges; raises `BoardError` where the board prints another form."""
+        self._good, self._others = self._good or bool(found), self._others + len(lines)
         if not self._good and self._others > PATIENCE_LINES:
             raise BoardError(
-                f"{self.name}: no range in {self._others} lines, the last is {line!r:.80}; name another dialect, or a "
-                "template of lines"
+                f"{self.name}: no range in {self._others} lines, the last is {lines[-1]!r:.80}; name another dialect, "
+                "or a template of lines"
             )
-
-
-def _exchanges(rows: Sequence[tuple[int | str, PrintedRange]], seen: Printed, time_ns: int) -> Exchanges:
-    """Return ranges of boards as exchanges."""
-    ends = [(seen.number(whose), seen.number(one.to_id)) for whose, one in rows]
-    kept = [k for k, (one, other) in enumerate(ends) if one != other]
-    seen.ranges += len(kept)
-    zero = [0] * len(kept)
-    return Exchanges.from_arrays(
-        [ends[k][0] for k in kept],
-        [ends[k][1] for k in kept],
-        **dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), zero),  # type: ignore[arg-type]
-        time_ns=time_ns,
-        range_m=[rows[k][1].range_m for k in kept],
-        fpp2_dbm=[rows[k][1].power_dbm for k in kept],
-    )
 
 
 def record_printed(
@@ -283,28 +254,38 @@ def record_printed(
     dialect: Dialect,
     *,
     force: bool = False,
-    watch: Callable[[Printed], None] | None = None,
+    watch: Callable[[Progress], None] = lambda _: None,
+    listeners: Iterable[Listener | Callable[[Heard], object]] = (),
     **how: Any,
 ) -> Printed:
     """Record ranges that boards print until `stop` returns true or the time is over; returns the counts.
 
-    `how` are other parameters of `printed_ranges`, which raises; nothing is left where no range was printed.
-    `KeyboardInterrupt` ends a recording like `stop`.
+    `how` are other parameters of `printed_ranges`, which raises; nothing is left where no range was printed. `watch`
+    and `listeners` are those of `uwblink.record`, and `KeyboardInterrupt` ends a recording like `stop`.
     """
-    path, seen = Path(output), Printed()
+    path, seen, others = Path(output), Printed(), as_listeners(listeners)
     check_output(path, force=force, recording=True)
     batches = printed_ranges(ports, dialect, seen=seen, **how)
-    first = next(batches, None)
+    first = next(filter(None, batches), None)
     if first is None:
         raise BoardError(f"no range was printed ({seen}); nothing is recorded")
     meta = {"source": "record", "dialect": dialect.name, "notes": ["ranges without stamps, as the boards print them"]}
     with Recording.create(path, meta=meta, force=force, live=True) as recording:
-        recording.append_exchanges(first)
         try:
-            for batch in batches:
-                recording.append_exchanges(batch)
-                if watch:
-                    watch(seen)
+            with RecordingWriter(recording) as writer:
+                begun, watched_s = set[Pair](), -1.0
+                for turns in chain([first], batches):
+                    for listener in others:
+                        listener.on_start(sorted({turn.pair for turn in turns} - begun))
+                    begun |= {turn.pair for turn in turns}
+                    for listener, turn in product([writer, *others], turns):
+                        if turn.report is not None:
+                            listener.on_message(Heard(turn.time_ns, turn.pair[0], turn.report))
+                        listener.on_turn(turn)
+                    writer.check()
+                    if seen.time_s - watched_s > 0.25:
+                        watched_s = seen.time_s
+                        watch(seen)
         except KeyboardInterrupt:
             pass
         finally:

@@ -206,7 +206,9 @@ class Progress(Listener):
             reports = [*state.reports]  # copied at once: a page asks in a thread of its own, while the recorder goes on
             rate_hz = sum(time_ns > since_ns for time_ns, *_ in reports) / over_s
             success = f"{100 * state.good / state.tried:.0f} %" if state.tried else ""
-            last = [(f"{report.range_m:.3f}", f"{report.fpp1_dbm:.1f}") for *_, report in reports[-1:]]
+            last = [
+                (f"{report.range_m:.3f}", f"{report.fpp1_dbm:.1f}".replace("nan", "")) for *_, report in reports[-1:]
+            ]
             rows.append((pair, [f"{rate_hz:.1f}", success, *(last or [("", "")])[0]]))
         return rows
 
@@ -295,8 +297,7 @@ class ReportCheck:
 
     def add(self, board: int, report: RangeReport) -> str | None:
         """Add a report; returns its differences from the report of the other board, None without any."""
-        mine = isinstance(report, TargetRangeReport)
-        pair = (report.neighbour, board) if mine else (board, report.neighbour)
+        pair = (report.neighbour, board) if isinstance(report, TargetRangeReport) else (board, report.neighbour)
         before = self._last.pop(pair, None)
         # Two reports of different exchanges have no stamp in common, but by chance.
         same = before and any(getattr(before[1], name) == getattr(report, name) != 0 for name in STAMPS)

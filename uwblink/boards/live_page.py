@@ -88,14 +88,9 @@ class LivePage(Closing, Listener):
         progress = self._progress
         faults = reversed([*progress.last_faults])
         items = "".join(f"<li>board {escape(f.board)}: {escape(f.kind)}: {escape(f.detail)}</li>" for f in faults)
-        parts = (
-            f"<h1>recording {escape(self._path.name)}</h1>",
-            f"<p>{escape(str(progress))}</p>",
-            self._table(progress),
-            f"<ul>{items}</ul>" if items else "",
-            self._disk(),
-        )
-        return "".join(parts)
+        listed = f"<ul>{items}</ul>" if items else ""
+        head = f"<h1>recording {escape(self._path.name)}</h1><p>{escape(str(progress))}</p>"
+        return f"{head}{self._table(progress)}{listed}{self._disk()}"
 
     def _table(self, progress: Progress) -> str:
         """Return a table with one row for each pair; pairs without ranges for two seconds are highlighted."""
@@ -112,7 +107,7 @@ class LivePage(Closing, Listener):
             last = (f"{series[k][-1]:.3f}" if shown else "" for k in kinds)
             image = picture([time_ns for time_ns, *_ in shown], series)
             cells = (f"{pair[0]}&nbsp;&rarr;&nbsp;{pair[1]}", rate, success, power, *last, image)
-            silent = " class='silent'" if success and rate == "0.0" else ""
+            silent = " class='silent'" if (success or shown) and rate == "0.0" else ""
             rows += f"<tr{silent}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
         head = "".join(f"<th>{name}</th>" for name in names)
         return f"<div class='wide live'><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>"

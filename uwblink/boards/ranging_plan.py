@@ -36,7 +36,7 @@ from uwblink.recording.antenna_delays import (
     known_delays,
     read_antenna_delays,
 )
-from uwblink.recording.schema import Tag, is_board_id, read_tags
+from uwblink.recording.schema import LARGEST_BOARD_ID, Tag, is_id, read_tags
 from uwblink.text_files import FileKey, TomlReader, heads, is_number
 
 PLAN_KEYS: Final = (
@@ -47,7 +47,7 @@ PLAN_KEYS: Final = (
     FileKey(
         "get_cir", "true or false", "false", "Whether the initiator prints its channel impulse response; this is slow."
     ),
-    FileKey("tags[].id", "whole number, 0 to 254", "needed", "A board with a known place on a body."),
+    FileKey("tags[].id", "whole number, 0 to 65535", "needed", "A board with a known place on a body."),
     FileKey("tags[].body", "text", "needed", "Its body, by the name of motion capture."),
     FileKey("tags[].lever_arm_m", "3 numbers, m", "[0.0, 0.0, 0.0]", "Position of its antenna in the body's frame."),
     *ANTENNA_DELAY_KEYS,
@@ -145,7 +145,8 @@ def load_plan(path: Path) -> RangingPlan:
 
 
 def _is_pair(pair: Any) -> bool:
-    return isinstance(pair, tuple) and len(pair) == 2 and all(map(is_board_id, pair)) and pair[0] != pair[1]
+    is_pair = isinstance(pair, tuple) and len(pair) == 2 and pair[0] != pair[1]
+    return is_pair and all(is_id(one, LARGEST_BOARD_ID) for one in pair)
 
 
 def _listed(tags: Iterable[int]) -> str:

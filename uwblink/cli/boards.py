@@ -40,7 +40,6 @@ from uwblink.cli.shared import (
     output,
     print_result,
     starting,
-    waiting,
 )
 from uwblink.display import printable
 from uwblink.errors import PlanError, RangingFailedError, RecordingError, RefusedError, UwblinkError
@@ -307,22 +306,20 @@ def record(
     """
 
     check_output(output, force=force, recording=True)
-    if dialect is not None:
-        _refuse_beside_dialect(plan=plan, pairs=pairs, rate=rate, arrangement=arrangement, passive=passive, cir=cir)
-        with interrupts() as stop, waiting("recording") as report:
-            done = uwblink.boards.record_printed(
-                ports,
-                output,
-                uwblink.boards.dialect_of(dialect),
-                ids=_ids(ids),
-                duration_s=duration or math.inf,
-                force=force,
-                stop=stop,
-                watch=lambda seen: report(str(seen)),
-            )
-        typer.echo(f"{output}: {done}")
-        return
-    if (plan is None) == (pairs is None):
+    _check_dialect(
+        dialect,
+        ids,
+        plan=plan,
+        pairs=pairs,
+        rate=rate,
+        arrangement=arrangement,
+        known=known,
+        order=order,
+        antenna_delays=antenna_delays,
+        passive=passive,
+        cir=cir,
+    )
+    if (plan is None) == (pairs is None) and dialect is None:
         raise PlanError("give either --plan plan.toml or --pairs all")
     if pairs not in (None, "all", "none"):
         raise PlanError(f"--pairs: found {pairs!r}, expected all or none; a plan file can name pairs")
@@ -333,7 +330,7 @@ def record(
         stop, watch = stack.enter_context(interrupts()), stack.enter_context(_watcher())
         pages = []
         if live:
-            correct = _correction(calibration, chosen)
+            correct = _correction(calibration, chosen if dialect is None else None)
             pages.append(stack.enter_context(uwblink.boards.LivePage(output, correct=correct, port=live_port)))
             typer.echo(f"live page: {pages[0].url}", err=True)
 
@@ -341,20 +338,14 @@ def record(
             for show in (watch, *(page.watch for page in pages)):
                 show(progress)
 
-        progress = uwblink.record(
-            ports,
-            output,
-            chosen,
-            duration_s=duration or math.inf,
-            passive=passive,
-            arrangement=arrangement,
-            known=known,
-            order=_ids(order),
-            force=force,
-            stop=stop,
-            watch=watch_all,
-            listeners=pages,
-        )
+        how: dict[str, Any] = {"duration_s": duration or math.inf, "force": force, "stop": stop}
+        how |= {"watch": watch_all, "listeners": pages}
+        if dialect is not None:
+            spoken = uwblink.boards.dialect_of(dialect)
+            progress: Progress = uwblink.boards.record_printed(ports, output, spoken, ids=_ids(ids, "ids"), **how)
+        else:
+            arranged: dict[str, Any] = {"arrangement": arrangement, "known": known, "order": _ids(order, "order")}
+            progress = uwblink.record(ports, output, chosen, passive=passive, **arranged, **how)
     typer.echo(f"{output}: {progress}")
 
 
@@ -385,10 +376,12 @@ def stream(
     --antenna-delays, and without those of a plan, 16436 ticks in each board are assumed.
     """
     of_boards = not (len(source) == 1 and source[0].endswith(".uwb"))
-    if not of_boards and (plan or rate or output or antenna_delays):
+    if not of_boards and (plan or rate or output or antenna_delays or dialect):
         raise PlanError(
-            f"{source[0]}: a recording takes no --plan, --rate, --antenna-delays and --output; they are for boards"
+            f"{source[0]}: a recording takes no --plan, --rate, --antenna-delays, --dialect and --output; they are for "
+            "boards"
         )
+    _check_dialect(dialect, ids, plan=plan, rate=rate, antenna_delays=antenna_delays)
     seen, count = uwblink.boards.Progress(), 0
     senders: list[Callable[[uwblink.StreamedRange], object]] = (
         [] if quiet else [lambda found: typer.echo(found.to_json())]
@@ -408,34 +401,24 @@ def stream(
             server = stack.enter_context(uwblink.streaming.FoxgloveServer(foxglove))
             typer.echo(f"foxglove: {server.url}", err=True)
             senders.append(server.send)
-        if dialect is not None:
-            _refuse_beside_dialect(plan=plan, rate=rate, output=output, antenna_delays=antenna_delays)
-        chosen = _plan(plan, antenna_delays, rate_hz=rate) if of_boards and dialect is None else None
-        correct = _correction(calibration, chosen, None if of_boards else source[0]) if dialect is None else None
-        duration_s = duration or math.inf
+        spoken = None if dialect is None else uwblink.boards.dialect_of(dialect)
+        chosen = _plan(plan, antenna_delays, rate_hz=rate) if of_boards and not spoken else None
+        correct = _correction(calibration, chosen, None if of_boards else source[0])
+        how: dict[str, Any] = {"duration_s": duration or math.inf, "stop": stop}
+        how |= {"ids": _ids(ids, "ids")} if spoken else {}
+        told: dict[str, Any] = {"listeners": [seen, uwblink.streaming.RangeListener(send_on, correct)], "force": force}
         try:
-            if output and chosen:
-                told = [seen, uwblink.streaming.RangeListener(send_on, correct)]
-                uwblink.record(source, output, chosen, duration_s=duration_s, stop=stop, listeners=told, force=force)
+            if output and spoken:
+                uwblink.boards.record_printed(source, output, spoken, **how, **told)
+            elif output and chosen:
+                uwblink.record(source, output, chosen, **how, **told)
             else:
+                how |= {"calibration": correct}
                 ranges = (
-                    uwblink.streaming.stream_printed(
-                        source,
-                        uwblink.boards.dialect_of(dialect),
-                        calibration=calibration,
-                        ids=_ids(ids),
-                        duration_s=duration_s,
-                        stop=stop,
-                    )
-                    if dialect is not None
+                    uwblink.streaming.stream_printed(source, spoken, **how)
+                    if spoken
                     else uwblink.stream(
-                        source if of_boards else source[0],
-                        calibration=correct,
-                        plan=chosen,
-                        duration_s=duration_s,
-                        speed=speed,
-                        stop=stop,
-                        listeners=[seen],
+                        source if of_boards else source[0], plan=chosen, speed=speed, listeners=[seen], **how
                     )
                 )
                 stack.callback(ranges.close)
@@ -447,9 +430,11 @@ def stream(
     typer.echo(f"{count} ranges" + (f"; faults: {seen.fault_counts()}" if seen.faults else ""), err=True)
 
 
-def _refuse_beside_dialect(**others: Any) -> None:
-    """Raise `PlanError` for options that plan exchanges: boards of a dialect range by themselves."""
-    for name, value in others.items():
+def _check_dialect(dialect: str | None, ids: str, **others: Any) -> None:
+    """Raise `PlanError` for options that plan exchanges, as boards of a dialect range by themselves, or ids without."""
+    if ids and dialect is None:
+        raise PlanError("goes with --dialect; boards of this project's firmware are asked for theirs", parameter="ids")
+    for name, value in others.items() if dialect is not None else ():
         if value:
             raise PlanError(
                 "boards of a dialect range by themselves, so this does not go with --dialect", parameter=name
@@ -478,10 +463,9 @@ def _correction(path: Path | None, plan: uwblink.RangingPlan | None, recording: 
     if path is None:
         return None
     correct = uwblink.boards.load_correction(path)
-    if plan is not None:
-        warning = uwblink.boards.delays_warning(correct, plan.delays())
-    else:
-        with uwblink.Recording.open(recording or "") as opened:
+    warning = uwblink.boards.delays_warning(correct, plan.delays()) if plan else ""
+    if recording is not None:
+        with uwblink.Recording.open(recording) as opened:
             delays, tags = uwblink.recording.delays_in_meta(opened.meta()), [one.tag for one in opened.tags()]
         warning = uwblink.boards.delays_warning(correct, delays, tags)
     if warning:
@@ -489,11 +473,10 @@ def _correction(path: Path | None, plan: uwblink.RangingPlan | None, recording: 
     return correct
 
 
-def _ids(text: str) -> tuple[int, ...]:
-
+def _ids(text: str, parameter: str) -> tuple[int, ...]:
     words = [word.strip() for word in text.split(",")] if text else []
     if not all(word.isascii() and word.isdigit() and len(word) < 6 for word in words):
-        raise PlanError(f"--order: found {text!r:.40}, expected ids with commas, as in 3,1,2")
+        raise PlanError(f"found {text!r:.40}, expected ids with commas, as in 3,1,2", parameter=parameter)
     return tuple(map(int, words))
 
 

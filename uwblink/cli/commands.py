@@ -165,8 +165,7 @@ def print_summary(summary: Summary, console: Console) -> None:
             table.add_row(*(escape(printable(cell)) for cell in row))
         if rows:
             console.print(table)
-    provenance = (printable(f"  {key}: {value}") for key, value in summary.provenance.items())
-    for line in (*summary.lines(), *provenance):
+    for line in (*summary.lines(), *(printable(f"  {key}: {value}") for key, value in summary.provenance.items())):
         console.print(escape(line))
 
 

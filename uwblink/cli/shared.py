@@ -30,7 +30,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from uwblink import __version__
 from uwblink.cli import INTERRUPTED as INTERRUPTED
-from uwblink.errors import ArgumentError, OfParameter, PluginWarning, UwblinkError
+from uwblink.errors import ArgumentError, OfParameter, PlainWarning, UwblinkError
 from uwblink.output import check_apart
 from uwblink.settings import flags_of
 
@@ -220,8 +220,8 @@ def apart(command: Callable[..., None]) -> Callable[..., None]:
 
 def epilog(*examples: str) -> str | None:
     """Return examples as an epilog, a line each; None without any."""
-    heads = ["Example:" if len(examples) == 1 else "Examples:"]
-    return "\n".join([*heads, *(f"  {escape(one)}" for one in examples)]) if examples else None
+    head = "Example:" if len(examples) == 1 else "Examples:"
+    return "\n".join([head, *(f"  {escape(one)}" for one in examples)]) if examples else None
 
 
 def choice(*names: str, more: Callable[[], Iterable[str]] | None = None) -> dict[str, Any]:
@@ -325,8 +325,7 @@ def run(
                 if text is None:
                     raise
                 typer.echo(f"error: {one_line(with_flags(text, FLAGS | dict(flags)))}", err=True)
-                found = (number for kind, number in (statuses or {}).items() if isinstance(error, kind))
-                status = next(found, 2)
+                status = next((number for kind, number in (statuses or {}).items() if isinstance(error, kind)), 2)
     if interrupted():
         # A library may have turned the interrupt into an error of its own, or swallowed it.
         typer.echo("interrupted", err=True)
@@ -406,11 +405,11 @@ def interrupts(*, at_once: bool = False) -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Print warnings about plug-ins as one line, and raise overflows and the like as errors."""
+    """Print the project's own warnings as one line each, and raise overflows and the like as errors."""
     shown = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
-        if issubclass(category, PluginWarning):
+        if issubclass(category, PlainWarning):
             typer.echo(f"warning: {message}", err=True)
         else:
             shown(message, category, *where, **more)

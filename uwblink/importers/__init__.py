@@ -2,11 +2,12 @@
 
 A registered reader takes a path and a map and returns `Contents`, or tables with a map. This module writes the
 recording, and never overwrites one unless it is told to. It also reads back what `uwblink export --to csv` or
-`parquet` wrote.
+`parquet` wrote, and data frames of pandas, Polars or Arrow, by DuckDB alone.
 """
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
@@ -17,11 +18,12 @@ from typing import Any, Final
 import duckdb
 
 from uwblink.arrays import is_frame
+from uwblink.database import connect
 from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.importers.bags import BAG_SUFFIXES, bag_to_table
 from uwblink.importers.column_map import ColumnMap
 from uwblink.importers.exchange_tables import TABLE_SUFFIXES, Imported, find_tables, import_tables
-from uwblink.importers.frames import map_of_frame, write_frame
+from uwblink.importers.guess import guess_map
 from uwblink.importers.miluv import read_miluv
 from uwblink.importers.poses import add_poses, pose_topics
 from uwblink.importers.staging import Watch, unwatched
@@ -236,8 +238,8 @@ def import_file(
     check_output(Path(output), force=force, recording=True)
     if is_frame(source):
         with TemporaryDirectory(prefix="uwblink-") as folder:
-            table = write_frame(source, Path(folder))
-            map_file = map_of_frame(table, map_file)
+            table = _write_frame(source, Path(folder))
+            map_file = _map_of_frame(table, map_file)
             return import_file(table, output, importer="csv", map_file=map_file, force=force, watch=watch)
     if isinstance(map_file, Mapping):
         raise ArgumentError(
@@ -276,7 +278,14 @@ def _choose(
     sources = [Path(source)] if isinstance(source, str | os.PathLike) else [Path(one) for one in source]
     if not sources:
         raise ArgumentError("found no files, expected a path or several", parameter="source")
-    row = _importer(sources[0], importer)
+    if importer is not None and importer not in IMPORTERS:
+        raise ArgumentError(f"importer: found {importer!r:.40}, allowed: {', '.join(IMPORTERS)}")
+    rows, ending = (IMPORTERS.values() if importer is None else [IMPORTERS[importer]]), sources[0].name.lower()
+    if (row := next((row for row in rows if importer or ending.endswith(row.suffixes)), None)) is None:
+        known = ", ".join(suffix for row in rows for suffix in row.suffixes)
+        raise ImportTableError(
+            f"{sources[0]}: no importer for such a file; known are {known}; or name one with importer="
+        )
     if map_file is not None and row.map_help is None:
         raise ArgumentError(f"map_file: importer {row.name!r} takes none")
     if len(sources) > 1 and not row.several:
@@ -284,14 +293,40 @@ def _choose(
     return sources, row, None if map_file is None else Path(map_file)
 
 
-def _importer(source: Path, name: str | None) -> Importer:
-    if name is not None:
-        if name not in IMPORTERS:
-            raise ArgumentError(f"importer: found {name!r:.40}, allowed: {', '.join(IMPORTERS)}")
-        return IMPORTERS[name]
-    ending = source.name.lower()
-    for row in IMPORTERS.values():
-        if ending.endswith(row.suffixes):
-            return row
-    known = ", ".join(suffix for row in IMPORTERS.values() for suffix in row.suffixes)
-    raise ImportTableError(f"{source}: no importer for such a file; known are {known}; or name one with importer=")
+DATA_FRAME = "data frame"
+"""What messages and recordings call a data frame."""
+
+
+def _write_frame(frame: Any, folder: Path) -> Path:
+    """Write a data frame as Parquet into a folder, named indices as columns; raises `ImportTableError`."""
+    path = folder / f"{DATA_FRAME}.parquet"
+    if any(name is not None for name in getattr(getattr(frame, "index", None), "names", [])):
+        frame = frame.reset_index()
+    with (
+        raising(ImportTableError, f"{DATA_FRAME}: cannot be read", duckdb.Error, TypeError, ValueError),
+        connect(folders=[folder]) as db,
+    ):
+        db.register("frame", frame)
+        written = str(path).replace("'", "''")
+        db.execute(f"COPY frame TO '{written}' (FORMAT parquet)")
+    return path
+
+
+def _map_of_frame(table: Path, given: str | os.PathLike[str] | Mapping[str, Any] | None) -> Path:
+    """Return the path of the map of a written frame: the given one, one that says what a mapping says, or a guess.
+
+    Raises `ImportTableError` where the frame does not tell everything, with what is missing.
+    """
+    if isinstance(given, str | os.PathLike):
+        return Path(given)
+    if given is not None:
+        path = table.with_suffix(".json")
+        path.write_text(json.dumps(given, default=dict), "utf-8")
+        return path
+    found, path = guess_map(table), table.with_suffix(".toml")
+    if found.asked or not found.complete:
+        what = f"state {' and '.join(found.asked)}" if found.asked else "name its columns"
+        proposed = "\n".join(line for line in found.text.splitlines()[1:] if line)
+        raise ImportTableError(f"{DATA_FRAME}: {what} in `map`, a mapping or a file such as\n{proposed}")
+    path.write_text(found.text, "utf-8")
+    return path

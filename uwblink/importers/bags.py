@@ -217,8 +217,7 @@ def matching_topics(stated: str, topics: Iterable[str]) -> dict[str, dict[str, f
     listed = list(topics)
     if stated in listed or not is_template(stated):
         return {stated: {}} if stated in listed else {}
-    found = {topic: Template(stated).match(topic) for topic in listed}
-    return {topic: {**places} for topic, places in found.items() if places is not None}
+    return {topic: {**places} for topic in listed if (places := Template(stated).match(topic)) is not None}
 
 
 def _rows(bag: Bag, topics: Mapping[str, dict[str, float | str]]) -> Iterator[dict[str, Any]]:

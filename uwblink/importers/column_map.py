@@ -3,7 +3,7 @@
 Every key is optional; docs/importing.md explains each.
 
 ```toml
-layout = "exchanges"       # or "messages", "stamps" (a row a stamp), "parts" (some rows an exchange), "ranges"
+layout = "exchanges"       # or "messages", "stamps" (a row a stamp), "parts" (of an exchange), "ranges", "broadcasts"
 bits = 32                  # of the counter that the stamps come from, 32 or 40
 counter = "wrapped"        # or "signed", "unwrapped"
 protocol = "ss"            # a protocol of uwblink.twr
@@ -51,12 +51,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from uwblink.errors import ImportTableError
-from uwblink.importers.chips import CHIPS, REGISTERS
-from uwblink.importers.lines import LINES
+from uwblink.importers.devices import CHIPS, LINES, REGISTERS
 from uwblink.importers.templates import Template, is_template, places
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import AntennaDelays, read_antenna_delays
-from uwblink.recording.schema import POSE
+from uwblink.recording.schema import POSE, is_id
 from uwblink.text_files import FileKey, TomlReader, heads, is_number
 from uwblink.ticks import METRES_PER_TICK, TICKS_PER_SECOND
 from uwblink.twr import BITS, LARGEST_ID, STAMPS
@@ -68,8 +67,8 @@ ASKED: Final = "?"
 """Placeholder of `uwblink import guess` for a value that the user must give."""
 
 NAMES: Final = (
-    "time_s", *IDS, *STAMPS, "fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2", *DISTANCES,
-    "sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "stamp", "event",
+    "time_s", *IDS, *STAMPS, "fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2", "sts1", "sts2", *DISTANCES,
+    "sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "sts", "stamp", "event", "heard",
 )  # fmt: skip
 """The columns of tables; `event` has words that tell whether a stamp is of transmission or of reception."""
 
@@ -93,10 +92,11 @@ SKEWS: Final = ("skew1", "skew2", "skew")
 MAP_KEYS: Final = (
     FileKey(
         "layout",
-        '"exchanges", "messages", "stamps", "parts" or "ranges"',
-        "by the columns; parts must be stated",
+        '"exchanges", "messages", "stamps", "parts", "ranges" or "broadcasts"',
+        "by the columns; parts and broadcasts must be stated",
         "What a row is: an exchange; a message; a stamp with `message`, as devices log their own; a part of an "
-        "exchange, for example if both devices report; a range without stamps.",
+        "exchange, for example if both devices report; a range without stamps; what a broadcast (sequence, tx) of "
+        "from_id says of an earlier one (heard) of to_id: when from_id received it (rx).",
     ),
     FileKey("bits", "32 or 40", "32 if the stamps fit, else 40", "Width of the counter of the stamps, in bits."),
     FileKey(
@@ -119,7 +119,8 @@ MAP_KEYS: Final = (
         f"template, or one of {', '.join(LINES)}",
         "the file is a table",
         "Of logs: the lines that are rows. Places in braces are columns; `{x:hex}` and `{x:int}` take digits, `{r[8]}` "
-        "is a list whose values are `r.0` to `r.7`, `{_}` and `{*}` are not used.",
+        "is a list whose values are `r.0` to `r.7`, `{_}` and `{*}` are not used. `{json}` alone: lines that end with "
+        "an object of JSON.",
     ),
     FileKey(
         "each",
@@ -187,9 +188,11 @@ MAP_KEYS: Final = (
     ),
     FileKey(
         "units.skew",
-        '"ppm", "-ppm", "integrator-2", "integrator-5", "integrator-9" or "offset"',
+        '"ppm", "-ppm", "integrator-2", "integrator-5", "integrator-9", "offset" or "-offset"',
         "ppm",
-        "Unit of skews: the carrier integrator on a channel, or the clock offset register of the DW3000, needs a chip.",
+        "Unit of skews: the carrier integrator on a channel, or the clock offset register of the DW3000, needs a chip. "
+        "offset is positive if the receiver's clock is faster; sources contradict each other, and -offset is the "
+        "opposite.",
     ),
     FileKey(
         "units.NAME",
@@ -279,6 +282,18 @@ class ColumnMap:
         return self.units.get(name, "dBm" if name in self.registers else self.power_unit)
 
 
+JSON_LINE: Final = "{json}"
+"""The `line` of logs whose lines end with an object of JSON."""
+
+
+def map_of_lines(name: str) -> ColumnMap:
+    """Return the map of a form of `LINES`."""
+    known = LINES[name]
+    return ColumnMap(
+        line=known["line"], each=known.get("each"), wide=known.get("wide", {}), distance_unit=known["units"]["distance"]
+    )
+
+
 def load_map(path: Path) -> ColumnMap:
     """Read a map; raises `ImportTableError` that names the key."""
     file = TomlReader(path, ImportTableError, "map")
@@ -302,49 +317,21 @@ def load_map(path: Path) -> ColumnMap:
         for place in places(Template(text)):
             _place(place, columns, units)
     file.known(units, ("stamps", "time", "distance", "power", "skew", *DISTANCES, *POWERS), "units.")
-    registers = {name: value for name, value in columns.items() if isinstance(value, dict)}
     chip = file.choice("chip", table.get("chip"), (None, *CHIPS))
-    for name, value in registers.items():
-        file.known(value, REGISTERS, f"columns.{name}.")
-        whole = {"n"} < value.keys() and (value.keys() >= {"f1", "f2", "f3"}) != ("c" in value)
-        whole &= name in POWERS and all(isinstance(one, str) for one in value.values())
-        file.check(f"columns.{name}", value, whole, "columns of f1, f2, f3 and n, or of c and n, for a power")
-        file.check(
-            "chip", chip, bool(chip) and bool(CHIPS[chip].offset_db), 'a chip whose registers are known: "dw1000"'
-        )
-    numbered = {type(value) is int for value in columns.values() if not isinstance(value, dict)}
-    for name, value in columns.items():
-        one = (isinstance(value, str) and value != ASKED) or name in registers or (type(value) is int and value > 0)
-        file.check(
-            f"columns.{name}", value, one and len(numbered) < 2, "the name of a column, or for all their numbers"
-        )
-    for name, value in wide.items():
-        by_device = isinstance(value, dict) and value and all(isinstance(one, str) for one in value.values())
-        is_family = isinstance(value, str) and is_template(value) and len(re.findall(r"\{\w+\}", value)) == 1
-        file.check(f"wide.{name}", value, by_device or is_family, "a name with one place, such as r_AN{to_id}")
-    missing = table.get("missing", [])
-    listed = isinstance(missing, list) and all(
-        is_number(one) or (isinstance(one, str) and one != ASKED) for one in missing
-    )
-    file.check("missing", missing, listed, "a list of numbers and words")
-    _constants(file, "constants", constants)
-    for topic, values in file.section("topics").items():
-        file.check(f"topics.{topic}", values, isinstance(values, dict), "a table of constants, which may be empty")
-        _constants(file, f"topics.{topic}", values)
-    for name, value in ids.items():
-        is_id = type(value) is int and 0 <= value <= LARGEST_ID
-        file.check(f"ids.{name}", value, is_id, f"a whole number from 0 to {LARGEST_ID}")
-    within = table.get("within_s", 1.0)
-    file.check("within_s", within, is_number(within) and within > 0, "seconds")
+    _check_columns(file, columns, wide, chip)
+    _check_values(file, ids)
+    registers = {name: value for name, value in columns.items() if isinstance(value, dict)}
     stamps = units.get("stamps", "ticks")
     return ColumnMap(
-        layout=file.choice("layout", table.get("layout"), (None, "exchanges", "messages", "stamps", "parts", "ranges")),
+        layout=file.choice(
+            "layout", table.get("layout"), (None, "exchanges", "messages", "stamps", "parts", "ranges", "broadcasts")
+        ),
         bits=file.choice("bits", table.get("bits"), (None, *BITS)),
         counter=file.choice("counter", table.get("counter"), (None, "wrapped", "signed", "unwrapped")),
         protocol=file.choice("protocol", table.get("protocol"), (None, *PROTOCOLS)),
         delimiter=file.choice("delimiter", table.get("delimiter"), (None, ",", ";", "\t", "|", " ")),
         decimal=file.choice("decimal", table.get("decimal"), (None, ".", ",")),
-        within_s=float(within),
+        within_s=float(table.get("within_s", 1.0)),
         columns={name: str(value) for name, value in columns.items() if name not in registers},
         ticks_per_unit=float(stamps * TICKS_PER_SECOND)
         if is_number(stamps) and stamps > 0
@@ -358,15 +345,52 @@ def load_map(path: Path) -> ColumnMap:
         each=table.get("each"),
         line=table.get("line"),
         from_name=table.get("from_name"),
-        missing=tuple(missing),
+        missing=tuple(table.get("missing", [])),
         chip=chip,
         prf=file.choice("prf", table.get("prf", 64), (16, 64)),
-        headerless=True in numbered,
+        headerless=any(type(value) is int for value in columns.values()),
         registers=registers,
         wide=wide,
         units=_units_of_columns(file, units, chip),
         topics=file.section("topics"),
     )
+
+
+def _check_columns(file: TomlReader, columns: dict[str, Any], wide: dict[str, Any], chip: str | None) -> None:
+    """Raise the file's error for names of columns, registers and families that cannot be."""
+    registers = {name: value for name, value in columns.items() if isinstance(value, dict)}
+    for name, value in registers.items():
+        file.known(value, REGISTERS, f"columns.{name}.")
+        whole = {"n"} < value.keys() and (value.keys() >= {"f1", "f2", "f3"}) != ("c" in value)
+        whole &= name in POWERS and all(isinstance(one, str) for one in value.values())
+        file.check(f"columns.{name}", value, whole, "columns of f1, f2, f3 and n, or of c and n, for a power")
+        file.check("chip", chip, bool(CHIPS[chip or "other"].offset_db), 'a chip whose registers are known: "dw1000"')
+    numbered = {type(value) is int for value in columns.values() if not isinstance(value, dict)}
+    for name, value in columns.items():
+        one = (isinstance(value, str) and value != ASKED) or name in registers or (type(value) is int and value > 0)
+        file.check(
+            f"columns.{name}", value, one and len(numbered) < 2, "the name of a column, or for all their numbers"
+        )
+    for name, value in wide.items():
+        by_device = isinstance(value, dict) and value and all(isinstance(one, str) for one in value.values())
+        is_family = isinstance(value, str) and is_template(value) and len(re.findall(r"\{\w+\}", value)) == 1
+        file.check(f"wide.{name}", value, by_device or is_family, "a name with one place, such as r_AN{to_id}")
+
+
+def _check_values(file: TomlReader, ids: dict[str, Any]) -> None:
+    """Raise the file's error for values that mean none, constants, topics and numbers of ids that cannot be."""
+    missing, within = file.table.get("missing", []), file.table.get("within_s", 1.0)
+    listed = isinstance(missing, list) and all(
+        is_number(one) or (isinstance(one, str) and one != ASKED) for one in missing
+    )
+    file.check("missing", missing, listed, "a list of numbers and words")
+    _constants(file, "constants", file.section("constants"))
+    for topic, values in file.section("topics").items():
+        file.check(f"topics.{topic}", values, isinstance(values, dict), "a table of constants, which may be empty")
+        _constants(file, f"topics.{topic}", values)
+    for name, value in ids.items():
+        file.check(f"ids.{name}", value, is_id(value), f"a whole number from 0 to {LARGEST_ID}")
+    file.check("within_s", within, is_number(within) and within > 0, "seconds")
 
 
 def _place(place: str, columns: dict[str, Any], units: dict[str, Any]) -> None:
@@ -394,5 +418,4 @@ def _constants(file: TomlReader, where: str, values: dict[str, Any]) -> None:
     for name, value in values.items():
         is_word = name in IDS and isinstance(value, str) and value != ASKED
         of_id = f"{IDS.get(name)}: a number or a word; or name its column in [columns]"
-        expected = of_id if name in IDS else "a finite number"
-        file.check(f"{where}.{name}", value, is_number(value) or is_word, expected)
+        file.check(f"{where}.{name}", value, is_number(value) or is_word, of_id if name in IDS else "a finite number")

@@ -38,6 +38,7 @@ from uwblink.importers.staging import (
     Staging,
     Watch,
     assemble_exchanges,
+    broadcast_exchanges,
     in_time_order,
     rows_back,
     time_conditions,
@@ -52,6 +53,12 @@ from uwblink.twr import STAMPS, raw_range
 
 LOG_SUFFIXES: Final = (".txt", ".log", ".dat", ".txt.gz", ".log.gz")
 TABLE_SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".parquet", ".jsonl", ".ndjson", ".jsonl.gz")
+
+_BESIDE: Final = {
+    "powers": {"rxp1": "rxp1_dbm", "rxp2": "rxp2_dbm"},
+    "quality": {"sts1": "sts1", "sts2": "sts2"},
+}
+"""Tables with a row an exchange, and their columns by those of maps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,8 +121,8 @@ def import_tables(
         meta |= {"chip": column_map.chip} if column_map.chip else {}
         with Recording.create(output, meta=meta, force=force, memory_mb=250) as recording:
             ends = " UNION ".join(f"SELECT {name} AS id FROM {rows.name} WHERE {rows.condition}" for name in IDS)
-            tags = [tag for (tag,) in db.execute(f"{ends} ORDER BY id").fetchall()]
-            bodies = {tag: staging.names.get(tag, f"tag{tag}") for tag in tags}
+            tags = db.execute(f"{ends} ORDER BY id").fetchall()
+            bodies = {tag: staging.names.get(tag, f"tag{tag}") for (tag,) in tags}
             recording.append_tags(Tag(tag, body, (0.0, 0.0, 0.0)) for tag, body in bodies.items())
             for block in rows.blocks():
                 watch("writing", done / total)
@@ -125,16 +132,21 @@ def import_tables(
                     raw, reported = raw_range(exchanges), exchanges.range_m
                     exchanges = replace(exchanges, range_m=np.where(np.isfinite(reported), reported, raw))
                 recording.append_exchanges(exchanges)
-                if "rxp1" in block or "rxp2" in block:
-                    powers = {name: getattr(exchanges, name) for name in ("time_ns", "initiator", "target")}
-                    recording.append("powers", powers | {f"{n}_dbm": optional(block, n) for n in ("rxp1", "rxp2")})
+                for table, columns in _BESIDE.items():
+                    if columns.keys() & block.keys():
+                        beside = {name: getattr(exchanges, name) for name in ("time_ns", "initiator", "target")}
+                        recording.append(table, beside | {kept: optional(block, n) for n, kept in columns.items()})
             for poses in _poses(rows, bodies):
                 recording.append_poses(poses)
+            for table, found in staging.beside.items():
+                recording.append(table, found)
             first = ""
             for some in faults:
                 first = first or some[0].detail
                 recording.append("faults", some)
-            counts = {name: recording.count(name) for name in ("exchanges", "poses", "powers", "faults")}
+            counts = {
+                name: recording.count(name) for name in ("exchanges", "poses", *_BESIDE, *staging.beside, "faults")
+            }
             if first:
                 lost = counts["faults"]
                 notes.append(f"{lost} of {total + lost} rows cannot be used and are kept as faults; the first: {first}")
@@ -165,7 +177,9 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
     if back := rows_back(staging.rows):
         notes.append(f"{back} rows are earlier than the row before, and are sorted by time")
     layout, protocol = column_map.layout or _layout(staging), column_map.protocol
-    if layout in ("messages", "stamps", "parts"):
+    if layout == "broadcasts":
+        rows, protocol = broadcast_exchanges(staging, faults)
+    elif layout in ("messages", "stamps", "parts"):
         rows, found = assemble_exchanges(staging, layout, faults, watch)
         protocol = protocol or found
     else:
@@ -209,7 +223,7 @@ def _layout(staging: Staging) -> str:
             return layout
     if has("range_m") and not any(map(has, STAMPS)):
         return "ranges"
-    raise staging.missing(next(name for name in STAMPS if not has(name)))
+    raise staging.tables[0].missing(staging.column_map.header(next(name for name in STAMPS if not has(name))))
 
 
 def _poses(rows: StagedRows, bodies: Mapping[int, str]) -> Iterator[Poses]:

@@ -1,18 +1,169 @@
-"""Recognise the form of a file for `uwblink import guess`: logs, tables without a header, wide ones, names of files."""
+"""Recognise forms and units for `uwblink import guess`: logs, tables without a header, wide ones, names of files.
+
+Names of columns are those that labs write, English and German; `PATTERNS` says which of `NAMES` they are.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
-from itertools import islice
+import unicodedata
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from itertools import islice, product
 from pathlib import Path
 from typing import Any, Final
 
-from uwblink.importers.column_map import ASKED, ColumnMap
-from uwblink.importers.column_names import PATTERNS, WORDS, plain_name
-from uwblink.importers.lines import LINES
-from uwblink.importers.tables import detect, lacks_header, open_file, reading
+import numpy as np
+
+from uwblink.arrays import Floats
+from uwblink.importers.column_map import (
+    ASKED,
+    DISTANCE_UNITS,
+    DISTANCES,
+    FLIGHT_UNITS,
+    JSON_LINE,
+    POSITIONS,
+    POWERS,
+    RANGE_UNITS,
+    TIME_UNITS,
+    ColumnMap,
+    map_of_lines,
+)
+from uwblink.importers.devices import LINES
+from uwblink.importers.plausibility import MIN_ROWS, reason_against_dbm, reason_against_metres
+from uwblink.importers.tables import detect, lacks_header, object_in, open_file, reading
 from uwblink.importers.templates import Template
+
+OF_MESSAGES: Final = ("tx", "rx", "fpp", "rxp", "skew", "sts", "sequence", "message")
+
+WORDS: Final = {
+    "end": (
+        r"(_(raw|ts|stamp|timestamp|time|ticks?|dtu|ps|ns|us|ms|s|sec|m|mm|cm|ft|in|meters?|metres?|"
+        r"dbm|db|ppm))*"
+    ),
+    "id": r"(_?(id|addr|address|mac|name))?",
+    "device": (
+        r"(tag|node|device|dev|board|robot|agent|anchor|module|modul|radio|unit|uwb|id|addr|address|"
+        r"mac|geraet|knoten)"
+    ),
+    "range": r"(range|dist|distance|abstand|distanz|entfernung|tof|time_?of_?flight)",
+    "made": r"(raw|filt(er)?(ered)?|corrected|corr|kalman|smooth(ed)?)",
+    "true": (
+        r"(gt|true|truth|ground_?truth|ref|reference|nominal|mocap|vicon|actual|tape(_?measured?)?|"
+        r"laser|soll|wahr(er)?|referenz)"
+    ),
+    "fpp": r"(fpp?|(fp|first_?path)_?(power|pwr|rssi|level|leistung)|first_?path|(rssi|power)_?(fp|first_?path))",
+    "rxp": r"(rxp|rx_?(power|pwr|level)|rssi|total_?power|pr)",
+    "skew": r"(skew|cfo|carrier|clock_?offset)",
+    "sts": r"sts(_?(q|qual|quality))?(_?(idx|index))?",
+    "of_time": r"((t|ts|time|stamp|timestamp|zeit)_)?",
+    "from": r"(from|src|source|initiator|tag|my|sender|tx|requester|robot|rover|mobile|node_?a|id_?1)",
+    "to": r"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|beacon|node_?b|id_?2)",
+}
+"""Words that patterns are made of."""
+
+
+def _place(name: str) -> str:
+    """Return the pattern of a column of `POSITIONS`, for names such as `tag_x`, `anchor_pos_x_m`, `x_tag` and `x1`.
+
+    A plain `x` is the initiator's, since the initiator moves if the other devices are called anchors.
+    """
+    end, axis = name.split("_")[:2]
+    words, number = WORDS[end], 1 if end == "from" else 2
+    true, place = r"((gt|true|truth|ground_?truth|mocap|ref)_?)?", r"(pos(ition)?|loc(ation)?|place|p)?"
+    forms = [rf"{true}{words}_?{place}_?{axis}", rf"{true}{place}_?{axis}_?({words}|{number})", rf"p{number}_?{axis}"]
+    forms += [rf"{true}{place}_?{axis}"] if end == "from" else []
+    return "|".join(forms)
+
+
+PATTERNS: Final = {
+    "time_s": (
+        r"(ros_?|host_?|unix_?|utc_?|mess_?)?"
+        r"(time|timestamp|stamp|t|datetime|date(_?time)?|epoch|zeit|zeitstempel|uhrzeit|datum)(_(utc|iso))?"
+    ),
+    "from_id": r"(from|src|source|initiator|tag|my|sender|tx|requester|node_?a|quelle|von|id_?(from|von)|id_?1){id}",
+    "to_id": (
+        r"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|node_?b|ziel|an|nach|anker|"
+        r"empf(ae|a)nger|id_?(to|an|nach)|id_?2){id}"
+    ),
+    "tx1": r"{of_time}(tx_?1|t_?1|poll_?(tx|sent)|tx_?poll)",
+    "rx1": r"{of_time}(rx_?1|t_?2|poll_?(rx|received)|rx_?poll)",
+    "tx2": r"{of_time}(tx_?2|t_?3|resp(onse)?_?(tx|sent)|tx_?resp(onse)?)",
+    "rx2": r"{of_time}(rx_?2|t_?4|resp(onse)?_?(rx|received)|rx_?resp(onse)?)",
+    "tx3": r"{of_time}(tx_?3|t_?5|(final|report)_?(tx|sent)|tx_?(final|report))",
+    "rx3": r"{of_time}(rx_?3|t_?6|(final|report)_?(rx|received)|rx_?(final|report))",
+    "fpp1": r"{fpp}_?1",
+    "fpp2": r"{fpp}_?2?",
+    "rxp1": r"{rxp}_?1",
+    "rxp2": r"{rxp}_?2?",
+    "skew1": r"{skew}_?1",
+    "skew2": r"{skew}_?2?",
+    "sts1": r"{sts}_?1",
+    "sts2": r"{sts}_?2?",
+    "gt_range_m": r"{true}_?{range}?|{range}_?{true}",
+    "range_m": r"({made}_?|device_?|measured?_?|uwb_?|est(imated)?_?)?{range}(_?{made})?",
+    "sequence": r"(seq|sequence|exchange|laufnummer)(_?(no|num|nr|number|id))?",
+    "message": r"(msg|message|frame|nachricht)(_?(no|num|nr|number|type|id))?",
+    "tx": r"tx",
+    "rx": r"rx",
+    "fpp": r"{fpp}",
+    "rxp": r"{rxp}",
+    "skew": r"{skew}",
+    "sts": r"{sts}",
+} | {name: _place(name) for name in POSITIONS}
+"""Patterns of the names of columns, in terms of `WORDS`."""
+
+_OF_MESSAGE: Final = {"poll": 1, "resp": 2, "response": 2}
+_AT_DEVICE: Final = {"resp": 1, "responder": 1, "target": 1, "anchor": 1, "init": 2, "initiator": 2, "tag": 2}
+
+
+def plain_name(header: str) -> str:
+    """Return a name in lower case without accents, its words joined by `_`: `first_path_1_dbm`."""
+    bare = unicodedata.normalize("NFKD", header.replace("ß", "ss")).encode("ascii", "ignore").decode()
+    return re.sub(r"[^a-z0-9]+", "_", bare.lower()).strip("_")
+
+
+def _plain_names(headers: Iterable[str]) -> dict[str, str]:
+    """Return plain names by header; powers and skews get the number of their message: `fp_power_init` is `fp_power_2`.
+
+    `resp` means the responding device if another column names the initiator, else the response message.
+    """
+    level = "(?P<level>{fpp}|{rxp}|{skew}|{sts})".format_map(WORDS)
+    end, whose = WORDS["end"], "|".join(sorted({*_OF_MESSAGE, *_AT_DEVICE}, key=len)[::-1])
+    forms = (rf"{level}_(at_|of_)?(?P<whose>{whose})(?P<end>{end})", rf"(?P<whose>{whose})_{level}(?P<end>{end})")
+    names = {header: plain_name(header) for header in headers}
+    matches = {h: re.fullmatch(forms[0], name) or re.fullmatch(forms[1], name) for h, name in names.items()}
+    ends = {match["whose"] for match in matches.values() if match}
+    numbers = _AT_DEVICE | _OF_MESSAGE | ({"resp": 1, "response": 1} if ends & {"init", "initiator", "tag"} else {})
+    return names | {h: f"{m['level']}_{numbers[m['whose']]}{m['end']}" for h, m in matches.items() if m}
+
+
+def named_columns(headers: Iterable[str]) -> dict[str, str]:
+    """Return the header of each recognised column; raw columns come before others, then earlier ones first."""
+    listed = sorted(headers, key=lambda header: "raw" not in header.lower())
+    called = _plain_names(listed)
+    found = _ends(called)
+    for ours, pattern in PATTERNS.items():
+        whole = f"({pattern}){{end}}".format_map(WORDS)
+        # Each column is used once, but for names of messages, which may repeat those of exchanges at this stage.
+        taken = {header for name, header in found.items() if (name in OF_MESSAGES) == (ours in OF_MESSAGES)}
+        free = (header for header in listed if listed.count(header) == 1 and header not in taken)
+        if header := next((header for header in free if re.fullmatch(whole, called[header])), None):
+            found[ours] = header
+    return found
+
+
+def _ends(called: dict[str, str]) -> dict[str, str]:
+    """Return the columns of the two devices if their names differ by a letter, as `node_i` and `node_j`."""
+    letters = (("a", "b"), ("i", "j"), ("1", "2"), ("0", "1"), ("one", "two"))
+    for both, form in product(letters, ("{0}_?{1}", "{0}{2}_{1}", "{0}_?{1}{2}")):
+        patterns = [form.format(WORDS["device"], letter, WORDS["id"]) for letter in both]
+        ends = [[header for header, name in called.items() if re.fullmatch(one, name)] for one in patterns]
+        stems = [{called[header][:2] for header in headers} for headers in ends]
+        if all(len(headers) == 1 for headers in ends) and stems[0] == stems[1]:
+            return {"from_id": ends[0][0], "to_id": ends[1][0]}
+    return {}
+
 
 Entries = dict[str, tuple[Any, str]]
 """Values of a map by key, each with its reason."""
@@ -29,6 +180,9 @@ def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
     """Return the form of a log by the templates of its first lines, with a time before them if there is one."""
     with reading(path), open_file(path) as file:
         lines = [line.decode("latin-1").rstrip("\r\n") for line in islice(file, 400)]
+    # Boards begin to print at different times, and in the middle of lines.
+    if 5 * sum(map(bool, map(object_in, lines))) > sum(map(bool, lines)):
+        return ColumnMap(line=JSON_LINE), {"line": (JSON_LINE, "lines that end with an object of JSON")}
     found: dict[str, list[re.Match[str]]] = {}
     for name, known in LINES.items():
         pattern = re.compile(Template(known["line"]).pattern)
@@ -38,7 +192,7 @@ def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
     if not found:
         return None
     name, matches = next(iter(found.items()))
-    known, line = LINES[name], LINES[name]["line"]
+    form, line = map_of_lines(name), LINES[name]["line"]
     leads = [match.string[: match.start()] for match in matches]
     time = r"\W*?([0-9]+(?:\.[0-9]+)?|[0-9]{4}-[0-9-]{5}[ T][0-9:.,]+Z?|[0-9]+:[0-9]{2}:[0-9.]+)(\W+)"
     times = [re.fullmatch(time, lead) for lead in leads]
@@ -46,9 +200,8 @@ def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
         line = f"{leads[0][: first.start(1)]}{{time_s}}{first[2]}{line}"
     both = ASKED, "ranges before and after the board's correction: write trek-raw or trek-corrected"
     entries: Entries = {"line": both if {"trek-raw", "trek-corrected"} <= found.keys() else (line, f"as {name}")}
-    entries |= {"each": (known["each"], "")} if "each" in known else {}
-    wide, unit = known.get("wide", {}), known["units"]["distance"]
-    return ColumnMap(line=line, each=known.get("each"), wide=wide, distance_unit=unit), entries
+    entries |= {"each": (form.each, "")} if form.each else {}
+    return replace(form, line=line), entries
 
 
 _DEVICE: Final = r"(an|anchor|anker|a|node|beacon|bs|responder|target|to|device|dev|uwb|id|ch)"
@@ -91,11 +244,10 @@ _REGISTERS: Final = {
 
 def register_columns(names: Sequence[str]) -> dict[str, dict[str, str]]:
     """Return the powers that can be made of registers, as their values in a map, by "fpp" and "rxp"."""
-    plain = {name: plain_name(name) for name in names}
     found = {
         key: header
         for key, pattern in _REGISTERS.items()
-        if (header := next((name for name, one in plain.items() if re.fullmatch(pattern, one)), None))
+        if (header := next((name for name in names if re.fullmatch(pattern, plain_name(name))), None))
     }
     wanted = {"fpp": ("f1", "f2", "f3", "n"), "rxp": ("c", "n")}
     powers = {ours: {key: found[key] for key in keys} for ours, keys in wanted.items() if set(keys) <= found.keys()}
@@ -122,3 +274,64 @@ def name_template(name: str, lacking: Collection[str]) -> str | None:
             text = f"{text[:start]}{{{place.format(match.groupdict().get('unit'))}}}{text[end:]}"
             found.add(ours)
     return text if found else None
+
+
+def units_of(form: ColumnMap, columns: dict[str, str], cells: dict[str, Floats]) -> Entries:
+    """Return the units of times, distances and powers, each with its reason, as far as they are not the default."""
+    found: Entries = {}
+    if "time_s" in columns:
+        found["time"] = _time_unit(columns["time_s"], cells["time_s"])
+        if found["time"][0] == ASKED and form.time_unit:
+            found["time"] = form.time_unit, "as times in bags"
+    named = {name: _header(form, name, columns[name]) for name in DISTANCES if name in columns}
+    units = {
+        name: unit
+        for name, header in named.items()
+        if (unit := unit_in(header, RANGE_UNITS if name == "range_m" else DISTANCE_UNITS))
+    }
+    alike = set(units.values())
+    if form.line and form.distance_unit:
+        found["distance"] = form.distance_unit, "as these boards print"
+    elif len(alike) == 1 and not alike & FLIGHT_UNITS.keys() and ("range_m" in units or "range_m" not in cells):
+        found["distance"] = next(iter(units.values())), "by the columns' names"
+        units = {}
+    elif "range_m" in cells and "range_m" not in units and (why := reason_against_metres(cells["range_m"])):
+        found["distance"] = ASKED, f"{why}: write {', '.join(DISTANCE_UNITS)}"
+    found |= {name: (unit, "by the column's name") for name, unit in units.items()}
+    if "range_m" in named and "range_m" not in units and re.search("tof|flight", named["range_m"].lower()):
+        found["range_m"] = ASKED, f"a time of flight: write {', '.join(FLIGHT_UNITS)}"
+    if why := next(filter(None, (reason_against_dbm(cells[name]) for name in POWERS if name in cells)), ""):
+        found["power"] = ASKED, f"{why}: write -dBm if they lack their sign"
+    return found
+
+
+def _header(form: ColumnMap, name: str, header: str) -> str:
+    """Return the name of a column in the file; that of a family is its template."""
+    stated = form.wide.get(name)
+    return re.sub(r"[_ ]*\{\w+\}", "", stated) if isinstance(stated, str) else header
+
+
+def _time_unit(header: str, values: Floats) -> tuple[str, str]:
+    if not np.isfinite(values).any():
+        return "iso", "no numbers"
+    if ended := unit_in(header, ("ns", "us", "ms", "s")):
+        return ended, "by the column's name"
+    largest = float(np.nanmax(np.abs(values)))
+    for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)):
+        if largest > least:
+            return unit, f"{largest:.3g} would be no date in seconds"
+    if len(values) < MIN_ROWS or not np.array_equal(values, np.rint(values), equal_nan=True):
+        return "s", f"numbers up to {largest:.6g}"
+    return ASKED, f"whole numbers up to {largest:.6g}, unit unknown: write {', '.join(TIME_UNITS)}"
+
+
+def units_in(columns: dict[str, str], names: Iterable[str], units: Iterable[str]) -> set[str]:
+    """Return the units at the ends of the headers of some columns."""
+    return {unit for name in names if name in columns and (unit := unit_in(columns[name], units))}
+
+
+def unit_in(header: str, units: Iterable[str]) -> str | None:
+    """Return the unit at the end of a name such as `range_mm` or `time [ns]`, None without one."""
+    last = re.split(r"[^a-z0-9]+", header.lower().strip(")] "))[-1]
+    last = {"tick": "ticks", "dtu": "ticks", "sec": "s"}.get(last, last)
+    return last if last in units and last != header.lower() else None

@@ -1,57 +1,69 @@
-"""Propose a map for a table or a log, with the reason for each line.
+"""Propose a map for a table, a log or a bag, with the reason for each line.
 
 The form of the file is recognised first (`forms`), then its columns by their names, or else by their contents. Units
 are determined from suffixes of the names, from the size of the numbers, and by which unit of the stamps makes plausible
 ranges; the protocol is found by trying all.
+
+Topics of a bag of one message type that differ by one or two numbers or words, such as `/uwb/1/range_2` and
+`/uwb/1/range_3`, are a template; what differs is the id of an initiator or a target. Which it is, the words before it
+tell, and which of both the messages have themselves. Their first messages are a table.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
 
 from uwblink.arrays import Floats
-from uwblink.errors import ImportTableError
-from uwblink.importers.bags import is_bag
+from uwblink.display import first_few
+from uwblink.errors import ImportTableError, raising
+from uwblink.importers.bags import Bag, fields_of, is_bag, matching_topics, open_bag
 from uwblink.importers.column_map import (
     ASKED,
     DISTANCE_UNITS,
-    DISTANCES,
-    FLIGHT_UNITS,
     IDS,
+    JSON_LINE,
     NAMES,
     POSITIONS,
     POWERS,
-    RANGE_UNITS,
     STAMP_UNITS,
-    TIME_UNITS,
     ColumnMap,
 )
-from uwblink.importers.column_names import OF_MESSAGES, WORDS, named_columns, plain_name
 from uwblink.importers.exchange_tables import tables_in
-from uwblink.importers.forms import Entries, form_of, name_template, register_columns, wide_columns
-from uwblink.importers.guess_bags import guess_bag
+from uwblink.importers.forms import (
+    OF_MESSAGES,
+    WORDS,
+    Entries,
+    form_of,
+    name_template,
+    named_columns,
+    plain_name,
+    register_columns,
+    unit_in,
+    units_in,
+    units_of,
+    wide_columns,
+)
 from uwblink.importers.plausibility import (
     ACCEPTED_SHARE,
     FITTING_SHARE,
-    MIN_ROWS,
     SAMPLE_ROWS,
     Reading,
     counter_format,
-    reason_against_dbm,
-    reason_against_metres,
     sentinels,
     stamps_of,
     truth_m,
     try_reading,
 )
+from uwblink.importers.poses import pose_topics
 from uwblink.importers.tables import Columns, SourceTable, message_number, open_table
 from uwblink.importers.templates import Template, places
 from uwblink.protocols.table import PROTOCOLS
@@ -97,10 +109,34 @@ def _is_event(table: SourceTable, name: str) -> bool:
     return sending + receiving > 0.9 and 0.25 < sending < 0.75
 
 
-_OF_EXCHANGES: Final = (*STAMPS, "fpp1", "fpp2", "rxp1", "rxp2", "skew1", "skew2")
+def _receptions(short: Mapping[str, str], each: str, found: Mapping[str, str]) -> dict[str, str]:
+    """Return further columns of broadcasts whose senders list what they heard before; none for other tables.
+
+    `short` are the columns by their names, those of the elements of the list `each` by their own.
+    """
+    if found.get("tx", f"{each}.").startswith(f"{each}."):
+        return {}
+    number, stamp = r"(.*_)?(sn|seq|sequence|number|nr|no)", r"(.*_)?(ts|rx|stamp|timestamp|ticks?)"
+    inner = {name: plain_name(name) for name, header in short.items() if header.startswith(f"{each}.")}
+    outer = {name: plain_name(name) for name in short if name not in inner}
+    wanted = {"sequence": (number, outer), "heard": (number, inner), "rx": (stamp, inner)}
+    columns = {
+        ours: short[name]
+        for ours, (pattern, names) in wanted.items()
+        if (name := next((n for n, plain in names.items() if re.fullmatch(pattern, plain)), None))
+    }
+    return columns if columns.keys() == wanted.keys() else {}
+
+
+_OF_EXCHANGES: Final = (*STAMPS, "fpp1", "fpp2", "rxp1", "rxp2", "skew1", "skew2", "sts1", "sts2")
 
 _LAYOUTS: Final = {
     "exchanges": (STAMPS[:4], OF_MESSAGES, "a row has the stamps of a whole exchange"),
+    "broadcasts": (
+        ("tx", "rx", "sequence", "heard"),
+        (*_OF_EXCHANGES, "fpp", "rxp", "skew", "sts"),
+        "broadcasts have lists of what their senders heard",
+    ),
     "messages": (("tx", "rx"), _OF_EXCHANGES, "a row has one stamp of a sender and one of a receiver"),
     "stamps": (("message",), _OF_EXCHANGES, "a row has one stamp, and says whether it is of sending or of receiving"),
     "ranges": (("range_m",), (*OF_MESSAGES, *STAMPS), "there are ranges and no stamps"),
@@ -130,9 +166,8 @@ def guess_map(path: Path) -> Guess:
     """Return the proposed map of a table, a log, a folder of them, or a bag; raises `ImportTableError`."""
     if path.suffix.lower() == ".uwb":
         raise ImportTableError(f"{path}: is a recording already and needs no map; 'uwblink show' prints its contents")
-    if is_bag(path):
-        return guess_bag(path, _of_table)
-    return _of_table(path, tables_in(path, ColumnMap(line="{*}"))[0] if path.is_dir() else path)
+    file = tables_in(path, ColumnMap(line="{*}"))[0] if path.is_dir() and not is_bag(path) else path
+    return _of_bag(path) if is_bag(path) else _of_table(path, file)
 
 
 def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Mapping[str, str] = {}) -> Guess:
@@ -145,9 +180,10 @@ def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Map
     with open_table(file, form) as table:
         if form.headerless:
             return _numbered(path, table)
-        columns = {} if form.line else with_stamp_and_event(table, named_columns(table.names))
+        is_log = form.line not in (None, JSON_LINE)
+        columns = {} if is_log else with_stamp_and_event(table, named_columns(table.names))
         wide = form.wide or wide_columns(table.names, columns)
-        if each := None if form.line or wide or "range_m" in columns else next(iter(table.lists), None):
+        if each := None if is_log or wide or "range_m" in columns else next(iter(table.lists), None):
             top["each"] = each, "a line has a list of them"
     given = {*given, *(n for text in (form.line, form.each) if text for n in places(Template(text)) if n in NAMES)}
     given |= {"to_id", *wide} if wide else set()
@@ -160,6 +196,7 @@ def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Map
     for ours, letters in (("to_id", ("id", "A", "a", "addr")), ("range_m", ("R", "r", "D", "d"))) if form.each else ():
         if ours not in found and (letter := next((name for name in letters if name in short), None)):
             found[ours] = short[letter]
+    found |= _receptions(short, form.each, found) if form.each else {}
     columns = {name: name for name in given}
     columns |= {
         ours: header
@@ -210,14 +247,14 @@ def _proposal(
         missing |= sentinels(cells[name]) if name in cells else {}
         cells |= {name: np.where(np.isin(cells[name], list(missing)), np.nan, cells[name])} if name in cells else {}
     words = {name for name, column in cells.items() if not np.isfinite(column).any()}
-    fitting = (one for one in ("exchanges", "messages", "ranges") if all(name in cells for name in _LAYOUTS[one][0]))
-    layout = "stamps" if "event" in columns else next(fitting, "nothing")
+    known = (one for one, (needed, *_) in _LAYOUTS.items() if one != "stamps" and {*needed} <= cells.keys())
+    layout = "stamps" if "event" in columns else next(known)
     needed, foreign, why = _LAYOUTS[layout]
     if layout == "messages" and "message" in words and columns["message"] != "message":
         del columns["message"], cells["message"]  # without a column of that name messages are told by their order
     top |= {} if layout == "nothing" else {"layout": (layout, why)}
-    units, undelayed = _units(form, columns, cells), False
-    if layout in ("exchanges", "messages", "stamps"):
+    units, undelayed = units_of(form, columns, cells), False
+    if layout not in ("ranges", "nothing"):
         counter, unit, undelayed = (_exchange_stamps if layout == "exchanges" else _message_stamps)(columns, cells)
         top, units = top | counter, {"stamps": unit, **units}
     if missing:
@@ -266,13 +303,18 @@ def _proposal(
     wide: Entries = {ours: (stated, "") for ours, stated in form.wide.items()}
     sections = {"columns": named, "wide": wide, "units": units, "constants": constants}
     sections |= {"antenna_delays": none if undelayed else {}}
-    # Names of files can have line breaks, which would end the comment.
-    lines = [f"# {json.dumps(path.name)}, as it would be read; every line can be changed", *_lines(top)]
-    for title, entries in sections.items():
-        lines += ["", f"[{title}]", *_lines(entries)] if entries else []
-    lines += ["", *(f"# {text}" for text, is_due in remarks.items() if is_due)]
     asked = [key for part in (constants, top, named, units) for key, (value, _) in part.items() if value == ASKED]
-    return Guess("\n".join(lines) + "\n", layout != "nothing" and not lacking, tuple(asked), tuple(columns))
+    text = _text(path, {"": top, **sections}, [text for text, is_due in remarks.items() if is_due])
+    return Guess(text, layout != "nothing" and not lacking, tuple(asked), tuple(columns))
+
+
+def _text(path: Path, sections: Mapping[str, Entries], remarks: Iterable[str]) -> str:
+    """Return a map as TOML, a section without a title first, and remarks below it."""
+    # Names of files can have line breaks, which would end the comment.
+    lines = [f"# {json.dumps(path.name)}, as it would be read; every line can be changed"]
+    for title, entries in sections.items():
+        lines += [*(["", f"[{title}]"] if title else []), *_lines(entries)] if entries else []
+    return "\n".join([*lines, "", *(f"# {text}" for text in remarks), ""])
 
 
 def _alike(header: str, names: Sequence[str]) -> list[str]:
@@ -302,21 +344,20 @@ _ANY_UNIT: Final = f"unit unknown: write {', '.join(STAMP_UNITS)}"
 def _message_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> StampEntries:
     """Return how to read the stamps of a table of messages or of single stamps."""
     stamps: dict[str, Floats] = {name: cells[name] for name in ("tx", "rx", "stamp") if name in cells}
-    named = next(iter(_ended(columns, stamps, STAMP_UNITS)), None)
+    named = next(iter(units_in(columns, stamps, STAMP_UNITS)), None)
     bits, kind = counter_format(column * STAMP_UNITS[named or "ticks"] for column in stamps.values())
     largest = max(float(np.nanmax(column, initial=0.0)) for column in stamps.values())
     # Of 22 stamps in ticks one at least is in the last tenth of the counter in nine tables of ten.
     full = _are_whole(stamps) and 0.9 * 2.0**bits < largest < 2.0**bits
     counter: Entries = {"bits": (bits, ""), "counter": (kind, "")}
-    if named:
-        return counter, (named, "by the columns' names"), False
-    return counter, ("ticks", f"whole numbers up to 2^{bits}") if full else (ASKED, _ANY_UNIT), False
+    unit = ("ticks", f"whole numbers up to 2^{bits}") if full else (ASKED, _ANY_UNIT)
+    return counter, (named, "by the columns' names") if named else unit, False
 
 
 def _exchange_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> StampEntries:
     """Return how to read the stamps of a table of exchanges: by which protocol and unit their ranges are plausible."""
     stamps: dict[str, Floats] = {name: cells[name] for name in STAMPS if name in cells}
-    whole, named = _are_whole(stamps), _ended(columns, stamps, STAMP_UNITS)
+    whole, named = _are_whole(stamps), units_in(columns, stamps, STAMP_UNITS)
     chosen = np.flatnonzero(np.all([np.isfinite(column) for column in stamps.values()], axis=0))[:SAMPLE_ROWS]
     if not len(chosen):
         raise ImportTableError("its stamps are no numbers in any row")
@@ -324,7 +365,7 @@ def _exchange_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> Stamp
     rows |= dict.fromkeys(("origin", *IDS), np.zeros(len(chosen), np.int64))
     if "gt_range_m" in cells:
         rows["gt_range_m"] = (
-            cells["gt_range_m"][chosen] * DISTANCE_UNITS[_suffix(columns["gt_range_m"], DISTANCE_UNITS) or "m"]
+            cells["gt_range_m"][chosen] * DISTANCE_UNITS[unit_in(columns["gt_range_m"], DISTANCE_UNITS) or "m"]
         )
     protocols = [row.name for row in PROTOCOLS.known() if set(stamps_of(row.name)) == set(stamps)]
     protocols = [name for name in protocols if name not in ("ss-cfo", "ds-sym")] or ["ss"]
@@ -353,62 +394,141 @@ def _are_whole(stamps: dict[str, Floats]) -> bool:
     return all(np.array_equal(column, np.rint(column), equal_nan=True) for column in stamps.values())
 
 
-def _units(form: ColumnMap, columns: dict[str, str], cells: dict[str, Floats]) -> Entries:
-    """Return the units of times, distances and powers, each with its reason, as far as they are not the default."""
-    found: Entries = {}
-    if "time_s" in columns:
-        found["time"] = _time_unit(columns["time_s"], cells["time_s"])
-        if found["time"][0] == ASKED and form.time_unit:
-            found["time"] = form.time_unit, "as times in bags"
-    named = {name: _header(form, name, columns[name]) for name in DISTANCES if name in columns}
-    units = {
-        name: unit
-        for name, header in named.items()
-        if (unit := _suffix(header, RANGE_UNITS if name == "range_m" else DISTANCE_UNITS))
-    }
-    alike = set(units.values())
-    if form.line and form.distance_unit:
-        found["distance"] = form.distance_unit, "as these boards print"
-    elif len(alike) == 1 and not alike & FLIGHT_UNITS.keys() and ("range_m" in units or "range_m" not in cells):
-        found["distance"] = next(iter(units.values())), "by the columns' names"
-        units = {}
-    elif "range_m" in cells and "range_m" not in units and (why := reason_against_metres(cells["range_m"])):
-        found["distance"] = ASKED, f"{why}: write {', '.join(DISTANCE_UNITS)}"
-    found |= {name: (unit, "by the column's name") for name, unit in units.items()}
-    if "range_m" in named and "range_m" not in units and re.search("tof|flight", named["range_m"].lower()):
-        found["range_m"] = ASKED, f"a time of flight: write {', '.join(FLIGHT_UNITS)}"
-    if why := next(filter(None, (reason_against_dbm(cells[name]) for name in POWERS if name in cells)), ""):
-        found["power"] = ASKED, f"{why}: write -dBm if they lack their sign"
-    return found
+NO_POSES: Final = (
+    "no poses and no true distances: ranges alone give delays of boards that stood still (`calib survey`); a flight "
+    "also needs attitudes, and anchors or first positions (calib.fit_from_ranges); constants of pairs need true "
+    "distances (docs/without-motion-capture.md)"
+)
+MESSAGES_READ: Final = 2000
+"""Messages of each group of topics that are looked at (a judgement)."""
+
+_NUMBERS: Final = r"std_msgs/msg/(Float|U?Int)[0-9]+(MultiArray)?"
+_OTHERS: Final = (
+    r"^((geometry|nav|tf2|rosgraph|diagnostic|visualization|actionlib)_msgs|rcl_interfaces)/|"
+    r"^sensor_msgs/msg/(?!Range )|"
+    rf"^{_NUMBERS} (?!.*(uwb|rang(e|ing)|dist|dwm?[0-9]|twr))|"
+    r" .*(height|altitude|lidar|laser|sonar|sonic|infrared|rangefinder|distance_sensor)"
+)
+"""Types and topics, with a blank between, that are of other things, and of numbers that are not called ranges."""
+
+_WORD: Final = "([^/_]+)"
+_WORDS: Final = {
+    "from_id": r"tag|drone|uav|robot|rover|mobile|initiator|agent|from|src|source",
+    "to_id": r"anchor|anker|target|responder|beacon|dst",
+}
 
 
-def _header(form: ColumnMap, name: str, header: str) -> str:
-    """Return the name of a column in the file; that of a family is its template."""
-    stated = form.wide.get(name)
-    return re.sub(r"[_ ]*\{\w+\}", "", stated) if isinstance(stated, str) else header
+def _of_bag(path: Path) -> Guess:
+    """Return the map of the topics of which most is recognised: stamps and powers, then ids.
+
+    Raises `ImportTableError` for a bag without ranges.
+    """
+    found: list[tuple[Guess, list[str]]] = []
+    why = "write a map with [topics]"
+    with open_bag(path) as bag, TemporaryDirectory(prefix="uwblink-") as folder:
+        kinds = dict(sorted(bag.kinds.items()))
+        fitting = [t for t, k in kinds.items() if not re.search(_OTHERS, f"{k} {t.lower()}")]
+        for kind in dict.fromkeys(kinds[topic] for topic in fitting):
+            for pattern, some in _grouped([topic for topic in fitting if kinds[topic] == kind]):
+                try:
+                    guess = _guess_topics(bag, pattern, some, Path(folder) / "messages.jsonl")
+                    found += [(guess, some)] if guess.complete else []
+                except ImportTableError as error:
+                    # Most topics are of something else; only a type without definition may hide ranges.
+                    why = str(error) if "has no definition" in str(error) else why
+    listed = [f"{json.dumps(topic)} ({kind})" for topic, kind in kinds.items()]
+    if not found:
+        raise ImportTableError(f"{path}: no topic with ranges was recognised in {first_few(listed, 20)}; {why}")
+    best, chosen = max(
+        found, key=lambda one: (len({*STAMPS, *POWERS} & {*one[0].columns}), -len(one[0].asked), len(one[0].columns))
+    )
+    poses = pose_topics(path)
+    advice = "" if poses or {"gt_range_m", *POSITIONS} & {*best.columns} else NO_POSES
+    others = [json.dumps(topic) for _, some in found if some is not chosen for topic in some]
+    remarks = ["topics of the bag:", *(f"  {one}" for one in listed)]
+    remarks += [f"also with ranges, for maps of their own: {', '.join(others)}"] if others else []
+    remarks += [f"poses, for `uwblink poses`: {first_few(map(json.dumps, poses))}"] if poses else []
+    text = best.text + "".join(f"# {line}\n" for line in (*remarks, advice) if line)
+    return replace(best, text=text, importer="bag", pose_topics=tuple(poses), advice=advice)
 
 
-def _time_unit(header: str, values: Floats) -> tuple[str, str]:
-    if not np.isfinite(values).any():
-        return "iso", "no numbers"
-    if ended := _suffix(header, ("ns", "us", "ms", "s")):
-        return ended, "by the column's name"
-    largest = float(np.nanmax(np.abs(values)))
-    for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)):
-        if largest > least:
-            return unit, f"{largest:.3g} would be no date in seconds"
-    if len(values) < MIN_ROWS or not np.array_equal(values, np.rint(values), equal_nan=True):
-        return "s", f"numbers up to {largest:.6g}"
-    return ASKED, f"whole numbers up to {largest:.6g}, unit unknown: write {', '.join(TIME_UNITS)}"
+def _guess_topics(bag: Bag, pattern: str, topics: list[str], table: Path) -> Guess:
+    """Return the map of topics of one type by their first messages, which are written as a table."""
+    kind, read = bag.kinds[topics[0]], islice(bag.messages(topics), MESSAGES_READ)
+    rows = [(topic, fields_of(kind, message)) for topic, _, _, message in read]
+    free = _ends_without_field(rows[0][1] if rows else {})
+    key = _with_places(pattern, topics[0], free)
+    ids = matching_topics(key, topics)
+    # One id may be in the names of all topics.
+    whole = name_template(topics[0], set(free) - ids[topics[0]].keys()) or topics[0]
+    constants = matching_topics(whole, topics[:1]).get(topics[0], {})
+    ids = {topic: {**places, **constants} for topic, places in ids.items()}
+    # A template that also matches topics of other types is no key.
+    stated = {key: constants} if len(matching_topics(key, bag.kinds)) == len(topics) else ids
+    with raising(ImportTableError, f"{bag.path}: cannot be turned into a table", OSError, RecursionError):
+        lines = (json.dumps(_unstamped(row) | ids[topic], allow_nan=False) for topic, row in rows)
+        table.write_text("".join(f"{line}\n" for line in lines), "utf-8")
+    guess = _of_table(bag.path, table, ids[topics[0]], {"data": "range"} if re.fullmatch(_NUMBERS, kind) else {})
+    sections = [
+        "\n".join([f"[topics.{json.dumps(topic)}]", *(f"{name} = {json.dumps(v)}" for name, v in values.items()), ""])
+        for topic, values in stated.items()
+    ]
+    return replace(guess, text=f"{guess.text}\n# {len(topics)} topics of {kind}\n{''.join(sections)}\n")
 
 
-def _ended(columns: dict[str, str], names: Iterable[str], units: Iterable[str]) -> set[str]:
-    """Return the units at the ends of the headers of some columns."""
-    return {unit for name in names if name in columns and (unit := _suffix(columns[name], units))}
+def _unstamped(row: dict[str, Any]) -> dict[str, Any]:
+    """Return a message without the stamp of its header, which is its time without a map."""
+    header = row.get("header")
+    return row | {"header": {**header, "stamp": {}}} if isinstance(header, dict) else row
 
 
-def _suffix(header: str, units: Iterable[str]) -> str | None:
-    """Return the unit at the end of a name such as `range_mm` or `time [ns]`, None without one."""
-    last = re.split(r"[^a-z0-9]+", header.lower().strip(")] "))[-1]
-    last = {"tick": "ticks", "dtu": "ticks", "sec": "s"}.get(last, last)
-    return last if last in units and last != header.lower() else None
+def _grouped(topics: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
+    """Yield topics that differ by one or two numbers, or else words, and a format of their names; then the others."""
+    braces, left = ([topic for topic in topics if ("{" in topic) == has] for has in (True, False))
+    for value in (r"([0-9]+)", _WORD):
+        alike: dict[tuple[str, ...], list[str]] = {}
+        for topic in left:
+            alike.setdefault(tuple(re.split(value, topic)[::2]), []).append(topic)
+        for literals, some in alike.items():
+            columns = [set(column) for column in zip(*(re.findall(value, topic) for topic in some), strict=True)]
+            varying = [k for k, column in enumerate(columns) if len(column) > 1]
+            both, words = [columns[k] for k in varying], {re.split("[^A-Za-z]", literals[k])[-1] for k in varying}
+            # Number 1 of a tag is not number 1 of an anchor; among pairs of words some have a word in common.
+            mixed = len(words) > 1 and both[0] & both[-1]
+            apart = len(both) == 2 and value == _WORD and all(len(column) == len(some) for column in both)
+            if not 1 <= len(varying) <= 2 or mixed or apart:
+                continue
+            parts = re.split(value, some[0])
+            for n, k in enumerate(varying):
+                parts[2 * k + 1] = f"{{{n}}}"
+            left = [topic for topic in left if topic not in some]
+            yield "".join(parts), some
+    yield from ((topic, [topic]) for topic in (*left, *braces))
+
+
+def _ends_without_field(row: Mapping[str, Any]) -> list[str]:
+    """Return which of the two ids a message does not have itself; lists and arrays have a target in each element."""
+    lists = [value for value in row.values() if isinstance(value, list)]
+    elements = [one for value in lists for one in value[:1] if isinstance(one, dict)]
+    named = {*named_columns(row), *(name for one in elements for name in named_columns(one))}
+    arrays = [f"{name}.{k}" for name, value in row.items() if isinstance(value, dict) for k in value]
+    if wide_columns(arrays, {}) or any({"id", "A", "a", "addr"} & one.keys() for one in elements):
+        named.add("to_id")
+    return [end for end in IDS if end not in named]
+
+
+def _with_places(pattern: str, topic: str, free: Sequence[str]) -> str:
+    """Return the template of topics, whose places are ids in `free`; `topic` is one of them."""
+    parts = re.split(r"\{[01]\}", pattern)
+    values = re.fullmatch("([^/]+?)".join(map(re.escape, parts)), topic)
+    if len(parts) == 1 or values is None:
+        return topic
+    contexts = [part.rstrip("/").split("/")[-1] + value for part, value in zip(parts, values.groups(), strict=False)]
+    ends = [next((end for end in IDS if re.search(_WORDS[end], text.lower())), "") for text in contexts]
+    if len(ends) == 2:
+        ends = list(IDS)[::-1] if ends[0] == "to_id" or ends[1] == "from_id" else list(IDS)
+    elif ends[0] not in free:
+        ends = list(free[-1:])
+    if len(free) == 1:  # number 1 of a tag is not number 1 of the anchors in the messages
+        pattern = re.sub(r"[A-Za-z]+\{", "{", pattern)
+    return pattern.format(*(f"{{{end if end in free else '_'}}}" for end in [*ends, "_"]))

@@ -40,13 +40,11 @@ _IDS: Final = (*_PAIR, "listener", "board")
 
 @dataclass(slots=True)
 class FlightFolder:
-    """A folder, its robots' folders, the number of duplicate rows by file, and faults.
-
-    Times are nanoseconds on the clock of the folder.
-    """
+    """A folder, its robots' folders, when its clock began, the number of duplicate rows by file, and faults."""
 
     folder: Path
     robots: tuple[Path, ...]
+    start_ns: int
     doubled: dict[str, int] = field(default_factory=dict)
     faults: list[Fault] = field(default_factory=list)
 
@@ -62,10 +60,10 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
         raise ImportTableError(
             f"{folder}: no such folder; expected one with a folder a robot (ifo001/uwb_range.csv ...)"
         )
-    flight = FlightFolder(folder, tuple(sorted(path.parent for path in folder.glob("*/uwb_range.csv"))))
+    start_ns = _read_yaml(folder / "timeshift.yaml", _start_ns, "whole numbers timeshift_s and timeshift_ns", 0)
+    flight = FlightFolder(folder, tuple(sorted(path.parent for path in folder.glob("*/uwb_range.csv"))), start_ns)
     if not flight.robots:
         raise ImportTableError(f"{folder}: no folder in it holds uwb_range.csv, as those of MILUV's robots do")
-    start_ns = _read_yaml(folder / "timeshift.yaml", _start_ns, "whole numbers timeshift_s and timeshift_ns", 0)
     exchanges, measured_m = _read_exchanges(flight)
     poses, tags = _read_poses(flight), _read_tags(flight)
     constellation, off_m, places = _find_anchors(flight, exchanges, measured_m, poses, tags, wanted)
@@ -80,18 +78,15 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
     sensed = {f"w{axis}": f"angular_velocity.{axis}" for axis in "xyz"}
     sensed |= {f"a{axis}": f"linear_acceleration.{axis}" for axis in "xyz"}
     imu, height = _read(flight, "imu_px4.csv", sensed), _read(flight, "height.csv", {"height_m": "range"})
-    for columns in (heard, cirs, imu, height):
-        if columns:
-            columns["time_ns"] += start_ns
     return Contents(
-        exchanges=replace(exchanges, truth_m=truth_m, time_ns=exchanges.time_ns + start_ns),
+        exchanges=replace(exchanges, truth_m=truth_m),
         tags=sorted(tags, key=lambda tag: tag.tag),
-        poses=replace(poses, time_ns=poses.time_ns + start_ns),
+        poses=poses,
         overheard=heard,
         cirs=_cir_rows(cirs),
         imu=imu,
         height=height,
-        faults=[replace(fault, time_ns=fault.time_ns + start_ns) for fault in flight.faults],
+        faults=flight.faults,
         meta=_meta(flight, start_ns, constellation, off_m),
     )
 
@@ -147,7 +142,12 @@ def _read(
             found = table.read({n: _cell(n, table.text(header)) for n, header in there.items()})
         bad = np.any([np.ma.getmaskarray(found[n]) for n in headers], axis=0)
         flight.faults += [
-            Fault(0, name, "unusable row", f"{robot.name}/{name}: row {row + 2}: a number is missing or none")
+            Fault(
+                flight.start_ns,
+                name,
+                "unusable row",
+                f"{robot.name}/{name}: row {row + 2}: a number is missing or none",
+            )
             for row in np.flatnonzero(bad).tolist()
         ]
         columns = {n: np.full(len(bad), np.nan) for n in optional} | {"body": np.full(len(bad), robot.name)}
@@ -157,11 +157,11 @@ def _read(
     if not sum(len(part["time_ns"]) for part in parts):
         return {}
     joined = {n: np.concatenate([part[n] for part in parts]) for n in parts[0]}
+    joined["time_ns"] += flight.start_ns
     order = np.argsort(joined["time_ns"], kind="stable")
     if ids:
         key = ["time_ns", *ids, *(n for n in ("tx1", "rx1") if n in joined)]
-        rows = np.column_stack([joined[n][order] for n in key])
-        first = np.sort(np.unique(rows, axis=0, return_index=True)[1])
+        first = np.sort(np.unique(np.column_stack([joined[n][order] for n in key]), axis=0, return_index=True)[1])
         flight.doubled[name] = len(order) - len(first)
         order = order[first]
     return {n: column[order] for n, column in joined.items()}

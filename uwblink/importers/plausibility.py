@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
-from uwblink.importers.chips import CHIPS
 from uwblink.importers.column_map import DISTANCE_UNITS, IDS, POSITIONS, POWERS, RANGE_UNITS, ColumnMap
+from uwblink.importers.devices import CHIPS
 from uwblink.importers.tables import Columns
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import REGISTER_MAX, AntennaDelay, delay_of
@@ -67,8 +67,7 @@ def to_ticks(
     def whole(values: NDArray[Any]) -> Ints:
         if ticks_per_unit == 1.0 and values.dtype == np.int64:
             return values
-        ticks = np.clip(np.nan_to_num(values * ticks_per_unit), -(2.0**62), 2.0**62)
-        return np.rint(ticks).astype(np.int64)
+        return np.rint(np.clip(np.nan_to_num(values * ticks_per_unit), -(2.0**62), 2.0**62)).astype(np.int64)
 
     found: dict[str, Ints] = {}
     for first, *others in by_clock:
@@ -282,8 +281,7 @@ def _remaining(errors_m: Floats) -> float:
     if len(finite) < MIN_ROWS:
         return float("nan")
     longest = REGISTER_MAX * METRES_PER_TICK  # the registers of both ends at their maximum
-    constant = np.clip(np.median(finite), -longest, longest)
-    return float(np.median(np.abs(finite - constant)))
+    return float(np.median(np.abs(finite - np.clip(np.median(finite), -longest, longest))))
 
 
 def sentinels(ranges: Floats) -> dict[float, float]:

@@ -1,28 +1,40 @@
-"""Motion-capture poses from text files (`pose_files`) and from bags of ROS 1, ROS 2 and MCAP (`uwbcal[bags]`)."""
+"""Motion-capture poses from text files and from bags of ROS 1, ROS 2 and MCAP (`uwbcal[bags]`), added to recordings.
+
+The own CSV has the columns `time_s` (or `time_ns`), `body`, `x, y, z` (metres) and `qx, qy, qz, qw` (body to world).
+TUM has `time x y z qx qy qz qw` separated by blanks, and EuRoC `time_ns, x, y, z, qw, qx, qy, qz, ...` below a line
+that begins with `#timestamp`, one body a file. Motive (OptiTrack), Vicon and Qualisys (6D) export a column for each
+number of each body, below several lines of header: quaternions or Euler angles; rotation vectors or quaternions; and
+rotation matrices, column by column. Their times begin with the take.
+"""
 
 from __future__ import annotations
 
+import csv
 import math
+import re
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
 from decimal import Decimal
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError, RecordingExistsError, raising
 from uwblink.importers.bags import open_bag
-from uwblink.importers.column_map import ColumnMap, load_map
+from uwblink.importers.column_map import DISTANCE_UNITS, TIME_UNITS, ColumnMap, load_map
+from uwblink.importers.forms import plain_name
 from uwblink.importers.plausibility import other_unit
-from uwblink.importers.pose_files import read_text_poses
 from uwblink.importers.tables import reading
 from uwblink.recording.distances import distances_m, find_offset
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Poses, Tag, load_places
+from uwblink.recording.schema import POSE, Poses, Tag, load_places
 from uwblink.text_files import require_regular
 from uwblink.twr import LATEST_NS, Exchanges, names_in, raw_range
 
@@ -72,8 +84,7 @@ def _read(path: Path, body: str | None, topics: Mapping[str, str] | None, stated
         raise ImportTableError(f"{path}: has no topics; only bags have")
     else:
         with reading(path), path.open(encoding="utf-8-sig", newline="") as file:
-            times, bodies, values, turned = read_text_poses(path, file, body, stated)
-        poses = _poses(path, times, bodies, values)
+            poses, turned = _from_text(path, file, body, stated)
     if not len(poses):
         raise ImportTableError(f"{path}: holds no poses")
     return poses, turned
@@ -277,3 +288,258 @@ def _apart(exchanges_ns: np.ndarray, poses_ns: np.ndarray) -> str:
     early_s = (int(exchanges_ns.min()) - int(poses_ns.max())) * 1e-9
     late_s = (int(poses_ns.min()) - int(exchanges_ns.max())) * 1e-9
     return f"{early_s:.1f} s before they begin" if early_s > 0 else f"and begin {late_s:.1f} s after they end"
+
+
+Lines = list[list[str]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseLayout:
+    """Where a form has its poses; columns are numbers from 0.
+
+    `bodies` are the columns of position and attitude by body, with the name "" if a column says the body. `header` is
+    the number of lines before the first pose. Poses of programs that lose sight of a body have `gaps`. `euler` is the
+    order of attitudes that are Euler angles about the body's own axes, such as "XYZ".
+    """
+
+    form: str
+    names: Sequence[str]
+    time: int
+    ns: float
+    bodies: Mapping[str, Sequence[int]]
+    header: int = 0
+    metres: float = 1.0
+    radians: float = 1.0
+    euler: str = ""
+    gaps: bool = True
+    body: int | None = None
+    comments: bool = False
+    iso: bool = False
+
+
+def _from_text(path: Path, file: TextIO, body: str | None, stated: ColumnMap) -> tuple[Poses, bool]:
+    """Return the poses of a text file, and whether it has attitudes; without them no body is turned.
+
+    Quaternions need not have length one. `body` names that of a file which does not; `stated` names the columns of a
+    CSV file, and the units of its times and positions. Raises `ImportTableError`.
+    """
+    first = file.readline()
+    lines = chain([first], file)
+    mark = max(",;\t", key=first.count)
+    blanks = path.suffix.lower() not in (".csv", ".tsv")
+    split: Iterator[list[str]] = (line.split() for line in lines) if blanks else csv.reader(lines, delimiter=mark)
+    head = list(islice(split, 40))
+    word = head[0][0].strip() if head and head[0] else ""
+    if blanks or word.lower().startswith("#timestamp"):
+        layout = _single(path, *(_TUM if blanks else _EUROC), body)
+    else:
+        layout = _FORMS[word](path, [*head, [], []]) if word in _FORMS else _plain(path, head, body, stated)
+    times, bodies, values = array("q"), list[str](), array("d")
+    for row, cells in enumerate(chain(head[layout.header :], split), start=1 + layout.header):
+        if not cells or (layout.comments and cells[0].startswith("#")):
+            continue
+        if (len(cells) < len(layout.names) and not layout.gaps) or (len(cells) > len(layout.names) and not layout.form):
+            raise ImportTableError(f"{path}: row {row}: found {len(cells)} cells, expected {' '.join(layout.names)}")
+        for name, places in layout.bodies.items():
+            texts = [cells[k] if k < len(cells) else "" for k in (layout.time, *places)]
+            texts[0] = _iso_ns(texts[0]) if layout.iso else texts[0]
+            found = [_number(text) for text in texts]
+            if layout.gaps and (not any(map(math.isfinite, found[1:])) or not any(found[1:])):
+                continue
+            named = name or (body or cells[layout.body or 0].strip())
+            columns = zip((layout.time, *places), texts, found, strict=True)
+            wrong = [(k, text, "a number") for k, text, value in columns if not math.isfinite(value)]
+            wrong += [] if abs(found[0]) * layout.ns <= LATEST_NS else [(layout.time, texts[0], "a time")]
+            wrong += [] if named else [(layout.body or 0, cells[layout.body or 0], "a name")]
+            for place, cell, expected in wrong:
+                raise ImportTableError(
+                    f"{path}: row {row}: column {layout.names[place]!r}: found {cell!r}, expected {expected}"
+                )
+            times.append(round(Decimal(texts[0].strip()) * Decimal(layout.ns)))
+            bodies.append(named)
+            values.extend(found[1:])
+    width = len(next(iter(layout.bodies.values()), (0, 0, 0)))
+    table = np.array(values).reshape(-1, width)
+    with raising(ImportTableError, f"{path}: its attitudes are no rotations", ValueError):
+        turned = _quaternions(table[:, 3:] * layout.radians, layout.euler)
+    values_of = np.column_stack([table[:, :3] * layout.metres, turned])
+    return _poses(path, np.array(times, np.int64), np.array(bodies, np.str_), values_of), width > 3
+
+
+def _quaternions(values: Floats, euler: str) -> Floats:
+    """Return quaternions (n, 4) from none, rotation vectors or Euler angles (n, 3), quaternions, or matrices by column
+    (n, 9)."""
+    if values.shape[1] == 0:
+        return np.tile([0.0, 0.0, 0.0, 1.0], (len(values), 1))
+    if values.shape[1] == 4 or not len(values):
+        return values.reshape(-1, 4)
+    if values.shape[1] == 3:
+        return np.asarray((Rotation.from_euler(euler, values) if euler else Rotation.from_rotvec(values)).as_quat())
+    return np.asarray(Rotation.from_matrix(values.reshape(-1, 3, 3).transpose(0, 2, 1)).as_quat())
+
+
+def _iso_ns(text: str) -> str:
+    """Return ISO 8601, UTC without a zone, as nanoseconds; other text as it is."""
+    try:
+        moment = datetime.fromisoformat(text.strip())
+    except ValueError:
+        return text
+    since = moment.replace(tzinfo=moment.tzinfo or UTC) - datetime(1970, 1, 1, tzinfo=UTC)
+    return str(since // timedelta(microseconds=1) * 1000)
+
+
+def _number(cell: str) -> float:
+    """Return a cell as a number, NaN if it is none."""
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
+
+
+_TUM: Final = "TUM", ("time_s", *POSE), 0
+_EUROC: Final = "EuRoC", ("time_ns", "x", "y", "z", "qw", "qx", "qy", "qz"), 1
+
+
+def _single(path: Path, form: str, names: tuple[str, ...], header: int, body: str | None) -> PoseLayout:
+    if not body:
+        raise ImportTableError(f"{path}: a {form} file has no names of bodies; name its body with `body`")
+    bodies = {body: [names.index(name) for name in POSE]}
+    ns = TIME_UNITS[names[0].removeprefix("time_")]
+    return PoseLayout(form=form, names=names, time=0, ns=ns, bodies=bodies, header=header, gaps=False, comments=True)
+
+
+_NAMES: Final = (
+    {"time_s": r"(.*_)?(time|timestamp|stamp|t)(_(?P<unit>s|ms|us|ns))?"}
+    | {"body": r"(rigid_?)?body(_name)?|object|subject|child_frame_id"}
+    | {axis: rf"(p|pos|t|(.*_)?(position|translation))?_?{axis}(_(?P<unit>m|cm|mm))?" for axis in "xyz"}
+    | {f"q{axis}": rf"(q|quat|rot|(.*_)?(quaternion|orientation|rotation))_?{axis}" for axis in "xyzw"}
+)
+"""Names of columns as programs write them, in plain words."""
+
+
+def _plain(path: Path, head: Lines, body: str | None, stated: ColumnMap) -> PoseLayout:
+    """Return the layout of CSV with the names of its columns in the first line."""
+    names = [name.strip() for name in (head[0] if head else ())]
+    found: dict[str, tuple[int, str | None]] = {}
+    for ours, pattern in _NAMES.items():
+        for k, name in enumerate(names):
+            match = re.fullmatch(pattern, plain_name(name)) if ours not in stated.columns else None
+            if name == stated.columns.get(ours, ours) or (match and ours not in found):
+                found[ours] = k, match.groupdict().get("unit") if match else None
+    needed = POSE if any(name in found for name in POSE[3:]) else POSE[:3]
+    if missing := [name for name in ("time_s", *needed, "body") if name not in found and not (name == "body" and body)]:
+        name = stated.columns.get(missing[0], missing[0])
+        raise ImportTableError(
+            f"{path}: column {name!r} is missing; there are {', '.join(names)[:400]}; "
+            "expected a first line of time_s or time_ns, body (or `body` for all rows), x, y, z, qx, qy, qz, qw; "
+            "a `map_file` can name them"
+        )
+    units = {found[axis][1] for axis in "xyz"}
+    if len(units) > 1:
+        raise ImportTableError(
+            f"{path}: columns {', '.join(names[found[axis][0]] for axis in 'xyz')} have several units"
+        )
+    (time, time_unit), unit = found["time_s"], next(iter(units))
+    first = head[1][time] if len(head) > 1 and time < len(head[1]) else ""
+    iso = math.isnan(_number(first)) and _iso_ns(first) != first
+    time_unit = "ns" if iso else stated.time_unit or time_unit or "s"
+    return PoseLayout(
+        form="", names=names, time=time, ns=TIME_UNITS[time_unit], iso=iso,
+        bodies={"": [found[name][0] for name in needed]}, header=1, gaps=False,
+        metres=DISTANCE_UNITS[stated.distance_unit or unit or "m"], body=None if body else found["body"][0],
+    )  # fmt: skip
+
+
+def _header(path: Path, head: Lines, *words: str) -> int:
+    """Return the number of the first line with these cells; raises `ImportTableError`."""
+    for k, cells in enumerate(head):
+        if set(words) <= {cell.strip() for cell in cells}:
+            return k
+    raise ImportTableError(f"{path}: its header has no line with {', '.join(words)}: export it with all lines")
+
+
+def _motive(path: Path, head: Lines) -> PoseLayout:
+    """Return the layout of Motive's CSV: lines of kinds, names, Rotation or Position, and axes, in any version.
+
+    Euler angles are about the axes as turned so far (NaturalPoint's knowledge base, "Changes in Motive's reported Euler
+    angles"), in degrees, in the order that the header names.
+    """
+    said = dict(zip(head[0][::2], head[0][1::2], strict=False))
+    units = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
+    unit, rotation = units.get(said.get("Length Units", "Meters").lower()), said.get("Rotation Type", "Quaternion")
+    euler = rotation if sorted(rotation) == ["X", "Y", "Z"] else ""
+    if unit is None or not (euler or rotation == "Quaternion"):
+        raise ImportTableError(
+            f"{path}: found {rotation} and {said.get('Length Units')}, export quaternions and metres"
+        )
+    types, kinds = _header(path, head, "Rigid Body"), _header(path, head, "Rotation", "Position")
+    bodies: dict[str, dict[str, int]] = {}
+    columns = zip(head[types], head[types + 1], head[kinds], head[kinds + 1], strict=False)
+    for k, (kind, name, what, axis) in enumerate(columns):
+        if kind == "Rigid Body" and what in ("Rotation", "Position"):
+            bodies.setdefault(name, {})[("q" if what == "Rotation" else "") + axis.lower()] = k
+    layout = PoseLayout(
+        form="Motive", names=head[kinds + 1], time=1, ns=1e9, header=kinds + 2, metres=DISTANCE_UNITS[unit],
+        bodies={}, euler=euler, radians=math.pi / 180 if euler else 1.0,
+    )  # fmt: skip
+    return _with_bodies(path, layout, bodies, (*POSE[:3], *(f"q{axis}" for axis in euler.lower())) if euler else POSE)
+
+
+def _vicon(path: Path, head: Lines) -> PoseLayout:
+    """Return the layout of Vicon's CSV: names, then axes, then units; RX, RY, RZ are a rotation vector without RW."""
+    axes = _header(path, head, "Frame", "RX", "TX")
+    rate = next((value for cells in head[:axes] if cells and (value := _number(cells[0])) > 0), math.nan)
+    bodies: dict[str, dict[str, int]] = {}
+    name = ""
+    for k, axis in enumerate(head[axes]):
+        name = (head[axes - 1][k] if k < len(head[axes - 1]) else "").strip().split(":")[-1] or name
+        if name and axis.strip()[1:] in "XYZW":
+            bodies.setdefault(name, {})[axis.strip()] = k
+    units = {cell.strip() for cell in head[axes + 1]} if axes + 1 < len(head) else set()
+    fields = ("TX", "TY", "TZ", "RX", "RY", "RZ", *(["RW"] if "RW" in head[axes] else []))
+    unit = next((one for one in ("mm", "cm", "m") if one in units), "mm")
+    radians = math.pi / 180 if units & {"deg", "degrees"} and "RW" not in fields else 1.0
+    layout = PoseLayout(
+        form="Vicon", names=head[axes], time=0, ns=1e9 / rate, bodies={}, header=axes + 2,
+        metres=DISTANCE_UNITS[unit], radians=radians,
+    )  # fmt: skip
+    return _with_bodies(path, layout, bodies, fields)
+
+
+def _qualisys(path: Path, head: Lines) -> PoseLayout:
+    """Return the layout of Qualisys' 6D TSV: lines of words and values, then a line of columns by body."""
+    said = {cells[0]: cells[1:] for cells in head if len(cells) > 1}
+    names, first = [name.strip() for name in said.get("BODY_NAMES", ()) if name.strip()], _header(path, head, "Rot[0]")
+    starts = [k for k, cell in enumerate(head[first]) if cell.strip().endswith("Rot[0]")]
+    if len(starts) != len(names):
+        raise ImportTableError(f"{path}: has {len(names)} BODY_NAMES and {len(starts)} bodies below: export 6D data")
+    # Position, three angles and the residual come before the matrix.
+    fields = ("x", "y", "z", *(f"r{k}" for k in range(9)))
+    places = [dict(zip(fields, (k - 7, k - 6, k - 5, *range(k, k + 9)), strict=True)) for k in starts]
+    timed, rate = head[first][1:2] == ["Time"], _number(next(iter(said.get("FREQUENCY", ())), "")) or math.nan
+    layout = PoseLayout(
+        form="Qualisys", names=head[first], time=int(timed), ns=1e9 if timed else 1e9 / rate, bodies={},
+        header=first + 1, metres=DISTANCE_UNITS["mm"],
+    )  # fmt: skip
+    return _with_bodies(path, layout, dict(zip(names, places, strict=True)), fields)
+
+
+def _with_bodies(
+    path: Path, layout: PoseLayout, bodies: Mapping[str, Mapping[str, int]], fields: Sequence[str]
+) -> PoseLayout:
+    """Return a layout with the bodies that have all fields; raises `ImportTableError` without bodies or a rate."""
+    whole = {name: [found[one] for one in fields] for name, found in bodies.items() if set(fields) <= found.keys()}
+    if not whole or not layout.ns > 0:
+        lacking = "a frame rate" if whole else "rigid bodies"
+        raise ImportTableError(f"{path}: a file of {layout.form} without {lacking}")
+    return replace(layout, bodies=whole)
+
+
+_FORMS: Final = {
+    "Format Version": _motive,
+    "Objects": _vicon,
+    "Segments": _vicon,
+    "FILE_VERSION": _qualisys,
+    "NO_OF_FRAMES": _qualisys,
+}
+"""Forms by the first cell of a file."""

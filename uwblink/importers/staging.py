@@ -21,8 +21,7 @@ from typing import Final, NamedTuple
 import duckdb
 import numpy as np
 
-from uwblink.errors import ImportTableError
-from uwblink.importers.chips import CHIPS, power_sql
+from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.importers.column_map import (
     DISTANCES,
     IDS,
@@ -33,18 +32,20 @@ from uwblink.importers.column_map import (
     TIME_UNITS,
     ColumnMap,
 )
-from uwblink.importers.plausibility import SAMPLE_ROWS, counter_format
+from uwblink.importers.devices import CHIPS, power_sql
+from uwblink.importers.plausibility import ROW_PERIOD_NS, SAMPLE_ROWS, counter_format
 from uwblink.importers.tables import (
     Columns,
     SourceTable,
     is_by_target,
-    lacks_header,
     message_number,
     number,
     time_ns,
     whole_number,
 )
+from uwblink.receptions import Receptions, exchanges_in
 from uwblink.recording.schema import Fault
+from uwblink.ticks import TICK_S
 from uwblink.twr import LARGEST_ID, STAMPS
 
 ROWS_PER_BLOCK: Final = 245_760
@@ -81,8 +82,7 @@ class StagedRows:
 
     def values(self, expressions: str) -> tuple[int, ...]:
         """Return SQL aggregates over the rows."""
-        ((*found,),) = self.db.execute(f"SELECT {expressions} FROM {self.name} WHERE {self.condition}").fetchall()
-        return tuple(found)
+        return tuple(self.db.execute(f"SELECT {expressions} FROM {self.name} WHERE {self.condition}").fetchall()[0])
 
     def count(self) -> int:
         """Return the number of rows."""
@@ -131,14 +131,12 @@ class Staging:
         self.tables: list[SourceTable] = []
         self.names: dict[int, str] = {}
         self.offsets = [0]
-        for name, value in column_map.constants.items():
-            db.execute(f"SET VARIABLE {name} = ?", [str(value)])
         columns: Collection[str] = ()
         for k, path in enumerate(paths):
             watch("reading", k / len(paths))
             table = SourceTable(db, path, column_map, key=k)
             self.tables.append(table)
-            cells = self._cells(table)
+            cells = staged_cells(table)
             if cells.keys() != (columns or cells.keys()):
                 raise ImportTableError(f"{path}: has other columns than {paths[0]}, so they are not one table")
             columns = cells.keys()
@@ -153,6 +151,8 @@ class Staging:
         """Rows without a range, such as an empty cell of a wide table, that are left out."""
         if "blank" in columns:
             (self.blanks,) = StagedRows(db, "staged", ()).values("count(*) FILTER (blank)")
+        self.beside: dict[str, Columns] = {}
+        """Rows of other tables of a recording that were found on the way, by table."""
         self._filled = "NOT blank" if self.blanks else "true"
         others = tuple(name for name in columns if name not in (*IDS, "blank"))
         ids = ", ".join(f"{cell} AS {name}" for name, cell in self._ids().items())
@@ -176,7 +176,7 @@ class Staging:
             header, cells = self.column_map.header(name), list[tuple[str, int, bool]]()
             for table in self.tables:
                 text = table.text(header, numeric=True)
-                kept = f"WHERE lower(trim({text})) NOT IN {NO_VALUES} AND NOT {self._is_missing(text)}"
+                kept = f"WHERE lower(trim({text})) NOT IN {NO_VALUES} AND NOT {_is_missing(table, text)}"
                 is_word = f"TRY_CAST({text} AS DOUBLE) IS NULL"
                 found = table.read({"first": f"any_value({text})", "n": "count(*)", "w": is_word}, f"{kept} GROUP BY 3")
                 cells += zip(found["first"].tolist(), found["n"].tolist(), found["w"].tolist(), strict=True)
@@ -194,81 +194,7 @@ class Staging:
         """Raise the error for the first column that rows lack."""
         for name in names:
             if not rows.has(name):
-                raise self.missing(name)
-
-    def missing(self, name: str) -> ImportTableError:
-        """Return the error for a missing column."""
-        names, header = self.tables[0].names, self.column_map.header(name)
-        remedy = "a `map_file` can rename columns or give constants, and `uwblink import guess` proposes one"
-        if lacks_header(names):
-            remedy = "its first line is a row: state the numbers of its columns in a map, such as from_id = 2"
-        if {"qx", "qy", "qz", "qw"} <= {name.lower() for name in names}:
-            remedy = "these are poses, which `uwblink poses` adds to a recording"
-        there = ", ".join(names)[:400]
-        return ImportTableError(f"{self.paths[0]}: column {header!r} is missing; there are {there}; {remedy}")
-
-    def _cells(self, table: SourceTable) -> dict[str, str]:
-        """Return SQL of the columns to stage, from cells of a table or constants; ids are words at first."""
-        column_map, found = self.column_map, dict[str, str]()
-        blank, constants = table.blank, column_map.constants
-        for name in NAMES:
-            header = column_map.header(name)
-            if name in column_map.registers:
-                cells = {key: number(table.text(one, numeric=True)) for key, one in column_map.registers[name].items()}
-                found[name] = power_sql(CHIPS[column_map.chip or "other"], column_map.prf, cells)
-                continue
-            if name in constants:
-                text = f"getvariable('{name}')"
-            elif header in table.names:
-                text = table.text(header, numeric=name not in IDS)
-            elif name in column_map.columns or name in IDS:
-                raise self.missing(name)
-            else:
-                continue
-            found["time_ns" if name == "time_s" else name] = self._cell(name, text)
-            if name == "range_m" and column_map.missing:
-                blank = " OR ".join(filter(None, [blank, self._is_missing(text)]))
-        message = column_map.header("message")
-        if message in table.names and all(n in constants or column_map.header(n) in table.named for n in IDS):
-            # The ids are of the pair for all messages; words tell which end sent one.
-            turned, (one, two) = is_by_target(table.text(message)), (found[n] for n in IDS)
-            found |= {
-                n: f"CASE WHEN {turned} THEN {a} ELSE {b} END"
-                for n, a, b in zip(IDS, (two, one), (one, two), strict=True)
-            }
-        return found | ({"blank": f"coalesce({blank}, false)"} if blank else {})
-
-    def _is_missing(self, text: str) -> str:
-        """Return SQL that is true for a text that means no value, by the map."""
-        words = [one.strip().lower() for one in self.column_map.missing if isinstance(one, str)]
-        self.db.execute("SET VARIABLE missing = ?", [["", *words]])
-        numbers = ", ".join(repr(float(one)) for one in self.column_map.missing if not isinstance(one, str))
-        is_word = f"list_contains(getvariable('missing'), lower(trim({text})))"
-        return f"({is_word} OR TRY_CAST({text} AS DOUBLE) IN ({numbers}))" if numbers else is_word
-
-    def _cell(self, name: str, text: str) -> str:
-        """Return SQL of a cell in SI units, from its text."""
-        column_map = self.column_map
-        if name in IDS:
-            return f"trim({text})"
-        if name == "time_s":
-            return time_ns(text, column_map.time_unit, TIME_UNITS.get(column_map.time_unit or "s", 1.0))
-        if name == "message":
-            return message_number(text)
-        if name == "event":
-            first = f"lower(left(trim({text}), 1))"
-            return f"CASE WHEN {first} IN ('t', 's') THEN 1.0 WHEN {first} = 'r' THEN 2.0 END"
-        if name in (*STAMPS, "tx", "rx", "stamp") and column_map.ticks_per_unit == 1.0:
-            return whole_number(text)
-        factor = RANGE_UNITS[column_map.distance_of(name) or "m"] if name in DISTANCES else 1.0
-        if name in POWERS and column_map.power_of(name) == "-dBm":
-            factor = -1.0
-        if name in SKEWS:
-            factor = CHIPS[column_map.chip or "other"].skew_ppm[column_map.units.get("skew", "ppm")]
-        value = number(text) + (f" * {factor!r}" if factor != 1.0 else "")
-        if column_map.missing and name in ("range_m", "gt_range_m", *POWERS, *SKEWS):
-            return f"CASE WHEN NOT {self._is_missing(text)} THEN {value} END"
-        return value
+                raise self.tables[0].missing(self.column_map.header(name))
 
     def _ids(self) -> dict[str, str]:
         """Return SQL of ids as whole numbers, NULL if missing; words get numbers."""
@@ -279,7 +205,7 @@ class Staging:
             if len(counts) == 200_000:
                 raise self._too_many_ids()
             # Up to 1 % of ids that are not numbers are faults; with more, ids are words.
-            odd = {word for word in counts if word not in _numbers([word])}
+            odd = {word for word in counts if word not in numbers_of([word])}
             few = sum(counts[word] for word in odd) <= 0.01 * self.offsets[-1]
             words |= counts.keys() - (odd if few else {"", *(word for word in odd if word.lower() in SUMMARIES)})
         numbers = self._number_words(sorted(words))
@@ -292,18 +218,85 @@ class Staging:
 
     def _number_words(self, words: list[str]) -> dict[str, int]:
         """Return the number of each id: its own, the map's, or else the next free one in alphabetical order."""
-        numbers = _numbers(words)
+        numbers = numbers_of(words)
         if len(numbers) < len(words):
             numbers = numbers | self.column_map.ids
             free = iter(sorted({*range(1, LARGEST_ID + 1)} - {*numbers.values()}))
             numbers |= dict(zip((word for word in words if word not in numbers), free, strict=False))
         if not numbers.keys() >= set(words):
             raise self._too_many_ids()
-        self.names = {numbers[word]: word for word in words if numbers[word] != _numbers([word]).get(word)}
+        self.names = {numbers[word]: word for word in words if numbers[word] != numbers_of([word]).get(word)}
         return {word: numbers[word] for word in words}
 
     def _too_many_ids(self) -> ImportTableError:
         return ImportTableError(f"{self.paths[0]}: more than {LARGEST_ID} different ids; are from_id and to_id ids?")
+
+
+def staged_cells(table: SourceTable) -> dict[str, str]:
+    """Return SQL of the columns to stage, from cells of a table or constants; ids are words at first."""
+    column_map, found = table.column_map, dict[str, str]()
+    blank, constants = table.blank, column_map.constants
+    for name, value in constants.items():
+        table.db.execute(f"SET VARIABLE {name} = ?", [str(value)])
+    for name in NAMES:
+        header = column_map.header(name)
+        if name in column_map.registers:
+            cells = {key: number(table.text(one, numeric=True)) for key, one in column_map.registers[name].items()}
+            found[name] = power_sql(CHIPS[column_map.chip or "other"], column_map.prf, cells)
+            continue
+        if name in constants:
+            text = f"getvariable('{name}')"
+        elif header in table.names or name in column_map.columns or name == "to_id" or (name in IDS and not table.live):
+            text = table.text(header, numeric=name not in IDS)
+        else:
+            continue
+        found["time_ns" if name == "time_s" else name] = _cell(table, name, text)
+        if name == "range_m" and column_map.missing:
+            blank = " OR ".join(filter(None, [blank, _is_missing(table, text)]))
+    message = column_map.header("message")
+    if message in table.names and all(n in constants or column_map.header(n) in table.named for n in IDS):
+        # The ids are of the pair for all messages; words tell which end sent one.
+        turned, (one, two) = is_by_target(table.text(message)), (found[n] for n in IDS)
+        found |= {
+            n: f"CASE WHEN {turned} THEN {a} ELSE {b} END" for n, a, b in zip(IDS, (two, one), (one, two), strict=True)
+        }
+    return found | ({"blank": f"coalesce({blank}, false)"} if blank else {})
+
+
+def _is_missing(table: SourceTable, text: str) -> str:
+    """Return SQL that is true for a text that means no value, by the map."""
+    missing = table.column_map.missing
+    table.db.execute(
+        "SET VARIABLE missing = ?", [["", *(one.strip().lower() for one in missing if isinstance(one, str))]]
+    )
+    numbers = ", ".join(repr(float(one)) for one in missing if not isinstance(one, str))
+    is_word = f"list_contains(getvariable('missing'), lower(trim({text})))"
+    return f"({is_word} OR TRY_CAST({text} AS DOUBLE) IN ({numbers}))" if numbers else is_word
+
+
+def _cell(table: SourceTable, name: str, text: str) -> str:
+    """Return SQL of a cell in SI units, from its text."""
+    column_map = table.column_map
+    if name in IDS:
+        return f"trim({text})"
+    if name == "time_s":
+        return time_ns(text, column_map.time_unit, TIME_UNITS.get(column_map.time_unit or "s", 1.0))
+    if name == "message":
+        return message_number(text)
+    if name == "event":
+        first = f"lower(left(trim({text}), 1))"
+        return f"CASE WHEN {first} IN ('t', 's') THEN 1.0 WHEN {first} = 'r' THEN 2.0 END"
+    if name in (*STAMPS, "tx", "rx", "stamp") and column_map.ticks_per_unit == 1.0:
+        return whole_number(text)
+    factor = RANGE_UNITS[column_map.distance_of(name) or "m"] if name in DISTANCES else 1.0
+    if name in POWERS and column_map.power_of(name) == "-dBm":
+        factor = -1.0
+    if name in SKEWS:
+        factor = CHIPS[column_map.chip or "other"].skew_ppm[column_map.units.get("skew", "ppm")]
+    value = number(text) + (f" * {factor!r}" if factor != 1.0 else "")
+    if column_map.missing and name in ("range_m", "gt_range_m", *POWERS, *SKEWS):
+        return f"CASE WHEN NOT {_is_missing(table, text)} THEN {value} END"
+    return value
 
 
 NO_VALUES: Final = "('', 'nan', 'none', 'null', 'na', 'n/a', '-', '--', 'inf', '-inf')"
@@ -318,11 +311,10 @@ SUMMARIES: Final = frozenset(
 """Words in place of an id that mark a row as a summary of others."""
 
 
-def _numbers(words: Iterable[str]) -> dict[str, int]:
+def numbers_of(words: Iterable[str]) -> dict[str, int]:
     """Return the ids that are whole numbers, such as "7" and "7.0"."""
     matches = {word: re.fullmatch(r"([0-9]{1,9})([.,]0*)?", word) for word in words}
-    found = {word: int(match[1]) for word, match in matches.items() if match}
-    return {word: value for word, value in found.items() if value <= LARGEST_ID}
+    return {word: int(match[1]) for word, match in matches.items() if match and int(match[1]) <= LARGEST_ID}
 
 
 def rows_back(rows: StagedRows) -> int:
@@ -482,7 +474,9 @@ def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Wat
         follows = "message >= lag(message) OVER ()" if layout == "stamps" and not rows.has("sequence") else follows
     first, cells = f"{message} = 1", dict[str, tuple[str, str]]()
     if of_messages:
-        theirs = {name: name for name in ("tx", "rx", "fpp", "rxp", "skew") if rows.has(name)} | {"sender": "from_id"}
+        theirs = {name: name for name in ("tx", "rx", "fpp", "rxp", "skew", "sts") if rows.has(name)} | {
+            "sender": "from_id"
+        }
         if layout == "stamps":
             theirs |= {name: f"CASE WHEN event = {k} THEN stamp END" for k, name in ((1.0, "tx"), (2.0, "rx"))}
         for n in (1, 2, 3):
@@ -514,6 +508,48 @@ def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Wat
     incomplete = Condition("message", "messages 1, 2 (and 3) of one exchange", f"NOT ({whole})")
     columns = tuple(name for name in columns if protocol != "ss" or name not in ("tx3", "rx3"))
     return replace(faults.reject(groups, [incomplete, conflict]), columns=columns), protocol
+
+
+def broadcast_exchanges(staging: Staging, faults: Faults) -> tuple[StagedRows, str]:
+    """Return the exchanges that broadcasts make whose senders list what they heard, and their protocol.
+
+    The receptions, and what third tags overheard of the exchanges, are put beside. Raises `ImportTableError`.
+    """
+    staging.require(staging.rows, ("tx", "rx", "sequence", "heard"))
+    if staging.column_map.ticks_per_unit != 1.0:
+        raise ImportTableError(f"{staging.paths[0]}: units.stamps: broadcasts need ticks")
+    whole = [Condition(name, "a whole number", f"{name} IS NULL") for name in ("tx", "rx", "sequence", "heard")]
+    rows = faults.reject(staging.rows, [*SOUND_IDS, *time_conditions(staging.rows), *whole])
+    sample, db = rows.sample(SAMPLE_ROWS), staging.db
+    bits, _ = counter_format((sample[name] for name in ("tx", "rx")), staging.column_map.bits, "wrapped")
+    named = "from_id, sequence, tx, min(origin) AS first" + (", min(time_ns) AS time_ns" if rows.has("time_s") else "")
+    # Without times, a restart (numbers begin anew) lasts as long as a counter takes to wrap, so that nothing spans it.
+    again = "sum(coalesce((sequence < before)::INT, 0)) OVER (ORDER BY first)"
+    time = (
+        f"row_number() OVER (ORDER BY first) * {ROW_PERIOD_NS} + {again} * {round(2**bits * TICK_S * 1e9)} AS time_ns"
+    )
+    db.execute(
+        f"CREATE TABLE frames AS SELECT * EXCLUDE (before){'' if rows.has('time_s') else f', {time}'} FROM (SELECT *, "
+        f"lag(sequence) OVER (PARTITION BY from_id ORDER BY first) AS before FROM (SELECT {named} FROM {rows.name} "
+        f"WHERE {rows.condition} GROUP BY from_id, sequence, tx)) ORDER BY first"
+    )
+    # Numbers of frames begin anew where a board restarts. A broadcast may be logged after those that list it.
+    heard = (
+        "SELECT f.time_ns, f.rowid AS frame, f.from_id AS sender, r.from_id AS listener, f.tx, min(r.rx) AS rx "
+        f"FROM (SELECT *, origin + 1000 AS until FROM {rows.name} WHERE {rows.condition}) r ASOF JOIN frames f "
+        "ON r.to_id = f.from_id AND r.heard = f.sequence AND r.until >= f.first GROUP BY ALL ORDER BY frame, listener"
+    )
+    with raising(ImportTableError, str(staging.paths[0]), ArgumentError):
+        receptions = Receptions.from_arrays(**dict(db.execute(heard).fetchnumpy()), bits=bits)
+        exchanges, overheard = exchanges_in(receptions)
+    staging.beside = {"receptions": receptions.to_dict(), "overheard": overheard}
+    db.register(
+        "found",
+        {"from_id": exchanges.initiator, "to_id": exchanges.target, "time_ns": exchanges.time_ns}
+        | {n: getattr(exchanges, n) for n in STAMPS},
+    )
+    db.execute("CREATE TABLE exchanges AS SELECT row_number() OVER () - 1 AS origin, * FROM found")
+    return StagedRows(db, "exchanges", ("origin", *IDS, "time_ns", *STAMPS)), "ds"
 
 
 def _group(rows: StagedRows, values: Mapping[str, str], follows: str, within_s: float) -> StagedRows:

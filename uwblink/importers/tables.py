@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from uwblink.arrays import Floats, Ints
 from uwblink.database import connect
 from uwblink.errors import ImportTableError, first_line, raising
-from uwblink.importers.column_map import ColumnMap
+from uwblink.importers.column_map import JSON_LINE, ColumnMap
 from uwblink.importers.templates import Template
 from uwblink.output import is_utf8
 from uwblink.text_files import require_regular
@@ -85,7 +85,7 @@ def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, boo
         raise ImportTableError(f"{path}: empty, expected a header and rows")
     if column_map.headerless:
         names, skip = tuple(str(k) for k in range(1, len(names) + 1)), first
-    if decimal is None:
+    if decimal is None and mark != ",":
         commas, points = (
             sum(bool(re.fullmatch(rf"[+-]?\d{digits}{mark}\d+([eE][+-]?\d+)?", cell)) for cell in cells)
             for digits, mark in (("+", ","), ("*", r"\."))
@@ -119,7 +119,7 @@ def check_lines(path: Path, delimiter: str) -> None:
     """
     line, length, cells = 1, 0, 0
     with reading(path), open_file(path) as file:
-        while piece := file.read(4096):
+        while piece := file.read(8192):
             ends = piece.count(b"\n")
             line += ends
             # Only lines that fill whole pieces are measured, so that short ones take no time.
@@ -214,12 +214,17 @@ class SourceTable:
         path: Path,
         column_map: ColumnMap | None = None,
         key: int = 0,
+        *,
+        live: bool = False,
     ) -> None:
         """Open a CSV file (plain or gzipped), a Parquet file or JSON lines, by its suffix, or a log by its template.
 
-        Raises `ImportTableError`. Tables of one connection have different keys.
+        A `live` log has the lines of the variable `lines` of the connection, in place of those of a file. Raises
+        `ImportTableError`. Tables of one connection have different keys.
         """
-        require_regular(path, ImportTableError, "table (.csv, .csv.gz, .parquet or .jsonl)")
+        self.live = live
+        if not live:
+            require_regular(path, ImportTableError, "table (.csv, .csv.gz, .parquet or .jsonl)")
         self.db, self.path, self._key = db, path, key
         self.column_map = column_map = column_map or ColumnMap()
         self._skip, self._decimal_comma, self._expanded = 0, False, False
@@ -233,14 +238,9 @@ class SourceTable:
         ending = path.name.lower().removesuffix(".gz")
         self._is_parquet = ending.endswith(".parquet")
         self._is_csv = not ending.endswith((".parquet", ".jsonl", ".ndjson", ".json")) and not column_map.line
-        if column_map.line:
-            self._open_log(Template(column_map.line))
-        elif self._is_csv:
-            self._open_csv()
-        elif self._is_parquet:
-            self._open_parquet()
-        else:
-            self._open_json()
+        open_log = self._open_log if column_map.line not in (None, JSON_LINE) else None
+        open_table = self._open_csv if self._is_csv else self._open_parquet if self._is_parquet else self._open_json
+        (open_log or open_table)()
         self._unpivot()
         self._add_names()
         if len(self.names) > MAX_CELLS:
@@ -261,19 +261,15 @@ class SourceTable:
             f"max_line_size={MAX_LINE_BYTES})"
         )
 
-    def _open_log(self, line: Template) -> None:
+    def _open_log(self) -> None:
         """Use the lines that a template matches, and each match of the other (`each`) in them as a row."""
-        check_lines(self.path, "\n")
+        line = Template(self.column_map.line or "")
         self._decimal_comma = self.column_map.decimal == ","
         each = Template(self.column_map.each) if self.column_map.each else None
         self.db.execute(f"SET VARIABLE line{self._key} = ?", [line.pattern])
-        # Whatever noise of a serial port is in it is read as letters.
-        text = (
-            f"read_csv(getvariable('file{self._key}'), auto_detect=false, header=false, delim='\x01', quote='', "
-            f"escape='', columns={{'line': 'VARCHAR'}}, strict_mode=false, encoding='latin-1', "
-            f"max_line_size={MAX_LINE_BYTES})"
+        matching = (
+            f"SELECT line FROM {self._source_of_lines()} WHERE regexp_matches(line, getvariable('line{self._key}'))"
         )
-        matching = f"SELECT line FROM {text} WHERE regexp_matches(line, getvariable('line{self._key}'))"
         self.source = f"(SELECT row_number() OVER () AS row, {line.extract('line', f'line{self._key}')} AS s"
         cells = line.columns("s")
         if each:
@@ -285,6 +281,17 @@ class SourceTable:
             self.source = f"(SELECT *, {each.extract('element', f'each{self._key}')} AS e FROM {self.source})"
         self.names, self._cells, self._expanded = tuple(cells), list(cells.values()), True
 
+    def _source_of_lines(self) -> str:
+        """Return SQL of the lines of a log; whatever noise of a serial port is in it is read as letters."""
+        if self.live:
+            return "(SELECT unnest(getvariable('lines')) AS line)"
+        check_lines(self.path, "\n")
+        return (
+            f"read_csv(getvariable('file{self._key}'), auto_detect=false, header=false, delim='\x01', quote='', "
+            f"escape='', columns={{'line': 'VARCHAR'}}, strict_mode=false, encoding='latin-1', "
+            f"max_line_size={MAX_LINE_BYTES})"
+        )
+
     def _open_json(self) -> None:
         """Use the fields of the first lines as columns; nested fields have names such as `pose.x`.
 
@@ -293,14 +300,14 @@ class SourceTable:
         check_lines(self.path, "\n")
         fields, each, lists = dict[str, str](), self.column_map.each, dict[str, None]()
         with reading(self.path), open_file(self.path) as file:
-            lines = [line.decode("utf-8-sig") for line in islice(file, 1000)]
-        for line in lines:
-            with suppress(ValueError, RecursionError):
-                row = json.loads(line)
-                found = {name: value for name, value in row.items() if isinstance(value, list) and is_objects(value)}
-                lists |= dict.fromkeys(found)
-                for one in [row | {each: one} for one in found.get(each, ())] if each else [row]:
-                    fields |= dict(_fields(one, "", ""))
+            lines = [
+                line.decode("utf-8-sig", "replace" if self.column_map.line else "strict") for line in islice(file, 1000)
+            ]
+        for row in filter(None, map(object_in, lines)):
+            found = {name: value for name, value in row.items() if isinstance(value, list) and is_objects(value)}
+            lists |= dict.fromkeys(found)
+            for one in [row | {each: one} for one in found.get(each, ())] if each else [row]:
+                fields |= dict(_fields(one, "", ""))
         self.lists = tuple(lists)
         if not fields:
             wanted = f"a list {each[:60]!r} of objects (each)" if each else "JSON objects"
@@ -310,6 +317,9 @@ class SourceTable:
         listed = f"getvariable('fields{self._key}')"
         self._cells = [f"json_extract_string(json, {listed}[{k}])" for k in range(1, len(fields) + 1)]
         self.source = f"read_ndjson_objects(getvariable('file{self._key}'), ignore_errors=true)"
+        if self.column_map.line:
+            ends = f"SELECT TRY_CAST(regexp_extract(line, '[{{].*') AS JSON) AS json FROM {self._source_of_lines()}"
+            self.source = f"(SELECT json FROM ({ends}) WHERE json_type(json) = 'OBJECT')"
         if each:
             # An element stands in place of the list that it is of.
             self.db.execute(f"SET VARIABLE each{self._key} = ?", [each])
@@ -390,12 +400,21 @@ class SourceTable:
         if self.names.count(name) > 1:
             raise ImportTableError(f"{self.path}: row 1: two columns are called {name[:60]!r}")
         if name not in self.names:
-            there = ", ".join(self.names)[:400]
-            raise ImportTableError(f"{self.path}: column {name[:60]!r} is missing; there are {there}")
+            raise self.missing(name)
         # DuckDB would cast a bare column while it reads the file, and would reject the whole row for a cell that is not
         # a number.
         text = f"coalesce(CAST({self._cells[self.names.index(name)]} AS VARCHAR), '')"
         return f"replace({text}, ',', '.')" if numeric and self._decimal_comma else text
+
+    def missing(self, header: str) -> ImportTableError:
+        """Return the error for a column that is not there."""
+        remedy = "a `map_file` can rename columns or give constants, and `uwblink import guess` proposes one"
+        if lacks_header(self.names):
+            remedy = "its first line is a row: state the numbers of its columns in a map, such as from_id = 2"
+        if {"qx", "qy", "qz", "qw"} <= {name.lower() for name in self.names}:
+            remedy = "these are poses, which `uwblink poses` adds to a recording"
+        there = ", ".join(self.names)[:400]
+        return ImportTableError(f"{self.path}: column {header[:60]!r} is missing; there are {there}; {remedy}")
 
     def read(self, cells: Mapping[str, str], more: str = "") -> Columns:
         """Return SQL expressions as arrays (n,) by name, masked where values are missing.
@@ -444,10 +463,19 @@ class SourceTable:
         rejected, blank = set(self.rejected()), "\r\n" if self._is_csv else None
         line = self.column_map.line
         counts = re.compile(Template(line).pattern).search if line else lambda text: text.strip(blank)
+        counts = object_in if line == JSON_LINE else counts
         with io.TextIOWrapper(open_file(self.path), "latin-1" if line else "utf-8-sig", "replace") as file:
-            numbered = enumerate(file, start=1)
-            filled = (n for n, text in numbered if n > self._skip and counts(text) and n not in rejected)
+            lines = enumerate(file, start=1)
+            filled = (n for n, text in lines if n > self._skip and counts(text) and n not in rejected)
             return np.fromiter(filled, np.int64)
+
+
+def object_in(line: str) -> dict[str, Any]:
+    """Return the object of JSON at the end of a line, an empty one where there is none."""
+    with suppress(ValueError, RecursionError):
+        found = json.loads(line[max(line.find("{"), 0) :])
+        return found if isinstance(found, dict) else {}
+    return {}
 
 
 def is_objects(values: list[Any]) -> bool:

@@ -9,7 +9,6 @@ linear in the text, so that a template of a stranger cannot stall an import.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -58,16 +57,6 @@ class Template:
             found |= {f"{name}.{n}": f"{values}[{n + 1}]" for n in range(count)}
             if not count:
                 found[name] = f"TRY_CAST('0x' || {group} AS BIGINT)" if form == "hex" else group
-        return found
-
-    def values(self, groups: Sequence[str | None]) -> dict[str, str]:
-        """Return texts by column from the groups of a match, as `columns` does in SQL; hexadecimal ones are decimal."""
-        found: dict[str, str] = {}
-        for (name, form, count), group in zip(self._places, groups, strict=False):
-            parts = re.split(r"[,;\s]+", (group or "").strip())
-            found |= {f"{name}.{k}": parts[k] for k in range(min(count, len(parts)))}
-            if not count:
-                found[name] = str(int(group or "0", 16)) if form == "hex" else group or ""
         return found
 
     def extract(self, text: str, variable: str) -> str:

@@ -28,6 +28,7 @@ STYLE: Final[Any] = {
     "font.size": 8.0,
     "axes.labelsize": "medium",
     "axes.titlesize": "medium",
+    "axes.titlelocation": "left",
     "xtick.labelsize": "medium",
     "ytick.labelsize": "medium",
     "legend.fontsize": "medium",

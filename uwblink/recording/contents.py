@@ -21,7 +21,7 @@ from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, CirRow, Fault, FrameRow, KnownDistance, Poses, Tag
 from uwblink.recording.summary import counted
 from uwblink.ticks import TICK_S
-from uwblink.twr import LARGEST_ID, LATEST_NS, Exchanges, middle_ns
+from uwblink.twr import LARGEST_ID, LATEST_NS, Exchanges, range_ns
 
 Row = TypeVar("Row", CirRow, FrameRow, Fault)
 
@@ -33,8 +33,8 @@ READING_MB: Final = 300
 class Contents:
     """The contents of a recording; all fields but the exchanges are optional.
 
-    `overheard`, `imu`, `height`, `powers`, `temperature`, `receptions` and `corrected` have the columns of the tables
-    of these names, or none; `meta` are the entries of the table `meta`.
+    `overheard`, `imu`, `height`, `powers`, `quality`, `temperature`, `receptions` and `corrected` have the columns of
+    the tables of these names, or none; `meta` are the entries of the table `meta`.
 
     >>> from uwblink import Contents, Exchanges, Tag
     >>> x = Exchanges.from_arrays([1, 2], [2, 3], tx1=[0, 9], rx1=[5, 3], tx2=[1005, 1003], rx2=[3000, 3009])
@@ -50,6 +50,7 @@ class Contents:
     imu: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     height: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     powers: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    quality: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     temperature: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     receptions: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     corrected: Mapping[str, NDArray[Any]] = field(default_factory=dict)
@@ -161,7 +162,7 @@ class Contents:
 _LISTS: Final = ("cirs", "frames", "faults", "arrangements", "known_distances")
 """The tables that are held as lists of rows."""
 
-_COLUMNS: Final = ("overheard", "imu", "height", "powers", "temperature", "receptions", "corrected")
+_COLUMNS: Final = ("overheard", "imu", "height", "powers", "quality", "temperature", "receptions", "corrected")
 """The tables that are held as columns by name."""
 
 
@@ -217,20 +218,20 @@ def pieces(recording: Recording, rows: int = 50_000) -> Iterator[Contents]:
 def distances_by_poses_m(recording: Recording, blocks: Iterable[Exchanges]) -> Iterator[Floats]:
     """Yield the distances (n,) between the antennas of each block of exchanges by the poses; NaN without poses.
 
-    They are distances at the middle between the first two messages, which is the time of a range.
+    They are distances at the times of the ranges (`uwblink.twr.range_ns`).
     """
     tracks, tags = tracks_of(recording.poses()), recording.tags()
     for some in blocks:
-        yield distances_m(tracks, tags, some.initiator, some.target, middle_ns(some))
+        yield distances_m(tracks, tags, some.initiator, some.target, range_ns(some))
 
 
 def exchanges_with_poses(recording: Recording) -> Iterator[tuple[Exchanges, Poses]]:
     """Yield blocks of all exchanges in the order of their rows, and the poses around them.
 
-    The poses suffice for distances at the times of exchanges and at the middle between their messages.
+    The poses suffice for distances at the times of exchanges and of their ranges.
     """
     tracks = tracks_of(recording.poses())
     for block in filter(len, recording.exchange_blocks()):
-        # A range belongs to the middle of its first two messages, which is after its time, by half a wrap at most.
+        # A range belongs to its poll or to a time after it, by half a wrap at most.
         later = int(2**block.bits * TICK_S * 0.5e9) + 1
         yield block, poses_around(tracks, int(block.time_ns.min()), int(block.time_ns.max()) + later)

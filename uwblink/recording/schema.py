@@ -15,7 +15,7 @@ from uwblink.display import first_few, printable
 from uwblink.errors import PlanError
 from uwblink.text_files import TomlReader, is_number
 from uwblink.ticks import ANTENNA_DELAY_TICKS, REPORT_BITS, SPEED_OF_LIGHT, TICKS_PER_SECOND
-from uwblink.twr import COLUMNS, LATEST_NS
+from uwblink.twr import COLUMNS, LARGEST_ID, LATEST_NS
 
 FORMAT_VERSION: Final = 1
 SUFFIX: Final = ".uwb"
@@ -67,6 +67,11 @@ TABLES: Final[dict[str, dict[str, str]]] = {
         **dict.fromkeys(("initiator", "target"), "USMALLINT"),
         **dict.fromkeys(("rxp1_dbm", "rxp2_dbm"), "DOUBLE"),
     },
+    "quality": {
+        "time_ns": "BIGINT",
+        **dict.fromkeys(("initiator", "target"), "USMALLINT"),
+        **dict.fromkeys(("sts1", "sts2"), "DOUBLE"),
+    },
     "temperature": {
         "time_ns": "BIGINT",
         "tag": "USMALLINT",
@@ -100,7 +105,17 @@ ADDED_LATER: Final = {
     "faults": frozenset({"initiator", "target"}),
     **{
         table: frozenset(TABLES[table])
-        for table in ("imu", "height", "powers", "temperature", "receptions", "corrected", "arrangements", "distances")
+        for table in (
+            "imu",
+            "height",
+            "powers",
+            "quality",
+            "temperature",
+            "receptions",
+            "corrected",
+            "arrangements",
+            "distances",
+        )
     },
 }
 """Columns that older recordings may lack; if these are all columns of a table, the table."""
@@ -295,7 +310,7 @@ def _point(file: TomlReader, key: str, value: Any) -> tuple[float, float, float]
 def _new_id(file: TomlReader, key: str, row: dict[str, Any], taken: set[int]) -> int:
     """Return the id of a tag or an anchor; raises the file's error for one that is none, or is taken."""
     number: Any = row.get("id")
-    file.check(key, number, is_board_id(number), "a whole number 0 to 254")
+    file.check(key, number, is_id(number), f"a whole number 0 to {LARGEST_ID}")
     file.check(key, number, number not in taken, "another id than those before")
     return int(number)
 
@@ -309,9 +324,13 @@ def _are_numbers(value: Any, count: int) -> bool:
     return isinstance(value, list) and len(value) == count and all(map(is_number, value))
 
 
-def is_board_id(value: Any) -> bool:
-    """Whether a value can be the id of a board: the firmware's ids have eight bits, and 255 is not used."""
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= 254
+LARGEST_BOARD_ID: Final = 254
+"""The firmware's ids have eight bits, and 255 is not used; those of other boards have 16."""
+
+
+def is_id(value: Any, largest: int = LARGEST_ID) -> bool:
+    """Whether a value can be the id of a tag."""
+    return type(value) is int and 0 <= value <= largest
 
 
 def standard_meta() -> dict[str, Any]:

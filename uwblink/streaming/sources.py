@@ -164,8 +164,10 @@ def stream_printed(
     `how` are other parameters of `uwblink.boards.printed_ranges`, which raises.
     """
     correct = _correction(calibration)
-    for exchanges in printed_ranges(ports, dialect, **how):
-        yield from streamed(exchanges, correct)
+    for turns in printed_ranges(ports, dialect, **how):
+        yield from streamed(
+            exchanges_of((one.time_ns, one.pair[0], one.report) for one in turns if one.report), correct
+        )
 
 
 def _correction(calibration: str | os.PathLike[str] | Correction | None) -> Correction | None:

@@ -28,15 +28,16 @@ import simpy
 
 from uwblink.boards.ports import Transport
 from uwblink.errors import PortLostError, PortMissingError
+from uwblink.recording.schema import LARGEST_BOARD_ID, is_id
 from uwblink.wire.codec import encode
 from uwblink.wire.messages import Message
 from uwbsim.boards.commands import ANSWER, EXECUTORS, Command, read_commands
 from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, Attempt, BoardAir, BoardRadio, Received, Steps
 from uwbsim.boards.ranging import received_by
-from uwbsim.errors import ParameterError
+from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import Source, as_scenario
-from uwbsim.scenario.model import Scenario
+from uwbsim.scenario.model import NO_BROADCASTS, Scenario
 from uwbsim.world.clocks import NS_PER_S
 
 PACKET_BYTES: Final = 64
@@ -116,7 +117,17 @@ class Bench:
     """The boards of a scenario on one medium; `send` is called with their output."""
 
     def __init__(self, scenario: Scenario, send: Sender, lost_share: float = 0.0) -> None:
-        """Power all boards at time zero; `lost_share` of all receptions fail in addition to weak ones."""
+        """Power all boards at time zero; `lost_share` of all receptions fail in addition to weak ones.
+
+        Raises `ScenarioError` for a scenario of broadcasts, and for ids that the firmware does not have.
+        """
+        if scenario.ranging.plan == "broadcast":
+            raise ScenarioError(NO_BROADCASTS)
+        if too_large := [tag.id for tag in scenario.tags if not is_id(tag.id, LARGEST_BOARD_ID)]:
+            raise ScenarioError(
+                f"tags: found id {too_large[0]}; boards have ids 0 to {LARGEST_BOARD_ID} by their firmware, and only "
+                "flights (`uwbsim run`) take others"
+            )
         self.env = simpy.Environment(initial_time=0)
         self.scenario = scenario
         self.send = send

@@ -215,7 +215,13 @@ def compare(
         return
     # On its side, because it has few protocols and many quantities.
     _print_table([[name.strip(), *map(show, found.outcomes)] for name, show in uwbsim.pages.COMPARISON_COLUMNS.items()])
+    _print_fleet(found.fleet)
     typer.echo(f"{output / uwbsim.pages.FILES[0]}, {', '.join(uwbsim.pages.FILES[1:])}")
+
+
+def _print_fleet(found: Sequence[uwbsim.FleetFigures]) -> None:
+    columns = uwbsim.pages.FLEET_COLUMNS
+    _print_table([[*columns], *([show(one) for show in columns.values()] for one in found)], f"{found[0].tags} tags")
 
 
 def _rows(protocols: str) -> list[RangingProtocol]:
@@ -280,28 +286,34 @@ def predict(
         bool,
         typer.Option("--whole-ticks", rich_help_panel="Noise", help="Round stamps to ticks of 15.65 ps."),
     ] = False,
+    tags: Annotated[
+        int | None,
+        typer.Option(help="Also predict what a fleet of so many tags gets by each way of ranging."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Predict the bias and standard deviation of a range analytically."""
-    found = uwbsim.predict_state(
-        uwbsim.State(
-            protocol=protocol,
-            skew_ppm=skew_ppm,
-            reply_delay_us=reply_delay_us,
-            final_delay_us=final_delay_us,
-            distance_m=distance_m,
-            speed_mps=speed_mps,
-            drift_ppm_per_s=drift_ppm_per_s,
-            tx_noise_ps=tx_noise_ps,
-            rx_noise_ps=rx_noise_ps,
-            carrier_noise_ppm=carrier_noise_ppm,
-            carrier_bias_ppm=carrier_bias_ppm,
-            delay_initiator_ns=delay_initiator_ns,
-            delay_target_ns=delay_target_ns,
-            whole_ticks=whole_ticks,
-        )
+    state = uwbsim.State(
+        protocol=protocol,
+        skew_ppm=skew_ppm,
+        reply_delay_us=reply_delay_us,
+        final_delay_us=final_delay_us,
+        distance_m=distance_m,
+        speed_mps=speed_mps,
+        drift_ppm_per_s=drift_ppm_per_s,
+        tx_noise_ps=tx_noise_ps,
+        rx_noise_ps=rx_noise_ps,
+        carrier_noise_ppm=carrier_noise_ppm,
+        carrier_bias_ppm=carrier_bias_ppm,
+        delay_initiator_ns=delay_initiator_ns,
+        delay_target_ns=delay_target_ns,
+        whole_ticks=whole_ticks,
     )
-    print_result(found.to_dict(), str(found), as_json=as_json)
+    found, fleet = uwbsim.predict_state(state), [] if tags is None else uwbsim.predict_fleet(state, tags)
+    more = {"fleet": [one.to_dict() for one in fleet]} if fleet else {}
+    print_result(found.to_dict() | more, str(found), as_json=as_json)
+    if fleet and not as_json:
+        _print_fleet(fleet)
 
 
 def optimum(

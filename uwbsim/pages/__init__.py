@@ -3,6 +3,7 @@
 from uwbsim.pages.documents import (
     COMPARISON_COLUMNS,
     FILES,
+    FLEET_COLUMNS,
     TWIN_COLUMNS,
     optimum_file,
     write_comparison,
@@ -14,6 +15,7 @@ from uwbsim.pages.documents import (
 __all__ = [
     "COMPARISON_COLUMNS",
     "FILES",
+    "FLEET_COLUMNS",
     "TWIN_COLUMNS",
     "optimum_file",
     "write_comparison",

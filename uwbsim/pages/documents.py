@@ -20,6 +20,7 @@ from uwbsim.errors import ScenarioError
 from uwbsim.pages import figures
 from uwbsim.protocols.comparison import BestDelay, ProtocolComparison, ProtocolErrors, over_reply, over_skew, over_state
 from uwbsim.protocols.conditions import conditions_of
+from uwbsim.protocols.fleet import FleetFigures
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import preview
@@ -83,9 +84,10 @@ def scene(scenario: Scenario) -> Document:
             "its sender and of its receiver."
         ),
     ]
-    for name in distinct.values():
-        draw = partial(figures.timing, scenario=scenario, name=name)
-        blocks.append(Picture(f"timing-{name}", draw, f"{PROTOCOLS[name].title}."))
+    blocks += [
+        Picture(f"timing-{name}", partial(figures.timing, scenario=scenario, name=name), f"{PROTOCOLS[name].title}.")
+        for name in distinct.values()
+    ]
     return Document(scenario.run.name, blocks)
 
 
@@ -104,6 +106,16 @@ COMPARISON_COLUMNS: Final[dict[str, Callable[[ProtocolErrors], str]]] = {
     "rate (1/s)": lambda o: f"{o.rate_hz:.0f}",
 }
 """Columns of tables of protocols, on the page and on the terminal."""
+
+FLEET_COLUMNS: Final[dict[str, Callable[[FleetFigures], str]]] = {
+    "of a fleet": lambda o: o.method,
+    "std (cm)": lambda o: f"{100 * o.std_m:.2f}",
+    "RMSE (cm)": lambda o: f"{100 * o.rmse_m:.2f}",
+    "air (µs)": lambda o: f"{1e6 * o.air_s:.0f}",
+    "radio on (µs)": lambda o: f"{1e6 * o.radio_on_s:.0f}",
+    "updates (1/s)": lambda o: f"{o.update_hz:.3g}",
+}
+"""Columns of tables of ways of ranging in a fleet; air and radio are per range, or difference of arrival."""
 
 FILES: Final = ("compare.html", "compare.csv", "compare.parquet")
 """Names of the files of `write_comparison`."""
@@ -186,6 +198,14 @@ def comparison(found: ProtocolComparison) -> Document:
             "second."
         ),
         Table(["scheduled delay (µs)", "one range", "per second", *(f"{name} (cm)" for name in protocols)], winners),
+        Heading(f"A fleet of {found.fleet[0].tags} tags"),
+        Text(
+            "Predicted, after calibration and without reflections. Protocols: the pairs range in turn. broadcast: each "
+            "tag sends a frame in turn, which all others hear. tdoa: the tags are anchors that do so; any number of "
+            "listeners have the differences of arrival. Air and radio on: per range, or per difference at a listener. "
+            "Updates: how often a second, at most, all pairs range, or a listener has all differences."
+        ),
+        Table([*FLEET_COLUMNS], [[show(one) for show in FLEET_COLUMNS.values()] for one in found.fleet]),
         Heading("Errors over skew, delay, distance and power"),
         Text(
             "Points are simulated, lines predicted; the first two figures are without antenna delays, power bias and "
@@ -193,9 +213,12 @@ def comparison(found: ProtocolComparison) -> Document:
             "to ± 1 cm and logarithmic beyond."
         ),
     ]
-    for curves, x, caption in over:
-        draw = partial(figures.error_over, curves=curves, x=x, logarithmic=x.startswith("delay"))
-        blocks.append(Picture(f"over {x}", draw, caption))
+    blocks += [
+        Picture(
+            f"over {x}", partial(figures.error_over, curves=curves, x=x, logarithmic=x.startswith("delay")), caption
+        )
+        for curves, x, caption in over
+    ]
     return Document(f"Protocols in {scenario.run.name}", blocks)
 
 
@@ -320,7 +343,7 @@ def write_twin(found: Twin, compared: Sequence[Compared], path: Path, *, force: 
     blocks: list[Block] = [
         Text(
             f"A scenario fitted to {len(found.measured):,} exchanges of {len(found.measured.pairs)} pairs, with the "
-            f"delays and the bias curve of {Path(found.calibration).name} as truth, and a comparison of its "
+            f"delays and the bias curve of {Path(found.known.where).name} as truth, and a comparison of its "
             f"simulation with the measurements. {alike} of {len(compared)} quantities are alike."
         ),
         Heading("Measured and simulated"),
@@ -358,10 +381,8 @@ def write_twin(found: Twin, compared: Sequence[Compared], path: Path, *, force: 
         Heading("What the recording does not determine"),
         Table(["kept at its default, or chosen without the recording"], [[text] for text in found.unknown], words=True),
     ]
-    write_text(path, to_html(Document(f"The twin of {Path(found.recording).name}", blocks)), force=force)
+    write_text(path, to_html(Document(f"The twin of {Path(found.measured.where).name}", blocks)), force=force)
 
 
 def _shown(value: object) -> str:
-    if value is None:
-        return "not determined"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return "not determined" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -108,9 +108,10 @@ def room(width_in: float, scenario: Scenario) -> Figure:
     paths = {body.name: world.trajectories[body.name].position_m(time) for body in scenario.bodies}
     spots, _ = world.antennas(np.arange(len(scenario.tags)), np.zeros(len(scenario.tags)))
     tags = {tag.id: spot for tag, spot in zip(scenario.tags, spots, strict=True)}
-    boxes: list[tuple[Obstacle | Room, str, dict[str, Any]]] = []
-    boxes += [(box, box.name, {"fc": GRID, "ec": MUTED, "lw": 0.6}) for box in scenario.obstacles]
-    boxes += [(scenario.room, "", {"fill": False, "ec": INK, "lw": 1.2, "zorder": 1})] if scenario.room else []
+    boxes: list[tuple[Obstacle | Room, str, dict[str, Any]]] = [
+        *((box, box.name, {"fc": GRID, "ec": MUTED, "lw": 0.6}) for box in scenario.obstacles),
+        *((box, "", {"fill": False, "ec": INK, "lw": 1.2, "zorder": 1}) for box in [scenario.room] if box),
+    ]
     corners = [np.array([box.min_m, box.max_m]) for box, _, _ in boxes]
     points = np.concatenate([*paths.values(), spots, *corners])
     # What is drawn is at least a metre large, with a margin.
@@ -131,10 +132,9 @@ def room(width_in: float, scenario: Scenario) -> Figure:
         for k, body in enumerate(scenario.bodies):
             own = {tag.id: tags[tag.id][[x, y]] for tag in scenario.tags if tag.body == body.name}
             _draw_body(axes, body.name, paths[body.name][:, [x, y]], own, look(k), middle[[x, y]])
-        axes.set(xlim=(low[x], high[x]), ylim=(low[y], high[y]), aspect="equal", axisbelow=True)
-        axes.set(xlabel=f"{'xyz'[x]} (m)", ylabel=f"{'xyz'[y]} (m)")
+        limits: dict[str, Any] = {"xlim": (low[x], high[x]), "ylim": (low[y], high[y]), "aspect": "equal"}
+        axes.set(title=name, xlabel=f"{'xyz'[x]} (m)", ylabel=f"{'xyz'[y]} (m)", axisbelow=True, **limits)
         axes.grid(True)
-        axes.set_title(name, loc="left")
     legend(figure, panels[0])
     return figure
 
@@ -169,8 +169,7 @@ def timing(width_in: float, scenario: Scenario, name: str) -> Figure:
     names = [f"{side} {tag}" for side, tag in zip(("initiator", "target"), scenario.pairs()[0], strict=True)]
     axes.set_yticks([1, 0], names, rotation=90 if narrow else 0, va="center")
     marker = "marker" if narrow else "ranging marker"
-    axes.set(ylim=(-0.8, 1.8), xlabel=f"time since the poll's {marker} (µs)")
-    axes.set_title(protocol.title, loc="left")
+    axes.set(ylim=(-0.8, 1.8), xlabel=f"time since the poll's {marker} (µs)", title=protocol.title)
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.tick_params(axis="y", length=0)
     axes.autoscale_view(scaley=False)
@@ -277,7 +276,7 @@ def _maps(
         for axis, own in ((axes.xaxis, x), (axes.yaxis, y)):
             kept = np.arange(len(own))[:: max(1, len(own) // 6)]
             axis.set_ticks(kept, labels=[f"{value:g}" for value in own[kept]])
-        axes.set_title(protocol, loc="left")
+        axes.set(title=protocol)
     figure.colorbar(image, ax=panels, label=name)
     first, second = keys
     figure.supxlabel(first, fontsize="medium")
@@ -294,8 +293,7 @@ def marginals(width_in: float, found: Sequence[Compared]) -> Figure:
         low, high = np.quantile(np.concatenate(one.drawn), [0.005, 0.995])
         edges = np.linspace(low, high if high > low else low + 1, 41)
         outlines(axes, dict(zip(colours, one.drawn, strict=True)), edges, lines, ends=False)
-        axes.set_title(one.name, loc="left")
-        axes.set(xlabel=one.unit, yticks=[])
+        axes.set(title=one.name, xlabel=one.unit, yticks=[])
     legend(figure, panels[0])
     return figure
 
@@ -314,7 +312,6 @@ def by_pair(width_in: float, found: Sequence[Compared], fewest: int = 5) -> Figu
             axes.plot(*points.T, "o", color=BLUE, markersize=3.5, alpha=0.7)
         else:
             axes.text(0.5, 0.5, "too few exchanges a pair", ha="center", va="center", transform=axes.transAxes)
-        axes.set_title(f"{one.name}:\n{name}", loc="left")
         unit = "autocorrelation" if what == "lag1" else one.unit
-        axes.set(xlabel=f"measured ({unit})", ylabel="simulated")
+        axes.set(title=f"{one.name}:\n{name}", xlabel=f"measured ({unit})", ylabel="simulated")
     return figure

@@ -14,18 +14,11 @@ from uwblink.arrays import Floats
 from uwblink.protocols.table import RangingProtocol
 from uwbsim.errors import ParameterError
 from uwbsim.protocols.conditions import Conditions, Protocols, calibrated, chosen, conditions_of, range_errors_m
+from uwbsim.protocols.fleet import FleetFigures, fleet_figures
 from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
-from uwbsim.scenario.ranging import (
-    RECEIVER_ON_S,
-    TURNAROUND_S,
-    after_marker_s,
-    exchange_air_s,
-    exchange_s,
-    frame_s,
-    message_bytes,
-)
+from uwbsim.scenario.ranging import TURNAROUND_S, exchange_costs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,13 +70,19 @@ class ProtocolComparison:
     >>> found.winners[0]["scheduled_us"], found.winners[0]["rmse"]
     (300, 'ss-cfo')
     >>> sorted(found.to_dict())
-    ['protocols', 'winners']
+    ['fleet', 'protocols', 'winners']
     """
 
     scenario: Scenario
     protocols: tuple[RangingProtocol, ...]
     outcomes: list[ProtocolErrors]
     samples: dict[str, Floats]
+
+    @cached_property
+    def fleet(self) -> list[FleetFigures]:
+        """Return by prediction what the scenario's tags get from each protocol, from broadcasts and as anchors."""
+        scenario, world = self.scenario, calibrated(conditions_of(self.scenario, 2048))
+        return fleet_figures(world, self.protocols, len(scenario.senders()), scenario.radio.preamble_symbols)
 
     @cached_property
     def winners(self) -> list[dict[str, Any]]:
@@ -114,7 +113,8 @@ class ProtocolComparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `uwbsim compare --json` prints."""
-        return {"protocols": [one.to_dict() for one in self.outcomes], "winners": self.winners}
+        outcomes, fleet = ([one.to_dict() for one in rows] for rows in (self.outcomes, self.fleet))
+        return {"protocols": outcomes, "winners": self.winners, "fleet": fleet}
 
     def __repr__(self) -> str:
         """Return a line a protocol."""
@@ -205,22 +205,10 @@ def costs(scenario: Scenario, protocol: RangingProtocol, scheduled_s: float | No
 
     `scheduled_s` replaces the scenario's delay.
     """
-    symbols = scenario.radio.preamble_symbols
-    scheduled, at_once = scheduled_s or scenario.ranging.scheduled_s, scenario.ranging.at_once_s
-    lengths = message_bytes(protocol)
-    marker, end = 0.0, after_marker_s(lengths[0])
-    radio = 2 * frame_s(lengths[0], symbols)
-    for message, length in zip(protocol.messages[1:], lengths[1:], strict=True):
-        marker += scheduled if message.timing == "scheduled" else at_once
-        # The receiver listens from the end of the frame before, as soon as it is on again.
-        listening = marker + after_marker_s(length) - end - RECEIVER_ON_S
-        radio += frame_s(length, symbols) + max(listening, 0.0)
-        end = marker + after_marker_s(length)
-    return {
-        "air_s": exchange_air_s(protocol, symbols),
-        "duration_s": exchange_s(protocol, symbols, scheduled, at_once),
-        "radio_on_s": radio,
-    }
+    ranging = scenario.ranging
+    return exchange_costs(
+        protocol, scenario.radio.preamble_symbols, scheduled_s or ranging.scheduled_s, ranging.at_once_s
+    )
 
 
 @dataclass(frozen=True, slots=True)

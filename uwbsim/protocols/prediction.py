@@ -196,6 +196,24 @@ def predict_state(q: State) -> Prediction:
     0.3
     """
     (protocol,) = chosen([q.protocol], "protocol")
+    found = predict(protocol, conditions_of_state(q, protocol))
+    bias, variance = found.pooled()
+    # A state has neither noise of clocks nor multipath.
+    parts = {name: part for name, part in found.parts_m2.items() if name not in ("clocks", "multipath")}
+    return Prediction(
+        protocol=protocol.name,
+        title=protocol.title,
+        bias_m=bias,
+        std_m=variance**0.5,
+        variance_m2=variance,
+        bias_ps=bias / SPEED_OF_LIGHT * 1e12,
+        std_ps=variance**0.5 / SPEED_OF_LIGHT * 1e12,
+        parts_m={name: float(part[0]) ** 0.5 for name, part in parts.items()},
+    )
+
+
+def conditions_of_state(q: State, protocol: RangingProtocol) -> Conditions:
+    """Return a state as conditions (1,) of exchanges of a protocol; raises what `predict_state` raises."""
     _check(q)
     # The target's reply is the scheduled message where there is no third one, or where both replies are equal.
     timings = [message.timing for message in protocol.messages]
@@ -210,7 +228,7 @@ def predict_state(q: State) -> Prediction:
     scheduled = q.reply_delay_us if target_waits else final_us
     at_once = final_us if final_at_once else q.reply_delay_us
     skew, aggregate = np.array([0.5e-6, -0.5e-6]), np.array([q.delay_initiator_ns, q.delay_target_ns])
-    conditions = Conditions.single(
+    return Conditions.single(
         flight=q.distance_m / SPEED_OF_LIGHT,
         flight_rate=q.speed_mps / SPEED_OF_LIGHT,
         rate=q.skew_ppm * skew,
@@ -224,18 +242,4 @@ def predict_state(q: State) -> Prediction:
         carrier_bias_ppm=q.carrier_bias_ppm,
         carrier_std_ppm=q.carrier_noise_ppm,
         quantize=q.whole_ticks,
-    )
-    found = predict(protocol, conditions)
-    bias, variance = found.pooled()
-    # A state has neither noise of clocks nor multipath.
-    parts = {name: part for name, part in found.parts_m2.items() if name not in ("clocks", "multipath")}
-    return Prediction(
-        protocol=protocol.name,
-        title=protocol.title,
-        bias_m=bias,
-        std_m=variance**0.5,
-        variance_m2=variance,
-        bias_ps=bias / SPEED_OF_LIGHT * 1e12,
-        std_ps=variance**0.5 / SPEED_OF_LIGHT * 1e12,
-        parts_m={name: float(part[0]) ** 0.5 for name, part in parts.items()},
     )

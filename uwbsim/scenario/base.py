@@ -85,7 +85,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Vector = tuple[float, float, float]
 Increasing = Annotated[tuple[float, ...], AfterValidator(_increasing)]
 NotDecreasing = Annotated[tuple[float, ...], AfterValidator(not_decreasing)]
-TagId = Annotated[int, Field(ge=0, le=254)]
+TagId = Annotated[int, Field(ge=0, le=65_535)]
 
 
 def _limits_in_schema(schema: dict[str, Any]) -> None:

@@ -266,7 +266,10 @@ class ScenarioTag(Section):
         None,
         description="Group delay of its antenna over direction; by default radio.group_delay.",
     )
-    passive: bool = Field(False, description="Whether it records the exchanges that it overhears.")
+    passive: bool = Field(
+        False,
+        description="Whether it records the exchanges that it overhears; with plan broadcast, whether it only listens.",
+    )
     tx_power_db: float = Field(0.0, description="Offset of its transmit power.")
     power_offset_db: float = Field(0.0, description="Offset of its power readings.")
     pattern_db: tuple[float, ...] = Field(

@@ -23,6 +23,10 @@ WAVELENGTH_M: Final = SPEED_OF_LIGHT / 3993.6e6
 """At the centre of channel 2, which the boards use (firmware wire format, 2.2)."""
 
 
+NO_BROADCASTS: Final = "ranging.plan: found 'broadcast', but the boards' firmware has no broadcasts; use `uwbsim run`"
+"""Why virtual boards, and their wire format, refuse a scenario of broadcasts."""
+
+
 class RunSettings(Section):
     """Name, seed and length of the simulation."""
 
@@ -80,14 +84,20 @@ class Scenario(Section):
         self._check_geometric()
         self._check_places()
         self._check_plan()
-        fastest = self.ranging.fastest_hz(self.radio.preamble_symbols)
+        fastest = self.ranging.fastest_hz(self.radio.preamble_symbols, len(self.senders()))
         if self.ranging.plan != "aloha" and self.ranging.rate_hz > fastest:
+            why = (
+                f"frames of {len(self.senders())} tags"
+                if self.ranging.plan == "broadcast"
+                else "this response_delay_uus"
+            )
             raise ValueError(
-                f"ranging.rate_hz: found {self.ranging.rate_hz:g}, at this response_delay_uus the air allows "
-                f"at most {fastest:.0f}"
+                f"ranging.rate_hz: found {self.ranging.rate_hz:g}, at {why} the air allows at most {fastest:.0f}"
             )
         if not self.pairs():
-            raise ValueError("ranging.pairs: no two tags sit on different bodies, so no exchange is possible")
+            raise ValueError(
+                "ranging.pairs: no two tags sit on different bodies, or send broadcasts, so no exchange is possible"
+            )
         return self
 
     def _check_tags(self, ids: list[int]) -> None:
@@ -146,6 +156,11 @@ class Scenario(Section):
                 )
 
     def _check_plan(self) -> None:
+        if self.ranging.plan == "broadcast":
+            for key in ("protocol", "pairs", "get_cir"):
+                found, only = getattr(self.ranging, key), Ranging.model_fields[key].default
+                if found != only:
+                    raise ValueError(f"ranging.{key}: found {found!r}, but plan broadcast allows only {only!r}")
         if isinstance(self.ranging.plan, str):
             return
         for k, (time_s, initiator, target) in enumerate(self.ranging.plan.slots):
@@ -161,10 +176,16 @@ class Scenario(Section):
             )
 
     def pairs(self) -> list[tuple[int, int]]:
-        """Return the (initiator, target) pairs in the order in which they range."""
+        """Return the (initiator, target) pairs in the order in which they range; of broadcasts, in either role."""
+        if self.ranging.plan == "broadcast":
+            return [*combinations(self.senders(), 2)]
         if self.ranging.pairs != "between-bodies":
             return list(self.ranging.pairs)
         return [(a.id, b.id) for a, b in combinations(self.tags, 2) if a.body != b.body]
+
+    def senders(self) -> list[int]:
+        """Return the ids of the tags that send: with plan broadcast, passive tags only listen."""
+        return [tag.id for tag in self.tags if not tag.passive or self.ranging.plan != "broadcast"]
 
     def planted(self) -> dict[str, Any]:
         """Return what a calibration of this scenario should find, JSON-ready."""

@@ -6,8 +6,10 @@ from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, Final, Literal, Self
 
+import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
+from uwblink.arrays import Bools, Floats, Ints
 from uwbsim.scenario.base import NotDecreasing, NotNegative, Positive, Section, Share, TagId, look_up
 from uwbsim.scenario.devices import GroupDelay, check_grid
 
@@ -364,13 +366,15 @@ class Radio(Section):
         description="Intervals in which pairs do not hear each other; by default none.",
     )
 
-    def loses(self, signal_dbm: float, start: int, other_dbm: float, other_start: int) -> bool:
+    def loses(
+        self, signal_dbm: float | Floats, start: int | Ints, other_dbm: float | Floats, other_start: int | Ints
+    ) -> Bools:
         """Return whether a frame is lost that overlaps another one, from powers at the receiver and times of start.
 
         It is received only if it is the first and stronger by `capture_db`; weak frames disturb no other.
         """
-        weaker = signal_dbm < other_dbm + self.capture_db
-        return other_dbm >= self.sensitivity_dbm and (weaker or start > other_start)
+        weaker = np.less(signal_dbm, other_dbm + self.capture_db)
+        return np.asarray(np.greater_equal(other_dbm, self.sensitivity_dbm) & (weaker | np.greater(start, other_start)))
 
     @property
     def independent_multipath(self) -> tuple[float, float]:

@@ -50,6 +50,13 @@ def after_marker_s(length_bytes: int) -> float:
     return 21 * UUS_S + (bits + 48 * math.ceil(bits / 330)) * (64 / 499.2e6)
 
 
+BROADCAST_BYTES: Final = 17
+HEARD_BYTES: Final = 6
+LONGEST_FRAME_BYTES: Final = 127
+"""Of a broadcast with its number and its own stamp of 40 bits; of each tag that it heard, with its id and such a stamp;
+and of the longest standard frame (User Manual, section 3.4): what it has no room for waits for the next one."""
+
+
 def frame_s(length_bytes: int, preamble_symbols: int) -> float:
     """Return the whole duration of a frame in seconds."""
     return before_marker_s(preamble_symbols) + after_marker_s(length_bytes)
@@ -65,10 +72,32 @@ def exchange_air_s(protocol: RangingProtocol, preamble_symbols: int) -> float:
     return sum(frame_s(length, preamble_symbols) for length in message_bytes(protocol))
 
 
-def exchange_s(protocol: RangingProtocol, preamble_symbols: int, scheduled_s: float, at_once_s: float) -> float:
-    """Return how long an exchange takes, from its first preamble to the end of its last frame."""
-    replies = sum(scheduled_s if message.timing == "scheduled" else at_once_s for message in protocol.messages[1:])
-    return before_marker_s(preamble_symbols) + replies + after_marker_s(message_bytes(protocol)[-1])
+def broadcast_s(tags: int, preamble_symbols: int) -> float:
+    """Return the duration of a broadcast that reports what its sender heard of all other of so many tags."""
+    length = BROADCAST_BYTES + HEARD_BYTES * (tags - 1)
+    return frame_s(min(length, LONGEST_FRAME_BYTES), preamble_symbols)
+
+
+def exchange_costs(
+    protocol: RangingProtocol, preamble_symbols: int, scheduled_s: float, at_once_s: float
+) -> dict[str, float]:
+    """Return the durations of an exchange: `air_s`, `duration_s`, and `radio_on_s` of both radios together.
+
+    `duration_s` is from the first preamble to the end of the last frame.
+    """
+    lengths, marker = message_bytes(protocol), 0.0
+    end, radio = after_marker_s(lengths[0]), 2 * frame_s(lengths[0], preamble_symbols)
+    for message, length in zip(protocol.messages[1:], lengths[1:], strict=True):
+        marker += scheduled_s if message.timing == "scheduled" else at_once_s
+        # The receiver listens from the end of the frame before, as soon as it is on again.
+        listening = marker + after_marker_s(length) - end - RECEIVER_ON_S
+        radio += frame_s(length, preamble_symbols) + max(listening, 0.0)
+        end = marker + after_marker_s(length)
+    return {
+        "air_s": exchange_air_s(protocol, preamble_symbols),
+        "duration_s": before_marker_s(preamble_symbols) + end,
+        "radio_on_s": radio,
+    }
 
 
 def _known(name: str) -> str:
@@ -81,7 +110,7 @@ ProtocolName = Annotated[
 ]
 
 
-PlanName = Literal["round-robin", "tdma", "aloha", "common-list"]
+PlanName = Literal["round-robin", "tdma", "aloha", "common-list", "broadcast"]
 
 
 class BoardReply(Section):
@@ -133,7 +162,9 @@ class Ranging(Section):
         "ds",
         description="Ranging protocol.",
     )
-    rate_hz: Positive = Field(description="Exchanges per second, all pairs together.")
+    rate_hz: Positive = Field(
+        description="Exchanges per second, all pairs together; frames of all tags with plan broadcast.",
+    )
     pairs: Literal["between-bodies"] | tuple[tuple[TagId, TagId], ...] = Field(
         "between-bodies",
         description="Pairs, as [initiator, target]; or all pairs of tags on different bodies.",
@@ -141,9 +172,13 @@ class Ranging(Section):
     plan: PlanName | PlanFile = Field(
         "round-robin",
         description="Order of exchanges: in turns, in slots of synchronized hosts (tdma), at random (aloha), by a list "
-        "that all robots share (common-list), or by a file.",
+        "that all robots share (common-list), or by a file. With broadcast, each tag that is not passive sends one "
+        "frame in its slot, and all others hear it: a frame of one tag and two of another make an exchange.",
     )
-    sync_error_ms: NotNegative = Field(0.1, description="Standard deviation of the hosts' clocks, with plan tdma.")
+    sync_error_ms: NotNegative = Field(
+        0.1,
+        description="Standard deviation of the hosts' clocks, with plan tdma, or of each frame's time, with broadcast.",
+    )
     list_timeout_ms: NotNegative = Field(
         10.0,
         description="Time for which a robot waits for an exchange that it cannot hear, with plan common-list.",
@@ -180,7 +215,19 @@ class Ranging(Section):
         median_s = 305e-6  # of boards (firmware wire format, 3.4)
         return float(self.reply.at_s(np.array(0.5))) if self.reply.model == "quantiles" else median_s
 
-    def fastest_hz(self, preamble_symbols: int) -> float:
-        """Return how many exchanges a second one after the other allow."""
+    def air_s(self, preamble_symbols: int, tags: int) -> float:
+        """Return the air time of an exchange; of a broadcast by one of so many tags."""
+        if self.plan == "broadcast":
+            return broadcast_s(tags, preamble_symbols)
+        return exchange_air_s(PROTOCOLS[self.protocol], preamble_symbols)
+
+    def fastest_hz(self, preamble_symbols: int, tags: int = 2) -> float:
+        """Return how many exchanges a second one after the other allow, or broadcasts by so many tags.
+
+        A tag sends its broadcast as soon after the one before as it sends a reply.
+        """
+        if self.plan == "broadcast":
+            return 1 / (self.air_s(preamble_symbols, tags) + self.at_once_s)
         row = PROTOCOLS[self.protocol]
-        return 1 / (exchange_s(row, preamble_symbols, self.scheduled_s, self.at_once_s) + TURNAROUND_S)
+        cost = exchange_costs(row, preamble_symbols, self.scheduled_s, self.at_once_s)
+        return 1 / (cost["duration_s"] + TURNAROUND_S)

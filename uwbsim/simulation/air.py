@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -52,14 +52,15 @@ class Schedule:
 
 
 def schedule(scenario: Scenario) -> Schedule:
-    """Return the exchanges that a scenario plans, in order of time."""
+    """Return the exchanges that a scenario plans, in order of time; a broadcast is one row for each listener."""
     place = {tag.id: k for k, tag in enumerate(scenario.tags)}
     plan, rate_hz, duration_s = scenario.ranging.plan, scenario.ranging.rate_hz, scenario.run.duration_s
     if not isinstance(plan, str):
         slots = [slot for slot in plan.slots if slot[0] <= duration_s]
         turns = np.array([[place[a], place[b]] for _, a, b in slots], dtype=np.int64)
         return _in_order(np.array([time_s for time_s, _, _ in slots]), turns, turns[:, 0])
-    pairs = np.array([[place[a], place[b]] for a, b in scenario.pairs()], dtype=np.int64)
+    turn = scenario.pairs() if plan != "broadcast" else [(a, a) for a in scenario.senders()]
+    pairs = np.array([[place[a], place[b]] for a, b in turn], dtype=np.int64)
     if plan == "aloha":
         # Every initiator ranges at random times with random targets; their rates add up to the plan's.
         initiators, parts = np.unique(pairs[:, 0]), []
@@ -75,11 +76,19 @@ def schedule(scenario: Scenario) -> Schedule:
     # it cannot hear that exchange, it waits for `list_timeout_ms` in addition (`Slots.pause`).
     count = int(duration_s * rate_hz)
     start, turns = np.arange(count) / rate_hz, pairs[np.arange(count) % len(pairs)]
-    if plan != "tdma":
+    if plan not in ("tdma", "broadcast"):
         return _in_order(start, turns, np.zeros(count, dtype=np.int64))
-    error_s = stream(scenario.run.seed, "sync error").normal(size=len(scenario.tags))
-    late = error_s * (scenario.ranging.sync_error_ms * 1e-3)
-    return _in_order(np.maximum(start + late[turns[:, 0]], 0), turns, turns[:, 0])
+    # With "broadcast" the tags keep their slots by the frames that they hear, with another error each time.
+    rng, which = stream(scenario.run.seed, "sync error"), np.arange(count) if plan == "broadcast" else turns[:, 0]
+    late = rng.normal(size=max(count, len(place))) * (scenario.ranging.sync_error_ms * 1e-3)
+    found = _in_order(np.maximum(start + late[which], 0), turns, turns[:, 0])
+    return _to_all_others(found, len(place)) if plan == "broadcast" else found
+
+
+def _to_all_others(sent: Schedule, tags: int) -> Schedule:
+    """Return broadcasts with a row for each other tag; the rows of a frame follow each other."""
+    listeners = (sent.initiator[:, None] + np.arange(1, tags)) % tags
+    return replace(sent[np.repeat(np.arange(len(sent.start)), tags - 1)], target=listeners.ravel())
 
 
 def _in_order(start_s: Floats, pairs: Ints, host: Ints) -> Schedule:

@@ -11,23 +11,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.arrays import Floats
-from uwblink.protocols.table import ON_BOARDS, PROTOCOLS
+from uwblink.arrays import Floats, Ints
+from uwblink.protocols.table import ON_BOARDS, PROTOCOLS, RangingProtocol
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import CirRow, Fault, FrameRow, Poses, Tag
-from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, UUS_TICKS, elapsed
+from uwblink.ticks import COUNTER_BITS, SPEED_OF_LIGHT, TICK_S, UUS_TICKS, elapsed
 from uwblink.twr import Exchanges, raw_range
 from uwblink.wire.codec import Decoder, encode, exchanges_of
 from uwblink.wire.messages import REPORTS, RangeReport
 from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import Source, as_scenario
-from uwbsim.scenario.model import Scenario
-from uwbsim.scenario.ranging import before_marker_s, exchange_air_s
-from uwbsim.simulation import air
+from uwbsim.scenario.model import NO_BROADCASTS, Scenario
+from uwbsim.scenario.ranging import before_marker_s
+from uwbsim.simulation import air, broadcasts
 from uwbsim.simulation.air import Schedule, schedule
 from uwbsim.simulation.timestamps import (
     Draws,
+    Stamped,
     draw,
     overhear,
     provenance,
@@ -48,10 +49,10 @@ class Simulated:
 
     `exchanges` are n exchanges in order of time and `truth_m` (n,) their true distances in metres, each the mean over
     the first two messages; `poses` are those of motion capture; `tags` are the tags with their bodies and lever arms;
-    `faults` are the exchanges that failed. `overheard` are the columns of what passive tags received, `cirs` impulse
-    responses (time_ns, board, initiator, target, first path in taps, 1016 magnitudes). `meta` is the recording's
-    provenance. `temperature` are the columns of the tags' readings of temperature and supply voltage, `imu` and
-    `height` those of the bodies' inertial and height sensors.
+    `faults` are the exchanges that failed. `overheard` are the columns of what passive tags received, `receptions`
+    those of all broadcasts, `cirs` impulse responses (time_ns, board, initiator, target, first path in taps, 1016
+    magnitudes). `meta` is the recording's provenance. `temperature` are the columns of the tags' readings of
+    temperature and supply voltage, `imu` and `height` those of the bodies' inertial and height sensors.
 
     >>> import uwbsim
     >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
@@ -82,6 +83,7 @@ class Simulated:
     temperature: dict[str, NDArray[Any]] = field(default_factory=dict)
     imu: dict[str, NDArray[Any]] = field(default_factory=dict)
     height: dict[str, NDArray[Any]] = field(default_factory=dict)
+    receptions: dict[str, NDArray[Any]] = field(default_factory=dict)
 
     @property
     def planted(self) -> dict[str, Any]:
@@ -105,7 +107,7 @@ class Simulated:
             recording.append_poses(self.poses)
             recording.append_exchanges(self.exchanges)
             recording.append("faults", self.faults)
-            for table in ("overheard", "temperature", "imu", "height"):
+            for table in ("overheard", "temperature", "imu", "height", "receptions"):
                 recording.append(table, getattr(self, table))
             recording.append("cirs", self.cirs)
             recording.append("frames", frames)
@@ -121,7 +123,8 @@ class Simulated:
             f"{len(self.tags)} tags on {len({tag.body for tag in self.tags})} bodies in {run['duration_s']:g} s",
             f"  failed: {failed}",
             f"  poses: {len(self.poses)}; overheard: {len(self.overheard.get('time_ns', ()))}; "
-            f"impulse responses: {len(self.cirs)}",
+            f"impulse responses: {len(self.cirs)}"
+            + (f"; receptions: {len(self.receptions['time_ns'])}" if self.receptions else ""),
         ]
         if len(error):
             median, spread = (100 * float(v) for v in (np.median(error), np.std(error)))
@@ -137,7 +140,8 @@ def simulate(
     `scenario` is a `Scenario`, a file (.toml), TOML text of more than one line, or the same as nested tables. Without
     `contention` there is no event loop: every exchange begins when planned and disturbs no other; stamps of exchanges
     that do not overlap are the same, and simulation is faster. `progress` is called with the done fraction, 0 to 1.
-    Raises `ScenarioError` for an invalid scenario, and for one longer than the integer true time can hold (36 h).
+    Raises `ScenarioError` for an invalid scenario, and for one longer than the integer true time can hold (36 h), and
+    `ArgumentError` for broadcasts that make no exchange.
 
     >>> import uwbsim
     >>> flight = uwbsim.simulate(
@@ -157,11 +161,15 @@ def simulate(
     scenario = as_scenario(scenario)
     if scenario.run.duration_s > LONGEST_RUN_S:
         raise ScenarioError(f"run.duration_s: at most {LONGEST_RUN_S:g} (36 h)")
-    protocol, world, plan = PROTOCOLS[scenario.ranging.protocol], World(scenario), schedule(scenario)
-    medium = Medium(scenario, world)
-    draws = draw(scenario, len(plan.start), len(protocol.messages))
-    slots = _slots(medium, world, plan, draws)
-    if contention:
+    broadcast, protocol = scenario.ranging.plan == "broadcast", PROTOCOLS[scenario.ranging.protocol]
+    if broadcast:  # every row of the plan is a message to one listener
+        protocol = replace(protocol, messages=protocol.messages[:1])
+    world, plan = World(scenario), schedule(scenario)
+    medium, draws = Medium(scenario, world), draw(scenario, len(plan.start), len(protocol.messages))
+    if broadcast:
+        draws = broadcasts.one_departure(draws, len(scenario.tags) - 1)
+    slots = _slots(medium, world, protocol, plan, draws)
+    if contention and not broadcast:
         sampled = SampledWorld(world)
         execution = air.Air(
             protocol, slots, lambda tag, time: sampled.from_sender(tag, max(time, 0)).power_dbm, scenario.radio
@@ -169,34 +177,42 @@ def simulate(
         outcomes = execution.execute(progress)
     else:
         outcomes = _undisturbed(scenario, slots)
+        if contention:
+            outcomes = broadcasts.with_collisions(medium, plan, outcomes)
     begun, lost = np.array(outcomes.start, dtype=np.int64), np.array(outcomes.lost)
     kept = np.flatnonzero(lost < 0)
     kept = kept[np.argsort(begun[kept], kind="stable")]
     rows = replace(plan[kept], start=begun[kept])
     stamped = stamp(medium, protocol, rows, draws[kept])
-    exchanges = reported_exchanges(medium, kept, len(plan.start), rows, stamped)
+    reported = broadcasts.reported if broadcast else _reported
+    found = reported(medium, kept, len(plan.start), rows, stamped)
     return Simulated(
-        exchanges=exchanges,
+        **found,
         poses=world.motion_capture(),
         tags=[Tag(t.id, t.body, t.lever_arm_m) for t in scenario.tags],
         faults=reported_faults(scenario, plan, outcomes),
-        overheard=overhear(medium, stamped, exchanges),
-        cirs=responses(scenario, world, protocol, exchanges, stamped) if scenario.ranging.get_cir else [],
-        truth_m=(stamped.links[0].distance_m + stamped.links[1].distance_m) / 2,
-        meta=provenance(scenario),
+        cirs=responses(scenario, world, protocol, found["exchanges"], stamped) if scenario.ranging.get_cir else [],
+        meta=provenance(scenario) | ({"timestamp_bits": COUNTER_BITS} if broadcast else {}),
         temperature=readings(scenario),
         imu=sensor_readings(scenario, world.trajectories, "imu"),
         height=sensor_readings(scenario, world.trajectories, "height"),
     )
 
 
-def _slots(medium: Medium, world: World, plan: Schedule, draws: Draws) -> air.Slots:
+def _reported(medium: Medium, kept: Ints, planned: int, rows: Schedule, stamped: Stamped) -> dict[str, Any]:
+    """Return what boards report of the `kept` exchanges (n,), of all `planned`, and their true distances."""
+    exchanges = reported_exchanges(medium, kept, planned, rows, stamped)
+    truth_m = (stamped.links[0].distance_m + stamped.links[1].distance_m) / 2
+    return {"exchanges": exchanges, "overheard": overhear(medium, stamped, exchanges), "truth_m": truth_m}
+
+
+def _slots(medium: Medium, world: World, protocol: RangingProtocol, plan: Schedule, draws: Draws) -> air.Slots:
     """Return the plan with the nominal delays of its messages, and whether each is strong enough.
 
     Power noise makes the limit soft. In a common list an initiator waits longer for an exchange that it cannot hear.
     """
     scenario, ranging, radio = medium.scenario, medium.scenario.ranging, medium.scenario.radio
-    messages, ends, pause = PROTOCOLS[ranging.protocol].messages, (plan.initiator, plan.target), plan.start * 0
+    messages, ends, pause = protocol.messages, (plan.initiator, plan.target), plan.start * 0
     at_once = np.rint(draws.reply_s * SUBTICKS_PER_SECOND).astype(np.int64)
     delays = {"at once": at_once, "scheduled": at_once * 0 + ranging.response_delay_uus * UUS_TICKS * SUBTICKS}
     delay = np.array([delays[message.timing] for message in messages])
@@ -248,6 +264,8 @@ def through_wire(simulated: Simulated) -> tuple[Simulated, list[FrameRow]]:
     >>> decoded.save("wire.uwb", frames=frames)
     """
     e = simulated.exchanges
+    if simulated.receptions:
+        raise ScenarioError(NO_BROADCASTS)
     strange = sorted(set(np.unique(e.protocol).tolist()) - set(ON_BOARDS))
     if strange:
         raise ScenarioError(
@@ -302,7 +320,8 @@ class Preview:
         plan = ranging.plan if isinstance(ranging.plan, str) else ranging.plan.file
         lines = [
             f"{scenario.run.name}: {PROTOCOLS[ranging.protocol].title}, plan {plan}, {self.duration_s:g} s",
-            f"{self.exchanges} exchanges planned among {len(self.pairs)} pairs, {self.rate_hz:.3g} a second "
+            f"{self.exchanges} {'broadcasts' if plan == 'broadcast' else 'exchanges'} planned among "
+            f"{len(self.pairs)} pairs, {self.rate_hz:.3g} a second "
             f"(one after the other at most {self.fastest_hz:.0f}); "
             f"frames on the air {100 * self.air_share:.1f} % of the time",
             f"{'pair':>10s}{'exchanges':>11s}{'Hz':>7s}{'metres':>17s}{'dBm':>18s}  SS-TWR's bias (cm)",
@@ -359,7 +378,8 @@ def preview(scenario: Scenario | Source) -> Preview:
     plan, world = schedule(scenario), World(scenario)
     duration, radio, samples = scenario.run.duration_s, scenario.radio, 200
     time = (np.linspace(0, duration, samples) * SUBTICKS_PER_SECOND).astype(np.int64)
-    ranging, pairs = scenario.ranging, []
+    ranging, pairs, senders = scenario.ranging, [], len(scenario.senders())
+    turns = len(plan.start) // (len(scenario.tags) - 1 if ranging.plan == "broadcast" else 1)
     for i, j in sorted(set(zip(plan.initiator.tolist(), plan.target.tolist(), strict=True))):
         count = int(np.count_nonzero((plan.initiator == i) & (plan.target == j)))
         link = world.link(np.full(samples, i), np.full(samples, j), time)
@@ -379,9 +399,9 @@ def preview(scenario: Scenario | Source) -> Preview:
     return Preview(
         scenario=scenario,
         pairs=tuple(pairs),
-        exchanges=len(plan.start),
-        rate_hz=len(plan.start) / duration,
-        fastest_hz=ranging.fastest_hz(radio.preamble_symbols),
-        air_share=ranging.rate_hz * exchange_air_s(PROTOCOLS[ranging.protocol], radio.preamble_symbols),
+        exchanges=turns,
+        rate_hz=turns / duration,
+        fastest_hz=ranging.fastest_hz(radio.preamble_symbols, senders),
+        air_share=ranging.rate_hz * ranging.air_s(radio.preamble_symbols, senders),
         duration_s=duration,
     )

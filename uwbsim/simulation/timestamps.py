@@ -153,11 +153,11 @@ def reported_exchanges(medium: Medium, kept: Ints, planned: int, rows: Schedule,
     ids = np.array([tag.id for tag in medium.scenario.tags], dtype=np.int64)
     none = np.zeros(len(kept), dtype=np.int64)
     stamps: dict[str, Ints] = {name: stamped.stamps.get(name, none) & MASK for name in STAMPS}
-    fpp1, skew1 = _readings(medium, 1, kept, planned, stamped)
-    fpp2, skew2 = _readings(medium, 2, kept, planned, stamped)
+    fpp1, skew1 = printed_readings(medium, 1, kept, planned, stamped)
+    fpp2, skew2 = printed_readings(medium, 2, kept, planned, stamped)
     nan = np.full(len(kept), np.nan)
     found = Exchanges(
-        time_ns=np.rint(stamped.frames[0].departure * (NS_PER_S / SUBTICKS_PER_SECOND)).astype(np.int64),
+        time_ns=time_ns(stamped.frames[0].departure),
         initiator=ids[rows.initiator],
         target=ids[rows.target],
         protocol=np.full(len(kept), medium.scenario.ranging.protocol),
@@ -175,8 +175,13 @@ def reported_exchanges(medium: Medium, kept: Ints, planned: int, rows: Schedule,
     return replace(found, range_m=printed(found))
 
 
-def _readings(medium: Medium, number: int, kept: Ints, planned: int, stamped: Stamped) -> tuple[Floats, Floats]:
-    """What the receiver of message `number` prints: first-path power and relative skew."""
+def time_ns(departure: Ints) -> Ints:
+    """Return true times (n,) in nanoseconds."""
+    return np.asarray(np.rint(departure * (NS_PER_S / SUBTICKS_PER_SECOND)).astype(np.int64))
+
+
+def printed_readings(medium: Medium, number: int, kept: Ints, planned: int, stamped: Stamped) -> tuple[Floats, Floats]:
+    """Return what receivers print of message `number`: first-path power and relative skew, (n,) each."""
     seed = medium.scenario.run.seed
     power_noise = stream(seed, "power reading", number).normal(size=planned)[kept]
     skew_noise = stream(seed, "skew reading", number).normal(size=planned)[kept]
@@ -187,12 +192,13 @@ def reported_faults(scenario: Scenario, plan: Schedule, outcomes: air.Outcomes) 
     """Return the failed exchanges, with their reasons and initiators."""
     ids, failed = np.array([tag.id for tag in scenario.tags]), np.flatnonzero(np.array(outcomes.lost) >= 0)
     tags = zip(ids[plan.initiator[failed]].tolist(), ids[plan.target[failed]].tolist(), strict=True)
+    what = "{} broadcast to {}: frame" if scenario.ranging.plan == "broadcast" else "{} ranged with {}: message {}"
     return [
         Fault(
             round(outcomes.start[k] * (NS_PER_S / SUBTICKS_PER_SECOND)),
             str(a),
             "lost frame" if outcomes.reason[k] == air.WEAK else outcomes.reason[k],
-            f"{a} ranged with {b}: message {outcomes.lost[k] + 1} {outcomes.reason[k]}",
+            f"{what.format(a, b, outcomes.lost[k] + 1)} {outcomes.reason[k]}",
             a,
             b,
         )

@@ -81,10 +81,12 @@ class Work:
 
     def check(self) -> None:
         """Raise `ParameterError` for a function that another process cannot import by its name."""
-        named: dict[str, object] = {f"channel effect {name!r}": effect for name, effect in self.effects}
         parts = ("flight_ticks", "delay_weights")
-        named |= {f"{part} of protocol {row.name!r}": getattr(row, part) for row in self.protocols for part in parts}
-        named |= {} if self.evaluate is None else {"evaluate": self.evaluate}
+        named: dict[str, object] = {
+            **{f"channel effect {name!r}": effect for name, effect in self.effects},
+            **{f"{part} of protocol {row.name!r}": getattr(row, part) for row in self.protocols for part in parts},
+            **({} if self.evaluate is None else {"evaluate": self.evaluate}),
+        }
         for what, function in named.items():
             module = sys.modules.get(getattr(function, "__module__", None) or "")
             if getattr(module, getattr(function, "__qualname__", ""), None) is not function:
@@ -100,10 +102,11 @@ class Work:
             if run.error:
                 raise UwbsimError(run.error)
             scenario = Scenario.model_validate_json(run.scenario)
-            if self.evaluate is None:
-                rows = [one.to_dict() for one in compare(scenario, self.protocols, self.ranges).outcomes]
-            else:
-                rows = [self._evaluated(scenario, row.name, self.evaluate) for row in self.protocols]
+            rows = (
+                [one.to_dict() for one in compare(scenario, self.protocols, self.ranges).outcomes]
+                if self.evaluate is None
+                else [self._evaluated(scenario, row.name, self.evaluate) for row in self.protocols]
+            )
         except (UwbsimError, UwblinkError, ArithmeticError, ValueError, MemoryError) as error:
             return self.failed(run, str(error) or type(error).__name__)
         return run.number, [self._head(run) | {"status": "ok", "error": None} | row for row in rows]

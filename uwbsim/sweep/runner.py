@@ -169,14 +169,9 @@ def _do(
 
 def _lost(chunk: Chunk, work: Work, attempts: Counter[int], again: list[Chunk]) -> list[Result]:
     """Queue the runs of a lost chunk one by one; return the rows of those whose worker died three times."""
-    rows = []
-    for run in chunk:
-        attempts[run.number] += 1
-        if attempts[run.number] >= 3:
-            rows.append(work.failed(run, "its worker died 3 times"))
-        else:
-            again.append([run])
-    return rows
+    attempts.update(run.number for run in chunk)
+    again += [[run] for run in chunk if attempts[run.number] < 3]
+    return [work.failed(run, "its worker died 3 times") for run in chunk if attempts[run.number] >= 3]
 
 
 class TableError(UwblinkError, ValueError):

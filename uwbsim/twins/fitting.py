@@ -118,8 +118,7 @@ def _finite_or_none(value: Any) -> Any:
     return None if value != value else value
 
 
-Column = Callable[[TwinFlight], Floats]
-QUANTITIES: Final[dict[str, tuple[str, Column]]] = {
+QUANTITIES: Final[dict[str, tuple[str, Callable[[TwinFlight], Floats]]]] = {
     "reply dt32": ("us", lambda f: intervals(f.exchanges).dt32 * TICK_S * 1e6),
     "first-path power at target": ("dBm", lambda f: f.exchanges.fpp1_dbm),
     "first-path power at initiator": ("dBm", lambda f: f.exchanges.fpp2_dbm),
@@ -202,8 +201,6 @@ class Twin:
     scenario: Scenario
     found: dict[str, Any]
     unknown: tuple[str, ...]
-    recording: str
-    calibration: str
     measured: TwinFlight
     known: KnownDevices
     paths: dict[str, Poses]
@@ -251,14 +248,14 @@ class Twin:
             write_text(plan, "\r\n".join([*lines, ""]), force=force)
             table["ranging"] = table["ranging"] | {"plan": {"file": plan.name}}
         head = (
-            f"The twin of {Path(self.recording).name} with {Path(self.calibration).name}: fitted to it by "
+            f"The twin of {Path(self.measured.where).name} with {Path(self.known.where).name}: fitted to it by "
             "`uwbsim twin`, which also wrote the files that it names. Keys that are left out have their defaults."
         )
         write_text(path, scenario_text(table, head), force=force)
 
     def __repr__(self) -> str:
         """Return what was found, a line each."""
-        head = f"Twin of {self.recording}: {len(self.measured)} exchanges of {len(self.measured.pairs)} pairs"
+        head = f"Twin of {self.measured.where}: {len(self.measured)} exchanges of {len(self.measured.pairs)} pairs"
         values = (f"  {name}: {value:.4g}" for name, value in self.found.items() if isinstance(value, float))
         return "\n".join([head, *values])
 
@@ -296,9 +293,8 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
         rows = flight.some(50_000)
         clocks = fit_clocks(flight[rows])
         noise_dbm, noise_s = receive_noise(clocks.receive_noise_s, flight.exchanges.fpp2_dbm[rows])
-        std_s = np.zeros_like(flight.power_dbm)
-        if len(noise_s):
-            std_s = np.interp(lifted(flight.power_dbm), lifted(noise_dbm), noise_s)
+        power = flight.power_dbm
+        std_s = np.interp(lifted(power), lifted(noise_dbm), noise_s) if len(noise_s) else np.zeros_like(power)
         errors = fit_range_errors(flight, np.sqrt(np.mean(std_s**2, axis=0)))
         powers = fit_powers(flight[rows], errors.reflected[rows])
         schedule = fit_schedule(flight, flown.faults)
@@ -317,8 +313,6 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
         scenario=scenario,
         found=summary(flight, fitted),
         unknown=tuple(unknowns(flight, fitted)),
-        recording=where,
-        calibration=known.where,
         measured=flight,
         known=known,
         paths=paths,

@@ -107,9 +107,8 @@ def effective_size(value: Floats, group: Ints) -> float:
 
 def some_rows(count: int, most: int) -> Ints:
     """Return `most` of `count` rows, chosen at random, in order: every k-th would leave out pairs that take turns."""
-    if count <= most:
-        return np.arange(count)
-    return np.sort(stream(0, "some rows", count).choice(count, most, replace=False))
+    chosen = range(count) if count <= most else stream(0, "some rows", count).choice(count, most, replace=False)
+    return np.sort(chosen)
 
 
 def bulk_spread(value: Floats) -> float:
@@ -235,6 +234,10 @@ class TwinFlight:
         row = PROTOCOLS[str(names[np.argmax(counts)])]
         x = flown.exchanges[np.flatnonzero(flown.exchanges.protocol == row.name)]
         require(len(x) >= fewest, f"holds {len(x)} exchanges, a twin needs {fewest} or more; record longer")
+        longest_ms = max(np.median(span) for span in (intervals(x).dt32, intervals(x).dt53)) * TICK_S * 1e3
+        require(
+            longest_ms < 6.7, f"waits {longest_ms:.1f} ms in its exchanges, boards 6.7 at most; broadcasts have no twin"
+        )
         require(len(flown.poses), "holds no poses; add motion capture with `uwblink poses`")
         x = x[np.argsort(x.time_ns, kind="stable")]
         powers = np.array([x.fpp1_dbm, x.fpp2_dbm])

@@ -59,25 +59,19 @@ def read_calibration(source: CalibrationSource) -> KnownDevices:
     from calib import CalibError, Calibration, load_calibration
 
     where = str(source) if isinstance(source, str | os.PathLike) else "calibration"
+    if not isinstance(source, str | os.PathLike | Mapping | Calibration):
+        raise ScenarioError(f"calibration: found {source!r:.60}, expected a file (.json) or a calibration")
     try:
-        if isinstance(source, Calibration):
-            found = source
-        elif isinstance(source, Mapping):
-            found = Calibration.from_json(json.dumps(source), where)
-        elif isinstance(source, str | os.PathLike):
-            found = load_calibration(source)
-        else:
-            raise ScenarioError(f"calibration: found {source!r:.60}, expected a file (.json) or a calibration")
+        known = Calibration.from_json(json.dumps(source), where) if isinstance(source, Mapping) else source
+        found = known if isinstance(known, Calibration) else load_calibration(known)
     except CalibError as error:
         raise ScenarioError(str(error)) from error
-    if found.groups:
-        raise ScenarioError(
-            f"{where}: groups: its tags have curves by group, and a scenario has one; fit one curve for all tags"
-        )
-    if found.pair_offsets:
-        raise ScenarioError(
-            f"{where}: pair_offsets: it knows constants of pairs, and a scenario has delays of tags; fit delays"
-        )
+    for key, text in (
+        ("groups", "its tags have curves by group, and a scenario has one; fit one curve for all tags"),
+        ("pair_offsets", "it knows constants of pairs, and a scenario has delays of tags; fit delays"),
+    ):
+        if getattr(found, key):
+            raise ScenarioError(f"{where}: {key}: {text}")
     # A scenario lifts powers about -82 dBm: 10^((p - alpha)/10) of the calibration differs by a factor.
     scale, curve = 10 ** ((found.alpha_dbm + 82.0) / 10), found.bias_curve
     knots = tuple(knot * scale for knot in curve.knots)

@@ -103,9 +103,8 @@ def tables(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the scenario's tables, and the poses by body that its `recorded` motions stand for."""
     schedule = fitted.schedule
-    duration = float(schedule.time_s[-1]) + AFTER_S
-    if schedule.turns is not None:
-        duration = (len(schedule.time_s) + 0.3) / schedule.rate_hz
+    whole = (len(schedule.time_s) + 0.3) / schedule.rate_hz
+    duration = whole if schedule.turns is not None else float(schedule.time_s[-1]) + AFTER_S
     bodies, paths = _bodies(flight, poses, duration)
     steps = [np.diff(poses.time_ns[poses.body == tag.body]) for tag in flight.tags]
     rates = [round(NS_PER_S / float(np.median(step)), 3) for step in steps if len(step) > 1]

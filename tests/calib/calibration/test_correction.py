@@ -7,6 +7,7 @@ import pytest
 
 import calib
 from calib.data.samples import sample_flight
+from tests.processes import refuse, succeed
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import TABLES, CirRow, Fault, FrameRow
 
@@ -28,7 +29,7 @@ def full_recording(path):
         recording.append("cirs", [CirRow(9, 1, 1, 2, 741.25, tuple(range(1016)))])
         recording.append("overheard", [{name: float(k) for k, name in enumerate(TABLES["overheard"])}])
         # And not "corrected", which is what is made.
-        for table in ("imu", "height", "powers", "temperature", "arrangements", "distances"):
+        for table in ("imu", "height", "powers", "quality", "receptions", "temperature", "arrangements", "distances"):
             kinds = {"BIGINT": np.array([11]), "VARCHAR": np.array(["b1"]), "DOUBLE": np.array([0.5])}
             kinds |= {"USMALLINT": np.array([3])}
             recording.append(table, {name: kinds[kind] for name, kind in TABLES[table].items()})
@@ -114,3 +115,33 @@ def test_blocks_of_any_size_are_corrected_alike(corrected, tmp_path, monkeypatch
     assert calib.apply(folder / "f.uwb", known, tmp_path / "c.uwb") == done
     for table in ("exchanges", "corrected", "poses", "cirs"):
         assert repr(rows(tmp_path / "c.uwb", table)) == repr(rows(folder / "c.uwb", table))
+
+
+def test_of_pairs_that_are_not_determined_the_others_are_corrected_and_they_are_named(tmp_path):
+    """Two tags and two anchors; in the second flight the tags range with each other, too."""
+    flight = calib.sample_flight()
+    e = flight.exchanges
+    lower = np.sort(np.unique(np.append(e.initiator, e.target)))[0]
+    across = (e.initiator == lower) ^ (e.target == lower)
+    for name, exchanges in (("across.uwb", e[across]), ("all.uwb", e), ("within.uwb", e[~across])):
+        with Recording.create(tmp_path / name) as recording:
+            recording.append_tags(flight.tags)
+            recording.append_poses(flight.poses)
+            recording.append_exchanges(exchanges)
+    succeed("calib", "fit", "across.uwb", "-o", "c.json", cwd=tmp_path)
+    whole = succeed("calib", "apply", "across.uwb", "-c", "c.json", "-o", "one.uwb", cwd=tmp_path)
+    part = succeed("calib", "apply", "all.uwb", "-c", "c.json", "-o", "two.uwb", cwd=tmp_path)
+    named = [f"{a}-{b}" for a, b in np.unique(np.sort(np.column_stack([e.initiator, e.target])[~across]), axis=0)]
+    assert "left out" not in whole.stderr
+    assert [line for line in part.stderr.splitlines() if all(pair in line for pair in named)]
+    assert f"{np.count_nonzero(~across)} ranges are left out" in part.stderr
+    for name in ("two.uwb", "one.uwb"):
+        assert rows(tmp_path / name, "corrected") == rows(tmp_path / "one.uwb", "corrected")
+        assert rows(tmp_path / name, "exchanges") == rows(tmp_path / "one.uwb", "exchanges")
+    # Evaluation and localization do the same.
+    for command in ("evaluate", "localize"):
+        said = [succeed("calib", command, name, "-c", "c.json", cwd=tmp_path) for name in ("across.uwb", "all.uwb")]
+        assert said[0].stdout.replace("across.uwb", "all.uwb").split() == said[1].stdout.split()
+        assert ["left out" in one.stderr for one in said] == [False, True]
+    refuse("calib", "apply", "within.uwb", "-c", "c.json", "-o", "no.uwb", cwd=tmp_path, naming=[named[0], "determine"])
+    assert not (tmp_path / "no.uwb").exists()

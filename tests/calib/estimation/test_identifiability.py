@@ -8,7 +8,7 @@ import yaml
 
 import calib
 from calib.cli.calibrating import delay_lines
-from calib.errors import BadInputError, UnanswerableError
+from calib.errors import BadInputError, LeftOutWarning, UnanswerableError
 from calib.estimator.range_model import MIN_RANGES_OF_GROUP as FEWEST
 from calib.evaluation.statistics import evaluate
 from calib.fitting.fitting import fit
@@ -57,9 +57,15 @@ def test_ranges_between_two_sides_are_corrected_and_others_refused_by_name(tmp_p
     direct = np.median(corrected.corrected_m - among(judged, ACROSS).truth_m)
     assert abs(direct) < 0.01
     assert evaluate(among(judged, ACROSS), known).overall.inside_95 == pytest.approx(0.95, abs=0.04)
-    for refused in (known.apply, lambda r: evaluate(r, known)):
-        with pytest.raises(BadInputError, match=r"ranges of 1-2, 3-7: only ranges between tags 1, 2 and tags 3, 7 are"):
-            refused(judged)
+    said = r"ranges of 1-2, 3-7: only ranges between tags 1, 2 and tags 3, 7 are"
+    with pytest.raises(BadInputError, match=said):
+        known.apply(judged)
+    with pytest.raises(BadInputError, match="ranges of 1-2: "):
+        evaluate(among(judged, [(1, 2)]), known)
+    with pytest.warns(LeftOutWarning, match=said) as caught:
+        left = evaluate(judged, known)
+    assert f"{len(judged) - len(among(judged, ACROSS))} of {len(judged)} ranges are left out" in str(caught[0].message)
+    assert left.overall == evaluate(among(judged, ACROSS), known).overall
     with pytest.raises(BadInputError, match="`to`: the data leave the delay of tag 1, 2, 3, 7 free"):
         calib.export(known, "registers")
     assert "pair     1-3  ranges" in "\n".join(delay_lines(known))

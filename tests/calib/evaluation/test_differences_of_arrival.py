@@ -72,7 +72,7 @@ def planted(sigma_m=0.005):
 
 def test_one_row_is_that_of_a_page_of_numpy(known, heard):
     x, h, row = heard[0].exchanges, heard[0].overheard, 1234
-    ranges = calib.load_ranges(heard[0], overheard=True)
+    ranges = calib.load_ranges(heard[0])
     found = known.correct_arrivals(ranges)
     own = {name: int(column[row]) for name, column in h.items() if column.dtype.kind == "i"}
     at = int(np.flatnonzero((x.tx1 == own["tx1_n"]) & (x.initiator == own["initiator"]))[0])
@@ -110,7 +110,7 @@ def test_one_row_is_that_of_a_page_of_numpy(known, heard):
 
 def test_without_noise_it_is_the_true_difference_and_the_robot_is_where_it_is():
     silent = flight(3110, 10.0, radio={"quantize": False})
-    ranges = calib.load_ranges(silent, overheard=True)
+    ranges = calib.load_ranges(silent)
     wrong = planted().correct_arrivals(ranges).corrected_m - ranges.arrivals.truth_m
     # Stamps in whole ticks of 4.7 mm: each is off by 1.4 mm, and a difference has the errors of four or so.
     assert abs(np.mean(wrong)) < 0.0005
@@ -125,7 +125,7 @@ def test_without_noise_it_is_the_true_difference_and_the_robot_is_where_it_is():
 def test_two_listeners_of_an_exchange_share_what_is_stated(known, heard):
     products, shared, squares, stated = [], [], [], []
     for one in heard:
-        ranges = calib.load_ranges(one, overheard=True)
+        ranges = calib.load_ranges(one)
         applied, a = known.correct_arrivals(ranges), ranges.arrivals
         wrong = applied.corrected_m - a.truth_m
         first, second = (np.flatnonzero(a.listener == tag)[np.argsort(a.exchange[a.listener == tag])] for tag in ROBOT)
@@ -156,7 +156,7 @@ def test_a_robot_that_never_sends_is_localized(known, heard):
 
 
 def test_the_filter_knows_what_listeners_of_an_exchange_share(heard):
-    (problem,), rng = problems(load_flight(heard[0], overheard=True)), np.random.default_rng(5)
+    (problem,), rng = problems(load_flight(heard[0])), np.random.default_rng(5)
     true_m = problem.ranges.arrivals.truth_m[problem.rows - len(problem.ranges)]
     drawn = 0.3 * rng.normal(size=len(problem.ranges))[problem.exchange] + 0.05 * rng.normal(size=len(true_m))
     own, common = np.full(len(true_m), 0.05), np.full(len(true_m), 0.3)
@@ -185,7 +185,7 @@ def test_what_is_overheard_helps_a_robot_that_ranges(known):
     ((ranging,), (both,)) = (calib.localize(all_hear, known, Settings(use=use)) for use in ("exchanges", "receptions"))
     ranges = len(ranging.tracks["raw"].time_ns)
     assert (ranging.arrivals, len(both.tracks["raw"].time_ns) - both.arrivals) == (0, ranges)
-    rows = calib.load_ranges(all_hear, overheard=True)
+    rows = calib.load_ranges(all_hear)
     heard, own = rows.arrivals, np.isin([rows.initiator, rows.target], ROBOT).any(axis=0)
     assert both.arrivals == np.count_nonzero(np.isin(heard.listener, ROBOT) | own[heard.exchange])
     for name in ("variance", "robust"):
@@ -211,7 +211,7 @@ def test_reflections_that_last_and_pass_the_gate_are_counted():
 
 
 def test_delays_that_are_known_in_sums_only_correct_no_difference(heard):
-    ranges, split = calib.load_ranges(heard[0], overheard=True), (((1, 2, 3, 4), (5, 6, 7, 8)),)
+    ranges, split = calib.load_ranges(heard[0]), (((1, 2, 3, 4), (5, 6, 7, 8)),)
     with pytest.raises(calib.BadInputError, match="tags 1, 2, 3"):
         replace(planted(), undetermined_splits=split).correct_arrivals(ranges)
     without = {tag: delay for tag, delay in DELAYS_NS.items() if tag not in ROBOT}

@@ -12,8 +12,14 @@ from calib.calibration.power_curves import Curve
 from calib.data.samples import sample_flight
 from calib.data.sources import Flight, load_flight
 from calib.errors import BadInputError, UnanswerableError
-from calib.evaluation.localization import fixed_std, localize, summarize
-from calib.evaluation.output import localization_json, localization_text, write_tum
+from calib.evaluation.localization import (
+    fixed_std,
+    localization_json,
+    localization_text,
+    localize,
+    summarize,
+    write_tum,
+)
 from calib.evaluation.tracking import Settings
 from calib.fitting.fitting import fit
 from calib.report.figures import rmse_bars

@@ -13,10 +13,9 @@ from calib.calibration.model import Calibration
 from calib.calibration.power_curves import Curve
 from calib.data.samples import stamped
 from calib.errors import BadInputError, UnanswerableError
-from calib.evaluation.inertial_filter import ProcessNoise
-from calib.evaluation.onboard import OnboardSettings, localize_onboard
-from calib.evaluation.output import onboard_json, onboard_text, write_tum
-from calib.evaluation.range_updates import multilaterate
+from calib.evaluation.filters import ProcessNoise, multilaterate
+from calib.evaluation.localization import write_tum
+from calib.evaluation.onboard import OnboardSettings, localize_onboard, onboard_json, onboard_text
 from tests.shared_data import shared
 from uwblink.importers import read_source
 from uwblink.recording.contents import Contents

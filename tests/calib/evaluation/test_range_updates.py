@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.evaluation.range_updates import RangeErrors, gated_update, mixture_update
+from calib.evaluation.filters import RangeErrors, gated_update, mixture_update
 
 STD = 0.1
 ERRORS = RangeErrors(share=0.3, least_m=0.05, detour_m=0.3, outlier=0.02, outlier_m=2.0)

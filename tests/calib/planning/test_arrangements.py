@@ -12,7 +12,7 @@ from benchmarks import surveys
 from benchmarks.standing import places_of, standing_boards
 from calib.cli.commands import app
 from calib.planning import SurveyPlanSettings
-from calib.planning.predicted import PLANNED_CURVE_STD_M, POWER_AT_1_M_DBM, delay_information, predict
+from calib.planning.surveys import PLANNED_CURVE_STD_M, POWER_AT_1_M_DBM, delay_information, predict
 
 C_M_PER_NS = 0.299702547
 

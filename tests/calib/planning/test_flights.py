@@ -12,8 +12,8 @@ import calib
 from calib.cli.commands import app
 from calib.cli.shared import CALIB_FLAGS
 from calib.errors import BadInputError
-from calib.planning import FlightPlanSettings, flight_information
-from calib.planning.flight_information import ExpectedErrors, Information, flight_of
+from calib.planning import FlightPlanSettings, flights
+from calib.planning.flights import ExpectedErrors, Information, flight_of
 from calib.planning.reference_motion import reference_motion
 from calib.settings import FlightSettings
 from tests.calib.trajectories.sines import flight
@@ -156,7 +156,7 @@ def test_trajectories_are_held_as_jerky_as_they_are_planned(monkeypatch):
     # with a weight of 1e15, beside which nothing may be lost.
     few = rehearsed(rate_hz=8.0, seconds=20.0)
     held = mean_ns(few, poses_until_s=5.0)
-    monkeypatch.setattr(flight_information, "_jerk", lambda *_: 50.0)
+    monkeypatch.setattr(flights, "_jerk", lambda *_: 50.0)
     assert 1.1 * held < mean_ns(few, poses_until_s=5.0) < 2 * held
 
 

@@ -9,7 +9,7 @@ import calib
 from benchmarks.standing import standing_boards
 from benchmarks.surveys import orders_of
 from calib.errors import BadInputError
-from calib.surveys.starts import exchanged_boards, is_in_order
+from calib.surveys.solution import exchanged_boards, is_in_order
 
 FIVE = standing_boards(4, boards=5, arrangements=5, reflected=0.05, each=20)
 
@@ -46,7 +46,7 @@ def test_exchanged_labels_are_named_and_the_ranges_are_believed(right):
         ([(str(k), 2, 5) for k in range(1, 6)], "1, 2, 3, 4, 5: boards 2 and 5 "),
     ):
         found = calib.survey(FIVE.ranges, known=said_with(FIVE, wrong), regardless=True)
-        assert [one.kind for one in found.contradictions] == ["labels"]
+        assert [one.fault for one in found.contradictions] == ["exchanged labels"]
         assert found.findings[0].startswith(text)
         assert found.calibration.delays_ns == pytest.approx(right.calibration.delays_ns, abs=1e-3)
 

@@ -13,8 +13,7 @@ from calib.surveys.knowledge import Knowledge
 from calib.surveys.network import Case
 from calib.surveys.recordings import read_surveys
 from calib.surveys.reflections import Marks
-from calib.surveys.solution import optimize
-from calib.surveys.starts import first_start
+from calib.surveys.solution import first_start, optimize
 from calib.surveys.survey import network_of
 
 PAIR_M, CURVE_M = 0.02, 0.03

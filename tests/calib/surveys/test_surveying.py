@@ -263,7 +263,7 @@ def wrong_labels():
     world = standing_boards(8, "plane", boards=6, arrangements=3, pair_error_m=0.01)
     names, where = {1: 2, 2: 1}, world.places[0]
     said = tuple(calib.KnownPosition(names.get(t, t), tuple(where[t - 1].tolist()), 0.01, "1") for t in range(1, 5))
-    return world, calib.Knowledge(shape="plane", positions=said), "labels", "if 1 and 2 are exchanged"
+    return world, calib.Knowledge(shape="plane", positions=said), "exchanged labels", "if 1 and 2 are exchanged"
 
 
 def wrong_tape():
@@ -273,23 +273,28 @@ def wrong_tape():
         standing_boards(9, places=FOUR[:5], pair_error_m=0.01),
         r"the known distance of 1 and 3 in 1 is \+\d+ cm",
     )
-    return world, calib.Knowledge(shape="line", distances=said), "distance", text
+    return world, calib.Knowledge(shape="line", distances=said), "wrong known distance", text
 
 
 def crooked_line():
     places = [p.copy() for p in FOUR[:5]]
     places[2][3, 1] = 0.8
-    return standing_boards(2, places=places, pair_error_m=0.01), "line", "shape", "^3 is said to be a line and is none"
+    return (
+        standing_boards(2, places=places, pair_error_m=0.01),
+        "line",
+        "arrangement not as it is said to be",
+        "^3 is said to be a line and is none",
+    )
 
 
 @pytest.mark.parametrize("mistake", [wrong_labels, wrong_tape, crooked_line])
 def test_what_is_said_wrongly_is_named(mistake):
     world, known, kind, message = mistake()
     result = calib.survey(world.ranges, known=known, regardless=True)
-    assert [one.kind for one in result.contradictions] == [kind]
+    assert [one.fault for one in result.contradictions] == [kind]
     assert re.search(message, result.findings[0])
     assert max(map(abs, scores(result, world.delays_ns).values())) < 4
-    if kind == "shape":
+    if kind == "arrangement not as it is said to be":
         assert [one.known for one in result.arrangements] == ["line", "line", "plane", "line", "line"]
 
 

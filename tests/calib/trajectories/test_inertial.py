@@ -8,7 +8,7 @@ import pytest
 import calib
 import uwbsim
 from calib.settings import FlightSettings
-from calib.trajectories.attitudes import Attitude
+from calib.trajectories.samples import Attitude
 from calib.trajectories.scene import scene_from
 from calib.trajectories.start import interpolated, resolve_headings
 from tests.calib.trajectories.sines import flight

@@ -1,9 +1,11 @@
 """Boards of other firmware, which print ranges: fake ones on pseudo-terminals, recorded, streamed, corrected."""
 
 import json
+import math
 import threading
 import time
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +13,11 @@ import pytest
 import calib
 import uwblink
 from tests.processes import refuse, succeed
-from uwblink.boards import DIALECTS, Dialect, PrintedRange, dialect_of
+from uwblink.boards import DIALECTS, Dialect, LivePage, PrintedRange, dialect_of, load_correction
 from uwblink.boards.dialects import Printed
 from uwblink.boards.ports import Terminal
-from uwblink.errors import ArgumentError
-from uwblink.importers.lines import LINES
+from uwblink.errors import ArgumentError, ImportTableError, PlanError
+from uwblink.importers.devices import LINES
 
 # What each board prints for a range of one metre to one device and of two metres to another; made from descriptions.
 BOTH = "from: 6018\t Range: 1.00 m\t RX power: -78.50 dBm\r\nfrom: 6019\t Range: 2.00 m\t RX power: -80.00 dBm\r\n"
@@ -154,8 +156,14 @@ def test_a_map_means_for_boards_what_it_means_for_their_log(tmp_path):
         'line = "{to_id} {range_m} {a} {b} {c} {n}"\nchip = "dw1000"\n[columns]\n'
         'fpp2 = { f1 = "a", f2 = "b", f3 = "c", n = "n" }\n'
     )
-    with pytest.raises(ArgumentError, match="registers"):
-        dialect_of(str(tmp_path / "by_register.toml"))
+    # DW1000 User Manual, 4.7.1: 10 log10((F1^2 + F2^2 + F3^2) / N^2) - A, A = 121.74 dB at 64 MHz.
+    (one,) = dialect_of(str(tmp_path / "by_register.toml")).parse(["65535 1.25 9000 8000 7000 118", "noise"])
+    power_dbm = 10 * math.log10((9000**2 + 8000**2 + 7000**2) / 118**2) - 121.74
+    assert (one.from_id, one.to_id, one.range_m) == (None, 65535, 1.25)
+    assert one.power_dbm == pytest.approx(power_dbm)
+    (tmp_path / "no_target.toml").write_text('line = "{from_id} {range_m}"\n')
+    with pytest.raises(ImportTableError, match="to_id"):
+        dialect_of(str(tmp_path / "no_target.toml"))
 
 
 def test_another_form_ends_with_a_line_and_no_file(tmp_path):
@@ -192,22 +200,86 @@ def test_a_board_that_is_unplugged_keeps_what_was_recorded(tmp_path):
 
 
 def test_a_dialect_of_ones_own_comes_by_an_entry_point_and_words_get_numbers_of_their_own():
-    def parse(line):
-        who, _, far = line.partition("=")
-        return [PrintedRange(to_id=who, range_m=float(far))] if far else []
+    def parse(lines):
+        cells = (line.partition("=") for line in lines)
+        return [PrintedRange(to_id=who, range_m=float(far)) for who, _, far in cells if far]
 
     DIALECTS.register(Dialect("mine", "A form of my own.", parse))
     try:
         with printing("alpha=1.0\nbeta=2.0\nbad line\n") as port:
             seen = Printed()
             batches = uwblink.boards.printed_ranges([port], dialect_of("mine"), ids=[1], duration_s=1.0, seen=seen)
-            found = uwblink.Exchanges.concatenate(list(batches))
+            found = [turn for turns in batches for turn in turns]
         # Words have numbers beside that of the board, in the order in which they are heard.
         assert sorted(seen.numbers.values()) == [1, 2, 3]
         named = {number: name for name, number in seen.numbers.items()}
-        told = {(named[k], far) for k, far in zip(found.target.tolist(), found.range_m.tolist(), strict=True)}
+        told = {(named[turn.pair[1]], turn.report.range_m) for turn in found}
         assert told == {("alpha", 1.0), ("beta", 2.0)}
     finally:
         DIALECTS.remove("mine")
     with pytest.raises(ArgumentError, match="parse"):
         DIALECTS.register(Dialect("bad", "No function.", None))  # type: ignore[arg-type]
+
+
+def calibrated(folder, target):
+    """Write a calibration that takes 25 cm off ranges of 40 and a target."""
+    own = calib.Ranges.from_arrays(
+        np.tile([1.25, 2.25, 3.25], 40),
+        initiator=40,
+        target=target,
+        truth_m=np.tile([1.0, 2.0, 3.0], 40),
+        time_ns=np.arange(120) * 10**8,
+    )
+    calib.fit(own, constants="pair", delays_only=True).save(folder / "c.json")
+    return folder / "c.json"
+
+
+def test_the_page_shows_printed_ranges_and_their_corrections(tmp_path):
+    correct = load_correction(calibrated(tmp_path, 6018))
+    one, other = BOTH.splitlines(keepends=True)
+    with printing(one) as port, LivePage(tmp_path / "r.uwb", correct=correct) as page:
+        how: dict[str, Any] = {"ids": [40], "duration_s": 1.5, "watch": page.watch, "listeners": [page]}
+        done = uwblink.boards.record_printed([port], tmp_path / "r.uwb", dialect_of("arduino"), **how)
+        body = page.body()
+    assert f"{done.exchanges} ranges of 2 devices" in str(done)
+    for text in (
+        "40&nbsp;&rarr;&nbsp;6018",
+        "<td>1.000</td><td>0.750</td>",
+        "polyline class='corrected'".replace("'", '"'),
+    ):
+        assert text in body
+    # No share of exchanges succeeded: of those that failed nothing is printed.
+    assert "%" not in body
+    with printing(other) as port, LivePage(tmp_path / "s.uwb", correct=correct) as page:
+        how = {"ids": [40], "duration_s": 30, "watch": page.watch, "listeners": [page]}
+        with pytest.raises(PlanError, match="6019"):
+            uwblink.boards.record_printed([port], tmp_path / "s.uwb", dialect_of("arduino"), **how)
+
+
+def test_a_stream_is_recorded_as_well_and_the_command_serves_the_page(tmp_path):
+    calibrated(tmp_path, 6018)
+    with printing(BOTH.splitlines(keepends=True)[0]) as port:
+        words = ("--dialect", "arduino", "--ids", "40", "-c", "c.json", "--duration", "1.5", "-o")
+        streamed = succeed("uwblink", "stream", port, *words, "s.uwb", cwd=tmp_path)
+        recorded = succeed("uwblink", "record", port, *words, "r.uwb", "--live", cwd=tmp_path)
+        refuse("uwblink", "record", port, *words, "q.uwb", cwd=tmp_path, naming=["--calibration", "--live"])
+        refuse("uwblink", "stream", port, "--ids", "40", cwd=tmp_path, naming=["--ids", "--dialect"])
+        refuse("uwblink", "stream", "r.uwb", "--dialect", "arduino", cwd=tmp_path, naming=["r.uwb", "--dialect"])
+        refuse(
+            "uwblink",
+            "record",
+            port,
+            *words[:2],
+            "--ids",
+            "a",
+            "-o",
+            "q.uwb",
+            cwd=tmp_path,
+            naming=["--ids: found 'a'"],
+        )
+    rows = [json.loads(line) for line in streamed.stdout.splitlines()]
+    found = uwblink.load(tmp_path / "s.uwb").exchanges
+    assert len(found) == len(rows) >= 5
+    assert [row["corrected_m"] for row in rows] == pytest.approx([0.75] * len(rows))
+    assert "live page: http://127.0.0.1:" in recorded.stderr
+    assert set(uwblink.load(tmp_path / "r.uwb").exchanges.range_m.tolist()) == {1.0}

@@ -444,6 +444,7 @@ def test_skews_of_registers_and_the_sign_of_both_chips(tmp_path):
     for chip, unit, ppm in (
         ("dw1000", "integrator-5", 998.4e6 / 2 / 1024 / 131072 / 6489.6),
         ("dw3000", "offset", 1e6 / 2**26),
+        ("dw3000", "-offset", -1e6 / 2**26),
     ):
         found = imported(tmp_path, text, f'chip = "{chip}"\n[units]\nskew = "{unit}"\n').exchanges
         np.testing.assert_allclose(found.skew2_ppm, (100 + np.arange(30)) * ppm)
@@ -507,3 +508,18 @@ def test_a_time_of_flight_without_a_unit_is_asked_for(tmp_path):
     source = table(tmp_path / "t.csv", rows)
     found = read_source(source, importer="csv", map_file=proposed(source, tmp_path / "m.toml", {"range_m": "ns"}))
     assert found.exchanges.range_m == pytest.approx([r.range_m for r in PLANT])
+
+
+def test_the_quality_of_secure_training_sequences_is_kept(tmp_path):
+    """By exchange and by message; a fit does not use it."""
+    rows = [row | {"sts_qual": 60 + k % 5} for k, row in enumerate(long_rows())]
+    source = table(tmp_path / "t.csv", rows)
+    found = read_source(source, importer="csv", map_file=proposed(source, tmp_path / "m.toml", {}))
+    assert found.quality["sts2"].tolist() == [row["sts_qual"] for row in rows]
+    assert np.isnan(found.quality["sts1"]).all()
+    found.save(tmp_path / "r.uwb")
+    assert load(tmp_path / "r.uwb").quality["sts2"].tolist() == found.quality["sts2"].tolist()
+    messages = [row | {"sts_quality": 50 + row["message"]} for row in as_messages(wrapped(flights(40)))]
+    source = table(tmp_path / "messages.csv", messages)
+    found = read_source(source, importer="csv", map_file=proposed(source, tmp_path / "m2.toml", {}))
+    assert {*zip(found.quality["sts1"].tolist(), found.quality["sts2"].tolist(), strict=True)} == {(51.0, 52.0)}

@@ -38,28 +38,44 @@ def lines(path, head, table, mark=","):
     return path
 
 
+def angles(turned, order):
+    """Angles about x, y and z in degrees, of rotations about the body's own axes in turn, by elements of the matrix.
+
+    R = Rx(a) Ry(b) Rz(c) or Rz(c) Ry(b) Rx(a), multiplied by hand.
+    """
+    r = turned.as_matrix()
+    if order == "XYZ":
+        found = np.arctan2(-r[1, 2], r[2, 2]), np.arcsin(r[0, 2]), np.arctan2(-r[0, 1], r[0, 0])
+    else:
+        found = np.arctan2(r[2, 1], r[2, 2]), -np.arcsin(r[2, 0]), np.arctan2(r[1, 0], r[0, 0])
+    return np.degrees(found)
+
+
 def motive(folder, version="1.23", unit="Millimeters", labelled=True, rotation="Quaternion"):
     scale = {"Millimeters": 1000.0, "Meters": 1.0}[unit]
+    turns = "XYZ" if len(rotation) == 3 else "XYZW"
 
     def numbers(name, k):
-        place, turned = BODIES[name][0][k] * scale, BODIES[name][1][k].as_quat()
-        return [*turned, *place, 0.001, *place]  # a marker of the body follows
+        place, turned = BODIES[name][0][k] * scale, BODIES[name][1][k]
+        written = angles(turned, rotation) if turns == "XYZ" else turned.as_quat()
+        return [*written, *place, 0.001, *place]  # a marker of the body follows
 
-    kinds = ["Rotation"] * 4 + ["Position"] * 3 + ["Mean Marker Error"] + ["Position"] * 3
-    axes = [*"XYZWXYZ", "", *"XYZ"]
+    kinds = ["Rotation"] * len(turns) + ["Position"] * 3 + ["Mean Marker Error"] + ["Position"] * 3
+    axes = [*turns, *"XYZ", "", *"XYZ"]
+    width = len(turns) + 4
     label = (lambda word: ["", word]) if labelled else lambda _: ["", ""]
     head = [
         ["Format Version", version, "Take Name", "Take 1", "Export Frame Rate", RATE, "Rotation Type", rotation,
          "Length Units", unit, "Coordinate Space", "Global"],
         [],
-        [*label("Type"), *(["Rigid Body"] * 8 + ["Rigid Body Marker"] * 3) * 2],
-        [*label("Name"), *(cell for name in BODIES for cell in [name] * 8 + [f"{name}:Marker 001"] * 3)],
-        [*label("ID"), *["1"] * 22],
+        [*label("Type"), *(["Rigid Body"] * width + ["Rigid Body Marker"] * 3) * 2],
+        [*label("Name"), *(cell for name in BODIES for cell in [name] * width + [f"{name}:Marker 001"] * 3)],
+        [*label("ID"), *["1"] * 2 * (width + 3)],
         ["", "", *kinds * 2],
         ["Frame" if labelled else "", "Time (Seconds)" if labelled else "", *axes * 2],
     ]  # fmt: skip
     table = [[k, f"{TIMES[k]:.6f}", *cells] for k, cells in enumerate(rows(numbers))]
-    table[3][2:13] = [""] * 11  # the first body is lost for a frame
+    table[3][2 : width + 5] = [""] * (width + 3)  # the first body is lost for a frame
     return lines(folder / "take.csv", head, table)
 
 
@@ -102,6 +118,8 @@ def qualisys(folder, time=True):
 EXPORTS = {
     "Motive, mm": motive,
     "Motive, version 1.0, m": lambda folder: motive(folder, "1.0", "Meters", labelled=False),
+    "Motive, angles X, Y, Z": lambda folder: motive(folder, rotation="XYZ"),
+    "Motive, angles Z, Y, X": lambda folder: motive(folder, rotation="ZYX"),
     "Vicon, rotation vectors in rad": vicon,
     "Vicon, rotation vectors in degrees": lambda folder: vicon(folder, "deg"),
     "Vicon, quaternions": lambda folder: vicon(folder, quaternions=True),
@@ -200,7 +218,7 @@ def test_columns_with_other_names_and_without_attitudes(tmp_path, head, text):
 @pytest.mark.parametrize(
     ("name", "broken", "said"),
     [
-        ("take.csv", lambda folder: motive(folder, rotation="XYZ"), "export quaternions"),
+        ("take.csv", lambda folder: motive(folder, rotation="Matrix"), "export quaternions"),
         ("take.csv", lambda folder: motive(folder).read_text().replace("Rigid Body", "Marker"), "Rigid Body"),
         ("vicon.csv", lambda folder: vicon(folder).read_text().replace("\n100\n", "\n\n"), "frame rate"),
         ("take_6D.tsv", lambda folder: qualisys(folder).read_text().replace("Rot[0]", "R"), "Rot[0]"),

@@ -29,6 +29,7 @@ INSTEAD = {
         **{n: np.ones(1) for n in TABLES["imu"] if n[0] in "wa"},
     },
     "powers": {name: np.array([1.0]) for name in TABLES["powers"]},
+    "quality": {name: np.array([1.0]) for name in TABLES["quality"]},
     "temperature": {name: np.array([2.0]) for name in TABLES["temperature"]},
     "receptions": {name: np.array([3.0]) for name in TABLES["receptions"]},
     "corrected": {name: np.array([1.0]) for name in TABLES["corrected"]},
@@ -52,6 +53,7 @@ def full(tmp_path_factory):
         readings = {"time_ns": np.array([7, 6]), "body": np.array(["a", "b"])}
         r.append("imu", {name: np.array([1.5, 2.5]) for name in TABLES["imu"]} | readings)
         r.append("powers", {name: np.array([2, 1]) for name in TABLES["powers"]})
+        r.append("quality", {name: np.array([2, 1]) for name in TABLES["quality"]})
         celsius = {"temperature_c": np.array([25.5, 26.0]), "supply_v": np.array([3.3, np.nan])}
         r.append("temperature", {"time_ns": np.array([4, 3]), "tag": np.array([1, 3])} | celsius)
         r.append("corrected", {name: np.array([1, 0]) for name in TABLES["corrected"] if name != "sigma_m"})

@@ -69,7 +69,8 @@ def test_every_key_has_a_description_and_the_reference_has_it(root):
 
 def test_the_reference_says_unit_default_and_range():
     page = reference(SCHEMAS["Scenario"], "Scenario")
-    assert "`rate_hz`\n: Exchanges per second, all pairs together.\n\n  *number; Hz; above 0 to 10⁶; needed*" in page
+    rate = "Exchanges per second, all pairs together; frames of all tags with plan broadcast."
+    assert f"`rate_hz`\n: {rate}\n\n  *number; Hz; above 0 to 10⁶; needed*" in page
     assert "*number; ps; from 0 to 10⁶; default `116.0`*" in page
     assert "*3 × number; m; default `[0.0, 0.0, 0.0]`*" in page
     assert [suffix for suffix in BY_UNIT if not any(ours.endswith(suffix) for ours in UNITS)] == []

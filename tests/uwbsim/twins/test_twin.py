@@ -34,6 +34,13 @@ def centred(values):
     return np.asarray(values) - np.mean(values)
 
 
+def test_broadcasts_have_no_twin():
+    """Their replies wait for slots, for longer than boards can."""
+    flight = uwbsim.simulate(uwbsim.load("broadcast", {"run.duration_s": 3.0}))
+    with pytest.raises(uwbsim.ScenarioError, match=r"waits 30\.\d ms in its exchanges.*broadcasts"):
+        uwbsim.twin(flight, known(world()))
+
+
 def test_rates_and_noises_are_found(found):
     """2250 ratios with 0.12 ppm each tell a rate to some 4e-3 ppm, and noise to 1.5 %."""
     planted = [tag["skew_ppm"] for tag in world()["tags"]]

@@ -1,11 +1,17 @@
-"""What the importers know of each chip, in one table: powers from registers, clock offsets, limits of powers.
+"""What the importers know of devices: chips (powers from registers, clock offsets, limits), and printed lines.
 
 DW1000: User Manual 2.18, section 4.7.1 for the first path, 10 log10((F1^2 + F2^2 + F3^2) / N^2) - A, and 4.7.2 for the
 total, 10 log10(C 2^17 / N^2) - A, with A = 113.77 dB or 121.74 dB at a pulse repetition frequency of 16 or 64 MHz.
 DW3000: User Manual, section 4.7: 6 D dB are added for the decision D of the digital gain control, amplitudes have two
 fractional bits, C is multiplied by 2^21, and A = 113.8 dB or 121.7 dB. These were taken from the vendor's driver, whose
 comments refer to the manual; 2^21 holds for the DW3000, 2^17 for later chips of the family. No board with a DW3000 was
-tried. Both count ticks of 15.65 ps on 40 bits.
+tried. The vendor's examples contradict each other on the sign of its clock offset: positive if the receiver's clock is
+faster by that of crystal trimming ("offset"), slower by that of single-sided ranging ("-offset"). Both chips count
+ticks of 15.65 ps on 40 bits.
+
+Lines are templates that `uwblink import guess` tries, and that a map can name. The forms are those of public firmware:
+the shell of the DWM1001 (`les`, `lec`), AT commands of ESP32 modules, examples of the Arduino library for the DW1000,
+and the reports of EVK1000 and TREK1000 (hexadecimal millimetres, a bit of the mask for each range).
 """
 
 from __future__ import annotations
@@ -13,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import log10
-from typing import Final
+from typing import Any, Final
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +53,12 @@ CHIPS: Final = {
     # The data sheets give sensitivities down to -106 dBm.
     "dw1000": Chip({16: 113.77, 64: 121.74}, _PPM | _CHANNELS, power_dbm=(-125.0, -40.0)),
     "dw3000": Chip(
-        {16: 113.8, 64: 121.7}, _PPM | _CHANNELS | {"offset": 1e6 / 2**26}, 0.25, 21, 6.0, power_dbm=(-125.0, -40.0)
+        {16: 113.8, 64: 121.7},
+        _PPM | _CHANNELS | {"offset": 1e6 / 2**26, "-offset": -1e6 / 2**26},
+        0.25,
+        21,
+        6.0,
+        power_dbm=(-125.0, -40.0),
     ),
     "other": Chip({}, _PPM),
 }
@@ -65,3 +76,26 @@ def power_sql(chip: Chip, prf_mhz: int, cells: Mapping[str, str]) -> str:
         energy, offset = cells["c"], 10 * log10(2) * chip.cir_bits
     level = f"10 * log10(nullif({energy}, 0) / nullif(pow({cells['n']}, 2), 0)) + {offset - chip.offset_db[prf_mhz]!r}"
     return f"{level} + {chip.gain_db!r} * {cells['d']}" if "d" in cells else level
+
+
+_AT: Final = "AT+RANGE=tid:{from_id},mask:{mask:hex},seq:{_},range:({r[8]}){*}"
+_REPORT: Final = " {mask:hex} {r0:hex} {r1:hex} {r2:hex} {r3:hex} {_} {_} {_} {_}{from_id:int}:"
+
+
+def _line(line: str, distance: str, each: str | None = None, **wide: str) -> dict[str, Any]:
+    """Return the keys of a map."""
+    found = {"line": line, "each": each, "wide": wide, "units": {"distance": distance}}
+    return {key: value for key, value in found.items() if value}
+
+
+LINES: Final = {
+    "dwm1001-lec": _line("DIST,{_},AN{_},", "m", "AN{_},{to_id},{_},{_},{_},{range_m}"),
+    "dwm1001-les": _line("{_}[{_},{_},{_}]={_}", "m", "{to_id}[{_},{_},{_}]={range_m}"),
+    "at-range-ids": _line(_AT + "ancid:({a[8]})", "cm", range_m="r.{_}", to_id="a.{_}"),
+    "at-range-power": _line(_AT + "rssi:({p[8]})", "cm", range_m="r.{to_id}", rxp2="p.{to_id}"),
+    "at-range": _line(_AT, "cm", range_m="r.{to_id}"),
+    "arduino": _line("from: {to_id} Range: {range_m} m RX power: {rxp2} dBm", "m"),
+    "trek-corrected": _line(f"mc{_REPORT}", "mm", range_m="r{to_id}"),
+    "trek-raw": _line(f"mr{_REPORT}", "mm", range_m="r{to_id}"),
+}
+"""Keys of a map by the name of a form; the first that matches is taken, so longer ones come first."""

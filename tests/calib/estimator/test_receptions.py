@@ -1,0 +1,182 @@
+"""What listeners overhear, fitted beside ranges: by worlds of NumPy alone, and by the simulator without noise."""
+
+import tarfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import calib
+from calib.errors import BadInputError, UnanswerableError
+from tests.calib.overhearing import bound_ns2, flight, least_squares_ns
+from tests.processes import call
+from tests.shared_data import shared
+from uwblink import Tag
+from uwblink.importers import read_source
+from uwbsim import simulate
+from uwbsim.scenario.loading import load
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+METRES_A_NS = 0.299702547
+ROBOTS_AND_ANCHORS = [(0, 1), (0, 2), (0, 3), (4, 1), (4, 2), (4, 3)]
+
+
+def fitted(data, use, **settings):
+    found = calib.fit(data, use=use, between_m=0.0, **settings)
+    names = sorted(found.calibration.delays_ns)
+    return np.array([[c[tag] for tag in names] for c in (found.calibration.delays_ns, found.calibration.delays_std_ns)])
+
+
+def test_each_listener_alone_finds_each_targets_delay_without_noise():
+    world = load(SCENARIOS / "noiseless.toml", ["run.duration_s=60", *(f"tags.{k}.passive=true" for k in range(6))])
+    found = simulate(world)
+    ranges = calib.load_ranges(found, need_power=False)
+    heard, target = ranges.arrivals, ranges.target[ranges.arrivals.exchange]
+    several = {(tag, k) for tag, k in zip(target.tolist(), heard.listener.tolist(), strict=True)}
+    assert len(several) == 20
+    # With the true distance in place of the range, whose errors contain both delays.
+    error_m = heard.error_m + (ranges.raw_m - ranges.truth_m)[heard.exchange]
+    for tag, listener in several:
+        own = error_m[(target == tag) & (heard.listener == listener)]
+        # Eight hundred differences and more of five rounded stamps, 8 ps each: 0.3 ps.
+        assert -np.mean(own) / METRES_A_NS == pytest.approx(found.planted["delays_ns"][str(tag)], abs=1.2e-3)
+
+
+def test_listeners_gain_what_theory_predicts_and_intervals_hold():
+    pairs = [(i, j) for i in range(6) for j in range(6) if i != j]
+    alone, bound = (np.sqrt(np.diag(bound_ns2(pairs, 6, listening=on)).mean()) for on in (False, True))
+    assert bound / alone == pytest.approx(0.764, abs=0.01)
+    beyond, errors, inside = np.zeros((20, 6)), np.zeros((20, 6)), np.zeros((20, 6), dtype=bool)
+    for seed in range(20):
+        data, planted = flight(7000 + seed)
+        delays, std = fitted(data, "receptions", delays_only=True, loss="l2")
+        beyond[seed], errors[seed] = delays - least_squares_ns(data), delays - planted
+        inside[seed] = np.abs(delays - planted) < 1.96 * std
+    # Least squares reaches the bound, and what another estimator adds to it is independent: the fit's standard
+    # deviation is within 10 % of the bound, which the errors themselves would show to a tenth with 100 flights only.
+    assert np.sqrt(1 + np.mean(beyond**2) / bound**2) < 1.1
+    # 120 errors, of which 20 are independent if all delays of a flight err together: rms to 16 %.
+    assert np.sqrt(np.mean(errors**2)) < 1.16 * 1.1 * bound
+    assert inside.mean() > 0.9
+
+
+def test_intervals_hold_among_reflections_with_a_curve():
+    """Contrasts of delays: a constant of the curve is theirs."""
+    errors, stated = [], []
+    for seed in range(10):
+        data, planted = flight(7100 + seed, reflected=0.15, bias_m=0.1)
+        delays, std = fitted(data, "receptions")
+        contrast = (delays - planted) - np.mean(delays - planted)
+        errors += contrast.tolist()
+        stated += std.tolist()
+    # An interval of a delay holds the constant, too, so contrasts lie within it more often.
+    assert np.mean(np.abs(errors) < 1.96 * np.array(stated)) > 0.9
+    assert np.sqrt(np.mean(np.square(errors))) < 0.02
+
+
+@pytest.mark.parametrize("listener", [1, 4])
+def test_one_listener_determines_what_anchors_and_robots_leave_free(listener):
+    data, planted = flight(7200, tags=5, pairs=ROBOTS_AND_ANCHORS, listeners=[listener])
+    without = calib.fit(data, delays_only=True)
+    assert without.calibration.undetermined_splits == (((0, 4), (1, 2, 3)),)
+    assert [w for w in without.warnings if "fit with `use` receptions" in w]
+    found = calib.fit(data, use="receptions", delays_only=True, between_m=0.0)
+    assert found.calibration.undetermined_splits == ()
+    assert found.calibration.provenance["arrivals"] == len(data.overheard["time_ns"])
+    delays, std = fitted(data, "receptions", delays_only=True)
+    assert (np.abs(delays - planted) < 3.5 * std).all()
+    assert std.max() < 0.04
+
+
+def test_recordings_are_fitted_together_with_what_each_overheard():
+    (one, _), (other, _) = flight(7300, count=800), flight(7301, count=800)
+    found = calib.fit([one, other], use="receptions", delays_only=True)
+    assert found.calibration.provenance["arrivals"] == 2 * 800 * 4
+    half = calib.load_ranges([one, other])
+    kept = half[half.session == 1]
+    assert len(kept.arrivals) == 800 * 4
+    alone = calib.load_ranges(other)
+    assert kept.arrivals.error_m == pytest.approx(alone.arrivals.error_m)
+    assert kept.raw_m[kept.arrivals.exchange] == pytest.approx(alone.raw_m[alone.arrivals.exchange])
+
+
+def test_a_listener_that_stands_elsewhere_is_named():
+    data, _ = flight(7400)
+    heard = data.overheard
+    # Tag 9 only listens, where tag 2 is, and is said to stand there or 10 cm beside it.
+    only = {name: column[heard["listener"] == 2] for name, column in heard.items()}
+    joined = {name: np.concatenate([heard[name], only[name]]) for name in heard}
+    joined["listener"] = np.append(heard["listener"], np.full(len(only["listener"]), 9))
+    for where, named in (((0.0, 0.0, 0.0), False), ((0.0, 0.1, 0.0), True)):
+        told = replace(data, tags=[*data.tags, Tag(9, "mast 2", where)], overheard=joined)
+        said = [w for w in calib.fit(told, use="receptions").warnings if "overheard" in w]
+        assert any("-9" in warning for warning in said) == named, said
+        assert all("-9" in warning for warning in said), said
+
+
+def test_a_target_whose_ranges_contradict_what_is_overheard_is_named():
+    data, _ = flight(7401)
+    # Ten ticks are 4.7 cm.
+    late = np.where(data.overheard["target"] == 3, 10, 0)
+    told = replace(data, overheard=dict(data.overheard) | {"rx2": data.overheard["rx2"] + late})
+    told.overheard["rx3"] += late
+    said = [w for w in calib.fit(told, use="receptions").warnings if "overheard" in w]
+    assert [w for w in said if w.startswith("tag 3: what listeners overheard contradicts its ranges")], said
+
+
+def test_two_messages_take_the_rate_from_the_carrier():
+    world = load(
+        SCENARIOS / "noiseless.toml",
+        ["run.duration_s=20", "ranging.protocol=ss", *(f"tags.{k}.passive=true" for k in range(6))],
+    )
+    found = simulate(world)
+    ranges = calib.load_ranges(found, need_power=False)
+    heard, target = ranges.arrivals, ranges.target[ranges.arrivals.exchange]
+    error_m = heard.error_m + (ranges.raw_m - ranges.truth_m)[heard.exchange]
+    for tag in np.unique(target).tolist():
+        delay_ns = -np.mean(error_m[target == tag]) / METRES_A_NS
+        # Carriers are read in steps of 0.0038 ppm at best; over a reply of 1.5 ms a thousandth is 1.5 ps.
+        assert delay_ns == pytest.approx(found.planted["delays_ns"][str(tag)], abs=0.05)
+
+
+def test_what_cannot_be_fitted_is_refused():
+    data, _ = flight(7500, count=300)
+    deaf = replace(data, overheard={})
+    with pytest.raises(UnanswerableError, match="no listener overheard"):
+        calib.fit(deaf, use="receptions")
+    for setting in ({"sequential": True}, {"constants": "pair"}):
+        with pytest.raises(BadInputError, match=next(iter(setting))):
+            calib.fit(data, use="receptions", **setting)
+    with pytest.raises(BadInputError, match="allowed: exchanges, receptions"):
+        calib.fit(data, use="everything")
+
+
+def test_the_command_says_how_many_were_fitted(tmp_path):
+    data, _ = flight(7600, count=400)
+    data.save(tmp_path / "f.uwb")
+    done = call("calib", "fit", tmp_path / "f.uwb", "-o", tmp_path / "c.json", "--use", "receptions", "--delays-only")
+    assert done.returncode == 0, done.stderr
+    assert "400 exchanges, 1600 differences of arrival" in done.stdout
+    assert calib.load_calibration(tmp_path / "c.json").provenance["settings"]["use"] == "receptions"
+
+
+def test_a_real_flight_has_narrower_intervals_and_the_same_delays(tmp_path):
+    with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
+        archive.extractall(tmp_path, filter="data")
+    flown = read_source(tmp_path / "cirObstacles_3_random_0", importer="miluv")
+    (delays, std), (heard, narrow) = (fitted(flown, use) for use in ("exchanges", "receptions"))
+    # 317 ranges, and some 700 differences of arrival at the five other tags.
+    assert (narrow < 0.85 * std).all()
+    # What the receptions add is independent, so the change has the difference of both variances (Hausman 1978).
+    change = (heard - delays) / np.sqrt(std**2 - narrow**2)
+    assert np.abs(change).max() < 3
+    # The doctor says what contradicts: two tags of one robot, a lever arm apart, hear each other's frames too early.
+    said = [w for w in calib.fit(flown, use="receptions").warnings if "overheard" in w]
+    assert all(w.startswith(("path 10-11", "path 20-21", "path 30-31")) for w in said), said
+
+
+def test_a_report_fits_receptions_as_well(tmp_path):
+    data, _ = flight(7700, count=600)
+    campaign = calib.run_campaign(data, use="receptions")
+    assert campaign.calibration.provenance["arrivals"] > 1900

@@ -1,0 +1,71 @@
+"""Ids of 16 bits, as other boards have them, from a scenario to corrected ranges; only this project's boards have 8."""
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+import calib
+import uwblink
+from calib.surveys.knowledge import load_knowledge
+from tests.processes import ROOT, refuse, succeed
+from uwblink.errors import PlanError
+
+LARGEST = 65535
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A flight without noise whose tags 1 to 6 are called 65535 to 65530."""
+    folder = tmp_path_factory.mktemp("ids")
+    text = re.sub(
+        r"^id = (\d)$",
+        lambda m: f"id = {LARGEST + 1 - int(m[1])}",
+        (ROOT / "scenarios/noiseless.toml").read_text(),
+        flags=re.M,
+    )
+    (folder / "s.toml").write_text(text)
+    succeed("uwbsim", "run", "s.toml", "-o", "flight.uwb", cwd=folder)
+    return folder
+
+
+def test_flights_fits_and_corrections_take_them(folder):
+    ids = {*range(LARGEST - 5, LARGEST + 1)}
+    succeed("calib", "fit", "flight.uwb", "-o", "c.json", cwd=folder)
+    assert calib.load_calibration(folder / "c.json").delays_ns.keys() == ids
+    for command in ("doctor", "evaluate", "localize"):
+        said = succeed("calib", command, "flight.uwb", *(["-c", "c.json"] if command != "doctor" else []), cwd=folder)
+        assert str(LARGEST) in said.stdout or command == "localize"
+    succeed("calib", "apply", "flight.uwb", "-c", "c.json", "--to", "csv", "-o", "tables", cwd=folder)
+    succeed("uwblink", "import", "exported", "tables", "-o", "again.uwb", cwd=folder)
+    again = uwblink.load(folder / "again.uwb").exchanges
+    assert {*again.initiator.tolist(), *again.target.tolist()} == ids
+    streamed = succeed("uwblink", "stream", "flight.uwb", "-c", "c.json", "--speed", "inf", "--quiet", cwd=folder)
+    assert streamed.stderr.startswith(f"{len(again)} ranges")
+
+
+def test_places_of_boards_take_them_and_plans_of_our_boards_do_not(folder):
+    stamps: Any = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(40, dtype=np.int64))
+    exchanges = uwblink.Exchanges.from_arrays(300, LARGEST, time_ns=np.arange(40) * 10**8, range_m=5.1, **stamps)
+    uwblink.Contents(exchanges=exchanges).save(folder / "bare.uwb")
+    places = {300: [0.0, 0.0, 0.0], LARGEST: [3.0, 4.0, 0.0]}
+    anchors = "".join(f"[[anchors]]\nid = {tag}\nposition_m = {place}\n" for tag, place in places.items())
+    (folder / "anchors.toml").write_text(anchors)
+    succeed("uwblink", "poses", "bare.uwb", "--tags", "anchors.toml", cwd=folder)
+    assert np.unique(uwblink.load(folder / "bare.uwb").poses.body).tolist() == ["anchor300", f"anchor{LARGEST}"]
+    (folder / "too_large.toml").write_text("[[anchors]]\nid = 65536\nposition_m = [0.0, 0.0, 0.0]\n")
+    refuse("uwblink", "poses", "bare.uwb", "--tags", "too_large.toml", cwd=folder, naming=["anchors[0].id", "65535"])
+    refuse("uwbsim", "serve", "s.toml", cwd=folder, naming=["tags", "id 6553", "0 to 254"])
+    with pytest.raises(PlanError, match="pairs"):
+        uwblink.RangingPlan(pairs=((1, 255),))
+    assert uwblink.RangingPlan(pairs=((1, 254),)).pairs == ((1, 254),)
+
+
+def test_what_is_known_of_a_survey_takes_them(tmp_path):
+    (tmp_path / "known.toml").write_text(
+        f"[[distances]]\nbetween = [{LARGEST}, 300]\ndistance_m = 3.0\n"
+        f"[[positions]]\ntag = {LARGEST}\nposition_m = [0.0, 0.0, 0.0]\n"
+    )
+    known = load_knowledge(tmp_path / "known.toml")
+    assert {known.distances[0].first, known.distances[0].second} == {LARGEST, 300}

@@ -1,0 +1,123 @@
+"""Logs of boards that range by broadcast: made here by clocks of their own, and recorded ones."""
+
+import json
+import tarfile
+
+import numpy as np
+import pytest
+
+from tests import processes
+from tests.shared_data import shared
+from tests.uwblink.test_receptions import PLACES, broadcasts
+from uwblink import raw_range
+from uwblink.errors import ImportTableError
+from uwblink.importers import read_source
+from uwblink.importers.guess import guess_map
+from uwblink.recording.contents import load
+
+NAMES = [f"0x{tag:04X}" for tag in (0xE621, 0x9042, 0x853C, 0xBB1E)]
+
+
+def printed(receptions, remembered=6):
+    """The lines of a log: every board that hears a broadcast, and its sender, prints it with what its sender heard.
+
+    `ts` of a listed frame is when the sender of the list received it.
+    """
+    memory: dict[int, list[dict[str, object]]] = {k: [] for k in range(4)}
+    lines, numbers = ["/dev/port1\tTrying to connect..."], dict.fromkeys(range(4), 90)
+    for frame in np.unique(receptions.frame):
+        rows = np.flatnonzero(receptions.frame == frame)
+        sender, tx = int(receptions.sender[rows[0]]) - 10, int(receptions.tx[rows[0]])
+        numbers[sender] += 1
+        body = {"tx": {"addr": NAMES[sender], "sn": numbers[sender], "ts": tx}, "rx": memory[sender][:remembered]}
+        for board in [sender, *(receptions.listener[rows] - 10).tolist()]:
+            head = {"type": "tx"} if board == sender else {"type": "rx", "clock_ratio_offset": 2e-6, "rssi": -78}
+            lines += [f"/dev/port{board}\t {json.dumps(head | body)}", ""]
+        for row in rows:
+            heard = {"addr": NAMES[sender], "sn": numbers[sender], "ts": int(receptions.rx[row])}
+            memory[int(receptions.listener[row]) - 10].insert(0, heard)
+    lines[40] = lines[40][len(lines[40]) // 2 :]  # a board began in the middle of a line
+    return "\n".join(lines) + "\n"
+
+
+def key(columns):
+    return {*zip(*(columns[n].tolist() for n in ("sender", "listener", "tx", "rx")), strict=True)}
+
+
+def test_every_reception_comes_from_the_lists_and_exchanges_from_receptions(tmp_path):
+    planted = broadcasts(rounds=1000, slot_s=0.02)  # 80 s, so that counters of 40 bits wrap
+    (tmp_path / "swarm.log").write_text(printed(planted))
+    said = processes.succeed("uwblink", "import", "guess", "swarm.log", "-o", "m.toml", cwd=tmp_path).stdout
+    assert "check it" in said
+    assert 'layout = "broadcasts"' in (tmp_path / "m.toml").read_text()
+    processes.succeed("uwblink", "import", "csv", "swarm.log", "--map", "m.toml", "-o", "s.uwb", cwd=tmp_path)
+    found = load(tmp_path / "s.uwb")
+    named = {tag.tag: NAMES.index(tag.body) + 10 for tag in found.tags}
+    assert sorted(named.values()) == [10, 11, 12, 13]
+    own = np.vectorize(named.get)
+    got = {
+        n: own(found.receptions[n]) if n in ("sender", "listener") else found.receptions[n] for n in found.receptions
+    }
+    # All but those of the last broadcasts, which no later one lists.
+    columns = {n: getattr(planted, n) for n in ("sender", "listener", "tx", "rx")}
+    missing = key(columns) - key(got)
+    assert key(got) <= key(columns)
+    assert len(missing) <= 3 * 4
+    assert np.all(np.diff(found.receptions["frame"]) >= 0)
+    e = found.exchanges
+    distance = np.linalg.norm(PLACES[own(e.initiator) - 10] - PLACES[own(e.target) - 10], axis=1)
+    assert np.abs(raw_range(e) - distance).max() < 0.01
+    assert len(e) > 6 * 900
+    assert len(found.overheard["time_ns"]) > len(e)
+
+
+def test_numbers_that_begin_anew_are_other_frames(tmp_path):
+    first, second = broadcasts(rounds=120), broadcasts(rounds=120, slot_s=0.007)
+    (tmp_path / "a.log").write_text(printed(first) + printed(second))
+    (tmp_path / "m.toml").write_text(guess_map(tmp_path / "a.log").text.replace('"?"', '"ticks"'))
+    found = read_source(tmp_path / "a.log", importer="csv", map_file=tmp_path / "m.toml")
+    named = {tag.tag: NAMES.index(tag.body) for tag in found.tags}
+    ends = [np.vectorize(named.get)(column) for column in (found.exchanges.initiator, found.exchanges.target)]
+    distance = np.linalg.norm(PLACES[ends[0]] - PLACES[ends[1]], axis=1)
+    assert len(found.exchanges) > 6 * 2 * 110
+    assert np.abs(raw_range(found.exchanges) - distance).max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('line = "{json}"\neach = "rx"\nlayout = "broadcasts"\n', "column"),
+        ('line = "{json}"\neach = "nothing"\n', "nothing"),
+        ('line = "{json}"\n[units]\nstamps = "ns"\n', "units.stamps"),
+    ],
+)
+def test_maps_that_cannot_be_are_refused_with_the_key(tmp_path, text, said):
+    (tmp_path / "a.log").write_text(printed(broadcasts(rounds=30)))
+    whole = guess_map(tmp_path / "a.log").text.replace('"?"', '"ticks"')
+    if "units" in text:
+        text = whole.replace('stamps = "ticks"', 'stamps = "ns"')
+    (tmp_path / "m.toml").write_text(text)
+    with pytest.raises(ImportTableError, match=said) as caught:
+        read_source(tmp_path / "a.log", importer="csv", map_file=tmp_path / "m.toml")
+    assert "\n" not in str(caught.value)
+
+
+def test_recorded_boards_give_the_ranges_of_their_description(tmp_path):
+    """Medians by an independent program (README of the data folder), of stamps of 40 bits over 20 s."""
+    with tarfile.open(shared("swarm_broadcast_logs.tar.xz")) as archive:
+        archive.extractall(tmp_path, filter="data")
+    (log,) = tmp_path.rglob("90-1.log")
+    (tmp_path / "m.toml").write_text(guess_map(log).text)
+    found = read_source(log, importer="csv", map_file=tmp_path / "m.toml")
+    assert len(found.receptions["rx"]) == 1098
+    named = {tag.tag: tag.body.removeprefix("0x") for tag in found.tags}
+    known = {"853C-9042": 0.53, "853C-BB1E": 0.60, "853C-E621": 2.09, "9042-BB1E": -0.87, "9042-E621": 0.67}
+    for pair, range_m in (known | {"BB1E-E621": 0.70}).items():
+        ends = [
+            np.isin(column, [k for k in named if named[k] in pair])
+            for column in (found.exchanges.initiator, found.exchanges.target)
+        ]
+        ours = found.exchanges.range_m[ends[0] & ends[1]]
+        assert len(ours) > 80
+        # Their spread is 5 to 7 cm.
+        assert np.median(ours) == pytest.approx(range_m, abs=0.07)

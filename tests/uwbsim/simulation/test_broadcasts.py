@@ -1,0 +1,231 @@
+"""Tags that broadcast in turn and tags that only listen, by geometry, planted delays, and loops over frames."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+import uwbsim
+from tests import processes
+from uwblink import load, raw_range
+from uwblink.receptions import Receptions, exchanges_in
+from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, elapsed
+from uwblink.twr import intervals
+
+PLACES = {1: (0.0, 0.0, 0.5), 2: (5.0, 0.3, 0.0), 3: (1.0, 6.0, 1.0), 4: (4.5, 5.5, 2.0), 9: (2.0, 2.5, 1.5)}
+DELAYS = {1: 0.5, 2: -0.31, 3: 0.12, 4: -0.07, 9: 0.8}
+SKEWS = {1: 3.0, 2: -8.0, 3: 11.0, 4: -1.0, 9: 5.0}
+QUIET = {"rx_noise_ps": 0.0, "skew_noise_ppm": 0.0, "skew_bias_ppm": 0.0, "quantize": False, "power_noise_db": 0.0}
+PS = 1e-12
+
+
+def world(duration_s=4.0, rate_hz=200.0, places=PLACES, tags=None, radio=None, motion=None, **ranging):
+    """Return a scenario of four tags that broadcast, and of tag 9, which listens."""
+    motions = {k: {"model": "static", "position_m": place} for k, place in places.items()} | (motion or {})
+    return {
+        "run": {"seed": 4, "duration_s": duration_s},
+        "ranging": {"plan": "broadcast", "rate_hz": rate_hz, "sync_error_ms": 0.0} | ranging,
+        "radio": QUIET | (radio or {}),
+        "bodies": [{"name": str(k), "motion": motion} for k, motion in motions.items()],
+        "tags": [
+            {"id": k, "body": str(k), "delay_ns": DELAYS[k], "skew_ppm": SKEWS[k], "passive": k == 9} | (tags or {})
+            for k in places
+        ],
+    }
+
+
+def table(flown):
+    """Return the receptions of a flight, or of a recording."""
+    columns: Any = flown.receptions
+    return Receptions(**columns)
+
+
+def apart_s(a, b):
+    return float(np.linalg.norm(np.subtract(PLACES[a], PLACES[b]))) / SPEED_OF_LIGHT
+
+
+def by_pair(*columns):
+    ends = np.column_stack(columns)
+    return [(*row, np.flatnonzero((ends == row).all(axis=1))) for row in np.unique(ends, axis=0).tolist()]
+
+
+@pytest.fixture(scope="module")
+def still():
+    # A counter of 17.2 s that wraps 0.2 s after the start, and others that do not.
+    return uwbsim.simulate(world(tags={"clock_offset_s": 17.0}))
+
+
+def test_ranges_are_the_distances_less_the_planted_delays(still):
+    """Six stamps of a range are rounded to 15.65 ps: single ranges are within 30 ps, means of 200 within 1.5."""
+    e = still.exchanges
+    pairs = by_pair(e.initiator, e.target)
+    assert {tuple(sorted(pair[:2])) for pair in pairs} == {(a, b) for a in range(1, 5) for b in range(a + 1, 5)}
+    for i, j, rows in pairs:
+        expected = apart_s(i, j) - (DELAYS[i] + DELAYS[j]) * 1e-9 / 2
+        errors = raw_range(e)[rows] / SPEED_OF_LIGHT - expected
+        assert np.abs(errors).max() < 30 * PS
+        assert abs(errors.mean()) < 1.5 * PS
+        assert still.truth_m[rows] == pytest.approx(apart_s(i, j) * SPEED_OF_LIGHT, abs=1e-9)
+
+
+def test_a_listener_has_differences_of_arrival_with_the_delay_of_the_second_sender_alone(still):
+    h = {name: column[still.overheard["listener"] == 9] for name, column in still.overheard.items()}
+    found = by_pair(h["initiator"], h["target"])
+    assert len(found) == 6
+    for i, j, rows in found:
+        assert still.exchanges.bits == 40
+        own = {name: h[name][rows] for name in ("rx1", "rx2", "rx3", "rx1_n", "tx2_n", "tx3_n")}
+        rate = elapsed(own["rx3"], own["rx2"], 40) / elapsed(own["tx3_n"], own["tx2_n"], 40)
+        reply = elapsed(own["tx2_n"], own["rx1_n"], 40)
+        difference_s = (elapsed(own["rx2"], own["rx1"], 40) - rate * reply) * TICK_S
+        expected = apart_s(i, j) + apart_s(j, 9) - apart_s(i, 9) - DELAYS[j] * 1e-9
+        assert abs(difference_s.mean() - expected) < 1.5 * PS
+
+
+def test_every_frame_is_a_reception_of_each_other_tag(still):
+    r = table(still)
+    assert len(r) == 4.0 * 200 * 4
+    assert np.unique(r.frame).tolist() == list(range(800))
+    assert set(r.sender.tolist()) == {1, 2, 3, 4}
+    assert (np.bincount(r.listener, minlength=10)[[1, 2, 3, 4, 9]] == [600, 600, 600, 600, 800]).all()
+    assert all(len(np.unique(r.tx[r.frame == frame])) == 1 for frame in (0, 1, 799)), "a frame leaves once"
+    assert r.tx.max() > 2**40 - 2**30 > 2**35 > r.tx.min(), "counters wrapped"
+    # A range needs two frames of its target, so the first and the last round lack some.
+    assert 6 * 197 <= len(still.exchanges) <= 6 * 199
+    assert r.skew_ppm[(r.sender == 2) & (r.listener == 3)] == pytest.approx(19.0, abs=1e-6)
+    assert still.faults == []
+    assert "receptions: 3200" in repr(still)
+
+
+def test_noise_is_of_the_stamps_and_the_departure_is_one_for_all(still):
+    """With transmit noise alone all listeners share it: their differences have only rounding, 4.5 ps each."""
+    r = table(uwbsim.simulate(world(radio={"tx_noise_ps": 500.0}, tags={"skew_ppm": 0.0})))
+    first = r[(r.sender == 1) & (r.listener == 2)], r[(r.sender == 1) & (r.listener == 9)]
+    late = [elapsed(one.rx, one.tx, 40) * TICK_S for one in first]
+    assert np.std(late[0] - late[0].mean()) == pytest.approx(500 * PS, rel=0.2)
+    assert np.std(late[0] - late[1]) < 10 * PS
+
+
+def test_moving_tags_range_as_their_poses_say():
+    """K has the Doppler shift, so a reply extrapolates the distance: d(1) and d(2) less its change over the reply."""
+    box = {"box_min_m": [1.0, 1.0, 0.4], "box_max_m": [4.0, 5.0, 2.4], "speed_mps": 1.5}
+    flight = uwbsim.simulate(world(motion={2: {"model": "random-flight"} | box}, tags={"delay_ns": 0.0}))
+    e, p = flight.exchanges, flight.poses
+    t = (
+        e.time_ns + np.cumsum([0 * e.time_ns, *(1e9 * TICK_S * s for s in (intervals(e).dt41, intervals(e).dt53))], 0)
+    ) * 1e-9
+    ends = []
+    for tags in (e.initiator, e.target):
+        place = np.zeros((3, len(e), 3))
+        for tag in np.unique(tags).tolist():
+            own = p.body == str(tag)
+            for axis in range(3):
+                at = np.interp(t, p.time_ns[own] * 1e-9, p.position_m[own, axis])
+                place[:, tags == tag, axis] = at[:, tags == tag]
+        ends.append(place)
+    d = np.linalg.norm(ends[0] - ends[1], axis=2)
+    expected = (d[0] + d[1] - (d[2] - d[1]) / intervals(e).dt53 * intervals(e).dt32) / 2
+    # Poses every 10 ms with accelerations of some 10 m/s^2 are interpolated to 0.1 mm, stamps rounded to 30 ps or 9 mm.
+    errors = raw_range(e) - expected
+    assert np.abs(errors).max() < 0.01
+    assert abs(errors.mean()) < 0.0005
+    assert np.abs(flight.truth_m - (d[0] + d[1]) / 2).max() < 0.0005
+
+
+def test_frames_that_overlap_are_lost_as_powers_and_times_say():
+    """By loops over all pairs of frames: the first of two is received if it is 3 dB stronger, none while sending."""
+    crowded = world(rate_hz=1000.0, sync_error_ms=0.5, duration_s=2.0, radio={"capture_db": 3.0})
+    calm, found = (uwbsim.simulate(crowded, contention=contention) for contention in (False, True))
+    every, received = table(calm), table(found)
+    assert len(every) == 2000 * 4
+    begin = dict(zip(every.frame.tolist(), every.time_ns.tolist(), strict=True))
+    sender = dict(zip(every.frame.tolist(), every.sender.tolist(), strict=True))
+    power = {(f, k): p for f, k, p in zip(every.frame.tolist(), every.listener.tolist(), every.fpp_dbm, strict=True)}
+    # Preamble and delimiter of 136 symbols, header of 21, and 35 bytes with 48 bits of parity.
+    lasts_ns = 136 * 508 / 0.4992 + 21 * 512 / 0.4992 + (8 * 35 + 48) * 64 / 0.4992
+    lost = set()
+    for f in range(2000):
+        for other in range(max(f - 12, 0), min(f + 13, 2000)):
+            if other == f or abs(begin[f] - begin[other]) >= lasts_ns:
+                continue
+            for k in PLACES:
+                if k == sender[f]:
+                    continue
+                beaten = k == sender[other] or power[f, k] < power[other, k] + 3.0 or begin[f] > begin[other]
+                if beaten:
+                    lost.add((f, k))
+    assert 500 < len(lost) < 3000
+    assert {(f, k) for f, k in power} - set(
+        zip(received.frame.tolist(), received.listener.tolist(), strict=True)
+    ) == lost
+    assert len(found.faults) == len(lost)
+    assert {fault.kind for fault in found.faults} == {"collision", "receiver busy"}
+    assert found.faults[0].detail.endswith(("frame collision", "frame receiver busy"))
+
+
+def test_who_is_out_of_range_hears_nothing_and_ranges_with_nobody():
+    far = uwbsim.simulate(world(places=PLACES | {4: (900.0, 0.0, 0.0)}))
+    r = table(far)
+    assert 4 not in r.sender
+    assert 4 not in r.listener
+    assert {fault.kind for fault in far.faults} == {"lost frame"}
+    assert len(far.faults) == 800 * 4 - len(r) == 200 * 4 + 3 * 200
+    assert {4, 9}.isdisjoint(far.exchanges.initiator.tolist() + far.exchanges.target.tolist())
+
+
+def test_the_recording_holds_receptions_and_the_exchanges_that_they_make(tmp_path):
+    out = tmp_path / "tdoa.uwb"
+    words = ("--set", "run.duration_s=2", "--set", "radio.bias=none")
+    processes.succeed("uwbsim", "run", "tdoa", "-o", out, *words)
+    held = load(out)
+    assert held.meta["timestamp_bits"] == held.exchanges.bits == 40
+    assert held.counts()["receptions"] == 2 * 200 * 9
+    again, overheard = exchanges_in(table(held))
+    assert again.rx3.tolist() == held.exchanges.rx3.tolist()
+    assert len(overheard["rx3"]) == len(held.overheard["rx3"]) > 0
+    assert {10, 11} <= set(held.overheard["listener"].tolist())
+    assert {10, 11}.isdisjoint(held.exchanges.initiator.tolist() + held.exchanges.target.tolist())
+    # Seven pairs of 49 ranges with 85 ps of noise, in which a delay counts half, tell it to 10 ps; four of these.
+    fitted = processes.succeed("calib", "fit", out, "-o", tmp_path / "c.json", "--delays-only", "--json")
+    found = json.loads(fitted.stdout)["delays_ns"]
+    assert found == pytest.approx(
+        {k: ns for k, ns in held.meta["planted"]["delays_ns"].items() if k in found}, abs=0.04
+    )
+    assert len(found) == 8
+
+
+def test_a_preview_counts_frames():
+    found = uwbsim.preview(world())
+    assert (found.exchanges, found.rate_hz) == (800, 200.0)
+    assert "800 broadcasts planned among 16 pairs" in str(found)
+    assert found.air_share == pytest.approx(200 * 201.99e-6, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"protocol": "ss"}, ["ranging.protocol", "'ss'", "'ds'"]),
+        ({"pairs": [(1, 2)]}, ["ranging.pairs", "between-bodies"]),
+        ({"get_cir": True}, ["ranging.get_cir"]),
+        ({"rate_hz": 5000.0}, ["ranging.rate_hz: found 5000", "frames of 4 tags"]),
+    ],
+)
+def test_what_broadcasts_cannot_have_is_refused_by_key(change, words):
+    with pytest.raises(uwbsim.ScenarioError) as caught:
+        uwbsim.load(world(**change))
+    assert all(word in str(caught.value) for word in words)
+
+
+def test_one_sender_and_boards_are_refused(tmp_path):
+    alone = world() | {"tags": [dict(tag, passive=tag["id"] != 1) for tag in world()["tags"]]}
+    with pytest.raises(uwbsim.ScenarioError, match=r"ranging\.pairs"):
+        uwbsim.load(alone)
+    with pytest.raises(uwbsim.ScenarioError, match=r"ranging\.plan: found 'broadcast'"):
+        uwbsim.VirtualPorts(uwbsim.load(world()))
+    for words in (
+        ("serve", "broadcast"),
+        ("run", "broadcast", "-o", "b.uwb", "--set", "run.duration_s=1", "--through-wire"),
+    ):
+        processes.refuse("uwbsim", *words, cwd=tmp_path, naming=["ranging.plan: found 'broadcast'"])
+    assert list(tmp_path.iterdir()) == []
