@@ -221,8 +221,8 @@ class Calibration:
         - b1_k; the corrected range in place of d_ij leaves (e1_j - e2_i)/2 + e2_k - e1_k. With sigma of the curve at
         the powers of exchange, response and poll its variance is sigma_ij^2 + 2 sigma_jk^2 + 2 sigma_ik^2, because
         a reception has twice the variance of a range; where the rate of the clocks comes from a third message, one
-        factor is above 2 and one below (`applying.reception_gains`). The listener's delay has no part. Raises `BadInputError`
-        where a delay is not known, or only in a sum with others.
+        factor is above 2 and one below (`applying.reception_gains`). The listener's delay has no part. Raises
+        `BadInputError` where a delay is not known, or only in a sum with others.
 
         >>> import calib
         >>> ranges = calib.load_ranges(calib.sample_flight())
