@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.calibration.document import Value, pair_name, split_text
 from calib.calibration.power_curves import ends, lift
+from calib.data.arrivals import Arrivals
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, LeftOutWarning
 from calib.pairs import pairs_of
@@ -22,8 +23,33 @@ if TYPE_CHECKING:
     from calib.calibration.model import Calibration
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CorrectedRanges:
+class CorrectedColumns:
+    """Base of dataclasses whose fields are columns (n,), of which one is `raw_m`."""
+
+    __slots__ = ()
+    TITLE: ClassVar[str]
+    raw_m: Floats
+
+    def to_dict(self) -> dict[str, NDArray[Any]]:
+        """Return the columns by name, as `pandas.DataFrame` and `polars.DataFrame` take them."""
+        columns: dict[str, Any] = self.__dataclass_fields__  # type: ignore[attr-defined]
+        return {name: getattr(self, name) for name in columns if name != "TITLE"}
+
+    def to_pandas(self) -> Any:
+        """Return the columns as a `pandas.DataFrame`; raises `ArgumentError` where pandas is not installed."""
+        return data_frame(self.to_dict())
+
+    def __repr__(self) -> str:
+        """Return a headline and the first rows, in lines of 79 characters."""
+        return as_text(f"{len(self.raw_m)} {self.TITLE}", excerpt(self.to_dict()))
+
+    def _repr_html_(self) -> str:
+        """Return the same as HTML, for notebooks."""
+        return as_html(f"{len(self.raw_m)} {self.TITLE}", excerpt(self.to_dict()))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class CorrectedRanges(CorrectedColumns):
     """Ranges in three stages, metres, and what is known of them, shape (n,).
 
     `sigma_m` is the noise of direct ranges. `sigma_total_m` is the standard deviation of all of them, reflected ones
@@ -41,6 +67,7 @@ class CorrectedRanges:
     (900,)
     """
 
+    TITLE = "corrected ranges"
     raw_m: Floats
     delay_corrected_m: Floats
     corrected_m: Floats
@@ -53,21 +80,24 @@ class CorrectedRanges:
     tail_probability: Floats
     outlier: Bools
 
-    def to_dict(self) -> dict[str, NDArray[Any]]:
-        """Return the columns by name, as `pandas.DataFrame` and `polars.DataFrame` take them."""
-        return {column.name: getattr(self, column.name) for column in fields(self)}
 
-    def to_pandas(self) -> Any:
-        """Return the columns as a `pandas.DataFrame`; raises `ArgumentError` where pandas is not installed."""
-        return data_frame(self.to_dict())
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class CorrectedArrivals(CorrectedColumns):
+    """Differences of arrival, metres, shape (n,): by how much farther from target than from initiator a listener is.
 
-    def __repr__(self) -> str:
-        """Return a headline and the first rows, in lines of 79 characters."""
-        return as_text(f"{len(self.raw_m)} corrected ranges", excerpt(self.to_dict()))
+    `sigma_m` is the noise without reflections. Differences of one exchange share `shared_m` of it: the covariance of
+    two is its square. They do not correlate with the range of that exchange, nor with other exchanges. `late_share` and
+    `early_share` are the shares in which a reflection of the response makes the difference longer, and one of the poll
+    shorter; NaN where a calibration has no error model.
+    """
 
-    def _repr_html_(self) -> str:
-        """Return the same as HTML, for notebooks."""
-        return as_html(f"{len(self.raw_m)} corrected ranges", excerpt(self.to_dict()))
+    TITLE = "corrected differences of arrival"
+    raw_m: Floats
+    corrected_m: Floats
+    sigma_m: Floats
+    shared_m: Floats
+    late_share: Floats
+    early_share: Floats
 
 
 class CorrectedRange(NamedTuple, Generic[Value]):
@@ -99,11 +129,90 @@ def corrected_ranges(calibration: Calibration, ranges: Ranges) -> CorrectedRange
         raw_m=ranges.raw_m,
         delay_corrected_m=delays,
         corrected_m=corrected,
-        sigma_m=_curve(calibration, ranges, lifted, "sigma_curve"),
+        sigma_m=noise_m(calibration, ranges),
         lifted=lifted,
         clamped=~calibration.bias_curve.inside(lifted),
         **_errors(calibration, ranges, lifted, corrected - ranges.truth_m),
     )
+
+
+def corrected_arrivals(calibration: Calibration, ranges: Ranges) -> CorrectedArrivals:
+    """Return what `Calibration.correct_arrivals` returns, and raise what that raises."""
+    heard, receptions = arrivals_in(ranges), heard_receptions(ranges)
+    exchange = replace(ranges, arrivals=None)[heard.exchange]
+    summed = sorted(
+        set(exchange.tags()) & {*calibration.sides, *(t for pair in calibration.pair_offsets for t in pair)}
+    )
+    if summed:
+        raise BadInputError(
+            f"{ranges.source}: the calibration knows the delays of tags {first_few(map(str, summed))} in sums only, "
+            "and differences of arrival need those of single tags; fit them with `use` receptions"
+        )
+    applied = corrected_ranges(calibration, exchange)
+    delay_ns = np.array([calibration.delays_ns[tag] for tag in exchange.target.tolist()])
+    late_m = 1e-9 * calibration.speed_of_light * delay_ns - reception_bias_m(calibration, receptions)
+    sigma, model = np.column_stack([noise_m(calibration, one) for one in receptions[:2]]), calibration.errors
+    late_share, early_share = np.full((2, len(heard)), np.nan)
+    if model is not None:
+        shapes = (model.shapes(calibration.lifted(one), one.initiator, one.target) for one in receptions[:2])
+        late_share, early_share = (one.tail_share for one in shapes)
+    return CorrectedArrivals(
+        raw_m=heard.raw_m,
+        corrected_m=heard.raw_m + late_m - (applied.corrected_m - exchange.raw_m),
+        sigma_m=np.sqrt(applied.sigma_m**2 + np.sum(reception_gains(heard) * sigma**2, axis=1)),
+        shared_m=applied.sigma_m,
+        late_share=late_share,
+        early_share=early_share,
+    )
+
+
+def arrivals_in(ranges: Ranges) -> Arrivals:
+    """Return the differences of arrival of ranges; raises `BadInputError` where nothing was overheard."""
+    if ranges.arrivals is None:
+        raise BadInputError(f"{ranges.source}: has no differences of arrival, because no tag overheard its ranges")
+    return ranges.arrivals
+
+
+def heard_receptions(ranges: Ranges) -> tuple[Ranges, Ranges, Ranges]:
+    """Return the receptions in differences of arrival (n,) as ranges with the power of one reception.
+
+    They are those of the response and of the poll at the listener, and of the poll at the target.
+    """
+    heard = arrivals_in(ranges)
+    initiator, target, listener = ranges.initiator[heard.exchange], ranges.target[heard.exchange], heard.listener
+    at_target_dbm = ends(ranges.fpp1_dbm, ranges.fpp2_dbm)[0][heard.exchange]
+    response, poll, at_target = (
+        Ranges.from_arrays(np.zeros(len(heard)), initiator=sender, target=receiver, fpp1_dbm=power_dbm)
+        for sender, receiver, power_dbm in (
+            (target, listener, heard.response_dbm),
+            (initiator, listener, heard.poll_dbm),
+            (initiator, target, at_target_dbm),
+        )
+    )
+    return response, poll, at_target
+
+
+def reception_bias_m(calibration: Calibration, receptions: tuple[Ranges, Ranges, Ranges]) -> Floats:
+    """Return by how much the bias of three receptions (`heard_receptions`) makes differences of arrival longer (n,)."""
+    response, poll, at_target = (_bias(calibration, one, calibration.lifted(one)) for one in receptions)
+    return response - poll + at_target
+
+
+def reception_gains(heard: Arrivals) -> Floats:
+    """Return the variances of differences of arrival (n, 2) by response and poll, in variances of a range.
+
+    A range is the mean of two receptions, so that one has twice its variance. With clocks compared over a duration that
+    begins with one of them, its error counts 1 + s, and that of the reception at the end s (`Arrivals.stretch`): in the
+    range, too, which then has the variance (1 + (1 + s)^2 + s^2)/4 of a reception's.
+    """
+    twice = (1 + heard.stretch) ** 2 + heard.stretch**2
+    gains = 4 / (1 + twice)[:, None] * np.column_stack([twice, np.ones_like(twice)])
+    return np.where(heard.stretch[:, None] < 0, gains[:, ::-1], gains)
+
+
+def noise_m(calibration: Calibration, ranges: Ranges) -> Floats:
+    """Return the noise of direct ranges (n,) in metres, NaN without a power."""
+    return _curve(calibration, ranges, calibration.lifted(ranges), "sigma_curve")
 
 
 def _without_delays(calibration: Calibration, ranges: Ranges) -> Floats:

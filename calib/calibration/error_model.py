@@ -19,7 +19,7 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 from scipy.optimize.elementwise import find_root
-from scipy.special import log_ndtr, ndtr
+from scipy.special import gammainc, log_ndtr, ndtr
 
 from calib.calibration.document import Metres, Number, OpenShare, PairName, Positive, Share, StdM, joint, pair_name
 from calib.data.ranges import Ranges
@@ -123,6 +123,15 @@ class ErrorModel:
     def square_m2(self, detour_m: Any) -> Any:
         """Return the mean square of detours whose exponential part has such a mean."""
         return self.least_m**2 + 2 * self.least_m * detour_m + 2 * self.long.square * detour_m**2
+
+    def square_below_m2(self, detour_m: Any, below_m: Any) -> Any:
+        """Return the mean of squares of detours below a bound, and of zero for longer ones."""
+        powers = (1, 2, 3), (self.least_m**2, 2 * self.least_m, 2.0)
+        return sum(
+            part * factor * mean_m ** (k - 1) * gammainc(k, np.maximum(below_m - self.least_m, 0.0) / mean_m)
+            for part, mean_m in self.long.kinds(detour_m)
+            for k, factor in zip(*powers, strict=True)
+        )
 
     def shapes(self, lifted: Floats, initiator: Ints, target: Ints) -> ErrorShapes:
         """Return the shape of the errors of ranges (n,) at lifted powers between two tags, in either direction."""

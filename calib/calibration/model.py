@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import PlainSerializer, TypeAdapter
 
-from calib.calibration.applying import CorrectedRange, CorrectedRanges, columns_of, corrected_ranges
+from calib.calibration.applying import (
+    CorrectedArrivals,
+    CorrectedRange,
+    CorrectedRanges,
+    columns_of,
+    corrected_arrivals,
+    corrected_ranges,
+)
 from calib.calibration.document import (
     IN_ORDER,
     DelayNs,
@@ -205,6 +212,26 @@ class Calibration:
         the pair that an undetermined split leaves open.
         """
         return corrected_ranges(self, ranges)
+
+    def correct_arrivals(self, ranges: Ranges) -> CorrectedArrivals:
+        """Correct what listeners overheard of ranges: the target's delay, the bias of each reception, the range.
+
+        The result has a row for each of the ranges' `arrivals`. With initiator i, target j, listener k, and bias b and
+        noise e of receptions of poll (1) and response (2), a difference of arrival is d_jk - d_ik - c d_j + b1_j + b2_k
+        - b1_k; the corrected range in place of d_ij leaves (e1_j - e2_i)/2 + e2_k - e1_k. With sigma of the curve at
+        the powers of exchange, response and poll its variance is sigma_ij^2 + 2 sigma_jk^2 + 2 sigma_ik^2, because
+        a reception has twice the variance of a range; where the rate of the clocks comes from a third message, one
+        factor is above 2 and one below (`applying.reception_gains`). The listener's delay has no part. Raises
+        `BadInputError` where a delay is not known, or only in a sum with others.
+
+        >>> import calib
+        >>> ranges = calib.load_ranges(calib.sample_flight())
+        >>> calib.fit(ranges).calibration.correct_arrivals(ranges)
+        Traceback (most recent call last):
+        ...
+        calib.errors.BadInputError: memory: has no differences of arrival, because no tag overheard its ranges
+        """
+        return corrected_arrivals(self, ranges)
 
     def quantiles(self, ranges: Ranges, shares: Sequence[float] = (0.025, 0.975)) -> Floats:
         """Return the errors (n, k), in metres, below which shares (k,) of the errors of such corrected ranges lie.

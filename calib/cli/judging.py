@@ -89,6 +89,14 @@ def localize(
             **choice("poses", "imu", "constant-velocity"),
         ),
     ] = "poses",
+    use: Annotated[
+        str,
+        typer.Option(
+            help="What is used: exchanges, a body's ranges; or receptions, with what tags overheard, which also "
+            "localizes a body that only listens.",
+            **choice("exchanges", "receptions"),
+        ),
+    ] = "exchanges",
     training: Annotated[
         Path | None,
         typer.Option(help="Flight on which the fixed variances are tuned (.uwb); by default those of the fit."),
@@ -104,7 +112,7 @@ def localize(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Track each moving body by its ranges, with and without calibration, and print the RMSE in m."""
+    """Track each moving body by its ranges or what it hears, with and without calibration, and print the RMSE in m."""
     from calib.evaluation import (
         Settings,
         localization_json,
@@ -120,11 +128,13 @@ def localize(
     table: Any
     with waiting("localizing"):
         if model == "poses":
-            settings = Settings(velocity_std_mps=process_noise, seeds=3 if seeds is None else seeds)
+            settings = Settings(velocity_std_mps=process_noise, seeds=3 if seeds is None else seeds, use=use)
             found = [one for path in recordings for one in calib.localize(path, known, settings, training=training)]
             # The text first: where it cannot be made, nothing is written.
             table = localization_json(found)
             text = localization_text(found, settings)
+        elif use != "exchanges":
+            raise calib.BadInputError("only exchanges go with a model on board; leave `model` away", parameter="use")
         else:
             onboard = calib.OnboardSettings(model=model)
             found = [one for path in recordings for one in calib.localize_onboard(path, known, onboard)]

@@ -9,6 +9,10 @@ apart, where K_k is the rate of the target's clock over the listener's. The list
 the initiator's: each row determines the delay of one target alone, also where anchors range with tags only. How a delay
 divides into transmission and reception is in no recording of free-running clocks: a shift of a tag's clock shifts its
 transmissions and receptions alike (docs/theory.md).
+
+The range of the same exchange takes the place of tof_ij. Of the errors e of receptions at j (poll), i (response) and
+k, (e1_j - e2_i)/2 + e2_k - e1_k is left, which has less variance than with a known distance, e1_j + e2_k - e1_k, and
+does not correlate with the error of the range, (e1_j + e2_i)/2.
 """
 
 from __future__ import annotations
@@ -36,18 +40,26 @@ LARGEST_ERROR_M: Final = 30.0
 class Arrivals(ColumnTable):
     """Differences of arrival as columns of length n, one for each exchange and listener that heard poll and response.
 
-    `exchange` is the row of the exchange among the ranges, `error_m` the measured difference less the one expected from
-    distances, reply time and clock rate: minus the target's delay, and the errors of three receptions, in metres: of
-    the poll at the target and the response at the listener, less that of the poll at the listener. `poll_dbm` and
-    `response_dbm` are the listener's first-path powers.
+    `exchange` is the row of the exchange among the ranges. `raw_m` is by how much farther from the target than from the
+    initiator the listener is, by stamps alone and with the raw range of the exchange; `truth_m` is the true difference.
+    `poll_dbm` and `response_dbm` are the listener's first-path powers. `stretch` is the duration from poll to response
+    over the one that gives the rate of the clocks, negative where the initiator sends at both ends of the latter, 0
+    where the rate is the carrier integrator's.
     """
 
     time_ns: Ints
     exchange: Ints
     listener: Ints
-    error_m: Floats
+    raw_m: Floats
+    truth_m: Floats
     poll_dbm: Floats
     response_dbm: Floats
+    stretch: Floats
+
+    @property
+    def error_m(self) -> Floats:
+        """Measured less true differences (n,)."""
+        return self.raw_m - self.truth_m
 
     def _title(self) -> str:
         return f"{len(self)} differences of arrival at {len(np.unique(self.listener))} listeners"
@@ -63,15 +75,15 @@ class Arrivals(ColumnTable):
 
 def arrivals_of(
     exchanges: Exchanges,
-    truth_m: Floats,
+    range_m: Floats,
     overheard: Mapping[str, NDArray[Any]],
     poses: Poses,
     tags: Sequence[Tag],
 ) -> Arrivals:
-    """Return what listeners know of exchanges with true distances `truth_m` (n,).
+    """Return what listeners know of exchanges with raw ranges `range_m` (n,).
 
-    `overheard` has the columns of the recording's table. Rows without distances, without the rate of the target's
-    clock, or with impossible stamps are left out.
+    `overheard` has the columns of the recording's table. Rows without true differences, without the rate of the
+    target's clock, or with impossible stamps are left out.
     """
     row = exchange_of(exchanges, overheard)
     heard = {name: column[row >= 0] for name, column in overheard.items()}
@@ -81,22 +93,24 @@ def arrivals_of(
     between = elapsed(heard["rx2"], heard["rx1"], e.bits) * TICK_S
     reply = elapsed(e.tx2, e.rx1, e.bits) * TICK_S
     # Less the reply first: two times of milliseconds, of which picoseconds matter.
-    late = between - reply + (_rates(e, heard) - 1) * between
-    error = SPEED_OF_LIGHT * late - (truth_m[row] + away - across)
-    good = np.isfinite(error) & (np.abs(error) < LARGEST_ERROR_M)
+    rate, stretch = _rates(e, heard, between)
+    late = between - reply + (rate - 1) * between
     found = Arrivals(
         time_ns=time_ns,
         exchange=row,
         listener=listener.astype(np.int64),
-        error_m=error,
+        raw_m=SPEED_OF_LIGHT * late - range_m[row],
+        truth_m=away - across,
         poll_dbm=heard["fpp1_dbm"],
         response_dbm=heard["fpp2_dbm"],
+        stretch=stretch,
     )
-    return found[good]
+    with np.errstate(invalid="ignore"):
+        return found[np.abs(found.error_m) < LARGEST_ERROR_M]
 
 
-def _rates(e: Exchanges, heard: Mapping[str, NDArray[Any]]) -> Floats:
-    """Return how fast the target's clock runs by the listener's (n,).
+def _rates(e: Exchanges, heard: Mapping[str, NDArray[Any]], between_s: Any) -> tuple[Floats, Floats]:
+    """Return how fast the target's clock runs by the listener's (n,), and the stretch of `Arrivals`.
 
     Where the target sends twice, from both transmissions; where the initiator does, from both receptions at the target
     and at the listener; with two messages from the listener's carrier integrator.
@@ -106,8 +120,9 @@ def _rates(e: Exchanges, heard: Mapping[str, NDArray[Any]]) -> Floats:
     own = np.where(by_target, elapsed(e.tx3, e.tx2, e.bits), elapsed(e.rx3, e.rx1, e.bits))
     at_listener = elapsed(heard["rx3"], np.where(by_target, heard["rx2"], heard["rx1"]), e.bits)
     with np.errstate(divide="ignore", invalid="ignore"):
-        by_stamps = own / at_listener
-    return np.where(by_target | by_initiator, by_stamps, 1 / (1 + heard["skew2_ppm"] * 1e-6))
+        by_stamps, stretch = own / at_listener, between_s / TICK_S / at_listener
+    rate = np.where(by_target | by_initiator, by_stamps, 1 / (1 + heard["skew2_ppm"] * 1e-6))
+    return rate, np.where(by_target, stretch, np.where(by_initiator, -stretch, 0.0))
 
 
 _ROLES: Final = ("target", "initiator")

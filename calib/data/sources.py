@@ -23,6 +23,7 @@ from calib.data.ranges import (
     Ranges,
     concatenate,
     contents_of_frame,
+    measured_powers,
     without_static,
 )
 from calib.errors import BadInputError, UnanswerableError
@@ -288,6 +289,14 @@ def require_times(ranges: Ranges) -> None:
         )
 
 
+def require_arrivals(ranges: Ranges) -> None:
+    """Raise `UnanswerableError` if no tag overheard a range."""
+    if ranges.arrivals is None or not len(ranges.arrivals):
+        raise UnanswerableError(
+            f"{ranges.source}: no listener overheard an exchange between tags with known distances", parameter="use"
+        )
+
+
 def load_flight(data: Data, *, need_power: bool = True) -> Flight:
     """Return a recording's usable ranges with its poses; of an exchange that both ends reported one report counts.
 
@@ -306,7 +315,9 @@ def load_flight(data: Data, *, need_power: bool = True) -> Flight:
         )
         heard = getattr(source, "overheard", None)
         if heard and len(heard["time_ns"]):
-            found = replace(found, arrivals=arrivals_of(exchanges, found.truth_m, heard, source.poses, source.tags))
+            arrivals = arrivals_of(exchanges, found.raw_m, heard, source.poses, source.tags)
+            powered = np.isfinite(measured_powers(arrivals.poll_dbm) + measured_powers(arrivals.response_dbm))
+            found = replace(found, arrivals=arrivals[powered | (not need_power)])
         fingerprint = sha256(exchanges.time_ns.tobytes() + exchanges.range_m.tobytes()).hexdigest()[:32]
         usable = found.usable(_why_no_truth(source), _why_no_power(exchanges), need_power=need_power)
         ranges = replace(usable, recordings=((name, fingerprint),))

@@ -1,10 +1,7 @@
 """Differences of arrival as rows of a fit, beside the ranges of the same exchanges.
 
-An exchange and its listeners share the reception of the poll at the target, so their errors correlate. The difference
-of arrival less the error of the range does not: with the errors e of receptions at i, j and k, a range has
-(e2_i + e1_j)/2, a difference of arrival e1_j + e2_k - e1_k, and what is left of it (e1_j - e2_i)/2 + e2_k - e1_k. A
-range depends on half the sum of both delays, and this on half their difference: rows of both kinds know different
-things.
+Their errors do not correlate with those of the ranges (`calib.data.arrivals`). A range depends on half the sum of both
+delays, and a difference of arrival on half their difference: rows of both kinds know different things.
 """
 
 from __future__ import annotations
@@ -78,7 +75,7 @@ class ArrivalModel:
         parts.append(Part(parameter=RESIDUAL, kind=OFFSET_OF_PATH, columns=number, values=signs))
         key = np.unique(np.column_stack([ends, arrivals.listener]), axis=0, return_inverse=True)[1]
         return cls(
-            residual=arrivals.error_m - (ranges.raw_m - ranges.truth_m)[row],
+            residual=arrivals.error_m,
             exchange=row,
             listener=listener,
             listeners=tuple(map(str, listeners.tolist())),

@@ -17,15 +17,25 @@ import numpy as np
 from scipy.signal import correlate
 from scipy.stats import chi2
 
-from calib.calibration.applying import keep_determined
+from calib.calibration.applying import heard_receptions, keep_determined, noise_m, reception_gains
 from calib.calibration.document import for_json
+from calib.calibration.error_model import GATE
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
-from calib.data.sources import Data, Flight, load_flight, require_times
+from calib.data.sources import Data, Flight, load_flight, require_arrivals, require_times
 from calib.errors import UnanswerableError
 from calib.evaluation.filters import range_errors
 from calib.evaluation.onboard import OnboardTrack
-from calib.evaluation.tracking import FILTERS, FilterRanges, Settings, Track, Trajectory, problems, run_filters
+from calib.evaluation.tracking import (
+    FILTERS,
+    FilterRanges,
+    Settings,
+    Track,
+    Trajectory,
+    distances_in,
+    problems,
+    run_filters,
+)
 from uwblink.arrays import Floats, Ints
 from uwblink.display import printable
 from uwblink.output import write_files
@@ -49,7 +59,8 @@ class FixedStd:
 class Localization:
     """One body of one recording: a track for each of `FILTERS`, and the RMSE of each over seeds (seeds,) in metres.
 
-    `simulated` tells whether the flight was simulated; `fixed` are the fixed standard deviations.
+    `simulated` tells whether the flight was simulated; `fixed` are the fixed standard deviations; `arrivals` counts
+    differences of arrival among the measurements.
     """
 
     source: str
@@ -58,6 +69,7 @@ class Localization:
     rmse_m: dict[str, Floats]
     fixed: FixedStd
     simulated: bool
+    arrivals: int = 0
 
     @property
     def label(self) -> str:
@@ -85,6 +97,8 @@ def localize(
 ) -> list[Localization]:
     """Track every body that moves and ranges in a recording, one at a time, with extended Kalman filters.
 
+    With `Settings(use="receptions")` also by what tags overheard, a body that only listens by that alone.
+
     `data` is the path of a recording, an open `Recording`, or anything with `exchanges`, `poses` and `tags`. The fixed
     variances are the best ones on the flight `training`; without it those of the errors that the calibration was fitted
     to, as it remembers them; never those of the flight itself, which a filter cannot know. Raises what
@@ -100,18 +114,20 @@ def localize(
     """
     calibration = given_calibration(calibration)
     chosen = settings or Settings()
-    flight = data if isinstance(data, Flight) else load_flight(data, need_power=calibration.needs_power)
+    flight = _flight_for(data, calibration, chosen)
     flight = replace(flight, ranges=keep_determined(calibration, flight.ranges))
     fixed = fixed_std(calibration, chosen, training)
     require_times(flight.ranges)
     bodies = problems(flight)
     if not bodies:
         raise UnanswerableError(
-            f"{flight.ranges.source}: no body moves among poses and ranges, so there is nothing to localize"
+            f"{flight.ranges.source}: no body moves among poses and ranges, so there is nothing to localize; one that "
+            "only listens needs `use` receptions"
         )
     found = []
     for problem in bodies:
-        tracks = run_filters(problem, filter_ranges(flight.ranges[problem.rows], calibration, fixed), chosen)
+        measured = filter_ranges(problem.ranges, calibration, fixed)
+        tracks = run_filters(problem, {name: one.at(problem.rows) for name, one in measured.items()}, chosen)
         found.append(
             Localization(
                 source=flight.ranges.source,
@@ -120,30 +136,103 @@ def localize(
                 rmse_m={name: np.array([track.rmse_m for track in own]) for name, own in tracks.items()},
                 fixed=fixed,
                 simulated=flight.ranges.planted is not None,
+                arrivals=int(np.count_nonzero(problem.rows >= len(problem.ranges))),
             )
         )
     return found
 
 
+def _flight_for(data: Data | Flight, calibration: Calibration, settings: Settings) -> Flight:
+    """Return a flight with what `settings` use of it."""
+    flight = data if isinstance(data, Flight) else load_flight(data, need_power=calibration.needs_power)
+    if settings.use == "receptions":
+        require_arrivals(flight.ranges)
+        return flight
+    return replace(flight, ranges=replace(flight.ranges, arrivals=None))
+
+
+@dataclass(frozen=True, slots=True)
+class _Receptions:
+    """What errors of n measurements are made of, raw and corrected, in metres.
+
+    They are `sign` (n, k) times those of `parts`, ranges or receptions with an independent variance of `gain` (n, k)
+    times that of a range, and what measurements of an exchange share, with a standard deviation of `common_m` (n,)
+    times that of a range.
+    """
+
+    raw_m: Floats
+    corrected_m: Floats
+    parts: list[Ranges]
+    sign: Floats
+    gain: Floats
+    common_m: Floats
+
+    @classmethod
+    def of(cls, ranges: Ranges, calibration: Calibration) -> _Receptions:
+        """Return those of ranges, and then of their arrivals."""
+        applied, sign, none = calibration.apply(ranges), distances_in(ranges)[1], np.zeros(len(ranges))
+        if ranges.arrivals is None:
+            return cls(applied.raw_m, applied.corrected_m, [ranges], sign, sign, none)
+        heard = calibration.correct_arrivals(ranges)
+        return cls(
+            np.append(applied.raw_m, heard.raw_m),
+            np.append(applied.corrected_m, heard.corrected_m),
+            [Ranges.concatenate([ranges, part]) for part in heard_receptions(ranges)[:2]],
+            sign,
+            np.concatenate([sign[: len(ranges)], reception_gains(ranges.arrivals)]),
+            np.append(none, heard.shared_m),
+        )
+
+    def own_m(self, std_m: Floats | float) -> Floats:
+        """Return the standard deviation of own errors (n,), where those of ranges (n, k) like the parts have this."""
+        return np.asarray(np.sqrt(np.sum(self.gain * np.square(std_m), axis=1)))
+
+    def fixed(self, measured_m: Floats, std_m: float) -> FilterRanges:
+        """Return what a filter measures that takes all ranges to have the same standard deviation."""
+        common_m = np.where(self.common_m > 0, std_m, 0.0)
+        return FilterRanges(measured_m, self.own_m(std_m), common_m, np.zeros_like(self.sign))
+
+
 def filter_ranges(ranges: Ranges, calibration: Calibration, fixed: FixedStd) -> dict[str, FilterRanges]:
-    """Return what each of `FILTERS` measures of a body; the robust filter needs an error model."""
-    applied = calibration.apply(ranges)
-    corrected, sigma, model = applied.corrected_m, applied.sigma_m, calibration.errors
+    """Return what each of `FILTERS` measures by ranges and then by arrivals; the robust one needs an error model."""
+    known, model = _Receptions.of(ranges, calibration), calibration.errors
+    corrected, sign, common = known.corrected_m, known.sign, known.common_m
+    nothing = np.zeros_like(sign)
+    sigma = np.column_stack([noise_m(calibration, part) for part in known.parts])
     found = {
-        "raw": FilterRanges(applied.raw_m, fixed.std_m["raw"]),
-        "calibrated": FilterRanges(corrected, fixed.std_m["calibrated"]),
-        "variance": FilterRanges(corrected, sigma),
+        "raw": known.fixed(known.raw_m, fixed.std_m["raw"]),
+        "calibrated": known.fixed(corrected, fixed.std_m["calibrated"]),
+        "variance": FilterRanges(corrected, known.own_m(sigma), common, nothing),
     }
     if model is None:
         return found
-    measured, noise, errors = range_errors(calibration, ranges, applied)
-    found["robust"] = FilterRanges(measured, noise, errors)
+    noises, kinds = zip(*(range_errors(calibration, part) for part in known.parts), strict=True)
+    noise, shares, detours = (
+        np.column_stack(some) for some in (noises, [one.share for one in kinds], [one.detour_m for one in kinds])
+    )
+    errors = replace(kinds[0], share=np.abs(sign) * shares, detour_m=detours)
+    measured = corrected - model.location_m * sign.sum(axis=1)
+    found["robust"] = FilterRanges(measured, known.own_m(noise), common, nothing, errors=errors)
     if lasting := model.lasting:
-        own, shared, time_s = np.sqrt(lasting.own_variance), np.sqrt(lasting.lasting_variance), lasting.time_s
+        # Receptions have independent noise: only reflections last in differences of arrival. A gate lets longer ones
+        # pass there, because these have five times the variance of ranges.
+        heard = common > 0
+        own, shared = np.where(heard, [[1.0], [0.0]], np.sqrt([[lasting.own_variance], [lasting.lasting_variance]]))
+        gate_m = np.sqrt(GATE) * np.hypot(known.own_m(sigma), common) * heard
+        detours_m2 = shares * model.square_below_m2(detours, gate_m[:, None])
+        centred = corrected - lasting.mean * np.sum(sign * sigma, axis=1)
         # The mixture contains reflections within the gate, so the total variance is that of the noise.
-        unit = noise / np.hypot(own, shared)
-        found["variance"] = FilterRanges(corrected - lasting.mean * sigma, own * sigma, None, shared * sigma, time_s)
-        found["robust"] = FilterRanges(measured, own * unit, errors, shared * unit, time_s)
+        units = np.ones(len(sign)), np.hypot(own, shared)
+        for name, one, std, unit in zip(
+            ("variance", "robust"), (centred, measured), (sigma, noise), units, strict=True
+        ):
+            found[name] = replace(
+                found[name],
+                measured_m=one,
+                std_m=own / unit * known.own_m(std),
+                shared_m=sign * np.sqrt((shared / unit)[:, None] ** 2 * std**2 + detours_m2),
+                lasting_s=lasting.time_s,
+            )
     return found
 
 
@@ -162,14 +251,14 @@ def fixed_std(calibration: Calibration, settings: Settings, training: Data | Fli
     if training is None:
         middle = float(calibration.sigma_curve(np.array([np.mean(calibration.sigma_curve.range)]))[0])
         return FixedStd(dict.fromkeys(("raw", "calibrated"), middle), "the sigma curve's middle")
-    flight = training if isinstance(training, Flight) else load_flight(training)
+    flight = _flight_for(training, calibration, settings)
     # About a minute of three bodies is enough: neighbouring candidates differ little.
     flight = replace(flight, ranges=flight.ranges[:7500])
-    applied = calibration.apply(flight.ranges)
     squares = np.zeros((2, len(TUNED_OVER)))
     for problem in problems(flight):
-        measured = [column[problem.rows] for column in (applied.raw_m, applied.corrected_m)]
-        ranges = {f"{k}, {std}": FilterRanges(own, std) for k, own in enumerate(measured) for std in TUNED_OVER}
+        known = _Receptions.of(problem.ranges, calibration)
+        measured = enumerate((known.raw_m, known.corrected_m))
+        ranges = {f"{k}, {s}": known.fixed(own, s).at(problem.rows) for k, own in measured for s in TUNED_OVER}
         errors = [[track.rmse_m for track in own] for own in run_filters(problem, ranges, settings).values()]
         squares += np.sum(np.square(errors), axis=1).reshape(squares.shape)
     raw, calibrated = (TUNED_OVER[k] for k in np.argmin(squares, axis=1))
@@ -289,6 +378,9 @@ def localization_text(found: list[Localization], settings: Settings) -> str:
         f"{summary.nis_bounds[1]:.2f}), NEES {summary.nees:.2f} (3 expected, {summary.nees_bounds[0]:.2f} to "
         f"{summary.nees_bounds[1]:.2f}), {100 * summary.accepted:.1f} % of the ranges pass the gate",
     ]
+    if arrivals := sum(one.arrivals for one in found):
+        every = sum(len(one.tracks["raw"].time_ns) for one in found)
+        lines.append(f"by {every - arrivals} ranges and {arrivals} differences of arrival")
     return "\n".join(lines)
 
 
@@ -303,6 +395,7 @@ def localization_json(found: list[Localization]) -> dict[str, Any]:
             "fixed_std_m": one.fixed.std_m,
             "fixed_std_source": one.fixed.source,
             "simulated": one.simulated,
+            "arrivals": one.arrivals,
         }
         for one in found
     ]

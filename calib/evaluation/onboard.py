@@ -190,7 +190,7 @@ def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
             continue
         rows = rows[np.argsort(ranges.time_ns[rows], kind="stable")]
         some = ranges[rows]
-        measured, noise, errors = range_errors(calibration, some, calibration.apply(some))
+        noise, errors = range_errors(calibration, some)
         imu_s, inertial = _table(imu, body, ("wx", "wy", "wz", "ax", "ay", "az"), began)
         height_s, height = _table(heights, body, ("height_m",), began)
         known = poses.body == body
@@ -199,7 +199,7 @@ def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
                 source=ranges.source,
                 body=body,
                 time_s=np.asarray((some.time_ns - began) * 1e-9, dtype=np.float64),
-                range_m=measured,
+                range_m=calibration.apply(some).corrected_m - errors.location_m,
                 noise_m=noise,
                 errors=errors,
                 arm_m=np.array([arms[tag] for tag in mine[rows].tolist()]),

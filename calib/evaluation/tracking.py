@@ -1,24 +1,27 @@
 """Extended Kalman filters of one body: what they are given, how they run, and what they come to.
 
 State is the body's position; its velocity and attitude are inputs taken from motion capture, velocity with noise; the
-places of the other bodies are known (ICRA 2023, section V).
+places of the other bodies are known (ICRA 2023, section V). A measurement is a sum of distances with signs: one of a
+range, two of a difference of arrival (`calib.data.arrivals`), of which those between other bodies are known.
 """
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
+from calib.data.ranges import Ranges
 from calib.data.sources import Flight
 from calib.evaluation.filters import RangeErrors, gated_update, mixture_update, multilaterate
 from calib.settings import CheckedSettings
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
 from uwblink.recording.schema import Poses
+from uwblink.settings import setting
 
 Trajectory = tuple[Ints, Floats, Floats]
 """Times in ns (n,), positions in metres (n, 3), attitudes x y z w (n, 4)."""
@@ -44,7 +47,8 @@ class Settings(CheckedSettings):
     quantile); the robust filter has no gate. A filter begins anew where its last ranges say
     (`multilaterate`) once the time in which it explained its ranges, 10 s at most, is used up by time in which it did
     not, and half of `reopen_s` besides. `seeds` are runs with other noise, each body and flight with its own; tracks
-    are those of the first, `seed`. Raises `BadInputError` that names the setting.
+    are those of the first, `seed`. `use` is "exchanges", a body's ranges, or "receptions", with all that it overheard
+    and others overheard of it. Raises `BadInputError` that names the setting.
     """
 
     velocity_std_mps: float = 0.3
@@ -56,6 +60,7 @@ class Settings(CheckedSettings):
     reopen_s: float = 1.0
     seed: int = 0
     seeds: int = 3
+    use: str = setting("exchanges", "What is used.", names=("exchanges", "receptions"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,7 +90,7 @@ class BodyTrack:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Track(BodyTrack):
-    """The track of one filter at each of its ranges: `accepted` (n,) are those within the gate.
+    """The track of one filter at each of its measurements: `accepted` (n,) are those within the gate.
 
     `attitude` is the filter's input.
     """
@@ -94,34 +99,43 @@ class Track(BodyTrack):
 
     def __repr__(self) -> str:
         """Return its length and how far off it is, on one line."""
-        return f"track of {len(self.time_ns)} ranges, rms error {self.rmse_m:.3f} m"
+        return f"track of {len(self.time_ns)} measurements, rms error {self.rmse_m:.3f} m"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Problem:
-    """What is known of one body at each of its ranges: rows of the flight, true place, own lever arm turned into the
-    world, and the other antenna's place, (n, 3) each; numbers of its pairs of tags (n,), from 0."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Problem(ColumnTable):
+    """What is known of one body at each of its measurements (n,).
+
+    `ranges` are all that it needs, `rows` the measurements among these and their arrivals, in order of time. `place` is
+    the true one (n, 3). Of the k distances in a measurement `sign` (n, k) is 0 where the body has no part, `arm` is the
+    own lever arm turned into the world, `other` the other antenna's place (n, k, 3), and `pair` numbers the pairs of
+    tags, from 0; `known_m` is the sum of distances in which the body has no part. `exchange` (n,) numbers exchanges.
+    """
 
     body: str
+    ranges: Ranges
     rows: Ints
     time_ns: Ints
+    exchange: Ints
     attitude: Floats
     place: Floats
+    sign: Floats
     arm: Floats
     other: Floats
     pair: Ints
+    known_m: Floats
 
     @property
     def elapsed_s(self) -> Floats:
-        """Time since the range before (n,)."""
+        """Time since the measurement before (n,)."""
         return np.asarray(np.diff(self.time_ns, prepend=self.time_ns[:1]) * 1e-9)
 
     def velocity_spread(self, settings: Settings) -> Floats:
-        """Return the variance that velocity noise adds per axis between ranges (n,), in square metres."""
+        """Return the variance that velocity noise adds per axis between measurements (n,), in square metres."""
         return settings.velocity_std_mps**2 / settings.velocity_rate_hz * self.elapsed_s
 
     def noisy(self, settings: Settings, seed: int) -> tuple[Floats, Floats]:
-        """Draw a start (3,) and displacements between ranges (n, 3), both with noise.
+        """Draw a start (3,) and displacements between measurements (n, 3), both with noise.
 
         The noise depends on body and flight, and is the same for every filter.
         """
@@ -134,33 +148,63 @@ class Problem:
 
 
 def problems(flight: Flight) -> list[Problem]:
-    """Return a problem for every body of a flight that moves, and ranges while its place is known."""
-    ranges, found = flight.ranges, []
+    """Return a problem for every body of a flight that moves, and ranges or listens while its place is known."""
+    found = []
     for body in flight.moving_bodies():
         mine = [tag.tag for tag in flight.tags if tag.body == body]
-        first, second = (np.isin(ids, mine) for ids in (ranges.initiator, ranges.target))
-        rows = np.flatnonzero(first ^ second)
-        rows = rows[np.argsort(ranges.time_ns[rows], kind="stable")]
-        time = ranges.time_ns[rows]
-        own = np.where(first[rows], ranges.initiator[rows], ranges.target[rows])
-        other = np.where(first[rows], ranges.target[rows], ranges.initiator[rows])
-        place = bodies_m(flight.poses, body, time)
-        antenna, away = (antennas_m(flight.poses, flight.tags, ids, time) for ids in (own, other))
-        known = np.isfinite(np.hstack([place, antenna, away])).all(axis=1)
-        if known.any():
-            found.append(
-                Problem(
-                    body=body,
-                    rows=rows[known],
-                    time_ns=time[known],
-                    attitude=nearest_attitude(flight.poses, body, time[known]),
-                    place=place[known],
-                    arm=(antenna - place)[known],
-                    other=away[known],
-                    pair=np.unique(own[known] * 2**16 + other[known], return_inverse=True)[1],
-                )
-            )
+        ranges = _ranges_about(flight.ranges, mine)
+        ends, sign, exchange = distances_in(ranges)
+        time, inside = ranges.time_ns[exchange], np.isin(ends, mine)
+        free = inside[..., 0] ^ inside[..., 1]
+        rows = np.flatnonzero((free & (sign != 0)).any(axis=1))
+        rows = rows[np.lexsort((exchange[rows], time[rows]))]
+        if not len(rows):
+            continue
+        ends, sign, time, free, first = ends[rows], sign[rows], time[rows], free[rows], inside[rows, :, 0]
+        place, sides = bodies_m(flight.poses, body, time), np.moveaxis(ends, 2, 0)
+        antenna, away = (
+            antennas_m(flight.poses, flight.tags, ids.ravel(), np.repeat(time, sign.shape[1])).reshape(*sign.shape, 3)
+            for ids in np.where(first, sides, sides[::-1])
+        )
+        problem = Problem(
+            body=body,
+            ranges=ranges,
+            rows=rows,
+            time_ns=time,
+            exchange=exchange[rows],
+            attitude=nearest_attitude(flight.poses, body, time),
+            place=place,
+            sign=np.where(free, sign, 0.0),
+            arm=antenna - place[:, None],
+            other=away,
+            pair=np.unique(ends.min(axis=2) * 2**16 + ends.max(axis=2), return_inverse=True)[1].reshape(sign.shape),
+            known_m=np.sum(np.where(free, 0.0, sign * np.linalg.norm(antenna - away, axis=2)), axis=1),
+        )
+        known = np.flatnonzero(np.isfinite(problem.arm + problem.other).all(axis=(1, 2)))
+        if len(known):
+            found.append(problem[known])
     return found
+
+
+def _ranges_about(ranges: Ranges, tags: list[int]) -> Ranges:
+    """Return the ranges of some tags with others, and those that these or others overheard, with their arrivals."""
+    needed, heard = np.isin(ranges.initiator, tags) ^ np.isin(ranges.target, tags), ranges.arrivals
+    if heard is not None:
+        heard = heard[needed[heard.exchange] | np.isin(heard.listener, tags)]
+        needed[heard.exchange] = True
+    return replace(ranges, arrivals=heard)[needed]
+
+
+def distances_in(ranges: Ranges) -> tuple[Ints, Floats, Ints]:
+    """Return the tags (n, k, 2) and signs (n, k) of the distances in ranges and arrivals, and exchanges (n,)."""
+    ends, exchange, heard = np.column_stack([ranges.initiator, ranges.target]), np.arange(len(ranges)), ranges.arrivals
+    if heard is None:
+        return ends[:, None], np.ones((len(ranges), 1)), exchange
+    # From the target, less from the initiator.
+    senders = ends[heard.exchange, ::-1]
+    of_heard = np.stack([senders, np.broadcast_to(heard.listener[:, None], senders.shape)], axis=2)
+    signs = np.repeat([[1.0, 0.0], [1.0, -1.0]], [len(ranges), len(heard)], axis=0)
+    return np.concatenate([np.stack([ends, ends], axis=1), of_heard]), signs, np.append(exchange, heard.exchange)
 
 
 def nearest_attitude(poses: Poses, body: str, time_ns: Ints) -> Floats:
@@ -173,37 +217,49 @@ def nearest_attitude(poses: Poses, body: str, time_ns: Ints) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class FilterRanges:
-    """What a filter measures (n,), the standard deviation of each range's own error, and its error model, if any.
+    """What a filter measures (n,), the standard deviation of each measurement's own error, and its error model, if any.
 
-    Ranges of a pair share an error with a standard deviation of `shared_m`, which lasts for `lasting_s`.
+    Ranges of a pair share an error with a standard deviation of `shared_m`, which lasts for `lasting_s`: (n, k) by the
+    distances in a measurement, with their signs. Measurements of an exchange share one of `common_m` (n,).
     """
 
     measured_m: Floats
-    std_m: Floats | float
-    errors: RangeErrors | None = None
-    shared_m: Floats | float = 0.0
+    std_m: Floats
+    common_m: Floats
+    shared_m: Floats
     lasting_s: float = np.inf
+    errors: RangeErrors | None = None
+
+    def at(self, rows: Ints) -> FilterRanges:
+        """Return some measurements."""
+        measured, std, common, shared = (x[rows] for x in (self.measured_m, self.std_m, self.common_m, self.shared_m))
+        errors = None if self.errors is None else self.errors.at(rows)
+        return FilterRanges(measured, std, common, shared, self.lasting_s, errors)
 
 
 def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: Settings) -> dict[str, list[Track]]:
     """Run filters on the ranges of a body with every noise; return the tracks of each, one for each noise.
 
-    A state is the position, and for each pair of tags the error that its ranges share: a Gauss-Markov process of first
-    order, in units of `shared_m` (Bar-Shalom, Li and Kirubarajan 2001, section 8.2). Arrays are (filters, seeds, ...).
+    A state is the position, for each pair of tags the error that its ranges share, a Gauss-Markov process of first
+    order in units of `shared_m` (Bar-Shalom, Li and Kirubarajan 2001, section 8.2), and the error that measurements of
+    one exchange share, in units of `common_m`. Arrays are (filters, seeds, ...).
     """
-    count, known = len(problem.time_ns), list(ranges.values())
-    measured, std, shared = (
-        np.stack([np.broadcast_to(getattr(one, name), count) for one in known], axis=1)[..., None]
-        for name in ("measured_m", "std_m", "shared_m")
+    count, known = len(problem), list(ranges.values())
+    measured, std, common = (
+        np.stack([getattr(one, name) for one in known], axis=1)[..., None]
+        for name in ("measured_m", "std_m", "common_m")
     )
+    shared = np.stack([one.shared_m for one in known], axis=1)[:, :, None]
     noises = [problem.noisy(settings, settings.seed + k) for k in range(settings.seeds)]
     moves = np.stack([moves for _, moves in noises], axis=1)
     moved = moves.cumsum(axis=0)
     kept = np.exp(-problem.elapsed_s[:, None] / [one.lasting_s for one in known])[..., None, None]
-    size = 4 + int(problem.pair.max())
+    size = 5 + int(problem.pair.max())
     of_place = np.arange(size) < 3
     factor = np.where(of_place, 1.0, kept)
     added = np.where(of_place, problem.velocity_spread(settings)[:, None, None, None], 1 - kept**2)
+    same = np.diff(problem.exchange, prepend=-1) == 0
+    factor[..., -1], added[..., -1] = same[:, None, None], ~same[:, None, None]
     prior = np.diag(np.where(of_place, settings.initial_std_m**2, 1.0))
 
     shape = len(known), settings.seeds
@@ -214,18 +270,22 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
     explained_s, most_s = np.zeros(shape), settings.reopen_s / 2 / 12
     estimate, (std_m, nis, nees) = np.empty((count, *shape, 3)), np.empty((3, count, *shape))
     accepted = np.empty((count, *shape), dtype=bool)
-    for k, pair in enumerate(3 + problem.pair):
+    for k, pairs in enumerate((3 + problem.pair).tolist()):
         x *= factor[k]
         x[..., :3] += moves[k]
         p *= factor[k][..., None] * factor[k][..., None, :]
         diagonal += added[k]
-        towards = x[..., :3] + problem.arm[k] - problem.other[k]
+        towards = x[..., None, :3] + problem.arm[k] - problem.other[k]
         distance = np.linalg.norm(towards, axis=-1)
         h = np.zeros_like(x)
-        h[..., :3], h[..., pair] = towards / np.maximum(distance, 1e-6)[..., None], shared[k]
+        h[..., :3] = np.sum(towards * (problem.sign[k] / np.maximum(distance, 1e-6))[..., None], axis=-2)
+        for which, pair in enumerate(pairs):
+            h[..., pair] += shared[k, ..., which]
+        h[..., -1] = common[k]
         ph = np.matmul(p, h[..., None])[..., 0]
         variance = np.sum(h * ph, axis=-1) + std[k] ** 2
-        innovation = measured[k] - distance - shared[k] * x[..., pair]
+        expected = problem.known_m[k] + distance @ problem.sign[k] + np.sum(h[..., 3:] * x[..., 3:], axis=-1)
+        innovation = measured[k] - expected
         update = gated_update(innovation, variance, settings.gate)
         for f, one in enumerate(known):
             if one.errors is not None:
@@ -243,8 +303,9 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
         for lost in zip(*np.nonzero(explained_s < -settings.reopen_s / 2), strict=True):
             rows = slice(np.searchsorted(problem.time_ns, problem.time_ns[k] - settings.reopen_s * 1e9), k + 1)
             # The body moved since these ranges: so do their anchors.
-            anchors = problem.other[rows] - problem.arm[rows] + (moved[k] - moved[rows])[:, lost[1]]
-            fix = multilaterate(measured[rows, lost[0], 0], anchors, 0.0)
+            anchors = problem.other[rows] - problem.arm[rows] + (moved[k] - moved[rows])[:, lost[1], None]
+            legs = measured[rows, lost[0], 0] - problem.known_m[rows]
+            fix = multilaterate(legs, anchors, 0.0, sign=problem.sign[rows])
             x[lost], p[lost], explained_s[lost] = 0.0, prior, 0.0
             x[lost][:3], p[lost][:3, :3] = fix.place_m, fix.covariance_m2
         wrong, covariance = x[..., :3] - problem.place[k], p[..., :3, :3]

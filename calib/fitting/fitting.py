@@ -31,7 +31,7 @@ from calib.checks.limits import (
     warnings_of,
 )
 from calib.data.ranges import Ranges, held_out
-from calib.data.sources import Data, load_ranges
+from calib.data.sources import Data, load_ranges, require_arrivals
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.known_distances import KnownDistances, fit_known_distances
 from calib.estimator.losses import MIXTURE, check_loss
@@ -74,10 +74,8 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     heard = 0 if ranges.arrivals is None else len(ranges.arrivals)
     if settings.use == "exchanges":
         ranges = replace(ranges, arrivals=None)
-    elif not heard:
-        raise UnanswerableError(
-            f"{ranges.source}: no listener overheard an exchange between tags with known distances", parameter="use"
-        )
+    else:
+        require_arrivals(ranges)
     fixed = _taken_over(source, ranges, curve=not settings.delays_only) | dict(settings.fixed_ns)
     refuse_impossible(ranges)
     # One thread: sums of several threads differ in the last digits, and threads slow small matrices down.

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
+from calib.calibration.applying import heard_receptions, reception_bias_m
 from calib.calibration.model import Calibration
-from calib.calibration.power_curves import lift
 from calib.data.arrivals import arrivals_of
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, opened
@@ -40,12 +40,10 @@ def heard_delays(data: Data, calibration: Calibration) -> dict[int, OverheardDel
             return {}
         exchanges, poses, tags = single_reports(source.exchanges).exchanges, source.poses, list(source.tags)
     ranges = Ranges.from_exchanges(exchanges, poses=poses, tags=tags, source=name)
-    arrivals = arrivals_of(exchanges, ranges.truth_m, heard, poses, tags)
-    of_target, of_response, of_poll = (
-        calibration.bias_curve(lift(power, calibration.alpha_dbm))
-        for power in (ranges.fpp1_dbm[arrivals.exchange], arrivals.response_dbm, arrivals.poll_dbm)
-    )
-    error_m, target = arrivals.error_m - (of_target + of_response - of_poll), ranges.target[arrivals.exchange]
+    arrivals = arrivals_of(exchanges, ranges.raw_m, heard, poses, tags)
+    bias_m = reception_bias_m(calibration, heard_receptions(replace(ranges, arrivals=arrivals)))
+    target, of_range = ranges.target[arrivals.exchange], (ranges.raw_m - ranges.truth_m)[arrivals.exchange]
+    error_m = arrivals.error_m + of_range - bias_m
     found = {}
     for tag in np.unique(target).tolist():
         values = error_m[(target == tag) & np.isfinite(error_m)]

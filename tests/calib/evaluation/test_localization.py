@@ -232,28 +232,33 @@ def test_bars_say_where_they_leave_bodies_out(flights, fitted):
 
 STD = 0.1
 ERRORS = RangeErrors(share=0.3, least_m=0.05, detour_m=0.3, outlier=0.02, outlier_m=2.0)
+BOTH_SIDES = replace(ERRORS, share=np.array([0.3, 0.15]), detour_m=np.array([0.3, 0.2]))
 COUNT = 2_000_000
 
 
-@pytest.fixture(scope="module")
-def draws():
-    rng = np.random.default_rng(3)
+@pytest.fixture(scope="module", params=[ERRORS, BOTH_SIDES])
+def draws(request):
+    errors, rng = request.param, np.random.default_rng(3)
     noise = rng.normal(0, STD, COUNT)
     kind = rng.random(COUNT)
     innovation = noise.copy()
-    reflected = kind < 0.98 * 0.3
-    innovation[reflected] += 0.05 + rng.exponential(0.3, np.count_nonzero(reflected))
+    # Of a difference of arrival either reception is reflected; where both are, one of the two counts.
+    shares = np.atleast_1d(errors.share)
+    ends = 0.98 * np.append(0, np.cumsum(shares) / shares.sum() * (1 - np.prod(1 - shares)))
+    for sign, begin, end, detour in zip((1, -1), ends, ends[1:], np.atleast_1d(errors.detour_m), strict=False):
+        reflected = (kind >= begin) & (kind < end)
+        innovation[reflected] += sign * (0.05 + rng.exponential(detour, np.count_nonzero(reflected)))
     wild = kind > 0.98
     # An outlier's innovation has the filter's own uncertainty in it, and says nothing of the noise.
     innovation[wild] = np.hypot(2.0, STD) * rng.normal(size=np.count_nonzero(wild))
-    return innovation, noise, wild
+    return errors, innovation, noise, wild
 
 
 @pytest.mark.parametrize("value", [-0.3, -0.1, 0.0, 0.1, 0.2, 0.35, 0.7, 1.2, -1.0])
 def test_mean_and_variance_of_the_noise_are_those_of_draws(draws, value):
-    innovation, noise, wild = draws
+    errors, innovation, noise, wild = draws
     near = np.abs(innovation - value) < 0.01
-    update = mixture_update(np.array([value]), np.array([STD**2]), ERRORS)
+    update = mixture_update(np.array([value]), np.array([STD**2]), errors)
     count = np.count_nonzero(near)
     spread = noise[near].std()
     # Four standard errors, and what the width of the bin does.

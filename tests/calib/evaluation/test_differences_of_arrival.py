@@ -1,0 +1,237 @@
+"""Differences of arrival: corrected as by hand, and a robot that never sends, localized among eight anchors."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.interpolate import BSpline
+
+import calib
+from calib.calibration.power_curves import Curve
+from calib.data.sources import load_flight
+from calib.evaluation import Settings, localization_json, localization_text, summarize
+from calib.evaluation.tracking import FilterRanges, problems, run_filters
+from tests import processes
+from uwbsim import simulate
+from uwbsim.scenario.model import Scenario
+
+ANCHORS = [(-4.0, -3.5, 0.3), (4.0, -3.5, 2.8), (4.0, 3.5, 0.4), (-4.0, 3.5, 2.9), (0.0, -3.5, 2.6), (4.0, 0.0, 0.2),
+           (0.0, 3.5, 2.4), (-4.0, 0.0, 0.5)]  # fmt: skip
+# Of the size that was measured: 0.3 ns of standard deviation.
+DELAYS_NS = {1: 0.31, 2: -0.42, 3: 0.12, 4: -0.25, 5: 0.48, 6: -0.06, 7: -0.33, 8: 0.22, 20: -0.4, 21: 0.15}
+ROBOT = (20, 21)
+BETWEEN_ANCHORS = list(itertools.combinations(range(1, 9), 2))
+NOISY = {"antenna": "dipole", "shadowing_db": 1.5, "power_noise_db": 0.3, "bias": "icra2023", "sigma": "icra2023"}
+LISTEN = Settings(use="receptions")
+
+
+def flight(seed, duration_s, *, pairs=BETWEEN_ANCHORS, passive=ROBOT, radio=None):
+    """Eight anchors and a robot with two tags; by default anchors range, and the robot listens."""
+    robot = {"model": "random-flight", "box_min_m": [-3, -2.5, 0.5], "box_max_m": [3, 2.5, 2.5], "speed_mps": 0.8}
+    arms = {20: [0.17, -0.17, -0.05], 21: [-0.17, 0.17, -0.05]}
+    quiet = {"first_path_at_1m_dbm": -76.0, "rx_noise_ps": 0.0, "skew_noise_ppm": 0.0, "skew_bias_ppm": 0.0}
+    anchors = [{"name": f"a{k}", "motion": {"model": "static", "position_m": at}} for k, at in enumerate(ANCHORS, 1)]
+    tags = [
+        {"id": tag, "body": "robot" if tag in ROBOT else f"a{tag}", "lever_arm_m": arms.get(tag, [0, 0, 0]),
+         "delay_ns": delay, "skew_ppm": 0.8 * (tag * 37 % 11 - 5), "passive": tag in passive}
+        for tag, delay in DELAYS_NS.items()
+    ]  # fmt: skip
+    return simulate(
+        Scenario.model_validate(
+            {
+                "run": {"seed": seed, "duration_s": duration_s},
+                "ranging": {"protocol": "ds", "rate_hz": 160.0, "pairs": pairs},
+                "radio": quiet | (NOISY if radio is None else radio),
+                "mocap": {"rate_hz": 100.0},
+                "bodies": [*anchors, {"name": "robot", "motion": robot}],
+                "tags": tags,
+            }
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def known():
+    """A calibration from a flight in which the robot ranges with the anchors, and these with each other."""
+    return calib.fit(flight(3100, 120.0, pairs="between-bodies", passive=())).calibration
+
+
+@pytest.fixture(scope="module")
+def heard():
+    return [flight(seed, 30.0) for seed in (3101, 3102, 3103)]
+
+
+def planted(sigma_m=0.005):
+    flat = [Curve((0.0,) * 4 + (9.0,) * 4, (value,) * 4, 3, (0.0, 9.0)) for value in (0.0, sigma_m)]
+    return calib.Calibration(
+        delays_ns=DELAYS_NS, delays_std_ns=dict.fromkeys(DELAYS_NS, 0.0), loss="cauchy", scale_ns=0.1,
+        lift="mean-of-lifted", alpha_dbm=-82.0, speed_of_light=299702547.0, bias_curve=flat[0], sigma_curve=flat[1],
+    )  # fmt: skip
+
+
+def test_one_row_is_that_of_a_page_of_numpy(known, heard):
+    x, h, row = heard[0].exchanges, heard[0].overheard, 1234
+    ranges = calib.load_ranges(heard[0])
+    found = known.correct_arrivals(ranges)
+    own = {name: int(column[row]) for name, column in h.items() if column.dtype.kind == "i"}
+    at = int(np.flatnonzero((x.tx1 == own["tx1_n"]) & (x.initiator == own["initiator"]))[0])
+    i, j, k = own["initiator"], own["target"], own["listener"]
+    mine = (ranges.arrivals.exchange == at) & (ranges.arrivals.listener == k)
+    assert np.count_nonzero(mine) == 1
+
+    def since(late, early):
+        return (late - early) % 2**40
+
+    reply, final = since(own["tx2_n"], own["rx1_n"]), since(own["tx3_n"], own["tx2_n"])
+    second, third = since(own["rx2"], own["rx1"]), since(own["rx3"], own["rx2"])
+    back, last = (since(int(x.rx2[at]), own["tx1_n"]), since(int(x.rx3[at]), int(x.rx2[at])))
+    metres = 299702547.0 / (499.2e6 * 128)
+    delay_m = {tag: 0.299702547 * ns for tag, ns in known.delays_ns.items()}
+    powers = h["fpp1_n_dbm"][row], h["fpp2_n_dbm"][row], h["fpp1_dbm"][row], h["fpp2_dbm"][row]
+    lifted = 10 ** ((np.array(powers) + 82) / 10)
+    bias, sigma = (
+        (lambda at, c=c: BSpline(c.knots, c.coefficients, c.degree)(np.clip(at, *c.range)))
+        for c in (known.bias_curve, known.sigma_curve)
+    )
+    both = (lifted[0] + lifted[1]) / 2
+    range_m = metres * (back - reply * last / final) / 2 + (delay_m[i] + delay_m[j] * last / final) / 2 - bias(both)
+    difference = metres * (second * final / third - reply) - range_m + delay_m[j]
+    difference -= bias(lifted[0]) + bias(lifted[3]) - bias(lifted[2])
+    assert found.corrected_m[mine][0] == pytest.approx(difference, abs=1e-5)
+    # A reception at i counts 1 + s and s in the range, as does one at k in the difference: with s = T12/T23.
+    s = second / third
+    twice = (1 + s) ** 2 + s**2
+    one = 4 / (1 + twice)
+    variance = sigma(both) ** 2 + one * twice * sigma(lifted[3]) ** 2 + one * sigma(lifted[2]) ** 2
+    assert found.sigma_m[mine][0] == pytest.approx(np.sqrt(variance), rel=1e-4)
+    assert found.shared_m[mine][0] == pytest.approx(sigma(both), rel=1e-9)
+
+
+def test_without_noise_it_is_the_true_difference_and_the_robot_is_where_it_is():
+    silent = flight(3110, 10.0, radio={"quantize": False})
+    ranges = calib.load_ranges(silent)
+    wrong = planted().correct_arrivals(ranges).corrected_m - ranges.arrivals.truth_m
+    # Stamps in whole ticks of 4.7 mm: each is off by 1.4 mm, and a difference has the errors of four or so.
+    assert abs(np.mean(wrong)) < 0.0005
+    assert np.sqrt(np.mean(wrong**2)) < 0.004
+    (found,) = calib.localize(silent, planted(), replace(LISTEN, velocity_std_mps=0.03))
+    assert len(found.tracks["variance"].time_ns) == found.arrivals == len(wrong) == 3200
+    late = found.tracks["variance"].time_ns > found.tracks["variance"].time_ns[0] + 10**9
+    off = np.linalg.norm(found.tracks["variance"].estimate_m - found.tracks["variance"].truth_m, axis=1)
+    assert np.sqrt(np.mean(off[late] ** 2)) < 0.004
+
+
+def test_two_listeners_of_an_exchange_share_what_is_stated(known, heard):
+    products, shared, squares, stated = [], [], [], []
+    for one in heard:
+        ranges = calib.load_ranges(one)
+        applied, a = known.correct_arrivals(ranges), ranges.arrivals
+        wrong = applied.corrected_m - a.truth_m
+        first, second = (np.flatnonzero(a.listener == tag)[np.argsort(a.exchange[a.listener == tag])] for tag in ROBOT)
+        assert np.array_equal(a.exchange[first], a.exchange[second])
+        products.append(wrong[first] * wrong[second])
+        shared.append(applied.shared_m[first] ** 2)
+        squares.append(wrong**2)
+        stated.append(applied.sigma_m**2)
+    products, shared = np.concatenate(products), np.concatenate(shared)
+    off = np.std(products) / np.sqrt(len(products))
+    assert np.mean(products) == pytest.approx(np.mean(shared), abs=3 * off)
+    assert 3 * off < 0.25 * np.mean(shared), "too few to tell half the covariance from all of it"
+    assert np.mean(np.concatenate(squares)) == pytest.approx(np.mean(np.concatenate(stated)), rel=0.08)
+
+
+def test_a_robot_that_never_sends_is_localized(known, heard):
+    found = [one for each in heard for one in calib.localize(each, known, LISTEN)]
+    total = summarize(found)
+    assert [one.body for one in found] == ["robot"] * 3
+    assert total.rmse_m["raw"] > 0.09
+    assert total.rmse_m["variance"] < 0.045
+    assert total.rmse_m["robust"] < 0.045
+    # 95 % of a chi-square over its degrees: three a value, over as many values as are independent.
+    assert total.nees_bounds[0] < total.nees < total.nees_bounds[1]
+    assert total.nees_bounds[1] - total.nees_bounds[0] < 1
+    assert localization_text(found, LISTEN).splitlines()[-1] == f"by 0 ranges and {3 * 9600} differences of arrival"
+    assert [one["arrivals"] for one in localization_json(found)["scenarios"]] == [9600] * 3
+
+
+def test_the_filter_knows_what_listeners_of_an_exchange_share(heard):
+    (problem,), rng = problems(load_flight(heard[0])), np.random.default_rng(5)
+    true_m = problem.ranges.arrivals.truth_m[problem.rows - len(problem.ranges)]
+    drawn = 0.3 * rng.normal(size=len(problem.ranges))[problem.exchange] + 0.05 * rng.normal(size=len(true_m))
+    own, common = np.full(len(true_m), 0.05), np.full(len(true_m), 0.3)
+    means = list[float]()
+    for std, shared in ((own, common), (np.hypot(own, common), 0 * common)):
+        measured = {"variance": FilterRanges(true_m + drawn, std, shared, np.zeros_like(problem.sign))}
+        tracks = run_filters(problem, measured, replace(LISTEN, gate=1e9))["variance"]
+        means.append(np.mean([track.nees for track in tracks]))
+    # Taken for independent, two listeners count as two exchanges, and the filter believes them too much.
+    assert 2.5 < means[0] < 3.5
+    assert means[1] > 1.3 * means[0]
+
+
+def test_a_wrong_start_is_left_by_differences_alone(known, heard):
+    settings = replace(LISTEN, initial_offset_m=(0.0, -8.0, 0.0), seeds=1)
+    (found,) = calib.localize(heard[0], known, settings)
+    for track in found.tracks.values():
+        off = np.linalg.norm(track.estimate_m - track.truth_m, axis=1)
+        assert off[0] > 5
+        assert off[track.time_ns > track.time_ns[0] + 2 * 10**9].max() < 0.5
+
+
+def test_what_is_overheard_helps_a_robot_that_ranges(known):
+    """Its tags hear the anchors, the anchors hear it, and each of its tags hears the other's exchanges."""
+    all_hear = flight(3120, 15.0, pairs="between-bodies", passive=DELAYS_NS)
+    ((ranging,), (both,)) = (calib.localize(all_hear, known, Settings(use=use)) for use in ("exchanges", "receptions"))
+    ranges = len(ranging.tracks["raw"].time_ns)
+    assert (ranging.arrivals, len(both.tracks["raw"].time_ns) - both.arrivals) == (0, ranges)
+    rows = calib.load_ranges(all_hear)
+    heard, own = rows.arrivals, np.isin([rows.initiator, rows.target], ROBOT).any(axis=0)
+    assert both.arrivals == np.count_nonzero(np.isin(heard.listener, ROBOT) | own[heard.exchange])
+    for name in ("variance", "robust"):
+        assert both.rmse_m[name].mean() < 0.9 * ranging.rmse_m[name].mean()
+    total = summarize([both])
+    assert total.nees_bounds[0] < total.nees < total.nees_bounds[1]
+
+
+def test_reflections_that_last_and_pass_the_gate_are_counted():
+    """A gate of 3.3 standard deviations of a difference lets half a metre pass, with plus and with minus."""
+    lasting = {"model": "two-state", "share": 0.14, "mean_excess_m": 0.35, "life_s": 0.15, "first_path_loss_db": 0.4,
+               "loss_std_db": 1.0, "total_loss_db": 0.0}  # fmt: skip
+    train, test = (
+        flight(seed, seconds, pairs=pairs, passive=passive, radio=NOISY | {"multipath": lasting})
+        for seed, seconds, pairs, passive in ((3140, 80.0, "between-bodies", ()), (3141, 30.0, BETWEEN_ANCHORS, ROBOT))
+    )
+    found = calib.localize(test, calib.fit(train), LISTEN)
+    total = summarize(found)
+    assert total.rmse_m["robust"] < 0.75 * total.rmse_m["raw"]
+    # Innovations are as stated to a tenth; with the noise of direct paths alone they are a third larger.
+    assert 0.85 < total.nis < 1.15
+    assert np.mean(found[0].tracks["robust"].nees) < 4.5
+
+
+def test_delays_that_are_known_in_sums_only_correct_no_difference(heard):
+    ranges, split = calib.load_ranges(heard[0]), (((1, 2, 3, 4), (5, 6, 7, 8)),)
+    with pytest.raises(calib.BadInputError, match="tags 1, 2, 3"):
+        replace(planted(), undetermined_splits=split).correct_arrivals(ranges)
+    without = {tag: delay for tag, delay in DELAYS_NS.items() if tag not in ROBOT}
+    listening = replace(planted(), delays_ns=without).correct_arrivals(ranges)
+    assert np.array_equal(listening.corrected_m, planted().correct_arrivals(ranges).corrected_m)
+    assert np.isnan(listening.late_share).all()
+
+
+@pytest.mark.parametrize(
+    ("listening", "options", "status", "naming"),
+    [
+        (ROBOT, "", 1, ["robot.uwb", "--use"]),
+        ((), "--use receptions", 1, ["robot.uwb", "--use"]),
+        (ROBOT, "--use receptions --model imu", 2, ["--use", "--model"]),
+        (ROBOT, "--use everything", 2, ["--use", "everything", "exchanges, receptions"]),
+    ],
+)
+def test_one_line_says_what_to_do(tmp_path, listening, options, status, naming):
+    flight(3130, 2.0, passive=listening).save(tmp_path / "robot.uwb")
+    planted().save(tmp_path / "c.json")
+    words = f"calib localize robot.uwb -c c.json --tum tum {options}".split()
+    processes.refuse(*words, cwd=tmp_path, naming=naming, status=status)
+    assert not (tmp_path / "tum").exists()
