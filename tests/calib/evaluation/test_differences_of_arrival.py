@@ -134,10 +134,10 @@ def test_two_listeners_of_an_exchange_share_what_is_stated(known, heard):
         shared.append(applied.shared_m[first] ** 2)
         squares.append(wrong**2)
         stated.append(applied.sigma_m**2)
-    products, shared = np.concatenate(products), np.concatenate(shared)
-    off = np.std(products) / np.sqrt(len(products))
-    assert np.mean(products) == pytest.approx(np.mean(shared), abs=3 * off)
-    assert 3 * off < 0.25 * np.mean(shared), "too few to tell half the covariance from all of it"
+    whole, common = np.concatenate(products), np.concatenate(shared)
+    off = np.std(whole) / np.sqrt(len(whole))
+    assert np.mean(whole) == pytest.approx(np.mean(common), abs=3 * off)
+    assert 3 * off < 0.25 * np.mean(common), "too few to tell half the covariance from all of it"
     assert np.mean(np.concatenate(squares)) == pytest.approx(np.mean(np.concatenate(stated)), rel=0.08)
 
 
@@ -164,7 +164,7 @@ def test_the_filter_knows_what_listeners_of_an_exchange_share(heard):
     for std, shared in ((own, common), (np.hypot(own, common), 0 * common)):
         measured = {"variance": FilterRanges(true_m + drawn, std, shared, np.zeros_like(problem.sign))}
         tracks = run_filters(problem, measured, replace(LISTEN, gate=1e9))["variance"]
-        means.append(np.mean([track.nees for track in tracks]))
+        means.append(float(np.mean([track.nees for track in tracks])))
     # Taken for independent, two listeners count as two exchanges, and the filter believes them too much.
     assert 2.5 < means[0] < 3.5
     assert means[1] > 1.3 * means[0]
