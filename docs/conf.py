@@ -59,7 +59,7 @@ nitpick_ignore_regex = [
     ),  # models of files, which have pages of their own
     (
         "py:class",
-        r"(Mapping|tuple)\[.*|AbstractContextManager|AntennaDelays|Draw|DuckDBPyConnection|OverheardDelay|deque|PathLike|Path|ndarray|dtype|float64|complex128|ArrayLike|Bools|Floats|Ints|NDArray|Axes|Figure|Data|Source|Using|ListPortInfo|PlacedBody|Value|World",
+        r"(Mapping|tuple)\[.*|AbstractContextManager|AntennaDelays|Draw|DuckDBPyConnection|OverheardDelay|deque|PathLike|Path|ndarray|dtype|float64|complex128|ArrayLike|Bools|Floats|Ints|NDArray|Axes|Figure|Data|Source|Using|ListPortInfo|Pair|PlacedBody|Value|World",
     ),
 ]
 
