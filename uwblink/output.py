@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -82,8 +83,12 @@ def place_beside(path: Path) -> Iterator[Path]:
     # It is removed at the end of the process at the latest, also after an interrupt.
     with interrupts_held():  # an interrupt between creating and storing it would leave the folder
         made = TemporaryDirectory(".partial", prefix, path.absolute().parent, ignore_cleanup_errors=True)
-    with made as folder:
-        yield Path(folder) / path.name
+    try:
+        with made as folder:
+            yield Path(folder) / path.name
+    finally:
+        # A thread of DuckDB may have made a file in it while it was being removed.
+        shutil.rmtree(made.name, ignore_errors=True)
 
 
 def take_name(partial: Path, path: Path) -> None:

@@ -320,7 +320,7 @@ def test_a_known_delay_stays_and_the_others_follow():
         ("[[distances]]\nbetween = [1, 2]\ndistance_m = -2.0", r"distances\[0\].distance_m"),
         ("[[distances]]\nbetween = [1, 2]", r"distances\[0\].distance_m"),
         ("[[distances]]\nbetween = [1, 2]\ndistance_m = 2\nsigma_m = 0", r"distances\[0\].sigma_m"),
-        ("[[positions]]\ntag = 300\nposition_m = [1, 2, 3]", r"positions\[0\].tag"),
+        ("[[positions]]\ntag = 65536\nposition_m = [1, 2, 3]", r"positions\[0\].tag"),
         ("[[positions]]\ntag = 3\nposition_m = [1, 2]", r"positions\[0\].position_m"),
         ("[[arrangements]]\nname = 'a'\nstart_s = 3", "start_s and end_s"),
         ("[[arrangements]]\nname = 'a'\nstart_s = -1e300\nend_s = 2", r"arrangements\[0\].start_s"),
