@@ -19,7 +19,7 @@ from uwblink import arrays
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.errors import ArgumentError
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.ticks import ANTENNA_DELAY_TICKS, COUNTER_BITS, METRES_PER_TICK, TICK_S, elapsed
+from uwblink.ticks import ANTENNA_DELAY_TICKS, COUNTER_BITS, METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S, elapsed
 from uwblink.twr import BITS, LARGEST_ID, LATEST_NS, STAMPS, Exchanges
 
 Columns = Mapping[str, NDArray[Any]]
@@ -134,8 +134,8 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
     A frame of i that j hears is a poll, j's first frame after it the response, j's next frame the final: an exchange of
     protocol `ds`. Of both roles a pair gets the one with the shorter replies, so that
     no stamp of a poll or response counts twice. The second result has the columns of the table `overheard`. Frames
-    between which a clock restarted, or its counter wrapped, make no exchange. Raises `ArgumentError` where there
-    is none.
+    between which a clock restarted, or its counter wrapped, make no exchange, and no stamp that others of its
+    link contradict. Raises `ArgumentError` where there is none.
 
     >>> from uwblink.receptions import Receptions, exchanges_in
     >>> frames, tags = [0, 1, 2], ([1, 2, 2], [2, 1, 1])
@@ -144,6 +144,7 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
     >>> found.initiator.tolist(), found.range_m.round(3).tolist()
     ([1], [0.469])
     """
+    receptions = receptions[~_off_the_line(receptions)]
     r, links = receptions, _Links(receptions)
     poll, polled = links.find(r.listener, r.sender, r.frame, -1)
     first, _ = links.find(r.sender, r.listener, r.frame[poll], 1)
@@ -184,6 +185,39 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     order = np.argsort(columns["time_ns"], kind="stable")
     return exchanges, {name: column[order] for name, column in columns.items()}
+
+
+MAX_ACCELERATION, MAX_DRIFT, LONGEST_DETOUR_M = 50.0, 0.2e-6, 10.0
+"""Judgements: robots accelerate by less than 5 g (m/s^2), and a reflection in a room is no longer than 10 m. The rate
+of a clock changes by less than 0.2e-6 a second: in logs of DWM1001 boards that warm up by 0.12e-6."""
+
+
+def _off_the_line(r: Receptions) -> Bools:
+    """Return which receptions (n,) have a stamp that those before and after it on their link contradict.
+
+    The reception stamp less the transmission stamp changes with the clocks' rates and the distance. Of three in a row
+    the middle one lies on the line between the others, but for acceleration, drift and a reflection. A wrong stamp
+    stands out twice as far as its neighbours, which it pulls the line away from.
+    """
+    wrong = np.zeros(len(r), dtype=bool)
+    links = _Links(r)
+    row, same = links.row, np.diff(links.link) == 0
+    late = elapsed(r.rx[row], r.tx[row], r.bits)
+    half, whole = 1 << (r.bits - 1), 1 << r.bits
+    step = ((np.diff(late) + half) % whole - half).astype(np.float64)
+    span = elapsed(r.tx[row][1:], r.tx[row][:-1], r.bits).astype(np.float64)
+    # A counter that restarted is no wrong stamp.
+    same &= np.abs(step) <= MAX_SKEW * span
+    there = np.concatenate([[False], same[1:] & same[:-1], [False]])[: len(row)]
+    both = np.maximum(span[1:] + span[:-1], 1.0)
+    off, allowed = np.zeros(len(row)), np.zeros(len(row))
+    off[1:-1] = np.abs(step[:-1] * span[1:] - step[1:] * span[:-1]) / both
+    bent = MAX_ACCELERATION / SPEED_OF_LIGHT + MAX_DRIFT
+    allowed[1:-1] = LONGEST_DETOUR_M / METRES_PER_TICK + bent / 2 * span[1:] * span[:-1] * TICK_S
+    off[~there] = 0.0
+    around = np.maximum(np.append(off[1:], 0.0), np.insert(off[:-1], 0, 0.0))
+    wrong[row] = there & (off > allowed) & (off >= around)
+    return wrong
 
 
 _FARTHEST: Final = 2 * (150 / METRES_PER_TICK + 2 * ANTENNA_DELAY_TICKS)

@@ -293,7 +293,9 @@ def require_arrivals(ranges: Ranges) -> None:
     """Raise `UnanswerableError` if no tag overheard a range."""
     if ranges.arrivals is None or not len(ranges.arrivals):
         raise UnanswerableError(
-            f"{ranges.source}: no listener overheard an exchange between tags with known distances", parameter="use"
+            f"{ranges.source}: no listener overheard an exchange between tags with known distances; record with "
+            "passive tags, or use exchanges",
+            parameter="use",
         )
 
 

@@ -34,7 +34,7 @@ class ArrivalModel:
 
     `exchange` (n,) is the row of each one's range, `listener` (n,) a number among `listeners`, `targets` (n,) the tags
     that respond, `path` (n, 2) the numbers among `paths` of those from initiator and target to the listener. Rows count
-    for a share 1/`alike` of as many independent ones.
+    for a share 1/`design_effect` of as many independent ones.
     """
 
     residual: Floats
@@ -47,7 +47,7 @@ class ArrivalModel:
     targets: Ints
     paths: tuple[str, ...]
     path: Ints
-    alike: float = 1.0
+    design_effect: float = 1.0
 
     @classmethod
     def of(cls, model: RangeModel) -> ArrivalModel | None:
@@ -103,7 +103,7 @@ class ArrivalModel:
     def rows(self, layout: Layout, errors: Errors, more: Sequence[Part] = ()) -> RangeRows:
         """Return the rows of all differences of arrival, with the parts whose unknowns a layout has."""
         used = [part for part in (*self.parts, *more) if part.kind in layout.where]
-        return replace(RangeRows.of(self.residual, self.key, used, errors, layout), alike=self.alike)
+        return replace(RangeRows.of(self.residual, self.key, used, errors, layout), design_effect=self.design_effect)
 
     def sample(self, rows: RangeRows, chosen: Ints | None) -> RangeRows:
         """Return those rows that belong to some exchanges, all for None."""
@@ -119,7 +119,7 @@ class ArrivalModel:
         """
         target = np.unique(self.targets, return_inverse=True)[1]
         lasting = lasting_in_pairs(own, target, replace(blocks, number=blocks.number[self.exchange]))
-        return replace(self, alike=max(lasting / lasting_in_pairs(of_ranges, pairs, blocks), 1.0))
+        return replace(self, design_effect=max(lasting / lasting_in_pairs(of_ranges, pairs, blocks), 1.0))
 
 
 def _delays(model: RangeModel, ends: Ints, weights: Floats) -> Part:

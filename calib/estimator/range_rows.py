@@ -180,7 +180,7 @@ class RangeRows:
     """Ranges whose residuals are `residual` (n,) plus the parts of the unknowns, less what `geometry` makes of them.
 
     Rows are kept sorted by `key`; `order` (n,) says which of the given rows each is. Rows that correlate count for a
-    share 1/`alike` of as many independent ones.
+    share 1/`design_effect` of as many independent ones.
     """
 
     residual: Floats
@@ -190,7 +190,7 @@ class RangeRows:
     starts: Ints
     parts: tuple[Part, ...]
     geometry: Geometry | None = None
-    alike: float = 1.0
+    design_effect: float = 1.0
 
     @classmethod
     def of(
@@ -250,7 +250,7 @@ class RangeRows:
         for blocks, rows, values, moved in self._pieces(x):
             log_density, by, tells = self.errors.slopes(values)
             found = self._as_terms(blocks, rows, float(np.sum(log_density)), by, tells, moved)
-            yield found if self.alike == 1 else found.tempered(self.alike)
+            yield found if self.design_effect == 1 else found.tempered(self.design_effect)
 
     def residuals(self, x: Floats) -> Floats:
         """Return the residuals (n,) at unknowns (p,), in the order in which rows were given; a sample's in its own."""

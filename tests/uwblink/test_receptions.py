@@ -73,6 +73,22 @@ def test_a_counter_that_restarts_makes_no_range():
     assert count - 6 <= len(exchanges) <= count - 3
 
 
+def test_a_stamp_that_its_neighbours_contradict_makes_no_range():
+    r = broadcasts()
+    whole, _ = exchanges_in(r)
+    # A hundred nanoseconds, 30 m, as receivers of logged boards have it at times.
+    wrong = (r.frame == 40) & (r.listener == 12)
+    rx = np.where(wrong, r.rx + 6400, r.rx)
+    found, overheard = exchanges_in(
+        Receptions.from_arrays(r.frame, r.sender, r.listener, tx=r.tx, rx=rx, time_ns=r.time_ns)
+    )
+    ends = np.column_stack([found.initiator, found.target]) - 10
+    distance = np.linalg.norm(PLACES[ends[:, 0]] - PLACES[ends[:, 1]], axis=1)
+    assert np.abs(raw_range(found) - distance).max() < 0.01
+    assert len(whole) - 2 <= len(found) < len(whole)
+    assert not np.isin(overheard["rx1"], rx[wrong]).any()
+
+
 def test_exchanges_give_their_receptions_and_those_of_listeners():
     exchanges, overheard = exchanges_in(broadcasts(rounds=4))
     own = receptions_of(exchanges, overheard)

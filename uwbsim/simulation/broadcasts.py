@@ -14,11 +14,10 @@ import numpy as np
 from uwblink.arrays import Ints
 from uwblink.receptions import Receptions, exchanges_in
 from uwblink.ticks import COUNTER_BITS
-from uwblink.twr import intervals
 from uwbsim.scenario.ranging import broadcast_s
 from uwbsim.simulation.air import BUSY, COLLIDED, Outcomes, Schedule
 from uwbsim.simulation.timestamps import Draws, Stamped, printed_readings, time_ns
-from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND
+from uwbsim.world.clocks import NS_PER_S, SUBTICKS_PER_SECOND
 from uwbsim.world.reception import Medium
 
 
@@ -51,7 +50,7 @@ def with_collisions(medium: Medium, plan: Schedule, alone: Outcomes) -> Outcomes
 def reported(medium: Medium, kept: Ints, planned: int, rows: Schedule, stamped: Stamped) -> dict[str, Any]:
     """Return what tags report of the `kept` rows (n,), of all `planned`: receptions, and the exchanges that they make.
 
-    Stamps are the chip's whole ones. `truth_m` are the mean distances at the first two messages of exchanges.
+    Stamps are the chip's whole ones. `truth_m` are the distances at the polls, which ranges measure (`range_ns`).
     """
     ids = np.array([tag.id for tag in medium.scenario.tags], dtype=np.int64)
     fpp, skew = printed_readings(medium, 1, kept, planned, stamped)
@@ -70,6 +69,5 @@ def reported(medium: Medium, kept: Ints, planned: int, rows: Schedule, stamped: 
     exchanges, overheard = exchanges_in(receptions)
     i, j = (np.argmax(ends[:, None] == ids, axis=1) for ends in (exchanges.initiator, exchanges.target))
     poll = np.rint(exchanges.time_ns * (SUBTICKS_PER_SECOND / NS_PER_S)).astype(np.int64)
-    response = poll + np.rint(intervals(exchanges).dt41).astype(np.int64) * SUBTICKS
-    truth_m = np.mean([medium.links.link(i, j, time).distance_m for time in (poll, response)], axis=0)
+    truth_m = medium.links.link(i, j, poll).distance_m
     return {"exchanges": exchanges, "overheard": overheard, "receptions": receptions.to_dict(), "truth_m": truth_m}
