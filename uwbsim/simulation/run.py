@@ -50,9 +50,10 @@ class Simulated:
     `exchanges` are n exchanges in order of time and `truth_m` (n,) their true distances in metres, each the mean over
     the first two messages, of broadcasts that at the poll; `poses` are those of motion capture; `tags` are the tags
     with their bodies and lever arms; `faults` are the exchanges that failed. `overheard` are the columns of what
-    passive tags received, `receptions` those of all broadcasts, `cirs` impulse responses (time_ns, board, initiator, target,
-    first path in taps, 1016 magnitudes). `meta` is the recording's provenance. `temperature` are the columns of the tags' readings of
-    temperature and supply voltage, `imu` and `height` those of the bodies' inertial and height sensors.
+    passive tags received, `receptions` those of all broadcasts, `cirs` impulse responses (time_ns, board, initiator,
+    target, first path in taps, 1016 magnitudes). `meta` is the recording's provenance. `temperature` are the columns of
+    the tags' readings of temperature and supply voltage, `imu` and `height` those of the bodies' inertial and height
+    sensors.
 
     >>> import uwbsim
     >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
