@@ -289,18 +289,24 @@ def distribution(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> F
 
 
 def z_scores(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figure:
-    """Draw errors over their sigma: a histogram beside the normal density, and quantiles against normal quantiles."""
+    """Draw errors over their sigma: a histogram beside the normal density, and the share of errors beyond a size."""
     z = (applied.corrected_m - ranges.truth_m) / applied.sigma_m
     figure, (left, right) = sheet(width_in, 2)
     grid = np.linspace(-6, 6, 61)
-    left.hist(np.clip(z, -6, 6), grid.tolist(), density=True, color=BLUE, alpha=0.55, label="ranges")
-    left.plot(grid, norm.pdf(grid), color=INK, lw=1.2, label="standard normal")
-    label(left, "error over its σ; all beyond ±6 in the last bins", "density")
-    shares = (np.arange(300) + 0.5) / 300
-    right.plot(norm.ppf(shares), np.clip(np.quantile(z, shares), -6, 12), ".", ms=3, color=BLUE)
-    right.plot([-3, 3], [-3, 3], color=INK, lw=1.2)
-    right.set_ylim(-6, 12)
-    label(right, "quantile of the standard normal", "quantile of error over σ")
+    density = np.histogram(z, grid)[0] / (len(z) * np.diff(grid))
+    left.stairs(density, grid, fill=True, color=BLUE, alpha=0.55, label="ranges")
+    left.plot(grid, norm.pdf(grid), color=INK, lw=1.2, label="noise alone (standard normal)")
+    beyond = 100 * float(np.mean(np.abs(z) > 6))
+    label(left, f"error over its σ ({beyond:.1f} % are beyond ± 6)", "density")
+    size = np.sort(np.abs(z))
+    # The largest errors are single ones: the line ends where ten are left.
+    shown = slice(None, max(1, len(size) - 10), len(size) // 1000 + 1)
+    right.semilogy(size[shown], (100 * (1 - np.arange(len(size)) / len(size)))[shown], color=BLUE, lw=1.4)
+    grid = np.linspace(0, 4, 81)
+    right.plot(grid, 200 * norm.sf(grid), color=INK, lw=1.2)
+    right.set(xlim=(0, None), ylim=(1000 / len(z), 100) if len(z) > 10 else None)
+    right.yaxis.set_major_formatter("{x:g}")
+    label(right, "size of the error over its σ", "ranges beyond (%)")
     legend(figure, left)
     return figure
 

@@ -69,7 +69,10 @@ def _label_paths(above: Axes, height: Axes) -> None:
 
 
 def track(width_in: float, one: Localization) -> Figure:
-    """Draw true and estimated paths from above, their heights, and the size of the error over time, by filter."""
+    """Draw true and estimated paths from above, their heights, and the size of the error over time.
+
+    The filters are that of raw ranges and that of calibrated ranges with their variance.
+    """
     last, narrow = one.tracks["variance"], width_in < NARROW_IN
     every = slice(None, None, max(1, len(last.time_ns) // SAMPLES))
     time = (last.time_ns - last.time_ns[0])[every] * 1e-9
@@ -78,14 +81,14 @@ def track(width_in: float, one: Localization) -> Figure:
     panels = figure.subplot_mosaic(places, height_ratios=[2.2, 1, 1.2] if narrow else [1.4, 1])
     above, height, error = panels["path"], panels["height"], panels["error"]
     usual = []
-    for stage, own in one.tracks.items():
+    for stage in ("raw", "variance"):
+        own = one.tracks[stage]
         name, colour, dashes, _ = FILTER_STYLES[stage]
         line: dict[str, Any] = {"color": colour, "ls": dashes, "lw": 0.9, "label": name}
         off = np.linalg.norm(own.estimate_m - own.truth_m, axis=1)
         usual.append(float(np.quantile(off, 0.995)))
         series(error, time, off[every], **line)
-        if stage in ("raw", "variance"):
-            _draw_path(above, height, time, own.estimate_m[every], **line)
+        _draw_path(above, height, time, own.estimate_m[every], **line)
     _draw_path(above, height, time, last.truth_m[every], color=INK, lw=0.9)
     error.plot([], [], color=INK, lw=0.9, label="true")
     error.plot(time, 3 * last.std_m[every], color=MUTED, lw=0.8, ls="--", label="3 σ, by the filter itself")
