@@ -252,7 +252,21 @@ RESULTS: Final = {
     "predicted_bias_m": "predicted mean error",
     "predicted_std_m": "predicted standard deviation",
 }
-"""Descriptions of the results of a sweep; the first eight are drawn first."""
+"""Descriptions of the results of a sweep; the first eight are drawn, or others where a sweep has none of them."""
+
+UNITS: Final = {unit: unit for unit in ("m", "ns", "s", "ps", "ppm", "us", "uus", "deg", "mps")} | {
+    "hz": "Hz",
+    "db": "dB",
+    "dbm": "dBm",
+    "mps": "m/s",
+}
+"""Units at the end of names, and how they are written."""
+
+
+def _spelled(name: str, units: Mapping[str, str] = UNITS) -> str:
+    """Return the last part of a dotted name in words, with its unit in brackets."""
+    stem, _, unit = name.rpartition(".")[2].replace("_", " ").rpartition(" ")
+    return f"{stem} ({units[unit]})" if stem and unit in units else f"{stem} {unit}".strip()
 
 
 def write_sweep_page(plan: SweepDesign, folder: Path) -> Path:
@@ -283,22 +297,26 @@ def _swept(plan: SweepDesign, rows: Sequence[Mapping[str, Any]]) -> Document:
             "every run."
         ),
     ]
-    found, most = _results(good, keys) if varied else {}, 8
+    found = _results(good, keys) if varied else {}
     if not found:
         blocks.append(Text("Nothing to draw: no result of a run is a number that changes.", "warning"))
     protocols = [str(row.get("protocol", "")) for row in good]
-    columns = {key: [row.get(key) for row in good] for key in varied}
-    for name in list(found)[:most]:
-        stem, _, unit = name.replace("_", " ").rpartition(" ")
-        unit, scale = ("cm", 100.0) if unit == "m" else (unit, 1.0)
-        shown = f"{stem} ({unit})" if unit in ("cm", "ns", "s", "hz", "ps", "ppm", "dbm") else f"{stem} {unit}".strip()
+    spelled = {key: _spelled(key) for key in varied}
+    columns = {
+        spelled[key] if list(spelled.values()).count(spelled[key]) == 1 else key: [row.get(key) for row in good]
+        for key in varied
+    }
+    most = list(RESULTS)[:8]
+    drawn = [name for name in found if name in most] or list(found)[: len(most)]
+    for name in drawn:
+        shown, scale = _spelled(name, UNITS | {"m": "cm"}), 100.0 if name.endswith("_m") else 1.0
         described = f": {RESULTS[name]}" if RESULTS.get(name) else ""
         draw = partial(
             figures.result_over_keys, keys=columns, protocol=protocols, result=scale * found[name], name=shown
         )
         blocks.append(Picture(name, draw, f"{shown}{described}."))
-    if len(found) > most:
-        blocks.append(Text(f"Not drawn: {', '.join(list(found)[most:])}.", "note"))
+    if len(found) > len(drawn):
+        blocks.append(Text(f"Not drawn: {', '.join(name for name in found if name not in drawn)}.", "note"))
     return Document(f"Sweep: {plan.name}", blocks)
 
 
@@ -312,8 +330,8 @@ def _results(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> dict[str
         known = values[np.isfinite(values)]
         if len(known) and np.ptp(known) > 0:
             found[name] = values
-    first = list(RESULTS)[:8]
-    return dict(sorted(found.items(), key=lambda item: first.index(item[0]) if item[0] in first else len(first)))
+    order = list(RESULTS)
+    return dict(sorted(found.items(), key=lambda item: order.index(item[0]) if item[0] in order else len(order)))
 
 
 TWIN_COLUMNS: Final[dict[str, Callable[[Compared], str]]] = {

@@ -211,6 +211,10 @@ def _draw_spans(axes: Axes, protocol: RangingProtocol, stamps_us: Mapping[str, f
         axes.annotate(text, place, away, textcoords="offset points", **upright)
 
 
+MAX_NUMBERS = 8
+"""Columns of a map up to which its cells hold numbers of three digits: so many fit beside each other."""
+
+
 def result_over_keys(
     width_in: float, keys: Mapping[str, Sequence[Any]], protocol: Sequence[str], result: Floats, name: str
 ) -> Figure:
@@ -230,7 +234,7 @@ def result_over_keys(
     figure, panels = sheet(width_in, max(len(columns), 1), height_in=2.6)
     for axes, (key, column) in zip(panels, columns.items(), strict=False):
         _lines(axes, column, rows, result)
-        label(axes, key.replace(".", ".\N{ZERO WIDTH SPACE}"), name)
+        label(axes, key, name)
     legend(figure, panels[0])
     return figure
 
@@ -259,7 +263,10 @@ def _lines(axes: Axes, column: NDArray[Any], rows: Mapping[str, Bools], result: 
 def _maps(
     width_in: float, keys: Mapping[str, NDArray[Any]], rows: Mapping[str, Bools], result: Floats, name: str
 ) -> Figure:
-    """Draw medians over seeds as colours over two keys, a panel a protocol, four at most."""
+    """Draw medians over seeds as numbers and colours over two keys, a panel a protocol, four at most.
+
+    Each panel has colours of its own, from its least to its largest value.
+    """
     protocols = list(rows)[:4]
     across = 1 if width_in < NARROW_IN else min(2, len(protocols))
     figure, panels = sheet(width_in, len(protocols), height_in=2.6, across=across, sharex=True, sharey=True)
@@ -269,15 +276,18 @@ def _maps(
         binned_statistic_2d(row[rows[one]], column[rows[one]], result[rows[one]], "median", cells).statistic
         for one in protocols
     ]
-    # "cividis" grows lighter evenly, and alike for all eyes.
-    colours: dict[str, Any] = {"cmap": "cividis", "vmin": np.nanmin(shown), "vmax": np.nanmax(shown)}
     for axes, protocol, values in zip(panels, protocols, shown, strict=True):
-        image = axes.pcolormesh(cells[1], cells[0], values, **colours)
+        low, high = np.nanmin(values), np.nanmax(values)
+        # "cividis" grows lighter evenly, and alike for all eyes; values alike within a tenth do not span all of it.
+        high = max(high, low + 0.1 * abs(low))
+        axes.pcolormesh(cells[1], cells[0], values, cmap="cividis", vmin=low, vmax=high)
+        for (up, right), value in np.ndenumerate(values if values.shape[1] <= MAX_NUMBERS else values[:0]):
+            colour = "white" if value < (low + high) / 2 else "black"
+            axes.text(right, up, f"{value:#.3g}".replace("-", "−"), ha="center", va="center", color=colour)
         for axis, own in ((axes.xaxis, x), (axes.yaxis, y)):
             kept = np.arange(len(own))[:: max(1, len(own) // 6)]
             axis.set_ticks(kept, labels=[f"{value:g}" for value in own[kept]])
-        axes.set(title=protocol)
-    figure.colorbar(image, ax=panels, label=name)
+        axes.set(title=f"{protocol}: {name}" if protocol else name)
     first, second = keys
     figure.supxlabel(first, fontsize="medium")
     figure.supylabel(second, fontsize="medium")

@@ -94,7 +94,7 @@ def judged(flight):
     [
         ("'calibrate'", "", "Figure 1. spread (cm)."),
         ("'calibrate'", "'radio.tx_noise_ps' = [0.0, 90.0]", "Figure 1. spread (cm)."),
-        ("'compare', ranges = 50", "", "Figure 4. low (cm): 2.5 % quantile of the errors of raw ranges."),
+        ("'compare', ranges = 50", "", "Figure 3. bias (cm): mean error of raw ranges."),
     ],
 )
 def test_a_sweep_draws_what_came_out_and_says_what_it_is(tmp_path, kind, more, caption):
@@ -105,8 +105,9 @@ def test_a_sweep_draws_what_came_out_and_says_what_it_is(tmp_path, kind, more, c
     page = write_sweep_page(design, tmp_path / "out").read_text()
     captions = re.findall("<figcaption>(.*?)</figcaption>", page)
     assert caption in captions
-    assert len(captions) == (1 if "calibrate" in kind else 8)
-    assert ("rx_noise_ps" in page, "3 seeds each" in page) == (True, True)
+    assert len(captions) == (1 if "calibrate" in kind else 3)
+    assert ("rx noise (ps)" in page, "3 seeds each" in page) == (True, True)
+    assert ("Not drawn: median_m, low_m, high_m" in page) == ("compare" in kind)
 
 
 def test_bands_over_seeds_reach_from_the_least_to_the_largest():
@@ -121,8 +122,10 @@ def test_bands_over_seeds_reach_from_the_least_to_the_largest():
 def test_two_keys_make_a_map_of_medians_over_seeds():
     keys: dict[str, list[object]] = {"a": [1.0, 1.0, 2.0, 2.0] * 2, "b": [10.0, 20.0] * 4}
     result = np.array([1.0, 2.0, 3.0, 4.0, 3.0, 4.0, 5.0, 6.0])
-    (mesh,) = result_over_keys(7.16, keys, ["ds"] * 8, result, "figure").axes[0].collections
-    assert mesh.get_array().tolist() == [[2.0, 4.0], [3.0, 5.0]]
+    (axes,) = result_over_keys(7.16, keys, ["ds"] * 8, result, "figure").axes
+    assert axes.collections[0].get_array().tolist() == [[2.0, 4.0], [3.0, 5.0]]
+    numbers = {text.get_position(): text.get_text() for text in axes.texts}
+    assert numbers == {(0, 0): "2.00", (1, 0): "4.00", (0, 1): "3.00", (1, 1): "5.00"}
 
 
 def test_words_and_many_keys_are_drawn_key_by_key():
