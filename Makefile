@@ -6,9 +6,9 @@ PYTHONS ?= python3.12 python3.13
 LOCKED := --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements-dev.lock
 # Tests run in many processes: what the first compiles, the others need not (an empty value counts as none).
 TESTS := -m pytest -n 3 --dist loadfile --no-loadscope-reorder
-test coverage lowest newest pythons: export PYTHONDONTWRITEBYTECODE :=
+test test-all coverage lowest newest pythons: export PYTHONDONTWRITEBYTECODE :=
 # Threads of linear algebra in three processes compete for two cores.
-test coverage lowest newest pythons: export OPENBLAS_NUM_THREADS := 1
+test test-all coverage lowest newest pythons: export OPENBLAS_NUM_THREADS := 1
 ITSELF := --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 
 .PHONY: $(shell sed -n 's/^\([a-z -]*\):.*\#\# .*/\1/p' $(firstword $(MAKEFILE_LIST)))
@@ -35,7 +35,10 @@ demo: setup ## simulate three flights, fit, evaluate, localize; writes demo/repo
 	$(BIN)/calib evaluate demo/test1.uwb demo/test2.uwb -c demo/calibration.json
 	$(BIN)/calib report demo/train.uwb --tests demo/test1.uwb demo/test2.uwb -o demo/report.html --force
 
-test: setup ## run the whole test suite; three processes, for two cores: many tests wait for boards
+test: setup ## run the tests but the slow ones; three processes, for two cores: many tests wait for boards
+	$(BIN)/python $(TESTS) -m "not slow"
+
+test-all: setup ## run the whole test suite, slow tests too (ten minutes on two cores)
 	$(BIN)/python $(TESTS)
 
 docs: setup ## build the documentation site into docs/_build/html; warnings are errors (a minute)

@@ -150,6 +150,7 @@ def test_every_output_of_every_command_is_written_onto_a_full_disk():
         assert re.search("full_disk|most_bytes", (ROOT / "tests" / file).read_text()), file
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("line", "most_bytes"), COMMANDS)
 def test_a_full_disk_is_one_line_and_leaves_nothing(seeds, tmp_path, line, most_bytes):
     words = [str(seeds / word.strip("{}")) if word.startswith("{") else word for word in line.split()]

@@ -33,6 +33,7 @@ def recordings(tmp_path_factory):
 RUN = [page for page in pages.pages() if any(not block.mark for block in pages.blocks(page))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", RUN, ids=lambda page: str(page.relative_to(pages.DOCS)))
 def test_the_blocks_of_a_page_work(page, recordings, tmp_path, monkeypatch):
     for name in ("scenarios", "docs"):
@@ -53,6 +54,7 @@ def test_the_blocks_of_a_page_work(page, recordings, tmp_path, monkeypatch):
             raise AssertionError(f"{page.name}, line {block.line}: {error}") from error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("notebook", sorted(pages.DOCS.glob("notebooks/*.ipynb")), ids=lambda path: path.stem)
 def test_a_notebook_runs_and_stands_with_its_outputs(notebook, monkeypatch):
     monkeypatch.chdir(notebook.parent)

@@ -136,6 +136,7 @@ def test_protocol_and_loss_of_another_distribution_are_simulated_and_fitted_with
     assert {tag: found[tag] for tag in planted} == pytest.approx(planted, abs=5e-3)
 
 
+@pytest.mark.slow
 def test_workers_in_other_processes_know_it_too(run, tmp_path):
     (tmp_path / "s.toml").write_text(
         '[sweep]\nscenario = "noiseless"\nprotocols = ["strange-ds"]\n'

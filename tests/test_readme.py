@@ -40,6 +40,7 @@ def test_the_two_commands_of_the_readme_print_what_it_says():
     np.testing.assert_allclose(np.array(printed, float), np.array(said, float), atol=0.005)
 
 
+@pytest.mark.slow
 def test_the_script_of_the_readme_simulates_fits_corrects_and_judges(folder):
     assert BLOCKS["python"].code == SCRIPT
     assert len(SCRIPT.splitlines()) <= 25
@@ -77,6 +78,7 @@ def serving(folder, label, *files):
         assert server.wait(30) == 0
 
 
+@pytest.mark.slow
 def test_the_commands_for_boards_work_on_served_ones(folder):
     (script,) = (b.code for b in pages.blocks(pages.DOCS / "boards.md") if "ports/tag10" in b.code and not b.label)
     with serving(folder, "serve", "poses.csv", "ports/tag20"):
@@ -89,6 +91,7 @@ def test_the_commands_for_boards_work_on_served_ones(folder):
     assert (folder / "cir.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_the_way_from_served_drones_to_a_calibration_works(folder):
     with serving(folder, "serve-drones", "motion.csv", "drones/tag6"):
         for command in BOARDS["drones"]:

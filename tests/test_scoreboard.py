@@ -10,6 +10,8 @@ from benchmarks import scoreboard
 from tests import processes
 from tests.shared_data import shared
 
+pytestmark = pytest.mark.slow
+
 CM = 100
 
 

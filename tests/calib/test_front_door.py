@@ -26,6 +26,7 @@ def test_the_names_are_sorted_and_all_there():
     assert set(calib.__all__) <= set(dir(calib))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in calib.__all__ if not name.endswith("Error")])
 def test_the_examples_run(name, monkeypatch):
     monkeypatch.setattr(figures, "drawn", pages.outline)

@@ -118,6 +118,7 @@ def board_id(client):
     return Board(client.transport, answer_s=TIMEOUT_S).id
 
 
+@pytest.mark.slow
 def test_nine_of_ten_impulse_responses_reach_both_ends(clients):
     """The firmware's own boards: 91 of 100."""
     one, two = clients

@@ -14,6 +14,8 @@ from tests import processes
 from tests.shared_data import ROOT, shared
 from uwblink import SPEED_OF_LIGHT, Recording
 
+pytestmark = pytest.mark.slow
+
 SCENARIOS = ROOT / "scenarios" / "icra2023"
 
 

@@ -26,6 +26,7 @@ def delays(calibration):
     return values - values.mean()
 
 
+@pytest.mark.slow
 def test_a_month_later_the_delays_are_the_same(tmp_path):
     then, now = (fit(ranges(tmp_path, name)).calibration for name in ("icra2023/train.toml", "day30/train.toml"))
     # Each fit knows a delay to 8 ps; 30 ps are 2.7 standard errors of a difference, for six of them.
@@ -123,6 +124,7 @@ def trained():
     return classifier().fit(found, detours)
 
 
+@pytest.mark.slow
 def test_it_separates_simulated_rooms_that_it_has_not_seen(trained):
     found, detours = of_rooms(range(12, 20), 8.0)
     assert 0.03 < detours.mean() < 0.3
@@ -133,6 +135,7 @@ def test_both_features_weigh_for_a_detour(trained):
     assert np.all(trained[-1].coef_ > 0)
 
 
+@pytest.mark.slow
 def test_it_says_something_of_a_real_flight(trained):
     """Better than chance: with 27 detours of 265 ranges, 0.5 has a standard error of 0.06."""
     shared("miluv_published_calibration.json")
@@ -148,6 +151,7 @@ def test_it_says_something_of_a_real_flight(trained):
 TRAIN = ROOT / "scenarios" / "icra2023" / "train.toml"
 
 
+@pytest.mark.slow
 def test_a_flight_through_encode_and_decode_calibrates_to_the_same_bytes(tmp_path):
     for name, more in (("direct", []), ("wire", ["--through-wire"])):
         (tmp_path / name).mkdir()

@@ -95,6 +95,7 @@ def errors_ns(path):
     return error, np.array(found.uncertainty.delays_ns2)
 
 
+@pytest.mark.slow
 def test_delays_against_their_mean_are_within_the_promise(done):
     folder, _ = done
     error, spread = errors_ns(folder / "calibration.json")

@@ -105,6 +105,7 @@ def test_an_import_that_is_interrupted_is_one_line_and_leaves_nothing(tmp_path):
     assert files(tmp_path) == (["t.csv"] if process.returncode else ["t.csv", "t.uwb"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "words"),
     [

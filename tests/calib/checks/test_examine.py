@@ -12,6 +12,8 @@ import calib
 from benchmarks import doctor as planted
 from benchmarks.flights import LIGHT, Plan, fly
 
+pytestmark = pytest.mark.slow
+
 SHORT = Plan(seconds=40, per_second=80)
 BRIEF = Plan(seconds=20, per_second=40)
 ONE_EACH = replace(SHORT, tags_a_body=1, bodies=5)

@@ -56,10 +56,12 @@ def faults(path):
     return {finding.fault: finding for finding in examine(path)}
 
 
+@pytest.mark.slow
 def test_nothing_is_said_of_a_sound_survey(tmp_path):
     assert faults(save(world_of(), tmp_path / "a.uwb")) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("world", "fault", "evidence"),
     [
@@ -73,6 +75,7 @@ def test_what_contradicts_a_survey_is_named(tmp_path, world, fault, evidence):
     assert found[fault].evidence.startswith(evidence)
 
 
+@pytest.mark.slow
 def test_a_wrong_tape_is_named(tmp_path):
     tape = [KnownDistance(1, 3, 2.1 + 0.3, 0.005, "A"), KnownDistance(2, 4, 2.7, 0.005, "A")]
     found = faults(save(world_of(), tmp_path / "a.uwb", distances=tape))

@@ -10,6 +10,8 @@ import calib
 from benchmarks.worlds import CLEAN, PLANTED, Recipe, make
 from tests.calib.estimation.fields import ranges_with_field
 
+pytestmark = pytest.mark.slow
+
 TAGS = {"four": 4, "six": 6}
 REFUSED = {
     "truth in millimetres": "millimetres",

@@ -11,6 +11,8 @@ from calib.calibration.formats import read_miluv
 from tests.shared_data import shared
 from uwblink.importers import read_source
 
+pytestmark = pytest.mark.slow
+
 FEW = "twelve tags, six ranges a pair"
 
 

@@ -106,6 +106,7 @@ def test_what_cannot_be_answered_says_why():
         fit(ranges(60))
 
 
+@pytest.mark.slow
 def test_the_mixture_knows_delays_better_than_a_loss_does():
     errors: dict[str, list[float]] = {"cauchy": [], "mixture": []}
     for seed in range(4):
@@ -118,6 +119,7 @@ def test_the_mixture_knows_delays_better_than_a_loss_does():
     assert spread["mixture"] < 0.9 * spread["cauchy"]
 
 
+@pytest.mark.slow
 def test_the_mixture_s_standard_errors_hold():
     scores = []
     for seed in range(16):
@@ -151,6 +153,7 @@ def test_ranges_without_any_error_have_no_delays_and_no_curve(loss):
     np.testing.assert_allclose(found.bias_curve(np.linspace(low, high, 20)), 0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_fit_is_the_same_to_the_last_digit_whatever_the_number_of_threads():
     # Sums of several threads end in other digits than those of one.
     found = []

@@ -103,6 +103,7 @@ def test_what_cannot_be_localized_or_summed_up(flights):
         localize(still, calibration)
 
 
+@pytest.mark.slow
 def test_a_calibration_is_worth_at_least_a_third_of_the_error(flights, fitted):
     flight = beginning(flights["test1"], 20)
     found = localize(flight, fitted, Settings(seeds=2))
@@ -149,6 +150,7 @@ def test_each_body_and_flight_has_noise_of_its_own(flights):
     assert again.rmse_m["raw"][0] == one.rmse_m["raw"][1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [(0.0, -10.0, 0.0), (0.0, 0.0, 5.0)])
 def test_a_wrong_start_is_left_within_two_seconds(flights, fitted, offset):
     for one in localize(beginning(flights["test1"], 4), fitted, Settings(seeds=1, initial_offset_m=offset)):
@@ -158,6 +160,7 @@ def test_a_wrong_start_is_left_within_two_seconds(flights, fitted, offset):
             assert wrong[track.time_ns > track.time_ns[0] + 2_000_000_000].max() < 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("far_m", "offset"), [(3.0, (0.0, -10.0, 0.0)), (10.0, (0.0, 0.0, 5.0))])
 def test_wrong_ranges_do_not_lock_the_filter_out(flights, far_m, offset):
     flight, calibration = clean(beginning(flights["test1"], 12))

@@ -172,6 +172,7 @@ def test_a_tape_between_robots_that_stand_says_what_all_delays_share():
     assert f"--distance {pair[0]}-{pair[1]}=METRES@0..4" in "\n".join(taped.commands("PORTS"))
 
 
+@pytest.mark.slow
 def test_the_best_tape_is_the_best_of_all():
     seen = planned(rehearsed(), poses_until_s=4.0, anchors="sought")
     pairs = [(a, b) for a in ANCHORS for b in ANCHORS if a < b]

@@ -159,6 +159,7 @@ def test_a_section_that_returns_no_blocks_is_named(campaign, tmp_path, blocks, s
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "names"),
     [
@@ -196,6 +197,7 @@ def words_of(svg):
     return re.findall(r"<text[^>]*>([^<]*)</text>", svg)
 
 
+@pytest.mark.slow
 def test_a_plan_has_a_picture_of_each_arrangement_with_tapes_and_intervals(tmp_path):
     words = ("plan", "survey", "7,12,3", "--on", "line", "--arrangements", "2", "--taped", "1")
     run(tmp_path, *words, "-o", "plan.html", "--figures", "f")

@@ -11,6 +11,8 @@ from benchmarks.surveys import orders_of
 from calib.errors import BadInputError
 from calib.surveys.solution import exchanged_boards, is_in_order
 
+pytestmark = pytest.mark.slow
+
 FIVE = standing_boards(4, boards=5, arrangements=5, reflected=0.05, each=20)
 
 

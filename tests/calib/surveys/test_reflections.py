@@ -16,6 +16,8 @@ from calib.surveys.reflections import Marks
 from calib.surveys.solution import first_start, optimize
 from calib.surveys.survey import network_of
 
+pytestmark = pytest.mark.slow
+
 PAIR_M, CURVE_M = 0.02, 0.03
 
 

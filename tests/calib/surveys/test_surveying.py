@@ -287,6 +287,7 @@ def crooked_line():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", [wrong_labels, wrong_tape, crooked_line])
 def test_what_is_said_wrongly_is_named(mistake):
     world, known, kind, message = mistake()

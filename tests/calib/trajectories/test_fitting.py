@@ -27,6 +27,7 @@ def fitted(flown):
     return calib.fit_from_ranges(flown, poses_until_s=8.0, progress=shares.append), shares
 
 
+@pytest.mark.slow
 def test_planted_delays_are_found_from_a_known_start(flown, fitted):
     result, shares = fitted
     std = np.array(list(result.calibration.delays_std_ns.values()))
@@ -95,6 +96,7 @@ def test_nearly_exact_ranges_give_nearly_exact_delays():
     assert max(abs(found.delays_ns[tag] - delay) for tag, delay in DELAYS_NS.items()) < 0.02
 
 
+@pytest.mark.slow
 def test_positions_of_anchors_replace_a_known_start():
     flown = flight(seconds=10.0, rate=120, anchors=ANCHORS)
     result = calib.fit_from_ranges(flown, poses_until_s=0.0)
@@ -106,6 +108,7 @@ def test_positions_of_anchors_replace_a_known_start():
     assert std[:6].max() < 0.15
 
 
+@pytest.mark.slow
 def test_sought_anchors_do_not_spoil_what_a_known_start_tells():
     flown = flight(seconds=10.0, rate=120, anchors=ANCHORS, seed=2)
     result = calib.fit_from_ranges(flown, poses_until_s=6.0, anchors="sought")

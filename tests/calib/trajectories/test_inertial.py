@@ -13,6 +13,8 @@ from calib.trajectories.scene import scene_from
 from calib.trajectories.start import interpolated, resolve_headings
 from tests.calib.trajectories.sines import flight
 
+pytestmark = pytest.mark.slow
+
 BOXES = {"a": ([-2.6, -2.6, 0.4], [-0.4, -0.2, 2.6]), "b": ([0.4, -2.6, 0.4], [2.6, -0.2, 2.6])}
 TWO_S = np.array([2.0])
 IMU = {"grade": "consumer", "vibration_mps2": 1.0}

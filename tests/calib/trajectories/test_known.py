@@ -12,6 +12,8 @@ from calib.trajectories.samples import tapes_of
 from tests.calib.trajectories.sines import DELAYS_NS, flight, scores
 from uwblink import Arrangement, KnownDistance
 
+pytestmark = pytest.mark.slow
+
 CEILING = [[3.5, 3.5, 2.6], [-3.5, 3.5, 2.6], [-3.5, -3.5, 2.6], [3.5, -3.5, 2.6]]
 CORNERS = [[3.5, 3.5, 0.3], [-3.5, 3.5, 2.6], [-3.5, -3.5, 0.5], [3.5, -3.5, 2.5]]
 KNOWN_START: dict[str, Any] = {"poses_until_s": 6.0, "heading_std_deg": 0.0}

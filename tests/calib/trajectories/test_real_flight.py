@@ -12,6 +12,8 @@ import uwbsim
 from tests.shared_data import shared
 from uwblink.importers import read_source
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):

@@ -263,6 +263,7 @@ def statements(monkeypatch):
     STATEMENTS.clear()
 
 
+@pytest.mark.slow
 def test_nothing_grows_with_the_recording(tmp_path, statements):
     ports, held = AnsweringPorts(), {}
     with Recording.create(tmp_path / "long.uwb", live=True) as recording:

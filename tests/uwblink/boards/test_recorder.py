@@ -252,6 +252,7 @@ def test_kill_9_loses_nothing_older_than_a_quarter_of_a_second(tmp_path):
     raise AssertionError(f"bytes of the last {ages} s were lost")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["f.uwb", ".f.uwb.*"])
 def test_a_recorder_that_is_killed_as_it_begins_leaves_a_recording_or_nothing(tmp_path, kind):
     """Killed at the first sight of the file, and of what is to become it."""
@@ -272,6 +273,7 @@ def test_a_recorder_that_is_killed_as_it_begins_leaves_a_recording_or_nothing(tm
         assert kind != "f.uwb"
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_with_a_clear_line_and_a_readable_file(tmp_path):
     path = tmp_path / "f.uwb"
     limit = 3000  # blocks of 1024 bytes that one file may have

@@ -19,6 +19,8 @@ from uwblink.errors import UwblinkError
 from uwbsim.sweep.executors import ClusterLostError
 from uwbsim.sweep.runner import ResultStore, SweepSummary, TableError, run_sweep
 
+pytestmark = pytest.mark.slow
+
 UWBSIM = str(Path(sys.executable).parent / "uwbsim")
 SMALL = HEAD + 'ranges = 100\n[vary]\n"radio.rx_noise_ps" = [0.0, 50.0]\n'
 

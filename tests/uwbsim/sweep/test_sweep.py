@@ -89,6 +89,7 @@ def test_what_fails_is_a_row_and_the_rest_goes_on(tmp_path):
     assert "rate_hz" in bad["error"]
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_is_replaced_and_several_give_the_same_bytes(alone, tmp_path, monkeypatch):
     p, out = alone
     pools: list[object] = []
@@ -107,6 +108,7 @@ def test_a_process_that_dies_is_replaced_and_several_give_the_same_bytes(alone, 
     assert (tmp_path / "out" / "results.csv").read_bytes() == (out / "results.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_survives_the_death_of_a_worker(tmp_path):
     distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
     p = plan(tmp_path, (HEAD + "ranges = 2_000\nseeds = 4\n" + GRID))
@@ -170,6 +172,7 @@ def stranger(tmp_path, monkeypatch):
     del sys.modules["stranger"]
 
 
+@pytest.mark.slow
 def test_functions_of_a_stranger_reach_other_processes(tmp_path, stranger):
     """An evaluation, a protocol and an effect of the channel, with the same results as in this process."""
     own = {"flight_ticks": stranger.flight_ticks, "delay_weights": stranger.delay_weights}

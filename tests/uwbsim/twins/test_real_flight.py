@@ -14,6 +14,8 @@ from calib.calibration.formats import read_miluv
 from tests.shared_data import shared
 from uwblink.importers import read_source
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory):

@@ -392,6 +392,7 @@ def other_found():
     return uwbsim.twin(uwbsim.simulate(antennas(), contention=False), known(antennas()))
 
 
+@pytest.mark.slow
 def test_antennas_and_offsets_are_told_apart(other_found):
     """Differences of directions are told by every exchange; of an antenna, fading leaves half a decibel open."""
     tags = {tag.id: tag for tag in other_found.scenario.tags}

@@ -118,6 +118,7 @@ def test_the_rate_of_a_noisy_clock_is_what_its_reading_gains_over_a_preamble_or_
 
 
 # For the long ones 20 hours altogether: 240 independent spans of 300 s, known to 5 %.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kinds", "long"), [([kind], long) for kind in NOMINAL for long in (False, True)] + [([*NOMINAL], False)]
 )
