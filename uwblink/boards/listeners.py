@@ -159,10 +159,14 @@ def as_listeners(listeners: Iterable[Listener | Callable[[Heard], object]]) -> l
 
 @dataclass(slots=True)
 class PairState:
-    """Counts of a pair, and the last reports of its exchanges, each with its host time (ns) and initiator."""
+    """Counts of a pair, and the last reports of its exchanges, each with its host time (ns) and initiator.
+
+    `recent` has when its turns ended, and whether with a report.
+    """
 
     tried: int = 0
     good: int = 0
+    recent: deque[tuple[int, bool]] = field(default_factory=lambda: deque(maxlen=1000))
     reports: deque[tuple[int, int, RangeReport]] = field(default_factory=lambda: deque(maxlen=1000))
 
 
@@ -170,7 +174,8 @@ class PairState:
 class Progress(Listener):
     """Counts of a recording. Times are in seconds since `start_ns` (host time).
 
-    `waiting` pieces of bytes are not in the file yet, whose last commit ended `behind_s` seconds ago.
+    `absent` has the host time at which each board was unplugged that has not come back. `waiting` pieces of bytes are
+    not in the file yet, whose last commit ended `behind_s` seconds ago.
     """
 
     start_ns: int = 0
@@ -178,6 +183,7 @@ class Progress(Listener):
     pairs: dict[Pair, PairState] = field(default_factory=dict)
     faults: Counter[str] = field(default_factory=Counter)
     last_faults: deque[Fault] = field(default_factory=lambda: deque(maxlen=8))
+    absent: dict[str, int] = field(default_factory=dict)
     overheard: int = 0
     cirs: int = 0
     waiting: int = 0
@@ -199,13 +205,15 @@ class Progress(Listener):
         return "".join(f"{fault.kind}: {fault.detail}" for fault in [*self.last_faults][-1:])
 
     def rows(self) -> list[tuple[Pair, list[str]]]:
-        """Return each pair's rate (Hz, over 2 s), success, last range (m) and its first-path power (dBm) as texts."""
-        since_ns, over_s = self.start_ns + (self.time_s - 2.0) * 1e9, min(2.0, max(self.time_s, 0.1))
+        """Return each pair's rate (Hz, over 2 s), success (over 10 s), last range (m) and its power (dBm) as texts."""
+        now_ns = self.start_ns + self.time_s * 1e9
+        since_ns, over_s = now_ns - 2e9, min(2.0, max(self.time_s, 0.1))
         rows = []
         for pair, state in [*self.pairs.items()]:
             reports = [*state.reports]  # copied at once: a page asks in a thread of its own, while the recorder goes on
             rate_hz = sum(time_ns > since_ns for time_ns, *_ in reports) / over_s
-            success = f"{100 * state.good / state.tried:.0f} %" if state.tried else ""
+            ended = [good for time_ns, good in [*state.recent] if time_ns > now_ns - 10e9]
+            success = f"{100 * sum(ended) / len(ended):.0f} %" if ended else ""
             last = [
                 (f"{report.range_m:.3f}", f"{report.fpp1_dbm:.1f}".replace("nan", "")) for *_, report in reports[-1:]
             ]
@@ -233,6 +241,7 @@ class Progress(Listener):
         """Count a turn of a pair."""
         state = self.pairs.setdefault(turn.pair, PairState())
         state.tried += 1
+        state.recent.append((turn.time_ns, turn.report is not None))
         if turn.report is not None:
             state.good += 1
             state.reports.append((turn.time_ns, turn.pair[0], turn.report))
@@ -241,6 +250,10 @@ class Progress(Listener):
         """Count a fault."""
         self.faults[fault.kind] += 1
         self.last_faults.append(fault)
+        if fault.kind == "unplugged":
+            self.absent.setdefault(fault.board, fault.time_ns)
+        elif fault.kind == "replugged":
+            self.absent.pop(fault.board, None)
 
 
 class WrongDelayError(PlanError):

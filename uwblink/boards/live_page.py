@@ -13,12 +13,15 @@ import math
 import shutil
 import sys
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
 from typing import Final
+
+import numpy as np
 
 from uwblink.boards.listeners import Correction, Listener, Pair, Progress, check_pairs
 from uwblink.closing import Closing
@@ -29,6 +32,9 @@ from uwblink.wire.codec import exchanges_of
 
 PICTURE_WIDTH, PICTURE_HEIGHT, PICTURE_MARGIN = 260, 44, 3
 """Size of a pair's picture, and of the margin around its lines, in pixels."""
+
+SILENT_NS: Final = 2_000_000_000
+"""A pair is silent after this time without a range: the time over which rates are counted."""
 
 SCRIPT: Final = """
 setInterval(async()=>{const m=document.querySelector('main');try{const r=await fetch('/body');
@@ -87,26 +93,40 @@ class LivePage(Closing, Listener):
         """Return the part that changes: name, counts, pairs, faults, disk. The next recorder may have the same port."""
         progress = self._progress
         faults = reversed([*progress.last_faults])
-        items = "".join(f"<li>board {escape(f.board)}: {escape(f.kind)}: {escape(f.detail)}</li>" for f in faults)
+        told = (f"{_clock(one.time_ns)} board {one.board}: {one.kind}: {one.detail}" for one in faults)
+        items = "".join(f"<li>{escape(text)}</li>" for text in told)
         listed = f"<ul>{items}</ul>" if items else ""
-        head = f"<h1>recording {escape(self._path.name)}</h1><p>{escape(str(progress))}</p>"
-        return f"{head}{self._table(progress)}{listed}{self._disk()}"
+        since = f" since {_clock(progress.start_ns)}" if progress.start_ns else ""
+        head = f"<h1>recording {escape(self._path.name)}{since}</h1><p>{escape(str(progress))}</p>"
+        absent = "".join(
+            f"<p class='bad'>board {escape(board)} is unplugged since {_clock(time_ns)}</p>"
+            for board, time_ns in sorted(progress.absent.copy().items())
+        )
+        return f"{head}{absent}{self._table(progress)}{listed}{self._disk()}"
 
     def _table(self, progress: Progress) -> str:
-        """Return a table with one row for each pair; pairs without ranges for two seconds are highlighted."""
+        """Return a table with one row for each pair; pairs without ranges for two seconds are highlighted.
+
+        The spread is that of ranges about their neighbours in time: motion hardly changes it at ten ranges a second.
+        """
         kinds = ("range", "corrected") if self._correct else ("range",)
-        drawn = ", ".join(f"<b class='{kind}'>{kind}</b>" for kind in kinds)
-        names = ("pair", "rate (Hz)", "success", "FPP (dBm)", *(f"{k} (m)" for k in kinds), f"last minute: {drawn}")
+        sigma = ("σ (cm)",) if self._correct else ()
+        drawn = (f"<b class='{kind}'>{kind}</b> (m)" for kind in kinds)
+        names = ("pair", "rate (Hz)", "success, 10 s", "FPP (dBm)", *drawn, "spread (cm)", *sigma, "last minute")
         rows = ""
         for pair, (rate, success, _, power) in progress.rows():
             shown = [*progress.pairs[pair].reports]
             shown = [one for one in shown if shown[-1][0] - one[0] <= 60e9]
             series = {"range": [report.range_m for *_, report in shown]}
+            expected = [""] * len(sigma)
             if self._correct and shown:
-                series["corrected"] = self._correct(exchanges_of(shown))["corrected_m"].tolist()
+                found = self._correct(exchanges_of(shown))
+                series["corrected"] = found["corrected_m"].tolist()
+                expected = [f"{100 * np.median(found['sigma_m']):.1f}" if "sigma_m" in found else ""]
             last = (f"{series[k][-1]:.3f}" if shown else "" for k in kinds)
             image = picture([time_ns for time_ns, *_ in shown], series)
-            cells = (f"{pair[0]}&nbsp;&rarr;&nbsp;{pair[1]}", rate, success, power, *last, image)
+            ends = f"{pair[0]}&nbsp;&rarr;&nbsp;{pair[1]}"
+            cells = (ends, rate, success, power, *last, spread_cm(series[kinds[-1]] if shown else []), *expected, image)
             silent = " class='silent'" if (success or shown) and rate == "0.0" else ""
             rows += f"<tr{silent}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
         head = "".join(f"<th>{name}</th>" for name in names)
@@ -172,8 +192,24 @@ class _Server(ThreadingHTTPServer):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 
 
+def _clock(time_ns: int) -> str:
+    """Return a host time as the time of day here."""
+    return time.strftime("%H:%M:%S", time.localtime(time_ns * 1e-9))
+
+
+def spread_cm(values: Sequence[float]) -> str:
+    """Return the standard deviation of values about their neighbours as text, "" of fewer than ten.
+
+    Second differences of white noise have six times its variance, and those of a smooth motion are small; 1.4826 makes
+    a median absolute deviation a standard deviation of normal errors.
+    """
+    if len(values) < 10:
+        return ""
+    return f"{100 * 1.4826 * np.nanmedian(np.abs(np.diff(values, 2))) / math.sqrt(6):.1f}"
+
+
 def picture(time_ns: Sequence[int], series: Mapping[str, Sequence[float]]) -> str:
-    """Draw series of ranges over time as SVG; the scale is that of the ranges."""
+    """Draw series of ranges over time as SVG, with its scale below; a line ends where nothing came for 2 s."""
     if len(time_ns) < 2:
         return ""
     known = [value for values in series.values() for value in values if math.isfinite(value)]
@@ -183,15 +219,19 @@ def picture(time_ns: Sequence[int], series: Mapping[str, Sequence[float]]) -> st
         (PICTURE_HEIGHT - 2 * PICTURE_MARGIN) / max(high - low, 1e-3),
     )
     lines = ""
+    pieces = np.split(np.arange(len(time_ns)), np.flatnonzero(np.diff(time_ns) > SILENT_NS) + 1)
     for kind, values in series.items():
-        points = " ".join(
-            f"{PICTURE_MARGIN + across * (t - first):.1f},{PICTURE_HEIGHT - PICTURE_MARGIN - up * (value - low):.1f}"
-            for t, value in zip(time_ns, values, strict=True)
-            if math.isfinite(value)
-        )
-        lines += f'<polyline class="{kind}" points="{points}"/>'
+        for piece in pieces:
+            points = " ".join(
+                f"{PICTURE_MARGIN + across * (time_ns[k] - first):.1f},"
+                f"{PICTURE_HEIGHT - PICTURE_MARGIN - up * (values[k] - low):.1f}"
+                for k in piece.tolist()
+                if math.isfinite(values[k])
+            )
+            lines += f'<polyline class="{kind}" points="{points}"/>'
     label = f"range from {low:.3f} to {high:.3f} m"
     return (
         f'<svg role="img" aria-label="{label}" viewBox="0 0 {PICTURE_WIDTH} {PICTURE_HEIGHT}" '
         f'preserveAspectRatio="none"><title>{label}</title>{lines}</svg>'
+        f"<small>{low:.2f} to {high:.2f} m, {(last - first) * 1e-9:.0f} s</small>"
     )

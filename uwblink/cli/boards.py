@@ -504,9 +504,10 @@ def _watcher() -> Iterator[Callable[[Progress], None]]:
 def _progress_table(progress: Progress) -> Table:
     """Return a recorder's progress as a table: rate and success of each pair, last range and power, faults."""
     table = Table(title=str(progress))
-    for name in ("pair", "rate (Hz)", "success", "range (m)", "FPP (dBm)"):
+    for name in ("pair", "rate (Hz)", "success, 10 s", "range (m)", "FPP (dBm)"):
         table.add_column(name, justify="right")
     for (initiator, target), cells in progress.rows():
         table.add_row(f"{initiator} -> {target}", *cells)
-    table.caption = escape(printable(progress.last_fault))
+    absent = [f"board {board} is unplugged" for board in sorted(progress.absent.copy())]
+    table.caption = escape(printable("; ".join(filter(None, [progress.last_fault, *absent]))))
     return table

@@ -11,6 +11,7 @@ import time
 import urllib.error
 import urllib.request
 
+import numpy as np
 import pytest
 
 import uwblink
@@ -60,17 +61,22 @@ def recorded(tmp_path, page, look, lost_share=0.1):
     return done, looking.seen[0]
 
 
+def corrected(exchanges):
+    return {"corrected_m": exchanges.range_m - 0.125, "sigma_m": np.full(len(exchanges), 0.034)}
+
+
 def test_the_page_shows_rates_success_ranges_power_faults_disk_and_queue(tmp_path):
-    with LivePage(tmp_path / "f.uwb", correct=lambda x: {"corrected_m": x.range_m - 0.125}) as page:
+    with LivePage(tmp_path / "f.uwb", correct=corrected) as page:
         done, (headers, text) = recorded(tmp_path, page, lambda: fetch(page))
     assert headers["Content-Type"] == "text/html; charset=utf-8"
     rows = re.findall(r"<tr><td>(\d)&nbsp;&rarr;&nbsp;(\d)</td>(.*?)</tr>", text)
     assert {(int(a), int(b)) for a, b, _ in rows} == set(done.pairs)
     for *_, cells in rows:
-        rate, success, power, distance, corrected, picture = re.findall(r"<td>(.*?)</td>", cells)
+        rate, success, power, distance, shorter, spread, sigma, picture = re.findall(r"<td>(.*?)</td>", cells)
         assert 20 < float(rate) < 40
         assert 80 < float(success.removesuffix(" %")) <= 100
-        assert float(corrected) == pytest.approx(float(distance) - 0.125, abs=0.0011)
+        assert float(shorter) == pytest.approx(float(distance) - 0.125, abs=0.0011)
+        assert (2 < float(spread) < 6, sigma) == (True, "3.4")
         assert -100 < float(power) < -70
         assert picture.count("<polyline") == 2
         assert len(re.findall(r"[\d.]+,[\d.]+", picture)) > 100
@@ -96,8 +102,44 @@ def test_the_picture_is_the_last_minute(tmp_path):
     assert across == pytest.approx([3 + 254 * k / 60 for k in range(61)], abs=0.06)
     assert down == pytest.approx([41 - 38 * k / 60 for k in range(61)], abs=0.06)
     assert "range from 3.290 to 3.890 m" in text
+    assert "<small>3.29 to 3.89 m, 60 s</small>" in text
     assert "class='silent'" in text, "the last range came six seconds ago"
     assert "corrected" not in text, "there is no calibration"
+
+
+def test_success_is_that_of_ten_seconds_spread_is_noise_and_gaps_are_gaps(tmp_path):
+    """20 s of ranges of a moving tag with planted noise, a gap of 5 s; in the last 10 s every second turn fails."""
+    began_ns, noise = 1_790_000_000_000_000_000, np.random.default_rng(7).normal(0, 0.05, 200)
+    progress = Progress(start_ns=began_ns, time_s=25.0)
+    for k in range(200):
+        time_ns = began_ns + k * 100_000_000 + 5_000_000_000 * (k >= 100)
+        report = RangeReport(2, 3.0 + 0.1 * k + noise[k], 1, 2, 3, 4, 5, 6, -85.0, -86.0, 0.0, 0.0)
+        progress.on_turn(Turn(time_ns, (1, 2), report))
+        if k >= 100:
+            progress.on_turn(Turn(time_ns, (1, 2), None))
+    with LivePage(tmp_path / "f.uwb") as page:
+        page.watch(progress)
+        cells = re.findall(r"<td>(.*?)</td>", page.body())
+    assert cells[2] == "50 %", "the whole recording has 67 %"
+    # 198 second differences know a spread to a tenth.
+    assert float(cells[5]) == pytest.approx(5.0, rel=0.25)
+    assert cells[-1].count("<polyline") == 2
+
+
+def test_an_unplugged_board_stays_named_until_it_is_back(tmp_path):
+    progress, noon_ns = Progress(), 1_790_000_000_000_000_000
+    with LivePage(tmp_path / "f.uwb") as page:
+        page.watch(progress)
+        progress.on_fault(Fault(noon_ns, "3", "unplugged", "gone"))
+        for _ in range(20):
+            progress.on_fault(Fault(noon_ns + 1, "1", "text", "noise"))
+        away = page.body()
+        progress.on_fault(Fault(noon_ns + 9, "3", "replugged", "board 3 is back"))
+        back = page.body()
+    clock = time.strftime("%H:%M:%S", time.localtime(noon_ns * 1e-9))
+    assert f"board 3 is unplugged since {clock}" in away
+    assert f"<li>{clock} board 1: text: noise</li>" in away
+    assert "unplugged since" not in back
 
 
 def test_what_boards_say_cannot_become_part_of_the_page(tmp_path):
