@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 PYTHONS ?= python3.12 python3.13
-LOCKED := --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements-dev.lock
+LOCKED := --progress-bar off --disable-pip-version-check --no-deps --require-hashes -r requirements-dev.lock
 # Tests run in many processes: what the first compiles, the others need not (an empty value counts as none).
 TESTS := -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 test test-all coverage lowest newest pythons: export PYTHONDONTWRITEBYTECODE :=
