@@ -249,8 +249,10 @@ class RangeRows:
         """Yield all ranges, some blocks at a time."""
         for blocks, rows, values, moved in self._pieces(x):
             log_density, by, tells = self.errors.slopes(values)
-            found = self._as_terms(blocks, rows, float(np.sum(log_density)), by, tells, moved)
-            yield found if self.design_effect == 1 else found.tempered(self.design_effect)
+            share = 1 / self.design_effect
+            by = {name: share * slope for name, slope in by.items()} if share != 1 else by
+            tells = None if tells is None else share * tells
+            yield self._as_terms(blocks, rows, share * float(np.sum(log_density)), by, tells, moved)
 
     def residuals(self, x: Floats) -> Floats:
         """Return the residuals (n,) at unknowns (p,), in the order in which rows were given; a sample's in its own."""
@@ -318,7 +320,7 @@ class RangeRows:
                 continue
             own = part.columns if len(part.columns) == 1 else part.columns[blocks]
             columns.append(np.broadcast_to(own + self.layout.where[part.kind].start, (several, own.shape[1])))
-            entries.append(np.ones((own.shape[1], count)) if part.values is None else part.values[:, rows])
+            entries.append(np.broadcast_to(1.0, (own.shape[1], count)) if part.values is None else part.values[:, rows])
             names.append(part.parameter)
         if moved is not None and self.geometry is not None:
             columns = [np.repeat(one, np.diff(starts), axis=0) for one in columns]
@@ -330,7 +332,15 @@ class RangeRows:
         stacked = np.concatenate(columns, axis=1)
         of_residual = [k for k, name in enumerate(names) if name == RESIDUAL]
         score = by[RESIDUAL]
-        found = Terms(value=value, slopes=slopes, columns=stacked, starts=starts, score=score, residual=score)
+        found = Terms(
+            value=value,
+            slopes=slopes,
+            columns=stacked,
+            starts=starts,
+            weight=self.design_effect,
+            score=score,
+            residual=score,
+        )
         if tells is None:
             return found
         unit = np.ones(count)

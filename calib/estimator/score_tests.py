@@ -243,7 +243,7 @@ def _weighed(terms: Terms) -> Iterator[tuple[Terms, Floats]]:
     for part in (terms, terms.beside):
         if part is not None:
             unit = np.ones(part.slopes.shape[1]) if part.residual is None else part.residual
-            yield part, unit if part.weight is None else unit * part.weight
+            yield part, unit * part.weight
 
 
 def search(tested: Sequence[Tested], rate: float) -> list[FoundOffset]:

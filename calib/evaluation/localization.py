@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from scipy.signal import correlate
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calib.calibration.applying import heard_receptions, keep_determined, noise_m, reception_gains
 from calib.calibration.document import for_json
@@ -336,8 +335,8 @@ def summarize(found: list[Localization]) -> LocalizationSummary:
 def _mean_bounds(count: float, degrees: int) -> tuple[float, float]:
     """Return the 95 % bounds of the mean of `count` independent chi-squares."""
     some = max(count, 1.0)
-    low, high = chi2.interval(0.95, some * degrees)
-    return float(low) / some, float(high) / some
+    low, high = chdtri(some * degrees, [0.975, 0.025]) / some
+    return float(low), float(high)
 
 
 def _inside(values: Floats, degrees: int) -> float:
@@ -351,7 +350,8 @@ def _independent(values: Floats) -> float:
     The sum ends where the autocorrelation first falls below a twentieth.
     """
     centred = values - values.mean()
-    correlation = correlate(centred, centred, method="fft")[len(centred) - 1 :]
+    # Twice as long with zeros: a spectrum's correlation is circular.
+    correlation = np.fft.irfft(np.abs(np.fft.rfft(centred, 2 * len(centred))) ** 2)[: len(centred)]
     correlation = correlation / max(float(correlation[0]), 1e-300)
     end = int(np.argmax(np.append(correlation, 0.0) < 0.05))
     return len(centred) / (1 + 2 * float(correlation[1:end].sum()))
