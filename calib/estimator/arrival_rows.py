@@ -15,7 +15,7 @@ from calib.calibration.power_curves import lift
 from calib.data.arrivals import Arrivals
 from calib.estimator.grouped_errors import error_unknowns, scattered
 from calib.estimator.range_model import METRES_A_NS, OFFSETS, RangeModel, SplineValues
-from calib.estimator.range_rows import RESIDUAL, Errors, Part, RangeRows, TwoSidedMixture
+from calib.estimator.range_rows import OF_ERRORS, RESIDUAL, Errors, Mixture, Part, RangeRows
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
 from calib.estimator.unknowns import Layout, Prior, Unknown
 from calib.pairs import pairs_of
@@ -88,7 +88,7 @@ class ArrivalModel:
             path=number,
         )
 
-    def error_model(self, residual: Floats) -> tuple[TwoSidedMixture, list[Unknown], list[Part]]:
+    def error_model(self, residual: Floats) -> tuple[Mixture, list[Unknown], list[Part]]:
         """Return the error model with its unknowns and parts, started from robust spreads of residuals (n,)."""
         spread = max(robust_spread(residual), 1e-3)
         unknowns, parts = error_unknowns(spread, self.listeners, self.listener, whose="listener")
@@ -96,7 +96,7 @@ class ArrivalModel:
         everyone = np.zeros((1, 1), dtype=np.int64)
         parts.append(Part(parameter="side", kind="late share", columns=everyone))
         return (
-            TwoSidedMixture(),
+            Mixture(parameters=(*OF_ERRORS, "side")),
             [replace(one, kind=HEARD + one.kind) for one in (*unknowns, side)],
             [replace(one, kind=HEARD + one.kind) for one in parts],
         )
@@ -148,5 +148,4 @@ def _curve_parts(model: RangeModel, spline: SplineValues, arrivals: Arrivals, li
         for sign, one, ends in received:
             share = sign if group is None else sign * 0.5 * sum(np.isin(end, group).astype(float) for end in ends)
             np.add.at(whole, (np.arange(len(row))[:, None], one.columns), one.values * np.reshape(share, (-1, 1)))
-        columns = np.broadcast_to(np.arange(spline.size), whole.shape)
-        yield Part(parameter=RESIDUAL, kind=kind, columns=columns, values=-whole)
+        yield Part(parameter=RESIDUAL, kind=kind, columns=np.arange(spline.size)[None], values=-whole)
