@@ -258,13 +258,14 @@ def _heard_by(listener: int, r: Receptions, links: _Links, rows: Ints, exchanges
 def exchange_of(exchanges: Exchanges, overheard: Columns) -> Ints:
     """Return the row of the exchange that each overheard one (n,) belongs to, -1 where it is not there.
 
-    Both have the initiator's first stamp and the target's second.
+    Both have the target's stamps of poll and response, which the frames of boards bring; those of the initiator may not
+    be there.
     """
     e, h, within = exchanges, overheard, (1 << exchanges.bits) - 1
     first, second = (
         np.unique(np.append(there, here).astype(np.int64) << exchanges.bits | stamps & within, return_inverse=True)[1]
         for there, here, stamps in (
-            (e.initiator, h["initiator"], np.append(e.tx1, h["tx1_n"])),
+            (e.initiator, h["initiator"], np.append(e.rx1, h["rx1_n"])),
             (e.target, h["target"], np.append(e.tx2, h["tx2_n"])),
         )
     )
