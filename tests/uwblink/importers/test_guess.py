@@ -348,7 +348,7 @@ def test_differences_of_arrival_without_stamps_are_named(tmp_path, header, colum
     """Of a table with the columns of the public set UTIL, of one as Loco's logs have it, and of one in between."""
     rows = "".join(",".join([f"{k / 50:.2f}", *["3"] * header.count(",")]) + "\n" for k in range(9))
     (tmp_path / "d.csv").write_text(f"{header}\n{rows}")
-    words = "uwblink import csv d.csv -o d.uwb".split()
+    words = ["uwblink", "import", "csv", "d.csv", "-o", "d.uwb"]
     processes.refuse(
         *words, cwd=tmp_path, naming=["d.csv", f"'{column}'", "differences of arrival", "stamps"], status=2
     )
