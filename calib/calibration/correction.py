@@ -134,8 +134,8 @@ def live_correction(path: Path) -> Callable[[Exchanges], dict[str, Floats]]:
         return {"corrected_m": known.pop("range_m"), **known}
 
     def differences(exchanges: Exchanges, overheard: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        ranges = Ranges.from_exchanges(exchanges, source=str(path))
-        heard = arrivals_of(exchanges, ranges.raw_m, overheard, Contents(exchanges=exchanges).poses, (), need_truth=False)
+        ranges, nowhere = Ranges.from_exchanges(exchanges, source=str(path)), Contents(exchanges=exchanges).poses
+        heard = arrivals_of(exchanges, ranges.raw_m, overheard, nowhere, (), need_truth=False)
         applied = calibration.correct_arrivals(replace(ranges, arrivals=heard))
         known = {name: getattr(exchanges, name)[heard.exchange] for name in ("time_ns", "initiator", "target")}
         known |= {"listener": heard.listener, "difference_m": applied.raw_m, "corrected_m": applied.corrected_m}

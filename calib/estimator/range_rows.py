@@ -308,9 +308,9 @@ class RangeRows:
             entries.append(-moved.T)
             names.append(RESIDUAL)
         slopes, first = np.empty((sum(map(len, entries)), count)), 0
-        for name, own in zip(names, entries, strict=True):
-            np.multiply(by[name], own, out=slopes[first : first + len(own)])
-            first += len(own)
+        for name, values in zip(names, entries, strict=True):
+            np.multiply(by[name], values, out=slopes[first : first + len(values)])
+            first += len(values)
         stacked = np.concatenate(columns, axis=1)
         of_residual = [k for k, name in enumerate(names) if name == RESIDUAL]
         score = by[RESIDUAL]

@@ -248,7 +248,7 @@ def _readings(data: Data, calibration: Calibration, use: str) -> list[_Readings]
 
 def _among(ranges: Ranges, tags: list[int]) -> Ranges:
     """Return the ranges between some tags, with what these overheard of them."""
-    found = ranges[np.isin([ranges.initiator, ranges.target], tags).all(axis=0)]
+    found = ranges[np.isin(ranges.initiator, tags) & np.isin(ranges.target, tags)]
     heard = found.arrivals
     return found if heard is None else replace(found, arrivals=heard[np.isin(heard.listener, tags)])
 

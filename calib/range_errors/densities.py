@@ -177,8 +177,8 @@ def error_slopes(residual: Floats, parameters: dict[str, Floats]) -> ErrorSlopes
     found = [densities(sign * residual, sigma, float(least[0]), long.mean * detour, long) for sign, _ in sides]
     inside = 1 - float(outlying[0])
     core, tail = inside * (1 - share) * found[0].direct, inside * share
-    reflected = sum(own * one.reflected for one, (_, own) in zip(found, sides, strict=True))
-    total = core + tail * reflected + float(outlying[0]) / OUTLIERS_OVER_M
+    likely = np.sum([own * one.reflected for one, (_, own) in zip(found, sides, strict=True)], axis=0)
+    total = core + tail * likely + float(outlying[0]) / OUTLIERS_OVER_M
     core, tail = core / total, tail / total
     z, inverse = residual / sigma, 1 / sigma
     noise, towards, mean, tail_noise = core * (z * z - 1), core * z, np.zeros_like(z), np.zeros_like(z)
@@ -193,7 +193,7 @@ def error_slopes(residual: Floats, parameters: dict[str, Floats]) -> ErrorSlopes
             noise += part * (own * own + kind.noise_var - 1)
             mean += part * ((beyond - kind.noise_m) / kind.detour_m - 1)
             tails.append(part)
-    reflected = sum(tails[1:], tails[0])
+    reflected = np.asarray(sum(tails[1:], tails[0]))
     both = core + reflected
     by = {
         "residual": -towards * inverse,

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from heapq import merge
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -178,8 +179,8 @@ def stream(  # noqa: PLR0913 - options by name
             raise ArgumentError(f"found {value!r:.40}, expected a number above 0", parameter=name)
     correct = _correction(calibration)
     if isinstance(source, str | os.PathLike):
-        found, heard = _recorded(Path(source), correct, listening=_check_use(use, correct))
-        return _play(found, heard, correct, duration_s, speed, stop)
+        recorded = _recorded(Path(source), correct, listening=_check_use(use, correct))
+        return _play(*recorded, correct, duration_s, speed, stop)
     chosen, ports = plan or RangingPlan(), using or SerialPorts()
     found = identify(source, ports)
     turns = chosen.turns(sorted(found))
@@ -331,8 +332,9 @@ def _play(
     for start in range(0, len(exchanges), 10_000):
         some, own = exchanges[start : start + 10_000], np.flatnonzero((row >= start) & (row < start + 10_000))
         columns = {name: column[own[np.argsort(row[own])]] for name, column in overheard.items()}
-        differences = streamed_differences(some, columns, correct) if len(own) else ()
-        for found in merge(streamed(some, correct), differences, key=lambda one: one.time_ns):
+        kinds: list[Iterable[Any]] = [streamed(some, correct)]
+        kinds += [streamed_differences(some, columns, correct)] if len(own) else []
+        for found in merge(*kinds, key=attrgetter("time_ns")):
             since_s = (found.time_ns - first_ns) * 1e-9
             if since_s > duration_s or not wait_until(start_s + since_s / speed, stop):
                 return
