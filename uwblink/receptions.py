@@ -258,22 +258,21 @@ def _heard_by(listener: int, r: Receptions, links: _Links, rows: Ints, exchanges
 def exchange_of(exchanges: Exchanges, overheard: Columns) -> Ints:
     """Return the row of the exchange that each overheard one (n,) belongs to, -1 where it is not there.
 
-    Both have the initiator's first stamp and the target's second.
+    Both have the target's stamps of poll and response, which the frames of boards bring; those of the initiator may not
+    be there.
     """
-    e, h = exchanges, overheard
-    there, here = (
-        np.column_stack(
-            [ends[0].astype(np.int64), ends[1], *(stamp & ((1 << exchanges.bits) - 1) for stamp in ends[2:])]
-        )
-        for ends in (
-            (e.initiator, e.target, e.tx1, e.tx2),
-            (h["initiator"], h["target"], h["tx1_n"], h["tx2_n"]),
+    e, h, within = exchanges, overheard, (1 << exchanges.bits) - 1
+    first, second = (
+        np.unique(np.append(there, here).astype(np.int64) << exchanges.bits | stamps & within, return_inverse=True)[1]
+        for there, here, stamps in (
+            (e.initiator, h["initiator"], np.append(e.rx1, h["rx1_n"])),
+            (e.target, h["target"], np.append(e.tx2, h["tx2_n"])),
         )
     )
-    number = np.unique(np.concatenate([there, here]), axis=0, return_inverse=True)[1].ravel()
+    number = np.unique(first * (int(second.max(initial=-1)) + 1) + second, return_inverse=True)[1]
     row = np.full(int(number.max(initial=-1)) + 1, -1)
-    row[number[: len(there)]] = np.arange(len(there))
-    return row[number[len(there) :]]
+    row[number[: len(e)]] = np.arange(len(e))
+    return row[number[len(e) :]]
 
 
 def receptions_of(exchanges: Exchanges, overheard: Columns | None = None) -> Receptions:

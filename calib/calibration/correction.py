@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from calib.calibration.applying import CorrectedRanges, columns_of, determined, within_text
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration, load_calibration
+from calib.data.arrivals import arrivals_of
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, LeftOutWarning
 from uwblink.arrays import Floats
 from uwblink.exporters import check_export, export_recording
 from uwblink.output import check_output
-from uwblink.recording.contents import READING_MB, exchanges_with_poses
+from uwblink.recording.contents import READING_MB, Contents, exchanges_with_poses
 from uwblink.recording.file import Recording
 from uwblink.twr import Exchanges
 
@@ -121,8 +122,9 @@ def live_correction(path: Path) -> Callable[[Exchanges], dict[str, Floats]]:
     """Return a function that corrects exchanges (n,) to `corrected_m`, and what else `CorrectedRange` has.
 
     The numbers are those of `calib.apply`; its attribute `antenna_delays` is what was programmed where the
-    calibration was fitted. The function raises what `Calibration.apply` raises, as for a tag that is not calibrated.
-    Raises what `load_calibration` raises.
+    calibration was fitted, and `differences` corrects what tags overheard (`Calibration.correct_arrivals`). The
+    function raises what `Calibration.apply` raises, as for a tag that is not calibrated. Raises what `load_calibration`
+    raises.
     """
     calibration = load_calibration(path)
 
@@ -131,5 +133,14 @@ def live_correction(path: Path) -> Callable[[Exchanges], dict[str, Floats]]:
         known = columns_of(calibration.apply(ranges))._asdict()
         return {"corrected_m": known.pop("range_m"), **known}
 
+    def differences(exchanges: Exchanges, overheard: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        ranges, nowhere = Ranges.from_exchanges(exchanges, source=str(path)), Contents(exchanges=exchanges).poses
+        heard = arrivals_of(exchanges, ranges.raw_m, overheard, nowhere, (), need_truth=False)
+        applied = calibration.correct_arrivals(replace(ranges, arrivals=heard))
+        known = {name: getattr(exchanges, name)[heard.exchange] for name in ("time_ns", "initiator", "target")}
+        known |= {"listener": heard.listener, "difference_m": applied.raw_m, "corrected_m": applied.corrected_m}
+        return known | {"sigma_m": applied.sigma_m, "shared_m": applied.shared_m}
+
     correct.antenna_delays = calibration.antenna_delays  # type: ignore[attr-defined]
+    correct.differences = differences  # type: ignore[attr-defined]
     return correct

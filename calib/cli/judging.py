@@ -133,10 +133,8 @@ def localize(
             # The text first: where it cannot be made, nothing is written.
             table = localization_json(found)
             text = localization_text(found, settings)
-        elif use != "exchanges":
-            raise calib.BadInputError("only exchanges go with a model on board; leave `model` away", parameter="use")
         else:
-            onboard = calib.OnboardSettings(model=model)
+            onboard = calib.OnboardSettings(model=model, use=use)
             found = [one for path in recordings for one in calib.localize_onboard(path, known, onboard)]
             table, text = onboard_json(found), onboard_text(found, onboard)
     if tum:

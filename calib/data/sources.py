@@ -306,21 +306,26 @@ def load_flight(data: Data, *, need_power: bool = True) -> Flight:
     `UnanswerableError` where no range can be used.
     """
     with opened(data) as (name, source):
-        exchanges = single_reports(source.exchanges).exchanges
-        found = Ranges.from_exchanges(
-            exchanges,
-            poses=source.poses,
-            tags=source.tags,
-            planted=planted_of(source, name),
-            source=name,
-            antenna_delays=antenna_delays_of(source, name),
-        )
-        heard = getattr(source, "overheard", None)
-        if heard and len(heard["time_ns"]):
-            arrivals = arrivals_of(exchanges, found.raw_m, heard, source.poses, source.tags)
-            powered = np.isfinite(measured_powers(arrivals.poll_dbm) + measured_powers(arrivals.response_dbm))
-            found = replace(found, arrivals=arrivals[powered | (not need_power)])
-        fingerprint = sha256(exchanges.time_ns.tobytes() + exchanges.range_m.tobytes()).hexdigest()[:32]
-        usable = found.usable(_why_no_truth(source), _why_no_power(exchanges), need_power=need_power)
-        ranges = replace(usable, recordings=((name, fingerprint),))
-        return Flight(ranges, source.poses, list(source.tags))
+        return flight_of(name, source, need_power=need_power)
+
+
+def flight_of(name: str, source: Source, *, need_power: bool = True, need_truth: bool = True) -> Flight:
+    """Return what `load_flight` returns of a source with a name; without `need_truth` also where no poses are."""
+    exchanges = single_reports(source.exchanges).exchanges
+    found = Ranges.from_exchanges(
+        exchanges,
+        poses=source.poses,
+        tags=source.tags,
+        planted=planted_of(source, name),
+        source=name,
+        antenna_delays=antenna_delays_of(source, name),
+    )
+    heard = getattr(source, "overheard", None)
+    if heard and len(heard["time_ns"]):
+        arrivals = arrivals_of(exchanges, found.raw_m, heard, source.poses, source.tags, need_truth=need_truth)
+        powered = np.isfinite(measured_powers(arrivals.poll_dbm) + measured_powers(arrivals.response_dbm))
+        found = replace(found, arrivals=arrivals[powered | (not need_power)])
+    fingerprint = sha256(exchanges.time_ns.tobytes() + exchanges.range_m.tobytes()).hexdigest()[:32]
+    usable = found.usable(_why_no_truth(source), _why_no_power(exchanges), need_power=need_power, need_truth=need_truth)
+    ranges = replace(usable, recordings=((name, fingerprint),))
+    return Flight(ranges, source.poses, list(source.tags))

@@ -15,9 +15,10 @@ from calib.calibration.power_curves import lift
 from calib.data.arrivals import Arrivals
 from calib.estimator.grouped_errors import error_unknowns, scattered
 from calib.estimator.range_model import METRES_A_NS, OFFSETS, RangeModel, SplineValues
-from calib.estimator.range_rows import RESIDUAL, Errors, Part, RangeRows, TwoSidedMixture
+from calib.estimator.range_rows import OF_ERRORS, RESIDUAL, Errors, Mixture, Part, RangeRows
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
 from calib.estimator.unknowns import Layout, Prior, Unknown
+from calib.pairs import pairs_of
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 
@@ -73,13 +74,13 @@ class ArrivalModel:
         paths, number = _paths(ends, arrivals.listener)
         signs = np.broadcast_to(PATH_SIGNS, number.shape)
         parts.append(Part(parameter=RESIDUAL, kind=OFFSET_OF_PATH, columns=number, values=signs))
-        key = np.unique(np.column_stack([ends, arrivals.listener]), axis=0, return_inverse=True)[1]
+        key = np.unique(ends[:, 0] << 32 | ends[:, 1] << 16 | arrivals.listener, return_inverse=True)[1]
         return cls(
             residual=arrivals.error_m,
             exchange=row,
             listener=listener,
             listeners=tuple(map(str, listeners.tolist())),
-            key=key.ravel(),
+            key=key,
             unknowns=(scattered(OFFSET_OF_PATH, paths, OFFSETS),),
             parts=tuple(parts),
             targets=ends[:, 1],
@@ -87,7 +88,7 @@ class ArrivalModel:
             path=number,
         )
 
-    def error_model(self, residual: Floats) -> tuple[TwoSidedMixture, list[Unknown], list[Part]]:
+    def error_model(self, residual: Floats) -> tuple[Mixture, list[Unknown], list[Part]]:
         """Return the error model with its unknowns and parts, started from robust spreads of residuals (n,)."""
         spread = max(robust_spread(residual), 1e-3)
         unknowns, parts = error_unknowns(spread, self.listeners, self.listener, whose="listener")
@@ -95,7 +96,7 @@ class ArrivalModel:
         everyone = np.zeros((1, 1), dtype=np.int64)
         parts.append(Part(parameter="side", kind="late share", columns=everyone))
         return (
-            TwoSidedMixture(),
+            Mixture(parameters=(*OF_ERRORS, "side")),
             [replace(one, kind=HEARD + one.kind) for one in (*unknowns, side)],
             [replace(one, kind=HEARD + one.kind) for one in parts],
         )
@@ -130,9 +131,8 @@ def _delays(model: RangeModel, ends: Ints, weights: Floats) -> Part:
 
 def _paths(ends: Ints, listener: Ints) -> tuple[tuple[str, ...], Ints]:
     """Return the names of the paths to listeners, and the numbers (n, 2) of those from the initiator and the target."""
-    pairs = np.stack([np.sort(np.column_stack([end, listener]), axis=1) for end in ends.T], axis=1)
-    names, number = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
-    return tuple(f"path {a}-{b}" for a, b in names.tolist()), number.reshape(-1, 2)
+    paths = pairs_of(ends.ravel(), np.repeat(listener, 2))
+    return tuple(f"path {name}" for name in paths.names), paths.number.reshape(-1, 2)
 
 
 def _curve_parts(model: RangeModel, spline: SplineValues, arrivals: Arrivals, lifted: list[Floats]) -> Iterator[Part]:
@@ -148,5 +148,4 @@ def _curve_parts(model: RangeModel, spline: SplineValues, arrivals: Arrivals, li
         for sign, one, ends in received:
             share = sign if group is None else sign * 0.5 * sum(np.isin(end, group).astype(float) for end in ends)
             np.add.at(whole, (np.arange(len(row))[:, None], one.columns), one.values * np.reshape(share, (-1, 1)))
-        columns = np.broadcast_to(np.arange(spline.size), whole.shape)
-        yield Part(parameter=RESIDUAL, kind=kind, columns=columns, values=-whole)
+        yield Part(parameter=RESIDUAL, kind=kind, columns=np.arange(spline.size)[None], values=-whole)

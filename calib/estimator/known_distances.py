@@ -83,7 +83,11 @@ class Fitted:
         kinds = [(self.rows, blocks)]
         if self.heard is not None and self.arrivals is not None:
             kinds.append((self.heard, replace(blocks, number=blocks.number[self.arrivals.exchange])))
-        return [Slopes(own, self.optimum, when, *(k for k in kinds if k[0] is not own)) for own, when in kinds]
+        found = [Slopes(own, self.optimum, when) for own, when in kinds]
+        sums, count = np.sum([one.own for one in found], axis=0), sum(one.count for one in found)
+        for one in found:
+            one.own, one.count = sums, count
+        return found
 
 
 @dataclass(frozen=True, kw_only=True)

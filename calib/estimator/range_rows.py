@@ -14,7 +14,6 @@ from typing import Any, Protocol
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, PPoly
-from scipy.special import expit
 
 from calib.estimator.losses import Weights
 from calib.estimator.rows import ROWS_AT_ONCE, Terms
@@ -26,7 +25,7 @@ RESIDUAL = "residual"
 """The parameter that delays, curves and offsets add to."""
 
 OF_ERRORS = ("noise", "odds", "detour", "least", "outliers", "long")
-"""The other parameters of an error's density."""
+"""The other parameters of an error's density; differences of arrival have "side" besides."""
 
 SHARED = "shared"
 """Name of the part of a residual's slope that the other parameters have, too."""
@@ -115,27 +114,6 @@ class Mixture:
         square, across = (others * weight) @ others.T, (others * weight) @ slope
         shared = np.linalg.lstsq(square + 1e-9 * np.eye(len(square)), across, rcond=1e-8)[0]
         return float(weight @ slope**2 - shared @ across), shared
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TwoSidedMixture:
-    """The same density for errors that reflections lengthen or shorten: differences of times of arrival.
-
-    A share, whose log odds are the parameter "side", is as `Mixture` has it, the others are with the opposite sign.
-    """
-
-    parameters: tuple[str, ...] = (*OF_ERRORS, "side")
-
-    def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
-        """Return log densities (n,) and slopes by each parameter (n,)."""
-        late, early = (error_slopes(sign * values[RESIDUAL], values) for sign in (1.0, -1.0))
-        share = expit(values["side"])
-        of_late, of_early = np.log(share) + late.log_density, np.log1p(-share) + early.log_density
-        log_density = np.logaddexp(of_late, of_early)
-        part = np.exp(of_late - log_density)
-        by = {name: part * late.by[name] + (1 - part) * early.by[name] for name in late.by}
-        by[RESIDUAL] = part * late.by[RESIDUAL] - (1 - part) * early.by[RESIDUAL]
-        return log_density, by | {"side": part - share}, None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -249,8 +227,10 @@ class RangeRows:
         """Yield all ranges, some blocks at a time."""
         for blocks, rows, values, moved in self._pieces(x):
             log_density, by, tells = self.errors.slopes(values)
-            found = self._as_terms(blocks, rows, float(np.sum(log_density)), by, tells, moved)
-            yield found if self.design_effect == 1 else found.tempered(self.design_effect)
+            share = 1 / self.design_effect
+            by = {name: share * slope for name, slope in by.items()} if share != 1 else by
+            tells = None if tells is None else share * tells
+            yield self._as_terms(blocks, rows, share * float(np.sum(log_density)), by, tells, moved)
 
     def residuals(self, x: Floats) -> Floats:
         """Return the residuals (n,) at unknowns (p,), in the order in which rows were given; a sample's in its own."""
@@ -296,8 +276,9 @@ class RangeRows:
 
     def _sum(self, part: Part, x: Floats, blocks: slice, rows: slice, counts: Ints) -> Floats:
         own = x[self.layout.where[part.kind]]
-        if part.columns.shape[0] == 1 and part.values is None:
-            return np.asarray(own[part.columns[0]])
+        if part.columns.shape[0] == 1:
+            weights = own[part.columns[0]]
+            return np.asarray(weights if part.values is None else weights @ part.values[:, rows])
         unknown = own[part.columns[blocks]]
         if part.values is None:
             return np.repeat(unknown.sum(axis=1), counts)
@@ -312,13 +293,13 @@ class RangeRows:
         """Return what rows say: by squares of slopes, or by what each residual tells and squares of what is beside."""
         count, several = rows.stop - rows.start, blocks.stop - blocks.start
         starts = self.starts[blocks.start : blocks.stop + 1] - rows.start
-        columns, entries, names = [], [], []
+        columns, entries, names = [], list[Floats](), list[str]()
         for part in self.parts:
             if part.parameter not in by:
                 continue
             own = part.columns if len(part.columns) == 1 else part.columns[blocks]
             columns.append(np.broadcast_to(own + self.layout.where[part.kind].start, (several, own.shape[1])))
-            entries.append(np.ones((own.shape[1], count)) if part.values is None else part.values[:, rows])
+            entries.append(np.broadcast_to(1.0, (own.shape[1], count)) if part.values is None else part.values[:, rows])
             names.append(part.parameter)
         if moved is not None and self.geometry is not None:
             columns = [np.repeat(one, np.diff(starts), axis=0) for one in columns]
@@ -326,11 +307,22 @@ class RangeRows:
             starts = np.arange(count + 1)
             entries.append(-moved.T)
             names.append(RESIDUAL)
-        slopes = np.concatenate([by[name] * own for name, own in zip(names, entries, strict=True)])
+        slopes, first = np.empty((sum(map(len, entries)), count)), 0
+        for name, values in zip(names, entries, strict=True):
+            np.multiply(by[name], values, out=slopes[first : first + len(values)])
+            first += len(values)
         stacked = np.concatenate(columns, axis=1)
         of_residual = [k for k, name in enumerate(names) if name == RESIDUAL]
         score = by[RESIDUAL]
-        found = Terms(value=value, slopes=slopes, columns=stacked, starts=starts, score=score, residual=score)
+        found = Terms(
+            value=value,
+            slopes=slopes,
+            columns=stacked,
+            starts=starts,
+            weight=self.design_effect,
+            score=score,
+            residual=score,
+        )
         if tells is None:
             return found
         unit = np.ones(count)
@@ -352,7 +344,7 @@ class RangeRows:
 
 def _sorted(part: Part, order: Ints, starts: Ints) -> Part:
     """Return a part in the rows' own order, with columns by block; one row of columns serves all ranges."""
-    if len(part.columns) == 1:
-        return part
     values = None if part.values is None else np.ascontiguousarray(part.values[order].T)
-    return replace(part, columns=part.columns[order[starts[:-1]]], values=values)
+    return replace(
+        part, columns=part.columns if len(part.columns) == 1 else part.columns[order[starts[:-1]]], values=values
+    )

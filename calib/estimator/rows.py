@@ -8,7 +8,7 @@ measurements with normal errors (tapes, anchors, poses, heights) are the other, 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -29,8 +29,8 @@ class Terms:
     """Some rows (n,) of which each touches K unknowns: blocks of rows that follow each other touch the same ones.
 
     `slopes` (K, n) are derivatives of a row's log likelihood by the unknowns `columns` (blocks, K); `starts`
-    (blocks + 1,) bound the blocks. The information of the rows is the sum over rows of `weight` (n,) times the outer
-    square of `entries` (K, n); None stands for 1 and the slopes themselves (Berndt, Hall, Hall, Hausman 1974).
+    (blocks + 1,) bound the blocks. The information of the rows is the sum over rows of `weight`, one or (n,), times the
+    outer square of `entries` (K, n); None stands for the slopes themselves (Berndt, Hall, Hall, Hausman 1974).
     Information `beside` that is added. Where rows have residuals, `score` (n,) are their slopes by the residual, and
     `residual` (n,) the entries that a unit offset of each row would have.
     """
@@ -39,26 +39,11 @@ class Terms:
     slopes: Floats
     columns: Ints
     starts: Ints
-    weight: Floats | None = None
+    weight: Floats | float = 1.0
     entries: Floats | None = None
     score: Floats | None = None
     residual: Floats | None = None
     beside: Terms | None = None
-
-    def tempered(self, by: float) -> Terms:
-        """Return rows that count for a share 1/by of as many independent ones."""
-        root, weighed = by**0.5, self.weight is not None
-        entries = self.slopes if self.entries is None else self.entries
-        return replace(
-            self,
-            value=self.value / by,
-            slopes=self.slopes / by,
-            weight=None if self.weight is None else self.weight / by,
-            entries=entries if weighed else entries / root,
-            score=None if self.score is None else self.score / by,
-            residual=self.residual if weighed or self.residual is None else self.residual / root,
-            beside=None if self.beside is None else self.beside.tempered(by),
-        )
 
     def as_matrix(self, values: Floats, size: int) -> sparse.csr_matrix:
         """Return values (K, n) at the rows' columns as a sparse matrix (n, size)."""
@@ -100,11 +85,12 @@ def sum_rows(rows: Sequence[Rows], x: Floats) -> Sums:
                 if part is None:
                     continue
                 entries = part.slopes if part.entries is None else part.entries
-                weighed = entries if part.weight is None else entries * part.weight
+                # One weight of all rows is that of their products, which are fewer.
+                weighed, times = (entries, part.weight) if np.ndim(part.weight) == 0 else (entries * part.weight, 1.0)
                 if entries.shape[1] < LONG_BLOCKS * len(part.columns):
-                    loose.append(part.as_matrix(weighed, size).T @ part.as_matrix(entries, size))
+                    loose.append(part.as_matrix(weighed, size).T @ part.as_matrix(entries, size) * times)
                     continue
-                products = _block_products(weighed, entries, part.starts).ravel()
+                products = _block_products(weighed, entries, part.starts).ravel() * times
                 place = (part.columns[:, :, None] * size + part.columns[:, None, :]).ravel()
                 if many:
                     loose.append(sparse.csr_matrix((products, divmod(place, size)), shape=(size, size)))

@@ -132,15 +132,13 @@ class Tested:
 class Slopes:
     """The slopes of a fit's ranges by the residual and by all unknowns, as sums and products that tests are made of.
 
-    `own` (blocks, p) are the slopes by unknowns, summed by block of time, `count` rows with those `beside`: rows of
-    another kind in the same search with their blocks of time. `score` (n,) are the slopes by residuals,
+    `own` (blocks, p) are the slopes by unknowns of `count` rows, summed by block of time; where a search has rows of
+    another kind beside these, of all (`Fitted.slopes`). `score` (n,) are the slopes by residuals,
     `tells` (n,) what residuals know, in the order of the rows. Slopes by unknowns are evaluated anew for tests: those
     of millions of ranges take gigabytes.
     """
 
-    def __init__(
-        self, rows: RangeRows, optimum: Optimum, blocks: TimeBlocks, *beside: tuple[RangeRows, TimeBlocks]
-    ) -> None:
+    def __init__(self, rows: RangeRows, optimum: Optimum, blocks: TimeBlocks) -> None:
         """Take rows at their optimum."""
         self.rows, self.optimum, self.blocks = rows, optimum, blocks
         self.order, size = rows.order, optimum.layout.size
@@ -151,9 +149,7 @@ class Slopes:
             self.score[which] = terms.score
             for part, weight in _weighed(terms):
                 self.tells[which] += weight if part.residual is None else weight * part.residual
-        self.count = len(rows) + sum(len(others) for others, _ in beside)
-        for others, their in beside:
-            self.own += Slopes(others, optimum, their).own
+        self.count = len(rows)
 
     def _pieces(self) -> Iterator[tuple[slice, Terms]]:
         """Yield which rows, and their terms."""
@@ -187,7 +183,7 @@ class Slopes:
         for which, terms in self._pieces():
             in_block = self.blocks.summing(self.order[which])
             matrices = [
-                (weight, part.as_matrix(part.slopes if part.entries is None else part.entries, size))
+                part.as_matrix(weight * (part.slopes if part.entries is None else part.entries), size)
                 for part, weight in _weighed(terms)
             ]
             for own, derivative in zip(sums, derivatives, strict=True):
@@ -196,8 +192,8 @@ class Slopes:
                 own[0] += (in_block @ sparse.diags(self.score[which]) @ kept).toarray()
                 own[1] += (in_block @ told @ kept.power(2)).toarray()
                 own[2] += (kept.T @ told @ kept).toarray()
-                for weight, matrix in matrices:
-                    own[3] += (kept.T @ sparse.diags(weight) @ matrix).toarray()
+                for matrix in matrices:
+                    own[3] += (kept.T @ matrix).toarray()
         return sums
 
     def _tested(self, family: Family, sums: Sequence[Floats]) -> Tested:
@@ -243,7 +239,7 @@ def _weighed(terms: Terms) -> Iterator[tuple[Terms, Floats]]:
     for part in (terms, terms.beside):
         if part is not None:
             unit = np.ones(part.slopes.shape[1]) if part.residual is None else part.residual
-            yield part, unit if part.weight is None else unit * part.weight
+            yield part, unit * part.weight
 
 
 def search(tested: Sequence[Tested], rate: float) -> list[FoundOffset]:

@@ -4,9 +4,10 @@ Filters differ in the error of a range that they assume. All update along the li
 state follow from the mean and variance of the noise in an innovation (moments of the posterior for Gaussian noise and
 state), by a gate or by a mixture of errors. A diverged filter restarts from ranges alone (`multilaterate`).
 
-The error-state Kalman filter has several headings at once, so that its arrays are (headings, ...). State errors (16):
+The error-state Kalman filter has several headings at once, so that its arrays are (headings, ...). State errors (17):
 position, velocity, attitude (in the axes of the body), bias of gyro, bias of accelerometer, offset of the height sensor
-(Solà 2017, sections 5 to 7). Without an IMU, attitude and biases are not estimated, and velocity wanders.
+(Solà 2017, sections 5 to 7), and the error that measurements of one exchange share. Without an IMU, attitude and biases
+are not estimated, and velocity wanders.
 """
 
 from __future__ import annotations
@@ -165,11 +166,11 @@ def multilaterate(
 GRAVITY_M_S2: Final = 9.81
 """Between 9.78 at the equator and 9.83 at the poles; the biases of a consumer accelerometer are larger."""
 
-SIZE: Final = 16
+SIZE: Final = 17
 """Size of the state. The names below slice its parts: position, velocity, attitude, biases, offset of the height
-sensor."""
+sensor, and the error that measurements of one exchange share, in units of its standard deviation."""
 
-P, V, A, G, F, H = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15), 15
+P, V, A, G, F, H, E = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15), 15, 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -236,23 +237,39 @@ class InertialFilter:
         self.covariance = whole @ self.covariance @ whole.transpose(0, 2, 1) + np.diag(added)
         self.covariance = (self.covariance + self.covariance.transpose(0, 2, 1)) / 2
 
+    def begin_exchange(self) -> None:
+        """Begin another exchange, whose measurements share another error."""
+        self.state[:, E] = 0.0
+        self.covariance[:, E, :] = self.covariance[:, :, E] = 0.0
+        self.covariance[:, E, E] = 1.0
+
     def update_range(
-        self, range_m: float, noise_m: float, errors: RangeErrors, arm_m: Floats, anchor_m: Floats
+        self,
+        measured_m: float,
+        noise_m: float,
+        errors: RangeErrors,
+        arm_m: Floats,
+        anchor_m: Floats,
+        sign: Floats,
+        common_m: float,
     ) -> RangeUpdate:
-        """Update by a range to an anchor (3,); return the update."""
-        towards = self.state[:, P] - anchor_m
-        if self.inertial:
-            towards = towards + self.attitude @ arm_m
-        else:
-            # Heading is unknown: a lever arm may point anywhere.
-            noise_m = float(np.hypot(noise_m, np.hypot(arm_m[0], arm_m[1]) / np.sqrt(2)))
-            towards = towards + np.array([0.0, 0.0, arm_m[2]])
-        distance = np.maximum(np.linalg.norm(towards, axis=1), 1e-6)
+        """Update by a sum of distances with a `sign` (k,) to anchors (k, 3): one in a range, two in a difference.
+
+        Measurements of an exchange share an error with a standard deviation of `common_m`. Returns the update.
+        """
+        towards = self.state[:, None, P] - anchor_m
+        towards = towards + ((self.attitude @ arm_m)[:, None] if self.inertial else np.array([0.0, 0.0, arm_m[2]]))
+        distance = np.maximum(np.linalg.norm(towards, axis=2), 1e-6)
         row = np.zeros_like(self.state)
-        row[:, P] = towards / distance[:, None]
+        row[:, P] = np.einsum("hk,hki->hi", sign / distance, towards)
+        row[:, E] = common_m
         if self.inertial:
             row[:, A] = -np.einsum("hi,hij->hj", row[:, P], self.attitude @ _cross(np.tile(arm_m, (len(distance), 1))))
-        update = self._update_scalar(row, range_m - distance, noise_m, errors)
+        else:
+            # Heading is unknown: a lever arm may point anywhere.
+            noise_m = float(np.hypot(noise_m, np.linalg.norm(row[0, P]) * np.hypot(arm_m[0], arm_m[1]) / np.sqrt(2)))
+        expected = distance @ sign + common_m * self.state[:, E]
+        update = self._update_scalar(row, measured_m - expected, noise_m, errors)
         self.likelihood = self.likelihood + update.log_density
         return update
 

@@ -11,11 +11,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from scipy.signal import correlate
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calib.calibration.applying import heard_receptions, keep_determined, noise_m, reception_gains
 from calib.calibration.document import for_json
@@ -24,8 +23,7 @@ from calib.calibration.model import Calibration, CalibrationSource, given_calibr
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, Flight, load_flight, require_arrivals, require_times
 from calib.errors import UnanswerableError
-from calib.evaluation.filters import range_errors
-from calib.evaluation.onboard import OnboardTrack
+from calib.evaluation.filters import RangeErrors, range_errors
 from calib.evaluation.tracking import (
     FILTERS,
     FilterRanges,
@@ -39,6 +37,9 @@ from calib.evaluation.tracking import (
 from uwblink.arrays import Floats, Ints
 from uwblink.display import printable
 from uwblink.output import write_files
+
+if TYPE_CHECKING:
+    from calib.evaluation.onboard import OnboardTrack
 
 PAPER_RMSE_M: Final = {"raw": 0.804, "calibrated": 0.500, "variance": 0.431}
 """Mean RMSE over six scenarios (ICRA 2023, its only table), with other flights and another process noise."""
@@ -152,7 +153,7 @@ def _flight_for(data: Data | Flight, calibration: Calibration, settings: Setting
 
 
 @dataclass(frozen=True, slots=True)
-class _Receptions:
+class MeasuredReceptions:
     """What errors of n measurements are made of, raw and corrected, in metres.
 
     They are `sign` (n, k) times those of `parts`, ranges or receptions with an independent variance of `gain` (n, k)
@@ -168,7 +169,7 @@ class _Receptions:
     common_m: Floats
 
     @classmethod
-    def of(cls, ranges: Ranges, calibration: Calibration) -> _Receptions:
+    def of(cls, ranges: Ranges, calibration: Calibration) -> MeasuredReceptions:
         """Return those of ranges, and then of their arrivals."""
         applied, sign, none = calibration.apply(ranges), distances_in(ranges)[1], np.zeros(len(ranges))
         if ranges.arrivals is None:
@@ -192,10 +193,21 @@ class _Receptions:
         common_m = np.where(self.common_m > 0, std_m, 0.0)
         return FilterRanges(measured_m, self.own_m(std_m), common_m, np.zeros_like(self.sign))
 
+    def robust(self, calibration: Calibration) -> tuple[FilterRanges, Floats, RangeErrors]:
+        """Return what a filter measures that knows errors, the noise of ranges like the parts (n, k), and errors."""
+        noises, kinds = zip(*(range_errors(calibration, part) for part in self.parts), strict=True)
+        noise, shares, detours = (
+            np.column_stack(some) for some in (noises, [one.share for one in kinds], [one.detour_m for one in kinds])
+        )
+        errors = replace(kinds[0], share=np.abs(self.sign) * shares, detour_m=detours)
+        measured = self.corrected_m - errors.location_m * self.sign.sum(axis=1)
+        nothing = np.zeros_like(self.sign)
+        return FilterRanges(measured, self.own_m(noise), self.common_m, nothing, errors=errors), noise, errors
+
 
 def filter_ranges(ranges: Ranges, calibration: Calibration, fixed: FixedStd) -> dict[str, FilterRanges]:
     """Return what each of `FILTERS` measures by ranges and then by arrivals; the robust one needs an error model."""
-    known, model = _Receptions.of(ranges, calibration), calibration.errors
+    known, model = MeasuredReceptions.of(ranges, calibration), calibration.errors
     corrected, sign, common = known.corrected_m, known.sign, known.common_m
     nothing = np.zeros_like(sign)
     sigma = np.column_stack([noise_m(calibration, part) for part in known.parts])
@@ -206,26 +218,19 @@ def filter_ranges(ranges: Ranges, calibration: Calibration, fixed: FixedStd) -> 
     }
     if model is None:
         return found
-    noises, kinds = zip(*(range_errors(calibration, part) for part in known.parts), strict=True)
-    noise, shares, detours = (
-        np.column_stack(some) for some in (noises, [one.share for one in kinds], [one.detour_m for one in kinds])
-    )
-    errors = replace(kinds[0], share=np.abs(sign) * shares, detour_m=detours)
-    measured = corrected - model.location_m * sign.sum(axis=1)
-    found["robust"] = FilterRanges(measured, known.own_m(noise), common, nothing, errors=errors)
+    found["robust"], noise, errors = known.robust(calibration)
     if lasting := model.lasting:
         # Receptions have independent noise: only reflections last in differences of arrival. A gate lets longer ones
         # pass there, because these have five times the variance of ranges.
         heard = common > 0
         own, shared = np.where(heard, [[1.0], [0.0]], np.sqrt([[lasting.own_variance], [lasting.lasting_variance]]))
         gate_m = np.sqrt(GATE) * np.hypot(known.own_m(sigma), common) * heard
-        detours_m2 = shares * model.square_below_m2(detours, gate_m[:, None])
+        detours_m2 = errors.share * model.square_below_m2(errors.detour_m, gate_m[:, None])
         centred = corrected - lasting.mean * np.sum(sign * sigma, axis=1)
         # The mixture contains reflections within the gate, so the total variance is that of the noise.
         units = np.ones(len(sign)), np.hypot(own, shared)
-        for name, one, std, unit in zip(
-            ("variance", "robust"), (centred, measured), (sigma, noise), units, strict=True
-        ):
+        both = centred, found["robust"].measured_m
+        for name, one, std, unit in zip(("variance", "robust"), both, (sigma, noise), units, strict=True):
             found[name] = replace(
                 found[name],
                 measured_m=one,
@@ -256,7 +261,7 @@ def fixed_std(calibration: Calibration, settings: Settings, training: Data | Fli
     flight = replace(flight, ranges=flight.ranges[:7500])
     squares = np.zeros((2, len(TUNED_OVER)))
     for problem in problems(flight):
-        known = _Receptions.of(problem.ranges, calibration)
+        known = MeasuredReceptions.of(problem.ranges, calibration)
         measured = enumerate((known.raw_m, known.corrected_m))
         ranges = {f"{k}, {s}": known.fixed(own, s).at(problem.rows) for k, own in measured for s in TUNED_OVER}
         errors = [[track.rmse_m for track in own] for own in run_filters(problem, ranges, settings).values()]
@@ -336,8 +341,8 @@ def summarize(found: list[Localization]) -> LocalizationSummary:
 def _mean_bounds(count: float, degrees: int) -> tuple[float, float]:
     """Return the 95 % bounds of the mean of `count` independent chi-squares."""
     some = max(count, 1.0)
-    low, high = chi2.interval(0.95, some * degrees)
-    return float(low) / some, float(high) / some
+    low, high = chdtri(some * degrees, [0.975, 0.025]) / some
+    return float(low), float(high)
 
 
 def _inside(values: Floats, degrees: int) -> float:
@@ -351,7 +356,8 @@ def _independent(values: Floats) -> float:
     The sum ends where the autocorrelation first falls below a twentieth.
     """
     centred = values - values.mean()
-    correlation = correlate(centred, centred, method="fft")[len(centred) - 1 :]
+    # Twice as long with zeros: a spectrum's correlation is circular.
+    correlation = np.fft.irfft(np.abs(np.fft.rfft(centred, 2 * len(centred))) ** 2)[: len(centred)]
     correlation = correlation / max(float(correlation[0]), 1e-300)
     end = int(np.argmax(np.append(correlation, 0.0) < 0.05))
     return len(centred) / (1 + 2 * float(correlation[1:end].sum()))

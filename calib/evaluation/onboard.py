@@ -1,5 +1,8 @@
 """Localization without motion capture: ranges to fixed anchors, optionally an IMU and a height sensor.
 
+With `OnboardSettings(use="receptions")` differences of arrival are measurements, too: what the body overhears of
+anchors, and what anchors overhear of it.
+
 The first ranges give the start (`multilaterate`), gravity gives the tilt, and several headings are tried in parallel;
 the likeliest is reported. If it does not explain its ranges, the filter restarts from them. Poses of the
 body are only used as truth for evaluation.
@@ -8,7 +11,7 @@ body are only used as truth for evaluation.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from typing import Any, Final
 
@@ -22,7 +25,7 @@ from calib.calibration.document import for_json
 from calib.calibration.error_model import GATE
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
-from calib.data.sources import Data, opened, require_times
+from calib.data.sources import Data, flight_of, opened, require_arrivals, require_times
 from calib.errors import BadInputError, UnanswerableError
 from calib.evaluation.filters import (
     GRAVITY_M_S2,
@@ -32,14 +35,19 @@ from calib.evaluation.filters import (
     ProcessNoise,
     RangeErrors,
     multilaterate,
-    range_errors,
 )
-from calib.evaluation.tracking import BodyTrack, Trajectory, nearest_attitude
+from calib.evaluation.localization import MeasuredReceptions
+from calib.evaluation.tracking import (
+    BodyTrack,
+    Trajectory,
+    distances_in,
+    nearest_attitude,
+    ranges_about,
+)
 from calib.settings import CheckedSettings
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import bodies_m
 from uwblink.recording.schema import Poses
-from uwblink.recording.summary import single_reports
 from uwblink.settings import setting
 
 MIN_ANCHORS: Final = 3
@@ -56,7 +64,8 @@ class OnboardSettings(CheckedSettings):
 
     `start_m` is where it begins, with a standard deviation of `start_std_m` an axis, instead of where its first ranges
     say; a wrong one is left after `reopen_s`, or as many ranges as a fix takes. `headings` are tried at once;
-    inertial readings are averaged to `rate_hz`. `speed_m_s` is how fast it may move at a start.
+    inertial readings are averaged to `rate_hz`. `speed_m_s` is how fast it may move at a start. `use` is "exchanges",
+    or "receptions", with differences of arrival.
 
     >>> import calib
     >>> calib.OnboardSettings(start_m=(0.0, 0.0, 1.0)).model
@@ -71,6 +80,7 @@ class OnboardSettings(CheckedSettings):
     headings: int = 8
     rate_hz: float = 50.0
     speed_m_s: float = 1.0
+    use: str = setting("exchanges", "What is used.", names=("exchanges", "receptions"))
     noise: ProcessNoise = field(default_factory=ProcessNoise)
 
     def __post_init__(self) -> None:
@@ -133,23 +143,28 @@ def localize_onboard(
     """
     calibration = given_calibration(calibration)
     chosen = settings or OnboardSettings()
-    return [_track(one, chosen) for one in _readings(data, calibration)]
+    return [_track(one, chosen) for one in _readings(data, calibration, chosen.use)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Readings:
-    """One body's: ranges (n,) in order of time with lever arms and anchors (n, 3), inertial readings, heights.
+    """One body's: measurements (n,) in order of time, less distances between anchors, inertial readings, heights.
 
-    Times are seconds since `began_ns`, the first exchange. `imu` are angular velocities in rad/s and specific forces in
+    Times are seconds since `began_ns`, the first exchange. A measurement is a sum of distances with signs `sign` (n, k)
+    from the antenna at `arm_m` (n, 3) to `anchor_m` (n, k, 3). Those of an `exchange` (n,) share an error with a
+    standard deviation of `common_m` (n,) beside their own. `imu` are angular velocities in rad/s and specific forces in
     m/s^2 (m, 6) in the axes of the body. `truth` are its poses, or None.
     """
 
     source: str
     body: str
     time_s: Floats
-    range_m: Floats
+    exchange: Ints
+    measured_m: Floats
     noise_m: Floats
+    common_m: Floats
     errors: RangeErrors
+    sign: Floats
     arm_m: Floats
     anchor_m: Floats
     imu_s: Floats
@@ -160,14 +175,16 @@ class _Readings:
     began_ns: int
 
 
-def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
-    """Return the readings of every body that is not an anchor and ranges with one."""
+def _readings(data: Data, calibration: Calibration, use: str) -> list[_Readings]:
+    """Return the readings of every body that is not an anchor and ranges with one, or listens."""
     with opened(data) as (name, source):
-        exchanges = single_reports(source.exchanges).exchanges
-        poses, tags = source.poses, list(source.tags)
+        flight = flight_of(name, source, need_power=calibration.needs_power, need_truth=False)
         imu, heights = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))
-    ranges = Ranges.from_exchanges(exchanges, source=name)
-    ranges = keep_determined(calibration, ranges.usable(need_power=calibration.needs_power, need_truth=False))
+    poses, tags, ranges = flight.poses, flight.tags, keep_determined(calibration, flight.ranges)
+    if use == "receptions":
+        require_arrivals(ranges)
+    else:
+        ranges = replace(ranges, arrivals=None)
     places = {body: poses.position_m[poses.body == body] for body in np.unique(poses.body).tolist()}
     still_m = 0.1  # poses of a body that stands still have some noise
     anchors = {body: np.median(some, axis=0) for body, some in places.items() if np.ptp(some, axis=0).max() <= still_m}
@@ -182,15 +199,21 @@ def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
     found = []
     for body in sorted({tag.body for tag in tags if tag.body not in anchors}):
         arms = {tag.tag: np.array(tag.lever_arm_m) for tag in tags if tag.body == body}
-        initiates = np.isin(ranges.initiator, list(arms))
-        ends = [ranges.initiator, ranges.target]
-        mine, other = np.where(initiates, ends, ends[::-1])
-        rows = np.flatnonzero(np.isin(mine, list(arms)) & np.isin(other, list(fixed)))
+        some = ranges_about(_among(ranges, [*arms, *fixed]), list(arms))
+        ends, sign, exchange = distances_in(some)
+        mine = np.isin(ends, list(arms))
+        free = np.where(mine[..., 0] ^ mine[..., 1], sign, 0.0)
+        rows = np.flatnonzero(free.any(axis=1))
         if not len(rows):
             continue
-        rows = rows[np.argsort(ranges.time_ns[rows], kind="stable")]
-        some = ranges[rows]
-        noise, errors = range_errors(calibration, some)
+        rows = rows[np.lexsort((exchange[rows], some.time_ns[exchange[rows]]))]
+        place = np.full((max(*arms, *fixed) + 1, 3), np.nan)
+        for tag, at in (fixed | arms).items():
+            place[tag] = at
+        first, second = np.moveaxis(place[ends[rows]], 2, 0)
+        between_m = np.sum((sign - free)[rows] * np.linalg.norm(first - second, axis=2), axis=1)
+        own, other = (np.where(mine[rows, :, :1], *both) for both in ((first, second), (second, first)))
+        measured, _, errors = MeasuredReceptions.of(some, calibration).robust(calibration)
         imu_s, inertial = _table(imu, body, ("wx", "wy", "wz", "ax", "ay", "az"), began)
         height_s, height = _table(heights, body, ("height_m",), began)
         known = poses.body == body
@@ -198,12 +221,15 @@ def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
             _Readings(
                 source=ranges.source,
                 body=body,
-                time_s=np.asarray((some.time_ns - began) * 1e-9, dtype=np.float64),
-                range_m=calibration.apply(some).corrected_m - errors.location_m,
-                noise_m=noise,
-                errors=errors,
-                arm_m=np.array([arms[tag] for tag in mine[rows].tolist()]),
-                anchor_m=np.array([fixed[tag] for tag in other[rows].tolist()]),
+                time_s=np.asarray((some.time_ns[exchange[rows]] - began) * 1e-9, dtype=np.float64),
+                exchange=exchange[rows],
+                measured_m=measured.measured_m[rows] - between_m,
+                noise_m=measured.std_m[rows],
+                common_m=measured.common_m[rows],
+                errors=errors.at(rows),
+                sign=free[rows],
+                arm_m=own[np.arange(len(rows)), np.argmax(free[rows] != 0, axis=1)],
+                anchor_m=other,
                 imu_s=imu_s,
                 imu=inertial,
                 height_s=height_s,
@@ -213,8 +239,18 @@ def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
             )
         )
     if not found:
-        raise UnanswerableError(f"{name}: no moving body ranges with a fixed anchor, so there is nothing to localize")
+        raise UnanswerableError(
+            f"{name}: no moving body ranges with a fixed anchor, so there is nothing to localize; one that "
+            "only listens needs `use` receptions"
+        )
     return found
+
+
+def _among(ranges: Ranges, tags: list[int]) -> Ranges:
+    """Return the ranges between some tags, with what these overheard of them."""
+    found = ranges[np.isin(ranges.initiator, tags) & np.isin(ranges.target, tags)]
+    heard = found.arrivals
+    return found if heard is None else replace(found, arrivals=heard[np.isin(heard.listener, tags)])
 
 
 def _table(
@@ -238,7 +274,7 @@ def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilt
         fix = Fix(np.array(settings.start_m, dtype=np.float64), np.eye(3) * settings.start_std_m**2)
     else:
         counts = range(MIN_RANGES_PER_FIX, len(one.time_s) + 1)
-        enough = (k for k in counts if len(np.unique(one.anchor_m[:k], axis=0)) > MIN_ANCHORS)
+        enough = (k for k in counts if _determined(one, np.arange(k)))
         first = next(enough, 0) - 1
         if first < 0:
             raise UnanswerableError(f"{one.source}: {one.body} ranges with too few anchors for a start; give it one")
@@ -252,6 +288,13 @@ def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilt
     return first, found
 
 
+def _determined(one: _Readings, rows: Ints) -> bool:
+    """Return whether some measurements have the anchors of a start: differences alone need one more."""
+    used = one.sign[rows] != 0
+    anchors = len(np.unique(one.anchor_m[rows][used], axis=0))
+    return bool(anchors - (used.sum(axis=1) > 1).all() > MIN_ANCHORS)
+
+
 def _fix(one: _Readings, rows: Ints, settings: OnboardSettings) -> Fix:
     """Return the position of a body at the last of some ranges (n,), during which it may move."""
     span = float(one.time_s[rows[-1]] - one.time_s[rows[0]])
@@ -259,7 +302,8 @@ def _fix(one: _Readings, rows: Ints, settings: OnboardSettings) -> Fix:
     moves = 0.3 * settings.speed_m_s * span
     near = np.abs(one.height_s - one.time_s[rows[-1]]) < 1.0 if settings.height else np.zeros(0, dtype=bool)
     height = float(np.median(one.height_m[near])) if near.any() else None
-    found = multilaterate(one.range_m[rows], one.anchor_m[rows], float(np.hypot(arm / 2, moves)), height)
+    spread_m, legs_m = float(np.hypot(arm / 2, moves)), one.measured_m[rows]
+    found = multilaterate(legs_m, one.anchor_m[rows], spread_m, height, one.sign[rows])
     return Fix(found.place_m, found.covariance_m2 + np.eye(3) * moves**2)
 
 
@@ -308,8 +352,8 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
     """Process ranges, steps and heights in order of time, and return the track of the likeliest heading."""
     first, running = _begin(one, settings)
     now = heard = float(one.time_s[first])
-    states, updates, restarts = list[Any](), list[tuple[float, float, bool]](), list[float]()
-    unexplained_s = 0.0
+    states, updates, restarts, exchange = list[Any](), list[tuple[float, float, bool]](), list[float](), -1
+    unexplained_s, numbers = 0.0, np.column_stack([one.measured_m, one.noise_m, one.common_m]).tolist()
     # The speed limit counts once a second: velocities are independent after a second.
     slow_every = max(round(settings.rate_hz), 1)
     for time_s, kind, number, inertial in _events(one, settings, now):
@@ -323,16 +367,17 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         elif kind == "step" and number % slow_every == 0:
             running.limit_speed(settings.speed_m_s)
         elif kind == "range":
-            measured, noise_m = float(one.range_m[number]), float(one.noise_m[number])
-            update = running.update_range(
-                measured, noise_m, one.errors.at(number), one.arm_m[number], one.anchor_m[number]
-            )
+            if exchange != (exchange := int(one.exchange[number])):
+                running.begin_exchange()
+            measured, noise_m, common_m = numbers[number]
+            geometry = one.arm_m[number], one.anchor_m[number], one.sign[number]
+            update = running.update_range(measured, noise_m, one.errors.at(number), *geometry, common_m)
             updates.append((now, float(update.nis[best]), bool(update.believed[best])))
             # As in `tracking.run_filters`, but explained ranges earn no trust: this filter drifts.
             lasted_s = min(now - heard, settings.reopen_s / 2 / MIN_RANGES_PER_FIX)
             unexplained_s = max(unexplained_s + (lasted_s if update.nis[best] > GATE else -lasted_s / 3), 0.0)
             heard, rows = now, _latest(one, number, settings)
-            if unexplained_s > settings.reopen_s / 2 and len(np.unique(one.anchor_m[rows], axis=0)) > MIN_ANCHORS:
+            if unexplained_s > settings.reopen_s / 2 and _determined(one, rows):
                 running.restart(_fix(one, rows, settings), settings.speed_m_s)
                 restarts.append(now)
                 unexplained_s = 0.0
@@ -351,12 +396,18 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         truth = bodies_m(one.truth, one.body, time_ns)
         turned = nearest_attitude(one.truth, one.body, time_ns)
     wrong = place - truth
-    used = ["ranges"] + ["imu"] * (settings.model == "imu") + ["height"] * (settings.height and len(one.height_s) > 0)
+    overheard = one.common_m > 0
+    used = {
+        "ranges": not overheard.all(),
+        "differences of arrival": overheard.any(),
+        "imu": settings.model == "imu",
+        "height": settings.height and len(one.height_s) > 0,
+    }
     return OnboardTrack(
         source=one.source,
         body=one.body,
         model=settings.model,
-        used=", ".join(used),
+        used=", ".join(name for name, there in used.items() if there),
         time_ns=time_ns,
         estimate_m=place,
         attitude=np.asarray(Rotation.from_matrix(np.array(attitudes)).as_quat()),

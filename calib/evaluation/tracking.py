@@ -152,7 +152,7 @@ def problems(flight: Flight) -> list[Problem]:
     found = []
     for body in flight.moving_bodies():
         mine = [tag.tag for tag in flight.tags if tag.body == body]
-        ranges = _ranges_about(flight.ranges, mine)
+        ranges = ranges_about(flight.ranges, mine)
         ends, sign, exchange = distances_in(ranges)
         time, inside = ranges.time_ns[exchange], np.isin(ends, mine)
         free = inside[..., 0] ^ inside[..., 1]
@@ -186,7 +186,7 @@ def problems(flight: Flight) -> list[Problem]:
     return found
 
 
-def _ranges_about(ranges: Ranges, tags: list[int]) -> Ranges:
+def ranges_about(ranges: Ranges, tags: list[int]) -> Ranges:
     """Return the ranges of some tags with others, and those that these or others overheard, with their arrivals."""
     needed, heard = np.isin(ranges.initiator, tags) ^ np.isin(ranges.target, tags), ranges.arrivals
     if heard is not None:

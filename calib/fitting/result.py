@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from calib import figures
+import calib
 from calib.calibration.model import Calibration
 from calib.data.ranges import Ranges
-from calib.figures import Axes
 from uwblink.arrays import Bools, Floats
+
+if TYPE_CHECKING:
+    from calib.figures import Axes
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,20 +71,20 @@ class FitResult:
 
     def plot_bias(self, axes: Axes | None = None) -> Axes:
         """Draw medians of the delay-corrected errors over lifted power, in cm, and the fitted curve with its band."""
-        return figures.curve_over_power(
+        return calib.figures.curve_over_power(
             self.ranges, self.calibration.apply(self.ranges), self.calibration, "bias", axes
         )
 
     def plot_sigma(self, axes: Axes | None = None) -> Axes:
         """Draw robust standard deviations of the errors over lifted power, in cm, and the curve with its band."""
-        return figures.curve_over_power(
+        return calib.figures.curve_over_power(
             self.ranges, self.calibration.apply(self.ranges), self.calibration, "sigma", axes
         )
 
     def plot_residuals(self, axes: Axes | None = None) -> Axes:
         """Draw a histogram of the errors in cm: raw, with the delays corrected, and fully corrected."""
-        return figures.histogram(self.ranges, self.calibration.apply(self.ranges), axes)
+        return calib.figures.histogram(self.ranges, self.calibration.apply(self.ranges), axes)
 
     def plot_delays(self, axes: Axes | None = None) -> Axes:
         """Draw the antenna delays in ns with their 95 % intervals."""
-        return figures.delays(self.calibration, axes=axes)
+        return calib.figures.delays(self.calibration, axes=axes)

@@ -164,40 +164,46 @@ def error_slopes(residual: Floats, parameters: dict[str, Floats]) -> ErrorSlopes
 
     `parameters` are "noise" (log sigma), "odds" (log odds of a reflection), "detour" (log of the first kind's
     mean), "least" (log of the least detour), "outliers" and "long" (log odds), arrays (n,) or (1,).
-    Outliers have the density 1/`OUTLIERS_OVER_M`.
+    Outliers have the density 1/`OUTLIERS_OVER_M`. With "side" reflections lengthen only a share of the errors, of which
+    these are the log odds, and shorten the others: those of differences of times of arrival.
     """
     sigma = np.exp(parameters["noise"])
     share = expit(parameters["odds"])
     detour = np.exp(parameters["detour"])
     least, outlying, long_share = np.exp(parameters["least"]), expit(parameters["outliers"]), expit(parameters["long"])
+    late = float(expit(parameters["side"][0])) if "side" in parameters else 1.0
     long = LongDetours(share=float(long_share[0]), factor=LONG_FACTOR)
-    found = densities(residual, sigma, float(least[0]), long.mean * detour, long)
+    sides = [(1.0, late), (-1.0, 1 - late)][: 1 + ("side" in parameters)]
+    found = [densities(sign * residual, sigma, float(least[0]), long.mean * detour, long) for sign, _ in sides]
     inside = 1 - float(outlying[0])
-    core, tail = inside * (1 - share) * found.direct, inside * share
-    total = core + tail * found.reflected + float(outlying[0]) / OUTLIERS_OVER_M
+    core, tail = inside * (1 - share) * found[0].direct, inside * share
+    likely = np.sum([own * one.reflected for one, (_, own) in zip(found, sides, strict=True)], axis=0)
+    total = core + tail * likely + float(outlying[0]) / OUTLIERS_OVER_M
     core, tail = core / total, tail / total
-    tails = [tail * kind.density for kind in found.kinds]
-    reflected = tails[0] + tails[1]
     z, inverse = residual / sigma, 1 / sigma
-    noise, mean, tail_noise = core * (z * z - 1), np.zeros_like(z), np.zeros_like(z)
-    beyond = residual - least
-    for part, kind in zip(tails, found.kinds, strict=True):
-        own = kind.noise_m * inverse
-        tail_noise += part * own
-        noise += part * (own * own + kind.noise_var - 1)
-        mean += part * ((beyond - kind.noise_m) / kind.detour_m - 1)
+    noise, towards, mean, tail_noise = core * (z * z - 1), core * z, np.zeros_like(z), np.zeros_like(z)
+    tails = list[Floats]()
+    for one, (sign, own_share) in zip(found, sides, strict=True):
+        beyond, whole = sign * residual - least, own_share * tail
+        for kind in one.kinds:
+            part, own = whole * kind.density, kind.noise_m * inverse
+            moved = part * own
+            tail_noise += moved
+            towards += sign * moved
+            noise += part * (own * own + kind.noise_var - 1)
+            mean += part * ((beyond - kind.noise_m) / kind.detour_m - 1)
+            tails.append(part)
+    reflected = np.asarray(sum(tails[1:], tails[0]))
     both = core + reflected
-    return ErrorSlopes(
-        log_density=np.log(total),
-        by={
-            "residual": -(core * z + tail_noise) * inverse,
-            "noise": noise,
-            "odds": reflected - share * both,
-            "detour": mean,
-            "least": tail_noise * inverse * least,
-            "outliers": inside - both,
-            "long": tails[1] - long_share * reflected,
-        },
-        reflected=reflected,
-        inlier=both,
-    )
+    by = {
+        "residual": -towards * inverse,
+        "noise": noise,
+        "odds": reflected - share * both,
+        "detour": mean,
+        "least": tail_noise * inverse * least,
+        "outliers": inside - both,
+        "long": sum(tails[3::2], tails[1]) - long_share * reflected,
+    }
+    if "side" in parameters:
+        by["side"] = tails[0] + tails[1] - late * reflected
+    return ErrorSlopes(log_density=np.log(total), by=by, reflected=reflected, inlier=both)

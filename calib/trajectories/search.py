@@ -303,7 +303,7 @@ def leverages(rows: RangeRows, found: Optimum) -> Floats:
     size, parts, values = found.layout.size, [], rows.values(found.x)
     for terms in rows.terms(found.x):
         part = terms.beside or terms
-        weight = np.ones(1) if part.weight is None else part.weight
+        weight = np.atleast_1d(part.weight)
         if part is not terms and terms.residual is not None:
             weight = weight + np.mean(terms.residual**2)
         parts.append((part.as_matrix(part.slopes if part.entries is None else part.entries, size), weight))

@@ -327,7 +327,9 @@ Correction = Callable[[Exchanges], Mapping[str, Floats | Bools]]
 """Returns columns (n,) for exchanges (n,), by name.
 
 `corrected_m` and `sigma_m` in metres, and other columns of the correction; NaN where a value is not known.
-Raises a `ValueError` for exchanges that it cannot correct, for example of a tag that is not calibrated.
+Raises a `ValueError` for exchanges that it cannot correct, for example of a tag that is not calibrated. Its attribute
+`differences`, where there is one, takes exchanges and columns of the table `overheard`, and returns columns of
+differences of arrival, named like the fields of `uwblink.streaming.StreamedDifference`.
 """
 
 

@@ -183,19 +183,19 @@ def append_rows(recording: Recording, rows: Sequence[Row]) -> None:
     recording.append("frames", [row for row in rows if isinstance(row, FrameRow)])
     recording.append("faults", [row for row in rows if isinstance(row, Fault)])
     recording.append_exchanges(exchanges_of(heard))
-    # What a report lacks is None there, and unknown here.
-    overheard = [
-        {"time_ns": t, "listener": board} | {n: np.nan if (v := getattr(o, n)) is None else v for n in Overheard.FIELDS}
-        for t, board, o in heard
-        if isinstance(o, Overheard)
-    ]
-    recording.append("overheard", overheard)
+    recording.append("overheard", [overheard_row(t, board, o) for t, board, o in heard if isinstance(o, Overheard)])
     cirs = [
         CirRow(t, board, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes)
         for t, board, c in heard
         if isinstance(c, Cir)
     ]
     recording.append("cirs", cirs)
+
+
+def overheard_row(time_ns: int, listener: int, heard: Overheard) -> dict[str, Any]:
+    """Return the row of the table `overheard` of a message; what it lacks is NaN."""
+    values = ((name, getattr(heard, name)) for name in Overheard.FIELDS)
+    return {"time_ns": time_ns, "listener": listener} | {n: np.nan if v is None else v for n, v in values}
 
 
 class RecordingWriter(Closing, Listener):

@@ -352,6 +352,14 @@ def record(
 def stream(
     source: Annotated[list[str], typer.Argument(metavar="SOURCE...", help="Ports of boards, or one recording (.uwb).")],
     calibration: OptionalCalibration = None,
+    use: Annotated[
+        str,
+        typer.Option(
+            help="What is printed: exchanges, their ranges; or receptions, with corrected differences of arrival at "
+            "boards that overheard them.",
+            **choice("exchanges", "receptions"),
+        ),
+    ] = "exchanges",
     plan: PlanFile = None,
     rate: Rate = None,
     antenna_delays: AntennaDelays = None,
@@ -372,6 +380,11 @@ def stream(
 ) -> None:
     """Print ranges as they arrive, one line of JSON each, and send them on.
 
+    A line has the times and ids of an exchange, and range_m or, with --use receptions, difference_m: by how much
+    farther from the target than from the initiator the listener is. corrected_m has the standard deviation sigma_m;
+    differences of an exchange have the covariance shared_m squared, and none with its range. --udp and --foxglove send
+    ranges only.
+
     Without --plan, every two boards range. Ends after --duration, else with the recording or Ctrl-C. Without
     --antenna-delays, and without those of a plan, 16436 ticks in each board are assumed.
     """
@@ -381,14 +394,18 @@ def stream(
             f"{source[0]}: a recording takes no --plan, --rate, --antenna-delays, --dialect and --output; they are for "
             "boards"
         )
-    _check_dialect(dialect, ids, plan=plan, rate=rate, antenna_delays=antenna_delays)
+    _check_dialect(dialect, ids, plan=plan, rate=rate, antenna_delays=antenna_delays, use=use == "receptions")
     seen, count = uwblink.boards.Progress(), 0
     senders: list[Callable[[uwblink.StreamedRange], object]] = (
         [] if quiet else [lambda found: typer.echo(found.to_json())]
     )
 
-    def send_on(found: uwblink.StreamedRange) -> None:
+    def send_on(found: uwblink.StreamedRange | uwblink.streaming.StreamedDifference) -> None:
         nonlocal count
+        if isinstance(found, uwblink.streaming.StreamedDifference):
+            if not quiet:
+                typer.echo(found.to_json())
+            return
         count += 1
         for send in senders:
             send(found)
@@ -406,19 +423,22 @@ def stream(
         correct = _correction(calibration, chosen, None if of_boards else source[0])
         how: dict[str, Any] = {"duration_s": duration or math.inf, "stop": stop}
         how |= {"ids": _ids(ids, "ids")} if spoken else {}
-        told: dict[str, Any] = {"listeners": [seen, uwblink.streaming.RangeListener(send_on, correct)], "force": force}
+        told: dict[str, Any] = {
+            "listeners": [seen, uwblink.streaming.RangeListener(send_on, correct, use)],
+            "force": force,
+        }
         try:
             if output and spoken:
                 uwblink.boards.record_printed(source, output, spoken, **how, **told)
             elif output and chosen:
-                uwblink.record(source, output, chosen, **how, **told)
+                uwblink.record(source, output, chosen, passive=use == "receptions", **how, **told)
             else:
                 how |= {"calibration": correct}
                 ranges = (
                     uwblink.streaming.stream_printed(source, spoken, **how)
                     if spoken
                     else uwblink.stream(
-                        source if of_boards else source[0], plan=chosen, speed=speed, listeners=[seen], **how
+                        source if of_boards else source[0], use=use, plan=chosen, speed=speed, listeners=[seen], **how
                     )
                 )
                 stack.callback(ranges.close)

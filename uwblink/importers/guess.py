@@ -64,7 +64,7 @@ from uwblink.importers.plausibility import (
     try_reading,
 )
 from uwblink.importers.poses import pose_topics
-from uwblink.importers.tables import Columns, SourceTable, message_number, open_table
+from uwblink.importers.tables import Columns, SourceTable, differences_remedy, message_number, open_table
 from uwblink.importers.templates import Template, places
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.text_files import require_regular
@@ -279,7 +279,7 @@ def _proposal(
     used = {*columns.values(), *(header for keys in registers.values() for header in keys.values())}
     left = [json.dumps(name) for name in names if name not in used and not form.line and not form.wide]
     remarks = {
-        why: layout == "nothing",
+        differences_remedy(names) or why: layout == "nothing",
         "without antenna delays that were programmed into the devices: give them in [antenna_delays]": not undelayed,
         f"positions are used where all six columns are there; missing: {', '.join(unplaced)}": 0 < len(unplaced) < 6,
         f"not used: {', '.join(left)[:300]}": left,

@@ -12,11 +12,11 @@ from calib.calibration.error_model import ErrorModel
 from calib.calibration.formats import read_miluv
 from calib.calibration.power_curves import Curve
 from calib.data.samples import stamped
-from calib.evaluation.filters import ProcessNoise, multilaterate
+from calib.evaluation.filters import Fix, InertialFilter, ProcessNoise, RangeErrors, multilaterate
 from calib.evaluation.localization import write_tum
 from calib.evaluation.onboard import onboard_json, onboard_text
 from tests.shared_data import shared
-from uwblink import Contents, Poses, Tag
+from uwblink import Contents, Exchanges, Poses, Tag
 from uwblink.importers import read_source
 
 ANCHORS = np.array([[3, 3, 0.3], [-3, 3, 2.2], [-3, -3, 0.4], [3, -3, 2.4], [0, 3.5, 1.2], [3.5, 0, 1.4]])
@@ -88,6 +88,51 @@ def flight(seconds=20.0, seed=1, reflected=0.0, rate=50.0, start=0.0):
         imu={"time_ns": (ti * 1e9).astype(np.int64) + ns, "body": np.full(len(ti), "drone"), **columns},
         height={"time_ns": (th * 1e9).astype(np.int64) + ns, "body": np.full(len(th), "drone"), "height_m": height},
     )
+
+
+def listening(seconds=20.0, seed=1, rate=50.0):
+    """The same flight, in which anchors range with each other and the body's tags only listen: stamps by formulas.
+
+    Receptions have independent noise of such a size that ranges have `NOISE_M`, and clocks have rates of their own.
+    """
+    c, tick, reply, third = 299702547.0, 1 / (128 * 499.2e6), 0.4e-3, 1.5e-3
+    rng, found = np.random.default_rng(seed), flight(seconds, seed, rate=rate)
+    share, ns = reply / third, 10**12
+    noise_s = 2 * NOISE_M / np.sqrt(1 + (1 + share) ** 2 + share**2) / c
+    t = np.arange(0, seconds, 1 / rate)
+    i = rng.integers(0, len(ANCHORS), len(t))
+    j = (i + rng.integers(1, len(ANCHORS), len(t))) % len(ANCHORS)
+    between = np.linalg.norm(ANCHORS[i] - ANCHORS[j], axis=1) / c
+    clocks = 1 + rng.normal(0, 5e-6, 12), rng.uniform(0, 0.01, 12)
+
+    def stamp(tag, time):
+        return np.rint((clocks[1][tag] + clocks[0][tag] * (time + 1.0)) / tick).astype(np.int64) % 2**40
+
+    def late(place, time):
+        return time + np.linalg.norm(place - antennas(time), axis=1) / c + rng.normal(0, noise_s, len(time))
+
+    def antennas(time):
+        return place(time) + attitude(time).apply(np.tile(ARMS[me], (len(time), 1)))
+
+    response = t + between + reply
+    final = response + third
+    stamps = {"tx1": stamp(i, t), "rx1": stamp(j, t + between + rng.normal(0, noise_s, len(t)))}
+    stamps |= {"tx2": stamp(j, response), "tx3": stamp(j, final)}
+    for name, sent in (("rx2", response), ("rx3", final)):
+        stamps[name] = stamp(i, sent + between + rng.normal(0, noise_s, len(t)))
+    time_ns, power = (t * 1e9).astype(np.int64) + ns, np.full(len(t), -85.0)
+    exchanges = Exchanges.from_arrays(
+        i, j, **stamps, protocol="ds", time_ns=time_ns, fpp1_dbm=power, fpp2_dbm=power, bits=40
+    )
+    parts = []
+    for me in ARMS:
+        columns = {"time_ns": time_ns, "listener": np.full(len(t), me), "initiator": i, "target": j}
+        columns |= {f"{name}_n": column for name, column in stamps.items()}
+        for n, (sender, sent) in enumerate(((i, t), (j, response), (j, final)), 1):
+            columns |= {f"rx{n}": stamp(me, late(ANCHORS[sender], sent)), f"fpp{n}_dbm": power, f"skew{n}_ppm": power}
+        parts.append(columns)
+    overheard = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return replace(found, exchanges=exchanges, overheard=overheard)
 
 
 def calibration(share=0.001):
@@ -192,6 +237,64 @@ def test_what_cannot_be_localized():
         OnboardSettings(model="magic")
     with pytest.raises(BadInputError, match="`start_m`"):
         OnboardSettings(start_m=(0.0, np.nan, 1.0))
+
+
+@pytest.mark.parametrize("seed", [41, 42, 43])
+def test_a_body_that_only_listens_knows_where_it_is_and_how_well(seed):
+    settings = OnboardSettings(noise=IMU, use="receptions")
+    (track,) = localize_onboard(listening(seed=seed), calibration(), settings)
+    assert track.used == "differences of arrival, imu, height"
+    assert len(track.nis) > 1980, "all 2000 differences but those of the start"
+    late = track.time_ns > track.time_ns[0] + 5_000_000_000
+    # Fifteen independent values of three, as in `test_it_knows_how_good_it_is`.
+    assert 1.5 < np.mean(track.nees[late]) < 5.0
+    settled = track.range_time_ns > track.time_ns[0] + 5_000_000_000
+    # Two listeners of an exchange have one error in common: the mean of 1500 squares is known to a twentieth.
+    assert np.mean(track.nis[settled]) == pytest.approx(1.0, abs=0.12)
+    assert np.sqrt(np.mean(errors_of(track, 5.0) ** 2)) < 0.1
+    assert track.restarts_s == ()
+
+
+def test_differences_need_neither_truth_nor_what_they_do_not_hold():
+    heard = listening(8.0)
+    blind = replace(heard, poses=heard.poses[heard.poses.body != "drone"])
+    settings = OnboardSettings(noise=IMU, use="receptions")
+    ((known,), (track,)) = (localize_onboard(one, calibration(), settings) for one in (heard, blind))
+    assert np.isnan(track.truth_m).all()
+    assert track.estimate_m == pytest.approx(known.estimate_m, abs=1e-9)
+    with pytest.raises(UnanswerableError, match="receptions"):
+        localize_onboard(heard, calibration(), OnboardSettings(noise=IMU))
+    with pytest.raises(UnanswerableError, match="no listener overheard"):
+        localize_onboard(flight(8.0), calibration(), settings)
+
+
+@pytest.mark.parametrize("inertial", [True, False])
+def test_an_update_by_a_difference_has_the_derivatives_of_finite_steps(inertial):
+    """By place, attitude and shared error, of a formula."""
+    rng = np.random.default_rng(7)
+    turned = attitude(np.array([0.3])).as_matrix() if inertial else np.eye(3)[None]
+    covariance = rng.normal(size=(17, 17))
+    covariance = covariance @ covariance.T * 1e-4
+    arm = np.array([0.3, -0.2, 0.1]) if inertial else np.array([0.0, 0.0, 0.1])
+    anchors, signs, common = ANCHORS[:2], np.array([1.0, -1.0]), 0.04
+
+    def expected(step):
+        antenna = np.array([0.4, -0.7, 1.2]) + step[:3] + turned[0] @ Rotation.from_rotvec(step[6:9]).apply(arm)
+        return np.linalg.norm(antenna - anchors, axis=1) @ signs + common * step[16]
+
+    steps = 1e-6 * np.eye(17)
+    slope = np.array([(expected(step) - expected(-step)) / 2e-6 for step in steps])
+    running = InertialFilter(Fix(np.array([0.4, -0.7, 1.2]), np.eye(3)), turned, IMU, inertial=inertial)
+    running.covariance = covariance[None].copy()
+    certain = RangeErrors(share=1e-12, least_m=0.0, detour_m=1.0, outlier=1e-12, outlier_m=1.0)
+    running.update_range(expected(np.zeros(17)) + 0.01, 0.05, certain, arm, anchors, signs, common)
+    slope[6:9] *= inertial  # a filter without an IMU has no attitude
+    gain = covariance @ slope / (slope @ covariance @ slope + 0.05**2)
+    assert running.covariance[0] == pytest.approx(covariance - np.outer(gain, slope @ covariance), abs=1e-8)
+    assert running.state[0, :3] == pytest.approx(np.array([0.4, -0.7, 1.2]) + 0.01 * gain[:3], abs=1e-8)
+    running.begin_exchange()
+    assert running.state[0, 16] == 0
+    assert running.covariance[0, 16] == pytest.approx(np.eye(17)[16])
 
 
 def test_multilateration_is_exact_and_leaves_a_reflection_out():

@@ -334,3 +334,23 @@ def test_third_stamps_of_the_initiator_in_exchanged_columns_are_not_those_of_the
     ]
     assert 'protocol = "ds"' in guess_map(write(tmp_path / "plain.csv", wrapped(skewed))).text
     assert 'protocol = "ds-alt"' in guess_map(write(tmp_path / "alternative.csv", noisy)).text
+
+
+@pytest.mark.parametrize(
+    ("header", "column"),
+    [
+        ("time_s,tag,anchor_a,anchor_b,difference_m", "difference_m"),
+        ("t_tdoa,idA,idB,tdoa_meas,t_imu,acc_x,acc_y,acc_z", "tdoa_meas"),
+        ("time,from_id,to_id,distanceDiff", "distanceDiff"),
+    ],
+)
+def test_differences_of_arrival_without_stamps_are_named(tmp_path, header, column):
+    """Of a table with the columns of the public set UTIL, of one as Loco's logs have it, and of one in between."""
+    rows = "".join(",".join([f"{k / 50:.2f}", *["3"] * header.count(",")]) + "\n" for k in range(9))
+    (tmp_path / "d.csv").write_text(f"{header}\n{rows}")
+    words = ["uwblink", "import", "csv", "d.csv", "-o", "d.uwb"]
+    processes.refuse(
+        *words, cwd=tmp_path, naming=["d.csv", f"'{column}'", "differences of arrival", "stamps"], status=2
+    )
+    assert not (tmp_path / "d.uwb").exists()
+    assert f"'{column}' looks like differences of arrival" in guess_map(tmp_path / "d.csv").text

@@ -7,6 +7,7 @@ import subprocess
 import time
 
 import duckdb
+import numpy as np
 import pytest
 
 import calib
@@ -17,6 +18,7 @@ from tests.processes import BIN
 from uwblink.boards import LivePage, Progress, load_correction
 from uwblink.errors import ArgumentError, PlanError, PortError
 from uwblink.streaming import RangeListener
+from uwblink.twr import STAMPS
 from uwbsim.boards.virtual_board import VirtualPorts
 
 
@@ -263,3 +265,73 @@ def test_the_example_of_the_listener_runs(tmp_path, monkeypatch):
         runner.run(example)
     assert runner.failures == 0
     assert (tmp_path / "f.uwb").exists()
+
+
+@pytest.fixture(scope="module")
+def overheard(tmp_path_factory):
+    """A recording in which every third board listens."""
+    path = tmp_path_factory.mktemp("overheard") / "f.uwb"
+    flight(path, passive=True)
+    return path
+
+
+def difference_of(contents, row, delays_ns):
+    """What a listener knows, corrected for delays alone: the page of numbers of `calib.data.arrivals`."""
+    x, h = contents.exchanges, {name: column[row].item() for name, column in contents.overheard.items()}
+    (at,) = np.flatnonzero((x.rx1 == h["rx1_n"]) & (x.tx2 == h["tx2_n"]) & (x.initiator == h["initiator"]))
+    e = {name: int(getattr(x, name)[at]) for name in ("initiator", "target", "time_ns", *STAMPS)}
+
+    def since(late, early):
+        return (late - early) % 2**x.bits
+
+    reply, final = since(e["tx2"], e["rx1"]), since(e["tx3"], e["tx2"])
+    ratio = since(e["rx3"], e["rx2"]) / final
+    metres, c = 299702547.0 / (499.2e6 * 128), 0.299702547
+    range_m = metres * (since(e["rx2"], e["tx1"]) - ratio * reply) / 2
+    raw = metres * (since(h["rx2"], h["rx1"]) * final / since(h["rx3"], h["rx2"]) - reply) - range_m
+    of_range = c * (delays_ns[e["initiator"]] + ratio * delays_ns[e["target"]]) / 2
+    return (e["time_ns"], e["initiator"], e["target"], h["listener"]), raw, raw + c * delays_ns[e["target"]] - of_range
+
+
+def test_what_boards_overhear_is_streamed_with_the_ranges(overheard, tmp_path):
+    delays_ns = {1: 0.25, 2: 0.0, 3: -0.25}
+    path = tmp_path / "flat.json"
+    zero, flat = ({"knots": [0.0] * 4 + [9.0] * 4, "coefficients": [v] * 4, "degree": 3} for v in (0.0, 0.05))
+    zero, flat = (curve | {"range": [0.0, 9.0]} for curve in (zero, flat))
+    known = json.loads(calibrated(path, (1, 2, 3)).read_text()) | {"bias_curve": zero, "sigma_curve": flat}
+    path.write_text(json.dumps(known))
+    contents = uwblink.load(overheard)
+    found = list(uwblink.stream(overheard, calibration=path, use="receptions", speed=math.inf))
+    ranges = [one for one in found if isinstance(one, uwblink.StreamedRange)]
+    others = {(one.time_ns, one.initiator, one.target, one.listener): one for one in found if one not in ranges}
+    assert len(ranges) == len(contents.exchanges)
+    assert len(others) == len(contents.overheard["time_ns"]) > 190
+    for row in range(0, len(others), 17):
+        whose, raw, corrected = difference_of(contents, row, delays_ns)
+        assert (others[whose].difference_m, others[whose].corrected_m) == pytest.approx((raw, corrected), abs=1e-6)
+        # Five times the variance of a range where the clocks' rate is known without error, more with one from stamps.
+        assert others[whose].shared_m == pytest.approx(0.05, rel=1e-6)
+        assert others[whose].sigma_m == pytest.approx(5**0.5 * 0.05, rel=0.02)
+    assert [one.time_ns for one in found] == sorted(one.time_ns for one in found)
+    # Boards that are streamed give the same as their recording.
+    ports, plan = VirtualPorts(bench_scenario()), uwblink.RangingPlan(rate_hz=50.0)
+    live = list(uwblink.stream(ports.names.values(), plan=plan, calibration=path, use="receptions", duration_s=4.0,
+                               using=ports))  # fmt: skip
+    assert sorted(map(str, live)) == sorted(map(str, found))
+
+
+def test_the_command_prints_differences_in_lines_of_their_own(overheard, calibration):
+    words = ["uwblink", "stream", overheard, "-c", calibration, "--speed", "inf", "--use", "receptions"]
+    rows = [json.loads(line) for line in processes.call(*words).stdout.splitlines()]
+    lines = [row for row in rows if "listener" in row]
+    assert len(lines) == len(uwblink.load(overheard).overheard["time_ns"])
+    assert all("range_m" in row for row in rows if "listener" not in row)
+    names = ["time_ns", "initiator", "target", "listener", "difference_m", "corrected_m", "sigma_m", "shared_m"]
+    assert all(list(row) == names for row in lines)
+
+
+@pytest.mark.parametrize(("which", "options"), [("flown", "-c {c}"), ("overheard", ""), ("port", "--dialect arduino")])
+def test_what_cannot_stream_differences(request, calibration, which, options):
+    source = which if which == "port" else request.getfixturevalue(which)
+    words = ["uwblink", "stream", source, "--use", "receptions", *options.format(c=calibration).split()]
+    processes.refuse(*words, naming=["--use"], status=2)
