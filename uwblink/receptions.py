@@ -8,6 +8,7 @@ of the target, and the one after that, from which the initiator has the rate of 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -144,7 +145,8 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
     >>> found.initiator.tolist(), found.range_m.round(3).tolist()
     ([1], [0.469])
     """
-    receptions = receptions[~_off_the_line(receptions)]
+    for _ in range(_PASSES):
+        receptions = receptions[~_off_the_line(receptions)]
     r, links = receptions, _Links(receptions)
     poll, polled = links.find(r.listener, r.sender, r.frame, -1)
     first, _ = links.find(r.sender, r.listener, r.frame[poll], 1)
@@ -191,32 +193,52 @@ MAX_ACCELERATION, MAX_DRIFT, LONGEST_DETOUR_M = 50.0, 0.2e-6, 10.0
 """Judgements: robots accelerate by less than 5 g (m/s^2), and a reflection in a room is no longer than 10 m. The rate
 of a clock changes by less than 0.2e-6 a second: in logs of DWM1001 boards that warm up by 0.12e-6."""
 
+_NEAR: Final = (-3, -2, -1, 1, 2, 3)
+"""A stamp is compared with each two of these on its link: wrong ones are few, so that most of six are right."""
+
+_PASSES: Final = 3
+"""Without the worst stamps those are seen that they outvoted. A clock that jumps costs so many stamps on both sides."""
+
 
 def _off_the_line(r: Receptions) -> Bools:
-    """Return which receptions (n,) have a stamp that those before and after it on their link contradict.
+    """Return which receptions (n,) have a stamp that those near it on their link contradict.
 
-    The reception stamp less the transmission stamp changes with the clocks' rates and the distance. Of three in a row
-    the middle one lies on the line between the others, but for acceleration, drift and a reflection. A wrong stamp
-    stands out twice as far as its neighbours, which it pulls the line away from.
+    The reception stamp less the transmission stamp changes with the clocks' rates and the distance, so that three of
+    them lie on a line, but for reflections, acceleration and drift. A stamp is left out if more of its triples bend
+    than do not; triples whose tolerance hides even four reflections do not count.
     """
-    wrong = np.zeros(len(r), dtype=bool)
     links = _Links(r)
-    row, same = links.row, np.diff(links.link) == 0
-    late = elapsed(r.rx[row], r.tx[row], r.bits)
+    row, count = links.row, len(r)
+    late, sent = elapsed(r.rx[row], r.tx[row], r.bits), r.tx[row]
     half, whole = 1 << (r.bits - 1), 1 << r.bits
-    step = ((np.diff(late) + half) % whole - half).astype(np.float64)
-    span = elapsed(r.tx[row][1:], r.tx[row][:-1], r.bits).astype(np.float64)
-    # A counter that restarted is no wrong stamp.
-    same &= np.abs(step) <= MAX_SKEW * span
-    there = np.concatenate([[False], same[1:] & same[:-1], [False]])[: len(row)]
-    both = np.maximum(span[1:] + span[:-1], 1.0)
-    off, allowed = np.zeros(len(row)), np.zeros(len(row))
-    off[1:-1] = np.abs(step[:-1] * span[1:] - step[1:] * span[:-1]) / both
-    bent = MAX_ACCELERATION / SPEED_OF_LIGHT + MAX_DRIFT
-    allowed[1:-1] = LONGEST_DETOUR_M / METRES_PER_TICK + bent / 2 * span[1:] * span[:-1] * TICK_S
-    off[~there] = 0.0
-    around = np.maximum(np.append(off[1:], 0.0), np.insert(off[:-1], 0, 0.0))
-    wrong[row] = there & (off > allowed) & (off >= around)
+    at = np.arange(count)
+
+    def apart(one: int, other: int) -> tuple[Floats, Floats, Bools]:
+        """Return the change of the difference and the time from one neighbour to another (n,), and where both are."""
+        a, b = np.clip(at + one, 0, count - 1), np.clip(at + other, 0, count - 1)
+        span = elapsed(sent[b], sent[a], r.bits).astype(np.float64)
+        step = ((late[b] - late[a] + half) % whole - half).astype(np.float64)
+        # A counter that restarted or wrapped between them is no wrong stamp.
+        within = (r.time_ns[row[b]] - r.time_ns[row[a]] < whole * TICK_S * 1e9) & (np.abs(step) <= MAX_SKEW * span)
+        return step, span, (b - a == other - one) & (links.link[a] == links.link[b]) & within
+
+    triples = []
+    for pair in itertools.combinations(_NEAR, 2):
+        one, two, three = sorted((*pair, 0))
+        (step1, span1, there1), (step2, span2, there2) = apart(one, two), apart(two, three)
+        both = np.maximum(span1 + span2, 1.0)
+        weight = {one: span2 / both, two: np.ones(count), three: span1 / both}[0]
+        bend = np.abs(step1 * span2 - step2 * span1) / both
+        triples.append((there1 & there2, bend, span1 * span2 * TICK_S / 2, weight))
+    there, bend, curved, weight = (np.array(column) for column in zip(*triples, strict=True))
+    usual = np.quantile((bend / np.maximum(curved, 1e-9))[there], 0.9) if there.any() else np.inf
+    bent = min(MAX_ACCELERATION / SPEED_OF_LIGHT + MAX_DRIFT, 3 * usual)
+    detour = LONGEST_DETOUR_M / METRES_PER_TICK
+    allowed = detour + bent * curved
+    told = there & (allowed <= 4 * detour * weight)
+    straight, bends = ((told & side).sum(axis=0) for side in (bend <= allowed, bend > allowed))
+    wrong = np.zeros(count, dtype=bool)
+    wrong[row] = (bends > 0) & (bends >= straight) | ((straight == 0) & told.any())
     return wrong
 
 
