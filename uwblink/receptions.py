@@ -129,14 +129,39 @@ class _Links:
         return self.row[inside], there
 
 
+def times_by_stamps(receptions: Receptions) -> Ints:
+    """Return when the frames of rows (n,), in order of frames, were sent, in ns after the first, by their stamps.
+
+    A frame is as long after an earlier one as the clock says that stamped both, of several clocks the one that stamped
+    last; a clock counts up to half of its range. A frame that shares no clock with earlier ones follows at once.
+
+    >>> from uwblink.receptions import Receptions, times_by_stamps
+    >>> heard = Receptions.from_arrays([0, 1], [1, 2], [2, 1], tx=[0, 63897700], rx=[100, 63897600])
+    >>> (times_by_stamps(heard) / 1e6).round(3).tolist()
+    [0.0, 1.0]
+    """
+    half, whole = 1 << (receptions.bits - 1), 1 << receptions.bits
+    columns = [getattr(receptions, name).tolist() for name in ("frame", "sender", "tx", "listener", "rx")]
+    seen: dict[int, tuple[int, int]] = {}
+    now, found = 0, []
+    for _, rows in itertools.groupby(zip(*columns, strict=True), key=lambda row: row[0]):
+        heard = list(rows)
+        stamps = {heard[0][1]: heard[0][2]} | {row[3]: row[4] for row in heard}
+        if known := [(*seen[clock], clock) for clock in stamps if clock in seen]:
+            then, stamp, clock = max(known)
+            now = then + (stamps[clock] - stamp + half) % whole - half
+        found += [now] * len(heard)
+        seen |= {clock: (now, stamp) for clock, stamp in stamps.items()}
+    return np.rint(np.array(found, dtype=np.float64) * TICK_S * 1e9).astype(np.int64)
+
+
 def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[Any]]]:
     """Return the exchanges that broadcasts make, and what third tags overheard of them, in order of time.
 
     A frame of i that j hears is a poll, j's first frame after it the response, j's next frame the final: an exchange of
-    protocol `ds`. Of both roles a pair gets the one with the shorter replies, so that
-    no stamp of a poll or response counts twice. The second result has the columns of the table `overheard`. Frames
-    between which a clock restarted, or its counter wrapped, make no exchange, and no stamp that others of its
-    link contradict. Raises `ArgumentError` where there is none.
+    protocol `ds`. Of both roles a pair gets the one with the shorter replies, so that no stamp of a poll or response
+    counts twice. The second result has the columns of the table `overheard`. Frames between which a clock restarted,
+    or its counter wrapped, make no exchange, nor do `contradicted` stamps. Raises `ArgumentError` where there is none.
 
     >>> from uwblink.receptions import Receptions, exchanges_in
     >>> frames, tags = [0, 1, 2], ([1, 2, 2], [2, 1, 1])
@@ -145,8 +170,7 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
     >>> found.initiator.tolist(), found.range_m.round(3).tolist()
     ([1], [0.469])
     """
-    for _ in range(_PASSES):
-        receptions = receptions[~_off_the_line(receptions)]
+    receptions = receptions[~contradicted(receptions)]
     r, links = receptions, _Links(receptions)
     poll, polled = links.find(r.listener, r.sender, r.frame, -1)
     first, _ = links.find(r.sender, r.listener, r.frame[poll], 1)
@@ -196,19 +220,30 @@ of a clock changes by less than 0.2e-6 a second: in logs of DWM1001 boards that 
 _NEAR: Final = (-3, -2, -1, 1, 2, 3)
 """A stamp is compared with each two of these on its link: wrong ones are few, so that most of six are right."""
 
+_FEW: Final = 0.1
+"""Stamps that no triple supports are left out if they are fewer: where all are far apart, as many as that are sound."""
+
 _PASSES: Final = 3
 """Without the worst stamps those are seen that they outvoted. A clock that jumps costs so many stamps on both sides."""
 
 
+def contradicted(receptions: Receptions) -> Bools:
+    """Return which receptions (n,) have a stamp that those near it on their link contradict, or that none supports."""
+    left = np.arange(len(receptions))
+    for _ in range(_PASSES):
+        left = left[~_off_the_line(receptions[left])]
+    return np.isin(np.arange(len(receptions)), left, invert=True)
+
+
 def _off_the_line(r: Receptions) -> Bools:
-    """Return which receptions (n,) have a stamp that those near it on their link contradict.
+    """Return which receptions (n,) bend at least as many lines with two neighbours as they fit, or fit none.
 
     The reception stamp less the transmission stamp changes with the clocks' rates and the distance, so that three of
-    them lie on a line, but for reflections, acceleration and drift. A stamp is left out if more of its triples bend
-    than do not; triples whose tolerance hides even four reflections do not count.
+    them lie on a line but for reflections, and for acceleration and drift: three times what nine of ten triples show,
+    within what is possible. Triples whose tolerance hides an error of four reflections do not count.
     """
     links = _Links(r)
-    row, count = links.row, len(r)
+    row, count = links.row, len(links.row)
     late, sent = elapsed(r.rx[row], r.tx[row], r.bits), r.tx[row]
     half, whole = 1 << (r.bits - 1), 1 << r.bits
     at = np.arange(count)
@@ -237,8 +272,9 @@ def _off_the_line(r: Receptions) -> Bools:
     allowed = detour + bent * curved
     told = there & (allowed <= 4 * detour * weight)
     straight, bends = ((told & side).sum(axis=0) for side in (bend <= allowed, bend > allowed))
-    wrong = np.zeros(count, dtype=bool)
-    wrong[row] = (bends > 0) & (bends >= straight) | ((straight == 0) & told.any())
+    alone = straight == 0
+    wrong = np.zeros(len(r), dtype=bool)
+    wrong[row] = (bends > 0) & (bends >= straight) | (alone & (np.mean(alone) < _FEW))
     return wrong
 
 
