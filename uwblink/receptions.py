@@ -180,9 +180,8 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
     reply = elapsed(r.tx[rows[:, 1]], r.rx[rows[:, 0]], r.bits)
     sent, heard = (elapsed(stamp[rows[:, 2]], stamp[rows[:, 1]], r.bits) for stamp in (r.tx, r.rx))
     round_trip = elapsed(r.rx[rows[:, 1]], r.tx[rows[:, 0]], r.bits)
-    within = r.time_ns[rows[:, 2]] - r.time_ns[rows[:, 0]] < 2**r.bits * TICK_S * 1e9
     steady = (
-        within
+        _within(r, rows[:, 0], rows[:, 2])
         & (np.abs(heard - sent) <= MAX_SKEW * sent)
         & (np.abs(round_trip - reply) <= MAX_SKEW * reply + _FARTHEST)
     )
@@ -194,7 +193,8 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
         )
     rows = rows[np.argsort(r.time_ns[rows[:, 0]], kind="stable")]
     p, s, f = rows.T
-    stamps = {"tx1": r.tx[p], "rx1": r.rx[p], "tx2": r.tx[s], "rx2": r.rx[s], "tx3": r.tx[f], "rx3": r.rx[f]}
+    stamps = {"tx1": r.tx[p], "rx1": r.rx[p], "tx2": r.tx[s], "rx2": r.rx[s], "tx3": r.tx[f]}
+    stamps["rx3"] = _without_drift(r, links, s, f, elapsed(r.tx[s], r.rx[p], r.bits))
     exchanges = Exchanges.from_arrays(
         r.sender[p],
         r.sender[s],
@@ -211,6 +211,26 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     order = np.argsort(columns["time_ns"], kind="stable")
     return exchanges, {name: column[order] for name, column in columns.items()}
+
+
+def _without_drift(r: Receptions, links: _Links, second: Ints, third: Ints, reply: Ints) -> Ints:
+    """Return rx3 (n,) as stamped by a clock that keeps the rate it has between poll and response.
+
+    `second` and `third` are the rows of response and final. A line through the rates before and after the response
+    gives the rate between poll and response, which is earlier than the final tells (docs/theory.md, drift).
+    """
+    before, there = links.find(r.sender[second], r.listener[second], r.frame[second], -1)
+    ends = (before, second), (second, third)
+    (sent0, heard0), (sent, heard) = ([elapsed(t[b], t[a], r.bits) for t in (r.tx, r.rx)] for a, b in ends)
+    there &= (np.abs(heard0 - sent0) <= MAX_SKEW * sent0) & _within(r, before, second)
+    bend = (heard0 - sent0) / np.maximum(sent0, 1) - (heard - sent) / np.maximum(sent, 1)
+    moved = np.rint((reply + sent) / np.maximum(sent0 + sent, 1) * bend * sent)
+    return (r.rx[third] + np.where(there, moved, 0.0).astype(np.int64)) % (1 << r.bits)
+
+
+def _within(r: Receptions, first: Ints, last: Ints) -> Bools:
+    """Return whether counters wrap at most once between rows (n,)."""
+    return np.asarray(r.time_ns[last] - r.time_ns[first] < 2**r.bits * TICK_S * 1e9)
 
 
 MAX_ACCELERATION, MAX_DRIFT, LONGEST_DETOUR_M = 50.0, 0.2e-6, 10.0
@@ -254,7 +274,7 @@ def _off_the_line(r: Receptions) -> Bools:
         span = elapsed(sent[b], sent[a], r.bits).astype(np.float64)
         step = ((late[b] - late[a] + half) % whole - half).astype(np.float64)
         # A counter that restarted or wrapped between them is no wrong stamp.
-        within = (r.time_ns[row[b]] - r.time_ns[row[a]] < whole * TICK_S * 1e9) & (np.abs(step) <= MAX_SKEW * span)
+        within = _within(r, row[a], row[b]) & (np.abs(step) <= MAX_SKEW * span)
         return step, span, (b - a == other - one) & (links.link[a] == links.link[b]) & within
 
     triples = []
@@ -305,9 +325,14 @@ def _heard_by(listener: int, r: Receptions, links: _Links, rows: Ints, exchanges
     e = exchanges[good]
     columns: dict[str, NDArray[Any]] = {"time_ns": e.time_ns, "listener": me[good]}
     columns |= {"initiator": e.initiator, "target": e.target} | {f"{name}_n": getattr(e, name) for name in STAMPS}
-    for k, (row, _) in enumerate(found, 1):
-        own = row[good]
-        columns |= {f"rx{k}": r.rx[own], f"fpp{k}_dbm": r.fpp_dbm[own], f"skew{k}_ppm": r.skew_ppm[own]}
+    own_rows = [row[good] for row, _ in found]
+    stamps = (
+        r.rx[own_rows[0]],
+        r.rx[own_rows[1]],
+        _without_drift(r, links, *own_rows[1:], elapsed(e.tx2, e.rx1, r.bits)),
+    )
+    for k, (own, rx) in enumerate(zip(own_rows, stamps, strict=True), 1):
+        columns |= {f"rx{k}": rx, f"fpp{k}_dbm": r.fpp_dbm[own], f"skew{k}_ppm": r.skew_ppm[own]}
     return columns | {
         f"{w}{k}_n_{u}": getattr(e, f"{w}{k}_{u}") for w, u in (("fpp", "dbm"), ("skew", "ppm")) for k in (1, 2)
     }
