@@ -210,9 +210,9 @@ def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: 
     )
 
 
-LEAST_INLIERS: Final = 0.3
-"""Share of ranges within three sigmas of a fit that can be believed; of direct ranges 99.7 % are. A judgement: where
-more than two thirds are reflected, delays rest on too few, and a wrong geometry leaves a quarter or less."""
+LEAST_INLIERS: Final = 0.5
+"""Share of ranges within three sigmas of a fit that can be believed; of direct ranges 99.7 % are. Where more than half
+are reflected, delays rest on the fewer ones; places that were made up leave 0 to 34 % (swarm broadcasts)."""
 
 
 def refuse_contradicted(inliers: float, ranges: Ranges, findings: Sequence[str]) -> None:
@@ -220,8 +220,8 @@ def refuse_contradicted(inliers: float, ranges: Ranges, findings: Sequence[str])
     if inliers < LEAST_INLIERS:
         evidence = "; ".join(findings[:1]) or "no single tag or pair explains it"
         raise UnanswerableError(
-            f"{ranges.source}: {100 * (1 - inliers):.0f} % of the ranges lie beyond three sigmas of this fit: delays do "
-            f"not explain them; check the true distances, and which tag is where ({evidence})"
+            f"{ranges.source}: {100 * (1 - inliers):.0f} % of the ranges lie beyond three sigmas of this fit, which "
+            f"therefore explains nothing; check the true distances, and which tag is where ({evidence})"
         )
 
 
