@@ -120,10 +120,9 @@ def recorded(tmp_path_factory):
 
 
 def by_pair(e):
-    """Rows (k,) of exchanges of each pair that has three or more."""
+    """Rows (k,) of exchanges of each pair."""
     key = np.sort(np.column_stack([e.initiator, e.target]), axis=1)
-    rows = [np.flatnonzero((key == pair).all(axis=1)) for pair in np.unique(key, axis=0)]
-    return [row for row in rows if len(row) > 2]
+    return [np.flatnonzero((key == pair).all(axis=1)) for pair in np.unique(key, axis=0)]
 
 
 def test_recorded_boards_give_the_ranges_of_their_description(recorded):
@@ -150,8 +149,10 @@ def test_a_lossy_run_has_no_range_that_its_stamps_do_not_support(recorded):
     e = found.exchanges
     assert len(e) > 0.96 * 496, "as many as there are with every stamp"
     pairs = by_pair(e)
+    # 0x0E5F heard 0xCDA3 nine times, four or five of them wrong.
     assert len(pairs) == 18
     for row in pairs:
+        assert len(row) > 5
         ranges = raw_range(e)[row]
         assert np.abs(ranges - np.median(ranges)).max() < 0.7
     # Frames stand in the log 76 ms apart, by all the clocks that stamped two.
