@@ -9,18 +9,18 @@ import uwbsim
 from uwblink import Exchanges, raw_range
 from uwblink.errors import ArgumentError
 from uwblink.receptions import Receptions, contradicted, exchange_of, exchanges_in, receptions_of, times_by_stamps
-from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
+from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S, elapsed
 
 PLACES = np.array([[0.0, 0, 0], [5, 0, 0], [0, 7, 0], [4, 6, 1]])
 RATE = 1 + np.array([3.0, -8.0, 12.0, -1.0]) * 1e-6
 START = np.array([0.7, 3.1, 16.9, 9.0]) / TICK_S
 
 
-def broadcasts(rounds=20, lost=(), slot_s=0.005, bits=40):
-    """Return receptions of four tags that send in turn, by clocks that run at their own rates."""
+def broadcasts(rounds=20, lost=(), slot_s=0.005, bits=40, drift_ppm_per_s=(0.0, 0.0, 0.0, 0.0)):
+    """Return receptions of four tags that send in turn, by clocks that run at their own rates, which may change."""
 
     def stamp(tag, t):
-        return int(np.rint(START[tag] + RATE[tag] * t / TICK_S)) & ((1 << bits) - 1)
+        return int(np.rint(START[tag] + (RATE[tag] * t + drift_ppm_per_s[tag] * 5e-7 * t**2) / TICK_S)) % (1 << bits)
 
     rows = []
     for frame in range(4 * rounds):
@@ -47,6 +47,20 @@ def test_broadcasts_in_turn_range_every_pair_and_overhear_it(bits):
     assert (exchange_of(exchanges, overheard) >= 0).all()
     assert not (overheard["listener"] == overheard["initiator"]).any()
     assert not (overheard["listener"] == overheard["target"]).any()
+
+
+def test_clocks_that_warm_up_change_no_range_and_no_difference_of_arrival():
+    """The rate after the response is not that before it: by the final alone, ranges here would be 0.1 to 0.4 m off."""
+    r = broadcasts(slot_s=0.08, drift_ppm_per_s=(0.0, 0.12, -0.03, 0.05))
+    exchanges, overheard = exchanges_in(r)
+    first = exchanges.time_ns < 2e9  # of two roles one has no frame before its response
+    assert np.abs(errors_m(exchanges[~first])).max() < 0.015
+    h = {name: column[overheard["time_ns"] > 2e9] for name, column in overheard.items()}
+    i, j, k = (h[name] - 10 for name in ("initiator", "target", "listener"))
+    rate = elapsed(h["rx3"], h["rx2"], 40) / elapsed(h["tx3_n"], h["tx2_n"], 40)
+    late = elapsed(h["rx2"], h["rx1"], 40) - rate * elapsed(h["tx2_n"], h["rx1_n"], 40)
+    away = [np.linalg.norm(PLACES[a] - PLACES[b], axis=1) for a, b in ((i, j), (j, k), (i, k))]
+    assert np.abs(late * METRES_PER_TICK - away[0] - away[1] + away[2]).max() < 0.03
 
 
 def test_lost_frames_cost_their_exchanges_and_no_others_become_wrong():
