@@ -216,9 +216,9 @@ are reflected, delays rest on the fewer ones; places that were made up leave 0 t
 
 
 def refuse_contradicted(inliers: float, ranges: Ranges, findings: Sequence[str]) -> None:
-    """Raise `UnanswerableError`, with the first of the findings, where most ranges contradict their own fit."""
+    """Raise `UnanswerableError`, with the findings, where most ranges contradict their own fit."""
     if inliers < LEAST_INLIERS:
-        evidence = "; ".join(findings[:1]) or "no single tag or pair explains it"
+        evidence = "; ".join(findings) or "no single tag or pair explains it"
         raise UnanswerableError(
             f"{ranges.source}: {100 * (1 - inliers):.0f} % of the ranges lie beyond three sigmas of this fit, which "
             f"therefore explains nothing; check the true distances, and which tag is where ({evidence})"

@@ -237,7 +237,7 @@ def result_of(
     residuals = applied.corrected_m - ranges.truth_m
     over_sigma = residuals / applied.sigma_m
     inliers: Bools = np.asarray(np.abs(over_sigma) < 3.0)
-    findings = list(findings)
+    findings = [*findings, *one_way(ranges)]
     refuse_contradicted(float(np.mean(inliers)), ranges, findings)
     if calibration.errors is not None:
         known = replace(calibration.errors, lasting=lasting_errors(ranges, over_sigma))
@@ -248,7 +248,6 @@ def result_of(
         *limits(found, ranges, residuals, fixed),
         *more,
         *findings,
-        *one_way(ranges),
         *implausible(calibration.delays_ns, residuals),
         *unlike_powers(ranges, calibration),
         *_beyond(found),
