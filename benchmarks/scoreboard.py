@@ -318,16 +318,14 @@ calib fit A.uwb -o A.json --hold-out 0.3
     ),
     DataSet(
         "swarm broadcasts",
-        "prathje/uwb-swarm-ranging at 0d023d2, `scripts/out`: serial logs of boards that range by broadcast, and stand "
-        "where nobody says. grid.toml has seven places that are made up: delays of tags cannot explain them, and the fit "
-        "is refused. With a constant for each pair they cancel, and tenths of a run judge each other.",
+        "prathje/uwb-swarm-ranging at 0d023d2, `scripts/out`: boards that broadcast and stand where nobody says. grid.toml "
+        "has places that are made up: a fit of delays is refused. They cancel where each pair has a constant.",
         "swarm_broadcast_logs.tar.xz",
         prepare_swarm,
         """\
 uwblink import guess A.log -o A.toml
 uwblink import csv A.log --map A.toml -o A.uwb
 uwblink poses A.uwb --tags grid.toml
-calib doctor A.uwb
 calib fit A.uwb -o A-tags.json --delays-only
 calib fit A.uwb -o A.json --constants pair --delays-only --between 0 --hold-out 0.5
 """,
@@ -395,7 +393,7 @@ def before(flight: str, raw: dict[str, Any], lab: Lab, data: DataSet) -> dict[st
     return rows
 
 
-FITS: Final = {"--use receptions": "and what listeners overheard", "--constants pair": "a constant a pair"}
+FITS: Final = {"--use receptions": "with receptions", "--constants pair": "by pair"}
 """What is said of a fit whose command has such options."""
 
 
