@@ -160,8 +160,9 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
 
     A frame of i that j hears is a poll, j's first frame after it the response, j's next frame the final: an exchange of
     protocol `ds`. Of both roles a pair gets the one with the shorter replies, so that no stamp of a poll or response
-    counts twice. The second result has the columns of the table `overheard`. Frames between which a clock restarted,
-    or its counter wrapped, make no exchange, nor do `contradicted` stamps. Raises `ArgumentError` where there is none.
+    counts twice. `rx3` is moved to where a clock stamps it that keeps the rate between poll and response. The second
+    result has the columns of the table `overheard`. Frames between which a clock restarted, or its counter wrapped,
+    make no exchange, nor do `contradicted` stamps. Raises `ArgumentError` where there is none.
 
     >>> from uwblink.receptions import Receptions, exchanges_in
     >>> frames, tags = [0, 1, 2], ([1, 2, 2], [2, 1, 1])
@@ -193,8 +194,8 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
         )
     rows = rows[np.argsort(r.time_ns[rows[:, 0]], kind="stable")]
     p, s, f = rows.T
-    stamps = {"tx1": r.tx[p], "rx1": r.rx[p], "tx2": r.tx[s], "rx2": r.rx[s], "tx3": r.tx[f]}
-    stamps["rx3"] = _without_drift(r, links, s, f, elapsed(r.tx[s], r.rx[p], r.bits))
+    rx3 = _without_drift(r, links, s, f, elapsed(r.tx[s], r.rx[p], r.bits))
+    stamps = {"tx1": r.tx[p], "rx1": r.rx[p], "tx2": r.tx[s], "rx2": r.rx[s], "tx3": r.tx[f], "rx3": rx3}
     exchanges = Exchanges.from_arrays(
         r.sender[p],
         r.sender[s],

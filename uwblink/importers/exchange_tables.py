@@ -164,12 +164,12 @@ def _notes(staging: Staging) -> list[str]:
         total = staging.offsets[-1]
         notes.append(f"{staging.blanks} of {total} rows or cells hold no range, and are left out")
     if not staging.rows.has("time_s"):
-        order = "rows are taken as a millisecond apart, in their order"
-        notes.append(f"there are no times; {_TIMED.get(staging.column_map.layout or '', order)}")
+        notes.append(f"there are no times; {_TIMED[staging.column_map.layout == 'broadcasts']}")
     return notes
 
 
-_TIMED: Final = {"broadcasts": "frames are timed by their stamps"}
+_TIMED: Final = ("rows are taken as a millisecond apart, in their order", "frames are timed by their stamps")
+"""How rows of tables without times get some, and frames of broadcasts."""
 
 
 def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) -> tuple[StagedRows, Reading | None]:
