@@ -8,6 +8,7 @@ of the target, and the one after that, from which the initiator has the rate of 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -128,14 +129,40 @@ class _Links:
         return self.row[inside], there
 
 
+def times_by_stamps(receptions: Receptions) -> Ints:
+    """Return when the frames of rows (n,), in order of frames, were sent, in ns after the first, by their stamps.
+
+    A frame is as long after an earlier one as the clock says that stamped both, of several clocks the one that stamped
+    last; a clock counts up to half of its range. A frame that shares no clock with earlier ones follows at once.
+
+    >>> from uwblink.receptions import Receptions, times_by_stamps
+    >>> heard = Receptions.from_arrays([0, 1], [1, 2], [2, 1], tx=[0, 63897700], rx=[100, 63897600])
+    >>> (times_by_stamps(heard) / 1e6).round(3).tolist()
+    [0.0, 1.0]
+    """
+    half, whole = 1 << (receptions.bits - 1), 1 << receptions.bits
+    columns = [getattr(receptions, name).tolist() for name in ("frame", "sender", "tx", "listener", "rx")]
+    seen: dict[int, tuple[int, int]] = {}
+    now, found = 0, []
+    for _, rows in itertools.groupby(zip(*columns, strict=True), key=lambda row: row[0]):
+        heard = list(rows)
+        stamps = {heard[0][1]: heard[0][2]} | {row[3]: row[4] for row in heard}
+        if known := [(*seen[clock], clock) for clock in stamps if clock in seen]:
+            then, stamp, clock = max(known)
+            now = then + (stamps[clock] - stamp + half) % whole - half
+        found += [now] * len(heard)
+        seen |= {clock: (now, stamp) for clock, stamp in stamps.items()}
+    return np.rint(np.array(found, dtype=np.float64) * TICK_S * 1e9).astype(np.int64)
+
+
 def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[Any]]]:
     """Return the exchanges that broadcasts make, and what third tags overheard of them, in order of time.
 
     A frame of i that j hears is a poll, j's first frame after it the response, j's next frame the final: an exchange of
-    protocol `ds`. Of both roles a pair gets the one with the shorter replies, so that
-    no stamp of a poll or response counts twice. The second result has the columns of the table `overheard`. Frames
-    between which a clock restarted, or its counter wrapped, make no exchange, and no stamp that others of its
-    link contradict. Raises `ArgumentError` where there is none.
+    protocol `ds`. Of both roles a pair gets the one with the shorter replies, so that no stamp of a poll or response
+    counts twice. `rx3` is moved to where a clock stamps it that keeps the rate between poll and response. The second
+    result has the columns of the table `overheard`. Frames between which a clock restarted, or its counter wrapped,
+    make no exchange, nor do `contradicted` stamps. Raises `ArgumentError` where there is none.
 
     >>> from uwblink.receptions import Receptions, exchanges_in
     >>> frames, tags = [0, 1, 2], ([1, 2, 2], [2, 1, 1])
@@ -144,7 +171,7 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
     >>> found.initiator.tolist(), found.range_m.round(3).tolist()
     ([1], [0.469])
     """
-    receptions = receptions[~_off_the_line(receptions)]
+    receptions = receptions[~contradicted(receptions)]
     r, links = receptions, _Links(receptions)
     poll, polled = links.find(r.listener, r.sender, r.frame, -1)
     first, _ = links.find(r.sender, r.listener, r.frame[poll], 1)
@@ -154,9 +181,8 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
     reply = elapsed(r.tx[rows[:, 1]], r.rx[rows[:, 0]], r.bits)
     sent, heard = (elapsed(stamp[rows[:, 2]], stamp[rows[:, 1]], r.bits) for stamp in (r.tx, r.rx))
     round_trip = elapsed(r.rx[rows[:, 1]], r.tx[rows[:, 0]], r.bits)
-    within = r.time_ns[rows[:, 2]] - r.time_ns[rows[:, 0]] < 2**r.bits * TICK_S * 1e9
     steady = (
-        within
+        _within(r, rows[:, 0], rows[:, 2])
         & (np.abs(heard - sent) <= MAX_SKEW * sent)
         & (np.abs(round_trip - reply) <= MAX_SKEW * reply + _FARTHEST)
     )
@@ -168,7 +194,8 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
         )
     rows = rows[np.argsort(r.time_ns[rows[:, 0]], kind="stable")]
     p, s, f = rows.T
-    stamps = {"tx1": r.tx[p], "rx1": r.rx[p], "tx2": r.tx[s], "rx2": r.rx[s], "tx3": r.tx[f], "rx3": r.rx[f]}
+    rx3 = _without_drift(r, links, s, f, elapsed(r.tx[s], r.rx[p], r.bits))
+    stamps = {"tx1": r.tx[p], "rx1": r.rx[p], "tx2": r.tx[s], "rx2": r.rx[s], "tx3": r.tx[f], "rx3": rx3}
     exchanges = Exchanges.from_arrays(
         r.sender[p],
         r.sender[s],
@@ -187,36 +214,88 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
     return exchanges, {name: column[order] for name, column in columns.items()}
 
 
+def _without_drift(r: Receptions, links: _Links, second: Ints, third: Ints, reply: Ints) -> Ints:
+    """Return rx3 (n,) as stamped by a clock that keeps the rate it has between poll and response.
+
+    `second` and `third` are the rows of response and final. A line through the rates before and after the response
+    gives the rate between poll and response, which is earlier than the final tells (docs/theory.md, drift).
+    """
+    before, there = links.find(r.sender[second], r.listener[second], r.frame[second], -1)
+    ends = (before, second), (second, third)
+    (sent0, heard0), (sent, heard) = ([elapsed(t[b], t[a], r.bits) for t in (r.tx, r.rx)] for a, b in ends)
+    there &= (np.abs(heard0 - sent0) <= MAX_SKEW * sent0) & _within(r, before, second)
+    bend = (heard0 - sent0) / np.maximum(sent0, 1) - (heard - sent) / np.maximum(sent, 1)
+    moved = np.rint((reply + sent) / np.maximum(sent0 + sent, 1) * bend * sent)
+    return (r.rx[third] + np.where(there, moved, 0.0).astype(np.int64)) % (1 << r.bits)
+
+
+def _within(r: Receptions, first: Ints, last: Ints) -> Bools:
+    """Return whether counters wrap at most once between rows (n,)."""
+    return np.asarray(r.time_ns[last] - r.time_ns[first] < 2**r.bits * TICK_S * 1e9)
+
+
 MAX_ACCELERATION, MAX_DRIFT, LONGEST_DETOUR_M = 50.0, 0.2e-6, 10.0
 """Judgements: robots accelerate by less than 5 g (m/s^2), and a reflection in a room is no longer than 10 m. The rate
 of a clock changes by less than 0.2e-6 a second: in logs of DWM1001 boards that warm up by 0.12e-6."""
 
+_NEAR: Final = (-3, -2, -1, 1, 2, 3)
+"""A stamp is compared with each two of these on its link: wrong ones are few, so that most of six are right."""
+
+_FEW: Final = 0.1
+"""Stamps that no triple supports are left out if they are fewer: where all are far apart, as many as that are sound."""
+
+_PASSES: Final = 3
+"""Without the worst stamps those are seen that they outvoted. A clock that jumps costs so many stamps on both sides."""
+
+
+def contradicted(receptions: Receptions) -> Bools:
+    """Return which receptions (n,) have a stamp that those near it on their link contradict, or that none supports."""
+    left = np.arange(len(receptions))
+    for _ in range(_PASSES):
+        left = left[~_off_the_line(receptions[left])]
+    return np.isin(np.arange(len(receptions)), left, invert=True)
+
 
 def _off_the_line(r: Receptions) -> Bools:
-    """Return which receptions (n,) have a stamp that those before and after it on their link contradict.
+    """Return which receptions (n,) bend at least as many lines with two neighbours as they fit, or fit none.
 
-    The reception stamp less the transmission stamp changes with the clocks' rates and the distance. Of three in a row
-    the middle one lies on the line between the others, but for acceleration, drift and a reflection. A wrong stamp
-    stands out twice as far as its neighbours, which it pulls the line away from.
+    The reception stamp less the transmission stamp changes with the clocks' rates and the distance, so that three of
+    them lie on a line but for reflections, and for acceleration and drift: three times what nine of ten triples show,
+    within what is possible. Triples whose tolerance hides an error of four reflections do not count.
     """
-    wrong = np.zeros(len(r), dtype=bool)
     links = _Links(r)
-    row, same = links.row, np.diff(links.link) == 0
-    late = elapsed(r.rx[row], r.tx[row], r.bits)
+    row, count = links.row, len(links.row)
+    late, sent = elapsed(r.rx[row], r.tx[row], r.bits), r.tx[row]
     half, whole = 1 << (r.bits - 1), 1 << r.bits
-    step = ((np.diff(late) + half) % whole - half).astype(np.float64)
-    span = elapsed(r.tx[row][1:], r.tx[row][:-1], r.bits).astype(np.float64)
-    # A counter that restarted is no wrong stamp.
-    same &= np.abs(step) <= MAX_SKEW * span
-    there = np.concatenate([[False], same[1:] & same[:-1], [False]])[: len(row)]
-    both = np.maximum(span[1:] + span[:-1], 1.0)
-    off, allowed = np.zeros(len(row)), np.zeros(len(row))
-    off[1:-1] = np.abs(step[:-1] * span[1:] - step[1:] * span[:-1]) / both
-    bent = MAX_ACCELERATION / SPEED_OF_LIGHT + MAX_DRIFT
-    allowed[1:-1] = LONGEST_DETOUR_M / METRES_PER_TICK + bent / 2 * span[1:] * span[:-1] * TICK_S
-    off[~there] = 0.0
-    around = np.maximum(np.append(off[1:], 0.0), np.insert(off[:-1], 0, 0.0))
-    wrong[row] = there & (off > allowed) & (off >= around)
+    at = np.arange(count)
+
+    def apart(one: int, other: int) -> tuple[Floats, Floats, Bools]:
+        """Return the change of the difference and the time from one neighbour to another (n,), and where both are."""
+        a, b = np.clip(at + one, 0, count - 1), np.clip(at + other, 0, count - 1)
+        span = elapsed(sent[b], sent[a], r.bits).astype(np.float64)
+        step = ((late[b] - late[a] + half) % whole - half).astype(np.float64)
+        # A counter that restarted or wrapped between them is no wrong stamp.
+        within = _within(r, row[a], row[b]) & (np.abs(step) <= MAX_SKEW * span)
+        return step, span, (b - a == other - one) & (links.link[a] == links.link[b]) & within
+
+    triples = []
+    for pair in itertools.combinations(_NEAR, 2):
+        one, two, three = sorted((*pair, 0))
+        (step1, span1, there1), (step2, span2, there2) = apart(one, two), apart(two, three)
+        both = np.maximum(span1 + span2, 1.0)
+        weight = {one: span2 / both, two: np.ones(count), three: span1 / both}[0]
+        bend = np.abs(step1 * span2 - step2 * span1) / both
+        triples.append((there1 & there2, bend, span1 * span2 * TICK_S / 2, weight))
+    there, bend, curved, weight = (np.array(column) for column in zip(*triples, strict=True))
+    usual = np.quantile((bend / np.maximum(curved, 1e-9))[there], 0.9) if there.any() else np.inf
+    bent = min(MAX_ACCELERATION / SPEED_OF_LIGHT + MAX_DRIFT, 3 * usual)
+    detour = LONGEST_DETOUR_M / METRES_PER_TICK
+    allowed = detour + bent * curved
+    told = there & (allowed <= 4 * detour * weight)
+    straight, bends = ((told & side).sum(axis=0) for side in (bend <= allowed, bend > allowed))
+    alone = straight == 0
+    wrong = np.zeros(len(r), dtype=bool)
+    wrong[row] = (bends > 0) & (bends >= straight) | (alone & (np.mean(alone) < _FEW))
     return wrong
 
 
@@ -247,9 +326,14 @@ def _heard_by(listener: int, r: Receptions, links: _Links, rows: Ints, exchanges
     e = exchanges[good]
     columns: dict[str, NDArray[Any]] = {"time_ns": e.time_ns, "listener": me[good]}
     columns |= {"initiator": e.initiator, "target": e.target} | {f"{name}_n": getattr(e, name) for name in STAMPS}
-    for k, (row, _) in enumerate(found, 1):
-        own = row[good]
-        columns |= {f"rx{k}": r.rx[own], f"fpp{k}_dbm": r.fpp_dbm[own], f"skew{k}_ppm": r.skew_ppm[own]}
+    own_rows = [row[good] for row, _ in found]
+    stamps = (
+        r.rx[own_rows[0]],
+        r.rx[own_rows[1]],
+        _without_drift(r, links, *own_rows[1:], elapsed(e.tx2, e.rx1, r.bits)),
+    )
+    for k, (own, rx) in enumerate(zip(own_rows, stamps, strict=True), 1):
+        columns |= {f"rx{k}": rx, f"fpp{k}_dbm": r.fpp_dbm[own], f"skew{k}_ppm": r.skew_ppm[own]}
     return columns | {
         f"{w}{k}_n_{u}": getattr(e, f"{w}{k}_{u}") for w, u in (("fpp", "dbm"), ("skew", "ppm")) for k in (1, 2)
     }

@@ -5,7 +5,7 @@ Data that cannot be what they claim are refused, or named before they are believ
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -208,6 +208,21 @@ def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: 
         f"spread by {spread:.3g} m in ranges of {typical:.3g} m; check the units of the true distances and of the "
         f"ranges: {guess}"
     )
+
+
+LEAST_INLIERS: Final = 0.5
+"""Share of ranges within three sigmas of a fit that can be believed; of direct ranges 99.7 % are. Where more than half
+are reflected, delays rest on the fewer ones; places that were made up leave 0 to 34 % (swarm broadcasts)."""
+
+
+def refuse_contradicted(inliers: float, ranges: Ranges, findings: Sequence[str]) -> None:
+    """Raise `UnanswerableError`, with the findings, where most ranges contradict their own fit."""
+    if inliers < LEAST_INLIERS:
+        evidence = "; ".join(findings) or "no single tag or pair explains it"
+        raise UnanswerableError(
+            f"{ranges.source}: {100 * (1 - inliers):.0f} % of the ranges lie beyond three sigmas of this fit, which "
+            f"therefore explains nothing; check the true distances, and which tag is where ({evidence})"
+        )
 
 
 def implausible(delays_ns: Mapping[int, float], residuals_m: Floats) -> Iterator[str]:

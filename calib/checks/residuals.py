@@ -324,7 +324,8 @@ def _changes(fit: QuickFit, courses: Floats) -> list[Change]:
         offsets = Offsets.of(fit.test(_by_pair(fit, courses)), groups, width)
         gain = (offsets.size**2 * offsets.known).reshape(width, len(groups)).T
         # By how much variances exceed those of slopes that are a likelihood's, for most changes.
-        excess = float(np.median((offsets.std**2 * offsets.known)[offsets.known > 0]))
+        told = offsets.known > 0
+        excess = float(np.median(offsets.std[told] ** 2 * offsets.known[told])) if told.any() else np.inf
         # Of these standard errors; a finding needs five of its own, which may be smaller.
         likely = [k for k in np.argsort(-gain.max(axis=1))[:4].tolist() if gain[k].max() > 3**2 * excess]
         trials = (

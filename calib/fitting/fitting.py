@@ -25,6 +25,7 @@ from calib.checks.limits import (
     implausible,
     limits,
     one_way,
+    refuse_contradicted,
     refuse_impossible,
     refuse_refuted,
     unlike_powers,
@@ -236,6 +237,8 @@ def result_of(
     residuals = applied.corrected_m - ranges.truth_m
     over_sigma = residuals / applied.sigma_m
     inliers: Bools = np.asarray(np.abs(over_sigma) < 3.0)
+    findings = [*findings, *one_way(ranges)]
+    refuse_contradicted(float(np.mean(inliers)), ranges, findings)
     if calibration.errors is not None:
         known = replace(calibration.errors, lasting=lasting_errors(ranges, over_sigma))
         calibration = replace(calibration, errors=known)
@@ -245,7 +248,6 @@ def result_of(
         *limits(found, ranges, residuals, fixed),
         *more,
         *findings,
-        *one_way(ranges),
         *implausible(calibration.delays_ns, residuals),
         *unlike_powers(ranges, calibration),
         *_beyond(found),

@@ -164,8 +164,12 @@ def _notes(staging: Staging) -> list[str]:
         total = staging.offsets[-1]
         notes.append(f"{staging.blanks} of {total} rows or cells hold no range, and are left out")
     if not staging.rows.has("time_s"):
-        notes.append("there are no times; rows are taken as a millisecond apart, in their order")
+        notes.append(f"there are no times; {_TIMED[staging.column_map.layout == 'broadcasts']}")
     return notes
+
+
+_TIMED: Final = ("rows are taken as a millisecond apart, in their order", "frames are timed by their stamps")
+"""How rows of tables without times get some, and frames of broadcasts."""
 
 
 def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) -> tuple[StagedRows, Reading | None]:
@@ -178,7 +182,7 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
         notes.append(f"{back} rows are earlier than the row before, and are sorted by time")
     layout, protocol = column_map.layout or _layout(staging), column_map.protocol
     if layout == "broadcasts":
-        rows, protocol = broadcast_exchanges(staging, faults)
+        rows, protocol = broadcast_exchanges(staging, faults, notes)
     elif layout in ("messages", "stamps", "parts"):
         rows, found = assemble_exchanges(staging, layout, faults, watch)
         protocol = protocol or found

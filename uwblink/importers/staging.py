@@ -33,7 +33,7 @@ from uwblink.importers.column_map import (
     ColumnMap,
 )
 from uwblink.importers.devices import CHIPS, power_sql
-from uwblink.importers.plausibility import ROW_PERIOD_NS, SAMPLE_ROWS, counter_format
+from uwblink.importers.plausibility import SAMPLE_ROWS, counter_format
 from uwblink.importers.tables import (
     Columns,
     SourceTable,
@@ -43,7 +43,7 @@ from uwblink.importers.tables import (
     time_ns,
     whole_number,
 )
-from uwblink.receptions import Receptions, exchanges_in
+from uwblink.receptions import Receptions, contradicted, exchanges_in, times_by_stamps
 from uwblink.recording.schema import Fault
 from uwblink.ticks import TICK_S
 from uwblink.twr import LARGEST_ID, STAMPS
@@ -510,8 +510,8 @@ def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Wat
     return replace(faults.reject(groups, [incomplete, conflict]), columns=columns), protocol
 
 
-def broadcast_exchanges(staging: Staging, faults: Faults) -> tuple[StagedRows, str]:
-    """Return the exchanges that broadcasts make whose senders list what they heard, and their protocol.
+def broadcast_exchanges(staging: Staging, faults: Faults, notes: list[str]) -> tuple[StagedRows, str]:
+    """Return the exchanges that broadcasts make whose senders list what they heard, and their protocol; adds to notes.
 
     The receptions, and what third tags overheard of the exchanges, are put beside. Raises `ImportTableError`.
     """
@@ -523,11 +523,9 @@ def broadcast_exchanges(staging: Staging, faults: Faults) -> tuple[StagedRows, s
     sample, db = rows.sample(SAMPLE_ROWS), staging.db
     bits, _ = counter_format((sample[name] for name in ("tx", "rx")), staging.column_map.bits, "wrapped")
     named = "from_id, sequence, tx, min(origin) AS first" + (", min(time_ns) AS time_ns" if rows.has("time_s") else "")
-    # Without times, a restart (numbers begin anew) lasts as long as a counter takes to wrap, so that nothing spans it.
+    # Without times, a restart (numbers begin anew) lasts longer than a counter takes to wrap, so that nothing spans it.
     again = "sum(coalesce((sequence < before)::INT, 0)) OVER (ORDER BY first)"
-    time = (
-        f"row_number() OVER (ORDER BY first) * {ROW_PERIOD_NS} + {again} * {round(2**bits * TICK_S * 1e9)} AS time_ns"
-    )
+    time = f"{again} * {round(2**bits * TICK_S * 2e9)} AS time_ns"
     db.execute(
         f"CREATE TABLE frames AS SELECT * EXCLUDE (before){'' if rows.has('time_s') else f', {time}'} FROM (SELECT *, "
         f"lag(sequence) OVER (PARTITION BY from_id ORDER BY first) AS before FROM (SELECT {named} FROM {rows.name} "
@@ -541,7 +539,13 @@ def broadcast_exchanges(staging: Staging, faults: Faults) -> tuple[StagedRows, s
     )
     with raising(ImportTableError, str(staging.paths[0]), ArgumentError):
         receptions = Receptions.from_arrays(**dict(db.execute(heard).fetchnumpy()), bits=bits)
+        if not rows.has("time_s"):
+            receptions = replace(receptions, time_ns=receptions.time_ns + times_by_stamps(receptions))
         exchanges, overheard = exchanges_in(receptions)
+    if wrong := np.count_nonzero(contradicted(receptions)):
+        notes.append(
+            f"{wrong} of {len(receptions)} receptions make no range, because others of their link contradict them"
+        )
     staging.beside = {"receptions": receptions.to_dict(), "overheard": overheard}
     db.register(
         "found",

@@ -2,7 +2,7 @@
 
 Everything is predicted. Broadcasts are double-sided exchanges whose replies wait for slots. A listener k has the
 difference of arrival of the frames of i and j as rx_k(j) - rx_k(i) - K (tx_j - rx_j(i)) - d_ij/c, where K is the rate
-of its clock relative to j's, from two frames of j.
+of its clock relative to j's between them, from three frames of j (`uwblink.receptions`).
 """
 
 from __future__ import annotations
@@ -84,9 +84,12 @@ def fleet_figures(
     c = c[np.arange(max(len(c), tags - 1)) % len(c)]
     apart = 1 + np.arange(len(c)) % (tags - 1)
     reply = slot * np.minimum(apart, tags - apart)
-    error = predict(PROTOCOLS["ds"], c.with_columns(at_once=reply, scheduled=tags * slot))
-    std_m, rmse_m = float(np.mean(error.variance_m2)) ** 0.5, error.mean_of(1) ** 0.5
-    difference_m = float(np.mean(difference_variance_m2(c, reply, tags * slot))) ** 0.5
+    # Frames before and after give the rate between them, which drift does not change.
+    error = predict(PROTOCOLS["ds"], c.with_columns(at_once=reply, scheduled=tags * slot, drift=0.0 * c.drift))
+    range_m2, difference_m2 = broadcast_variances_m2(c, reply, tags * slot)
+    range_m2 = float(np.mean(range_m2 + error.parts_m2["multipath"]))
+    std_m, rmse_m = range_m2**0.5, float(np.mean(error.mean_m**2) + range_m2) ** 0.5
+    difference_m = float(np.mean(difference_m2)) ** 0.5
     each, listening = tags * frame / pairs, tags * frame / (tags - 1)
     title = "Broadcasts in turn, every pair double-sided"
     ways.append(("broadcast", title, std_m, rmse_m, each, tags * each, tags * slot))
@@ -100,15 +103,17 @@ def fleet_figures(
     ]
 
 
-def difference_variance_m2(c: Conditions, reply_s: Floats | float, round_s: Floats | float) -> Floats:
-    """Return the variance of differences of arrival (n,) in square metres: first order in the errors of stamps.
+def broadcast_variances_m2(c: Conditions, reply_s: Floats | float, round_s: Floats | float) -> tuple[Floats, Floats]:
+    """Return variances of ranges and of differences of arrival (n,) in square metres: first order in errors of stamps.
 
-    `reply_s` is from the frame of i to that of j, `round_s` from there to the next one of j, whose ratio r rescales the
-    reply: rx_k(i), rx_j(i), rx_k(j) and the next rx_k(j) count by 1, 1, 1 + r and r. The transmit error of i's frame is
-    in two of them and cancels. White noise of both clocks is integrated over the reply with weight 1, over the round
-    with weight r.
+    `reply_s` is from the frame of i to that of j, `round_s` between frames of j; r is their ratio. The rate of the
+    clocks comes from the frames of j before, in and after the exchange, whose errors count by r (1 + r)/2, 1 - r^2 and
+    r (1 - r)/2, together 1 - 3/2 r^2 (1 - r^2). Both errors of i's frame count in a range, at i and j; a difference has
+    two receptions of it, so that its transmission cancels. White noise of both clocks is integrated over these frames.
     """
     r = np.asarray(reply_s) / round_s
-    rounding = TICK_S**2 / 12 * c.quantize
-    frames = (c.rx_std**2 + rounding) * (3 + 2 * r + 2 * r**2) + c.tx_std**2 * ((1 + r) ** 2 + r**2)
-    return np.asarray((frames + (c.white**2).sum(axis=0) * reply_s * (1 + r)) * SPEED_OF_LIGHT**2)
+    of_j = 1 - 1.5 * r**2 * (1 - r**2)
+    clocks = (c.white**2).sum(axis=0) * reply_s * (1 - r**2) * (1 - r / 2)
+    rx, tx = c.rx_std**2 + TICK_S**2 / 12 * c.quantize, c.tx_std**2
+    ranges, differences = ((rx + tx) * (1 + of_j) + clocks) / 4, rx * (2 + of_j) + tx * of_j + clocks
+    return np.asarray(ranges * SPEED_OF_LIGHT**2), np.asarray(differences * SPEED_OF_LIGHT**2)

@@ -19,6 +19,8 @@ REFUSED = {
     "88 % left out": "left out",
     "all times zero": "same time",
     "transmissions and receptions swapped": "ranges grow",
+    "carrier with the opposite sign": "clock skew",
+    "third leg longer than a wrap": "clock skew",
 }
 NAMED = {
     "one pair of four tags reads 45 cm long": "pair 1-2",
@@ -31,8 +33,6 @@ NAMED = {
     "a tag short by 20 cm for a tenth": "tag 4",
     "a tag's delay goes with power": "tag 1",
     "uncorrected skew": "clock skew",
-    "carrier with the opposite sign": "clock skew",
-    "third leg longer than a wrap": "clock skew",
     "antenna delays of 514 ns not configured": "more than boards differ by",
 }
 """What the first sentences must name; the others need only be right, or doubted."""

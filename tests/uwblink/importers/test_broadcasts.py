@@ -1,17 +1,19 @@
 """Logs of boards that range by broadcast: made here by clocks of their own, and recorded ones."""
 
 import json
+import shutil
 import tarfile
 
 import numpy as np
 import pytest
 
+import calib
 from tests import processes
 from tests.shared_data import shared
 from tests.uwblink.test_receptions import PLACES, broadcasts
 from uwblink import raw_range
 from uwblink.errors import ImportTableError
-from uwblink.importers import read_source
+from uwblink.importers import import_file, read_source
 from uwblink.importers.guess import guess_map
 from uwblink.recording.contents import load
 
@@ -102,13 +104,30 @@ def test_maps_that_cannot_be_are_refused_with_the_key(tmp_path, text, said):
     assert "\n" not in str(caught.value)
 
 
-def test_recorded_boards_give_the_ranges_of_their_description(tmp_path):
-    """Medians by an independent program (README of the data folder), of stamps of 40 bits over 20 s."""
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """The recorded logs by their first number, imported."""
+    folder = tmp_path_factory.mktemp("swarm")
     with tarfile.open(shared("swarm_broadcast_logs.tar.xz")) as archive:
-        archive.extractall(tmp_path, filter="data")
-    (log,) = tmp_path.rglob("90-1.log")
-    (tmp_path / "m.toml").write_text(guess_map(log).text)
-    found = read_source(log, importer="csv", map_file=tmp_path / "m.toml")
+        archive.extractall(folder, filter="data")
+    found = {}
+    for log in folder.rglob("*.log"):
+        (folder / "m.toml").write_text(guess_map(log).text)
+        run = int(log.name.split("-")[0])
+        found[run] = folder / f"{run}.uwb"
+        import_file(log, found[run], importer="csv", map_file=folder / "m.toml")
+    return found
+
+
+def by_pair(e):
+    """Rows (k,) of exchanges of each pair."""
+    key = np.sort(np.column_stack([e.initiator, e.target]), axis=1)
+    return [np.flatnonzero((key == pair).all(axis=1)) for pair in np.unique(key, axis=0)]
+
+
+def test_recorded_boards_give_the_ranges_of_their_description(recorded):
+    """Medians by an independent program (README of the data folder), of stamps of 40 bits over 20 s."""
+    found = load(recorded[90])
     assert len(found.receptions["rx"]) == 1098
     named = {tag.tag: tag.body.removeprefix("0x") for tag in found.tags}
     known = {"853C-9042": 0.53, "853C-BB1E": 0.60, "853C-E621": 2.09, "9042-BB1E": -0.87, "9042-E621": 0.67}
@@ -119,5 +138,62 @@ def test_recorded_boards_give_the_ranges_of_their_description(tmp_path):
         ]
         ours = found.exchanges.range_m[ends[0] & ends[1]]
         assert len(ours) > 80
-        # Their spread is 5 to 7 cm.
-        assert np.median(ours) == pytest.approx(range_m, abs=0.07)
+        # They are printed to a centimetre; a rate from later frames alone would be off by 5 cm.
+        assert np.median(ours) == pytest.approx(range_m, abs=0.011)
+        assert ours.std() < 0.04
+
+
+def test_a_lossy_run_has_no_range_that_its_stamps_do_not_support(recorded):
+    """Seven boards stand still, and one in forty of their stamps is wrong by up to 110 m."""
+    found = load(recorded[70])
+    e = found.exchanges
+    assert len(e) > 0.96 * 496, "as many as there are with every stamp"
+    pairs = by_pair(e)
+    # 0x0E5F heard 0xCDA3 nine times, four or five of them wrong.
+    assert len(pairs) == 18
+    for row in pairs:
+        assert len(row) > 5
+        ranges = raw_range(e)[row]
+        assert np.abs(ranges - np.median(ranges)).max() < 0.7
+    # Frames stand in the log 76 ms apart, by all the clocks that stamped two.
+    assert np.ptp(e.time_ns) * 1e-9 == pytest.approx(28.5, abs=1)
+
+
+@pytest.mark.parametrize("run", [90, 110])
+@pytest.mark.parametrize("first", [0, 1])
+def test_halves_of_a_run_agree_within_their_intervals(recorded, run, first):
+    """A distance that nobody measured is in the constants of both halves, and cancels.
+
+    In run 110 a board is warming up: by the rate of later frames alone its pairs would drift by 12 to 19 cm.
+    """
+    e = load(recorded[run]).exchanges
+    later = e.time_ns >= np.median(e.time_ns)
+    halves = [
+        calib.Ranges.from_arrays(
+            raw_range(e)[h], initiator=e.initiator[h], target=e.target[h], time_ns=e.time_ns[h], truth_m=2.0
+        )
+        for h in (~later, later)
+    ]
+    settings = calib.FitSettings(constants="pair", delays_only=True, between_m=0.0)
+    fitted = calib.fit(halves[first], settings)
+    stage = calib.evaluate(halves[1 - first], fitted.calibration).to_dict()["overall"]
+    assert abs(stage["full"]["median_m"]) < 0.02
+    # Of 270 ranges 95 % and four standard errors, which count double, since errors last.
+    assert stage["inside_95"] > 0.89
+
+
+@pytest.mark.parametrize(("run", "use"), [(90, "exchanges"), (90, "receptions"), (70, "exchanges")])
+def test_a_geometry_that_was_made_up_is_refuted(recorded, tmp_path, run, use):
+    shutil.copy(recorded[run], tmp_path / "q.uwb")
+    grid = (f"[[anchors]]\nid = {k + 1}\nposition_m = [{k % 2}, {k // 2}, 1.0]\n" for k in range(7))
+    (tmp_path / "grid.toml").write_text("".join(grid))
+    processes.succeed("uwblink", "poses", "q.uwb", "--tags", "grid.toml", cwd=tmp_path)
+    answer = json.loads(processes.succeed("calib", "doctor", "q.uwb", "--json", cwd=tmp_path).stdout)
+    assert answer["findings"][0]["fault"] == "pairs that do not close"
+    processes.refuse(
+        *("calib", "fit", "q.uwb", "-o", "c.json", "--delays-only", "--use", use),
+        cwd=tmp_path,
+        naming=["q.uwb", "% of the ranges", "pair 1-4 or pair 2-3" if run == 90 else "pair"],
+        status=1,
+    )
+    assert not (tmp_path / "c.json").exists()

@@ -11,7 +11,7 @@ from uwblink import raw_range
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, elapsed
 from uwbsim.protocols.comparison import compare
 from uwbsim.protocols.conditions import calibrated, conditions_of
-from uwbsim.protocols.fleet import difference_variance_m2
+from uwbsim.protocols.fleet import broadcast_variances_m2
 
 PLACES = {1: (0.0, 0.0, 0.5), 2: (5.0, 0.3, 0.0), 3: (1.0, 6.0, 1.0), 4: (4.5, 5.5, 2.0), 5: (-3.0, 4.0, 1.0)}
 LISTENER = (2.0, 2.5, 1.5)
@@ -61,7 +61,7 @@ def test_broadcasts_and_differences_err_as_predicted(white):
     slot = 1 / scenario.ranging.rate_hz
     near = {name: column[reply < 1.5 * slot] for name, column in heard.items()}
     world = calibrated(conditions_of(scenario, 100))
-    expected = np.sqrt(difference_variance_m2(world, slot, 5 * slot).mean())
+    expected = np.sqrt(broadcast_variances_m2(world, slot, 5 * slot)[1].mean())
     assert np.std(differences_m(near)) == pytest.approx(expected, rel=0.02)
     # Ten pairs a round; a range needs the round after it.
     assert len(flight.exchanges) / 20.0 == pytest.approx(10 * found["broadcast"].update_hz, rel=0.001)
@@ -82,11 +82,12 @@ def test_costs_are_those_of_the_frames():
     assert five["ds"].update_hz / fifty["ds"].update_hz == pytest.approx(50 * 49 / 20)
     longest_s = 138.397e-6 + 21.538e-6 + (8 * 127 + 4 * 48) * 64 / 499.2e6
     assert fifty["tdoa"].update_hz == pytest.approx(1 / (50 * (longest_s + 300e-6)), rel=1e-4)
-    # Replies take a fifth or two of a round: (1 + r + r^2)/2 for a range, 3 + 2 r + 2 r^2 for a difference.
+    # Replies take a fifth or two of a round; frames of one tag count by 1 - 3/2 r^2 (1 - r^2), three others by 1.
     metre_s = 100e-12 * SPEED_OF_LIGHT
     ratios = np.array([0.2, 0.4])
-    assert five["broadcast"].std_m == pytest.approx(metre_s * np.mean((1 + ratios + ratios**2) / 2) ** 0.5, rel=1e-3)
-    assert five["tdoa"].std_m == pytest.approx(metre_s * np.mean(3 + 2 * ratios + 2 * ratios**2) ** 0.5, rel=1e-9)
+    saved = 1.5 * np.mean(ratios**2 - ratios**4)
+    assert five["broadcast"].std_m == pytest.approx(metre_s * ((2 - saved) / 4) ** 0.5, rel=1e-3)
+    assert five["tdoa"].std_m == pytest.approx(metre_s * (3 - saved) ** 0.5, rel=1e-9)
     assert {one.tags for one in fifty.values()} == {50}
 
 
