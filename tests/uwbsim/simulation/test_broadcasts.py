@@ -176,7 +176,7 @@ def test_who_is_out_of_range_hears_nothing_and_ranges_with_nobody():
 
 def test_the_recording_holds_receptions_and_the_exchanges_that_they_make(tmp_path):
     out = tmp_path / "tdoa.uwb"
-    words = ("--set", "run.duration_s=2", "--set", "radio.bias=none", "--set", "radio.shadowing_db=0.0")
+    words = ("--set", "run.duration_s=2", "--set", "radio.bias=none")
     processes.succeed("uwbsim", "run", "tdoa", "-o", out, *words)
     held = load(out)
     assert held.meta["timestamp_bits"] == held.exchanges.bits == 40
