@@ -9,6 +9,7 @@ import pytest
 from benchmarks import scoreboard
 from tests import processes
 from tests.shared_data import shared
+from uwblink import load
 
 pytestmark = pytest.mark.slow
 
@@ -53,6 +54,7 @@ def corrected(work, recording, calibration):
 
 WANTED = ("truth_m", "raw_m", "corrected_m", "sigma_m")
 PAPER = ["icra2023_bias_fpp.csv", "icra2023_published_fits.json"]
+SWARM = ["swarm_broadcast_logs.tar.xz"]
 MILUV = ["miluv_cirObstacles_3_random_0.tar.xz", "miluv_published_calibration.json"]
 
 
@@ -107,6 +109,23 @@ def test_a_flight_is_judged_with_the_published_calibration_and_on_what_was_held_
     assert number(rows[flight, "authors'"][3]) == pytest.approx(inside, abs=0.06)
     assert 0.25 < int(rows[f"{flight}, held out", "ours, by the rest"][0]) / len(raw) < 0.35
     assert all(re.fullmatch(r"\d\.\d\d", rows[flight, name][4]) for name in ("none", "authors'"))
+
+
+@pytest.mark.parametrize("folder", [SWARM], indirect=True)
+def test_boards_that_stand_nowhere_known_are_judged_by_the_spread_within_pairs(folder, tmp_path, monkeypatch):
+    page, work = written(folder, tmp_path, monkeypatch)
+    rows = {name: row for (name, _), row in table(page).items() if "held out" in name}
+    assert sorted(rows) == ["110-1, held out", "70-1, held out", "90-1, held out"]
+    for name, row in rows.items():
+        e = load(work / f"{name.split(',')[0]}.uwb").exchanges
+        link = e.initiator.astype(int) * 1000 + e.target
+        errors = np.concatenate([e.range_m[link == k] - np.median(e.range_m[link == k]) for k in np.unique(link)])
+        # Half of the ranges, by constants of the other half.
+        assert int(row[0]) == pytest.approx(len(e) / 2, rel=0.03)
+        assert abs(number(row[1])) < 1.0
+        assert number(row[2]) == pytest.approx(CM * spread(errors), rel=0.15)
+        assert 92 < number(row[3]) < 99
+    assert page.count("% of the ranges lie beyond three sigmas of this fit") == 3
 
 
 def test_a_folder_without_any_data_set_is_one_line(tmp_path, capsys):

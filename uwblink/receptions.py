@@ -326,13 +326,9 @@ def _heard_by(listener: int, r: Receptions, links: _Links, rows: Ints, exchanges
     e = exchanges[good]
     columns: dict[str, NDArray[Any]] = {"time_ns": e.time_ns, "listener": me[good]}
     columns |= {"initiator": e.initiator, "target": e.target} | {f"{name}_n": getattr(e, name) for name in STAMPS}
-    own_rows = [row[good] for row, _ in found]
-    stamps = (
-        r.rx[own_rows[0]],
-        r.rx[own_rows[1]],
-        _without_drift(r, links, *own_rows[1:], elapsed(e.tx2, e.rx1, r.bits)),
-    )
-    for k, (own, rx) in enumerate(zip(own_rows, stamps, strict=True), 1):
+    first, second, third = (row[good] for row, _ in found)
+    rx3 = _without_drift(r, links, second, third, elapsed(e.tx2, e.rx1, r.bits))
+    for k, (own, rx) in enumerate(((first, r.rx[first]), (second, r.rx[second]), (third, rx3)), 1):
         columns |= {f"rx{k}": rx, f"fpp{k}_dbm": r.fpp_dbm[own], f"skew{k}_ppm": r.skew_ppm[own]}
     return columns | {
         f"{w}{k}_n_{u}": getattr(e, f"{w}{k}_{u}") for w, u in (("fpp", "dbm"), ("skew", "ppm")) for k in (1, 2)

@@ -86,10 +86,10 @@ def fleet_figures(
     reply = slot * np.minimum(apart, tags - apart)
     # Frames before and after give the rate between them, which drift does not change.
     error = predict(PROTOCOLS["ds"], c.with_columns(at_once=reply, scheduled=tags * slot, drift=0.0 * c.drift))
-    range_m2, difference_m2 = broadcast_variances_m2(c, reply, tags * slot)
-    range_m2 = float(np.mean(range_m2 + error.parts_m2["multipath"]))
+    of_ranges, of_differences = broadcast_variances_m2(c, reply, tags * slot)
+    range_m2 = float(np.mean(of_ranges + error.parts_m2["multipath"]))
     std_m, rmse_m = range_m2**0.5, float(np.mean(error.mean_m**2) + range_m2) ** 0.5
-    difference_m = float(np.mean(difference_m2)) ** 0.5
+    difference_m = float(np.mean(of_differences)) ** 0.5
     each, listening = tags * frame / pairs, tags * frame / (tags - 1)
     title = "Broadcasts in turn, every pair double-sided"
     ways.append(("broadcast", title, std_m, rmse_m, each, tags * each, tags * slot))
