@@ -79,11 +79,13 @@ def arrivals_of(
     overheard: Mapping[str, NDArray[Any]],
     poses: Poses,
     tags: Sequence[Tag],
+    *,
+    need_truth: bool = True,
 ) -> Arrivals:
     """Return what listeners know of exchanges with raw ranges `range_m` (n,).
 
-    `overheard` has the columns of the recording's table. Rows without true differences, without the rate of the
-    target's clock, or with impossible stamps are left out.
+    `overheard` has the columns of the recording's table. Rows without the rate of the target's clock or with impossible
+    stamps are left out, and those without true differences if they are needed.
     """
     row = exchange_of(exchanges, overheard)
     heard = {name: column[row >= 0] for name, column in overheard.items()}
@@ -106,7 +108,8 @@ def arrivals_of(
         stretch=stretch,
     )
     with np.errstate(invalid="ignore"):
-        return found[np.abs(found.error_m) < LARGEST_ERROR_M]
+        usable = np.abs(found.error_m) < LARGEST_ERROR_M
+        return found[usable | (np.isfinite(found.raw_m) & np.isnan(found.truth_m) & (not need_truth))]
 
 
 def _rates(e: Exchanges, heard: Mapping[str, NDArray[Any]], between_s: Any) -> tuple[Floats, Floats]:

@@ -299,8 +299,10 @@ def require_arrivals(ranges: Ranges) -> None:
         )
 
 
-def load_flight(data: Data, *, need_power: bool = True) -> Flight:
+def load_flight(data: Data, *, need_power: bool = True, need_truth: bool = True) -> Flight:
     """Return a recording's usable ranges with its poses; of an exchange that both ends reported one report counts.
+
+    Without `need_truth` ranges and differences of arrival without true distances stay.
 
     Raises what `opened` raises, `BadInputError` for planted values or antenna delays that cannot be read, and
     `UnanswerableError` where no range can be used.
@@ -317,10 +319,11 @@ def load_flight(data: Data, *, need_power: bool = True) -> Flight:
         )
         heard = getattr(source, "overheard", None)
         if heard and len(heard["time_ns"]):
-            arrivals = arrivals_of(exchanges, found.raw_m, heard, source.poses, source.tags)
+            arrivals = arrivals_of(exchanges, found.raw_m, heard, source.poses, source.tags, need_truth=need_truth)
             powered = np.isfinite(measured_powers(arrivals.poll_dbm) + measured_powers(arrivals.response_dbm))
             found = replace(found, arrivals=arrivals[powered | (not need_power)])
         fingerprint = sha256(exchanges.time_ns.tobytes() + exchanges.range_m.tobytes()).hexdigest()[:32]
-        usable = found.usable(_why_no_truth(source), _why_no_power(exchanges), need_power=need_power)
+        why = _why_no_truth(source), _why_no_power(exchanges)
+        usable = found.usable(*why, need_power=need_power, need_truth=need_truth)
         ranges = replace(usable, recordings=((name, fingerprint),))
         return Flight(ranges, source.poses, list(source.tags))

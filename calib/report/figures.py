@@ -78,8 +78,9 @@ def track(width_in: float, one: Localization) -> Figure:
     panels = figure.subplot_mosaic(places, height_ratios=[2.2, 1, 1.2] if narrow else [1.4, 1])
     above, height, error = panels["path"], panels["height"], panels["error"]
     usual = []
-    for stage, own in one.tracks.items():
-        name, colour, dashes, _ = FILTER_STYLES[stage]
+    for stage, (name, colour, dashes, _) in FILTER_STYLES.items():
+        if (own := one.tracks.get(stage)) is None:
+            continue
         line: dict[str, Any] = {"color": colour, "ls": dashes, "lw": 0.9, "label": name}
         off = np.linalg.norm(own.estimate_m - own.truth_m, axis=1)
         usual.append(float(np.quantile(off, 0.995)))
