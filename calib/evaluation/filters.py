@@ -10,7 +10,7 @@ One body in a room is a case of it (`InertialFilter`): a room is a reference who
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -396,26 +396,19 @@ class InertialFilter(RelativeFilter):
 
         The update determines the sum of tilt error and accelerometer bias.
         """
-        pull, attitude = force - self.state[:, F], self.attitude[:, 0]
-        acceleration = np.einsum("hij,hj->hi", attitude, pull) - ROOM[3:]
-        self._update_linear([(A, -attitude @ _cross(pull)), (F, -attitude)], -acceleration, std)
+        for axis in range(3):
+            pull, attitude, row = force - self.state[:, F], self.attitude[:, 0], np.zeros_like(self.state)
+            row[:, A], row[:, F] = -(attitude @ _cross(pull))[:, axis], -attitude[:, axis]
+            innovation = ROOM[3 + axis] - np.einsum("hj,hj->h", attitude[:, axis], pull)
+            self.update(row, innovation, std**2, partial(gated_update, gate=np.inf))
 
     def limit_speed(self, speed_m_s: float) -> None:
         """Update by a velocity of zero with standard deviation `speed_m_s`: it bounds the state while there are no
         ranges."""
-        self._update_linear([(V, np.eye(3))], -self.state[:, V], speed_m_s)
-
-    def _update_linear(self, parts: Sequence[tuple[slice, Floats]], innovation: Floats, std: float) -> None:
-        """Update by a linear measurement of parts of the state (headings, 3, 3 each) with normal noise."""
-        rows = np.zeros((len(self.state), 3, H + 1))
-        for part, slopes in parts:
-            rows[:, :, part] = slopes
-        reach = self.covariance @ rows.transpose(0, 2, 1)
-        gain = reach @ np.linalg.inv(rows @ reach + std**2 * np.eye(3))
-        self._move(np.einsum("hij,hj->hi", gain, innovation))
-        # Joseph's form: symmetric and positive whatever rounding does.
-        left = np.eye(H + 1) - gain @ rows
-        self.covariance = left @ self.covariance @ left.transpose(0, 2, 1) + std**2 * gain @ gain.transpose(0, 2, 1)
+        for axis in range(V.start, V.stop):
+            row = np.zeros_like(self.state)
+            row[:, axis] = 1.0
+            self.update(row, -self.state[:, axis], speed_m_s**2, partial(gated_update, gate=np.inf))
 
     def restart(self, fix: Fix, speed_m_s: float) -> None:
         """Restart at a fix, with the present attitude and biases."""

@@ -25,7 +25,7 @@ from calib.calibration.model import CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, load_flight, opened, require_arrivals, require_times
 from calib.errors import BadInputError, UnanswerableError, WeakHeadingWarning
-from calib.evaluation.filters import BODY, A, F, G, P, ProcessNoise, RelativeFilter, V
+from calib.evaluation.filters import BODY, A, P, ProcessNoise, RelativeFilter, V
 from calib.evaluation.localization import Localization, consistency, filter_ranges, fixed_std
 from calib.evaluation.onboard import inertial_readings, mean_readings
 from calib.evaluation.tracking import FilterRanges, Settings, Track, Trajectory, distances_in, pair_numbers, weigh
@@ -36,17 +36,14 @@ from uwblink.recording.distances import tracks_of
 from uwblink.recording.schema import Poses, Tag
 from uwblink.settings import setting
 
-PAPER_REDUCTION: Final = 0.48
-"""By how much listening lowers the position error, at most, in real flights of three quadcopters with two tags each
-(arXiv 2304.03837v3, abstract)."""
-
-COVERED_S: Final = 0.1
-"""Seconds of exchanges that readings may leave out at either end, in which they count as constant."""
-
 BENT_S: Final = 5.0
 """How long what is not linear in distances lasts, as errors of the state across the line of sight do."""
 
-DEAD_RECKONING, RANGES_ONLY = "dead reckoning", ", ranges only"
+PAPER: Final = "arXiv 2304.03837: up to -48 % in flights of three quadcopters"
+
+BASELINES: Final = (", own ranges", ", ranges only")
+"""Ends of the names of filters that do not listen: by ranges of the reference, as a robot that is alone with what its
+own tags measure; by those of the whole team."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,7 +95,7 @@ class RelativeTrack(Track):
 class RelativePose(Localization):
     """One body of a team, in the frame of another: tracks by filter (`FILTERS`), by what was asked to be used.
 
-    Further tracks are "dead reckoning" and, where the team listens, those of filters that do not ("..., ranges only").
+    Further tracks are "dead reckoning" and, where the team listens, those of filters that do not (`BASELINES`).
     """
 
     reference: str
@@ -120,8 +117,9 @@ class RelativePose(Localization):
 class _Team:
     """A recording: bodies with IMUs, the reference last, and measurements (n,) in order of time, by exchange.
 
-    `body` and `arm` (n, k, 2) are the ends of the distances in a measurement, with signs (n, k), in pairs of tags
-    `pair` (n, k). `readings` are times in ns and inertial readings of each body.
+    `body` and `arm` (n, k, 2) are the ends of the distances in a measurement, with signs (n, k). `shares` (n, k, 2) are
+    the states of errors that they share: of pairs of tags, and then of pairs of bodies. `readings` are times in seconds
+    and inertial readings of each body.
     """
 
     bodies: list[str]
@@ -132,18 +130,20 @@ class _Team:
     sign: Floats
     body: Ints
     arm: Floats
-    pair: Ints
+    shares: Ints
     readings: list[tuple[Floats, Floats]]
     poses: Poses
 
-    def poses_at(self, time_ns: Ints) -> tuple[Floats, Floats]:
-        """Return positions (bodies, n, 3) and attitudes (bodies, n, 3, 3) in the world, NaN where poses do not say."""
+    def points_m(self, time_ns: Ints) -> Floats:
+        """Return points of each body in the world, a metre along its axes and its middle, NaN where poses do not say.
+
+        The shape is (bodies, n, 4, 3).
+        """
         tracks, points = tracks_of(self.poses), np.full((len(self.bodies), len(time_ns), 4, 3), np.nan)
         for one, body in zip(points, self.bodies, strict=True):
             if body in tracks:
                 one[:] = np.stack([tracks[body].point_m(time_ns, at).T for at in np.eye(4)[:, :3]], axis=1)
-        # The last of the points is the body's middle, the others lie a metre along its axes.
-        return points[:, :, 3], (points[:, :, :3] - points[:, :, 3:]).swapaxes(2, 3)
+        return points
 
     def relative_poses(self, time_ns: Ints) -> tuple[Floats, Floats]:
         """Return positions (n, bodies, 3) and attitudes (n, bodies, 3, 3) in the frame of the reference, which is left
@@ -151,22 +151,21 @@ class _Team:
 
         Where poses do not say, positions are NaN and attitudes the identity.
         """
-        place, axes = self.poses_at(time_ns)
-        to_frame = axes[-1].swapaxes(1, 2)
-        apart = np.einsum("nij,bnj->nbi", to_frame, place[:-1] - place[-1])
-        turned = np.moveaxis(to_frame @ axes[:-1], 0, 1)
-        return apart, np.where(np.isfinite(apart[..., None]), turned, np.eye(3))
+        points = self.points_m(time_ns)
+        middle = points[-1, :, 3:]
+        found = np.einsum("bnpi,nai->nbpa", points[:-1] - middle, points[-1, :, :3] - middle)
+        place, turned = found[:, :, 3], (found[:, :, :3] - found[:, :, 3:]).swapaxes(2, 3)
+        return place, np.where(np.isfinite(place[..., None]), turned, np.eye(3))
 
     def start(self) -> tuple[Floats, Floats, Floats]:
         """Return positions, velocities (bodies, 3) and attitudes (bodies, 3, 3) at the first exchange.
 
         Velocities are those of parabolas through poses of the first 0.2 s.
         """
-        time_ns = self.time_ns[0] + 10**8 * np.arange(3)
-        place, axes = self.poses_at(time_ns)
-        speed = np.einsum("bni,n->bi", place, [-15.0, 20.0, -5.0]) @ axes[-1, 0]
-        apart, turned = self.relative_poses(time_ns[:1])
-        return apart[0], speed[:-1] - speed[-1], turned[0]
+        points = self.points_m(self.time_ns[0] + 10**8 * np.arange(3))
+        place, turned = self.relative_poses(self.time_ns[:1])
+        speed = np.einsum("bni,n->bi", points[:-1, :, 3] - points[-1, :, 3], [-15.0, 20.0, -5.0])
+        return place[0], speed @ (points[-1, 0, :3] - points[-1, 0, 3]).T, turned[0]
 
 
 def localize_team(
@@ -190,9 +189,11 @@ def localize_team(
     fixed = fixed_std(calibration, Settings())
     measured = {name: one.at(team.rows) for name, one in filter_ranges(team.ranges, calibration, fixed).items()}
     heard = team.rows >= len(team.ranges)
-    filters = {DEAD_RECKONING: (measured["raw"], np.zeros_like(heard))}
+    filters = {"dead reckoning": (measured["raw"], np.zeros_like(heard))}
     if chosen.use == "receptions":
-        filters |= {name + RANGES_ONLY: (one, ~heard) for name, one in measured.items()}
+        own = ~heard & (team.body == len(team.bodies) - 1).any(axis=(1, 2))
+        for end, used in zip(BASELINES, (own, ~heard), strict=True):
+            filters |= {name + end: (one, used) for name, one in measured.items()}
     filters |= {name: (one, np.ones_like(heard)) for name, one in measured.items()}
     return [
         RelativePose(
@@ -245,14 +246,16 @@ def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, A
             stacklevel=3,
         )
     rows = rows[np.lexsort((exchange[rows], time[rows]))]
-    began, ended = (int(time[rows[k]]) for k in (0, -1))
-    readings = [inertial_readings(imu, one, began) for one in bodies]
+    readings = [inertial_readings(imu, one, int(time[rows[0]])) for one in bodies]
+    last_s = float(np.ptp(time[rows])) * 1e-9
     for one, (time_s, _) in zip(bodies, readings, strict=True):
-        if time_s[0] > COVERED_S or time_s[-1] < (ended - began) * 1e-9 - COVERED_S:
+        # Beyond the first and last reading they count as constant, for a tenth of a second at most.
+        if time_s[0] > 0.1 or time_s[-1] < last_s - 0.1:
             raise UnanswerableError(
                 f"{name}: inertial readings of {one} cover {time_s[0]:.1f} to {time_s[-1]:.1f} s after the first "
-                f"exchange, not all exchanges to {(ended - began) * 1e-9:.1f} s"
+                f"exchange, not all exchanges to {last_s:.1f} s"
             )
+    pairs = pair_numbers(ends[rows])
     return _Team(
         bodies=bodies,
         ranges=ranges,
@@ -262,7 +265,7 @@ def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, A
         sign=sign[rows],
         body=body[rows],
         arm=arms[ends[rows]],
-        pair=pair_numbers(ends[rows]),
+        shares=np.stack([pairs, pairs.max() + 1 + pair_numbers(body[rows])], axis=-1),
         readings=readings,
         poses=poses,
     )
@@ -277,24 +280,15 @@ def _start(team: _Team, settings: TeamSettings, filters: int) -> RelativeFilter:
             f"{team.ranges.source}: no poses of {lost[0]} and {team.bodies[-1]} at the first exchange, near which "
             "estimates begin; import poses that cover it"
         )
-    turn_std = np.radians(settings.start_std_deg)
-    own = zlib.crc32(team.time_ns.tobytes())
-    rng = np.random.default_rng([settings.seed, own])
+    turn_std, noise = np.radians(settings.start_std_deg), settings.noise
+    stds = settings.start_std_m, settings.start_std_m_s, turn_std, noise.gyro_start, noise.force_start
+    spread = np.concatenate([np.tile(np.repeat(stds, 3), len(place)), np.repeat(stds[3:], 3)])
+    spread = np.append(spread, np.ones(team.shares.max() + 2))
+    rng = np.random.default_rng([settings.seed, zlib.crc32(team.time_ns.tobytes())])
     place = place + rng.normal(size=place.shape) * settings.start_std_m
     attitude = attitude @ Rotation.from_rotvec(rng.normal(size=place.shape) * turn_std).as_matrix()
-    spread = np.zeros(BODY)
-    spread[P], spread[V], spread[A] = settings.start_std_m, settings.start_std_m_s, turn_std
-    spread[G], spread[F] = settings.noise.gyro_start, settings.noise.force_start
-    spread = np.concatenate(
-        [
-            np.tile(spread, len(place)),
-            spread[G],
-            spread[F],
-            np.ones(int(team.pair.max() + pair_numbers(team.body).max()) + 3),
-        ]
-    )
     start = np.tile(place, (filters, 1, 1)), np.tile(attitude, (filters, 1, 1, 1))
-    found = RelativeFilter(*start, spread, settings.noise, moving=True)
+    found = RelativeFilter(*start, spread, noise, moving=True)
     found.own[..., V] = speed + rng.normal(size=speed.shape) * settings.start_std_m_s
     return found
 
@@ -304,8 +298,8 @@ def _run(
 ) -> dict[str, dict[str, RelativeTrack]]:
     """Run filters on the measurements that each uses (n,); return the tracks of each body by filter.
 
-    States beside those of `RelativeFilter` are as in `run_filters`: an error for each pair of tags, then that of an
-    exchange.
+    States beside those of `RelativeFilter` are errors in units of their standard deviation: as in `run_filters` of
+    pairs of tags and of an exchange, and of pairs of bodies what is not linear in their distances.
     """
     known, uses = [one for one, _ in filters.values()], np.stack([used for _, used in filters.values()], axis=1)
     measured, std, common, shared = (
@@ -313,36 +307,32 @@ def _run(
         for name in ("measured_m", "std_m", "common_m", "shared_m")
     )
     running = _start(team, settings, len(known))
-    began, end = team.time_ns[0], team.time_ns[-1]
-    steps = np.arange(began, end, round(1e9 / settings.rate_hz))
+    steps = np.arange(team.time_ns[0], team.time_ns[-1], round(1e9 / settings.rate_hz))
     time_ns = np.unique(np.concatenate([team.time_ns, steps]))
-    elapsed = np.diff(time_ns) * 1e-9
-    inertial = np.stack([mean_readings(*one, (time_ns - began) * 1e-9) for one in team.readings], axis=1)
+    time_s = (time_ns - time_ns[0]) * 1e-9
+    inertial = np.stack([mean_readings(*one, time_s) for one in team.readings], axis=1)
     firsts = np.append(np.searchsorted(team.time_ns, time_ns), len(team.rows))
     truth, turned = team.relative_poses(time_ns)
     pose = BODY * np.arange(len(team.bodies) - 1)[:, None] + np.r_[P, A]
-    # States of pairs of tags, then of pairs of bodies.
-    of_tags = running.known + team.pair
-    between = running.known + int(team.pair.max()) + 1 + pair_numbers(team.body)
-    lasting = np.array([one.lasting_s for one in known])
+    # How long the shared errors last: of pairs of tags, of pairs of bodies, of an exchange.
+    lasting = np.full((len(known), team.shares.max() + 2), BENT_S)
+    lasting[:, : team.shares[..., 1].min()] = [[one.lasting_s] for one in known]
+    lasting[:, -1] = 1e-12
     shape = len(time_ns), len(known), len(team.bodies) - 1
     place, attitude, std_m, nees = np.empty((*shape, 3)), np.empty((*shape, 3, 3)), np.empty(shape), np.empty(shape)
     nis, accepted = np.empty(std.shape), np.empty(std.shape, dtype=bool)
-    others = running.state.shape[1] - running.known
-    exchange, last_s = -1, 0.0
+    exchange, last_s = -1, -1.0
     for k in range(len(time_ns)):
         if k:
-            running.predict(elapsed[k - 1], inertial[k - 1, :-1], inertial[k - 1, -1])
+            running.predict(time_s[k] - time_s[k - 1], inertial[k - 1, :-1], inertial[k - 1, -1])
         for row in range(firsts[k], firsts[k + 1]):
             if team.exchange[row] != exchange:
-                now_s = (time_ns[k] - began) * 1e-9
-                kept = np.repeat(np.exp((last_s - now_s) / lasting)[:, None], others, axis=1)
-                kept[:, between.min() - running.known :] = np.exp((last_s - now_s) / BENT_S)
-                kept[:, -1] = 0.0
+                # Two exchanges at one time share no error, either.
+                kept = np.exp(-np.maximum(time_s[k] - last_s, 1e-9) / lasting)
                 running.decay(kept, 1 - kept**2)
-                exchange, last_s = team.exchange[row], now_s
+                exchange, last_s = team.exchange[row], time_s[k]
             expected, slopes, bent_m = running.distances(team.body[row], team.arm[row], team.sign[row])
-            for which, (pair, sides) in enumerate(zip(of_tags[row].tolist(), between[row].tolist(), strict=True)):
+            for which, (pair, sides) in enumerate((running.known + team.shares[row]).tolist()):
                 slopes[:, pair] += shared[row, :, which]
                 slopes[:, sides] += team.sign[row, which] * bent_m[:, which]
             slopes[:, -1] = common[row]
@@ -393,10 +383,9 @@ def team_text(found: list[RelativePose], settings: TeamSettings) -> str:
         f"fixed standard deviations, {fixed.source}: raw {fixed.std_m['raw']:.3f} m, calibrated "
         f"{fixed.std_m['calibrated']:.3f} m; NEES should be {RelativeTrack.DEGREES}",
     ]
-    if less := _reductions(rows):
+    for end, less in _reductions(rows).items():
         changes = ", ".join(f"{name} {-100 * share:+.0f} %" for name, share in less.items())
-        paper = f"{-100 * PAPER_REDUCTION:+.0f} % at most in flights of its own"
-        lines.append(f"position errors by listening: {changes}; arXiv 2304.03837: {paper}")
+        lines.append(f"position errors by listening, against {end}: {changes} ({PAPER})")
     return "\n".join(lines)
 
 
@@ -410,10 +399,14 @@ def team_json(found: list[RelativePose]) -> dict[str, Any]:
     return {"bodies": rows, "summary": for_json(summary), "reduction_by_listening": for_json(_reductions(summary))}
 
 
-def _reductions(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Return by which share overheard frames lower the RMSE of the position, by filter."""
-    alone = {name.removesuffix(RANGES_ONLY): one for name, one in rows.items() if name.endswith(RANGES_ONLY)}
-    return {name: 1 - rows[name]["rmse_m"] / one["rmse_m"] for name, one in alone.items()}
+def _reductions(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, float]]:
+    """Return by which share listening lowers the RMSE of the position, by baseline and filter."""
+    both = {end[2:]: {name: name + end for name in rows if name + end in rows} for end in BASELINES}
+    return {
+        end: {name: 1 - rows[name]["rmse_m"] / rows[other]["rmse_m"] for name, other in names.items()}
+        for end, names in both.items()
+        if names
+    }
 
 
 def _figures(found: list[RelativePose]) -> dict[str, dict[str, Any]]:
