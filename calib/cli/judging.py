@@ -21,7 +21,7 @@ from calib.cli.shared import (
     warn,
     with_flags,
 )
-from calib.settings import FitSettings
+from calib.settings import FitSettings, check_choice
 from uwblink.cli.shared import AsJson, CalibrationFile, Figures, Force, ReportFile, Seeds, add, choice, output, waiting
 
 if TYPE_CHECKING:
@@ -141,6 +141,7 @@ def localize(
     )
 
     check_report(None, figures, force=force)
+    check_choice("imu", imu, IMUS)
     known = known_calibration(calibration, recordings)
     found: list[Any]
     table: Any
