@@ -192,6 +192,32 @@ def value_of(one, bodies, arms):
     return one.distances(bodies[:1], arms[:1], np.ones(1))[0][0]
 
 
+def test_noise_of_readings_moves_bodies_as_stated_and_that_of_the_reference_all_at_once():
+    rng, dt, count = np.random.default_rng(5), 0.02, 2000
+    loud = ProcessNoise(force=0.05, gyro=0.01, force_bias=0.0, gyro_bias=0.0)
+    where, turned = rng.normal(size=(1, 2, 3)) * 3, Rotation.random(2, rng=rng).as_matrix()[None]
+    stated, drawn = (
+        RelativeFilter(np.tile(where, (n, 1, 1)), np.tile(turned, (n, 1, 1, 1)), np.zeros(36), loud, moving=True)
+        for n in (1, count)
+    )
+    read = rng.normal(size=(3, 6)) * 0.5 + np.array([0, 0, 0, 0, 0, 9.81])
+    errors = np.r_[9:15, 24:30, 30:36]
+    for _ in range(50):
+        # A bias for one step is white noise.
+        drawn.state[:, errors] = rng.normal(size=(count, 18)) * np.tile(np.repeat([0.01, 0.05], 3), 3) / np.sqrt(dt)
+        for one in (stated, drawn):
+            one.predict(dt, read[:2], read[2])
+    apart = stated.attitude[:, :2].swapaxes(2, 3) @ drawn.attitude[:, :2]
+    turns = Rotation.from_matrix(apart.reshape(-1, 3, 3)).as_rotvec().reshape(count, 2, 3)
+    seen = np.concatenate([(drawn.own - stated.own)[..., :6], turns], axis=2).reshape(count, 18)
+    rows = np.r_[0:9, 15:24]
+    expected = stated.covariance[0][np.ix_(rows, rows)]
+    scale = np.sqrt(np.diag(expected))
+    # Two thousand draws know a covariance to 3 % of the product of the standard deviations.
+    np.testing.assert_allclose(np.cov(seen.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.12)
+    assert abs(expected[0, 9]) > 0.2 * scale[0] * scale[9]
+
+
 def batch(contents, t, ends, measured, start):
     """Return the relative poses at the last range by least squares of all ranges, and standard deviations.
 
