@@ -253,10 +253,10 @@ class RelativeFilter:
         place = own[..., P] + own[..., V] * dt + 0.5 * force * dt**2
         own[..., P] = np.einsum("fbij,fbj->fbi", back, place)
         own[..., V] = np.einsum("fbij,fbj->fbi", back, own[..., V] + force * dt)
+        tilt, axes = -back @ attitude @ _cross(pull) * dt, -back @ attitude @ middle * dt
         turned = _turned(turn * dt)
         self.attitude[:, :-1] = back @ attitude @ turned
         step, q = np.tile(np.eye(self.known), (len(self.state), 1, 1)), np.zeros(self.known)
-        tilt, axes = -back @ attitude @ _cross(pull) * dt, -back @ attitude @ middle * dt
         towards = self.attitude[:, :-1].transpose(0, 1, 3, 2) * dt
         for b in range(self.bodies):
             p, v, a, g, f = (slice(BODY * b + one.start, BODY * b + one.stop) for one in (P, V, A, G, F))

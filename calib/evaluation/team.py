@@ -104,8 +104,11 @@ class RelativePose(Localization):
         return f"{self.body}-from-{self.reference}"
 
     def trajectories(self) -> dict[str, Trajectory]:
-        """Return the trajectory of each filter and the true one, by name."""
-        found = {name: (one.time_ns, one.estimate_m, one.attitude) for name, one in self.tracks.items()}
+        """Return the trajectory of each filter and the true one, by name without spaces."""
+        found = {
+            name.replace(",", "").replace(" ", "-"): (one.time_ns, one.estimate_m, one.attitude)
+            for name, one in self.tracks.items()
+        }
         one: Any = self.tracks["raw"]
         known = np.isfinite(one.truth_m).all(axis=1)
         return found | {"truth": (one.time_ns[known], one.truth_m[known], one.true_attitude[known])}
