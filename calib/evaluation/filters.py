@@ -170,7 +170,7 @@ BODY: Final = 15
 
 P, V, A, G, F = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
 
-ROOM: Final = np.array([0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY_M_S2])
+REST: Final = np.array([0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY_M_S2])
 """What an IMU without errors reads that rests in a room: angular velocity and specific force."""
 
 
@@ -240,7 +240,7 @@ class RelativeFilter:
         """The states of the bodies (filters, bodies, `BODY`), which can be written to."""
         return self.state[:, : BODY * self.bodies].reshape(len(self.state), self.bodies, BODY)
 
-    def predict(self, dt: float, readings: Floats, reference: Floats = ROOM) -> None:
+    def predict(self, dt: float, readings: Floats, reference: Floats = REST) -> None:
         """Predict over `dt` seconds by mean angular velocities and specific forces of bodies (bodies, 6) and (6,)."""
         noise, own, fixed = self.noise, self.own, slice(BODY * self.bodies, self.known)
         moving = fixed.start < fixed.stop
@@ -365,7 +365,7 @@ class InertialFilter(RelativeFilter):
 
     def step(self, dt: float, readings: Floats) -> None:
         """Predict over `dt` seconds by mean readings (6,); without an IMU they are ignored."""
-        self.predict(dt, readings[None] if self.inertial else ROOM[None])
+        self.predict(dt, readings[None] if self.inertial else REST[None])
         self.covariance[:, H, H] += self.noise.height_offset**2 * dt
 
     def update_range(
@@ -399,7 +399,7 @@ class InertialFilter(RelativeFilter):
         for axis in range(3):
             pull, attitude, row = force - self.state[:, F], self.attitude[:, 0], np.zeros_like(self.state)
             row[:, A], row[:, F] = -(attitude @ _cross(pull))[:, axis], -attitude[:, axis]
-            innovation = ROOM[3 + axis] - np.einsum("hj,hj->h", attitude[:, axis], pull)
+            innovation = REST[3 + axis] - np.einsum("hj,hj->h", attitude[:, axis], pull)
             self.update(row, innovation, std**2, partial(gated_update, gate=np.inf))
 
     def limit_speed(self, speed_m_s: float) -> None:

@@ -178,6 +178,12 @@ def localize_team(
     one tag are estimated with a `WeakHeadingWarning`. Raises what `Calibration.apply` raises, and `UnanswerableError`
     where fewer than two robots have inertial readings, where these do not range with each other, where nothing was
     overheard although it is to be used, and where poses do not give the start.
+
+    >>> import calib
+    >>> known = calib.fit(calib.sample_flight()).calibration
+    >>> calib.localize_team(calib.sample_flight(), known)  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    calib.errors.UnanswerableError: memory: inertial readings of 0 bodies with tags (none), ...
     """
     calibration = given_calibration(calibration)
     chosen = settings or TeamSettings()

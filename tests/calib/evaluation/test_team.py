@@ -432,4 +432,4 @@ def test_the_command_prints_writes_and_refuses(known, tmp_path):
     replace(simulated(307, 2.0), imu={}).save(bare)
     assert "bare.uwb" in processes.refuse(*words[:2], bare, *words[3:], status=1, runner=processes.call, naming=["imu"])
     processes.refuse(*words, "--imu", "wooden", runner=processes.call, naming=["industrial"])
-    processes.refuse(*words, "--start-std", "0", "1", "1", runner=processes.call, naming=["start-std"])
+    processes.refuse(*words, "--start-std", "0", "1", "1", runner=processes.call, naming=["--start-std:"])
