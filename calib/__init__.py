@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from calib.evaluation.localization import localize
     from calib.evaluation.onboard import OnboardSettings, localize_onboard
     from calib.evaluation.statistics import evaluate
+    from calib.evaluation.team import TeamSettings, localize_team
     from calib.fitting.fitting import add_tag, fit
     from calib.fitting.result import FitResult
     from calib.planning.flights import plan_flight
@@ -56,6 +57,7 @@ __all__ = [
     "SurveyPlanSettings",
     "SurveyResult",
     "SurveySettings",
+    "TeamSettings",
     "UnanswerableError",
     "add_tag",
     "apply",
@@ -69,6 +71,7 @@ __all__ = [
     "load_ranges",
     "localize",
     "localize_onboard",
+    "localize_team",
     "plan",
     "plan_flight",
     "register_loss",
@@ -98,6 +101,7 @@ _homes = {
     "SurveyPlanSettings": "calib.planning.settings",
     "SurveyResult": "calib.surveys.result",
     "SurveySettings": "calib.settings",
+    "TeamSettings": "calib.evaluation.team",
     "UnanswerableError": "calib.errors",
     "add_tag": "calib.fitting.fitting",
     "apply": "calib.calibration.correction",
@@ -111,6 +115,7 @@ _homes = {
     "load_ranges": "calib.data.sources",
     "localize": "calib.evaluation.localization",
     "localize_onboard": "calib.evaluation.onboard",
+    "localize_team": "calib.evaluation.team",
     "plan": "calib.planning.surveys",
     "plan_flight": "calib.planning.flights",
     "register_loss": "calib.estimator.losses",

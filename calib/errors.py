@@ -25,3 +25,7 @@ class UnanswerableError(CalibError, ValueError):
 
 class LeftOutWarning(PlainWarning):
     """Ranges of pairs that a calibration does not determine are left out; names the pairs."""
+
+
+class WeakHeadingWarning(PlainWarning):
+    """Robots with a single tag, whose heading ranges tell only from motion; names the robots."""

@@ -31,7 +31,7 @@ NUMBERS: Final = {
     "heading_std_deg": (0.0, math.inf, "a number of 0 or more"),
     "pair_error_m": (POSITIVE, math.inf, "a positive number of metres"),
     **dict.fromkeys(("velocity_std_mps", "velocity_rate_hz", "initial_std_m", "gate", "reopen_s"), ABOVE_ZERO),
-    **dict.fromkeys(("start_std_m", "rate_hz", "speed_m_s"), ABOVE_ZERO),
+    **dict.fromkeys(("start_std_m", "start_std_deg", "start_std_m_s", "rate_hz", "speed_m_s"), ABOVE_ZERO),
     "seeds": (1, 1000, "1 to 1000"),
 }
 """The least and the largest value of settings that state no `bounds` themselves, and what is expected."""

@@ -21,7 +21,7 @@ from calib.cli.shared import (
     warn,
     with_flags,
 )
-from calib.settings import FitSettings
+from calib.settings import FitSettings, check_choice
 from uwblink.cli.shared import AsJson, CalibrationFile, Figures, Force, ReportFile, Seeds, add, choice, output, waiting
 
 if TYPE_CHECKING:
@@ -85,8 +85,9 @@ def localize(
         str,
         typer.Option(
             help="Motion model between ranges. poses: velocity and attitude from motion capture, to compare "
-            "calibrations; imu, constant-velocity: on board, by ranges to anchors and a height sensor.",
-            **choice("poses", "imu", "constant-velocity"),
+            "calibrations; imu, constant-velocity: on board, by ranges to anchors and a height sensor; team: poses of "
+            "robots in the frame of one of them by their IMUs and ranges, without anchors.",
+            **choice("poses", "imu", "constant-velocity", "team"),
         ),
     ] = "poses",
     use: Annotated[
@@ -104,6 +105,20 @@ def localize(
     process_noise: Annotated[
         float, typer.Option(help="White noise of the velocity input (m/s per axis at 100 Hz).")
     ] = 0.3,
+    imu: Annotated[
+        str,
+        typer.Option(
+            help="Noise of the IMUs, for --model imu and team. drone: a consumer's that vibrates.",
+            **choice("drone", "consumer", "industrial", "tactical"),
+        ),
+    ] = "drone",
+    start_std: Annotated[
+        tuple[float, float, float],
+        typer.Option(
+            help="How well relative positions (m), attitudes (deg) and velocities (m/s) are known at the first "
+            "exchange, standard deviations an axis, for --model team.",
+        ),
+    ] = (0.1, 3.0, 0.1),
     seeds: Seeds = 3,
     tum: Annotated[
         Path | None, typer.Option(help="Folder for the estimated trajectories, one file per body and filter (.tum).")
@@ -114,15 +129,19 @@ def localize(
 ) -> None:
     """Track each moving body by its ranges or what it hears, with and without calibration, and print the RMSE in m."""
     from calib.evaluation import (
+        IMUS,
         Settings,
         localization_json,
         localization_text,
         onboard_json,
         onboard_text,
+        team_json,
+        team_text,
         write_tum,
     )
 
     check_report(None, figures, force=force)
+    check_choice("imu", imu, IMUS)
     known = known_calibration(calibration, recordings)
     found: list[Any]
     table: Any
@@ -133,8 +152,15 @@ def localize(
             # The text first: where it cannot be made, nothing is written.
             table = localization_json(found)
             text = localization_text(found, settings)
+        elif model == "team":
+            metres, degrees, speed = start_std
+            team = calib.TeamSettings(
+                use=use, start_std_m=metres, start_std_deg=degrees, start_std_m_s=speed, noise=IMUS[imu]
+            )
+            found = [one for path in recordings for one in calib.localize_team(path, known, team)]
+            table, text = team_json(found), team_text(found, team)
         else:
-            onboard = calib.OnboardSettings(model=model, use=use)
+            onboard = calib.OnboardSettings(model=model, use=use, noise=IMUS[imu])
             found = [one for path in recordings for one in calib.localize_onboard(path, known, onboard)]
             table, text = onboard_json(found), onboard_text(found, onboard)
     if tum:

@@ -26,6 +26,7 @@ CALIB_FLAGS: Final = {
     "arrangement": "--save-anchors",
     "base": "--antenna-delays",
     "velocity_std_mps": "--process-noise",
+    **dict.fromkeys(("start_std_m", "start_std_deg", "start_std_m_s"), "--start-std"),
     **flags_of(FitSettings),
     **flags_of(FlightSettings),
     **flags_of(SurveySettings),

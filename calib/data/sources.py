@@ -299,14 +299,16 @@ def require_arrivals(ranges: Ranges) -> None:
         )
 
 
-def load_flight(data: Data, *, need_power: bool = True) -> Flight:
+def load_flight(data: Data, *, need_power: bool = True, need_truth: bool = True) -> Flight:
     """Return a recording's usable ranges with its poses; of an exchange that both ends reported one report counts.
+
+    Without `need_truth` ranges and differences of arrival without true distances stay.
 
     Raises what `opened` raises, `BadInputError` for planted values or antenna delays that cannot be read, and
     `UnanswerableError` where no range can be used.
     """
     with opened(data) as (name, source):
-        return flight_of(name, source, need_power=need_power)
+        return flight_of(name, source, need_power=need_power, need_truth=need_truth)
 
 
 def flight_of(name: str, source: Source, *, need_power: bool = True, need_truth: bool = True) -> Flight:

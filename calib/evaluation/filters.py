@@ -1,19 +1,18 @@
-"""Filters: updates by a range, for many filters at once, and an error-state filter with inertial readings.
+"""Filters: updates by a range, for many filters at once, and error-state filters with inertial readings.
 
 Filters differ in the error of a range that they assume. All update along the line of sight: mean and covariance of the
 state follow from the mean and variance of the noise in an innovation (moments of the posterior for Gaussian noise and
 state), by a gate or by a mixture of errors. A diverged filter restarts from ranges alone (`multilaterate`).
 
-The error-state Kalman filter has several headings at once, so that its arrays are (headings, ...). State errors (17):
-position, velocity, attitude (in the axes of the body), bias of gyro, bias of accelerometer, offset of the height sensor
-(Solà 2017, sections 5 to 7), and the error that measurements of one exchange share. Without an IMU, attitude and biases
-are not estimated, and velocity wanders.
+The error-state Kalman filter (Solà 2017, sections 5 to 7) has bodies in the frame of a reference (`RelativeFilter`).
+One body in a room is a case of it (`InertialFilter`): a room is a reference whose readings are those of rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from typing import Any, Final
 
@@ -25,7 +24,7 @@ from calib.calibration.applying import noise_m
 from calib.calibration.model import Calibration
 from calib.data.ranges import Ranges
 from calib.range_errors.densities import ONE_KIND, ROOT_2PI, LongDetours, densities
-from uwblink.arrays import Bools, Floats
+from uwblink.arrays import Bools, Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,18 +165,21 @@ def multilaterate(
 GRAVITY_M_S2: Final = 9.81
 """Between 9.78 at the equator and 9.83 at the poles; the biases of a consumer accelerometer are larger."""
 
-SIZE: Final = 17
-"""Size of the state. The names below slice its parts: position, velocity, attitude, biases, offset of the height
-sensor, and the error that measurements of one exchange share, in units of its standard deviation."""
+BODY: Final = 15
+"""States of a body. The names below slice them: position, velocity, attitude, biases of gyro and accelerometer."""
 
-P, V, A, G, F, H, E = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15), 15, 16
+P, V, A, G, F = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
+
+REST: Final = np.array([0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY_M_S2])
+"""What an IMU without errors reads that rests in a room: angular velocity and specific force."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProcessNoise:
     """Process noise of the filter: accelerometer and gyro (per root of Hz), their biases, and motion without an IMU.
 
-    The defaults are those of a consumer IMU on a small vibrating drone. `acceleration` (m/s^2 per root of Hz) is the
+    The defaults are those of a consumer IMU on a small vibrating drone. `force_start` and `gyro_start` are the standard
+    deviations of the biases at the start, in m/s^2 and rad/s. `acceleration` (m/s^2 per root of Hz) is the
     random walk of velocity without an IMU.
     """
 
@@ -185,57 +187,187 @@ class ProcessNoise:
     gyro: float = 0.005
     force_bias: float = 0.02
     gyro_bias: float = 0.0005
+    force_start: float = 0.4
+    gyro_start: float = 0.02
     acceleration: float = 1.0
     height_m: float = 0.1
     height_offset: float = 0.005
 
 
-class InertialFilter:
-    """Predicts by inertial readings or constant velocity, and updates by ranges and heights."""
+IMUS: Final = {
+    "drone": ProcessNoise(),
+    "consumer": ProcessNoise(
+        force=3e-3, gyro=1.7e-4, force_bias=2e-3, gyro_bias=1.7e-4, force_start=0.1, gyro_start=8.7e-3
+    ),
+    "industrial": ProcessNoise(
+        force=1e-3, gyro=8.7e-5, force_bias=5e-4, gyro_bias=3.5e-5, force_start=0.03, gyro_start=1.7e-3
+    ),
+    "tactical": ProcessNoise(
+        force=3e-4, gyro=1.7e-5, force_bias=5e-5, gyro_bias=1.7e-6, force_start=0.01, gyro_start=8.7e-5
+    ),
+}
+"""Noise by grade of IMU: a consumer's that vibrates, and those of data sheets, as a scenario's `imu.grade` has them."""
+
+
+class RelativeFilter:
+    """Poses of bodies in the frame of a reference: a room, or one more body with an IMU (`moving`).
+
+    Several filters at once: arrays begin with (filters, bodies). Of a body with angular velocity w and specific force f
+    and a reference with w0 and f0, attitude C, position p and velocity v in the axes of the reference obey
+
+        C' = C [w]x - [w0]x C,  p' = v - w0 x p,  v' = C f - f0 - w0 x v
+
+    Gravity cancels (Shalaby et al. 2023, arXiv 2304.03837). No state says where the team is as a whole: what distances
+    between bodies cannot tell is no state, so no linearization can seem to tell it (Huang et al. 2011, Autonomous
+    Robots 30). Errors of attitudes are in the axes of the body. States: `BODY` of each body, the biases of a moving
+    reference, and others, whose meaning is the caller's.
+    """
+
+    def __init__(
+        self, place_m: Floats, attitudes: Floats, spread: Floats, noise: ProcessNoise, *, moving: bool = False
+    ) -> None:
+        """Start at places (filters, bodies, 3) with attitudes (filters, bodies, 3, 3), and standard deviations."""
+        count, self.bodies = attitudes.shape[:2]
+        self.noise, self.known = noise, BODY * self.bodies + 6 * moving
+        # Attitude errors move into the attitude, so that part of the state stays zero. The last body is the reference.
+        self.attitude = np.concatenate([attitudes, np.tile(np.eye(3), (count, 1, 1, 1))], axis=1)
+        self.state = np.zeros((count, len(spread)))
+        self.own[..., P] = place_m
+        self.covariance = np.tile(np.diag(spread**2), (count, 1, 1))
+
+    @property
+    def own(self) -> Floats:
+        """The states of the bodies (filters, bodies, `BODY`), which can be written to."""
+        return self.state[:, : BODY * self.bodies].reshape(len(self.state), self.bodies, BODY)
+
+    def predict(self, dt: float, readings: Floats, reference: Floats = REST) -> None:
+        """Predict over `dt` seconds by mean angular velocities and specific forces of bodies (bodies, 6) and (6,)."""
+        noise, own, fixed = self.noise, self.own, slice(BODY * self.bodies, self.known)
+        moving = fixed.start < fixed.stop
+        still = reference - (self.state[:, fixed] if moving else 0.0 * self.state[:, :6])
+        turn, pull, rate = readings[:, :3] - own[..., G], readings[:, 3:] - own[..., F], still[:, None, :3]
+        # Forces count in the attitude at the middle of the step.
+        middle, back, half = _turned(turn * (dt / 2)), _turned(-rate * dt), _turned(rate * (dt / 2))
+        pull, attitude = np.einsum("fbij,fbj->fbi", middle, pull), self.attitude[:, :-1]
+        force = np.einsum("fbij,fbj->fbi", attitude, pull) - np.einsum("fbij,fbj->fbi", half, still[:, None, 3:])
+        place = own[..., P] + own[..., V] * dt + 0.5 * force * dt**2
+        own[..., P] = np.einsum("fbij,fbj->fbi", back, place)
+        own[..., V] = np.einsum("fbij,fbj->fbi", back, own[..., V] + force * dt)
+        tilt, axes = -back @ attitude @ _cross(pull) * dt, -back @ attitude @ middle * dt
+        turned = _turned(turn * dt)
+        self.attitude[:, :-1] = back @ attitude @ turned
+        step, q = np.tile(np.eye(self.known), (len(self.state), 1, 1)), np.zeros(self.known)
+        towards = self.attitude[:, :-1].transpose(0, 1, 3, 2) * dt
+        for b in range(self.bodies):
+            p, v, a, g, f = (slice(BODY * b + one.start, BODY * b + one.stop) for one in (P, V, A, G, F))
+            step[:, p, p] = step[:, v, v] = back[:, 0]
+            step[:, p, v], step[:, p, a] = back[:, 0] * dt, tilt[:, b] * (dt / 2)
+            step[:, v, a], step[:, v, f] = tilt[:, b], axes[:, b]
+            step[:, a, a], step[:, a, g] = turned[:, b].transpose(0, 2, 1), -np.eye(3) * dt
+            q[v], q[a], q[g], q[f] = (n**2 * dt for n in (noise.force, noise.gyro, noise.gyro_bias, noise.force_bias))
+            if moving:
+                w, f = slice(fixed.start, fixed.start + 3), slice(fixed.start + 3, fixed.stop)
+                step[:, p, w], step[:, v, w] = -_cross(own[:, b, P]) * dt, -_cross(own[:, b, V]) * dt
+                step[:, a, w], step[:, v, f] = towards[:, b], (back @ half)[:, 0] * dt
+                q[w], q[f] = noise.gyro_bias**2 * dt, noise.force_bias**2 * dt
+        known = self.covariance[:, : self.known]
+        known[:] = step @ known
+        known = self.covariance[:, :, : self.known]
+        known[:] = known @ step.transpose(0, 2, 1)
+        known[:, range(self.known), range(self.known)] += q
+        if moving:
+            # The noise of the reference's readings moves all bodies at once.
+            shared = step[:, : fixed.start, fixed] * np.repeat([noise.gyro, noise.force], 3) / np.sqrt(dt)
+            self.covariance[:, : fixed.start, : fixed.start] += shared @ shared.transpose(0, 2, 1)
+        self.covariance = (self.covariance + self.covariance.transpose(0, 2, 1)) / 2
+
+    def decay(self, factor: Floats, added: Floats) -> None:
+        """Multiply the states after those of bodies by factors (filters, states), and add variances to theirs."""
+        others = slice(self.known, None)
+        self.state[:, others] *= factor
+        self.covariance[:, others] *= factor[:, :, None]
+        self.covariance[:, :, others] *= factor[:, None, :]
+        np.einsum("fii->fi", self.covariance)[:, others] += added
+
+    def distances(self, bodies: Ints, arm_m: Floats, sign: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return expected sums of distances (filters,) with signs (k,), their derivatives by the states (filters,
+        states), and standard deviations (filters, k) of what in the distances is not linear in errors of the state.
+
+        Distances are between points `arm_m` (k, 2, 3) of `bodies` (k, 2); the number after the last is the reference.
+        Means and standard deviations have the terms of second order (Bar-Shalom, Li and Kirubarajan 2001, section
+        10.3.2): a tag that is 0.3 m off across the line of sight changes 3 m by 1.5 cm.
+        """
+        places = np.concatenate([self.own[..., P], np.zeros((len(self.state), 1, 3))], axis=1)
+        attitude, size = self.attitude[:, bodies], BODY * self.bodies
+        points = places[:, bodies] + np.einsum("fkeij,kej->fkei", attitude, arm_m)
+        between, turns = points[:, :, 0] - points[:, :, 1], -attitude @ _cross(arm_m)
+        distance = np.maximum(np.linalg.norm(between, axis=-1), 1e-6)
+        along = between / distance[..., None]
+        slopes = np.zeros((len(self.state), len(sign), 3, self.bodies + 1, BODY))
+        for k, ends in enumerate(bodies.tolist()):
+            for side, body, way in zip((0, 1), ends, (1.0, -1.0), strict=True):
+                slopes[:, k, :, body, P] += way * np.eye(3)
+                slopes[:, k, :, body, A] += way * turns[:, k, side]
+        slopes = slopes[..., :-1, :].reshape(*slopes.shape[:3], size)
+        row = np.zeros_like(self.state)
+        row[:, :size] = np.einsum("fki,fkis->fs", along * sign[:, None], slopes)
+        spread = slopes @ self.covariance[:, None, :size, :size] @ slopes.swapaxes(2, 3)
+        bend = (np.eye(3) - along[..., None] * along[..., None, :]) @ spread / distance[..., None, None]
+        expected = (distance + np.trace(bend, axis1=2, axis2=3) / 2) @ sign
+        return expected, row, np.sqrt(np.einsum("fkij,fkji->fk", bend, bend) / 2)
+
+    def update(
+        self, row: Floats, innovation: Floats, noise_m2: Floats | float, weigh: Callable[[Floats, Floats], RangeUpdate]
+    ) -> RangeUpdate:
+        """Update by scalar measurements with derivatives `row` (filters, states) and noise of variance `noise_m2`.
+
+        `weigh` is given innovations and their variances (filters,), as `mixture_update`.
+        """
+        reach = np.einsum("hij,hj->hi", self.covariance, row)
+        variance = np.einsum("hi,hi->h", row, reach) + noise_m2
+        update = weigh(innovation, variance)
+        gain = reach / variance[:, None]
+        self._move(gain * update.noise_m[:, None])
+        change = (update.variance_m2 - variance)[:, None, None]
+        self.covariance = self.covariance + gain[:, :, None] * gain[:, None, :] * change
+        return update
+
+    def _move(self, by: Floats) -> None:
+        self.state = self.state + by
+        self.attitude[:, :-1] = self.attitude[:, :-1] @ _turned(self.own[..., A])
+        self.own[..., A] = 0.0
+
+
+H, E = BODY, BODY + 1
+"""States of `InertialFilter` after those of its body: the offset of the height sensor, and the error that measurements
+of one exchange share, in units of its standard deviation."""
+
+
+class InertialFilter(RelativeFilter):
+    """One body in a room, with several headings at once; updates by ranges to points of the room, and by heights.
+
+    Without an IMU the body is taken to be level, and its velocity wanders.
+    """
 
     def __init__(
         self, fix: Fix, attitudes: Floats, noise: ProcessNoise, *, inertial: bool, speed_m_s: float = 1.0
     ) -> None:
         """Start at a fix with attitudes (headings, 3, 3), body to world."""
-        count = len(attitudes)
-        self.noise, self.inertial = noise, inertial
-        # Attitude errors move into the attitude, so that part of the state stays zero.
-        self.state, self.attitude = np.zeros((count, SIZE)), attitudes.copy()
-        self.likelihood = np.zeros(count)
-        spread = np.zeros(SIZE)
+        count, spread = len(attitudes), np.zeros(BODY + 2)
+        self.inertial, self.likelihood = inertial, np.zeros(count)
         if inertial:
             # Headings are those of a grid; other standard deviations are those of consumer sensors.
-            spread[A], spread[G], spread[F] = (0.3, 0.3, np.pi / count), 0.02, 0.4
+            spread[A], spread[G], spread[F] = (0.3, 0.3, np.pi / count), noise.gyro_start, noise.force_start
+        else:
+            noise = replace(noise, force=noise.acceleration, gyro=0.0, gyro_bias=0.0, force_bias=0.0)
         spread[H] = 0.15
-        self.covariance = np.tile(np.diag(spread**2), (count, 1, 1))
+        super().__init__(fix.place_m, attitudes[:, None], spread, noise)
         self.restart(fix, speed_m_s)
 
-    def predict(self, dt: float, gyro: Floats, force: Floats) -> None:
-        """Predict over `dt` seconds with mean angular velocity (3,) and specific force (3,); without an IMU they are
-        ignored."""
-        noise, state = self.noise, self.state
-        step = np.zeros((len(state), SIZE, SIZE))
-        step[:, P, V] = np.eye(3) * dt
-        added = np.zeros(SIZE)
-        if self.inertial:
-            turn, pull = gyro - state[:, G], force - state[:, F]
-            world = self._acceleration(pull)
-            step[:, V, A] = -self.attitude @ _cross(pull) * dt
-            step[:, V, F] = -self.attitude * dt
-            step[:, A, A] = -_cross(turn) * dt
-            step[:, A, G] = -np.eye(3) * dt
-            self.attitude = self.attitude @ Rotation.from_rotvec(turn * dt).as_matrix()
-            added[V], added[A] = noise.force**2 * dt, noise.gyro**2 * dt
-            added[G], added[F] = noise.gyro_bias**2 * dt, noise.force_bias**2 * dt
-        else:
-            world = np.zeros((len(state), 3))
-            added[P], added[V] = noise.acceleration**2 * dt**3 / 3, noise.acceleration**2 * dt
-        state[:, P] += state[:, V] * dt + 0.5 * world * dt**2
-        state[:, V] += world * dt
-        added[H] = noise.height_offset**2 * dt
-        whole = np.eye(SIZE) + step
-        self.covariance = whole @ self.covariance @ whole.transpose(0, 2, 1) + np.diag(added)
-        self.covariance = (self.covariance + self.covariance.transpose(0, 2, 1)) / 2
+    def step(self, dt: float, readings: Floats) -> None:
+        """Predict over `dt` seconds by mean readings (6,); without an IMU they are ignored."""
+        self.predict(dt, readings[None] if self.inertial else REST[None])
+        self.covariance[:, H, H] += self.noise.height_offset**2 * dt
 
     def begin_exchange(self) -> None:
         """Begin another exchange, whose measurements share another error."""
@@ -257,19 +389,15 @@ class InertialFilter:
 
         Measurements of an exchange share an error with a standard deviation of `common_m`. Returns the update.
         """
-        towards = self.state[:, None, P] - anchor_m
-        towards = towards + ((self.attitude @ arm_m)[:, None] if self.inertial else np.array([0.0, 0.0, arm_m[2]]))
-        distance = np.maximum(np.linalg.norm(towards, axis=2), 1e-6)
-        row = np.zeros_like(self.state)
-        row[:, P] = np.einsum("hk,hki->hi", sign / distance, towards)
-        row[:, E] = common_m
-        if self.inertial:
-            row[:, A] = -np.einsum("hi,hij->hj", row[:, P], self.attitude @ _cross(np.tile(arm_m, (len(distance), 1))))
-        else:
+        points = np.stack([np.tile(arm_m if self.inertial else arm_m * (0.0, 0.0, 1.0), (len(sign), 1)), anchor_m], 1)
+        expected, row, bent_m = self.distances(np.tile([0, 1], (len(sign), 1)), points, sign)
+        if not self.inertial:
             # Heading is unknown: a lever arm may point anywhere.
             noise_m = float(np.hypot(noise_m, np.linalg.norm(row[0, P]) * np.hypot(arm_m[0], arm_m[1]) / np.sqrt(2)))
-        expected = distance @ sign + common_m * self.state[:, E]
-        update = self._update_scalar(row, measured_m - expected, noise_m, errors)
+        row[:, E] = common_m
+        variance = noise_m**2 + np.sum((sign * bent_m) ** 2, axis=1)
+        innovation = measured_m - expected - common_m * self.state[:, E]
+        update = self.update(row, innovation, variance, partial(mixture_update, errors=errors))
         self.likelihood = self.likelihood + update.log_density
         return update
 
@@ -278,18 +406,8 @@ class InertialFilter:
         row = np.zeros_like(self.state)
         row[:, [2, H]] = 1.0
         errors = RangeErrors(share=1e-6, least_m=0.0, detour_m=1.0, outlier=0.05, outlier_m=1.0)
-        self._update_scalar(row, height_m - self.state[:, 2] - self.state[:, H], self.noise.height_m, errors)
-
-    def _update_scalar(self, row: Floats, innovation: Floats, noise_m: float, errors: RangeErrors) -> RangeUpdate:
-        """Update by a scalar measurement with derivatives `row` (headings, states) and a non-normal error."""
-        reach = np.einsum("hij,hj->hi", self.covariance, row)
-        variance = np.einsum("hi,hi->h", row, reach) + noise_m**2
-        update = mixture_update(innovation, variance, errors)
-        gain = reach / variance[:, None]
-        self._move(gain * update.noise_m[:, None])
-        change = (update.variance_m2 - variance)[:, None, None]
-        self.covariance = self.covariance + gain[:, :, None] * gain[:, None, :] * change
-        return update
+        innovation = height_m - self.state[:, 2] - self.state[:, H]
+        self.update(row, innovation, self.noise.height_m**2, partial(mixture_update, errors=errors))
 
     def update_gravity(self, force: Floats, std: float) -> None:
         """Update by the direction of gravity: the mean specific force (3,) with an acceleration of `std` m/s^2 per
@@ -297,30 +415,19 @@ class InertialFilter:
 
         The update determines the sum of tilt error and accelerometer bias.
         """
-        pull = force - self.state[:, F]
-        slopes = [(A, -self.attitude @ _cross(pull)), (F, -self.attitude)]
-        self._update_linear(slopes, -self._acceleration(pull), std)
-
-    def _acceleration(self, force: Floats) -> Floats:
-        """Return the acceleration in the world (headings, 3) of specific forces (headings, 3) in the body's axes."""
-        return np.asarray(np.einsum("hij,hj->hi", self.attitude, force) - (0.0, 0.0, GRAVITY_M_S2))
+        for axis in range(3):
+            pull, attitude, row = force - self.state[:, F], self.attitude[:, 0], np.zeros_like(self.state)
+            row[:, A], row[:, F] = -(attitude @ _cross(pull))[:, axis], -attitude[:, axis]
+            innovation = REST[3 + axis] - np.einsum("hj,hj->h", attitude[:, axis], pull)
+            self.update(row, innovation, std**2, partial(gated_update, gate=np.inf))
 
     def limit_speed(self, speed_m_s: float) -> None:
         """Update by a velocity of zero with standard deviation `speed_m_s`: it bounds the state while there are no
         ranges."""
-        self._update_linear([(V, np.eye(3))], -self.state[:, V], speed_m_s)
-
-    def _update_linear(self, parts: Sequence[tuple[slice, Floats]], innovation: Floats, std: float) -> None:
-        """Update by a linear measurement of parts of the state (headings, 3, 3 each) with normal noise."""
-        rows = np.zeros((len(self.state), 3, SIZE))
-        for part, slopes in parts:
-            rows[:, :, part] = slopes
-        reach = self.covariance @ rows.transpose(0, 2, 1)
-        gain = reach @ np.linalg.inv(rows @ reach + std**2 * np.eye(3))
-        self._move(np.einsum("hij,hj->hi", gain, innovation))
-        # Joseph's form: symmetric and positive whatever rounding does.
-        left = np.eye(SIZE) - gain @ rows
-        self.covariance = left @ self.covariance @ left.transpose(0, 2, 1) + std**2 * gain @ gain.transpose(0, 2, 1)
+        for axis in range(V.start, V.stop):
+            row = np.zeros_like(self.state)
+            row[:, axis] = 1.0
+            self.update(row, -self.state[:, axis], speed_m_s**2, partial(gated_update, gate=np.inf))
 
     def restart(self, fix: Fix, speed_m_s: float) -> None:
         """Restart at a fix, with the present attitude and biases."""
@@ -329,13 +436,16 @@ class InertialFilter:
             self.covariance[:, part, :] = self.covariance[:, :, part] = 0
             self.covariance[:, part, part] = covariance
 
-    def _move(self, by: Floats) -> None:
-        self.state = self.state + by
-        if self.inertial:
-            self.attitude = self.attitude @ Rotation.from_rotvec(by[:, A]).as_matrix()
-        self.state[:, A] = 0.0
-
 
 def _cross(vectors: Floats) -> Floats:
-    """Return the cross-product matrices (n, 3, 3) of vectors (n, 3)."""
-    return np.asarray(np.cross(np.eye(3), vectors[:, None, :]))
+    """Return the cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    return np.asarray(vectors @ CROSS).reshape(*vectors.shape, 3)
+
+
+CROSS: Final = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1).reshape(3, 9)
+"""The cross-product matrices of the three axes."""
+
+
+def _turned(angles: Floats) -> Floats:
+    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3)."""
+    return np.asarray(Rotation.from_rotvec(angles.reshape(-1, 3)).as_matrix()).reshape(*angles.shape, 3)

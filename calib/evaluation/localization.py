@@ -320,7 +320,7 @@ def summarize(found: list[Localization]) -> LocalizationSummary:
     rmse = {name: float(np.mean(over)) for name, over in means.items()}
     last = [one.tracks["variance"] for one in found]
     nis = np.concatenate([track.nis[track.accepted] for track in last])
-    nees = np.concatenate([track.nees for track in last])
+    nees, nees_bounds, nees_inside = consistency(last)
     if not len(nis):
         names = ", ".join(f"{one.source}: {one.body}" for one in found)
         raise UnanswerableError(f"{names}: no range agrees with the track within its gate; look at `calib doctor`")
@@ -331,11 +331,24 @@ def summarize(found: list[Localization]) -> LocalizationSummary:
         nis=float(np.mean(nis)),
         nis_bounds=_mean_bounds(len(nis), 1),
         nis_inside=_inside(nis, 1),
-        nees=float(np.mean(nees)),
-        nees_bounds=_mean_bounds(sum(_independent(track.nees) for track in last), 3),
-        nees_inside=_inside(nees, 3),
+        nees=nees,
+        nees_bounds=nees_bounds,
+        nees_inside=nees_inside,
         accepted=float(np.mean([np.mean(track.accepted) for track in last])),
     )
+
+
+def consistency(tracks: Sequence[Track]) -> tuple[float, tuple[float, float], float]:
+    """Return the mean NEES of tracks, 95 % bounds of such a mean, and the share of single ones in their 95 % bounds.
+
+    Without truth they are NaN.
+    """
+    known = [track.nees[np.isfinite(track.nees)] for track in tracks]
+    nees, degrees = np.concatenate(known), tracks[0].DEGREES
+    if not len(nees):
+        return np.nan, (np.nan, np.nan), np.nan
+    bounds = _mean_bounds(sum(_independent(one) for one in known if len(one)), degrees)
+    return float(np.mean(nees)), bounds, _inside(nees, degrees)
 
 
 def _mean_bounds(count: float, degrees: int) -> tuple[float, float]:

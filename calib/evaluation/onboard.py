@@ -214,7 +214,7 @@ def _readings(data: Data, calibration: Calibration, use: str) -> list[_Readings]
         between_m = np.sum((sign - free)[rows] * np.linalg.norm(first - second, axis=2), axis=1)
         own, other = (np.where(mine[rows, :, :1], *both) for both in ((first, second), (second, first)))
         measured, _, errors = MeasuredReceptions.of(some, calibration).robust(calibration)
-        imu_s, inertial = _table(imu, body, ("wx", "wy", "wz", "ax", "ay", "az"), began)
+        imu_s, inertial = inertial_readings(imu, body, began)
         height_s, height = _table(heights, body, ("height_m",), began)
         known = poses.body == body
         found.append(
@@ -251,6 +251,11 @@ def _among(ranges: Ranges, tags: list[int]) -> Ranges:
     found = ranges[np.isin(ranges.initiator, tags) & np.isin(ranges.target, tags)]
     heard = found.arrivals
     return found if heard is None else replace(found, arrivals=heard[np.isin(heard.listener, tags)])
+
+
+def inertial_readings(table: Mapping[str, NDArray[Any]], body: str, began_ns: int) -> tuple[Floats, Floats]:
+    """Return times in seconds since `began_ns` and inertial readings (n, 6) of a body, in order of time."""
+    return _table(table, body, ("wx", "wy", "wz", "ax", "ay", "az"), began_ns)
 
 
 def _table(
@@ -331,21 +336,21 @@ def _events(one: _Readings, settings: OnboardSettings, begin_s: float) -> Iterat
         rows = every[(one.height_s[every] >= begin_s) & (one.height_s[every] <= end_s)]
         happens += [(float(one.height_s[row]), "height", row) for row in rows.tolist()]
     happens.sort(key=itemgetter(0))
-    between = _means(one, np.array([begin_s, *(time_s for time_s, _, _ in happens)]))
+    between = mean_readings(one.imu_s, one.imu, np.array([begin_s, *(time_s for time_s, _, _ in happens)]))
     for event, inertial in zip(happens, between, strict=True):
         yield *event, inertial
 
 
-def _means(one: _Readings, edges: Floats) -> Floats:
-    """Return the means of inertial readings between edges (n + 1,), linear between two readings: (n, 6)."""
-    if len(one.imu_s) < 2:
+def mean_readings(time_s: Floats, readings: Floats, edges: Floats) -> Floats:
+    """Return the means of inertial readings (m, 6) between edges (n + 1,), linear between two readings: (n, 6)."""
+    if len(time_s) < 2:
         return np.zeros((len(edges) - 1, 6))
-    readings = make_interp_spline(one.imu_s, one.imu, k=1)
-    inside = np.clip(edges, one.imu_s[0], one.imu_s[-1])
+    curve = make_interp_spline(time_s, readings, k=1)
+    inside = np.clip(edges, time_s[0], time_s[-1])
     span = np.diff(inside)[:, None]
-    sums = np.diff(readings.antiderivative()(inside), axis=0)
+    sums = np.diff(curve.antiderivative()(inside), axis=0)
     # The rounding of a sum is divided by the span.
-    return np.asarray(np.where(span > 1e-9, sums / np.maximum(span, 1e-9), readings(inside[1:])))
+    return np.asarray(np.where(span > 1e-9, sums / np.maximum(span, 1e-9), curve(inside[1:])))
 
 
 def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
@@ -357,9 +362,8 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
     # The speed limit counts once a second: velocities are independent after a second.
     slow_every = max(round(settings.rate_hz), 1)
     for time_s, kind, number, inertial in _events(one, settings, now):
-        gyro, force = inertial[:3], inertial[3:]
         if time_s > now:
-            running.predict(time_s - now, gyro, force)
+            running.step(time_s - now, inertial)
             now = time_s
         best = int(np.argmax(running.likelihood))
         if kind == "height":
@@ -382,7 +386,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
                 restarts.append(now)
                 unexplained_s = 0.0
         best = int(np.argmax(running.likelihood))
-        state = running.state[best, P], running.attitude[best], running.covariance[best, P, P]
+        state = running.state[best, P], running.attitude[best, 0], running.covariance[best, P, P]
         states.append((now, *(part.copy() for part in state)))
 
     def nanoseconds(seconds: Any) -> Ints:

@@ -10,13 +10,13 @@ from __future__ import annotations
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
 from calib.data.ranges import Ranges
 from calib.data.sources import Flight
-from calib.evaluation.filters import RangeErrors, gated_update, mixture_update, multilaterate
+from calib.evaluation.filters import RangeErrors, RangeUpdate, gated_update, mixture_update, multilaterate
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
@@ -92,9 +92,10 @@ class BodyTrack:
 class Track(BodyTrack):
     """The track of one filter at each of its measurements: `accepted` (n,) are those within the gate.
 
-    `attitude` is the filter's input.
+    `attitude` is the filter's input. `DEGREES` is what `nees` should be.
     """
 
+    DEGREES: ClassVar[int] = 3
     accepted: Bools
 
     def __repr__(self) -> str:
@@ -177,13 +178,19 @@ def problems(flight: Flight) -> list[Problem]:
             sign=np.where(free, sign, 0.0),
             arm=antenna - place[:, None],
             other=away,
-            pair=np.unique(ends.min(axis=2) * 2**16 + ends.max(axis=2), return_inverse=True)[1].reshape(sign.shape),
+            pair=pair_numbers(ends),
             known_m=np.sum(np.where(free, 0.0, sign * np.linalg.norm(antenna - away, axis=2)), axis=1),
         )
         known = np.flatnonzero(np.isfinite(problem.arm + problem.other).all(axis=(1, 2)))
         if len(known):
             found.append(problem[known])
     return found
+
+
+def pair_numbers(ends: Ints) -> Ints:
+    """Return the numbers, from 0, of the pairs of tags (n, k) that are the ends (n, k, 2) of distances."""
+    pairs = ends.min(axis=2) * 2**16 + ends.max(axis=2)
+    return np.asarray(np.unique(pairs, return_inverse=True)[1]).reshape(pairs.shape)
 
 
 def ranges_about(ranges: Ranges, tags: list[int]) -> Ranges:
@@ -237,6 +244,16 @@ class FilterRanges:
         return FilterRanges(measured, std, common, shared, self.lasting_s, errors)
 
 
+def weigh(known: list[FilterRanges], row: int, innovation_m: Floats, variance_m2: Floats, gate: float) -> RangeUpdate:
+    """Return the updates of filters (filters, ...) by their measurement `row`: by a gate, or by an error model."""
+    update = gated_update(innovation_m, variance_m2, gate)
+    for f, one in enumerate(known):
+        if one.errors is not None:
+            own = mixture_update(innovation_m[f], variance_m2[f], one.errors.at(row))
+            update.noise_m[f], update.variance_m2[f], update.believed[f] = own.noise_m, own.variance_m2, own.believed
+    return update
+
+
 def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: Settings) -> dict[str, list[Track]]:
     """Run filters on the ranges of a body with every noise; return the tracks of each, one for each noise.
 
@@ -286,15 +303,7 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
         variance = np.sum(h * ph, axis=-1) + std[k] ** 2
         expected = problem.known_m[k] + distance @ problem.sign[k] + np.sum(h[..., 3:] * x[..., 3:], axis=-1)
         innovation = measured[k] - expected
-        update = gated_update(innovation, variance, settings.gate)
-        for f, one in enumerate(known):
-            if one.errors is not None:
-                own = mixture_update(innovation[f], variance[f], one.errors.at(k))
-                update.noise_m[f], update.variance_m2[f], update.believed[f] = (
-                    own.noise_m,
-                    own.variance_m2,
-                    own.believed,
-                )
+        update = weigh(known, k, innovation, variance, settings.gate)
         gain = ph / variance[..., None]
         x += gain * update.noise_m[..., None]
         p += gain[..., None] * gain[..., None, :] * (update.variance_m2 - variance)[..., None, None]

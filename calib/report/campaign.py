@@ -27,6 +27,7 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.evaluation.localization import Localization, localize, summarize
 from calib.evaluation.onboard import OnboardTrack
 from calib.evaluation.statistics import Evaluation, evaluate
+from calib.evaluation.team import RelativePose
 from calib.findings import Finding
 from calib.fitting.fitting import fit
 from calib.fitting.passive_listeners import heard_delays
@@ -111,7 +112,7 @@ def write_track_figures(
     Raises what `check_places` raises.
     """
     compared = [one for one in found if isinstance(one, Localization)]
-    draws: dict[type, Any] = {Localization: track, OnboardTrack: onboard}
+    draws: dict[type, Any] = {Localization: track, RelativePose: track, OnboardTrack: onboard}
     pictures: list[Block] = [
         *([Picture("rmse", partial(rmse_bars, found=compared), "RMSE")] if compared else []),
         *(Picture(track_name(one.source, one.body), partial(draws[type(one)], one=one), one.body) for one in found),

@@ -82,7 +82,8 @@ def track(width_in: float, one: Localization) -> Figure:
     above, height, error = panels["path"], panels["height"], panels["error"]
     usual = []
     for stage in ("raw", "variance"):
-        own = one.tracks[stage]
+        if (own := one.tracks.get(stage)) is None:
+            continue
         name, colour, dashes, _ = FILTER_STYLES[stage]
         line: dict[str, Any] = {"color": colour, "ls": dashes, "lw": 0.9, "label": name}
         off = np.linalg.norm(own.estimate_m - own.truth_m, axis=1)

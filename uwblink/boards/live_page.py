@@ -200,12 +200,13 @@ def _clock(time_ns: int) -> str:
 def spread_cm(values: Sequence[float]) -> str:
     """Return the standard deviation of values about their neighbours as text, "" of fewer than ten.
 
-    Second differences of white noise have six times its variance, and those of a smooth motion are small; 1.4826 makes
-    a median absolute deviation a standard deviation of normal errors.
+    Second differences of white noise have six times its variance, and those of a smooth motion are small. Two thirds
+    of normal errors lie within a standard deviation.
     """
     if len(values) < 10:
         return ""
-    return f"{100 * 1.4826 * np.nanmedian(np.abs(np.diff(values, 2))) / math.sqrt(6):.1f}"
+    low, high = np.nanquantile(np.diff(values, 2), (0.16, 0.84))
+    return f"{100 * (high - low) / 2 / math.sqrt(6):.1f}"
 
 
 def picture(time_ns: Sequence[int], series: Mapping[str, Sequence[float]]) -> str:

@@ -32,7 +32,7 @@ ONLY_FROM_PYTHON = {
     *("shares", "start_m", "information", "loosest", "boards", "robots"),
     # Named by the command itself, as its own option.
     *("seconds", "speed_m_s", "apart_m", "still_s", "noise_m", "size_m", "rate_hz", "tape_sigma_m", "anchor_sigma_m"),
-    "anchor_places",
+    *("anchor_places", "reference"),
     # A part of the error of differences of arrival.
     "side",
 }

@@ -1,0 +1,434 @@
+"""Relative poses of a team of robots from ranges, overheard frames and IMUs, without anchors or motion capture.
+
+All robots are estimated together in the frame of one of them (`calib.evaluation.filters.RelativeFilter`). Poses of the
+recording give the start, with noise of a stated size, and the truth to judge by; nothing else. Rows are those of
+`calib.evaluation.tracking`: sums of distances with signs, of which differences of arrival of one exchange share an
+error. Several filters run at once, which differ in what they take ranges for, and whether they listen.
+"""
+
+from __future__ import annotations
+
+import warnings
+import zlib
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, ClassVar, Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.calibration.applying import keep_determined
+from calib.calibration.document import for_json
+from calib.calibration.model import CalibrationSource, given_calibration
+from calib.data.ranges import Ranges
+from calib.data.sources import Data, load_flight, opened, require_arrivals, require_times
+from calib.errors import BadInputError, UnanswerableError, WeakHeadingWarning
+from calib.evaluation.filters import BODY, A, P, ProcessNoise, RelativeFilter, V
+from calib.evaluation.localization import Localization, consistency, filter_ranges, fixed_std
+from calib.evaluation.onboard import inertial_readings, mean_readings
+from calib.evaluation.tracking import FilterRanges, Settings, Track, Trajectory, distances_in, pair_numbers, weigh
+from calib.settings import CheckedSettings
+from uwblink.arrays import Bools, Floats, Ints
+from uwblink.display import first_few, printable
+from uwblink.recording.distances import tracks_of
+from uwblink.recording.schema import Poses, Tag
+from uwblink.settings import setting
+
+BENT_S: Final = 5.0
+"""How long what is not linear in distances lasts, as errors of the state across the line of sight do."""
+
+BASELINES: Final = (", own ranges", ", ranges only")
+"""Ends of the names of filters that do not listen: by ranges of the reference, as a robot that is alone with what its
+own tags measure; by those of the whole team."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TeamSettings(CheckedSettings):
+    """How relative poses are estimated, in the frame of the body `reference`, by default the first by name.
+
+    The start is the relative pose and velocity at the first exchange with noise of `start_std_m` and `start_std_m_s` an
+    axis and `start_std_deg` about each, drawn from `seed`. `use` is "exchanges", or "receptions": what robots
+    overheard, too. Poses are predicted at every exchange and `rate_hz` times a second. A range is taken when its
+    squared innovation over its variance is below `gate`. `noise` is that of the IMUs.
+
+    >>> import calib
+    >>> calib.TeamSettings(use="receptions").start_std_deg
+    3.0
+    """
+
+    use: str = setting("exchanges", "What is used.", names=("exchanges", "receptions"))
+    reference: str | None = None
+    start_std_m: float = 0.1
+    start_std_deg: float = 3.0
+    start_std_m_s: float = 0.1
+    rate_hz: float = 50.0
+    gate: float = 10.83
+    seed: int = 0
+    noise: ProcessNoise = field(default_factory=ProcessNoise)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class RelativeTrack(Track):
+    """Poses of a body in the frame of another: positions (n, 3), attitudes x y z w (n, 4), and the true ones.
+
+    `nees` (n,) are of positions and attitudes, six degrees of freedom; `nis` and `accepted` are at measurements.
+    """
+
+    DEGREES: ClassVar[int] = 6
+    true_attitude: Floats
+
+    @property
+    def attitude_rmse_deg(self) -> float:
+        """Root of the mean squared angle between estimate and truth, NaN without truth."""
+        known = np.isfinite(self.true_attitude).all(axis=1)
+        if not known.any():
+            return np.nan
+        apart = Rotation.from_quat(self.attitude[known]).inv() * Rotation.from_quat(self.true_attitude[known])
+        return float(np.degrees(np.sqrt(np.mean(apart.magnitude() ** 2))))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class RelativePose(Localization):
+    """One body of a team, in the frame of another: tracks by filter (`FILTERS`), by what was asked to be used.
+
+    Further tracks are "dead reckoning" and, where the team listens, those of filters that do not (`BASELINES`).
+    """
+
+    reference: str
+
+    @property
+    def label(self) -> str:
+        """Both bodies, as names of files have them."""
+        return f"{self.body}-from-{self.reference}"
+
+    def trajectories(self) -> dict[str, Trajectory]:
+        """Return the trajectory of each filter and the true one, by name without spaces."""
+        found = {
+            name.replace(",", "").replace(" ", "-"): (one.time_ns, one.estimate_m, one.attitude)
+            for name, one in self.tracks.items()
+        }
+        one: Any = self.tracks["raw"]
+        known = np.isfinite(one.truth_m).all(axis=1)
+        return found | {"truth": (one.time_ns[known], one.truth_m[known], one.true_attitude[known])}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Team:
+    """A recording: bodies with IMUs, the reference last, and measurements (n,) in order of time, by exchange.
+
+    `body` and `arm` (n, k, 2) are the ends of the distances in a measurement, with signs (n, k). `shares` (n, k, 2) are
+    the states of errors that they share: of pairs of tags, and then of pairs of bodies. `readings` are times in seconds
+    and inertial readings of each body.
+    """
+
+    bodies: list[str]
+    ranges: Ranges
+    rows: Ints
+    time_ns: Ints
+    exchange: Ints
+    sign: Floats
+    body: Ints
+    arm: Floats
+    shares: Ints
+    readings: list[tuple[Floats, Floats]]
+    poses: Poses
+
+    def points_m(self, time_ns: Ints) -> Floats:
+        """Return points of each body in the world, a metre along its axes and its middle, NaN where poses do not say.
+
+        The shape is (bodies, n, 4, 3).
+        """
+        tracks, points = tracks_of(self.poses), np.full((len(self.bodies), len(time_ns), 4, 3), np.nan)
+        for one, body in zip(points, self.bodies, strict=True):
+            if body in tracks:
+                one[:] = np.stack([tracks[body].point_m(time_ns, at).T for at in np.eye(4)[:, :3]], axis=1)
+        return points
+
+    def relative_poses(self, time_ns: Ints) -> tuple[Floats, Floats]:
+        """Return positions (n, bodies, 3) and attitudes (n, bodies, 3, 3) in the frame of the reference, which is left
+        out.
+
+        Where poses do not say, positions are NaN and attitudes the identity.
+        """
+        points = self.points_m(time_ns)
+        middle = points[-1, :, 3:]
+        found = np.einsum("bnpi,nai->nbpa", points[:-1] - middle, points[-1, :, :3] - middle)
+        place, turned = found[:, :, 3], (found[:, :, :3] - found[:, :, 3:]).swapaxes(2, 3)
+        return place, np.where(np.isfinite(place[..., None]), turned, np.eye(3))
+
+    def start(self) -> tuple[Floats, Floats, Floats]:
+        """Return positions, velocities (bodies, 3) and attitudes (bodies, 3, 3) at the first exchange.
+
+        Velocities are those of parabolas through poses of the first 0.2 s.
+        """
+        points = self.points_m(self.time_ns[0] + 10**8 * np.arange(3))
+        place, turned = self.relative_poses(self.time_ns[:1])
+        speed = np.einsum("bni,n->bi", points[:-1, :, 3] - points[-1, :, 3], [-15.0, 20.0, -5.0])
+        return place[0], speed @ (points[-1, 0, :3] - points[-1, 0, 3]).T, turned[0]
+
+
+def localize_team(
+    data: Data, calibration: CalibrationSource, settings: TeamSettings | None = None
+) -> list[RelativePose]:
+    """Estimate the poses of robots in the frame of one of them by IMUs and ranges, with and without calibration.
+
+    `data` is what `localize_onboard` takes. Bodies without inertial readings, and so anchors, are left out. Robots with
+    one tag are estimated with a `WeakHeadingWarning`. Raises what `Calibration.apply` raises, and `UnanswerableError`
+    where fewer than two robots have inertial readings, where these do not range with each other, where nothing was
+    overheard although it is to be used, and where poses do not give the start.
+
+    >>> import calib
+    >>> known = calib.fit(calib.sample_flight()).calibration
+    >>> calib.localize_team(calib.sample_flight(), known)  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    calib.errors.UnanswerableError: memory: inertial readings of 0 bodies with tags (none), ...
+    """
+    calibration = given_calibration(calibration)
+    chosen = settings or TeamSettings()
+    flight = load_flight(data, need_power=calibration.needs_power, need_truth=False)
+    with opened(data) as (_, source):
+        imu = dict(getattr(source, "imu", None) or {})
+    require_times(flight.ranges)
+    ranges = keep_determined(calibration, flight.ranges)
+    team = _team(ranges, flight.poses, flight.tags, imu, chosen)
+    fixed = fixed_std(calibration, Settings())
+    measured = {name: one.at(team.rows) for name, one in filter_ranges(team.ranges, calibration, fixed).items()}
+    heard = team.rows >= len(team.ranges)
+    filters = {"dead reckoning": (measured["raw"], np.zeros_like(heard))}
+    if chosen.use == "receptions":
+        own = ~heard & (team.body == len(team.bodies) - 1).any(axis=(1, 2))
+        for end, used in zip(BASELINES, (own, ~heard), strict=True):
+            filters |= {name + end: (one, used) for name, one in measured.items()}
+    filters |= {name: (one, np.ones_like(heard)) for name, one in measured.items()}
+    return [
+        RelativePose(
+            source=ranges.source,
+            body=body,
+            reference=team.bodies[-1],
+            tracks=dict(tracks),
+            rmse_m={name: np.array([track.rmse_m]) for name, track in tracks.items()},
+            fixed=fixed,
+            simulated=ranges.planted is not None,
+            arrivals=int(np.count_nonzero(heard)),
+        )
+        for body, tracks in _run(team, filters, chosen).items()
+    ]
+
+
+def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, Any], settings: TeamSettings) -> _Team:
+    """Return the measurements between bodies that have inertial readings, and warn of those with one tag."""
+    name, sensing = ranges.source, sorted({tag.body for tag in tags} & set(np.unique(imu.get("body", [])).tolist()))
+    if len(sensing) < 2:
+        raise UnanswerableError(
+            f"{name}: inertial readings of {len(sensing)} bodies with tags ({', '.join(sensing) or 'none'}), relative "
+            "poses need two or more; record or import the table imu"
+        )
+    reference = settings.reference or sensing[0]
+    if reference not in sensing:
+        raise BadInputError(f"found {reference!r:.60}, {name} has {', '.join(sensing)}", parameter="reference")
+    bodies = [*(body for body in sensing if body != reference), reference]
+    mine = [tag for tag in tags if tag.body in bodies]
+    members, heard = [tag.tag for tag in mine], ranges.arrivals if settings.use == "receptions" else None
+    if heard is not None:
+        heard = heard[np.isin(heard.listener, members)]
+    inside = np.isin(ranges.initiator, members) & np.isin(ranges.target, members)
+    ranges = replace(ranges, arrivals=heard)[inside]
+    numbers, arms = np.zeros(max(members) + 1, dtype=np.int64), np.zeros((max(members) + 1, 3))
+    numbers[members], arms[members] = [bodies.index(tag.body) for tag in mine], [tag.lever_arm_m for tag in mine]
+    ends, sign, exchange = distances_in(ranges)
+    time, body = ranges.time_ns[exchange], numbers[ends]
+    rows = np.flatnonzero(((body[..., 0] != body[..., 1]) & (sign != 0)).any(axis=1))
+    if not len(rows):
+        raise UnanswerableError(f"{name}: the tags of {', '.join(bodies)} do not range with each other")
+    if settings.use == "receptions":
+        require_arrivals(ranges)
+    single = [one for one, count in Counter(numbers[np.unique(ends)].tolist()).items() if count == 1]
+    if single:
+        warnings.warn(
+            f"{name}: {first_few(bodies[one] for one in single)} has one tag that ranges or listens: without a second, "
+            "its heading follows from motion alone, weakly",
+            WeakHeadingWarning,
+            stacklevel=3,
+        )
+    rows = rows[np.lexsort((exchange[rows], time[rows]))]
+    readings = [inertial_readings(imu, one, int(time[rows[0]])) for one in bodies]
+    last_s = float(np.ptp(time[rows])) * 1e-9
+    for one, (time_s, _) in zip(bodies, readings, strict=True):
+        # Beyond the first and last reading they count as constant, for a tenth of a second at most.
+        if time_s[0] > 0.1 or time_s[-1] < last_s - 0.1:
+            raise UnanswerableError(
+                f"{name}: inertial readings of {one} cover {time_s[0]:.1f} to {time_s[-1]:.1f} s after the first "
+                f"exchange, not all exchanges to {last_s:.1f} s"
+            )
+    pairs = pair_numbers(ends[rows])
+    return _Team(
+        bodies=bodies,
+        ranges=ranges,
+        rows=rows,
+        time_ns=time[rows],
+        exchange=exchange[rows],
+        sign=sign[rows],
+        body=body[rows],
+        arm=arms[ends[rows]],
+        shares=np.stack([pairs, pairs.max() + 1 + pair_numbers(body[rows])], axis=-1),
+        readings=readings,
+        poses=poses,
+    )
+
+
+def _start(team: _Team, settings: TeamSettings, filters: int) -> RelativeFilter:
+    """Return filters that begin at the relative poses of the first exchange with noise, and know nothing else of it."""
+    place, speed, attitude = team.start()
+    lost = [body for body, one in zip(team.bodies, place + speed, strict=False) if not np.isfinite(one).all()]
+    if lost:
+        raise UnanswerableError(
+            f"{team.ranges.source}: no poses of {lost[0]} and {team.bodies[-1]} at the first exchange, near which "
+            "estimates begin; import poses that cover it"
+        )
+    turn_std, noise = np.radians(settings.start_std_deg), settings.noise
+    stds = settings.start_std_m, settings.start_std_m_s, turn_std, noise.gyro_start, noise.force_start
+    spread = np.concatenate([np.tile(np.repeat(stds, 3), len(place)), np.repeat(stds[3:], 3)])
+    spread = np.append(spread, np.ones(team.shares.max() + 2))
+    rng = np.random.default_rng([settings.seed, zlib.crc32(team.time_ns.tobytes())])
+    place = place + rng.normal(size=place.shape) * settings.start_std_m
+    attitude = attitude @ Rotation.from_rotvec(rng.normal(size=place.shape) * turn_std).as_matrix()
+    start = np.tile(place, (filters, 1, 1)), np.tile(attitude, (filters, 1, 1, 1))
+    found = RelativeFilter(*start, spread, noise, moving=True)
+    found.own[..., V] = speed + rng.normal(size=speed.shape) * settings.start_std_m_s
+    return found
+
+
+def _run(
+    team: _Team, filters: Mapping[str, tuple[FilterRanges, Bools]], settings: TeamSettings
+) -> dict[str, dict[str, RelativeTrack]]:
+    """Run filters on the measurements that each uses (n,); return the tracks of each body by filter.
+
+    States beside those of `RelativeFilter` are errors in units of their standard deviation: as in `run_filters` of
+    pairs of tags and of an exchange, and of pairs of bodies what is not linear in their distances.
+    """
+    known, uses = [one for one, _ in filters.values()], np.stack([used for _, used in filters.values()], axis=1)
+    measured, std, common, shared = (
+        np.stack([getattr(one, name) for one in known], axis=1)
+        for name in ("measured_m", "std_m", "common_m", "shared_m")
+    )
+    running = _start(team, settings, len(known))
+    steps = np.arange(team.time_ns[0], team.time_ns[-1], round(1e9 / settings.rate_hz))
+    time_ns = np.unique(np.concatenate([team.time_ns, steps]))
+    time_s = (time_ns - time_ns[0]) * 1e-9
+    inertial = np.stack([mean_readings(*one, time_s) for one in team.readings], axis=1)
+    firsts = np.append(np.searchsorted(team.time_ns, time_ns), len(team.rows))
+    truth, turned = team.relative_poses(time_ns)
+    pose = BODY * np.arange(len(team.bodies) - 1)[:, None] + np.r_[P, A]
+    # How long the shared errors last: of pairs of tags, of pairs of bodies, of an exchange.
+    lasting = np.full((len(known), team.shares.max() + 2), BENT_S)
+    lasting[:, : team.shares[..., 1].min()] = [[one.lasting_s] for one in known]
+    lasting[:, -1] = 1e-12
+    shape = len(time_ns), len(known), len(team.bodies) - 1
+    place, attitude, std_m, nees = np.empty((*shape, 3)), np.empty((*shape, 3, 3)), np.empty(shape), np.empty(shape)
+    nis, accepted = np.empty(std.shape), np.empty(std.shape, dtype=bool)
+    exchange, last_s = -1, -1.0
+    for k in range(len(time_ns)):
+        if k:
+            running.predict(time_s[k] - time_s[k - 1], inertial[k - 1, :-1], inertial[k - 1, -1])
+        for row in range(firsts[k], firsts[k + 1]):
+            if team.exchange[row] != exchange:
+                # Two exchanges at one time share no error, either.
+                kept = np.exp(-np.maximum(time_s[k] - last_s, 1e-9) / lasting)
+                running.decay(kept, 1 - kept**2)
+                exchange, last_s = team.exchange[row], time_s[k]
+            expected, slopes, bent_m = running.distances(team.body[row], team.arm[row], team.sign[row])
+            for which, (pair, sides) in enumerate((running.known + team.shares[row]).tolist()):
+                slopes[:, pair] += shared[row, :, which]
+                slopes[:, sides] += team.sign[row, which] * bent_m[:, which]
+            slopes[:, -1] = common[row]
+            expected = expected + np.sum((slopes * running.state)[:, running.known :], axis=1)
+            weighed = partial(weigh, known, row, gate=settings.gate)
+            update = running.update(slopes * uses[row, :, None], measured[row] - expected, std[row] ** 2, weighed)
+            nis[row], accepted[row] = update.nis, update.believed
+        place[k], attitude[k] = running.own[..., P], running.attitude[:, :-1]
+        covariance = running.covariance[:, pose[:, :, None], pose[:, None]]
+        turns = Rotation.from_matrix((attitude[k].swapaxes(2, 3) @ turned[k]).reshape(-1, 3, 3)).as_rotvec()
+        wrong = np.concatenate([truth[k] - place[k], turns.reshape(place[k].shape)], axis=-1)
+        nees[k] = np.sum(wrong * np.linalg.solve(covariance, wrong[..., None])[..., 0], axis=-1)
+        std_m[k] = np.sqrt(np.trace(covariance[..., P, P], axis1=-2, axis2=-1))
+
+    def track(f: int, b: int) -> RelativeTrack:
+        used = uses[:, f]
+        return RelativeTrack(
+            time_ns=time_ns,
+            attitude=Rotation.from_matrix(attitude[:, f, b]).as_quat(),
+            estimate_m=place[:, f, b],
+            truth_m=truth[:, b],
+            true_attitude=np.where(np.isfinite(truth[:, b, :1]), Rotation.from_matrix(turned[:, b]).as_quat(), np.nan),
+            std_m=std_m[:, f, b],
+            nis=nis[used, f],
+            nees=nees[:, f, b],
+            accepted=accepted[used, f],
+        )
+
+    return {body: {name: track(f, b) for f, name in enumerate(filters)} for b, body in enumerate(team.bodies[:-1])}
+
+
+def team_text(found: list[RelativePose], settings: TeamSettings) -> str:
+    """Return a table with a row for each filter: means over bodies and recordings."""
+    rows, noise, fixed = _figures(found), settings.noise, found[0].fixed
+    title = f"pose in the frame of {printable(found[0].reference)}"
+    lines = [f"{title:36s}{'RMSE (m)':>10s}{'(deg)':>8s}{'NEES':>9s}  95 % bounds   accepted"]
+    for name, one in rows.items():
+        low, high = one["nees_bounds"]
+        lines.append(
+            f"{name:36s}{one['rmse_m']:10.3f}{one['attitude_rmse_deg']:8.2f}{one['nees']:9.2f}"
+            f"  {low:4.2f} to {high:5.2f}{100 * one['accepted']:9.1f} %".replace("nan %", "    -")
+        )
+    lines += [
+        f"start: relative poses within {settings.start_std_m:g} m, {settings.start_std_deg:g} deg and "
+        f"{settings.start_std_m_s:g} m/s an axis (standard deviations); after it poses only serve as truth",
+        f"IMU: {noise.force:g} m/s^2 and {noise.gyro:g} rad/s a root of Hz, biases of {noise.force_start:g} m/s^2 and "
+        f"{noise.gyro_start:g} rad/s that wander by {noise.force_bias:g} and {noise.gyro_bias:g} a root of a second",
+        f"fixed standard deviations, {fixed.source}: raw {fixed.std_m['raw']:.3f} m, calibrated "
+        f"{fixed.std_m['calibrated']:.3f} m; NEES should be {RelativeTrack.DEGREES}",
+    ]
+    for end, less in _reductions(rows).items():
+        changes = ", ".join(f"{name} {-100 * share:+.0f} %" for name, share in less.items())
+        lines.append(f"position errors by listening, against {end}: {changes}; arXiv 2304.03837: up to -48 %")
+    return "\n".join(lines)
+
+
+def team_json(found: list[RelativePose]) -> dict[str, Any]:
+    """Return what `calib localize --model team --json` prints: figures by body and filter, and their means."""
+    rows = [
+        {"recording": one.source, "body": one.body, "reference": one.reference, "filters": for_json(_figures([one]))}
+        for one in found
+    ]
+    summary = _figures(found)
+    return {"bodies": rows, "summary": for_json(summary), "reduction_by_listening": for_json(_reductions(summary))}
+
+
+def _reductions(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, float]]:
+    """Return by which share listening lowers the RMSE of the position, by baseline and filter."""
+    both = {end[2:]: {name: name + end for name in rows if name + end in rows} for end in BASELINES}
+    return {
+        end: {name: 1 - rows[name]["rmse_m"] / rows[other]["rmse_m"] for name, other in names.items()}
+        for end, names in both.items()
+        if names
+    }
+
+
+def _figures(found: list[RelativePose]) -> dict[str, dict[str, Any]]:
+    """Return means over bodies and recordings by filter: RMSE, NEES with bounds, and the share that passes the gate."""
+    table = dict[str, dict[str, Any]]()
+    for name in found[0].tracks:
+        tracks: list[Any] = [one.tracks[name] for one in found]
+        mean, bounds, inside = consistency(tracks)
+        shares = [track.accepted.mean() for track in tracks if len(track.accepted)]
+        table[name] = {
+            "rmse_m": float(np.mean([track.rmse_m for track in tracks])),
+            "attitude_rmse_deg": float(np.mean([track.attitude_rmse_deg for track in tracks])),
+            "nees": mean,
+            "nees_bounds": bounds,
+            "nees_inside": inside,
+            "accepted": float(np.mean(shares)) if shares else np.nan,
+        }
+    return table

@@ -1,0 +1,435 @@
+"""Relative poses of a team: worlds written down as formulas and a batch of least squares, which share no code with the
+filter, and simulated flights with seeds chosen before looking."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import calib
+import uwbsim
+from calib import BadInputError, Calibration, TeamSettings, UnanswerableError, localize_team
+from calib.calibration.power_curves import Curve
+from calib.data.samples import stamped
+from calib.errors import WeakHeadingWarning
+from calib.evaluation import team
+from calib.evaluation.filters import IMUS, ProcessNoise, RelativeFilter
+from calib.evaluation.team import team_json, team_text
+from calib.evaluation.tracking import FilterRanges, distances_in
+from tests import processes
+from uwblink import Contents, Poses, Tag
+
+ROBOTS = ("a", "b", "c")
+ARMS = {1: (0.2, -0.15, 0.1), 2: (-0.2, 0.15, -0.1), 3: (0.15, 0.2, 0.1), 4: (-0.15, -0.2, -0.1),
+        5: (0.25, 0.0, -0.1), 6: (-0.2, 0.1, 0.1)}  # fmt: skip
+NOISE_M = 0.02
+RATE_HZ, NS = 100.0, 10**12
+EXACT = ProcessNoise(force=1e-9, gyro=1e-9, force_bias=0.0, gyro_bias=0.0, force_start=0.02, gyro_start=0.002)
+
+
+def place(robot, t):
+    """Where a robot is: each on its own sum of sines, three metres from the others."""
+    centre = np.array([[0.0, 0.0, 1.0], [3.0, 0.5, 1.6], [1.2, 2.8, 0.7]])[robot]
+    way = [np.sin(0.9 * t + robot), np.cos((0.7 + 0.1 * robot) * t), 0.5 * np.sin(1.1 * t + 2 * robot)]
+    return centre + 0.7 * np.stack(way, axis=-1)
+
+
+def attitude(robot, t):
+    turn = [0.5 * t * (-1) ** robot + robot, 0.12 * np.sin(1.1 * t + robot), 0.1 * np.cos(0.8 * t - robot)]
+    return Rotation.from_euler("ZYX", np.stack(turn, axis=-1))
+
+
+def readings(robot, t):
+    """Angular velocity and specific force in the axes of the robot, by differences of attitudes and places."""
+    turning = (attitude(robot, t - 5e-6).inv() * attitude(robot, t + 5e-6)).as_rotvec() / 1e-5
+    bend = (place(robot, t + 1e-3) - 2 * place(robot, t) + place(robot, t - 1e-3)) / 1e-6
+    return np.hstack([turning, attitude(robot, t).inv().apply(bend + np.array([0.0, 0.0, 9.81]))])
+
+
+def antenna(tag, t):
+    robot = (tag - 1) // 2
+    return place(robot, t) + attitude(robot, t).apply(ARMS[tag])
+
+
+def relative(robot, t):
+    """Pose in the frame of robot a: positions and rotations."""
+    frame = attitude(0, t).inv()
+    return frame.apply(place(robot, t) - place(0, t)), frame * attitude(robot, t)
+
+
+def biases(seed, size=1.0):
+    return np.random.default_rng([7, seed]).normal(size=(3, 6)) * size * np.repeat([0.002, 0.02], 3)
+
+
+def ranging(seconds, seed, rate=60.0):
+    """Times, pairs of tags of different robots, and ranges with white noise."""
+    rng, t = np.random.default_rng(seed), np.arange(0.0, seconds, 1 / rate)
+    pairs = np.array([(i, j) for i in ARMS for j in ARMS if (i - 1) // 2 != (j - 1) // 2])
+    ends = pairs[rng.integers(0, len(pairs), len(t))]
+    exact = [np.linalg.norm(antenna(i, s) - antenna(j, s)) for (i, j), s in zip(ends.tolist(), t, strict=True)]
+    return t, ends, np.array(exact) + NOISE_M * rng.normal(size=len(t))
+
+
+def flight(seconds=4.0, seed=1, bias=1.0, **changes):
+    """A recording of three robots without anchors, whose IMUs have constant biases and no noise."""
+    t, ends, measured = ranging(seconds, seed)
+    ti = np.arange(-0.05, seconds + 0.3, 1 / RATE_HZ)
+    rows = [readings(robot, ti) + biases(seed, bias)[robot] for robot in range(3)]
+    columns = dict(zip(("wx", "wy", "wz", "ax", "ay", "az"), np.vstack(rows).T, strict=True))
+    tp = np.arange(-0.1, seconds + 0.4, 0.002)
+    time_ns = np.tile(np.rint(tp * 1e9).astype(np.int64) + NS, 3)
+    poses = Poses(
+        time_ns,
+        np.repeat(ROBOTS, len(tp)),
+        np.vstack([place(robot, tp) for robot in range(3)]),
+        np.vstack([attitude(robot, tp).as_quat() for robot in range(3)]),
+    )
+    made = Contents(
+        exchanges=stamped((t * 1e9).astype(np.int64) + NS, ends, measured, np.full((2, len(t)), -85.0)),
+        tags=[Tag(tag, ROBOTS[(tag - 1) // 2], arm) for tag, arm in ARMS.items()],
+        poses=poses,
+        imu={"time_ns": np.tile(np.rint(ti * 1e9).astype(np.int64) + NS, 3), "body": np.repeat(ROBOTS, len(ti))}
+        | columns,
+    )
+    return replace(made, **changes)
+
+
+def calibration(sigma_m=NOISE_M):
+    zero, sigma = (Curve((0.0,) * 4 + (9.0,) * 4, (v,) * 4, 3, (0.0, 9.0)) for v in (0.0, sigma_m))
+    return Calibration(
+        delays_ns=dict.fromkeys(ARMS, 0.0), delays_std_ns=dict.fromkeys(ARMS, 0.0), loss="cauchy", scale_ns=0.1,
+        lift="mean-of-lifted", alpha_dbm=-82.0, speed_of_light=299702547.0, bias_curve=zero, sigma_curve=sigma,
+    )  # fmt: skip
+
+
+CLOSE = TeamSettings(noise=EXACT, start_std_m=0.02, start_std_deg=0.5, start_std_m_s=0.02, gate=1e9)
+
+
+def test_without_errors_dead_reckoning_is_the_relative_motion():
+    still = replace(EXACT, force_start=1e-6, gyro_start=1e-6)
+    exact = replace(CLOSE, noise=still, start_std_m=1e-6, start_std_deg=1e-5, start_std_m_s=1e-6)
+    found = localize_team(flight(bias=0.0), calibration(), exact)
+    assert [(one.body, one.reference) for one in found] == [("b", "a"), ("c", "a")]
+    for robot, one in enumerate(found, 1):
+        track = one.tracks["dead reckoning"]
+        where, turned = relative(robot, (track.time_ns - NS) * 1e-9)
+        # Readings are linear between two of them, 10 ms apart; the start's velocity is that of poses 0.1 s apart.
+        assert np.abs(track.estimate_m - where).max() < 0.03
+        assert (Rotation.from_quat(track.attitude).inv() * turned).magnitude().max() < 5e-4
+        np.testing.assert_allclose(track.truth_m, where, atol=1e-4)
+    # Another frame: poses of a in that of c are the inverses.
+    back = {one.body: one for one in localize_team(flight(bias=0.0), calibration(), replace(exact, reference="c"))}
+    here, there = back["a"].tracks["dead reckoning"], found[1].tracks["dead reckoning"]
+    undone = -Rotation.from_quat(there.attitude).inv().apply(there.estimate_m)
+    assert np.abs(here.estimate_m - undone).max() < 0.03
+
+
+def some_filter(noise, spread=1e-3):
+    rng = np.random.default_rng(3)
+    start = rng.normal(size=(1, 2, 3)) * 3, Rotation.random(2, rng=rng).as_matrix()[None]
+    found = RelativeFilter(*start, np.full(2 * 15 + 6 + 1, spread), noise, moving=True)
+    found.state[:] += rng.normal(size=found.state.shape) * 0.3
+    return found
+
+
+def shifted(state, by):
+    """Return the filter with a state that is off: positions and so on add, attitudes turn about the body's axes."""
+    off = by.copy()
+    for body in range(2):
+        turn = slice(15 * body + 6, 15 * body + 9)
+        state.attitude[0, body] = state.attitude[0, body] @ Rotation.from_rotvec(by[turn]).as_matrix()
+        off[turn] = 0.0
+    state.state[0] += off
+    return state
+
+
+def apart(first, second):
+    by = first.state[0] - second.state[0]
+    for body in range(2):
+        turned = second.attitude[0, body].T @ first.attitude[0, body]
+        by[15 * body + 6 : 15 * body + 9] = Rotation.from_matrix(turned).as_rotvec()
+    return by
+
+
+def test_derivatives_are_those_of_finite_differences():
+    rng, none = np.random.default_rng(4), ProcessNoise(force=0.0, gyro=0.0, force_bias=0.0, gyro_bias=0.0)
+    read = rng.normal(size=(3, 6)) + np.array([0, 0, 0, 0, 0, 9.81])
+    size, dt, step = 37, 1e-3, 1e-6
+
+    def moved(by):
+        one = shifted(some_filter(none), by)
+        one.predict(dt, read[:2], read[2])
+        return one
+
+    middle = moved(np.zeros(size))
+    changes = [apart(moved(e), middle) - apart(moved(-e), middle) for e in step * np.eye(size)]
+    by_state = np.array(changes).T / (2 * step)
+    # Terms in the square of the step are left out: 1e-6 of derivatives of up to 10.
+    np.testing.assert_allclose(middle.covariance[0], 1e-6 * by_state @ by_state.T, atol=1e-6 * 1e-5)
+
+    bodies, arms, sign = np.array([[0, 1], [2, 1]]), rng.normal(size=(2, 2, 3)), np.array([1.0, -1.0])
+    _, row, bent_m = some_filter(none, 0.0).distances(bodies, arms, sign)
+    assert bent_m == pytest.approx(0.0)
+    for k, e in enumerate(step * np.eye(size)):
+        ends = [shifted(some_filter(none, 0.0), way * e).distances(bodies, arms, sign)[0][0] for way in (1, -1)]
+        assert row[0, k] == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-7)
+    # Mean and spread of distances between places that are off by chance, beside the terms of second order.
+    spread = np.r_[np.full(3, 0.3), np.zeros(12)]
+    vague = some_filter(none, 0.0)
+    vague.covariance[0, :15, :15] = np.diag(spread**2)
+    mean, row, bent_m = vague.distances(bodies[:1], arms[:1], np.ones(1))
+    drawn = rng.normal(size=(4000, size)) * np.r_[spread, np.zeros(size - 15)]
+    seen = [shifted(some_filter(none, 0.0), by).distances(bodies[:1], arms[:1], np.ones(1))[0][0] for by in drawn]
+    assert mean[0] == pytest.approx(np.mean(seen), abs=4 * 0.3 / np.sqrt(4000))
+    bend = np.array(seen) - value_of(some_filter(none, 0.0), bodies, arms) - drawn @ row[0]
+    assert bent_m[0, 0] == pytest.approx(np.std(bend), rel=0.15)
+    assert mean[0] - value_of(some_filter(none, 0.0), bodies, arms) == pytest.approx(np.mean(bend), rel=0.1)
+
+
+def value_of(one, bodies, arms):
+    return one.distances(bodies[:1], arms[:1], np.ones(1))[0][0]
+
+
+def test_noise_of_readings_moves_bodies_as_stated_and_that_of_the_reference_all_at_once():
+    rng, dt, count = np.random.default_rng(5), 0.02, 2000
+    loud = ProcessNoise(force=0.05, gyro=0.01, force_bias=0.0, gyro_bias=0.0)
+    where, turned = rng.normal(size=(1, 2, 3)) * 3, Rotation.random(2, rng=rng).as_matrix()[None]
+    stated, drawn = (
+        RelativeFilter(np.tile(where, (n, 1, 1)), np.tile(turned, (n, 1, 1, 1)), np.zeros(36), loud, moving=True)
+        for n in (1, count)
+    )
+    read = rng.normal(size=(3, 6)) * 0.5 + np.array([0, 0, 0, 0, 0, 9.81])
+    errors = np.r_[9:15, 24:30, 30:36]
+    for _ in range(50):
+        # A bias for one step is white noise.
+        drawn.state[:, errors] = rng.normal(size=(count, 18)) * np.tile(np.repeat([0.01, 0.05], 3), 3) / np.sqrt(dt)
+        for one in (stated, drawn):
+            one.predict(dt, read[:2], read[2])
+    apart = stated.attitude[:, :2].swapaxes(2, 3) @ drawn.attitude[:, :2]
+    turns = Rotation.from_matrix(apart.reshape(-1, 3, 3)).as_rotvec().reshape(count, 2, 3)
+    seen = np.concatenate([(drawn.own - stated.own)[..., :6], turns], axis=2).reshape(count, 18)
+    rows = np.r_[0:9, 15:24]
+    expected = stated.covariance[0][np.ix_(rows, rows)]
+    scale = np.sqrt(np.diag(expected))
+    # Two thousand draws know a covariance to 3 % of the product of the standard deviations.
+    np.testing.assert_allclose(np.cov(seen.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.12)
+    assert abs(expected[0, 9]) > 0.2 * scale[0] * scale[9]
+
+
+def batch(contents, t, ends, measured, start):
+    """Return the relative poses at the last range by least squares of all ranges, and standard deviations.
+
+    Everything is integrated in a world in which robot a begins at rest without gravity, (37, ...) states at once.
+    """
+    read = np.stack([np.column_stack([contents.imu[n] for n in ("wx", "wy", "wz", "ax", "ay", "az")])
+                     [contents.imu["body"] == robot] for robot in ROBOTS])  # fmt: skip
+    read = read[:, 5:]
+    prior = np.concatenate([np.tile(np.repeat([0.02, np.radians(0.5), 0.02], 3), 2), np.tile(
+        np.repeat([0.002, 0.02], 3), 3)])  # fmt: skip
+
+    def run(p):
+        """Return distances (p, n), last positions and attitudes of b and c in the frame of a."""
+        count, h = len(p), 1 / RATE_HZ
+        place_m, speed = np.zeros((2, 3, count, 3))
+        turn = [Rotation.identity(count)] * 3
+        for robot in (1, 2):
+            own = p[:, 9 * robot - 9 : 9 * robot]
+            place_m[robot], speed[robot] = start[robot][0] + own[:, :3], start[robot][2] + own[:, 6:]
+            turn[robot] = start[robot][1] * Rotation.from_rotvec(own[:, 3:6])
+        off = p[:, 18:].reshape(count, 3, 6)
+        found, row = np.empty((count, len(t))), 0
+        for k in range(read.shape[1] - 1):
+            while row < len(t) and t[row] < (k + 1) * h - 1e-9:
+                part = t[row] - k * h
+                tip = []
+                for tag in ends[row].tolist():
+                    robot = (tag - 1) // 2
+                    w, f = (read[robot, k] - off[:, robot]).reshape(count, 2, 3).swapaxes(0, 1)
+                    here = place_m[robot] + speed[robot] * part + turn[robot].apply(f) * part**2 / 2
+                    tip.append(here + (turn[robot] * Rotation.from_rotvec(w * part)).apply(ARMS[tag]))
+                found[:, row] = np.linalg.norm(tip[0] - tip[1], axis=1)
+                row += 1
+                last = k, part
+            if row == len(t):
+                break
+            for robot in range(3):
+                w, f = ((read[robot, k] + read[robot, k + 1]) / 2 - off[:, robot]).reshape(count, 2, 3).swapaxes(0, 1)
+                half = turn[robot] * Rotation.from_rotvec(w * h / 2)
+                force = half.apply(f)
+                place_m[robot] += speed[robot] * h + force * h**2 / 2
+                speed[robot] += force * h
+                turn[robot] = turn[robot] * Rotation.from_rotvec(w * h)
+        k, part = last
+        for robot in range(3):
+            w, f = (read[robot, k] - off[:, robot]).reshape(count, 2, 3).swapaxes(0, 1)
+            place_m[robot] += speed[robot] * part + turn[robot].apply(f) * part**2 / 2
+            turn[robot] = turn[robot] * Rotation.from_rotvec(w * part)
+        where = [turn[0].inv().apply(place_m[robot] - place_m[0]) for robot in (1, 2)]
+        return found, where, [turn[0].inv() * turn[robot] for robot in (1, 2)]
+
+    x, step = np.zeros(36), 1e-5
+    for _ in range(5):
+        found, where, turned = run(x + np.vstack([np.zeros(36), step * np.eye(36)]))
+        slopes = (found[1:] - found[0]).T / step
+        normal = slopes.T @ slopes / NOISE_M**2 + np.diag(1 / prior**2)
+        x = x + np.linalg.solve(normal, slopes.T @ (measured - found[0]) / NOISE_M**2 - x / prior**2)
+    covariance, poses = np.linalg.inv(normal), []
+    for at, turn in zip(where, turned, strict=True):
+        by_x = np.hstack([at[1:] - at[0], (turn[0].inv() * turn[1:]).as_rotvec()]).T / step
+        poses.append((at[0], turn[0], np.sqrt(np.diag(by_x @ covariance @ by_x.T))))
+    return poses
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_at_the_end_it_is_a_batch_of_least_squares_in_a_world(seed):
+    contents = flight(4.0, seed)
+    t, ends, measured = ranging(4.0, seed)
+    found = localize_team(contents, calibration(), CLOSE)
+    tracks = [one.tracks["variance"] for one in found]
+    # Both begin at the same noisy poses and velocities, those of dead reckoning.
+    start = [None]
+    for track in (one.tracks["dead reckoning"] for one in found):
+        s = (track.time_ns[:10] - track.time_ns[0]) * 1e-9
+        rate = np.polynomial.polynomial.polyfit(s, track.estimate_m[:10], 4)[1]
+        turning = np.array([contents.imu[name][5] for name in ("wx", "wy", "wz")])
+        speed = rate + np.cross(turning, track.estimate_m[0])
+        start.append((track.estimate_m[0], Rotation.from_quat(track.attitude[0]), speed))
+    for track, (where, turned, std) in zip(tracks, batch(contents, t, ends, measured, start), strict=True):
+        off = np.r_[
+            track.estimate_m[-1] - where, (turned.inv() * Rotation.from_quat(track.attitude[-1])).as_rotvec()
+        ] / std  # fmt: skip
+        assert np.abs(off).max() < 0.5
+        assert track.std_m[-1] == pytest.approx(np.linalg.norm(std[:3]), rel=0.1)
+
+
+THREE = uwbsim.load("three_quadcopters")
+
+
+def simulated(seed, duration_s):
+    run = THREE.run.model_copy(update={"seed": seed, "duration_s": duration_s})
+    return uwbsim.simulate(THREE.model_copy(update={"run": run}))
+
+
+@pytest.fixture(scope="module")
+def known():
+    return calib.fit(simulated(300, 60.0), use="receptions").calibration
+
+
+LISTEN = TeamSettings(use="receptions", noise=IMUS["industrial"])
+
+
+@pytest.fixture(scope="module")
+def heard(known):
+    """Three flights of the paper's setting, with seeds chosen before looking."""
+    return [one for seed in (301, 302, 303) for one in localize_team(simulated(seed, 12.0), known, LISTEN)]
+
+
+def test_three_quadcopters_know_where_the_others_are_and_how_well(heard):
+    assert [(one.body, one.reference) for one in heard] == 3 * [("robot2", "robot1"), ("robot3", "robot1")]
+    found = team_json(heard)
+    figures, less = found["summary"], found["reduction_by_listening"]
+    assert figures["dead reckoning"]["rmse_m"] > 20 * figures["variance"]["rmse_m"]
+    assert figures["raw"]["rmse_m"] > 2 * figures["variance"]["rmse_m"]
+    # Ranges have 5 cm of noise, and baselines of half a metre see directions over three metres.
+    assert figures["variance"]["rmse_m"] < 0.2
+    assert figures["variance"]["attitude_rmse_deg"] < 1.5
+    for name in ("calibrated", "variance", "robust"):
+        # The paper has 48 % at best, in other flights.
+        assert 0.1 < less["ranges only"][name] < less["own ranges"][name] < 1
+    for name in ("variance", "robust"):
+        low, high = figures[name]["nees_bounds"]
+        assert low < figures[name]["nees"] < high
+        assert high - low < 2.5
+    assert figures["raw"]["nees"] > 50
+    assert figures["variance"]["accepted"] > 0.995
+    text = team_text(heard, LISTEN)
+    assert f"{figures['variance']['rmse_m']:.3f}" in text
+    assert "against own ranges: raw" in text
+
+
+def test_poses_after_the_start_only_judge(known):
+    whole = simulated(304, 3.0)
+    off = np.array([5.0, -3.0, 1.0]) * (whole.poses.body == "robot2")[:, None] * (whole.poses.time_ns > 3e8)[:, None]
+    elsewhere = replace(whole, poses=replace(whole.poses, position_m=whole.poses.position_m + off))
+    first = replace(whole, poses=whole.poses[np.flatnonzero(whole.poses.time_ns < 3e8)])
+    found = [localize_team(one, known, LISTEN) for one in (whole, elsewhere, first)]
+    for body in range(2):
+        tracks = [one[body].tracks["robust"] for one in found]
+        np.testing.assert_array_equal(tracks[0].estimate_m, tracks[2].estimate_m)
+        np.testing.assert_array_equal(tracks[0].estimate_m, tracks[1].estimate_m)
+        np.testing.assert_array_equal(tracks[0].attitude, tracks[2].attitude)
+        assert len(tracks[0].nis) == len(tracks[2].nis) > 1500
+        assert np.isnan(tracks[2].truth_m[-1]).all()
+        assert (tracks[1].rmse_m > 1.0) == (body == 0)
+        assert np.isfinite(tracks[2].rmse_m)
+
+
+def test_the_filter_knows_what_listeners_of_an_exchange_share(known, monkeypatch):
+    def drawn(ranges, *_):
+        rng, heard, count = np.random.default_rng(8), ranges.arrivals, len(ranges)
+        truth, nothing = np.append(ranges.truth_m, heard.truth_m), 0 * distances_in(ranges)[1]
+        wrong = np.append(0.2 * rng.normal(size=count), 0.05 * rng.normal(size=count)[heard.exchange])
+        own = np.append(np.full(count, 0.2), np.full(len(heard), 0.01))
+        common = np.append(np.zeros(count), np.full(len(heard), 0.05))
+        measured = truth + wrong + 0.01 * rng.normal(size=len(truth))
+        # For the filter called raw, listeners of an exchange are independent.
+        apart = FilterRanges(measured, np.hypot(own, common), 0 * common, nothing)
+        return {"raw": apart, "variance": FilterRanges(measured, own, common, nothing)}
+
+    monkeypatch.setattr(team, "filter_ranges", drawn)
+    ungated, flights = replace(LISTEN, gate=1e9), [simulated(seed, 6.0) for seed in (305, 306)]
+    figures = team_json([one for each in flights for one in localize_team(each, known, ungated)])["summary"]
+    assert 4.5 < figures["variance"]["nees"] < 7
+    assert figures["raw"]["nees"] > 1.3 * figures["variance"]["nees"]
+
+
+def test_one_tag_and_missing_sensors_are_named():
+    contents = flight(2.0)
+    with pytest.raises(UnanswerableError, match=r"memory: inertial readings of 0 bodies with tags \(none\)"):
+        localize_team(replace(contents, imu={}), calibration(), CLOSE)
+    only = contents.imu["body"] == "a"
+    with pytest.raises(UnanswerableError, match=r"of 1 bodies with tags \(a\), .* two or more"):
+        localize_team(replace(contents, imu={k: v[only] for k, v in contents.imu.items()}), calibration(), CLOSE)
+    late = (contents.imu["body"] != "b") | (contents.imu["time_ns"] < NS + 10**9)
+    with pytest.raises(UnanswerableError, match=r"inertial readings of b cover -0.1 to 1.0 s .* to 2.0 s"):
+        localize_team(replace(contents, imu={k: v[late] for k, v in contents.imu.items()}), calibration(), CLOSE)
+    with pytest.raises(UnanswerableError, match="no listener overheard"):
+        localize_team(contents, calibration(), replace(CLOSE, use="receptions"))
+    with pytest.raises(BadInputError, match="`reference`: found 'd', memory has a, b, c"):
+        localize_team(contents, calibration(), replace(CLOSE, reference="d"))
+    with pytest.raises(BadInputError, match="`start_std_deg`"):
+        TeamSettings(start_std_deg=-1.0)
+    blind = contents.poses[np.flatnonzero(contents.poses.body != "c")]
+    with pytest.raises(UnanswerableError, match="no poses of c"):
+        localize_team(replace(contents, poses=blind), calibration(), CLOSE)
+    two = (contents.exchanges.initiator != 6) & (contents.exchanges.target != 6)
+    with pytest.warns(WeakHeadingWarning, match="memory: c has one tag that ranges"):
+        found = localize_team(replace(contents, exchanges=contents.exchanges[two]), calibration(), CLOSE)
+    assert found[1].tracks["variance"].rmse_m < 0.2
+
+
+def test_the_command_prints_writes_and_refuses(known, tmp_path):
+    recording, document = tmp_path / "three.uwb", tmp_path / "c.json"
+    simulated(307, 2.0).save(recording)
+    known.save(document)
+    words = "calib", "localize", recording, "-c", document, "--model", "team"
+    said = json.loads(processes.call(*words, "--use", "receptions", "--imu", "industrial", "--json").stdout)
+    assert [(one["body"], one["reference"]) for one in said["bodies"]] == [("robot2", "robot1"), ("robot3", "robot1")]
+    assert said["summary"]["dead reckoning"]["accepted"] is None
+    for less in (said["reduction_by_listening"][against] for against in ("own ranges", "ranges only")):
+        assert set(less) == {"raw", "calibrated", "variance", "robust"}
+    text = processes.call(*words, "--start-std", "0.02", "1", "0.05", "--tum", tmp_path / "tum").stdout
+    assert "start: relative poses within 0.02 m, 1 deg and 0.05 m/s" in text
+    assert "by listening" not in text
+    assert (tmp_path / "tum" / "three_uwb-robot2-from-robot1-dead-reckoning.tum").exists()
+    truth = np.loadtxt(tmp_path / "tum" / "three_uwb-robot3-from-robot1-truth.tum")
+    close = np.loadtxt(tmp_path / "tum" / "three_uwb-robot3-from-robot1-variance.tum")
+    assert np.abs(truth[:, 1:4] - close[:, 1:4]).max() < 0.3
+    assert np.abs(np.sum(truth[:, 4:] * close[:, 4:], axis=1)).min() > np.cos(np.radians(5) / 2)
+    bare = tmp_path / "bare.uwb"
+    replace(simulated(307, 2.0), imu={}).save(bare)
+    assert "bare.uwb" in processes.refuse(*words[:2], bare, *words[3:], status=1, runner=processes.call, naming=["imu"])
+    processes.refuse(*words, "--imu", "wooden", runner=processes.call, naming=["industrial"])
+    processes.refuse(*words, "--start-std", "0", "1", "1", runner=processes.call, naming=["--start-std:"])
