@@ -112,7 +112,7 @@ def _why(found: KnownDistances, directions: Directions, vague: Sequence[int]) ->
     if not np.isfinite(ranges.toward).all(axis=2).any():
         return f"{ranges.source}: no direction is known; a pattern needs poses with attitudes (`uwblink poses`)"
     if len(vague) < len(directions.tags):
-        return f"{ranges.source}: {len(ranges)} ranges are too few for a pattern, at least {_needed(found)} are needed"
+        return f"{ranges.source}: too few ranges for a pattern, at least {_needed(found)} are needed"
     still = f"no body turns by more than {math.degrees(LEAST_TURN_RAD):.0f}° of tags"
     whose = first_few(map(str, directions.tags or ranges.tags()))
     return f"{ranges.source}: {'tags' if directions.tags else still} {whose}: {TURNED_TOO_LITTLE}"
