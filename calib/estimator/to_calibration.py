@@ -19,7 +19,7 @@ from calib.calibration.model import Calibration, PairOffset, TagGroup, Uncertain
 from calib.calibration.patterns import HARMONICS, Pattern
 from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, flat_curve
 from calib.estimator.known_distances import LARGEST_SPREAD_M, DescribedErrors, KnownDistances, described_errors
-from calib.estimator.pattern_unknowns import OF_PAIR, OWN, SHARED
+from calib.estimator.pattern_unknowns import OF_PLACES, OWN, SHARED
 from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel, SplineValues
 from calib.estimator.range_rows import RESIDUAL
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
@@ -119,22 +119,14 @@ def patterns_of(found: KnownDistances) -> tuple[Pattern, ...]:
     directions, values = found.model.directions, found.values
     if directions is None:
         return ()
-    several = len(directions.tags) if OWN in values else 0
-    patterns = []
-    for k in range(max(several, 1)):
-        # A tag has the shared part and its own.
-        parts = (
-            np.hstack([np.eye(HARMONICS), np.kron(np.eye(several)[k : k + 1], np.eye(HARMONICS))])
-            if several
-            else np.eye(HARMONICS)
-        )
-        factors = parts @ np.concatenate([values[kind] for kind in (SHARED, OWN) if kind in values])
-        covariance = parts @ found.covariances["pattern"] @ parts.T
-        tags = directions.tags[k : k + 1] if several else directions.tags
-        rms = math.sqrt(float(np.sum(directions.square * (np.outer(factors, factors) + covariance))))
-        patterns.append(
-            Pattern(tags, tuple(factors.tolist()), tuple(directions.centre.tolist()), matrix_of(covariance), rms)
-        )
+    whose = [(tag,) for tag in directions.tags] if OWN in values else [directions.tags]
+    factors, patterns = values[OWN if OWN in values else SHARED].reshape(-1, HARMONICS), []
+    for k, (tags, own) in enumerate(zip(whose, factors, strict=True)):
+        which = slice(k * HARMONICS, (k + 1) * HARMONICS)
+        covariance = found.covariances["pattern"][which, which]
+        rms = math.sqrt(float(np.sum(directions.square * (np.outer(own, own) + covariance))))
+        centre = tuple(directions.centre.tolist())
+        patterns.append(Pattern(tags, tuple(own.tolist()), centre, matrix_of(covariance), rms))
     return tuple(patterns)
 
 
@@ -200,8 +192,9 @@ def _correction_std(found: KnownDistances, delays_ns2: Floats, lifted: Floats) -
         of_pairs = np.sum(delays @ delays_ns2 * delays, axis=1)
     if model.directions is not None:
         # What belongs to places, and depends on direction there, is not corrected.
-        _, columns, entries = model.directions.entries(OF_PAIR, model.pairs)
-        of_pairs = of_pairs + np.var(np.sum(entries * found.values[OF_PAIR][columns], axis=1))
+        parts = ((*model.directions.entries(kind, model.pairs)[1:], found.values[kind]) for kind in OF_PLACES)
+        left = sum(np.sum(entries * values[columns], axis=1) for columns, entries, values in parts)
+        of_pairs = of_pairs + np.var(left)
     variance = np.full(len(lifted), float(np.mean(of_pairs)))
     if model.curve is not None:
         at = SplineValues.at(lifted, model.curve.knots)

@@ -8,12 +8,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy import sparse
 
 from calib.calibration.patterns import HARMONICS
 from calib.data.ranges import LEAST_TURN_RAD, Ranges
 from calib.errors import UnanswerableError
 from calib.estimator.known_distances import KnownDistances, fit_known_distances
-from calib.estimator.pattern_unknowns import OWN, SHARED, SPREAD_M, Directions
+from calib.estimator.optimize import Optimum
+from calib.estimator.pattern_unknowns import OF_PAIR, OWN, SHARED, SPREAD_M, Directions
 from calib.estimator.score_tests import Derivative, Family, Tested
 from calib.settings import FitSettings
 from uwblink.display import first_few
@@ -45,26 +47,35 @@ def fit_with_pattern(ranges: Ranges, settings: FitSettings) -> tuple[KnownDistan
     if asked == "none" or settings.excludes_patterns:
         return nothing
     directions = Directions.of(plain.model.ranges)
-    kinds = {"tag": OWN, "shared": SHARED} if len(directions.tags) > 1 else {"shared": SHARED}
-    tested = plain.slopes.tests(
-        [_family(plain, directions, kind) for kind in kinds.values()] if directions.tags else []
-    )
-    vague = _vague(directions, tested[0 if asked == "tag" else -1]) if tested else []
-    if len(vague) == len(directions.tags) or len(plain.model.ranges) < _needed(plain):
+    kinds = {"shared": SHARED, "tag": OWN} if len(directions.tags) > 1 else {"shared": SHARED}
+    families = [_family(plain, directions, kind) for kind in (SHARED, OWN)] if directions.tags else []
+    tested = plain.slopes.tests(families)
+    vague = _vague(directions, tested[asked == "tag"]) if tested else []
+    if len(vague) == len(directions.tags) or len(plain.model.ranges) < _needed(plain, directions):
         if asked == "auto":
             return nothing
         raise UnanswerableError(_why(plain, directions, vague), parameter="pattern")
     warnings = [f"tags {first_few(map(str, vague))}: {TURNED_TOO_LITTLE}"] if vague else []
-    if asked == "auto" and max(map(log_evidence, tested)) < LOG_EVIDENCE:
+    if asked != "auto":
+        return fit_known_distances(ranges, settings), {"kind": asked}, warnings
+    if max(map(log_evidence, tested)) < LOG_EVIDENCE:
         return nothing
-    for mode, kind in kinds.items() if asked == "auto" else [(asked, "")]:
-        found = fit_known_distances(ranges, replace(settings, pattern=mode if mode in kinds else "shared"))
-        if asked != "auto":
-            return found, {"kind": asked}, warnings
+    best, likeliest = nothing, -math.inf
+    for mode, kind in kinds.items():
+        found = fit_known_distances(ranges, replace(settings, pattern=mode))
         evidence = log_evidence(found.slopes.test(_family(found, directions, kind, fitted=True)))
-        if evidence >= LOG_EVIDENCE:
-            return found, {"kind": mode, "log_evidence": round(evidence, 1)}, []
-    return nothing
+        marginal = _log_marginal(found.searches[0].optimum)
+        if evidence >= LOG_EVIDENCE and marginal > likeliest:
+            best, likeliest = (found, {"kind": mode, "log_evidence": round(evidence, 1)}, []), marginal
+    return best
+
+
+def _log_marginal(optimum: Optimum) -> float:
+    """Return the log likelihood with all unknowns integrated out (Laplace), less what fits to the same rows share."""
+    priors, free = optimum.priors, optimum.layout.free()
+    known = sparse.csc_matrix(optimum.information + priors.precision()).toarray()[np.ix_(free, free)]
+    weights = sum(rank * math.log(weight) for rank, weight in zip(priors.ranks, priors.weights, strict=True))
+    return optimum.value + 0.5 * weights - 0.5 * float(np.linalg.slogdet(known)[1])
 
 
 def _family(found: KnownDistances, directions: Directions, kind: str, *, fitted: bool = False) -> Family:
@@ -101,9 +112,9 @@ def _vague(directions: Directions, tested: Tested) -> list[int]:
     return [tag for tag, vague in zip(directions.tags, each, strict=True) if vague]
 
 
-def _needed(found: KnownDistances) -> int:
-    """Return how many ranges determine the pattern of antennas beside those of pairs."""
-    return RANGES_AN_UNKNOWN * HARMONICS * (len(found.model.pairs.ends) + 1)
+def _needed(found: KnownDistances, directions: Directions) -> int:
+    """Return how many ranges determine the pattern of antennas beside those of bodies."""
+    return RANGES_AN_UNKNOWN * len(directions.entries(OF_PAIR, found.model.pairs)[0])
 
 
 def _why(found: KnownDistances, directions: Directions, vague: Sequence[int]) -> str:
@@ -112,7 +123,7 @@ def _why(found: KnownDistances, directions: Directions, vague: Sequence[int]) ->
     if not np.isfinite(ranges.toward).all(axis=2).any():
         return f"{ranges.source}: no direction is known; a pattern needs poses with attitudes (`uwblink poses`)"
     if len(vague) < len(directions.tags):
-        return f"{ranges.source}: too few ranges for a pattern, at least {_needed(found)} are needed"
+        return f"{ranges.source}: too few ranges for a pattern, at least {_needed(found, directions)} are needed"
     still = f"no body turns by more than {math.degrees(LEAST_TURN_RAD):.0f}° of tags"
     whose = first_few(map(str, directions.tags or ranges.tags()))
     return f"{ranges.source}: {'tags' if directions.tags else still} {whose}: {TURNED_TOO_LITTLE}"
