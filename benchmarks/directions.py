@@ -1,18 +1,20 @@
 """Flights whose antennas delay by direction, by a generator that shares no code with fits, and what fits make of them.
 
 Robots fly on sums of sines and turn about all axes; each carries a tag. What an antenna adds is a sum of waves over
-azimuth, faded towards its poles, and no spherical harmonic. Powers, reflections and a curve are those of other worlds.
+azimuth, faded towards its poles, and no spherical harmonic. `python -m benchmarks.directions` prints what fits find.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+import calib
 from calib.data.samples import SampleFlight, stamped
 from uwblink.recording.schema import Poses, Tag
 
@@ -186,3 +188,36 @@ def _wander(rng: np.random.Generator, recipe: Recipe, time_s: Floats, which: Any
         rows = which == pair
         found[rows] = np.interp(time_s[rows], grid, path)
     return found
+
+
+SOUND: Final = {
+    "sound": Recipe(pattern_m=0.0),
+    "20 s, three robots": Recipe(pattern_m=0.0, seconds=20.0, robots=3),
+    "errors of 4 cm that last": Recipe(pattern_m=0.0, wander_m=0.04),
+    "walls of 5 cm": Recipe(pattern_m=0.0, wall_m=0.05, wander_m=0.02),
+    "errors of places, 3 cm": Recipe(pattern_m=0.0, room_m=0.03),
+    "the same, one robot and six anchors": Recipe(pattern_m=0.0, robots=1, anchors=6, room_m=0.03, wander_m=0.02),
+    "the same, on a loop": Recipe(pattern_m=0.0, robots=1, anchors=8, loop=True, room_m=0.04, wander_m=0.02),
+}
+PLANTED: Final = {
+    f"{100 * size_m:.0f} cm, {'each its own' if own else 'shared'}": Recipe(pattern_m=size_m, own=own)
+    for own in (False, True)
+    for size_m in (0.05, 0.1, 0.2)
+}
+
+
+def main() -> None:
+    """Print by recipe which patterns fits find, and the spread of another flight's errors with over without them."""
+    for name, recipe in (SOUND | PLANTED).items():
+        found, ratios = Counter[str](), []
+        for seed in range(100, 108):
+            (first, _), (second, _) = flight(recipe, seed), flight(recipe, seed, 1)
+            fits = [calib.fit(first, between_m=0.0, pattern=pattern) for pattern in ("none", "auto")]
+            found[fits[1].calibration.provenance.get("pattern", {}).get("kind", "none")] += 1
+            without, known = (calib.evaluate(second, one).overall.full.robust_std_m for one in fits)
+            ratios.append(known / without)
+        print(f"{name}: {dict(found)}, spread {np.mean(ratios):.2f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -80,6 +80,11 @@ class Directions:
         values = np.concatenate([self.lower, self.higher], axis=1)
         return tuple(f"{name} {k}" for name in names for k in each), columns[pairs.number], values
 
+    def apart_from_places(self, pairs: Pairs) -> bool:
+        """Return whether bodies see more than two others each: with fewer, places can do all that own patterns do."""
+        bodies = {self.bodies.get(tag, str(tag)) for tag in self.tags}
+        return len(self.entries(OF_BODIES, pairs)[0]) > 2 * HARMONICS * len(bodies)
+
     def _owner(self, kind: str, tag: int, pair: list[int]) -> tuple[int | str, ...]:
         """Return whose unknowns of a kind a tag has in a pair, () where it sees no direction."""
         if tag not in self.tags:

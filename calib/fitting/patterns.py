@@ -47,7 +47,9 @@ def fit_with_pattern(ranges: Ranges, settings: FitSettings) -> tuple[KnownDistan
     if asked == "none" or settings.excludes_patterns:
         return nothing
     directions = Directions.of(plain.model.ranges)
-    kinds = {"shared": SHARED, "tag": OWN} if len(directions.tags) > 1 else {"shared": SHARED}
+    kinds = {"shared": SHARED}
+    if len(directions.tags) > 1 and directions.apart_from_places(plain.model.pairs):
+        kinds["tag"] = OWN
     families = [_family(plain, directions, kind) for kind in (SHARED, OWN)] if directions.tags else []
     tested = plain.slopes.tests(families)
     vague = _vague(directions, tested[asked == "tag"]) if tested else []
