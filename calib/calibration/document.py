@@ -116,11 +116,13 @@ CALIBRATION_KEYS: Final = (
         "none",
         "Sides that ranged only with each other: only ranges between the two sides can be corrected.",
     ),
-    FileKey("patterns.tags", "whole numbers", "no patterns", "Tags whose ranges depend on direction alike."),
-    FileKey("patterns.coefficients_m", "8 numbers, m", "needed", "Factors of spherical harmonics (theory)."),
-    FileKey("patterns.centre", "8 numbers", "needed", "Means of the harmonics over the fitted directions."),
-    FileKey("patterns.covariance_m2", "matrix, m²", "needed", "Covariance of the coefficients."),
-    FileKey("patterns.rms_m", "number, m", "needed", "Root mean square over the fitted directions."),
+    FileKey(
+        "patterns",
+        "list of tables",
+        "none",
+        "`tags`; `coefficients_m` of 8 spherical harmonics less their `centre`, by which ranges are longer; their "
+        "`covariance_m2`; `rms_m`, without directions.",
+    ),
 )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.calibration.document import Matrix, Metres, Number, StdM, Tags, joint
 from uwblink.arrays import Floats
@@ -18,7 +19,7 @@ HARMONICS: Final = 8
 """Number of spherical harmonics of degrees 1 and 2: waves once and twice around, as published patterns have them."""
 
 
-def harmonics(toward: Floats) -> Floats:
+def harmonics(toward: Floats | NDArray[np.float32]) -> Floats:
     """Return the real spherical harmonics of degrees 1 and 2 (n, 8) at unit vectors (n, 3).
 
     Their mean over all directions is 0, their mean square 1. The first three are the components of the vector: a wrong
@@ -51,7 +52,7 @@ class Pattern:
     covariance_m2: Matrix
     rms_m: StdM
 
-    def values(self, toward: Floats) -> Floats:
+    def values(self, toward: Floats | NDArray[np.float32]) -> Floats:
         """Return the harmonics less their centre (n, 8) at unit vectors (n, 3), NaN for unknown ones."""
         return np.asarray(harmonics(toward) - np.array(self.centre))
 
@@ -75,7 +76,7 @@ def patterns_m(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Floats
         for end, ids in enumerate((ranges.initiator, ranges.target)):
             rows = np.flatnonzero(np.isin(ids, pattern.tags))
             own = pattern.values(ranges.toward[rows, end])
-            unknown = np.isnan(own).any(axis=1)
+            unknown = np.asarray(np.isnan(own).any(axis=1))
             values[rows] += np.where(unknown[:, None], 0.0, own)
             variance[rows] += np.where(unknown, pattern.rms_m**2, 0.0)
         longer += values @ np.array(pattern.coefficients_m)

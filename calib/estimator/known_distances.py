@@ -19,7 +19,7 @@ from calib.estimator.arrival_rows import ArrivalModel
 from calib.estimator.covariance import Kept, sandwich
 from calib.estimator.losses import LOSSES, MIXTURE
 from calib.estimator.optimize import Optimum, maximize
-from calib.estimator.pattern_unknowns import OWN, SHARED
+from calib.estimator.pattern_unknowns import COMMON, OWN
 from calib.estimator.range_model import METRES_A_NS, RangeModel
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows, Robust
 from calib.estimator.rows import NormalRows, Rows
@@ -137,7 +137,7 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> KnownDistances
     if settings.sequential and model.curve is not None and not model.pinned:
         return _in_sequence(model, error, loss, scale_m, blocks)
     robust, heard = loss if loss != MIXTURE else ROBUST_LOSS, ArrivalModel.of(model)
-    first = ("delay", *model.curve_kinds(), SHARED, OWN)
+    first = ("delay", *model.curve_kinds(), COMMON, OWN)
     pilot = robust_fit(model, error, robust, scale_m, first, sample=PILOT, heard=heard)
     if heard is not None and pilot.heard is not None:
         heard = _weighed(heard, model, pilot.heard, pilot, blocks)
@@ -312,7 +312,7 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDis
         "delay": Kept.delays(layout.indices(["delay"]), len(fitted.residuals) / len(model.pairs.ends)),
         "curve": Kept.curve(layout.indices(model.curve_kinds())),
         "noise": Kept.curve(layout.indices(noise_kinds(layout))),
-        "pattern": Kept.curve(layout.indices([SHARED, OWN])),
+        "pattern": Kept.curve(layout.indices([COMMON, OWN])),
     }
     kept = {name: group for name, group in kept.items() if len(group.indices)}
     slopes, *of_heard = fitted.slopes(blocks)

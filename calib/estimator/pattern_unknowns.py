@@ -20,7 +20,7 @@ from calib.estimator.unknowns import Unknown
 from calib.pairs import Pairs
 from uwblink.arrays import Floats, Ints
 
-SHARED, OWN, OF_BODIES, OF_PAIR = "pattern", "pattern of tag", "pattern of bodies", "pattern of pair"
+COMMON, OWN, OF_BODIES, OF_PAIR = "pattern", "pattern of tag", "pattern of bodies", "pattern of pair"
 """Kinds of unknowns: of all antennas, of one, of two bodies, and of a pair of tags."""
 
 SPREAD_M = (0.02, 1e-4, 0.3)
@@ -70,13 +70,13 @@ class Directions:
 
     def entries(self, kind: str, pairs: Pairs) -> tuple[tuple[str, ...], Ints, Floats]:
         """Return the names of the unknowns of a kind, and of each range the columns and values (n, k) that it has."""
-        each, count = np.arange(HARMONICS, dtype=np.int32), len(self.lower)
-        if kind == SHARED:
+        each, count = np.arange(HARMONICS), len(self.lower)
+        if kind == COMMON:
             return tuple(map(str, each)), np.broadcast_to(each, (count, HARMONICS)), self.lower + self.higher
         whose = [[self._owner(kind, tag, both) for tag in both] for both in pairs.ends.tolist()]
         names = sorted({one for both in whose for one in both if one})
         ends = np.array([[names.index(one) if one else 0 for one in both] for both in whose])
-        columns = (ends[:, :, None] * HARMONICS + each).reshape(len(ends), -1).astype(np.int32)
+        columns = (ends[:, :, None] * HARMONICS + each).reshape(len(ends), -1)
         values = np.concatenate([self.lower, self.higher], axis=1)
         return tuple(f"{name} {k}" for name in names for k in each), columns[pairs.number], values
 
@@ -102,5 +102,5 @@ class Directions:
 
 
 OF_PLACES = (OF_BODIES, OF_PAIR)
-KINDS = {"shared": (SHARED, *OF_PLACES), "tag": (OWN, *OF_PLACES)}
+KINDS = {"shared": (COMMON, *OF_PLACES), "tag": (OWN, *OF_PLACES)}
 """Kinds of unknowns by the setting `pattern`."""

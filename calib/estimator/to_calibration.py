@@ -19,7 +19,7 @@ from calib.calibration.model import Calibration, PairOffset, TagGroup, Uncertain
 from calib.calibration.patterns import HARMONICS, Pattern
 from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, flat_curve
 from calib.estimator.known_distances import LARGEST_SPREAD_M, DescribedErrors, KnownDistances, described_errors
-from calib.estimator.pattern_unknowns import OF_PLACES, OWN, SHARED
+from calib.estimator.pattern_unknowns import COMMON, OF_PLACES, OWN
 from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel, SplineValues
 from calib.estimator.range_rows import RESIDUAL
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
@@ -120,7 +120,7 @@ def patterns_of(found: KnownDistances) -> tuple[Pattern, ...]:
     if directions is None:
         return ()
     whose = [(tag,) for tag in directions.tags] if OWN in values else [directions.tags]
-    factors, patterns = values[OWN if OWN in values else SHARED].reshape(-1, HARMONICS), []
+    factors, patterns = values[OWN if OWN in values else COMMON].reshape(-1, HARMONICS), []
     for k, (tags, own) in enumerate(zip(whose, factors, strict=True)):
         which = slice(k * HARMONICS, (k + 1) * HARMONICS)
         covariance = found.covariances["pattern"][which, which]

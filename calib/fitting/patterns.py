@@ -15,7 +15,7 @@ from calib.data.ranges import LEAST_TURN_RAD, Ranges
 from calib.errors import UnanswerableError
 from calib.estimator.known_distances import KnownDistances, fit_known_distances
 from calib.estimator.optimize import Optimum
-from calib.estimator.pattern_unknowns import OF_PAIR, OWN, SHARED, SPREAD_M, Directions
+from calib.estimator.pattern_unknowns import COMMON, OF_PAIR, OWN, SPREAD_M, Directions
 from calib.estimator.score_tests import Derivative, Family, Tested
 from calib.settings import FitSettings
 from uwblink.display import first_few
@@ -47,10 +47,10 @@ def fit_with_pattern(ranges: Ranges, settings: FitSettings) -> tuple[KnownDistan
     if asked == "none" or settings.excludes_patterns:
         return nothing
     directions = Directions.of(plain.model.ranges)
-    kinds = {"shared": SHARED}
+    kinds = {"shared": COMMON}
     if len(directions.tags) > 1 and directions.apart_from_places(plain.model.pairs):
         kinds["tag"] = OWN
-    families = [_family(plain, directions, kind) for kind in (SHARED, OWN)] if directions.tags else []
+    families = [_family(plain, directions, kind) for kind in (COMMON, OWN)] if directions.tags else []
     tested = plain.slopes.tests(families)
     vague = _vague(directions, tested[asked == "tag"]) if tested else []
     if len(vague) == len(directions.tags) or len(plain.model.ranges) < _needed(plain, directions):
