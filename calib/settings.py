@@ -171,8 +171,10 @@ class FitSettings(CheckedSettings):
     `reference_power_dbm`, `alpha_dbm` by default; `delays_only` fits no curve; `delays_from` is a calibration, or its
     path, whose delays are taken over; `constants` "pair" gives each pair a constant instead of each tag a delay. `use`
     "receptions" also fits what third tags overheard of the exchanges, which determines the delay of each target alone.
-    With `hold_out` a second fit, to the other ranges, is judged on such a share of them, by `fold`; what was found is
-    in the provenance of the calibration, which is fitted to all.
+    `pattern` is the delay of an antenna over direction: "shared" by all tags on bodies that turn, one of each "tag",
+    "none", or "auto": that for which the data are evidence of 100 to 1. With `hold_out` a second fit, to the other
+    ranges, is judged on such a share of them, by `fold`; what was found is in the provenance of the calibration, which
+    is fitted to all.
 
     >>> import calib
     >>> settings = calib.FitSettings(loss="huber", fixed_ns={1: -0.3})
@@ -259,6 +261,13 @@ class FitSettings(CheckedSettings):
         names=("exchanges", "receptions"),
         rich_help_panel=MODEL_PANEL,
     )
+    pattern: str = setting(
+        "auto",
+        "Delay of an antenna over direction: none; a pattern that tags on bodies that turn share; one of each tag; or "
+        "auto, that for which the data are evidence.",
+        names=("auto", "none", "shared", "tag"),
+        rich_help_panel=MODEL_PANEL,
+    )
     hold_out: float = setting(
         0.0,
         "Share of the data to hold out, such as 0.3; a second fit, to the rest, is judged on it.",
@@ -284,6 +293,11 @@ class FitSettings(CheckedSettings):
             raise BadInputError(
                 f"receptions go with delays of tags that are fitted at once, not with `{other}`", parameter="use"
             )
+        if self.pattern in ("shared", "tag") and self.excludes_patterns:
+            raise BadInputError(
+                f"{self.pattern} goes with delays of tags by ranges, not with `{self.excludes_patterns}`",
+                parameter="pattern",
+            )
         seen: dict[int, str] = {}
         for name, tags in (self.groups or {}).items():
             listed = list(tags) if isinstance(tags, Iterable) and not isinstance(tags, str) else []
@@ -294,6 +308,15 @@ class FitSettings(CheckedSettings):
                     raise BadInputError(f"tag {tag} is in {seen[tag]!r} and in {name!r}", parameter="groups")
                 seen[tag] = name
         object.__setattr__(self, "groups", {name: tuple(map(int, tags)) for name, tags in (self.groups or {}).items()})
+
+    @property
+    def excludes_patterns(self) -> str:
+        """The setting with which no pattern over direction can be fitted, "" if there is none."""
+        if self.sequential:
+            return "sequential"
+        if self.constants == "pair":
+            return "constants"
+        return "use" if self.use == "receptions" else ""
 
 
 def read_distances(texts: Iterable[str]) -> tuple[KnownDistance, ...]:

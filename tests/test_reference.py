@@ -10,6 +10,7 @@ import calib
 import uwblink
 import uwbsim
 from calib.calibration.document import CALIBRATION_KEYS as CALIBRATION
+from calib.calibration.patterns import Pattern
 from docs.site import commands, doors, file_keys
 from uwblink.boards import ranging_plan
 from uwblink.importers import column_map
@@ -54,6 +55,9 @@ def test_the_reference_of_calibrations_has_every_key_of_files_and_no_other():
         received = dataclasses.replace(calibration, power_at="reception")
         for one in (calibration, received):
             found |= set(flat(json.loads(one.to_json())))
+    matrix = ((0.0,) * 8,) * 8
+    turned = dataclasses.replace(calibration, patterns=(Pattern((1,), matrix[0], matrix[0], matrix, 0.0),))
+    found |= set(flat(json.loads(turned.to_json())))
     ranges = calib.load_ranges(flight)
     found |= set(flat(json.loads(calib.fit(ranges[ranges.initiator == 1]).calibration.to_json())))
     assert found == {key.name for key in CALIBRATION}

@@ -2,7 +2,7 @@
 
 from calib.calibration.applying import keep_determined
 from calib.calibration.formats import antenna_delays_warning, free_delays, programmed, read_miluv
-from calib.calibration.model import delay_rows, held_out_line, pair_rows, rests_on
+from calib.calibration.model import delay_rows, held_out_line, pair_rows, pattern_rows, rests_on
 
 __all__ = [
     "antenna_delays_warning",
@@ -11,6 +11,7 @@ __all__ = [
     "held_out_line",
     "keep_determined",
     "pair_rows",
+    "pattern_rows",
     "programmed",
     "read_miluv",
     "rests_on",

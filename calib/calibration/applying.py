@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.calibration.document import Value, pair_name, split_text
+from calib.calibration.patterns import patterns_m
 from calib.calibration.power_curves import ends, lift
 from calib.data.arrivals import Arrivals
 from calib.data.ranges import Ranges
@@ -57,8 +58,8 @@ class CorrectedRanges(CorrectedColumns):
     are reflected. `tail_probability` is the same given the range itself, where its true distance is known, and
     `outlier` marks what is then neither noise nor a reflection; elsewhere it equals `tail_share`, and nothing is
     marked. `clamped` marks lifted powers at which the curves had no data and are held constant; `sigma_total_m` grows
-    there by the slope of the curve at its end. All but `sigma_m` and `clamped` are NaN where a calibration has no error
-    model (`Calibration.errors`), and without a power.
+    there by the slope of the curve at its end, and by what a pattern over direction leaves open. All but `sigma_m` and
+    `clamped` are NaN where a calibration has no error model (`Calibration.errors`), and without a power.
 
     >>> import calib
     >>> flight = calib.load_ranges(calib.sample_flight())
@@ -124,7 +125,8 @@ def corrected_ranges(calibration: Calibration, ranges: Ranges) -> CorrectedRange
     """Return what `Calibration.apply` returns, and raise what that raises."""
     delays = _without_delays(calibration, ranges)
     lifted = calibration.lifted(ranges)
-    corrected = delays - _bias(calibration, ranges, lifted)
+    longer, unknown = patterns_m(calibration, ranges)
+    corrected = delays - _bias(calibration, ranges, lifted) - longer
     return CorrectedRanges(
         raw_m=ranges.raw_m,
         delay_corrected_m=delays,
@@ -132,7 +134,7 @@ def corrected_ranges(calibration: Calibration, ranges: Ranges) -> CorrectedRange
         sigma_m=noise_m(calibration, ranges),
         lifted=lifted,
         clamped=~calibration.bias_curve.inside(lifted),
-        **_errors(calibration, ranges, lifted, corrected - ranges.truth_m),
+        **_errors(calibration, ranges, lifted, corrected - ranges.truth_m, unknown),
     )
 
 
@@ -147,6 +149,11 @@ def corrected_arrivals(calibration: Calibration, ranges: Ranges) -> CorrectedArr
         raise BadInputError(
             f"{ranges.source}: the calibration knows the delays of tags {first_few(map(str, summed))} in sums only, "
             "and differences of arrival need those of single tags; fit them with `use` receptions"
+        )
+    if calibration.patterns:
+        raise BadInputError(
+            f"{ranges.source}: the calibration has patterns over direction, which say nothing of overheard frames; fit "
+            "one with `pattern` none"
         )
     applied = corrected_ranges(calibration, exchange)
     delay_ns = np.array([calibration.delays_ns[tag] for tag in exchange.target.tolist()])
@@ -270,8 +277,13 @@ def _offsets_m(calibration: Calibration, ranges: Ranges) -> Floats:
     return np.array([offsets[pair].offset_m for pair in ends])[pairs.number]
 
 
-def _errors(calibration: Calibration, ranges: Ranges, lifted: Floats, error_m: Floats) -> dict[str, Any]:
-    """Return the expected errors of ranges (n,), by the names of `CorrectedRanges`."""
+def _errors(
+    calibration: Calibration, ranges: Ranges, lifted: Floats, error_m: Floats, unknown_m: Floats
+) -> dict[str, Any]:
+    """Return the expected errors of ranges (n,), by the names of `CorrectedRanges`.
+
+    `unknown_m` (n,) is the standard deviation of what patterns leave open.
+    """
     model = calibration.errors
     if model is None:
         nothing = np.full(len(ranges), np.nan)
@@ -284,7 +296,7 @@ def _errors(calibration: Calibration, ranges: Ranges, lifted: Floats, error_m: F
         tail, likely = model.tail_given(np.where(looked_at, error_m, 0.0), shapes)
         outlier = looked_at & (likely > 0.5)
     return {
-        "sigma_total_m": np.hypot(model.total_m(shapes), calibration.bias_curve.beyond(lifted)),
+        "sigma_total_m": np.hypot(np.hypot(model.total_m(shapes), calibration.bias_curve.beyond(lifted)), unknown_m),
         "mean_error_m": model.mean_m(shapes),
         "tail_share": shapes.tail_share,
         "tail_probability": np.where(looked_at, tail, shapes.tail_share),

@@ -43,9 +43,10 @@ def _curve_keys(name: str, of: str) -> tuple[FileKey, ...]:
 CALIBRATION_KEYS: Final = (
     FileKey(
         "schema_version",
-        "1 to 5",
+        "1 to 6",
         "needed",
-        "2 with `groups`, 3 with `power_at` reception, 4 with `pair_offsets`, 5 with `undetermined_splits`.",
+        "2 with `groups`, 3 with `power_at` reception, 4 with `pair_offsets`, 5 with `undetermined_splits`, 6 with "
+        "`patterns`.",
     ),
     FileKey("delays_ns.TAG", "number, ns", "needed", "Aggregate antenna delay of a tag, transmit less receive."),
     FileKey("delays_std_ns.TAG", "number, ns, or null", "needed", "Its standard error; null where data leave it free."),
@@ -114,6 +115,13 @@ CALIBRATION_KEYS: Final = (
         "pairs of lists of tags",
         "none",
         "Sides that ranged only with each other: only ranges between the two sides can be corrected.",
+    ),
+    FileKey(
+        "patterns",
+        "list of tables",
+        "none",
+        "`tags`; `coefficients_m` of 8 spherical harmonics less their `centre`, by which ranges are longer; their "
+        "`covariance_m2`; `rms_m`, without directions.",
     ),
 )
 
@@ -226,6 +234,9 @@ FreeStdNs = Annotated[
 ]
 """A standard error, which is infinite (null in files) where data leave a delay free."""
 
+Matrix = tuple[tuple[Number, ...], ...]
+"""A matrix as a tuple of rows."""
+
 Tags = tuple[Annotated[int, number(0, LARGEST_ID, "the id of a tag", int)], ...]
 Split = tuple[Tags, Tags]
 TagKey = Annotated[int, expect("tag ids as keys", is_tag, int)]
@@ -242,13 +253,14 @@ def write(calibration: Value, adapter: TypeAdapter[Value]) -> str:
 
     The version is what a program must support to read it: 2 with groups of tags, 3 with a curve that is taken at each
     reception (taken at the mean power it is wrong by up to a decimetre), 4 with constants of pairs, 5 with pairs that
-    cannot be corrected.
+    cannot be corrected, 6 with patterns over direction (without them ranges are wrong by up to a decimetre).
     """
     table = adapter.dump_python(calibration, mode="json")
     # These are left out where there is nothing to say; they stand last, in this order.
-    optional = ("power_at", "groups", "errors", "pair_offsets", "antenna_delays", "uncertainty", "undetermined_splits")
+    optional = ("power_at", "groups", "errors", "pair_offsets", "antenna_delays", "uncertainty", "undetermined_splits",
+                "patterns")  # fmt: skip
     used = {key: value for key in optional if (value := table.pop(key)) and value != "exchange"}
-    needed = (("undetermined_splits", 5), ("pair_offsets", 4), ("power_at", 3), ("groups", 2))
+    needed = (("patterns", 6), ("undetermined_splits", 5), ("pair_offsets", 4), ("power_at", 3), ("groups", 2))
     version = next((version for key, version in needed if key in used), 1)
     text = json.dumps({"schema_version": version} | table | used, indent=1, allow_nan=False)
     # Lists of numbers stand on one line each: a matrix reads as rows.
@@ -266,8 +278,8 @@ def read(adapter: TypeAdapter[Value], text: str, where: str) -> Value:
         raise BadInputError(f"{where}: not JSON ({error})") from error
     if not isinstance(table, dict) or "schema_version" not in table:
         raise BadInputError(f"{where}: not a calibration (no schema_version)")
-    if table["schema_version"] not in (1, 2, 3, 4, 5):
-        raise BadInputError(f"{where}: schema version {table['schema_version']!r}, this uwbcal reads 1 to 5")
+    if table["schema_version"] not in (1, 2, 3, 4, 5, 6):
+        raise BadInputError(f"{where}: schema version {table['schema_version']!r}, this uwbcal reads 1 to 6")
     try:
         return adapter.validate_python(table)
     except ValidationError as error:

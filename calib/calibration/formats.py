@@ -411,7 +411,8 @@ def export(
     of its build), "json", "csv" (delays), "miluv", "ros-yaml" or "c-header" (tables and a function that corrects a
     range). Registers are on top of what was programmed when the devices were recorded: the calibration's
     `antenna_delays`, or `base` (`programmed`). Raises `BadInputError` for another form, for a calibration with groups
-    of tags in a form that has one curve, and for registers of tags whose delays the data left free.
+    of tags or patterns over direction in a form that has one curve, and for registers of tags whose delays the data
+    left free.
 
     >>> import calib
     >>> print(calib.export(calib.fit(calib.sample_flight()).calibration, "registers").splitlines()[2])
@@ -422,6 +423,11 @@ def export(
         raise BadInputError(f"found {to!r}, allowed: {', '.join(FORMATS)}", parameter="to")
     if calibration.pair_offsets and to != "json":
         raise BadInputError(f"{to} has no place for constants of pairs; export it as json", parameter="to")
+    if calibration.patterns and to in ("miluv", "ros-yaml", "c-header"):
+        raise BadInputError(
+            f"{to} has no place for patterns over direction; export it as json, or fit with `pattern` none",
+            parameter="to",
+        )
     if calibration.groups and to in ("miluv", "ros-yaml", "c-header"):
         raise BadInputError(
             f"{to} has one curve for all tags, this calibration one for each of the groups "

@@ -27,8 +27,8 @@ from calib.calibration.document import (
     DelayNs,
     FreeStdNs,
     Light,
+    Matrix,
     Metres,
-    Number,
     PairKey,
     PowerDbm,
     Split,
@@ -44,18 +44,16 @@ from calib.calibration.document import (
     write,
 )
 from calib.calibration.error_model import CheckedErrors
+from calib.calibration.patterns import CheckedPattern, patterns_m
 from calib.calibration.power_curves import LIFTS, BiasCurve, SigmaCurve, basis, lifted_power
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats
-from uwblink.display import as_html, as_text
+from uwblink.display import as_html, as_text, first_few
 from uwblink.output import write_text
 from uwblink.recording.antenna_delays import REGISTER_MAX, AntennaDelay
 from uwblink.text_files import read_text
-
-Matrix = tuple[tuple[Number, ...], ...]
-"""A matrix as a tuple of rows."""
 
 
 def matrix_of(values: Floats) -> Matrix:
@@ -124,7 +122,8 @@ class Calibration:
 
     `undetermined_splits` are pairs of sides, as anchors and robots, that ranged only with each other: the delays of one
     side may be longer and those of the other shorter by as much. Ranges between two sides can be corrected, and no
-    others of their tags.
+    others of their tags. `patterns` say how ranges depend on the directions in which antennas see each other; where
+    these are not known, ranges are corrected without them, and `sigma_total_m` contains what is missing.
     """
 
     delays_ns: Annotated[dict[TagKey, DelayNs], IN_ORDER]
@@ -144,6 +143,7 @@ class Calibration:
     antenna_delays: Annotated[Mapping[TagKey | None, Registers], IN_ORDER] = field(default_factory=dict)
     uncertainty: Uncertainty | None = None
     undetermined_splits: tuple[Split, ...] = ()
+    patterns: tuple[CheckedPattern, ...] = ()
 
     @property
     def sides(self) -> dict[int, int]:
@@ -252,7 +252,8 @@ class Calibration:
         lifted = self.lifted(ranges)
         found = self.errors.quantiles(shares, lifted, ranges.initiator, ranges.target)
         total = self.errors.total_m(self.errors.shapes(lifted, ranges.initiator, ranges.target))
-        return np.asarray(found * np.hypot(1, self.bias_curve.beyond(lifted) / total)[:, None])
+        more = np.hypot(self.bias_curve.beyond(lifted), patterns_m(self, ranges)[1])
+        return np.asarray(found * np.hypot(1, more / total)[:, None])
 
     @overload
     def correct(
@@ -264,6 +265,8 @@ class Calibration:
         target: int,
         *,
         weights: tuple[float, float] = ...,
+        azimuth_deg: tuple[float, float] = ...,
+        elevation_deg: tuple[float, float] = ...,
     ) -> CorrectedRange[float]: ...
 
     @overload
@@ -276,6 +279,8 @@ class Calibration:
         target: ArrayLike,
         *,
         weights: tuple[ArrayLike, ArrayLike] = ...,
+        azimuth_deg: tuple[ArrayLike, ArrayLike] = ...,
+        elevation_deg: tuple[ArrayLike, ArrayLike] = ...,
     ) -> CorrectedRange[Floats]: ...
 
     def correct(
@@ -287,13 +292,17 @@ class Calibration:
         target: Any,
         *,
         weights: tuple[Any, Any] = (0.5, 0.5),
+        azimuth_deg: tuple[Any, Any] = (math.nan, math.nan),
+        elevation_deg: tuple[Any, Any] = (0.0, 0.0),
     ) -> CorrectedRange[Any]:
         """Correct one range, or arrays of them (n,): the corrected range and its standard deviations, in metres.
 
         `range_m` is as the board gives it, powers are in dBm, NaN or 0 where a board has none. A call takes
         less than a millisecond, for one range or for hundreds. `weights` are those of the two delays
         (`uwblink.twr.delay_weights`); halves take both clocks for equally fast (K = 1), wrong by a millionth of the
-        delays, a hundredth of a millimetre at most. Equals `apply` otherwise, and raises what that raises.
+        delays, a hundredth of a millimetre at most. `azimuth_deg` and `elevation_deg` are the directions from the
+        antennas of initiator and target to each other, in the frames of their bodies, NaN where they are not known;
+        only a calibration with `patterns` uses them. Equals `apply` otherwise, and raises what that raises.
 
         >>> import calib
         >>> known = calib.fit(calib.sample_flight()).calibration
@@ -302,10 +311,18 @@ class Calibration:
         '2.94 m, sigma 0.03 m'
         """
         ranges = Ranges.from_arrays(
-            range_m, initiator=initiator, target=target, fpp1_dbm=fpp1_dbm, fpp2_dbm=fpp2_dbm, weights=weights
+            range_m,
+            initiator=initiator,
+            target=target,
+            fpp1_dbm=fpp1_dbm,
+            fpp2_dbm=fpp2_dbm,
+            weights=weights,
+            azimuth_deg=azimuth_deg,
+            elevation_deg=elevation_deg,
         )
         found = columns_of(self.apply(ranges))
-        if any(map(np.ndim, (range_m, fpp1_dbm, fpp2_dbm, initiator, target, *weights))):
+        columns = (range_m, fpp1_dbm, fpp2_dbm, initiator, target, *weights, *azimuth_deg, *elevation_deg)
+        if any(map(np.ndim, columns)):
             return found
         return CorrectedRange(*(column.item() for column in found))
 
@@ -401,6 +418,7 @@ def _tables(calibration: Calibration) -> dict[str, list[tuple[str, ...]]]:
     bodies = {
         "Antenna delays": [("tag", "delay (ns)", "interval"), *delay_rows(calibration)],
         "Constants": [("pair", "constant (cm)", "interval"), *pair_rows(calibration)],
+        "Patterns over direction": [("tags", "rms (cm)", "most"), *pattern_rows(calibration)],
     }
     most = 40  # tags or pairs that are printed, about a screen
     tables: dict[str, list[tuple[str, ...]]] = {
@@ -432,6 +450,20 @@ def delay_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
     sides = calibration.sides
     delays = sorted((tag, delay) for tag, delay in calibration.delays_ns.items() if tag not in sides)
     return [(str(tag), f"{delay:+.4f}", interval(std_ns.get(tag, math.nan))) for tag, delay in delays]
+
+
+def pattern_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
+    """Return the tags of each pattern over direction, its root mean square in cm, and where it is largest."""
+    around = np.radians(np.arange(360))
+    level = np.column_stack([np.cos(around), np.sin(around), np.zeros(360)])
+    rows = []
+    for pattern in calibration.patterns:
+        values = pattern.values(level)
+        longer, std = values @ np.array(pattern.coefficients_m), pattern.std_m(values)
+        top = int(np.argmax(longer))
+        most = f"{100 * longer[top]:+.1f} cm at azimuth {top}°, {interval(100 * float(std[top]), 1)}"
+        rows.append((first_few(map(str, pattern.tags)), f"{100 * pattern.rms_m:.1f}", most))
+    return rows
 
 
 def curve_rows(calibration: Calibration) -> list[tuple[str, ...]]:

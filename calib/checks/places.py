@@ -59,9 +59,11 @@ def of_places(found: KnownDistances, slopes: Slopes, pairs: Tested, before_ns2: 
     own, more = (np.diag(apart @ one @ apart) for one in (before_ns2, widening))
     if max(deviation, stays) <= CERTAIN_DEVIATION or not np.any(more > np.maximum(own, SMALLEST_NS**2)):
         return widening, []
+    directions = found.model.directions is None
     return widening, [
-        "errors belong to places or directions: ranges between the same two bodies are wrong together, as walls "
-        "and things near them make it, or a wrong lever arm, or an antenna whose delay depends on the direction, "
+        f"errors belong to places{' or directions' * directions}: ranges between the same two bodies are wrong "
+        "together, as walls and things near them make it, or a wrong lever arm"
+        f"{', or an antenna whose delay depends on the direction' * directions}, "
         f"which may move differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals are widened for "
         "it; check the lever arms, then record elsewhere too, or farther from walls: what all ranges are too long "
         "by in common no range shows"

@@ -22,7 +22,7 @@ from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, known_delays
 from uwblink.recording.contents import Contents
-from uwblink.recording.distances import distances_m
+from uwblink.recording.distances import sights, tracks_of
 from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import Exchanges, delay_weights, range_ns, raw_range, without_stamps
 
@@ -39,6 +39,9 @@ STATIC: Final = "static"
 
 MAX_RANGE_M: Final = 1e4
 """Ranges beyond this come from impossible stamps: no ultra-wideband radio reaches a tenth of it."""
+
+LEAST_TURN_RAD: Final = math.radians(45.0)
+"""Angle by which the attitudes of a body differ that turns: a hovering drone tilts by less (a judgement)."""
 
 FAINTEST_DBM, LOUDEST_DBM = -140.0, -30.0
 """Received powers lie between these bounds; a board that cannot tell a strong power prints 0."""
@@ -57,7 +60,8 @@ class Ranges(ColumnTable):
     `recordings` are names and fingerprints of the recordings, empty for ranges of arrays; `left_skew` is what clock
     skew may have left in single-sided ranges, None without any; `bodies` are tags with the body that carries each;
     `antenna_delays` are those programmed into the tags, as far as known; `arrivals` is what other tags overheard of
-    these exchanges, None without any.
+    these exchanges, None without any. `toward` (n, 2, 3) are unit vectors from the antennas of initiator and target to
+    each other, in the frames of their bodies, NaN where attitudes are not known; `turning` are tags whose bodies turn.
     """
 
     source: str
@@ -81,11 +85,16 @@ class Ranges(ColumnTable):
     sessions: tuple[str, ...] = ()
     antenna_delays: AntennaDelays = field(default_factory=dict)
     arrivals: Arrivals | None = None
+    toward: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2, 3), dtype=np.float32))
+    turning: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        """Put all ranges into one session where none are given."""
+        """Put all ranges into one session, and take directions for unknown, where none are given."""
         if len(self.session) != len(self.time_ns):
             object.__setattr__(self, "session", np.zeros(len(self.time_ns), dtype=np.int32))
+        if len(self.toward) != len(self.time_ns):
+            unknown = np.broadcast_to(np.float32(np.nan), (len(self.time_ns), 2, 3))
+            object.__setattr__(self, "toward", unknown)
 
     @classmethod
     def from_exchanges(
@@ -108,10 +117,13 @@ class Ranges(ColumnTable):
         truth = exchanges.truth_m if truth_m is None else np.asarray(truth_m, dtype=np.float64)
         if truth.shape != (len(exchanges),):
             raise BadInputError(f"has shape {truth.shape}, expected ({len(exchanges)},)", parameter="truth_m")
-        known = np.isfinite(truth)
-        if not known.all() and poses is not None and len(poses):
-            ends = exchanges.initiator, exchanges.target, range_ns(exchanges)
-            truth = np.where(known, truth, distances_m(poses, tags, *ends))
+        seen: dict[str, Any] = {}
+        if poses is not None and len(poses):
+            tracks = tracks_of(poses)
+            distance, toward = sights(tracks, tags, exchanges.initiator, exchanges.target, range_ns(exchanges))
+            truth = np.where(np.isfinite(truth), truth, distance)
+            turning = {body for body, track in tracks.items() if track.turn_rad() > LEAST_TURN_RAD}
+            seen = {"toward": toward.astype(np.float32), "turning": tuple(t.tag for t in tags if t.body in turning)}
         of_initiator, of_target = delay_weights(exchanges)
         bare = without_stamps(exchanges)
         return cls(
@@ -132,6 +144,7 @@ class Ranges(ColumnTable):
             clocks_apart=clocks_apart(exchanges),
             bodies=tuple((tag.tag, tag.body) for tag in tags),
             antenna_delays=antenna_delays or {},
+            **seen,
         )
 
     @classmethod
@@ -147,14 +160,18 @@ class Ranges(ColumnTable):
         time_ns: ArrayLike = 0,
         protocol: str = "ds",
         weights: tuple[ArrayLike, ArrayLike] = (0.5, 0.5),
+        azimuth_deg: tuple[ArrayLike, ArrayLike] = (math.nan, math.nan),
+        elevation_deg: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
         source: str = IN_MEMORY,
     ) -> Ranges:
         """Return a row for every range of arrays (n,), metres and dBm; a single number serves all rows.
 
         `truth_m` and `time_ns` are needed to fit, and not to correct; powers where there is a curve. A single power per
         range is `fpp1_dbm`. `weights` are those of the two delays (`uwblink.twr.delay_weights`): by default halves, as
-        if both clocks ran alike, which changes no range by more than a hundredth of a millimetre. Raises
-        `BadInputError` where the arrays do not fit each other.
+        if both clocks ran alike, which changes no range by more than a hundredth of a millimetre. `azimuth_deg` and
+        `elevation_deg` are the directions from the antennas of initiator and target to each other, in the frames of
+        their bodies; only a direction pattern needs them. Raises `BadInputError` where the arrays do not fit each
+        other.
 
         >>> from calib import Ranges
         >>> len(Ranges.from_arrays([3.1, 4.2], initiator=1, target=[2, 3], fpp1_dbm=-85.0))
@@ -162,15 +179,17 @@ class Ranges(ColumnTable):
         """
         if protocol not in PROTOCOLS:
             raise BadInputError(f"found {protocol!r:.40}, allowed: {', '.join(PROTOCOLS)}", parameter="protocol")
-        if len(weights) != 2:
-            raise BadInputError(f"found {len(weights)}, expected those of initiator and target", parameter="weights")
+        both = {"weights": weights, "azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
+        for name, pair in both.items():
+            if len(pair) != 2:
+                raise BadInputError(f"found {len(pair)}, expected those of initiator and target", parameter=name)
         floats = {
             "raw_m": range_m,
             "truth_m": truth_m,
             "fpp1_dbm": fpp1_dbm,
             "fpp2_dbm": math.nan if fpp2_dbm is None else fpp2_dbm,
-            "weight_initiator": weights[0],
-            "weight_target": weights[1],
+            **dict(zip(("weight_initiator", "weight_target"), weights, strict=True)),
+            **{f"{name} {end}": both[name][end] for name in ("azimuth_deg", "elevation_deg") for end in (0, 1)},
         }
         ints = {"initiator": initiator, "target": target, "time_ns": time_ns}
         with raising(BadInputError, "arrays of ranges do not fit each other", TypeError, ValueError):
@@ -185,7 +204,13 @@ class Ranges(ColumnTable):
             row = int(np.argmax(itself))
             raise BadInputError(f"row {row} is of tag {columns['target'][row]} with itself", parameter="target")
         columns |= {name: measured_powers(columns[name]) for name in ("fpp1_dbm", "fpp2_dbm")}
-        return cls(source=source, protocol=np.full(len(rows[0]), protocol), excluded={}, planted=None, **columns)
+        angles = {name: np.radians([columns.pop(f"{name} {end}") for end in (0, 1)]).T for name in [*both][1:]}
+        around, up = angles["azimuth_deg"], angles["elevation_deg"]
+        toward = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1)
+        found = cls(source=source, protocol=np.full(len(rows[0]), protocol), excluded={}, planted=None, **columns)
+        if not np.isfinite(around).any():
+            return found
+        return replace(found, toward=toward.astype(np.float32), turning=tuple(found.tags()))
 
     @classmethod
     def from_dataframe(cls, frame: Any, map: MapSource | None = None) -> Ranges:  # noqa: A002 - what it is called elsewhere
@@ -210,6 +235,10 @@ class Ranges(ColumnTable):
         """Return the chosen ranges, in their order, with their arrivals."""
         found = ColumnTable.__getitem__(self, rows)
         return found if self.arrivals is None else replace(found, arrivals=self.arrivals.of_exchanges(rows, len(self)))
+
+    def to_dict(self) -> dict[str, NDArray[Any]]:
+        """Return the columns by name, (n,) each, without directions."""
+        return {name: column for name, column in self._columns().items() if name != "toward"}
 
     def _title(self) -> str:
         left = "".join(f", {count} left out: {reason}" for reason, count in self.excluded.items())
@@ -297,6 +326,7 @@ def concatenate(parts: Sequence[Ranges]) -> Ranges:
         recordings=tuple(one for part in parts for one in part.recordings),
         # A tag that changes its body belongs to none.
         bodies=tuple(sorted(bodies)) if len({tag for tag, _ in bodies}) == len(bodies) else (),
+        turning=tuple(sorted({tag for part in parts for tag in part.turning})),
         session=session,
         sessions=names,
         antenna_delays=_antenna_delays_of_all(parts),

@@ -50,7 +50,7 @@ class Derivative:
         columns = self.columns[rows]
         values = np.broadcast_to(self.values if len(self.values) == 1 else self.values[rows], columns.shape)
         bounds = np.arange(len(columns) + 1) * columns.shape[1]
-        return sparse.csr_matrix((values.ravel(), columns.ravel(), bounds), shape=(len(columns), self.size))
+        return sparse.csr_matrix((values.flatten(), columns.ravel(), bounds), shape=(len(columns), self.size))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,8 +16,10 @@ from scipy.special import expit
 
 from calib.calibration.error_model import ErrorModel, PairErrors
 from calib.calibration.model import Calibration, PairOffset, TagGroup, Uncertainty, matrix_of
+from calib.calibration.patterns import HARMONICS, Pattern
 from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, flat_curve
 from calib.estimator.known_distances import LARGEST_SPREAD_M, DescribedErrors, KnownDistances, described_errors
+from calib.estimator.pattern_unknowns import COMMON, OF_PLACES, OWN
 from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel, SplineValues
 from calib.estimator.range_rows import RESIDUAL
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
@@ -108,7 +110,24 @@ def calibration_of(found: KnownDistances, delays_ns2: Floats) -> Calibration:
         errors=errors,
         antenna_delays=known_delays(model.ranges.antenna_delays, model.ranges.tags()),
         undetermined_splits=tuple(model.free),
+        patterns=patterns_of(found),
     )
+
+
+def patterns_of(found: KnownDistances) -> tuple[Pattern, ...]:
+    """Return the patterns over direction of a fit: one that all tags share, or one of each tag."""
+    directions, values = found.model.directions, found.values
+    if directions is None:
+        return ()
+    whose = [(tag,) for tag in directions.tags] if OWN in values else [directions.tags]
+    factors, patterns = values[OWN if OWN in values else COMMON].reshape(-1, HARMONICS), []
+    for k, (tags, own) in enumerate(zip(whose, factors, strict=True)):
+        which = slice(k * HARMONICS, (k + 1) * HARMONICS)
+        covariance = found.covariances["pattern"][which, which]
+        rms = math.sqrt(float(np.sum(directions.square * (np.outer(own, own) + covariance))))
+        centre = tuple(directions.centre.tolist())
+        patterns.append(Pattern(tags, tuple(own.tolist()), centre, matrix_of(covariance), rms))
+    return tuple(patterns)
 
 
 def bias_curves(found: KnownDistances) -> dict[str, Curve]:
@@ -171,6 +190,11 @@ def _correction_std(found: KnownDistances, delays_ns2: Floats, lifted: Floats) -
     else:
         delays = np.sum(model.pairs.ends[:, :, None] == np.array(model.tags), axis=1) * METRES_A_NS / 2
         of_pairs = np.sum(delays @ delays_ns2 * delays, axis=1)
+    if model.directions is not None:
+        # What belongs to places, and depends on direction there, is not corrected.
+        parts = ((*model.directions.entries(kind, model.pairs)[1:], found.values[kind]) for kind in OF_PLACES)
+        left = sum(np.sum(entries * values[columns], axis=1) for columns, entries, values in parts)
+        of_pairs = of_pairs + np.var(left)
     variance = np.full(len(lifted), float(np.mean(of_pairs)))
     if model.curve is not None:
         at = SplineValues.at(lifted, model.curve.knots)

@@ -34,11 +34,12 @@ from calib.checks.limits import (
 from calib.data.ranges import Ranges, held_out
 from calib.data.sources import Data, load_ranges, require_arrivals
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimator.known_distances import KnownDistances, fit_known_distances
+from calib.estimator.known_distances import KnownDistances
 from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
 from calib.fitting.passive_listeners import MIN_OF_DELAY
+from calib.fitting.patterns import fit_with_pattern
 from calib.fitting.result import FitResult, HeldOut
 from calib.settings import FitSettings, check_tag
 from uwblink.arrays import Bools
@@ -81,7 +82,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     refuse_impossible(ranges)
     # One thread: sums of several threads differ in the last digits, and threads slow small matrices down.
     with threadpool_limits(limits=1, user_api="blas"):
-        found = fit_known_distances(ranges, replace(settings, fixed_ns=fixed))
+        found, pattern, vague = fit_with_pattern(ranges, replace(settings, fixed_ns=fixed))
         fitted = dict(zip(found.model.tags, found.delays.tolist(), strict=False))
         refuse_refuted(fitted, found.residuals, found.model.ranges)
         covariance_ns2, findings = examine_fit(found)
@@ -99,6 +100,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         "fitted": what_was_fitted(found),
         **({"arrivals": len(arrivals.residual)} if (arrivals := found.searches[0].arrivals) else {}),
         "gauge": _gauge(found),
+        **({"pattern": pattern} if pattern else {}),
         **({"held_out": _judged(held, settings)} if held else {}),
     }
     result = result_of(
@@ -109,7 +111,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         settings=settings,
         fixed=fixed,
         first=_hints(calibration, heard if settings.use == "exchanges" else 0),
-        more=_stopped(found, settings.loss),
+        more=[*vague, *_stopped(found, settings.loss)],
     )
     return replace(result, held_out=held)
 
@@ -156,7 +158,9 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
     applied = joined.apply(some)
     straight = replace(some, raw_m=some.raw_m + applied.corrected_m - applied.delay_corrected_m)
     partners = replace(calibration, undetermined_splits=())
-    settings = FitSettings(loss=loss, delays_from=partners, delays_only=True, alpha_dbm=calibration.alpha_dbm)
+    settings = FitSettings(
+        loss=loss, delays_from=partners, delays_only=True, alpha_dbm=calibration.alpha_dbm, pattern="none"
+    )
     found = fit(straight, settings, lift=calibration.lift)
     added = {"tag": tag, "recording": ranges.source, "exchanges": len(some)}
     return replace(

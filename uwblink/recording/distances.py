@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.recording.schema import POSE, Poses, Tag
 from uwblink.twr import Exchanges, names_in, raw_range
@@ -33,11 +33,28 @@ class PoseTrack:
         Positions are interpolated linearly, attitudes along the chord of their quaternions; a body with a single pose
         does not move.
         """
+        place, attitude, known = self._at(time_ns)
+        return np.where(known, place + attitude.apply(lever_arm_m).T, np.nan)
+
+    def into_body(self, time_ns: Ints, vector: Floats) -> Floats:
+        """Return vectors (n, 3) of the world in the frame of the body at some times (n,), NaN outside its poses."""
+        _, attitude, known = self._at(time_ns)
+        return np.where(known[:, None], attitude.apply(vector, inverse=True), np.nan)
+
+    def turn_rad(self) -> float:
+        """Return the largest angle between the body's first known attitude and another."""
+        known = self.columns[3:, np.isfinite(self.columns[3:]).all(axis=0)]
+        if not known.shape[1]:
+            return 0.0
+        unit = known / np.linalg.norm(known, axis=0)
+        return float(2 * np.arccos(np.clip(np.abs(unit[:, 0] @ unit).min(), 0, 1)))
+
+    def _at(self, time_ns: Ints) -> tuple[Floats, Rotation, Bools]:
+        """Return places (3, n) and attitudes at some times (n,), and where they are known (n,)."""
         time, outside = time_ns.astype(np.float64), None if len(self._time) == 1 else np.nan
         found = np.array([np.interp(time, self._time, column, outside, outside) for column in self.columns])
         known = np.isfinite(found).all(axis=0)
-        turned = Rotation.from_quat(np.where(known, found[3:], 1.0).T).apply(lever_arm_m)
-        return np.where(known, found[:3] + turned.T, np.nan)
+        return found[:3], Rotation.from_quat(np.where(known, found[3:], 1.0).T), known
 
 
 Tracks = dict[str, PoseTrack]
@@ -80,6 +97,28 @@ def distances_m(poses: Poses | Tracks, tags: Sequence[Tag], initiator: Ints, tar
     here, there = (antennas_m(poses, tags, ids, time_ns) for ids in (target, initiator))
     x, y, z = (here - there).T
     return np.asarray(np.sqrt(x * x + y * y + z * z))
+
+
+def sights(
+    poses: Poses | Tracks, tags: Sequence[Tag], initiator: Ints, target: Ints, time_ns: Ints
+) -> tuple[Floats, Floats]:
+    """Return distances as `distances_m` (n,), and unit vectors from each antenna to the other in its body's frame.
+
+    The vectors have shape (n, 2, 3), that of the initiator first; NaN where a distance or an attitude is not known.
+    """
+    tracks = tracks_of(poses) if isinstance(poses, Poses) else poses
+    here, there = (antennas_m(tracks, tags, ids, time_ns) for ids in (initiator, target))
+    way = there - here
+    x, y, z = way.T
+    distance = np.sqrt(x * x + y * y + z * z)
+    way = way / np.maximum(distance, 1e-9)[:, None]
+    found = np.full((len(time_ns), 2, 3), np.nan)
+    for tag in tags:
+        for end, (ids, sign) in enumerate(((initiator, 1.0), (target, -1.0))):
+            rows = np.flatnonzero(ids == tag.tag)
+            if len(rows) and tag.body in tracks:
+                found[rows, end] = tracks[tag.body].into_body(time_ns[rows], sign * way[rows])
+    return np.asarray(distance), found
 
 
 def antennas_m(poses: Poses | Tracks, tags: Sequence[Tag], ids: Ints, time_ns: Ints) -> Floats:

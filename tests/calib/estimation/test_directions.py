@@ -1,0 +1,195 @@
+"""Antennas whose delay depends on direction: found, corrected and refused, in flights of a generator of its own."""
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import calib
+import uwblink
+from benchmarks.directions import Recipe, flight, pattern_m
+from calib.errors import BadInputError, UnanswerableError
+from tests.processes import call
+from uwblink.recording.contents import Contents
+from uwblink.recording.distances import sights
+from uwblink.recording.schema import Poses, Tag
+
+TEN = Recipe(reflected=0.0, noise_m=0.04)
+"""Ranges differ by 10 cm over directions, and none is reflected."""
+
+
+@cache
+def flown(recipe, seed, number=0):
+    return flight(recipe, seed, number)
+
+
+@cache
+def fitted(recipe, seed, **settings):
+    return calib.fit(flown(recipe, seed)[0], between_m=0.0, **settings)
+
+
+def written(path, recipe, seed, number=0):
+    found, _ = flown(recipe, seed, number)
+    Contents(exchanges=found.exchanges, poses=found.poses, tags=found.tags, meta=found.meta).save(path)
+    return path
+
+
+def seen(ranges, tag):
+    """Directions in which a tag saw others (m, 3)."""
+    ends = (ranges.initiator, ranges.target)
+    return np.concatenate([ranges.toward[ids == tag, end] for end, ids in enumerate(ends)]).astype(float)
+
+
+def spread(ranges, calibration):
+    return float(np.std(calibration.apply(ranges).corrected_m - ranges.truth_m))
+
+
+@pytest.mark.parametrize("size_m", [0.05, 0.1, 0.2])
+@pytest.mark.parametrize("own", [False, True])
+def test_a_planted_pattern_is_found_within_its_intervals(size_m, own):
+    recipe = Recipe(pattern_m=size_m, own=own)
+    result, waves = fitted(recipe, 11), flown(recipe, 11)[1]["waves"]
+    patterns, fitted_ones = result.calibration.patterns, result.ranges
+    assert [p.tags for p in patterns] == ([(1,), (2,), (3,), (4,)] if own else [(1, 2, 3, 4)])
+    everywhere = np.concatenate([seen(fitted_ones, tag) for tag in (1, 2, 3, 4)])
+    there = calib.load_ranges(flown(recipe, 11, 1)[0])
+    inside, error = [], []
+    for pattern in patterns:
+        for tag in pattern.tags:
+            toward = seen(there, tag)
+            planted = pattern_m(toward, waves[tag], size_m) - pattern_m(everywhere, waves[tag], size_m).mean()
+            values = pattern.values(toward)
+            off = values @ np.array(pattern.coefficients_m) - planted
+            inside.append(np.mean(np.abs(off) < 1.96 * pattern.std_m(values)))
+            error.append(np.sqrt(np.mean(off**2)))
+    assert np.mean(inside) > 0.9
+    # 3600 ranges with 5 cm of noise know each of eight or 32 factors to 1 mm or 3 mm.
+    assert max(error) < (0.008 if own else 0.004)
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_another_flight_is_corrected_by_directions_from_its_poses(own, tmp_path):
+    recipe = replace(TEN, own=own)
+    first, second = written(tmp_path / "a.uwb", recipe, 3), written(tmp_path / "b.uwb", recipe, 3, 1)
+    for name, more in (("none", ["--pattern", "none"]), ("auto", [])):
+        done = call("calib", "fit", first, "-o", tmp_path / f"{name}.json", "--between", 0, *more)
+        assert done.returncode == 0
+        assert ("over direction" in done.stdout) == (name == "auto")
+    without, known = (calib.load_calibration(tmp_path / f"{name}.json") for name in ("none", "auto"))
+    there = calib.load_ranges(second)
+    # Of 6 cm, 4 are noise.
+    assert spread(there, known) < 0.75 * spread(there, without)
+    assert 0.92 < calib.evaluate(second, known).overall.inside_95 < 0.98
+    assert call("calib", "apply", second, "-c", tmp_path / "auto.json", "-o", tmp_path / "c.uwb").returncode == 0
+    assert uwblink.load(tmp_path / "c.uwb").exchanges.range_m == pytest.approx(known.apply(there).corrected_m, abs=1e-9)
+
+
+SOUND = {
+    "plain": Recipe(pattern_m=0.0),
+    "short": Recipe(pattern_m=0.0, seconds=20.0, robots=3),
+    "errors that last": Recipe(pattern_m=0.0, wander_m=0.04),
+    "walls": Recipe(pattern_m=0.0, wall_m=0.05, wander_m=0.02),
+    "errors of places": Recipe(pattern_m=0.0, robots=1, anchors=8, loop=True, room_m=0.04, wander_m=0.02),
+}
+
+
+@pytest.mark.parametrize("recipe", SOUND.values(), ids=SOUND)
+def test_sound_flights_have_no_pattern(recipe):
+    for seed in (21, 22):
+        found = fitted(recipe, seed).calibration
+        assert found.patterns == ()
+        assert json.loads(found.to_json())["schema_version"] < 6
+
+
+def test_what_belongs_to_places_does_not_pass_for_the_antennas():
+    # A robot that heads along its loop sees every wall in one direction. A pattern that is asked for stays small.
+    recipe = replace(SOUND["errors of places"], room_m=0.06)
+    (pattern,) = fitted(recipe, 23, pattern="shared").calibration.patterns
+    assert pattern.rms_m < 0.03
+
+
+def test_a_pattern_that_attitudes_do_not_excite_is_refused_with_the_flight_that_would(tmp_path):
+    still = written(tmp_path / "still.uwb", replace(TEN, turning=0.0), 5)
+    for name in ("shared", "tag"):
+        done = call("calib", "fit", still, "-o", tmp_path / "x.json", "--pattern", name)
+        assert done.returncode == 1
+        assert "tags 1, 2, 3, 4" in done.stderr
+        assert "turns once around" in done.stderr
+        assert done.stderr.count("\n") == 1
+        assert not (tmp_path / "x.json").exists()
+    assert fitted(replace(TEN, turning=0.0), 5).calibration.patterns == ()
+
+
+def test_a_pattern_needs_directions_and_enough_ranges():
+    flown_ranges = calib.load_ranges(flown(TEN, 5)[0])
+    with pytest.raises(UnanswerableError, match="no direction is known"):
+        calib.fit(replace(flown_ranges, toward=np.full_like(flown_ranges.toward, np.nan)), pattern="shared")
+    with pytest.raises(UnanswerableError, match="too few ranges for a pattern, at least 960"):
+        calib.fit(flown_ranges[:300], pattern="tag")
+    assert calib.fit(flown_ranges[:300]).calibration.patterns == ()
+
+
+@pytest.mark.parametrize(
+    "settings", [{"sequential": True}, {"constants": "pair"}, {"use": "receptions"}], ids=lambda one: next(iter(one))
+)
+def test_fits_that_cannot_have_a_pattern_refuse_it(settings):
+    with pytest.raises(BadInputError, match=next(iter(settings))):
+        calib.FitSettings(pattern="shared", **settings)
+    with pytest.raises(BadInputError, match="pattern"):
+        calib.fit_from_ranges(flown(TEN, 5)[0], pattern="shared")
+
+
+def test_a_range_is_corrected_by_two_directions_and_says_what_is_missing_without():
+    known, there = fitted(TEN, 3).calibration, calib.load_ranges(flown(TEN, 3, 1)[0])[:500]
+    x, y, z = np.moveaxis(there.toward.astype(float), 2, 0)
+    columns = (there.raw_m, there.fpp1_dbm, there.fpp2_dbm, there.initiator, there.target)
+    weights = (there.weight_initiator, there.weight_target)
+    angles = {"azimuth_deg": np.degrees(np.arctan2(y, x)).T, "elevation_deg": np.degrees(np.arcsin(z)).T}
+    corrected = known.correct(*columns, weights=weights, **{name: tuple(both) for name, both in angles.items()})
+    assert corrected.range_m == pytest.approx(known.apply(there).corrected_m, abs=1e-5)
+    blind = known.correct(*columns, weights=weights)
+    plain = replace(known, patterns=()).correct(*columns, weights=weights)
+    assert blind.range_m == pytest.approx(plain.range_m, abs=1e-12)
+    error = blind.range_m - there.truth_m
+    assert np.std(error / blind.sigma_total_m) == pytest.approx(1.0, abs=0.1)
+    assert np.std(error / plain.sigma_total_m) > 1.2
+    one = known.correct(3.0, -85.0, -86.0, 1, 2, azimuth_deg=(30.0, 200.0))
+    assert isinstance(one.range_m, float)
+    assert one.range_m != known.correct(3.0, -85.0, -86.0, 1, 2).range_m
+    bare = replace(there, toward=np.full_like(there.toward, np.nan))
+    low, high = known.quantiles(bare, (0.025, 0.975)).T
+    assert 0.92 < np.mean((error > low) & (error < high)) < 0.98
+    with pytest.raises(BadInputError, match="azimuth_deg"):
+        known.correct(3.0, -85.0, -86.0, 1, 2, azimuth_deg=(1.0, 2.0, 3.0))
+
+
+def test_the_file_keeps_patterns_and_older_programs_refuse_it():
+    known = fitted(TEN, 3).calibration
+    text = known.to_json()
+    assert calib.Calibration.from_json(text) == known
+    assert json.loads(text)["schema_version"] == 6
+    table = json.loads(text)
+    table["patterns"][0]["centre"].pop()
+    with pytest.raises(BadInputError, match=r"here: patterns.*8"):
+        calib.Calibration.from_json(json.dumps(table), "here")
+    for form in ("c-header", "miluv", "ros-yaml"):
+        with pytest.raises(BadInputError, match="patterns over direction"):
+            calib.export(known, form)
+    assert "over direction" in repr(known)
+
+
+def test_directions_are_those_in_the_frames_of_the_bodies():
+    # Body a at the origin has turned by 90° to the left: what lies north of it is ahead. Body b looks along the axes.
+    half = np.sqrt(0.5)
+    poses = Poses(
+        np.array([0, 0]), np.array(["a", "b"]), np.array([[0.0, 0, 0], [0, 4, 3]]),
+        np.array([[0, 0, half, half], [0, 0, 0, 1.0]]),
+    )  # fmt: skip
+    tags = [Tag(1, "a", (0.0, 0.0, 0.0)), Tag(2, "b", (0.0, 0.0, 0.0))]
+    distance, toward = sights(poses, tags, np.array([1, 2, 1]), np.array([2, 1, 9]), np.zeros(3, np.int64))
+    ahead, back = [0.8, 0.0, 0.6], [0.0, -0.8, -0.6]
+    assert distance == pytest.approx([5, 5, np.nan], nan_ok=True)
+    assert toward[:2] == pytest.approx(np.array([[ahead, back], [back, ahead]]), abs=1e-12)
+    assert np.isnan(toward[2]).all()
