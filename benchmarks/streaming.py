@@ -42,8 +42,9 @@ def main() -> int:
         plan = uwblink.RangingPlan(rate_hz=100.0)
         with UdpSender(str(ear.getsockname()[1])) as sender:
             for found in uwblink.stream(names, plan=plan, listeners=[note]):
-                sender.send(found)
-                sent += 1
+                if isinstance(found, uwblink.StreamedRange):
+                    sender.send(found)
+                    sent += 1
                 if sent >= COUNT:
                     break
         listener.join(10)

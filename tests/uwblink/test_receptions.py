@@ -1,6 +1,7 @@
 """Receptions of frames: what broadcasts and exchanges say of each other, by clocks that share no code with them."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -161,7 +162,7 @@ def test_a_clock_that_jumps_costs_the_ranges_beside_the_jump_alone():
 def test_no_stamp_of_flying_tags_is_left_out(rate_hz, loss):
     """Two quadcopters turn at 0.8 m/s under 100 ps of noise, and clocks drift, while frames are lost."""
     changes = {"ranging.rate_hz": rate_hz, "run.duration_s": 1200 / rate_hz}
-    columns = uwbsim.simulate("broadcast", changes).receptions
+    columns: Any = uwbsim.simulate(uwbsim.load("broadcast", changes)).receptions
     r = Receptions(**columns)
     r = r[np.random.default_rng(1).random(len(r)) >= loss]
     assert contradicted(r).mean() < 0.001

@@ -213,7 +213,7 @@ class Progress(Listener):
             reports = [*state.reports]  # copied at once: a page asks in a thread of its own, while the recorder goes on
             rate_hz = sum(time_ns > since_ns for time_ns, *_ in reports) / over_s
             ended = [good for time_ns, good in [*state.recent] if time_ns > now_ns - 10e9]
-            success = f"{100 * sum(ended) / len(ended):.0f} %" if ended else ""
+            success = f"{100 * sum(ended) / len(ended):.0f} %" if ended and state.tried else ""
             last = [
                 (f"{report.range_m:.3f}", f"{report.fpp1_dbm:.1f}".replace("nan", "")) for *_, report in reports[-1:]
             ]

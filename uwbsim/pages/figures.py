@@ -277,7 +277,7 @@ def _maps(
         for one in protocols
     ]
     for axes, protocol, values in zip(panels, protocols, shown, strict=True):
-        low, high = np.nanmin(values), np.nanmax(values)
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
         # "cividis" grows lighter evenly, and alike for all eyes; values alike within a tenth do not span all of it.
         high = max(high, low + 0.1 * abs(low))
         axes.pcolormesh(cells[1], cells[0], values, cmap="cividis", vmin=low, vmax=high)

@@ -3,6 +3,7 @@ filter, and simulated flights with seeds chosen before looking."""
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -289,7 +290,7 @@ def test_at_the_end_it_is_a_batch_of_least_squares_in_a_world(seed):
     found = localize_team(contents, calibration(), CLOSE)
     tracks = [one.tracks["variance"] for one in found]
     # Both begin at the same noisy poses and velocities, those of dead reckoning.
-    start = [None]
+    start: list[Any] = [None]
     for track in (one.tracks["dead reckoning"] for one in found):
         s = (track.time_ns[:10] - track.time_ns[0]) * 1e-9
         rate = np.polynomial.polynomial.polyfit(s, track.estimate_m[:10], 4)[1]

@@ -178,6 +178,7 @@ def test_a_range_is_at_somebody_else_s_20_ms_after_its_poll(ear):
     names = list(ports.names.values())
     with UdpSender(str(ear.getsockname()[1])) as sender:
         for found in uwblink.stream(names, duration_s=1.0, using=ports):
+            assert isinstance(found, uwblink.StreamedRange)
             sender.send(found)
             row = json.loads(ear.recv(65536))
             assert row["timestamp"] == pytest.approx(found.time_ns * 1e-9, abs=1e-6)
