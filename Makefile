@@ -38,7 +38,7 @@ demo: setup ## simulate three flights, fit, evaluate, localize; writes demo/repo
 test: setup ## run the tests but the slow ones; three processes, for two cores: many tests wait for boards
 	$(BIN)/python $(TESTS) -m "not slow"
 
-test-all: setup ## run the whole test suite, slow tests too (ten minutes on two cores)
+test-all: setup ## run the whole test suite, slow tests too (a quarter of an hour on two cores)
 	$(BIN)/python $(TESTS)
 
 docs: setup ## build the documentation site into docs/_build/html; warnings are errors (a minute)
