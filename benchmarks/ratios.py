@@ -77,8 +77,8 @@ def pairs(folder: Path) -> list[Pair]:
         Pair(f"`uwblink import csv` of {ROWS} rows", "DuckDB's `read_csv` of them",
              lambda: uwblink.import_recording(folder / "table.csv", folder / "table.uwb", force=True),
              lambda: plain.parse(folder / "table.csv"), 3.0, 9.0),
-        # 13 to 19 are measured, of which the score tests for direction are a sixth: corrected steps settle in rooms, and slopes are evaluated again for the checks, which halves
-        # the memory of long recordings. Before both it was 9 to 10, with a bound of 14.
+        # 13 to 19 are measured; score tests for direction are a sixth. Corrected steps settle in rooms, and slopes are
+        # evaluated again for the checks, which halves the memory of long recordings.
         Pair("a fit of the flight: delays, curve, intervals, doubts", "SciPy's `least_squares`, delays alone",
              lambda: fit(ranges), lambda: plain.least_squares(errors, ranges.initiator, ranges.target), None, 18.0),
         # 4.6 are measured, for five times the rows, of which two thirds are within the curve; 5.6 before both sides of
