@@ -308,10 +308,10 @@ def load_flight(data: Data, *, need_power: bool = True, need_truth: bool = True)
     `UnanswerableError` where no range can be used.
     """
     with opened(data) as (name, source):
-        return flight_of(name, source, need_power=need_power, need_truth=need_truth)
+        return read_flight(name, source, need_power=need_power, need_truth=need_truth)
 
 
-def flight_of(name: str, source: Source, *, need_power: bool = True, need_truth: bool = True) -> Flight:
+def read_flight(name: str, source: Source, *, need_power: bool = True, need_truth: bool = True) -> Flight:
     """Return what `load_flight` returns of a source with a name; without `need_truth` also where no poses are."""
     exchanges = single_reports(source.exchanges).exchanges
     found = Ranges.from_exchanges(

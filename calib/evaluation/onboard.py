@@ -25,7 +25,7 @@ from calib.calibration.document import for_json
 from calib.calibration.error_model import GATE
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
-from calib.data.sources import Data, flight_of, opened, require_arrivals, require_times
+from calib.data.sources import Data, opened, read_flight, require_arrivals, require_times
 from calib.errors import BadInputError, UnanswerableError
 from calib.evaluation.filters import (
     GRAVITY_M_S2,
@@ -178,7 +178,7 @@ class _Readings:
 def _readings(data: Data, calibration: Calibration, use: str) -> list[_Readings]:
     """Return the readings of every body that is not an anchor and ranges with one, or listens."""
     with opened(data) as (name, source):
-        flight = flight_of(name, source, need_power=calibration.needs_power, need_truth=False)
+        flight = read_flight(name, source, need_power=calibration.needs_power, need_truth=False)
         imu, heights = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))
     poses, tags, ranges = flight.poses, flight.tags, keep_determined(calibration, flight.ranges)
     if use == "receptions":

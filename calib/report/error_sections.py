@@ -184,7 +184,7 @@ def localization(results: Results) -> list[Block]:
     worst = max(found, key=lambda one: float(one.rmse_m["variance"].mean()))
     caption = (
         f"{worst.source}, {worst.body}, the body with the largest error after calibration: path from above, height, "
-        "and position error over time. Where the blue line is above three sigmas, the filter is surer than it may be."
+        "and position error over time. Where the blue line is above three sigmas, the filter states too small an error."
     )
     return [
         Heading("Localization"),

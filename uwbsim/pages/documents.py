@@ -254,7 +254,7 @@ RESULTS: Final = {
 }
 """Descriptions of the results of a sweep; the first eight are drawn, or others where a sweep has none of them."""
 
-UNITS: Final = {unit: unit for unit in ("m", "ns", "s", "ps", "ppm", "us", "uus", "deg", "mps")} | {
+UNITS: Final = {unit: unit for unit in ("m", "ns", "s", "ps", "ppm", "us", "uus", "deg")} | {
     "hz": "Hz",
     "db": "dB",
     "dbm": "dBm",
