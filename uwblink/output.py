@@ -9,7 +9,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TextIO
+from threading import current_thread, main_thread
+from typing import Final, TextIO
 
 from uwblink.errors import ArgumentError, OutputError, RecordingError, RecordingExistsError, raising
 
@@ -26,18 +27,31 @@ __all__ = [
     "write_text",
 ]
 
+_INTERRUPTS: Final = (signal.SIGINT, signal.SIGTERM)
+
 
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Delay SIGINT and SIGTERM until the end of the block, on systems that support it."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    """Delay SIGINT and SIGTERM until the end of the block, also in processes that are started in it.
+
+    The system can give a signal to any thread that does not block it, such as those of DuckDB, and Python handles it
+    in the main thread all the same. So the handlers are replaced, too; only the main thread can do that.
+    """
+    came: list[int] = []
+    handlers = {} if current_thread() is not main_thread() else {int(one): signal.getsignal(one) for one in _INTERRUPTS}
+    for number in handlers:
+        signal.signal(number, lambda number, _: came.append(number))
+    masks = hasattr(signal, "pthread_sigmask")
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTS) if masks else set()
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number, handler in handlers.items():
+            signal.signal(number, handler or signal.SIG_DFL)
+        for number in came:
+            signal.raise_signal(number)
 
 
 def write_text(path: Path, text: str, *, force: bool) -> None:
@@ -80,15 +94,13 @@ def place_beside(path: Path) -> Iterator[Path]:
     # File systems take names of 255 bytes, of which `tempfile` draws eight, and nine are ".partial".
     if len(os.fsencode(prefix)) > 255 - 8 - 9:
         prefix = "."
-    # It is removed at the end of the process at the latest, also after an interrupt.
-    with interrupts_held():  # an interrupt between creating and storing it would leave the folder
-        made = TemporaryDirectory(".partial", prefix, path.absolute().parent, ignore_cleanup_errors=True)
-    try:
-        with made as folder:
-            yield Path(folder) / path.name
-    finally:
-        # A thread of DuckDB may have made a file in it while it was being removed.
-        shutil.rmtree(made.name, ignore_errors=True)
+    with ExitStack() as place:
+        with interrupts_held():  # an interrupt between creating and storing it would leave the folder
+            made = TemporaryDirectory(".partial", prefix, path.absolute().parent, ignore_cleanup_errors=True)
+            # A thread of DuckDB may make a file in it while it is being removed.
+            place.callback(shutil.rmtree, made.name, ignore_errors=True)
+            place.enter_context(made)
+        yield Path(made.name) / path.name
 
 
 def take_name(partial: Path, path: Path) -> None:

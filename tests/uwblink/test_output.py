@@ -1,5 +1,10 @@
 """Output files: whole or not there at all."""
 
+import signal
+import tempfile
+import threading
+import time
+
 import pytest
 
 from uwblink.errors import ArgumentError, ImportTableError, OutputError, RecordingError, RecordingExistsError
@@ -100,3 +105,33 @@ def test_what_cannot_be_read_is_one_line(tmp_path, name, line):
 def test_text_comes_back_as_it_is(tmp_path):
     (tmp_path / "text").write_text("µ\n", encoding="utf-8")
     assert read_text(tmp_path / "text", ValueError) == "µ\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_that_another_thread_receives_as_a_file_begins_leaves_nothing(tmp_path, monkeypatch, number):
+    """Python handles it in the main thread, where it must not part the making of a folder from its removal."""
+
+    def leave(*_):
+        raise KeyboardInterrupt
+
+    def made_and_then(*arguments):
+        folder = plain(*arguments)
+        signal.pthread_kill(other.ident, number)
+        time.sleep(0.05)
+        return folder
+
+    plain, done = tempfile.mkdtemp, threading.Event()
+    other = threading.Thread(target=done.wait)
+    other.start()
+    monkeypatch.setattr(tempfile, "mkdtemp", made_and_then)
+    before = signal.signal(number, leave)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            write_bytes(tmp_path / "a", b"first", force=False)
+        assert signal.getsignal(number) is leave
+        assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == set()
+    finally:
+        signal.signal(number, before)
+        done.set()
+        other.join()
+    assert list(tmp_path.iterdir()) == []
