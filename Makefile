@@ -87,9 +87,6 @@ format: setup ## rewrite the code in the house style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-notebooks: setup ## run the notebooks and store what they print and draw
-	$(BIN)/python -m docs.site.notebooks
-
 picture: setup ## draw the README's picture; DATA=folder, with public data sets, adds a recorded flight
 	$(BIN)/python -m benchmarks.picture $(DATA)
 

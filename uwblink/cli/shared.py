@@ -25,7 +25,14 @@ from typing import Annotated, Any, Final, NoReturn, get_type_hints
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    Progress,
+    SpinnerColumn,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from typer.core import TyperCommand, TyperGroup
 
 from uwblink import __version__
@@ -424,19 +431,21 @@ def _plain_warnings() -> Iterator[None]:
 def waiting(what: str) -> Iterator[Callable[[str | float], None]]:
     """Show on a terminal what the block does, as in "fitting"; the line is gone after the block, which must not print.
 
-    Yields a function that takes another text, or the share that is done (0 to 1). Nothing is shown elsewhere.
+    Yields a function that takes another text, or the share that is done (0 to 1), from which the line states the time
+    left. Nothing is shown elsewhere.
     """
     if not sys.stderr.isatty():
         yield lambda _: None
         return
     columns = (SpinnerColumn("line"), TextColumn("{task.description}"), TaskProgressColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as line:
-        task = line.add_task(escape(what), total=None)
+    left = (TimeRemainingColumn(), TextColumn("{task.fields[left]}"))  # nothing where a block states no share
+    with Progress(*columns, *left, console=Console(stderr=True), transient=True) as line:
+        task = line.add_task(escape(what), total=None, left="")
 
         def update(found: str | float) -> None:
             if isinstance(found, str):
                 line.update(task, description=escape(found))
             else:
-                line.update(task, total=1.0, completed=found)
+                line.update(task, total=1.0, completed=found, left="left")
 
         yield update
