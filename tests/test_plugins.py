@@ -10,84 +10,18 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from tests import processes
+from tests import pages, processes
 from uwblink.errors import ArgumentError, PluginWarning
 from uwblink.plugins import Registry
 
-PROJECT = """
-[build-system]
-requires = ["hatchling"]
-build-backend = "hatchling.build"
-
-[project]
-name = "strange-ranging"
-version = "1.0"
-
-[project.entry-points."uwbcal.protocols"]
-strange = "strange_ranging:PROTOCOL"
-broken = "strange_ranging:NOTHING"
-
-[project.entry-points."uwbcal.importers"]
-strange = "strange_ranging:IMPORTERS"
-
-[project.entry-points."uwbcal.losses"]
-welsch = "strange_ranging.losses:WELSCH"
-bad = "strange_ranging.losses:BAD"
-
-[tool.hatch.build.targets.wheel]
-packages = ["strange_ranging"]
-"""
-MODULE = """
-import numpy as np
-
-from uwblink import Contents, Exchanges
-from uwblink.importers import Importer
-from uwblink.protocols.table import ProtocolMessage, RangingProtocol
-
-
-def flight_ticks(t):
-    return (t.dt41 * t.dt53 / t.dt64 - t.dt32) / 2
-
-
-def delay_weights(t):
-    return t.dt53 / t.dt64 / 2, np.full_like(t.dt41, 0.5)
-
-
-PROTOCOL = RangingProtocol(
-    "strange-ds",
-    "DS-TWR of a stranger",
-    (
-        ProtocolMessage("initiator", "", "at once"),
-        ProtocolMessage("target", "rx1", "at once"),
-        ProtocolMessage("target", "tx2", "scheduled"),
-    ),
-    flight_ticks,
-    delay_weights,
+# The example of CONTRIBUTING.md, and two rows that cannot be used.
+PROJECT, MODULE = (
+    next(b.code for b in pages.blocks(pages.ROOT / "CONTRIBUTING.md") if b.language == language and word in b.code)
+    for language, word in (("toml", "uwbcal.protocols"), ("python", "PROTOCOL = "))
 )
-
-
-def read(source, _map):
-    columns = np.loadtxt(source, dtype=np.int64, unpack=True, ndmin=2)
-    names = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
-    stamps = dict(zip(names, columns[2:], strict=True))
-    return Contents(exchanges=Exchanges.from_arrays(*columns[:2], **stamps, protocol="strange-ds"))
-
-
-IMPORTERS = [Importer("eight", (".eight",), read, "Import eight numbers a line.")]
-"""
-LOSSES = """
-import numpy as np
-from calib.estimator.losses import RobustLoss
-
-
-def weights(u):
-    weight = np.exp(-(u**2) / 2)
-    return weight, weight * (1 - u**2)
-
-
-WELSCH = RobustLoss("welsch", weights)
-BAD = RobustLoss("bad", lambda u: (u, u))
-"""
+PROJECT = PROJECT.replace("strange = ", 'broken = "strange_ranging:NOTHING"\nstrange = ', 1)
+PROJECT = PROJECT.replace("welsch = ", 'bad = "strange_ranging:BAD"\nwelsch = ', 1)
+MODULE += 'BAD = RobustLoss("bad", lambda u: (u, u))\n'
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +31,6 @@ def installed(tmp_path_factory):
     (source / "strange_ranging").mkdir()
     (source / "pyproject.toml").write_text(PROJECT)
     (source / "strange_ranging" / "__init__.py").write_text(MODULE)
-    (source / "strange_ranging" / "losses.py").write_text(LOSSES)
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
     pip += ["--disable-pip-version-check", "--target", str(site), str(source)]
     subprocess.run(pip, check=True, capture_output=True, text=True)
@@ -155,6 +88,33 @@ def test_the_importer_of_another_distribution_is_a_command_and_without_it_its_re
     assert shown["protocols"] == {"strange-ds": 1}
     told = processes.refuse("uwblink", "show", tmp_path / "t.uwb")
     assert told.startswith(f"error: {tmp_path / 't.uwb'}: exchanges of an unknown protocol; known are ss, ")
+
+
+def test_its_exporter_correction_and_evaluator_are_used(run, tmp_path):
+    flight = tmp_path / "f.uwb"
+    assert run("calib", "sample", "-o", flight, "-n", 300).returncode == 0
+    assert run("uwblink", "export", flight, "--to", "pairs", "-o", tmp_path / "out").returncode == 0
+    written = (tmp_path / "out" / "pairs.txt").read_text().splitlines()
+    assert (len(written), set(written)) == (300, {"1 2", "2 3", "3 1"})
+
+    (tmp_path / "s.toml").write_text(
+        '[sweep]\nscenario = "noiseless"\nkind = "count"\n[vary]\n"run.duration_s" = [1.0, 2.0]\n'
+    )
+    done = run("uwbsim", "sweep", tmp_path / "s.toml", "-o", tmp_path / "swept", "--workers", "1")
+    assert done.returncode == 0, done.stderr
+    header, *rows = [line.split(",") for line in (tmp_path / "swept" / "results.csv").read_text().splitlines()]
+    counts = [int(row[header.index("exchanges")]) for row in rows]
+    assert counts[1] == 2 * counts[0] > 0
+    (tmp_path / "s.toml").write_text((tmp_path / "s.toml").read_text().replace("count", "cuont"))
+    done = run("uwbsim", "sweep", tmp_path / "s.toml", "-o", tmp_path / "no", "--workers", "1")
+    assert (done.returncode, (tmp_path / "no").exists()) == (2, False)
+    assert "sweep.kind: found 'cuont', expected calibrate, compare, count, or a name" in done.stderr
+
+    (tmp_path / "offset.txt").write_text("100.0")
+    done = run("uwblink", "stream", flight, "--speed", "inf", "-c", tmp_path / "offset.txt")
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(rows) == 300, done.stderr
+    assert [row["corrected_m"] for row in rows] == pytest.approx([row["range_m"] - 100.0 for row in rows], abs=1e-3)
 
 
 @pytest.mark.parametrize("command", ["uwblink", "uwbsim", "calib"])

@@ -7,11 +7,12 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.text_files import read_text
@@ -23,7 +24,22 @@ from uwbsim.scenario.ranging import ProtocolName
 MOST_RUNS: Final = 10_000_000
 """Runs of a sweep, seeds and values of a Latin hypercube at most: their numbers fit into memory."""
 
+EVALUATORS: Final = "uwbcal.evaluators"
+"""Entry points: functions of a flight that return columns of results."""
+
 Count = Annotated[int, Field(strict=True, ge=1, le=MOST_RUNS)]
+
+
+def evaluators() -> dict[str, EntryPoint]:
+    """Return what installed distributions offer to do with the flights of a sweep, by the kind of sweep."""
+    return {entry.name: entry for entry in entry_points(group=EVALUATORS)}
+
+
+def _known_kind(kind: str) -> str:
+    known = ["calibrate", "compare", *sorted(evaluators().keys() - {"calibrate"})]
+    if kind not in known:
+        raise ValueError(f"found {kind!r}, expected {', '.join(known)}, or a name in the entry points of {EVALUATORS}")
+    return kind
 
 
 class _Table(BaseModel):
@@ -37,8 +53,10 @@ class SweepSettings(_Table):
     scenario: str = Field(
         description="The scenario to vary: a file relative to the folder of this one, or the name of a shipped one."
     )
-    kind: Literal["compare", "calibrate"] = Field(
-        "compare", description="What a run does: compare protocols, or simulate a flight, calibrate and evaluate."
+    kind: Annotated[str, AfterValidator(_known_kind)] = Field(
+        "compare",
+        description="What a run does: compare protocols; or simulate a flight, and calibrate and evaluate it, or what "
+        "an installed distribution offers by that name.",
     )
     protocols: Annotated[tuple[ProtocolName, ...], Field(min_length=1)] | None = Field(
         None, description='The protocols of each run; by default all, or ["ds"] to calibrate.'

@@ -27,7 +27,6 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import entry_points
 from multiprocessing.connection import Connection
 from threading import Thread
 from typing import Any
@@ -43,7 +42,7 @@ from uwbsim.errors import ParameterError, UwbsimError
 from uwbsim.protocols.comparison import compare
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import Simulated, simulate
-from uwbsim.sweep.design import Run
+from uwbsim.sweep.design import EVALUATORS, Run, evaluators
 from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, ChannelEffect
 
 Evaluate = Callable[[Simulated], Mapping[str, Any]]
@@ -149,20 +148,20 @@ def run_chunk(runs: Sequence[Run], work: Work) -> tuple[list[Result], float]:
 
 def evaluator(kind: str) -> Evaluate:
     """Return the entry point of an installed distribution for a kind of sweep; raises `ParameterError`."""
-    group = "uwbcal.evaluators"
-    for entry in entry_points(group=group, name=kind):
-        try:
-            found: Evaluate = entry.load()
-        except (ImportError, AttributeError) as error:
-            raise ParameterError(
-                f"{entry.value}, which {group} names, cannot be imported: {error}", parameter="evaluate"
-            ) from error
-        return found
-    raise ParameterError(
-        f"a sweep of kind {kind!r} needs a function that evaluates a flight, and no installed distribution offers one "
-        f"(entry point {kind!r} of the group {group})",
-        parameter="evaluate",
-    )
+    entry = evaluators().get(kind)
+    if entry is None:
+        raise ParameterError(
+            f"a sweep of kind {kind!r} needs a function that evaluates a flight, and no installed distribution offers "
+            f"one (entry point {kind!r} of the group {EVALUATORS})",
+            parameter="evaluate",
+        )
+    try:
+        found: Evaluate = entry.load()
+    except (ImportError, AttributeError) as error:
+        raise ParameterError(
+            f"{entry.value}, which {EVALUATORS} names, cannot be imported: {error}", parameter="evaluate"
+        ) from error
+    return found
 
 
 class ClusterLostError(UwbsimError, ConnectionError):

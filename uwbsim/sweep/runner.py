@@ -54,9 +54,9 @@ def run_sweep(
 ) -> SweepSummary:
     """Do the runs that have no results yet, and write results.csv and results.parquet in the order of the runs.
 
-    Runs of kind `compare` compare protocols; those of kind `calibrate` simulate a flight and have `evaluate(flight)`
-    return its results, a mapping of column to number, text or None; by default the entry point `calibrate` of the group
-    `uwbcal.evaluators` of an installed distribution. Runs are done by `workers` processes (None: all cores), or by the
+    Runs of kind `compare` compare protocols; those of other kinds simulate a flight and have `evaluate(flight)` return
+    its results, a mapping of column to number, text or None; by default the entry point of that name of the group
+    `uwbcal.evaluators`, as `calibrate`. Runs are done by `workers` processes (None: all cores), or by the
     Dask cluster at the address `scheduler`; both import `evaluate` by its name. `progress` is called with the done
     fraction, 0 to 1.
 
@@ -84,10 +84,10 @@ def run_sweep(
     check_folder(folder)
     _check(plan, folder, resume=resume)
     kind = plan.settings.kind
-    if kind == "calibrate":
+    if kind != "compare":
         evaluate = evaluate or evaluator(kind)
     elif evaluate is not None:
-        raise ParameterError(f"goes with a sweep of kind 'calibrate', and this one's is {kind!r}", parameter="evaluate")
+        raise ParameterError("goes with sweeps of flights, and the kind of this one is 'compare'", parameter="evaluate")
     if workers is not None and workers < 1:
         raise ParameterError(f"found {workers}, expected 1 or more", parameter="workers")
     work = Work.of_here(plan.scenario.stem, plan.protocols, plan.settings.ranges, evaluate)

@@ -209,13 +209,13 @@ def test_functions_that_other_processes_cannot_import_are_refused(tmp_path, stra
         run_sweep(p, tmp_path / "out", workers=2, evaluate=lambda flight: {})
     with pytest.raises(ParameterError, match=r"^`workers`: found 0"):
         run_sweep(p, tmp_path / "out", workers=0, evaluate=stranger.figures)
-    with pytest.raises(ParameterError, match=r"^`evaluate`: goes with a sweep of kind 'calibrate'"):
+    with pytest.raises(ParameterError, match=r"^`evaluate`: goes with sweeps of flights"):
         run_sweep(plan(tmp_path), tmp_path / "out", evaluate=stranger.figures)
     assert not (tmp_path / "out").exists()
 
 
 def test_without_a_function_and_without_a_distribution_that_offers_one(tmp_path, monkeypatch):
-    monkeypatch.setattr("uwbsim.sweep.executors.entry_points", lambda **_: ())
+    monkeypatch.setattr("uwbsim.sweep.design.entry_points", lambda **_: ())
     with pytest.raises(ParameterError, match="no installed distribution offers one"):
         run_sweep(plan(tmp_path, CALIBRATE), tmp_path / "out", workers=1)
     assert not (tmp_path / "out").exists()
