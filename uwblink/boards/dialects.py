@@ -33,13 +33,6 @@ from uwblink.recording.schema import Tag
 from uwblink.twr import LARGEST_ID, STAMPS
 from uwblink.wire.messages import RangeReport
 
-MAX_PRINTED_BYTES: Final = 4096
-"""Bytes after which a line without an end is dropped; a list of 64 ranges takes half of that."""
-
-PATIENCE_LINES: Final = 50
-"""Lines without a range after which a board is taken to print another form: banners and menus are shorter (a
-judgement)."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PrintedRange:
@@ -239,13 +232,14 @@ class _Lines:
     def feed(self, data: bytes) -> list[str]:
         """Take bytes; return the lines that ended in them."""
         *lines, self._rest = re.split(rb"[\r\n]+", self._rest + data)
-        self._rest = self._rest[-MAX_PRINTED_BYTES:]
+        self._rest = self._rest[-4096:]  # of a line without an end; a list of 64 ranges takes half of that
         return [line.decode("latin-1") for line in lines if line.strip()]
 
     def note(self, lines: Sequence[str], found: Sequence[PrintedRange]) -> None:
         """Note lines and their ranges; raises `BoardError` where the board prints another form."""
         self._good, self._others = self._good or bool(found), self._others + len(lines)
-        if not self._good and self._others > PATIENCE_LINES:
+        # Banners and menus are shorter (a judgement).
+        if not self._good and self._others > 50:
             raise BoardError(
                 f"{self.name}: no range in {self._others} lines, the last is {lines[-1]!r:.80}; name another dialect, "
                 "or a template of lines"

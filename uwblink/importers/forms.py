@@ -204,10 +204,6 @@ def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
     return replace(form, line=line), entries
 
 
-_DEVICE: Final = r"(an|anchor|anker|a|node|beacon|bs|responder|target|to|device|dev|uwb|id|ch)"
-_HELD: Final = ("range_m", "gt_range_m", "fpp2", "rxp2", "skew2")
-
-
 def wide_columns(names: Sequence[str], taken: Mapping[str, str]) -> dict[str, str | dict[str, str]]:
     """Return the families of columns that differ by the number of a device, as the values of `wide`.
 
@@ -219,12 +215,13 @@ def wide_columns(names: Sequence[str], taken: Mapping[str, str]) -> dict[str, st
     matches = (re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", name) for name in names if name not in ends)
     stems = [(match[1], match[3]) for match in matches if match]
     found: dict[str, str | dict[str, str]] = {}
+    device = r"(^|_)(an|anchor|anker|a|node|beacon|bs|responder|target|to|device|dev|uwb|id|ch)(?=_|$)"
     for before, after in dict.fromkeys(stem for stem in stems if stems.count(stem) > 1):
         plain = plain_name(f"{before} {after}")
-        bare = re.sub(rf"(^|_){_DEVICE}(?=_|$)", "", plain)
+        bare = re.sub(device, "", plain)
         # Without words of devices nothing but a unit may remain.
         short = r"|(r|d|dis|dis_arr(ay)?|data|ranges|distances|dists)" + ("|" if bare != plain else "")
-        for ours in _HELD:
+        for ours in ("range_m", "gt_range_m", "fpp2", "rxp2", "skew2"):
             pattern = f"_?({PATTERNS[ours]}{short if ours == 'range_m' else ''}){{end}}".format_map(WORDS)
             if ours not in found and re.fullmatch(pattern, bare):
                 found[ours] = f"{before}{{to_id}}{after}"

@@ -34,7 +34,6 @@ Vectors = dict[str, dict[int, tuple[float, float, float]]]
 """Vectors by name and number: lever arms by robot and tag, or places in metres by constellation and anchor."""
 
 _PAIR: Final = {"initiator": "from_id", "target": "to_id"}
-_XYZ: Final = "groups of tags, each with [x, y, z] in metres"
 _IDS: Final = (*_PAIR, "listener", "board")
 
 
@@ -60,7 +59,12 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
         raise ImportTableError(
             f"{folder}: no such folder; expected one with a folder a robot (ifo001/uwb_range.csv ...)"
         )
-    start_ns = _read_yaml(folder / "timeshift.yaml", _start_ns, "whole numbers timeshift_s and timeshift_ns", 0)
+    start_ns = _read_yaml(
+        folder / "timeshift.yaml",
+        lambda table: int(table["timeshift_s"]) * 1_000_000_000 + int(table["timeshift_ns"]),
+        0,
+        expected="whole numbers timeshift_s and timeshift_ns",
+    )
     flight = FlightFolder(folder, tuple(sorted(path.parent for path in folder.glob("*/uwb_range.csv"))), start_ns)
     if not flight.robots:
         raise ImportTableError(f"{folder}: no folder in it holds uwb_range.csv, as those of MILUV's robots do")
@@ -223,7 +227,7 @@ def _read_poses(flight: FlightFolder) -> Poses:
 
 def _read_tags(flight: FlightFolder) -> list[Tag]:
     """Return the robots' tags and lever arms from tags.yaml; none without such a file."""
-    arms: Vectors = _read_yaml(flight.folder / "tags.yaml", _vectors, _XYZ, {})
+    arms: Vectors = _read_yaml(flight.folder / "tags.yaml", _vectors, {})
     names = {robot.name for robot in flight.robots}
     return [Tag(number, body, arm) for body, tags in arms.items() if body in names for number, arm in tags.items()]
 
@@ -238,7 +242,7 @@ def _find_anchors(
     constellation fits.
     """
     path = flight.folder / "anchors.yaml"
-    known: Vectors = _read_yaml(path, _vectors, _XYZ, {})
+    known: Vectors = _read_yaml(path, _vectors, {})
     if wanted is not None and wanted not in known:
         raise ImportTableError(f"{path}: no constellation {wanted[:40]!r}; there are {', '.join(known) or 'none'}")
     ends = exchanges.initiator, exchanges.target
@@ -274,11 +278,6 @@ def _with_anchors(
     return Poses.concatenate([poses, standing]).in_time_order(), [*tags, *anchors]
 
 
-def _start_ns(table: Any) -> int:
-    """Return the start of the clock by timeshift.yaml."""
-    return int(table["timeshift_s"]) * 1_000_000_000 + int(table["timeshift_ns"])
-
-
 def _vectors(table: Any) -> Vectors:
     """Return vectors of tags.yaml and anchors.yaml; each is a list, or text such as "[1.0, 2.0, 3.0]"."""
     found: Vectors = {}
@@ -291,7 +290,13 @@ def _vectors(table: Any) -> Vectors:
     return found
 
 
-def _read_yaml(path: Path, convert: Callable[[Any], Found], expected: str, absent: Found) -> Found:
+def _read_yaml(
+    path: Path,
+    convert: Callable[[Any], Found],
+    absent: Found,
+    *,
+    expected: str = "groups of tags, each with [x, y, z] in metres",
+) -> Found:
     """Return a YAML file as `convert` makes it, `absent` without a file; raises `ImportTableError` if it fails."""
     if not path.exists():
         return absent

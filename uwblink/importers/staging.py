@@ -266,11 +266,9 @@ def staged_cells(table: SourceTable) -> dict[str, str]:
 def _is_missing(table: SourceTable, text: str) -> str:
     """Return SQL that is true for a text that means no value, by the map."""
     missing = table.column_map.missing
-    table.db.execute(
-        "SET VARIABLE missing = ?", [["", *(one.strip().lower() for one in missing if isinstance(one, str))]]
-    )
+    words = table.variable("missing", ["", *(one.strip().lower() for one in missing if isinstance(one, str))])
     numbers = ", ".join(repr(float(one)) for one in missing if not isinstance(one, str))
-    is_word = f"list_contains(getvariable('missing'), lower(trim({text})))"
+    is_word = f"list_contains({words}, lower(trim({text})))"
     return f"({is_word} OR TRY_CAST({text} AS DOUBLE) IN ({numbers}))" if numbers else is_word
 
 
