@@ -179,7 +179,8 @@ def form_of(path: Path) -> tuple[ColumnMap, Entries]:
 def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
     """Return the form of a log by the templates of its first lines, with a time before them if there is one."""
     with reading(path), open_file(path) as file:
-        lines = [line.decode("latin-1").rstrip("\r\n") for line in islice(file, 400)]
+        # The time of a search grows with the square of a line's length; no board prints 10,000 letters in one.
+        lines = [line[:10_000].decode("latin-1").rstrip("\r\n") for line in islice(file, 400)]
     # Boards begin to print at different times, and in the middle of lines.
     if 5 * sum(map(bool, map(object_in, lines))) > sum(map(bool, lines)):
         return ColumnMap(line=JSON_LINE), {"line": (JSON_LINE, "lines that end with an object of JSON")}
