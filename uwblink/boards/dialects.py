@@ -10,7 +10,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import chain, product
@@ -270,7 +270,7 @@ def record_printed(
     meta = {"source": "record", "dialect": dialect.name, "notes": ["ranges without stamps, as the boards print them"]}
     with Recording.create(path, meta=meta, force=force, live=True) as recording:
         try:
-            with RecordingWriter(recording) as writer:
+            with suppress(KeyboardInterrupt), RecordingWriter(recording) as writer:
                 begun, watched_s = set[Pair](), -1.0
                 for turns in chain([first], batches):
                     for listener in others:
@@ -284,8 +284,6 @@ def record_printed(
                     if seen.time_s - watched_s > 0.25:
                         watched_s = seen.time_s
                         watch(seen)
-        except KeyboardInterrupt:
-            pass
         finally:
             names = {number: name if isinstance(name, str) else f"tag{name}" for name, number in seen.numbers.items()}
             recording.append_tags(Tag(number, names[number], (0.0, 0.0, 0.0)) for number in sorted(names))

@@ -20,6 +20,7 @@ import yaml
 from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError, raising
 from uwblink.importers.plausibility import clocks, to_ticks
+from uwblink.importers.poses import in_order
 from uwblink.importers.tables import Columns, number, open_table, time_ns, whole_number
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
@@ -270,12 +271,9 @@ def _with_anchors(
     poses: Poses, tags: list[Tag], places: dict[int, tuple[float, float, float]]
 ) -> tuple[Poses, list[Tag]]:
     """Return poses and tags with anchors added, each on a body of its own with a single pose."""
-    numbers = sorted(places)
-    anchors = [Tag(number, f"anchor{number}", (0.0, 0.0, 0.0)) for number in numbers]
-    begins = int(poses.time_ns.min()) if len(poses) else 0
-    position = np.array([places[number] for number in numbers], dtype=np.float64).reshape(-1, 3)
-    standing = Poses.from_arrays([begins] * len(numbers), [tag.body for tag in anchors], position)
-    return Poses.concatenate([poses, standing]).in_time_order(), [*tags, *anchors]
+    anchors = [Tag(number, f"anchor{number}", (0.0, 0.0, 0.0)) for number in sorted(places)]
+    standing = [Poses.from_arrays([0], tag.body, [places[tag.tag]]) for tag in anchors]
+    return in_order([poses, *standing]), [*tags, *anchors]
 
 
 def _vectors(table: Any) -> Vectors:
