@@ -181,22 +181,20 @@ def printed_ranges(
     own = list(ids) or list(range(1, len(names) + 1))
     if len(own) != len(names) or len(set(own)) < len(own):
         raise PlanError(f"{len(names)} ports and {len(own)} ids of boards; give each port an id of its own")
-    for one in own:
-        seen.number(one)
+    seen.numbers |= {one: one for one in own}
     with ExitStack() as stack:
-        opened: list[Transport] = []
-        for name in names:
-            opened.append(using.open(name))
-            stack.callback(using.close, opened[-1])
-        begun = {id(port): (board, _Lines(port.name)) for port, board in zip(opened, own, strict=True)}
-        for port in opened:
-            if dialect.start:
-                port.write(dialect.start)
+        boards: dict[Transport, tuple[int, _Lines]] = {}
+        for name, board in zip(names, own, strict=True):
+            port = using.open(name)
+            stack.callback(port.close)
+            boards[port] = board, _Lines(name)
+        for port in boards if dialect.start else ():
+            port.write(dialect.start)
         start_s, seen.start_ns = using.now_s(), using.host_ns()
         while not stop() and seen.time_s < duration_s:
             turns = []
-            for port in using.wait(min(0.1, duration_s - seen.time_s)):
-                board, lines = begun[id(port)]
+            for port in using.wait([*boards], min(0.1, duration_s - seen.time_s)):
+                board, lines = boards[port]
                 came = lines.feed(port.read(0.0))
                 found = list(dialect.parse(came)) if came else []
                 lines.note(came, found)

@@ -158,11 +158,8 @@ def identify(names: Iterable[str], ports: Ports | None = None) -> dict[int, str]
     using = ports or SerialPorts()
     found: dict[int, str] = {}
     for name in names:
-        port = using.open(name)
-        try:
-            number = Board(port).id
-        finally:
-            using.close(port)
+        with Board(using.open(name)) as board:
+            number = board.id
         if number in found:
             raise PlanError(f"{found[number]} and {name} both have the id {number}; ids must differ")
         found[number] = name

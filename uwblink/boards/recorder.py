@@ -66,7 +66,7 @@ class Station:
     def unplug(self, now_s: float) -> None:
         """Close the port of a board that is gone."""
         if self.port is not None:
-            self._ports.close(self.port)
+            self.port.close()
         self.port, self._retry_s = None, now_s + 0.2
 
     def plug_again(self, now_s: float) -> bool:
@@ -157,14 +157,15 @@ class Recorder:
                 with suppress(BoardError, PortError):
                     Board(station.port, connection=station.connection).set_passive(False)
             with suppress(PortError):
-                self._ports.close(station.port)
+                station.port.close()
 
     def _step(self, end_s: float) -> None:
         """Wait for the next event and handle it."""
         for listener in self._listeners:
             listener.check()
         self._begin()
-        ready = self._ports.wait(self._wait_s(end_s))
+        opened = [station.port for station in self._stations.values() if station.port is not None]
+        ready = self._ports.wait(opened, self._wait_s(end_s))
         for station in self._stations.values():
             if station.plug_again(self._ports.now_s()):
                 self._fault(station, "replugged", f"{station.name}: board {station.board} is back")
