@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from itertools import chain, product
 from pathlib import Path
 from typing import Any, Final
@@ -94,16 +94,6 @@ def parser_of(known: ColumnMap) -> Callable[[Sequence[str]], list[PrintedRange]]
     return parse
 
 
-def check_dialect(row: Any) -> None:
-    """Raise `ArgumentError` for a row that cannot be a dialect."""
-    fields = {
-        "help": (is_text, "a line of text"),
-        "parse": (callable, "a function from lines to ranges"),
-        "start": (lambda found: isinstance(found, bytes), "bytes"),
-    }
-    check_row("dialect", row, Dialect, fields)
-
-
 # The shell of the DWM1001 opens on two carriage returns; `lec` prints distances as comma-separated lines.
 _START: Final = {"dwm1001-lec": b"\r\rlec\r", "dwm1001-les": b"\r\rles\r"}
 
@@ -111,7 +101,16 @@ DIALECTS: Final[Registry[Dialect]] = Registry(
     "dialect",
     "uwbcal.dialects",
     tuple(Dialect(name, LINES[name]["line"], parser_of(map_of_lines(name)), _START.get(name, b"")) for name in LINES),
-    check_dialect,
+    partial(
+        check_row,
+        "dialect",
+        Dialect,
+        {
+            "help": (is_text, "a line of text"),
+            "parse": (callable, "a function from lines to ranges"),
+            "start": (lambda found: isinstance(found, bytes), "bytes"),
+        },
+    ),
 )
 """Dialects by name: the project's, and those of installed distributions."""
 

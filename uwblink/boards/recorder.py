@@ -15,6 +15,7 @@ from uwblink.boards.board import FENCE, QUIET_AFTER_CIR_S, QUIET_TARGET_S, Board
 from uwblink.boards.listeners import Heard, Listener, Pair, PairState, Progress, ReportCheck, Turn
 from uwblink.boards.ports import Ports, SerialPorts, Transport, serial_number
 from uwblink.boards.ranging_plan import RangingPlan
+from uwblink.closing import Closing
 from uwblink.errors import BoardError, PortError, PortLostError
 from uwblink.recording.schema import Fault
 from uwblink.wire.codec import LONGEST_LINE, Event
@@ -88,7 +89,7 @@ class Station:
         self._todo = deque([*again, SetPassive(True)] if self._passive else again)
 
 
-class Recorder:
+class Recorder(Closing):
     """The loop of a recording: `boards` maps ids to ports, `turns` are the pairs that take turns."""
 
     def __init__(

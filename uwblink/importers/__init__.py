@@ -75,7 +75,6 @@ def check_importer(row: Any) -> None:
     """Raise `ArgumentError` for a row that cannot be an importer."""
     check_row(
         "importer",
-        row,
         Importer,
         {
             "suffixes": (
@@ -89,6 +88,7 @@ def check_importer(row: Any) -> None:
             "help": (is_text, "a line of text"),
             "map_help": (lambda found: found is None or is_text(found), "a line of text"),
         },
+        row,
     )
 
 
