@@ -230,21 +230,16 @@ def wide_columns(names: Sequence[str], taken: Mapping[str, str]) -> dict[str, st
     return found if "range_m" in found else {}
 
 
-_REGISTERS: Final = {
-    "f1": r"fp_?ampl?(itude)?_?1|f1",
-    "f2": r"fp_?ampl?(itude)?_?2|f2",
-    "f3": r"fp_?ampl?(itude)?_?3|f3",
-    "n": r"rx_?pacc(_?nosat)?|preamble_?(acc(um)?_?)?count|acc(um)?_?count",
-    "c": r"cir_?(pwr|power)",
-    "d": r"dgc(_?decision)?",
-}
-
-
 def register_columns(names: Sequence[str]) -> dict[str, dict[str, str]]:
     """Return the powers that can be made of registers, as their values in a map, by "fpp" and "rxp"."""
+    called = {f"f{k}": rf"fp_?ampl?(itude)?_?{k}|f{k}" for k in (1, 2, 3)} | {
+        "n": r"rx_?pacc(_?nosat)?|preamble_?(acc(um)?_?)?count|acc(um)?_?count",
+        "c": r"cir_?(pwr|power)",
+        "d": r"dgc(_?decision)?",
+    }
     found = {
         key: header
-        for key, pattern in _REGISTERS.items()
+        for key, pattern in called.items()
         if (header := next((name for name in names if re.fullmatch(pattern, plain_name(name))), None))
     }
     wanted = {"fpp": ("f1", "f2", "f3", "n"), "rxp": ("c", "n")}
