@@ -94,6 +94,11 @@ class Connection:
         self._pending: _Pending | None = None
         self._quiet_until_s = 0.0
 
+    @property
+    def busy(self) -> bool:
+        """Whether a command is outstanding."""
+        return self._pending is not None
+
     def ready_s(self, now_s: float) -> float:
         """Return how long to wait until the board may be asked again."""
         return max(self._quiet_until_s - now_s, 0.0)

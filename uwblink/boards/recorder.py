@@ -44,8 +44,7 @@ class Station:
 
         A fence comes first if a late answer is possible, then the board is set up, and only then it may range.
         """
-        free = self.port is not None and self.connection.deadline_s() is None
-        idle = free and self.connection.ready_s(now_s) <= 0
+        idle = self.port is not None and not self.connection.busy and self.connection.ready_s(now_s) <= 0
         if not idle or now_s < self.pause_until_s:
             return None
         if self.connection.doubtful:
