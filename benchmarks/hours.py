@@ -142,7 +142,7 @@ class AnsweringPorts:
         until = self.time_ns + int(timeout_s * 1e9) + 1
         due = min((port.due[0][0] for port in ports if port.due), default=until)
         self.time_ns = max(self.time_ns, min(due, until))
-        return [port for port in self._open.values() if port.due and port.due[0][0] <= self.time_ns]
+        return [port for port in ports if port.due and port.due[0][0] <= self.time_ns]
 
     def now_s(self) -> float:
         """Return the virtual time in seconds."""
