@@ -143,7 +143,7 @@ class SerialPorts:
         """Open a port; raises one of the `PortError`s."""
         return SerialPort(name, self._baud_rate)
 
-    def wait(self, ports: Sequence[SerialPort], timeout_s: float) -> Sequence[SerialPort]:
+    def wait(self, ports: Sequence[Any], timeout_s: float) -> Sequence[SerialPort]:
         """Return ports at which bytes may be waiting; those without a descriptor must be asked again and again."""
         polled = [port for port in ports if port.fileno is None]
         watched = {port.fileno: port for port in ports if port.fileno is not None}
