@@ -80,8 +80,8 @@ class Suspended(VirtualPorts):
     left_out_ns = 5 * 10**9
     at_ns = 10**9
 
-    def wait(self, timeout_s):
-        ready = super().wait(timeout_s)
+    def wait(self, ports, timeout_s):
+        ready = super().wait(ports, timeout_s)
         if self.now_ns() > self.at_ns and self.left_out_ns:
             self.bench.advance(self.now_ns() + self.left_out_ns)
             self.left_out_ns = 0
