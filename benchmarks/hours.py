@@ -26,7 +26,6 @@ from benchmarks.flights import Plan, fly
 from benchmarks.large import peak_mb
 from uwblink.boards import record as writer
 from uwblink.boards.listeners import Heard, Progress
-from uwblink.boards.ports import Transport
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.record import record
 from uwblink.recording.contents import Contents
@@ -73,7 +72,7 @@ class AnsweringPort:
     def read(self, timeout_s: float) -> bytes:
         """Return what is due, waiting for it no longer than that."""
         if not self.due or self.due[0][0] > self._ports.time_ns:
-            self._ports.wait(timeout_s)
+            self._ports.wait([self], timeout_s)
         found = b""
         while self.due and self.due[0][0] <= self._ports.time_ns:
             found += self.due.popleft()[1]
@@ -98,7 +97,6 @@ class AnsweringPorts:
     def __init__(self, seed: int = 1, a_round: int = A_ROUND) -> None:
         """Make so many reports for `a_round` of the flight."""
         self.time_ns = 0
-        self._open: dict[str, AnsweringPort] = {}
         self.flight = fly(Plan(seconds=ROUND_S, per_second=a_round / ROUND_S), seed)
         e = self.flight.exchanges
         self._reports: dict[bytes, tuple[list[int], list[bytes]]] = {}
@@ -137,19 +135,14 @@ class AnsweringPorts:
 
     def open(self, name: str) -> AnsweringPort:
         """Return a port."""
-        self._open[name] = AnsweringPort(self, name)
-        return self._open[name]
+        return AnsweringPort(self, name)
 
-    def close(self, port: Transport) -> None:
-        """Close a port."""
-        self._open.pop(port.name, None)
-
-    def wait(self, timeout_s: float) -> Sequence[AnsweringPort]:
+    def wait(self, ports: Sequence[AnsweringPort], timeout_s: float) -> Sequence[AnsweringPort]:
         """Let time pass until something is due, or the time is over."""
         until = self.time_ns + int(timeout_s * 1e9) + 1
-        due = min((port.due[0][0] for port in self._open.values() if port.due), default=until)
+        due = min((port.due[0][0] for port in ports if port.due), default=until)
         self.time_ns = max(self.time_ns, min(due, until))
-        return [port for port in self._open.values() if port.due and port.due[0][0] <= self.time_ns]
+        return [port for port in ports if port.due and port.due[0][0] <= self.time_ns]
 
     def now_s(self) -> float:
         """Return the virtual time in seconds."""

@@ -22,7 +22,7 @@ NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9-]{0,40}")
 """Names of rows, which are typed on command lines and stored in files."""
 
 
-def check_row(kind: str, row: Any, of: type[Any], fields: Mapping[str, tuple[Callable[[Any], object], str]]) -> None:
+def check_row(kind: str, of: type[Any], fields: Mapping[str, tuple[Callable[[Any], object], str]], row: Any) -> None:
     """Raise `ArgumentError` for a row that is not `of` a class, or has a field that is not as it must be.
 
     `fields` has a test of each field and what is expected, beside the name, which must be a word.

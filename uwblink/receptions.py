@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from uwblink import arrays
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.errors import ArgumentError
-from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import ANTENNA_DELAY_TICKS, COUNTER_BITS, METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S, elapsed
 from uwblink.twr import BITS, LARGEST_ID, LATEST_NS, STAMPS, Exchanges
 
@@ -181,10 +180,12 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
     reply = elapsed(r.tx[rows[:, 1]], r.rx[rows[:, 0]], r.bits)
     sent, heard = (elapsed(stamp[rows[:, 2]], stamp[rows[:, 1]], r.bits) for stamp in (r.tx, r.rx))
     round_trip = elapsed(r.rx[rows[:, 1]], r.tx[rows[:, 0]], r.bits)
+    # 150 m, farther than these radios reach, and antenna delays that were not programmed
+    farthest = 2 * (150 / METRES_PER_TICK + 2 * ANTENNA_DELAY_TICKS)
     steady = (
         _within(r, rows[:, 0], rows[:, 2])
         & (np.abs(heard - sent) <= MAX_SKEW * sent)
-        & (np.abs(round_trip - reply) <= MAX_SKEW * reply + _FARTHEST)
+        & (np.abs(round_trip - reply) <= MAX_SKEW * reply + farthest)
     )
     rows, reply = rows[steady], reply[steady]
     rows = rows[_shorter_replies(r.sender[rows[:, 0]], r.sender[rows[:, 1]], reply)]
@@ -238,20 +239,12 @@ MAX_ACCELERATION, MAX_DRIFT, LONGEST_DETOUR_M = 50.0, 0.2e-6, 10.0
 """Judgements: robots accelerate by less than 5 g (m/s^2), and a reflection in a room is no longer than 10 m. The rate
 of a clock changes by less than 0.2e-6 a second: in logs of DWM1001 boards that warm up by 0.12e-6."""
 
-_NEAR: Final = (-3, -2, -1, 1, 2, 3)
-"""A stamp is compared with each two of these on its link: wrong ones are few, so that most of six are right."""
-
-_FEW: Final = 0.1
-"""Stamps that no triple supports are left out if they are fewer: where all are far apart, as many as that are sound."""
-
-_PASSES: Final = 3
-"""Without the worst stamps those are seen that they outvoted. A clock that jumps costs so many stamps on both sides."""
-
 
 def contradicted(receptions: Receptions) -> Bools:
     """Return which receptions (n,) have a stamp that those near it on their link contradict, or that none supports."""
     left = np.arange(len(receptions))
-    for _ in range(_PASSES):
+    # Without the worst stamps those are seen that they outvoted. A clock that jumps costs three stamps on both sides.
+    for _ in range(3):
         left = left[~_off_the_line(receptions[left])]
     return np.isin(np.arange(len(receptions)), left, invert=True)
 
@@ -279,7 +272,8 @@ def _off_the_line(r: Receptions) -> Bools:
         return step, span, (b - a == other - one) & (links.link[a] == links.link[b]) & within
 
     triples = []
-    for pair in itertools.combinations(_NEAR, 2):
+    # Three on each side: wrong stamps are few, so that most of six are right.
+    for pair in itertools.combinations((-3, -2, -1, 1, 2, 3), 2):
         one, two, three = sorted((*pair, 0))
         (step1, span1, there1), (step2, span2, there2) = apart(one, two), apart(two, three)
         both = np.maximum(span1 + span2, 1.0)
@@ -295,12 +289,9 @@ def _off_the_line(r: Receptions) -> Bools:
     straight, bends = ((told & side).sum(axis=0) for side in (bend <= allowed, bend > allowed))
     alone = straight == 0
     wrong = np.zeros(len(r), dtype=bool)
-    wrong[row] = (bends > 0) & (bends >= straight) | (alone & (np.mean(alone) < _FEW))
+    # Where all are far apart, more than a tenth are alone and sound.
+    wrong[row] = (bends > 0) & (bends >= straight) | (alone & (np.mean(alone) < 0.1))
     return wrong
-
-
-_FARTHEST: Final = 2 * (150 / METRES_PER_TICK + 2 * ANTENNA_DELAY_TICKS)
-"""A round trip in ticks of 150 m, farther than these radios reach, with antenna delays that were not programmed."""
 
 
 def _shorter_replies(initiator: Ints, target: Ints, reply: Ints) -> Bools:
@@ -353,38 +344,3 @@ def exchange_of(exchanges: Exchanges, overheard: Columns) -> Ints:
     row = np.full(int(number.max(initial=-1)) + 1, -1)
     row[number[: len(e)]] = np.arange(len(e))
     return row[number[len(e) :]]
-
-
-def receptions_of(exchanges: Exchanges, overheard: Columns | None = None) -> Receptions:
-    """Return every reception of exchanges with stamps, and of what listeners overheard, in order of frames.
-
-    Frame k of the exchange in row n has the number 3 n + k, from 0.
-    """
-    h: Columns = overheard or {}
-    whose = exchange_of(exchanges, h) if h and len(h["time_ns"]) else np.zeros(0, dtype=np.int64)
-    heard = np.flatnonzero(whose >= 0)
-    third = {name: PROTOCOLS[name].third_sender for name in np.unique(exchanges.protocol).tolist()}
-    sender3 = np.array([third[name] or "" for name in exchanges.protocol.tolist()], dtype="U9")
-    parts = []
-    for k in range(3):
-        target_sends = (sender3 == "target") if k == 2 else np.full(len(exchanges), k == 1)
-        there = (sender3 != "") if k == 2 else (exchanges.tx1 | exchanges.rx1 | exchanges.tx2 | exchanges.rx2) != 0
-        ends = exchanges.initiator, exchanges.target
-        sender, listener = np.where(target_sends, ends[::-1], ends)
-        tx = getattr(exchanges, f"tx{k + 1}")
-        nothing = np.full(len(exchanges), np.nan)
-        power, skew = (
-            getattr(exchanges, f"{name}{k + 1}_{u}", nothing) for name, u in (("fpp", "dbm"), ("skew", "ppm"))
-        )
-        of_frame = [exchanges.time_ns, 3 * np.arange(len(exchanges)) + k, sender]
-        own = [*of_frame, listener, tx, getattr(exchanges, f"rx{k + 1}"), power, skew]
-        parts.append([column[there] for column in own])
-        if len(heard):
-            rows = whose[heard]
-            more = [*(c[rows] for c in of_frame), h["listener"][heard], tx[rows], h[f"rx{k + 1}"][heard]]
-            more += [h[f"fpp{k + 1}_dbm"][heard], h[f"skew{k + 1}_ppm"][heard]]
-            parts.append([column[there[rows]] for column in more])
-    names = ("time_ns", "frame", "sender", "listener", "tx", "rx", "fpp_dbm", "skew_ppm")
-    columns: dict[str, Any] = {n: np.concatenate([p[k] for p in parts]) for k, n in enumerate(names)}
-    found = Receptions(rxp_dbm=np.full(len(columns["tx"]), np.nan), bits=exchanges.bits, **columns)
-    return found[np.argsort(found.frame, kind="stable")]

@@ -167,20 +167,16 @@ def intervals(exchanges: Exchanges) -> Intervals:
     )
 
 
-_RANGED_AFTER: Final = {None: 0.5, "target": 0.0, "initiator": 1.0}
-"""Share of the initiator's round trip after which a distance is what a range says, by the sender of the third message.
-
-With flights t1, t2, t3 that change with the distance the formulas give, to first order: (t1 + t2)/2 for two messages;
-t1 where the target sends the third, because the ratio of the clocks holds the Doppler shift; t2 where the initiator
-does (docs/theory.md, "Predicting a protocol").
-"""
-
-
 def range_ns(exchanges: Exchanges) -> Ints:
-    """Return the time (n,) in ns of the distance that a range measures while it changes."""
+    """Return the time (n,) in ns of the distance that a range measures while it changes.
+
+    It is a share of the initiator's round trip after the poll. With flights t1, t2, t3 that change with the distance
+    the formulas give, to first order: (t1 + t2)/2 for two messages; t1 where the target sends the third, because the
+    ratio of the clocks holds the Doppler shift; t2 where the initiator does (docs/theory.md, "Predicting a protocol").
+    """
     share = np.zeros(len(exchanges))
     for row, rows in _rows_by_protocol(exchanges.protocol):
-        share[rows] = _RANGED_AFTER[row.third_sender]
+        share[rows] = {None: 0.5, "target": 0.0, "initiator": 1.0}[row.third_sender]
     return exchanges.time_ns + np.rint(intervals(exchanges).dt41 * share * (TICK_S * 1e9)).astype(np.int64)
 
 

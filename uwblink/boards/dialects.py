@@ -10,9 +10,9 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from itertools import chain, product
 from pathlib import Path
 from typing import Any, Final
@@ -32,13 +32,6 @@ from uwblink.recording.file import Recording
 from uwblink.recording.schema import Tag
 from uwblink.twr import LARGEST_ID, STAMPS
 from uwblink.wire.messages import RangeReport
-
-MAX_PRINTED_BYTES: Final = 4096
-"""Bytes after which a line without an end is dropped; a list of 64 ranges takes half of that."""
-
-PATIENCE_LINES: Final = 50
-"""Lines without a range after which a board is taken to print another form: banners and menus are shorter (a
-judgement)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,16 +94,6 @@ def parser_of(known: ColumnMap) -> Callable[[Sequence[str]], list[PrintedRange]]
     return parse
 
 
-def check_dialect(row: Any) -> None:
-    """Raise `ArgumentError` for a row that cannot be a dialect."""
-    fields = {
-        "help": (is_text, "a line of text"),
-        "parse": (callable, "a function from lines to ranges"),
-        "start": (lambda found: isinstance(found, bytes), "bytes"),
-    }
-    check_row("dialect", row, Dialect, fields)
-
-
 # The shell of the DWM1001 opens on two carriage returns; `lec` prints distances as comma-separated lines.
 _START: Final = {"dwm1001-lec": b"\r\rlec\r", "dwm1001-les": b"\r\rles\r"}
 
@@ -118,7 +101,16 @@ DIALECTS: Final[Registry[Dialect]] = Registry(
     "dialect",
     "uwbcal.dialects",
     tuple(Dialect(name, LINES[name]["line"], parser_of(map_of_lines(name)), _START.get(name, b"")) for name in LINES),
-    check_dialect,
+    partial(
+        check_row,
+        "dialect",
+        Dialect,
+        {
+            "help": (is_text, "a line of text"),
+            "parse": (callable, "a function from lines to ranges"),
+            "start": (lambda found: isinstance(found, bytes), "bytes"),
+        },
+    ),
 )
 """Dialects by name: the project's, and those of installed distributions."""
 
@@ -188,22 +180,20 @@ def printed_ranges(
     own = list(ids) or list(range(1, len(names) + 1))
     if len(own) != len(names) or len(set(own)) < len(own):
         raise PlanError(f"{len(names)} ports and {len(own)} ids of boards; give each port an id of its own")
-    for one in own:
-        seen.number(one)
+    seen.numbers |= {one: one for one in own}
     with ExitStack() as stack:
-        opened: list[Transport] = []
-        for name in names:
-            opened.append(using.open(name))
-            stack.callback(using.close, opened[-1])
-        begun = {id(port): (board, _Lines(port.name)) for port, board in zip(opened, own, strict=True)}
-        for port in opened:
-            if dialect.start:
-                port.write(dialect.start)
+        boards: dict[Transport, tuple[int, _Lines]] = {}
+        for name, board in zip(names, own, strict=True):
+            port = using.open(name)
+            stack.callback(port.close)
+            boards[port] = board, _Lines(name)
+        for port in boards if dialect.start else ():
+            port.write(dialect.start)
         start_s, seen.start_ns = using.now_s(), using.host_ns()
         while not stop() and seen.time_s < duration_s:
             turns = []
-            for port in using.wait(min(0.1, duration_s - seen.time_s)):
-                board, lines = begun[id(port)]
+            for port in using.wait([*boards], min(0.1, duration_s - seen.time_s)):
+                board, lines = boards[port]
                 came = lines.feed(port.read(0.0))
                 found = list(dialect.parse(came)) if came else []
                 lines.note(came, found)
@@ -239,13 +229,14 @@ class _Lines:
     def feed(self, data: bytes) -> list[str]:
         """Take bytes; return the lines that ended in them."""
         *lines, self._rest = re.split(rb"[\r\n]+", self._rest + data)
-        self._rest = self._rest[-MAX_PRINTED_BYTES:]
+        self._rest = self._rest[-4096:]  # of a line without an end; a list of 64 ranges takes half of that
         return [line.decode("latin-1") for line in lines if line.strip()]
 
     def note(self, lines: Sequence[str], found: Sequence[PrintedRange]) -> None:
         """Note lines and their ranges; raises `BoardError` where the board prints another form."""
         self._good, self._others = self._good or bool(found), self._others + len(lines)
-        if not self._good and self._others > PATIENCE_LINES:
+        # Banners and menus are shorter (a judgement).
+        if not self._good and self._others > 50:
             raise BoardError(
                 f"{self.name}: no range in {self._others} lines, the last is {lines[-1]!r:.80}; name another dialect, "
                 "or a template of lines"
@@ -276,7 +267,7 @@ def record_printed(
     meta = {"source": "record", "dialect": dialect.name, "notes": ["ranges without stamps, as the boards print them"]}
     with Recording.create(path, meta=meta, force=force, live=True) as recording:
         try:
-            with RecordingWriter(recording) as writer:
+            with suppress(KeyboardInterrupt), RecordingWriter(recording) as writer:
                 begun, watched_s = set[Pair](), -1.0
                 for turns in chain([first], batches):
                     for listener in others:
@@ -290,8 +281,6 @@ def record_printed(
                     if seen.time_s - watched_s > 0.25:
                         watched_s = seen.time_s
                         watch(seen)
-        except KeyboardInterrupt:
-            pass
         finally:
             names = {number: name if isinstance(name, str) else f"tag{name}" for name, number in seen.numbers.items()}
             recording.append_tags(Tag(number, names[number], (0.0, 0.0, 0.0)) for number in sorted(names))

@@ -33,9 +33,6 @@ from uwblink.wire.codec import exchanges_of
 PICTURE_WIDTH, PICTURE_HEIGHT, PICTURE_MARGIN = 260, 44, 3
 """Size of a pair's picture, and of the margin around its lines, in pixels."""
 
-SILENT_NS: Final = 2_000_000_000
-"""A pair is silent after this time without a range: the time over which rates are counted."""
-
 SCRIPT: Final = """
 setInterval(async()=>{const m=document.querySelector('main');try{const r=await fetch('/body');
 if(r.ok){m.innerHTML=await r.text();document.title=m.querySelector('h1').textContent;}
@@ -220,7 +217,8 @@ def picture(time_ns: Sequence[int], series: Mapping[str, Sequence[float]]) -> st
         (PICTURE_HEIGHT - 2 * PICTURE_MARGIN) / max(high - low, 1e-3),
     )
     lines = ""
-    pieces = np.split(np.arange(len(time_ns)), np.flatnonzero(np.diff(time_ns) > SILENT_NS) + 1)
+    # Two seconds: the time over which rates are counted.
+    pieces = np.split(np.arange(len(time_ns)), np.flatnonzero(np.diff(time_ns) > 2_000_000_000) + 1)
     for kind, values in series.items():
         for piece in pieces:
             points = " ".join(

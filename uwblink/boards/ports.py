@@ -55,13 +55,10 @@ class Ports(Protocol):
     """What a recorder needs of all ports; `uwbsim.VirtualPorts` has virtual time."""
 
     def open(self, name: str) -> Transport:
-        """Open a port and watch it; raises one of the `PortError`s."""
+        """Open a port; raises one of the `PortError`s."""
 
-    def close(self, port: Transport) -> None:
-        """Close a port that was opened here."""
-
-    def wait(self, timeout_s: float) -> Sequence[Transport]:
-        """Return ports at which bytes may be waiting, none when the time is over."""
+    def wait(self, ports: Sequence[Any], timeout_s: float) -> Sequence[Transport]:
+        """Return those of open ports at which bytes may be waiting, none when the time is over."""
 
     def now_s(self) -> float:
         """Return a time that never goes back, in seconds; that of the ports."""
@@ -137,27 +134,19 @@ class SerialPorts:
     """The serial ports of this computer."""
 
     def __init__(self, baud_rate: int = 19_200) -> None:
-        """Start the clock; no port is open. Ports are opened at a rate."""
+        """Start the clock. Ports are opened at a rate."""
         self._baud_rate = baud_rate
-        self._open: list[SerialPort] = []
         # No change of the wall clock moves the times of a recording.
         self._epoch_ns = time.time_ns() - _since_boot_ns()
 
     def open(self, name: str) -> SerialPort:
-        """Open a port and watch it; raises one of the `PortError`s."""
-        port = SerialPort(name, self._baud_rate)
-        self._open.append(port)
-        return port
+        """Open a port; raises one of the `PortError`s."""
+        return SerialPort(name, self._baud_rate)
 
-    def close(self, port: Transport) -> None:
-        """Close a port that was opened here."""
-        self._open = [one for one in self._open if one is not port]
-        port.close()
-
-    def wait(self, timeout_s: float) -> Sequence[SerialPort]:
+    def wait(self, ports: Sequence[Any], timeout_s: float) -> Sequence[SerialPort]:
         """Return ports at which bytes may be waiting; those without a descriptor must be asked again and again."""
-        polled = [port for port in self._open if port.fileno is None]
-        watched = {port.fileno: port for port in self._open if port.fileno is not None}
+        polled = [port for port in ports if port.fileno is None]
+        watched = {port.fileno: port for port in ports if port.fileno is not None}
         timeout_s = min(timeout_s, POLL_S) if polled else timeout_s
         return [watched[fileno] for fileno in select.select(watched, [], [], max(timeout_s, 0.0))[0]] + polled
 

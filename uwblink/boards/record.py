@@ -102,17 +102,14 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
             recording.append_tags(placed.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
             with RecordingWriter(recording) as writer:
                 listening = [writer, DelayCheck(delays), *others]
-                recorder = Recorder(found, plan, turns, listening, passive=passive, ports=using)
 
                 def report(progress: Progress) -> None:
                     progress.waiting, progress.behind_s = writer.waiting, writer.behind_s
                     if watch:
                         watch(progress)
 
-                try:
+                with Recorder(found, plan, turns, listening, passive=passive, ports=using) as recorder:
                     recorder.run(duration_s, stop, report)
-                finally:
-                    recorder.close()
             if arrangement:
                 first_ns = recorder.progress.start_ns
                 mark = replace(mark, start_ns=first_ns, end_ns=max(using.host_ns(), first_ns + 1))
@@ -158,11 +155,8 @@ def identify(names: Iterable[str], ports: Ports | None = None) -> dict[int, str]
     using = ports or SerialPorts()
     found: dict[int, str] = {}
     for name in names:
-        port = using.open(name)
-        try:
-            number = Board(port).id
-        finally:
-            using.close(port)
+        with Board(using.open(name)) as board:
+            number = board.id
         if number in found:
             raise PlanError(f"{found[number]} and {name} both have the id {number}; ids must differ")
         found[number] = name

@@ -15,6 +15,7 @@ from uwblink.boards.board import FENCE, QUIET_AFTER_CIR_S, QUIET_TARGET_S, Board
 from uwblink.boards.listeners import Heard, Listener, Pair, PairState, Progress, ReportCheck, Turn
 from uwblink.boards.ports import Ports, SerialPorts, Transport, serial_number
 from uwblink.boards.ranging_plan import RangingPlan
+from uwblink.closing import Closing
 from uwblink.errors import BoardError, PortError, PortLostError
 from uwblink.recording.schema import Fault
 from uwblink.wire.codec import LONGEST_LINE, Event
@@ -65,7 +66,7 @@ class Station:
     def unplug(self, now_s: float) -> None:
         """Close the port of a board that is gone."""
         if self.port is not None:
-            self._ports.close(self.port)
+            self.port.close()
         self.port, self._retry_s = None, now_s + 0.2
 
     def plug_again(self, now_s: float) -> bool:
@@ -87,7 +88,7 @@ class Station:
         self._todo = deque([*again, SetPassive(True)] if self._passive else again)
 
 
-class Recorder:
+class Recorder(Closing):
     """The loop of a recording: `boards` maps ids to ports, `turns` are the pairs that take turns."""
 
     def __init__(
@@ -156,14 +157,15 @@ class Recorder:
                 with suppress(BoardError, PortError):
                     Board(station.port, connection=station.connection).set_passive(False)
             with suppress(PortError):
-                self._ports.close(station.port)
+                station.port.close()
 
     def _step(self, end_s: float) -> None:
         """Wait for the next event and handle it."""
         for listener in self._listeners:
             listener.check()
         self._begin()
-        ready = self._ports.wait(self._wait_s(end_s))
+        opened = [station.port for station in self._stations.values() if station.port is not None]
+        ready = self._ports.wait(opened, self._wait_s(end_s))
         for station in self._stations.values():
             if station.plug_again(self._ports.now_s()):
                 self._fault(station, "replugged", f"{station.name}: board {station.board} is back")

@@ -396,19 +396,16 @@ def stream(
         )
     _check_dialect(dialect, ids, plan=plan, rate=rate, antenna_delays=antenna_delays, use=use == "receptions")
     seen, count = uwblink.boards.Progress(), 0
-    senders: list[Callable[[uwblink.StreamedRange], object]] = (
-        [] if quiet else [lambda found: typer.echo(found.to_json())]
-    )
+    senders: list[Callable[[uwblink.StreamedRange], object]] = []
 
     def send_on(found: uwblink.StreamedRange | uwblink.streaming.StreamedDifference) -> None:
         nonlocal count
-        if isinstance(found, uwblink.streaming.StreamedDifference):
-            if not quiet:
-                typer.echo(found.to_json())
-            return
-        count += 1
-        for send in senders:
-            send(found)
+        if not quiet:
+            typer.echo(found.to_json())
+        if isinstance(found, uwblink.StreamedRange):
+            count += 1
+            for send in senders:
+                send(found)
 
     with ExitStack() as stack:
         stop = stack.enter_context(interrupts())

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import duckdb
 import numpy as np
@@ -136,11 +136,6 @@ class Exporter:
     help: str
 
 
-def check_exporter(row: Any) -> None:
-    """Raise `ArgumentError` for a row that cannot be an exporter."""
-    check_row("exporter", row, Exporter, {"write": (callable, "a function of two paths")})
-
-
 EXPORTERS: Final[Registry[Exporter]] = Registry(
     "exporter",
     "uwbcal.exporters",
@@ -164,7 +159,7 @@ EXPORTERS: Final[Registry[Exporter]] = Registry(
         Exporter("mcap", write_mcap, "one file of JSON messages, for Foxglove and PlotJuggler"),
         Exporter("rosbag2", write_rosbag2, "a bag of ROS 2: PoseStamped, tf, sensor_msgs/Range and Imu"),
     ),
-    check_exporter,
+    partial(check_row, "exporter", Exporter, {"write": (callable, "a function of two paths")}),
 )
 """Exporters by name: the project's, those of `register_exporter`, and those of installed distributions."""
 

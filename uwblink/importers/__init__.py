@@ -75,7 +75,6 @@ def check_importer(row: Any) -> None:
     """Raise `ArgumentError` for a row that cannot be an importer."""
     check_row(
         "importer",
-        row,
         Importer,
         {
             "suffixes": (
@@ -89,6 +88,7 @@ def check_importer(row: Any) -> None:
             "help": (is_text, "a line of text"),
             "map_help": (lambda found: found is None or is_text(found), "a line of text"),
         },
+        row,
     )
 
 
@@ -293,17 +293,13 @@ def _choose(
     return sources, row, None if map_file is None else Path(map_file)
 
 
-DATA_FRAME = "data frame"
-"""What messages and recordings call a data frame."""
-
-
 def _write_frame(frame: Any, folder: Path) -> Path:
     """Write a data frame as Parquet into a folder, named indices as columns; raises `ImportTableError`."""
-    path = folder / f"{DATA_FRAME}.parquet"
+    path = folder / "data frame.parquet"  # what messages and recordings call it
     if any(name is not None for name in getattr(getattr(frame, "index", None), "names", [])):
         frame = frame.reset_index()
     with (
-        raising(ImportTableError, f"{DATA_FRAME}: cannot be read", duckdb.Error, TypeError, ValueError),
+        raising(ImportTableError, f"{path.stem}: cannot be read", duckdb.Error, TypeError, ValueError),
         connect(folders=[folder]) as db,
     ):
         db.register("frame", frame)
@@ -327,6 +323,6 @@ def _map_of_frame(table: Path, given: str | os.PathLike[str] | Mapping[str, Any]
     if found.asked or not found.complete:
         what = f"state {' and '.join(found.asked)}" if found.asked else "name its columns"
         proposed = "\n".join(line for line in found.text.splitlines()[1:] if line)
-        raise ImportTableError(f"{DATA_FRAME}: {what} in `map`, a mapping or a file such as\n{proposed}")
+        raise ImportTableError(f"{table.stem}: {what} in `map`, a mapping or a file such as\n{proposed}")
     path.write_text(found.text, "utf-8")
     return path

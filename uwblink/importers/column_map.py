@@ -72,9 +72,6 @@ NAMES: Final = (
 )  # fmt: skip
 """The columns of tables; `event` has words that tell whether a stamp is of transmission or of reception."""
 
-NAMES_OF_POSES: Final = ("body", *POSE)
-"""The columns of files of poses besides `time_s`, for `uwblink poses --map`."""
-
 STAMP_UNITS: Final = {
     "ticks": 1.0,
     "ps": TICKS_PER_SECOND * 1e-12,
@@ -304,7 +301,7 @@ def load_map(path: Path) -> ColumnMap:
     if known := LINES.get(table.get("line", "")):
         file.table = table = known | table | {"line": known["line"]}
     columns, units, constants, ids, wide = (file.section(n) for n in ("columns", "units", "constants", "ids", "wide"))
-    file.known(columns, (*NAMES, *NAMES_OF_POSES), "columns.")
+    file.known(columns, (*NAMES, "body", *POSE), "columns.")  # the last are of poses, for `uwblink poses --map`
     file.known(wide, NAMES, "wide.")
     templates = [
         name for name in ("line", "from_name", "each") if name in table and (name != "each" or "line" in table)

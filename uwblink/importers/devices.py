@@ -40,13 +40,12 @@ class Chip:
     """Limits of received powers."""
 
 
-_INTEGRATOR_HZ: Final = 998.4e6 / 2 / 1024 / 131072
-"""Carrier offset per unit of the carrier integrator at 850 kb/s and 6.8 Mb/s, by the vendor's driver; positive if the
-receiver's clock is faster."""
-
 _PPM: Final = {"ppm": 1.0, "-ppm": -1.0}
 _CHANNELS: Final = {
-    f"integrator-{n}": _INTEGRATOR_HZ * 1e6 / hz for n, hz in ((2, 3993.6e6), (5, 6489.6e6), (9, 7987.2e6))
+    # Carrier offset per unit of the carrier integrator at 850 kb/s and 6.8 Mb/s, by the vendor's driver; positive if
+    # the receiver's clock is faster.
+    f"integrator-{n}": 998.4e6 / 2 / 1024 / 131072 * 1e6 / hz
+    for n, hz in ((2, 3993.6e6), (5, 6489.6e6), (9, 7987.2e6))
 }
 
 CHIPS: Final = {

@@ -51,7 +51,6 @@ from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import STAMPS, raw_range
 
-LOG_SUFFIXES: Final = (".txt", ".log", ".dat", ".txt.gz", ".log.gz")
 TABLE_SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".parquet", ".jsonl", ".ndjson", ".jsonl.gz")
 
 _BESIDE: Final = {
@@ -85,7 +84,7 @@ def tables_in(folder: Path, column_map: ColumnMap) -> list[Path]:
     A template of names (`from_name`) chooses those that match it, in folders within, too.
     """
     name = Template(column_map.from_name) if column_map.from_name else None
-    suffixes = (*TABLE_SUFFIXES, *LOG_SUFFIXES) if column_map.line else TABLE_SUFFIXES
+    suffixes = TABLE_SUFFIXES + ((".txt", ".log", ".dat", ".txt.gz", ".log.gz") if column_map.line else ())
     inner = folder.rglob("*") if name and "/" in name.text else folder.iterdir()
     paths = sorted(p for p in inner if (name.match(p.as_posix()) if name else p.name.lower().endswith(suffixes)))
     if not paths:
@@ -164,12 +163,10 @@ def _notes(staging: Staging) -> list[str]:
         total = staging.offsets[-1]
         notes.append(f"{staging.blanks} of {total} rows or cells hold no range, and are left out")
     if not staging.rows.has("time_s"):
-        notes.append(f"there are no times; {_TIMED[staging.column_map.layout == 'broadcasts']}")
+        rows = "rows are taken as a millisecond apart, in their order"
+        timed = "frames are timed by their stamps" if staging.column_map.layout == "broadcasts" else rows
+        notes.append(f"there are no times; {timed}")
     return notes
-
-
-_TIMED: Final = ("rows are taken as a millisecond apart, in their order", "frames are timed by their stamps")
-"""How rows of tables without times get some, and frames of broadcasts."""
 
 
 def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) -> tuple[StagedRows, Reading | None]:

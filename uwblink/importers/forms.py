@@ -179,7 +179,8 @@ def form_of(path: Path) -> tuple[ColumnMap, Entries]:
 def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
     """Return the form of a log by the templates of its first lines, with a time before them if there is one."""
     with reading(path), open_file(path) as file:
-        lines = [line.decode("latin-1").rstrip("\r\n") for line in islice(file, 400)]
+        # The time of a search grows with the square of a line's length; no board prints 10,000 letters in one.
+        lines = [line[:10_000].decode("latin-1").rstrip("\r\n") for line in islice(file, 400)]
     # Boards begin to print at different times, and in the middle of lines.
     if 5 * sum(map(bool, map(object_in, lines))) > sum(map(bool, lines)):
         return ColumnMap(line=JSON_LINE), {"line": (JSON_LINE, "lines that end with an object of JSON")}
@@ -204,10 +205,6 @@ def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
     return replace(form, line=line), entries
 
 
-_DEVICE: Final = r"(an|anchor|anker|a|node|beacon|bs|responder|target|to|device|dev|uwb|id|ch)"
-_HELD: Final = ("range_m", "gt_range_m", "fpp2", "rxp2", "skew2")
-
-
 def wide_columns(names: Sequence[str], taken: Mapping[str, str]) -> dict[str, str | dict[str, str]]:
     """Return the families of columns that differ by the number of a device, as the values of `wide`.
 
@@ -219,12 +216,13 @@ def wide_columns(names: Sequence[str], taken: Mapping[str, str]) -> dict[str, st
     matches = (re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", name) for name in names if name not in ends)
     stems = [(match[1], match[3]) for match in matches if match]
     found: dict[str, str | dict[str, str]] = {}
+    device = r"(^|_)(an|anchor|anker|a|node|beacon|bs|responder|target|to|device|dev|uwb|id|ch)(?=_|$)"
     for before, after in dict.fromkeys(stem for stem in stems if stems.count(stem) > 1):
         plain = plain_name(f"{before} {after}")
-        bare = re.sub(rf"(^|_){_DEVICE}(?=_|$)", "", plain)
+        bare = re.sub(device, "", plain)
         # Without words of devices nothing but a unit may remain.
         short = r"|(r|d|dis|dis_arr(ay)?|data|ranges|distances|dists)" + ("|" if bare != plain else "")
-        for ours in _HELD:
+        for ours in ("range_m", "gt_range_m", "fpp2", "rxp2", "skew2"):
             pattern = f"_?({PATTERNS[ours]}{short if ours == 'range_m' else ''}){{end}}".format_map(WORDS)
             if ours not in found and re.fullmatch(pattern, bare):
                 found[ours] = f"{before}{{to_id}}{after}"
@@ -232,21 +230,16 @@ def wide_columns(names: Sequence[str], taken: Mapping[str, str]) -> dict[str, st
     return found if "range_m" in found else {}
 
 
-_REGISTERS: Final = {
-    "f1": r"fp_?ampl?(itude)?_?1|f1",
-    "f2": r"fp_?ampl?(itude)?_?2|f2",
-    "f3": r"fp_?ampl?(itude)?_?3|f3",
-    "n": r"rx_?pacc(_?nosat)?|preamble_?(acc(um)?_?)?count|acc(um)?_?count",
-    "c": r"cir_?(pwr|power)",
-    "d": r"dgc(_?decision)?",
-}
-
-
 def register_columns(names: Sequence[str]) -> dict[str, dict[str, str]]:
     """Return the powers that can be made of registers, as their values in a map, by "fpp" and "rxp"."""
+    called = {f"f{k}": rf"fp_?ampl?(itude)?_?{k}|f{k}" for k in (1, 2, 3)} | {
+        "n": r"rx_?pacc(_?nosat)?|preamble_?(acc(um)?_?)?count|acc(um)?_?count",
+        "c": r"cir_?(pwr|power)",
+        "d": r"dgc(_?decision)?",
+    }
     found = {
         key: header
-        for key, pattern in _REGISTERS.items()
+        for key, pattern in called.items()
         if (header := next((name for name in names if re.fullmatch(pattern, plain_name(name))), None))
     }
     wanted = {"fpp": ("f1", "f2", "f3", "n"), "rxp": ("c", "n")}

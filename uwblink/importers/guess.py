@@ -399,8 +399,6 @@ NO_POSES: Final = (
     "also needs attitudes, and anchors or first positions (calib.fit_from_ranges); constants of pairs need true "
     "distances (docs/without-motion-capture.md)"
 )
-MESSAGES_READ: Final = 2000
-"""Messages of each group of topics that are looked at (a judgement)."""
 
 _NUMBERS: Final = r"std_msgs/msg/(Float|U?Int)[0-9]+(MultiArray)?"
 _OTHERS: Final = (
@@ -454,7 +452,7 @@ def _of_bag(path: Path) -> Guess:
 
 def _guess_topics(bag: Bag, pattern: str, topics: list[str], table: Path) -> Guess:
     """Return the map of topics of one type by their first messages, which are written as a table."""
-    kind, read = bag.kinds[topics[0]], islice(bag.messages(topics), MESSAGES_READ)
+    kind, read = bag.kinds[topics[0]], islice(bag.messages(topics), 2000)  # a judgement
     rows = [(topic, fields_of(kind, message)) for topic, _, _, message in read]
     free = _ends_without_field(rows[0][1] if rows else {})
     key = _with_places(pattern, topics[0], free)

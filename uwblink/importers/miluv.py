@@ -20,6 +20,7 @@ import yaml
 from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError, raising
 from uwblink.importers.plausibility import clocks, to_ticks
+from uwblink.importers.poses import in_order
 from uwblink.importers.tables import Columns, number, open_table, time_ns, whole_number
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
@@ -34,7 +35,6 @@ Vectors = dict[str, dict[int, tuple[float, float, float]]]
 """Vectors by name and number: lever arms by robot and tag, or places in metres by constellation and anchor."""
 
 _PAIR: Final = {"initiator": "from_id", "target": "to_id"}
-_XYZ: Final = "groups of tags, each with [x, y, z] in metres"
 _IDS: Final = (*_PAIR, "listener", "board")
 
 
@@ -60,7 +60,12 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
         raise ImportTableError(
             f"{folder}: no such folder; expected one with a folder a robot (ifo001/uwb_range.csv ...)"
         )
-    start_ns = _read_yaml(folder / "timeshift.yaml", _start_ns, "whole numbers timeshift_s and timeshift_ns", 0)
+    start_ns = _read_yaml(
+        folder / "timeshift.yaml",
+        lambda table: int(table["timeshift_s"]) * 1_000_000_000 + int(table["timeshift_ns"]),
+        0,
+        expected="whole numbers timeshift_s and timeshift_ns",
+    )
     flight = FlightFolder(folder, tuple(sorted(path.parent for path in folder.glob("*/uwb_range.csv"))), start_ns)
     if not flight.robots:
         raise ImportTableError(f"{folder}: no folder in it holds uwb_range.csv, as those of MILUV's robots do")
@@ -223,7 +228,7 @@ def _read_poses(flight: FlightFolder) -> Poses:
 
 def _read_tags(flight: FlightFolder) -> list[Tag]:
     """Return the robots' tags and lever arms from tags.yaml; none without such a file."""
-    arms: Vectors = _read_yaml(flight.folder / "tags.yaml", _vectors, _XYZ, {})
+    arms: Vectors = _read_yaml(flight.folder / "tags.yaml", _vectors, {})
     names = {robot.name for robot in flight.robots}
     return [Tag(number, body, arm) for body, tags in arms.items() if body in names for number, arm in tags.items()]
 
@@ -238,7 +243,7 @@ def _find_anchors(
     constellation fits.
     """
     path = flight.folder / "anchors.yaml"
-    known: Vectors = _read_yaml(path, _vectors, _XYZ, {})
+    known: Vectors = _read_yaml(path, _vectors, {})
     if wanted is not None and wanted not in known:
         raise ImportTableError(f"{path}: no constellation {wanted[:40]!r}; there are {', '.join(known) or 'none'}")
     ends = exchanges.initiator, exchanges.target
@@ -266,17 +271,9 @@ def _with_anchors(
     poses: Poses, tags: list[Tag], places: dict[int, tuple[float, float, float]]
 ) -> tuple[Poses, list[Tag]]:
     """Return poses and tags with anchors added, each on a body of its own with a single pose."""
-    numbers = sorted(places)
-    anchors = [Tag(number, f"anchor{number}", (0.0, 0.0, 0.0)) for number in numbers]
-    begins = int(poses.time_ns.min()) if len(poses) else 0
-    position = np.array([places[number] for number in numbers], dtype=np.float64).reshape(-1, 3)
-    standing = Poses.from_arrays([begins] * len(numbers), [tag.body for tag in anchors], position)
-    return Poses.concatenate([poses, standing]).in_time_order(), [*tags, *anchors]
-
-
-def _start_ns(table: Any) -> int:
-    """Return the start of the clock by timeshift.yaml."""
-    return int(table["timeshift_s"]) * 1_000_000_000 + int(table["timeshift_ns"])
+    anchors = [Tag(number, f"anchor{number}", (0.0, 0.0, 0.0)) for number in sorted(places)]
+    standing = [Poses.from_arrays([0], tag.body, [places[tag.tag]]) for tag in anchors]
+    return in_order([poses, *standing]), [*tags, *anchors]
 
 
 def _vectors(table: Any) -> Vectors:
@@ -291,7 +288,13 @@ def _vectors(table: Any) -> Vectors:
     return found
 
 
-def _read_yaml(path: Path, convert: Callable[[Any], Found], expected: str, absent: Found) -> Found:
+def _read_yaml(
+    path: Path,
+    convert: Callable[[Any], Found],
+    absent: Found,
+    *,
+    expected: str = "groups of tags, each with [x, y, z] in metres",
+) -> Found:
     """Return a YAML file as `convert` makes it, `absent` without a file; raises `ImportTableError` if it fails."""
     if not path.exists():
         return absent

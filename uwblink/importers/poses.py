@@ -209,7 +209,7 @@ def add_poses(
     what = ", ".join(str(path) for path in files.values()) or str(tags_from)
     given, anchors = load_places(tags_from) if tags_from else ((), {})
     fixed = [Tag(number, f"anchor{number}", (0.0, 0.0, 0.0)) for number in anchors]
-    poses = _in_order([*parts, *(Poses.from_arrays([0], f"anchor{n}", [place]) for n, place in anchors.items())])
+    poses = in_order([*parts, *(Poses.from_arrays([0], f"anchor{n}", [place]) for n, place in anchors.items())])
     with Recording.open(recording, update=True) as opened:
         if not force and (there := opened.count("poses")):
             raise RecordingExistsError(f"{recording}: holds {there} poses already; `force` replaces them")
@@ -268,7 +268,7 @@ def _check_units(what: str, exchanges: Exchanges, poses: Poses, tags: Sequence[T
         raise ImportTableError(f"{what}: {found}, not metres, by comparison of ranges and distances; convert them")
 
 
-def _in_order(parts: list[Poses]) -> Poses:
+def in_order(parts: list[Poses]) -> Poses:
     """Join poses in order of time; single poses of bodies that stand still get the first time of the others."""
     if len(parts) == 1:
         return parts[0]
@@ -331,7 +331,7 @@ def _from_text(path: Path, file: TextIO, body: str | None, stated: ColumnMap) ->
     head = list(islice(split, 40))
     word = head[0][0].strip() if head and head[0] else ""
     if blanks or word.lower().startswith("#timestamp"):
-        layout = _single(path, *(_TUM if blanks else _EUROC), body)
+        layout = _single(path, body, blanks=blanks)
     else:
         layout = _FORMS[word](path, [*head, [], []]) if word in _FORMS else _plain(path, head, body, stated)
     times, bodies, values = array("q"), list[str](), array("d")
@@ -396,16 +396,16 @@ def _number(cell: str) -> float:
         return math.nan
 
 
-_TUM: Final = "TUM", ("time_s", *POSE), 0
-_EUROC: Final = "EuRoC", ("time_ns", "x", "y", "z", "qw", "qx", "qy", "qz"), 1
-
-
-def _single(path: Path, form: str, names: tuple[str, ...], header: int, body: str | None) -> PoseLayout:
+def _single(path: Path, body: str | None, *, blanks: bool) -> PoseLayout:
+    """Return the layout of TUM, whose cells have blanks between them, or of EuRoC."""
+    form, unit, quaternion = ("TUM", "s", POSE[3:]) if blanks else ("EuRoC", "ns", ("qw", "qx", "qy", "qz"))
     if not body:
         raise ImportTableError(f"{path}: a {form} file has no names of bodies; name its body with `body`")
-    bodies = {body: [names.index(name) for name in POSE]}
-    ns = TIME_UNITS[names[0].removeprefix("time_")]
-    return PoseLayout(form=form, names=names, time=0, ns=ns, bodies=bodies, header=header, gaps=False, comments=True)
+    names = (f"time_{unit}", *POSE[:3], *quaternion)
+    return PoseLayout(
+        form=form, names=names, time=0, ns=TIME_UNITS[unit], bodies={body: [names.index(name) for name in POSE]},
+        header=0 if blanks else 1, gaps=False, comments=True,
+    )  # fmt: skip
 
 
 _NAMES: Final = (

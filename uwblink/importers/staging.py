@@ -172,11 +172,12 @@ class Staging:
             if self.rows.has(name) and name not in {*self.column_map.registers, *self.column_map.constants}
         ]
         lacking = self.rows.values(", ".join(f"count(*) - count({name})" for name in there)) if there else ()
+        none = "'', 'nan', 'none', 'null', 'na', 'n/a', '-', '--', 'inf', '-inf'"  # words for no number
         for name in (name for name, count in zip(there, lacking, strict=True) if count):
             header, cells = self.column_map.header(name), list[tuple[str, int, bool]]()
             for table in self.tables:
                 text = table.text(header, numeric=True)
-                kept = f"WHERE lower(trim({text})) NOT IN {NO_VALUES} AND NOT {_is_missing(table, text)}"
+                kept = f"WHERE lower(trim({text})) NOT IN ({none}) AND NOT {_is_missing(table, text)}"
                 is_word = f"TRY_CAST({text} AS DOUBLE) IS NULL"
                 found = table.read({"first": f"any_value({text})", "n": "count(*)", "w": is_word}, f"{kept} GROUP BY 3")
                 cells += zip(found["first"].tolist(), found["n"].tolist(), found["w"].tolist(), strict=True)
@@ -266,11 +267,9 @@ def staged_cells(table: SourceTable) -> dict[str, str]:
 def _is_missing(table: SourceTable, text: str) -> str:
     """Return SQL that is true for a text that means no value, by the map."""
     missing = table.column_map.missing
-    table.db.execute(
-        "SET VARIABLE missing = ?", [["", *(one.strip().lower() for one in missing if isinstance(one, str))]]
-    )
+    words = table.variable("missing", ["", *(one.strip().lower() for one in missing if isinstance(one, str))])
     numbers = ", ".join(repr(float(one)) for one in missing if not isinstance(one, str))
-    is_word = f"list_contains(getvariable('missing'), lower(trim({text})))"
+    is_word = f"list_contains({words}, lower(trim({text})))"
     return f"({is_word} OR TRY_CAST({text} AS DOUBLE) IN ({numbers}))" if numbers else is_word
 
 
@@ -298,9 +297,6 @@ def _cell(table: SourceTable, name: str, text: str) -> str:
         return f"CASE WHEN NOT {_is_missing(table, text)} THEN {value} END"
     return value
 
-
-NO_VALUES: Final = "('', 'nan', 'none', 'null', 'na', 'n/a', '-', '--', 'inf', '-inf')"
-"""SQL of the words that programs write for no number, in small letters."""
 
 SUMMARIES: Final = frozenset(
     {

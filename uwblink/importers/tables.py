@@ -250,7 +250,7 @@ class SourceTable:
         """Fields of JSON lines that are lists of objects."""
         self.blank = ""
         """SQL that is true for rows that hold no range at all, such as an empty cell of a wide table; "" for none."""
-        db.execute(f"SET VARIABLE file{key} = ?", [str(path)])
+        self._file = self.variable("file", str(path))
         ending = path.name.lower().removesuffix(".gz")
         self._is_parquet = ending.endswith(".parquet")
         self._is_csv = not ending.endswith((".parquet", ".jsonl", ".ndjson", ".json")) and not column_map.line
@@ -262,6 +262,11 @@ class SourceTable:
         if len(self.names) > MAX_CELLS:
             raise ImportTableError(f"{path}: has {len(self.names)} columns, expected {MAX_CELLS} at most")
 
+    def variable(self, name: str, value: Any) -> str:
+        """Return SQL of a value that comes from a file or a map, as a variable of the connection."""
+        self.db.execute(f"SET VARIABLE {name}{self._key} = ?", [value])
+        return f"getvariable('{name}{self._key}')"
+
     def _open_csv(self) -> None:
         if self.column_map.each:
             raise ImportTableError(f"{self.path}: each is of JSON lines, bags and logs (with line), not of a table")
@@ -271,7 +276,7 @@ class SourceTable:
         columns = ", ".join(f"'{cell}': 'VARCHAR'" for cell in self._cells)
         mark = "\\t" if mark == "\t" else mark
         self.source = (
-            f"read_csv(getvariable('file{self._key}'), auto_detect=false, header=false, skip={self._skip}, "
+            f"read_csv({self._file}, auto_detect=false, header=false, skip={self._skip}, "
             f"delim='{mark}', quote='\"', escape='\"', columns={{{columns}}}, null_padding=true, store_rejects=true, "
             f"rejects_limit=0, rejects_table='rejects{self._key}', rejects_scan='scans{self._key}', "
             f"max_line_size={MAX_LINE_BYTES})"
@@ -281,20 +286,14 @@ class SourceTable:
         """Use the lines that a template matches, and each match of the other (`each`) in them as a row."""
         line = Template(self.column_map.line or "")
         self._decimal_comma = self.column_map.decimal == ","
-        each = Template(self.column_map.each) if self.column_map.each else None
-        self.db.execute(f"SET VARIABLE line{self._key} = ?", [line.pattern])
-        matching = (
-            f"SELECT line FROM {self._source_of_lines()} WHERE regexp_matches(line, getvariable('line{self._key}'))"
-        )
-        self.source = f"(SELECT row_number() OVER () AS row, {line.extract('line', f'line{self._key}')} AS s"
-        cells = line.columns("s")
-        if each:
-            self.db.execute(f"SET VARIABLE each{self._key} = ?", [each.pattern])
-            self.source += f", unnest(regexp_extract_all(line, getvariable('each{self._key}'))) AS element"
-            cells |= each.columns("e")
-        self.source += f" FROM ({matching}))"
-        if each:
-            self.source = f"(SELECT *, {each.extract('element', f'each{self._key}')} AS e FROM {self.source})"
+        pattern, cells = self.variable("line", line.pattern), line.columns("s")
+        matching = f"FROM {self._source_of_lines()} WHERE regexp_matches(line, {pattern})"
+        self.source = f"(SELECT row_number() OVER () AS row, line, {line.extract('line', pattern)} AS s {matching})"
+        if self.column_map.each:
+            each = Template(self.column_map.each)
+            pattern, cells = self.variable("each", each.pattern), cells | each.columns("e")
+            elements = f"SELECT *, unnest(regexp_extract_all(line, {pattern})) AS element FROM {self.source}"
+            self.source = f"(SELECT *, {each.extract('element', pattern)} AS e FROM ({elements}))"
         self.names, self._cells, self._expanded = tuple(cells), list(cells.values()), True
 
     def _source_of_lines(self) -> str:
@@ -303,7 +302,7 @@ class SourceTable:
             return "(SELECT unnest(getvariable('lines')) AS line)"
         check_lines(self.path, "\n")
         return (
-            f"read_csv(getvariable('file{self._key}'), auto_detect=false, header=false, delim='\x01', quote='', "
+            f"read_csv({self._file}, auto_detect=false, header=false, delim='\x01', quote='', "
             f"escape='', columns={{'line': 'VARCHAR'}}, strict_mode=false, encoding='latin-1', "
             f"max_line_size={MAX_LINE_BYTES})"
         )
@@ -329,17 +328,15 @@ class SourceTable:
             wanted = f"a list {each[:60]!r} of objects (each)" if each else "JSON objects"
             raise ImportTableError(f"{self.path}: holds no {wanted}, one a line")
         self.names = tuple(fields)
-        self.db.execute(f"SET VARIABLE fields{self._key} = ?", [list(fields.values())])
-        listed = f"getvariable('fields{self._key}')"
+        listed = self.variable("fields", list(fields.values()))
         self._cells = [f"json_extract_string(json, {listed}[{k}])" for k in range(1, len(fields) + 1)]
-        self.source = f"read_ndjson_objects(getvariable('file{self._key}'), ignore_errors=true)"
+        self.source = f"read_ndjson_objects({self._file}, ignore_errors=true)"
         if self.column_map.line:
             ends = f"SELECT TRY_CAST(regexp_extract(line, '[{{].*') AS JSON) AS json FROM {self._source_of_lines()}"
             self.source = f"(SELECT json FROM ({ends}) WHERE json_type(json) = 'OBJECT')"
         if each:
             # An element stands in place of the list that it is of.
-            self.db.execute(f"SET VARIABLE each{self._key} = ?", [each])
-            name = f"getvariable('each{self._key}')"
+            name = self.variable("each", each)
             escaped = f"replace(replace({name}, '~', '~0'), '/', '~1')"
             elements = f"unnest(CAST(json_extract(json, '/' || {escaped}) AS JSON[])) AS element"
             self.source = f"(SELECT row_number() OVER () AS row, json, {elements} FROM {self.source})"
@@ -347,7 +344,7 @@ class SourceTable:
             self.source, self._expanded = f"(SELECT row, {merged} FROM {self.source})", True
 
     def _open_parquet(self) -> None:
-        read = f"read_parquet(getvariable('file{self._key}'))"
+        read = f"read_parquet({self._file})"
         with self.reading():
             rows = self.db.execute(f"DESCRIBE SELECT * FROM {read}").fetchall()
         self.names = tuple(str(row[0]) for row in rows)
@@ -365,8 +362,8 @@ class SourceTable:
         }
         end = "from_id" if "{from_id}" in str(self.column_map.wide) else "to_id"
         if end not in lists:
-            self.db.execute(f"SET VARIABLE labels{self._key} = ?", [labels])
-            lists[end] = [f"getvariable('labels{self._key}')[{n}]" for n in range(1, len(labels) + 1)]
+            listed = self.variable("labels", labels)
+            lists[end] = [f"{listed}[{n}]" for n in range(1, len(labels) + 1)]
         cells = {ours: f"[{', '.join(cells)}][k]" for ours, cells in lists.items()}
         numbered = "" if self._expanded else ", row_number() OVER () AS row"
         self.source = f"(SELECT *{numbered}, unnest(range(1, {len(labels) + 1})) AS k FROM {self.source})"
@@ -396,9 +393,8 @@ class SourceTable:
         if values is None:
             raise ImportTableError(f"{self.path}: its name is not {self.column_map.from_name!r}, which the map states")
         self.named = frozenset(values)
-        for k, (name, value) in enumerate(values.items()):
-            self.db.execute(f"SET VARIABLE name{self._key}_{k} = ?", [value])
-            self.names, self._cells = (*self.names, name), [*self._cells, f"getvariable('name{self._key}_{k}')"]
+        self.names = (*self.names, *values)
+        self._cells += [self.variable(f"name{k}_", value) for k, value in enumerate(values.values())]
 
     @contextmanager
     def reading(self) -> Iterator[None]:

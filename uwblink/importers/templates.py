@@ -59,10 +59,10 @@ class Template:
                 found[name] = f"TRY_CAST('0x' || {group} AS BIGINT)" if form == "hex" else group
         return found
 
-    def extract(self, text: str, variable: str) -> str:
-        """Return SQL of the groups in an SQL text; `variable` of the connection holds the pattern."""
+    def extract(self, text: str, pattern: str) -> str:
+        """Return SQL of the groups in an SQL text; `pattern` is SQL of the pattern."""
         listed = ", ".join(f"'g{k}'" for k in range(max(1, len(self._places))))
-        return f"regexp_extract({text}, getvariable('{variable}'), [{listed}])"
+        return f"regexp_extract({text}, {pattern}, [{listed}])"
 
     def match(self, text: str) -> dict[str, str] | None:
         """Return the values at the end of a path or a topic, by place, without slashes; None if it does not match."""

@@ -186,7 +186,7 @@ def check_protocol(row: RangingProtocol) -> None:
     )
     title = (is_text, "what pages call it")
     fields = {"title": title, "messages": is_messages, "flight_ticks": formula, "delay_weights": formula}
-    check_row("protocol", row, RangingProtocol, fields)
+    check_row("protocol", RangingProtocol, fields, row)
     _check_messages(row)
     _check_formulas(row)
 

@@ -194,15 +194,12 @@ def stream(  # noqa: PLR0913 - options by name
         listener.on_start(turns)
 
     def live() -> Stream:
-        recorder = Recorder(found, chosen, turns, listening, passive=use == "receptions", ports=ports)
-        try:
+        with Recorder(found, chosen, turns, listening, passive=use == "receptions", ports=ports) as recorder:
             for _ in recorder.steps(duration_s, stop):
                 while ranges:
                     yield ranges.popleft()
             recorder.finish()
             yield from ranges
-        finally:
-            recorder.close()
 
     return live()
 

@@ -26,7 +26,6 @@ from typing import Final
 
 import simpy
 
-from uwblink.boards.ports import Transport
 from uwblink.errors import PortLostError, PortMissingError
 from uwblink.recording.schema import LARGEST_BOARD_ID, is_id
 from uwblink.wire.codec import encode
@@ -342,7 +341,6 @@ class VirtualPorts:
         self.bench = Bench(scenario, self._arrived, lost_share)
         self._epoch_ns = epoch_ns
         self._ports: dict[int, VirtualPort] = {}
-        self._opened: list[VirtualPort] = []
         self.names = {tag.id: f"virtual board {tag.id}" for tag in scenario.tags}
         self.transfers: deque[tuple[int, int, bytes]] = deque(maxlen=20_000)
         """The last 20,000 transfers of boards, some MB: time (ns), board, bytes of one USB transfer."""
@@ -360,19 +358,13 @@ class VirtualPorts:
             raise PortMissingError(f"{name}: no such port; there are {', '.join(self.names.values())}")
         port = self.port(tag)
         port.waiting.clear()
-        self._opened.append(port)
         return port
 
-    def close(self, port: Transport) -> None:
-        """Close a port."""
-        port.close()
-        self._opened = [p for p in self._opened if p is not port]
-
-    def wait(self, timeout_s: float) -> Sequence[VirtualPort]:
-        """Advance time until bytes wait at an open port, or to the timeout; return the ports to read from."""
+    def wait(self, ports: Sequence[VirtualPort], timeout_s: float) -> Sequence[VirtualPort]:
+        """Advance time until bytes wait at one of some ports, or to the timeout; return the ports to read from."""
 
         def ready() -> list[VirtualPort]:
-            return [p for p in self._opened if p.waiting or not self.bench.boards[p.tag].powered]
+            return [p for p in ports if p.waiting or not self.bench.boards[p.tag].powered]
 
         self.bench.advance_until(ready, timeout_s)
         return ready()

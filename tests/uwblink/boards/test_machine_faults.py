@@ -80,8 +80,8 @@ class Suspended(VirtualPorts):
     left_out_ns = 5 * 10**9
     at_ns = 10**9
 
-    def wait(self, timeout_s):
-        ready = super().wait(timeout_s)
+    def wait(self, ports, timeout_s):
+        ready = super().wait(ports, timeout_s)
         if self.now_ns() > self.at_ns and self.left_out_ns:
             self.bench.advance(self.now_ns() + self.left_out_ns)
             self.left_out_ns = 0
@@ -282,17 +282,13 @@ class Flooding:
 
     def __init__(self):
         self.time_s, self.said, self.piece = 0.0, 0, bytes(4096)
-        self.open_ports: list[FloodingPort] = []
 
     def open(self, name):
         return FloodingPort(self, name)
 
-    def close(self, port):
-        self.open_ports = [p for p in self.open_ports if p is not port]
-
-    def wait(self, _timeout_s):
+    def wait(self, ports, _timeout_s):
         self.time_s += 0.001
-        return self.open_ports
+        return ports
 
     def now_s(self):
         return self.time_s
@@ -307,7 +303,6 @@ class Flooding:
 class FloodingPort:
     def __init__(self, ports, name):
         self.ports, self.name, self.answer = ports, name, b""
-        ports.open_ports = [*ports.open_ports, self]
 
     def read(self, timeout_s):
         self.ports.time_s += min(timeout_s, 0.001)

@@ -44,6 +44,12 @@ def test_a_line_of_very_many_letters_is_named_with_its_row(tmp_path):
         assert "row 2" in refused(tmp_path / name)
 
 
+def test_a_map_of_a_line_without_an_end_is_refused_soon(tmp_path):
+    (tmp_path / "t.csv").write_text(HEAD + 5_000_000 * "1", encoding="utf-8")
+    # The patterns of logs were searched from each letter to the end of the line, which took minutes.
+    processes.refuse("uwblink", "import", "guess", tmp_path / "t.csv", naming=["t.csv: row 2"], timeout=90)
+
+
 def test_a_long_line_takes_no_memory(tmp_path):
     """Half a gigabyte in one line, of which no more than a few lines' worth is ever read."""
     with gzip.open(tmp_path / "t.csv.gz", "wb", compresslevel=1) as file:
