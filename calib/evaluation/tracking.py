@@ -88,8 +88,8 @@ class Track:
 
     @property
     def known(self) -> Bools:
-        """At which times (n,) the truth is known."""
-        return np.asarray(np.isfinite(self.truth_m).all(axis=1) & np.isfinite(self.true_attitude).all(axis=1))
+        """At which times (n,) the true position is known."""
+        return np.asarray(np.isfinite(self.truth_m).all(axis=1))
 
     @property
     def rmse_m(self) -> float:
@@ -242,7 +242,10 @@ def ranges_among(ranges: Ranges, tags: list[int]) -> Ranges:
 
 
 def used_part(ranges: Ranges, use: str) -> Ranges:
-    """Return ranges with what was overheard, if receptions are used, or without; raises what `require_arrivals` raises."""
+    """Return ranges with what was overheard, if receptions are used, or without it.
+
+    Raises what `require_arrivals` raises.
+    """
     if use == "receptions":
         require_arrivals(ranges)
         return ranges
