@@ -24,7 +24,7 @@ Complexes = NDArray[np.complex128]
 
 
 class ColumnTable:
-    """Base of dataclasses whose fields are columns of length n, one of them `time_ns`; other fields hold for all rows.
+    """Base of dataclasses whose fields are columns of length n; fields that are no arrays hold for all rows.
 
     A derived class defines `to_dict`, which names its columns for data frames, and `_title`.
     """
@@ -39,7 +39,8 @@ class ColumnTable:
 
     def __len__(self) -> int:
         """Return the number of rows."""
-        return len(self.time_ns)
+        values = (getattr(self, name) for name in self.__dataclass_fields__)  # type: ignore[attr-defined]
+        return next(len(one) for one in values if isinstance(one, np.ndarray))
 
     def __getitem__(self, rows: int | slice | Bools | Ints) -> Self:
         """Return the chosen rows, in their order; one row for a number."""

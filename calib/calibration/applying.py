@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.calibration.document import Value, pair_name, split_text
 from calib.calibration.patterns import patterns_m
@@ -17,40 +16,15 @@ from calib.data.arrivals import Arrivals
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, LeftOutWarning
 from calib.pairs import pairs_of
-from uwblink.arrays import Bools, Floats, data_frame
-from uwblink.display import as_html, as_text, excerpt, first_few
+from uwblink.arrays import Bools, ColumnTable, Floats
+from uwblink.display import as_text, excerpt, first_few
 
 if TYPE_CHECKING:
     from calib.calibration.model import Calibration
 
 
-class CorrectedColumns:
-    """Base of dataclasses whose fields are columns (n,), of which one is `raw_m`."""
-
-    __slots__ = ()
-    TITLE: ClassVar[str]
-    raw_m: Floats
-
-    def to_dict(self) -> dict[str, NDArray[Any]]:
-        """Return the columns by name, as `pandas.DataFrame` and `polars.DataFrame` take them."""
-        columns: dict[str, Any] = self.__dataclass_fields__  # type: ignore[attr-defined]
-        return {name: getattr(self, name) for name in columns if name != "TITLE"}
-
-    def to_pandas(self) -> Any:
-        """Return the columns as a `pandas.DataFrame`; raises `ArgumentError` where pandas is not installed."""
-        return data_frame(self.to_dict())
-
-    def __repr__(self) -> str:
-        """Return a headline and the first rows, in lines of 79 characters."""
-        return as_text(f"{len(self.raw_m)} {self.TITLE}", excerpt(self.to_dict()))
-
-    def _repr_html_(self) -> str:
-        """Return the same as HTML, for notebooks."""
-        return as_html(f"{len(self.raw_m)} {self.TITLE}", excerpt(self.to_dict()))
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class CorrectedRanges(CorrectedColumns):
+class CorrectedRanges(ColumnTable):
     """Ranges in three stages, metres, and what is known of them, shape (n,).
 
     `sigma_m` is the noise of direct ranges. `sigma_total_m` is the standard deviation of all of them, reflected ones
@@ -68,7 +42,6 @@ class CorrectedRanges(CorrectedColumns):
     (900,)
     """
 
-    TITLE = "corrected ranges"
     raw_m: Floats
     delay_corrected_m: Floats
     corrected_m: Floats
@@ -81,9 +54,12 @@ class CorrectedRanges(CorrectedColumns):
     tail_probability: Floats
     outlier: Bools
 
+    def _title(self) -> str:
+        return f"{len(self)} corrected ranges"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class CorrectedArrivals(CorrectedColumns):
+class CorrectedArrivals(ColumnTable):
     """Differences of arrival, metres, shape (n,): by how much farther from target than from initiator a listener is.
 
     `sigma_m` is the noise without reflections. Differences of one exchange share `shared_m` of it: the covariance of
@@ -92,13 +68,15 @@ class CorrectedArrivals(CorrectedColumns):
     shorter; NaN where a calibration has no error model.
     """
 
-    TITLE = "corrected differences of arrival"
     raw_m: Floats
     corrected_m: Floats
     sigma_m: Floats
     shared_m: Floats
     late_share: Floats
     early_share: Floats
+
+    def _title(self) -> str:
+        return f"{len(self)} corrected differences of arrival"
 
 
 class CorrectedRange(NamedTuple, Generic[Value]):

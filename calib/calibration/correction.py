@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,6 +18,7 @@ from calib.data.arrivals import arrivals_of
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, LeftOutWarning
 from uwblink.arrays import Floats
+from uwblink.corrections import Columns, Correction
 from uwblink.exporters import check_export, export_recording
 from uwblink.output import check_output
 from uwblink.recording.contents import READING_MB, Contents, exchanges_with_poses
@@ -118,13 +118,12 @@ def _append(written: Recording, exchanges: Exchanges, applied: CorrectedRanges) 
     return len(exchanges), int(np.count_nonzero(applied.clamped & powered)), int(np.count_nonzero(~powered))
 
 
-def live_correction(path: Path) -> Callable[[Exchanges], dict[str, Floats]]:
-    """Return a function that corrects exchanges (n,) to `corrected_m`, and what else `CorrectedRange` has.
+def live_correction(path: Path) -> Correction:
+    """Return the correction of exchanges and of what tags overheard, as they come, by the calibration in a file.
 
-    The numbers are those of `calib.apply`; its attribute `antenna_delays` is what was programmed where the
-    calibration was fitted, and `differences` corrects what tags overheard (`Calibration.correct_arrivals`). The
-    function raises what `Calibration.apply` raises, as for a tag that is not calibrated. Raises what `load_calibration`
-    raises.
+    Columns are `corrected_m` and what else `CorrectedRange` has, with the numbers of `calib.apply`. The correction
+    raises what `Calibration.apply` and `Calibration.correct_arrivals` raise, as for a tag that is not calibrated.
+    Raises what `load_calibration` raises.
     """
     calibration = load_calibration(path)
 
@@ -133,7 +132,7 @@ def live_correction(path: Path) -> Callable[[Exchanges], dict[str, Floats]]:
         known = columns_of(calibration.apply(ranges))._asdict()
         return {"corrected_m": known.pop("range_m"), **known}
 
-    def differences(exchanges: Exchanges, overheard: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    def differences(exchanges: Exchanges, overheard: Columns) -> Columns:
         ranges, nowhere = Ranges.from_exchanges(exchanges, source=str(path)), Contents(exchanges=exchanges).poses
         heard = arrivals_of(exchanges, ranges.raw_m, overheard, nowhere, (), need_truth=False)
         applied = calibration.correct_arrivals(replace(ranges, arrivals=heard))
@@ -141,6 +140,4 @@ def live_correction(path: Path) -> Callable[[Exchanges], dict[str, Floats]]:
         known |= {"listener": heard.listener, "difference_m": applied.raw_m, "corrected_m": applied.corrected_m}
         return known | {"sigma_m": applied.sigma_m, "shared_m": applied.shared_m}
 
-    correct.antenna_delays = calibration.antenna_delays  # type: ignore[attr-defined]
-    correct.differences = differences  # type: ignore[attr-defined]
-    return correct
+    return Correction(correct, differences, calibration.antenna_delays)

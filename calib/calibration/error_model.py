@@ -31,10 +31,6 @@ from uwblink.arrays import Floats, Ints
 GATE: Final = 10.83
 """99.9 % quantile of chi-square with one degree of freedom: filters take ranges whose squared errors are below it."""
 
-LONGEST_S: Final = 2.0
-"""Longest lag. A filter forgets its position within about a second; with lags up to a minute the fit describes the
-first second less well, and positions in an office became 32 % worse instead of equal."""
-
 
 @dataclass(frozen=True, slots=True)
 class LastingErrors:
@@ -262,11 +258,14 @@ def lasting_errors(ranges: Ranges, z: Floats) -> LastingErrors | None:
     pair, time_s = pair[order], ranges.time_ns[inside][order] * 1e-9
     mean, total = float(np.mean(z[inside])), float(np.var(z[inside]))
     away = z[inside][order] - mean
-    edges = np.geomspace(0.01, LONGEST_S, 17)
+    # A filter forgets its position within about a second; with lags up to a minute the fit describes the first second
+    # less well, and positions in an office became 32 % worse instead of equal.
+    longest_s = 2.0
+    edges = np.geomspace(0.01, longest_s, 17)
     count, product, lag = np.zeros((3, len(edges) + 1))
     for step in np.unique(np.rint(1.15 ** np.arange(60))).astype(np.int64):
         apart = time_s[step:] - time_s[:-step]
-        same = (pair[step:] == pair[:-step]) & (apart < LONGEST_S)
+        same = (pair[step:] == pair[:-step]) & (apart < longest_s)
         if not same.any():
             break
         place = np.digitize(apart[same], edges)
@@ -277,7 +276,7 @@ def lasting_errors(ranges: Ranges, z: Floats) -> LastingErrors | None:
     if not len(told):
         return None
     covariance, lag = product[told] / count[told], lag[told] / count[told]
-    times = np.geomspace(0.02, LONGEST_S, 60)
+    times = np.geomspace(0.02, longest_s, 60)
     shapes = np.exp(-lag / times[:, None])
     size = np.clip(shapes @ covariance / np.sum(shapes**2, axis=1), 1e-6, 0.99 * total)
     best = int(np.argmin(np.sum((size[:, None] * shapes - covariance) ** 2, axis=1)))

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Protocol, overload, runtime_checkable
+from typing import Annotated, Any, Final, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -387,16 +387,32 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     return Calibration.from_json(read_text(path, BadInputError, "calibration file (.json)"), str(path))
 
 
-@runtime_checkable
-class HasCalibration(Protocol):
-    """What a fit or a survey returns."""
+class CalibrationResult:
+    """Base of what a fit and a survey return: a calibration, how it came about, and warnings."""
 
-    @property
-    def calibration(self) -> Calibration:
-        """The calibration."""
+    __slots__ = ()
+    calibration: Calibration
+    warnings: Sequence[str]
+
+    def headline(self) -> str:
+        """Return what the calibration rests on, in one line."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        """Return the calibration as a table, below what it rests on, above the warnings."""
+        return "\n".join([self.headline(), repr(self.calibration), *(f"warning: {text}" for text in self.warnings)])
+
+    def _repr_html_(self) -> str:
+        """Return the same as HTML, for notebooks."""
+        warned = "".join(f"<p><b>Warning:</b> {escape(text)}</p>" for text in self.warnings)
+        return f"<p>{escape(self.headline())}</p>{self.calibration._repr_html_()}{warned}"
+
+    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+        """Write the calibration as JSON, whole or not at all; replaces a file only with `force`."""
+        self.calibration.save(path, force=force)
 
 
-CalibrationSource = Calibration | HasCalibration | str | os.PathLike[str]
+CalibrationSource = Calibration | CalibrationResult | str | os.PathLike[str]
 """A calibration, the result of a fit or a survey, or the path of a calibration's file."""
 
 

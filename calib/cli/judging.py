@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import sys
+from collections import ChainMap
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -18,11 +20,12 @@ from calib.cli.shared import (
     check_report,
     command_line,
     known_calibration,
+    refuse_given,
     warn,
     with_flags,
 )
 from calib.settings import FitSettings, check_choice
-from uwblink.cli.shared import AsJson, CalibrationFile, Figures, Force, ReportFile, Seeds, add, choice, output, waiting
+from uwblink.cli.shared import AsJson, CalibrationFile, Figures, Force, ReportFile, add, choice, output, waiting
 
 if TYPE_CHECKING:
     from calib.evaluation import Evaluation
@@ -78,7 +81,23 @@ def _warn_of_seen(evaluation: Evaluation) -> None:
         )
 
 
+OF_MODELS: Final = {
+    "training": ("poses",),
+    "process_noise": ("poses",),
+    "seeds": ("poses",),
+    "imu": ("imu", "team"),
+    "start_std": ("team",),
+}
+"""The options of `localize` that some motion models use, by those; all models use the others."""
+
+
+def _of_model(option: str, text: str, **shown: Any) -> Any:
+    """Return an option of `localize` whose help ends with the motion models that use it."""
+    return typer.Option(help=f"{text} For --model {' or '.join(OF_MODELS[option])}.", **shown)
+
+
 def localize(
+    context: typer.Context,
     recordings: Recordings,
     calibration: CalibrationFile,
     model: Annotated[
@@ -100,26 +119,30 @@ def localize(
     ] = "exchanges",
     training: Annotated[
         Path | None,
-        typer.Option(help="Flight on which the fixed variances are tuned (.uwb); by default those of the fit."),
+        _of_model(
+            "training", "Flight on which the fixed variances are tuned (.uwb); by default those of the fit are used."
+        ),
     ] = None,
     process_noise: Annotated[
-        float, typer.Option(help="White noise of the velocity input (m/s per axis at 100 Hz).")
+        float, _of_model("process_noise", "White noise of the velocity input (m/s per axis at 100 Hz).")
     ] = 0.3,
     imu: Annotated[
         str,
-        typer.Option(
-            help="Noise of the IMUs, for --model imu and team. drone: a consumer's that vibrates.",
+        _of_model(
+            "imu",
+            "Noise of the IMUs. drone: a consumer's that vibrates.",
             **choice("drone", "consumer", "industrial", "tactical"),
         ),
     ] = "drone",
     start_std: Annotated[
         tuple[float, float, float],
-        typer.Option(
-            help="How well relative positions (m), attitudes (deg) and velocities (m/s) are known at the first "
-            "exchange, standard deviations an axis, for --model team.",
+        _of_model(
+            "start_std",
+            "How well relative positions (m), attitudes (deg) and velocities (m/s) are known at the first exchange, "
+            "standard deviations an axis.",
         ),
     ] = (0.1, 3.0, 0.1),
-    seeds: Seeds = 3,
+    seeds: Annotated[int, _of_model("seeds", "Number of simulated runs, each with another seed.", min=1)] = 3,
     tum: Annotated[
         Path | None, typer.Option(help="Folder for the estimated trajectories, one file per body and filter (.tum).")
     ] = None,
@@ -128,41 +151,28 @@ def localize(
     force: Force = False,
 ) -> None:
     """Track each moving body by its ranges or what it hears, with and without calibration, and print the RMSE in m."""
-    from calib.evaluation import (
-        IMUS,
-        Settings,
-        localization_json,
-        localization_text,
-        onboard_json,
-        onboard_text,
-        team_json,
-        team_text,
-        write_tum,
-    )
+    from calib.evaluation import IMUS, MODELS, write_tum
 
-    check_report(None, figures, force=force)
+    check_choice("model", model, MODELS)
     check_choice("imu", imu, IMUS)
+    for option, models in OF_MODELS.items():
+        if model not in models:
+            refuse_given(context, [option], f"goes with `model` {' or '.join(models)}, not with {model}")
+    check_report(None, figures, force=force)
+    fields: dict[str, dict[str, Any]] = {
+        "process_noise": {"velocity_std_mps": process_noise},
+        "seeds": {"seeds": seeds},
+        "imu": {"noise": IMUS[imu]},
+        "start_std": dict(zip(("start_std_m", "start_std_deg", "start_std_m_s"), start_std, strict=True)),
+    }
+    used = [values for option, values in fields.items() if model in OF_MODELS[option]]
+    settings = MODELS[model].settings(use=use, **dict(ChainMap(*used)))
+    track = partial(MODELS[model].localize, **({} if training is None else {"training": training}))
     known = known_calibration(calibration, recordings)
-    found: list[Any]
-    table: Any
     with waiting("localizing"):
-        if model == "poses":
-            settings = Settings(velocity_std_mps=process_noise, seeds=3 if seeds is None else seeds, use=use)
-            found = [one for path in recordings for one in calib.localize(path, known, settings, training=training)]
-            # The text first: where it cannot be made, nothing is written.
-            table = localization_json(found)
-            text = localization_text(found, settings)
-        elif model == "team":
-            metres, degrees, speed = start_std
-            team = calib.TeamSettings(
-                use=use, start_std_m=metres, start_std_deg=degrees, start_std_m_s=speed, noise=IMUS[imu]
-            )
-            found = [one for path in recordings for one in calib.localize_team(path, known, team)]
-            table, text = team_json(found), team_text(found, team)
-        else:
-            onboard = calib.OnboardSettings(model=model, use=use, noise=IMUS[imu])
-            found = [one for path in recordings for one in calib.localize_onboard(path, known, onboard)]
-            table, text = onboard_json(found), onboard_text(found, onboard)
+        found = [one for path in recordings for one in track(path, known, settings)]
+        # The text first: where it cannot be made, nothing is written.
+        table, text = MODELS[model].table(found), MODELS[model].text(found, settings)
     if tum:
         write_tum(found, tum, force=force)
     if figures:

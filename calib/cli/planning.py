@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 import calib
-from calib.cli.shared import check_report
+from calib.cli.shared import check_report, refuse_given
 from calib.errors import BadInputError
 from calib.planning import FlightPlanSettings, SurveyPlanSettings, read_whole
 from uwblink.cli.shared import AsJson, Figures, Force, Group, add, epilog, output, waiting
@@ -96,10 +96,8 @@ def flight(
     check_report(output, figures, force=force)
     who: Any = Path(robots)
     if robots.endswith(".uwb"):
-        for name in ("seconds", "rate_hz", "size_m", "speed_m_s", "apart_m", "anchors"):
-            source = context.get_parameter_source(name)
-            if source is not None and source.name != "DEFAULT":
-                raise BadInputError("the recording determines it; leave it out", parameter=name)
+        recorded = ("seconds", "rate_hz", "size_m", "speed_m_s", "apart_m", "anchors")
+        refuse_given(context, recorded, "the recording determines it; leave it out")
     else:
         tags = [read_whole(robot, "robots") for robot in robots.split("/")]
         who = tags if "/" in robots or "," in robots else tags[0][0]

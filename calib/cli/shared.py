@@ -11,6 +11,7 @@ from typing import Annotated, Final
 import typer
 
 import calib
+from calib.errors import BadInputError
 from calib.settings import FitSettings, FlightSettings, SurveySettings
 from uwblink.cli import shared
 from uwblink.cli.shared import output
@@ -53,6 +54,14 @@ def with_flags(text: str) -> str:
 def warn(text: str) -> None:
     """Print a warning on standard error."""
     typer.echo(f"warning: {with_flags(text)}", err=True)
+
+
+def refuse_given(context: typer.Context, options: Iterable[str], why: str) -> None:
+    """Raise `BadInputError` that says why for the first of some options that was given on the command line."""
+    for name in options:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name != "DEFAULT":
+            raise BadInputError(why, parameter=name)
 
 
 def check_report(report: Path | None, figures: Path | None, *, pdf: Path | None = None, force: bool) -> None:

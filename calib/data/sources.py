@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline
 
 from calib.data.arrivals import arrivals_of
@@ -268,11 +268,12 @@ FORMS: Final = {"delays_ns": (_delays, "numbers by tag"), "bias_curve": CURVE, "
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """Ranges together with where bodies and tags were."""
+    """Ranges together with where bodies and tags were, and columns of tables of sensors by their names."""
 
     ranges: Ranges
     poses: Poses
     tags: list[Tag]
+    sensors: Mapping[str, Mapping[str, NDArray[Any]]] = field(default_factory=dict)
 
     def moving_bodies(self) -> list[str]:
         """Return the bodies whose position changes by more than a decimetre."""
@@ -299,35 +300,44 @@ def require_arrivals(ranges: Ranges) -> None:
         )
 
 
-def load_flight(data: Data, *, need_power: bool = True, need_truth: bool = True) -> Flight:
+def load_flight(data: Data, *, need_power: bool = True, need_truth: bool = True, sensors: Sequence[str] = ()) -> Flight:
     """Return a recording's usable ranges with its poses; of an exchange that both ends reported one report counts.
 
-    Without `need_truth` ranges and differences of arrival without true distances stay.
+    Without `need_truth` ranges and differences of arrival without true distances stay, also where no poses are.
+    `sensors` name the tables of sensors that are read, too.
 
     Raises what `opened` raises, `BadInputError` for planted values or antenna delays that cannot be read, and
     `UnanswerableError` where no range can be used.
     """
     with opened(data) as (name, source):
-        return read_flight(name, source, need_power=need_power, need_truth=need_truth)
+        exchanges = single_reports(source.exchanges).exchanges
+        found = Ranges.from_exchanges(
+            exchanges,
+            poses=source.poses,
+            tags=source.tags,
+            planted=planted_of(source, name),
+            source=name,
+            antenna_delays=antenna_delays_of(source, name),
+        )
+        heard = getattr(source, "overheard", None)
+        if heard and len(heard["time_ns"]):
+            arrivals = arrivals_of(exchanges, found.raw_m, heard, source.poses, source.tags, need_truth=need_truth)
+            powered = np.isfinite(measured_powers(arrivals.poll_dbm) + measured_powers(arrivals.response_dbm))
+            found = replace(found, arrivals=arrivals[powered | (not need_power)])
+        fingerprint = sha256(exchanges.time_ns.tobytes() + exchanges.range_m.tobytes()).hexdigest()[:32]
+        reasons = _why_no_truth(source), _why_no_power(exchanges)
+        usable = found.usable(*reasons, need_power=need_power, need_truth=need_truth)
+        tables = {table: dict(getattr(source, table, None) or {}) for table in sensors}
+        return Flight(replace(usable, recordings=((name, fingerprint),)), source.poses, list(source.tags), tables)
 
 
-def read_flight(name: str, source: Source, *, need_power: bool = True, need_truth: bool = True) -> Flight:
-    """Return what `load_flight` returns of a source with a name; without `need_truth` also where no poses are."""
-    exchanges = single_reports(source.exchanges).exchanges
-    found = Ranges.from_exchanges(
-        exchanges,
-        poses=source.poses,
-        tags=source.tags,
-        planted=planted_of(source, name),
-        source=name,
-        antenna_delays=antenna_delays_of(source, name),
-    )
-    heard = getattr(source, "overheard", None)
-    if heard and len(heard["time_ns"]):
-        arrivals = arrivals_of(exchanges, found.raw_m, heard, source.poses, source.tags, need_truth=need_truth)
-        powered = np.isfinite(measured_powers(arrivals.poll_dbm) + measured_powers(arrivals.response_dbm))
-        found = replace(found, arrivals=arrivals[powered | (not need_power)])
-    fingerprint = sha256(exchanges.time_ns.tobytes() + exchanges.range_m.tobytes()).hexdigest()[:32]
-    usable = found.usable(_why_no_truth(source), _why_no_power(exchanges), need_power=need_power, need_truth=need_truth)
-    ranges = replace(usable, recordings=((name, fingerprint),))
-    return Flight(ranges, source.poses, list(source.tags))
+def sensor_rows(
+    table: Mapping[str, NDArray[Any]], body: str, names: Sequence[str], began_ns: int
+) -> tuple[Floats, Floats]:
+    """Return times in seconds and columns (n, names) of a body's rows, in order of time, one for each time."""
+    if not table:
+        return np.zeros(0), np.zeros((0, len(names)))
+    mine = np.flatnonzero(table["body"] == body)
+    time_ns, first = np.unique(table["time_ns"][mine], return_index=True)
+    columns = np.column_stack([np.asarray(table[name][mine[first]], dtype=np.float64) for name in names])
+    return np.asarray((time_ns - began_ns) * 1e-9), columns

@@ -130,6 +130,11 @@ def mixture_update(innovation_m: Floats, variance_m2: Floats, errors: RangeError
     )
 
 
+def squared_over(wrong: Floats, covariance: Floats) -> Floats:
+    """Return squares (...) of errors (..., k) over their covariance (..., k, k)."""
+    return np.asarray(np.sum(wrong * np.linalg.solve(covariance, wrong[..., None])[..., 0], axis=-1))
+
+
 @dataclass(frozen=True, slots=True)
 class Fix:
     """A position (3,) and its covariance (3, 3), in metres."""
@@ -209,7 +214,62 @@ IMUS: Final = {
 """Noise by grade of IMU: a consumer's that vibrates, and those of data sheets, as a scenario's `imu.grade` has them."""
 
 
-class RelativeFilter:
+class GaussianFilters:
+    """Filters at once, with states (..., n) and covariances (..., n, n).
+
+    States after the first `known` are errors that measurements share, in units of their standard deviation:
+    Gauss-Markov processes of first order (Bar-Shalom, Li and Kirubarajan 2001, section 8.2).
+    """
+
+    def __init__(self, state: Floats, covariance: Floats, known: int) -> None:
+        """Start at states with covariances."""
+        self.state, self.covariance, self.known = state, covariance, known
+
+    def add_variance(self, states: Any, variance: Floats | float) -> None:
+        """Add variances to those of some states."""
+        np.einsum("...ii->...i", self.covariance)[..., states] += variance
+
+    def decay(self, kept: Floats) -> None:
+        """Let shared errors decay to shares `kept` (..., states) of what they were, at the same standard deviation."""
+        others = slice(self.known, None)
+        self.state[..., others] *= kept
+        self.covariance[..., others, :] *= kept[..., None]
+        self.covariance[..., others] *= kept[..., None, :]
+        self.add_variance(others, 1 - kept**2)
+
+    def forget(self, states: Any, covariance: Floats) -> None:
+        """Take states to be zero, with a covariance, and independent of all others."""
+        self.state[..., states] = 0.0
+        self.covariance[..., states, :] = 0.0
+        self.covariance[..., states] = 0.0
+        self.covariance[..., states, states] = covariance
+
+    def update(
+        self,
+        row: Floats,
+        innovation: Floats,
+        noise_m2: Floats | float,
+        weigh: Callable[[Floats, Floats], RangeUpdate],
+    ) -> RangeUpdate:
+        """Update by scalar measurements with derivatives `row` (..., n) and noise of variance `noise_m2`.
+
+        `innovation` (...) is measured less expected, but for the shared errors, which are linear. `weigh` is given
+        innovations and their variances (...), as `mixture_update`.
+        """
+        innovation = innovation - np.sum((row * self.state)[..., self.known :], axis=-1)
+        reach = np.matmul(self.covariance, row[..., None])[..., 0]
+        variance = np.sum(row * reach, axis=-1) + noise_m2
+        update = weigh(innovation, variance)
+        gain = reach / variance[..., None]
+        self._move(gain * update.noise_m[..., None])
+        self.covariance += gain[..., None] * gain[..., None, :] * (update.variance_m2 - variance)[..., None, None]
+        return update
+
+    def _move(self, by: Floats) -> None:
+        self.state += by
+
+
+class RelativeFilter(GaussianFilters):
     """Poses of bodies in the frame of a reference: a room, or one more body with an IMU (`moving`).
 
     Several filters at once: arrays begin with (filters, bodies). Of a body with angular velocity w and specific force f
@@ -228,12 +288,12 @@ class RelativeFilter:
     ) -> None:
         """Start at places (filters, bodies, 3) with attitudes (filters, bodies, 3, 3), and standard deviations."""
         count, self.bodies = attitudes.shape[:2]
-        self.noise, self.known = noise, BODY * self.bodies + 6 * moving
+        self.noise = noise
         # Attitude errors move into the attitude, so that part of the state stays zero. The last body is the reference.
         self.attitude = np.concatenate([attitudes, np.tile(np.eye(3), (count, 1, 1, 1))], axis=1)
-        self.state = np.zeros((count, len(spread)))
+        covariance = np.tile(np.diag(spread**2), (count, 1, 1))
+        super().__init__(np.zeros((count, len(spread))), covariance, BODY * self.bodies + 6 * moving)
         self.own[..., P] = place_m
-        self.covariance = np.tile(np.diag(spread**2), (count, 1, 1))
 
     @property
     def own(self) -> Floats:
@@ -281,14 +341,6 @@ class RelativeFilter:
             self.covariance[:, : fixed.start, : fixed.start] += shared @ shared.transpose(0, 2, 1)
         self.covariance = (self.covariance + self.covariance.transpose(0, 2, 1)) / 2
 
-    def decay(self, factor: Floats, added: Floats) -> None:
-        """Multiply the states after those of bodies by factors (filters, states), and add variances to theirs."""
-        others = slice(self.known, None)
-        self.state[:, others] *= factor
-        self.covariance[:, others] *= factor[:, :, None]
-        self.covariance[:, :, others] *= factor[:, None, :]
-        np.einsum("fii->fi", self.covariance)[:, others] += added
-
     def distances(self, bodies: Ints, arm_m: Floats, sign: Floats) -> tuple[Floats, Floats, Floats]:
         """Return expected sums of distances (filters,) with signs (k,), their derivatives by the states (filters,
         states), and standard deviations (filters, k) of what in the distances is not linear in errors of the state.
@@ -316,24 +368,8 @@ class RelativeFilter:
         expected = (distance + np.trace(bend, axis1=2, axis2=3) / 2) @ sign
         return expected, row, np.sqrt(np.einsum("fkij,fkji->fk", bend, bend) / 2)
 
-    def update(
-        self, row: Floats, innovation: Floats, noise_m2: Floats | float, weigh: Callable[[Floats, Floats], RangeUpdate]
-    ) -> RangeUpdate:
-        """Update by scalar measurements with derivatives `row` (filters, states) and noise of variance `noise_m2`.
-
-        `weigh` is given innovations and their variances (filters,), as `mixture_update`.
-        """
-        reach = np.einsum("hij,hj->hi", self.covariance, row)
-        variance = np.einsum("hi,hi->h", row, reach) + noise_m2
-        update = weigh(innovation, variance)
-        gain = reach / variance[:, None]
-        self._move(gain * update.noise_m[:, None])
-        change = (update.variance_m2 - variance)[:, None, None]
-        self.covariance = self.covariance + gain[:, :, None] * gain[:, None, :] * change
-        return update
-
     def _move(self, by: Floats) -> None:
-        self.state = self.state + by
+        super()._move(by)
         self.attitude[:, :-1] = self.attitude[:, :-1] @ _turned(self.own[..., A])
         self.own[..., A] = 0.0
 
@@ -367,13 +403,11 @@ class InertialFilter(RelativeFilter):
     def step(self, dt: float, readings: Floats) -> None:
         """Predict over `dt` seconds by mean readings (6,); without an IMU they are ignored."""
         self.predict(dt, readings[None] if self.inertial else REST[None])
-        self.covariance[:, H, H] += self.noise.height_offset**2 * dt
+        self.add_variance(H, self.noise.height_offset**2 * dt)
 
     def begin_exchange(self) -> None:
         """Begin another exchange, whose measurements share another error."""
-        self.state[:, E] = 0.0
-        self.covariance[:, E, :] = self.covariance[:, :, E] = 0.0
-        self.covariance[:, E, E] = 1.0
+        self.forget(E, np.ones(1))
 
     def update_range(
         self,
@@ -396,8 +430,7 @@ class InertialFilter(RelativeFilter):
             noise_m = float(np.hypot(noise_m, np.linalg.norm(row[0, P]) * np.hypot(arm_m[0], arm_m[1]) / np.sqrt(2)))
         row[:, E] = common_m
         variance = noise_m**2 + np.sum((sign * bent_m) ** 2, axis=1)
-        innovation = measured_m - expected - common_m * self.state[:, E]
-        update = self.update(row, innovation, variance, partial(mixture_update, errors=errors))
+        update = self.update(row, measured_m - expected, variance, partial(mixture_update, errors=errors))
         self.likelihood = self.likelihood + update.log_density
         return update
 
@@ -406,8 +439,7 @@ class InertialFilter(RelativeFilter):
         row = np.zeros_like(self.state)
         row[:, [2, H]] = 1.0
         errors = RangeErrors(share=1e-6, least_m=0.0, detour_m=1.0, outlier=0.05, outlier_m=1.0)
-        innovation = height_m - self.state[:, 2] - self.state[:, H]
-        self.update(row, innovation, self.noise.height_m**2, partial(mixture_update, errors=errors))
+        self.update(row, height_m - self.state[:, 2], self.noise.height_m**2, partial(mixture_update, errors=errors))
 
     def update_gravity(self, force: Floats, std: float) -> None:
         """Update by the direction of gravity: the mean specific force (3,) with an acceleration of `std` m/s^2 per
@@ -431,10 +463,9 @@ class InertialFilter(RelativeFilter):
 
     def restart(self, fix: Fix, speed_m_s: float) -> None:
         """Restart at a fix, with the present attitude and biases."""
-        self.state[:, P], self.state[:, V] = fix.place_m, 0.0
-        for part, covariance in ((P, fix.covariance_m2), (V, np.eye(3) * speed_m_s**2)):
-            self.covariance[:, part, :] = self.covariance[:, :, part] = 0
-            self.covariance[:, part, part] = covariance
+        self.forget(P, fix.covariance_m2)
+        self.forget(V, np.eye(3) * speed_m_s**2)
+        self.state[:, P] = fix.place_m
 
 
 def _cross(vectors: Floats) -> Floats:

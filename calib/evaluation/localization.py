@@ -7,9 +7,8 @@ ranges with the variance of the sigma curve, and calibrated ranges with the whol
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -21,7 +20,7 @@ from calib.calibration.document import for_json
 from calib.calibration.error_model import GATE
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
-from calib.data.sources import Data, Flight, load_flight, require_arrivals, require_times
+from calib.data.sources import Data, Flight, load_flight, require_times
 from calib.errors import UnanswerableError
 from calib.evaluation.filters import RangeErrors, range_errors
 from calib.evaluation.tracking import (
@@ -33,9 +32,11 @@ from calib.evaluation.tracking import (
     distances_in,
     problems,
     run_filters,
+    used_part,
 )
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Floats
 from uwblink.display import printable
+from uwblink.exporters import file_names, tum_lines
 from uwblink.output import write_files
 
 if TYPE_CHECKING:
@@ -78,15 +79,28 @@ class Localization:
         return self.body
 
     def trajectories(self) -> dict[str, Trajectory]:
-        """Return the trajectory of each filter and the true one, by name, with the attitudes that were given."""
-        found = {name: (one.time_ns, one.estimate_m, one.attitude) for name, one in self.tracks.items()}
-        one = self.tracks["raw"]
-        return found | {"truth": (one.time_ns, one.truth_m, one.attitude)}
+        """Return the trajectory of each filter and the true one, by name without spaces."""
+        found = {name.replace(",", "").replace(" ", "-"): one.trajectories()[""] for name, one in self.tracks.items()}
+        return found | {kind: own for kind, own in self.tracks["raw"].trajectories().items() if kind}
 
     def __repr__(self) -> str:
         """Return the RMSE of each filter, over seeds, on one line."""
         found = ", ".join(f"{name} {np.mean(rmse):.3f} m" for name, rmse in self.rmse_m.items())
         return f"{self.body} of {self.source}: rms error {found}"
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizationModel:
+    """A motion model: its settings, the function that localizes by it, and what is printed of its results.
+
+    `localize` takes data, a calibration and settings, and returns a list; `table` makes JSON of that list, and `text`
+    lines of the list and the settings.
+    """
+
+    settings: Callable[..., Any]
+    localize: Callable[..., list[Any]]
+    table: Callable[[list[Any]], Any]
+    text: Callable[[list[Any], Any], str]
 
 
 def localize(
@@ -137,7 +151,7 @@ def localize(
                 rmse_m={name: np.array([track.rmse_m for track in own]) for name, own in tracks.items()},
                 fixed=fixed,
                 simulated=flight.ranges.planted is not None,
-                arrivals=int(np.count_nonzero(problem.rows >= len(problem.ranges))),
+                arrivals=int(np.count_nonzero(problem.heard)),
             )
         )
     return found
@@ -146,10 +160,7 @@ def localize(
 def _flight_for(data: Data | Flight, calibration: Calibration, settings: Settings) -> Flight:
     """Return a flight with what `settings` use of it."""
     flight = data if isinstance(data, Flight) else load_flight(data, need_power=calibration.needs_power)
-    if settings.use == "receptions":
-        require_arrivals(flight.ranges)
-        return flight
-    return replace(flight, ranges=replace(flight.ranges, arrivals=None))
+    return replace(flight, ranges=used_part(flight.ranges, settings.use))
 
 
 @dataclass(frozen=True, slots=True)
@@ -423,27 +434,10 @@ def localization_json(found: list[Localization]) -> dict[str, Any]:
 
 def write_tum(found: Sequence[Localization | OnboardTrack], folder: Path, *, force: bool = False) -> None:
     """Write the trajectories of each body, the true one among them, into a folder, which is made if it is missing."""
+    names = file_names(f"{one.source}-{one.label}" for one in found)
     files = {
-        f"{name}{'-' if kind else ''}{kind}.tum": _tum(*columns).encode()
-        for name, one in zip(_names(f"{one.source}-{one.label}" for one in found), found, strict=True)
+        f"{name}{'-' if kind else ''}{kind}.tum": "".join(["# time x y z qx qy qz qw\n", *tum_lines(*columns)]).encode()
+        for name, one in zip(names, found, strict=True)
         for kind, columns in one.trajectories().items()
     }
     write_files(folder, files, force=force)
-
-
-def _names(texts: Iterable[str]) -> list[str]:
-    """Return file names; equal names of recordings in different folders are numbered."""
-    found: list[str] = []
-    for text in texts:
-        plain = "".join(c if c.isalnum() or c in "-_" else "_" for c in text)
-        numbered = (f"{plain}_{k}" for k in count(2))
-        found.append(plain if plain not in found else next(name for name in numbered if name not in found))
-    return found
-
-
-def _tum(time_ns: Ints, place_m: Floats, attitude: Floats) -> str:
-    rows = [
-        f"{time * 1e-9:.9f} {x:.6f} {y:.6f} {z:.6f} {qx:.6f} {qy:.6f} {qz:.6f} {qw:.6f}"
-        for time, (x, y, z), (qx, qy, qz, qw) in zip(time_ns.tolist(), place_m.tolist(), attitude.tolist(), strict=True)
-    ]
-    return "# time x y z qx qy qz qw\n" + "\n".join(rows) + "\n"

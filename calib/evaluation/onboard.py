@@ -24,8 +24,7 @@ from calib.calibration.applying import keep_determined
 from calib.calibration.document import for_json
 from calib.calibration.error_model import GATE
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
-from calib.data.ranges import Ranges
-from calib.data.sources import Data, opened, read_flight, require_arrivals, require_times
+from calib.data.sources import Data, load_flight, require_times, sensor_rows
 from calib.errors import BadInputError, UnanswerableError
 from calib.evaluation.filters import (
     GRAVITY_M_S2,
@@ -35,14 +34,18 @@ from calib.evaluation.filters import (
     ProcessNoise,
     RangeErrors,
     multilaterate,
+    squared_over,
 )
 from calib.evaluation.localization import MeasuredReceptions
 from calib.evaluation.tracking import (
-    BodyTrack,
-    Trajectory,
-    distances_in,
+    FilterRanges,
+    Measurements,
+    Track,
+    apart,
     nearest_attitude,
     ranges_about,
+    ranges_among,
+    used_part,
 )
 from calib.settings import CheckedSettings
 from uwblink.arrays import Floats, Ints
@@ -91,33 +94,24 @@ class OnboardSettings(CheckedSettings):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class OnboardTrack(BodyTrack):
+class OnboardTrack(Track):
     """The track of a body from its first fix on, by the sensors that are `used`.
 
-    `true_attitude` (n, 4) is NaN where poses do not say. `nis` (ranges,) and `believed`, which ranges were accepted,
-    are at `range_time_ns`; `restarts_s` when the filter began anew, in seconds since the first exchange.
+    `nis` and `accepted` (ranges,) are at `range_time_ns`; `restarts_s` is when the filter began anew, in seconds since
+    the first exchange.
     """
 
     source: str
     body: str
     model: str
     used: str
-    true_attitude: Floats
     range_time_ns: Ints
-    believed: Floats
     restarts_s: tuple[float, ...]
 
     @property
     def label(self) -> str:
         """The body and the model, as names of files have them."""
         return f"{self.body}-{self.model}"
-
-    def trajectories(self) -> dict[str, Trajectory]:
-        """Return the trajectory, and as "truth" the true one where there is one."""
-        found = {"": (self.time_ns, self.estimate_m, self.attitude)}
-        known = np.isfinite(self.truth_m).all(axis=1) & np.isfinite(self.true_attitude).all(axis=1)
-        truth = self.time_ns[known], self.truth_m[known], self.true_attitude[known]
-        return found | ({"truth": truth} if known.any() else {})
 
     def __repr__(self) -> str:
         """Return the inputs and the RMSE, on one line."""
@@ -148,21 +142,19 @@ def localize_onboard(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Readings:
-    """One body's: measurements (n,) in order of time, less distances between anchors, inertial readings, heights.
+    """One body's: measurements (n,), inertial readings, heights.
 
-    Times are seconds since `began_ns`, the first exchange. A measurement is a sum of distances with signs `sign` (n, k)
-    from the antenna at `arm_m` (n, 3) to `anchor_m` (n, k, 3). Those of an `exchange` (n,) share an error with a
-    standard deviation of `common_m` (n,) beside their own. `imu` are angular velocities in rad/s and specific forces in
-    m/s^2 (m, 6) in the axes of the body. `truth` are its poses, or None.
+    Of the k distances in a measurement `sign` (n, k) is 0 for those between anchors, which are taken off what is
+    `measured`; the others are from the antenna at `arm_m` (n, 3) to `anchor_m` (n, k, 3). Times are seconds since
+    `began_ns`, the first exchange. `imu` are angular velocities in rad/s and specific forces in m/s^2 (m, 6) in the
+    axes of the body. `truth` are its poses, or None.
     """
 
     source: str
     body: str
     time_s: Floats
     exchange: Ints
-    measured_m: Floats
-    noise_m: Floats
-    common_m: Floats
+    measured: FilterRanges
     errors: RangeErrors
     sign: Floats
     arm_m: Floats
@@ -177,14 +169,9 @@ class _Readings:
 
 def _readings(data: Data, calibration: Calibration, use: str) -> list[_Readings]:
     """Return the readings of every body that is not an anchor and ranges with one, or listens."""
-    with opened(data) as (name, source):
-        flight = read_flight(name, source, need_power=calibration.needs_power, need_truth=False)
-        imu, heights = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))
-    poses, tags, ranges = flight.poses, flight.tags, keep_determined(calibration, flight.ranges)
-    if use == "receptions":
-        require_arrivals(ranges)
-    else:
-        ranges = replace(ranges, arrivals=None)
+    flight = load_flight(data, need_power=calibration.needs_power, need_truth=False, sensors=("imu", "height"))
+    name, (imu, heights) = flight.ranges.source, flight.sensors.values()
+    poses, tags, ranges = flight.poses, flight.tags, used_part(keep_determined(calibration, flight.ranges), use)
     places = {body: poses.position_m[poses.body == body] for body in np.unique(poses.body).tolist()}
     still_m = 0.1  # poses of a body that stands still have some noise
     anchors = {body: np.median(some, axis=0) for body, some in places.items() if np.ptp(some, axis=0).max() <= still_m}
@@ -199,36 +186,34 @@ def _readings(data: Data, calibration: Calibration, use: str) -> list[_Readings]
     found = []
     for body in sorted({tag.body for tag in tags if tag.body not in anchors}):
         arms = {tag.tag: np.array(tag.lever_arm_m) for tag in tags if tag.body == body}
-        some = ranges_about(_among(ranges, [*arms, *fixed]), list(arms))
-        ends, sign, exchange = distances_in(some)
-        mine = np.isin(ends, list(arms))
-        free = np.where(mine[..., 0] ^ mine[..., 1], sign, 0.0)
-        rows = np.flatnonzero(free.any(axis=1))
+        unknown = apart(list(arms))
+        some = ranges_about(ranges_among(ranges, [*arms, *fixed]), list(arms))
+        rows = Measurements.of(some, unknown)
         if not len(rows):
             continue
-        rows = rows[np.lexsort((exchange[rows], some.time_ns[exchange[rows]]))]
+        free = np.where(unknown(rows.ends), rows.sign, 0.0)
         place = np.full((max(*arms, *fixed) + 1, 3), np.nan)
         for tag, at in (fixed | arms).items():
             place[tag] = at
-        first, second = np.moveaxis(place[ends[rows]], 2, 0)
-        between_m = np.sum((sign - free)[rows] * np.linalg.norm(first - second, axis=2), axis=1)
-        own, other = (np.where(mine[rows, :, :1], *both) for both in ((first, second), (second, first)))
-        measured, _, errors = MeasuredReceptions.of(some, calibration).robust(calibration)
+        first, second = np.moveaxis(place[rows.ends], 2, 0)
+        between_m = np.sum((rows.sign - free) * np.linalg.norm(first - second, axis=2), axis=1)
+        mine = np.isin(rows.ends[..., :1], list(arms))
+        own, other = (np.where(mine, *both) for both in ((first, second), (second, first)))
+        every, _, errors = MeasuredReceptions.of(some, calibration).robust(calibration)
+        measured = every.at(rows.rows)
         imu_s, inertial = inertial_readings(imu, body, began)
-        height_s, height = _table(heights, body, ("height_m",), began)
+        height_s, height = sensor_rows(heights, body, ("height_m",), began)
         known = poses.body == body
         found.append(
             _Readings(
                 source=ranges.source,
                 body=body,
-                time_s=np.asarray((some.time_ns[exchange[rows]] - began) * 1e-9, dtype=np.float64),
-                exchange=exchange[rows],
-                measured_m=measured.measured_m[rows] - between_m,
-                noise_m=measured.std_m[rows],
-                common_m=measured.common_m[rows],
-                errors=errors.at(rows),
-                sign=free[rows],
-                arm_m=own[np.arange(len(rows)), np.argmax(free[rows] != 0, axis=1)],
+                time_s=np.asarray((rows.time_ns - began) * 1e-9, dtype=np.float64),
+                exchange=rows.exchange,
+                measured=replace(measured, measured_m=measured.measured_m - between_m),
+                errors=errors.at(rows.rows),
+                sign=free,
+                arm_m=own[np.arange(len(rows)), np.argmax(free != 0, axis=1)],
                 anchor_m=other,
                 imu_s=imu_s,
                 imu=inertial,
@@ -246,28 +231,9 @@ def _readings(data: Data, calibration: Calibration, use: str) -> list[_Readings]
     return found
 
 
-def _among(ranges: Ranges, tags: list[int]) -> Ranges:
-    """Return the ranges between some tags, with what these overheard of them."""
-    found = ranges[np.isin(ranges.initiator, tags) & np.isin(ranges.target, tags)]
-    heard = found.arrivals
-    return found if heard is None else replace(found, arrivals=heard[np.isin(heard.listener, tags)])
-
-
 def inertial_readings(table: Mapping[str, NDArray[Any]], body: str, began_ns: int) -> tuple[Floats, Floats]:
     """Return times in seconds since `began_ns` and inertial readings (n, 6) of a body, in order of time."""
-    return _table(table, body, ("wx", "wy", "wz", "ax", "ay", "az"), began_ns)
-
-
-def _table(
-    table: Mapping[str, NDArray[Any]], body: str, names: tuple[str, ...], began_ns: int
-) -> tuple[Floats, Floats]:
-    """Return times in seconds and columns (n, names) of a body's rows, in order of time, one for each time."""
-    if not table:
-        return np.zeros(0), np.zeros((0, len(names)))
-    mine = np.flatnonzero(table["body"] == body)
-    time_ns, first = np.unique(table["time_ns"][mine], return_index=True)
-    columns = np.column_stack([np.asarray(table[name][mine[first]], dtype=np.float64) for name in names])
-    return np.asarray((time_ns - began_ns) * 1e-9), columns
+    return sensor_rows(table, body, ("wx", "wy", "wz", "ax", "ay", "az"), began_ns)
 
 
 def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilter]:
@@ -307,7 +273,7 @@ def _fix(one: _Readings, rows: Ints, settings: OnboardSettings) -> Fix:
     moves = 0.3 * settings.speed_m_s * span
     near = np.abs(one.height_s - one.time_s[rows[-1]]) < 1.0 if settings.height else np.zeros(0, dtype=bool)
     height = float(np.median(one.height_m[near])) if near.any() else None
-    spread_m, legs_m = float(np.hypot(arm / 2, moves)), one.measured_m[rows]
+    spread_m, legs_m = float(np.hypot(arm / 2, moves)), one.measured.measured_m[rows]
     found = multilaterate(legs_m, one.anchor_m[rows], spread_m, height, one.sign[rows])
     return Fix(found.place_m, found.covariance_m2 + np.eye(3) * moves**2)
 
@@ -355,10 +321,10 @@ def mean_readings(time_s: Floats, readings: Floats, edges: Floats) -> Floats:
 
 def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
     """Process ranges, steps and heights in order of time, and return the track of the likeliest heading."""
-    first, running = _begin(one, settings)
+    (first, running), known = _begin(one, settings), one.measured
     now = heard = float(one.time_s[first])
     states, updates, restarts, exchange = list[Any](), list[tuple[float, float, bool]](), list[float](), -1
-    unexplained_s, numbers = 0.0, np.column_stack([one.measured_m, one.noise_m, one.common_m]).tolist()
+    unexplained_s, numbers = 0.0, np.column_stack([known.measured_m, known.std_m, known.common_m]).tolist()
     # The speed limit counts once a second: velocities are independent after a second.
     slow_every = max(round(settings.rate_hz), 1)
     for time_s, kind, number, inertial in _events(one, settings, now):
@@ -393,14 +359,13 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         return one.began_ns + np.rint(np.array(seconds) * 1e9).astype(np.int64)
 
     times, places, attitudes, covariances = zip(*states, strict=True)
-    heard_s, nis, believed = zip(*updates, strict=True)
+    heard_s, nis, accepted = zip(*updates, strict=True)
     time_ns, place, covariance = nanoseconds(times), np.array(places), np.array(covariances)
     truth, turned = np.full_like(place, np.nan), np.full((len(place), 4), np.nan)
     if one.truth is not None:
         truth = bodies_m(one.truth, one.body, time_ns)
         turned = nearest_attitude(one.truth, one.body, time_ns)
-    wrong = place - truth
-    overheard = one.common_m > 0
+    overheard = known.common_m > 0
     used = {
         "ranges": not overheard.all(),
         "differences of arrival": overheard.any(),
@@ -418,10 +383,10 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         std_m=np.sqrt(np.trace(covariance, axis1=1, axis2=2)),
         truth_m=truth,
         true_attitude=turned,
-        nees=np.einsum("ni,ni->n", wrong, np.linalg.solve(covariance, wrong[..., None])[..., 0]),
+        nees=squared_over(place - truth, covariance),
         range_time_ns=nanoseconds(heard_s),
         nis=np.array(nis),
-        believed=np.array(believed),
+        accepted=np.array(accepted),
         restarts_s=tuple(restarts),
     )
 
@@ -462,7 +427,7 @@ def onboard_json(found: list[OnboardTrack]) -> list[dict[str, Any]]:
             "rmse_m": for_json(one.rmse_m),
             "std_m": float(np.sqrt(np.mean(one.std_m**2))),
             "nis": float(np.mean(one.nis)),
-            "believed": float(np.mean(one.believed)),
+            "believed": float(np.mean(one.accepted)),
             "restarts_s": list(one.restarts_s),
         }
         for one in found

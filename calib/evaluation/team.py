@@ -12,7 +12,7 @@ import warnings
 import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar, Final
 
@@ -23,21 +23,28 @@ from calib.calibration.applying import keep_determined
 from calib.calibration.document import for_json
 from calib.calibration.model import CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
-from calib.data.sources import Data, load_flight, opened, require_arrivals, require_times
+from calib.data.sources import Data, load_flight, require_times
 from calib.errors import BadInputError, UnanswerableError, WeakHeadingWarning
-from calib.evaluation.filters import BODY, A, P, ProcessNoise, RelativeFilter, V
+from calib.evaluation.filters import BODY, A, P, ProcessNoise, RelativeFilter, V, squared_over
 from calib.evaluation.localization import Localization, consistency, filter_ranges, fixed_std
 from calib.evaluation.onboard import inertial_readings, mean_readings
-from calib.evaluation.tracking import FilterRanges, Settings, Track, Trajectory, distances_in, pair_numbers, weigh
+from calib.evaluation.tracking import (
+    FilterRanges,
+    Measurements,
+    Settings,
+    Track,
+    pair_numbers,
+    ranges_among,
+    side_by_side,
+    used_part,
+    weigh,
+)
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import first_few, printable
 from uwblink.recording.distances import tracks_of
 from uwblink.recording.schema import Poses, Tag
 from uwblink.settings import setting
-
-BENT_S: Final = 5.0
-"""How long what is not linear in distances lasts, as errors of the state across the line of sight do."""
 
 BASELINES: Final = (", own ranges", ", ranges only")
 """Ends of the names of filters that do not listen: by ranges of the reference, as a robot that is alone with what its
@@ -73,20 +80,18 @@ class TeamSettings(CheckedSettings):
 class RelativeTrack(Track):
     """Poses of a body in the frame of another: positions (n, 3), attitudes x y z w (n, 4), and the true ones.
 
-    `nees` (n,) are of positions and attitudes, six degrees of freedom; `nis` and `accepted` are at measurements.
+    `nees` (n,) are of positions and attitudes, six degrees of freedom.
     """
 
     DEGREES: ClassVar[int] = 6
-    true_attitude: Floats
 
     @property
     def attitude_rmse_deg(self) -> float:
         """Root of the mean squared angle between estimate and truth, NaN without truth."""
-        known = np.isfinite(self.true_attitude).all(axis=1)
-        if not known.any():
+        if not self.known.any():
             return np.nan
-        apart = Rotation.from_quat(self.attitude[known]).inv() * Rotation.from_quat(self.true_attitude[known])
-        return float(np.degrees(np.sqrt(np.mean(apart.magnitude() ** 2))))
+        estimate, truth = (Rotation.from_quat(some[self.known]) for some in (self.attitude, self.true_attitude))
+        return float(np.degrees(np.sqrt(np.mean((estimate.inv() * truth).magnitude() ** 2))))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -103,32 +108,17 @@ class RelativePose(Localization):
         """Both bodies, as names of files have them."""
         return f"{self.body}-from-{self.reference}"
 
-    def trajectories(self) -> dict[str, Trajectory]:
-        """Return the trajectory of each filter and the true one, by name without spaces."""
-        found = {
-            name.replace(",", "").replace(" ", "-"): (one.time_ns, one.estimate_m, one.attitude)
-            for name, one in self.tracks.items()
-        }
-        one: Any = self.tracks["raw"]
-        known = np.isfinite(one.truth_m).all(axis=1)
-        return found | {"truth": (one.time_ns[known], one.truth_m[known], one.true_attitude[known])}
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Team(Measurements):
+    """A recording: bodies with IMUs, the reference last, and measurements (n,) between them.
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Team:
-    """A recording: bodies with IMUs, the reference last, and measurements (n,) in order of time, by exchange.
-
-    `body` and `arm` (n, k, 2) are the ends of the distances in a measurement, with signs (n, k). `shares` (n, k, 2) are
-    the states of errors that they share: of pairs of tags, and then of pairs of bodies. `readings` are times in seconds
-    and inertial readings of each body.
+    `body` (n, k, 2) and `arm` (n, k, 2, 3) are those of the ends of distances. `shares` (n, k, 2) are the states of
+    errors that they share: of pairs of tags, and then of pairs of bodies. `readings` are times in seconds and inertial
+    readings of each body.
     """
 
     bodies: list[str]
-    ranges: Ranges
-    rows: Ints
-    time_ns: Ints
-    exchange: Ints
-    sign: Floats
     body: Ints
     arm: Floats
     shares: Ints
@@ -187,15 +177,13 @@ def localize_team(
     """
     calibration = given_calibration(calibration)
     chosen = settings or TeamSettings()
-    flight = load_flight(data, need_power=calibration.needs_power, need_truth=False)
-    with opened(data) as (_, source):
-        imu = dict(getattr(source, "imu", None) or {})
+    flight = load_flight(data, need_power=calibration.needs_power, need_truth=False, sensors=("imu",))
     require_times(flight.ranges)
     ranges = keep_determined(calibration, flight.ranges)
-    team = _team(ranges, flight.poses, flight.tags, imu, chosen)
+    team = _team(ranges, flight.poses, flight.tags, flight.sensors["imu"], chosen)
     fixed = fixed_std(calibration, Settings())
     measured = {name: one.at(team.rows) for name, one in filter_ranges(team.ranges, calibration, fixed).items()}
-    heard = team.rows >= len(team.ranges)
+    heard = team.heard
     filters = {"dead reckoning": (measured["raw"], np.zeros_like(heard))}
     if chosen.use == "receptions":
         own = ~heard & (team.body == len(team.bodies) - 1).any(axis=(1, 2))
@@ -230,21 +218,14 @@ def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, A
         raise BadInputError(f"found {reference!r:.60}, {name} has {', '.join(sensing)}", parameter="reference")
     bodies = [*(body for body in sensing if body != reference), reference]
     mine = [tag for tag in tags if tag.body in bodies]
-    members, heard = [tag.tag for tag in mine], ranges.arrivals if settings.use == "receptions" else None
-    if heard is not None:
-        heard = heard[np.isin(heard.listener, members)]
-    inside = np.isin(ranges.initiator, members) & np.isin(ranges.target, members)
-    ranges = replace(ranges, arrivals=heard)[inside]
+    members = [tag.tag for tag in mine]
+    ranges = used_part(ranges_among(ranges, members), settings.use)
     numbers, arms = np.zeros(max(members) + 1, dtype=np.int64), np.zeros((max(members) + 1, 3))
     numbers[members], arms[members] = [bodies.index(tag.body) for tag in mine], [tag.lever_arm_m for tag in mine]
-    ends, sign, exchange = distances_in(ranges)
-    time, body = ranges.time_ns[exchange], numbers[ends]
-    rows = np.flatnonzero(((body[..., 0] != body[..., 1]) & (sign != 0)).any(axis=1))
-    if not len(rows):
+    found = Measurements.of(ranges, lambda ends: np.asarray(np.diff(numbers[ends])[..., 0] != 0))
+    if not len(found):
         raise UnanswerableError(f"{name}: the tags of {', '.join(bodies)} do not range with each other")
-    if settings.use == "receptions":
-        require_arrivals(ranges)
-    single = [one for one, count in Counter(numbers[np.unique(ends)].tolist()).items() if count == 1]
+    single = [one for one, count in Counter(numbers[np.unique(found.ends)].tolist()).items() if count == 1]
     if single:
         warnings.warn(
             f"{name}: {first_few(bodies[one] for one in single)} has one tag that ranges or listens: without a second, "
@@ -252,9 +233,9 @@ def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, A
             WeakHeadingWarning,
             stacklevel=3,
         )
-    rows = rows[np.lexsort((exchange[rows], time[rows]))]
-    readings = [inertial_readings(imu, one, int(time[rows[0]])) for one in bodies]
-    last_s = float(np.ptp(time[rows])) * 1e-9
+    time_ns, body = found.time_ns, numbers[found.ends]
+    readings = [inertial_readings(imu, one, int(time_ns[0])) for one in bodies]
+    last_s = float(np.ptp(time_ns)) * 1e-9
     for one, (time_s, _) in zip(bodies, readings, strict=True):
         # Beyond the first and last reading they count as constant, for a tenth of a second at most.
         if time_s[0] > 0.1 or time_s[-1] < last_s - 0.1:
@@ -262,17 +243,14 @@ def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, A
                 f"{name}: inertial readings of {one} cover {time_s[0]:.1f} to {time_s[-1]:.1f} s after the first "
                 f"exchange, not all exchanges to {last_s:.1f} s"
             )
-    pairs = pair_numbers(ends[rows])
+    pairs = found.pair
     return _Team(
-        bodies=bodies,
+        **found.to_dict(),
         ranges=ranges,
-        rows=rows,
-        time_ns=time[rows],
-        exchange=exchange[rows],
-        sign=sign[rows],
-        body=body[rows],
-        arm=arms[ends[rows]],
-        shares=np.stack([pairs, pairs.max() + 1 + pair_numbers(body[rows])], axis=-1),
+        bodies=bodies,
+        body=body,
+        arm=arms[found.ends],
+        shares=np.stack([pairs, pairs.max() + 1 + pair_numbers(body)], axis=-1),
         readings=readings,
         poses=poses,
     )
@@ -309,10 +287,7 @@ def _run(
     pairs of tags and of an exchange, and of pairs of bodies what is not linear in their distances.
     """
     known, uses = [one for one, _ in filters.values()], np.stack([used for _, used in filters.values()], axis=1)
-    measured, std, common, shared = (
-        np.stack([getattr(one, name) for one in known], axis=1)
-        for name in ("measured_m", "std_m", "common_m", "shared_m")
-    )
+    measured, std, common, shared = side_by_side(known)
     running = _start(team, settings, len(known))
     steps = np.arange(team.time_ns[0], team.time_ns[-1], round(1e9 / settings.rate_hz))
     time_ns = np.unique(np.concatenate([team.time_ns, steps]))
@@ -321,8 +296,9 @@ def _run(
     firsts = np.append(np.searchsorted(team.time_ns, time_ns), len(team.rows))
     truth, turned = team.relative_poses(time_ns)
     pose = BODY * np.arange(len(team.bodies) - 1)[:, None] + np.r_[P, A]
-    # How long the shared errors last: of pairs of tags, of pairs of bodies, of an exchange.
-    lasting = np.full((len(known), team.shares.max() + 2), BENT_S)
+    # How long the shared errors last: of pairs of tags; of pairs of bodies, 5 s, as errors of the state across the line
+    # of sight do; of an exchange.
+    lasting = np.full((len(known), team.shares.max() + 2), 5.0)
     lasting[:, : team.shares[..., 1].min()] = [[one.lasting_s] for one in known]
     lasting[:, -1] = 1e-12
     shape = len(time_ns), len(known), len(team.bodies) - 1
@@ -336,14 +312,13 @@ def _run(
             if team.exchange[row] != exchange:
                 # Two exchanges at one time share no error, either.
                 kept = np.exp(-np.maximum(time_s[k] - last_s, 1e-9) / lasting)
-                running.decay(kept, 1 - kept**2)
+                running.decay(kept)
                 exchange, last_s = team.exchange[row], time_s[k]
             expected, slopes, bent_m = running.distances(team.body[row], team.arm[row], team.sign[row])
             for which, (pair, sides) in enumerate((running.known + team.shares[row]).tolist()):
                 slopes[:, pair] += shared[row, :, which]
                 slopes[:, sides] += team.sign[row, which] * bent_m[:, which]
             slopes[:, -1] = common[row]
-            expected = expected + np.sum((slopes * running.state)[:, running.known :], axis=1)
             weighed = partial(weigh, known, row, gate=settings.gate)
             update = running.update(slopes * uses[row, :, None], measured[row] - expected, std[row] ** 2, weighed)
             nis[row], accepted[row] = update.nis, update.believed
@@ -351,7 +326,7 @@ def _run(
         covariance = running.covariance[:, pose[:, :, None], pose[:, None]]
         turns = Rotation.from_matrix((attitude[k].swapaxes(2, 3) @ turned[k]).reshape(-1, 3, 3)).as_rotvec()
         wrong = np.concatenate([truth[k] - place[k], turns.reshape(place[k].shape)], axis=-1)
-        nees[k] = np.sum(wrong * np.linalg.solve(covariance, wrong[..., None])[..., 0], axis=-1)
+        nees[k] = squared_over(wrong, covariance)
         std_m[k] = np.sqrt(np.trace(covariance[..., P, P], axis1=-2, axis2=-1))
 
     def track(f: int, b: int) -> RelativeTrack:

@@ -8,15 +8,24 @@ range, two of a difference of arrival (`calib.data.arrivals`), of which those be
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar, Final
 
 import numpy as np
 
 from calib.data.ranges import Ranges
-from calib.data.sources import Flight
-from calib.evaluation.filters import RangeErrors, RangeUpdate, gated_update, mixture_update, multilaterate
+from calib.data.sources import Flight, require_arrivals
+from calib.evaluation.filters import (
+    GaussianFilters,
+    RangeErrors,
+    RangeUpdate,
+    gated_update,
+    mixture_update,
+    multilaterate,
+    squared_over,
+)
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
@@ -27,13 +36,6 @@ Trajectory = tuple[Ints, Floats, Floats]
 """Times in ns (n,), positions in metres (n, 3), attitudes x y z w (n, 4)."""
 
 FILTERS: Final = ("raw", "calibrated", "variance", "robust")
-
-PATIENCE_S: Final = 10.0
-"""Most seconds for which a filter that explained its ranges is trusted while it does not.
-
-Between metal racks (scenarios/hall_with_metal) half of a body's ranges are metres too long for up to nine seconds, and
-a position from these ranges alone is metres off.
-"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,40 +65,42 @@ class Settings(CheckedSettings):
     use: str = setting("exchanges", "What is used.", names=("exchanges", "receptions"))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BodyTrack:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Track:
     """Estimated and true positions of a body (n, 3) at times (n,), with attitudes x y z w (n, 4).
 
     `std_m` (n,) is the standard deviation by the filter itself: the root of the sum of its three variances. `nees` (n,)
-    are the squared errors over their covariance. `truth_m` and `nees` are NaN where poses do not say. `nis` are the
-    squared innovations of ranges over their variance.
+    are the squared errors over their covariance, which should be `DEGREES`. Truth and `nees` are NaN where poses do not
+    say. `nis` (measurements,) are the squared innovations over their variance, and `accepted` (measurements,) which are
+    within the gate.
     """
 
+    DEGREES: ClassVar[int] = 3
     time_ns: Ints
     attitude: Floats
     estimate_m: Floats
     truth_m: Floats
+    true_attitude: Floats
     std_m: Floats
     nis: Floats
     nees: Floats
+    accepted: Bools
+
+    @property
+    def known(self) -> Bools:
+        """At which times (n,) the true position is known."""
+        return np.asarray(np.isfinite(self.truth_m).all(axis=1))
 
     @property
     def rmse_m(self) -> float:
         """Root of the mean squared distance between estimate and truth, NaN without truth."""
-        known = np.isfinite(self.truth_m).all(axis=1)
-        wrong = self.estimate_m[known] - self.truth_m[known]
-        return float(np.sqrt(np.mean(np.sum(wrong**2, axis=1)))) if known.any() else np.nan
+        wrong = (self.estimate_m - self.truth_m)[self.known]
+        return float(np.sqrt(np.mean(np.sum(wrong**2, axis=1)))) if len(wrong) else np.nan
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Track(BodyTrack):
-    """The track of one filter at each of its measurements: `accepted` (n,) are those within the gate.
-
-    `attitude` is the filter's input. `DEGREES` is what `nees` should be.
-    """
-
-    DEGREES: ClassVar[int] = 3
-    accepted: Bools
+    def trajectories(self) -> dict[str, Trajectory]:
+        """Return the trajectory as "", and the true one as "truth", where it is known at some time."""
+        truth = (self.time_ns[self.known], self.truth_m[self.known], self.true_attitude[self.known])
+        return {"": (self.time_ns, self.estimate_m, self.attitude)} | ({"truth": truth} if len(truth[0]) else {})
 
     def __repr__(self) -> str:
         """Return its length and how far off it is, on one line."""
@@ -104,26 +108,71 @@ class Track(BodyTrack):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Problem(ColumnTable):
-    """What is known of one body at each of its measurements (n,).
+class Measurements(ColumnTable):
+    """Measurements (n,) in order of time, and then of exchange: `rows` among ranges and then their arrivals.
 
-    `ranges` are all that it needs, `rows` the measurements among these and their arrivals, in order of time. `place` is
-    the true one (n, 3). Of the k distances in a measurement `sign` (n, k) is 0 where the body has no part, `arm` is the
-    own lever arm turned into the world, `other` the other antenna's place (n, k, 3), and `pair` numbers the pairs of
-    tags, from 0; `known_m` is the sum of distances in which the body has no part. `exchange` (n,) numbers exchanges.
+    A measurement is a sum of k distances between tags `ends` (n, k, 2) with a `sign` (n, k), 0 for none. `exchange`
+    (n,) numbers exchanges.
     """
 
-    body: str
-    ranges: Ranges
     rows: Ints
     time_ns: Ints
     exchange: Ints
+    ends: Ints
+    sign: Floats
+    ranges: Ranges
+
+    @classmethod
+    def of(cls, ranges: Ranges, unknown: Callable[[Ints], Bools]) -> Measurements:
+        """Return those of ranges with a distance that is `unknown` (n, k) by its ends (n, k, 2)."""
+        ends, sign, exchange = distances_in(ranges)
+        time_ns = ranges.time_ns[exchange]
+        rows = np.lexsort((exchange, time_ns))
+        rows = rows[(unknown(ends) & (sign != 0)).any(axis=1)[rows]]
+        return cls(
+            ranges=ranges,
+            rows=rows,
+            time_ns=time_ns[rows],
+            exchange=exchange[rows],
+            ends=ends[rows],
+            sign=sign[rows],
+        )
+
+    @property
+    def pair(self) -> Ints:
+        """The numbers (n, k), from 0, of the pairs of tags."""
+        return pair_numbers(self.ends)
+
+    @property
+    def heard(self) -> Bools:
+        """Which measurements (n,) are differences of arrival."""
+        return np.asarray(self.rows >= len(self.ranges))
+
+
+def apart(own: Sequence[int]) -> Callable[[Ints], Bools]:
+    """Return a function that tells which pairs of tags (..., 2) have one of some `own` tags and another one."""
+
+    def told(ends: Ints) -> Bools:
+        inside = np.isin(ends, own)
+        return np.asarray(inside[..., 0] ^ inside[..., 1])
+
+    return told
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Problem(Measurements):
+    """What is known of one body at each of its measurements (n,).
+
+    `place` is the true one (n, 3). Of the k distances in a measurement `sign` (n, k) is 0 where the body has no part,
+    `arm` is the own lever arm turned into the world, and `other` the other antenna's place (n, k, 3); `known_m` is the
+    sum of distances in which the body has no part.
+    """
+
+    body: str
     attitude: Floats
     place: Floats
-    sign: Floats
     arm: Floats
     other: Floats
-    pair: Ints
     known_m: Floats
 
     @property
@@ -153,32 +202,24 @@ def problems(flight: Flight) -> list[Problem]:
     found = []
     for body in flight.moving_bodies():
         mine = [tag.tag for tag in flight.tags if tag.body == body]
-        ranges = ranges_about(flight.ranges, mine)
-        ends, sign, exchange = distances_in(ranges)
-        time, inside = ranges.time_ns[exchange], np.isin(ends, mine)
-        free = inside[..., 0] ^ inside[..., 1]
-        rows = np.flatnonzero((free & (sign != 0)).any(axis=1))
-        rows = rows[np.lexsort((exchange[rows], time[rows]))]
-        if not len(rows):
+        unknown = apart(mine)
+        measured = Measurements.of(ranges_about(flight.ranges, mine), unknown)
+        if not len(measured):
             continue
-        ends, sign, time, free, first = ends[rows], sign[rows], time[rows], free[rows], inside[rows, :, 0]
-        place, sides = bodies_m(flight.poses, body, time), np.moveaxis(ends, 2, 0)
+        ends, sign, time, free = measured.ends, measured.sign, measured.time_ns, unknown(measured.ends)
+        place, sides, first = bodies_m(flight.poses, body, time), np.moveaxis(ends, 2, 0), np.isin(ends[..., 0], mine)
         antenna, away = (
             antennas_m(flight.poses, flight.tags, ids.ravel(), np.repeat(time, sign.shape[1])).reshape(*sign.shape, 3)
             for ids in np.where(first, sides, sides[::-1])
         )
         problem = Problem(
+            **(measured.to_dict() | {"sign": np.where(free, sign, 0.0)}),
+            ranges=measured.ranges,
             body=body,
-            ranges=ranges,
-            rows=rows,
-            time_ns=time,
-            exchange=exchange[rows],
             attitude=nearest_attitude(flight.poses, body, time),
             place=place,
-            sign=np.where(free, sign, 0.0),
             arm=antenna - place[:, None],
             other=away,
-            pair=pair_numbers(ends),
             known_m=np.sum(np.where(free, 0.0, sign * np.linalg.norm(antenna - away, axis=2)), axis=1),
         )
         known = np.flatnonzero(np.isfinite(problem.arm + problem.other).all(axis=(1, 2)))
@@ -191,6 +232,24 @@ def pair_numbers(ends: Ints) -> Ints:
     """Return the numbers, from 0, of the pairs of tags (n, k) that are the ends (n, k, 2) of distances."""
     pairs = ends.min(axis=2) * 2**16 + ends.max(axis=2)
     return np.asarray(np.unique(pairs, return_inverse=True)[1]).reshape(pairs.shape)
+
+
+def ranges_among(ranges: Ranges, tags: list[int]) -> Ranges:
+    """Return the ranges between some tags, with what these overheard of them."""
+    found = ranges[np.isin(ranges.initiator, tags) & np.isin(ranges.target, tags)]
+    heard = found.arrivals
+    return found if heard is None else replace(found, arrivals=heard[np.isin(heard.listener, tags)])
+
+
+def used_part(ranges: Ranges, use: str) -> Ranges:
+    """Return ranges with what was overheard, if receptions are used, or without it.
+
+    Raises what `require_arrivals` raises.
+    """
+    if use == "receptions":
+        require_arrivals(ranges)
+        return ranges
+    return replace(ranges, arrivals=None)
 
 
 def ranges_about(ranges: Ranges, tags: list[int]) -> Ranges:
@@ -254,73 +313,64 @@ def weigh(known: list[FilterRanges], row: int, innovation_m: Floats, variance_m2
     return update
 
 
+def side_by_side(filters: Sequence[FilterRanges]) -> Iterator[Floats]:
+    """Yield what filters measure, the standard deviations of own errors and of those of an exchange (n, filters), and
+    of errors that pairs share (n, filters, k)."""
+    for name in ("measured_m", "std_m", "common_m", "shared_m"):
+        yield np.stack([getattr(one, name) for one in filters], axis=1)
+
+
 def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: Settings) -> dict[str, list[Track]]:
     """Run filters on the ranges of a body with every noise; return the tracks of each, one for each noise.
 
-    A state is the position, for each pair of tags the error that its ranges share, a Gauss-Markov process of first
-    order in units of `shared_m` (Bar-Shalom, Li and Kirubarajan 2001, section 8.2), and the error that measurements of
-    one exchange share, in units of `common_m`. Arrays are (filters, seeds, ...).
+    A state is the position, for each pair of tags the error that its ranges share, in units of `shared_m`, and the
+    error that measurements of one exchange share, in units of `common_m`. Arrays are (filters, seeds, ...).
     """
-    count, known = len(problem), list(ranges.values())
-    measured, std, common = (
-        np.stack([getattr(one, name) for one in known], axis=1)[..., None]
-        for name in ("measured_m", "std_m", "common_m")
-    )
-    shared = np.stack([one.shared_m for one in known], axis=1)[:, :, None]
+    count, known, pair, elapsed_s = len(problem), list(ranges.values()), problem.pair, problem.elapsed_s
+    measured, std, common, shared = side_by_side(known)
     noises = [problem.noisy(settings, settings.seed + k) for k in range(settings.seeds)]
-    moves = np.stack([moves for _, moves in noises], axis=1)
-    moved = moves.cumsum(axis=0)
-    kept = np.exp(-problem.elapsed_s[:, None] / [one.lasting_s for one in known])[..., None, None]
-    size = 5 + int(problem.pair.max())
-    of_place = np.arange(size) < 3
-    factor = np.where(of_place, 1.0, kept)
-    added = np.where(of_place, problem.velocity_spread(settings)[:, None, None, None], 1 - kept**2)
-    same = np.diff(problem.exchange, prepend=-1) == 0
-    factor[..., -1], added[..., -1] = same[:, None, None], ~same[:, None, None]
-    prior = np.diag(np.where(of_place, settings.initial_std_m**2, 1.0))
-
-    shape = len(known), settings.seeds
-    x, p = np.zeros((*shape, size)), np.tile(prior, (*shape, 1, 1))
-    x[..., :3] = [start for start, _ in noises]
-    diagonal = np.einsum("fsii->fsi", p)
-    # Twelve unexplained ranges at least, four for each coordinate, before a filter begins anew.
-    explained_s, most_s = np.zeros(shape), settings.reopen_s / 2 / 12
+    moves, spread = np.stack([moves for _, moves in noises], axis=1), problem.velocity_spread(settings)
+    moved, shape, size = moves.cumsum(axis=0), (len(known), settings.seeds), 5 + int(pair.max())
+    kept = np.exp(-elapsed_s[:, None, None] / [[one.lasting_s] for one in known])
+    kept = np.broadcast_to(kept, (count, len(known), size - 3)).copy()
+    kept[..., -1] = np.diff(problem.exchange, prepend=-1)[:, None] == 0
+    place = slice(0, 3)
+    prior = np.diag(np.where(np.arange(size) < 3, settings.initial_std_m**2, 1.0))
+    running = GaussianFilters(np.zeros((*shape, size)), np.tile(prior, (*shape, 1, 1)), 3)
+    running.state[..., place] = [start for start, _ in noises]
     estimate, (std_m, nis, nees) = np.empty((count, *shape, 3)), np.empty((3, count, *shape))
     accepted = np.empty((count, *shape), dtype=bool)
-    for k, pairs in enumerate((3 + problem.pair).tolist()):
-        x *= factor[k]
-        x[..., :3] += moves[k]
-        p *= factor[k][..., None] * factor[k][..., None, :]
-        diagonal += added[k]
-        towards = x[..., None, :3] + problem.arm[k] - problem.other[k]
+    # Twelve unexplained ranges at least, four for each coordinate, before a filter begins anew. One that explained its
+    # ranges is trusted for up to 10 s while it does not: between metal racks (scenarios/hall_with_metal) half of a
+    # body's ranges are metres too long for up to nine seconds, and a position from these ranges alone is metres off.
+    explained_s, most_s = np.zeros(shape), settings.reopen_s / 2 / 12
+    for k in range(count):
+        running.decay(kept[k][:, None])
+        running.state[..., place] += moves[k]
+        running.add_variance(place, spread[k])
+        towards = running.state[..., None, place] + problem.arm[k] - problem.other[k]
         distance = np.linalg.norm(towards, axis=-1)
-        h = np.zeros_like(x)
-        h[..., :3] = np.sum(towards * (problem.sign[k] / np.maximum(distance, 1e-6))[..., None], axis=-2)
-        for which, pair in enumerate(pairs):
-            h[..., pair] += shared[k, ..., which]
-        h[..., -1] = common[k]
-        ph = np.matmul(p, h[..., None])[..., 0]
-        variance = np.sum(h * ph, axis=-1) + std[k] ** 2
-        expected = problem.known_m[k] + distance @ problem.sign[k] + np.sum(h[..., 3:] * x[..., 3:], axis=-1)
-        innovation = measured[k] - expected
-        update = weigh(known, k, innovation, variance, settings.gate)
-        gain = ph / variance[..., None]
-        x += gain * update.noise_m[..., None]
-        p += gain[..., None] * gain[..., None, :] * (update.variance_m2 - variance)[..., None, None]
-        lasted_s = min(problem.elapsed_s[k], most_s)
-        explained_s = np.minimum(explained_s + np.where(update.nis < settings.gate, lasted_s, -lasted_s), PATIENCE_S)
+        h = np.zeros_like(running.state)
+        h[..., place] = np.sum(towards * (problem.sign[k] / np.maximum(distance, 1e-6))[..., None], axis=-2)
+        for which, own in enumerate((3 + pair[k]).tolist()):
+            h[..., own] += shared[k, :, which, None]
+        h[..., -1] = common[k][:, None]
+        expected = problem.known_m[k] + distance @ problem.sign[k]
+        weighed = partial(weigh, known, k, gate=settings.gate)
+        update = running.update(h, measured[k][:, None] - expected, std[k][:, None] ** 2, weighed)
+        lasted_s = min(elapsed_s[k], most_s)
+        explained_s = np.minimum(explained_s + np.where(update.nis < settings.gate, lasted_s, -lasted_s), 10.0)
         for lost in zip(*np.nonzero(explained_s < -settings.reopen_s / 2), strict=True):
             rows = slice(np.searchsorted(problem.time_ns, problem.time_ns[k] - settings.reopen_s * 1e9), k + 1)
             # The body moved since these ranges: so do their anchors.
             anchors = problem.other[rows] - problem.arm[rows] + (moved[k] - moved[rows])[:, lost[1], None]
-            legs = measured[rows, lost[0], 0] - problem.known_m[rows]
-            fix = multilaterate(legs, anchors, 0.0, sign=problem.sign[rows])
-            x[lost], p[lost], explained_s[lost] = 0.0, prior, 0.0
-            x[lost][:3], p[lost][:3, :3] = fix.place_m, fix.covariance_m2
-        wrong, covariance = x[..., :3] - problem.place[k], p[..., :3, :3]
-        estimate[k], accepted[k], nis[k] = x[..., :3], update.believed, update.nis
+            fix = multilaterate(measured[rows, lost[0]] - problem.known_m[rows], anchors, 0.0, sign=problem.sign[rows])
+            running.state[lost], running.covariance[lost], explained_s[lost] = 0.0, prior, 0.0
+            running.state[lost][place], running.covariance[lost][place, place] = fix.place_m, fix.covariance_m2
+        covariance = running.covariance[..., place, place]
+        estimate[k], accepted[k], nis[k] = running.state[..., place], update.believed, update.nis
         std_m[k] = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
-        nees[k] = np.sum(wrong * np.linalg.solve(covariance, wrong[..., None])[..., 0], axis=-1)
+        nees[k] = squared_over(estimate[k] - problem.place[k], covariance)
 
     def track(f: int, seed: int) -> Track:
         return Track(
@@ -328,6 +378,7 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
             attitude=problem.attitude,
             estimate_m=estimate[:, f, seed],
             truth_m=problem.place,
+            true_attitude=problem.attitude,
             std_m=std_m[:, f, seed],
             nis=nis[:, f, seed],
             nees=nees[:, f, seed],

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from html import escape
 from typing import TYPE_CHECKING, Any
 
 import calib
-from calib.calibration.model import Calibration
+from calib.calibration.model import Calibration, CalibrationResult
 from calib.data.ranges import Ranges
 from uwblink.arrays import Bools, Floats
 
@@ -25,7 +23,7 @@ class HeldOut:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class FitResult:
+class FitResult(CalibrationResult):
     """A calibration and how it came about.
 
     `ranges` are those that were fitted (n,), `residuals_m` their fully corrected errors, corrected range less truth;
@@ -49,21 +47,9 @@ class FitResult:
     warnings: list[str]
     held_out: HeldOut | None = None
 
-    def __repr__(self) -> str:
-        """Return the calibration as a table, below what it was fitted to, above the warnings."""
-        return "\n".join([self._headline(), repr(self.calibration), *(f"warning: {text}" for text in self.warnings)])
-
-    def _repr_html_(self) -> str:
-        """Return the same as HTML, for notebooks."""
-        warned = "".join(f"<p><b>Warning:</b> {escape(text)}</p>" for text in self.warnings)
-        return f"<p>{escape(self._headline())}</p>{self.calibration._repr_html_()}{warned}"
-
-    def _headline(self) -> str:
+    def headline(self) -> str:
+        """Return what was fitted, and how the search ended, in one line."""
         return f"Fit of {len(self.ranges)} ranges of {self.ranges.source}: {self.message}"
-
-    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write the calibration as JSON, whole or not at all; replaces a file only with `force`."""
-        self.calibration.save(path, force=force)
 
     def correct(self, *columns: Any, **named: Any) -> Any:
         """Correct one range, or arrays of them, as `Calibration.correct` does."""

@@ -24,9 +24,10 @@ from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, RangeRows
 from calib.estimator.rows import sum_rows
 from calib.estimator.unknowns import Layout, Priors
+from calib.evaluation.filters import IMUS
 from calib.planning.reference_motion import reference_motion
 from calib.planning.result import FlightPlan, NextBest, mean_std_ns
-from calib.planning.settings import ACCELEROMETERS, FlightPlanSettings
+from calib.planning.settings import FlightPlanSettings
 from calib.range_errors.densities import error_slopes
 from calib.settings import FitSettings, FlightSettings
 from calib.spread import TWO_SIDED_95
@@ -37,13 +38,6 @@ from calib.trajectories.scene import Scene, scene_from
 from calib.trajectories.start import Trajectories, interpolated
 from uwblink.arrays import Floats
 from uwblink.recording.schema import KnownDistance
-
-TYPICAL_CURVE_M, CURVE_BENDS = 0.05, 3.0
-"""Amplitude (m) and phase over the power range (rad) of a typical bias curve, which sets the smoothness that a fit will
-estimate."""
-
-ENDS = 4
-"""Control points at either end of a path that planned positions do not determine well."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,7 +157,8 @@ class Information:
         knots = np.zeros(0) if model.curve is None else model.curve.knots
         for kind in model.curve_kinds():
             centres = np.convolve(knots[1:-1], np.full(3, 1 / 3), mode="valid")
-            self.x[self.layout.where[kind]] = TYPICAL_CURVE_M * np.sin(CURVE_BENDS * centres)
+            # A typical bias curve, of 5 cm and 3 rad over the range of powers: it sets the smoothness that a fit finds.
+            self.x[self.layout.where[kind]] = 0.05 * np.sin(3.0 * centres)
         geometry = Distances.of(self.motion, self.layout, (model.ranges.initiator, model.ranges.target), scene.time_s)
         raw = np.zeros(len(scene.time_s))
         ranges = RangeRows.of(raw, model.key(), model.parts, flight.errors, self.layout, geometry)
@@ -205,17 +200,11 @@ class Information:
 
 def _jerk(points: Floats, step_s: float) -> float:
     """Return the jerk that paths by control points (k, bodies, 3) have, root mean square, away from their ends."""
-    inner = points[ENDS:-ENDS] if len(points) > 3 * ENDS else points
+    # Planned positions do not determine four control points at either end well.
+    inner = points[4:-4] if len(points) > 12 else points
     jerk = np.diff(inner, n=3, axis=0) / step_s**3
     return max(float(np.sqrt(np.mean(jerk**2))), LEAST_JERK)
 
-
-MORE_KNOWN_S, MORE_ANCHORS, STANDS_S, HEADING_DEG = 10.0, 4, 5.0, 0.5
-"""Further measurements that are proposed: so many seconds of known positions, anchors, seconds at a stand, and degrees
-of error of headings. Each is what a team can do without other equipment."""
-
-OTHER_DELAY_STD_NS = 0.05
-"""Standard error of the delay of one tag from another calibration or a survey (`make surveys`: 41 to 94 ps)."""
 
 Robots = int | Sequence[Sequence[int]]
 
@@ -269,7 +258,7 @@ def _information(asked: FlightPlanSettings, data: Data | None) -> Information:
         None
         if asked.imu is None
         # The second part is vibration that is left in a mean (m/s^2): a judgement; a fit weighs by its residuals.
-        else TRUSTED * math.hypot(ACCELEROMETERS[asked.imu] / math.sqrt(SAMPLE_S), 0.2)
+        else TRUSTED * math.hypot(IMUS[asked.imu].force / math.sqrt(SAMPLE_S), 0.2)
     )
     flight = flight_of(
         reference_motion(asked) if data is None else data,
@@ -312,12 +301,11 @@ def _more(asked: FlightPlanSettings, data: Data | None, found: Information) -> I
             mean = _mean_ns(changed.covariance_ns2[np.ix_(same, same)])
             if mean < now:
                 yield NextBest(what.format(*changed.flight.tapes[-1:]), mean, now)
-    c = found.covariance_ns2
-    means = [_mean_ns(c - np.outer(c[k], c[k]) / (c[k, k] + OTHER_DELAY_STD_NS**2)) for k in range(len(c))]
+    # Another calibration or a survey finds the delay of a tag to 41 to 94 ps (`make surveys`).
+    c, other_ns = found.covariance_ns2, 0.05
+    means = [_mean_ns(c - np.outer(c[k], c[k]) / (c[k, k] + other_ns**2)) for k in range(len(c))]
     best = int(np.argmin(np.round(means, 6)))
-    yield NextBest(
-        f"the delay of tag {found.tags[best]} from elsewhere, to {OTHER_DELAY_STD_NS:g} ns", means[best], now
-    )
+    yield NextBest(f"the delay of tag {found.tags[best]} from elsewhere, to {other_ns:g} ns", means[best], now)
 
 
 def _changes(asked: FlightPlanSettings, flight: PlannedFlight) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -325,14 +313,17 @@ def _changes(asked: FlightPlanSettings, flight: PlannedFlight) -> Iterator[tuple
 
     The words have places for both tags of the last taped distance.
     """
-    longer, poses = (asked.poses_until_s or 0.0) + MORE_KNOWN_S, asked.attitudes == "poses"
+    # Seconds at a stand, anchors and degrees of error of headings that a team can have without other equipment, beside
+    # ten more seconds of known positions.
+    stands_s, more_anchors, heading_deg = 5.0, 4, 0.5
+    longer, poses = (asked.poses_until_s or 0.0) + 10.0, asked.attitudes == "poses"
     free, given = asked.robots is not None, {"anchor_places": "given"}
     tags = [*(tag for robot in asked.robots or () for tag in robot), *asked.anchors]
     one, four = (
         given | {"anchors": (*asked.anchors, *range(max(tags, default=0) + 1, max(tags, default=0) + 1 + more))}
-        for more in (1, MORE_ANCHORS)
+        for more in (1, more_anchors)
     )
-    standing = f"robots that stand for the first {STANDS_S:g} s, and the distance of two of their tags by tape"
+    standing = f"robots that stand for the first {stands_s:g} s, and the distance of two of their tags by tape"
     tape = {"taped": asked.taped + 1}
     rows: list[tuple[bool, str, dict[str, Any]]] = [
         (
@@ -343,13 +334,13 @@ def _changes(asked: FlightPlanSettings, flight: PlannedFlight) -> Iterator[tuple
         (True, "the distance of tags {0[0]} and {0[1]} by tape", tape),
         (bool(flight.scene.sought), "the places of the anchors, measured", given),
         (
-            poses and asked.heading_std_deg > HEADING_DEG,
-            f"headings good to {HEADING_DEG:g} degrees",
-            {"heading_std_deg": HEADING_DEG},
+            poses and asked.heading_std_deg > heading_deg,
+            f"headings good to {heading_deg:g} degrees",
+            {"heading_std_deg": heading_deg},
         ),
-        (free and not asked.still_s, standing, tape | {"still_s": STANDS_S}),
+        (free and not asked.still_s, standing, tape | {"still_s": stands_s}),
         (free, f"a flight of {2 * asked.seconds:g} s", {"seconds": 2 * asked.seconds}),
-        (free and not asked.anchors, f"{MORE_ANCHORS} anchors at known places", four),
+        (free and not asked.anchors, f"{more_anchors} anchors at known places", four),
         (
             free and bool(asked.anchors) and asked.anchor_places == "given",
             "one anchor more at a known place",

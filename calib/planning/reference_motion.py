@@ -16,9 +16,6 @@ from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
 
-STARTING_S = 3.0
-"""Seconds from standstill to full speed: a judgement, gentle at 1 m/s."""
-
 
 def reference_motion(flown: FlightPlanSettings) -> SampleFlight:
     """Return a flight without errors or delays; the same for the same seed."""
@@ -50,7 +47,7 @@ def _motion(flown: FlightPlanSettings, number: int, rng: np.random.Generator) ->
     """Return position and yaw (4,) of a body over time: two sines an axis about a middle of its own, upright, turning
     to and fro.
 
-    Until it starts it stands; `STARTING_S` later it is as fast as it will be.
+    Until it starts it stands; 3 s later it is as fast as it will be: a judgement, gentle at 1 m/s.
     """
     size, angle = np.array(flown.size_m), 2 * np.pi * number / len(flown.robots) + 0.4
     # Middles lie on an ellipse of 0.3 of the room; each of the two sines is 0.12 of it.
@@ -66,8 +63,8 @@ def _motion(flown: FlightPlanSettings, number: int, rng: np.random.Generator) ->
     along = time = np.arange(-1.5, flown.seconds + 1.5, 0.02)
     if flown.still_s:
         # The pace rises from 0 to 1 by 3 u^2 - 2 u^3, whose integral this is.
-        u = np.clip((time - flown.still_s) / STARTING_S, 0.0, 1.0)
-        along = STARTING_S * (u**3 - u**4 / 2) + np.maximum(time - flown.still_s - STARTING_S, 0.0)
+        u = np.clip((time - flown.still_s) / 3.0, 0.0, 1.0)
+        along = 3.0 * (u**3 - u**4 / 2) + np.maximum(time - flown.still_s - 3.0, 0.0)
     place = middle + reach * np.sin(rate * along[:, None, None] + phase).sum(axis=2)
     return make_interp_spline(time, np.column_stack([place, heading + 1.2 * np.sin(turning * along)]))
 

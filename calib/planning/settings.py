@@ -14,12 +14,8 @@ from uwblink.settings import setting
 ROOMS_M: Final = {"line": (5.0,), "plane": (3.0, 2.0), "space": (6.0, 5.0, 2.5)}
 """Where boards may stand, and its default lengths: a string across a room, a large table, a room."""
 
-ACCELEROMETERS: Final = {"consumer": 3e-3, "industrial": 1e-3, "tactical": 3e-4}
-"""Noise of accelerometers by grade, in m/s^2 a root of Hz, orders of magnitude of data sheets."""
-
-MAX_TAGS: Final = 60
-MAX_RANGES: Final = 200_000
-"""Bounds that keep a mistyped number from filling the memory: 1770 pairs, and five training flights' exchanges."""
+IMU_GRADES: Final = ("consumer", "industrial", "tactical")
+"""Grades of IMUs whose noise data sheets state (`calib.evaluation.IMUS`)."""
 
 
 def read_numbers(text: str, parameter: str | None = None) -> list[float]:
@@ -52,18 +48,20 @@ def _are_lengths(size_m: Sequence[float], dimensions: int) -> bool:
     return len(size_m) == dimensions and all(math.isfinite(v) and 0 < v <= 1000 for v in size_m)
 
 
-_SIZE: Any = {"flag": "--size", "kind": str | None, "parse": read_numbers, "metavar": "M,M,M"}
-_ANCHORS: Any = {
-    "help": "Boards at known positions, which stay there.",
-    "flag": "--anchor-tags",
-    "kind": str | None,
-    "parse": read_whole,
-    "metavar": "TAG,TAG...",
+OF_BOTH: Final[dict[str, Any]] = {
+    "size_m": {"flag": "--size", "kind": str | None, "parse": read_numbers, "metavar": "M,M,M"},
+    "anchors": {
+        "help": "Boards at known positions, which stay there.",
+        "flag": "--anchor-tags",
+        "kind": str | None,
+        "parse": read_whole,
+        "metavar": "TAG,TAG...",
+    },
+    "rate_hz": {"help": "Exchanges per second, all pairs together (Hz).", "flag": "--rate"},
+    "taped": {"help": "Number of distances that will be measured with a tape."},
+    "tape_sigma_m": {"help": "Standard deviation of a distance by tape (m).", "flag": "--tape-sigma"},
 }
-_RATE: Any = {"help": "Exchanges per second, all pairs together (Hz).", "flag": "--rate"}
-_TAPED: Any = {"help": "Number of distances that will be measured with a tape."}
-_SIGMA: Any = {"bounds": (1e-9, 100.0)}
-_TAPE: Any = {"help": "Standard deviation of a distance by tape (m).", "flag": "--tape-sigma"}
+"""The options of settings that plans of both kinds have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,17 +89,21 @@ class SurveyPlanSettings(CheckedSettings):
     arrangements: int | None = setting(
         None, "Number of arrangements; by default as many as are worth it.", bounds=(1, 26)
     )
-    size_m: Sequence[float] | None = setting(None, "Length of the line, or sides of plane or room (m).", **_SIZE)
-    taped: int = setting(0, **_TAPED, bounds=(0, 1000))
-    tape_sigma_m: float = setting(0.005, **_TAPE, **_SIGMA)
-    anchors: Sequence[int] = setting((), **_ANCHORS)
-    anchor_sigma_m: float = setting(0.01, "Standard deviation of known positions (m).", flag="--anchor-sigma", **_SIGMA)
+    size_m: Sequence[float] | None = setting(
+        None, "Length of the line, or sides of plane or room (m).", **OF_BOTH["size_m"]
+    )
+    taped: int = setting(0, **OF_BOTH["taped"], bounds=(0, 1000))
+    tape_sigma_m: float = setting(0.005, **OF_BOTH["tape_sigma_m"], bounds=(1e-9, 100.0))
+    anchors: Sequence[int] = setting((), **OF_BOTH["anchors"])
+    anchor_sigma_m: float = setting(
+        0.01, "Standard deviation of known positions (m).", flag="--anchor-sigma", bounds=(1e-9, 100.0)
+    )
     pair_error_m: float = setting(
-        0.02, "Constant error of a pair in an arrangement (m).", flag="--pair-error", **_SIGMA
+        0.02, "Constant error of a pair in an arrangement (m).", flag="--pair-error", bounds=(1e-9, 100.0)
     )
     # Of more pairs nobody could tell which are reflected.
     reflected: float = setting(0.0, "Share of pairs that are reflected.", bounds=(0.0, 0.3))
-    rate_hz: float = setting(50.0, **_RATE, bounds=(1e-3, 1e5))
+    rate_hz: float = setting(50.0, **OF_BOTH["rate_hz"], bounds=(1e-3, 1e5))
     seed: int = 1
 
     def __post_init__(self) -> None:
@@ -148,8 +150,8 @@ class FlightPlanSettings(CheckedSettings):
 
     robots: Any = None
     seconds: float = setting(60.0, "Duration in seconds.", flag="--duration", bounds=(5.0, 3600.0))
-    rate_hz: float = setting(80.0, **_RATE, bounds=(0.5, 2000.0))
-    size_m: Sequence[float] = setting((6.0, 5.0, 2.5), "Sides of the room (m).", **_SIZE)
+    rate_hz: float = setting(80.0, **OF_BOTH["rate_hz"], bounds=(0.5, 2000.0))
+    size_m: Sequence[float] = setting((6.0, 5.0, 2.5), "Sides of the room (m).", **OF_BOTH["size_m"])
     speed_m_s: float = setting(1.0, "Mean speed of the robots (m/s).", flag="--robot-speed", bounds=(0.05, 10.0))
     apart_m: float = setting(0.5, "Distance between the tags of a robot (m).", flag="--tag-spacing", bounds=(0.0, 3.0))
     poses_until_s: float | None = setting(
@@ -163,8 +165,8 @@ class FlightPlanSettings(CheckedSettings):
     heading_std_deg: float = setting(
         3.0, "Standard deviation of headings; 0: headings are exact.", flag="--heading-std", metavar="DEGREES"
     )
-    imu: str | None = setting(None, "Grade of the robots' inertial sensors.", names=tuple(ACCELEROMETERS))
-    anchors: Sequence[int] = setting((), **_ANCHORS)
+    imu: str | None = setting(None, "Grade of the robots' inertial sensors.", names=IMU_GRADES)
+    anchors: Sequence[int] = setting((), **OF_BOTH["anchors"])
     anchor_places: str = setting(
         "given", "Positions of anchors: given, or sought (estimated).", flag="--anchors", names=("given", "sought")
     )
@@ -175,8 +177,8 @@ class FlightPlanSettings(CheckedSettings):
         metavar="SECONDS",
         bounds=(0.0, 600.0),
     )
-    taped: int = setting(0, **_TAPED, bounds=(0, 10))
-    tape_sigma_m: float = setting(0.01, **_TAPE, bounds=(1e-4, 1.0))
+    taped: int = setting(0, **OF_BOTH["taped"], bounds=(0, 10))
+    tape_sigma_m: float = setting(0.01, **OF_BOTH["tape_sigma_m"], bounds=(1e-4, 1.0))
     noise_m: float = setting(0.04, "Noise of a range (m).", flag="--range-noise", bounds=(1e-4, 10.0))
     reflected: float = setting(0.08, "Share of ranges that are reflected.", bounds=(0.0, 0.9))
     delays_only: bool = setting(False, "Plan for a fit without a curve over power.")
@@ -186,19 +188,25 @@ class FlightPlanSettings(CheckedSettings):
         """Check all values, and the robots where there are some."""
         CheckedSettings.__post_init__(self)
         if self.imu is not None:
-            check_choice("imu", self.imu, ACCELEROMETERS)
+            check_choice("imu", self.imu, IMU_GRADES)
         asked, known = self.robots, self.robots is not None
         listed = [(2 * k + 1, 2 * k + 2) for k in range(asked)] if isinstance(asked, int) else asked or ()
         robots = tuple(tuple(map(int, tags)) for tags in listed)
         tags, anchors, ranges = [tag for robot in robots for tag in robot], self.anchors, self.seconds * self.rate_hz
-        once = len(set(tags)) == len(tags) and len(tags) + len(anchors) <= MAX_TAGS
+        # Bounds that keep a mistyped number from filling the memory: 1770 pairs, and the exchanges of five flights.
+        most_tags, most_ranges = 60, 200_000
+        once = len(set(tags)) == len(tags) and len(tags) + len(anchors) <= most_tags
         among = (
-            f"found {self.robots!r:.60}, expected robots with a tag or more each, every tag once, at most {MAX_TAGS}"
+            f"found {self.robots!r:.60}, expected robots with a tag or more each, every tag once, at most {most_tags}"
         )
         others = len(set(anchors)) == len(anchors) and not set(anchors) & set(tags)
         refused = [
             ("size_m", not _are_lengths(self.size_m, 3), "found {}, expected three lengths in metres"),
-            ("seconds", known and ranges > MAX_RANGES, f"{ranges:.0f} ranges are more than a plan takes, {MAX_RANGES}"),
+            (
+                "seconds",
+                known and ranges > most_ranges,
+                f"{ranges:.0f} ranges are more than a plan takes, {most_ranges}",
+            ),
             (
                 "still_s",
                 known and self.still_s > self.seconds / 2,

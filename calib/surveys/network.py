@@ -116,46 +116,36 @@ class Case:
         return replace(self, pair_m=self.pair_m * math.exp(pair), curve_m=self.curve_m * math.exp(curve))
 
 
-@dataclass(frozen=True, kw_only=True)
 class Linear:
     """A network that is linear about unknowns (p,) in a case: all errors are normal.
 
     `left` (n,) is measured less predicted and `jacobian` (n, p) the derivative of what is predicted, both over the
-    standard deviation `std` (n,) of each row. `prior` (p, p) is the precision of the priors, whose slope is `pull`
-    (p,) and value -2 log density `prior_value`. `free` are the indices of the unknowns that are sought, `guessed` those
-    whose prior is no knowledge but the usual size.
+    standard deviation `std` (n,) of each row. `information` (p, p) is that of the rows, `prior` (p, p) the precision of
+    the priors, and `slope` (p,) that of the log likelihood of both.
     """
 
-    left: Floats
-    jacobian: Floats
-    std: Floats
-    prior: Floats
-    pull: Floats
-    prior_value: float
-    free: Ints
-    guessed: Ints
-
-    @cached_property
-    def information(self) -> Floats:
-        """The information (p, p) of the rows."""
-        return self.jacobian.T @ self.jacobian
+    def __init__(self, network: Network, x: Floats, case: Case) -> None:
+        """Take the derivatives at unknowns (p,)."""
+        (left, jacobian), priors = network.linear(x, case.marks), network.priors(case.curve_m)
+        precision, self.std = priors.precision(), network.std_m(case)
+        self.left, self.jacobian = left / self.std, jacobian / self.std[:, None]
+        self.information: Floats = self.jacobian.T @ self.jacobian
+        self.prior: Floats = precision.toarray() if sparse.issparse(precision) else precision
+        self.slope: Floats = self.jacobian.T @ self.left + priors.pull(x)
+        self._prior_value = -2 * priors.value(x)
+        self._free, self._guessed = network.layout.free(), network.guessed
 
     @property
     def known(self) -> Floats:
         """The information (p, p) of the rows and of what is known, without guesses."""
-        found = self.information + self.prior
-        found[self.guessed, self.guessed] -= self.prior[self.guessed, self.guessed]
+        found, guessed = self.information + self.prior, (self._guessed, self._guessed)
+        found[guessed] -= self.prior[guessed]
         return found
 
     @cached_property
     def covariance(self) -> Floats:
         """The covariance (p, p) of the free unknowns by rows and prior, zero elsewhere."""
-        return np.asarray(inverse_of(self.information + self.prior, self.free))
-
-    @cached_property
-    def slope(self) -> Floats:
-        """The slope (p,) of the log likelihood by the unknowns."""
-        return np.asarray(self.jacobian.T @ self.left + self.pull)
+        return np.asarray(inverse_of(self.information + self.prior, self._free))
 
     @cached_property
     def step(self) -> Floats:
@@ -164,8 +154,8 @@ class Linear:
 
     def unlikely(self) -> float:
         """Return -2 log likelihood of the rows, integrated over the unknowns (Laplace's approximation)."""
-        own = np.ix_(self.free, self.free)
-        value = float(self.left @ self.left) + self.prior_value - float(self.slope @ self.step)
+        own = np.ix_(self._free, self._free)
+        value = float(self.left @ self.left) + self._prior_value - float(self.slope @ self.step)
         value += 2 * float(np.log(self.std).sum()) + float(np.linalg.slogdet((self.information + self.prior)[own])[1])
         return value - float(np.linalg.slogdet(self.prior[own])[1])
 
@@ -358,18 +348,7 @@ class Network:
 
     def at(self, x: Floats, case: Case) -> Linear:
         """Return the network about unknowns (p,) in a case."""
-        (left, jacobian), priors, std = self.linear(x, case.marks), self.priors(case.curve_m), self.std_m(case)
-        precision = priors.precision()
-        return Linear(
-            left=left / std,
-            jacobian=jacobian / std[:, None],
-            std=std,
-            prior=precision.toarray() if sparse.issparse(precision) else precision,
-            pull=priors.pull(x),
-            prior_value=-2 * priors.value(x),
-            free=self.layout.free(),
-            guessed=self.guessed,
-        )
+        return Linear(self, x, case)
 
     def alone(self, arrangement: int) -> Network:
         """Return the network of the means of one arrangement, in which only its places are sought."""

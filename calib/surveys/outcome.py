@@ -33,10 +33,6 @@ from uwblink.arrays import Floats
 from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 
-MIN_BELIEVED, MIN_MENTIONED = 0.5, 0.1
-"""Probabilities from which a pair is believed to be reflected, and from which it is said that it may be: more
-likely than not, and a tenth."""
-
 
 def students_factor(freedom: float) -> float:
     """Return by how much Student's 95 % quantile is more than the normal one: the spread of errors is estimated.
@@ -96,13 +92,13 @@ def result_of(
 
 
 def _reflected_pairs(found: Solution) -> list[ReflectedPair]:
-    """Return the pairs that may be reflected, the likeliest first."""
+    """Return the pairs that are reflected with a probability of a tenth or more, the likeliest first."""
     means, longer = found.network.means, found.network.linear(found.x)[0].tolist()
     names = [found.network.arrangements[k].name for k in means.arrangement.tolist()]
     return [
         ReflectedPair(names[k], int(means.ends[k, 0]), int(means.ends[k, 1]), longer[k], float(found.chance[k]))
         for k in np.argsort(-found.chance, kind="stable").tolist()
-        if found.chance[k] >= MIN_MENTIONED
+        if found.chance[k] >= 0.1
     ]
 
 
@@ -110,11 +106,11 @@ def _notes(
     found: Solution, second: SecondBest | None, verdict: Verdict, reflected: Sequence[ReflectedPair]
 ) -> list[str]:
     """Return what a user should know, a line each."""
-    believed = [one for one in reflected if one.chance >= MIN_BELIEVED]
+    believed = [one for one in reflected if one.believed]
     perhaps = ", ".join(
         f"{one.first}-{one.second} in {one.arrangement} ({100 * one.chance:.0f} %)"
         for one in reflected
-        if one.chance < MIN_BELIEVED
+        if not one.believed
     )
     where, who, worse = ("", (), 0.0) if second is None else (second.arrangement, second.tags, second.worse)
     notes = [

@@ -8,7 +8,7 @@ varies by while nothing moves is an error of its measurement.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import PurePath
 
 import numpy as np
@@ -27,7 +27,7 @@ from calib.pairs import Pairs, pairs_of
 from calib.settings import FitSettings
 from calib.spread import STD_OF_MEDIAN, medians, robust_spread
 from calib.surveys.knowledge import Knowledge
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import ColumnTable, Floats, Ints
 from uwblink.recording.antenna_delays import AntennaDelays
 from uwblink.recording.schema import Arrangement, KnownDistance
 from uwblink.recording.summary import single_reports
@@ -45,16 +45,12 @@ WINDOW_BINS = 5
 """Bins of a second before and after an instant whose medians are compared: a hand needs less to move a board."""
 
 
-MOVED_M, MOVED_BINS, MIN_SIDE_BINS = 0.03, 60, 8
-"""Smallest change of a pair's range that tells of a board that was moved within an arrangement; bins into which the
-arrangement is divided for that, and how many of them either side needs."""
-
 SIGMAS = 6.0
 """Standard deviations of noise from which a change is one: one in 5e8 by chance, and there are thousands."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PairMeans:
+class PairMeans(ColumnTable):
     """One row a pair and arrangement (n,): `ends` (n, 2) are its tags, the smaller first, `weights` multiply delays.
 
     `range_m` is the mean of raw ranges, `std_m` how well it is known, `noise_m` the spread of single ranges, `lifted`
@@ -69,10 +65,6 @@ class PairMeans:
     noise_m: Floats
     count: Ints
     lifted: Floats
-
-    def __getitem__(self, rows: Bools) -> PairMeans:
-        """Return some of the rows."""
-        return PairMeans(**{one.name: getattr(self, one.name)[rows] for one in fields(self)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,15 +193,16 @@ def find_motion(name: str, ranges: Ranges) -> list[Finding]:
     if len(ranges.tags()) < 3:
         return []
     begin = int(ranges.time_ns.min())
-    ends, starts, median, noise = _binned(ranges, int(np.ptp(ranges.time_ns)) // MOVED_BINS + 1)
+    # An arrangement is divided into sixty bins, of which either side needs eight.
+    ends, starts, median, noise = _binned(ranges, int(np.ptp(ranges.time_ns)) // 60 + 1)
     step = _steps(median, len(starts))[:, 1:-1]
     before = np.cumsum(np.isfinite(median), axis=1)[:, :-1]
     after = np.isfinite(median).sum(axis=1, keepdims=True) - before
-    sides = np.minimum(before, after) >= MIN_SIDE_BINS
+    sides = np.minimum(before, after) >= 8
     with np.errstate(divide="ignore", invalid="ignore"):
         std = STD_OF_MEDIAN * np.maximum(noise, METRES_PER_TICK)[:, None] * np.sqrt(1 / before + 1 / after)
         size = np.where(sides, np.abs(step) / std, 0.0)
-    changed = (size > SIGMAS) & (np.abs(step) > MOVED_M)
+    changed = (size > SIGMAS) & (np.abs(step) > 0.03)
     member = (ends[:, :, None] == np.array(ranges.tags())).any(axis=1).T.astype(float)
     total = (member @ np.where(changed, np.minimum(size, 50.0), 0.0)) * (member @ changed >= 2)
     if not total.any():

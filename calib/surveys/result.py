@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.calibration.model import Calibration
+from calib.calibration.model import Calibration, CalibrationResult
 from calib.errors import BadInputError
 from calib.findings import Finding
 from calib.information import Verdict
@@ -109,6 +109,11 @@ class ReflectedPair:
     longer_m: float
     chance: float
 
+    @property
+    def believed(self) -> bool:
+        """Whether it is more likely than not."""
+        return self.chance >= 0.5
+
     def to_dict(self) -> dict[str, Any]:
         """Return everything as JSON takes it."""
         return {
@@ -120,7 +125,7 @@ class ReflectedPair:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class SurveyResult:
+class SurveyResult(CalibrationResult):
     """A calibration from boards that stood still, and where they stood.
 
     `pair_error_m` is the constant error that a pair has in an arrangement, as a standard deviation; `verdict` says what
@@ -148,11 +153,6 @@ class SurveyResult:
         """The contradictions in words."""
         return tuple(map(str, self.contradictions))
 
-    def __repr__(self) -> str:
-        """Return the calibration as a table, below what it rests on, above the warnings."""
-        lines = [self.headline(), repr(self.calibration), *(f"warning: {text}" for text in self.warnings)]
-        return "\n".join(lines)
-
     def headline(self) -> str:
         """Return what the survey rests on, in one line."""
         count = len(self.arrangements)
@@ -161,10 +161,6 @@ class SurveyResult:
             f"Survey of {count} arrangement{'s' * (count > 1)}, {pairs} pairs: constant error of a pair "
             f"{100 * self.pair_error_m:.1f} cm"
         )
-
-    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write the calibration as JSON, whole or not at all; replaces a file only with `force`."""
-        self.calibration.save(path, force=force)
 
     def save_anchors(
         self, path: str | os.PathLike[str], *, arrangement: str | None = None, force: bool = False

@@ -22,9 +22,9 @@ from operator import attrgetter, itemgetter
 import numpy as np
 from scipy.linalg import orthogonal_procrustes
 from scipy.optimize import minimize_scalar
-from scipy.sparse.csgraph import floyd_warshall
 
 from calib.estimator.optimize import maximize
+from calib.estimator.scaling import scaled_places
 from calib.surveys.network import Boards, Case, Lengths, Linear, Network
 from calib.surveys.reflections import Marks, unlikely
 from calib.surveys.result import SecondBest
@@ -66,12 +66,12 @@ def first_start(network: Network, delays: Floats | None = None) -> Floats:
     measured = network.linear(np.where(np.arange(len(x)) < place.size, 0.0, x))[0]  # with all points at the origin
     for k, boards in enumerate(network.arrangements):
         here = network.seats(k)
-        apart = _distances(network, measured, here)
-        centring = np.eye(len(here)) - 1 / len(here)
-        values, vectors = np.linalg.eigh(-0.5 * centring @ apart**2 @ centring)
-        top = np.argsort(values)[::-1][: boards.dimensions]
-        found = np.zeros((len(here), 3))
-        found[:, : len(top)] = vectors[:, top] * np.sqrt(np.maximum(values[top], 1e-6))
+        rows = np.flatnonzero(np.isin(network.ends[: len(network.means.range_m), 0], here))
+        first, second = np.searchsorted(here, network.ends[rows]).T
+        length = np.full((len(here), len(here)), np.inf)
+        length[first, second] = length[second, first] = np.maximum(measured[rows], 0.01)
+        # A derivative by a coordinate of which all are zero would be zero.
+        found = scaled_places(length, boards.dimensions, least_m2=1e-6)
         known = [n for n, point in enumerate(here.tolist()) if point in network.known_places]
         if known:
             goal, mine = np.array([network.known_places[here[n]][0] for n in known]), found[known]
@@ -108,18 +108,6 @@ def _replaced(points: Floats, rows: list[int], places: Floats) -> Floats:
     return found
 
 
-def _distances(network: Network, measured: Floats, here: Ints) -> Floats:
-    """Return the distances (n, n) of the points of an arrangement; by way of others where they were not measured."""
-    apart = np.full((len(here), len(here)), np.inf)
-    np.fill_diagonal(apart, 0.0)
-    rows = np.flatnonzero(np.isin(network.ends[: len(network.means.range_m), 0], here))
-    ends = np.searchsorted(here, network.ends[rows])
-    apart[ends[:, 0], ends[:, 1]] = apart[ends[:, 1], ends[:, 0]] = np.maximum(measured[rows], 0.01)
-    apart = floyd_warshall(apart)
-    longest = float(apart[np.isfinite(apart)].max(initial=1.0))
-    return np.where(np.isfinite(apart), apart, longest)
-
-
 PAIR_STD_M, PAIR_PRIOR_FREEDOM = 0.02, 3.0
 """Prior standard deviation of the constant error of a pair, and the degrees of freedom that it counts as.
 Half or twice of either moves delays beside reflections by 0.29 standard errors, which become 0.93 to 1.3 times as large
@@ -129,9 +117,6 @@ Half or twice of either moves delays beside reflections by 0.29 standard errors,
 CURVE_STD_M, CURVE_FACTOR = 0.1, 1.7
 """Prior standard deviation of a curve, and the factor by which that may be wrong (`CURVE_LENGTH_DB`)."""
 
-
-MIN_DIFFERENCE_M = 0.03
-"""How far a board must move for a solution to count as another one."""
 
 MAX_WORSE_ALONE = 60.0
 """By how much -2 log likelihood of one arrangement's other solution may be worse for all to be solved with it:
@@ -336,20 +321,22 @@ def _other_solutions(
     network, boards, seats = found.network, found.network.arrangements[arrangement], found.network.seats(arrangement)
     alone, mine = network.alone(arrangement), network.means.arrangement == arrangement
     case = replace(found.case, marks=found.case.marks[mine])
+    # A solution counts as another one if a board moves by 3 cm.
+    least_m = 0.03
     most, seen = unlikelihood(alone, found.x, case) + MAX_WORSE_ALONE, [_signature(network, found.x, seats)]
     for points in other_starts(network.positions_m(found.x)[seats], boards, seed=arrangement):
         start = network.with_positions(found.x, points, seats)
         x, own = settle(alone, start, replace(case, marks=np.zeros_like(case.marks)))
         mark = _signature(network, x, seats)
-        if unlikelihood(alone, x, own) > most or any(np.abs(mark - one).max() < MIN_DIFFERENCE_M for one in seen):
+        if unlikelihood(alone, x, own) > most or any(np.abs(mark - one).max() < least_m for one in seen):
             continue
         seen.append(mark)
         marks = found.case.marks.copy()
         marks[mine] = own.marks
         x, whole = settle(network, x, replace(found.case, marks=marks))
         change = np.abs(_signature(network, x, seats) - seen[0]).max(axis=1)
-        if change.max() >= MIN_DIFFERENCE_M:
-            tags = np.array(boards.tags)[change > max(MIN_DIFFERENCE_M, 0.5 * change.max())]
+        if change.max() >= least_m:
+            tags = np.array(boards.tags)[change > max(least_m, 0.5 * change.max())]
             yield unlikelihood(network, x, whole), x, whole, (boards.name, tuple(tags.tolist()))
 
 

@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import combinations
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -26,7 +26,7 @@ from calib.data.ranges import Ranges
 from calib.data.samples import ANCHOR_DELAYS_NS
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
-from calib.findings import Finding
+from calib.findings import BUDGET, Finding
 from calib.settings import SurveySettings
 from calib.surveys.knowledge import Knowledge, check_knowledge, load_knowledge
 from calib.surveys.network import DIMENSIONS, Boards, CurvePrior, Network
@@ -37,13 +37,6 @@ from calib.surveys.solution import Solution, adjust, averaged, exchanged_boards,
 from uwblink.recording.schema import SHAPES
 from uwblink.ticks import SPEED_OF_LIGHT
 
-FALSE_ALARMS = 0.01
-"""Share of sound surveys in which a check may find something."""
-
-
-START_BESIDE_M = 0.15
-"""How far boards are put beside a line, or plane, at the start of a search: on it a derivative would be zero."""
-
 
 def likeliest_fault(found: Solution) -> tuple[Finding, Solution] | None:
     """Return the likeliest fault that chance does not explain, and the solution without it."""
@@ -52,7 +45,7 @@ def likeliest_fault(found: Solution) -> tuple[Finding, Solution] | None:
         for fault, (hypotheses, remedy) in HYPOTHESES.items()
         for text, without in hypotheses(found)
     ]
-    likely = (one for one in tried if one[0].p_value < FALSE_ALARMS)
+    likely = (one for one in tried if one[0].p_value < BUDGET)
     return min(likely, key=lambda one: one[1].unlikely, default=None)
 
 
@@ -84,9 +77,9 @@ def _shapes(found: Solution) -> Iterator[tuple[str, Solution]]:
         freed = replace(network, arrangements=tuple(arrangements))
         seats, beside = network.seats(k), boards.dimensions
         place = freed.positions_m(first_start(freed, found.delays))[seats]
-        # Where scaling finds nothing beside the line, a derivative there would be zero.
-        if np.ptp(place[:, beside]) < START_BESIDE_M:
-            place[:, beside] += START_BESIDE_M * np.where(np.arange(len(seats)) % 2, 1.0, -1.0)
+        # Where scaling finds nothing beside the line, a derivative there would be zero: boards begin 15 cm beside it.
+        if np.ptp(place[:, beside]) < 0.15:
+            place[:, beside] += np.where(np.arange(len(seats)) % 2, 0.15, -0.15)
         marks = found.case.marks & (network.means.arrangement != k)
         without = adjust(freed, freed.with_positions(found.x, place, seats), marks=marks, start_m=found.case.pair_m)
         away = freed.positions_m(without.x)[seats, beside]
@@ -157,7 +150,7 @@ def wrong_orders(found: Solution) -> Iterator[Finding]:
             f"{where}: {what}: said was {'-'.join(map(str, said))}, the ranges of "
             f"{network.arrangements[same[0]].name} say {'-'.join(map(str, seen))}"
         )
-        yield Finding("exchanged labels", text, "look at their labels", FALSE_ALARMS)
+        yield Finding("exchanged labels", text, "look at their labels", BUDGET)
 
 
 def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, **changes: Any) -> SurveyResult:
@@ -273,10 +266,6 @@ def network_of(gathered: SurveyData, knowledge: Knowledge, fixed_ns: Mapping[int
     )
 
 
-ORDERS: Final = ((1, 2, 3, 4), (2, 1, 4, 3), (3, 1, 4, 2), (2, 4, 1, 3), (4, 3, 2, 1), (1, 3, 4, 2))
-"""Tags from left to right; every two tags are neighbours somewhere, and each is somewhere in the middle."""
-
-
 def sample_arrangements(count: int = 6, *, seed: int = 1) -> Ranges:
     """Return ranges of four boards on a string in `count` orders (at most 6), each held for 30 s, 20 ranges a second.
 
@@ -287,12 +276,14 @@ def sample_arrangements(count: int = 6, *, seed: int = 1) -> Ranges:
     >>> calib.sample_arrangements(2)
     <Ranges of memory: 1200 of tags 1, 2, 3, 4>
     """
+    # Tags from left to right; every two tags are neighbours somewhere, and each is somewhere in the middle.
+    orders = ((1, 2, 3, 4), (2, 1, 4, 3), (3, 1, 4, 2), (2, 4, 1, 3), (4, 3, 2, 1), (1, 3, 4, 2))
     rng, held = np.random.default_rng(seed), 600
-    pairs = np.array(list(combinations(sorted(ORDERS[0]), 2)))
-    delays = np.array([0.0, *(ANCHOR_DELAYS_NS[tag] for tag in ORDERS[0])])[pairs].sum(axis=1)
+    pairs = np.array(list(combinations(orders[0], 2)))
+    delays = np.array([0.0, *(ANCHOR_DELAYS_NS[tag] for tag in orders[0])])[pairs].sum(axis=1)
     pair = np.arange(held) % len(pairs)
     raw = []
-    for order in ORDERS[:count]:
+    for order in orders[:count]:
         place = np.zeros(5)
         place[list(order)] = np.cumsum(rng.uniform(0.5, 1.5, 4))
         error = 0.01 * rng.normal(size=len(pairs))

@@ -48,14 +48,6 @@ COMMON_SETTINGS = (
 )
 """The settings of `fit` that a fit without known distances has, too."""
 
-SHARE_OF_START = 0.3
-"""Share of the work, for the progress bar, that is done when the search has its initial guess."""
-
-
-TAPE_UNCHECKED, TAPE_MIN_DEVIATION, TAPE_MIN_ERROR_M = 0.999, 4.0, 0.03
-"""A tape that no range checks (leverage above the first) is not tested. Others contradict the fit if their deleted
-residual exceeds so many standard errors and so many metres."""
-
 
 def fit_from_ranges(
     data: Data,
@@ -92,14 +84,15 @@ def fit_from_ranges(
     '0.4 ns, planted 0.4 ns'
     """
     flight, settings, known = _settings(flight, settings, changes)
-    report = progress or (lambda _: None)
+    # Three tenths of the work are done when the search has its initial guess.
+    report, begun = progress or (lambda _: None), 0.3
     scene = scene_from(data, flight, need_power=not settings.delays_only)
     # One thread: the same bytes on any machine.
     with threadpool_limits(limits=1, user_api="blas"):
         model, scene = range_model(scene, settings, curve=not settings.delays_only and known is None)
-        scene, state, rival = begin(scene, lambda share: report(SHARE_OF_START * share))
+        scene, state, rival = begin(scene, lambda share: report(begun * share))
         error = model.ranges.raw_m if known is None else model.ranges.raw_m - known.bias_curve(model.lifted)
-        top = search(scene, model, error, state, lambda share: report(SHARE_OF_START + (1 - SHARE_OF_START) * share))
+        top = search(scene, model, error, state, lambda share: report(begun + (1 - begun) * share))
         result = _result(_described(model, top, known), top, flight, settings, known, rival)
     report(1.0)
     return result
@@ -350,7 +343,10 @@ def _of_motion(top: Search) -> Iterator[str]:
 
 
 def _of_tapes(top: Search) -> Iterator[str]:
-    """Yield a sentence for each tape that the ranges contradict, by deleted residuals (Cook and Weisberg 1982)."""
+    """Yield a sentence for each tape that the ranges contradict, by deleted residuals (Cook and Weisberg 1982).
+
+    These are beyond four standard errors and three centimetres.
+    """
     rows, x = top.known.get("tape"), top.optimum.x
     if not isinstance(rows, TapeRows):
         return
@@ -358,12 +354,14 @@ def _of_tapes(top: Search) -> Iterator[str]:
     for number, one in enumerate(tapes.stated):
         mine = np.flatnonzero(tapes.number == number)
         moved = rows.geometry.derivatives(x, mine).mean(axis=0)
-        free = 1 - min(float(moved @ (top.optimum.covariance @ moved)) / one.sigma_m**2, TAPE_UNCHECKED)
+        leverage = float(moved @ (top.optimum.covariance @ moved)) / one.sigma_m**2
+        # A tape that no range checks has all the leverage, and is not tested.
+        if leverage >= 0.999:
+            continue
+        free = 1 - leverage
         without = float(left[mine].mean()) / free
         deviation = abs(without) * math.sqrt(free) / one.sigma_m
-        # A tape that no range checks is at its bound.
-        checked = free > 1 - TAPE_UNCHECKED
-        if checked and deviation >= TAPE_MIN_DEVIATION and abs(without) >= TAPE_MIN_ERROR_M:
+        if deviation >= 4.0 and abs(without) >= 0.03:
             yield (
                 f"the distance of tags {one.first} and {one.second}, {one.distance_m:.3f} m, is "
                 f"{100 * abs(without):.0f} cm {'more' if without > 0 else 'less'} than all else says ({deviation:.0f} "

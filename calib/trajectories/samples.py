@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation, Slerp
 
+from calib.data.sources import sensor_rows
 from calib.errors import BadInputError
 from calib.evaluation.filters import GRAVITY_M_S2
 from calib.spread import medians, robust_spread
@@ -46,10 +47,6 @@ class Samples(ColumnTable):
     """
 
     time_s: Floats
-
-    def __len__(self) -> int:
-        """Return the number of samples."""
-        return len(self.time_s)
 
     def between(self, begin_s: float, end_s: float) -> Self:
         """Return the samples inside a span of time, and those that always hold."""
@@ -248,14 +245,10 @@ class Readings(Samples):
     @classmethod
     def of(cls, table: Mapping[str, NDArray[Any]], body: str, began_ns: int) -> Readings | None:
         """Return the readings of a body from a recording's table; None if it has fewer than ten."""
-        if not table:
-            return None
-        values = np.column_stack([table[f"{kind}{axis}"] for kind in "wa" for axis in "xyz"]).astype(np.float64)
-        good: Bools = np.asarray((table["body"] == body) & np.isfinite(values).all(axis=1))
-        rows = np.flatnonzero(good)
-        rows = rows[np.argsort(table["time_ns"][rows], kind="stable")]
-        time_s = np.asarray((table["time_ns"][rows] - began_ns) * 1e-9, dtype=np.float64)
-        return cls(time_s, values[rows, :3], values[rows, 3:]) if len(rows) >= 10 else None
+        time_s, values = sensor_rows(table, body, ("wx", "wy", "wz", "ax", "ay", "az"), began_ns)
+        good: Bools = np.asarray(np.isfinite(values).all(axis=1))
+        found = cls(time_s, values[:, :3], values[:, 3:])[good]
+        return found if len(found) >= 10 else None
 
     @property
     def per_window(self) -> int:

@@ -30,9 +30,9 @@ from uwblink.arrays import Floats, Ints
 State = Mapping[str, Floats]
 """Unknowns of motion by their kind."""
 
-JERK_M_S3, QUICK_M_S3 = 8.0, 100.0
-"""Standard deviation of jerk before it is estimated; the second for refined control points. Half or twice of the first
-moves delays by 0.1 standard errors (`python -m benchmarks.constants`)."""
+JERK_M_S3 = 8.0
+"""Standard deviation of jerk before it is estimated. Half or twice of it moves delays by 0.1 standard errors
+(`python -m benchmarks.constants`)."""
 
 FIRST_SCALE_M = 0.15
 """First scale of Cauchy's loss, while delays and curve are unknown."""
@@ -43,10 +43,6 @@ are divided by the root of 1 - leverage."""
 
 MIN_RANGES_PER_PAIR = 15
 """With fewer ranges per pair, less those that the unknowns use up, all pairs share one error model."""
-
-MAX_TURNS, STILL = 8, 0.1
-"""Maximum number of alternations of motion and errors. They end when no delay moves by more than this share of its
-standard error."""
 
 
 def _cauchy(scale_m: float) -> Robust:
@@ -202,7 +198,8 @@ class Search:
         self.motion = finer
         self.weights.pop(("path", 0))
         errors = self.rows.errors
-        self.build(errors, jerk_m_s3=QUICK_M_S3)
+        # Motion that wider control points do not follow is quick; its jerk is estimated from here.
+        self.build(errors, jerk_m_s3=100.0)
         self.optimize(errors)
 
     def fit_likelihood(self) -> None:
@@ -216,7 +213,8 @@ class Search:
         if few:
             unknowns = tuple(u if len(u.names) == 1 else _as_known(u, u.start) for u in unknowns)
         errors, delays, settled = replace(mixture, expected=True), self.values["delay"], False
-        for turn in range(MAX_TURNS):
+        # At most eight turns; they end when no delay moves by more than a tenth of its standard error.
+        for turn in range(8):
             # The parameters of errors, from the residuals.
             layout, rows = self.model.build(self.residuals(), mixture, unknowns, parts, only=())
             priors = Priors(layout)
@@ -232,7 +230,7 @@ class Search:
             own = self.layout.where["delay"]
             std = np.sqrt(np.maximum(np.diag(found.covariance[:, own][own]), 1e-12))
             moved, delays = np.abs(found.x[own] - delays), found.x[own]
-            settled = turn > 1 and bool(np.all(moved < STILL * std))
+            settled = turn > 1 and bool(np.all(moved < 0.1 * std))
             if settled:
                 break
         # The parameters of errors are unknowns as well: the covariance contains them.
@@ -243,7 +241,7 @@ class Search:
         self.optimum = replace(found, success=settled)
 
     def missed_motion_m(self) -> float:
-        """Return the size of the motion along an axis that paths miss, in metres; 0 if it is not significant.
+        """Return the size of the motion along an axis that paths miss, in metres; 0 below 4 standard errors or 1 cm.
 
         A missed motion enters all ranges of the body along their directions, so residuals of ranges that follow each
         other correlate as their directions do. Only ranges of different pairs are multiplied, which excludes lasting
@@ -259,7 +257,8 @@ class Search:
             one, other = (side.mover == body for side in self.geometry.sides)
             mine = np.flatnonzero(one != other)
             towards = away[mine] * np.where(one[mine], 1.0, -1.0)[:, None]
-            for step in range(1, min(NEIGHBOURS, len(mine) - 1) + 1):
+            # Each range is compared with the eight before it.
+            for step in range(1, min(8, len(mine) - 1) + 1):
                 a, b = mine[:-step], mine[step:]
                 along = np.einsum("na,na->n", towards[:-step], towards[step:])
                 products = [slope[a] * slope[b] * along, (information * along) ** 2, time[b] - time[a]]
@@ -269,29 +268,18 @@ class Search:
         # Time differences of neighbours, as shares of the time between control points.
         for begin, end in pairwise([-1.0, *(part * self.motion.places.step_s for part in (0.08, 0.16, 0.3))]):
             some = (apart > begin) & (apart <= end)
-            if np.count_nonzero(some) >= FEWEST:
+            if np.count_nonzero(some) >= 50:
                 total = float(np.sum(product[some]))
                 deviation = total / float(np.sqrt(np.sum(product[some] ** 2) + 1e-300))
                 spans.append((deviation, float(np.sqrt(max(total / np.sum(of_a_metre[some]), 0.0)))))
         deviation, motion_m = max(spans, default=(0.0, 0.0))
-        return motion_m if deviation > MIN_DEVIATION and motion_m > MIN_MOTION_M else 0.0
-
-
-NEIGHBOURS, FEWEST = 8, 50
-"""Previous ranges of the body that each range is compared with, and the minimum number of products."""
-
-MIN_DEVIATION, MIN_MOTION_M = 4.0, 0.01
-"""The path misses motion if neighbours correlate by so many standard errors, and by a motion of so many metres."""
+        return motion_m if deviation > 4.0 and motion_m > 0.01 else 0.0
 
 
 def _as_known(unknown: Unknown, values: Floats) -> Unknown:
     """Return a block of unknowns with fixed values and prior weights."""
     priors = tuple(replace(prior, bounds=None) for prior in unknown.priors)
     return replace(unknown, start=values, known=np.ones(len(values), dtype=bool), priors=priors)
-
-
-LEVERAGE_PROBES = 48
-"""Random vectors for leverages (Hutchinson 1990; Bekas, Kokiopoulou and Saad 2007): exact to about 10 %."""
 
 
 def leverages(rows: RangeRows, found: Optimum) -> Floats:
@@ -312,7 +300,8 @@ def leverages(rows: RangeRows, found: Optimum) -> Floats:
         # The information of a residual is at most that of normal errors (Stam 1959).
         weight = np.minimum(weight, np.exp(-2 * values["noise"][rows.order]))
     reach = sparse.csr_matrix(sparse.diags_array(np.sqrt(weight)) @ sparse.vstack([matrix for matrix, _ in parts]))
-    probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(rows), LEVERAGE_PROBES))
+    # 48 random vectors are exact to about 10 % (Hutchinson 1990; Bekas, Kokiopoulou and Saad 2007).
+    probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(rows), 48))
     shares = np.empty(len(rows))
     shares[rows.order] = np.mean(probes * (reach @ (found.covariance @ (reach.T @ probes))), axis=1)
     return np.clip(shares, 0.0, MAX_LEVERAGE)

@@ -10,17 +10,16 @@ from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
-from scipy.sparse.csgraph import shortest_path
 
+from calib.estimator.scaling import scaled_places
 from calib.trajectories.motion import Motion
 from calib.trajectories.samples import SAMPLE_S, Places, Samples
 from calib.trajectories.scene import Scene
 from calib.trajectories.search import JERK_M_S3, MotionFit, State, fit_motion
 from uwblink.arrays import Floats
 
-LENGTHS_S = (2.0, 20.0)
 RANGES_A_BODY = 24
-"""A window has so many ranges per moving body, within these bounds in seconds; the next begins half a window later."""
+"""A window has so many ranges per moving body, within 2 to 20 s; the next begins half a window later."""
 
 
 SCALES_M = (3.0, 1.0, 0.3)
@@ -29,25 +28,14 @@ SCALES_M = (3.0, 1.0, 0.3)
 WINDOW_JERK_M_S3 = 3.0
 """Standard deviation of jerk in a window; small, because ranges count less under a wide likelihood."""
 
-START_COUNT, KEPT_STARTS, SAMPLED_RANGES = 24, 8, 400
-"""Random starts of the first window, how many of them go on after the widest likelihood, which is nearly convex, and
-the number of the window's ranges that are used."""
+START_COUNT, SAMPLED_RANGES = 24, 400
+"""Random starts of the first window, and the number of its ranges that are used."""
 
 START_SPREAD_M = 2.0
 """Standard deviation of random starts about known positions: the size of a room."""
 
 EQUAL_LIKELIHOOD = 6.0
 """Solutions whose log likelihoods differ by less are equally likely."""
-
-ROOM_M = 20.0
-"""Distance of bodies in an initial guess that no ranges tell, and the largest one."""
-
-OTHER_PLACE_M, OTHER_DISTANCE_M = 0.5, 0.1
-"""Solutions differ if positions among given anchors, or distances, differ by more in the median."""
-
-
-PASSES, SAMPLED_FLIGHT = 2, 600
-"""Passes over all headings, and the number of ranges of the flight that are used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +104,7 @@ def interpolated(places: Places, time_s: Floats, bodies: int) -> Trajectories:
 def _window_s(scene: Scene) -> float:
     """Return the length of a window in seconds."""
     rate = len(scene.time_s) / max(float(scene.time_s[-1] - scene.time_s[0]), 1e-9)
-    return float(np.clip(2 * round(RANGES_A_BODY * len(scene.moving) / rate / 2), *LENGTHS_S))
+    return float(np.clip(2 * round(RANGES_A_BODY * len(scene.moving) / rate / 2), 2.0, 20.0))
 
 
 def _fit_window(window: Scene, guess: Trajectories, stand: Floats) -> MotionFit:
@@ -173,7 +161,8 @@ def _fit_first_window(scene: Scene) -> tuple[Scene, Trajectories, Floats, str]:
 
     guesses = list(_guesses(window, time, headless))
     wide = [(tried(guess.state(window, stand), heading, SCALES_M[:1]), heading) for guess, stand, heading in guesses]
-    kept = sorted(wide, key=lambda one: -one[0].value)[:KEPT_STARTS]
+    # Eight starts go on after the widest likelihood, which is nearly convex.
+    kept = sorted(wide, key=lambda one: -one[0].value)[:8]
     narrow = [(tried(one.state, heading, SCALES_M[1:]), heading) for one, heading in kept]
     best, heading = max(narrow, key=lambda one: one[0].value)
     rival = _second_solution(scene, best, [one for one, _ in narrow], time)
@@ -186,7 +175,8 @@ def _second_solution(scene: Scene, best: MotionFit, tried: list[MotionFit], time
     for one in sorted(tried, key=lambda one: -one.value):
         away = np.median(np.linalg.norm(one.positions(time) - best.positions(time), axis=2), axis=0)
         longer = float(np.median(np.abs(one.residuals - best.residuals)))
-        differs = away.max() >= OTHER_PLACE_M if given else longer >= OTHER_DISTANCE_M
+        # Positions among given anchors differ by half a metre, or distances by a decimetre, in the median.
+        differs = away.max() >= 0.5 if given else longer >= 0.1
         if differs and best.value - one.value < EQUAL_LIKELIHOOD:
             what = f"{scene.moving[int(np.argmax(away))]} {away.max():.1f} m elsewhere" if given else "other distances"
             return (
@@ -213,11 +203,7 @@ def _guesses(
 
 
 def _shape(scene: Scene) -> Floats:
-    """Return relative positions of bodies (moving, then sought) by multidimensional scaling of their mean ranges.
-
-    Classical scaling (Torgerson 1952). Bodies that do not range with each other are as far apart as the shortest path
-    over others.
-    """
+    """Return relative positions of bodies (moving, then sought) by scaling of their mean ranges."""
     bodies = [*scene.moving, *scene.sought]
     number = {tag: bodies.index(body) for tag, (body, _) in scene.arms.items() if body in bodies}
     ends = [[number.get(tag, -1) for tag in ids.tolist()] for ids in (scene.ranges.initiator, scene.ranges.target)]
@@ -227,13 +213,9 @@ def _shape(scene: Scene) -> Floats:
     np.add.at(total, (i[between], j[between]), scene.ranges.raw_m[between])
     np.add.at(times, (i[between], j[between]), 1.0)
     total, times = total + total.T, times + times.T
-    mean = np.where(times > 0, total / np.maximum(times, 1.0), ROOM_M)
-    # A distance of zero would be no link, and delays can make a range negative.
-    apart = np.minimum(shortest_path(np.maximum(mean, 1e-3), directed=False), ROOM_M)
-    centre = np.eye(len(bodies)) - 1 / len(bodies)
-    values, vectors = np.linalg.eigh(-0.5 * centre @ apart**2 @ centre)
-    found = vectors[:, ::-1][:, :3] * np.sqrt(np.maximum(values[::-1][:3], 0.0))
-    return np.pad(found, ((0, 0), (0, 3 - found.shape[1])))
+    # A distance of zero would be no link, and delays can make a range negative. Twenty metres are a large hall.
+    mean = np.where(times > 0, np.maximum(total / np.maximum(times, 1.0), 1e-3), np.inf)
+    return scaled_places(mean, 3, most_m=20.0)
 
 
 def _initial_anchors(scene: Scene, seed: Trajectories) -> Floats:
@@ -262,13 +244,13 @@ def resolve_headings(scene: Scene, state: State) -> tuple[Scene, State, str]:
         return scene, state, ""
 
     def fitted(heading: Mapping[str, float], start: State) -> MotionFit:
-        few = scene.turned_by(heading).thinned(SAMPLED_FLIGHT)
+        few = scene.turned_by(heading).thinned(600)
         return fit_motion(few, start, SCALES_M[-1:], JERK_M_S3, steps=8)
 
     turns = np.radians(np.arange(30, 360, 30)).tolist()
     heading, unsure = dict.fromkeys(unknown, 0.0), list[str]()
     best = fitted(heading, state)
-    for _ in range(PASSES):
+    for _ in range(2):
         unsure, before = [], dict(heading)
         for body in unknown:
             here = heading[body]

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from uwblink.boards.dialects import DIALECTS, Dialect, PrintedRange, dialect_of, printed_ranges, record_printed
-from uwblink.boards.listeners import Correction, Heard, Progress, delays_warning, load_correction
+from uwblink.boards.listeners import Heard, Progress, delays_warning, load_correction
 from uwblink.boards.live_page import LivePage
 from uwblink.boards.ports import Terminal, boards_ports, serial_number, wait_until
 from uwblink.boards.ranging_plan import load_plan
 from uwblink.boards.record import append_rows
+from uwblink.corrections import Correction
 from uwblink.errors import RecordingError
 from uwblink.output import write_bytes
 from uwblink.recording.file import Recording

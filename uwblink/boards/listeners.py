@@ -15,20 +15,20 @@ they must be quick: at most 0.1 ms for a message. Slower work belongs in a threa
 writer. An exception of a listener ends the recording; the file keeps everything before.
 
 Ranges are corrected by other distributions, because uwblink does not import packages that depend on it. An entry point
-of the group `uwbcal.corrections` names a function that takes the path of a calibration and returns a function that
-corrects exchanges.
+of the group `uwbcal.corrections` names a function that takes the path of a calibration and returns a `Correction`, or a
+function that corrects exchanges.
 """
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from uwblink.arrays import Bools, Floats
+from uwblink.corrections import Columns, Correction
 from uwblink.errors import PlanError
 from uwblink.recording.antenna_delays import AntennaDelays, delays_differ
 from uwblink.recording.schema import Fault
@@ -323,16 +323,6 @@ class ReportCheck:
         return f"{whose}: {told}" if told else None
 
 
-Correction = Callable[[Exchanges], Mapping[str, Floats | Bools]]
-"""Returns columns (n,) for exchanges (n,), by name.
-
-`corrected_m` and `sigma_m` in metres, and other columns of the correction; NaN where a value is not known.
-Raises a `ValueError` for exchanges that it cannot correct, for example of a tag that is not calibrated. Its attribute
-`differences`, where there is one, takes exchanges and columns of the table `overheard`, and returns columns of
-differences of arrival, named like the fields of `uwblink.streaming.StreamedDifference`.
-"""
-
-
 def load_correction(path: Path) -> Correction:
     """Return the correction of a calibration file; raises `PlanError`, also if no installed distribution corrects.
 
@@ -341,9 +331,12 @@ def load_correction(path: Path) -> Correction:
     found = sorted(entry_points(group="uwbcal.corrections"), key=lambda entry: entry.name)
     if not found:
         raise PlanError(f"{path}: no installed distribution corrects ranges (entry points of uwbcal.corrections)")
+    translated = _as_plan_errors()
     with _as_plan_errors():
-        make: Callable[[Path], Correction] = found[0].load()
-        return _as_plan_errors()(make(path))
+        made = found[0].load()(path)
+    known = made if isinstance(made, Correction) else Correction(made)
+    differences = known.differences and translated(known.differences)
+    return replace(known, ranges=translated(known.ranges), differences=differences)
 
 
 @contextmanager
@@ -357,14 +350,13 @@ def _as_plan_errors() -> Iterator[None]:
 def delays_warning(correct: Correction | None, delays: AntennaDelays, tags: Iterable[int] | None = None) -> str:
     """Return a warning if a correction is for other antenna delays than those programmed now; "" if not, or unknown.
 
-    The attribute `antenna_delays` of a correction has its delays. `tags` are the ranging tags, by default all tags of
-    the correction.
+    `tags` are the ranging tags, by default all tags of the correction.
     """
-    then: AntennaDelays = getattr(correct, "antenna_delays", {})
+    then: AntennaDelays = correct.antenna_delays if correct else {}
     return delays_differ(then, delays, (tag for tag in then if tag is not None) if tags is None else tags)
 
 
-def check_pairs(correct: Correction | None, pairs: Sequence[tuple[int, int]]) -> None:
+def check_pairs(correct: Callable[[Exchanges], Columns] | None, pairs: Sequence[tuple[int, int]]) -> None:
     """Correct one range of each pair, so that the correction raises its error for pairs that it cannot correct."""
     if correct and pairs:
         initiator, target = zip(*pairs, strict=True)

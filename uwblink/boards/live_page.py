@@ -14,7 +14,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
@@ -23,11 +23,13 @@ from typing import Final
 
 import numpy as np
 
-from uwblink.boards.listeners import Correction, Listener, Pair, Progress, check_pairs
+from uwblink.boards.listeners import Listener, Pair, Progress, check_pairs
 from uwblink.closing import Closing
+from uwblink.corrections import Columns
 from uwblink.database import log_of
 from uwblink.errors import PortError, raising
 from uwblink.pages.blocks import CSS
+from uwblink.twr import Exchanges
 from uwblink.wire.codec import exchanges_of
 
 PICTURE_WIDTH, PICTURE_HEIGHT, PICTURE_MARGIN = 260, 44, 3
@@ -45,7 +47,7 @@ m.querySelector('p').textContent='This recording has ended; below is the last th
 class LivePage(Closing, Listener):
     """A page that shows the progress of a recording. A context manager: leaving it ends the server."""
 
-    def __init__(self, path: Path, *, correct: Correction | None = None, port: int = 0) -> None:
+    def __init__(self, path: Path, *, correct: Callable[[Exchanges], Columns] | None = None, port: int = 0) -> None:
         """Serve a page about the recording at `path`; port 0 takes any that is free. Raises `PortError`.
 
         With `correct` each range is shown corrected, too.

@@ -15,12 +15,14 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from decimal import Decimal
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Final
 
 import duckdb
 import numpy as np
 
+from uwblink.arrays import Floats, Ints
 from uwblink.database import check_log, connect, log_of
 from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError, raising
 from uwblink.exporters.mcap import write_mcap, write_rosbag2
@@ -28,7 +30,7 @@ from uwblink.output import place_beside, take_name
 from uwblink.plugins import Registry, check_row
 from uwblink.recording.contents import READING_MB, distances_by_poses_m, pieces
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM, Poses
+from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM
 from uwblink.recording.store import check_name
 
 
@@ -92,34 +94,34 @@ def write_tum(recording: Path, folder: Path) -> dict[str, int]:
     Letters of a body's name that are not safe in a file's name become "_". Raises `RecordingError`.
     """
     with Recording.open(recording, memory_mb=READING_MB) as opened, ExitStack() as files:
-        names = _file_names(body for (body,) in opened.tally("poses", "body"))
-        if not names:
+        bodies = sorted(body for (body,) in opened.tally("poses", "body"))
+        if not bodies:
             raise RecordingError(f"{recording}: holds no poses")
+        names = {body: f"{name}.tum" for body, name in zip(bodies, file_names(bodies), strict=True)}
         out = {body: files.enter_context((folder / name).open("w", encoding="utf-8")) for body, name in names.items()}
         written = dict.fromkeys(names.values(), 0)
         for held in pieces(opened):
             for body in np.unique(held.poses.body).tolist():
                 mine = held.poses[held.poses.body == body]
-                out[body].writelines(_lines(mine))
+                out[body].writelines(tum_lines(mine.time_ns, mine.position_m, mine.quaternion))
                 written[names[body]] += len(mine)
     return written
 
 
-def _file_names(bodies: Iterable[str]) -> dict[str, str]:
-    """Return the name of each body's file, all different."""
-    found: dict[str, str] = {}
-    for body in sorted(bodies):
-        name = "".join(c if c.isalnum() or c in "-_" else "_" for c in body) or "_"
-        while f"{name}.tum" in found.values():
-            name += "_"
-        found[body] = f"{name}.tum"
+def file_names(texts: Iterable[str]) -> list[str]:
+    """Return a name of a file for each text, without what is not safe there; equal ones are numbered."""
+    found: list[str] = []
+    for text in texts:
+        plain = "".join(c if c.isalnum() or c in "-_" else "_" for c in text) or "_"
+        numbered = (f"{plain}_{k}" for k in count(2))
+        found.append(plain if plain not in found else next(name for name in numbered if name not in found))
     return found
 
 
-def _lines(poses: Poses) -> Iterator[str]:
-    columns = (poses.time_ns.tolist(), poses.position_m.tolist(), poses.quaternion.tolist())
-    for time_ns, place, turn in zip(*columns, strict=True):
-        seconds = f"{Decimal(time_ns).scaleb(-9):f}"  # exactly
+def tum_lines(time_ns: Ints, position_m: Floats, quaternion: Floats) -> Iterator[str]:
+    """Yield the lines of a trajectory (n,): time in seconds, position, quaternion x y z w."""
+    for time, place, turn in zip(time_ns.tolist(), position_m.tolist(), quaternion.tolist(), strict=True):
+        seconds = f"{Decimal(time).scaleb(-9):f}"  # exactly
         yield " ".join([seconds, *map(repr, [*place, *turn])]) + "\n"
 
 

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from uwblink.boards.dialects import Dialect, printed_ranges
 from uwblink.boards.listeners import (
-    Correction,
     DelayCheck,
     Heard,
     Listener,
@@ -33,6 +32,7 @@ from uwblink.boards.ports import Ports, SerialPorts, wait_until
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.record import identify, overheard_row
 from uwblink.boards.recorder import Recorder
+from uwblink.corrections import Columns, Correction
 from uwblink.errors import ArgumentError
 from uwblink.receptions import exchange_of
 from uwblink.recording.file import Recording
@@ -41,6 +41,7 @@ from uwblink.wire.codec import exchanges_of
 from uwblink.wire.messages import Overheard, RangeReport
 
 Stream = Generator["StreamedRange | StreamedDifference", None, None]
+CorrectionSource = str | os.PathLike[str] | Correction | Callable[[Exchanges], Columns]
 
 
 class Streamed:
@@ -120,7 +121,7 @@ def streamed_differences(
     exchanges: Exchanges, overheard: Mapping[str, NDArray[Any]], correct: Correction | None
 ) -> Iterator[StreamedDifference]:
     """Yield what tags overheard of exchanges, by columns of the table `overheard`, corrected."""
-    columns = correct.differences(exchanges, overheard)  # type: ignore[union-attr]  # `_check_use` looks for it
+    columns = correct.differences(exchanges, overheard) if correct and correct.differences else {}
     for row in zip(*(column.tolist() for column in columns.values()), strict=True):
         yield StreamedDifference(**dict(zip(columns, row, strict=True)))
 
@@ -129,7 +130,7 @@ def _check_use(use: str, correct: Correction | None) -> bool:
     """Return whether differences of arrival are streamed; raises `ArgumentError` where nothing corrects them."""
     if use not in ("exchanges", "receptions"):
         raise ArgumentError(f"found {use!r:.40}, allowed: exchanges, receptions", parameter="use")
-    if use == "receptions" and not hasattr(correct, "differences"):
+    if use == "receptions" and not (correct and correct.differences):
         raise ArgumentError("receptions need a `calibration`, which corrects them", parameter="use")
     return use == "receptions"
 
@@ -137,7 +138,7 @@ def _check_use(use: str, correct: Correction | None) -> bool:
 def stream(  # noqa: PLR0913 - options by name
     source: str | os.PathLike[str] | Iterable[str],
     *,
-    calibration: str | os.PathLike[str] | Correction | None = None,
+    calibration: CorrectionSource | None = None,
     use: str = "exchanges",
     plan: RangingPlan | None = None,
     duration_s: float = math.inf,
@@ -208,7 +209,7 @@ def stream_printed(
     ports: Iterable[str],
     dialect: Dialect,
     *,
-    calibration: str | os.PathLike[str] | Correction | None = None,
+    calibration: CorrectionSource | None = None,
     **how: Any,
 ) -> Stream:
     """Yield ranges that boards of other firmware print, corrected with a calibration.
@@ -222,8 +223,10 @@ def stream_printed(
         )
 
 
-def _correction(calibration: str | os.PathLike[str] | Correction | None) -> Correction | None:
-    return load_correction(Path(calibration)) if isinstance(calibration, str | os.PathLike) else calibration
+def _correction(calibration: CorrectionSource | None) -> Correction | None:
+    if isinstance(calibration, str | os.PathLike):
+        return load_correction(Path(calibration))
+    return calibration if calibration is None or isinstance(calibration, Correction) else Correction(calibration)
 
 
 class RangeListener(Listener):
@@ -254,7 +257,7 @@ class RangeListener(Listener):
     def __init__(
         self,
         callback: Callable[[Any], object],
-        calibration: str | os.PathLike[str] | Correction | None = None,
+        calibration: CorrectionSource | None = None,
         use: str = "exchanges",
     ) -> None:
         """Call `callback` in the recorder's own loop, so it must be quick; raises what `load_correction` raises.

@@ -411,6 +411,23 @@ def test_one_tag_and_missing_sensors_are_named():
     assert found[1].tracks["variance"].rmse_m < 0.2
 
 
+@pytest.mark.parametrize(
+    ("option", "used_by"),
+    [
+        (("--training", "t.uwb"), ("poses",)),
+        (("--process-noise", "0.3"), ("poses",)),
+        (("--seeds", "3"), ("poses",)),
+        (("--imu", "drone"), ("imu", "team")),
+        (("--start-std", "0.1", "3", "0.1"), ("team",)),
+    ],
+)
+def test_an_option_of_another_model_is_refused(option, used_by, tmp_path):
+    for model in ("poses", "imu", "constant-velocity", "team"):
+        words = "calib", "localize", "a.uwb", "-c", tmp_path / "c.json", "--model", model, *option
+        said = processes.refuse(*words, runner=processes.call, naming=["c.json"] if model in used_by else used_by)
+        assert said.startswith(f"error: {option[0]}: goes with --model ") == (model not in used_by)
+
+
 def test_the_command_prints_writes_and_refuses(known, tmp_path):
     recording, document = tmp_path / "three.uwb", tmp_path / "c.json"
     simulated(307, 2.0).save(recording)
