@@ -1,6 +1,11 @@
-"""The order of files: the longest first, so that two cores end at the same time."""
+"""The order of files: the longest first, so that two cores end at the same time. And what hypothesis may take."""
 
 from typing import Final
+
+from hypothesis import settings
+
+settings.register_profile("no clock", deadline=None)  # on a busy machine an example takes long
+settings.load_profile("no clock")
 
 LONGEST: Final = (
     "tests/calib/report/test_report.py",

@@ -67,7 +67,7 @@ def taken_from_duckdb(source):
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "duckdb":
             found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "duckdb":
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "duckdb":
             found.add(node.attr)
     return {name for name in found if not name.endswith(("Exception", "Error", "DuckDBPyConnection", "__version__"))}
 
