@@ -27,16 +27,18 @@ with uwblink.Recording.create(sys.argv[1], live=True) as recording:
 
 
 class Reader(uwblink.Listener):
-    """Reads the recording in another process when so many exchanges have been told of; `found` is what it says."""
+    """Reads the recording in another process when so many exchanges have been told of, until it has `found` them."""
 
     def __init__(self, path, at):
-        self.path, self.at, self.turns, self.found = path, at, 0, []
+        self.path, self.at, self.turns, self.found = path, at, 0, 0
 
     def on_turn(self, turn):
         self.turns += turn.report is not None
         if self.turns == self.at:
-            time.sleep(0.5)  # the writer commits every 0.1 s
-            self.found.append(processes.succeed("uwblink", "show", "--json", self.path))
+            until_s = time.monotonic() + 60.0  # the writer commits every 0.1 s, and on a busy machine later
+            while self.found != self.at and time.monotonic() < until_s:
+                shown = processes.succeed("uwblink", "show", "--json", self.path).stdout
+                self.found = json.loads(shown)["counts"]["exchanges"]
 
 
 def test_another_process_reads_what_is_recorded_so_far(tmp_path):
@@ -44,8 +46,7 @@ def test_another_process_reads_what_is_recorded_so_far(tmp_path):
     reader, ports = Reader(path, 100), VirtualPorts(bench_scenario())
     plan = uwblink.RangingPlan(rate_hz=100.0)
     uwblink.record(ports.names.values(), path, plan, duration_s=2.0, listeners=[reader], using=ports)
-    (done,) = reader.found
-    assert json.loads(done.stdout)["counts"]["exchanges"] == 100
+    assert reader.found == 100
     assert [p.name for p in tmp_path.iterdir()] == [path.name], "no copy, no log is left"
     assert len(uwblink.load(path).exchanges) > 100
 
