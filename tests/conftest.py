@@ -1,6 +1,11 @@
-"""The order of files: the longest first, so that two cores end at the same time."""
+"""The order of files: the longest first, so that two cores end at the same time. And what hypothesis may take."""
 
 from typing import Final
+
+from hypothesis import settings
+
+settings.register_profile("no clock", deadline=None)  # on a busy machine an example takes long
+settings.load_profile("no clock")
 
 LONGEST: Final = (
     "tests/calib/report/test_report.py",
@@ -13,8 +18,12 @@ LONGEST: Final = (
     "tests/calib/trajectories/test_real_flight.py",
     "tests/calib/trajectories/test_known.py",
     "tests/calib/report/test_files.py",
-    "tests/test_readme.py",
     "tests/test_bad_input.py",
+    "tests/uwblink/exporters/test_exporters.py",
+    "tests/uwbsim/twins/test_twin.py",
+    "tests/uwbsim/protocols/test_monte_carlo.py",
+    "tests/uwbsim/pages/test_pages.py",
+    "tests/test_readme.py",
     "tests/test_full_disk.py",
     "tests/uwblink/boards/test_recorder.py",
     "tests/calib/evaluation/test_localization.py",

@@ -34,6 +34,7 @@ CONTEXT.set_forkserver_preload(
         for path in sorted((ROOT / name).rglob("*.py"))
         if path.stem not in ("__main__", "__init__")
     ]
+    + ["tests.frozen"]
 )
 
 
@@ -48,9 +49,9 @@ def run(
 ) -> subprocess.CompletedProcess[str]:
     """Run a command as `subprocess.run` does with captured text, its first word the name of the command.
 
-    `env` is the whole environment; what is set there for the time of importing has no effect. No file that the command
-    writes may be longer than `most_bytes`, as on a full disk; `limits` are others of `resource`. `user` takes its
-    rights away.
+    `env` is the whole environment; of what is set there for the time of importing only PYTHONPATH has an effect. No
+    file that the command writes may be longer than `most_bytes`, as on a full disk; `limits` are others of `resource`.
+    `user` takes its rights away.
     """
     argv = [str(BIN / str(words[0])), *map(str, words[1:])]
     limits = dict(limits or {}) | ({} if most_bytes is None else {resource.RLIMIT_FSIZE: most_bytes})
@@ -113,6 +114,7 @@ def _work(
     os.chdir(cwd)
     os.environ.clear()
     os.environ.update(env)
+    sys.path[:0] = filter(None, env.get("PYTHONPATH", "").split(os.pathsep))
     status = 1
     try:
         if user is not None:

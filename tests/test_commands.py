@@ -1,6 +1,5 @@
 """The three commands: versions, usage errors, Ctrl-C while they begin; and they behave in forks as in new processes."""
 
-import os
 import subprocess
 import sys
 
@@ -48,23 +47,3 @@ def test_status_and_output_of_a_fork_are_those_of_a_new_process(words, monkeypat
     plain = subprocess.run([processes.BIN / words[0], *words[1:]], capture_output=True, text=True)
     forked = processes.run(*words)
     assert (forked.returncode, forked.stdout, forked.stderr) == (plain.returncode, plain.stdout, plain.stderr)
-
-
-def test_a_fork_has_a_folder_an_environment_and_limits_of_its_own(tmp_path):
-    show = ("uwbsim", "show", processes.ROOT / "scenarios" / "noiseless.toml", "-o")
-    processes.succeed(*show, "s.svg", cwd=tmp_path)
-    processes.refuse(*show, "full.svg", cwd=tmp_path, most_bytes=1000, naming=["File too large"])
-    assert [path.name for path in tmp_path.iterdir()] == ["s.svg"]
-    wide, narrow = (
-        processes.run("calib", "fit", "--help", env=os.environ | {"COLUMNS": columns}).stdout.splitlines()
-        for columns in ("150", "80")
-    )
-    assert max(map(len, wide)) > 120
-    assert max(map(len, narrow)) <= 80
-
-
-def test_what_hangs_is_ended():
-    bench = processes.ROOT / "scenarios/two_boards_on_a_bench/bench.toml"
-    with pytest.raises(subprocess.TimeoutExpired):
-        processes.run("uwbsim", "serve", bench, timeout=1.0)
-    processes.succeed("uwbsim", "--version")

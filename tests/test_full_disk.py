@@ -27,25 +27,31 @@ NOISELESS = ROOT / "scenarios" / "noiseless.toml"
 
 
 @pytest.fixture(scope="module")
-def seeds(tmp_path_factory):
+def flight(tmp_path_factory):
+    """A folder with a short flight, and its trajectories as files."""
     folder = tmp_path_factory.mktemp("seeds")
-    short = NOISELESS.read_text().replace("duration_s = 60.0", "duration_s = 2.0")
-    (folder / "s.toml").write_text(short)
-    flight = uwbsim.simulate(folder / "s.toml")
-    flight.save(folder / "f.uwb")
-    calib.fit(flight).calibration.save(folder / "c.json")
-    one_less = flight.exchanges[(flight.exchanges.initiator != 6) & (flight.exchanges.target != 6)]
-    five = uwblink.Contents(exchanges=one_less, tags=flight.tags, poses=flight.poses)
-    calib.fit(five).calibration.save(folder / "five.json")
-    shutil.copyfile(ROOT / "docs" / "examples" / "exchanges.csv", folder / "t.csv")
-    ports = uwbsim.VirtualPorts(uwbsim.load(folder / "s.toml"))
-    uwblink.record([*ports.names.values()], folder / "boards.uwb", uwblink.RangingPlan(), using=ports, duration_s=2.0)
-    string = (ROOT / "scenarios/string/string.toml").read_text().replace("stay_s = 140.0", "stay_s = 10.0")
-    uwbsim.simulate(string.replace("duration_s = 1200.0", "duration_s = 160.0")).save(folder / "string.uwb")
-    calib.export(calib.load_calibration(folder / "c.json"), "miluv", folder / "miluv.json")
-    for form in ("csv", "mcap", "tum"):
-        export_recording(folder / "f.uwb", folder / form, to=form)
+    (folder / "s.toml").write_text(NOISELESS.read_text().replace("duration_s = 60.0", "duration_s = 2.0"))
+    uwbsim.simulate(folder / "s.toml").save(folder / "f.uwb")
+    export_recording(folder / "f.uwb", folder / "tum", to="tum")
     return folder
+
+
+@pytest.fixture(scope="module")
+def seeds(flight):
+    """The same folder with all that the commands of the table take."""
+    flown = uwblink.load(flight / "f.uwb")
+    calib.fit(flown).calibration.save(flight / "c.json")
+    x = flown.exchanges
+    calib.fit(replace(flown, exchanges=x[(x.initiator != 6) & (x.target != 6)])).calibration.save(flight / "five.json")
+    shutil.copyfile(ROOT / "docs" / "examples" / "exchanges.csv", flight / "t.csv")
+    ports = uwbsim.VirtualPorts(uwbsim.load(flight / "s.toml"))
+    uwblink.record([*ports.names.values()], flight / "boards.uwb", uwblink.RangingPlan(), using=ports, duration_s=2.0)
+    string = (ROOT / "scenarios/string/string.toml").read_text().replace("stay_s = 140.0", "stay_s = 10.0")
+    uwbsim.simulate(string.replace("duration_s = 1200.0", "duration_s = 160.0")).save(flight / "string.uwb")
+    calib.export(calib.load_calibration(flight / "c.json"), "miluv", flight / "miluv.json")
+    for form in ("csv", "mcap"):
+        export_recording(flight / "f.uwb", flight / form, to=form)
+    return flight
 
 
 COMMANDS = (
@@ -164,11 +170,11 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(seeds, tmp_path, line, most_
 
 
 @pytest.mark.parametrize("room", [0, 20_000])
-def test_poses_for_which_the_disk_has_no_room_or_room_in_the_log_alone(seeds, tmp_path, room):
+def test_poses_for_which_the_disk_has_no_room_or_room_in_the_log_alone(flight, tmp_path, room):
     path = tmp_path / "f.uwb"
-    flight = uwblink.load(seeds / "f.uwb")
-    replace(flight, poses=flight.poses[:0]).save(path)
-    source = [word for body in ("ifo001", "ifo002") for word in ("--from", f"{body}={seeds / 'tum' / body}.tum")]
+    flown = uwblink.load(flight / "f.uwb")
+    replace(flown, poses=flown.poses[:0]).save(path)
+    source = [word for body in ("ifo001", "ifo002") for word in ("--from", f"{body}={flight / 'tum' / body}.tum")]
     most_bytes = path.stat().st_size + room if room else 1000
     naming = ["everything before is kept", "keep the two together"] if room else ["cannot be written"]
     refuse("uwblink", "poses", path, *source, cwd=tmp_path, most_bytes=most_bytes, naming=naming)
@@ -177,7 +183,7 @@ def test_poses_for_which_the_disk_has_no_room_or_room_in_the_log_alone(seeds, tm
     assert {"f.uwb", *(["f.uwb.wal"] if room else [])} <= names <= {"f.uwb", "f.uwb.wal"}
     after = uwblink.load(path)
     assert set(after.poses.body) == ({"ifo001", "ifo002"} if room else set())
-    assert len(after.exchanges) == len(flight.exchanges)
+    assert len(after.exchanges) == len(flown.exchanges)
 
 
 @pytest.mark.parametrize(

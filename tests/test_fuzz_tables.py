@@ -1,9 +1,14 @@
-"""The tables of the fuzzer hold today's commands and options."""
+"""The tables of the fuzzer hold today's commands and options; and damaged calibrations, as its target had them."""
 
+import functools
+import re
 import shlex
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+import calib
 from tests.fuzz.options import command_of, commands
 from tests.fuzz.seeds import KINDS
 
@@ -25,3 +30,20 @@ def test_every_line_is_one_that_its_command_takes(line):
 
 def test_every_command_has_a_line():
     assert {command_of(line.split()) for line in LINES} == set(commands()) - OF_BOARDS - OF_FOLDERS
+
+
+@functools.cache
+def document():
+    return calib.fit(calib.sample_flight(300)).calibration.to_json()
+
+
+@given(st.integers(0, 2000), st.sampled_from(["null", "-1", "1e400", "NaN", '"x"', "[]", "{}", "true", "0", "1e300"]))
+def test_a_damaged_calibration_is_read_again_the_same_or_refused_in_one_line(place, word):
+    values = [*re.finditer(r"(?<=: )[^{}\[\],]+|-?[0-9][0-9.e-]*", document())]
+    start, end = values[place % len(values)].span()
+    try:
+        found = calib.Calibration.from_json(document()[:start] + word + document()[end:])
+        said, same = "", calib.Calibration.from_json(found.to_json()) == found
+    except calib.CalibError as error:
+        said, same = str(error), True
+    assert ("\n" not in said, same) == (True, True)

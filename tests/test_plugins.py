@@ -6,6 +6,7 @@ import subprocess
 import sys
 import warnings
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import EntryPoint
 
 import pytest
@@ -39,13 +40,8 @@ def installed(tmp_path_factory):
 
 @pytest.fixture
 def run(installed):
-    """Runs a command in a new process, which finds the distribution."""
-
-    def run(name, *words):
-        argv = [processes.BIN / name, *map(str, words)]
-        return subprocess.run(argv, env=installed, capture_output=True, text=True, check=False, timeout=300)
-
-    return run
+    """Runs a command in a process that finds the distribution."""
+    return partial(processes.run, env=installed, timeout=300)
 
 
 WARNING = (

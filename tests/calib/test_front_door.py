@@ -19,13 +19,6 @@ from uwblink.pages import figures
 from uwblink.pages.figures import style
 
 
-def test_the_names_are_sorted_and_all_there():
-    assert calib.__all__ == sorted(calib.__all__)
-    for name in calib.__all__:
-        assert getattr(calib, name).__name__ == name
-    assert set(calib.__all__) <= set(dir(calib))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in calib.__all__ if not name.endswith("Error")])
 def test_the_examples_run(name, monkeypatch):

@@ -5,78 +5,18 @@ It keeps no bytes between two reads, scans ids 0 to 10, and takes one line with 
 
 import random
 import re
-import time
-from contextlib import contextmanager
-from types import SimpleNamespace
-from typing import Any
-from unittest.mock import patch
 
 import pytest
 
-from tests.boards import bench_scenario, two_ports
+from tests.boards import two_ports
 from uwblink.boards.board import Board
-from uwblink.boards.ports import SerialPort
 from uwblink.wire import messages as m
 from uwblink.wire.codec import Decoder
 from uwblink.wire.messages import REPORTS
-from uwbsim import Server
 
 TIMEOUT_S = 0.1
 LATENCY_S = (0.0002, 0.0015)
 """From the end of a line to the client's next look at its port: an operating system and an interpreter."""
-
-
-class SteppedPort(SerialPort):
-    """The port of a served board whose time passes only while a client waits: no machine is too busy for it."""
-
-    def __init__(self, server, tag, clock):
-        super().__init__(server.names[tag])
-        self.server, self.tag, self.clock, self.board = server, tag, clock, server.bench.boards[tag]
-
-    def now_s(self):
-        return self.clock.ns * 1e-9
-
-    def write(self, data):
-        """Send bytes, and wait until they have come through the pseudo-terminal."""
-        with patch.object(self.board, "write", wraps=self.board.write) as written:
-            super().write(data)
-            while not written.called:
-                self.server.step()
-
-    def read(self, timeout_s):
-        """Let time pass until the board has printed something, which is there however late the terminal gives it."""
-        until = self.clock.ns + int(timeout_s * 1e9) + 1
-        while not self.clock.printed[self.tag] and self.clock.ns < until:
-            due = self.server.bench.next_ns()
-            self.clock.ns = int(min(max(due, self.clock.ns + 1), until))
-            if due <= until:  # a server that has nothing to do waits for the wall clock
-                self.server.step()
-        data = super().read(60.0) if self.clock.printed[self.tag] else b""
-        assert data or not self.clock.printed[self.tag], "what a board printed does not come"
-        self.clock.printed[self.tag] -= len(data)
-        return data
-
-
-@contextmanager
-def stepped_ports():
-    """Give the ports of two boards behind pseudo-terminals, in time that passes step by step."""
-    clock: Any = SimpleNamespace(
-        ns=0, monotonic_ns=lambda: clock.ns, time_ns=time.time_ns, printed=dict.fromkeys((1, 2, 3), 0)
-    )
-    with patch("uwbsim.boards.server.time", clock):
-        server = Server(bench_scenario())
-        send = server.bench.send
-
-        def noted(time_ns, tag, data):
-            clock.printed[tag] += len(data)
-            send(time_ns, tag, data)
-
-        server.bench.send = noted
-        ports = [SteppedPort(server, tag, clock) for tag in (1, 2)]
-        yield ports, server.bench
-        for port in ports:
-            port.close()
-        server.close()
 
 
 class Client:
@@ -107,10 +47,10 @@ class Client:
         return found
 
 
-@pytest.fixture(params=["virtual", "terminal", "real"])
+@pytest.fixture(params=["virtual", "real"])
 def clients(request):
-    """Two clients, the initiator first."""
-    with stepped_ports() if request.param == "terminal" else two_ports(request.param) as (ports, _):
+    """Two clients, the initiator first; test_boards.py has what a terminal does to bytes."""
+    with two_ports(request.param) as (ports, _):
         yield [Client(port, seed) for seed, port in enumerate(ports, 1)]
 
 

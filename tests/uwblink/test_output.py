@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from uwblink.errors import ArgumentError, ImportTableError, OutputError, RecordingError, RecordingExistsError
+from uwblink.errors import ArgumentError, ImportTableError, OutputError
 from uwblink.output import check_apart, write_bytes, write_files, write_text
 from uwblink.text_files import read_text
 
@@ -16,15 +16,6 @@ def test_text_is_utf8_and_nothing_is_left_beside_it(tmp_path):
     write_text(tmp_path / "a.txt", "± 1 µs\n", force=False)
     assert (tmp_path / "a.txt").read_bytes() == "± 1 µs\n".encode()
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
-
-
-def test_only_force_replaces(tmp_path):
-    write_bytes(tmp_path / "a", b"first", force=False)
-    with pytest.raises(RecordingExistsError):
-        write_bytes(tmp_path / "a", b"second", force=False)
-    assert (tmp_path / "a").read_bytes() == b"first"
-    write_bytes(tmp_path / "a", b"second", force=True)
-    assert (tmp_path / "a").read_bytes() == b"second"
 
 
 def test_what_was_there_stays_where_the_disk_is_full(tmp_path, monkeypatch):
@@ -39,11 +30,6 @@ def test_what_was_there_stays_where_the_disk_is_full(tmp_path, monkeypatch):
     with pytest.raises(OutputError, match=r"a: cannot be written \(No space left"):
         write_bytes(tmp_path / "a", b"second", force=True)
     assert ((tmp_path / "a").read_bytes(), [path.name for path in tmp_path.iterdir()]) == (b"first", ["a"])
-
-
-def test_a_folder_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(RecordingError, match="does not exist"):
-        write_text(tmp_path / "no" / "a", "x", force=False)
 
 
 def test_no_output_is_written_over_another_or_over_what_is_read(tmp_path):

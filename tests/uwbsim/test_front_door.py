@@ -1,4 +1,3 @@
-import doctest
 import re
 import tomllib
 from pathlib import Path
@@ -17,14 +16,6 @@ from uwbsim.tables import write_tables
 
 NOISELESS = Path(__file__).parents[2] / "scenarios" / "noiseless.toml"
 SHORT = {"run.duration_s": 2.0}
-
-
-@pytest.mark.parametrize("name", uwbsim.__all__)
-def test_every_example_runs(name, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    runner = doctest.DocTestRunner()
-    for example in doctest.DocTestFinder(recurse=False).find(getattr(uwbsim, name), name):
-        assert runner.run(example).failed == 0
 
 
 def test_a_scenario_is_a_file_a_text_tables_or_itself():

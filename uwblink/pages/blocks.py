@@ -194,15 +194,20 @@ class Document:
         return [block.text for block in self.blocks if isinstance(block, Heading)]
 
 
-def draw_figures(document: Document, *kinds: str, progress: Callable[[str], None] = lambda _: None) -> dict[str, bytes]:
-    """Draw each figure of a document once at each width; returns files of these kinds, such as "errors-page.svg"."""
+def draw_figures(
+    document: Document, kinds: Mapping[str, Sequence[str]], progress: Callable[[str], None] = lambda _: None
+) -> dict[str, bytes]:
+    """Draw each figure of a document once at each width; returns files such as "errors-page.svg".
+
+    `kinds` are the kinds of files by width, "page" or "column".
+    """
     from uwblink.pages.figures import WIDTHS, drawn
 
     files: dict[str, bytes] = {}
     for one in document.pictures():
         progress(f"drawing {one.name}")
         for width, width_in in WIDTHS.items():
-            made = drawn(one.draw, width_in, kinds, salt=f"{one.name} {width}")
+            made = drawn(one.draw, width_in, kinds[width], salt=f"{one.name} {width}") if kinds[width] else {}
             files |= {f"{one.name}-{width}.{kind}": data for kind, data in made.items()}
     return files
 
@@ -212,7 +217,7 @@ def to_html(document: Document, drawings: Mapping[str, bytes] | None = None) -> 
 
     `drawings` are its figures as `draw_figures` returns them; without, they are drawn.
     """
-    drawings = draw_figures(document, "svg") if drawings is None else drawings
+    drawings = draw_figures(document, {"page": ["svg"], "column": ["svg"]}) if drawings is None else drawings
     captions, number = document.captions(), 0
     parts = [f"<p class='note'>{escape(document.subtitle)}</p>"] if document.subtitle else []
     for block in document.blocks:
@@ -273,7 +278,9 @@ def write_document(
     """
     page = output if output is not None and output.suffix.lower() != ".pdf" else None
     papers = [path for path in (output if page is None else None, pdf) if path is not None]
-    made = draw_figures(document, "svg", *(["pdf"] if papers or figures else []), progress=progress)
+    svg = ["svg"] if page or figures else []
+    kinds = {"page": [*svg, *(["pdf"] if papers or figures else [])], "column": [*svg, *(["pdf"] if figures else [])]}
+    made = draw_figures(document, kinds, progress)
     if papers:
         from uwblink.pages.pdf import to_pdf
 

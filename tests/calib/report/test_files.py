@@ -54,6 +54,9 @@ def sections(monkeypatch):
 
 
 def test_a_campaign_is_what_the_command_makes(folder, tmp_path, monkeypatch, sections):
+    # Figures are rendered in test_report.py.
+    monkeypatch.setattr(figures, "drawn", pages.outline)
+    sections |= {"delays": SECTIONS["delays"]}
     opened, whole = [], Recording.open
 
     def noted(path, **kwargs):
@@ -69,12 +72,13 @@ def test_a_campaign_is_what_the_command_makes(folder, tmp_path, monkeypatch, sec
     campaign = replace(campaign, origin=replace(campaign.origin, files={}))
     campaign.write(tmp_path / "python.html")
     monkeypatch.chdir(folder)
-    words = ["report", "a.uwb", "--tests", "b.uwb", "-o", "command.html", "--loss", "huber", "--json"]
-    done = CliRunner().invoke(app, words, catch_exceptions=False)
+    words = "report a.uwb --tests b.uwb -o command.html --loss huber --json --figures drawn"
+    done = CliRunner().invoke(app, words.split(), catch_exceptions=False)
     assert json.loads(done.stdout) == json.loads(json.dumps(campaign.to_dict()))
-    pages = [(tmp_path / "python.html").read_text(), (folder / "command.html").read_text()]
+    assert {path.name for path in (folder / "drawn").iterdir()} == {f"delays-{form}" for form in FORMS}
+    made = [(tmp_path / "python.html").read_text(), (folder / "command.html").read_text()]
     # When, by which command, and from which files is not the same.
-    texts = [re.sub(r"<p class='note'>Made.*?</p>|[0-9a-f]{12}|in memory", "", page) for page in pages]
+    texts = [re.sub(r"<p class='note'>Made.*?</p>|[0-9a-f]{12}|in memory", "", page) for page in made]
     assert len({text[: text.index(">Provenance</h2>")] for text in texts}) == 1
 
 
@@ -190,7 +194,8 @@ def test_one_file_does_not_take_the_place_of_another(folder, tmp_path):
         check_places(tmp_path / "a.pdf", tmp_path / "a.pdf", None, force=True)
     pictures = [Picture("same", lambda width: sheet(width)[0], text) for text in ("one", "two")]
     write_document(Document("", [*pictures]), None, figures=tmp_path / "f")
-    assert {path.name.rpartition("-")[0] for path in (tmp_path / "f").iterdir()} == {"same", "same-2"}
+    names = {path.name for path in (tmp_path / "f").iterdir()}
+    assert names == {f"{name}-{form}" for name in ("same", "same-2") for form in FORMS}
 
 
 def words_of(svg):

@@ -27,6 +27,12 @@ def fitted(flown):
     return calib.fit_from_ranges(flown, poses_until_s=8.0, progress=shares.append), shares
 
 
+@pytest.fixture(scope="module")
+def known():
+    """The calibration of another flight, whose headings are known."""
+    return calib.fit_from_ranges(flight(seconds=10.0), poses_until_s=6.0, heading_std_deg=0.0).calibration
+
+
 @pytest.mark.slow
 def test_planted_delays_are_found_from_a_known_start(flown, fitted):
     result, shares = fitted
@@ -50,16 +56,15 @@ def test_planted_delays_are_found_from_a_known_start(flown, fitted):
     assert shares[-1] == 1.0
 
 
-def test_it_corrects_ranges_of_another_flight_as_any_calibration(fitted):
+def test_it_corrects_ranges_of_another_flight_as_any_calibration(known):
     other = flight(seed=9)
-    applied = fitted[0].calibration.apply(calib.load_ranges(other))
+    applied = known.apply(calib.load_ranges(other))
     # Reflected ranges aside, what is left of the bias is far below that of raw ones.
     assert abs(np.median(applied.corrected_m - other.distance_m)) < 0.012
     assert abs(np.median(applied.raw_m - other.distance_m)) > 0.012
 
 
-def test_a_curve_is_taken_from_another_calibration_with_its_uncertainty(fitted):
-    known = fitted[0].calibration
+def test_a_curve_is_taken_from_another_calibration_with_its_uncertainty(known):
     flown = flight(seconds=8.0, seed=3)
     given: dict[str, Any] = {"poses_until_s": 5.0, "heading_std_deg": 0.0}
     result = calib.fit_from_ranges(flown, **given, curve_from=known)
@@ -71,8 +76,7 @@ def test_a_curve_is_taken_from_another_calibration_with_its_uncertainty(fitted):
     assert all(surer.delays_std_ns[tag] < found.delays_std_ns[tag] for tag in DELAYS_NS)
 
 
-def test_a_bad_parameter_is_named(flown, fitted):
-    known = fitted[0].calibration
+def test_a_bad_parameter_is_named(flown, known):
     wrong: list[tuple[str, dict[str, Any]]] = [
         ("attitudes", {"attitudes": "guess"}),
         ("anchors", {"anchors": "moved"}),

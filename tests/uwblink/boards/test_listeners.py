@@ -56,7 +56,7 @@ class Everything(uwblink.Listener):
 
 def test_a_listener_is_told_bytes_turns_and_faults(tmp_path):
     ports, listener = VirtualPorts(bench_scenario(), lost_share=0.4), Everything()
-    done = recorded(tmp_path / "f.uwb", ports, listener)
+    done = recorded(tmp_path / "f.uwb", ports, listener, seconds=2.0)
     assert len(listener.turns) == done.tried
     assert sum(t.report is not None for t in listener.turns) == done.exchanges < done.tried
     with Recording.open(tmp_path / "f.uwb") as recording:
@@ -85,7 +85,7 @@ def test_a_recorder_needs_no_file(tmp_path):
     heard: list[uwblink.Heard] = []
     found = identify(ports.names.values(), ports)
     recorder = Recorder(found, uwblink.RangingPlan(), [(1, 2)], [as_listener(heard)], ports=ports)
-    recorder.run(1.0)
+    recorder.run(0.5)
     recorder.close()
     assert recorder.progress.exchanges == sum(isinstance(h.message, RangeReport) for h in heard) > 100
 

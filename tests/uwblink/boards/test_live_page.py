@@ -268,7 +268,7 @@ def test_the_command_says_where_the_page_is_and_serves_it_while_it_records(tmp_p
         words = [str(BIN / "uwblink"), "record", *ports, "-o", str(tmp_path / "f.uwb"), "--pairs", "all", "--live"]
         process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         url = re.search(r"live page: (http://127\.0\.0\.1:\d+/)", process.stderr.readline())[1]
-        for _ in range(600):
+        for _ in range(2400):
             with urllib.request.urlopen(url + "body", timeout=30) as answer:  # noqa: S310 - the page's own address
                 text = answer.read().decode()
             if text.count("<polyline") == 3:

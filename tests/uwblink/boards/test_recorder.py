@@ -197,12 +197,12 @@ def command(path, server, *more):
 def wait_for_rows(path, process):
     """Wait until a recorder has committed some hundred rows, which takes longer on a busy machine."""
     log = Path(f"{path}.wal")
-    for _ in range(600):
+    for _ in range(2400):
         if log.exists() and log.stat().st_size > 30_000:
             return
         assert process.poll() is None
         time.sleep(0.05)
-    raise AssertionError("the recorder wrote nothing in half a minute")
+    raise AssertionError("the recorder wrote nothing in two minutes")
 
 
 def test_ctrl_c_ends_cleanly_and_completely(tmp_path):

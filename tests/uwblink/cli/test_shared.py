@@ -176,19 +176,19 @@ app = typer.Typer()
 def wait():
     try:
         os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(10)
+        time.sleep(100)
     finally:  # cleaning up, which the second signal leaves alone and the third one ends
         os.kill(os.getpid(), signal.SIGINT)
         print("cleaned", flush=True)
         os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(10)
+        time.sleep(100)
 
 run(app, arguments=[])
 """
 
 
 def test_a_third_interrupt_ends_a_command_that_hangs():
-    done = subprocess.run([sys.executable, "-c", STUCK], capture_output=True, text=True, timeout=9)
+    done = subprocess.run([sys.executable, "-c", STUCK], capture_output=True, text=True, timeout=90)
     assert (done.returncode, done.stdout) == (-signal.SIGINT, "cleaned\n")
 
 
@@ -215,13 +215,13 @@ app = typer.Typer()
 @app.command()
 def work():
     import imported
-    time.sleep(10)
+    time.sleep(100)
     print("went on")
 
 run(app, arguments=[])
 """
     )
-    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, timeout=9, cwd=tmp_path)
+    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, timeout=90, cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
 
 

@@ -1,5 +1,6 @@
 """Figures at paper size, and drawings as parts of pages."""
 
+import io
 import itertools
 import json
 import re
@@ -8,6 +9,7 @@ from html import unescape
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from pypdf import PdfReader
 
 from tests.browser import chromium, lies_well
 from uwblink.pages.blocks import (
@@ -53,7 +55,7 @@ def test_it_is_drawn_once_for_all_files():
 
     files = drawn(draw, 3.5, ["svg", "pdf", "png"])
     assert calls == [3.5]
-    assert files["pdf"].startswith(b"%PDF")
+    assert PdfReader(io.BytesIO(files["pdf"])).pages[0].mediabox.width == pytest.approx(252, abs=0.1)
     assert files["png"].startswith(b"\x89PNG")
     assert b'width="252pt"' in files["svg"]
     assert files == drawn(two_panels, 3.5, ["svg", "pdf", "png"]), "the same bytes each time"

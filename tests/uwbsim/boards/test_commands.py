@@ -277,7 +277,7 @@ def test_served_poses_go_on_after_the_scenario_s_duration(tmp_path):
     short = scenario.model_copy(update={"run": scenario.run.model_copy(update={"duration_s": 1.0})})
     with served(short, speed=20.0) as server:
         server.write_poses(tmp_path / "p.csv")
-        for _ in range(200):
+        for _ in range(2400):
             # The file may grow between two looks at it, so only its complete lines count.
             complete = (tmp_path / "p.csv").read_text().rpartition("\n")[0].splitlines()[1:]
             served_s = (int(complete[-1].partition(",")[0]) - server.epoch_ns) * 1e-9

@@ -1,5 +1,7 @@
 """Scenes, comparisons and sweeps as pages: what stands on them, and how it lies in a window."""
 
+import csv
+import json
 import re
 from itertools import pairwise
 
@@ -7,18 +9,18 @@ import numpy as np
 import pytest
 
 import uwbsim
+from tests import processes
 from tests.browser import lies_well
 from tests.shared_data import ROOT
 from uwblink import PROTOCOLS
-from uwblink.pages.blocks import to_html
 from uwblink.pages.figures import picture, style
 from uwbsim.pages import write_sweep_page
-from uwbsim.pages.documents import comparison, scene
 from uwbsim.pages.figures import error_over, result_over_keys, room, timing
 from uwbsim.protocols.comparison import ErrorCurve
 
 SCENARIOS = ROOT / "scenarios"
 BENCH, OFFICE = SCENARIOS / "two_boards_on_a_bench/bench.toml", SCENARIOS / "office/office.toml"
+NLOS_OFFICE = SCENARIOS / "nlos_office/office.toml"
 
 
 def words(draw):
@@ -71,16 +73,33 @@ def test_a_timing_diagram_has_every_interval_with_its_length(name):
 
 
 @pytest.fixture(scope="module")
-def pages():
-    found = uwbsim.compare(uwbsim.load(BENCH), None, 3000)
-    return {"scene": to_html(scene(uwbsim.load(OFFICE))), "comparison": to_html(comparison(found))}
+def folder(tmp_path_factory):
+    """A scene, and a comparison in place of an older one, as commands write them."""
+    folder = tmp_path_factory.mktemp("pages")
+    processes.succeed("uwbsim", "show", NLOS_OFFICE, "-o", folder / "scene.html")
+    (folder / "out").mkdir()
+    (folder / "out" / "compare.csv").write_text("old")
+    done = processes.succeed("uwbsim", "compare", BENCH, "-o", folder / "out", "-n", 3000, "--force", "--json")
+    (folder / "told.json").write_text(done.stdout)
+    return folder
 
 
 @pytest.mark.parametrize("width", [1280, 390])
-@pytest.mark.parametrize("name", ["scene", "comparison"])
-def test_pages_lie_well(width, name, pages, tmp_path):
-    lies_well(pages[name], width, tmp_path)
-    assert ("log axis" in pages[name]) == ("logarithmic beyond" in pages[name]) == (name == "comparison")
+@pytest.mark.parametrize("name", ["scene", "out/compare"])
+def test_pages_lie_well(width, name, folder, tmp_path):
+    page = (folder / f"{name}.html").read_text()
+    lies_well(page, width, tmp_path)
+    assert (page.count("<figure>"), page.count("src='http")) == (5, 0)
+    assert ("log axis" in page) == ("logarithmic beyond" in page) == (name == "out/compare")
+
+
+def test_a_comparison_has_tables_and_json_and_takes_the_place_of_no_other(folder):
+    said = json.loads((folder / "told.json").read_text())["protocols"]
+    assert [row["protocol"] for row in said] == list(PROTOCOLS)
+    assert {p.name for p in (folder / "out").iterdir()} == {"compare.html", "compare.csv", "compare.parquet"}
+    with (folder / "out" / "compare.csv").open(newline="") as stream:
+        assert [float(row["std_m"]) for row in csv.DictReader(stream)] == [row["std_m"] for row in said]
+    processes.refuse("uwbsim", "compare", BENCH, "-o", folder / "out", "-n", 10, naming=["--force"])
 
 
 def judged(flight):

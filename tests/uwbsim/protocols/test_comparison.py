@@ -1,6 +1,5 @@
 """The workbench's commands: what they print, what they write, and what they refuse."""
 
-import csv
 import json
 
 import numpy as np
@@ -108,23 +107,6 @@ def test_compare_counts_as_many_exchanges_a_second_as_a_run_has(name):
     assert said == pytest.approx(fastest, rel=1e-9)
     # Replies at once take 4 us longer on average than in the median, and a second has whole exchanges.
     assert 1e9 * (len(time_ns) - 1) / np.ptp(time_ns) == pytest.approx(said, rel=0.004)
-
-
-def test_compare_writes_a_page_and_tables(tmp_path):
-    out = tmp_path / "out"
-    words = ("compare", TEST1, "-o", out, "--protocols", "ss, ds", "-n", "20000", "--json")
-    document = json.loads(processes.succeed("uwbsim", *words).stdout)
-    assert [row["protocol"] for row in document["protocols"]] == ["ss", "ds"]
-    assert {p.name for p in out.iterdir()} == {"compare.html", "compare.csv", "compare.parquet"}
-    with (out / "compare.csv").open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    assert float(rows[1]["std_m"]) == document["protocols"][1]["std_m"]
-    page = (out / "compare.html").read_text()
-    assert page.count("<figure>") == 5
-    assert "src='http" not in page
-    again = ("uwbsim", "compare", TEST1, "-o", out, "--protocols", "ss", "-n", "10")
-    processes.refuse(*again, naming=["--force"])
-    processes.succeed(*again, "--force")
 
 
 def test_predict_and_optimum_answer_in_words_and_json(tmp_path):
