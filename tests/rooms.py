@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -17,14 +17,16 @@ PACKAGES = ("uwblink", "uwbsim", "calib")
 Rooms = dict[str, set[str]]
 
 
-def imports(source: str) -> Iterator[str]:
-    """Yield the dotted names that a module imports, those under `if TYPE_CHECKING` among them."""
+@cache
+def imports(source: str) -> frozenset[str]:
+    """Return the dotted names that a module imports, those under `if TYPE_CHECKING` among them."""
+    found: set[str] = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            yield node.module
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return frozenset(found)
 
 
 def room_of(path: Path, package: Path) -> str:
