@@ -41,7 +41,7 @@ def test_the_sdist_has_what_make_demo_and_the_tests_need(archives):
 def test_links_of_the_page_of_the_package_are_absolute_and_lead_to_files_of_the_sdist(archives):
     wheel = zipfile.ZipFile(archives[0])
     (name,) = (name for name in wheel.namelist() if name.endswith(".dist-info/METADATA"))
-    page = message_from_bytes(wheel.read(name)).get_payload()
+    page = str(message_from_bytes(wheel.read(name)).get_payload())
     with tarfile.open(archives[1]) as archive:
         files = {name.partition("/")[2] for name in archive.getnames()}
     links = re.findall(r"\]\((\S+?)\)", page)

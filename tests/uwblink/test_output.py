@@ -102,7 +102,7 @@ def test_an_interrupt_that_another_thread_receives_as_a_file_begins_leaves_nothi
 
     def made_and_then(*arguments):
         folder = plain(*arguments)
-        signal.pthread_kill(other.ident, number)
+        signal.pthread_kill(other.ident or 0, number)
         time.sleep(0.05)
         return folder
 
