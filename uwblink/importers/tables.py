@@ -102,22 +102,6 @@ def lacks_header(names: Sequence[str]) -> bool:
     return len(numbers) == len(names) or (2 * len(numbers) >= len(names) and any("." in one for one in numbers))
 
 
-def differences_remedy(names: Iterable[str]) -> str:
-    """Return what to do about a table of differences of arrival, "" where no column is called like them.
-
-    No table of a recording holds them: from stamps each has the range of its exchange and the rates of the clocks.
-    """
-    found = [
-        name for name in names if re.search(r"tdoa|dtoa|(range|dist(ance)?)[ _]?diff|\bdifference", name, re.IGNORECASE)
-    ]
-    if not found:
-        return ""
-    return (
-        f"{found[-1][:60]!r} looks like differences of arrival, which a recording has as stamps only: import the log "
-        "of frames that each listener received"
-    )
-
-
 def _delimiter(lines: list[str]) -> str:
     """Return the delimiter that splits header and rows into equal numbers of cells, and into the most."""
 
@@ -429,7 +413,6 @@ class SourceTable:
             remedy = "its first line is a row: state the numbers of its columns in a map, such as from_id = 2"
         if {"qx", "qy", "qz", "qw"} <= {name.lower() for name in self.names}:
             remedy = "these are poses, which `uwblink poses` adds to a recording"
-        remedy = differences_remedy(self.names) or remedy
         there = ", ".join(self.names)[:400]
         return ImportTableError(f"{self.path}: column {header[:60]!r} is missing; there are {there}; {remedy}")
 
