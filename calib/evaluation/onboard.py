@@ -38,6 +38,7 @@ from calib.evaluation.filters import (
 )
 from calib.evaluation.localization import MeasuredReceptions
 from calib.evaluation.tracking import (
+    PATIENCE_S,
     BodyTrack,
     Trajectory,
     distances_in,
@@ -178,7 +179,7 @@ class _Readings:
 def _readings(data: Data, calibration: Calibration, use: str) -> list[_Readings]:
     """Return the readings of every body that is not an anchor and ranges with one, or listens."""
     with opened(data) as (name, source):
-        flight = read_flight(name, source, need_power=calibration.needs_power, need_truth=False)
+        flight = read_flight(name, source, need_power=calibration.needs_power, need_truth=False, use=use)
         imu, heights = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))
     poses, tags, ranges = flight.poses, flight.tags, keep_determined(calibration, flight.ranges)
     if use == "receptions":
@@ -248,7 +249,9 @@ def _readings(data: Data, calibration: Calibration, use: str) -> list[_Readings]
 
 def _among(ranges: Ranges, tags: list[int]) -> Ranges:
     """Return the ranges between some tags, with what these overheard of them."""
-    found = ranges[np.isin(ranges.initiator, tags) & np.isin(ranges.target, tags)]
+    found = ranges[
+        np.isin(ranges.initiator, tags) & np.isin(ranges.target, tags) & np.isin(ranges.listener, [-1, *tags])
+    ]
     heard = found.arrivals
     return found if heard is None else replace(found, arrivals=heard[np.isin(heard.listener, tags)])
 
@@ -400,7 +403,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         truth = bodies_m(one.truth, one.body, time_ns)
         turned = nearest_attitude(one.truth, one.body, time_ns)
     wrong = place - truth
-    overheard = one.common_m > 0
+    overheard = (one.common_m > 0) | ((one.sign != 0).sum(axis=1) > 1)
     used = {
         "ranges": not overheard.all(),
         "differences of arrival": overheard.any(),
@@ -442,6 +445,12 @@ def onboard_text(found: list[OnboardTrack], settings: OnboardSettings) -> str:
         cells = "".join(f"{'-':>9s}" if value != value else f"{value:9.3f}" for value in figures)
         own = float(np.sqrt(np.mean(one.std_m**2)))
         lines.append(f"{one.source + ' ' + one.body:33s} {cells}{own:9.3f}  {len(one.restarts_s)}")
+        lasts_s = float(np.ptp(one.range_time_ns)) * 1e-9
+        if len(one.restarts_s) > max(lasts_s / PATIENCE_S, 3):
+            lines.append(
+                f"  began anew {len(one.restarts_s)} times in {lasts_s:.0f} s: what was measured contradicts the "
+                "anchors' places, or differences without stamps have the other sign (from_id and to_id of the import)"
+            )
     noise = settings.noise
     moves = (
         f"accelerometer {noise.force:g} m/s^2 and gyro {noise.gyro:g} rad/s a root of Hz"

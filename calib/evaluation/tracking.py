@@ -196,6 +196,7 @@ def pair_numbers(ends: Ints) -> Ints:
 def ranges_about(ranges: Ranges, tags: list[int]) -> Ranges:
     """Return the ranges of some tags with others, and those that these or others overheard, with their arrivals."""
     needed, heard = np.isin(ranges.initiator, tags) ^ np.isin(ranges.target, tags), ranges.arrivals
+    needed |= np.isin(ranges.listener, tags)
     if heard is not None:
         heard = heard[needed[heard.exchange] | np.isin(heard.listener, tags)]
         needed[heard.exchange] = True
@@ -205,13 +206,16 @@ def ranges_about(ranges: Ranges, tags: list[int]) -> Ranges:
 def distances_in(ranges: Ranges) -> tuple[Ints, Floats, Ints]:
     """Return the tags (n, k, 2) and signs (n, k) of the distances in ranges and arrivals, and exchanges (n,)."""
     ends, exchange, heard = np.column_stack([ranges.initiator, ranges.target]), np.arange(len(ranges)), ranges.arrivals
-    if heard is None:
+    if heard is None and not ranges.differences.any():
         return ends[:, None], np.ones((len(ranges), 1)), exchange
+    listener = ranges.listener
+    if heard is not None:
+        exchange, listener = np.append(exchange, heard.exchange), np.append(listener, heard.listener)
     # From the target, less from the initiator.
-    senders = ends[heard.exchange, ::-1]
-    of_heard = np.stack([senders, np.broadcast_to(heard.listener[:, None], senders.shape)], axis=2)
-    signs = np.repeat([[1.0, 0.0], [1.0, -1.0]], [len(ranges), len(heard)], axis=0)
-    return np.concatenate([np.stack([ends, ends], axis=1), of_heard]), signs, np.append(exchange, heard.exchange)
+    listens, listener, senders = listener[:, None, None] >= 0, listener[:, None], ends[exchange, ::-1]
+    of_heard = np.stack([senders, np.broadcast_to(listener, senders.shape)], axis=2)
+    signs = np.where(listens[:, 0], [1.0, -1.0], [1.0, 0.0])
+    return np.where(listens, of_heard, np.stack([ends, ends], axis=1)[exchange]), signs, exchange
 
 
 def nearest_attitude(poses: Poses, body: str, time_ns: Ints) -> Floats:

@@ -165,9 +165,10 @@ MAP_KEYS: Final = (
     ),
     FileKey(
         "wide.NAME",
-        "text with one place; or a table of columns by device",
+        "text with one place (two of difference_m); or a table of columns by device",
         "none",
-        "Columns that differ by a device: `r_AN{to_id}` makes a row of each. Families are joined by what differs; "
+        "Columns that differ by a device: `r_AN{to_id}` makes a row of each, `d{from_id}-{to_id}` of each "
+        "difference_m. Families are joined by what differs; "
         "`{_}` is no id. A column called mask has a bit for each device with a range.",
     ),
     FileKey(
@@ -383,7 +384,8 @@ def _check_columns(file: TomlReader, columns: dict[str, Any], wide: dict[str, An
         )
     for name, value in wide.items():
         by_device = isinstance(value, dict) and value and all(isinstance(one, str) for one in value.values())
-        is_family = isinstance(value, str) and is_template(value) and len(re.findall(r"\{\w+\}", value)) == 1
+        most = 2 if name == "difference_m" else 1
+        is_family = isinstance(value, str) and is_template(value) and 0 < len(re.findall(r"\{\w+\}", value)) <= most
         file.check(f"wide.{name}", value, by_device or is_family, "a name with one place, such as r_AN{to_id}")
 
 

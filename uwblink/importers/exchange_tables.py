@@ -198,7 +198,7 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
         rows = faults.reject(staging.rows, SOUND_IDS)
     total = rows.count() + len(faults)
     watch("checking", 0.0)
-    value = _VALUES.get(layout, "")
+    value = {"ranges": "range_m", "differences": "difference_m"}.get(layout)
     notes += staging.words_in(name for name in (*DISTANCES, *POWERS, *SKEWS) if name != value)
     if not any(map(rows.has, ("fpp1", "fpp2"))) and any(map(rows.has, ("rxp1", "rxp2"))):
         notes.append("there is no first-path power; the received power serves in its place")
@@ -233,17 +233,13 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
     return in_time_order(rows), reading
 
 
-_VALUES: Final = {"ranges": "range_m", "differences": "difference_m"}
-"""The column with the values of layouts without stamps."""
-
-
 def _layout(staging: Staging) -> str:
     """Return the layout that the columns suggest."""
     has = staging.rows.has
     for layout, names in (("exchanges", STAMPS[:4]), ("messages", ("tx", "rx")), ("stamps", ("stamp", "event"))):
         if all(map(has, names)):
             return layout
-    for layout, name in _VALUES.items():
+    for layout, name in (("ranges", "range_m"), ("differences", "difference_m")):
         if has(name) and not any(map(has, STAMPS)):
             return layout
     raise staging.tables[0].missing(staging.column_map.header(next(name for name in STAMPS if not has(name))))

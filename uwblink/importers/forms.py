@@ -46,6 +46,7 @@ WORDS: Final = {
         r"mac|geraet|knoten)"
     ),
     "range": r"(range|dist|distance|abstand|distanz|entfernung|tof|time_?of_?flight)",
+    "difference": r"(\b|_)(tdoa|dtoa)|(range|dist(ance)?)_?diff|\bdifference",
     "made": r"(raw|filt(er)?(ered)?|corrected|corr|kalman|smooth(ed)?)",
     "true": (
         r"(gt|true|truth|ground_?truth|ref|reference|nominal|mocap|vicon|actual|tape(_?measured?)?|"
@@ -112,10 +113,9 @@ PATTERNS: Final = {
 } | {name: _place(name) for name in POSITIONS}
 """Patterns of the names of columns, in terms of `WORDS`."""
 
-_DIFFERENCE: Final = r"\btdoa|\bdtoa|(range|dist(ance)?)_?diff|\bdifference"
 _OF_DIFFERENCES: Final = PATTERNS | {
     "time_s": rf"{PATTERNS['time_s']}|t_?tdoa",
-    "difference_m": rf".*({_DIFFERENCE}).*",
+    "difference_m": r".*({difference}).*",
     "at_id": r"(at|tag|listener|robot|drone|mobile|receiver|rx|ziel){id}",
     "from_id": r"(from|minus|src|source){id}|(anchor|anker|node)_?from{id}",
     "to_id": r"(to|plus|dst|target){id}|(anchor|anker|node)_?to{id}",
@@ -152,7 +152,7 @@ def named_columns(headers: Iterable[str]) -> dict[str, str]:
     listed = sorted(headers, key=lambda header: "raw" not in header.lower())
     called = _plain_names(listed)
     found, words = _ends(called), " ".join(called.values())
-    differ = re.search(_DIFFERENCE, words) is not None
+    differ = re.search(WORDS["difference"], words) is not None
     for ours, pattern in (_OF_DIFFERENCES if differ else PATTERNS).items():
         whole = f"({pattern}){{end}}".format_map(WORDS)
         # Each column is used once, but for names of messages, which may repeat those of exchanges at this stage.
@@ -225,6 +225,8 @@ def wide_columns(names: Sequence[str], taken: Mapping[str, str]) -> dict[str, st
     """
     if any(ours in taken for ours in ("range_m", "tx1", "rx1", "tx", "rx", "stamp")):
         return {}
+    if pairs := [match[1] for name in names if (match := re.fullmatch(r"(.*\bd|.*tdoa.*?)[0-9]+-[0-9]+", name))]:
+        return {"difference_m": f"{pairs[0]}{{from_id}}-{{to_id}}"}
     ends = [taken[ours] for ours in ("from_id", "to_id", "time_s") if ours in taken]
     matches = (re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", name) for name in names if name not in ends)
     stems = [(match[1], match[3]) for match in matches if match]

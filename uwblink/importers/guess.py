@@ -189,7 +189,7 @@ def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Map
         if each := None if is_log or wide or "range_m" in columns else next(iter(table.lists), None):
             top["each"] = each, "a line has a list of them"
     given = {*given, *(n for text in (form.line, form.each) if text for n in places(Template(text)) if n in NAMES)}
-    given |= {"to_id", *wide} if wide else set()
+    given |= {"to_id", *wide, *(["from_id"] if "{from_id}" in str(wide) else [])} if wide else set()
     form = replace(form, wide=wide, each=form.each or each, time_unit="ns" if is_bag(path) else None)
     with open_table(file, form) as table:
         # Fields of the elements of a list are called by their own names.

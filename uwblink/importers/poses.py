@@ -241,7 +241,7 @@ def add_poses(
         moved = replace(poses, time_ns=poses.time_ns + shift_ns)
         truth = distances_m(moved, placed, first, second, time_ns)
         covered = int(np.count_nonzero(np.isfinite(truth)))
-        if not covered:
+        if not covered and files:
             raise ImportTableError(
                 f"{what}: no exchange lies within its poses, which end {_apart(time_ns, moved.time_ns)}; "
                 "give `offset` in seconds, or auto"

@@ -347,10 +347,11 @@ class SourceTable:
         lists = {
             ours: [self.text(family[n]) if n in family else "''" for n in labels] for ours, family in families.items()
         }
-        end = "from_id" if "{from_id}" in str(self.column_map.wide) else "to_id"
-        if end not in lists:
-            self.db.execute(f"SET VARIABLE labels{self._key} = ?", [labels])
-            lists[end] = [f"getvariable('labels{self._key}')[{n}]" for n in range(1, len(labels) + 1)]
+        ends = dict.fromkeys(re.findall(r"\{(from_id|to_id)\}", str(self.column_map.wide)) or ["to_id"])
+        for end, own in zip(ends, zip(*labels, strict=False), strict=False):
+            if end not in lists:
+                self.db.execute(f"SET VARIABLE {end}s{self._key} = ?", [own])
+                lists[end] = [f"getvariable('{end}s{self._key}')[{n}]" for n in range(1, len(labels) + 1)]
         cells = {ours: f"[{', '.join(cells)}][k]" for ours, cells in lists.items()}
         numbered = "" if self._expanded else ", row_number() OVER () AS row"
         self.source = f"(SELECT *{numbered}, unnest(range(1, {len(labels) + 1})) AS k FROM {self.source})"
@@ -360,13 +361,12 @@ class SourceTable:
             self.blank += f" OR TRY_CAST({self.text('mask')} AS BIGINT) & (1 << (k - 1)) = 0"
         self.names, self._cells, self._expanded = (*self.names, *cells), [*self._cells, *cells.values()], True
 
-    def _family(self, ours: str, stated: str | dict[str, str]) -> dict[str, str]:
+    def _family(self, ours: str, stated: str | dict[str, str]) -> dict[tuple[str, ...], str]:
         """Return the columns of a family by what differs in their names."""
         if isinstance(stated, dict):
-            return stated
-        before, after = re.split(r"\{\w+\}", stated)
-        pattern = rf"{re.escape(before)}(.+){re.escape(after)}"
-        found = {match[1]: name for name in self.names if (match := re.fullmatch(pattern, name))}
+            return {(label,): name for label, name in stated.items()}
+        pattern = "(.+)".join(map(re.escape, re.split(r"\{\w+\}", stated)))
+        found = {match.groups(): name for name in self.names if (match := re.fullmatch(pattern, name))}
         if not found:
             there = ", ".join(self.names)[:400]
             raise ImportTableError(f"{self.path}: wide.{ours}: no column {stated[:60]!r}; there are {there}")
