@@ -75,8 +75,8 @@ def imported(folder, rows, *, swapped=False, mocap=True):
 def folder(tmp_path_factory):
     """Two recordings, fit/d.uwb and fly/d.uwb, and a fit of the one: fit.json."""
     found = tmp_path_factory.mktemp("differences")
-    imported(found / "fit", flown(1, 90.0))
-    imported(found / "fly", flown(2, 40.0))
+    imported(found / "fit", flown(1, 60.0))
+    imported(found / "fly", flown(2, 20.0))
     processes.succeed("calib", "fit", "fit/d.uwb", "-o", "fit.json", *FIT, cwd=found)
     return found
 
@@ -85,9 +85,9 @@ def test_delays_come_out_but_for_what_they_have_in_common(folder):
     known = calib.load_calibration(folder / "fit.json")
     found = np.array([known.delays_ns[tag] for tag in range(1, 9)])
     std = np.array([known.std_of_sum_ns([tag]) for tag in range(1, 9)])
-    # Of 14400 rows each anchor is in a quarter, by half its delay: 0.1 m/sqrt(3600)/0.15 m/ns = 0.011 ns and more for
-    # the loss, the partners' delays and 5 % of reflections.
-    assert np.all((std > 0.011) & (std < 0.02))
+    # Of 9600 rows each anchor is in a quarter, by half its delay: 0.1 m/sqrt(2400)/0.15 m/ns = 0.0136 ns, which the
+    # partners' delays, the loss and 5 % of reflections make half as large again at most.
+    assert np.all((std > 0.012) & (std < 0.022))
     wrong = found - (DELAYS_NS - DELAYS_NS.mean())
     assert np.all(np.abs(wrong) < 4 * std)
     assert np.sqrt(np.mean((wrong / std) ** 2)) < 1.8, "99.9 % of the roots of chi-square over seven"
@@ -99,14 +99,14 @@ def test_delays_come_out_but_for_what_they_have_in_common(folder):
 
 def test_the_fit_names_what_stays_free(folder):
     done = processes.run("calib", "fit", "fit/d.uwb", "-o", "again.json", *FIT, cwd=folder)
-    assert "0 exchanges, 14400 differences of arrival" in done.stdout
+    assert "0 exchanges, 9600 differences of arrival" in done.stdout
     assert done.stdout.count("less the mean of all") == 8
     assert "only differences of arrival from tags 1, 2, 3" in done.stderr
     assert "have in common" in done.stderr
     pinned = calib.fit(folder / "fit/d.uwb", use="receptions", delays_only=True, fixed_ns={1: DELAYS_NS[0]}).calibration
     assert not pinned.undetermined_splits
     for tag in range(2, 9):
-        assert abs(pinned.delays_ns[tag] - DELAYS_NS[tag - 1]) < 4 * pinned.delays_std_ns[tag] < 0.1
+        assert abs(pinned.delays_ns[tag] - DELAYS_NS[tag - 1]) < 4 * pinned.delays_std_ns[tag] < 0.13
 
 
 def test_what_is_not_determined_is_not_corrected(folder):
@@ -121,35 +121,33 @@ def test_the_tag_is_where_it_is(folder):
             "calib", "localize", "fly/d.uwb", "-c", "fit.json", "--use", "receptions", "--json", cwd=folder
         ).stdout
     )
-    (one,), total = done["scenarios"], done
-    assert one["arrivals"] == 6400
+    (one,) = done["scenarios"]
+    assert one["arrivals"] == 3200
     assert one["rmse_m"]["raw"] > 0.08
     assert one["rmse_m"]["variance"] < 0.045
     assert one["rmse_m"]["robust"] < 0.04
-    print(total)
 
 
 @pytest.mark.parametrize("model", ["constant-velocity", "imu"])
 def test_the_tag_is_tracked_on_board(folder, model):
     contents = uwblink.load(folder / "fly/d.uwb")
-    time_s = np.arange(0, 40.0, 0.01)
+    time_s = np.arange(0, 20.0, 0.01)
     rates = np.array([0.5, 0.37, 0.29])
     swing = np.column_stack([2.5 * np.sin(0.5 * time_s), 2.2 * np.cos(0.37 * time_s), 0.7 * np.sin(0.29 * time_s)])
     force = -(rates**2) * swing + [0.0, 0.0, 9.80665]
-    columns = dict(zip(("ax", "ay", "az"), force.T, strict=True)) | dict.fromkeys(("wx", "wy", "wz"), np.zeros(4000))
-    imu = {"time_ns": np.rint(time_s * 1e9).astype(np.int64), "body": np.full(4000, "tag20"), **columns}
+    columns = dict(zip(("ax", "ay", "az"), force.T, strict=True)) | dict.fromkeys(("wx", "wy", "wz"), np.zeros(2000))
+    imu = {"time_ns": np.rint(time_s * 1e9).astype(np.int64), "body": np.full(2000, "tag20"), **columns}
     settings = calib.OnboardSettings(model=model, use="receptions")
     (found,) = calib.localize_onboard(replace(contents, imu=imu), folder / "fit.json", settings)
     assert found.used == "differences of arrival" + (", imu" if model == "imu" else "")
     assert not found.restarts_s
     assert found.rmse_m < {"constant-velocity": 0.1, "imu": 0.06}[model]
-    print(found.rmse_m)
 
 
 def test_a_calibration_of_ranges_corrects_differences(folder):
     """Its noise is that of a range, of which a difference has five times the variance."""
     random = np.random.default_rng(5)
-    time_s = np.arange(0, 90.0, 1 / 80)
+    time_s = np.arange(0, 60.0, 1 / 80)
     anchor = np.arange(len(time_s)) % 8
     truth = np.linalg.norm(ANCHORS[anchor] - place_m(time_s), axis=1)
     noise = random.normal(size=len(time_s)) * NOISE_M / 5**0.5
@@ -161,7 +159,8 @@ def test_a_calibration_of_ranges_corrects_differences(folder):
     found = calib.localize(folder / "fly/d.uwb", known, Settings(use="receptions"))
     total = summarize(found)
     assert total.rmse_m["variance"] < 0.045 < 0.08 < total.rmse_m["raw"]
-    assert total.nees_bounds[0] < total.nees < total.nees_bounds[1]
+    # The bounds, 2.5 and 3.5, hold 95 %: 0.9 is 3.5 standard deviations. A variance of half as much would give 6.
+    assert total.nees == pytest.approx(3.0, abs=0.9)
 
 
 @pytest.mark.parametrize(
@@ -169,7 +168,7 @@ def test_a_calibration_of_ranges_corrects_differences(folder):
 )
 def test_the_other_sign_is_noticed_by_poses(folder, words):
     if not (folder / "swapped").exists():
-        imported(folder / "swapped", flown(3, 20.0), swapped=True)
+        imported(folder / "swapped", flown(3, 8.0), swapped=True)
     command, *others = words
     naming = ["d.uwb", "the other sign", "from_id", "to_id"]
     processes.refuse("calib", command, "d.uwb", *others, cwd=folder / "swapped", naming=naming, status=2)
@@ -177,9 +176,67 @@ def test_the_other_sign_is_noticed_by_poses(folder, words):
 
 
 def test_the_other_sign_is_doubted_without_poses(folder):
-    rows = flown(4, 20.0)
+    rows = flown(4, 8.0)
     doubted = imported(folder / "blind", rows, swapped=True, mocap=False)
     believed = imported(folder / "right", rows, mocap=False)
     words = ("-c", folder / "fit.json", "--use", "receptions", "--model", "constant-velocity")
     assert "the other sign" in processes.succeed("calib", "localize", doubted, *words).stdout
     assert "the other sign" not in processes.succeed("calib", "localize", believed, *words).stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "naming", "status"),
+    [
+        (("fit", "d.uwb", "-o", "x.json", "--use", "receptions"), ["d.uwb", "powers", "--delays-only"], 1),
+        (("fit", "d.uwb", "-o", "x.json", "--delays-only"), ["d.uwb", "3200 differences", "--use receptions"], 1),
+        (("evaluate", "d.uwb", "-c", "../fit.json"), ["d.uwb", "3200 differences", "no exchanges"], 1),
+        (("localize", "d.uwb", "-c", "../fit.json"), ["d.uwb", "3200 differences", "--use receptions"], 1),
+    ],
+)
+def test_what_does_not_go_with_differences_is_said(folder, words, naming, status):
+    processes.refuse("calib", *words, cwd=folder / "fly", naming=naming, status=status)
+    assert not (folder / "fly" / "x.json").exists()
+
+
+@pytest.mark.parametrize(
+    "words", [("fit", "-o", "x.json", *FIT), ("localize", "-c", "fit.json", "--use", "receptions")]
+)
+def test_an_anchor_without_a_place_is_named(folder, words):
+    contents = uwblink.load(folder / "fly/d.uwb")
+    lost = contents.differences["plus"].copy()
+    lost[7] = 77
+    replace(contents, differences=contents.differences | {"plus": lost}).save(folder / "lost.uwb", force=True)
+    naming = ["lost.uwb", "anchor 77", "no place"]
+    processes.refuse("calib", words[0], "lost.uwb", *words[1:], cwd=folder, naming=naming, status=2)
+
+
+def test_ranges_and_differences_are_used_together_and_fitted_apart(folder):
+    contents = uwblink.load(folder / "fly/d.uwb")
+    time_s = np.arange(0.1, 19.0, 0.1)
+    truth = np.linalg.norm(ANCHORS[0] - place_m(time_s), axis=1)
+    ranges = uwblink.Exchanges.from_arrays(
+        TAG, 1, time_ns=np.rint(time_s * 1e9).astype(np.int64), protocol="ss", range_m=truth, tx1=0, rx1=0, tx2=0, rx2=0
+    )  # fmt: skip
+    both = replace(contents, exchanges=ranges)
+    with pytest.raises(calib.CalibError, match="fit each alone"):
+        calib.fit(both, use="receptions", delays_only=True)
+    known = replace(
+        calib.load_calibration(folder / "fit.json"),
+        delays_ns=dict(zip((*range(1, 9), TAG), (*DELAYS_NS, -DELAYS_NS[0]), strict=True)),
+        undetermined_splits=(),
+    )
+    (found,) = calib.localize(both, known, Settings(use="receptions"))
+    assert (found.arrivals, len(found.tracks["raw"].time_ns)) == (3200, 3200 + len(time_s))
+    assert found.rmse_m["variance"].mean() < 0.045
+
+
+def test_a_recording_keeps_them(folder):
+    contents = uwblink.load(folder / "fly/d.uwb")
+    processes.succeed("uwblink", "export", "fly/d.uwb", "--to", "csv", "-o", "exported", cwd=folder)
+    processes.succeed("uwblink", "import", "exported", "exported", "-o", "again.uwb", cwd=folder)
+    again = uwblink.load(folder / "again.uwb").differences
+    assert all(np.array_equal(again[name], column) for name, column in contents.differences.items())
+    some = contents.select(start_s=5.0, stop_s=6.0).differences
+    assert len(some["time_ns"]) == 160
+    assert some["time_ns"][0] == contents.differences["time_ns"][0] + 5 * 10**9
+    assert "also: differences 3200" in processes.succeed("uwblink", "show", "fly/d.uwb", cwd=folder).stdout
