@@ -245,7 +245,7 @@ def determined(calibration: Calibration, ranges: Ranges) -> Bools:
     first, second = (
         np.array([[sides.get(tag, 0) for tag in pair] for pair in pairs.ends.tolist()], int).reshape(-1, 2).T
     )
-    return np.where(ranges.differences, (first == second)[pairs.number], (first == -second)[pairs.number])
+    return np.asarray(np.where(ranges.differences, (first == second)[pairs.number], (first == -second)[pairs.number]))
 
 
 def keep_determined(calibration: Calibration, ranges: Ranges) -> Ranges:

@@ -214,9 +214,9 @@ def test_ranges_and_differences_are_used_together_and_fitted_apart(folder):
     contents = uwblink.load(folder / "fly/d.uwb")
     time_s = np.arange(0.1, 19.0, 0.1)
     truth = np.linalg.norm(ANCHORS[0] - place_m(time_s), axis=1)
-    ranges = uwblink.Exchanges.from_arrays(
-        TAG, 1, time_ns=np.rint(time_s * 1e9).astype(np.int64), protocol="ss", range_m=truth, tx1=0, rx1=0, tx2=0, rx2=0
-    )  # fmt: skip
+    none = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(len(time_s), dtype=np.int64))
+    when_ns = np.rint(time_s * 1e9).astype(np.int64)
+    ranges = uwblink.Exchanges.from_arrays(TAG, 1, time_ns=when_ns, protocol="ss", range_m=truth, **none)
     both = replace(contents, exchanges=ranges)
     with pytest.raises(calib.CalibError, match="fit each alone"):
         calib.fit(both, use="receptions", delays_only=True)

@@ -132,8 +132,8 @@ def import_tables(
                 done += len(exchanges)
                 if reading is None and rows.has("difference_m"):
                     named = {"minus": "from_id", "plus": "to_id", "listener": "at_id", "difference_m": "difference_m"}
-                    columns = {kept: block[name] for kept, name in named.items()}
-                    recording.append("differences", {"time_ns": exchanges.time_ns} | columns)
+                    values = {kept: block[name] for kept, name in named.items()}
+                    recording.append("differences", {"time_ns": exchanges.time_ns} | values)
                     continue
                 if not np.isfinite(exchanges.range_m).all():
                     raw, reported = raw_range(exchanges), exchanges.range_m
