@@ -220,8 +220,10 @@ def _without_delays(calibration: Calibration, ranges: Ranges) -> Floats:
 def determined(calibration: Calibration, ranges: Ranges) -> Bools:
     """Return of which ranges (n,) a calibration knows the delays, and not only in sums with those of other tags."""
     sides, pairs = calibration.sides, pairs_of(ranges.initiator, ranges.target)
-    good = [not sum(sides.get(tag, 0) for tag in pair) for pair in pairs.ends.tolist()]
-    return np.array(good, dtype=bool)[pairs.number]
+    first, second = (
+        np.array([[sides.get(tag, 0) for tag in pair] for pair in pairs.ends.tolist()], int).reshape(-1, 2).T
+    )
+    return np.asarray(np.where(ranges.differences, (first == second)[pairs.number], (first == -second)[pairs.number]))
 
 
 def keep_determined(calibration: Calibration, ranges: Ranges) -> Ranges:

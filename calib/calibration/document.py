@@ -114,7 +114,8 @@ CALIBRATION_KEYS: Final = (
         "undetermined_splits",
         "pairs of lists of tags",
         "none",
-        "Sides that ranged only with each other: only ranges between the two sides can be corrected.",
+        "Sides that ranged only with each other: only ranges between the two sides can be corrected. Of a side without "
+        "another: only differences of arrival from its tags.",
     ),
     FileKey(
         "patterns",
@@ -186,19 +187,30 @@ def pair_name(pair: Sequence[int]) -> str:
 
 
 def known_of_splits(splits: Iterable[Split]) -> str:
-    """Return in words which ranges undetermined splits leave known."""
+    """Return in words what undetermined splits leave known: ranges between two sides, or differences within one."""
+
+    def named(tags: Sequence[int]) -> str:
+        return f"tag{'s' * (len(tags) > 1)} {first_few(map(str, tags))}"
+
     known = (
-        " and ".join(f"tag{'s' * (len(tags) > 1)} {first_few(map(str, tags))}" for tags in sides) for sides in splits
+        f"ranges between {named(one)} and {named(other)}"
+        if one and other
+        else f"differences of arrival from {named(one or other)}"
+        for one, other in splits
     )
-    return f"only ranges between {'; '.join(known)} are determined"
+    return f"only {'; '.join(known)} are determined"
 
 
 def split_text(splits: Iterable[Split]) -> str:
-    """Return in words which ranges undetermined splits leave known, why, and what determines the others."""
-    return (
-        f"{known_of_splits(splits)}, because the delays of one side can grow as those of the other shrink; ranges "
-        "among three of these tags, or a known delay (`fixed_ns`), determine the rest"
+    """Return in words what undetermined splits leave known, why, and what determines the rest."""
+    splits = list(splits)
+    why = (
+        "the delays of one side can grow as those of the other shrink; ranges among three of these tags, or a known "
+        "delay (`fixed_ns`), determine the rest"
+        if any(map(all, splits))
+        else "what all of their delays have in common cancels in these; a known delay (`fixed_ns`) determines the rest"
     )
+    return f"{known_of_splits(splits)}, because {why}"
 
 
 MAX_DELAY_NS: Final = 1e4

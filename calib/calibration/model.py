@@ -122,8 +122,10 @@ class Calibration:
 
     `undetermined_splits` are pairs of sides, as anchors and robots, that ranged only with each other: the delays of one
     side may be longer and those of the other shorter by as much. Ranges between two sides can be corrected, and no
-    others of their tags. `patterns` say how ranges depend on the directions in which antennas see each other; where
-    these are not known, ranges are corrected without them, and `sigma_total_m` contains what is missing.
+    others of their tags. With an empty side all delays of the other may be longer alike: they are stated less their
+    mean, and correct differences of arrival without stamps only. `patterns` say how ranges depend on the directions in
+    which antennas see each other; where these are not known, ranges are corrected without them, and `sigma_total_m`
+    contains what is missing.
     """
 
     delays_ns: Annotated[dict[TagKey, DelayNs], IN_ORDER]
@@ -165,10 +167,10 @@ class Calibration:
         for one, other in self.undetermined_splits:
             for pair in sorted((min(a, b), max(a, b)) for a in one for b in other):
                 delay_ns = sum(self.delays_ns[tag] for tag in pair)
-                found[pair] = PairOffset(-half_m * delay_ns, half_m * self._std_of_sum_ns(pair))
+                found[pair] = PairOffset(-half_m * delay_ns, half_m * self.std_of_sum_ns(pair))
         return found
 
-    def _std_of_sum_ns(self, tags: Collection[int]) -> float:
+    def std_of_sum_ns(self, tags: Collection[int]) -> float:
         """Return the standard error of the sum of some tags' delays, NaN where it is not known."""
         if self.uncertainty is None:
             return math.nan
@@ -459,13 +461,22 @@ def pair_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 
 def delay_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """Return tag, delay in ns, and its interval in words, of tags whose delays are not only known as parts of pairs."""
+    """Return tag, delay in ns, and its interval in words, of tags whose delays are not only known as parts of pairs.
+
+    Delays of which only differences are known are those less their mean.
+    """
     if calibration.pair_offsets and not any(calibration.delays_ns.values()):
         return []
     std_ns = calibration.delays_std_ns
-    sides = calibration.sides
-    delays = sorted((tag, delay) for tag, delay in calibration.delays_ns.items() if tag not in sides)
-    return [(str(tag), f"{delay:+.4f}", interval(std_ns.get(tag, math.nan))) for tag, delay in delays]
+    alone = {tag for sides in calibration.undetermined_splits if not all(sides) for tags in sides for tag in tags}
+    hidden = calibration.sides.keys() - alone
+    return [
+        (str(tag), f"{delay:+.4f}", f"{interval(calibration.std_of_sum_ns([tag]))}, less the mean of all")
+        if tag in alone
+        else (str(tag), f"{delay:+.4f}", interval(std_ns.get(tag, math.nan)))
+        for tag, delay in sorted(calibration.delays_ns.items())
+        if tag not in hidden
+    ]
 
 
 def pattern_rows(calibration: Calibration) -> list[tuple[str, str, str]]:

@@ -104,7 +104,9 @@ def fit(
             result = _fit_from_ranges(recordings, flight, settings, trim_static=trim_static)
         else:
             with waiting("fitting"):
-                ranges = calib.load_ranges(recordings, trim_static=trim_static, need_power=not settings.delays_only)
+                ranges = calib.load_ranges(
+                    recordings, trim_static=trim_static, need_power=not settings.delays_only, use=settings.use
+                )
                 result = calib.fit(ranges, settings)
     result.save(output, force=force)
     _print_fit(result, output, as_json=as_json)
@@ -120,7 +122,8 @@ def _print_fit(result: calib.FitResult, output: Path, *, as_json: bool) -> None:
     else:
         heard = found.provenance.get("arrivals")
         also = f", {heard} differences of arrival" if heard else ""
-        typer.echo(f"{output}: {len(result.ranges)} exchanges{also}, {result.message}, scale {found.scale_ns:.3f} ns")
+        used = f"{found.provenance['exchanges']} exchanges{also}"
+        typer.echo(f"{output}: {used}, {result.message}, scale {found.scale_ns:.3f} ns")
         lines = [*delay_lines(found), *(f"  left out: {number} exchanges, {reason}" for reason, number in left_out)]
         typer.echo("\n".join(filter(str.strip, [*lines, f"  {held_out_line(found)}"])))
         for warning in result.warnings:

@@ -22,9 +22,9 @@ from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, known_delays
 from uwblink.recording.contents import Contents
-from uwblink.recording.distances import sights, tracks_of
+from uwblink.recording.distances import distances_m, sights, tracks_of
 from uwblink.recording.schema import Poses, Tag
-from uwblink.twr import Exchanges, delay_weights, range_ns, raw_range, without_stamps
+from uwblink.twr import Exchanges, delay_weights, names_in, range_ns, raw_range, without_stamps
 
 MapSource = str | os.PathLike[str] | Mapping[str, Any]
 
@@ -62,6 +62,9 @@ class Ranges(ColumnTable):
     `antenna_delays` are those programmed into the tags, as far as known; `arrivals` is what other tags overheard of
     these exchanges, None without any. `toward` (n, 2, 3) are unit vectors from the antennas of initiator and target to
     each other, in the frames of their bodies, NaN where attitudes are not known; `turning` are tags whose bodies turn.
+
+    A row with a `listener` (-1 elsewhere) is a difference of arrival without stamps: by how much farther from the
+    target than from the initiator the listener is. The weight of its initiator is negative.
     """
 
     source: str
@@ -87,9 +90,12 @@ class Ranges(ColumnTable):
     arrivals: Arrivals | None = None
     toward: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2, 3), dtype=np.float32))
     turning: tuple[int, ...] = ()
+    listener: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
         """Put all ranges into one session, and take directions for unknown, where none are given."""
+        if len(self.listener) != len(self.time_ns):
+            object.__setattr__(self, "listener", np.full(len(self.time_ns), -1))
         if len(self.session) != len(self.time_ns):
             object.__setattr__(self, "session", np.zeros(len(self.time_ns), dtype=np.int32))
         if len(self.toward) != len(self.time_ns):
@@ -231,14 +237,57 @@ class Ranges(ColumnTable):
         found = contents_of_frame(frame, map)
         return cls.from_exchanges(found.exchanges, poses=found.poses, tags=found.tags, source="data frame")
 
+    @classmethod
+    def from_differences(
+        cls, table: Mapping[str, NDArray[Any]], *, poses: Poses, tags: Sequence[Tag], source: str = IN_MEMORY
+    ) -> Ranges:
+        """Return a row for every difference of arrival without stamps, columns of the table `differences`.
+
+        It depends on half the difference of both anchors' delays, as with stamps (`calib.data.arrivals`): anchors that
+        keep a common time measure their distances with the same delays, and a delay is half of transmission. The
+        smaller id is the initiator. Raises `BadInputError` for an anchor without a place, and where `poses` show that
+        all differences have the other sign.
+        """
+        first, second = np.minimum(table["minus"], table["plus"]), np.maximum(table["minus"], table["plus"])
+        places = set(names_in(poses.body))
+        lost = np.setdiff1d(np.append(first, second), [tag.tag for tag in tags if tag.body in places])
+        if len(lost):
+            raise BadInputError(
+                f"{source}: differences of arrival name anchor {lost[0]}, which has no place: state it with "
+                "`uwblink poses --tags`, or leave it out of the log"
+            )
+        away, across = (distances_m(poses, tags, ends, table["listener"], table["time_ns"]) for ends in (second, first))
+        found = cls.from_arrays(
+            np.where(table["minus"] == first, 1.0, -1.0) * table["difference_m"],
+            initiator=first,
+            target=second,
+            truth_m=away - across,
+            time_ns=table["time_ns"],
+            weights=(-0.5, 0.5),
+            source=source,
+        )
+        right, swapped = (np.abs(found.raw_m + sign * found.truth_m) for sign in (-1, 1))
+        if (known := np.isfinite(right)).any() and np.median(right[known]) > 2 * np.median(swapped[known]):
+            raise BadInputError(
+                f"{source}: by its poses the differences of arrival have the other sign (their median error is "
+                f"{np.median(right[known]):.2f} m, and {np.median(swapped[known]):.2f} m with that): exchange from_id "
+                "and to_id in the map of their import"
+            )
+        return replace(found, protocol=np.full(len(found), NO_STAMPS), listener=table["listener"].astype(np.int64))
+
+    @property
+    def differences(self) -> Bools:
+        """Return which rows (n,) are differences of arrival without stamps."""
+        return np.asarray(self.listener >= 0)
+
     def __getitem__(self, rows: int | slice | Bools | Ints) -> Ranges:
         """Return the chosen ranges, in their order, with their arrivals."""
         found = ColumnTable.__getitem__(self, rows)
         return found if self.arrivals is None else replace(found, arrivals=self.arrivals.of_exchanges(rows, len(self)))
 
     def to_dict(self) -> dict[str, NDArray[Any]]:
-        """Return the columns by name, (n,) each, without directions."""
-        return {name: column for name, column in self._columns().items() if name != "toward"}
+        """Return the columns by name, (n,) each, without directions and listeners."""
+        return {name: column for name, column in self._columns().items() if name not in ("toward", "listener")}
 
     def _title(self) -> str:
         left = "".join(f", {count} left out: {reason}" for reason, count in self.excluded.items())

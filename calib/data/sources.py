@@ -42,8 +42,8 @@ class Source(Protocol):
     """An object in place of a file: exchanges, poses of bodies, and the tags on them.
 
     A simulation's result has these attributes. Used where they exist: `planted`, what a simulation put in, which is
-    shown and never used (or `meta` with that entry, and with the programmed antenna delays); `faults`; `overheard`,
-    columns of the recording's table.
+    shown and never used (or `meta` with that entry, and with the programmed antenna delays); `faults`; `overheard` and
+    `differences`, columns of the recording's tables.
     """
 
     @property
@@ -69,7 +69,7 @@ READERS: Final[dict[str, Callable[[Recording], Any]]] = {
     "tags": Recording.tags,
     "meta": Recording.meta,
     "faults": Recording.faults,
-    **{table: partial(Recording.columns, table=table) for table in ("overheard", "imu", "height")},
+    **{table: partial(Recording.columns, table=table) for table in ("overheard", "imu", "height", "differences")},
     "arrangements": Recording.arrangements,
     "known_distances": Recording.known_distances,
 }
@@ -122,33 +122,40 @@ def _no_recording(data: object) -> BadInputError:
     )
 
 
-def load_ranges(data: Data | Iterable[Data], *, trim_static: bool = False, need_power: bool = True) -> Ranges:
+def load_ranges(
+    data: Data | Iterable[Data], *, trim_static: bool = False, need_power: bool = True, use: str = "exchanges"
+) -> Ranges:
     """Return the ranges of one or more recordings with their true distances, without those that cannot be used.
 
     `data` is the path of a recording, an open `Recording`, `Exchanges` with their true distances, `Ranges`, a data
     frame (`Ranges.from_dataframe`), any object with `exchanges`, `poses` and `tags` (a simulation in memory), or
     several of those. `trim_static` leaves out spans
     of two seconds in which a pair's distance stays within two centimetres. Ranges without any power are left out unless
-    `need_power` is False. What other tags overheard of them is in `arrivals`. Raises the errors of `Recording.open`,
-    and `UnanswerableError` where nothing can be used.
+    `need_power` is False. What other tags overheard of them is in `arrivals`; with `use` "receptions" differences of
+    arrival without stamps are rows, too. Raises the errors of `Recording.open`, and `UnanswerableError` where nothing
+    can be used.
 
     >>> import calib
     >>> own = calib.Ranges.from_arrays([3.1, 4.2], initiator=1, target=2, fpp1_dbm=-85.0, truth_m=[3.0, 4.0])
     >>> calib.load_ranges(own)
     <Ranges of memory: 2 of tags 1, 2>
     """
-    parts = load_each(data, trim_static=trim_static, need_power=need_power)
+    parts = load_each(data, trim_static=trim_static, need_power=need_power, use=use)
     return parts[0] if len(parts) == 1 else concatenate(parts)
 
 
-def load_each(data: Data | Iterable[Data], *, trim_static: bool = False, need_power: bool = True) -> list[Ranges]:
+def load_each(
+    data: Data | Iterable[Data], *, trim_static: bool = False, need_power: bool = True, use: str = "exchanges"
+) -> list[Ranges]:
     """Return the ranges of each recording; raises what `load_ranges` raises.
 
     Raises `BadInputError` where two recordings hold the same exchanges: counted twice, they would seem to tell more.
     """
     given = each(data)
     parts = [
-        one.usable(need_power=need_power) if isinstance(one, Ranges) else load_flight(one, need_power=need_power).ranges
+        one.usable(need_power=need_power)
+        if isinstance(one, Ranges)
+        else load_flight(one, need_power=need_power, use=use).ranges
         for one in given
     ]
     seen: dict[str, str] = {}
@@ -291,8 +298,8 @@ def require_times(ranges: Ranges) -> None:
 
 
 def require_arrivals(ranges: Ranges) -> None:
-    """Raise `UnanswerableError` if no tag overheard a range."""
-    if ranges.arrivals is None or not len(ranges.arrivals):
+    """Raise `UnanswerableError` if no tag overheard a range, and there are no differences of arrival without stamps."""
+    if (ranges.arrivals is None or not len(ranges.arrivals)) and not ranges.differences.any():
         raise UnanswerableError(
             f"{ranges.source}: no listener overheard an exchange between tags with known distances; record with "
             "passive tags, or use exchanges",
@@ -300,11 +307,19 @@ def require_arrivals(ranges: Ranges) -> None:
         )
 
 
-def load_flight(data: Data, *, need_power: bool = True, need_truth: bool = True, sensors: Sequence[str] = ()) -> Flight:
+def load_flight(
+    data: Data,
+    *,
+    need_power: bool = True,
+    need_truth: bool = True,
+    use: str = "exchanges",
+    sensors: Sequence[str] = (),
+) -> Flight:
     """Return a recording's usable ranges with its poses; of an exchange that both ends reported one report counts.
 
     Without `need_truth` ranges and differences of arrival without true distances stay, also where no poses are.
-    `sensors` name the tables of sensors that are read, too.
+    With `use` "receptions" differences without stamps are rows, too. `sensors` name the tables of sensors that are
+    read, too.
 
     Raises what `opened` raises, `BadInputError` for planted values or antenna delays that cannot be read, and
     `UnanswerableError` where no range can be used.
@@ -324,11 +339,37 @@ def load_flight(data: Data, *, need_power: bool = True, need_truth: bool = True,
             arrivals = arrivals_of(exchanges, found.raw_m, heard, source.poses, source.tags, need_truth=need_truth)
             powered = np.isfinite(measured_powers(arrivals.poll_dbm) + measured_powers(arrivals.response_dbm))
             found = replace(found, arrivals=arrivals[powered | (not need_power)])
-        fingerprint = sha256(exchanges.time_ns.tobytes() + exchanges.range_m.tobytes()).hexdigest()[:32]
+        bare = dict(getattr(source, "differences", None) or {})
+        count = len(bare.get("time_ns", ()))
+        if count:
+            found = _with_differences(found, bare, source, need_power=need_power, use=use)
+        content = exchanges.time_ns.tobytes() + exchanges.range_m.tobytes()
+        content += bare["difference_m"].tobytes() if count else b""
+        fingerprint = sha256(content).hexdigest()[:32]
         reasons = _why_no_truth(source), _why_no_power(exchanges)
         usable = found.usable(*reasons, need_power=need_power, need_truth=need_truth)
         tables = {table: dict(getattr(source, table, None) or {}) for table in sensors}
         return Flight(replace(usable, recordings=((name, fingerprint),)), source.poses, list(source.tags), tables)
+
+
+def _with_differences(
+    found: Ranges, bare: Mapping[str, NDArray[Any]], source: Source, *, need_power: bool, use: str
+) -> Ranges:
+    """Return ranges, and with `use` "receptions" rows of a table `differences`."""
+    if use == "receptions":
+        if need_power:
+            raise UnanswerableError(
+                f"{found.source}: differences of arrival without stamps have no powers, so that no curve over power "
+                "goes with them: fit and use a calibration with `delays_only`"
+            )
+        apart = Ranges.from_differences(bare, poses=source.poses, tags=list(source.tags), source=found.source)
+        return Ranges.concatenate([found, apart])
+    if not len(found):
+        raise UnanswerableError(
+            f"{found.source}: holds {len(bare['time_ns'])} differences of arrival and no exchanges: only `calib fit` "
+            "and `calib localize` use them, with `use` receptions"
+        )
+    return found
 
 
 def sensor_rows(

@@ -159,7 +159,9 @@ def localize(
 
 def _flight_for(data: Data | Flight, calibration: Calibration, settings: Settings) -> Flight:
     """Return a flight with what `settings` use of it."""
-    flight = data if isinstance(data, Flight) else load_flight(data, need_power=calibration.needs_power)
+    flight = (
+        data if isinstance(data, Flight) else load_flight(data, need_power=calibration.needs_power, use=settings.use)
+    )
     return replace(flight, ranges=used_part(flight.ranges, settings.use))
 
 
@@ -183,15 +185,18 @@ class MeasuredReceptions:
     def of(cls, ranges: Ranges, calibration: Calibration) -> MeasuredReceptions:
         """Return those of ranges, and then of their arrivals."""
         applied, sign, none = calibration.apply(ranges), distances_in(ranges)[1], np.zeros(len(ranges))
+        # Without stamps a difference has 5 times the variance of a range, but where the fit was to differences alone.
+        whole = [1.0, 0.0] if calibration.provenance.get("exchanges") == 0 else [2.5, 2.5]
+        own = np.where(ranges.differences[:, None], whole[: sign.shape[1]], sign[: len(ranges)])
         if ranges.arrivals is None:
-            return cls(applied.raw_m, applied.corrected_m, [ranges], sign, sign, none)
+            return cls(applied.raw_m, applied.corrected_m, [ranges] * sign.shape[1], sign, own, none)
         heard = calibration.correct_arrivals(ranges)
         return cls(
             np.append(applied.raw_m, heard.raw_m),
             np.append(applied.corrected_m, heard.corrected_m),
             [Ranges.concatenate([ranges, part]) for part in heard_receptions(ranges)[:2]],
             sign,
-            np.concatenate([sign[: len(ranges)], reception_gains(ranges.arrivals)]),
+            np.concatenate([own, reception_gains(ranges.arrivals)]),
             np.append(none, heard.shared_m),
         )
 
@@ -233,7 +238,7 @@ def filter_ranges(ranges: Ranges, calibration: Calibration, fixed: FixedStd) -> 
     if lasting := model.lasting:
         # Receptions have independent noise: only reflections last in differences of arrival. A gate lets longer ones
         # pass there, because these have five times the variance of ranges.
-        heard = common > 0
+        heard = np.abs(sign).sum(axis=1) > 1
         own, shared = np.where(heard, [[1.0], [0.0]], np.sqrt([[lasting.own_variance], [lasting.lasting_variance]]))
         gate_m = np.sqrt(GATE) * np.hypot(known.own_m(sigma), common) * heard
         detours_m2 = errors.share * model.square_below_m2(errors.detour_m, gate_m[:, None])

@@ -38,6 +38,7 @@ from calib.evaluation.filters import (
 )
 from calib.evaluation.localization import MeasuredReceptions
 from calib.evaluation.tracking import (
+    PATIENCE_S,
     FilterRanges,
     Measurements,
     Track,
@@ -169,7 +170,7 @@ class _Readings:
 
 def _readings(data: Data, calibration: Calibration, use: str) -> list[_Readings]:
     """Return the readings of every body that is not an anchor and ranges with one, or listens."""
-    flight = load_flight(data, need_power=calibration.needs_power, need_truth=False, sensors=("imu", "height"))
+    flight = load_flight(data, need_power=calibration.needs_power, need_truth=False, use=use, sensors=("imu", "height"))
     name, (imu, heights) = flight.ranges.source, flight.sensors.values()
     poses, tags, ranges = flight.poses, flight.tags, used_part(keep_determined(calibration, flight.ranges), use)
     places = {body: poses.position_m[poses.body == body] for body in np.unique(poses.body).tolist()}
@@ -365,7 +366,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
     if one.truth is not None:
         truth = bodies_m(one.truth, one.body, time_ns)
         turned = nearest_attitude(one.truth, one.body, time_ns)
-    overheard = known.common_m > 0
+    overheard = (known.common_m > 0) | ((one.sign != 0).sum(axis=1) > 1)
     used = {
         "ranges": not overheard.all(),
         "differences of arrival": overheard.any(),
@@ -407,6 +408,12 @@ def onboard_text(found: list[OnboardTrack], settings: OnboardSettings) -> str:
         cells = "".join(f"{'-':>9s}" if value != value else f"{value:9.3f}" for value in figures)
         own = float(np.sqrt(np.mean(one.std_m**2)))
         lines.append(f"{one.source + ' ' + one.body:33s} {cells}{own:9.3f}  {len(one.restarts_s)}")
+        lasts_s = float(np.ptp(one.range_time_ns)) * 1e-9
+        if len(one.restarts_s) > max(lasts_s / PATIENCE_S, 3):
+            lines.append(
+                f"  began anew {len(one.restarts_s)} times in {lasts_s:.0f} s: what was measured contradicts the "
+                "anchors' places, or differences without stamps have the other sign (from_id and to_id of the import)"
+            )
     noise = settings.noise
     moves = (
         f"accelerometer {noise.force:g} m/s^2 and gyro {noise.gyro:g} rad/s a root of Hz"

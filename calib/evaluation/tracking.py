@@ -37,6 +37,13 @@ Trajectory = tuple[Ints, Floats, Floats]
 
 FILTERS: Final = ("raw", "calibrated", "variance", "robust")
 
+PATIENCE_S: Final = 10.0
+"""Most seconds for which a filter that explained its ranges is trusted while it does not.
+
+Between metal racks (scenarios/hall_with_metal) half of a body's ranges are metres too long for up to nine seconds, and
+a position from these ranges alone is metres off.
+"""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings(CheckedSettings):
@@ -146,7 +153,7 @@ class Measurements(ColumnTable):
     @property
     def heard(self) -> Bools:
         """Which measurements (n,) are differences of arrival."""
-        return np.asarray(self.rows >= len(self.ranges))
+        return np.asarray((self.rows >= len(self.ranges)) | self.ranges.differences[self.exchange])
 
 
 def apart(own: Sequence[int]) -> Callable[[Ints], Bools]:
@@ -236,7 +243,9 @@ def pair_numbers(ends: Ints) -> Ints:
 
 def ranges_among(ranges: Ranges, tags: list[int]) -> Ranges:
     """Return the ranges between some tags, with what these overheard of them."""
-    found = ranges[np.isin(ranges.initiator, tags) & np.isin(ranges.target, tags)]
+    found = ranges[
+        np.isin(ranges.initiator, tags) & np.isin(ranges.target, tags) & np.isin(ranges.listener, [-1, *tags])
+    ]
     heard = found.arrivals
     return found if heard is None else replace(found, arrivals=heard[np.isin(heard.listener, tags)])
 
@@ -255,6 +264,7 @@ def used_part(ranges: Ranges, use: str) -> Ranges:
 def ranges_about(ranges: Ranges, tags: list[int]) -> Ranges:
     """Return the ranges of some tags with others, and those that these or others overheard, with their arrivals."""
     needed, heard = np.isin(ranges.initiator, tags) ^ np.isin(ranges.target, tags), ranges.arrivals
+    needed |= np.isin(ranges.listener, tags)
     if heard is not None:
         heard = heard[needed[heard.exchange] | np.isin(heard.listener, tags)]
         needed[heard.exchange] = True
@@ -264,13 +274,16 @@ def ranges_about(ranges: Ranges, tags: list[int]) -> Ranges:
 def distances_in(ranges: Ranges) -> tuple[Ints, Floats, Ints]:
     """Return the tags (n, k, 2) and signs (n, k) of the distances in ranges and arrivals, and exchanges (n,)."""
     ends, exchange, heard = np.column_stack([ranges.initiator, ranges.target]), np.arange(len(ranges)), ranges.arrivals
-    if heard is None:
+    if heard is None and not ranges.differences.any():
         return ends[:, None], np.ones((len(ranges), 1)), exchange
+    listener = ranges.listener
+    if heard is not None:
+        exchange, listener = np.append(exchange, heard.exchange), np.append(listener, heard.listener)
     # From the target, less from the initiator.
-    senders = ends[heard.exchange, ::-1]
-    of_heard = np.stack([senders, np.broadcast_to(heard.listener[:, None], senders.shape)], axis=2)
-    signs = np.repeat([[1.0, 0.0], [1.0, -1.0]], [len(ranges), len(heard)], axis=0)
-    return np.concatenate([np.stack([ends, ends], axis=1), of_heard]), signs, np.append(exchange, heard.exchange)
+    listens, listener, senders = listener[:, None, None] >= 0, listener[:, None], ends[exchange, ::-1]
+    of_heard = np.stack([senders, np.broadcast_to(listener, senders.shape)], axis=2)
+    signs = np.where(listens[:, 0], [1.0, -1.0], [1.0, 0.0])
+    return np.where(listens, of_heard, np.stack([ends, ends], axis=1)[exchange]), signs, exchange
 
 
 def nearest_attitude(poses: Poses, body: str, time_ns: Ints) -> Floats:
@@ -340,9 +353,7 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
     running.state[..., place] = [start for start, _ in noises]
     estimate, (std_m, nis, nees) = np.empty((count, *shape, 3)), np.empty((3, count, *shape))
     accepted = np.empty((count, *shape), dtype=bool)
-    # Twelve unexplained ranges at least, four for each coordinate, before a filter begins anew. One that explained its
-    # ranges is trusted for up to 10 s while it does not: between metal racks (scenarios/hall_with_metal) half of a
-    # body's ranges are metres too long for up to nine seconds, and a position from these ranges alone is metres off.
+    # Twelve unexplained ranges at least, four for each coordinate, before a filter begins anew.
     explained_s, most_s = np.zeros(shape), settings.reopen_s / 2 / 12
     for k in range(count):
         running.decay(kept[k][:, None])
@@ -359,7 +370,7 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
         weighed = partial(weigh, known, k, gate=settings.gate)
         update = running.update(h, measured[k][:, None] - expected, std[k][:, None] ** 2, weighed)
         lasted_s = min(elapsed_s[k], most_s)
-        explained_s = np.minimum(explained_s + np.where(update.nis < settings.gate, lasted_s, -lasted_s), 10.0)
+        explained_s = np.minimum(explained_s + np.where(update.nis < settings.gate, lasted_s, -lasted_s), PATIENCE_S)
         for lost in zip(*np.nonzero(explained_s < -settings.reopen_s / 2), strict=True):
             rows = slice(np.searchsorted(problem.time_ns, problem.time_ns[k] - settings.reopen_s * 1e9), k + 1)
             # The body moved since these ranges: so do their anchors.

@@ -72,7 +72,12 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     check_loss(settings.loss)
     given = settings.delays_from
     source = None if given is None else given_calibration(given, "delays_from")
-    ranges = load_ranges(data, need_power=not settings.delays_only)
+    ranges = load_ranges(data, need_power=not settings.delays_only, use=settings.use)
+    if ranges.differences.any() and not ranges.differences.all():
+        raise UnanswerableError(
+            f"{ranges.source}: ranges and differences of arrival without stamps have other errors: fit each alone, the "
+            "ranges with `use` exchanges, differences from recordings without exchanges"
+        )
     heard = 0 if ranges.arrivals is None else len(ranges.arrivals)
     if settings.use == "exchanges":
         ranges = replace(ranges, arrivals=None)
@@ -99,6 +104,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         "recipe": "sequential" if settings.sequential else "joint",
         "fitted": what_was_fitted(found),
         **({"arrivals": len(arrivals.residual)} if (arrivals := found.searches[0].arrivals) else {}),
+        **({"arrivals": len(ranges)} if ranges.differences.any() else {}),
         "gauge": _gauge(found),
         **({"pattern": pattern} if pattern else {}),
         **({"held_out": _judged(held, settings)} if held else {}),
@@ -259,7 +265,7 @@ def result_of(
     ]
     provenance: dict[str, Any] = {
         "writer": f"uwbcal {uwblink.__version__}",
-        "exchanges": len(ranges),
+        "exchanges": int(np.count_nonzero(~ranges.differences)),
         "inliers": int(np.count_nonzero(inliers)),
         "excluded": ranges.excluded,
         "converged": found.success,

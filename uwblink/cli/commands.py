@@ -217,7 +217,7 @@ def poses(
         )
     typer.echo(
         f"{recording}: {found.poses} poses of {', '.join(found.bodies)}, offset {found.offset_s:+.4f} s; "
-        f"{found.covered} of {found.exchanges} exchanges have a true distance"
+        f"{found.covered} of {found.exchanges} measurements have a true distance"
     )
 
 

@@ -3,7 +3,7 @@
 Every key is optional; docs/importing.md explains each.
 
 ```toml
-layout = "exchanges"       # or "messages", "stamps" (a row a stamp), "parts" (of an exchange), "ranges", "broadcasts"
+layout = "exchanges"       # or "messages", "stamps", "parts" (of an exchange), "ranges", "differences", "broadcasts"
 bits = 32                  # of the counter that the stamps come from, 32 or 40
 counter = "wrapped"        # or "signed", "unwrapped"
 protocol = "ss"            # a protocol of uwblink.twr
@@ -61,13 +61,17 @@ from uwblink.ticks import METRES_PER_TICK, TICKS_PER_SECOND
 from uwblink.twr import BITS, LARGEST_ID, STAMPS
 
 POSITIONS: Final = tuple(f"{end}_{axis}_m" for end in ("from", "to") for axis in "xyz")
-DISTANCES: Final = ("range_m", "gt_range_m", *POSITIONS)
+DISTANCES: Final = ("range_m", "gt_range_m", "difference_m", *POSITIONS)
 IDS: Final = {"from_id": "the initiator of each exchange", "to_id": "its target"}
+ALL_IDS: Final = IDS | {"at_id": "the tag at which a difference of arrival was measured"}
+SIGN: Final = "a difference is taken for the distance of at_id to to_id less that to from_id"
+"""What the order of the ids of a difference of arrival means."""
+
 ASKED: Final = "?"
 """Placeholder of `uwblink import guess` for a value that the user must give."""
 
 NAMES: Final = (
-    "time_s", *IDS, *STAMPS, "fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2", "sts1", "sts2", *DISTANCES,
+    "time_s", *ALL_IDS, *STAMPS, "fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2", "sts1", "sts2", *DISTANCES,
     "sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "sts", "stamp", "event", "heard",
 )  # fmt: skip
 """The columns of tables; `event` has words that tell whether a stamp is of transmission or of reception."""
@@ -81,19 +85,23 @@ STAMP_UNITS: Final = {
 }
 TIME_UNITS: Final = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 DISTANCE_UNITS: Final = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "in": 0.0254}
-FLIGHT_UNITS: Final = {unit: STAMP_UNITS[unit] * METRES_PER_TICK for unit in ("ticks", "ps", "ns", "us")}
+FLIGHT_UNITS: Final = {unit: STAMP_UNITS[unit] * METRES_PER_TICK for unit in STAMP_UNITS}
 """Units of times of flight, which are ranges, too."""
 RANGE_UNITS: Final = DISTANCE_UNITS | FLIGHT_UNITS
+UNITS_OF_DISTANCES: Final = dict.fromkeys(DISTANCES, DISTANCE_UNITS) | dict.fromkeys(
+    ("range_m", "difference_m"), RANGE_UNITS
+)
 POWERS: Final = ("fpp1", "fpp2", "rxp1", "rxp2", "fpp", "rxp")
 SKEWS: Final = ("skew1", "skew2", "skew")
 MAP_KEYS: Final = (
     FileKey(
         "layout",
-        '"exchanges", "messages", "stamps", "parts", "ranges" or "broadcasts"',
+        '"exchanges", "messages", "stamps", "parts", "ranges", "differences" or "broadcasts"',
         "by the columns; parts and broadcasts must be stated",
         "What a row is: an exchange; a message; a stamp with `message`, as devices log their own; a part of an "
-        "exchange, for example if both devices report; a range without stamps; what a broadcast (sequence, tx) of "
-        "from_id says of an earlier one (heard) of to_id: when from_id received it (rx).",
+        "exchange, for example if both devices report; a range without stamps; a difference of arrival without stamps: "
+        "by how much farther at_id is from to_id than from from_id; what a broadcast (sequence, tx) of from_id says of "
+        "an earlier one (heard) of to_id: when from_id received it (rx).",
     ),
     FileKey("bits", "32 or 40", "32 if the stamps fit, else 40", "Width of the counter of the stamps, in bits."),
     FileKey(
@@ -154,9 +162,10 @@ MAP_KEYS: Final = (
     ),
     FileKey(
         "wide.NAME",
-        "text with one place; or a table of columns by device",
+        "text with one place (two of difference_m); or a table of columns by device",
         "none",
-        "Columns that differ by a device: `r_AN{to_id}` makes a row of each. Families are joined by what differs; "
+        "Columns that differ by a device: `r_AN{to_id}` makes a row of each, `d{from_id}-{to_id}` of each "
+        "difference_m. Families are joined by what differs; "
         "`{_}` is no id. A column called mask has a bit for each device with a range.",
     ),
     FileKey(
@@ -193,9 +202,9 @@ MAP_KEYS: Final = (
     ),
     FileKey(
         "units.NAME",
-        'as for all; for range_m also "ticks", "ps", "ns", "us"',
+        'as for all; for range_m and difference_m also "ticks", "ps", "ns", "us", "s"',
         "that for all",
-        "Unit of one column of distances or powers; a range may be a time of flight.",
+        "Unit of one column of distances or powers; a range may be a time of flight, and a difference one of times.",
     ),
     FileKey(
         "constants.NAME", "number; text for an id", "none", "A value for all rows, for a column that the table lacks."
@@ -321,7 +330,9 @@ def load_map(path: Path) -> ColumnMap:
     stamps = units.get("stamps", "ticks")
     return ColumnMap(
         layout=file.choice(
-            "layout", table.get("layout"), (None, "exchanges", "messages", "stamps", "parts", "ranges", "broadcasts")
+            "layout",
+            table.get("layout"),
+            (None, "exchanges", "messages", "stamps", "parts", "ranges", "differences", "broadcasts"),
         ),
         bits=file.choice("bits", table.get("bits"), (None, *BITS)),
         counter=file.choice("counter", table.get("counter"), (None, "wrapped", "signed", "unwrapped")),
@@ -370,7 +381,8 @@ def _check_columns(file: TomlReader, columns: dict[str, Any], wide: dict[str, An
         )
     for name, value in wide.items():
         by_device = isinstance(value, dict) and value and all(isinstance(one, str) for one in value.values())
-        is_family = isinstance(value, str) and is_template(value) and len(re.findall(r"\{\w+\}", value)) == 1
+        most = 2 if name == "difference_m" else 1
+        is_family = isinstance(value, str) and is_template(value) and 0 < len(re.findall(r"\{\w+\}", value)) <= most
         file.check(f"wide.{name}", value, by_device or is_family, "a name with one place, such as r_AN{to_id}")
 
 
@@ -392,20 +404,19 @@ def _check_values(file: TomlReader, ids: dict[str, Any]) -> None:
 
 def _place(place: str, columns: dict[str, Any], units: dict[str, Any]) -> None:
     """State which column a place such as `gt_range_cm` is, and its unit."""
-    known = dict.fromkeys(DISTANCES, DISTANCE_UNITS) | {"range_m": RANGE_UNITS, "time_s": TIME_UNITS}
+    known = UNITS_OF_DISTANCES | {"time_s": TIME_UNITS}
     for name, units_of in known.items():
         stem, unit = place.rpartition("_")[::2]
         if stem == name.rpartition("_")[0] and unit in units_of:
             columns.setdefault(name, place)
-            if place == "range_m" and "distance" in units:
+            if place == name and "distance" in units:
                 continue  # our own name, whose unit is stated
             units.setdefault(name if name != "time_s" else "time", unit)
 
 
 def _units_of_columns(file: TomlReader, units: dict[str, Any], chip: str | None) -> dict[str, str]:
     """Return the units of single columns, and of skews."""
-    allowed: dict[str, Any] = dict.fromkeys(DISTANCES, DISTANCE_UNITS) | dict.fromkeys(POWERS, ("dBm", "-dBm"))
-    allowed["range_m"] = RANGE_UNITS
+    allowed: dict[str, Any] = UNITS_OF_DISTANCES | dict.fromkeys(POWERS, ("dBm", "-dBm"))
     allowed["skew"] = CHIPS[chip or "other"].skew_ppm
     return {name: file.choice(f"units.{name}", unit, allowed[name]) for name, unit in units.items() if name in allowed}
 
@@ -413,6 +424,7 @@ def _units_of_columns(file: TomlReader, units: dict[str, Any], chip: str | None)
 def _constants(file: TomlReader, where: str, values: dict[str, Any]) -> None:
     file.known(values, NAMES, f"{where}.")
     for name, value in values.items():
-        is_word = name in IDS and isinstance(value, str) and value != ASKED
-        of_id = f"{IDS.get(name)}: a number or a word; or name its column in [columns]"
-        file.check(f"{where}.{name}", value, is_number(value) or is_word, of_id if name in IDS else "a finite number")
+        is_word = name in ALL_IDS and isinstance(value, str) and value != ASKED
+        of_id = f"{ALL_IDS.get(name)}: a number or a word; or name its column in [columns]"
+        expected = of_id if name in ALL_IDS else "a finite number"
+        file.check(f"{where}.{name}", value, is_number(value) or is_word, expected)

@@ -18,7 +18,7 @@ import numpy as np
 
 from uwblink.display import first_few
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import DISTANCES, IDS, POSITIONS, POWERS, SKEWS, ColumnMap, load_map
+from uwblink.importers.column_map import ALL_IDS, DISTANCES, IDS, POSITIONS, POWERS, SIGN, SKEWS, ColumnMap, load_map
 from uwblink.importers.plausibility import (
     MIN_ROWS,
     ROW_PERIOD_NS,
@@ -31,6 +31,7 @@ from uwblink.importers.plausibility import (
     stamps_of,
 )
 from uwblink.importers.staging import (
+    OF_DIFFERENCES,
     SOUND_IDS,
     Condition,
     Faults,
@@ -119,7 +120,8 @@ def import_tables(
         meta |= {"tag_names": names} if names else {}
         meta |= {"chip": column_map.chip} if column_map.chip else {}
         with Recording.create(output, meta=meta, force=force, memory_mb=250) as recording:
-            ends = " UNION ".join(f"SELECT {name} AS id FROM {rows.name} WHERE {rows.condition}" for name in IDS)
+            ids = [name for name in ALL_IDS if rows.has(name)]
+            ends = " UNION ".join(f"SELECT {name} AS id FROM {rows.name} WHERE {rows.condition}" for name in ids)
             tags = db.execute(f"{ends} ORDER BY id").fetchall()
             bodies = {tag: staging.names.get(tag, f"tag{tag}") for (tag,) in tags}
             recording.append_tags(Tag(tag, body, (0.0, 0.0, 0.0)) for tag, body in bodies.items())
@@ -127,6 +129,11 @@ def import_tables(
                 watch("writing", done / total)
                 exchanges = exchanges_of(column_map, block, reading, done)
                 done += len(exchanges)
+                if reading is None and rows.has("difference_m"):
+                    named = {"minus": "from_id", "plus": "to_id", "listener": "at_id", "difference_m": "difference_m"}
+                    values = {kept: block[name] for kept, name in named.items()}
+                    recording.append("differences", {"time_ns": exchanges.time_ns} | values)
+                    continue
                 if not np.isfinite(exchanges.range_m).all():
                     raw, reported = raw_range(exchanges), exchanges.range_m
                     exchanges = replace(exchanges, range_m=np.where(np.isfinite(reported), reported, raw))
@@ -144,7 +151,8 @@ def import_tables(
                 first = first or some[0].detail
                 recording.append("faults", some)
             counts = {
-                name: recording.count(name) for name in ("exchanges", "poses", *_BESIDE, *staging.beside, "faults")
+                name: recording.count(name)
+                for name in ("exchanges", "differences", "poses", *_BESIDE, *staging.beside, "faults")
             }
             if first:
                 lost = counts["faults"]
@@ -187,15 +195,21 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
         rows = faults.reject(staging.rows, SOUND_IDS)
     total = rows.count() + len(faults)
     watch("checking", 0.0)
-    optional_columns = (name for name in (*DISTANCES, *POWERS, *SKEWS) if layout != "ranges" or name != "range_m")
-    notes += staging.words_in(optional_columns)
+    value = {"ranges": "range_m", "differences": "difference_m"}.get(layout)
+    notes += staging.words_in(name for name in (*DISTANCES, *POWERS, *SKEWS) if name != value)
     if not any(map(rows.has, ("fpp1", "fpp2"))) and any(map(rows.has, ("rxp1", "rxp2"))):
         notes.append("there is no first-path power; the received power serves in its place")
-    if layout == "ranges":
-        staging.require(rows, ["range_m"])
-        rows = faults.reject(rows, [*time_conditions(rows), Condition("range_m", "a finite number", "range_m IS NULL")])
+    if value:
+        of_differences = OF_DIFFERENCES if layout == "differences" else ()
+        staging.require(rows, [value, *(["at_id"] if of_differences else [])])
+        sound = (*time_conditions(rows), *of_differences, Condition(value, "a finite number", f"{value} IS NULL"))
+        rows = faults.reject(rows, sound)
         faults.check(total)
         check_units(column_map, path, rows.sample(SAMPLE_ROWS), None)
+        if of_differences:
+            ends = ", ".join(f"{name} is {column_map.header(name)!r:.60}" for name in ("to_id", "from_id"))
+            notes.append(f"{SIGN} ({ends}): exchange the two in a map if the log has it the other way round")
+            return in_time_order(rows), None
         rows, note = _without_repeats(in_time_order(rows))
         notes += filter(None, [note])
         return rows, None
@@ -222,8 +236,9 @@ def _layout(staging: Staging) -> str:
     for layout, names in (("exchanges", STAMPS[:4]), ("messages", ("tx", "rx")), ("stamps", ("stamp", "event"))):
         if all(map(has, names)):
             return layout
-    if has("range_m") and not any(map(has, STAMPS)):
-        return "ranges"
+    for layout, name in (("ranges", "range_m"), ("differences", "difference_m")):
+        if has(name) and not any(map(has, STAMPS)):
+            return layout
     raise staging.tables[0].missing(staging.column_map.header(next(name for name in STAMPS if not has(name))))
 
 

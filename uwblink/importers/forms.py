@@ -18,14 +18,13 @@ import numpy as np
 from uwblink.arrays import Floats
 from uwblink.importers.column_map import (
     ASKED,
-    DISTANCE_UNITS,
     DISTANCES,
     FLIGHT_UNITS,
     JSON_LINE,
     POSITIONS,
     POWERS,
-    RANGE_UNITS,
     TIME_UNITS,
+    UNITS_OF_DISTANCES,
     ColumnMap,
     map_of_lines,
 )
@@ -47,6 +46,7 @@ WORDS: Final = {
         r"mac|geraet|knoten)"
     ),
     "range": r"(range|dist|distance|abstand|distanz|entfernung|tof|time_?of_?flight)",
+    "difference": r"(\b|_)(tdoa|dtoa)|(range|dist(ance)?)_?diff|\bdifference",
     "made": r"(raw|filt(er)?(ered)?|corrected|corr|kalman|smooth(ed)?)",
     "true": (
         r"(gt|true|truth|ground_?truth|ref|reference|nominal|mocap|vicon|actual|tape(_?measured?)?|"
@@ -113,6 +113,15 @@ PATTERNS: Final = {
 } | {name: _place(name) for name in POSITIONS}
 """Patterns of the names of columns, in terms of `WORDS`."""
 
+_OF_DIFFERENCES: Final = PATTERNS | {
+    "time_s": rf"{PATTERNS['time_s']}|t_?tdoa",
+    "difference_m": r".*({difference}).*",
+    "at_id": r"(at|tag|listener|robot|drone|mobile|receiver|rx|ziel){id}",
+    "from_id": r"(from|minus|src|source){id}|(anchor|anker|node)_?from{id}",
+    "to_id": r"(to|plus|dst|target){id}|(anchor|anker|node)_?to{id}",
+}
+"""Patterns of names in tables of differences of arrival, whose ids have other roles than those of ranges."""
+
 _OF_MESSAGE: Final = {"poll": 1, "resp": 2, "response": 2}
 _AT_DEVICE: Final = {"resp": 1, "responder": 1, "target": 1, "anchor": 1, "init": 2, "initiator": 2, "tag": 2}
 
@@ -142,8 +151,9 @@ def named_columns(headers: Iterable[str]) -> dict[str, str]:
     """Return the header of each recognised column; raw columns come before others, then earlier ones first."""
     listed = sorted(headers, key=lambda header: "raw" not in header.lower())
     called = _plain_names(listed)
-    found = _ends(called)
-    for ours, pattern in PATTERNS.items():
+    found, words = _ends(called), " ".join(called.values())
+    differ = re.search(WORDS["difference"], words) is not None
+    for ours, pattern in (_OF_DIFFERENCES if differ else PATTERNS).items():
         whole = f"({pattern}){{end}}".format_map(WORDS)
         # Each column is used once, but for names of messages, which may repeat those of exchanges at this stage.
         taken = {header for name, header in found.items() if (name in OF_MESSAGES) == (ours in OF_MESSAGES)}
@@ -212,6 +222,8 @@ def wide_columns(names: Sequence[str], taken: Mapping[str, str]) -> dict[str, st
     """
     if any(ours in taken for ours in ("range_m", "tx1", "rx1", "tx", "rx", "stamp")):
         return {}
+    if pairs := [match[1] for name in names if (match := re.fullmatch(r"(.*\bd|.*tdoa.*?)[0-9]+-[0-9]+", name))]:
+        return {"difference_m": f"{pairs[0]}{{from_id}}-{{to_id}}"}
     ends = [taken[ours] for ours in ("from_id", "to_id", "time_s") if ours in taken]
     matches = (re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", name) for name in names if name not in ends)
     stems = [(match[1], match[3]) for match in matches if match]
@@ -277,19 +289,16 @@ def units_of(form: ColumnMap, columns: dict[str, str], cells: dict[str, Floats])
         if found["time"][0] == ASKED and form.time_unit:
             found["time"] = form.time_unit, "as times in bags"
     named = {name: _header(form, name, columns[name]) for name in DISTANCES if name in columns}
-    units = {
-        name: unit
-        for name, header in named.items()
-        if (unit := unit_in(header, RANGE_UNITS if name == "range_m" else DISTANCE_UNITS))
-    }
-    alike = set(units.values())
+    units = {name: unit for name, header in named.items() if (unit := unit_in(header, UNITS_OF_DISTANCES[name]))}
+    alike, value = set(units.values()), "difference_m" if "difference_m" in cells else "range_m"
     if form.line and form.distance_unit:
         found["distance"] = form.distance_unit, "as these boards print"
-    elif len(alike) == 1 and not alike & FLIGHT_UNITS.keys() and ("range_m" in units or "range_m" not in cells):
+    elif len(alike) == 1 and not alike & FLIGHT_UNITS.keys() and (value in units or value not in cells):
         found["distance"] = next(iter(units.values())), "by the columns' names"
         units = {}
-    elif "range_m" in cells and "range_m" not in units and (why := reason_against_metres(cells["range_m"])):
-        found["distance"] = ASKED, f"{why}: write {', '.join(DISTANCE_UNITS)}"
+    elif value in cells and value not in units and (why := reason_against_metres(cells[value])):
+        listed = ", ".join(UNITS_OF_DISTANCES[value])
+        found["distance" if value == "range_m" else value] = ASKED, f"{why}: write {listed}"
     found |= {name: (unit, "by the column's name") for name, unit in units.items()}
     if "range_m" in named and "range_m" not in units and re.search("tof|flight", named["range_m"].lower()):
         found["range_m"] = ASKED, f"a time of flight: write {', '.join(FLIGHT_UNITS)}"

@@ -27,6 +27,7 @@ from uwblink.display import first_few
 from uwblink.errors import ImportTableError, raising
 from uwblink.importers.bags import Bag, fields_of, is_bag, matching_topics, open_bag
 from uwblink.importers.column_map import (
+    ALL_IDS,
     ASKED,
     DISTANCE_UNITS,
     IDS,
@@ -34,6 +35,7 @@ from uwblink.importers.column_map import (
     NAMES,
     POSITIONS,
     POWERS,
+    SIGN,
     STAMP_UNITS,
     ColumnMap,
 )
@@ -64,7 +66,7 @@ from uwblink.importers.plausibility import (
     try_reading,
 )
 from uwblink.importers.poses import pose_topics
-from uwblink.importers.tables import Columns, SourceTable, differences_remedy, message_number, open_table
+from uwblink.importers.tables import Columns, SourceTable, message_number, open_table
 from uwblink.importers.templates import Template, places
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.text_files import require_regular
@@ -140,6 +142,7 @@ _LAYOUTS: Final = {
     "messages": (("tx", "rx"), _OF_EXCHANGES, "a row has one stamp of a sender and one of a receiver"),
     "stamps": (("message",), _OF_EXCHANGES, "a row has one stamp, and says whether it is of sending or of receiving"),
     "ranges": (("range_m",), (*OF_MESSAGES, *STAMPS), "there are ranges and no stamps"),
+    "differences": (("difference_m",), (*OF_MESSAGES, *STAMPS, "range_m"), f"{SIGN}: exchange the two if it is not"),
     "nothing": ((), OF_MESSAGES, "neither stamps nor ranges were recognised: rename columns below"),
 }
 """The layouts that are recognised: the columns that each needs, those that it does not have, and the reason."""
@@ -186,7 +189,7 @@ def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Map
         if each := None if is_log or wide or "range_m" in columns else next(iter(table.lists), None):
             top["each"] = each, "a line has a list of them"
     given = {*given, *(n for text in (form.line, form.each) if text for n in places(Template(text)) if n in NAMES)}
-    given |= {"to_id", *wide} if wide else set()
+    given |= {"to_id", *wide, *(["from_id"] if "{from_id}" in str(wide) else [])} if wide else set()
     form = replace(form, wide=wide, each=form.each or each, time_unit="ns" if is_bag(path) else None)
     with open_table(file, form) as table:
         # Fields of the elements of a list are called by their own names.
@@ -254,7 +257,7 @@ def _proposal(
         del columns["message"], cells["message"]  # without a column of that name messages are told by their order
     top |= {} if layout == "nothing" else {"layout": (layout, why)}
     units, undelayed = units_of(form, columns, cells), False
-    if layout not in ("ranges", "nothing"):
+    if layout not in ("ranges", "differences", "nothing"):
         counter, unit, undelayed = (_exchange_stamps if layout == "exchanges" else _message_stamps)(columns, cells)
         top, units = top | counter, {"stamps": unit, **units}
     if missing:
@@ -268,9 +271,9 @@ def _proposal(
     constants: Entries = {
         name: (
             ASKED,
-            f"no column was recognised as {IDS[name]}: write a number or a word for all rows, or the column above",
+            f"no column was recognised as {ALL_IDS[name]}: write a number or a word for all rows, or the column above",
         )
-        for name in IDS
+        for name in (ALL_IDS if layout == "differences" else IDS)
         if name not in columns
     }
     lacking = [name for name in needed if name not in cells or name in words]
@@ -279,7 +282,7 @@ def _proposal(
     used = {*columns.values(), *(header for keys in registers.values() for header in keys.values())}
     left = [json.dumps(name) for name in names if name not in used and not form.line and not form.wide]
     remarks = {
-        differences_remedy(names) or why: layout == "nothing",
+        why: layout == "nothing",
         "without antenna delays that were programmed into the devices: give them in [antenna_delays]": not undelayed,
         f"positions are used where all six columns are there; missing: {', '.join(unplaced)}": 0 < len(unplaced) < 6,
         f"not used: {', '.join(left)[:300]}": left,

@@ -315,6 +315,8 @@ def reason_against_metres(ranges: Floats) -> str:
     middle = float(np.median(np.abs(finite))) if len(finite) >= MIN_ROWS else 0.0
     if middle > 300.0:  # DW1000 devices reach 290 m in the open by their data sheet
         return f"the median range is {middle:.6g}, farther than devices reach in metres"
+    if 0.0 < middle < 1e-6:  # seconds: light travels 300 m in a microsecond
+        return f"the median is {middle:.3g}, nothing that could be measured in metres"
     # With noise of centimetres, ranges are not all integers, unless one number repeats.
     if len(np.unique(finite)) > MIN_ROWS // 4 and np.array_equal(finite, np.rint(finite)) and middle:
         return "all ranges are whole numbers, which measured metres are not"
@@ -355,8 +357,9 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
         for value, share in sentinels(np.round(optional(rows, name) / factor, 6)).items():
             why = f"{share:.1%} of its numbers are {value:.10g}, which is no distance"
             reasons[name] = why, f"missing = [{value:.10g}] in the map"
-    if column_map.distance_of("range_m") is None and "range_m" not in reasons:
-        reasons["range_m"] = reason_against_metres(ranges), "units.distance in the map"
+    for name in ("range_m", "difference_m"):
+        if column_map.distance_of(name) is None and name not in reasons:
+            reasons[name] = reason_against_metres(optional(rows, name)), f"units.distance or units.{name} in the map"
     for name, (why, remedy) in reasons.items():
         if why:
             raise ImportTableError(f"{path}: column {column_map.header(name)!r}: {why}; state {remedy}")

@@ -213,10 +213,15 @@ def add_poses(
     with Recording.open(recording, update=True) as opened:
         if not force and (there := opened.count("poses")):
             raise RecordingExistsError(f"{recording}: holds {there} poses already; `force` replaces them")
-        exchanges = opened.exchanges()
-        placed = [tag for tag in (given or opened.tags()) if tag.tag not in anchors] + fixed
+        exchanges, heard = opened.exchanges(), opened.columns("differences")
+        first, second, time_ns = exchanges.initiator, exchanges.target, exchanges.time_ns
         if not len(exchanges):
-            raise ImportTableError(f"{recording}: holds no exchanges to add truth to")
+            first, second, time_ns = heard["plus"], heard["listener"], heard["time_ns"]
+        placed = [tag for tag in (given or opened.tags()) if tag.tag not in anchors] + fixed
+        if not len(time_ns) or (shift_ns is None and not len(exchanges)):
+            raise ImportTableError(
+                f"{recording}: holds no exchanges to {'add truth to' if shift_ns is not None else 'find the offset by'}"
+            )
         bodies = set(names_in(poses.body))
         with_poses = [tag for tag in placed if tag.body in bodies]
         if len(with_poses) < 2:
@@ -234,17 +239,18 @@ def add_poses(
             _check_units(what, exchanges, poses, placed, int(exchanges.time_ns.min() - poses.time_ns.min()))
             shift_ns = find_offset(exchanges, poses, placed)
         moved = replace(poses, time_ns=poses.time_ns + shift_ns)
-        truth = distances_m(moved, placed, exchanges.initiator, exchanges.target, exchanges.time_ns)
+        truth = distances_m(moved, placed, first, second, time_ns)
         covered = int(np.count_nonzero(np.isfinite(truth)))
-        if not covered:
+        if not covered and files:
             raise ImportTableError(
-                f"{what}: no exchange lies within its poses, which end {_apart(exchanges.time_ns, moved.time_ns)}; "
+                f"{what}: no exchange lies within its poses, which end {_apart(time_ns, moved.time_ns)}; "
                 "give `offset` in seconds, or auto"
             )
-        _check_units(what, exchanges, moved, placed)
+        if len(exchanges):
+            _check_units(what, exchanges, moved, placed)
         meta = {"poses_from": ", ".join(path.name for path in files.values()), "poses_offset_s": shift_ns * 1e-9}
         opened.replace_poses(moved, meta, placed if tags_from else None)
-    return AddedPoses(len(poses), tuple(sorted(bodies)), shift_ns * 1e-9, len(exchanges), covered)
+    return AddedPoses(len(poses), tuple(sorted(bodies)), shift_ns * 1e-9, len(time_ns), covered)
 
 
 def _check_units(what: str, exchanges: Exchanges, poses: Poses, tags: Sequence[Tag], shift_ns: int = 0) -> None:

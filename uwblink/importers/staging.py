@@ -23,6 +23,7 @@ import numpy as np
 
 from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.importers.column_map import (
+    ALL_IDS,
     DISTANCES,
     IDS,
     NAMES,
@@ -154,12 +155,12 @@ class Staging:
         self.beside: dict[str, Columns] = {}
         """Rows of other tables of a recording that were found on the way, by table."""
         self._filled = "NOT blank" if self.blanks else "true"
-        others = tuple(name for name in columns if name not in (*IDS, "blank"))
-        ids = ", ".join(f"{cell} AS {name}" for name, cell in self._ids().items())
+        others = tuple(name for name in columns if name not in (*ALL_IDS, "blank"))
+        ids = ", ".join(f"{cell} AS {name}" for name, cell in self._ids([n for n in ALL_IDS if n in columns]).items())
         listed = ", ".join(("CAST(rowid AS UINTEGER) AS origin", ids, *others))
         db.execute(f"CREATE TABLE rows AS SELECT {listed} FROM staged WHERE {self._filled}")
         db.execute("DROP TABLE staged")
-        self.rows = StagedRows(db, "rows", ("origin", *IDS, *others))
+        self.rows = StagedRows(db, "rows", ("origin", *(n for n in ALL_IDS if n in columns), *others))
 
     def words_in(self, names: Iterable[str]) -> Iterator[str]:
         """Yield a note for each of some columns that has cells that are no numbers, and are taken as missing.
@@ -197,10 +198,10 @@ class Staging:
             if not rows.has(name):
                 raise self.tables[0].missing(self.column_map.header(name))
 
-    def _ids(self) -> dict[str, str]:
+    def _ids(self, names: Sequence[str]) -> dict[str, str]:
         """Return SQL of ids as whole numbers, NULL if missing; words get numbers."""
         words: set[str] = set()
-        for name in IDS:
+        for name in names:
             query = f"SELECT {name}, count(*) FROM staged WHERE {self._filled} GROUP BY {name} LIMIT 200000"
             counts: dict[str, int] = dict(self.db.execute(query).fetchall())
             if len(counts) == 200_000:
@@ -214,7 +215,7 @@ class Staging:
         self.db.execute("SET VARIABLE numbers = ?", [[None, *numbers.values()]])
         self.db.execute("CREATE TYPE word AS ENUM (SELECT unnest(getvariable('words')))")
         return {
-            name: f"CAST(getvariable('numbers')[enum_code(TRY_CAST({name} AS word)) + 1] AS INTEGER)" for name in IDS
+            name: f"CAST(getvariable('numbers')[enum_code(TRY_CAST({name} AS word)) + 1] AS INTEGER)" for name in names
         }
 
     def _number_words(self, words: list[str]) -> dict[str, int]:
@@ -248,11 +249,11 @@ def staged_cells(table: SourceTable) -> dict[str, str]:
         if name in constants:
             text = f"getvariable('{name}')"
         elif header in table.names or name in column_map.columns or name == "to_id" or (name in IDS and not table.live):
-            text = table.text(header, numeric=name not in IDS)
+            text = table.text(header, numeric=name not in ALL_IDS)
         else:
             continue
         found["time_ns" if name == "time_s" else name] = _cell(table, name, text)
-        if name == "range_m" and column_map.missing:
+        if name in ("range_m", "difference_m") and column_map.missing:
             blank = " OR ".join(filter(None, [blank, _is_missing(table, text)]))
     message = column_map.header("message")
     if message in table.names and all(n in constants or column_map.header(n) in table.named for n in IDS):
@@ -276,7 +277,7 @@ def _is_missing(table: SourceTable, text: str) -> str:
 def _cell(table: SourceTable, name: str, text: str) -> str:
     """Return SQL of a cell in SI units, from its text."""
     column_map = table.column_map
-    if name in IDS:
+    if name in ALL_IDS:
         return f"trim({text})"
     if name == "time_s":
         return time_ns(text, column_map.time_unit, TIME_UNITS.get(column_map.time_unit or "s", 1.0))
@@ -293,7 +294,7 @@ def _cell(table: SourceTable, name: str, text: str) -> str:
     if name in SKEWS:
         factor = CHIPS[column_map.chip or "other"].skew_ppm[column_map.units.get("skew", "ppm")]
     value = number(text) + (f" * {factor!r}" if factor != 1.0 else "")
-    if column_map.missing and name in ("range_m", "gt_range_m", *POWERS, *SKEWS):
+    if column_map.missing and name in ("range_m", "difference_m", "gt_range_m", *POWERS, *SKEWS):
         return f"CASE WHEN NOT {_is_missing(table, text)} THEN {value} END"
     return value
 
@@ -346,6 +347,11 @@ SOUND_IDS: Final = (
     Condition("to_id", "another tag than from_id", "from_id = to_id"),
 )
 """Conditions on the ids of the two devices."""
+OF_DIFFERENCES: Final = (
+    Condition("at_id", f"a whole number from 0 to {LARGEST_ID}", "at_id IS NULL"),
+    Condition("at_id", "another tag than from_id and to_id", "at_id IN (from_id, to_id)"),
+)
+"""Further conditions where a tag measured the difference of arrival from both."""
 
 
 class Faults:

@@ -102,22 +102,6 @@ def lacks_header(names: Sequence[str]) -> bool:
     return len(numbers) == len(names) or (2 * len(numbers) >= len(names) and any("." in one for one in numbers))
 
 
-def differences_remedy(names: Iterable[str]) -> str:
-    """Return what to do about a table of differences of arrival, "" where no column is called like them.
-
-    No table of a recording holds them: from stamps each has the range of its exchange and the rates of the clocks.
-    """
-    found = [
-        name for name in names if re.search(r"tdoa|dtoa|(range|dist(ance)?)[ _]?diff|\bdifference", name, re.IGNORECASE)
-    ]
-    if not found:
-        return ""
-    return (
-        f"{found[-1][:60]!r} looks like differences of arrival, which a recording has as stamps only: import the log "
-        "of frames that each listener received"
-    )
-
-
 def _delimiter(lines: list[str]) -> str:
     """Return the delimiter that splits header and rows into equal numbers of cells, and into the most."""
 
@@ -360,10 +344,11 @@ class SourceTable:
         lists = {
             ours: [self.text(family[n]) if n in family else "''" for n in labels] for ours, family in families.items()
         }
-        end = "from_id" if "{from_id}" in str(self.column_map.wide) else "to_id"
-        if end not in lists:
-            listed = self.variable("labels", labels)
-            lists[end] = [f"{listed}[{n}]" for n in range(1, len(labels) + 1)]
+        ends = dict.fromkeys(re.findall(r"\{(from_id|to_id)\}", str(self.column_map.wide)) or ["to_id"])
+        for end, own in zip(ends, zip(*labels, strict=False), strict=False):
+            if end not in lists:
+                listed = self.variable(f"{end}s", own)
+                lists[end] = [f"{listed}[{n}]" for n in range(1, len(labels) + 1)]
         cells = {ours: f"[{', '.join(cells)}][k]" for ours, cells in lists.items()}
         numbered = "" if self._expanded else ", row_number() OVER () AS row"
         self.source = f"(SELECT *{numbered}, unnest(range(1, {len(labels) + 1})) AS k FROM {self.source})"
@@ -373,13 +358,12 @@ class SourceTable:
             self.blank += f" OR TRY_CAST({self.text('mask')} AS BIGINT) & (1 << (k - 1)) = 0"
         self.names, self._cells, self._expanded = (*self.names, *cells), [*self._cells, *cells.values()], True
 
-    def _family(self, ours: str, stated: str | dict[str, str]) -> dict[str, str]:
+    def _family(self, ours: str, stated: str | dict[str, str]) -> dict[tuple[str, ...], str]:
         """Return the columns of a family by what differs in their names."""
         if isinstance(stated, dict):
-            return stated
-        before, after = re.split(r"\{\w+\}", stated)
-        pattern = rf"{re.escape(before)}(.+){re.escape(after)}"
-        found = {match[1]: name for name in self.names if (match := re.fullmatch(pattern, name))}
+            return {(label,): name for label, name in stated.items()}
+        pattern = "(.+)".join(map(re.escape, re.split(r"\{\w+\}", stated)))
+        found = {match.groups(): name for name in self.names if (match := re.fullmatch(pattern, name))}
         if not found:
             there = ", ".join(self.names)[:400]
             raise ImportTableError(f"{self.path}: wide.{ours}: no column {stated[:60]!r}; there are {there}")
@@ -425,7 +409,6 @@ class SourceTable:
             remedy = "its first line is a row: state the numbers of its columns in a map, such as from_id = 2"
         if {"qx", "qy", "qz", "qw"} <= {name.lower() for name in self.names}:
             remedy = "these are poses, which `uwblink poses` adds to a recording"
-        remedy = differences_remedy(self.names) or remedy
         there = ", ".join(self.names)[:400]
         return ImportTableError(f"{self.path}: column {header[:60]!r} is missing; there are {there}; {remedy}")
 

@@ -33,8 +33,8 @@ READING_MB: Final = 300
 class Contents:
     """The contents of a recording; all fields but the exchanges are optional.
 
-    `overheard`, `imu`, `height`, `powers`, `quality`, `temperature`, `receptions` and `corrected` have the columns of
-    the tables of these names, or none; `meta` are the entries of the table `meta`.
+    `overheard`, `imu`, `height`, `powers`, `quality`, `temperature`, `receptions`, `differences` and `corrected` have
+    the columns of the tables of these names, or none; `meta` are the entries of the table `meta`.
 
     >>> from uwblink import Contents, Exchanges, Tag
     >>> x = Exchanges.from_arrays([1, 2], [2, 3], tx1=[0, 9], rx1=[5, 3], tx2=[1005, 1003], rx2=[3000, 3009])
@@ -53,6 +53,7 @@ class Contents:
     quality: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     temperature: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     receptions: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    differences: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     corrected: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     cirs: list[CirRow] = field(default_factory=list)
     frames: list[FrameRow] = field(default_factory=list)
@@ -154,7 +155,8 @@ class Contents:
                 raise ArgumentError(f"{name}: found {value!r}, expected seconds since the first exchange")
         if start_s is not None and stop_s is not None and stop_s < start_s:
             raise ArgumentError(f"stop_s: found {stop_s:g}, expected no less than start_s, {start_s:g}")
-        origin = int(self.exchanges.time_ns.min()) if len(self.exchanges) else 0
+        times = self.exchanges.time_ns if len(self.exchanges) else self.differences.get("time_ns", ())
+        origin = int(min(times, default=0))
         first = -LATEST_NS if start_s is None else origin + round(start_s * 1e9)
         return first, LATEST_NS if stop_s is None else origin + round(stop_s * 1e9)
 
@@ -162,7 +164,17 @@ class Contents:
 _LISTS: Final = ("cirs", "frames", "faults", "arrangements", "known_distances")
 """The tables that are held as lists of rows."""
 
-_COLUMNS: Final = ("overheard", "imu", "height", "powers", "quality", "temperature", "receptions", "corrected")
+_COLUMNS: Final = (
+    "overheard",
+    "imu",
+    "height",
+    "powers",
+    "quality",
+    "temperature",
+    "receptions",
+    "differences",
+    "corrected",
+)
 """The tables that are held as columns by name."""
 
 

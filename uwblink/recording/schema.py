@@ -82,6 +82,11 @@ TABLES: Final[dict[str, dict[str, str]]] = {
         **dict.fromkeys(("sender", "listener"), "USMALLINT"),
         **dict.fromkeys(("fpp_dbm", "rxp_dbm", "skew_ppm"), "DOUBLE"),
     },
+    "differences": {
+        "time_ns": "BIGINT",
+        **dict.fromkeys(("minus", "plus", "listener"), "USMALLINT"),
+        "difference_m": "DOUBLE",
+    },
     "arrangements": {"start_ns": "BIGINT", "end_ns": "BIGINT", **dict.fromkeys(("name", "known"), "VARCHAR")},
     "distances": {
         **dict.fromkeys(("first", "second"), "USMALLINT"),
@@ -112,6 +117,7 @@ ADDED_LATER: Final = {
             "quality",
             "temperature",
             "receptions",
+            "differences",
             "corrected",
             "arrangements",
             "distances",

@@ -336,21 +336,75 @@ def test_third_stamps_of_the_initiator_in_exchanged_columns_are_not_those_of_the
     assert 'protocol = "ds-alt"' in guess_map(write(tmp_path / "alternative.csv", noisy)).text
 
 
+OWN = {"time_s": "time_s", "at_id": "tag", "from_id": "anchor_a", "to_id": "anchor_b", "difference_m": "difference_m"}
+
+
 @pytest.mark.parametrize(
-    ("header", "column"),
+    ("header", "named", "units"),
     [
-        ("time_s,tag,anchor_a,anchor_b,difference_m", "difference_m"),
-        ("t_tdoa,idA,idB,tdoa_meas,t_imu,acc_x,acc_y,acc_z", "tdoa_meas"),
-        ("time,from_id,to_id,distanceDiff", "distanceDiff"),
+        ("time_s,tag,anchor_a,anchor_b,difference_m", OWN, {}),
+        ("time_s,tag,anchor_a,anchor_b,tdoa_ns", OWN | {"difference_m": "tdoa_ns"}, {"difference_m": "ns"}),
+        (
+            "t_tdoa,idA,idB,tdoa_meas,t_imu,acc_x,acc_y,acc_z",
+            {"time_s": "t_tdoa", "from_id": "idA", "to_id": "idB", "difference_m": "tdoa_meas"},
+            {},
+        ),
+        ("time,from_id,to_id,distanceDiff", {"time_s": "time", "difference_m": "distanceDiff"}, {}),
     ],
 )
-def test_differences_of_arrival_without_stamps_are_named(tmp_path, header, column):
-    """Of a table with the columns of the public set UTIL, of one as Loco's logs have it, and of one in between."""
-    rows = "".join(",".join([f"{k / 50:.2f}", *["3"] * header.count(",")]) + "\n" for k in range(9))
-    (tmp_path / "d.csv").write_text(f"{header}\n{rows}")
-    words = ["uwblink", "import", "csv", "d.csv", "-o", "d.uwb"]
-    processes.refuse(
-        *words, cwd=tmp_path, naming=["d.csv", f"'{column}'", "differences of arrival", "stamps"], status=2
+def test_differences_of_arrival_without_stamps_are_read(tmp_path, header, named, units):
+    """Of a table with the columns of the public set UTIL, and of others; what their sign is taken for is said."""
+    cells = {"tag": "9", "anchor_a": "1", "idA": "1", "from_id": "1", "anchor_b": "2", "idB": "2", "to_id": "2"}
+    rows = "".join(
+        ",".join(cells.get(name, f"{1.37 + k / 50:.2f}") for name in header.split(",")) + "\n" for k in range(30)
     )
+    (tmp_path / "d.csv").write_text(f"{header}\n{rows}")
+    guess = guess_map(tmp_path / "d.csv")
+    assert guess.asked == (() if "tag" in header else ("at_id",))
+    assert "distance of at_id to to_id less that to from_id" in guess.text
+    (tmp_path / "map.toml").write_text(guess.text.replace('at_id = "?"', "at_id = 9"))
+    found_map = load_map(tmp_path / "map.toml")
+    assert found_map.layout == "differences"
+    assert {ours: found_map.columns[ours] for ours in named} == named
+    assert found_map.units == units
+    said = processes.succeed(
+        "uwblink", "import", "csv", "d.csv", "--map", "map.toml", "-o", "d.uwb", cwd=tmp_path
+    ).stdout
+    assert "0 exchanges, 30 differences" in said
+    assert "distance of at_id to to_id less that to from_id" in said
+    found = load(tmp_path / "d.uwb").differences
+    assert [found[name].tolist() for name in ("minus", "plus", "listener")] == [[1] * 30, [2] * 30, [9] * 30]
+    scale = 0.299702547 if units else 1.0
+    assert found["difference_m"] == pytest.approx(scale * (1.37 + np.arange(30) / 50), rel=1e-9)
+
+
+def test_a_log_of_the_loco_deck_has_a_column_a_pair(tmp_path):
+    rows = "".join(f"{10 * k},{0.11 + k / 50:.2f},,{-0.13 - k / 50:.2f}\n" for k in range(30))
+    (tmp_path / "d.csv").write_text(f"Timestamp,tdoa.d7-0,tdoa.d0-1,tdoa.d1-2\n{rows}")
+    text = guess_map(tmp_path / "d.csv").text
+    assert 'difference_m = "tdoa.d{from_id}-{to_id}"' in text
+    (tmp_path / "map.toml").write_text(text.replace('at_id = "?"', "at_id = 9").replace('time = "?"', 'time = "ms"'))
+    import_recording(tmp_path / "d.csv", tmp_path / "d.uwb", map_file=tmp_path / "map.toml")
+    found = load(tmp_path / "d.uwb").differences
+    assert [found[name][:4].tolist() for name in ("minus", "plus")] == [[7, 1, 7, 1], [0, 2, 0, 2]]
+    assert found["difference_m"][:4].tolist() == [0.11, -0.13, 0.13, -0.15]
+    assert found["time_ns"][2] == 10_000_000
+
+
+@pytest.mark.parametrize(
+    ("change", "naming"),
+    [
+        (lambda row: row | {"difference_m": "nan"}, ["row 2", "'difference_m'", "'nan'", "finite"]),
+        (lambda row: row | {"difference_m": row["difference_m"] / 3e8}, ["'difference_m'", "metres", "units."]),
+        (lambda row: row | {"difference_m": row["difference_m"] * 1e3}, ["'difference_m'", "units."]),
+        (lambda row: row | {"at_id": row["to_id"]}, ["row 2", "'at_id'", "another tag"]),
+        (lambda row: {n: v for n, v in row.items() if n != "at_id"}, ["'at_id'", "missing"]),
+    ],
+)
+def test_differences_that_cannot_be_are_refused(tmp_path, change, naming):
+    row = {"time_s": 0.0, "from_id": 1, "to_id": 2, "at_id": 9}
+    rows = [row | {"time_s": k / 100, "difference_m": 1.003 + 0.017 * k} for k in range(40)]
+    write(tmp_path / "d.csv", [change(one) for one in rows])
+    words = ["uwblink", "import", "csv", "d.csv", "-o", "d.uwb"]
+    processes.refuse(*words, cwd=tmp_path, naming=["d.csv", *naming], status=2)
     assert not (tmp_path / "d.uwb").exists()
-    assert f"'{column}' looks like differences of arrival" in guess_map(tmp_path / "d.csv").text

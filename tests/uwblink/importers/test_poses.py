@@ -121,7 +121,7 @@ def test_auto_finds_the_offset_from_the_ranges(flight, copied):
 
 def test_the_command_says_what_it_did_and_refuses_what_cannot_be(flight, copied, tmp_path):
     said = processes.run("uwblink", "poses", copied, "--from", flight / "p.csv", "--offset", "-3.21").stdout
-    assert "3320 of 3320 exchanges have a true distance" in said
+    assert "3320 of 3320 measurements have a true distance" in said
     done = processes.run("uwblink", "poses", copied, "--from", flight / "p.csv", "--offset", "soon", "--force")
     assert (done.returncode, done.stderr.count("\n"), "--offset" in done.stderr) == (2, 1, True)
     for more, error, fragment in (

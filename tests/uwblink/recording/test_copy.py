@@ -32,6 +32,7 @@ INSTEAD = {
     "quality": {name: np.array([1.0]) for name in TABLES["quality"]},
     "temperature": {name: np.array([2.0]) for name in TABLES["temperature"]},
     "receptions": {name: np.array([3.0]) for name in TABLES["receptions"]},
+    "differences": {name: np.array([3.0]) for name in TABLES["differences"]},
     "corrected": {name: np.array([1.0]) for name in TABLES["corrected"]},
     "height": {"time_ns": np.array([3]), "body": np.array(["z"]), "height_m": np.array([np.nan])},
     "arrangements": [Arrangement("Z", 1, 2, "plane")],
@@ -58,6 +59,7 @@ def full(tmp_path_factory):
         r.append("temperature", {"time_ns": np.array([4, 3]), "tag": np.array([1, 3])} | celsius)
         r.append("corrected", {name: np.array([1, 0]) for name in TABLES["corrected"] if name != "sigma_m"})
         r.append("receptions", {name: np.array([2, 1]) for name in TABLES["receptions"]})
+        r.append("differences", {name: np.array([2, 1]) for name in TABLES["differences"]})
         r.append("height", {"height_m": np.array([0.5, 0.25])} | readings)
         r.append("arrangements", [Arrangement("B", 5, 9, "line"), Arrangement("A", 1, 4)])
         r.append("distances", [KnownDistance(1, 2, 3.06, 0.005, "A"), KnownDistance(1, 3, 2.5, 0.01)])

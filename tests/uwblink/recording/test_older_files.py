@@ -8,7 +8,7 @@ from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import TABLES, Tag
 
-LATER = ("imu", "height", "powers", "quality", "temperature", "receptions", "corrected")
+LATER = ("imu", "height", "powers", "quality", "temperature", "receptions", "differences", "corrected")
 
 
 @pytest.fixture

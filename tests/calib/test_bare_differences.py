@@ -1,0 +1,242 @@
+"""Differences of arrival without stamps, from a table to a calibration and a track.
+
+A page of NumPy that shares no code with the packages makes the table: a tag flies among eight anchors whose delays are
+planted, and logs by how much farther it is from one anchor than from another.
+"""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import calib
+import uwblink
+from calib.evaluation import Settings, summarize
+from tests import processes
+
+ANCHORS = np.array([(-4.0, -3.5, 0.3), (4.0, -3.5, 2.8), (4.0, 3.5, 0.4), (-4.0, 3.5, 2.9), (0.0, -3.5, 2.6),
+                    (4.0, 0.0, 0.2), (0.0, 3.5, 2.4), (-4.0, 0.0, 0.5)])  # fmt: skip
+DELAYS_NS = np.array([0.31, -0.42, 0.12, -0.25, 0.48, -0.06, -0.33, 0.22])
+METRES_A_NS = 0.299702547
+TAG = 20
+NOISE_M = 0.1
+FIT = ("--use", "receptions", "--delays-only")
+
+
+def place_m(time_s):
+    return np.column_stack([2.5 * np.sin(0.5 * time_s), 2.2 * np.cos(0.37 * time_s), 1.4 + 0.7 * np.sin(0.29 * time_s)])
+
+
+def flown(seed, seconds, *, reflected=0.05):
+    """Times, ids from 1 and differences: to the second anchor, less to the first, with noise and some reflections."""
+    random = np.random.default_rng(seed)
+    time_s = np.arange(0, seconds, 1 / 160)
+    first = np.arange(len(time_s)) % 8
+    second = (first + 1 + np.arange(len(time_s)) // 8 % 7) % 8
+    to_first, to_second = (np.linalg.norm(ANCHORS[k] - place_m(time_s), axis=1) for k in (first, second))
+    difference = to_second - to_first + NOISE_M * random.normal(size=len(time_s))
+    difference -= METRES_A_NS * (DELAYS_NS[second] - DELAYS_NS[first]) / 2
+    late = random.exponential(0.5, len(time_s)) * random.choice([-1, 1], len(time_s))
+    difference += np.where(random.random(len(time_s)) < reflected, late, 0.0)
+    return time_s, first + 1, second + 1, difference
+
+
+def write(folder, rows, header="time_s,tag,anchor_a,anchor_b,difference_m"):
+    """A table of differences, poses of the tag and the places of the anchors."""
+    time_s, first, second, difference = rows
+    lines = [f"{t:.6f},{TAG},{a},{b},{d:.12g}" for t, a, b, d in zip(time_s, first, second, difference, strict=True)]
+    (folder / "d.csv").write_text("\n".join([header, *lines, ""]))
+    around = np.arange(time_s[0] - 0.5, time_s[-1] + 0.5, 0.01)
+    poses = [
+        f"{t:.6f},tag20,{x:.6f},{y:.6f},{z:.6f},0,0,0,1" for t, (x, y, z) in zip(around, place_m(around), strict=True)
+    ]
+    (folder / "poses.csv").write_text("\n".join(["time_s,body,x,y,z,qx,qy,qz,qw", *poses, ""]))
+    places = [f"[[anchors]]\nid = {k}\nposition_m = {at.tolist()}\n" for k, at in enumerate(ANCHORS, 1)]
+    (folder / "tags.toml").write_text(f'[[tags]]\nid = {TAG}\nbody = "tag20"\n{"".join(places)}')
+
+
+def imported(folder, rows, *, swapped=False, mocap=True):
+    """The path of a recording with what is flown; `swapped` by a map with the other sign."""
+    folder.mkdir(exist_ok=True)
+    write(folder, rows)
+    processes.succeed("uwblink", "import", "guess", "d.csv", "-o", "map.toml", cwd=folder)
+    if swapped:
+        text = (folder / "map.toml").read_text()
+        text = text.replace("anchor_a", "x").replace("anchor_b", "anchor_a").replace('"x"', '"anchor_b"')
+        (folder / "map.toml").write_text(text)
+    processes.succeed("uwblink", "import", "csv", "d.csv", "-o", "d.uwb", "--map", "map.toml", cwd=folder)
+    words = ["uwblink", "poses", "d.uwb", "--tags", "tags.toml", *(["--from", "poses.csv"] if mocap else [])]
+    processes.succeed(*words, cwd=folder)
+    return folder / "d.uwb"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two recordings, fit/d.uwb and fly/d.uwb, and a fit of the one: fit.json."""
+    found = tmp_path_factory.mktemp("differences")
+    imported(found / "fit", flown(1, 60.0))
+    imported(found / "fly", flown(2, 20.0))
+    processes.succeed("calib", "fit", "fit/d.uwb", "-o", "fit.json", *FIT, cwd=found)
+    return found
+
+
+def test_delays_come_out_but_for_what_they_have_in_common(folder):
+    known = calib.load_calibration(folder / "fit.json")
+    found = np.array([known.delays_ns[tag] for tag in range(1, 9)])
+    std = np.array([known.std_of_sum_ns([tag]) for tag in range(1, 9)])
+    # Of 9600 rows each anchor is in a quarter, by half its delay: 0.1 m/sqrt(2400)/0.15 m/ns = 0.0136 ns, which the
+    # partners' delays, the loss and 5 % of reflections make half as large again at most.
+    assert np.all((std > 0.012) & (std < 0.022))
+    wrong = found - (DELAYS_NS - DELAYS_NS.mean())
+    assert np.all(np.abs(wrong) < 4 * std)
+    assert np.sqrt(np.mean((wrong / std) ** 2)) < 1.8, "99.9 % of the roots of chi-square over seven"
+    assert set(known.delays_std_ns.values()) == {np.inf}
+    assert known.undetermined_splits == (((), tuple(range(1, 9))),)
+    # Noise is that of a difference.
+    assert known.sigma_curve(np.ones(1))[0] == pytest.approx(NOISE_M, rel=0.05)
+
+
+def test_the_fit_names_what_stays_free(folder):
+    done = processes.run("calib", "fit", "fit/d.uwb", "-o", "again.json", *FIT, cwd=folder)
+    assert "0 exchanges, 9600 differences of arrival" in done.stdout
+    assert done.stdout.count("less the mean of all") == 8
+    assert "only differences of arrival from tags 1, 2, 3" in done.stderr
+    assert "have in common" in done.stderr
+    pinned = calib.fit(folder / "fit/d.uwb", use="receptions", delays_only=True, fixed_ns={1: DELAYS_NS[0]}).calibration
+    assert not pinned.undetermined_splits
+    for tag in range(2, 9):
+        assert abs(pinned.delays_ns[tag] - DELAYS_NS[tag - 1]) < 4 * pinned.delays_std_ns[tag] < 0.13
+
+
+def test_what_is_not_determined_is_not_corrected(folder):
+    ranges = calib.Ranges.from_arrays([3.0] * 5, initiator=1, target=2)
+    with pytest.raises(calib.CalibError, match="only differences of arrival"):
+        calib.load_calibration(folder / "fit.json").apply(ranges)
+
+
+def test_the_tag_is_where_it_is(folder):
+    done = json.loads(
+        processes.succeed(
+            "calib", "localize", "fly/d.uwb", "-c", "fit.json", "--use", "receptions", "--json", cwd=folder
+        ).stdout
+    )
+    (one,) = done["scenarios"]
+    assert one["arrivals"] == 3200
+    assert one["rmse_m"]["raw"] > 0.08
+    assert one["rmse_m"]["variance"] < 0.045
+    assert one["rmse_m"]["robust"] < 0.04
+
+
+@pytest.mark.parametrize("model", ["constant-velocity", "imu"])
+def test_the_tag_is_tracked_on_board(folder, model):
+    contents = uwblink.load(folder / "fly/d.uwb")
+    time_s = np.arange(0, 20.0, 0.01)
+    rates = np.array([0.5, 0.37, 0.29])
+    swing = np.column_stack([2.5 * np.sin(0.5 * time_s), 2.2 * np.cos(0.37 * time_s), 0.7 * np.sin(0.29 * time_s)])
+    force = -(rates**2) * swing + [0.0, 0.0, 9.80665]
+    columns = dict(zip(("ax", "ay", "az"), force.T, strict=True)) | dict.fromkeys(("wx", "wy", "wz"), np.zeros(2000))
+    imu = {"time_ns": np.rint(time_s * 1e9).astype(np.int64), "body": np.full(2000, "tag20"), **columns}
+    settings = calib.OnboardSettings(model=model, use="receptions")
+    (found,) = calib.localize_onboard(replace(contents, imu=imu), folder / "fit.json", settings)
+    assert found.used == "differences of arrival" + (", imu" if model == "imu" else "")
+    assert not found.restarts_s
+    assert found.rmse_m < {"constant-velocity": 0.1, "imu": 0.06}[model]
+
+
+def test_a_calibration_of_ranges_corrects_differences(folder):
+    """Its noise is that of a range, of which a difference has five times the variance."""
+    random = np.random.default_rng(5)
+    time_s = np.arange(0, 60.0, 1 / 80)
+    anchor = np.arange(len(time_s)) % 8
+    truth = np.linalg.norm(ANCHORS[anchor] - place_m(time_s), axis=1)
+    noise = random.normal(size=len(time_s)) * NOISE_M / 5**0.5
+    ranges = calib.Ranges.from_arrays(
+        truth - METRES_A_NS * (DELAYS_NS[anchor] + 0.1) / 2 + noise, initiator=TAG, target=anchor + 1, truth_m=truth,
+        time_ns=np.rint(time_s * 1e9).astype(np.int64),
+    )  # fmt: skip
+    known = calib.fit(ranges, delays_only=True, fixed_ns={TAG: 0.1}, between_m=0.0).calibration
+    found = calib.localize(folder / "fly/d.uwb", known, Settings(use="receptions"))
+    total = summarize(found)
+    assert total.rmse_m["variance"] < 0.045 < 0.08 < total.rmse_m["raw"]
+    # The bounds, 2.5 and 3.5, hold 95 %: 0.9 is 3.5 standard deviations. A variance of half as much would give 6.
+    assert total.nees == pytest.approx(3.0, abs=0.9)
+
+
+@pytest.mark.parametrize(
+    "words", [("fit", "-o", "x.json", *FIT), ("localize", "-c", "../fit.json", "--use", "receptions")]
+)
+def test_the_other_sign_is_noticed_by_poses(folder, words):
+    if not (folder / "swapped").exists():
+        imported(folder / "swapped", flown(3, 8.0), swapped=True)
+    command, *others = words
+    naming = ["d.uwb", "the other sign", "from_id", "to_id"]
+    processes.refuse("calib", command, "d.uwb", *others, cwd=folder / "swapped", naming=naming, status=2)
+    assert not (folder / "swapped" / "x.json").exists()
+
+
+def test_the_other_sign_is_doubted_without_poses(folder):
+    rows = flown(4, 8.0)
+    doubted = imported(folder / "blind", rows, swapped=True, mocap=False)
+    believed = imported(folder / "right", rows, mocap=False)
+    words = ("-c", folder / "fit.json", "--use", "receptions", "--model", "constant-velocity")
+    assert "the other sign" in processes.succeed("calib", "localize", doubted, *words).stdout
+    assert "the other sign" not in processes.succeed("calib", "localize", believed, *words).stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "naming", "status"),
+    [
+        (("fit", "d.uwb", "-o", "x.json", "--use", "receptions"), ["d.uwb", "powers", "--delays-only"], 1),
+        (("fit", "d.uwb", "-o", "x.json", "--delays-only"), ["d.uwb", "3200 differences", "--use receptions"], 1),
+        (("evaluate", "d.uwb", "-c", "../fit.json"), ["d.uwb", "3200 differences", "no exchanges"], 1),
+        (("localize", "d.uwb", "-c", "../fit.json"), ["d.uwb", "3200 differences", "--use receptions"], 1),
+    ],
+)
+def test_what_does_not_go_with_differences_is_said(folder, words, naming, status):
+    processes.refuse("calib", *words, cwd=folder / "fly", naming=naming, status=status)
+    assert not (folder / "fly" / "x.json").exists()
+
+
+@pytest.mark.parametrize(
+    "words", [("fit", "-o", "x.json", *FIT), ("localize", "-c", "fit.json", "--use", "receptions")]
+)
+def test_an_anchor_without_a_place_is_named(folder, words):
+    contents = uwblink.load(folder / "fly/d.uwb")
+    lost = contents.differences["plus"].copy()
+    lost[7] = 77
+    replace(contents, differences=contents.differences | {"plus": lost}).save(folder / "lost.uwb", force=True)
+    naming = ["lost.uwb", "anchor 77", "no place"]
+    processes.refuse("calib", words[0], "lost.uwb", *words[1:], cwd=folder, naming=naming, status=2)
+
+
+def test_ranges_and_differences_are_used_together_and_fitted_apart(folder):
+    contents = uwblink.load(folder / "fly/d.uwb")
+    time_s = np.arange(0.1, 19.0, 0.1)
+    truth = np.linalg.norm(ANCHORS[0] - place_m(time_s), axis=1)
+    none = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(len(time_s), dtype=np.int64))
+    when_ns = np.rint(time_s * 1e9).astype(np.int64)
+    ranges = uwblink.Exchanges.from_arrays(TAG, 1, time_ns=when_ns, protocol="ss", range_m=truth, **none)
+    both = replace(contents, exchanges=ranges)
+    with pytest.raises(calib.CalibError, match="fit each alone"):
+        calib.fit(both, use="receptions", delays_only=True)
+    known = replace(
+        calib.load_calibration(folder / "fit.json"),
+        delays_ns=dict(zip((*range(1, 9), TAG), (*DELAYS_NS, -DELAYS_NS[0]), strict=True)),
+        undetermined_splits=(),
+    )
+    (found,) = calib.localize(both, known, Settings(use="receptions"))
+    assert (found.arrivals, len(found.tracks["raw"].time_ns)) == (3200, 3200 + len(time_s))
+    assert found.rmse_m["variance"].mean() < 0.045
+
+
+def test_a_recording_keeps_them(folder):
+    contents = uwblink.load(folder / "fly/d.uwb")
+    processes.succeed("uwblink", "export", "fly/d.uwb", "--to", "csv", "-o", "exported", cwd=folder)
+    processes.succeed("uwblink", "import", "exported", "exported", "-o", "again.uwb", cwd=folder)
+    again = uwblink.load(folder / "again.uwb").differences
+    assert all(np.array_equal(again[name], column) for name, column in contents.differences.items())
+    some = contents.select(start_s=5.0, stop_s=6.0).differences
+    assert len(some["time_ns"]) == 160
+    assert some["time_ns"][0] == contents.differences["time_ns"][0] + 5 * 10**9
+    assert "also: differences 3200" in processes.succeed("uwblink", "show", "fly/d.uwb", cwd=folder).stdout
