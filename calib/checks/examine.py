@@ -45,13 +45,9 @@ def surveyed(recordings: list[Data]) -> Iterator[Candidate]:
         found = survey(recordings, regardless=True)
     except UnanswerableError as error:
         yield Candidate("survey determines nothing", str(error))
-    for one in found.contradictions if found else contradictions:
-        yield Candidate(one.fault, one.evidence)
-    if found:
-        yield from _weak(found)
-
-
-def _weak(found: SurveyResult) -> Iterator[Candidate]:
+    yield from (Candidate(one.fault, one.evidence) for one in (found.contradictions if found else contradictions))
+    if not found:
+        return
     made, second = found.calibration.provenance, found.second_best
     if made["undetermined"]:
         who = ", ".join(map(str, made["undetermined"][0]))

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
-from scipy.special import ndtr
+from scipy.special import expit, ndtr
 
 from calib.calibration.power_curves import basis
 from calib.checks.places import of_places
@@ -109,7 +109,9 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
         yield of_tags("decibels", louder_m[:, None] / size)
     forth = np.where(ranges.initiator < ranges.target, 1.0, -1.0)
     yield of_tags("skew", forth[:, None] * [1.0, -1.0])
-    shared = (_scale(ranges.truth_m) if beside_curve else {}) | late(model)
+    shared, reach = late(model), float(np.ptp(ranges.truth_m))
+    if beside_curve and reach > 0:
+        shared = {"scale": (ranges.truth_m - float(np.median(ranges.truth_m))) / reach} | shared
     if shared:
         everyone = np.broadcast_to(np.arange(len(shared)), (count, len(shared)))
         values = np.column_stack(list(shared.values()))
@@ -161,12 +163,6 @@ def _of_sessions(found: KnownDistances, tags: list[str], ends: Ints) -> Family:
         fitted=found.searches[0].optimum.layout.indices(kinds if len(names) > len(tags) else kinds[:1]),
         sessions=sessions,
     )
-
-
-def _scale(truth_m: Floats) -> dict[str, Floats]:
-    """Return the true distances (n,) over their reach; nothing where they are all the same."""
-    reach = float(np.ptp(truth_m))
-    return {"scale": (truth_m - float(np.median(truth_m))) / reach} if reach > 0 else {}
 
 
 def misread(model: RangeModel, louder_m: Floats) -> Floats | None:
@@ -239,13 +235,15 @@ def _weighed(
         findings = [one for one in findings if one.kind != "pair"]
     covariance, matter, said = plain + places_ns2, dict[tuple[str, tuple[str, ...]], FoundOffset](), of_places
     for one in findings:
-        moved, cause = _moved(one, plain), _is_cause(one, plain, certain=bool(of_places))
+        moved, large = _moved(one, plain), abs(one.offset_m) > SMALLEST_M
+        # True distances of another time than ranges move ranges, and hardly delays.
+        cause = one.kind == "shared" and (bool(of_places) or (large and (moved > MATTERS or "late" in one.names)))
         if moved > MATTERS:
             covariance = covariance + one.spread_ns2
         if cause and "late" in one.names:
             # Ranges of two bodies are wrong together then, too: the narrower cause is named.
             said = []
-        large = abs(one.offset_m) > SMALLEST_M or (moved > CLEARLY and one.largest_ns > SMALLEST_NS)
+        large = large or (moved > CLEARLY and one.largest_ns > SMALLEST_NS)
         # Powers that are read with noise: the curve is right for the powers that are read.
         if one.kind != "readings" and (cause or (moved > MATTERS and large)):
             # A tag that was moved stands out in more than one span of time: once is enough.
@@ -255,17 +253,6 @@ def _weighed(
         *(sentence + noise for sentence in said),
         *(sentence_of(one) + noise * (one.kind == "shared") for one in matter.values()),
     ]
-
-
-def _is_cause(finding: FoundOffset, before_ns2: Floats, *, certain: bool) -> bool:
-    """Return whether a finding that all ranges share is a cause by itself, with places `certain` or not.
-
-    True distances of another time than ranges move ranges, and hardly delays.
-    """
-    if finding.kind != "shared":
-        return False
-    large = abs(finding.offset_m) > SMALLEST_M
-    return certain or (large and ("late" in finding.names or _moved(finding, before_ns2) > MATTERS))
 
 
 def _moved(finding: FoundOffset, covariance: Floats) -> float:
@@ -321,33 +308,27 @@ def sentence_of(finding: FoundOffset) -> str:
     return "; or ".join(SENTENCES[name].format(**words) for name in names)
 
 
-def shares_of_pairs(found: KnownDistances) -> tuple[Floats, Floats]:
-    """Return the share of reflected ranges of each pair (k,) and their mean detour (k,), metres; 0 if not fitted."""
-    values = found.values
+def reflected_pairs(found: KnownDistances) -> tuple[Floats, Floats, Bools]:
+    """Return the share of reflected ranges of each pair (k,), their mean detour in metres, and where most surely are.
+
+    The log odds are held against their standard errors, with errors that last; all are 0 where they are not fitted.
+    """
+    values, optimum, count = found.values, found.searches[-1].optimum, len(found.model.pairs.ends)
     if not isinstance(found.searches[-1].rows.errors, Mixture) or "odds of pair" not in values:
-        return np.zeros(len(found.model.pairs.ends)), np.zeros(len(found.model.pairs.ends))
-    share = 1 / (1 + np.exp(-values["odds level"] - values["odds of pair"]))
+        return np.zeros(count), np.zeros(count), np.zeros(count, dtype=bool)
+    which = np.zeros((len(optimum.x), count))
+    which[optimum.layout.where["odds level"]], which[optimum.layout.where["odds of pair"]] = 1.0, np.eye(count)
+    odds = which.T @ optimum.x
+    variance = found.persistence.factor * np.einsum("pk,pk->k", which, np.asarray(optimum.covariance @ which))
     detour = np.exp(values["least detour"]) + np.exp(values["detour level"] + values["detour of pair"])
-    return share, detour
-
-
-def _mostly(found: KnownDistances) -> Bools:
-    """Return of which pairs (k,) more than half of the ranges are reflected, by their log odds and standard errors."""
-    search, count = found.searches[-1], len(found.model.pairs.ends)
-    if "odds of pair" not in found.values:
-        return np.zeros(count, dtype=bool)
-    where = search.optimum.layout.where
-    odds = np.zeros((len(search.optimum.x), count))
-    odds[where["odds level"]], odds[where["odds of pair"]] = 1.0, np.eye(count)
-    variance = found.persistence.factor * np.einsum("pk,pk->k", odds, np.asarray(search.optimum.covariance @ odds))
-    return np.asarray(count * ndtr(-(odds.T @ search.optimum.x) / np.sqrt(variance)) < OF_A_FIT)
+    return expit(odds), detour, np.asarray(count * ndtr(-odds / np.sqrt(variance)) < OF_A_FIT)
 
 
 def _reflected(found: KnownDistances) -> Iterator[str]:
     """Name the pairs of which hardly a range is direct, or else a tag about half of whose ranges are not."""
-    share, detour_m = shares_of_pairs(found)
+    share, detour_m, most = reflected_pairs(found)
     ends, far = found.model.pairs.ends, detour_m > NAMED_DETOUR_M
-    hidden, tags = np.flatnonzero((share > HIDDEN) & far & _mostly(found)).tolist(), np.unique(ends).tolist()
+    hidden, tags = np.flatnonzero((share > HIDDEN) & far & most).tolist(), np.unique(ends).tolist()
     for number in hidden:
         a, b = ends[number].tolist()
         others = [tag for tag in tags if tag not in (a, b)]
