@@ -224,7 +224,7 @@ CHECKS: Final = (
     ),
     Check(
         "radio",
-        "Are more than 15 % of the ranges reflected, or of one tag more than of others, or do reflections last?",
+        "Are more than 15 % of the ranges reflected, or of one tag 15 % more than of others, or do reflections last?",
         "share of ranges that are 12 cm long; long ranges after long ones",
         f"{OVER_STRETCHES}; binomial, for all tags or pairs",
         {

@@ -211,7 +211,8 @@ class Slopes:
             for own, derivative in zip(sums, derivatives, strict=True):
                 kept = derivative[self.order[which]]
                 if more is not None:
-                    kept = sparse.hstack([kept, more[self.order[which], None]], format="csr")
+                    last = sparse.csr_matrix(more[self.order[which], None])
+                    kept = sparse.csr_matrix(sparse.hstack([kept, last]))
                 told = sparse.diags(self.tells[which])
                 own[0] += (in_block @ sparse.diags(self.score[which]) @ kept).toarray()
                 own[1] += (in_block @ told @ kept.power(2)).toarray()
