@@ -140,7 +140,7 @@ places: setup ## fits where errors belong to places, into docs/accuracy.md (20 m
 surveys: setup ## survey worlds of standing boards, 50 seeds each, into docs/accuracy.md (10 minutes)
 	$(BIN)/python -m benchmarks.surveys --write
 
-sound: setup ## false alarms of the checks on 200 sound recordings, then planted faults (15 minutes)
+sound: setup ## false alarms of the checks on sound recordings of 19 worlds, then planted faults (1 hour)
 	$(BIN)/python -W ignore -m benchmarks.sound_recordings
 	$(BIN)/python -W ignore -m benchmarks.sound_recordings --planted --seeds 4
 

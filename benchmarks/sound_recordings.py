@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections import Counter
+from collections import ChainMap, Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -29,49 +29,67 @@ FIRST_SEED: Final = 101_000
 MINUTE: Final = Plan(seconds=60)
 
 
-def _simulated(name: str, seed: int) -> Any:
-    return uwbsim.simulate(uwbsim.load(name, {"run.duration_s": 60.0, "run.seed": seed}))
+def _simulated(name: str, seconds: float, seed: int) -> Any:
+    return uwbsim.simulate(uwbsim.load(name, {"run.duration_s": seconds, "run.seed": seed}))
 
 
 def _flown(plan: Plan, seed: int) -> Any:
     return fly(plan, seed)
 
 
+SCENARIOS: Final = {
+    "six_robots/six_robots": (12, 60),
+    "anchors_and_tag/anchors_and_tag": (12, 60),
+    "room/room": (60,),
+    "day30/train": (15, 60),
+    "broadcast": (12, 60),
+    "tdoa": (12, 60),
+    "three_quadcopters": (12, 60),
+}
+"""Shipped scenarios without a fault, and the seconds of their short and long recordings."""
+
 WORLDS: Final[dict[str, Callable[[int], Any]]] = {
-    "simulator, six robots": partial(_simulated, "six_robots/six_robots"),
-    "simulator, anchors and a tag": partial(_simulated, "anchors_and_tag/anchors_and_tag"),
-    "simulator, room": partial(_simulated, "room/room"),
-    "simulator, ICRA 2023 on day 30": partial(_simulated, "day30/train"),
+    **{f"{name}, {s} s": partial(_simulated, name, float(s)) for name, several in SCENARIOS.items() for s in several},
+    "broadcast, 12 s, receptions": partial(_simulated, "broadcast", 12.0),
+    "three_quadcopters, 12 s, receptions": partial(_simulated, "three_quadcopters", 12.0),
     "flight of three bodies": partial(_flown, MINUTE),
     "flight of five tags": partial(_flown, replace(MINUTE, tags_a_body=1, bodies=5)),
     "flight among four anchors": partial(_flown, replace(MINUTE, anchors=4, tags_a_body=1)),
     "single-sided flight, corrected": partial(_flown, replace(MINUTE, protocol="ss-cfo")),
 }
-"""Worlds without a fault: four of the simulator, four of a generator that shares nothing with it."""
+"""Worlds without a fault: some of the simulator, four of a generator that shares nothing with it."""
+
+SETTINGS: Final = {"tdoa": {"delays_only": True}, "receptions": {"use": "receptions"}}
+"""Settings of fits by words in the names of worlds: anchors that stand still do not show a curve."""
 
 TRUE_OF: Final = {
-    "simulator, room": {
+    "room/room": {
         "reflections that last",
         "reflections",
         "pairs that do not close",
         "ranges that do not follow the distances",
-    }
+    },
+    "tdoa": {"static data"},
+    "three_quadcopters": {"power confounded with distance"},
 }
 """Findings that are true of a world: in the room a metal cabinet stands between tag 1 and the third quadcopter, so that
-half of their ranges are 0.2 to 1.5 m too long, and ranges of other pairs are reflected for seconds."""
+half of their ranges are 0.2 to 1.5 m too long, and ranges of other pairs are reflected for seconds. Power of the
+quadcopters follows the distance by 93 to 95 % in one recording of six."""
+
+STATED: Final = ("only ", "delays only", "errors last", "power and distance are confounded")
+"""How warnings begin that state what data cannot tell, and doubt nothing: not counted."""
 
 
 def said_of_sound(job: tuple[str, int]) -> tuple[str, int, list[str], list[str]]:
     """Return a world and seed with the faults that `examine` finds and that are not true, and warnings of a fit."""
     name, seed = job
-    data = WORLDS[name](seed)
-    ranges = calib.Ranges.from_exchanges(data.exchanges, poses=data.poses, tags=data.tags).usable()
+    data, given = WORLDS[name](seed), [own for word, own in SETTINGS.items() if word in name]
     try:
-        warnings = calib.fit(ranges).warnings
+        warnings = [text for text in calib.fit(data, **ChainMap(*given)).warnings if not text.startswith(STATED)]
     except calib.UnanswerableError as error:
         warnings = [f"refused: {error}"]
     found = [one.fault for one in calib.examine(data)]
-    return name, seed, [fault for fault in found if fault not in TRUE_OF.get(name, ())], warnings
+    return name, seed, [fault for fault in found if fault not in TRUE_OF.get(name.split(",")[0], ())], warnings
 
 
 def said_of_planted(job: tuple[int, int]) -> tuple[str, int, bool, list[str]]:

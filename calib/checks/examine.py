@@ -45,13 +45,9 @@ def surveyed(recordings: list[Data]) -> Iterator[Candidate]:
         found = survey(recordings, regardless=True)
     except UnanswerableError as error:
         yield Candidate("survey determines nothing", str(error))
-    for one in found.contradictions if found else contradictions:
-        yield Candidate(one.fault, one.evidence)
-    if found:
-        yield from _weak(found)
-
-
-def _weak(found: SurveyResult) -> Iterator[Candidate]:
+    yield from (Candidate(one.fault, one.evidence) for one in (found.contradictions if found else contradictions))
+    if not found:
+        return
     made, second = found.calibration.provenance, found.second_best
     if made["undetermined"]:
         who = ", ".join(map(str, made["undetermined"][0]))
@@ -228,7 +224,7 @@ CHECKS: Final = (
     ),
     Check(
         "radio",
-        "Are more than 15 % of the ranges reflected, or of one tag more than of others, or do reflections last?",
+        "Are more than 15 % of the ranges reflected, or of one tag 15 % more than of others, or do reflections last?",
         "share of ranges that are 12 cm long; long ranges after long ones",
         f"{OVER_STRETCHES}; binomial, for all tags or pairs",
         {

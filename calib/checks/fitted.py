@@ -7,9 +7,11 @@ fit, so their variance is in the intervals whether one of them stands out or not
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
+from scipy.special import expit, ndtr
 
 from calib.calibration.power_curves import basis
 from calib.checks.places import of_places
@@ -21,7 +23,7 @@ from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes,
 from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.estimator.to_calibration import bias_curves
 from calib.findings import NAMED_DETOUR_M, OF_A_FIT, SMALLEST_NS
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
 OFFSET_SPANS, SPAN_S = 6, 20.0
@@ -50,7 +52,13 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
     Returns the covariance (tags, tags) of the stated delays in ns^2 with what does not fit, and what to say of it.
     """
     slopes, louder, alone = found.slopes, change_per_decibel(found), len(found.searches) > 1
-    tested = slopes.tests(list(families(found, louder, beside_curve=not alone)))
+    readings = None if alone else misread(found.model, louder)
+    tested = slopes.tests(list(families(found, louder, beside_curve=not alone)), readings)
+    if readings is not None:
+        # Powers are read with noise in every recording, and alternatives are tested beside it.
+        noise = replace(tested[-1], family=replace(tested[-1].family, kind="readings", names=["readings"]))
+        noise = noise.turned(np.eye(len(noise.total))[-1:])
+        tested = [*(one.beside([-1]).turned(np.eye(len(one.total))[:-1]) for one in tested), noise]
     if found.slopes_of_heard is not None:
         tested += found.slopes_of_heard.tests(list(_of_heard(found)))
     findings = _without_repeats(search(tested, OF_A_FIT))
@@ -101,7 +109,9 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
         yield of_tags("decibels", louder_m[:, None] / size)
     forth = np.where(ranges.initiator < ranges.target, 1.0, -1.0)
     yield of_tags("skew", forth[:, None] * [1.0, -1.0])
-    shared = _shared(found, louder_m) if beside_curve else late(found.model)
+    shared, reach = late(model), float(np.ptp(ranges.truth_m))
+    if beside_curve and reach > 0:
+        shared = {"scale": (ranges.truth_m - float(np.median(ranges.truth_m))) / reach} | shared
     if shared:
         everyone = np.broadcast_to(np.arange(len(shared)), (count, len(shared)))
         values = np.column_stack(list(shared.values()))
@@ -155,26 +165,21 @@ def _of_sessions(found: KnownDistances, tags: list[str], ends: Ints) -> Family:
     )
 
 
-def _shared(found: KnownDistances, louder_m: Floats) -> dict[str, Floats]:
-    """Return what errors of all ranges (n,) may go with: distance, the speed at which it changes, noise of powers.
+def misread(model: RangeModel, louder_m: Floats) -> Floats | None:
+    """Return the error (n,) that noise of power readings leaves, over its root mean square; None where there is none.
 
-    Where powers are read with noise, the error that goes with the power itself is left in part, and goes with what
-    distance lets expect of the power beyond what was read (regression calibration: Carroll et al. 2006, chapter 4).
-    Without this explanation ranges seem to grow with the distance. All are tested together, and what explains most is
-    found first.
+    The error that goes with the power itself is left in part, and goes with what distance lets expect of the power
+    beyond what was read (regression calibration: Carroll et al. 2006, chapter 4). Without it ranges seem to grow with
+    the distance, or pairs at some distances to have offsets; much noise leaves more than is linear in it, so that it is
+    named beside such findings.
     """
-    truth_m = found.model.ranges.truth_m
-    reach = float(np.ptp(truth_m))
-    if reach <= 0:
-        return {}
-    shared = {"scale": (truth_m - float(np.median(truth_m))) / reach} | late(found.model)
-    if np.any(louder_m):
-        decibels = 10 * np.log10(np.maximum(found.model.lifted, 1e-4))
-        far = np.log(np.maximum(truth_m, 0.1))
-        slope, level = np.polyfit(far, decibels, 1)
-        missing = louder_m * (slope * far + level - decibels)
-        shared["readings"] = missing / max(_root_mean_square(missing), 1e-12)
-    return shared
+    if not np.any(louder_m) or not np.ptp(model.ranges.truth_m) > 0:
+        return None
+    decibels = 10 * np.log10(np.maximum(model.lifted, 1e-4))
+    far = np.log(np.maximum(model.ranges.truth_m, 0.1))
+    slope, level = np.polyfit(far, decibels, 1)
+    missing = louder_m * (slope * far + level - decibels)
+    return np.asarray(missing / max(_root_mean_square(missing), 1e-12))
 
 
 def late(model: RangeModel) -> dict[str, Floats]:
@@ -230,29 +235,24 @@ def _weighed(
         findings = [one for one in findings if one.kind != "pair"]
     covariance, matter, said = plain + places_ns2, dict[tuple[str, tuple[str, ...]], FoundOffset](), of_places
     for one in findings:
-        moved, cause = _moved(one, plain), _is_cause(one, plain, certain=bool(of_places))
+        moved, large = _moved(one, plain), abs(one.offset_m) > SMALLEST_M
+        # True distances of another time than ranges move ranges, and hardly delays.
+        cause = one.kind == "shared" and (bool(of_places) or (large and (moved > MATTERS or "late" in one.names)))
         if moved > MATTERS:
             covariance = covariance + one.spread_ns2
         if cause and "late" in one.names:
             # Ranges of two bodies are wrong together then, too: the narrower cause is named.
             said = []
-        large = abs(one.offset_m) > SMALLEST_M or (moved > CLEARLY and one.largest_ns > SMALLEST_NS)
+        large = large or (moved > CLEARLY and one.largest_ns > SMALLEST_NS)
         # Powers that are read with noise: the curve is right for the powers that are read.
-        if one.names != ("readings",) and (cause or (moved > MATTERS and large)):
+        if one.kind != "readings" and (cause or (moved > MATTERS and large)):
             # A tag that was moved stands out in more than one span of time: once is enough.
             matter.setdefault((one.kind, one.names), one)
-    return covariance, [*said, *map(sentence_of, matter.values())]
-
-
-def _is_cause(finding: FoundOffset, before_ns2: Floats, *, certain: bool) -> bool:
-    """Return whether a finding that all ranges share is a cause by itself, with places `certain` or not.
-
-    True distances of another time than ranges move ranges, and hardly delays.
-    """
-    if finding.kind != "shared" or finding.names == ("readings",):
-        return False
-    large = abs(finding.offset_m) > SMALLEST_M
-    return certain or (large and ("late" in finding.names or _moved(finding, before_ns2) > MATTERS))
+    noise = NOISE if any(one.kind == "readings" for one in findings) else ""
+    return covariance, [
+        *(sentence + noise for sentence in said),
+        *(sentence_of(one) + noise * (one.kind == "shared") for one in matter.values()),
+    ]
 
 
 def _moved(finding: FoundOffset, covariance: Floats) -> float:
@@ -289,6 +289,9 @@ SENTENCES = {
 """What to say of findings, by their kinds, or by the names of what all ranges share."""
 
 
+NOISE = "; or powers are read with noise, and what it leaves of the curve looks so: turn the antennas while recording"
+
+
 def sentence_of(finding: FoundOffset) -> str:
     """Return a finding as a sentence; where two causes leave the same trace, both are named."""
     own, others = finding.sessions
@@ -305,21 +308,27 @@ def sentence_of(finding: FoundOffset) -> str:
     return "; or ".join(SENTENCES[name].format(**words) for name in names)
 
 
-def shares_of_pairs(found: KnownDistances) -> tuple[Floats, Floats]:
-    """Return the share of reflected ranges of each pair (k,) and their mean detour (k,), metres; 0 if not fitted."""
-    values = found.values
+def reflected_pairs(found: KnownDistances) -> tuple[Floats, Floats, Bools]:
+    """Return the share of reflected ranges of each pair (k,), their mean detour in metres, and where most surely are.
+
+    The log odds are held against their standard errors, with errors that last; all are 0 where they are not fitted.
+    """
+    values, optimum, count = found.values, found.searches[-1].optimum, len(found.model.pairs.ends)
     if not isinstance(found.searches[-1].rows.errors, Mixture) or "odds of pair" not in values:
-        return np.zeros(len(found.model.pairs.ends)), np.zeros(len(found.model.pairs.ends))
-    share = 1 / (1 + np.exp(-values["odds level"] - values["odds of pair"]))
+        return np.zeros(count), np.zeros(count), np.zeros(count, dtype=bool)
+    which = np.zeros((len(optimum.x), count))
+    which[optimum.layout.where["odds level"]], which[optimum.layout.where["odds of pair"]] = 1.0, np.eye(count)
+    odds = which.T @ optimum.x
+    variance = found.persistence.factor * np.einsum("pk,pk->k", which, np.asarray(optimum.covariance @ which))
     detour = np.exp(values["least detour"]) + np.exp(values["detour level"] + values["detour of pair"])
-    return share, detour
+    return expit(odds), detour, np.asarray(count * ndtr(-odds / np.sqrt(variance)) < OF_A_FIT)
 
 
 def _reflected(found: KnownDistances) -> Iterator[str]:
     """Name the pairs of which hardly a range is direct, or else a tag about half of whose ranges are not."""
-    share, detour_m = shares_of_pairs(found)
+    share, detour_m, most = reflected_pairs(found)
     ends, far = found.model.pairs.ends, detour_m > NAMED_DETOUR_M
-    hidden, tags = np.flatnonzero((share > HIDDEN) & far).tolist(), np.unique(ends).tolist()
+    hidden, tags = np.flatnonzero((share > HIDDEN) & far & most).tolist(), np.unique(ends).tolist()
     for number in hidden:
         a, b = ends[number].tolist()
         others = [tag for tag in tags if tag not in (a, b)]

@@ -61,15 +61,12 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
         else "",
         _without_curve(found, ranges, residuals_m) if model.curve is None else "",
         "curve only: the delays are those that were given; what they have in common that is wrong is in the curve, "
-        f"where they differ it stays in the ranges (medians of pairs lie within {_apart(ranges, residuals_m)})"
+        f"where they differ it stays in the ranges (medians of pairs lie within "
+        f"{as_length(float(np.ptp(medians(residuals_m, pairs_of(ranges.initiator, ranges.target).number))))})"
         if fixed and set(model.tags) <= set(fixed)
         else "",
     )
     yield from filter(None, notes)
-
-
-def _apart(ranges: Ranges, residuals_m: Floats) -> str:
-    return as_length(float(np.ptp(medians(residuals_m, pairs_of(ranges.initiator, ranges.target).number))))
 
 
 def _without_curve(found: KnownDistances, ranges: Ranges, residuals_m: Floats) -> str:

@@ -207,12 +207,20 @@ class QuickFit:
         return replace(found, x=found._search(found.ranges, x, steps=20).x)
 
     def _search(self, ranges: RangeRows, x: Floats, steps: int) -> Optimum:
-        return maximize([ranges, *self.start.gauge], Priors(ranges.layout), x, steps=steps, evidence_steps=0)
+        priors = Priors(ranges.layout)
+        # The roughness of the curve is estimated in the first fit.
+        priors.recall(self.start.optimum.priors.by_key())
+        return maximize([ranges, *self.start.gauge], priors, x, steps=steps, evidence_steps=0)
 
     @cached_property
     def ranges(self) -> RangeRows:
         """The ranges (n,) as rows."""
         return self.model.build(self.error, self.start.rows.errors, only=tuple(self.start.optimum.layout.where))[1]
+
+    @property
+    def ends(self) -> Ints:
+        """The two tags of each range (n, 2)."""
+        return np.asarray(self.model.pairs.ends[self.model.pairs.number])
 
     @cached_property
     def residual(self) -> Floats:
@@ -281,13 +289,8 @@ class QuickFit:
         ends = (self.model.pairs.ends[:, :, None] == self.model.tags).sum(axis=1)
         taken = found.information @ ends
         left = np.eye(len(ends)) - taken @ np.linalg.pinv(ends.T @ taken, rcond=1e-9, hermitian=True) @ ends.T
-        return replace(
-            found,
-            # Constants are in ns.
-            total=METRES_A_NS * left @ found.total,
-            covariance=left @ found.covariance @ left.T,
-            information=left @ found.information,
-        )
+        # Constants are in ns.
+        return replace(found, total=METRES_A_NS * found.total).turned(left)
 
     def offset(self, derivative: Floats, *, tolerance: float = 0.0, tried: int = 1) -> tuple[float, float]:
         """Return an offset of which each range has so much (n,), and the p-value if it is the tolerance at most.

@@ -132,22 +132,22 @@ def reflections(view: RecordingView) -> Iterator[Candidate]:
     if fit is None or len(fit.rows) < 150:
         return
     long = fit.reflected > 0.5
-    evidence = f"about {_in_words(fit, long)} on average"
-    if view.quick_fit is None:
-        yield from _of_tags(fit, long, evidence)
-        return
-    lasting = [
-        one for pair in range(len(fit.model.pairs.ends)) for one in _of_pair(fit, pair, long) if one.p_value < BUDGET
-    ]
+    lasting = [one for pair in range(len(fit.model.pairs.ends)) for one in _of_pair(fit, pair, long)]
+    lasting = sorted((one for one in lasting if one.p_value < BUDGET), key=lambda one: -one.gain)
     if lasting:
-        lasting.sort(key=lambda one: -one.gain)
         more = f"; and {len(lasting) - 4} pairs more" if lasting[4:] else ""
         named = "; ".join(one.evidence for one in lasting[:4]) + more
         yield Candidate("reflections that last", named, min(one.p_value for one in lasting))
-    else:
-        far = long & (fit.residual > NAMED_DETOUR_M)
-        p_value = positive(np.array([np.mean(far[s]) - MANY_SHARE for s in stretches(len(long))]))
-        yield Candidate("reflections", evidence, p_value, {"more": "move antennas away from bodies and walls"})
+        return
+    far = long & (fit.residual > NAMED_DETOUR_M)
+    p_value = positive(np.array([np.mean(far[s]) - MANY_SHARE for s in stretches(len(far))]))
+    evidence, remedy = f"about {_in_words(fit, long)} on average", "move antennas away from bodies and walls"
+    if view.quick_fit is None:
+        remedy = "see what stands near these antennas; pairs have too few ranges to say more: record for longer"
+        for tag, own in _of_tags(fit, far).items():
+            p_value = min(p_value, own)
+            evidence += f"; tag {tag}: {_in_words(fit, long, (fit.ends == tag).any(axis=1))}"
+    yield Candidate("reflections", evidence, p_value, {"more": remedy})
 
 
 def _in_words(fit: QuickFit, long: Bools, mine: Bools | slice = slice(None)) -> str:
@@ -192,22 +192,15 @@ def _life_s(reflected: Floats, step_s: float) -> float:
     return float(min(1 / max(rate * (1 - reflected.mean()), 1e-9), step_s * len(reflected) / 4))
 
 
-def _of_tags(fit: QuickFit, long: Bools, evidence: str) -> Iterator[Candidate]:
-    """Where pairs have a few ranges each: the tags of whose ranges many more are reflected than of the others'."""
-    p_value, tags = more_often(int(long.sum()), len(long), MANY_SHARE), np.unique(fit.model.pairs.ends).tolist()
+def _of_tags(fit: QuickFit, far: Bools) -> dict[int, float]:
+    """Return the p-values of tags of whose ranges more are reflected than the others' share and the tolerance."""
+    found, tags = {}, np.unique(fit.ends).tolist()
     for tag in tags:
-        mine = (fit.model.pairs.ends == tag).any(axis=1)[fit.model.pairs.number]
-        others = float(np.mean(long[~mine])) if (~mine).any() else float(np.mean(long))
-        p_tag = more_often(int(long[mine].sum()), int(mine.sum()), max(others, LEAST_SHARE), tried=len(tags))
-        if p_tag < BUDGET:
-            p_value = min(p_value, p_tag)
-            evidence += f"; tag {tag}: {_in_words(fit, long, mine)}"
-    yield Candidate(
-        "reflections",
-        evidence,
-        p_value,
-        {"more": "see what stands near these antennas; pairs have too few ranges to say more: record for longer"},
-    )
+        mine = (fit.ends == tag).any(axis=1)
+        others = far[~mine] if not mine.all() else far
+        usual = min(float(np.mean(others)) + MANY_SHARE, 1.0)
+        found[tag] = more_often(int(far[mine].sum()), int(mine.sum()), usual, tried=len(tags))
+    return {tag: p_value for tag, p_value in found.items() if p_value < BUDGET}
 
 
 PAIR_M: Final = 0.04
@@ -224,22 +217,17 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
     fit = view.quick_fit or quick_fit([view], ranges_a_pair=10)
     if fit is None:
         return
-    tested = fit.test_constants()
-    total, information = tested.total, tested.information
+    tested, several = fit.test_constants(), len(fit.model.pairs.names)
+    top = [fit.model.pairs.names.index(one.names[0]) for one in findings(tested, several, BUDGET, PAIR_M)]
     # What offsets that are found leave of the others.
-    top = [
-        fit.model.pairs.names.index(name)
-        for one in findings(tested, len(fit.model.pairs.names), BUDGET, PAIR_M)
-        for name in one.names[:1]
-    ]
-    rest = total - information[:, top] @ np.linalg.lstsq(information[np.ix_(top, top)], total[top], rcond=1e-9)[0]
-    spread_m = robust_spread(rest / np.maximum(np.diag(information), 1e-300), 0.0)
+    rest = tested.beside(top).total / np.maximum(np.diag(tested.information), 1e-300)
+    spread_m = robust_spread(rest, 0.0)
     # Where reflections make all pairs differ, one of them has to stand out among these.
     # Biases by power of two pairs may differ by 0.2 m (published curves), where the pairs share no power.
-    tolerance = max(PAIR_M, float(special.ndtri(1 - BUDGET / (2 * len(total)))) * spread_m) + (
+    tolerance = max(PAIR_M, float(special.ndtri(1 - BUDGET / (2 * several))) * spread_m) + (
         0.2 if view.standing_m is not None else 0.0
     )
-    for one in findings(tested, len(total), BUDGET, tolerance):
+    for one in findings(tested, several, BUDGET, tolerance):
         yield Candidate(
             "pairs that do not close",
             f"ranges of pair {' or pair '.join(one.names)} are {100 * abs(one.offset_m):.1f} cm too "

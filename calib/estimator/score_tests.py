@@ -8,7 +8,7 @@ unknowns that are in the fit already, with a variance by evidence, the same is a
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import sparse
@@ -128,6 +128,23 @@ class Tested:
     lasting: Persistence
     blocks: int
 
+    def turned(self, step: Floats) -> Tested:
+        """Return the slopes of other offsets: those that unit offsets make are the rows of a step (m, k)."""
+        return replace(
+            self,
+            total=step @ self.total,
+            covariance=step @ self.covariance @ step.T,
+            information=step @ self.information @ step.T,
+            effects=self.effects @ step.T,
+        )
+
+    def beside(self, fitted: Sequence[int]) -> Tested:
+        """Return the slopes with some offsets fitted too: the others keep what these do not explain."""
+        which, step = np.array(fitted, dtype=np.int64), np.eye(len(self.total))
+        own = self.information[np.ix_(which, which)]
+        step[:, which] -= self.information[:, which] @ np.linalg.pinv(own, rcond=1e-9, hermitian=True)
+        return self.turned(step)
+
 
 class Slopes:
     """The slopes of a fit's ranges by the residual and by all unknowns, as sums and products that tests are made of.
@@ -167,18 +184,23 @@ class Slopes:
         """Return a family's efficient slopes."""
         return self.tests([family])[0]
 
-    def tests(self, families: Sequence[Family]) -> list[Tested]:
-        """Return the efficient slopes of families, whose sums are taken in one pass over the ranges."""
-        sums = self._sums([family.derivative for family in families])
+    def tests(self, families: Sequence[Family], more: Floats | None = None) -> list[Tested]:
+        """Return the efficient slopes of families, whose sums are taken in one pass over the ranges.
+
+        With derivatives of the ranges by one offset `more` (n,), each family has that one as its last.
+        """
+        sums = self._sums([family.derivative for family in families], more)
         return [self._tested(family, own) for family, own in zip(families, sums, strict=True)]
 
-    def _sums(self, derivatives: Sequence[Derivative | sparse.csr_matrix]) -> list[list[Floats]]:
-        """Return sums over all ranges for offsets with derivatives (n, k) of given ranges.
+    def _sums(
+        self, derivatives: Sequence[Derivative | sparse.csr_matrix], more: Floats | None = None
+    ) -> list[list[Floats]]:
+        """Return sums over all ranges for offsets with derivatives (n, k) of given ranges, and for one `more` (n,).
 
         By block of time, those of slopes (blocks, k) and of what residuals know (blocks, k); then what offsets know of
         each other (k, k), and what they share with the unknowns (k, p).
         """
-        (blocks, size), counts = self.own.shape, [each.shape[1] for each in derivatives]
+        (blocks, size), counts = self.own.shape, [each.shape[1] + (more is not None) for each in derivatives]
         sums = [[np.zeros(shape) for shape in ((blocks, k), (blocks, k), (k, k), (k, size))] for k in counts]
         for which, terms in self._pieces():
             in_block = self.blocks.summing(self.order[which])
@@ -188,6 +210,9 @@ class Slopes:
             ]
             for own, derivative in zip(sums, derivatives, strict=True):
                 kept = derivative[self.order[which]]
+                if more is not None:
+                    last = sparse.csr_matrix(more[self.order[which], None])
+                    kept = sparse.csr_matrix(sparse.hstack([kept, last]))
                 told = sparse.diags(self.tells[which])
                 own[0] += (in_block @ sparse.diags(self.score[which]) @ kept).toarray()
                 own[1] += (in_block @ told @ kept.power(2)).toarray()
@@ -200,11 +225,11 @@ class Slopes:
         plain, known, square, link = sums
         taken = self._taken(link, family.fitted)
         efficient, information = plain - self.own @ taken.T, square - taken @ link.T
-        whole = max(float(np.diag(square).max()), 1e-300)
+        whole = max(float(np.diag(square)[: family.derivative.shape[1]].max()), 1e-300)
         total = efficient.sum(axis=0)
         if len(family.fitted):
             # The quadratic that the likelihood is near its top says what the slopes were without these unknowns.
-            total = total + information @ self.optimum.x[family.fitted]
+            total = total + information[:, : len(family.fitted)] @ self.optimum.x[family.fitted]
         # An offset is in every block by as much as a block knows of it: it is no scatter between them.
         whose = known.sum(axis=0)
         share = np.where(whose > 0, efficient.sum(axis=0) / np.where(whose > 0, whose, 1.0), 0.0)
@@ -255,8 +280,8 @@ def findings(tested: Tested, several: int, rate: float, tolerance_m: float = 0.0
     Offsets up to the tolerance are no finding.
     """
     family, freedom = tested.family, max(tested.lasting.freedom, 3.0)
-    total, covariance, information = tested.total.copy(), tested.covariance.copy(), tested.information.copy()
     for _ in range(MOST_NAMED):
+        total, covariance, information = tested.total, tested.covariance, tested.information
         std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         known = np.diag(information) > REACHED * tested.whole
         beyond = np.maximum(np.abs(total) - tolerance_m * np.diag(information), 0.0)
@@ -287,10 +312,7 @@ def findings(tested: Tested, several: int, rate: float, tolerance_m: float = 0.0
             sessions=sessions,
             fitted=len(family.fitted) > 0,
         )
-        # With this offset fitted too, the others keep what it does not explain.
-        step = np.eye(len(total))
-        step[:, top] -= information[:, top] / information[top, top]
-        total, covariance, information = step @ total, step @ covariance @ step.T, step @ information @ step.T
+        tested = tested.beside([top])
 
 
 def widening(tested: Tested) -> Floats:

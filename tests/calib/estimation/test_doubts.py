@@ -133,3 +133,16 @@ def test_a_sequential_fit_takes_the_curve_for_no_wall():
     ranges = replace(ranges, raw_m=ranges.raw_m + 0.15 * np.exp(-lifted / 0.4))
     said = calib.fit(ranges, sequential=True).warnings
     assert not any("places" in one or "with the distance" in one for one in said)
+
+
+@pytest.mark.parametrize(("noise_db", "seed", "place"), [(0.3, 101, False), (1.0, 5, True)])
+def test_noise_of_powers_that_follow_the_distance_is_not_called_places_alone(noise_db, seed, place):
+    """Nothing belongs to places here; with much noise in the powers the curve is too flat, which looks so."""
+    import uwbsim
+
+    radio = {"first_path_at_1m_dbm": -78.0, "shadowing_db": 0.0, "saturation_dbm": -50.0, "power_noise_db": noise_db}
+    settings = {"run.duration_s": 12.0, "run.seed": seed} | {f"radio.{name}": value for name, value in radio.items()}
+    warnings = calib.fit(uwbsim.simulate(uwbsim.load("broadcast", settings))).warnings
+    places = [text for text in warnings if text.startswith(("errors belong", "ranges grow", "pair"))]
+    assert len(places) == place
+    assert all("or powers are read with noise" in text for text in places)
