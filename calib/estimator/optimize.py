@@ -138,7 +138,9 @@ def _with_logarithms(known: Matrix, layout: Layout, slope: Floats) -> Matrix:
     nothing, whose squares are small, shortens most steps.
     """
     more = np.where(layout.logarithms(), np.maximum(-slope, slope / LONGER), 0.0)
-    return known + (sparse.diags(more, format="csc") if sparse.issparse(known) else np.diag(more))
+    if sparse.issparse(known):
+        return sparse.csc_matrix(known + sparse.diags(more))
+    return np.asarray(known + np.diag(more))
 
 
 def _damped(moved: Floats, fell: Floats, expected: Floats) -> Floats:
