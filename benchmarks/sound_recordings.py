@@ -59,7 +59,7 @@ WORLDS: Final[dict[str, Callable[[int], Any]]] = {
 }
 """Worlds without a fault: some of the simulator, four of a generator that shares nothing with it."""
 
-SETTINGS: Final = {"tdoa": {"delays_only": True}, "receptions": {"use": "receptions"}}
+SETTINGS: Final[dict[str, dict[str, Any]]] = {"tdoa": {"delays_only": True}, "receptions": {"use": "receptions"}}
 """Settings of fits by words in the names of worlds: anchors that stand still do not show a curve."""
 
 TRUE_OF: Final = {

@@ -24,7 +24,7 @@ class UnanswerableError(CalibError, ValueError):
 
 
 class LeftOutWarning(PlainWarning):
-    """Ranges of pairs that a calibration does not determine are left out; names the pairs."""
+    """Measurements that are not corrected: ranges of pairs that a calibration does not determine, differences."""
 
 
 class WeakHeadingWarning(PlainWarning):

@@ -80,6 +80,11 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
     with Recording.open(source, memory_mb=READING_MB) as recording:
         if "calibration" in recording.meta():
             raise BadInputError(f"{source}: its ranges are corrected already; apply to the original")
+        if (bare := recording.count("differences")) and not recording.count("exchanges"):
+            raise BadInputError(
+                f"{source}: holds {bare} differences of arrival and no ranges; `calib localize` corrects them as it "
+                "uses them, with `use` receptions"
+            )
         tags, counts, left_out, why = recording.tags(), np.zeros(3, dtype=np.int64), 0, ""
         meta = {"calibration": calibration.provenance}
         with recording.copying(output, without=("exchanges", "corrected"), meta=meta, force=force) as written:
@@ -94,6 +99,8 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
                 raise BadInputError(why)
     if left_out:
         warnings.warn(f"{why}; {left_out} ranges are left out", LeftOutWarning, stacklevel=3)
+    if bare:
+        warnings.warn(f"{bare} differences of arrival without stamps stay as they were", LeftOutWarning, stacklevel=3)
     return Applied(*counts.tolist())
 
 

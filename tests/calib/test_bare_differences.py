@@ -6,6 +6,7 @@ planted, and logs by how much farther it is from one anchor than from another.
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -191,11 +192,12 @@ def test_the_other_sign_is_doubted_without_poses(folder):
         (("fit", "d.uwb", "-o", "x.json", "--delays-only"), ["d.uwb", "3200 differences", "--use receptions"], 1),
         (("evaluate", "d.uwb", "-c", "../fit.json"), ["d.uwb", "3200 differences", "no exchanges"], 1),
         (("localize", "d.uwb", "-c", "../fit.json"), ["d.uwb", "3200 differences", "--use receptions"], 1),
+        (("apply", "d.uwb", "-c", "../fit.json", "-o", "x.uwb"), ["d.uwb", "3200 differences", "--use receptions"], 2),
     ],
 )
 def test_what_does_not_go_with_differences_is_said(folder, words, naming, status):
     processes.refuse("calib", *words, cwd=folder / "fly", naming=naming, status=status)
-    assert not (folder / "fly" / "x.json").exists()
+    assert [path.name for path in (folder / "fly").glob("x.*")] == []
 
 
 @pytest.mark.parametrize(
@@ -205,7 +207,7 @@ def test_an_anchor_without_a_place_is_named(folder, words):
     contents = uwblink.load(folder / "fly/d.uwb")
     lost = contents.differences["plus"].copy()
     lost[7] = 77
-    replace(contents, differences=contents.differences | {"plus": lost}).save(folder / "lost.uwb", force=True)
+    replace(contents, differences={**contents.differences, "plus": lost}).save(folder / "lost.uwb", force=True)
     naming = ["lost.uwb", "anchor 77", "no place"]
     processes.refuse("calib", words[0], "lost.uwb", *words[1:], cwd=folder, naming=naming, status=2)
 
@@ -214,7 +216,7 @@ def test_ranges_and_differences_are_used_together_and_fitted_apart(folder):
     contents = uwblink.load(folder / "fly/d.uwb")
     time_s = np.arange(0.1, 19.0, 0.1)
     truth = np.linalg.norm(ANCHORS[0] - place_m(time_s), axis=1)
-    none = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(len(time_s), dtype=np.int64))
+    none: Any = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(len(time_s), dtype=np.int64))
     when_ns = np.rint(time_s * 1e9).astype(np.int64)
     ranges = uwblink.Exchanges.from_arrays(TAG, 1, time_ns=when_ns, protocol="ss", range_m=truth, **none)
     both = replace(contents, exchanges=ranges)
@@ -226,6 +228,9 @@ def test_ranges_and_differences_are_used_together_and_fitted_apart(folder):
         undetermined_splits=(),
     )
     (found,) = calib.localize(both, known, Settings(use="receptions"))
+    both.save(folder / "both.uwb", force=True)
+    with pytest.warns(calib.errors.LeftOutWarning, match="3200 differences of arrival"):
+        assert calib.apply(folder / "both.uwb", known, folder / "both-corrected.uwb", force=True).count == len(time_s)
     assert (found.arrivals, len(found.tracks["raw"].time_ns)) == (3200, 3200 + len(time_s))
     assert found.rmse_m["variance"].mean() < 0.045
 

@@ -33,7 +33,7 @@ def test_a_search_ends_at_one_optimum_of_unknowns_and_weights(ranges, most):
         known = zip(optimum.priors.weights, optimum.priors.all, strict=True)
         weights = [w if prior.bounds is None else w * np.exp(rng.normal()) for w, (_, prior) in known]
         # By a standard error each, logarithms by a half at most: farther away there may be other optima.
-        away = np.minimum(np.sqrt(np.diag(optimum.covariance)), 0.5) * rng.normal(size=len(optimum.x))
+        away = np.minimum(np.sqrt(np.diag(np.asarray(optimum.covariance))), 0.5) * rng.normal(size=len(optimum.x))
         again = maximize(rows, Priors(optimum.layout, weights), optimum.x + away, asked=asked)
         assert again.success
         assert again.steps < 25
