@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import expit
 
-from calib.estimator.optimize import Optimum, maximize
+from calib.estimator.optimize import maximize
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows
 from calib.estimator.unknowns import Layout, Prior, Priors, Unknown
 from calib.range_errors.densities import LONG_FACTOR, LongDetours
@@ -55,21 +55,13 @@ def error_unknowns(
     everyone, own = np.zeros((1, 1), dtype=np.int64), group[:, None]
     starts = {name: centre for name, (_, centre, _) in SHARED_LEVELS.items()} | {"noise": np.log(0.9 * spread_m)}
     unknowns = [
-        logarithms(kind, ("",), np.array([starts[name]]), Prior.of_deviation(deviation, centre))
+        Unknown(kind=kind, names=("",), start=np.array([starts[name]]), priors=(Prior.of_deviation(deviation, centre),))
         for name, (kind, centre, deviation) in SHARED_LEVELS.items()
     ]
-    each = np.zeros(len(names))
-    unknowns += [
-        logarithms(f"{name} of {whose}", names, each, Prior.of_spread(*spread)) for name, spread in SCATTER.items()
-    ]
+    unknowns += [scattered(f"{name} of {whose}", names, spread) for name, spread in SCATTER.items()]
     parts = [Part(parameter=name, kind=kind, columns=everyone) for name, (kind, *_) in SHARED_LEVELS.items()]
     parts += [Part(parameter=name, kind=f"{name} of {whose}", columns=own) for name in SCATTER]
     return unknowns, parts
-
-
-def logarithms(kind: str, names: tuple[str, ...], start: Floats, *priors: Prior) -> Unknown:
-    """Return unknowns that are logarithms, or log odds."""
-    return Unknown(kind=kind, names=names, start=start, priors=priors, logarithm=True)
 
 
 def scattered(kind: str, names: tuple[str, ...], spread: tuple[float, float, float]) -> Unknown:
@@ -93,26 +85,6 @@ class GroupedErrors:
     outliers: Floats
 
 
-OTHER_KIND = 2.0
-"""Log odds of the commoner kind of detours where another optimum is looked for: 12 % are of the other kind."""
-
-
-def _likelier_kinds(rows: RangeRows, layout: Layout) -> Optimum:
-    """Return the better of two optima: a few detours are longer than most, or a few are shorter.
-
-    The other one is looked for from where the kinds have changed places, with the mean detour as it was.
-    """
-    found = maximize([rows], Priors(layout), layout.start())
-    start = found.by_kind()
-    long = OTHER_KIND * np.where(start["long detours"] > 0, -1.0, 1.0)
-    before, after = (
-        LongDetours(share=float(expit(u[0])), factor=LONG_FACTOR).mean for u in (start["long detours"], long)
-    )
-    start |= {"long detours": long, "detour level": start["detour level"] + np.log(before / after)}
-    other = maximize([rows], Priors(layout), layout.start(start | {"least detour": np.log([LEAST_DETOUR_M])}))
-    return max(found, other, key=Optimum.log_marginal)
-
-
 def fit_grouped_errors(groups: Sequence[Floats], most: int = 20_000) -> GroupedErrors:
     """Return the maximum likelihood error model of groups of errors in metres; larger groups are thinned evenly to
     `most`.
@@ -131,12 +103,13 @@ def fit_grouped_errors(groups: Sequence[Floats], most: int = 20_000) -> GroupedE
     unknowns = [unknown for unknown in unknowns if not unknown.kind.startswith("noise")]
     parts = [part for part in parts if part.kind != "noise level"]
     log_spread = np.log(spread)
-    unknowns.append(logarithms("noise of group", names, log_spread, Prior.of_deviation(2.0, log_spread)))
+    wide = (Prior.of_deviation(2.0, log_spread),)
+    unknowns.append(Unknown(kind="noise of group", names=names, start=log_spread, priors=wide))
     centre = Unknown(kind="centre", names=names, start=np.zeros(count), priors=(Prior.of_deviation(100.0),))
     parts.append(Part(parameter=RESIDUAL, kind="centre", columns=group[:, None], values=np.full((len(group), 1), -1.0)))
     layout = Layout((centre, *unknowns))
     rows = RangeRows.of(error_m - middle[group], group, parts, Mixture(), layout)
-    found = _likelier_kinds(rows, layout)
+    found = maximize([rows], Priors(layout), layout.start())
     each = rows.error_slopes(found.x, ())
     long = LongDetours(share=float(expit(found.of("long detours")[0])), factor=LONG_FACTOR)
     of_centre = layout.where["centre"]

@@ -52,7 +52,6 @@ class ExpectedErrors:
     reflected: float
     detour_m: float = 0.3
     parameters: tuple[str, ...] = ()
-    dispersion: float = 1.0
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats]:
         """Return log densities and slopes of zero, and the information of each residual (n,)."""

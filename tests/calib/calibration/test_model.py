@@ -140,7 +140,17 @@ def full_recording(path):
         recording.append("cirs", [CirRow(9, 1, 1, 2, 741.25, tuple(range(1016)))])
         recording.append("overheard", [{name: float(k) for k, name in enumerate(TABLES["overheard"])}])
         # And not "corrected", which is what is made.
-        for table in ("imu", "height", "powers", "quality", "receptions", "temperature", "arrangements", "distances"):
+        for table in (
+            "imu",
+            "height",
+            "powers",
+            "quality",
+            "receptions",
+            "differences",
+            "temperature",
+            "arrangements",
+            "distances",
+        ):
             kinds = {"BIGINT": np.array([11]), "VARCHAR": np.array(["b1"]), "DOUBLE": np.array([0.5])}
             kinds |= {"USMALLINT": np.array([3])}
             recording.append(table, {name: kinds[kind] for name, kind in TABLES[table].items()})
