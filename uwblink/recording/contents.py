@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -164,17 +164,7 @@ class Contents:
 _LISTS: Final = ("cirs", "frames", "faults", "arrangements", "known_distances")
 """The tables that are held as lists of rows."""
 
-_COLUMNS: Final = (
-    "overheard",
-    "imu",
-    "height",
-    "powers",
-    "quality",
-    "temperature",
-    "receptions",
-    "differences",
-    "corrected",
-)
+_COLUMNS: Final = tuple(one.name for one in fields(Contents) if one.default_factory is dict and one.name != "meta")
 """The tables that are held as columns by name."""
 
 
