@@ -52,7 +52,7 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
     Returns the covariance (tags, tags) of the stated delays in ns^2 with what does not fit, and what to say of it.
     """
     slopes, louder, alone = found.slopes, change_per_decibel(found), len(found.searches) > 1
-    readings = None if alone else misread(found.model, louder)
+    readings = None if alone else errors_of_readings(found.model, louder)
     tested = slopes.tests(list(families(found, louder, beside_curve=not alone)), readings)
     if readings is not None:
         # Powers are read with noise in every recording, and alternatives are tested beside it.
@@ -165,7 +165,7 @@ def _of_sessions(found: KnownDistances, tags: list[str], ends: Ints) -> Family:
     )
 
 
-def misread(model: RangeModel, louder_m: Floats) -> Floats | None:
+def errors_of_readings(model: RangeModel, louder_m: Floats) -> Floats | None:
     """Return the error (n,) that noise of power readings leaves, over its root mean square; None where there is none.
 
     The error that goes with the power itself is left in part, and goes with what distance lets expect of the power
@@ -248,7 +248,9 @@ def _weighed(
         if one.kind != "readings" and (cause or (moved > MATTERS and large)):
             # A tag that was moved stands out in more than one span of time: once is enough.
             matter.setdefault((one.kind, one.names), one)
-    noise = NOISE if any(one.kind == "readings" for one in findings) else ""
+    noise = ""
+    if any(one.kind == "readings" for one in findings):
+        noise = "; or powers are read with noise, which changes ranges alike: turn the antennas while recording"
     return covariance, [
         *(sentence + noise for sentence in said),
         *(sentence_of(one) + noise * (one.kind == "shared") for one in matter.values()),
@@ -287,9 +289,6 @@ SENTENCES = {
     "and ranges are not of the same time; see to the clocks (`calib doctor` says by how much)",
 }
 """What to say of findings, by their kinds, or by the names of what all ranges share."""
-
-
-NOISE = "; or powers are read with noise, and what it leaves of the curve looks so: turn the antennas while recording"
 
 
 def sentence_of(finding: FoundOffset) -> str:
