@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.calibration.power_curves import lift
 from calib.data.arrivals import Arrivals
-from calib.estimator.grouped_errors import error_unknowns, scattered
+from calib.estimator.grouped_errors import error_unknowns, logarithms, scattered
 from calib.estimator.range_model import METRES_A_NS, OFFSETS, RangeModel, SplineValues
 from calib.estimator.range_rows import OF_ERRORS, RESIDUAL, Errors, Mixture, Part, RangeRows
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
@@ -92,11 +92,11 @@ class ArrivalModel:
         """Return the error model with its unknowns and parts, started from robust spreads of residuals (n,)."""
         spread = max(robust_spread(residual), 1e-3)
         unknowns, parts = error_unknowns(spread, self.listeners, self.listener, whose="listener")
-        side = Unknown(kind="late share", names=("",), start=np.zeros(1), priors=(Prior.of_deviation(1.0),))
+        side = logarithms("late share", ("",), np.zeros(1), Prior.of_deviation(1.0))
         everyone = np.zeros((1, 1), dtype=np.int64)
         parts.append(Part(parameter="side", kind="late share", columns=everyone))
         return (
-            Mixture(parameters=(*OF_ERRORS, "side")),
+            Mixture(parameters=(*OF_ERRORS, "side"), dispersion=self.design_effect),
             [replace(one, kind=HEARD + one.kind) for one in (*unknowns, side)],
             [replace(one, kind=HEARD + one.kind) for one in parts],
         )
@@ -104,7 +104,7 @@ class ArrivalModel:
     def rows(self, layout: Layout, errors: Errors, more: Sequence[Part] = ()) -> RangeRows:
         """Return the rows of all differences of arrival, with the parts whose unknowns a layout has."""
         used = [part for part in (*self.parts, *more) if part.kind in layout.where]
-        return replace(RangeRows.of(self.residual, self.key, used, errors, layout), design_effect=self.design_effect)
+        return RangeRows.of(self.residual, self.key, used, errors, layout)
 
     def sample(self, rows: RangeRows, chosen: Ints | None) -> RangeRows:
         """Return those rows that belong to some exchanges, all for None."""

@@ -14,7 +14,7 @@ from scipy.special import expit
 from calib.estimator.optimize import maximize
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows
 from calib.estimator.unknowns import Layout, Prior, Priors, Unknown
-from calib.range_errors.densities import LONG_FACTOR, LongDetours
+from calib.range_errors.densities import LEAST_DETOUR_M, LONG_FACTOR, LongDetours
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 
@@ -23,16 +23,15 @@ NOISE_M, NOISE_WORTH = 0.06, 20.0
 in the open (its user manual, 8.3), which gives 3 to 10 cm. Half or twice the number moves delays of worlds by less
 than 0.01 standard errors (`python -m benchmarks.constants`)."""
 
-DETOUR_M, DETOUR_WORTH, LEAST_DETOUR_M = 0.2, 5.0, 0.03
-"""Prior of the mean of the shorter kind of exponential detours, the number of reflections that it counts for, and the
-least detour (published detours are 0.1 to 0.5 m: MILUV, STAR-loc). Half or twice the number, or the least detour, moves
-delays of worlds by 0.01 standard errors (`python -m benchmarks.constants`)."""
+DETOUR_M, DETOUR_WORTH = 0.2, 5.0
+"""Prior of the mean of the shorter kind of exponential detours, and the number of reflections that it counts for
+(published detours are 0.1 to 0.5 m: MILUV, STAR-loc). Half or twice the number moves delays of worlds by 0.01 standard
+errors (`python -m benchmarks.constants`)."""
 
 SHARED_LEVELS = {
     "noise": ("noise level", np.log(NOISE_M), (2 * NOISE_WORTH) ** -0.5),
     "odds": ("odds level", -2.2, 2.0),  # a reflection: one range in ten; 1.5 to 45 % within one standard deviation
     "detour": ("detour level", np.log(DETOUR_M), DETOUR_WORTH**-0.5),
-    "least": ("least detour", np.log(LEAST_DETOUR_M), 2**0.5),
     "outliers": ("outliers", -6.0, 3.0),
     "long": ("long detours", -1.1, 1.0),  # of the longer kind: one reflection in four; 11 to 48 %
 }
@@ -55,13 +54,21 @@ def error_unknowns(
     everyone, own = np.zeros((1, 1), dtype=np.int64), group[:, None]
     starts = {name: centre for name, (_, centre, _) in SHARED_LEVELS.items()} | {"noise": np.log(0.9 * spread_m)}
     unknowns = [
-        Unknown(kind=kind, names=("",), start=np.array([starts[name]]), priors=(Prior.of_deviation(deviation, centre),))
+        logarithms(kind, ("",), np.array([starts[name]]), Prior.of_deviation(deviation, centre))
         for name, (kind, centre, deviation) in SHARED_LEVELS.items()
     ]
-    unknowns += [scattered(f"{name} of {whose}", names, spread) for name, spread in SCATTER.items()]
+    each = np.zeros(len(names))
+    unknowns += [
+        logarithms(f"{name} of {whose}", names, each, Prior.of_spread(*spread)) for name, spread in SCATTER.items()
+    ]
     parts = [Part(parameter=name, kind=kind, columns=everyone) for name, (kind, *_) in SHARED_LEVELS.items()]
     parts += [Part(parameter=name, kind=f"{name} of {whose}", columns=own) for name in SCATTER]
     return unknowns, parts
+
+
+def logarithms(kind: str, names: tuple[str, ...], start: Floats, *priors: Prior) -> Unknown:
+    """Return unknowns that are logarithms, or log odds."""
+    return Unknown(kind=kind, names=names, start=start, priors=priors, logarithm=True)
 
 
 def scattered(kind: str, names: tuple[str, ...], spread: tuple[float, float, float]) -> Unknown:
@@ -103,8 +110,7 @@ def fit_grouped_errors(groups: Sequence[Floats], most: int = 20_000) -> GroupedE
     unknowns = [unknown for unknown in unknowns if not unknown.kind.startswith("noise")]
     parts = [part for part in parts if part.kind != "noise level"]
     log_spread = np.log(spread)
-    wide = (Prior.of_deviation(2.0, log_spread),)
-    unknowns.append(Unknown(kind="noise of group", names=names, start=log_spread, priors=wide))
+    unknowns.append(logarithms("noise of group", names, log_spread, Prior.of_deviation(2.0, log_spread)))
     centre = Unknown(kind="centre", names=names, start=np.zeros(count), priors=(Prior.of_deviation(100.0),))
     parts.append(Part(parameter=RESIDUAL, kind="centre", columns=group[:, None], values=np.full((len(group), 1), -1.0)))
     layout = Layout((centre, *unknowns))
@@ -118,7 +124,6 @@ def fit_grouped_errors(groups: Sequence[Floats], most: int = 20_000) -> GroupedE
         centre_std_m=np.sqrt(np.diag(found.covariance[of_centre, of_centre])),
         sigma_m=np.exp(found.of("noise of group")),
         reflected=np.bincount(group, each.reflected) / size,
-        detour_m=np.exp(found.of("least detour")[0])
-        + long.mean * np.exp(found.of("detour level") + found.of("detour of group")),
+        detour_m=LEAST_DETOUR_M + long.mean * np.exp(found.of("detour level") + found.of("detour of group")),
         outliers=np.bincount(group, 1 - each.inlier) / size,
     )

@@ -205,14 +205,17 @@ def robust_fit(  # noqa: PLR0913 - a search has that many sides
     if sample is not None and sample < len(error):
         # A fixed random choice: a regular one could coincide with the schedule of pairs.
         chosen = np.sort(np.random.default_rng(0).permutation(len(error))[:sample])
-    rows = [every if chosen is None else every.sample(chosen)]
+    rows, effects = [every if chosen is None else every.sample(chosen)], [1.0, heard.design_effect if heard else 1.0]
     if heard is not None:
         rows.append(heard.sample(heard.rows(layout, every.errors), chosen))
     priors, steps = Priors(layout), 0
     for turn in range(2 if start is not None else 4):
         residuals = [each.residuals(x) for each in rows]
         scales = [scale_m or max(SCALE_OF_SPREAD * robust_spread(r), LEAST_SCALE_M) for r in residuals]
-        errors = [Robust(weights=weights, scale_m=s).tempered(r) for s, r in zip(scales, residuals, strict=True)]
+        errors = [
+            Robust(weights=weights, scale_m=s).tempered(r, effect)
+            for s, r, effect in zip(scales, residuals, effects, strict=False)
+        ]
         rows = [replace(each, errors=own) for each, own in zip(rows, errors, strict=True)]
         found = maximize([*rows, *gauge], priors, x, steps=15, evidence_steps=15 * (turn > 0))
         x, steps = found.x, steps + found.steps
@@ -220,8 +223,8 @@ def robust_fit(  # noqa: PLR0913 - a search has that many sides
         found = maximize([*rows, *gauge], priors, x, steps=200, evidence_steps=0)
         x, steps = found.x, steps + found.steps
         final = [
-            replace(each, errors=replace(own.tempered(each.residuals(x)), least=None))
-            for each, own in zip(rows, errors, strict=True)
+            replace(each, errors=replace(own.tempered(each.residuals(x), effect), least=None))
+            for each, own, effect in zip(rows, errors, effects, strict=False)
         ]
         ended = maximize([*final, *gauge], priors, x, steps=20, evidence_steps=0)
         # With few ranges most may lie where the loss is concave; weights then stay in the place of the curvature.

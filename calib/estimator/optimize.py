@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 from calib.estimator.inverse import Inverse, Matrix, inverse_of
 from calib.estimator.rows import Rows, Sums, sum_rows
@@ -27,12 +28,12 @@ Half or twice as many change standard errors of worlds by 1 % (`python -m benchm
 MOST_STEPS = 100
 """Steps after which a search is given up: sound ones take ten to sixty."""
 
-LONGER = 4.0
-"""How many times longer a corrected step may be than one by the information alone, in standard errors: a judgement.
-Without a limit, logarithms of shares overflowed in a fit of 3.8 million ranges."""
+LONGER = 2.0
+"""How many times longer a corrected step may be than one by the information alone, in standard errors, and by how much
+a logarithm may grow: judgements. Without limits, logarithms of shares overflowed in a fit of 3.8 million ranges."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Optimum:
     """Where a search ended: unknowns `x` (p,), inverse of information and priors, and the rows' own information."""
 
@@ -53,6 +54,13 @@ class Optimum:
         """Return all unknowns by their kinds."""
         return {kind: self.x[where] for kind, where in self.layout.where.items()}
 
+    def log_marginal(self) -> float:
+        """Return the log likelihood with all unknowns integrated out (Laplace), less a constant of the rows."""
+        priors, free = self.priors, self.layout.free()
+        known = sparse.csc_matrix(self.information + priors.precision()).toarray()[np.ix_(free, free)]
+        weights = float(np.dot(priors.ranks, np.log(priors.weights)))
+        return self.value + 0.5 * weights - 0.5 * float(np.linalg.slogdet(known)[1])
+
 
 def maximize(
     rows: Sequence[Rows],
@@ -70,7 +78,8 @@ def maximize(
     `longest` returns which share of a step (p,) may be taken at most, where unknowns are not linear.
 
     Squared slopes are not quite the curvature: their inverse is corrected by the changes of slopes over the last steps
-    (L-BFGS: Nocedal and Wright 2006, algorithm 7.4). A likelihood that falls shortens the step.
+    (L-BFGS: Nocedal and Wright 2006, algorithm 7.4), and for steps by `_with_logarithms`. A likelihood that falls
+    shortens the step.
     """
     layout, free = priors.layout, priors.layout.free()
     most, near, shorter = MOST_STEPS if steps is None else steps, 0, 0
@@ -96,11 +105,11 @@ def maximize(
         best_x, sums, shorter = x, found, 0
         precision = priors.precision()
         known = sums.information + precision
-        covariance = inverse_of(known, free)
         slope = sums.gradient + priors.pull(x)
         bent = [(moved, _damped(moved, fell + precision @ moved, known @ moved)) for moved, fell in changes]
-        step = _corrected(covariance, slope, bent)
-        reach = float(slope @ (covariance @ slope)) / max(float(step @ known @ step), 1e-300)
+        quick = inverse_of(_with_logarithms(known, layout, sums.gradient), free)
+        step = _corrected(quick, slope, bent)
+        reach = float(slope @ (quick @ slope)) / max(float(step @ known @ step), 1e-300)
         step *= min(1.0, LONGER * reach**0.5) if reach > 0 else 1.0
         gain, best = float(slope @ step), value
         settled = gain < tolerance
@@ -111,23 +120,27 @@ def maximize(
         if near < evidence_steps:
             before = list(priors.weights)
             # At the start nothing has moved yet, and says nothing of how far it may.
-            priors.update(x + step, covariance)
+            priors.update(x + step, inverse_of(known, free))
             change = [abs(np.log(a / b)) for a, b in zip(priors.weights, before, strict=True)]
             settled = settled and max(change, default=0.0) < 0.05
             best = sums.value + priors.value(x)
         step *= 1.0 if longest is None else min(1.0, longest(step))
         promised = float(slope @ step)
         x = best_x + step
-    return Optimum(
-        layout=layout,
-        priors=priors,
-        x=best_x,
-        covariance=covariance,
-        information=sums.information,
-        value=best,
-        steps=taken,
-        success=settled,
-    )
+    return Optimum(layout, priors, best_x, inverse_of(known, free), sums.information, best, taken, settled)
+
+
+def _with_logarithms(known: Matrix, layout: Layout, slope: Floats) -> Matrix:
+    """Return what is known (p, p) with the curvature that logarithms have from a `slope` (p,) of the likelihood.
+
+    The curvature by a share or a length is about its squared slopes. By its logarithm the slope is taken off, so that
+    none falls by more than a factor e a step; by how much one grows is limited by `LONGER`. Without it a share of
+    nothing, whose squares are small, shortens most steps.
+    """
+    more = np.where(layout.logarithms(), np.maximum(-slope, slope / LONGER), 0.0)
+    if sparse.issparse(known):
+        return sparse.csc_matrix(known + sparse.diags(more))
+    return np.asarray(known + np.diag(more))
 
 
 def _damped(moved: Floats, fell: Floats, expected: Floats) -> Floats:

@@ -16,7 +16,7 @@ from calib.calibration.document import Split
 from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, knots_for, lift, lifted_power, populated
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimator.grouped_errors import error_unknowns, scattered
+from calib.estimator.grouped_errors import error_unknowns, logarithms, scattered
 from calib.estimator.identifiability import free_directions
 from calib.estimator.pattern_unknowns import KINDS, Directions
 from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
@@ -239,8 +239,9 @@ class RangeModel:
                 values = self.noise.values if share is None else share[:, None] * self.noise.values
                 for parameter, deviation in (("noise", 1.0), ("odds", 0.7)):
                     kind = f"{parameter} curve {name}".strip()
-                    priors = (rough, Prior.of_deviation(deviation))
-                    unknowns.append(Unknown(kind=kind, names=several, start=np.zeros(len(several)), priors=priors))
+                    unknowns.append(
+                        logarithms(kind, several, np.zeros(len(several)), rough, Prior.of_deviation(deviation))
+                    )
                     parts.append(Part(parameter=parameter, kind=kind, columns=self.noise.columns, values=values))
         return Mixture(), tuple(unknowns), tuple(parts)
 

@@ -24,7 +24,7 @@ from uwblink.arrays import Floats, Ints
 RESIDUAL = "residual"
 """The parameter that delays, curves and offsets add to."""
 
-OF_ERRORS = ("noise", "odds", "detour", "least", "outliers", "long")
+OF_ERRORS = ("noise", "odds", "detour", "outliers", "long")
 """The other parameters of an error's density; differences of arrival have "side" besides."""
 
 SHARED = "shared"
@@ -65,6 +65,11 @@ class Errors(Protocol):
         """Return which parameters it has beside the residual, for which there are parts."""
         ...
 
+    @property
+    def dispersion(self) -> float:
+        """Return by how much sums of slopes vary more than those of as many independent draws of the density."""
+        ...
+
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
         """Return log densities (n,), slopes by each parameter (n,) and what a residual tells (n,), or None.
 
@@ -84,6 +89,7 @@ class Mixture:
 
     expected: bool = False
     used: float = 0.0
+    dispersion: float = 1.0
     parameters: tuple[str, ...] = OF_ERRORS
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
@@ -130,11 +136,12 @@ class Robust:
     dispersion: float = 1.0
     parameters: tuple[str, ...] = ()
 
-    def tempered(self, residual: Floats) -> Robust:
-        """Return the loss divided by its dispersion at residuals (n,): squares of its slopes over its curvature."""
+    def tempered(self, residual: Floats, effect: float = 1.0) -> Robust:
+        """Return the loss with its dispersion at residuals (n,): squares of its slopes over its curvature, times the
+        `effect` of errors that correlate."""
         weight, slope = self.weights(residual / self.scale_m)
         square = float(np.mean((weight * residual / self.scale_m) ** 2))
-        return replace(self, dispersion=max(square / max(float(np.mean(slope)), 1e-3), 1e-9))
+        return replace(self, dispersion=effect * max(square / max(float(np.mean(slope)), 1e-3), 1e-9))
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
         """Return minus the loss (n,), its slope by the residual (n,) and what each tells (n,)."""
@@ -142,7 +149,7 @@ class Robust:
         weight, slope = self.weights(u)
         tells = (slope if self.least is None else np.maximum(slope, self.least * weight)) / self.scale_m**2
         by, value = -weight * u / self.scale_m, -_loss(self.weights)(np.abs(u))
-        return value / self.dispersion, {RESIDUAL: by / self.dispersion}, tells / self.dispersion
+        return value, {RESIDUAL: by}, tells
 
 
 @cache
@@ -157,8 +164,8 @@ def _loss(weights: Weights) -> PPoly:
 class RangeRows:
     """Ranges whose residuals are `residual` (n,) plus the parts of the unknowns, less what `geometry` makes of them.
 
-    Rows are kept sorted by `key`; `order` (n,) says which of the given rows each is. Rows that correlate count for a
-    share 1/`design_effect` of as many independent ones.
+    Rows are kept sorted by `key`; `order` (n,) says which of the given rows each is. Log likelihoods are divided by
+    the dispersion of the errors.
     """
 
     residual: Floats
@@ -168,7 +175,6 @@ class RangeRows:
     starts: Ints
     parts: tuple[Part, ...]
     geometry: Geometry | None = None
-    design_effect: float = 1.0
 
     @classmethod
     def of(
@@ -227,7 +233,7 @@ class RangeRows:
         """Yield all ranges, some blocks at a time."""
         for blocks, rows, values, moved in self._pieces(x):
             log_density, by, tells = self.errors.slopes(values)
-            share = 1 / self.design_effect
+            share = 1 / self.errors.dispersion
             by = {name: share * slope for name, slope in by.items()} if share != 1 else by
             tells = None if tells is None else share * tells
             yield self._as_terms(blocks, rows, share * float(np.sum(log_density)), by, tells, moved)
@@ -314,14 +320,9 @@ class RangeRows:
         stacked = np.concatenate(columns, axis=1)
         of_residual = [k for k, name in enumerate(names) if name == RESIDUAL]
         score = by[RESIDUAL]
+        weight = self.errors.dispersion
         found = Terms(
-            value=value,
-            slopes=slopes,
-            columns=stacked,
-            starts=starts,
-            weight=self.design_effect,
-            score=score,
-            residual=score,
+            value=value, slopes=slopes, columns=stacked, starts=starts, weight=weight, score=score, residual=score
         )
         if tells is None:
             return found

@@ -59,7 +59,7 @@ class Prior:
 class Unknown:
     """A block of unknowns: `names` (k,) say of what each is, `start` (k,) where a search begins.
 
-    `known` (k,) marks those that keep their start.
+    `known` (k,) marks those that keep their start; `logarithm` says that they are logarithms of lengths, or log odds.
     """
 
     kind: str
@@ -67,6 +67,7 @@ class Unknown:
     start: Floats
     priors: tuple[Prior, ...] = ()
     known: Bools | None = None
+    logarithm: bool = False
 
     def __post_init__(self) -> None:
         """Raise `BadInputError` where start and names differ in length."""
@@ -104,6 +105,10 @@ class Layout:
         """Return the indices of the unknowns that are not known already."""
         known = [np.zeros(len(b.start), bool) if b.known is None else b.known for b in self.blocks]
         return np.flatnonzero(~np.concatenate(known))
+
+    def logarithms(self) -> Bools:
+        """Return which unknowns (p,) are logarithms."""
+        return np.repeat([b.logarithm for b in self.blocks], [len(b.start) for b in self.blocks])
 
     def indices(self, kinds: Sequence[str]) -> Ints:
         """Return the indices of some kinds, in the order given; kinds that are not there have none."""

@@ -52,6 +52,7 @@ class ExpectedErrors:
     reflected: float
     detour_m: float = 0.3
     parameters: tuple[str, ...] = ()
+    dispersion: float = 1.0
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats]:
         """Return log densities and slopes of zero, and the information of each residual (n,)."""
@@ -67,7 +68,6 @@ class ExpectedErrors:
             "noise": self.noise_m,
             "odds": share / (1 - share),
             "detour": self.detour_m,
-            "least": 1e-3,
             "outliers": none,
             "long": none,
         }
