@@ -29,8 +29,7 @@ CASES: Final = {
 }
 STUDIED: Final = {
     ("estimator", "covariance.py"): ("CURVE_SERIES",),
-    ("range_errors", "densities.py"): ("LEAST_DETOUR_M",),
-    ("estimator", "grouped_errors.py"): ("NOISE_WORTH", "DETOUR_WORTH", "SCATTER"),
+    ("estimator", "grouped_errors.py"): ("NOISE_WORTH", "DETOUR_WORTH", "LEAST_DETOUR_M", "SCATTER"),
     ("estimator", "inverse.py"): ("PROBES",),
     ("estimator", "known_distances.py"): ("PILOT", "FIRST_SAMPLE", "SAMPLE_GROWTH"),
     ("estimator", "optimize.py"): ("EVIDENCE_STEPS", "LONGER"),

@@ -23,7 +23,6 @@ from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes,
 from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.estimator.to_calibration import bias_curves
 from calib.findings import NAMED_DETOUR_M, OF_A_FIT, SMALLEST_NS
-from calib.range_errors.densities import LEAST_DETOUR_M
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -320,7 +319,7 @@ def reflected_pairs(found: KnownDistances) -> tuple[Floats, Floats, Bools]:
     which[optimum.layout.where["odds level"]], which[optimum.layout.where["odds of pair"]] = 1.0, np.eye(count)
     odds = which.T @ optimum.x
     variance = found.persistence.factor * np.einsum("pk,pk->k", which, np.asarray(optimum.covariance @ which))
-    detour = LEAST_DETOUR_M + np.exp(values["detour level"] + values["detour of pair"])
+    detour = np.exp(values["least detour"]) + np.exp(values["detour level"] + values["detour of pair"])
     return expit(odds), detour, np.asarray(count * ndtr(-odds / np.sqrt(variance)) < OF_A_FIT)
 
 

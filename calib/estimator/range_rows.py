@@ -24,7 +24,7 @@ from uwblink.arrays import Floats, Ints
 RESIDUAL = "residual"
 """The parameter that delays, curves and offsets add to."""
 
-OF_ERRORS = ("noise", "odds", "detour", "outliers", "long")
+OF_ERRORS = ("noise", "odds", "detour", "least", "outliers", "long")
 """The other parameters of an error's density; differences of arrival have "side" besides."""
 
 SHARED = "shared"

@@ -23,7 +23,7 @@ from calib.estimator.pattern_unknowns import COMMON, OF_PLACES, OWN
 from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel, SplineValues
 from calib.estimator.range_rows import RESIDUAL
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
-from calib.range_errors.densities import LEAST_DETOUR_M, LONG_FACTOR, LongDetours
+from calib.range_errors.densities import LONG_FACTOR, LongDetours
 from calib.spread import robust_spread
 from uwblink.arrays import Floats
 from uwblink.recording.antenna_delays import known_delays
@@ -242,15 +242,15 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
     above = float(np.exp(values["detour level"][0]))
     any_mean = above * float(np.exp(any_detour + any_detour_var / 2))
     means = above * np.exp(detour + detour_var / 2)
-    reach = BEYOND_MEANS * long.longest * long.mean * float(means.max())
+    reach = BEYOND_MEANS * long.longest * float(means.max())
     outlying = np.clip(1 - found.inlier, 0, 1) * (np.abs(residual - errors.location_m) < reach)
     square = float(np.sum(outlying * (residual - errors.location_m) ** 2))
     stated = ErrorModel(
         lifted=tuple(lifted.tolist()),
         noise_m=tuple(noise.tolist()),
         tail_share=tuple(np.clip(expit(common + curve - np.mean(curve)), 1e-4, 1 - 1e-4).tolist()),
-        least_m=LEAST_DETOUR_M,
-        detour_m=long.mean * any_mean,
+        least_m=float(np.exp(values["least detour"][0])),
+        detour_m=any_mean,
         outlier_share=max(float(np.mean(outlying)), 1e-9),
         outlier_m=float(np.sqrt(square / max(float(np.sum(outlying)), 1e-9))) or reach,
         location_m=errors.location_m,

@@ -68,6 +68,7 @@ class ExpectedErrors:
             "noise": self.noise_m,
             "odds": share / (1 - share),
             "detour": self.detour_m,
+            "least": 1e-3,
             "outliers": none,
             "long": none,
         }

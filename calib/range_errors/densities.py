@@ -1,8 +1,8 @@
 """The one model of a range's error: direct with normal noise, reflected by a detour besides, or an outlier.
 
 A detour is a least one plus an exponential one of one of two kinds with different means; outliers are anywhere in a
-room. Four of the numbers differ between ranges (location, noise, share, detour), two are common (outliers, share of
-the second kind); the likelihood has a slope by each of the six.
+room. Four of the numbers differ between ranges (location, noise, share, detour), three are common (least detour,
+outliers, share of the second kind); the likelihood has a slope by each of the seven.
 """
 
 from __future__ import annotations
@@ -21,14 +21,7 @@ LONG_FACTOR: Final = 4.0
 """Mean of the second kind of detour over that of the first, where it is fitted.
 
 It is no parameter: where all detours are of one kind, its slope is zero at 1 for every range, so that nothing would say
-how far to step. Where kinds differ by another factor, the mean and the share make up for it.
-"""
-
-LEAST_DETOUR_M: Final = 0.03
-"""The least detour where errors are fitted: half of the noise of a range, below which a reflection does not show.
-
-It is no parameter: a longer one with a smaller share of reflections is as likely (in 40,000 errors of a share of 0.12,
-0.11 m and 0.09 by less than 3 of the log likelihood), and shares then differ by a quarter between flights.
+how far to step. Where kinds differ by another factor, the least detour, the mean and the share make up for it.
 """
 
 
@@ -169,32 +162,34 @@ class ErrorSlopes:
 def error_slopes(residual: Floats, parameters: dict[str, Floats]) -> ErrorSlopes:
     """Return the log density of errors (n,) in metres and its slopes.
 
-    `parameters` are "noise" (log sigma), "odds" (log odds of a reflection), "detour" (log of the first kind's
-    mean), "outliers" and "long" (log odds), arrays (n,) or (1,).
+    `parameters` are "noise" (log sigma), "odds" (log odds of a reflection), "detour" (log of the mean
+    exponential one), "least" (log of the least detour), "outliers" and "long" (log odds), arrays (n,) or (1,).
     Outliers have the density 1/`OUTLIERS_OVER_M`. With "side" reflections lengthen only a share of the errors, of which
     these are the log odds, and shorten the others: those of differences of times of arrival.
     """
     sigma = np.exp(parameters["noise"])
     share = expit(parameters["odds"])
     detour = np.exp(parameters["detour"])
-    outlying, long_share = expit(parameters["outliers"]), expit(parameters["long"])
+    least, outlying, long_share = np.exp(parameters["least"]), expit(parameters["outliers"]), expit(parameters["long"])
     late = float(expit(parameters["side"][0])) if "side" in parameters else 1.0
     long = LongDetours(share=float(long_share[0]), factor=LONG_FACTOR)
     sides = [(1.0, late), (-1.0, 1 - late)][: 1 + ("side" in parameters)]
-    found = [densities(sign * residual, sigma, LEAST_DETOUR_M, long.mean * detour, long) for sign, _ in sides]
+    found = [densities(sign * residual, sigma, float(least[0]), detour, long) for sign, _ in sides]
     inside = 1 - float(outlying[0])
     core, tail = inside * (1 - share) * found[0].direct, inside * share
     likely = np.sum([own * one.reflected for one, (_, own) in zip(found, sides, strict=True)], axis=0)
     total = core + tail * likely + float(outlying[0]) / OUTLIERS_OVER_M
     core, tail = core / total, tail / total
     z, inverse = residual / sigma, 1 / sigma
-    noise, towards, mean = core * (z * z - 1), core * z, np.zeros_like(z)
+    noise, towards, mean, tail_noise = core * (z * z - 1), core * z, np.zeros_like(z), np.zeros_like(z)
     tails = list[Floats]()
     for one, (sign, own_share) in zip(found, sides, strict=True):
-        beyond, whole = sign * residual - LEAST_DETOUR_M, own_share * tail
+        beyond, whole = sign * residual - least, own_share * tail
         for kind in one.kinds:
             part, own = whole * kind.density, kind.noise_m * inverse
-            towards += sign * part * own
+            moved = part * own
+            tail_noise += moved
+            towards += sign * moved
             noise += part * (own * own + kind.noise_var - 1)
             mean += part * ((beyond - kind.noise_m) / kind.detour_m - 1)
             tails.append(part)
@@ -205,8 +200,9 @@ def error_slopes(residual: Floats, parameters: dict[str, Floats]) -> ErrorSlopes
         "noise": noise,
         "odds": reflected - share * both,
         "detour": mean,
+        "least": tail_noise * inverse * least,
         "outliers": inside - both,
-        "long": sum(tails[3::2], tails[1]) - long_share * reflected,
+        "long": sum(tails[3::2], tails[1]) - long_share * reflected - (1 - 1 / long.mean) * (1 - long_share) * mean,
     }
     if "side" in parameters:
         by["side"] = tails[0] + tails[1] - late * reflected

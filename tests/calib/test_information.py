@@ -174,6 +174,7 @@ SHAPE = {
     "noise": np.log(0.06),
     "odds": -1.5,
     "detour": np.log(0.2),
+    "least": np.log(0.05),
     "outliers": -4.0,
     "long": -1.0,
 }

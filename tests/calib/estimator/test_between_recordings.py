@@ -107,11 +107,11 @@ def test_delays_of_150_ranges_of_a_real_flight_agree_with_those_of_all(starloc):
     # Nothing tells what both tags of the rig have more and all anchors less, nor what all have.
     free = np.array([np.ones(len(tags)), [1.0 if tag in (1, 2) else -1.0 for tag in tags]])
     known = np.linalg.svd(free)[2][2:]
-    for seed in range(12):
+    for seed in range(48):
         rows = np.sort(np.random.default_rng(seed).choice(len(starloc[0]), 150, replace=False))
         part = calib.fit(starloc[0][rows]).calibration
         away = known @ [part.delays_ns[tag] - whole.delays_ns[tag] for tag in tags]
         covariance = known @ np.array(part.uncertainty.delays_ns2) @ known.T
         scores.append(away @ np.linalg.solve(covariance, away))
-    # 96 squares of normal values: 95 % of such means lie below 1.25; a third more for what 150 ranges leave unknown.
-    assert np.mean(scores) / len(known) < 1.6
+    # 384 squares of normal values: 95 % of such means lie below 1.12; a third more for what 150 ranges leave unknown.
+    assert np.mean(scores) / len(known) < 1.5

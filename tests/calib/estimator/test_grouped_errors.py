@@ -45,7 +45,7 @@ def test_groups_of_unlike_noise_do_not_blur_each_other():
     np.testing.assert_allclose(found.centre_m, [0, 1, 2], atol=0.005)
 
 
-VALUES = {"noise": np.log(0.04), "odds": -2.0, "detour": np.log(0.3), "outliers": -8.0}
+VALUES = {"noise": np.log(0.04), "odds": -2.0, "detour": np.log(0.3), "least": np.log(0.02), "outliers": -8.0}
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def drawn():
     layout = Layout(tuple(Unknown(kind=kind, names=("",), start=np.array([at])) for kind, at in kinds.items()))
     count, one = 40_000, np.zeros((1, 1), dtype=np.int64)
     reflected = rng.random(count) < 1 / (1 + np.exp(2.0))
-    error = 0.04 * rng.normal(size=count) + reflected * (0.03 + rng.exponential(0.3, count))
+    error = 0.04 * rng.normal(size=count) + reflected * (0.02 + rng.exponential(0.3, count))
     parts = [Part(parameter=kind, kind=kind, columns=one) for kind in kinds]
     return layout, RangeRows.of(error, np.zeros(count, dtype=np.int64), parts, Mixture(), layout)
 
