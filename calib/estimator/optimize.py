@@ -54,13 +54,6 @@ class Optimum:
         """Return all unknowns by their kinds."""
         return {kind: self.x[where] for kind, where in self.layout.where.items()}
 
-    def log_marginal(self) -> float:
-        """Return the log likelihood with all unknowns integrated out (Laplace), less a constant of the rows."""
-        priors, free = self.priors, self.layout.free()
-        known = sparse.csc_matrix(self.information + priors.precision()).toarray()[np.ix_(free, free)]
-        weights = float(np.dot(priors.ranks, np.log(priors.weights)))
-        return self.value + 0.5 * weights - 0.5 * float(np.linalg.slogdet(known)[1])
-
 
 def maximize(
     rows: Sequence[Rows],

@@ -8,11 +8,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy import sparse
 
 from calib.calibration.patterns import HARMONICS
 from calib.data.ranges import LEAST_TURN_RAD, Ranges
 from calib.errors import UnanswerableError
 from calib.estimator.known_distances import KnownDistances, fit_known_distances
+from calib.estimator.optimize import Optimum
 from calib.estimator.pattern_unknowns import COMMON, OF_PAIR, OWN, SPREAD_M, Directions
 from calib.estimator.score_tests import Derivative, Family, Tested
 from calib.settings import FitSettings
@@ -64,10 +66,18 @@ def fit_with_pattern(ranges: Ranges, settings: FitSettings) -> tuple[KnownDistan
     for mode, kind in kinds.items():
         found = fit_known_distances(ranges, replace(settings, pattern=mode))
         evidence = log_evidence(found.slopes.test(_family(found, directions, kind, fitted=True)))
-        marginal = found.searches[0].optimum.log_marginal()
+        marginal = _log_marginal(found.searches[0].optimum)
         if evidence >= LOG_EVIDENCE and marginal > likeliest:
             best, likeliest = (found, {"kind": mode, "log_evidence": round(evidence, 1)}, []), marginal
     return best
+
+
+def _log_marginal(optimum: Optimum) -> float:
+    """Return the log likelihood with all unknowns integrated out (Laplace), less what fits to the same rows share."""
+    priors, free = optimum.priors, optimum.layout.free()
+    known = sparse.csc_matrix(optimum.information + priors.precision()).toarray()[np.ix_(free, free)]
+    weights = sum(rank * math.log(weight) for rank, weight in zip(priors.ranks, priors.weights, strict=True))
+    return optimum.value + 0.5 * weights - 0.5 * float(np.linalg.slogdet(known)[1])
 
 
 def _family(found: KnownDistances, directions: Directions, kind: str, *, fitted: bool = False) -> Family:
