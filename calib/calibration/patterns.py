@@ -132,14 +132,12 @@ def warn_of_temperatures(calibration: Calibration, ranges: Ranges, beyond_k: flo
     A slope that is known to half of the manual's 2.15 mm/K is off by 5 mm after 5 K, less than ranges repeat to.
     """
     ends = np.column_stack([ranges.initiator, ranges.target])
-    for one in calibration.temperatures:
-        low, high = one.span_c
+    for low, high in sorted({one.span_c for one in calibration.temperatures}):
         with np.errstate(invalid="ignore"):
             outside = (ranges.temperature_c < low - beyond_k) | (ranges.temperature_c > high + beyond_k)
-        if tags := sorted({*one.tags} & {*ends[outside].tolist()}):
+        fitted = {tag for one in calibration.temperatures if one.span_c == (low, high) for tag in one.tags}
+        if tags := sorted(fitted & {*ends[outside].tolist()}):
             named = first_few(map(str, tags))
-            text = f"the calibration was fitted at {low:.0f} to {high:.0f} °C, and tags {named} were used beyond that"
-            # Not at its caller's place: Python shows a text once for each place.
-            warnings.warn(
-                f"{text} by more than {beyond_k:.0f} K: what it says there is extrapolated", TemperatureWarning, 1
-            )
+            text = f"tags {named} were used more than {beyond_k:.0f} K beyond the {low:.0f} to {high:.0f} °C at which"
+            # From here, and not from the caller's place: Python shows a text once for each place.
+            warnings.warn(f"{text} the calibration was fitted: it extrapolates there", TemperatureWarning, stacklevel=1)

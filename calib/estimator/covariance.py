@@ -50,9 +50,9 @@ class Kept:
         return cls(indices=indices, combinations=apart, independent=max(count - 1, 1), freedom=max(each - 1, 2.0))
 
     @classmethod
-    def curve(cls, indices: Ints) -> Kept:
-        """Return the coefficients of a smooth curve."""
-        return cls(indices=indices, combinations=np.eye(len(indices)), independent=CURVE_SERIES)
+    def curve(cls, indices: Ints, independent: int = CURVE_SERIES) -> Kept:
+        """Return the coefficients of a smooth curve, or so many `independent` ones."""
+        return cls(indices=indices, combinations=np.eye(len(indices)), independent=independent)
 
 
 def sandwich(

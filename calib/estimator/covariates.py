@@ -30,17 +30,16 @@ SPREAD_M = (0.02, 1e-4, 0.3)
 """Standard deviation of factors of harmonics: start, and bounds between which it is estimated, m. Published antennas
 have patterns of up to 0.25 m."""
 
-MANUAL_M_PER_K = (0.00215, 0.0091)
-"""Mean and standard deviation of slopes before anything is measured. The mean is that of the DW1000 user manual (8.3.1)
-which gives no spread; users see up to 2 cm/K (lps-node-firmware 56), which the 95 % interval reaches."""
-
 PRIORS = {
     **dict.fromkeys((COMMON, OWN), Prior.of_spread(*SPREAD_M)),
     # A smaller start, so that what belongs to places does not take a pattern at once.
     **dict.fromkeys((OF_BODIES, OF_PAIR), Prior.of_spread(0.005, *SPREAD_M[1:])),
-    WARMTH: Prior.of_deviation(MANUAL_M_PER_K[1], MANUAL_M_PER_K[0]),
+    # The mean of the DW1000 user manual (8.3.1), which gives no spread. Users see up to 2 cm/K (lps-node-firmware 56):
+    # 95 % of this prior lie between -1.6 and 2 cm/K.
+    WARMTH: Prior.of_deviation(0.0091, 0.00215),
     OWN_WARMTH: Prior.of_spread(0.001, 1e-5, 0.02),
 }
+"""What is known of factors of harmonics (m) and of slopes (m/K) before anything is measured."""
 
 LEAST_SQUARE = 0.2
 """Mean square of a harmonic over the fitted directions from which it is fitted, of 1 over all directions. A judgement:
@@ -127,15 +126,11 @@ class Covariate:
 
 
 OF_PLACES = (OF_BODIES, OF_PAIR)
-KINDS = {
-    "pattern": {"shared": (COMMON, *OF_PLACES), "tag": (OWN, *OF_PLACES)},
-    "temperature": {"shared": (WARMTH,), "tag": (WARMTH, OWN_WARMTH)},
+COVARIATES: dict[str, tuple[Callable[[Ranges], Covariate], dict[str, tuple[str, ...]]]] = {
+    "temperature": (Covariate.of_temperatures, {"shared": (WARMTH,), "tag": (WARMTH, OWN_WARMTH)}),
+    "pattern": (Covariate.of_directions, {"shared": (COMMON, *OF_PLACES), "tag": (OWN, *OF_PLACES)}),
 }
-"""Kinds of unknowns by the settings `pattern` and `temperature`."""
+"""What delays depend on by setting, and the kinds of unknowns by its value.
 
-COVARIATES: dict[str, Callable[[Ranges], Covariate]] = {
-    "temperature": Covariate.of_temperatures,
-    "pattern": Covariate.of_directions,
-}
-"""What delays depend on, by setting. Temperatures come first: a drift could pass for a pattern, and no pattern, which
-turns with the robot, for a drift."""
+Temperatures come first: a drift could pass for a pattern, and no pattern, which turns with the robot, for a drift.
+"""

@@ -313,12 +313,13 @@ def _maximize_by_samples(
 def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDistances:
     """Return a fit with the covariances of what was fitted."""
     layout = fitted.optimum.layout
+    warmth = layout.indices([WARMTH, OWN_WARMTH])
     kept = {
         "delay": Kept.delays(layout.indices(["delay"]), len(fitted.residuals) / len(model.pairs.ends)),
         "curve": Kept.curve(layout.indices(model.curve_kinds())),
         "noise": Kept.curve(layout.indices(noise_kinds(layout))),
         "pattern": Kept.curve(layout.indices([COMMON, OWN])),
-        "temperature": Kept.curve(layout.indices([WARMTH, OWN_WARMTH])),
+        "temperature": Kept.curve(warmth, len(warmth)),
     }
     kept = {name: group for name, group in kept.items() if len(group.indices)}
     slopes, *of_heard = fitted.slopes(blocks)

@@ -16,7 +16,7 @@ from calib.calibration.document import Split
 from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, knots_for, lift, lifted_power, populated
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimator.covariates import COVARIATES, KINDS, Covariate
+from calib.estimator.covariates import COVARIATES, Covariate
 from calib.estimator.grouped_errors import error_unknowns, scattered
 from calib.estimator.identifiability import free_directions
 from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
@@ -142,10 +142,11 @@ class RangeModel:
             noise = SplineValues.at(lifted, knots_for(ordered, SIGMA_SEGMENTS, (low, high)))
         if offsets:
             blocks += _offsets(ranges, pairs, tags, of_pairs=_offsets_identifiable(pairs, tags, settings, carriers))
-        asked = {name: of.get(getattr(settings, name), ()) for name, of in KINDS.items()}
-        covariates = {name: COVARIATES[name](ranges) for name, kinds in asked.items() if kinds}
-        for name, one in covariates.items():
-            blocks += one.blocks(asked[name], pairs)
+        covariates = {}
+        for name, (read, kinds) in COVARIATES.items():
+            if (asked := getattr(settings, name)) in kinds:
+                covariates[name] = read(ranges)
+                blocks += covariates[name].blocks(kinds[asked], pairs)
         return cls(
             ranges=ranges,
             settings=settings,

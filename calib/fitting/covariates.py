@@ -14,8 +14,6 @@ from calib.errors import UnanswerableError
 from calib.estimator.covariates import (
     COMMON,
     COVARIATES,
-    KINDS,
-    MANUAL_M_PER_K,
     OWN,
     OWN_WARMTH,
     PRIORS,
@@ -62,12 +60,14 @@ def fit_with_covariates(
     """
     found = fit_known_distances(ranges, replace(settings, **dict.fromkeys(COVARIATES, "none")))
     told, warnings = dict[str, dict[str, Any]](), list[str]()
-    for name in COVARIATES:
-        asked = getattr(settings, name)
-        if asked != "none" and not settings.excludes_patterns:
-            found, kept, more = _with(name, asked, found, ranges)
-            told |= {name: kept} if kept else {}
-            warnings += more
+    # Without the pattern of a robot that turns slowly, a slope is too uncertain: it is asked for again beside one.
+    for name in (*COVARIATES, "temperature"):
+        asked, again = getattr(settings, name), name in told
+        if asked == "none" or settings.excludes_patterns or (again and ("kind" in told[name] or "pattern" not in told)):
+            continue
+        found, kept, more = _with(name, asked, found, ranges)
+        told |= {name: kept} if kept else {}
+        warnings += more
     return found, told, warnings
 
 
@@ -76,17 +76,17 @@ def _with(
 ) -> tuple[KnownDistances, dict[str, Any], list[str]]:
     """Return a fit with the dependence `name` beside those of a `plain` fit, if there is evidence or it is `asked`."""
     model, nothing = plain.model, (plain, dict[str, Any](), list[str]())
-    covariate, kinds = COVARIATES[name](model.ranges), {"shared": COMMON, "tag": OWN}
+    covariate, kinds = COVARIATES[name][0](model.ranges), {"shared": COMMON, "tag": OWN}
     if name == "temperature":
         kinds = {"shared": WARMTH, "tag": OWN_WARMTH}
     tested = plain.slopes.tests([_family(plain, covariate, kind) for kind in kinds.values()]) if covariate.tags else []
     vague = _vague(name, covariate, tested[asked == "tag"]) if tested else []
-    needed = RANGES_AN_UNKNOWN * len(covariate.entries(KINDS[name]["tag"][-1], model.pairs)[0])
+    needed = RANGES_AN_UNKNOWN * len(covariate.entries(COVARIATES[name][1]["tag"][-1], model.pairs)[0])
     if len(vague) == len(covariate.tags) or len(model.ranges) < needed:
         why = _why(name, covariate, model.ranges, needed if len(vague) < len(covariate.tags) else 0)
         if asked != "auto":
             raise UnanswerableError(f"{ranges.source}: {why}", parameter=name)
-        return plain, _told(name, covariate, why), []
+        return plain, _told(name, covariate, why.rpartition(": ")[2].partition(";")[0]), []
     warnings = [f"tags {first_few(map(str, vague))}: {MISSING[name][1]}"] if vague else []
     if asked != "auto":
         return fit_known_distances(ranges, replace(model.settings, **{name: asked})), {"kind": asked}, warnings
@@ -150,7 +150,7 @@ def log_evidence(tested: Tested) -> float:
 
 def _vague(name: str, covariate: Covariate, tested: Tested) -> list[int]:
     """Return the tags of whose first wave around, or slope, ranges determine too little."""
-    typical, first = (TYPICAL_M, 2) if name == "pattern" else (MANUAL_M_PER_K[1], 1)
+    typical, first = (TYPICAL_M, 2) if name == "pattern" else (PRIORS[WARMTH].weight ** -0.5, 1)
     known = tested.information / tested.lasting.factor + np.eye(len(tested.total)) / typical**2
     left = np.linalg.inv(known)
     waves = [left[k : k + first, k : k + first] for k in range(0, len(left), len(covariate.centre))]
