@@ -273,7 +273,7 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
             fault,
             f"ranges of tag {one.tag} {what} by {100 * one.size_m:+.1f} cm {when} {one} do not",
             one.p_value,
-            {"tag": one.tag, "remedy": by_readings * (one.tag in view.warming)},
+            {"tag": one.tag, "readings": by_readings * (one.tag in view.warming)},
         )
 
 

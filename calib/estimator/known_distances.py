@@ -96,10 +96,10 @@ class KnownDistances:
     """A fit to known distances: its `model`, the search that ended it, and the covariances of what was fitted.
 
     `values` are unknowns by kind, `covariances` those of "delay", of all curves side by side ("curve"), of the noise
-    ("noise"), of patterns over direction ("pattern") and of slopes over temperature ("temperature"). `residuals` (n,)
-    are fitted less true ranges in the order of the model's ranges, metres. `searches` are the one search, or that of
-    the delays and that of the curves. `persistence` is that of errors of delays, and `slopes` and `slopes_of_heard` are
-    those of the first search.
+    ("noise"), of patterns over direction ("pattern") and of delays and slopes over temperature ("temperature").
+    `residuals` (n,) are fitted less true ranges in the order of the model's ranges, metres. `searches` are the one
+    search, or that of the delays and that of the curves. `persistence` is that of errors of delays, and `slopes` and
+    `slopes_of_heard` are those of the first search.
     """
 
     model: RangeModel
@@ -313,14 +313,14 @@ def _maximize_by_samples(
 def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDistances:
     """Return a fit with the covariances of what was fitted."""
     layout = fitted.optimum.layout
-    warmth = layout.indices([WARMTH, OWN_WARMTH])
     kept = {
         "delay": Kept.delays(layout.indices(["delay"]), len(fitted.residuals) / len(model.pairs.ends)),
         "curve": Kept.curve(layout.indices(model.curve_kinds())),
         "noise": Kept.curve(layout.indices(noise_kinds(layout))),
         "pattern": Kept.curve(layout.indices([COMMON, OWN])),
-        "temperature": Kept.curve(warmth, len(warmth)),
     }
+    if len(warmth := layout.indices([WARMTH, OWN_WARMTH])):
+        kept["temperature"] = kept["delay"].beside(warmth)
     kept = {name: group for name, group in kept.items() if len(group.indices)}
     slopes, *of_heard = fitted.slopes(blocks)
     found = sandwich(slopes, kept, fitted.beside)

@@ -141,7 +141,8 @@ def temperatures_of(found: KnownDistances) -> tuple[TemperatureSlope, ...]:
     # A tag's slope is the common one and its own, side by side among the unknowns.
     sums = np.column_stack([np.ones(len(whose)), np.eye(len(own))]) if len(own) else np.ones((1, 1))
     slopes = sums @ np.append(values[WARMTH], own)
-    std = np.sqrt(np.diag(sums @ found.covariances["temperature"] @ sums.T))
+    covariance = found.covariances["temperature"][-sums.shape[1] :, -sums.shape[1] :]
+    std = np.sqrt(np.diag(sums @ covariance @ sums.T))
     span = (float(known.span[0, 0]), float(known.span[1, 0]))
     rows = zip(whose, slopes.tolist(), std.tolist(), strict=True)
     return tuple(TemperatureSlope(tags, slope, error, float(known.centre[0]), span) for tags, slope, error in rows)

@@ -23,6 +23,7 @@ from calib.estimator.covariates import (
 from calib.estimator.known_distances import KnownDistances, fit_known_distances
 from calib.estimator.optimize import Optimum
 from calib.estimator.score_tests import Derivative, Family, Tested
+from calib.estimator.time_blocks import Persistence
 from calib.settings import FitSettings
 from uwblink.display import first_few
 
@@ -99,12 +100,23 @@ def _with(
     for mode, kind in kinds.items():
         found = fit_known_distances(ranges, replace(model.settings, **{name: mode}))
         one = found.slopes.test(_family(found, covariate, kind, fitted=True))
+        if name == "temperature":
+            one = _as_lasting(one, found.persistence)
         slopes.append(1e3 * np.array([one.total[0], 1.96 * one.covariance[0, 0] ** 0.5]) / one.information[0, 0])
         evidence, marginal = log_evidence(one), _log_marginal(found.searches[0].optimum)
         if evidence >= LOG_EVIDENCE and marginal > likeliest:
             best, likeliest = (found, {"kind": mode, "log_evidence": round(evidence, 1)}, []), marginal
     why = "{:+.2f} ± {:.2f} mm/K are no evidence of one".format(*slopes[0])
     return best or (plain, _told(name, covariate, why), [])
+
+
+def _as_lasting(tested: Tested, known: Persistence) -> Tested:
+    """Return slopes whose errors last no less than those of delays: more series tell how long these last.
+
+    Alternatives that follow a pattern differ from block to block, and the errors in their sums last less.
+    """
+    factor = max(known.factor / tested.lasting.factor, 1.0)
+    return replace(tested, covariance=factor * tested.covariance, lasting=known if factor > 1 else tested.lasting)
 
 
 def _told(name: str, covariate: Covariate, why: str) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import pytest
 import calib
 from benchmarks import doctor as planted
 from benchmarks.flights import LIGHT, Plan, fly
+from uwblink import Contents
 
 pytestmark = pytest.mark.slow
 
@@ -229,8 +230,15 @@ def test_a_step_is_named_with_tag_size_and_time():
 def test_a_drift_is_none():
     flight = fly(replace(SHORT, seconds=60), 46)
     drift = 0.15 * planted.seconds(flight) / 60
-    found = only(planted.longer(flight, np.where(planted.of_tag(flight, 30), drift, 0.0)), "delay drifts")
+    drifting = planted.longer(flight, np.where(planted.of_tag(flight, 30), drift, 0.0))
+    found = only(drifting, "delay drifts")
     assert "tag 30 drift" in found.evidence
+    assert "readings" not in found.remedy
+    readings = {"time_ns": np.zeros(1, np.int64), "tag": np.array([30]), "temperature_c": np.array([20.0])}
+    with_readings = Contents(
+        exchanges=drifting.exchanges, poses=drifting.poses, tags=drifting.tags, temperature=readings
+    )
+    assert "`temperature`" in only(with_readings, "delay drifts").remedy
 
 
 @pytest.mark.parametrize(
