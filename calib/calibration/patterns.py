@@ -113,7 +113,8 @@ def dependences_m(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Flo
     temperature is not known the second has the slope times the fitted temperatures' span.
     """
     longer, variance = np.zeros((2, len(ranges)))
-    for one in (*calibration.patterns, *calibration.temperatures):
+    every: tuple[Pattern | TemperatureSlope, ...] = (*calibration.patterns, *calibration.temperatures)
+    for one in every:
         values = np.zeros((len(ranges), len(one.coefficients_m)))
         for end, ids in enumerate((ranges.initiator, ranges.target)):
             rows = np.flatnonzero(np.isin(ids, one.tags))

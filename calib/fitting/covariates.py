@@ -59,7 +59,7 @@ def fit_with_covariates(
     Raises `UnanswerableError` where one is asked for that the data do not determine, and what `fit_known_distances`
     raises.
     """
-    found = fit_known_distances(ranges, replace(settings, **dict.fromkeys(COVARIATES, "none")))
+    found = fit_known_distances(ranges, replace(settings, pattern="none", temperature="none"))
     told, warnings = dict[str, dict[str, Any]](), list[str]()
     # Without the pattern of a robot that turns slowly, a slope is too uncertain: it is asked for again beside one.
     for name in (*COVARIATES, "temperature"):
@@ -78,6 +78,7 @@ def _with(
     """Return a fit with the dependence `name` beside those of a `plain` fit, if there is evidence or it is `asked`."""
     model, nothing = plain.model, (plain, dict[str, Any](), list[str]())
     covariate, kinds = COVARIATES[name][0](model.ranges), {"shared": COMMON, "tag": OWN}
+    changes: dict[str, dict[str, Any]] = {mode: {name: mode} for mode in kinds}
     if name == "temperature":
         kinds = {"shared": WARMTH, "tag": OWN_WARMTH}
     tested = plain.slopes.tests([_family(plain, covariate, kind) for kind in kinds.values()]) if covariate.tags else []
@@ -90,24 +91,27 @@ def _with(
         return plain, _told(name, covariate, why.rpartition(": ")[2].partition(";")[0]), []
     warnings = [f"tags {first_few(map(str, vague))}: {MISSING[name][1]}"] if vague else []
     if asked != "auto":
-        return fit_known_distances(ranges, replace(model.settings, **{name: asked})), {"kind": asked}, warnings
+        return fit_known_distances(ranges, replace(model.settings, **changes[asked])), {"kind": asked}, warnings
     # A drift of many times the noise passes for reflections where it is not fitted.
     if name == "pattern" and max(map(log_evidence, tested)) < LOG_EVIDENCE:
         return nothing
     if len(covariate.tags) < 2 or (name == "pattern" and not covariate.apart_from_places(model.pairs)):
         del kinds["tag"]
-    best, likeliest, slopes = None, -math.inf, []
+    best, likeliest, slopes, beside = nothing, -math.inf, [], 0.0
     for mode, kind in kinds.items():
-        found = fit_known_distances(ranges, replace(model.settings, **{name: mode}))
+        found = fit_known_distances(ranges, replace(model.settings, **changes[mode]))
         one = found.slopes.test(_family(found, covariate, kind, fitted=True))
         if name == "temperature":
             one = _as_lasting(one, found.persistence)
         slopes.append(1e3 * np.array([one.total[0], 1.96 * one.covariance[0, 0] ** 0.5]) / one.information[0, 0])
-        evidence, marginal = log_evidence(one), _log_marginal(found.searches[0].optimum)
+        evidence, marginal = log_evidence(one) + beside, _log_marginal(found.searches[0].optimum)
         if evidence >= LOG_EVIDENCE and marginal > likeliest:
             best, likeliest = (found, {"kind": mode, "log_evidence": round(evidence, 1)}, []), marginal
-    why = "{:+.2f} ± {:.2f} mm/K are no evidence of one".format(*slopes[0])
-    return best or (plain, _told(name, covariate, why), [])
+        # Slopes of tags are about a common one: what speaks against that speaks against them, too.
+        beside = min(evidence, 0.0) * (name == "temperature")
+    if best is nothing:
+        return plain, _told(name, covariate, "{:+.2f} ± {:.2f} mm/K are no evidence of one".format(*slopes[0])), []
+    return best
 
 
 def _as_lasting(tested: Tested, known: Persistence) -> Tested:
