@@ -219,7 +219,7 @@ class Ranges(ColumnTable):
             raise BadInputError(f"row {row} is of tag {columns['target'][row]} with itself", parameter="target")
         columns |= {name: measured_powers(columns[name]) for name in ("fpp1_dbm", "fpp2_dbm")}
         warm, around, up = (np.array([columns.pop(f"{name} {end}") for end in (0, 1)]).T for name in both)
-        columns["temperature_c"], around, up = warm.astype(np.float32), np.radians(around), np.radians(up)
+        columns["temperature_c"], around, up = measured_c(warm), np.radians(around), np.radians(up)
         toward = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1)
         found = cls(source=source, protocol=np.full(len(rows[0]), protocol), excluded={}, planted=None, **columns)
         if not np.isfinite(around).any():
@@ -368,7 +368,7 @@ def read_c(table: Mapping[str, NDArray[Any]], ids: Ints, time_ns: Ints) -> NDArr
     the next reading: boards warm up within a minute or more, so that less than half of a change is missed.
     """
     found = np.full(ids.shape, np.nan, dtype=np.float32)
-    known = np.isfinite(table["temperature_c"])
+    known = np.isfinite(measured_c(table["temperature_c"]))
     for tag in np.unique(table["tag"][known]).tolist():
         when, first = np.unique(table["time_ns"][known & (table["tag"] == tag)], return_index=True)
         celsius = table["temperature_c"][known & (table["tag"] == tag)][first]
@@ -378,6 +378,11 @@ def read_c(table: Mapping[str, NDArray[Any]], ids: Ints, time_ns: Ints) -> NDArr
         away = [np.abs(when[np.clip(after - k, 0, len(when) - 1)] - at) for k in (0, 1)]
         found[row, end] = np.where(np.minimum(*away) <= 30e9, np.interp(at, when, celsius), np.nan)
     return found
+
+
+def measured_c(temperature_c: Floats) -> NDArray[np.float32]:
+    """Return temperatures in degrees Celsius, NaN where the number cannot be that of a board."""
+    return np.where(np.abs(temperature_c) < 300.0, temperature_c, np.nan).astype(np.float32)
 
 
 def measured_powers(fpp_dbm: Floats) -> Floats:

@@ -233,9 +233,8 @@ def test_a_drift_is_none():
     drifting = planted.longer(flight, np.where(planted.of_tag(flight, 30), drift, 0.0))
     found = only(drifting, "delay drifts")
     assert ("tag 30 drift" in found.evidence, "`temperature`" in found.remedy) == (True, False)
-    readings = {"time_ns": np.zeros(1, np.int64), "tag": np.array([30]), "temperature_c": np.array([20.0])}
     with_readings = Contents(
-        exchanges=drifting.exchanges, poses=drifting.poses, tags=drifting.tags, temperature=readings
+        exchanges=drifting.exchanges, poses=drifting.poses, tags=drifting.tags, temperature={"tag": np.array([30])}
     )
     assert "`temperature`" in only(with_readings, "delay drifts").remedy
 

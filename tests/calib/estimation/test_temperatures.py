@@ -22,9 +22,7 @@ WARM = Recipe(pattern_m=0.0, reflected=0.0, noise_m=0.04, warmer_k=15.0, mm_per_
 """Boards warm up by 15 K in a minute, and ranges grow by 5 mm a kelvin of either end: by 15 cm."""
 
 
-@cache
-def flown(recipe, seed, number=0):
-    return flight(recipe, seed, number)
+flown = cache(flight)
 
 
 @cache
@@ -34,8 +32,8 @@ def fitted(recipe, seed, **settings):
 
 def written(path, recipe, seed, number=0, **more):
     found, _ = flown(recipe, seed, number)
-    names = ("exchanges", "poses", "tags", "meta", "temperature")
-    uwblink.Contents(**{name: getattr(found, name) for name in names} | more).save(path)
+    kept = {name: getattr(found, name) for name in ("exchanges", "poses", "tags", "meta", "temperature")}
+    uwblink.Contents(**kept | more).save(path)
     return path
 
 
@@ -85,9 +83,9 @@ def test_a_warmer_flight_is_corrected_by_its_readings(tmp_path):
 
 @pytest.mark.parametrize(("celsius", "why"), [(None, "no temperature is known"), (30.0, "vary too little")])
 def test_a_slope_that_readings_do_not_determine_is_refused_and_said(tmp_path, celsius, why):
-    found, _ = flown(WARM, 3)
-    flat = found.temperature | {"temperature_c": np.full(len(found.temperature["tag"]), celsius or 0.0)}
-    path = written(tmp_path / "a.uwb", WARM, 3, temperature=flat if celsius else {})
+    read = flown(WARM, 3)[0].temperature
+    flat = read | {"temperature_c": np.full(len(read["tag"]), celsius)} if celsius else {}
+    path = written(tmp_path / "a.uwb", WARM, 3, temperature=flat)
     done = call("calib", "fit", path, "-o", tmp_path / "x.json", "--temperature", "shared")
     assert (done.returncode, why in done.stderr, done.stderr.count("\n")) == (1, True, 1)
     known = calib.fit(path).calibration
@@ -164,14 +162,13 @@ def test_differences_of_arrival_are_corrected_for_the_temperature_of_their_targe
     moved = {tag: known.delays_ns[tag] - 0.008 * tag / 0.299702547 for tag in known.delays_ns}
     slope = TemperatureSlope(tuple(tags.tolist()), 0.004, 0.0, 20.0, (10.0, 40.0))
     by_slope, by_delays = replace(known, temperatures=(slope,)), replace(known, delays_ns=moved)
-    both = [one.correct_arrivals(warm).corrected_m for one in (by_slope, by_delays)]
-    assert both[0] == pytest.approx(both[1], abs=1e-6)
+    expected = pytest.approx(by_delays.correct_arrivals(warm).corrected_m, abs=1e-6)
+    assert by_slope.correct_arrivals(warm).corrected_m == expected
 
 
 def test_temperatures_come_from_columns_of_a_table(tmp_path):
-    rows = ["time_s,from_id,to_id,range_m,t_a,to_temperature_c"]
-    rows += [f"{k},1,2,{3 + 0.01 * k},{20 + k},{'' if k == 5 else 40}" for k in range(60)]
-    (tmp_path / "t.csv").write_text("\n".join(rows))
+    rows = [f"{k},1,2,{3 + 0.01 * k},{20 + k},{'' if k == 5 else 40}" for k in range(60)]
+    (tmp_path / "t.csv").write_text("\n".join(["time_s,from_id,to_id,range_m,t_a,to_temperature_c", *rows]))
     (tmp_path / "m.toml").write_text('[columns]\nfrom_temperature_c = "t_a"\n')
     call("uwblink", "import", "csv", tmp_path / "t.csv", "--map", tmp_path / "m.toml", "-o", tmp_path / "t.uwb")
     read = uwblink.load(tmp_path / "t.uwb").temperature
