@@ -25,6 +25,7 @@ from calib.estimator.optimize import Optimum
 from calib.estimator.score_tests import Derivative, Family, Tested
 from calib.estimator.time_blocks import Persistence
 from calib.settings import FitSettings
+from calib.spread import TWO_SIDED_95
 from uwblink.display import first_few
 
 LOG_EVIDENCE = math.log(100.0)
@@ -103,7 +104,9 @@ def _with(
         one = found.slopes.test(_family(found, covariate, kind, fitted=True))
         if name == "temperature":
             one = _as_lasting(one, found.persistence)
-        slopes.append(1e3 * np.array([one.total[0], 1.96 * one.covariance[0, 0] ** 0.5]) / one.information[0, 0])
+        slopes.append(
+            1e3 * np.array([one.total[0], TWO_SIDED_95 * one.covariance[0, 0] ** 0.5]) / one.information[0, 0]
+        )
         evidence, marginal = log_evidence(one) + beside, _log_marginal(found.searches[0].optimum)
         if evidence >= LOG_EVIDENCE and marginal > likeliest:
             best, likeliest = (found, {"kind": mode, "log_evidence": round(evidence, 1)}, []), marginal
@@ -115,12 +118,13 @@ def _with(
 
 
 def _as_lasting(tested: Tested, known: Persistence) -> Tested:
-    """Return slopes whose errors last no less than those of delays: more series tell how long these last.
+    """Return slopes whose errors last no less than those of delays, of which more series tell, and how surely.
 
     Alternatives that follow a pattern differ from block to block, and the errors in their sums last less.
     """
-    factor = max(known.factor / tested.lasting.factor, 1.0)
-    return replace(tested, covariance=factor * tested.covariance, lasting=known if factor > 1 else tested.lasting)
+    longest = max(known, tested.lasting, key=lambda one: one.factor)
+    factor = longest.factor / tested.lasting.factor * (known.quantile95 / TWO_SIDED_95) ** 2
+    return replace(tested, covariance=factor * tested.covariance, lasting=longest)
 
 
 def _told(name: str, covariate: Covariate, why: str) -> dict[str, Any]:
