@@ -64,8 +64,10 @@ def fit_with_covariates(
     told, warnings = dict[str, dict[str, Any]](), list[str]()
     # Without the pattern of a robot that turns slowly, a slope is too uncertain: it is asked for again beside one.
     for name in (*COVARIATES, "temperature"):
-        asked, again = getattr(settings, name), name in told
-        if asked == "none" or settings.excludes_patterns or (again and ("kind" in told[name] or "pattern" not in told)):
+        asked, before = getattr(settings, name), told.get(name, {})
+        settled = "kind" in before or (before and "pattern" not in told)
+        unread = name == "temperature" and asked == "auto" and not np.isfinite(ranges.temperature_c).any()
+        if asked == "none" or settings.excludes_patterns or settled or unread:
             continue
         found, kept, more = _with(name, asked, found, ranges)
         told |= {name: kept} if kept else {}
