@@ -31,7 +31,9 @@ class Recipe:
     `own` each antenna has a pattern of its own. `turning` is the share of a full turn to which attitudes are confined,
     0 for robots that never turn. `wall_m` is the standard deviation of an offset of each pair, `wander_m` that of an
     error of each pair that forgets itself within three seconds, `room_m` that of an error of each pair that depends on
-    the place of its first robot. Robots that fly a `loop` head along it, so that directions follow places.
+    the place of its first robot. Robots that fly a `loop` head along it, so that directions follow places. Tags warm
+    up by `warmer_k`, from `start_c` in some tens of seconds, and say so each second; each end makes ranges longer by
+    `mm_per_k`, of which tags differ by the standard deviation `apart_mm_per_k`.
     """
 
     robots: int = 4
@@ -47,6 +49,10 @@ class Recipe:
     room_m: float = 0.0
     anchors: int = 0
     loop: bool = False
+    warmer_k: float = 0.0
+    start_c: float = 20.0
+    mm_per_k: float = 0.0
+    apart_mm_per_k: float = 0.0
 
 
 def waves(rng: np.random.Generator, recipe: Recipe) -> Floats:
@@ -92,6 +98,15 @@ def flight(recipe: Recipe, seed: int, number: int = 0) -> tuple[SampleFlight, di
             rows = ends[:, side] == tag
             error[rows] += pattern_m(direction[rows], wave[tag], recipe.pattern_m)
     power = -81 - 20 * np.log10(distance / 4) + 3 * np.sin(0.9 * time_s[None] + ends.T) + rng.normal(0, 0.8, (2, count))
+    warmth, of_boards = np.random.default_rng([seed, 5_151, number]), np.random.default_rng([seed, 5_151])
+    slopes = recipe.mm_per_k + recipe.apart_mm_per_k * of_boards.normal(size=tags + 1)
+    slow_s, far = warmth.uniform(15, 40, tags + 1), warmth.uniform(0.7, 1.3, tags + 1)
+    second = np.arange(0.0, recipe.seconds + 1)
+
+    def celsius(tag: Any, at_s: Any) -> Floats:
+        return np.asarray(recipe.start_c + recipe.warmer_k * far[tag] * (1 - np.exp(-at_s / slow_s[tag])))
+
+    error += 1e-3 * sum(slopes[ends[:, side]] * (celsius(ends[:, side], time_s) - 25) for side in (0, 1))
     error += 0.12 * np.exp(-np.mean(10 ** ((power + 82) / 10), axis=0) / 0.4) + walls_m[which]
     error += recipe.noise_m * rng.normal(size=count)
     error += np.where(rng.random(count) < recipe.reflected, rng.gamma(2.0, 0.17, count), 0.0)
@@ -112,7 +127,21 @@ def flight(recipe: Recipe, seed: int, number: int = 0) -> tuple[SampleFlight, di
     )
     carried = [Tag(tag, name, tuple(arms[tag].tolist())) for tag, name in enumerate(names, 1)]
     known = {"delays_ns": {str(tag): float(delays_ns[tag]) for tag in range(1, tags + 1)}}
-    return SampleFlight(stamped(time_ns, ends, distance + error, power), poses, carried, known), {"waves": wave}
+    read = np.tile(second, tags), np.repeat(np.arange(1, tags + 1), len(second))
+    readings = {
+        "time_ns": 1_000_000_000 + (read[0] * 1e9).astype(np.int64),
+        "tag": read[1],
+        "temperature_c": celsius(read[1], read[0]) + warmth.normal(0, 0.2, len(read[0])),
+        "supply_v": np.full(len(read[0]), np.nan),
+    }
+    found = SampleFlight(
+        stamped(time_ns, ends, distance + error, power),
+        poses,
+        carried,
+        known,
+        temperature=readings if recipe.warmer_k else {},
+    )
+    return found, {"waves": wave, "mm_per_k": slopes}
 
 
 def _motion(rng: np.random.Generator, recipe: Recipe) -> Any:

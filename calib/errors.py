@@ -27,5 +27,9 @@ class LeftOutWarning(PlainWarning):
     """Measurements that are not corrected: ranges of pairs that a calibration does not determine, differences."""
 
 
+class TemperatureWarning(PlainWarning):
+    """Tags that are used at temperatures at which a calibration was not fitted; names the tags."""
+
+
 class WeakHeadingWarning(PlainWarning):
     """Robots with a single tag, whose heading ranges tell only from motion; names the robots."""

@@ -172,9 +172,9 @@ class FitSettings(CheckedSettings):
     path, whose delays are taken over; `constants` "pair" gives each pair a constant instead of each tag a delay. `use`
     "receptions" also fits what third tags overheard of the exchanges, which determines the delay of each target alone.
     `pattern` is the delay of an antenna over direction: "shared" by all tags on bodies that turn, one of each "tag",
-    "none", or "auto": that for which the data are evidence of 100 to 1. With `hold_out` a second fit, to the other
-    ranges, is judged on such a share of them, by `fold`; what was found is in the provenance of the calibration, which
-    is fitted to all.
+    "none", or "auto": that for which the data are evidence of 100 to 1. `temperature` is the growth of ranges with the
+    readings of tags' temperatures, likewise. With `hold_out` a second fit, to the other ranges, is judged on such a
+    share of them, by `fold`; what was found is in the provenance of the calibration, which is fitted to all.
 
     >>> import calib
     >>> settings = calib.FitSettings(loss="huber", fixed_ns={1: -0.3})
@@ -268,6 +268,13 @@ class FitSettings(CheckedSettings):
         names=("auto", "none", "shared", "tag"),
         rich_help_panel=MODEL_PANEL,
     )
+    temperature: str = setting(
+        "auto",
+        "Growth of ranges with the temperature that tags read: none; one slope for all tags; one of each tag; or auto, "
+        "that for which the data are evidence.",
+        names=("auto", "none", "shared", "tag"),
+        rich_help_panel=MODEL_PANEL,
+    )
     hold_out: float = setting(
         0.0,
         "Share of the data to hold out, such as 0.3; a second fit, to the rest, is judged on it.",
@@ -293,11 +300,12 @@ class FitSettings(CheckedSettings):
             raise BadInputError(
                 f"receptions go with delays of tags that are fitted at once, not with `{other}`", parameter="use"
             )
-        if self.pattern in ("shared", "tag") and self.excludes_patterns:
-            raise BadInputError(
-                f"{self.pattern} goes with delays of tags by ranges, not with `{self.excludes_patterns}`",
-                parameter="pattern",
-            )
+        for name in ("pattern", "temperature"):
+            mode = getattr(self, name)
+            if mode in ("shared", "tag") and self.excludes_patterns:
+                raise BadInputError(
+                    f"{mode} goes with delays of tags by ranges, not with `{self.excludes_patterns}`", parameter=name
+                )
         seen: dict[int, str] = {}
         for name, tags in (self.groups or {}).items():
             listed = list(tags) if isinstance(tags, Iterable) and not isinstance(tags, str) else []
@@ -311,7 +319,7 @@ class FitSettings(CheckedSettings):
 
     @property
     def excludes_patterns(self) -> str:
-        """The setting with which no pattern over direction can be fitted, "" if there is none."""
+        """The setting with which no pattern over direction or temperature can be fitted, "" if there is none."""
         if self.sequential:
             return "sequential"
         if self.constants == "pair":

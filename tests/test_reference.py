@@ -10,7 +10,7 @@ import calib
 import uwblink
 import uwbsim
 from calib.calibration.document import CALIBRATION_KEYS as CALIBRATION
-from calib.calibration.patterns import Pattern
+from calib.calibration.patterns import Pattern, TemperatureSlope
 from docs.site import commands, doors, file_keys
 from uwblink.boards import ranging_plan
 from uwblink.importers import column_map
@@ -56,8 +56,9 @@ def test_the_reference_of_calibrations_has_every_key_of_files_and_no_other():
         for one in (calibration, received):
             found |= set(flat(json.loads(one.to_json())))
     matrix = ((0.0,) * 8,) * 8
-    turned = dataclasses.replace(calibration, patterns=(Pattern((1,), matrix[0], matrix[0], matrix, 0.0),))
-    found |= set(flat(json.loads(turned.to_json())))
+    patterns = (Pattern((1,), matrix[0], matrix[0], matrix, 0.0),)
+    slopes = (TemperatureSlope((1,), 0.002, 0.0, 20.0, (10.0, 30.0)),)
+    found |= set(flat(json.loads(dataclasses.replace(calibration, patterns=patterns, temperatures=slopes).to_json())))
     ranges = calib.load_ranges(flight)
     found |= set(flat(json.loads(calib.fit(ranges[ranges.initiator == 1]).calibration.to_json())))
     assert found == {key.name for key in CALIBRATION}

@@ -2,7 +2,7 @@
 
 from calib.calibration.applying import keep_determined
 from calib.calibration.formats import antenna_delays_warning, free_delays, programmed, read_miluv
-from calib.calibration.model import delay_rows, held_out_line, pair_rows, pattern_rows, rests_on
+from calib.calibration.model import delay_rows, held_out_line, pair_rows, pattern_rows, rests_on, temperature_rows
 
 __all__ = [
     "antenna_delays_warning",
@@ -15,4 +15,5 @@ __all__ = [
     "programmed",
     "read_miluv",
     "rests_on",
+    "temperature_rows",
 ]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple
 import numpy as np
 
 from calib.calibration.document import Value, pair_name, split_text
-from calib.calibration.patterns import patterns_m
+from calib.calibration.patterns import dependences_m, warn_of_temperatures
 from calib.calibration.power_curves import ends, lift
 from calib.data.arrivals import Arrivals
 from calib.data.ranges import Ranges
@@ -32,8 +32,8 @@ class CorrectedRanges(ColumnTable):
     are reflected. `tail_probability` is the same given the range itself, where its true distance is known, and
     `outlier` marks what is then neither noise nor a reflection; elsewhere it equals `tail_share`, and nothing is
     marked. `clamped` marks lifted powers at which the curves had no data and are held constant; `sigma_total_m` grows
-    there by the slope of the curve at its end, and by what a pattern over direction leaves open. All but `sigma_m` and
-    `clamped` are NaN where a calibration has no error model (`Calibration.errors`), and without a power.
+    there by the slope of the curve at its end, and by what directions and temperatures leave open. All but `sigma_m`
+    and `clamped` are NaN where a calibration has no error model (`Calibration.errors`), and without a power.
 
     >>> import calib
     >>> flight = calib.load_ranges(calib.sample_flight())
@@ -103,7 +103,8 @@ def corrected_ranges(calibration: Calibration, ranges: Ranges) -> CorrectedRange
     """Return what `Calibration.apply` returns, and raise what that raises."""
     delays = _without_delays(calibration, ranges)
     lifted = calibration.lifted(ranges)
-    longer, unknown = patterns_m(calibration, ranges)
+    longer, unknown = dependences_m(calibration, ranges)
+    warn_of_temperatures(calibration, ranges)
     corrected = delays - _bias(calibration, ranges, lifted) - longer
     return CorrectedRanges(
         raw_m=ranges.raw_m,
@@ -136,6 +137,9 @@ def corrected_arrivals(calibration: Calibration, ranges: Ranges) -> CorrectedArr
     applied = corrected_ranges(calibration, exchange)
     delay_ns = np.array([calibration.delays_ns[tag] for tag in exchange.target.tolist()])
     late_m = 1e-9 * calibration.speed_of_light * delay_ns - reception_bias_m(calibration, receptions)
+    # A delay is twice what it takes off a range. Only the target's counts.
+    of_target = replace(exchange, temperature_c=np.where([False, True], exchange.temperature_c, np.float32(np.nan)))
+    late_m -= 2 * dependences_m(calibration, of_target)[0]
     sigma, model = np.column_stack([noise_m(calibration, one) for one in receptions[:2]]), calibration.errors
     late_share, early_share = np.full((2, len(heard)), np.nan)
     if model is not None:
@@ -262,7 +266,7 @@ def _errors(
 ) -> dict[str, Any]:
     """Return the expected errors of ranges (n,), by the names of `CorrectedRanges`.
 
-    `unknown_m` (n,) is the standard deviation of what patterns leave open.
+    `unknown_m` (n,) is the standard deviation of what directions and temperatures leave open.
     """
     model = calibration.errors
     if model is None:

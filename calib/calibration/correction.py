@@ -85,11 +85,14 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
                 f"{source}: holds {bare} differences of arrival and no ranges; `calib localize` corrects them as it "
                 "uses them, with `use` receptions"
             )
+        warm = recording.columns("temperature")
         tags, counts, left_out, why = recording.tags(), np.zeros(3, dtype=np.int64), 0, ""
         meta = {"calibration": calibration.provenance}
         with recording.copying(output, without=("exchanges", "corrected"), meta=meta, force=force) as written:
             for exchanges, poses in exchanges_with_poses(recording):
-                ranges = Ranges.from_exchanges(exchanges, poses=poses, tags=tags, source=Path(source).name)
+                ranges = Ranges.from_exchanges(
+                    exchanges, poses=poses, tags=tags, source=Path(source).name, temperature=warm
+                )
                 good = determined(calibration, ranges)
                 if not good.all():
                     left_out, why = left_out + int(np.count_nonzero(~good)), within_text(calibration, ranges, good)

@@ -43,10 +43,10 @@ def _curve_keys(name: str, of: str) -> tuple[FileKey, ...]:
 CALIBRATION_KEYS: Final = (
     FileKey(
         "schema_version",
-        "1 to 6",
+        "1 to 7",
         "needed",
         "2 with `groups`, 3 with `power_at` reception, 4 with `pair_offsets`, 5 with `undetermined_splits`, 6 with "
-        "`patterns`.",
+        "`patterns`, 7 with `temperatures`.",
     ),
     FileKey("delays_ns.TAG", "number, ns", "needed", "Aggregate antenna delay of a tag, transmit less receive."),
     FileKey("delays_std_ns.TAG", "number, ns, or null", "needed", "Its standard error; null where data leave it free."),
@@ -123,6 +123,13 @@ CALIBRATION_KEYS: Final = (
         "none",
         "`tags`; `coefficients_m` of 8 spherical harmonics less their `centre`, by which ranges are longer; their "
         "`covariance_m2`; `rms_m`, without directions.",
+    ),
+    FileKey(
+        "temperatures",
+        "list of tables",
+        "none",
+        "`tags`; `m_per_k` by which ranges are longer for each kelvin of an end above `reference_c`; its standard "
+        "error `std_m_per_k`; `span_c`, lowest and highest fitted temperature.",
     ),
 )
 
@@ -227,6 +234,7 @@ StdNs = Annotated[float, number(0.0, MAX_DELAY_NS, f"nanoseconds, 0 to {MAX_DELA
 Metres = Annotated[
     float, number(-MAX_RANGE_M, MAX_RANGE_M, f"metres, up to ±{MAX_RANGE_M:g}, the longest range that is read")
 ]
+Celsius = Annotated[float, number(-273.15, 1e3, "degrees Celsius, -273 to 1000")]
 StdM = Annotated[float, number(0.0, MAX_RANGE_M, f"metres, 0 to {MAX_RANGE_M:g}")]
 PowerDbm = Annotated[float, number(-200.0, 100.0, "dBm, -200 to 100: the noise in a bandwidth of 500 MHz is -87 dBm")]
 Light = Annotated[
@@ -265,15 +273,16 @@ def write(calibration: Value, adapter: TypeAdapter[Value]) -> str:
 
     The version is what a program must support to read it: 2 with groups of tags, 3 with a curve that is taken at each
     reception (taken at the mean power it is wrong by up to a decimetre), 4 with constants of pairs, 5 with pairs that
-    cannot be corrected, 6 with patterns over direction (without them ranges are wrong by up to a decimetre).
+    cannot be corrected, 6 with patterns over direction (without them ranges are wrong by up to a decimetre), 7 with
+    slopes over temperature.
     """
     table = adapter.dump_python(calibration, mode="json")
     # These are left out where there is nothing to say; they stand last, in this order.
     optional = ("power_at", "groups", "errors", "pair_offsets", "antenna_delays", "uncertainty", "undetermined_splits",
-                "patterns")  # fmt: skip
+                "patterns", "temperatures")  # fmt: skip
     used = {key: value for key in optional if (value := table.pop(key)) and value != "exchange"}
-    needed = (("patterns", 6), ("undetermined_splits", 5), ("pair_offsets", 4), ("power_at", 3), ("groups", 2))
-    version = next((version for key, version in needed if key in used), 1)
+    needed = ("groups", "power_at", "pair_offsets", "undetermined_splits", "patterns", "temperatures")
+    version = max((number for number, key in enumerate(needed, 2) if key in used), default=1)
     text = json.dumps({"schema_version": version} | table | used, indent=1, allow_nan=False)
     # Lists of numbers stand on one line each: a matrix reads as rows.
     on_lines = re.sub(
@@ -290,8 +299,8 @@ def read(adapter: TypeAdapter[Value], text: str, where: str) -> Value:
         raise BadInputError(f"{where}: not JSON ({error})") from error
     if not isinstance(table, dict) or "schema_version" not in table:
         raise BadInputError(f"{where}: not a calibration (no schema_version)")
-    if table["schema_version"] not in (1, 2, 3, 4, 5, 6):
-        raise BadInputError(f"{where}: schema version {table['schema_version']!r}, this uwbcal reads 1 to 6")
+    if table["schema_version"] not in range(1, 8):
+        raise BadInputError(f"{where}: schema version {table['schema_version']!r}, this uwbcal reads 1 to 7")
     try:
         return adapter.validate_python(table)
     except ValidationError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -17,6 +17,7 @@ from scipy.interpolate import PPoly
 from calib.calibration.document import ends_of, finite
 from calib.calibration.error_model import ErrorModel
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
+from calib.calibration.patterns import TemperatureSlope
 from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.data.ranges import FAINTEST_DBM, LOUDEST_DBM
 from calib.data.sources import antenna_delays_in
@@ -325,9 +326,33 @@ def c_header(calibration: Calibration) -> str:
         *_c_curve("sigma", calibration.sigma_curve),
     ]
     text = "\n".join(lines) + _C_CODE
+    if calibration.temperatures:
+        text += "\n" + _c_temperatures(calibration.temperatures)
     if calibration.errors:
         text += "\n" + "\n".join(_c_errors(calibration.errors, bias)) + _C_ERRORS
     return text + "#endif\n"
+
+
+def _c_temperatures(slopes: Sequence[TemperatureSlope]) -> str:
+    """Return tables of slopes over temperature, and a function that takes one."""
+    each = [(str(tag), one) for one in slopes for tag in one.tags]
+    return f"""\
+#define UWB_TEMPERATURE_TAGS {len(each)}
+static const int uwb_temperature_tag[] = {{{", ".join(tag for tag, _ in each)}}};
+static const double uwb_m_per_k[] = {{{_numbers(one.m_per_k for _, one in each)}}};
+static const double uwb_reference_c[] = {{{_numbers(one.reference_c for _, one in each)}}};
+
+/* By how much a range is longer, in metres, because a tag at one of its ends has this temperature (degrees Celsius):
+   subtract that of both ends from what uwb_correct() gives. 0 for NaN and for a tag of which it is not known. */
+static inline double uwb_warmth(int tag, double temperature_c)
+{{
+    int k;
+    for (k = 0; k < UWB_TEMPERATURE_TAGS; k++)
+        if (uwb_temperature_tag[k] == tag && !isnan(temperature_c))
+            return uwb_m_per_k[k] * (temperature_c - uwb_reference_c[k]);
+    return 0.0;
+}}
+"""
 
 
 def _c_errors(model: ErrorModel, bias: Curve) -> list[str]:
@@ -423,6 +448,11 @@ def export(
         raise BadInputError(f"found {to!r}, allowed: {', '.join(FORMATS)}", parameter="to")
     if calibration.pair_offsets and to != "json":
         raise BadInputError(f"{to} has no place for constants of pairs; export it as json", parameter="to")
+    if calibration.temperatures and to in ("miluv", "ros-yaml"):
+        raise BadInputError(
+            f"{to} has no place for slopes over temperature; export it as json, or fit with `temperature` none",
+            parameter="to",
+        )
     if calibration.patterns and to in ("miluv", "ros-yaml", "c-header"):
         raise BadInputError(
             f"{to} has no place for patterns over direction; export it as json, or fit with `pattern` none",

@@ -44,7 +44,7 @@ from calib.calibration.document import (
     write,
 )
 from calib.calibration.error_model import CheckedErrors
-from calib.calibration.patterns import CheckedPattern, patterns_m
+from calib.calibration.patterns import CheckedPattern, TemperatureSlope, dependences_m
 from calib.calibration.power_curves import LIFTS, BiasCurve, SigmaCurve, basis, lifted_power
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
@@ -124,8 +124,8 @@ class Calibration:
     side may be longer and those of the other shorter by as much. Ranges between two sides can be corrected, and no
     others of their tags. With an empty side all delays of the other may be longer alike: they are stated less their
     mean, and correct differences of arrival without stamps only. `patterns` say how ranges depend on the directions in
-    which antennas see each other; where these are not known, ranges are corrected without them, and `sigma_total_m`
-    contains what is missing.
+    which antennas see each other, and `temperatures` how they grow with the temperatures of their ends; where these
+    are not known, ranges are corrected without them, and `sigma_total_m` contains what is missing.
     """
 
     delays_ns: Annotated[dict[TagKey, DelayNs], IN_ORDER]
@@ -146,6 +146,7 @@ class Calibration:
     uncertainty: Uncertainty | None = None
     undetermined_splits: tuple[Split, ...] = ()
     patterns: tuple[CheckedPattern, ...] = ()
+    temperatures: tuple[TemperatureSlope, ...] = ()
 
     @property
     def sides(self) -> dict[int, int]:
@@ -254,7 +255,7 @@ class Calibration:
         lifted = self.lifted(ranges)
         found = self.errors.quantiles(shares, lifted, ranges.initiator, ranges.target)
         total = self.errors.total_m(self.errors.shapes(lifted, ranges.initiator, ranges.target))
-        more = np.hypot(self.bias_curve.beyond(lifted), patterns_m(self, ranges)[1])
+        more = np.hypot(self.bias_curve.beyond(lifted), dependences_m(self, ranges)[1])
         return np.asarray(found * np.hypot(1, more / total)[:, None])
 
     @overload
@@ -269,6 +270,7 @@ class Calibration:
         weights: tuple[float, float] = ...,
         azimuth_deg: tuple[float, float] = ...,
         elevation_deg: tuple[float, float] = ...,
+        temperature_c: tuple[float, float] = ...,
     ) -> CorrectedRange[float]: ...
 
     @overload
@@ -283,9 +285,10 @@ class Calibration:
         weights: tuple[ArrayLike, ArrayLike] = ...,
         azimuth_deg: tuple[ArrayLike, ArrayLike] = ...,
         elevation_deg: tuple[ArrayLike, ArrayLike] = ...,
+        temperature_c: tuple[ArrayLike, ArrayLike] = ...,
     ) -> CorrectedRange[Floats]: ...
 
-    def correct(
+    def correct(  # noqa: PLR0913 - columns by name
         self,
         range_m: Any,
         fpp1_dbm: Any,
@@ -296,6 +299,7 @@ class Calibration:
         weights: tuple[Any, Any] = (0.5, 0.5),
         azimuth_deg: tuple[Any, Any] = (math.nan, math.nan),
         elevation_deg: tuple[Any, Any] = (0.0, 0.0),
+        temperature_c: tuple[Any, Any] = (math.nan, math.nan),
     ) -> CorrectedRange[Any]:
         """Correct one range, or arrays of them (n,): the corrected range and its standard deviations, in metres.
 
@@ -304,7 +308,8 @@ class Calibration:
         (`uwblink.twr.delay_weights`); halves take both clocks for equally fast (K = 1), wrong by a millionth of the
         delays, a hundredth of a millimetre at most. `azimuth_deg` and `elevation_deg` are the directions from the
         antennas of initiator and target to each other, in the frames of their bodies, NaN where they are not known;
-        only a calibration with `patterns` uses them. Equals `apply` otherwise, and raises what that raises.
+        only a calibration with `patterns` uses them, and only one with `temperatures` the temperatures `temperature_c`
+        of both. Equals `apply` otherwise, and raises what that raises.
 
         >>> import calib
         >>> known = calib.fit(calib.sample_flight()).calibration
@@ -321,9 +326,11 @@ class Calibration:
             weights=weights,
             azimuth_deg=azimuth_deg,
             elevation_deg=elevation_deg,
+            temperature_c=temperature_c,
         )
         found = columns_of(self.apply(ranges))
-        columns = (range_m, fpp1_dbm, fpp2_dbm, initiator, target, *weights, *azimuth_deg, *elevation_deg)
+        ends = (*weights, *azimuth_deg, *elevation_deg, *temperature_c)
+        columns = (range_m, fpp1_dbm, fpp2_dbm, initiator, target, *ends)
         if any(map(np.ndim, columns)):
             return found
         return CorrectedRange(*(column.item() for column in found))
@@ -437,6 +444,7 @@ def _tables(calibration: Calibration) -> dict[str, list[tuple[str, ...]]]:
         "Antenna delays": [("tag", "delay (ns)", "interval"), *delay_rows(calibration)],
         "Constants": [("pair", "constant (cm)", "interval"), *pair_rows(calibration)],
         "Patterns over direction": [("tags", "rms (cm)", "most"), *pattern_rows(calibration)],
+        "Slopes over temperature": [("tags", "slope", "interval"), *temperature_rows(calibration)],
     }
     most = 40  # tags or pairs that are printed, about a screen
     tables: dict[str, list[tuple[str, ...]]] = {
@@ -491,6 +499,21 @@ def pattern_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
         most = f"{100 * longer[top]:+.1f} cm at azimuth {top}°, {interval(100 * float(std[top]), 1)}"
         rows.append((first_few(map(str, pattern.tags)), f"{100 * pattern.rms_m:.1f}", most))
     return rows
+
+
+def temperature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
+    """Return the tags of each slope over temperature, the slope, and its interval in words and where delays hold."""
+    told = calibration.provenance.get("temperature")
+    why = told.get("why") if isinstance(told, Mapping) else None
+    rows = [
+        (
+            first_few(map(str, one.tags)),
+            f"{1e3 * one.m_per_k:+.2f} mm/K",
+            f"{interval(1e3 * one.std_m_per_k, 2)}, from {one.reference_c:.1f} °C",
+        )
+        for one in calibration.temperatures
+    ]
+    return rows + [("all", "none", f"{why}")] * bool(why)
 
 
 def curve_rows(calibration: Calibration) -> list[tuple[str, ...]]:

@@ -1,15 +1,20 @@
-"""The part of an antenna's delay that depends on direction, as low-order harmonics in the frame of its body."""
+"""The parts of delays that depend on something else: on direction, as low-order harmonics in the frame of the body of
+an antenna; and on temperature."""
 
 from __future__ import annotations
 
+import math
+import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.calibration.document import Matrix, Metres, Number, StdM, Tags, joint
+from calib.calibration.document import Celsius, Matrix, Metres, Number, StdM, Tags, joint
+from calib.errors import TemperatureWarning
 from uwblink.arrays import Floats
+from uwblink.display import first_few
 
 if TYPE_CHECKING:
     from calib.calibration.model import Calibration
@@ -46,6 +51,7 @@ class Pattern:
     is that of the coefficients. `rms_m` is the root mean square over the fitted directions, what is unknown included.
     """
 
+    covariate: ClassVar[str] = "toward"
     tags: Tags
     coefficients_m: tuple[Metres, ...]
     centre: tuple[Number, ...]
@@ -65,20 +71,74 @@ class Pattern:
 CheckedPattern = Annotated[Pattern, joint(_misfit)]
 
 
-def patterns_m(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Floats]:
-    """Return by how much patterns make ranges longer (n,), and the standard deviation of what is unknown of that (n,).
+@dataclass(frozen=True, slots=True)
+class TemperatureSlope:
+    """By how much ranges of some tags are longer for each kelvin that an end is warmer than `reference_c`.
 
-    Where a direction is not known the first is 0, and the second has the mean square of the pattern.
+    That is `m_per_k` for each end, of which `std_m_per_k` is the standard error. `span_c` are the lowest and the
+    highest of the fitted temperatures.
+    """
+
+    covariate: ClassVar[str] = "temperature_c"
+    tags: Tags
+    m_per_k: Metres
+    std_m_per_k: StdM
+    reference_c: Celsius
+    span_c: tuple[Celsius, Celsius]
+
+    @property
+    def coefficients_m(self) -> tuple[float]:
+        """Return the slope, in a tuple as the coefficients of a `Pattern`."""
+        return (self.m_per_k,)
+
+    @property
+    def rms_m(self) -> float:
+        """Return the standard deviation of an end whose temperature is not known: the slope times the fitted span."""
+        return math.hypot(self.m_per_k, self.std_m_per_k) * (self.span_c[1] - self.span_c[0])
+
+    def values(self, temperature_c: Floats | NDArray[np.float32]) -> Floats:
+        """Return temperatures (n,) less the reference, (n, 1)."""
+        return np.asarray(temperature_c, dtype=np.float64)[:, None] - self.reference_c
+
+    def std_m(self, values: Floats) -> Floats:
+        """Return the standard error of the slope times such values (n, 1), or sums of them."""
+        return np.asarray(self.std_m_per_k * np.abs(values[:, 0]))
+
+
+def dependences_m(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Floats]:
+    """Return by how much directions and temperatures make ranges longer (n,), and the standard deviation (n,) of what
+    is unknown of that.
+
+    Where a direction is not known the first is 0, and the second has the mean square of the pattern; where a
+    temperature is not known the second has the slope times the fitted temperatures' span.
     """
     longer, variance = np.zeros((2, len(ranges)))
-    for pattern in calibration.patterns:
-        values = np.zeros((len(ranges), HARMONICS))
+    every: tuple[Pattern | TemperatureSlope, ...] = (*calibration.patterns, *calibration.temperatures)
+    for one in every:
+        values = np.zeros((len(ranges), len(one.coefficients_m)))
         for end, ids in enumerate((ranges.initiator, ranges.target)):
-            rows = np.flatnonzero(np.isin(ids, pattern.tags))
-            own = pattern.values(ranges.toward[rows, end])
+            rows = np.flatnonzero(np.isin(ids, one.tags))
+            own = one.values(getattr(ranges, one.covariate)[rows, end])
             unknown = np.asarray(np.isnan(own).any(axis=1))
             values[rows] += np.where(unknown[:, None], 0.0, own)
-            variance[rows] += np.where(unknown, pattern.rms_m**2, 0.0)
-        longer += values @ np.array(pattern.coefficients_m)
-        variance += pattern.std_m(values) ** 2
+            variance[rows] += np.where(unknown, one.rms_m**2, 0.0)
+        longer += values @ np.array(one.coefficients_m)
+        variance += one.std_m(values) ** 2
     return longer, np.sqrt(variance)
+
+
+def warn_of_temperatures(calibration: Calibration, ranges: Ranges, beyond_k: float = 5.0) -> None:
+    """Give a `TemperatureWarning` that names the tags whose temperatures are beyond the fitted ones.
+
+    A slope that is known to half of the manual's 2.15 mm/K is off by 5 mm after 5 K, less than ranges repeat to.
+    """
+    ends = np.column_stack([ranges.initiator, ranges.target])
+    for low, high in sorted({one.span_c for one in calibration.temperatures}):
+        with np.errstate(invalid="ignore"):
+            outside = (ranges.temperature_c < low - beyond_k) | (ranges.temperature_c > high + beyond_k)
+        fitted = {tag for one in calibration.temperatures if one.span_c == (low, high) for tag in one.tags}
+        if tags := sorted(fitted & {*ends[outside].tolist()}):
+            named = first_few(map(str, tags))
+            text = f"tags {named} were used more than {beyond_k:.0f} K beyond the {low:.0f} to {high:.0f} °C at which"
+            # From here, and not from the caller's place: Python shows a text once for each place.
+            warnings.warn(f"{text} the calibration was fitted: it extrapolates there", TemperatureWarning, stacklevel=1)

@@ -208,7 +208,7 @@ CHECKS: Final = (
         {
             "delay changed mid-flight": "look for a loose antenna or another voltage on tag {tag}; calibrate the "
             "two parts apart",
-            "delay drifts": "let tag {tag} warm up, see to its supply; calibrate short parts apart",
+            "delay drifts": "{readings}let tag {tag} warm up, see to its supply; calibrate short parts apart",
         },
         residuals.changed_delays,
     ),

@@ -59,7 +59,7 @@ def of_places(found: KnownDistances, slopes: Slopes, pairs: Tested, before_ns2: 
     own, more = (np.diag(apart @ one @ apart) for one in (before_ns2, widening))
     if max(deviation, stays) <= CERTAIN_DEVIATION or not np.any(more > np.maximum(own, SMALLEST_NS**2)):
         return widening, []
-    directions = found.model.directions is None
+    directions = "pattern" not in found.model.covariates
     return widening, [
         f"errors belong to places{' or directions' * directions}: ranges between the same two bodies are wrong "
         "together, as walls and things near them make it, or a wrong lever arm"

@@ -41,7 +41,8 @@ class RecordingView:
 
     `reported_twice` exchanges were reported by both ends, and `contradictions` are the differences of such reports;
     `doubled` rows repeated another one. A recording is `posed` if true distances come from poses, and `standing` if it
-    was made for a survey: arrangements of boards, without poses and true distances.
+    was made for a survey: arrangements of boards, without poses and true distances. `warming` are the tags that read
+    their temperature.
     """
 
     name: str
@@ -55,6 +56,7 @@ class RecordingView:
     doubled: int
     posed: bool
     standing: bool
+    warming: frozenset[int] = frozenset()
 
     @cached_property
     def quick_fit(self) -> QuickFit | None:
@@ -118,6 +120,7 @@ def view_of(name: str, source: Source) -> RecordingView:
         contradictions=[", ".join(differences(both, a, b)) for a, b in reports.differing.tolist()],
         doubled=int(np.count_nonzero(again)),
         posed=posed,
+        warming=frozenset((getattr(source, "temperature", None) or {"tag": np.zeros(0)})["tag"].tolist()),
         standing=bool(getattr(source, "arrangements", ())) and not len(looked.poses) and not np.isfinite(truth_m).any(),
     )
 

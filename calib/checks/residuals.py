@@ -263,6 +263,7 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
     # 1 % of its size; they are fewer for many pairs, for the sake of memory.
     cuts = np.linspace(1 / 8, 7 / 8, min(47, 1500 // len(fit.model.pairs.ends)))
     courses = np.column_stack([share[:, None] >= cuts, share])
+    by_readings = "fit how ranges grow with its temperature, which it reads (setting `temperature`); or "
     for one in changes_of_tags(fit, courses):
         fault, what, when = "delay drifts", "drift", "over the recording"
         if one.course < len(cuts):
@@ -272,7 +273,7 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
             fault,
             f"ranges of tag {one.tag} {what} by {100 * one.size_m:+.1f} cm {when} {one} do not",
             one.p_value,
-            {"tag": one.tag},
+            {"tag": one.tag, "readings": by_readings * (one.tag in view.warming)},
         )
 
 

@@ -156,12 +156,13 @@ def _fit_from_ranges(
 
 
 def delay_lines(found: calib.Calibration) -> list[str]:
-    """Return a line per pair with a constant, per tag and per pattern: constant or delay, and its 95 % interval."""
-    from calib.calibration import delay_rows, pair_rows, pattern_rows
+    """Return a line per pair with a constant, per tag, per pattern and per slope, each with its 95 % interval."""
+    from calib.calibration import delay_rows, pair_rows, pattern_rows, temperature_rows
 
     lines = [f"  pair {pair:>7}  ranges {value} cm too long  {interval}" for pair, value, interval in pair_rows(found)]
     lines += [f"  tag {tag:>3}  delay {value} ns  {interval}" for tag, value, interval in delay_rows(found)]
-    return lines + [f"  tags {tags}  {rms} cm rms over direction, {most}" for tags, rms, most in pattern_rows(found)]
+    lines += [f"  tags {tags}  {rms} cm rms over direction, {most}" for tags, rms, most in pattern_rows(found)]
+    return lines + [f"  tags {tags}  {slope} over temperature, {more}" for tags, slope, more in temperature_rows(found)]
 
 
 def add_tag(

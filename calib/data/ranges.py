@@ -62,6 +62,7 @@ class Ranges(ColumnTable):
     `antenna_delays` are those programmed into the tags, as far as known; `arrivals` is what other tags overheard of
     these exchanges, None without any. `toward` (n, 2, 3) are unit vectors from the antennas of initiator and target to
     each other, in the frames of their bodies, NaN where attitudes are not known; `turning` are tags whose bodies turn.
+    `temperature_c` (n, 2) are the temperatures of initiator and target, NaN where no reading is near in time.
 
     A row with a `listener` (-1 elsewhere) is a difference of arrival without stamps: by how much farther from the
     target than from the initiator the listener is. The weight of its initiator is negative.
@@ -90,17 +91,18 @@ class Ranges(ColumnTable):
     arrivals: Arrivals | None = None
     toward: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2, 3), dtype=np.float32))
     turning: tuple[int, ...] = ()
+    temperature_c: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.float32))
     listener: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
-        """Put all ranges into one session, and take directions for unknown, where none are given."""
+        """Put all ranges into one session, and take directions and temperatures for unknown, where none are given."""
         if len(self.listener) != len(self.time_ns):
             object.__setattr__(self, "listener", np.full(len(self.time_ns), -1))
         if len(self.session) != len(self.time_ns):
             object.__setattr__(self, "session", np.zeros(len(self.time_ns), dtype=np.int32))
-        if len(self.toward) != len(self.time_ns):
-            unknown = np.broadcast_to(np.float32(np.nan), (len(self.time_ns), 2, 3))
-            object.__setattr__(self, "toward", unknown)
+        for name, shape in (("toward", (2, 3)), ("temperature_c", (2,))):
+            if len(getattr(self, name)) != len(self.time_ns):
+                object.__setattr__(self, name, np.broadcast_to(np.float32(np.nan), (len(self.time_ns), *shape)))
 
     @classmethod
     def from_exchanges(
@@ -113,12 +115,13 @@ class Ranges(ColumnTable):
         planted: Mapping[str, Any] | None = None,
         source: str = IN_MEMORY,
         antenna_delays: AntennaDelays | None = None,
+        temperature: Mapping[str, NDArray[Any]] | None = None,
     ) -> Ranges:
         """Return a row for every exchange, usable or not (`usable` leaves out those that a fit cannot use).
 
         True distances are `truth_m` (n,), or those of the exchanges; where neither is finite they come from `poses` and
-        the lever arms of `tags`. A power that cannot have been measured is NaN. Raises `BadInputError` where `truth_m`
-        has another length than the exchanges.
+        the lever arms of `tags`. A power that cannot have been measured is NaN. `temperature` are readings, the columns
+        of a recording's table. Raises `BadInputError` where `truth_m` has another length than the exchanges.
         """
         truth = exchanges.truth_m if truth_m is None else np.asarray(truth_m, dtype=np.float64)
         if truth.shape != (len(exchanges),):
@@ -130,6 +133,9 @@ class Ranges(ColumnTable):
             truth = np.where(np.isfinite(truth), truth, distance)
             turning = {body for body, track in tracks.items() if track.turn_rad() > LEAST_TURN_RAD}
             seen = {"toward": toward.astype(np.float32), "turning": tuple(t.tag for t in tags if t.body in turning)}
+        if temperature:
+            ends = np.column_stack([exchanges.initiator, exchanges.target])
+            seen["temperature_c"] = read_c(temperature, ends, exchanges.time_ns)
         of_initiator, of_target = delay_weights(exchanges)
         bare = without_stamps(exchanges)
         return cls(
@@ -168,6 +174,7 @@ class Ranges(ColumnTable):
         weights: tuple[ArrayLike, ArrayLike] = (0.5, 0.5),
         azimuth_deg: tuple[ArrayLike, ArrayLike] = (math.nan, math.nan),
         elevation_deg: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
+        temperature_c: tuple[ArrayLike, ArrayLike] = (math.nan, math.nan),
         source: str = IN_MEMORY,
     ) -> Ranges:
         """Return a row for every range of arrays (n,), metres and dBm; a single number serves all rows.
@@ -176,8 +183,8 @@ class Ranges(ColumnTable):
         range is `fpp1_dbm`. `weights` are those of the two delays (`uwblink.twr.delay_weights`): by default halves, as
         if both clocks ran alike, which changes no range by more than a hundredth of a millimetre. `azimuth_deg` and
         `elevation_deg` are the directions from the antennas of initiator and target to each other, in the frames of
-        their bodies; only a direction pattern needs them. Raises `BadInputError` where the arrays do not fit each
-        other.
+        their bodies; only a direction pattern needs them. `temperature_c` are the temperatures of both. Raises
+        `BadInputError` where the arrays do not fit each other.
 
         >>> from calib import Ranges
         >>> len(Ranges.from_arrays([3.1, 4.2], initiator=1, target=[2, 3], fpp1_dbm=-85.0))
@@ -185,8 +192,9 @@ class Ranges(ColumnTable):
         """
         if protocol not in PROTOCOLS:
             raise BadInputError(f"found {protocol!r:.40}, allowed: {', '.join(PROTOCOLS)}", parameter="protocol")
-        both = {"weights": weights, "azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
-        for name, pair in both.items():
+        angles = {"azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
+        both = {"temperature_c": temperature_c} | angles
+        for name, pair in ({"weights": weights} | both).items():
             if len(pair) != 2:
                 raise BadInputError(f"found {len(pair)}, expected those of initiator and target", parameter=name)
         floats = {
@@ -195,7 +203,7 @@ class Ranges(ColumnTable):
             "fpp1_dbm": fpp1_dbm,
             "fpp2_dbm": math.nan if fpp2_dbm is None else fpp2_dbm,
             **dict(zip(("weight_initiator", "weight_target"), weights, strict=True)),
-            **{f"{name} {end}": both[name][end] for name in ("azimuth_deg", "elevation_deg") for end in (0, 1)},
+            **{f"{name} {end}": pair[end] for name, pair in both.items() for end in (0, 1)},
         }
         ints = {"initiator": initiator, "target": target, "time_ns": time_ns}
         with raising(BadInputError, "arrays of ranges do not fit each other", TypeError, ValueError):
@@ -210,8 +218,8 @@ class Ranges(ColumnTable):
             row = int(np.argmax(itself))
             raise BadInputError(f"row {row} is of tag {columns['target'][row]} with itself", parameter="target")
         columns |= {name: measured_powers(columns[name]) for name in ("fpp1_dbm", "fpp2_dbm")}
-        angles = {name: np.radians([columns.pop(f"{name} {end}") for end in (0, 1)]).T for name in [*both][1:]}
-        around, up = angles["azimuth_deg"], angles["elevation_deg"]
+        warm, around, up = (np.array([columns.pop(f"{name} {end}") for end in (0, 1)]).T for name in both)
+        columns["temperature_c"], around, up = measured_c(warm), np.radians(around), np.radians(up)
         toward = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1)
         found = cls(source=source, protocol=np.full(len(rows[0]), protocol), excluded={}, planted=None, **columns)
         if not np.isfinite(around).any():
@@ -235,7 +243,9 @@ class Ranges(ColumnTable):
         900
         """
         found = contents_of_frame(frame, map)
-        return cls.from_exchanges(found.exchanges, poses=found.poses, tags=found.tags, source="data frame")
+        return cls.from_exchanges(
+            found.exchanges, poses=found.poses, tags=found.tags, source="data frame", temperature=found.temperature
+        )
 
     @classmethod
     def from_differences(
@@ -286,8 +296,9 @@ class Ranges(ColumnTable):
         return found if self.arrivals is None else replace(found, arrivals=self.arrivals.of_exchanges(rows, len(self)))
 
     def to_dict(self) -> dict[str, NDArray[Any]]:
-        """Return the columns by name, (n,) each, without directions and listeners."""
-        return {name: column for name, column in self._columns().items() if name not in ("toward", "listener")}
+        """Return the columns by name, (n,) each, without directions, temperatures and listeners."""
+        hidden = ("toward", "temperature_c", "listener")
+        return {name: column for name, column in self._columns().items() if name not in hidden}
 
     def _title(self) -> str:
         left = "".join(f", {count} left out: {reason}" for reason, count in self.excluded.items())
@@ -348,6 +359,30 @@ def contents_of_frame(frame: Any, map_source: MapSource | None = None) -> Conten
     for note in found.meta.get("notes", ()):
         warnings.warn(note, stacklevel=3)
     return found
+
+
+def read_c(table: Mapping[str, NDArray[Any]], ids: Ints, time_ns: Ints) -> NDArray[np.float32]:
+    """Return the temperatures of tags `ids` (n, 2) at times (n,) by readings, columns of a table `temperature`.
+
+    Interpolated linearly between readings, and held before the first and after the last; NaN further than 30 s from
+    the next reading: boards warm up within a minute or more, so that less than half of a change is missed.
+    """
+    found = np.full(ids.shape, np.nan, dtype=np.float32)
+    known = np.isfinite(measured_c(table["temperature_c"]))
+    for tag in np.unique(table["tag"][known]).tolist():
+        when, first = np.unique(table["time_ns"][known & (table["tag"] == tag)], return_index=True)
+        celsius = table["temperature_c"][known & (table["tag"] == tag)][first]
+        row, end = np.nonzero(ids == tag)
+        at = time_ns[row]
+        after = np.searchsorted(when, at)
+        away = [np.abs(when[np.clip(after - k, 0, len(when) - 1)] - at) for k in (0, 1)]
+        found[row, end] = np.where(np.minimum(*away) <= 30e9, np.interp(at, when, celsius), np.nan)
+    return found
+
+
+def measured_c(temperature_c: Floats) -> NDArray[np.float32]:
+    """Return temperatures in degrees Celsius, NaN where the number cannot be that of a board."""
+    return np.where(np.abs(temperature_c) < 300.0, temperature_c, np.nan).astype(np.float32)
 
 
 def measured_powers(fpp_dbm: Floats) -> Floats:

@@ -32,6 +32,7 @@ class SampleFlight:
     planted: dict[str, Any]
     imu: Mapping[str, Any] = field(default_factory=dict)
     height: Mapping[str, Any] = field(default_factory=dict)
+    temperature: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def meta(self) -> dict[str, Any]:

@@ -42,8 +42,8 @@ class Source(Protocol):
     """An object in place of a file: exchanges, poses of bodies, and the tags on them.
 
     A simulation's result has these attributes. Used where they exist: `planted`, what a simulation put in, which is
-    shown and never used (or `meta` with that entry, and with the programmed antenna delays); `faults`; `overheard` and
-    `differences`, columns of the recording's tables.
+    shown and never used (or `meta` with that entry, and with the programmed antenna delays); `faults`; `overheard`,
+    `temperature` and `differences`, columns of the recording's tables.
     """
 
     @property
@@ -69,7 +69,10 @@ READERS: Final[dict[str, Callable[[Recording], Any]]] = {
     "tags": Recording.tags,
     "meta": Recording.meta,
     "faults": Recording.faults,
-    **{table: partial(Recording.columns, table=table) for table in ("overheard", "imu", "height", "differences")},
+    **{
+        table: partial(Recording.columns, table=table)
+        for table in ("overheard", "imu", "height", "temperature", "differences")
+    },
     "arrangements": Recording.arrangements,
     "known_distances": Recording.known_distances,
 }
@@ -333,6 +336,7 @@ def load_flight(
             planted=planted_of(source, name),
             source=name,
             antenna_delays=antenna_delays_of(source, name),
+            temperature=getattr(source, "temperature", None),
         )
         heard = getattr(source, "overheard", None)
         if heard and len(heard["time_ns"]):

@@ -9,9 +9,10 @@ pooled, and fitted with an autocorrelation a rho^h (`persistence`). What the fit
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import stdtrit
 
 from calib.estimator.inverse import trace_of_product
@@ -53,6 +54,14 @@ class Kept:
     def curve(cls, indices: Ints) -> Kept:
         """Return the coefficients of a smooth curve."""
         return cls(indices=indices, combinations=np.eye(len(indices)), independent=CURVE_SERIES)
+
+    def beside(self, indices: Ints) -> Kept:
+        """Return these unknowns and others after them, of which there are too few to tell how long their errors last.
+
+        The errors of ranges of the same pairs are behind both.
+        """
+        whole = block_diag(self.combinations, np.eye(len(indices)))
+        return replace(self, indices=np.append(self.indices, indices), combinations=whole)
 
 
 def sandwich(

@@ -17,9 +17,9 @@ from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.arrival_rows import ArrivalModel
 from calib.estimator.covariance import Kept, sandwich
+from calib.estimator.covariates import COMMON, OWN, OWN_WARMTH, WARMTH
 from calib.estimator.losses import LOSSES, MIXTURE
 from calib.estimator.optimize import Optimum, maximize
-from calib.estimator.pattern_unknowns import COMMON, OWN
 from calib.estimator.range_model import METRES_A_NS, RangeModel
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows, Robust
 from calib.estimator.rows import NormalRows, Rows
@@ -96,9 +96,10 @@ class KnownDistances:
     """A fit to known distances: its `model`, the search that ended it, and the covariances of what was fitted.
 
     `values` are unknowns by kind, `covariances` those of "delay", of all curves side by side ("curve"), of the noise
-    ("noise") and of patterns over direction ("pattern"). `residuals` (n,) are fitted less true ranges in the order of
-    the model's ranges, metres. `searches` are the one search, or that of the delays and that of the curves.
-    `persistence` is that of errors of delays, and `slopes` and `slopes_of_heard` are those of the first search.
+    ("noise"), of patterns over direction ("pattern") and of delays and slopes over temperature ("temperature").
+    `residuals` (n,) are fitted less true ranges in the order of the model's ranges, metres. `searches` are the one
+    search, or that of the delays and that of the curves. `persistence` is that of errors of delays, and `slopes` and
+    `slopes_of_heard` are those of the first search.
     """
 
     model: RangeModel
@@ -141,7 +142,7 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> KnownDistances
     if settings.sequential and model.curve is not None and not model.pinned:
         return _in_sequence(model, error, loss, scale_m, blocks)
     robust, heard = loss if loss != MIXTURE else ROBUST_LOSS, ArrivalModel.of(model)
-    first = ("delay", *model.curve_kinds(), COMMON, OWN)
+    first = ("delay", *model.curve_kinds(), COMMON, OWN, WARMTH, OWN_WARMTH)
     pilot = robust_fit(model, error, robust, scale_m, first, sample=PILOT, heard=heard)
     if heard is not None and pilot.heard is not None:
         heard = _weighed(heard, model, pilot.heard, pilot, blocks)
@@ -321,6 +322,8 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDis
         "noise": Kept.curve(layout.indices(noise_kinds(layout))),
         "pattern": Kept.curve(layout.indices([COMMON, OWN])),
     }
+    if len(warmth := layout.indices([WARMTH, OWN_WARMTH])):
+        kept["temperature"] = kept["delay"].beside(warmth)
     kept = {name: group for name, group in kept.items() if len(group.indices)}
     slopes, *of_heard = fitted.slopes(blocks)
     found = sandwich(slopes, kept, fitted.beside)

@@ -7,7 +7,7 @@ and differ only in the source of distances.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -16,9 +16,9 @@ from calib.calibration.document import Split
 from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, knots_for, lift, lifted_power, populated
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
+from calib.estimator.covariates import COVARIATES, Covariate
 from calib.estimator.grouped_errors import error_unknowns, logarithms, scattered
 from calib.estimator.identifiability import free_directions
-from calib.estimator.pattern_unknowns import KINDS, Directions
 from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Unknown
@@ -88,7 +88,7 @@ class RangeModel:
     `unknowns` are delays, curves and offsets; `error_model` adds those of errors. `carriers` has for each curve the
     weights (tags,) with which delays can take over a constant of it, or None: such a curve keeps the constant, which
     pinned delays determine. Delays have no part along the directions `held` (tags, k), which no range determines and
-    which shift the tags of the groups `free`. `directions` are there where patterns over direction are fitted.
+    which shift the tags of the groups `free`. `covariates` are what delays depend on in this fit, by setting.
     """
 
     ranges: Ranges
@@ -105,7 +105,7 @@ class RangeModel:
     carriers: tuple[Floats | None, ...]
     held: Floats
     free: list[Split]
-    directions: Directions | None = None
+    covariates: Mapping[str, Covariate] = field(default_factory=dict)
 
     @classmethod
     def of(cls, ranges: Ranges, settings: FitSettings, *, offsets: bool = True, trimmed: bool = True) -> RangeModel:
@@ -142,14 +142,15 @@ class RangeModel:
             noise = SplineValues.at(lifted, knots_for(ordered, SIGMA_SEGMENTS, (low, high)))
         if offsets:
             blocks += _offsets(ranges, pairs, tags, of_pairs=_offsets_identifiable(pairs, tags, settings, carriers))
-        kinds = KINDS.get(settings.pattern, ())
-        directions = Directions.of(ranges) if kinds else None
-        if directions is not None:
-            blocks += directions.blocks(kinds, pairs)
+        covariates = {}
+        for name, (read, kinds) in COVARIATES.items():
+            if (asked := getattr(settings, name)) in kinds:
+                covariates[name] = read(ranges)
+                blocks += covariates[name].blocks(kinds[asked], pairs)
         return cls(
             ranges=ranges,
             settings=settings,
-            directions=directions,
+            covariates=covariates,
             lifted=lifted,
             powered=powered,
             span=(low, high),

@@ -16,10 +16,10 @@ from scipy.special import expit
 
 from calib.calibration.error_model import ErrorModel, PairErrors
 from calib.calibration.model import Calibration, PairOffset, TagGroup, Uncertainty, matrix_of
-from calib.calibration.patterns import HARMONICS, Pattern
+from calib.calibration.patterns import HARMONICS, Pattern, TemperatureSlope
 from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, flat_curve
+from calib.estimator.covariates import COMMON, OF_PLACES, OWN, OWN_WARMTH, WARMTH
 from calib.estimator.known_distances import LARGEST_SPREAD_M, DescribedErrors, KnownDistances, described_errors
-from calib.estimator.pattern_unknowns import COMMON, OF_PLACES, OWN
 from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel, SplineValues
 from calib.estimator.range_rows import RESIDUAL
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
@@ -111,12 +111,13 @@ def calibration_of(found: KnownDistances, delays_ns2: Floats) -> Calibration:
         antenna_delays=known_delays(model.ranges.antenna_delays, model.ranges.tags()),
         undetermined_splits=tuple(model.free),
         patterns=patterns_of(found),
+        temperatures=temperatures_of(found),
     )
 
 
 def patterns_of(found: KnownDistances) -> tuple[Pattern, ...]:
     """Return the patterns over direction of a fit: one that all tags share, or one of each tag."""
-    directions, values = found.model.directions, found.values
+    directions, values = found.model.covariates.get("pattern"), found.values
     if directions is None:
         return ()
     whose = [(tag,) for tag in directions.tags] if OWN in values else [directions.tags]
@@ -128,6 +129,23 @@ def patterns_of(found: KnownDistances) -> tuple[Pattern, ...]:
         centre = tuple(directions.centre.tolist())
         patterns.append(Pattern(tags, tuple(own.tolist()), centre, matrix_of(covariance), rms))
     return tuple(patterns)
+
+
+def temperatures_of(found: KnownDistances) -> tuple[TemperatureSlope, ...]:
+    """Return the slopes over temperature of a fit: one that all tags share, or one of each tag."""
+    known, values = found.model.covariates.get("temperature"), found.values
+    if known is None:
+        return ()
+    own = values.get(OWN_WARMTH, np.zeros(0))
+    whose = [(tag,) for tag in known.tags] if len(own) else [known.tags]
+    # A tag's slope is the common one and its own, side by side among the unknowns.
+    sums = np.column_stack([np.ones(len(whose)), np.eye(len(own))]) if len(own) else np.ones((1, 1))
+    slopes = sums @ np.append(values[WARMTH], own)
+    covariance = found.covariances["temperature"][-sums.shape[1] :, -sums.shape[1] :]
+    std = np.sqrt(np.diag(sums @ covariance @ sums.T))
+    span = (float(known.span[0, 0]), float(known.span[1, 0]))
+    rows = zip(whose, slopes.tolist(), std.tolist(), strict=True)
+    return tuple(TemperatureSlope(tags, slope, error, float(known.centre[0]), span) for tags, slope, error in rows)
 
 
 def bias_curves(found: KnownDistances) -> dict[str, Curve]:
@@ -190,9 +208,9 @@ def _correction_std(found: KnownDistances, delays_ns2: Floats, lifted: Floats) -
     else:
         delays = np.sum(model.pairs.ends[:, :, None] == np.array(model.tags), axis=1) * METRES_A_NS / 2
         of_pairs = np.sum(delays @ delays_ns2 * delays, axis=1)
-    if model.directions is not None:
+    if (directions := model.covariates.get("pattern")) is not None:
         # What belongs to places, and depends on direction there, is not corrected.
-        parts = ((*model.directions.entries(kind, model.pairs)[1:], found.values[kind]) for kind in OF_PLACES)
+        parts = ((*directions.entries(kind, model.pairs)[1:], found.values[kind]) for kind in OF_PLACES)
         left = sum(np.sum(entries * values[columns], axis=1) for columns, entries, values in parts)
         of_pairs = of_pairs + np.var(left)
     variance = np.full(len(lifted), float(np.mean(of_pairs)))

@@ -38,8 +38,8 @@ from calib.estimator.known_distances import KnownDistances
 from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
+from calib.fitting.covariates import fit_with_covariates
 from calib.fitting.passive_listeners import MIN_OF_DELAY
-from calib.fitting.patterns import fit_with_pattern
 from calib.fitting.result import FitResult, HeldOut
 from calib.settings import FitSettings, check_tag
 from uwblink.arrays import Bools
@@ -87,7 +87,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     refuse_impossible(ranges)
     # One thread: sums of several threads differ in the last digits, and threads slow small matrices down.
     with threadpool_limits(limits=1, user_api="blas"):
-        found, pattern, vague = fit_with_pattern(ranges, replace(settings, fixed_ns=fixed))
+        found, dependences, vague = fit_with_covariates(ranges, replace(settings, fixed_ns=fixed))
         fitted = dict(zip(found.model.tags, found.delays.tolist(), strict=False))
         refuse_refuted(fitted, found.residuals, found.model.ranges)
         covariance_ns2, findings = examine_fit(found)
@@ -106,7 +106,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         **({"arrivals": len(arrivals.residual)} if (arrivals := found.searches[0].arrivals) else {}),
         **({"arrivals": len(ranges)} if ranges.differences.any() else {}),
         "gauge": _gauge(found),
-        **({"pattern": pattern} if pattern else {}),
+        **dependences,
         **({"held_out": _judged(held, settings)} if held else {}),
     }
     result = result_of(
@@ -165,7 +165,12 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
     straight = replace(some, raw_m=some.raw_m + applied.corrected_m - applied.delay_corrected_m)
     partners = replace(calibration, undetermined_splits=())
     settings = FitSettings(
-        loss=loss, delays_from=partners, delays_only=True, alpha_dbm=calibration.alpha_dbm, pattern="none"
+        loss=loss,
+        delays_from=partners,
+        delays_only=True,
+        alpha_dbm=calibration.alpha_dbm,
+        pattern="none",
+        temperature="none",
     )
     found = fit(straight, settings, lift=calibration.lift)
     added = {"tag": tag, "recording": ranges.source, "exchanges": len(some)}

@@ -72,6 +72,7 @@ ASKED: Final = "?"
 
 NAMES: Final = (
     "time_s", *ALL_IDS, *STAMPS, "fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2", "sts1", "sts2", *DISTANCES,
+    "from_temperature_c", "to_temperature_c",
     "sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "sts", "stamp", "event", "heard",
 )  # fmt: skip
 """The columns of tables; `event` has words that tell whether a stamp is of transmission or of reception."""

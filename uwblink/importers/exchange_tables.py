@@ -45,12 +45,12 @@ from uwblink.importers.staging import (
     time_conditions,
     usable_exchanges,
 )
-from uwblink.importers.tables import connected
+from uwblink.importers.tables import Columns, connected
 from uwblink.importers.templates import Template
 from uwblink.recording.antenna_delays import AntennaDelay, meta_of_delays
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
-from uwblink.twr import STAMPS, raw_range
+from uwblink.twr import STAMPS, Exchanges, raw_range
 
 TABLE_SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".parquet", ".jsonl", ".ndjson", ".jsonl.gz")
 
@@ -138,10 +138,8 @@ def import_tables(
                     raw, reported = raw_range(exchanges), exchanges.range_m
                     exchanges = replace(exchanges, range_m=np.where(np.isfinite(reported), reported, raw))
                 recording.append_exchanges(exchanges)
-                for table, columns in _BESIDE.items():
-                    if columns.keys() & block.keys():
-                        beside = {name: getattr(exchanges, name) for name in ("time_ns", "initiator", "target")}
-                        recording.append(table, beside | {kept: optional(block, n) for n, kept in columns.items()})
+                for table, beside in _beside(exchanges, block):
+                    recording.append(table, beside)
             for poses in _poses(rows, bodies):
                 recording.append_poses(poses)
             for table, found in staging.beside.items():
@@ -152,13 +150,26 @@ def import_tables(
                 recording.append("faults", some)
             counts = {
                 name: recording.count(name)
-                for name in ("exchanges", "differences", "poses", *_BESIDE, *staging.beside, "faults")
+                for name in ("exchanges", "differences", "poses", "temperature", *_BESIDE, *staging.beside, "faults")
             }
             if first:
                 lost = counts["faults"]
                 notes.append(f"{lost} of {total + lost} rows cannot be used and are kept as faults; the first: {first}")
             recording.append_meta({"notes": notes})
         return Imported({name: n for name, n in counts.items() if n or name == "exchanges"}, notes)
+
+
+def _beside(exchanges: Exchanges, block: Columns) -> Iterator[tuple[str, Columns]]:
+    """Yield what rows say beside exchanges, by table of the recording."""
+    for table, columns in _BESIDE.items():
+        if columns.keys() & block.keys():
+            ends = {name: getattr(exchanges, name) for name in ("time_ns", "initiator", "target")}
+            yield table, ends | {kept: optional(block, name) for name, kept in columns.items()}
+    for end, name in (("initiator", "from_temperature_c"), ("target", "to_temperature_c")):
+        if name in block:
+            read = {"time_ns": exchanges.time_ns, "tag": getattr(exchanges, end), "temperature_c": block[name]}
+            read |= {"supply_v": np.full(len(exchanges), np.nan)}
+            yield "temperature", {kept: column[np.isfinite(block[name])] for kept, column in read.items()}
 
 
 def _notes(staging: Staging) -> list[str]:

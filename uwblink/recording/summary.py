@@ -115,7 +115,8 @@ class ClockSkew:
 
     `stamps_ppm` is that by the third leg of `count` exchanges, `carrier_ppm` by readings of the carriers, None without
     any; `residual_ppm` is the scatter of readings about their median. `slope`, the ratio of the second to the first,
-    and `same_sign` are None if the skew is too small.
+    and `same_sign` are None if the skew is too small. `drift_ppm` is by how much the skew by stamps grows from the
+    first tenth of the exchanges to the last, as crystals that warm up drift.
     """
 
     pair: str
@@ -125,10 +126,11 @@ class ClockSkew:
     residual_ppm: float | None
     slope: float | None
     same_sign: bool | None
+    drift_ppm: float = 0.0
 
     def __str__(self) -> str:
         """Return stamps, carriers, slope, residual and sign in one line."""
-        start = f"pair {self.pair}: {self.stamps_ppm:+.2f} ppm by the stamps"
+        start = f"pair {self.pair}: {self.stamps_ppm:+.2f} ppm by the stamps, drift {self.drift_ppm:+.2f}"
         if self.carrier_ppm is None:
             return f"{start}, carriers not read"
         slope, sign = ("", "") if self.slope is None else (f", slope {self.slope:.3f}", f", {SIGNS[self.same_sign]}")
@@ -175,7 +177,9 @@ def _skew(pair: int, by_stamps: Floats, by_carriers: Floats) -> ClockSkew:
     # The sign of a skew below 0.5 ppm cannot be compared with readings of the carriers, which scatter by 0.2 ppm.
     slope = None if carrier is None or abs(stamps) <= 0.5 else carrier / stamps
     sign = None if slope is None else slope > 0
-    return ClockSkew(f"{pair >> 16}-{pair & 0xFFFF}", len(by_stamps), stamps, carrier, spread, slope, sign)
+    tenth = len(by_stamps) // 10 + 1
+    drift = float(np.median(by_stamps[-tenth:]) - np.median(by_stamps[:tenth]))
+    return ClockSkew(f"{pair >> 16}-{pair & 0xFFFF}", len(by_stamps), stamps, carrier, spread, slope, sign, drift)
 
 
 def skew_summary(skews: Sequence[ClockSkew]) -> str:

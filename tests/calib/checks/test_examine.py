@@ -11,6 +11,7 @@ import pytest
 import calib
 from benchmarks import doctor as planted
 from benchmarks.flights import LIGHT, Plan, fly
+from uwblink import Contents
 
 pytestmark = pytest.mark.slow
 
@@ -229,8 +230,13 @@ def test_a_step_is_named_with_tag_size_and_time():
 def test_a_drift_is_none():
     flight = fly(replace(SHORT, seconds=60), 46)
     drift = 0.15 * planted.seconds(flight) / 60
-    found = only(planted.longer(flight, np.where(planted.of_tag(flight, 30), drift, 0.0)), "delay drifts")
-    assert "tag 30 drift" in found.evidence
+    drifting = planted.longer(flight, np.where(planted.of_tag(flight, 30), drift, 0.0))
+    found = only(drifting, "delay drifts")
+    assert ("tag 30 drift" in found.evidence, "`temperature`" in found.remedy) == (True, False)
+    with_readings = Contents(
+        exchanges=drifting.exchanges, poses=drifting.poses, tags=drifting.tags, temperature={"tag": np.array([30])}
+    )
+    assert "`temperature`" in only(with_readings, "delay drifts").remedy
 
 
 @pytest.mark.parametrize(

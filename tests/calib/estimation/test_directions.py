@@ -131,14 +131,15 @@ def test_a_pattern_needs_directions_and_enough_ranges():
     assert calib.fit(flown_ranges[:300]).calibration.patterns == ()
 
 
+@pytest.mark.parametrize("name", ["pattern", "temperature"])
 @pytest.mark.parametrize(
     "settings", [{"sequential": True}, {"constants": "pair"}, {"use": "receptions"}], ids=lambda one: next(iter(one))
 )
-def test_fits_that_cannot_have_a_pattern_refuse_it(settings):
+def test_fits_that_cannot_have_a_pattern_or_slope_refuse_it(settings, name):
     with pytest.raises(BadInputError, match=next(iter(settings))):
-        calib.FitSettings(pattern="shared", **settings)
-    with pytest.raises(BadInputError, match="pattern"):
-        calib.fit_from_ranges(flown(TEN, 5)[0], pattern="shared")
+        calib.FitSettings(**{name: "shared"}, **settings)
+    with pytest.raises(BadInputError, match=name):
+        calib.fit_from_ranges(flown(TEN, 5)[0], **{name: "shared"})
 
 
 def test_a_range_is_corrected_by_two_directions_and_says_what_is_missing_without():

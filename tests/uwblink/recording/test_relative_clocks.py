@@ -10,12 +10,12 @@ TICKS = 128 * 499.2e6
 SKEW_PPM = {1: 0.0, 2: 6.0, 3: -2.5}
 
 
-def exchanges(protocol, sign=1.0, carriers=True):
+def exchanges(protocol, sign=1.0, carriers=True, warmer_ppm=0.0):
     """Ranges of 3 m both ways in every pair; a stamp is its true time by its own clock."""
     pairs = np.array([(1, 2), (2, 1), (1, 3), (3, 1), (2, 3), (3, 2)] * 20)
     first, second = pairs.T
     begin = 1e-3 * np.arange(len(pairs))
-    fast = np.array([0.0] + [SKEW_PPM[tag] for tag in (1, 2, 3)])
+    fast = np.array([0.0] + [SKEW_PPM[tag] + warmer_ppm * (tag == 3) for tag in (1, 2, 3)])
 
     def stamp(tag, after):
         return np.rint((begin + after) * (1 + fast[tag] * 1e-6) * TICKS).astype(np.int64)
@@ -56,7 +56,12 @@ def test_the_other_sign_is_said():
 def test_nothing_is_said_of_carriers_that_were_not_read():
     (first, *_) = clock_skews(exchanges("ds", carriers=False))
     assert (first.carrier_ppm, first.slope, first.same_sign) == (None, None, None)
-    assert str(first) == "pair 1-2: +6.00 ppm by the stamps, carriers not read"
+    assert str(first) == "pair 1-2: +6.00 ppm by the stamps, drift +0.00, carriers not read"
+
+
+def test_a_clock_that_drifts_is_told_by_its_pairs():
+    drifts = [one.drift_ppm for one in clock_skews([exchanges("ds"), exchanges("ds", warmer_ppm=1.5)])]
+    assert drifts == pytest.approx([0.0, 1.5, 1.5], abs=0.01)
 
 
 def test_single_sided_exchanges_have_none():

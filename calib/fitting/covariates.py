@@ -1,0 +1,192 @@
+"""Whether delays depend on direction or temperature: what data determine of that, and whether they are evidence."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from calib.data.ranges import LEAST_TURN_RAD, Ranges
+from calib.errors import UnanswerableError
+from calib.estimator.covariates import (
+    COMMON,
+    COVARIATES,
+    OWN,
+    OWN_WARMTH,
+    PRIORS,
+    WARMTH,
+    Covariate,
+)
+from calib.estimator.known_distances import KnownDistances, fit_known_distances
+from calib.estimator.optimize import Optimum
+from calib.estimator.score_tests import Derivative, Family, Tested
+from calib.estimator.time_blocks import Persistence
+from calib.settings import FitSettings
+from calib.spread import TWO_SIDED_95
+from uwblink.display import first_few
+
+LOG_EVIDENCE = math.log(100.0)
+"""Logarithm of the Bayes factor from which a pattern counts as found: "decisive" (Jeffreys 1961, appendix B)."""
+
+TYPICAL_M, UNKNOWN = 0.05, 0.5
+"""Standard deviation of factors of a pattern before anything is measured, and the share of it up to which data must
+determine those of the first wave around. Judgements: published patterns are 3 to 12 cm."""
+
+RANGES_AN_UNKNOWN = 10
+"""Minimum number of ranges for each unknown of patterns: with two (MILUV's 317 ranges) the noise went to nothing."""
+
+MISSING = {
+    "pattern": (
+        "no direction is known; a pattern needs poses with attitudes (`uwblink poses`)",
+        "attitudes vary too little to tell a pattern of the antenna from what belongs to places; record a flight in "
+        "which the robot turns once around in several places",
+    ),
+    "temperature": (
+        "no temperature is known; a slope needs readings within 30 s of ranges (table `temperature`)",
+        "temperatures vary too little to tell what they do to ranges; record while the boards warm up",
+    ),
+}
+"""What ranges lack that determine no dependence, by setting: values at all, and values that differ enough."""
+
+
+def fit_with_covariates(
+    ranges: Ranges, settings: FitSettings
+) -> tuple[KnownDistances, dict[str, dict[str, Any]], list[str]]:
+    """Return the fit with the dependences that `settings` ask for, what to remember of them by setting, and warnings.
+
+    Raises `UnanswerableError` where one is asked for that the data do not determine, and what `fit_known_distances`
+    raises.
+    """
+    found = fit_known_distances(ranges, replace(settings, pattern="none", temperature="none"))
+    told, warnings = dict[str, dict[str, Any]](), list[str]()
+    # Without the pattern of a robot that turns slowly, a slope is too uncertain: it is asked for again beside one.
+    for name in (*COVARIATES, "temperature"):
+        asked, before = getattr(settings, name), told.get(name, {})
+        settled = "kind" in before or (before and "pattern" not in told)
+        unread = name == "temperature" and asked == "auto" and not np.isfinite(ranges.temperature_c).any()
+        if asked == "none" or settings.excludes_patterns or settled or unread:
+            continue
+        found, kept, more = _with(name, asked, found, ranges)
+        told |= {name: kept} if kept else {}
+        warnings += more
+    return found, told, warnings
+
+
+def _with(
+    name: str, asked: str, plain: KnownDistances, ranges: Ranges
+) -> tuple[KnownDistances, dict[str, Any], list[str]]:
+    """Return a fit with the dependence `name` beside those of a `plain` fit, if there is evidence or it is `asked`."""
+    model, nothing = plain.model, (plain, dict[str, Any](), list[str]())
+    covariate, kinds = COVARIATES[name][0](model.ranges), {"shared": COMMON, "tag": OWN}
+    changes: dict[str, dict[str, Any]] = {mode: {name: mode} for mode in kinds}
+    if name == "temperature":
+        kinds = {"shared": WARMTH, "tag": OWN_WARMTH}
+    tested = plain.slopes.tests([_family(plain, covariate, kind) for kind in kinds.values()]) if covariate.tags else []
+    vague = _vague(name, covariate, tested[asked == "tag"]) if tested else []
+    needed = RANGES_AN_UNKNOWN * len(covariate.entries(COVARIATES[name][1]["tag"][-1], model.pairs)[0])
+    if len(vague) == len(covariate.tags) or len(model.ranges) < needed:
+        why = _why(name, covariate, model.ranges, needed if len(vague) < len(covariate.tags) else 0)
+        if asked != "auto":
+            raise UnanswerableError(f"{ranges.source}: {why}", parameter=name)
+        return plain, _told(name, covariate, why.rpartition(": ")[2].partition(";")[0]), []
+    warnings = [f"tags {first_few(map(str, vague))}: {MISSING[name][1]}"] if vague else []
+    if asked != "auto":
+        return fit_known_distances(ranges, replace(model.settings, **changes[asked])), {"kind": asked}, warnings
+    # A drift of many times the noise passes for reflections where it is not fitted.
+    if name == "pattern" and max(map(log_evidence, tested)) < LOG_EVIDENCE:
+        return nothing
+    if len(covariate.tags) < 2 or (name == "pattern" and not covariate.apart_from_places(model.pairs)):
+        del kinds["tag"]
+    best, likeliest, slopes, beside = nothing, -math.inf, [], 0.0
+    for mode, kind in kinds.items():
+        found = fit_known_distances(ranges, replace(model.settings, **changes[mode]))
+        one = found.slopes.test(_family(found, covariate, kind, fitted=True))
+        if name == "temperature":
+            one = _as_lasting(one, found.persistence)
+        slopes.append(
+            1e3 * np.array([one.total[0], TWO_SIDED_95 * one.covariance[0, 0] ** 0.5]) / one.information[0, 0]
+        )
+        evidence, marginal = log_evidence(one) + beside, _log_marginal(found.searches[0].optimum)
+        if evidence >= LOG_EVIDENCE and marginal > likeliest:
+            best, likeliest = (found, {"kind": mode, "log_evidence": round(evidence, 1)}, []), marginal
+        # Slopes of tags are about a common one: what speaks against that speaks against them, too.
+        beside = min(evidence, 0.0) * (name == "temperature")
+    if best is nothing:
+        return plain, _told(name, covariate, "{:+.2f} ± {:.2f} mm/K are no evidence of one".format(*slopes[0])), []
+    return best
+
+
+def _as_lasting(tested: Tested, known: Persistence) -> Tested:
+    """Return slopes whose errors last no less than those of delays, of which more series tell, and how surely.
+
+    Alternatives that follow a pattern differ from block to block, and the errors in their sums last less.
+    """
+    longest = max(known, tested.lasting, key=lambda one: one.factor)
+    factor = longest.factor / tested.lasting.factor * (known.quantile95 / TWO_SIDED_95) ** 2
+    return replace(tested, covariance=factor * tested.covariance, lasting=longest)
+
+
+def _told(name: str, covariate: Covariate, why: str) -> dict[str, Any]:
+    """Return what to remember of a slope over temperature that was not fitted although temperatures are known."""
+    return {"why": why} if name == "temperature" and covariate.tags else {}
+
+
+def _log_marginal(optimum: Optimum) -> float:
+    """Return the log likelihood with all unknowns integrated out (Laplace), less what fits to the same rows share."""
+    priors, free = optimum.priors, optimum.layout.free()
+    known = sparse.csc_matrix(optimum.information + priors.precision()).toarray()[np.ix_(free, free)]
+    weights = sum(rank * math.log(weight) for rank, weight in zip(priors.ranks, priors.weights, strict=True))
+    return optimum.value + 0.5 * weights - 0.5 * float(np.linalg.slogdet(known)[1])
+
+
+def _family(found: KnownDistances, covariate: Covariate, kind: str, *, fitted: bool = False) -> Family:
+    """Return the unknowns of a kind as alternatives to a fit, or as the ones that are `fitted`."""
+    names, columns, values = covariate.entries(kind, found.model.pairs)
+    indices = found.searches[0].optimum.layout.indices([kind] if fitted else [])
+    return Family(kind=kind, names=names, derivative=Derivative(columns, -values, len(names)), fitted=indices)
+
+
+def log_evidence(tested: Tested) -> float:
+    """Return the logarithm of the Bayes factor for alternatives that are draws of one variance, against none.
+
+    They are about the centre of their prior, and where that has bounds the likeliest variance v counts. Slopes with the
+    information F have the covariance F, of which noise makes a part that errors which last multiply; with the
+    alternatives they have v F F more.
+    """
+    prior, information = PRIORS[tested.family.kind], tested.information
+    lasting = 1 - 1 / max(tested.lasting.factor, 1.0)
+    covariance = information + lasting * tested.covariance
+    covariance = covariance + 1e-9 * np.trace(covariance) * np.eye(len(covariance))
+    root = np.linalg.cholesky(covariance)
+    whitened = np.linalg.solve(root, information)
+    known, vectors = np.linalg.eigh(whitened @ whitened.T)
+    expected = information @ np.full(len(information), prior.centre)
+    found, about = ((vectors.T @ np.linalg.solve(root, one)) ** 2 for one in (tested.total, tested.total - expected))
+    variances = 1 / np.geomspace(*(prior.bounds or (prior.weight,) * 2), 100)
+    grown = np.maximum(known, 0.0)[:, None] * variances
+    return float(np.max(0.5 * np.sum(found[:, None] - about[:, None] / (1 + grown) - np.log1p(grown), axis=0)))
+
+
+def _vague(name: str, covariate: Covariate, tested: Tested) -> list[int]:
+    """Return the tags of whose first wave around, or slope, ranges determine too little."""
+    typical, first = (TYPICAL_M, 2) if name == "pattern" else (PRIORS[WARMTH].weight ** -0.5, 1)
+    known = tested.information / tested.lasting.factor + np.eye(len(tested.total)) / typical**2
+    left = np.linalg.inv(known)
+    waves = [left[k : k + first, k : k + first] for k in range(0, len(left), len(covariate.centre))]
+    loose = [bool(np.linalg.eigvalsh(own)[-1] > (UNKNOWN * typical) ** 2) for own in waves]
+    each = loose if len(loose) == len(covariate.tags) else loose * len(covariate.tags)
+    return [tag for tag, vague in zip(covariate.tags, each, strict=True) if vague]
+
+
+def _why(name: str, covariate: Covariate, ranges: Ranges, needed: int) -> str:
+    """Return in words why ranges determine no dependence, and what would; `needed` ranges where they are too few."""
+    if needed:
+        return f"too few ranges for a {name}, at least {needed} are needed"
+    known = np.isfinite(ranges.toward if name == "pattern" else ranges.temperature_c)
+    if not known.any():
+        return MISSING[name][0]
+    still = "" if covariate.tags else f"no body turns by more than {math.degrees(LEAST_TURN_RAD):.0f}° of "
+    return f"{still}tags {first_few(map(str, covariate.tags or ranges.tags()))}: {MISSING[name][1]}"

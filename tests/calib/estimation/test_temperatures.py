@@ -1,0 +1,176 @@
+"""Ranges that grow with the temperature of their ends: found, corrected and refused, in flights of NumPy alone."""
+
+import json
+import shutil
+import subprocess
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import calib
+import uwblink
+from benchmarks.directions import Recipe, flight
+from calib.calibration.patterns import TemperatureSlope
+from calib.data.ranges import read_c
+from calib.errors import BadInputError, TemperatureWarning
+from tests.calib import overhearing
+from tests.processes import call, run
+
+WARM = Recipe(pattern_m=0.0, reflected=0.0, noise_m=0.04, warmer_k=15.0, mm_per_k=5.0)
+"""Boards warm up by 15 K in a minute, and ranges grow by 5 mm a kelvin of either end: by 15 cm."""
+
+
+flown = cache(flight)
+
+
+@cache
+def fitted(recipe, seed, **settings):
+    return calib.fit(flown(recipe, seed)[0], between_m=0.0, **settings).calibration
+
+
+def written(path, recipe, seed, number=0, **more):
+    found, _ = flown(recipe, seed, number)
+    kept = {name: getattr(found, name) for name in ("exchanges", "poses", "tags", "meta", "temperature")}
+    uwblink.Contents(**kept | more).save(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("mm_per_k", "apart", "pattern_m"), [(2, 0, 0), (20, 0, 0), (2, 4, 0), (20, 8, 0), (2, 0, 0.1)]
+)
+def test_planted_slopes_are_found_within_their_intervals(mm_per_k, apart, pattern_m):
+    recipe = Recipe(pattern_m=pattern_m, warmer_k=15.0, mm_per_k=mm_per_k, apart_mm_per_k=apart)
+    slopes, planted = fitted(recipe, 41).temperatures, flown(recipe, 41)[1]["mm_per_k"]
+    assert [one.tags for one in slopes] == ([(1,), (2,), (3,), (4,)] if apart else [(1, 2, 3, 4)])
+    for one in slopes:
+        # 3600 ranges with 5 cm of noise over 15 K know a common slope to 0.15 mm/K, and each tag's to 0.6.
+        assert one.std_m_per_k < (0.0007 if apart else 0.0002)
+        assert abs(one.m_per_k - 1e-3 * planted[one.tags[0]]) < 3 * one.std_m_per_k
+
+
+@pytest.mark.parametrize(
+    "recipe",
+    [Recipe(pattern_m=0.0, warmer_k=15.0), Recipe(pattern_m=0.0, warmer_k=2.0, wander_m=0.03)],
+    ids=["plain", "little warmth, errors that last"],
+)
+@pytest.mark.parametrize("seed", [306, 315, 316])
+def test_sound_flights_have_no_slope_and_say_how_little_they_show(recipe, seed):
+    found = fitted(recipe, seed)
+    assert (found.temperatures, json.loads(found.to_json())["schema_version"] < 7) == ((), True)
+    assert "mm/K are no evidence" in repr(found)
+
+
+def test_a_warmer_flight_is_corrected_by_its_readings(tmp_path):
+    first = written(tmp_path / "a.uwb", WARM, 3)
+    second = written(tmp_path / "b.uwb", replace(WARM, start_c=45.0, warmer_k=5.0), 3, 1)
+    for name, more in (("none", ["--temperature", "none"]), ("auto", [])):
+        done = call("calib", "fit", first, "-o", tmp_path / f"{name}.json", "--between", 0, *more)
+        assert ("mm/K over temperature" in done.stdout) == (name == "auto")
+    without, known = (calib.load_calibration(tmp_path / f"{name}.json") for name in ("none", "auto"))
+    with pytest.warns(TemperatureWarning, match=r"^tags 1, 2, 3, 4 were used more than 5 K beyond the 20 to 3\d °C"):
+        judged = calib.evaluate(second, known).overall
+    assert 0.92 < judged.inside_95 < 0.98
+    # At 18 K above the fitted mean ranges are 18 cm too long; the slope's standard error leaves 0.5 cm.
+    assert judged.full.abs95_m < 0.1 < 0.2 < calib.evaluate(second, without).overall.full.abs95_m
+    said = run("calib", "apply", second, "-c", tmp_path / "auto.json", "-o", tmp_path / "c.uwb").stderr
+    assert said.count("warning: tags 1, 2, 3, 4 were used more than 5 K beyond") == 1
+    corrected = uwblink.load(tmp_path / "c.uwb").exchanges.range_m - calib.load_ranges(second).truth_m
+    assert np.std(corrected) == pytest.approx(judged.full.std_m, abs=1e-9)
+    assert "mm/K" in call("calib", "show", tmp_path / "auto.json").stdout
+
+
+@pytest.mark.parametrize(("celsius", "why"), [(None, "no temperature is known"), (30.0, "vary too little")])
+def test_a_slope_that_readings_do_not_determine_is_refused_and_said(tmp_path, celsius, why):
+    read = flown(WARM, 3)[0].temperature
+    flat = read | {"temperature_c": np.full(len(read["tag"]), celsius)} if celsius else {}
+    path = written(tmp_path / "a.uwb", WARM, 3, temperature=flat)
+    done = call("calib", "fit", path, "-o", tmp_path / "x.json", "--temperature", "shared")
+    assert (done.returncode, why in done.stderr, done.stderr.count("\n")) == (1, True, 1)
+    known = calib.fit(path).calibration
+    assert ((tmp_path / "x.json").exists(), known.temperatures, why in repr(known)) == (False, (), bool(celsius))
+
+
+def test_a_range_is_corrected_by_two_temperatures_and_says_what_is_missing_without():
+    known, there = fitted(WARM, 3), calib.load_ranges(flown(WARM, 3, 1)[0])[:500]
+    columns = (there.raw_m, there.fpp1_dbm, there.fpp2_dbm, there.initiator, there.target)
+    weights, (slope,) = (there.weight_initiator, there.weight_target), known.temperatures
+    corrected = known.correct(*columns, weights=weights, temperature_c=tuple(there.temperature_c.T))
+    assert corrected.range_m == pytest.approx(known.apply(there).corrected_m, abs=1e-6)
+    blind, plain = (one.correct(*columns, weights=weights) for one in (known, replace(known, temperatures=())))
+    assert blind.range_m == pytest.approx(plain.range_m, abs=1e-12)
+    missing = np.sqrt(2) * np.hypot(slope.m_per_k, slope.std_m_per_k) * (slope.span_c[1] - slope.span_c[0])
+    assert blind.sigma_total_m == pytest.approx(np.hypot(plain.sigma_total_m, missing), rel=1e-6)
+    one, other = (known.correct(3.0, -85.0, -86.0, 1, 2, temperature_c=(25.0, c)).range_m for c in (25.0, 26.0))
+    assert one - other == pytest.approx(slope.m_per_k, abs=1e-6)
+
+
+def test_the_file_keeps_slopes_and_older_programs_refuse_it():
+    known = fitted(WARM, 3)
+    text = known.to_json()
+    assert (calib.Calibration.from_json(text), json.loads(text)["schema_version"]) == (known, 7)
+    with pytest.raises(BadInputError, match=r"here: temperatures.*span_c"):
+        calib.Calibration.from_json(text.replace('"span_c": [', '"span_c": [-500, '), "here")
+    with pytest.raises(BadInputError, match="slopes over temperature"):
+        calib.export(known, "ros-yaml")
+
+
+MAIN = """
+#include <stdio.h>
+#include "calibration.h"
+int main(void)
+{
+    double x;
+    (void)uwb_correct(1, 0, 0, 1, 2, &x, 0);
+    (void)uwb_errors(0, 0, 1, 2, &x, &x, &x);
+    printf("%.17g %g %g\\n", uwb_warmth(3, 40.0), uwb_warmth(3, NAN), uwb_warmth(9, 40.0));
+    return 0;
+}
+"""
+
+
+def test_the_c_header_tells_what_temperatures_add(tmp_path):
+    if (compiler := shutil.which("cc") or shutil.which("gcc")) is None:
+        pytest.skip("no C compiler on this machine")
+    calib.export(fitted(WARM, 3), "c-header", tmp_path / "calibration.h")
+    (tmp_path / "main.c").write_text(MAIN)
+    strict = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+    subprocess.run([compiler, *strict, "main.c", "-o", "main", "-lm"], cwd=tmp_path, check=True)
+    found = subprocess.run(["./main"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout.split()
+    (slope,) = fitted(WARM, 3).temperatures
+    assert list(map(float, found)) == pytest.approx([slope.m_per_k * (40 - slope.reference_c), 0, 0], abs=1e-12)
+
+
+def test_temperatures_lie_between_readings_and_end_half_a_minute_after_the_last():
+    table = {"time_ns": np.array([20, 0, 0, 10]) * 10**9, "tag": np.array([1, 1, 2, 1])}
+    found = read_c(
+        table | {"temperature_c": np.array([30.0, 20, 50, np.nan])},
+        np.tile([1, 3], (5, 1)),
+        np.array([-31, -29, 5, 49, 51]) * 10**9,
+    )
+    assert found[:, 0] == pytest.approx([np.nan, 20, 22.5, 30, np.nan], nan_ok=True)
+    assert np.isnan(found[:, 1]).all()
+
+
+def test_differences_of_arrival_are_corrected_for_the_temperature_of_their_target():
+    found, _ = overhearing.flight(5, count=600)
+    known, tags = calib.fit(found, use="receptions").calibration, np.arange(6)
+    readings = {"time_ns": 0 * tags, "tag": tags, "temperature_c": 20.0 + tags, "supply_v": tags * np.nan}
+    warm = calib.load_ranges(replace(found, temperature=readings), use="receptions")
+    # A tag that is x longer in a range has a delay that is shorter by 2 x over the speed of light.
+    moved = {tag: known.delays_ns[tag] - 0.008 * tag / 0.299702547 for tag in known.delays_ns}
+    slope = TemperatureSlope(tuple(tags.tolist()), 0.004, 0.0, 20.0, (10.0, 40.0))
+    by_slope, by_delays = replace(known, temperatures=(slope,)), replace(known, delays_ns=moved)
+    expected = pytest.approx(by_delays.correct_arrivals(warm).corrected_m, abs=1e-6)
+    assert by_slope.correct_arrivals(warm).corrected_m == expected
+
+
+def test_temperatures_come_from_columns_of_a_table(tmp_path):
+    rows = [f"{k},1,2,{3 + 0.01 * k},{20 + k},{'' if k == 5 else 40}" for k in range(60)]
+    (tmp_path / "t.csv").write_text("\n".join(["time_s,from_id,to_id,range_m,t_a,to_temperature_c", *rows]))
+    (tmp_path / "m.toml").write_text('[columns]\nfrom_temperature_c = "t_a"\n')
+    call("uwblink", "import", "csv", tmp_path / "t.csv", "--map", tmp_path / "m.toml", "-o", tmp_path / "t.uwb")
+    read = uwblink.load(tmp_path / "t.uwb").temperature
+    expected = [(k, 1, 20.0 + k) for k in range(60)] + [(k, 2, 40.0) for k in range(60) if k != 5]
+    assert sorted(zip(read["time_ns"] // 10**9, read["tag"], read["temperature_c"], strict=True)) == sorted(expected)
