@@ -174,7 +174,7 @@ def test_the_file_keeps_patterns_and_older_programs_refuse_it():
     table["patterns"][0]["centre"].pop()
     with pytest.raises(BadInputError, match=r"here: patterns.*8"):
         calib.Calibration.from_json(json.dumps(table), "here")
-    for form in ("c-header", "miluv", "ros-yaml"):
+    for form in ("miluv", "ros-yaml"):
         with pytest.raises(BadInputError, match="patterns over direction"):
             calib.export(known, form)
     assert "over direction" in repr(known)
