@@ -11,7 +11,11 @@ import calib
 import uwblink
 from benchmarks.directions import Recipe, flight, pattern_m
 from calib.errors import BadInputError, UnanswerableError
+from calib.report import Picture
+from calib.report.results import Results
+from calib.report.sections import SECTIONS
 from tests.processes import call
+from uwblink.pages.figures import drawn
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import sights
 from uwblink.recording.schema import Poses, Tag
@@ -39,7 +43,7 @@ def written(path, recipe, seed, number=0):
 def seen(ranges, tag):
     """Directions in which a tag saw others (m, 3)."""
     ends = (ranges.initiator, ranges.target)
-    return np.concatenate([ranges.toward[ids == tag, end] for end, ids in enumerate(ends)]).astype(float)
+    return np.concatenate([ranges.toward[np.isin(ids, tag), end] for end, ids in enumerate(ends)]).astype(float)
 
 
 def spread(ranges, calibration):
@@ -178,6 +182,50 @@ def test_the_file_keeps_patterns_and_older_programs_refuse_it():
         with pytest.raises(BadInputError, match="patterns over direction"):
             calib.export(known, form)
     assert "over direction" in repr(known)
+
+
+def test_the_report_draws_patterns_with_their_bands_at_the_level_of_flight():
+    known, flown_ranges = fitted(TEN, 3).calibration, fitted(TEN, 3).ranges
+    blocks = SECTIONS["patterns"](Results(calibration=known, training=[flown_ranges]))
+    (picture,) = [block for block in blocks if isinstance(block, Picture)]
+    (axes,) = picture.draw(7.0).axes
+    # Robots tilt: the middle of the flown elevations, a tenth below and a tenth above, and the circle of zero.
+    middle, low, high, zero = axes.lines
+    level, up = (
+        seen(flown_ranges, (1, 2, 3, 4)),
+        [float(line.get_label()[10:-1].replace("−", "-")) for line in axes.lines[:3]],
+    )
+    assert up == pytest.approx(np.degrees(np.arcsin(np.quantile(level[:, 2], (0.5, 0.1, 0.9)))), abs=0.6)
+    assert not np.any(zero.get_ydata())
+    for line, deg in zip((middle, low, high), np.radians(up), strict=True):
+        around = line.get_xdata()
+        toward = np.array(
+            [np.cos(around) * np.cos(deg), np.sin(around) * np.cos(deg), np.full(len(around), np.sin(deg))]
+        )
+        values = known.patterns[0].values(toward.T)
+        assert line.get_ydata() == pytest.approx(100 * values @ known.patterns[0].coefficients_m, abs=0.1)
+    (band, *_) = axes.collections
+    edges, std = band.get_paths()[0].vertices[:, 1], known.patterns[0].std_m(values)
+    assert np.ptp(edges) > np.ptp(middle.get_ydata()) + 196 * std.min()
+    assert SECTIONS["patterns"](Results(calibration=replace(known, patterns=()), training=[flown_ranges])) == []
+    # A page reads values of straight axes under the pointer, and none of these.
+    assert b"names" not in drawn(picture.draw, 7.0, ["svg"])["svg"]
+    nowhere = SECTIONS["patterns"](Results(calibration=known))[-1]
+    assert len(nowhere.draw(3.5).axes[0].lines) == 2
+
+
+def test_a_stream_knows_no_directions_and_its_total_sigma_contains_the_pattern(tmp_path):
+    fitted(TEN, 3).calibration.save(tmp_path / "known.json")
+    path = written(tmp_path / "second.uwb", TEN, 3, 1)
+    truth = calib.load_ranges(path).truth_m[:1000]
+    streamed = [
+        one
+        for one, _ in zip(uwblink.stream(path, calibration=tmp_path / "known.json", speed=np.inf), truth, strict=False)
+    ]
+    error = np.array([one.corrected_m for one in streamed]) - truth
+    total = np.array([one.more["sigma_total_m"] for one in streamed])
+    assert np.std(error / total) == pytest.approx(1.0, abs=0.1)
+    assert np.std(error / [one.sigma_m for one in streamed]) > 1.2
 
 
 def test_directions_are_those_in_the_frames_of_the_bodies():
