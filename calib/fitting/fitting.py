@@ -39,7 +39,7 @@ from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
 from calib.fitting.passive_listeners import MIN_OF_DELAY
-from calib.fitting.patterns import fit_with_pattern
+from calib.fitting.patterns import OWN_PATTERN, fit_with_pattern, with_new_tag
 from calib.fitting.result import FitResult, HeldOut
 from calib.settings import FitSettings, check_tag
 from uwblink.arrays import Bools
@@ -160,7 +160,18 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
             f"{ranges.source}: {len(some)} exchanges of tag {tag} with calibrated tags are too few, "
             f"at least {MIN_OF_DELAY} are needed"
         )
+    directed = [one for pattern in calibration.patterns for one in pattern.tags]
+    some = some[
+        ~(np.isnan(some.toward).any(axis=2) & np.isin(np.stack([some.initiator, some.target], 1), directed)).any(1)
+    ]
+    if len(some) < MIN_OF_DELAY:
+        raise UnanswerableError(
+            f"{ranges.source}: the calibration has patterns over direction, and directions are known of {len(some)} "
+            f"exchanges, at least {MIN_OF_DELAY} are needed: state poses with attitudes (`uwblink poses`), or fit with "
+            "`pattern` none"
+        )
     joined = _with_side(replace(calibration, delays_ns=calibration.delays_ns | {tag: 0.0}), tag, some)
+    joined = with_new_tag(joined, tag, some)
     applied = joined.apply(some)
     straight = replace(some, raw_m=some.raw_m + applied.corrected_m - applied.delay_corrected_m)
     partners = replace(calibration, undetermined_splits=())
@@ -169,6 +180,7 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
     )
     found = fit(straight, settings, lift=calibration.lift)
     added = {"tag": tag, "recording": ranges.source, "exchanges": len(some)}
+    lone = len(joined.patterns) > len(calibration.patterns)
     return replace(
         found,
         calibration=replace(
@@ -181,7 +193,10 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
         ),
         ranges=some,
         # The curve is known, and was taken off before.
-        warnings=[text for text in found.warnings if not text.startswith(WITHOUT_CURVE)],
+        warnings=[
+            *[text for text in found.warnings if not text.startswith(WITHOUT_CURVE)],
+            *([f"tag {tag}: {OWN_PATTERN}"] if lone else []),
+        ],
     )
 
 

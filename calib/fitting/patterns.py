@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from calib.calibration.patterns import HARMONICS
+from calib.calibration.model import Calibration
+from calib.calibration.patterns import HARMONICS, Pattern, harmonics
 from calib.data.ranges import LEAST_TURN_RAD, Ranges
 from calib.errors import UnanswerableError
 from calib.estimator.known_distances import KnownDistances, fit_known_distances
@@ -18,6 +19,7 @@ from calib.estimator.optimize import Optimum
 from calib.estimator.pattern_unknowns import COMMON, OF_PAIR, OWN, SPREAD_M, Directions
 from calib.estimator.score_tests import Derivative, Family, Tested
 from calib.settings import FitSettings
+from calib.spread import robust_spread
 from uwblink.display import first_few
 
 LOG_EVIDENCE = math.log(100.0)
@@ -33,6 +35,11 @@ RANGES_AN_UNKNOWN = 10
 TURNED_TOO_LITTLE = (
     "attitudes vary too little to tell a pattern of the antenna from what belongs to places; record a flight in which "
     "the robot turns once around in several places"
+)
+
+OWN_PATTERN = (
+    "its pattern over direction is none that other tags share, and is not known: total sigmas contain one as large as "
+    "theirs; fit all recordings together to find it"
 )
 
 
@@ -70,6 +77,33 @@ def fit_with_pattern(ranges: Ranges, settings: FitSettings) -> tuple[KnownDistan
         if evidence >= LOG_EVIDENCE and marginal > likeliest:
             best, likeliest = (found, {"kind": mode, "log_evidence": round(evidence, 1)}, []), marginal
     return best
+
+
+def with_new_tag(calibration: Calibration, tag: int, ranges: Ranges) -> Calibration:
+    """Return a calibration in which a tag on a body that turns has a pattern, chosen by its `ranges`.
+
+    That is one which others share, if errors scatter less with it; else one that is unknown and as large as theirs, so
+    that total sigmas contain it.
+    """
+    patterns = calibration.patterns
+    if tag not in ranges.turning or not patterns:
+        return calibration
+    ends = np.stack([ranges.initiator, ranges.target], axis=1)
+    variance = np.mean([np.square(one.coefficients_m) + np.diag(one.covariance_m2) for one in patterns])
+    unknown = Pattern(
+        tags=(tag,),
+        coefficients_m=(0.0,) * HARMONICS,
+        centre=tuple(np.nanmean(harmonics(ranges.toward[ends == tag]), axis=0).tolist()),
+        covariance_m2=tuple(map(tuple, (variance * np.eye(HARMONICS)).tolist())),
+        rms_m=math.sqrt(np.mean([one.rms_m**2 for one in patterns])),
+    )
+    several = [(*patterns, unknown)] + [
+        (*patterns[:k], replace(one, tags=(*one.tags, tag)), *patterns[k + 1 :])
+        for k, one in enumerate(patterns)
+        if len(one.tags) > 1
+    ]
+    found = [replace(calibration, patterns=own) for own in several]
+    return min(found, key=lambda one: robust_spread(one.apply(ranges).corrected_m - ranges.truth_m))
 
 
 def _log_marginal(optimum: Optimum) -> float:

@@ -228,6 +228,32 @@ def test_a_stream_knows_no_directions_and_its_total_sigma_contains_the_pattern(t
     assert np.std(error / [one.sigma_m for one in streamed]) > 1.2
 
 
+@pytest.mark.parametrize("own", [False, True])
+def test_a_tag_that_is_added_has_the_pattern_that_others_share_or_one_that_is_unknown(own, tmp_path):
+    recipe = replace(TEN, own=own, robots=5)
+    ranges, there = (calib.load_ranges(flown(recipe, 3, k)[0]) for k in (0, 1))
+    known = calib.fit(ranges[(ranges.initiator != 5) & (ranges.target != 5)], between_m=0.0).calibration
+    assert [one.tags for one in known.patterns] == ([(1,), (2,), (3,), (4,)] if own else [(1, 2, 3, 4)])
+    known.save(tmp_path / "known.json")
+    second = written(tmp_path / "second.uwb", recipe, 3, 1)
+    done = call("calib", "add-tag", second, "-c", tmp_path / "known.json", "--tag", 5, "-o", tmp_path / "five.json")
+    assert done.returncode == 0
+    assert ("tag 5: its pattern over direction" in done.stderr) == own
+    added = calib.load_calibration(tmp_path / "five.json")
+    assert added.patterns[-1].tags == ((5,) if own else (1, 2, 3, 4, 5))
+    planted = flown(recipe, 3)[0].planted["delays_ns"]
+    off = {tag: added.delays_ns[tag] - planted[str(tag)] for tag in (1, 2, 3, 4, 5)}
+    # What all delays share goes with the curve; of the rest 10 ps are 1.5 mm of a range.
+    assert off[5] - np.mean(list(off.values())) == pytest.approx(0, abs=0.02 + 0.1 * own)
+    of_five = there[(there.initiator == 5) | (there.target == 5)]
+    applied = added.apply(of_five)
+    error = applied.corrected_m - of_five.truth_m
+    assert np.std(error) < (0.065 if own else 0.045)
+    assert np.std(error / applied.sigma_total_m) == pytest.approx(1.0, abs=0.1)
+    with pytest.raises(UnanswerableError, match="directions are known of 0"):
+        calib.add_tag(replace(there, toward=np.full_like(there.toward, np.nan)), known, 5)
+
+
 def test_directions_are_those_in_the_frames_of_the_bodies():
     # Body a at the origin has turned by 90° to the left: what lies north of it is ahead. Body b looks along the axes.
     half = np.sqrt(0.5)
