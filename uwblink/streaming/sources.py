@@ -131,7 +131,10 @@ def _check_use(use: str, correct: Correction | None) -> bool:
     if use not in ("exchanges", "receptions"):
         raise ArgumentError(f"found {use!r:.40}, allowed: exchanges, receptions", parameter="use")
     if use == "receptions" and not (correct and correct.differences):
-        raise ArgumentError("receptions need a `calibration`, which corrects them", parameter="use")
+        raise ArgumentError(
+            "receptions need a `calibration` that corrects them: one with delays and without patterns over direction",
+            parameter="use",
+        )
     return use == "receptions"
 
 

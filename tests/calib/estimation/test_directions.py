@@ -226,6 +226,8 @@ def test_a_stream_knows_no_directions_and_its_total_sigma_contains_the_pattern(t
     total = np.array([one.more["sigma_total_m"] for one in streamed])
     assert np.std(error / total) == pytest.approx(1.0, abs=0.1)
     assert np.std(error / [one.sigma_m for one in streamed]) > 1.2
+    with pytest.raises(ValueError, match="without patterns over direction"):
+        uwblink.stream(path, calibration=tmp_path / "known.json", use="receptions")
 
 
 @pytest.mark.parametrize("own", [False, True])
@@ -252,6 +254,38 @@ def test_a_tag_that_is_added_has_the_pattern_that_others_share_or_one_that_is_un
     assert np.std(error / applied.sigma_total_m) == pytest.approx(1.0, abs=0.1)
     with pytest.raises(UnanswerableError, match="directions are known of 0"):
         calib.add_tag(replace(there, toward=np.full_like(there.toward, np.nan)), known, 5)
+
+
+def test_delays_of_calibrations_with_patterns_are_compared_for_the_same_directions(tmp_path):
+    known, again = (calib.fit(flown(TEN, 3, k)[0], between_m=0.0).calibration for k in (0, 1))
+    found = calib.compare(known, again)
+    assert found.same
+    assert found.pattern_probability > 0.01
+    assert found.pattern_rms_m < 0.015
+    # The same patterns about another centre, one of each tag: delays are those of other directions.
+    centres = np.random.default_rng(1).normal(0, 0.5, (4, 8))
+    patterns, delays = [], dict(known.delays_ns)
+    for tag, centre in zip((1, 2, 3, 4), centres, strict=True):
+        (one,) = known.patterns
+        delays[tag] -= 2 / 0.299702547 * float((centre - one.centre) @ one.coefficients_m)
+        patterns.append(replace(one, tags=(tag,), centre=tuple(centre.tolist())))
+    elsewhere = replace(known, delays_ns=delays, patterns=tuple(patterns))
+    there = calib.load_ranges(flown(TEN, 3, 1)[0])
+    assert elsewhere.apply(there).corrected_m == pytest.approx(known.apply(there).corrected_m, abs=1e-5)
+    for first, second in ((known, elsewhere), (elsewhere, known)):
+        found = calib.compare(first, second)
+        assert max(map(abs, found.difference_ns.values())) < 1e-9
+        assert found.pattern_rms_m == pytest.approx(0, abs=1e-12)
+    (one,) = known.patterns
+    turned = replace(known, patterns=(replace(one, coefficients_m=one.coefficients_m[::-1]),))
+    turned.save(tmp_path / "turned.json")
+    fitted(TEN, 3, pattern="none").calibration.save(tmp_path / "none.json")
+    known.save(tmp_path / "known.json")
+    done = call("calib", "compare", tmp_path / "known.json", tmp_path / "turned.json")
+    assert float(done.stdout.split("rms apart, probability ")[1].split()[0]) < 1e-3
+    done = call("calib", "compare", tmp_path / "known.json", tmp_path / "none.json")
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "tags 1, 2, 3, 4 have a pattern over direction in one" in done.stderr
 
 
 def test_directions_are_those_in_the_frames_of_the_bodies():
