@@ -45,9 +45,6 @@ MIN_RANGES_PER_BIN: Final = 60
 MOST_RANGES_PER_BIN: Final = 2000
 """With so many ranges the standard error of the centre is a fortieth of the noise, less than a drawn point."""
 
-MOST_PATTERNS: Final = 6
-"""Patterns over direction that are drawn, a page of them."""
-
 MOST_PAIRS: Final = 24
 """Pairs whose errors are drawn over time, those with the largest spread."""
 
@@ -257,8 +254,8 @@ def keep_strays_out(axes: Axes, values: Floats) -> None:
 
 
 def patterns(width_in: float, calibration: Calibration, ranges: Ranges | None = None) -> Figure:
-    """Draw the largest patterns over azimuth with bands of 95 %, at the elevations of the directions in `ranges`."""
-    largest = sorted(calibration.patterns, key=lambda one: -one.rms_m)[:MOST_PATTERNS]
+    """Draw the six largest patterns over azimuth with bands of 95 %, at elevations of the directions in `ranges`."""
+    largest = sorted(calibration.patterns, key=lambda one: -one.rms_m)[:6]
     polar: dict[str, Any] = {"subplot_kw": {"projection": "polar"}, "height_in": 3.2}
     figure, panels = sheet(width_in, len(largest), across=min(len(largest), int(width_in / 3)), **polar)
     around, reach_cm = np.radians(np.arange(0, 361, 3)), 0.0

@@ -38,8 +38,9 @@ from calib.estimator.known_distances import KnownDistances
 from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
+from calib.fitting.drift import drift_of
 from calib.fitting.passive_listeners import MIN_OF_DELAY
-from calib.fitting.patterns import OWN_PATTERN, fit_with_pattern, with_new_tag
+from calib.fitting.patterns import fit_with_pattern, with_new_tag
 from calib.fitting.result import FitResult, HeldOut
 from calib.settings import FitSettings, check_tag
 from uwblink.arrays import Bools
@@ -107,6 +108,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         **({"arrivals": len(ranges)} if ranges.differences.any() else {}),
         "gauge": _gauge(found),
         **({"pattern": pattern} if pattern else {}),
+        **({"drift": drift} if (drift := drift_of(found)) else {}),
         **({"held_out": _judged(held, settings)} if held else {}),
     }
     result = result_of(
@@ -180,7 +182,10 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
     )
     found = fit(straight, settings, lift=calibration.lift)
     added = {"tag": tag, "recording": ranges.source, "exchanges": len(some)}
-    lone = len(joined.patterns) > len(calibration.patterns)
+    unshared = (
+        f"tag {tag}: its pattern over direction is none that other tags share, and is not known: total sigmas contain "
+        "one as large as theirs; fit all recordings together to find it"
+    )
     return replace(
         found,
         calibration=replace(
@@ -195,7 +200,7 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
         # The curve is known, and was taken off before.
         warnings=[
             *[text for text in found.warnings if not text.startswith(WITHOUT_CURVE)],
-            *([f"tag {tag}: {OWN_PATTERN}"] if lone else []),
+            *([unshared] if len(joined.patterns) > len(calibration.patterns) else []),
         ],
     )
 

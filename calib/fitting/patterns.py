@@ -20,6 +20,7 @@ from calib.estimator.pattern_unknowns import COMMON, OF_PAIR, OWN, SPREAD_M, Dir
 from calib.estimator.score_tests import Derivative, Family, Tested
 from calib.settings import FitSettings
 from calib.spread import robust_spread
+from uwblink.arrays import Floats
 from uwblink.display import first_few
 
 LOG_EVIDENCE = math.log(100.0)
@@ -35,11 +36,6 @@ RANGES_AN_UNKNOWN = 10
 TURNED_TOO_LITTLE = (
     "attitudes vary too little to tell a pattern of the antenna from what belongs to places; record a flight in which "
     "the robot turns once around in several places"
-)
-
-OWN_PATTERN = (
-    "its pattern over direction is none that other tags share, and is not known: total sigmas contain one as large as "
-    "theirs; fit all recordings together to find it"
 )
 
 
@@ -124,18 +120,27 @@ def _family(found: KnownDistances, directions: Directions, kind: str, *, fitted:
 def log_evidence(tested: Tested) -> float:
     """Return the logarithm of the Bayes factor for alternatives that are draws of one variance, against none.
 
-    The likeliest variance v counts. Slopes with the information F have the covariance F, of which noise makes a part
-    that errors which last multiply; with the alternatives they have v F F more.
+    The likeliest variance counts.
+    """
+    variances = np.geomspace(*SPREAD_M[1:], 100) ** 2
+    return float(np.max(log_likelihood(tested, np.eye(len(tested.total)), variances)))
+
+
+def log_likelihood(tested: Tested, steps: Floats, variances: Floats) -> Floats:
+    """Return the log likelihood of alternatives (k,) that are sums `steps` (k, m) of draws, less that of none.
+
+    It is that of each of some variances (v,). Slopes with the information F have the covariance F, of which noise makes
+    a part that errors which last multiply; with alternatives of covariance S they have F S F more.
     """
     information, lasting = tested.information, 1 - 1 / max(tested.lasting.factor, 1.0)
     covariance = information + lasting * tested.covariance
     covariance = covariance + 1e-9 * np.trace(covariance) * np.eye(len(covariance))
     root = np.linalg.cholesky(covariance)
-    whitened = np.linalg.solve(root, information)
+    whitened = np.linalg.solve(root, information @ steps)
     known, vectors = np.linalg.eigh(whitened @ whitened.T)
     square = (vectors.T @ np.linalg.solve(root, tested.total)) ** 2
-    grown = np.maximum(known, 0.0)[:, None] * np.geomspace(*SPREAD_M[1:], 100) ** 2
-    return float(np.max(0.5 * np.sum(square[:, None] * grown / (1 + grown) - np.log1p(grown), axis=0)))
+    grown = np.maximum(known, 0.0)[:, None] * variances
+    return np.asarray(0.5 * np.sum(square[:, None] * grown / (1 + grown) - np.log1p(grown), axis=0))
 
 
 def _vague(directions: Directions, tested: Tested) -> list[int]:
