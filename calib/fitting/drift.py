@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,8 @@ def drift_of(found: KnownDistances) -> dict[str, Any]:
     ends = np.searchsorted(tags, pairs.ends)[pairs.number]
     offsets = Derivative(ends * count + ranges.session[:, None], np.ones((1, 1)), len(tags) * count)
     tested = found.slopes.test(Family(kind="session", names=(), derivative=offsets, fitted=fitted))
+    # What lasts within a session is in the offsets of its pairs, whose variance the information contains.
+    tested = replace(tested, total=tested.total + tested.pulled, covariance=0.0 * tested.covariance)
     totals = [np.bincount(ranges.session, weights, count) for weights in (ranges.time_ns / 86_400e9, None)]
     # A session that is held out has no ranges; its date does not matter.
     days = np.maximum(totals[0] / np.maximum(totals[1], 1), ranges.time_ns.min() / 86_400e9)

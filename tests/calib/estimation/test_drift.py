@@ -13,13 +13,13 @@ RECIPE = Recipe(tags=5, seconds=20, per_second=120)
 DAY_NS = 86_400 * 10**9
 
 
-def sessions(seed, days, rate_m2=0.0, scatter_m=0.0, *, begin=20_000):
+def sessions(seed, days, rate_m2=0.0, scatter_m=0.0, *, begin=20_000, wander_m=0.0):
     """Recordings on some days: what each tag adds to ranges is a random walk of a rate a day, and scatters besides."""
     random, parts, walk = np.random.default_rng([seed, 77]), [], np.zeros(RECIPE.tags + 1)
     for k, day in enumerate(days):
         walk = walk + np.sqrt(rate_m2 * (day - days[max(k - 1, 0)])) * random.normal(size=RECIPE.tags + 1)
         adds_m = walk + scatter_m * random.normal(size=RECIPE.tags + 1)
-        ranges = make(RECIPE, seed, k).ranges
+        ranges = make(replace(RECIPE, wander_m=wander_m), seed, k).ranges
         time_ns = ranges.time_ns + int((begin + day) * DAY_NS)
         raw_m = ranges.raw_m + adds_m[ranges.initiator] + adds_m[ranges.target]
         parts.append(replace(ranges, source=f"day{k}", time_ns=time_ns, raw_m=raw_m))
@@ -31,23 +31,24 @@ def told(seed, *args, **kwargs):
     return calib.fit(sessions(seed, days, *args, **kwargs)).calibration.provenance["drift"]
 
 
-@pytest.mark.parametrize("rate_m2", [1e-6, 1e-5])
-def test_the_rate_of_a_drift_is_found_within_its_interval(rate_m2):
-    found = [told(seed, rate_m2) for seed in range(12)]
+@pytest.mark.parametrize(("rate_m2", "wander_m"), [(1e-5, 0.0), (1e-4, 0.04)])
+def test_the_rate_of_a_drift_is_found_within_its_interval(rate_m2, wander_m):
+    # Errors of pairs that last for seconds scatter between sessions, too.
+    found = [told(seed, rate_m2, wander_m=wander_m) for seed in range(12)]
     # Of 12 intervals of 95 %, 10 or more hold the rate in 98 of 100 such studies.
     assert sum(low <= rate_m2 <= high for low, _, high in (one["m2_per_day"] for one in found)) >= 10
     likeliest = np.array([one["m2_per_day"][1] for one in found])
     assert 0.4 < np.median(likeliest) / rate_m2 < 2.5
-    if rate_m2 > 1e-6:
-        assert all(one["told"] for one in found)
-        assert np.mean([one["by_age"] for one in found]) > 0.3
+    assert np.mean([one["told"] for one in found]) > 0.7
+    assert np.mean([one["by_age"] for one in found]) > 0.2
 
 
-def test_nothing_is_claimed_where_nothing_drifts():
-    found = [told(seed) for seed in range(20, 28)]
+@pytest.mark.parametrize(("wander_m", "most_m2"), [(0.0, 3e-6), (0.04, 1e-4)])
+def test_nothing_is_claimed_where_nothing_drifts(wander_m, most_m2):
+    found = [told(seed, wander_m=wander_m) for seed in range(20, 28)]
     assert not any(one["told"] or one["by_age"] for one in found)
-    # Without a drift the data still bound it: a centimetre in a hundred days.
-    assert max(one["m2_per_day"][2] for one in found) < 5e-6
+    # Sessions still bound what they do not see.
+    assert max(one["m2_per_day"][2] for one in found) < most_m2
 
 
 def test_what_scatters_between_sessions_is_not_called_age():
