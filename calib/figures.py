@@ -274,7 +274,7 @@ def patterns(width_in: float, calibration: Calibration, ranges: Ranges | None = 
     for axes in panels:
         axes.set(theta_zero_location="N", ylim=(-1.05 * reach_cm, 1.05 * reach_cm), rlabel_position=-22)
         axes.set_xticks(np.radians(np.arange(0, 360, 90)), ["ahead", "left", "behind", "right"])
-        ticks = MaxNLocator(5).tick_values(-reach_cm, reach_cm)
+        ticks = np.asarray(MaxNLocator(5).tick_values(-reach_cm, reach_cm))
         axes.set_yticks(ticks[np.abs(ticks) <= reach_cm])
         axes.spines["polar"].set_color(GRID)
     legend(figure)
@@ -286,7 +286,8 @@ def _elevations(calibration: Calibration, ranges: Ranges | None) -> list[float]:
     tags = [tag for one in calibration.patterns for tag in one.tags]
     z = np.zeros(1)
     if ranges is not None:
-        z = ranges.toward[np.isin(np.stack([ranges.initiator, ranges.target], axis=1), tags)][:, 2]
+        seen = np.isin(np.stack([ranges.initiator, ranges.target], axis=1), tags)
+        z = ranges.toward[seen].astype(np.float64)[:, 2]
     low, middle, high = np.arcsin(np.nanquantile(z, (0.1, 0.5, 0.9)) if np.isfinite(z).any() else np.zeros(3)).tolist()
     return [middle, low, high] if high - low > np.radians(30) else [middle]
 

@@ -41,7 +41,7 @@ def drift_of(found: KnownDistances) -> dict[str, Any]:
     variances = np.geomspace(*OFFSETS[1:], 400) ** 2
     # Rates are such that a thousand days make as much.
     rates = variances / 1000
-    walk = log_likelihood(tested, np.kron(np.eye(len(tags)), steps), rates)
+    walk = log_likelihood(tested, np.asarray(np.kron(np.eye(len(tags)), steps)), rates)
     scatter = log_likelihood(tested, np.eye(len(tags) * count), variances)
     within = rates[walk > walk.max() - chdtri(1, 0.05) / 2]
     told = bool(walk.max() > chdtri(1, 0.02) / 2)

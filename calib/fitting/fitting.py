@@ -163,9 +163,8 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
             f"at least {MIN_OF_DELAY} are needed"
         )
     directed = [one for pattern in calibration.patterns for one in pattern.tags]
-    some = some[
-        ~(np.isnan(some.toward).any(axis=2) & np.isin(np.stack([some.initiator, some.target], 1), directed)).any(1)
-    ]
+    blind = np.isnan(some.toward).any(axis=2) & np.isin(np.stack([some.initiator, some.target], axis=1), directed)
+    some = some[np.flatnonzero(~blind.any(axis=1))]
     if len(some) < MIN_OF_DELAY:
         raise UnanswerableError(
             f"{ranges.source}: the calibration has patterns over direction, and directions are known of {len(some)} "
