@@ -186,48 +186,39 @@ def test_the_file_keeps_patterns_and_older_programs_refuse_it():
 
 def test_the_report_draws_patterns_with_their_bands_at_the_level_of_flight():
     known, flown_ranges = fitted(TEN, 3).calibration, fitted(TEN, 3).ranges
-    blocks = SECTIONS["patterns"](Results(calibration=known, training=[flown_ranges]))
-    (picture,) = [block for block in blocks if isinstance(block, Picture)]
-    (axes,) = picture.draw(7.0).axes
+    *_, picture = SECTIONS["patterns"](Results(calibration=known, training=[flown_ranges]))
+    assert isinstance(picture, Picture)
+    (axes,), (pattern,) = picture.draw(7.0).axes, known.patterns
     # Robots tilt: the middle of the flown elevations, a tenth below and a tenth above, and the circle of zero.
-    middle, low, high, zero = axes.lines
-    level, up = (
-        seen(flown_ranges, (1, 2, 3, 4)),
-        [float(line.get_label()[10:-1].replace("−", "-")) for line in axes.lines[:3]],
-    )
-    assert up == pytest.approx(np.degrees(np.arcsin(np.quantile(level[:, 2], (0.5, 0.1, 0.9)))), abs=0.6)
-    assert not np.any(zero.get_ydata())
-    for line, deg in zip((middle, low, high), np.radians(up), strict=True):
-        around = line.get_xdata()
-        toward = np.array(
-            [np.cos(around) * np.cos(deg), np.sin(around) * np.cos(deg), np.full(len(around), np.sin(deg))]
-        )
-        values = known.patterns[0].values(toward.T)
-        assert line.get_ydata() == pytest.approx(100 * values @ known.patterns[0].coefficients_m, abs=0.1)
-    (band, *_) = axes.collections
-    edges, std = band.get_paths()[0].vertices[:, 1], known.patterns[0].std_m(values)
-    assert np.ptp(edges) > np.ptp(middle.get_ydata()) + 196 * std.min()
-    assert SECTIONS["patterns"](Results(calibration=replace(known, patterns=()), training=[flown_ranges])) == []
-    # A page reads values of straight axes under the pointer, and none of these.
-    assert b"names" not in drawn(picture.draw, 7.0, ["svg"])["svg"]
-    nowhere = SECTIONS["patterns"](Results(calibration=known))[-1]
-    assert len(nowhere.draw(3.5).axes[0].lines) == 2
+    *lines, zero = axes.lines
+    up = np.radians([float(line.get_label()[10:-1].replace("−", "-")) for line in lines])
+    level = np.quantile(seen(flown_ranges, (1, 2, 3, 4))[:, 2], (0.5, 0.1, 0.9))
+    assert (np.sin(up), zero.get_ydata().any()) == (pytest.approx(level, abs=0.01), False)
+    around = lines[0].get_xdata()
+    for line, one in zip(lines, up, strict=True):
+        toward = [np.cos(around) * np.cos(one), np.sin(around) * np.cos(one), np.full(len(around), np.sin(one))]
+        values = pattern.values(np.transpose(toward))
+        assert line.get_ydata() == pytest.approx(100 * values @ pattern.coefficients_m, abs=0.1)
+    edges = axes.collections[0].get_paths()[0].vertices[:, 1]
+    assert np.ptp(edges) > np.ptp(lines[0].get_ydata()) + 196 * pattern.std_m(values).min()
+    # A page reads values of straight axes under the pointer, and none of these. Without ranges there is one line.
+    one = SECTIONS["patterns"](Results(calibration=known))[-1].draw
+    assert (len(one(3.5).axes[0].lines), b"names" in drawn(one, 7.0, ["svg"])["svg"]) == (2, False)
+    assert SECTIONS["patterns"](Results(calibration=replace(known, patterns=()))) == []
 
 
 def test_a_stream_knows_no_directions_and_its_total_sigma_contains_the_pattern(tmp_path):
     fitted(TEN, 3).calibration.save(tmp_path / "known.json")
-    path = written(tmp_path / "second.uwb", TEN, 3, 1)
-    truth = calib.load_ranges(path).truth_m[:1000]
-    streamed = [
-        one
-        for one, _ in zip(uwblink.stream(path, calibration=tmp_path / "known.json", speed=np.inf), truth, strict=False)
+    path, how = written(tmp_path / "second.uwb", TEN, 3, 1), {"calibration": tmp_path / "known.json"}
+    rows = [
+        (one.corrected_m, one.sigma_m, one.more["sigma_total_m"]) for one in uwblink.stream(path, speed=np.inf, **how)
     ]
-    error = np.array([one.corrected_m for one in streamed]) - truth
-    total = np.array([one.more["sigma_total_m"] for one in streamed])
+    corrected, sigma, total = np.transpose(rows)
+    error = corrected - calib.load_ranges(path).truth_m
     assert np.std(error / total) == pytest.approx(1.0, abs=0.1)
-    assert np.std(error / [one.sigma_m for one in streamed]) > 1.2
+    assert np.std(error / sigma) > 1.2
     with pytest.raises(ValueError, match="without patterns over direction"):
-        uwblink.stream(path, calibration=tmp_path / "known.json", use="receptions")
+        uwblink.stream(path, use="receptions", **how)
 
 
 @pytest.mark.parametrize("own", [False, True])
@@ -239,53 +230,44 @@ def test_a_tag_that_is_added_has_the_pattern_that_others_share_or_one_that_is_un
     known.save(tmp_path / "known.json")
     second = written(tmp_path / "second.uwb", recipe, 3, 1)
     done = call("calib", "add-tag", second, "-c", tmp_path / "known.json", "--tag", 5, "-o", tmp_path / "five.json")
-    assert done.returncode == 0
-    assert ("tag 5: its pattern over direction" in done.stderr) == own
-    added = calib.load_calibration(tmp_path / "five.json")
-    assert added.patterns[-1].tags == ((5,) if own else (1, 2, 3, 4, 5))
-    planted = flown(recipe, 3)[0].planted["delays_ns"]
-    off = {tag: added.delays_ns[tag] - planted[str(tag)] for tag in (1, 2, 3, 4, 5)}
+    assert (done.returncode, "tag 5: its pattern over direction" in done.stderr) == (0, own)
+    added, planted = calib.load_calibration(tmp_path / "five.json"), flown(recipe, 3)[0].planted["delays_ns"]
+    off = [added.delays_ns[tag] - planted[str(tag)] for tag in (1, 2, 3, 4, 5)]
     # What all delays share goes with the curve; of the rest 10 ps are 1.5 mm of a range.
-    assert off[5] - np.mean(list(off.values())) == pytest.approx(0, abs=0.02 + 0.1 * own)
+    assert off[4] - np.mean(off) == pytest.approx(0, abs=0.02 + 0.1 * own)
     of_five = there[(there.initiator == 5) | (there.target == 5)]
-    applied = added.apply(of_five)
-    error = applied.corrected_m - of_five.truth_m
+    error = added.apply(of_five).corrected_m - of_five.truth_m
     assert np.std(error) < (0.065 if own else 0.045)
-    assert np.std(error / applied.sigma_total_m) == pytest.approx(1.0, abs=0.1)
+    assert np.std(error / added.apply(of_five).sigma_total_m) == pytest.approx(1.0, abs=0.1)
     with pytest.raises(UnanswerableError, match="directions are known of 0"):
         calib.add_tag(replace(there, toward=np.full_like(there.toward, np.nan)), known, 5)
 
 
 def test_delays_of_calibrations_with_patterns_are_compared_for_the_same_directions(tmp_path):
     known, again = (calib.fit(flown(TEN, 3, k)[0], between_m=0.0).calibration for k in (0, 1))
-    found = calib.compare(known, again)
-    assert found.same
-    assert found.pattern_probability > 0.01
-    assert found.pattern_rms_m < 0.015
-    # The same patterns about another centre, one of each tag: delays are those of other directions.
-    centres = np.random.default_rng(1).normal(0, 0.5, (4, 8))
-    patterns, delays = [], dict(known.delays_ns)
-    for tag, centre in zip((1, 2, 3, 4), centres, strict=True):
-        (one,) = known.patterns
-        delays[tag] -= 2 / 0.299702547 * float((centre - one.centre) @ one.coefficients_m)
-        patterns.append(replace(one, tags=(tag,), centre=tuple(centre.tolist())))
-    elsewhere = replace(known, delays_ns=delays, patterns=tuple(patterns))
+    found, (pattern,) = calib.compare(known, again), known.patterns
+    assert (found.same, found.pattern_probability > 0.01, found.pattern_rms_m < 0.015) == (True, True, True)
+    # The same pattern about another centre, one of each tag: delays are those of other directions.
+    centres = dict(zip((1, 2, 3, 4), np.random.default_rng(1).normal(0, 0.5, (4, 8)), strict=True))
+    moved_m = {tag: float((centre - pattern.centre) @ pattern.coefficients_m) for tag, centre in centres.items()}
+    elsewhere = replace(
+        known,
+        delays_ns={tag: delay - 2 / 0.299702547 * moved_m[tag] for tag, delay in known.delays_ns.items()},
+        patterns=tuple(replace(pattern, tags=(tag,), centre=tuple(one.tolist())) for tag, one in centres.items()),
+    )
     there = calib.load_ranges(flown(TEN, 3, 1)[0])
     assert elsewhere.apply(there).corrected_m == pytest.approx(known.apply(there).corrected_m, abs=1e-5)
-    for first, second in ((known, elsewhere), (elsewhere, known)):
-        found = calib.compare(first, second)
-        assert max(map(abs, found.difference_ns.values())) < 1e-9
-        assert found.pattern_rms_m == pytest.approx(0, abs=1e-12)
-    (one,) = known.patterns
-    turned = replace(known, patterns=(replace(one, coefficients_m=one.coefficients_m[::-1]),))
-    turned.save(tmp_path / "turned.json")
-    fitted(TEN, 3, pattern="none").calibration.save(tmp_path / "none.json")
-    known.save(tmp_path / "known.json")
-    done = call("calib", "compare", tmp_path / "known.json", tmp_path / "turned.json")
-    assert float(done.stdout.split("rms apart, probability ")[1].split()[0]) < 1e-3
-    done = call("calib", "compare", tmp_path / "known.json", tmp_path / "none.json")
-    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
-    assert "tags 1, 2, 3, 4 have a pattern over direction in one" in done.stderr
+    for found in (calib.compare(known, elsewhere), calib.compare(elsewhere, known)):
+        assert [*found.difference_ns.values(), found.pattern_rms_m] == pytest.approx([0] * 5, abs=1e-9)
+    turned = replace(pattern, coefficients_m=pattern.coefficients_m[::-1])
+    for name, patterns in (("known", (pattern,)), ("turned", (turned,)), ("none", ())):
+        replace(known, patterns=patterns).save(tmp_path / f"{name}.json")
+    other, lone = (
+        call("calib", "compare", *(tmp_path / f"{n}.json" for n in ("known", to))) for to in ("turned", "none")
+    )
+    assert float(other.stdout.split("rms apart, probability ")[1].split()[0]) < 1e-3
+    assert (lone.returncode, lone.stderr.count("\n")) == (1, 1)
+    assert "tags 1, 2, 3, 4 have a pattern over direction in one" in lone.stderr
 
 
 def test_directions_are_those_in_the_frames_of_the_bodies():
