@@ -71,8 +71,29 @@ def fit_with_pattern(ranges: Ranges, settings: FitSettings) -> tuple[KnownDistan
         evidence = log_evidence(found.slopes.test(_family(found, directions, kind, fitted=True)))
         marginal = _log_marginal(found.searches[0].optimum)
         if evidence >= LOG_EVIDENCE and marginal > likeliest:
-            best, likeliest = (found, {"kind": mode, "log_evidence": round(evidence, 1)}, []), marginal
+            explained = log_evidence(_beside_power(plain, directions, kind)) < LOG_EVIDENCE
+            said = (
+                "the pattern over direction may be one of power: errors of single tags that go with power explain as "
+                "much; compare with a fit with `pattern` none and `groups` of tags"
+            )
+            known = {"kind": mode, "log_evidence": round(evidence, 1)}
+            best, likeliest = (found, known, [said] * explained), marginal
     return best
+
+
+def _beside_power(plain: KnownDistances, directions: Directions, kind: str) -> Tested:
+    """Return the slopes of a pattern beside offsets of each tag that go with the rank of power."""
+    names, columns, values = directions.entries(kind, plain.model.pairs)
+    tags, pairs, count = plain.model.tags, plain.model.pairs, len(values)
+    rank = np.linspace(-1, 1, count)[np.argsort(np.argsort(plain.model.lifted, kind="stable"))]
+    ends = np.searchsorted(tags, pairs.ends)[pairs.number] + len(names)
+    derivative = Derivative(
+        np.concatenate([columns, ends], axis=1),
+        np.concatenate([-values, rank[:, None], rank[:, None]], axis=1),
+        len(names) + len(tags),
+    )
+    tested = plain.slopes.test(Family(kind=kind, names=names, derivative=derivative))
+    return tested.beside(range(len(names), derivative.size)).turned(np.eye(len(names), derivative.size))
 
 
 def with_new_tag(calibration: Calibration, tag: int, ranges: Ranges) -> Calibration:

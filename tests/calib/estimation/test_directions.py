@@ -114,6 +114,20 @@ def test_what_belongs_to_places_does_not_pass_for_the_antennas():
     assert pattern.rms_m < 0.03
 
 
+def test_power_that_explains_what_looks_like_direction_is_named():
+    ranges = calib.load_ranges(flown(replace(TEN, pattern_m=0.0), 3)[0])
+    azimuth = np.arctan2(ranges.toward[:, :, 1], ranges.toward[:, :, 0])
+    of_one = np.stack([ranges.initiator, ranges.target], axis=1) == 1
+    # The antenna of tag 1 is louder by 6 dB ahead, and its ranges alone grow with power.
+    louder = 6.0 * np.sum(np.cos(azimuth) * of_one, axis=1)
+    powers = {name: getattr(ranges, name) + louder for name in ("fpp1_dbm", "fpp2_dbm")}
+    order = np.argsort(np.argsort(sum(powers.values()))) / len(ranges)
+    found = calib.fit(replace(ranges, raw_m=ranges.raw_m + 0.12 * order * of_one.any(axis=1), **powers), between_m=0.0)
+    assert [said for said in found.warnings if "may be one of power" in said]
+    assert found.calibration.patterns
+    assert not [said for said in fitted(TEN, 3).warnings if "may be one of power" in said]
+
+
 def test_a_pattern_that_attitudes_do_not_excite_is_refused_with_the_flight_that_would(tmp_path):
     still = written(tmp_path / "still.uwb", replace(TEN, turning=0.0), 5)
     for name in ("shared", "tag"):
