@@ -13,6 +13,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from matplotlib.axes import Axes as Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from scipy.stats import norm
 
 from calib.calibration.applying import CorrectedRanges
@@ -23,7 +24,8 @@ from calib.estimator.grouped_errors import fit_grouped_errors
 from calib.evaluation.statistics import CORRECTION_STAGES, compare_with_planted, pair_rows, planted_curve
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
-from uwblink.pages.colours import BLUE, GREEN, INK, MUTED, PALE, VERMILION, WINE
+from uwblink.display import first_few
+from uwblink.pages.colours import BLUE, GREEN, GRID, INK, MUTED, PALE, VERMILION, WINE, look
 from uwblink.pages.figures import NARROW_IN, WIDTHS, label, legend, mark, outlines, series, sheet
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -249,6 +251,45 @@ def keep_strays_out(axes: Axes, values: Floats) -> None:
     inside = values[within_fence(values)]
     margin = 0.12 * float(np.ptp(inside)) + 1e-9
     axes.set_ylim(inside.min() - margin, inside.max() + margin)
+
+
+def patterns(width_in: float, calibration: Calibration, ranges: Ranges | None = None) -> Figure:
+    """Draw the six largest patterns over azimuth with bands of 95 %, at elevations of the directions in `ranges`."""
+    largest = sorted(calibration.patterns, key=lambda one: -one.rms_m)[:6]
+    polar: dict[str, Any] = {"subplot_kw": {"projection": "polar"}, "height_in": 3.2}
+    figure, panels = sheet(width_in, len(largest), across=min(len(largest), int(width_in / 3)), **polar)
+    around, reach_cm = np.radians(np.arange(0, 361, 3)), 0.0
+    for axes, pattern in zip(panels, sorted(largest, key=lambda one: one.tags), strict=True):
+        for k, up in enumerate(_elevations(calibration, ranges)):
+            toward = [np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.full(len(around), np.sin(up))]
+            values = pattern.values(np.column_stack(toward))
+            longer = 100 * (values @ np.array(pattern.coefficients_m))
+            low, high = (longer + side * 100 * TWO_SIDED_95 * pattern.std_m(values) for side in (-1, 1))
+            reach_cm = max(reach_cm, -low.min(), high.max())
+            line = {"color": look(k).colour, "ls": look(k).dashes}
+            text = f"elevation {np.degrees(up):.0f}°".replace("-", "−")
+            series(axes, around, longer, (low, high), band="" if k else "95 % band", label=text, **line)
+        axes.plot(around, np.zeros(len(around)), color=MUTED, lw=1.0)
+        axes.set_title(f"tag{'s' * (len(pattern.tags) > 1)} {first_few(map(str, pattern.tags))}: longer by (cm)")
+    for axes in panels:
+        axes.set(theta_zero_location="N", ylim=(-1.05 * reach_cm, 1.05 * reach_cm), rlabel_position=-22)
+        axes.set_xticks(np.radians(np.arange(0, 360, 90)), ["ahead", "left", "behind", "right"])
+        ticks = np.asarray(MaxNLocator(5).tick_values(-reach_cm, reach_cm))
+        axes.set_yticks(ticks[np.abs(ticks) <= reach_cm])
+        axes.spines["polar"].set_color(GRID)
+    legend(figure)
+    return figure
+
+
+def _elevations(calibration: Calibration, ranges: Ranges | None) -> list[float]:
+    """Return the middle elevation in radians of directions at tags with patterns, and those of 10 and 90 % if apart."""
+    tags = [tag for one in calibration.patterns for tag in one.tags]
+    z = np.zeros(1)
+    if ranges is not None:
+        seen = np.isin(np.stack([ranges.initiator, ranges.target], axis=1), tags)
+        z = ranges.toward[seen].astype(np.float64)[:, 2]
+    low, middle, high = np.arcsin(np.nanquantile(z, (0.1, 0.5, 0.9)) if np.isfinite(z).any() else np.zeros(3)).tolist()
+    return [middle, low, high] if high - low > np.radians(30) else [middle]
 
 
 def new_axes() -> Axes:

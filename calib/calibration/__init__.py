@@ -2,9 +2,18 @@
 
 from calib.calibration.applying import keep_determined
 from calib.calibration.formats import antenna_delays_warning, free_delays, programmed, read_miluv
-from calib.calibration.model import delay_rows, held_out_line, pair_rows, pattern_rows, rests_on, temperature_rows
+from calib.calibration.model import (
+    age_line,
+    delay_rows,
+    held_out_line,
+    pair_rows,
+    pattern_rows,
+    rests_on,
+    temperature_rows,
+)
 
 __all__ = [
+    "age_line",
     "antenna_delays_warning",
     "delay_rows",
     "free_delays",

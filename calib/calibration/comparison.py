@@ -11,8 +11,10 @@ from scipy.special import chdtrc
 
 from calib.calibration.document import for_json
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration, interval
+from calib.calibration.patterns import HARMONICS
 from calib.errors import UnanswerableError
 from uwblink.arrays import Floats
+from uwblink.display import first_few
 from uwblink.ticks import SPEED_OF_LIGHT
 
 
@@ -22,9 +24,11 @@ class CalibrationComparison:
 
     A shift common to all delays and a constant of the curve are the same thing, so only together do they mean anything:
     `offset_m` is what the second calibration adds to every range beyond the first, at equal power. What a calibration's
-    `undetermined_splits` leave open is taken out, too. `std_ns` is NaN for tags of which a calibration states no
-    standard error, as published ones; `chi_square` has `degrees` of freedom, and where there are none, nothing can be
-    tested, and `chi_square` and `probability` are NaN.
+    `undetermined_splits` leave open is taken out, too. Where both have patterns over direction, delays are those of the
+    directions that the first was fitted to, `pattern_rms_m` is the difference of the patterns over all directions, and
+    `pattern_probability` that of a larger one by chance; NaN where there are none. `std_ns` is NaN for tags of which a
+    calibration states no standard error, as published ones; `chi_square` has `degrees` of freedom, and where there are
+    none, nothing can be tested, and `chi_square` and `probability` are NaN.
     """
 
     difference_ns: dict[int, float]
@@ -34,6 +38,8 @@ class CalibrationComparison:
     chi_square: float
     degrees: int
     probability: float
+    pattern_rms_m: float
+    pattern_probability: float
     only_first: tuple[int, ...]
     only_second: tuple[int, ...]
 
@@ -61,6 +67,10 @@ class CalibrationComparison:
             f"offset of all ranges {100 * self.offset_m:+.1f} cm, "
             f"shape of the bias curves {100 * self.curve_rms_m:.1f} cm rms"
         )
+        patterns = (
+            f"patterns over direction {100 * self.pattern_rms_m:.1f} cm rms apart, probability "
+            f"{self.pattern_probability:.3f}"
+        )
         sides = (first, self.only_first), (second, self.only_second)
         only = [f"only in {name}: tags {', '.join(map(str, tags))}" for name, tags in sides if tags]
         verdict = (
@@ -69,7 +79,7 @@ class CalibrationComparison:
             else f"the delays are {'the same' if self.same else 'different'}: chi-square {self.chi_square:.1f} with "
             f"{self.degrees} degrees of freedom, probability {self.probability:.3f}"
         )
-        return "\n".join([*lines, shapes, *only, verdict])
+        return "\n".join([*lines, shapes, *([] if np.isnan(self.pattern_rms_m) else [patterns]), *only, verdict])
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `calib compare --json` prints."""
@@ -81,7 +91,8 @@ def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationC
     """Test whether the delays of two calibrations differ by more than their standard errors explain, by chi-square.
 
     Differences in ns are second minus first, less what is common to all delays and what undetermined splits leave open.
-    Raises `UnanswerableError` where fewer than two tags have a determined delay in both.
+    Raises `UnanswerableError` where fewer than two tags have a determined delay in both, and where one of them has
+    a pattern over direction in one of both only.
 
     >>> import calib
     >>> first, second = (calib.fit(calib.sample_flight(seed=seed)).calibration for seed in (1, 2))
@@ -99,12 +110,14 @@ def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationC
         )
     stated = [t for t in common if all(_is_stated(c, t) for c in both)]
     tags = stated if len(stated) > 1 else common
-    delta = np.array([second.delays_ns[t] - first.delays_ns[t] for t in common])
+    moved_ns, moved_ns2, *patterns = _by_direction(first, second, common)
+    delta = np.array([second.delays_ns[t] - first.delays_ns[t] for t in common]) - moved_ns
     loose = loose_shifts(both, common)
     rows = np.isin(common, tags)
     covariance = np.eye(len(tags))
     if len(stated) > 1:
         covariance = sum(_covariance_ns2(c, stated) for c in both) + 1e-12 * np.eye(len(stated))
+        covariance = covariance + moved_ns2[np.ix_(rows, rows)]
     # Most likely values of what is loose; what is left has a covariance of as many ranks less.
     precision = np.linalg.inv(covariance)
     of_loose = np.linalg.pinv(loose[rows].T @ precision @ loose[rows], hermitian=True)
@@ -130,9 +143,44 @@ def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationC
         chi_square=score,
         degrees=max(degrees, 0),
         probability=probability,
+        pattern_rms_m=patterns[0],
+        pattern_probability=patterns[1],
         only_first=tuple(sorted(set(first.delays_ns) - set(common))),
         only_second=tuple(sorted(set(second.delays_ns) - set(common))),
     )
+
+
+def _by_direction(first: Calibration, second: Calibration, tags: list[int]) -> tuple[Floats, Floats, float, float]:
+    """Return by how much delays (tags,) of the second are longer in its average direction than in that of the first.
+
+    That is in ns, with its covariance; then come the rms of the difference of patterns, and its probability.
+    """
+    centre, apart = np.zeros((2, len(tags), HARMONICS))
+    members, covariance = np.zeros((2, len(tags)), dtype=bool), np.zeros((len(tags) * HARMONICS,) * 2)
+    moved_ns, moved_ns2 = np.zeros(len(tags)), np.zeros((len(tags),) * 2)
+    for side, calibration in enumerate((first, second)):
+        for pattern in calibration.patterns:
+            own = np.isin(tags, pattern.tags)
+            members[side] |= own
+            factors, known = np.array(pattern.coefficients_m), np.array(pattern.covariance_m2)
+            apart += (2 * side - 1) * np.outer(own, factors)
+            covariance += np.kron(np.outer(own, own), known)
+            if not side:
+                centre += np.outer(own, pattern.centre)
+                continue
+            # A range has half of a delay, with the other sign.
+            away = 2e9 / SPEED_OF_LIGHT * own[:, None] * (centre - pattern.centre)
+            moved_ns, moved_ns2 = moved_ns + away @ factors, moved_ns2 + away @ known @ away.T
+    if (lone := np.flatnonzero(members[0] != members[1])).size:
+        raise UnanswerableError(
+            f"tags {first_few(str(tags[k]) for k in lone)} have a pattern over direction in one of the calibrations "
+            "only: their delays are those of other directions; fit both with the same `pattern`"
+        )
+    if not members.any():
+        return moved_ns, moved_ns2, np.nan, np.nan
+    score = float(apart.ravel() @ np.linalg.pinv(covariance, hermitian=True) @ apart.ravel())
+    probability = float(chdtrc(np.linalg.matrix_rank(covariance, hermitian=True), score))
+    return moved_ns, moved_ns2, float(np.sqrt(np.mean(np.sum(apart**2, axis=1)[members[0]]))), probability
 
 
 def loose_shifts(calibrations: Iterable[Calibration], tags: list[int]) -> Floats:

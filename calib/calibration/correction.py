@@ -150,4 +150,5 @@ def live_correction(path: Path) -> Correction:
         known |= {"listener": heard.listener, "difference_m": applied.raw_m, "corrected_m": applied.corrected_m}
         return known | {"sigma_m": applied.sigma_m, "shared_m": applied.shared_m}
 
-    return Correction(correct, differences, calibration.antenna_delays)
+    # Patterns say nothing of overheard frames.
+    return Correction(correct, None if calibration.patterns else differences, calibration.antenna_delays)

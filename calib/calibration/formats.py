@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +18,7 @@ from scipy.interpolate import PPoly
 from calib.calibration.document import ends_of, finite
 from calib.calibration.error_model import ErrorModel
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
-from calib.calibration.patterns import TemperatureSlope
+from calib.calibration.patterns import Pattern, TemperatureSlope
 from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.data.ranges import FAINTEST_DBM, LOUDEST_DBM
 from calib.data.sources import antenna_delays_in
@@ -188,8 +189,9 @@ def _error_tables(model: ErrorModel) -> dict[str, Any]:
 
 
 _C_HEAD: Final = """\
-/* Calibration of ranging tags: antenna delays, and bias and standard deviation of ranges by first-path power.
-   Include it where ranges are corrected, and call uwb_correct(). C99 and C++; needs math.h. */
+/* Calibration of ranging tags: antenna delays, bias and standard deviation of ranges by first-path power, and patterns
+   over direction. Include it where ranges are corrected, and call uwb_correct(), or uwb_correct_toward() where
+   directions are known. C99 and C++; needs math.h. */
 #ifndef UWB_CALIBRATION_H
 #define UWB_CALIBRATION_H
 #include <math.h>
@@ -255,16 +257,79 @@ static inline int uwb_correct(double range_m, double fpp1_dbm, double fpp2_dbm, 
         *sigma_m = UWB_SIGMA(lifted);
     return lifted < UWB_LOWEST || lifted > UWB_HIGHEST;
 }
+
+/* Add the harmonics in the direction of a unit vector, less their centre. */
+static void uwb_harmonics(const double *toward, const double *centre, double *values)
+{
+    const double x = toward[0], y = toward[1], z = toward[2], first = sqrt(3.0), second = sqrt(15.0);
+    int k;
+    values[0] += first * x;
+    values[1] += first * y;
+    values[2] += first * z;
+    values[3] += second * x * y;
+    values[4] += second * y * z;
+    values[5] += second * x * z;
+    values[6] += second * (x * x - y * y) / 2.0;
+    values[7] += second * (z * z - 1.0 / 3.0) * first / 2.0;
+    for (k = 0; k < 8; k++)
+        values[k] -= centre[k];
+}
+
+/* By how much directions make a range longer than on average, in metres. toward_initiator is the unit vector (x, y, z)
+   from the initiator's antenna to the target's in the frame of the initiator's body, toward_target the one back in the
+   frame of the target's; NULL, or NaN in it, where it is not known. *unknown_m2 is the variance of what is unknown. */
+static double uwb_pattern(int initiator, int target, const double *toward_initiator, const double *toward_target,
+                          double *unknown_m2)
+{
+    double longer = 0.0, sum;
+    int p, end, k, m;
+    *unknown_m2 = 0.0;
+    for (p = 0; p < UWB_PATTERNS; p++) {
+        double values[8] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
+        for (end = 0; end < 2; end++) {
+            const double *toward = end ? toward_target : toward_initiator;
+            for (k = 0; k < UWB_TAGS; k++) {
+                if (!uwb_pattern_has[p][k] || uwb_tag[k] != (end ? target : initiator))
+                    continue;
+                sum = toward ? toward[0] + toward[1] + toward[2] : NAN;
+                if (sum == sum)
+                    uwb_harmonics(toward, uwb_pattern_centre[p], values);
+                else
+                    *unknown_m2 += uwb_pattern_rms_m[p][0] * uwb_pattern_rms_m[p][0];
+            }
+        }
+        for (k = 0; k < 8; k++) {
+            longer += uwb_pattern_m[p][k] * values[k];
+            for (m = 0; m < 8; m++)
+                *unknown_m2 += values[k] * uwb_pattern_m2[p][8 * k + m] * values[m];
+        }
+    }
+    return longer;
+}
+
+/* Correct a range as uwb_correct() does, and by the directions of uwb_pattern(). */
+static inline int uwb_correct_toward(double range_m, double fpp1_dbm, double fpp2_dbm, int initiator, int target,
+                                     const double *toward_initiator, const double *toward_target, double *corrected_m,
+                                     double *sigma_m)
+{
+    double unknown_m2;
+    int status = uwb_correct(range_m, fpp1_dbm, fpp2_dbm, initiator, target, corrected_m, sigma_m);
+    if (status == 0 || status == 1)
+        *corrected_m -= uwb_pattern(initiator, target, toward_initiator, toward_target, &unknown_m2);
+    return status;
+}
 """
 
 _C_ERRORS: Final = """
-/* What errors to expect of corrected ranges of two tags, reflections included: their standard deviation about their
-   mean, that mean (reflections make ranges long), in metres, and the share of them that are reflected. Returns 0; 2
-   where no power was measured (all are NaN). */
-static inline int uwb_errors(double fpp1_dbm, double fpp2_dbm, int initiator, int target, double *sigma_total_m,
-                      double *mean_error_m, double *tail_share)
+/* What errors to expect of ranges of two tags that uwb_correct_toward() corrects, reflections included: their standard
+   deviation about their mean, that mean (reflections make ranges long), in metres, and the share of them that are
+   reflected. Where a direction is not known, the first contains the pattern. Returns 0; 2 where no power was measured
+   (all are NaN). */
+static inline int uwb_errors_toward(double fpp1_dbm, double fpp2_dbm, int initiator, int target,
+                                    const double *toward_initiator, const double *toward_target, double *sigma_total_m,
+                                    double *mean_error_m, double *tail_share)
 {
-    double lifted, part = 0.0, noise, detour, away, square;
+    double lifted, part = 0.0, noise, detour, away, square, unknown_m2;
     int k = 0, pair = 0;
     *sigma_total_m = *mean_error_m = *tail_share = NAN;
     if (!uwb_lifted(&fpp1_dbm, &fpp2_dbm, &lifted))
@@ -292,9 +357,18 @@ static inline int uwb_errors(double fpp1_dbm, double fpp2_dbm, int initiator, in
     away = lifted < UWB_LOWEST    ? (UWB_LOWEST - lifted) * UWB_SLOPE_BELOW
            : lifted > UWB_HIGHEST ? (lifted - UWB_HIGHEST) * UWB_SLOPE_ABOVE
                                   : 0.0;
-    *sigma_total_m = sqrt(UWB_ERROR_SCALE * UWB_ERROR_SCALE * square + away * away);
+    (void)uwb_pattern(initiator, target, toward_initiator, toward_target, &unknown_m2);
+    *sigma_total_m = sqrt(UWB_ERROR_SCALE * UWB_ERROR_SCALE * square + away * away + unknown_m2);
     *mean_error_m += UWB_ERROR_LOCATION_M;
     return 0;
+}
+
+/* The same of ranges that uwb_correct() corrects, without directions. */
+static inline int uwb_errors(double fpp1_dbm, double fpp2_dbm, int initiator, int target, double *sigma_total_m,
+                             double *mean_error_m, double *tail_share)
+{
+    return uwb_errors_toward(fpp1_dbm, fpp2_dbm, initiator, target, NULL, NULL, sigma_total_m, mean_error_m,
+                             tail_share);
 }
 """
 
@@ -324,6 +398,7 @@ def c_header(calibration: Calibration) -> str:
         f"static const double uwb_delay_m[UWB_TAGS] = {{{_numbers(metres)}}};",
         *_c_curve("bias", bias),
         *_c_curve("sigma", calibration.sigma_curve),
+        *_c_patterns(calibration.patterns, tags),
     ]
     text = "\n".join(lines) + _C_CODE
     if calibration.temperatures:
@@ -381,6 +456,25 @@ def _c_errors(model: ErrorModel, bias: Curve) -> list[str]:
         "static const double uwb_error_factor[][3] = {",
         *(f"    {{{_numbers(row)}}}," for row in [*factors, (0.0, 0.0, model.detour_m)]),
         "};",
+    ]
+
+
+def _c_patterns(patterns: Sequence[Pattern], tags: list[int]) -> list[str]:
+    """Return patterns over direction, and a row of zeros after the last."""
+    tables = {
+        "int uwb_pattern_has[][UWB_TAGS]": [", ".join(str(int(tag in p.tags)) for tag in tags) for p in patterns],
+        "double uwb_pattern_rms_m[][1]": [_number(p.rms_m) for p in patterns],
+        "double uwb_pattern_m[][8]": [_numbers(p.coefficients_m) for p in patterns],
+        "double uwb_pattern_centre[][8]": [_numbers(p.centre) for p in patterns],
+        "double uwb_pattern_m2[][64]": [_numbers(chain(*p.covariance_m2)) for p in patterns],
+    }
+    return [
+        "/* Patterns over direction: whether a tag has one, root mean square, factors of harmonics, covariance. */",
+        f"#define UWB_PATTERNS {len(patterns)}",
+        *(
+            "\n".join([f"static const {name} = {{", *(f"    {{{row}}}," for row in [*rows, "0"]), "};"])
+            for name, rows in tables.items()
+        ),
     ]
 
 
@@ -453,7 +547,7 @@ def export(
             f"{to} has no place for slopes over temperature; export it as json, or fit with `temperature` none",
             parameter="to",
         )
-    if calibration.patterns and to in ("miluv", "ros-yaml", "c-header"):
+    if calibration.patterns and to in ("miluv", "ros-yaml"):
         raise BadInputError(
             f"{to} has no place for patterns over direction; export it as json, or fit with `pattern` none",
             parameter="to",

@@ -568,6 +568,21 @@ def held_out_line(calibration: Calibration) -> str:
     )
 
 
+def age_line(calibration: Calibration) -> str:
+    """Return in how many days 95 % of delays change ranges by less than 2 cm, "" without several dated sessions."""
+    told = calibration.provenance.get("drift")
+    if not isinstance(told, Mapping):
+        return ""
+    least, likeliest, most = ((0.02 / TWO_SIDED_95) ** 2 / max(rate, 1e-12) for rate in told["m2_per_day"][::-1])
+    within = "95 % of delays change ranges by less than 2 cm for"
+    days = f"{within} {likeliest:.0f} days ({least:.0f} to {most:.0f}, 95 %)"
+    over = f"{told['sessions']} sessions over {told['days']:.0f} days"
+    if not told["told"]:
+        return f"{over} tell no drift: {within} {least:.0f} days or more"
+    why = "delays drift" if told["by_age"] else "delays differ, and do not tell whether by age; if so"
+    return f"{over}: {why}, {days}"
+
+
 def _listed(names: object, one: str, many: str) -> str:
     count = len(names) if isinstance(names, list) else 0
     return f"{count} {one if count == 1 else many}"

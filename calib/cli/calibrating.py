@@ -265,7 +265,7 @@ def show(
     calibration: Annotated[Path, typer.Argument(help="Calibration to show (.json).")], as_json: AsJson = False
 ) -> None:
     """Print a calibration: delays, curves, the data of its fit, and its limits."""
-    from calib.calibration import rests_on
+    from calib.calibration import age_line, rests_on
 
     known = calib.load_calibration(calibration)
     if as_json:
@@ -276,6 +276,7 @@ def show(
     lines = [
         *(f"{name}: {_listed(value)}" for name, value in told.items() if value),
         *([f"distances: {distances}"] if distances else _survey_lines(made.get("rests_on"))),
+        *([f"age: {age}"] if (age := age_line(known)) else []),
     ]
     warnings = (f"warning: {with_flags(str(text))}" for text in made.get("warnings", []))
     typer.echo("\n".join([repr(known), *(f"  {line}" for line in lines), *warnings]))

@@ -444,17 +444,22 @@ def _antenna_delays_of_all(parts: Sequence[Ranges]) -> AntennaDelays:
     return {tag: delay for tag, (delay, _) in found.items()}
 
 
+def of_host_clock(time_ns: int) -> bool:
+    """Return whether a time counts from 1970, as that of a host does (`uwblink record`); others count from a start."""
+    return time_ns > 20 * 365 * 86_400 * 1_000_000_000
+
+
 def _sessions(parts: Sequence[Ranges]) -> tuple[Ints, tuple[str, ...]]:
     """Return the session of each range of recordings that are joined (n,), and the names of the sessions.
 
     Recordings that ran at the same time, by the clocks of their hosts, are one session.
     """
-    # Times of a host's clock count from 1970 (`uwblink record`): they are beyond 20 years. Others count from a start.
-    of_host_ns = 20 * 365 * 86_400 * 1_000_000_000
     number, names, ends = list[Ints](), list[str](), list[tuple[int, int]]()
     for part in parts:
         begin, end = (int(part.time_ns.min()), int(part.time_ns.max())) if len(part) else (0, 0)
-        together = [k for k, (first, last) in enumerate(ends) if begin > of_host_ns and begin <= last and first <= end]
+        together = [
+            k for k, (first, last) in enumerate(ends) if of_host_clock(begin) and begin <= last and first <= end
+        ]
         if together and len(part.sessions) < 2:
             k = together[0]
             names[k], ends[k] = f"{names[k]}, {part.source}", (min(ends[k][0], begin), max(ends[k][1], end))

@@ -115,8 +115,8 @@ class FoundOffset:
 class Tested:
     """A family and its efficient slopes: sums `total` (k,), their `covariance` (k, k) and `information` (k, k).
 
-    `effects` (tags, k) are in ns/m, `whole` is the largest information that an alternative would have, were nothing
-    else fitted.
+    `pulled` (k,) is what the priors of fitted unknowns, such as offsets that scatter, add to the sums. `effects` (tags,
+    k) are in ns/m, `whole` is the largest information that an alternative would have, were nothing else fitted.
     """
 
     family: Family
@@ -124,6 +124,7 @@ class Tested:
     covariance: Floats
     information: Floats
     effects: Floats
+    pulled: Floats
     whole: float
     lasting: Persistence
     blocks: int
@@ -136,6 +137,7 @@ class Tested:
             covariance=step @ self.covariance @ step.T,
             information=step @ self.information @ step.T,
             effects=self.effects @ step.T,
+            pulled=step @ self.pulled,
         )
 
     def beside(self, fitted: Sequence[int]) -> Tested:
@@ -242,6 +244,7 @@ class Slopes:
             covariance=lasting.factor * (scatter.T @ scatter),
             information=information,
             effects=-taken.T[self.optimum.layout.where["delay"]],
+            pulled=-taken @ self.optimum.priors.pull(self.optimum.x),
             whole=whole,
             lasting=lasting,
             blocks=len(scatter),

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from calib.calibration.model import Calibration
+from calib.calibration.patterns import HARMONICS, Pattern, harmonics
 from calib.data.ranges import LEAST_TURN_RAD, Ranges
 from calib.errors import UnanswerableError
 from calib.estimator.covariates import (
@@ -25,7 +27,8 @@ from calib.estimator.optimize import Optimum
 from calib.estimator.score_tests import Derivative, Family, Tested
 from calib.estimator.time_blocks import Persistence
 from calib.settings import FitSettings
-from calib.spread import TWO_SIDED_95
+from calib.spread import TWO_SIDED_95, robust_spread
+from uwblink.arrays import Floats
 from uwblink.display import first_few
 
 LOG_EVIDENCE = math.log(100.0)
@@ -50,6 +53,11 @@ MISSING = {
     ),
 }
 """What ranges lack that determine no dependence, by setting: values at all, and values that differ enough."""
+
+PASSES_FOR_POWER = (
+    "the pattern over direction may be one of power: errors of single tags that go with power explain as much; compare "
+    "with a fit with `pattern` none and `groups` of tags"
+)
 
 
 def fit_with_covariates(
@@ -111,7 +119,9 @@ def _with(
         )
         evidence, marginal = log_evidence(one) + beside, _log_marginal(found.searches[0].optimum)
         if evidence >= LOG_EVIDENCE and marginal > likeliest:
-            best, likeliest = (found, {"kind": mode, "log_evidence": round(evidence, 1)}, []), marginal
+            explained = name == "pattern" and log_evidence(_beside_power(plain, covariate, kind)) < LOG_EVIDENCE
+            known = {"kind": mode, "log_evidence": round(evidence, 1)}
+            best, likeliest = (found, known, [PASSES_FOR_POWER] * explained), marginal
         # Slopes of tags are about a common one: what speaks against that speaks against them, too.
         beside = min(evidence, 0.0) * (name == "temperature")
     if best is nothing:
@@ -134,6 +144,48 @@ def _told(name: str, covariate: Covariate, why: str) -> dict[str, Any]:
     return {"why": why} if name == "temperature" and covariate.tags else {}
 
 
+def _beside_power(plain: KnownDistances, covariate: Covariate, kind: str) -> Tested:
+    """Return the slopes of a pattern beside offsets of each tag that go with the rank of power."""
+    names, columns, values = covariate.entries(kind, plain.model.pairs)
+    tags, pairs, count = plain.model.tags, plain.model.pairs, len(values)
+    rank = np.linspace(-1, 1, count)[np.argsort(np.argsort(plain.model.lifted, kind="stable"))]
+    ends = np.searchsorted(tags, pairs.ends)[pairs.number] + len(names)
+    derivative = Derivative(
+        np.concatenate([columns, ends], axis=1),
+        np.concatenate([-values, rank[:, None], rank[:, None]], axis=1),
+        len(names) + len(tags),
+    )
+    tested = plain.slopes.test(Family(kind=kind, names=names, derivative=derivative))
+    return tested.beside(range(len(names), derivative.size)).turned(np.eye(len(names), derivative.size))
+
+
+def with_new_tag(calibration: Calibration, tag: int, ranges: Ranges) -> Calibration:
+    """Return a calibration in which a tag on a body that turns has a pattern, chosen by its `ranges`.
+
+    That is one which others share, if errors scatter less with it; else one that is unknown and as large as theirs, so
+    that total sigmas contain it.
+    """
+    patterns = calibration.patterns
+    if tag not in ranges.turning or not patterns:
+        return calibration
+    ends = np.stack([ranges.initiator, ranges.target], axis=1)
+    variance = np.mean([np.square(one.coefficients_m) + np.diag(one.covariance_m2) for one in patterns])
+    unknown = Pattern(
+        tags=(tag,),
+        coefficients_m=(0.0,) * HARMONICS,
+        centre=tuple(np.nanmean(harmonics(ranges.toward[ends == tag]), axis=0).tolist()),
+        covariance_m2=tuple(map(tuple, (variance * np.eye(HARMONICS)).tolist())),
+        rms_m=math.sqrt(np.mean([one.rms_m**2 for one in patterns])),
+    )
+    several = [(*patterns, unknown)] + [
+        (*patterns[:k], replace(one, tags=(*one.tags, tag)), *patterns[k + 1 :])
+        for k, one in enumerate(patterns)
+        if len(one.tags) > 1
+    ]
+    found = [replace(calibration, patterns=own) for own in several]
+    return min(found, key=lambda one: robust_spread(one.apply(ranges).corrected_m - ranges.truth_m))
+
+
 def _log_marginal(optimum: Optimum) -> float:
     """Return the log likelihood with all unknowns integrated out (Laplace), less what fits to the same rows share."""
     priors, free = optimum.priors, optimum.layout.free()
@@ -152,22 +204,29 @@ def _family(found: KnownDistances, covariate: Covariate, kind: str, *, fitted: b
 def log_evidence(tested: Tested) -> float:
     """Return the logarithm of the Bayes factor for alternatives that are draws of one variance, against none.
 
-    They are about the centre of their prior, and where that has bounds the likeliest variance v counts. Slopes with the
-    information F have the covariance F, of which noise makes a part that errors which last multiply; with the
-    alternatives they have v F F more.
+    They are about the centre of their prior, and where that has bounds the likeliest variance counts.
     """
-    prior, information = PRIORS[tested.family.kind], tested.information
-    lasting = 1 - 1 / max(tested.lasting.factor, 1.0)
+    prior, one_each = PRIORS[tested.family.kind], np.eye(len(tested.total))
+    variances = 1 / np.geomspace(*(prior.bounds or (prior.weight,) * 2), 100)
+    return float(np.max(log_likelihood(tested, one_each, variances, prior.centre)))
+
+
+def log_likelihood(tested: Tested, steps: Floats, variances: Floats, centre: Floats | float = 0.0) -> Floats:
+    """Return the log likelihood of alternatives (k,) that are sums `steps` (k, m) of draws, less that of none.
+
+    It is that of each of some variances (v,), about a `centre`. Slopes with the information F have the covariance F, of
+    which noise makes a part that errors which last multiply; with alternatives of covariance S they have F S F more.
+    """
+    information, lasting = tested.information, 1 - 1 / max(tested.lasting.factor, 1.0)
     covariance = information + lasting * tested.covariance
     covariance = covariance + 1e-9 * np.trace(covariance) * np.eye(len(covariance))
     root = np.linalg.cholesky(covariance)
-    whitened = np.linalg.solve(root, information)
+    whitened = np.linalg.solve(root, information @ steps)
     known, vectors = np.linalg.eigh(whitened @ whitened.T)
-    expected = information @ np.full(len(information), prior.centre)
+    expected = information @ np.broadcast_to(centre, len(information))
     found, about = ((vectors.T @ np.linalg.solve(root, one)) ** 2 for one in (tested.total, tested.total - expected))
-    variances = 1 / np.geomspace(*(prior.bounds or (prior.weight,) * 2), 100)
     grown = np.maximum(known, 0.0)[:, None] * variances
-    return float(np.max(0.5 * np.sum(found[:, None] - about[:, None] / (1 + grown) - np.log1p(grown), axis=0)))
+    return np.asarray(0.5 * np.sum(found[:, None] - about[:, None] / (1 + grown) - np.log1p(grown), axis=0))
 
 
 def _vague(name: str, covariate: Covariate, tested: Tested) -> list[int]:

@@ -38,7 +38,8 @@ from calib.estimator.known_distances import KnownDistances
 from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
-from calib.fitting.covariates import fit_with_covariates
+from calib.fitting.covariates import fit_with_covariates, with_new_tag
+from calib.fitting.drift import drift_of
 from calib.fitting.passive_listeners import MIN_OF_DELAY
 from calib.fitting.result import FitResult, HeldOut
 from calib.settings import FitSettings, check_tag
@@ -107,6 +108,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         **({"arrivals": len(ranges)} if ranges.differences.any() else {}),
         "gauge": _gauge(found),
         **dependences,
+        **({"drift": drift} if (drift := drift_of(found)) else {}),
         **({"held_out": _judged(held, settings)} if held else {}),
     }
     result = result_of(
@@ -160,7 +162,17 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
             f"{ranges.source}: {len(some)} exchanges of tag {tag} with calibrated tags are too few, "
             f"at least {MIN_OF_DELAY} are needed"
         )
+    directed = [one for pattern in calibration.patterns for one in pattern.tags]
+    blind = np.isnan(some.toward).any(axis=2) & np.isin(np.stack([some.initiator, some.target], axis=1), directed)
+    some = some[np.flatnonzero(~blind.any(axis=1))]
+    if len(some) < MIN_OF_DELAY:
+        raise UnanswerableError(
+            f"{ranges.source}: the calibration has patterns over direction, and directions are known of {len(some)} "
+            f"exchanges, at least {MIN_OF_DELAY} are needed: state poses with attitudes (`uwblink poses`), or fit with "
+            "`pattern` none"
+        )
     joined = _with_side(replace(calibration, delays_ns=calibration.delays_ns | {tag: 0.0}), tag, some)
+    joined = with_new_tag(joined, tag, some)
     applied = joined.apply(some)
     straight = replace(some, raw_m=some.raw_m + applied.corrected_m - applied.delay_corrected_m)
     partners = replace(calibration, undetermined_splits=())
@@ -174,6 +186,10 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
     )
     found = fit(straight, settings, lift=calibration.lift)
     added = {"tag": tag, "recording": ranges.source, "exchanges": len(some)}
+    unshared = (
+        f"tag {tag}: its pattern over direction is none that other tags share, and is not known: total sigmas contain "
+        "one as large as theirs; fit all recordings together to find it"
+    )
     return replace(
         found,
         calibration=replace(
@@ -186,7 +202,10 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
         ),
         ranges=some,
         # The curve is known, and was taken off before.
-        warnings=[text for text in found.warnings if not text.startswith(WITHOUT_CURVE)],
+        warnings=[
+            *[text for text in found.warnings if not text.startswith(WITHOUT_CURVE)],
+            *([unshared] if len(joined.patterns) > len(calibration.patterns) else []),
+        ],
     )
 
 

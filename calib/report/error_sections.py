@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib import figures
-from calib.calibration.model import curve_rows
+from calib.calibration.model import curve_rows, pattern_rows
 from calib.estimator.grouped_errors import fit_grouped_errors
 from calib.evaluation.localization import PAPER_RMSE_M, Localization, rmse_rows, summarize
 from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, pair_rows, stage_cells
@@ -53,6 +53,22 @@ def _over_power(known: tuple[Any, Any, Any], which: Any) -> Draw:
     """Return a function that draws a curve at a width; errors are binned once for all widths."""
     found = cache(lambda: figures.over_power(*known, which))
     return lambda width: figures.alone(lambda axes: figures.curve_over_power(*known, which, axes, found()), width)
+
+
+def patterns(results: Results) -> list[Block]:
+    """Return patterns over direction as a table and in a figure; nothing of a calibration that has none."""
+    calibration = results.calibration
+    if not calibration.patterns:
+        return []
+    draw = partial(figures.patterns, calibration=calibration, ranges=results.trained if results.recordings else None)
+    caption = (
+        "By how much ranges are longer in a direction than on average, in the frame of the body that carries the tag: "
+        "outside the inner circle they are longer, inside it shorter, and where the band holds the circle, the data do "
+        "not tell which."
+    )
+    rows = list(map(list, pattern_rows(calibration)))
+    table = Table(["tags", "rms (cm)", "most, at the level of the body"], rows, words=True)
+    return [Heading("Patterns over direction"), table, Picture("patterns", draw, caption)]
 
 
 def before_after(results: Results) -> list[Block]:

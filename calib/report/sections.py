@@ -280,6 +280,7 @@ SECTIONS: Final[dict[str, Section]] = {
     "determined": _determined,
     "delays": _delays,
     "curves": error_sections.curves,
+    "patterns": error_sections.patterns,
     "before and after": error_sections.before_after,
     "outliers": error_sections.outliers,
     "localization": error_sections.localization,

@@ -197,7 +197,7 @@ def _panels(figure: Figure) -> list[dict[str, Any]]:
     found = []
     for axes in figure.axes:
         place, scales = axes.get_position(), [axes.get_xscale(), axes.get_yscale()]
-        if not axes.get_visible() or not set(scales) <= {"linear", "log"}:
+        if not axes.get_visible() or not set(scales) <= {"linear", "log"} or axes.name == "polar":
             continue
         box = (place.x0 * width, (1 - place.y1) * height, place.x1 * width, (1 - place.y0) * height)
         names = [axes.get_xlabel() or figure.get_supxlabel(), axes.get_ylabel() or figure.get_supylabel()]

@@ -84,7 +84,8 @@ class StreamedRange(Streamed):
     """A range in metres, the time of its exchange (host time, Unix epoch), and its pair.
 
     `range_m` is the reported range. `corrected_m` and its standard deviation `sigma_m` are NaN without a
-    calibration, and for tags that are not calibrated; `more` are other columns of the correction, such as `clamped`.
+    calibration, and for tags that are not calibrated; `more` are other columns of the correction, such as
+    `sigma_total_m`, which contains reflections and what directions would tell.
 
     >>> import uwblink
     >>> x = uwblink.Exchanges.from_arrays([1], [2], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
@@ -131,7 +132,10 @@ def _check_use(use: str, correct: Correction | None) -> bool:
     if use not in ("exchanges", "receptions"):
         raise ArgumentError(f"found {use!r:.40}, allowed: exchanges, receptions", parameter="use")
     if use == "receptions" and not (correct and correct.differences):
-        raise ArgumentError("receptions need a `calibration`, which corrects them", parameter="use")
+        raise ArgumentError(
+            "receptions need a `calibration` that corrects them: one with delays and without patterns over direction",
+            parameter="use",
+        )
     return use == "receptions"
 
 

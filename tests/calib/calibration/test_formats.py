@@ -15,6 +15,7 @@ import pytest
 import calib
 from calib import BadInputError, Calibration, Ranges, fit, sample_flight
 from calib.calibration.formats import programmed, read_miluv, registers
+from calib.calibration.patterns import Pattern
 from tests.calib.synthetic import DELAYS_NS, ranges
 from tests.shared_data import shared
 from uwblink.importers import read_source
@@ -57,21 +58,43 @@ MAIN = """
 #include "calibration.h"
 int main(void)
 {
-    double range, one, two, corrected = 0, sigma = 0, total, mean, share;
-    int initiator, target;
+    double range, one, two, to[2][3], corrected = 0, sigma = 0, total, mean, share, blind = 0, blind_total;
+    int initiator, target, k;
     while (scanf("%lf %lf %lf %d %d", &range, &one, &two, &initiator, &target) == 5) {
-        int status = uwb_correct(range, one, two, initiator, target, &corrected, &sigma);
-        (void)uwb_errors(one, two, initiator, target, &total, &mean, &share);
-        printf("%d %.17g %.17g %.17g %.17g %.17g\\n", status, corrected, sigma, total, share, mean);
+        int status;
+        for (k = 0; k < 6; k++)
+            if (scanf("%lf", &to[k / 3][k % 3]) != 1)
+                return 1;
+        status = uwb_correct(range, one, two, initiator, target, &blind, NULL);
+        (void)uwb_errors(one, two, initiator, target, &blind_total, &mean, &share);
+        if (status != uwb_correct_toward(range, one, two, initiator, target, to[0], to[1], &corrected, &sigma))
+            return 2;
+        (void)uwb_errors_toward(one, two, initiator, target, to[0], to[1], &total, &mean, &share);
+        printf("%d %.17g %.17g %.17g ", status, corrected, sigma, total);
+        printf("%.17g %.17g %.17g %.17g\\n", blind, blind_total, mean, share);
     }
     return 0;
 }
 """
 
 
+def pattern(tags, seed):
+    factors, centre, *spread = np.random.default_rng(seed).normal(0, 0.05, (10, 8))
+    return Pattern(
+        tags, tuple(factors), tuple(centre), tuple(map(tuple, np.square(spread) @ np.square(spread).T)), 0.05
+    )
+
+
 @pytest.mark.parametrize(
     "change",
-    [{}, {"lift": "lift-of-mean"}, {"power_at": "reception"}, {"undetermined_splits": (((1, 7), (2, 3)),)}],
+    [
+        {},
+        {"lift": "lift-of-mean"},
+        {"power_at": "reception"},
+        {"undetermined_splits": (((1, 7), (2, 3)),)},
+        {"patterns": (pattern((1, 2), 1), pattern((3,), 2))},
+    ],
+    ids=lambda change: next(iter(change), "plain"),
 )
 def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
     compiler = shutil.which("cc") or shutil.which("gcc")
@@ -91,28 +114,37 @@ def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
     ]
     one, two = tags[:2]
     rows += [(1.0, 0.0, -85.0, one, two), (1.0, -85.0, math.nan, one, two), (1.0, 0.0, 0.0, one, two)]
-    lines = "\n".join(" ".join(map(str, row)) for row in [*rows, (1.0, -85.0, -85.0, 9999, one)])
+    away = random.normal(size=(len(rows), 2, 3))
+    # The same precision as in `Ranges`, so that both sides have the same numbers; every tenth direction is unknown.
+    away = (away / np.linalg.norm(away, axis=2, keepdims=True)).astype(np.float32)
+    away.reshape(-1, 3)[::10] = math.nan
+    every = [*rows, (1.0, -85.0, -85.0, 9999, one)]
+    lines = "\n".join(
+        " ".join(map(str, (*row, *map(float, toward))))
+        for row, toward in zip(every, [*away.reshape(-1, 6), range(6)], strict=True)
+    )
     done = subprocess.run(["./main"], cwd=tmp_path, input=lines, capture_output=True, text=True, check=True)
-    found = [line.split() for line in done.stdout.splitlines()]
+    found = [(status, *map(float, numbers)) for status, *numbers in map(str.split, done.stdout.splitlines())]
     assert len(found) == len(rows) + 1
-    for row, (status, corrected, sigma, total, share, mean) in zip(rows, found, strict=False):
+    for row, toward, (status, corrected, sigma, *told) in zip(rows, away, found, strict=False):
         if sum(known.sides.get(tag, 0) for tag in row[3:]):
             assert status == "-1"
             with pytest.raises(BadInputError, match="does not determine"):
                 known.correct(*row)
             continue
-        expected = known.correct(*row)
-        columns = known.apply(
-            Ranges.from_arrays(row[0], initiator=row[3], target=row[4], fpp1_dbm=row[1], fpp2_dbm=row[2])
-        )
-        assert float(total) == pytest.approx(expected.sigma_total_m, abs=1e-12, nan_ok=True)
-        assert float(share) == pytest.approx(expected.tail_share, abs=1e-12, nan_ok=True)
-        assert float(mean) == pytest.approx(columns.mean_error_m[0], abs=1e-12, nan_ok=True)
-        assert float(corrected) == pytest.approx(expected.range_m, abs=1e-12)
-        assert float(sigma) == pytest.approx(expected.sigma_m, abs=1e-12, nan_ok=True)
-        assert (status != "0") == expected.clamped
-    assert len({share for *_, share, _ in found}) > 100, "shares differ by pair and power"
+        blind = known.correct(*row)
+        one_range = Ranges.from_arrays(row[0], initiator=row[3], target=row[4], fpp1_dbm=row[1], fpp2_dbm=row[2])
+        seen = known.apply(replace(one_range, toward=toward[None]))
+        other = (blind.range_m, blind.sigma_total_m, seen.mean_error_m[0], seen.tail_share[0])
+        assert told == pytest.approx((seen.sigma_total_m[0], *other), abs=1e-12, nan_ok=True)
+        # Without a power a range has the delays' part only.
+        assert corrected == pytest.approx(seen.corrected_m[0] if status != "2" else blind.range_m, abs=1e-12)
+        assert sigma == pytest.approx(blind.sigma_m, abs=1e-12, nan_ok=True)
+        assert (status != "0") == blind.clamped
+    assert len({share for *_, share in found}) > 100, "shares differ by pair and power"
     assert ({status for status, *_ in found}, found[-1][0]) == ({"0", "1", "2", "-1"}, "-1")
+    differ = [abs(corrected - blind) > 1e-3 for _, corrected, _, _, blind, *_ in found]
+    assert np.mean(differ) == pytest.approx(0.9 if known.patterns else 0.0, abs=0.15)
 
 
 def test_miluv_is_read_and_given_back_unchanged():

@@ -11,7 +11,11 @@ import calib
 import uwblink
 from benchmarks.directions import Recipe, flight, pattern_m
 from calib.errors import BadInputError, UnanswerableError
+from calib.report import Picture
+from calib.report.results import Results
+from calib.report.sections import SECTIONS
 from tests.processes import call
+from uwblink.pages.figures import drawn
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import sights
 from uwblink.recording.schema import Poses, Tag
@@ -39,7 +43,7 @@ def written(path, recipe, seed, number=0):
 def seen(ranges, tag):
     """Directions in which a tag saw others (m, 3)."""
     ends = (ranges.initiator, ranges.target)
-    return np.concatenate([ranges.toward[ids == tag, end] for end, ids in enumerate(ends)]).astype(float)
+    return np.concatenate([ranges.toward[np.isin(ids, tag), end] for end, ids in enumerate(ends)]).astype(float)
 
 
 def spread(ranges, calibration):
@@ -110,6 +114,20 @@ def test_what_belongs_to_places_does_not_pass_for_the_antennas():
     assert pattern.rms_m < 0.03
 
 
+def test_power_that_explains_what_looks_like_direction_is_named():
+    ranges = calib.load_ranges(flown(replace(TEN, pattern_m=0.0), 3)[0])
+    azimuth = np.arctan2(ranges.toward[:, :, 1], ranges.toward[:, :, 0])
+    of_one = np.stack([ranges.initiator, ranges.target], axis=1) == 1
+    # The antenna of tag 1 is louder by 6 dB ahead, and its ranges alone grow with power.
+    louder = 6.0 * np.sum(np.cos(azimuth) * of_one, axis=1)
+    powers = {name: getattr(ranges, name) + louder for name in ("fpp1_dbm", "fpp2_dbm")}
+    order = np.argsort(np.argsort(sum(powers.values()))) / len(ranges)
+    found = calib.fit(replace(ranges, raw_m=ranges.raw_m + 0.12 * order * of_one.any(axis=1), **powers), between_m=0.0)
+    assert [said for said in found.warnings if "may be one of power" in said]
+    assert found.calibration.patterns
+    assert not [said for said in fitted(TEN, 3).warnings if "may be one of power" in said]
+
+
 def test_a_pattern_that_attitudes_do_not_excite_is_refused_with_the_flight_that_would(tmp_path):
     still = written(tmp_path / "still.uwb", replace(TEN, turning=0.0), 5)
     for name in ("shared", "tag"):
@@ -175,10 +193,96 @@ def test_the_file_keeps_patterns_and_older_programs_refuse_it():
     table["patterns"][0]["centre"].pop()
     with pytest.raises(BadInputError, match=r"here: patterns.*8"):
         calib.Calibration.from_json(json.dumps(table), "here")
-    for form in ("c-header", "miluv", "ros-yaml"):
+    for form in ("miluv", "ros-yaml"):
         with pytest.raises(BadInputError, match="patterns over direction"):
             calib.export(known, form)
     assert "over direction" in repr(known)
+
+
+def test_the_report_draws_patterns_with_their_bands_at_the_level_of_flight():
+    known, flown_ranges = fitted(TEN, 3).calibration, fitted(TEN, 3).ranges
+    *_, picture = SECTIONS["patterns"](Results(calibration=known, training=[flown_ranges]))
+    assert isinstance(picture, Picture)
+    (axes,), (pattern,) = picture.draw(7.0).axes, known.patterns
+    # Robots tilt: the middle of the flown elevations, a tenth below and a tenth above, and the circle of zero.
+    *lines, zero = axes.lines
+    up = np.radians([float(line.get_label()[10:-1].replace("−", "-")) for line in lines])
+    level = np.quantile(seen(flown_ranges, (1, 2, 3, 4))[:, 2], (0.5, 0.1, 0.9))
+    assert (np.sin(up), zero.get_ydata().any()) == (pytest.approx(level, abs=0.01), False)
+    around = lines[0].get_xdata()
+    for line, one in zip(lines, up, strict=True):
+        toward = [np.cos(around) * np.cos(one), np.sin(around) * np.cos(one), np.full(len(around), np.sin(one))]
+        values = pattern.values(np.transpose(toward))
+        assert line.get_ydata() == pytest.approx(100 * values @ pattern.coefficients_m, abs=0.1)
+    edges = axes.collections[0].get_paths()[0].vertices[:, 1]
+    assert np.ptp(edges) > np.ptp(lines[0].get_ydata()) + 196 * pattern.std_m(values).min()
+    # A page reads values of straight axes under the pointer, and none of these. Without ranges there is one line.
+    one = SECTIONS["patterns"](Results(calibration=known))[-1].draw
+    assert (len(one(3.5).axes[0].lines), b"names" in drawn(one, 7.0, ["svg"])["svg"]) == (2, False)
+    assert SECTIONS["patterns"](Results(calibration=replace(known, patterns=()))) == []
+
+
+def test_a_stream_knows_no_directions_and_its_total_sigma_contains_the_pattern(tmp_path):
+    fitted(TEN, 3).calibration.save(tmp_path / "known.json")
+    path, how = written(tmp_path / "second.uwb", TEN, 3, 1), {"calibration": tmp_path / "known.json"}
+    rows = [
+        (one.corrected_m, one.sigma_m, one.more["sigma_total_m"]) for one in uwblink.stream(path, speed=np.inf, **how)
+    ]
+    corrected, sigma, total = np.transpose(rows)
+    error = corrected - calib.load_ranges(path).truth_m
+    assert np.std(error / total) == pytest.approx(1.0, abs=0.1)
+    assert np.std(error / sigma) > 1.2
+    with pytest.raises(ValueError, match="without patterns over direction"):
+        uwblink.stream(path, use="receptions", **how)
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_a_tag_that_is_added_has_the_pattern_that_others_share_or_one_that_is_unknown(own, tmp_path):
+    recipe = replace(TEN, own=own, robots=5)
+    ranges, there = (calib.load_ranges(flown(recipe, 3, k)[0]) for k in (0, 1))
+    known = calib.fit(ranges[(ranges.initiator != 5) & (ranges.target != 5)], between_m=0.0).calibration
+    assert [one.tags for one in known.patterns] == ([(1,), (2,), (3,), (4,)] if own else [(1, 2, 3, 4)])
+    known.save(tmp_path / "known.json")
+    second = written(tmp_path / "second.uwb", recipe, 3, 1)
+    done = call("calib", "add-tag", second, "-c", tmp_path / "known.json", "--tag", 5, "-o", tmp_path / "five.json")
+    assert (done.returncode, "tag 5: its pattern over direction" in done.stderr) == (0, own)
+    added, planted = calib.load_calibration(tmp_path / "five.json"), flown(recipe, 3)[0].planted["delays_ns"]
+    off = [added.delays_ns[tag] - planted[str(tag)] for tag in (1, 2, 3, 4, 5)]
+    # What all delays share goes with the curve; of the rest 10 ps are 1.5 mm of a range.
+    assert off[4] - np.mean(off) == pytest.approx(0, abs=0.02 + 0.1 * own)
+    of_five = there[(there.initiator == 5) | (there.target == 5)]
+    error = added.apply(of_five).corrected_m - of_five.truth_m
+    assert np.std(error) < (0.065 if own else 0.045)
+    assert np.std(error / added.apply(of_five).sigma_total_m) == pytest.approx(1.0, abs=0.1)
+    with pytest.raises(UnanswerableError, match="directions are known of 0"):
+        calib.add_tag(replace(there, toward=np.full_like(there.toward, np.nan)), known, 5)
+
+
+def test_delays_of_calibrations_with_patterns_are_compared_for_the_same_directions(tmp_path):
+    known, again = (calib.fit(flown(TEN, 3, k)[0], between_m=0.0).calibration for k in (0, 1))
+    found, (pattern,) = calib.compare(known, again), known.patterns
+    assert (found.same, found.pattern_probability > 0.01, found.pattern_rms_m < 0.015) == (True, True, True)
+    # The same pattern about another centre, one of each tag: delays are those of other directions.
+    centres = dict(zip((1, 2, 3, 4), np.random.default_rng(1).normal(0, 0.5, (4, 8)), strict=True))
+    moved_m = {tag: float((centre - pattern.centre) @ pattern.coefficients_m) for tag, centre in centres.items()}
+    elsewhere = replace(
+        known,
+        delays_ns={tag: delay - 2 / 0.299702547 * moved_m[tag] for tag, delay in known.delays_ns.items()},
+        patterns=tuple(replace(pattern, tags=(tag,), centre=tuple(one.tolist())) for tag, one in centres.items()),
+    )
+    there = calib.load_ranges(flown(TEN, 3, 1)[0])
+    assert elsewhere.apply(there).corrected_m == pytest.approx(known.apply(there).corrected_m, abs=1e-5)
+    for found in (calib.compare(known, elsewhere), calib.compare(elsewhere, known)):
+        assert [*found.difference_ns.values(), found.pattern_rms_m] == pytest.approx([0] * 5, abs=1e-9)
+    turned = replace(pattern, coefficients_m=pattern.coefficients_m[::-1])
+    for name, patterns in (("known", (pattern,)), ("turned", (turned,)), ("none", ())):
+        replace(known, patterns=patterns).save(tmp_path / f"{name}.json")
+    other, lone = (
+        call("calib", "compare", *(tmp_path / f"{n}.json" for n in ("known", to))) for to in ("turned", "none")
+    )
+    assert float(other.stdout.split("rms apart, probability ")[1].split()[0]) < 1e-3
+    assert (lone.returncode, lone.stderr.count("\n")) == (1, 1)
+    assert "tags 1, 2, 3, 4 have a pattern over direction in one" in lone.stderr
 
 
 def test_directions_are_those_in_the_frames_of_the_bodies():
