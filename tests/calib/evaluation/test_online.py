@@ -124,7 +124,7 @@ def smoothed(ranges, known, anchors_m, moves_m, std_m):
     spread = np.zeros((len(ranges), 3 + len(states.tags)))
     spread[:, :3], spread[1:, 3:] = std_m**2, states.walk_m**2 * np.diff(ranges.time_ns)[:, None] * 1e-9
     found, moves = np.pad(np.cumsum(moves_m, axis=0), ((0, 0), (0, len(states.tags)))), np.zeros_like(spread)
-    moves[:, :3], latest = moves_m, np.inf
+    moves[:, :3], latest = moves_m, np.full_like(spread, np.inf)
     while np.abs(found - latest).max() > 1e-6:
         innovation, along = updates.innovation(found[:, :3], np.array([anchors_m[tag] for tag in ranges.target]))
         # Expectation maximisation: what weighing takes for noise is left to explain.
@@ -171,9 +171,9 @@ def test_a_factor_has_the_derivatives_of_finite_differences(known):
     both = RangeUpdate.of(known, Ranges.from_arrays([4.0, 4.0], initiator=1, target=12, fpp1_dbm=-85.0))
     ends = Antenna(np.array([0.2, -0.1, 0.05]), 1), Antenna(np.array([0.0, 0.3, 0.1]), 2)
     states, values, numeric = DelayStates.of(known, (12, 1)), gtsam.Values(), []
-    values.insert(1, gtsam.Pose3(gtsam.Rot3.RzRyRx(0.3, -0.4, 1.2), (1.0, 2.0, 0.5)))
-    values.insert(2, gtsam.Pose3(gtsam.Rot3(), (4.0, 1.0, 2.0)))
-    values.insert(3, np.array([0.03, -0.02]))
+    poses = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.3, -0.4, 1.2), (1.0, 2.0, 0.5)), gtsam.Pose3(gtsam.Rot3(), (4.0, 1.0, 2.0))
+    for key, value in enumerate((*poses, np.array([0.03, -0.02])), 1):
+        values.insert(key, value)
     factor = range_factor(both.at([0]), states, 3, *ends)
     for column in 1e-6 * np.eye(14):
         steps = gtsam.VectorValues()
