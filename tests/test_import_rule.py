@@ -38,6 +38,7 @@ CONFINED = {
     "mcap": lambda path: path in {"uwblink/importers/bags.py", "uwblink/exporters/mcap.py"},
     "rosbags": lambda path: path in {"uwblink/importers/bags.py", "uwblink/exporters/mcap.py"},
     "foxglove": lambda path: path == "uwblink/streaming/senders.py",
+    "gtsam": lambda path: path == "calib/factors.py",
     "pandas": lambda path: path == "uwblink/arrays.py",
     "distributed": lambda path: path == "uwbsim/sweep/executors.py",
 }

@@ -143,6 +143,10 @@ def localize(
         ),
     ] = (0.1, 3.0, 0.1),
     seeds: Annotated[int, _of_model("seeds", "Number of simulated runs, each with another seed.", min=1)] = 3,
+    online: Annotated[
+        bool,
+        typer.Option("--online", help="Compare with a filter whose delays are states, with the calibration as prior."),
+    ] = False,
     tum: Annotated[
         Path | None, typer.Option(help="Folder for the estimated trajectories, one file per body and filter (.tum).")
     ] = None,
@@ -166,7 +170,7 @@ def localize(
         "start_std": dict(zip(("start_std_m", "start_std_deg", "start_std_m_s"), start_std, strict=True)),
     }
     used = [values for option, values in fields.items() if model in OF_MODELS[option]]
-    settings = MODELS[model].settings(use=use, **dict(ChainMap(*used)))
+    settings = MODELS[model].settings(use=use, online=online, **dict(ChainMap(*used)))
     track = partial(MODELS[model].localize, **({} if training is None else {"training": training}))
     known = known_calibration(calibration, recordings)
     with waiting("localizing"):

@@ -20,114 +20,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calib.calibration.applying import noise_m
-from calib.calibration.model import Calibration
-from calib.data.ranges import Ranges
-from calib.range_errors.densities import ONE_KIND, ROOT_2PI, LongDetours, densities
-from uwblink.arrays import Bools, Floats, Ints
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RangeErrors:
-    """The error model of a range: reflected with probability `share`, by a least detour and an exponential one.
-
-    Metres and shares of 1. Outliers have the share `outlier` and a size of about `outlier_m`. Of several ranges,
-    `share` and `detour_m` are columns (n,), or (n, 2) of differences of arrival, which reflections of the one reception
-    lengthen and of the other shorten. `detour_m` is the mean of both kinds of exponential detour, `long` their
-    proportions, `location_m` the centre of the noise of a range.
-    """
-
-    share: Floats | float
-    least_m: float
-    detour_m: Floats | float
-    outlier: float
-    outlier_m: float
-    long: LongDetours = ONE_KIND
-    location_m: float = 0.0
-
-    def at(self, rows: Any) -> RangeErrors:
-        """Return the model of some of several ranges, or of one."""
-        return replace(self, share=np.asarray(self.share)[rows], detour_m=np.asarray(self.detour_m)[rows])
-
-
-def range_errors(calibration: Calibration, ranges: Ranges) -> tuple[Floats, RangeErrors]:
-    """Return the noise (n,) of corrected ranges within a flight, and their errors.
-
-    Outliers have a share of a thousandth at least, of about 3 m, because a filter meets errors that the calibration did
-    not. Without an error model a tenth of the ranges is taken to be reflected, by 30 cm on average.
-    """
-    model, lifted = calibration.errors, calibration.lifted(ranges)
-    if model is None:
-        share, detour_m = np.repeat([[0.1], [0.3]], len(ranges), axis=1)
-        unknown = RangeErrors(share=share, least_m=0.0, detour_m=detour_m, outlier=0.01, outlier_m=3.0)
-        return noise_m(calibration, ranges), unknown
-    shapes = model.shapes(lifted, ranges.initiator, ranges.target)
-    errors = RangeErrors(
-        share=shapes.tail_share,
-        least_m=model.least_m,
-        detour_m=shapes.detour_m,
-        outlier=max(model.outlier_share, 1e-3),
-        outlier_m=max(model.outlier_m, 3.0),
-        long=model.long,
-        location_m=model.location_m,
-    )
-    return np.hypot(model.within_m(shapes.noise_m), calibration.bias_curve.beyond(lifted)), errors
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RangeUpdate:
-    """An update by a range: mean and variance of the noise in the innovation, and whether the range is accepted.
-
-    `log_density` is that of the innovation, in 1/m; `nis` is its square over its variance with plain noise.
-    """
-
-    noise_m: Floats
-    variance_m2: Floats
-    believed: Bools
-    log_density: Floats
-    nis: Floats
-
-
-def gated_update(innovation_m: Floats, variance_m2: Floats, gate: float) -> RangeUpdate:
-    """Accept an innovation if its square over its variance is below the gate; otherwise the state does not change."""
-    believed = innovation_m**2 < gate * variance_m2
-    return RangeUpdate(
-        noise_m=np.where(believed, innovation_m, 0.0),
-        variance_m2=np.where(believed, 0.0, variance_m2),
-        believed=believed,
-        log_density=-0.5 * (innovation_m**2 / variance_m2 + np.log(2 * np.pi * variance_m2)),
-        nis=innovation_m**2 / variance_m2,
-    )
-
-
-def mixture_update(innovation_m: Floats, variance_m2: Floats, errors: RangeErrors) -> RangeUpdate:
-    """Weigh direct, reflected and outlying ranges by the likelihood of the innovation.
-
-    The noise in a reflected range is a normal distribution, truncated above (`calib.range_errors.densities`,
-    docs/theory.md); in a difference of arrival that reads short, truncated below. An outlier has no information.
-    """
-    sigma_m, inside = np.sqrt(variance_m2), 1 - errors.outlier
-    shares, detours_m = np.atleast_1d(errors.share, errors.detour_m)
-    direct = np.prod(1 - shares)
-    wide = np.hypot(errors.outlier_m, sigma_m)
-    wild = errors.outlier * np.exp(-0.5 * (innovation_m / wide) ** 2) / (wide * ROOT_2PI) + 1e-300
-    core = np.exp(-0.5 * innovation_m**2 / variance_m2) / (sigma_m * ROOT_2PI) * (inside * direct)
-    total, mean, square = core + wild, core * innovation_m, core * innovation_m**2 + wild * variance_m2
-    for sign, share, detour_m in zip((1.0, -1.0), shares, detours_m, strict=False):
-        if share:
-            found = densities(sign * innovation_m, sigma_m, errors.least_m, detour_m, errors.long)
-            tail = found.reflected * (inside * (1 - direct) * share / shares.sum())
-            noise = sign * found.noise_m()
-            total, mean = total + tail, mean + tail * noise
-            square = square + tail * (noise**2 + variance_m2 * found.noise_var())
-    mean, square, wild = mean / total, square / total, wild / total
-    return RangeUpdate(
-        noise_m=mean,
-        variance_m2=np.maximum(square - mean**2, 0.0),
-        believed=wild < 0.5,
-        log_density=np.log(total),
-        nis=innovation_m**2 / variance_m2,
-    )
+from calib.online import FIXED_DELAYS, DelayStates, RangeErrors, WeighedInnovation, gated_update, mixture_update
+from uwblink.arrays import Floats, Ints
 
 
 def squared_over(wrong: Floats, covariance: Floats) -> Floats:
@@ -229,9 +123,28 @@ class GaussianFilters:
         """Add variances to those of some states."""
         np.einsum("...ii->...i", self.covariance)[..., states] += variance
 
+    def append(self, delays: DelayStates) -> slice:
+        """Append states of delays, and return which these are: shared errors in metres, which do not decay."""
+        size, count = self.state.shape[-1], len(delays.tags)
+        self.state = np.concatenate([self.state, np.zeros((*self.state.shape[:-1], count))], axis=-1)
+        around = [(0, 0)] * (self.covariance.ndim - 2) + [(0, count)] * 2
+        self.covariance = np.pad(self.covariance, around)
+        self.covariance[..., size:, size:] = delays.covariance_m2
+        self.delays, self.changes = delays, slice(size, size + count)
+        return self.changes
+
+    def wander(self, dt: float) -> None:
+        """Let delays change for `dt` seconds."""
+        self.add_variance(self.changes, self.delays.walk_m**2 * dt)
+
+    def delays_at(self, filter_: tuple[int, ...], delays: DelayStates) -> dict[int, tuple[float, float]]:
+        """Return what one of the filters estimates of the delays that are its states (`DelayStates.estimates`)."""
+        change_m, own = self.state[filter_][self.changes], self.covariance[filter_][self.changes, self.changes]
+        return delays.estimates(change_m, own) if delays.tags else {}
+
     def decay(self, kept: Floats) -> None:
         """Let shared errors decay to shares `kept` (..., states) of what they were, at the same standard deviation."""
-        others = slice(self.known, None)
+        others = slice(self.known, self.known + kept.shape[-1])
         self.state[..., others] *= kept
         self.covariance[..., others, :] *= kept[..., None]
         self.covariance[..., others] *= kept[..., None, :]
@@ -249,8 +162,8 @@ class GaussianFilters:
         row: Floats,
         innovation: Floats,
         noise_m2: Floats | float,
-        weigh: Callable[[Floats, Floats], RangeUpdate],
-    ) -> RangeUpdate:
+        weigh: Callable[[Floats, Floats], WeighedInnovation],
+    ) -> WeighedInnovation:
         """Update by scalar measurements with derivatives `row` (..., n) and noise of variance `noise_m2`.
 
         `innovation` (...) is measured less expected, but for the shared errors, which are linear. `weigh` is given
@@ -376,7 +289,7 @@ class RelativeFilter(GaussianFilters):
 
 H, E = BODY, BODY + 1
 """States of `InertialFilter` after those of its body: the offset of the height sensor, and the error that measurements
-of one exchange share, in units of its standard deviation."""
+of one exchange share, in units of its standard deviation. Changes of delays follow, if any."""
 
 
 class InertialFilter(RelativeFilter):
@@ -386,7 +299,14 @@ class InertialFilter(RelativeFilter):
     """
 
     def __init__(
-        self, fix: Fix, attitudes: Floats, noise: ProcessNoise, *, inertial: bool, speed_m_s: float = 1.0
+        self,
+        fix: Fix,
+        attitudes: Floats,
+        noise: ProcessNoise,
+        *,
+        inertial: bool,
+        speed_m_s: float = 1.0,
+        delays: DelayStates = FIXED_DELAYS,
     ) -> None:
         """Start at a fix with attitudes (headings, 3, 3), body to world."""
         count, spread = len(attitudes), np.zeros(BODY + 2)
@@ -398,12 +318,14 @@ class InertialFilter(RelativeFilter):
             noise = replace(noise, force=noise.acceleration, gyro=0.0, gyro_bias=0.0, force_bias=0.0)
         spread[H] = 0.15
         super().__init__(fix.place_m, attitudes[:, None], spread, noise)
+        self.append(delays)
         self.restart(fix, speed_m_s)
 
     def step(self, dt: float, readings: Floats) -> None:
         """Predict over `dt` seconds by mean readings (6,); without an IMU they are ignored."""
         self.predict(dt, readings[None] if self.inertial else REST[None])
         self.add_variance(H, self.noise.height_offset**2 * dt)
+        self.wander(dt)
 
     def begin_exchange(self) -> None:
         """Begin another exchange, whose measurements share another error."""
@@ -417,18 +339,19 @@ class InertialFilter(RelativeFilter):
         arm_m: Floats,
         anchor_m: Floats,
         sign: Floats,
-        common_m: float,
-    ) -> RangeUpdate:
+        shared: Floats | float,
+    ) -> WeighedInnovation:
         """Update by a sum of distances with a `sign` (k,) to anchors (k, 3): one in a range, two in a difference.
 
-        Measurements of an exchange share an error with a standard deviation of `common_m`. Returns the update.
+        `shared` are the standard deviation in metres of the error that measurements of an exchange share, and the
+        derivatives by delays, where these are states. Returns the update.
         """
         points = np.stack([np.tile(arm_m if self.inertial else arm_m * (0.0, 0.0, 1.0), (len(sign), 1)), anchor_m], 1)
         expected, row, bent_m = self.distances(np.tile([0, 1], (len(sign), 1)), points, sign)
         if not self.inertial:
             # Heading is unknown: a lever arm may point anywhere.
             noise_m = float(np.hypot(noise_m, np.linalg.norm(row[0, P]) * np.hypot(arm_m[0], arm_m[1]) / np.sqrt(2)))
-        row[:, E] = common_m
+        row[:, E:] = shared
         variance = noise_m**2 + np.sum((sign * bent_m) ** 2, axis=1)
         update = self.update(row, measured_m - expected, variance, partial(mixture_update, errors=errors))
         self.likelihood = self.likelihood + update.log_density

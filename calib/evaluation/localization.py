@@ -7,7 +7,7 @@ ranges with the variance of the sigma curve, and calibrated ranges with the whol
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -18,11 +18,10 @@ from scipy.special import chdtri
 from calib.calibration.applying import heard_receptions, keep_determined, noise_m, reception_gains
 from calib.calibration.document import for_json
 from calib.calibration.error_model import GATE
-from calib.calibration.model import Calibration, CalibrationSource, given_calibration
+from calib.calibration.model import Calibration, CalibrationSource, given_calibration, interval
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, Flight, load_flight, require_times
 from calib.errors import UnanswerableError
-from calib.evaluation.filters import RangeErrors, range_errors
 from calib.evaluation.tracking import (
     FILTERS,
     FilterRanges,
@@ -34,6 +33,7 @@ from calib.evaluation.tracking import (
     run_filters,
     used_part,
 )
+from calib.online import DelayStates, RangeErrors, delay_slopes, ends_of, range_errors
 from uwblink.arrays import Floats
 from uwblink.display import printable
 from uwblink.exporters import file_names, tum_lines
@@ -77,6 +77,11 @@ class Localization:
     def label(self) -> str:
         """The body, as names of files have it."""
         return self.body
+
+    @property
+    def delays(self) -> Mapping[int, tuple[float, float]]:
+        """The delays at the end and their standard deviations, by tag in ns, empty where they are no states."""
+        return self.tracks["online"].delays if "online" in self.tracks else {}
 
     def trajectories(self) -> dict[str, Trajectory]:
         """Return the trajectory of each filter and the true one, by name without spaces."""
@@ -141,7 +146,7 @@ def localize(
         )
     found = []
     for problem in bodies:
-        measured = filter_ranges(problem.ranges, calibration, fixed)
+        measured = filter_ranges(problem.ranges, calibration, fixed, online=chosen.online)
         tracks = run_filters(problem, {name: one.at(problem.rows) for name, one in measured.items()}, chosen)
         found.append(
             Localization(
@@ -221,8 +226,13 @@ class MeasuredReceptions:
         return FilterRanges(measured, self.own_m(noise), self.common_m, nothing, errors=errors), noise, errors
 
 
-def filter_ranges(ranges: Ranges, calibration: Calibration, fixed: FixedStd) -> dict[str, FilterRanges]:
-    """Return what each of `FILTERS` measures by ranges and then by arrivals; the robust one needs an error model."""
+def filter_ranges(
+    ranges: Ranges, calibration: Calibration, fixed: FixedStd, *, online: bool = False
+) -> dict[str, FilterRanges]:
+    """Return what each of `FILTERS` measures by ranges and then by arrivals.
+
+    The robust one needs an error model; the one with `online` delays is the robust one, or that with a variance.
+    """
     known, model = MeasuredReceptions.of(ranges, calibration), calibration.errors
     corrected, sign, common = known.corrected_m, known.sign, known.common_m
     nothing = np.zeros_like(sign)
@@ -233,7 +243,7 @@ def filter_ranges(ranges: Ranges, calibration: Calibration, fixed: FixedStd) -> 
         "variance": FilterRanges(corrected, known.own_m(sigma), common, nothing),
     }
     if model is None:
-        return found
+        return found | with_delays(found["variance"], ranges, calibration, online=online)
     found["robust"], noise, errors = known.robust(calibration)
     if lasting := model.lasting:
         # Receptions have independent noise: only reflections last in differences of arrival. A gate lets longer ones
@@ -254,7 +264,18 @@ def filter_ranges(ranges: Ranges, calibration: Calibration, fixed: FixedStd) -> 
                 shared_m=sign * np.sqrt((shared / unit)[:, None] ** 2 * std**2 + detours_m2),
                 lasting_s=lasting.time_s,
             )
-    return found
+    return found | with_delays(found["robust"], ranges, calibration, online=online)
+
+
+def with_delays(
+    measured: FilterRanges, ranges: Ranges, calibration: Calibration, *, online: bool
+) -> dict[str, FilterRanges]:
+    """Return what a filter measures of ranges and then of arrivals, as "online" with delays as states."""
+    if not online:
+        return {}
+    states = DelayStates.of(calibration, ranges.tags())
+    slopes = states.slopes(ends_of(ranges), delay_slopes(ranges))
+    return {"online": replace(measured, delays=states, delay_slopes=slopes)}
 
 
 def fixed_std(calibration: Calibration, settings: Settings, training: Data | Flight | None = None) -> FixedStd:
@@ -412,6 +433,7 @@ def localization_text(found: list[Localization], settings: Settings) -> str:
         f"with the calibrated variance: NIS {summary.nis:.2f} (1 expected, 95 % bounds {summary.nis_bounds[0]:.2f} to "
         f"{summary.nis_bounds[1]:.2f}), NEES {summary.nees:.2f} (3 expected, {summary.nees_bounds[0]:.2f} to "
         f"{summary.nees_bounds[1]:.2f}), {100 * summary.accepted:.1f} % of the ranges pass the gate",
+        *(delay_line(f"{one.source} {one.body}", one.delays) for one in found if one.delays),
     ]
     if arrivals := sum(one.arrivals for one in found):
         every = sum(len(one.tracks["raw"].time_ns) for one in found)
@@ -431,10 +453,23 @@ def localization_json(found: list[Localization]) -> dict[str, Any]:
             "fixed_std_source": one.fixed.source,
             "simulated": one.simulated,
             "arrivals": one.arrivals,
+            **delays_json(one.delays),
         }
         for one in found
     ]
     return {"scenarios": rows, "summary": for_json(asdict(summarize(found)))}
+
+
+def delay_line(title: str, delays: Mapping[int, tuple[float, float]]) -> str:
+    """Return the delays at the end of a flight on a line, with 95 % intervals."""
+    each = ", ".join(f"{tag}: {delay:+.3f} {interval(std, 3)}" for tag, (delay, std) in delays.items())
+    return f"delays at the end of {printable(title)} (ns): {each}"
+
+
+def delays_json(delays: Mapping[int, tuple[float, float]]) -> dict[str, Any]:
+    """Return delays at the end as JSON has them; nothing where they are no states."""
+    rows = {str(tag): {"delay_ns": one, "std_ns": for_json(std)} for tag, (one, std) in delays.items()}
+    return {"delays": rows} if rows else {}
 
 
 def write_tum(found: Sequence[Localization | OnboardTrack], folder: Path, *, force: bool = False) -> None:

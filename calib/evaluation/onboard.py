@@ -32,11 +32,10 @@ from calib.evaluation.filters import (
     InertialFilter,
     P,
     ProcessNoise,
-    RangeErrors,
     multilaterate,
     squared_over,
 )
-from calib.evaluation.localization import MeasuredReceptions
+from calib.evaluation.localization import MeasuredReceptions, delay_line, delays_json, with_delays
 from calib.evaluation.tracking import (
     PATIENCE_S,
     FilterRanges,
@@ -46,8 +45,10 @@ from calib.evaluation.tracking import (
     nearest_attitude,
     ranges_about,
     ranges_among,
+    side_by_side,
     used_part,
 )
+from calib.online import RangeErrors
 from calib.settings import CheckedSettings
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import bodies_m
@@ -69,7 +70,7 @@ class OnboardSettings(CheckedSettings):
     `start_m` is where it begins, with a standard deviation of `start_std_m` an axis, instead of where its first ranges
     say; a wrong one is left after `reopen_s`, or as many ranges as a fix takes. `headings` are tried at once;
     inertial readings are averaged to `rate_hz`. `speed_m_s` is how fast it may move at a start. `use` is "exchanges",
-    or "receptions", with differences of arrival.
+    or "receptions", with differences of arrival. With `online` each body has one more track, with delays as states.
 
     >>> import calib
     >>> calib.OnboardSettings(start_m=(0.0, 0.0, 1.0)).model
@@ -85,6 +86,7 @@ class OnboardSettings(CheckedSettings):
     rate_hz: float = 50.0
     speed_m_s: float = 1.0
     use: str = setting("exchanges", "What is used.", names=("exchanges", "receptions"))
+    online: bool = False
     noise: ProcessNoise = field(default_factory=ProcessNoise)
 
     def __post_init__(self) -> None:
@@ -112,7 +114,12 @@ class OnboardTrack(Track):
     @property
     def label(self) -> str:
         """The body and the model, as names of files have them."""
-        return f"{self.body}-{self.model}"
+        return f"{self.body}-{self.model}{'-online' if self.delays else ''}"
+
+    @property
+    def title(self) -> str:
+        """The recording and the body, and whether delays were states, in words."""
+        return f"{self.source} {self.body}{', delays online' if self.delays else ''}"
 
     def __repr__(self) -> str:
         """Return the inputs and the RMSE, on one line."""
@@ -138,7 +145,7 @@ def localize_onboard(
     """
     calibration = given_calibration(calibration)
     chosen = settings or OnboardSettings()
-    return [_track(one, chosen) for one in _readings(data, calibration, chosen.use)]
+    return [_track(one, chosen) for one in _readings(data, calibration, chosen)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,8 +175,10 @@ class _Readings:
     began_ns: int
 
 
-def _readings(data: Data, calibration: Calibration, use: str) -> list[_Readings]:
-    """Return the readings of every body that is not an anchor and ranges with one, or listens."""
+def _readings(data: Data, calibration: Calibration, settings: OnboardSettings) -> list[_Readings]:
+    """Return the readings of every body that is not an anchor and ranges with one, or listens: with fixed delays, and
+    if chosen with delays as states."""
+    use = settings.use
     flight = load_flight(data, need_power=calibration.needs_power, need_truth=False, use=use, sensors=("imu", "height"))
     name, (imu, heights) = flight.ranges.source, flight.sensors.values()
     poses, tags, ranges = flight.poses, flight.tags, used_part(keep_determined(calibration, flight.ranges), use)
@@ -201,11 +210,10 @@ def _readings(data: Data, calibration: Calibration, use: str) -> list[_Readings]
         mine = np.isin(rows.ends[..., :1], list(arms))
         own, other = (np.where(mine, *both) for both in ((first, second), (second, first)))
         every, _, errors = MeasuredReceptions.of(some, calibration).robust(calibration)
-        measured = every.at(rows.rows)
         imu_s, inertial = inertial_readings(imu, body, began)
         height_s, height = sensor_rows(heights, body, ("height_m",), began)
         known = poses.body == body
-        found.append(
+        found += [
             _Readings(
                 source=ranges.source,
                 body=body,
@@ -223,7 +231,9 @@ def _readings(data: Data, calibration: Calibration, use: str) -> list[_Readings]
                 truth=poses[known] if known.any() else None,
                 began_ns=began,
             )
-        )
+            for kind in (every, *with_delays(every, some, calibration, online=settings.online).values())
+            for measured in (kind.at(rows.rows),)
+        ]
     if not found:
         raise UnanswerableError(
             f"{name}: no moving body ranges with a fixed anchor, so there is nothing to localize; one that "
@@ -254,7 +264,8 @@ def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilt
     near = np.abs(one.imu_s - float(one.time_s[first])) < 0.25  # s: the first tilt is that of half a second
     force = one.imu[near, 3:].mean(axis=0) if near.any() else np.array([0.0, 0.0, GRAVITY_M_S2])
     turned = _attitudes(force, settings.headings) if inertial else np.eye(3)[None]
-    found = InertialFilter(fix, turned, settings.noise, inertial=inertial, speed_m_s=settings.speed_m_s)
+    delays = one.measured.delays
+    found = InertialFilter(fix, turned, settings.noise, inertial=inertial, speed_m_s=settings.speed_m_s, delays=delays)
     if inertial:
         found.update_gravity(force, 0.7)  # m/s^2: how a body may accelerate while it begins
     return first, found
@@ -325,7 +336,9 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
     (first, running), known = _begin(one, settings), one.measured
     now = heard = float(one.time_s[first])
     states, updates, restarts, exchange = list[Any](), list[tuple[float, float, bool]](), list[float](), -1
-    unexplained_s, numbers = 0.0, np.column_stack([known.measured_m, known.std_m, known.common_m]).tolist()
+    unexplained_s, numbers = 0.0, np.column_stack([known.measured_m, known.std_m]).tolist()
+    *_, common, _, slopes = side_by_side([known])
+    shared = np.column_stack([common, slopes[:, 0]])
     # The speed limit counts once a second: velocities are independent after a second.
     slow_every = max(round(settings.rate_hz), 1)
     for time_s, kind, number, inertial in _events(one, settings, now):
@@ -340,9 +353,9 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         elif kind == "range":
             if exchange != (exchange := int(one.exchange[number])):
                 running.begin_exchange()
-            measured, noise_m, common_m = numbers[number]
+            measured, noise_m = numbers[number]
             geometry = one.arm_m[number], one.anchor_m[number], one.sign[number]
-            update = running.update_range(measured, noise_m, one.errors.at(number), *geometry, common_m)
+            update = running.update_range(measured, noise_m, one.errors.at(number), *geometry, shared[number])
             updates.append((now, float(update.nis[best]), bool(update.believed[best])))
             # As in `tracking.run_filters`, but explained ranges earn no trust: this filter drifts.
             lasted_s = min(now - heard, settings.reopen_s / 2 / MIN_RANGES_PER_FIX)
@@ -389,6 +402,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         nis=np.array(nis),
         accepted=np.array(accepted),
         restarts_s=tuple(restarts),
+        delays=running.delays_at((best,), known.delays),
     )
 
 
@@ -407,7 +421,7 @@ def onboard_text(found: list[OnboardTrack], settings: OnboardSettings) -> str:
         figures = (one.rmse_m, *np.quantile(off, (0.5, 0.95))) if len(off) else (np.nan,) * 3
         cells = "".join(f"{'-':>9s}" if value != value else f"{value:9.3f}" for value in figures)
         own = float(np.sqrt(np.mean(one.std_m**2)))
-        lines.append(f"{one.source + ' ' + one.body:33s} {cells}{own:9.3f}  {len(one.restarts_s)}")
+        lines.append(f"{one.title:33s} {cells}{own:9.3f}  {len(one.restarts_s)}")
         lasts_s = float(np.ptp(one.range_time_ns)) * 1e-9
         if len(one.restarts_s) > max(lasts_s / PATIENCE_S, 3):
             lines.append(
@@ -420,6 +434,7 @@ def onboard_text(found: list[OnboardTrack], settings: OnboardSettings) -> str:
         if settings.model == "imu"
         else f"velocity wanders by {noise.acceleration:g} m/s^2 a root of Hz"
     )
+    lines += [delay_line(f"{one.source} {one.body}", one.delays) for one in found if one.delays]
     return "\n".join([*lines, f"used: {found[0].used}; process noise: {moves}, speed about {settings.speed_m_s:g} m/s"])
 
 
@@ -436,6 +451,7 @@ def onboard_json(found: list[OnboardTrack]) -> list[dict[str, Any]]:
             "nis": float(np.mean(one.nis)),
             "believed": float(np.mean(one.accepted)),
             "restarts_s": list(one.restarts_s),
+            **delays_json(one.delays),
         }
         for one in found
     ]

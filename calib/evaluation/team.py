@@ -26,13 +26,14 @@ from calib.data.ranges import Ranges
 from calib.data.sources import Data, load_flight, require_times
 from calib.errors import BadInputError, UnanswerableError, WeakHeadingWarning
 from calib.evaluation.filters import BODY, A, P, ProcessNoise, RelativeFilter, V, squared_over
-from calib.evaluation.localization import Localization, consistency, filter_ranges, fixed_std
+from calib.evaluation.localization import Localization, consistency, delay_line, delays_json, filter_ranges, fixed_std
 from calib.evaluation.onboard import inertial_readings, mean_readings
 from calib.evaluation.tracking import (
     FilterRanges,
     Measurements,
     Settings,
     Track,
+    delay_states,
     pair_numbers,
     ranges_among,
     side_by_side,
@@ -58,7 +59,8 @@ class TeamSettings(CheckedSettings):
     The start is the relative pose and velocity at the first exchange with noise of `start_std_m` and `start_std_m_s` an
     axis and `start_std_deg` about each, drawn from `seed`. `use` is "exchanges", or "receptions": what robots
     overheard, too. Poses are predicted at every exchange and `rate_hz` times a second. A range is taken when its
-    squared innovation over its variance is below `gate`. `noise` is that of the IMUs.
+    squared innovation over its variance is below `gate`. With `online` one more filter has delays as states. `noise` is
+    that of the IMUs.
 
     >>> import calib
     >>> calib.TeamSettings(use="receptions").start_std_deg
@@ -73,6 +75,7 @@ class TeamSettings(CheckedSettings):
     rate_hz: float = 50.0
     gate: float = 10.83
     seed: int = 0
+    online: bool = False
     noise: ProcessNoise = field(default_factory=ProcessNoise)
 
 
@@ -182,7 +185,8 @@ def localize_team(
     ranges = keep_determined(calibration, flight.ranges)
     team = _team(ranges, flight.poses, flight.tags, flight.sensors["imu"], chosen)
     fixed = fixed_std(calibration, Settings())
-    measured = {name: one.at(team.rows) for name, one in filter_ranges(team.ranges, calibration, fixed).items()}
+    every = filter_ranges(team.ranges, calibration, fixed, online=chosen.online)
+    measured = {name: one.at(team.rows) for name, one in every.items()}
     heard = team.heard
     filters = {"dead reckoning": (measured["raw"], np.zeros_like(heard))}
     if chosen.use == "receptions":
@@ -287,8 +291,9 @@ def _run(
     pairs of tags and of an exchange, and of pairs of bodies what is not linear in their distances.
     """
     known, uses = [one for one, _ in filters.values()], np.stack([used for _, used in filters.values()], axis=1)
-    measured, std, common, shared = side_by_side(known)
+    measured, std, common, shared, changes = side_by_side(known)
     running = _start(team, settings, len(known))
+    last, delays = running.state.shape[1] - 1, running.append(delay_states(known))
     steps = np.arange(team.time_ns[0], team.time_ns[-1], round(1e9 / settings.rate_hz))
     time_ns = np.unique(np.concatenate([team.time_ns, steps]))
     time_s = (time_ns - time_ns[0]) * 1e-9
@@ -313,12 +318,13 @@ def _run(
                 # Two exchanges at one time share no error, either.
                 kept = np.exp(-np.maximum(time_s[k] - last_s, 1e-9) / lasting)
                 running.decay(kept)
+                running.wander(time_s[k] - max(last_s, 0.0))
                 exchange, last_s = team.exchange[row], time_s[k]
             expected, slopes, bent_m = running.distances(team.body[row], team.arm[row], team.sign[row])
             for which, (pair, sides) in enumerate((running.known + team.shares[row]).tolist()):
                 slopes[:, pair] += shared[row, :, which]
                 slopes[:, sides] += team.sign[row, which] * bent_m[:, which]
-            slopes[:, -1] = common[row]
+            slopes[:, last], slopes[:, delays] = common[row], changes[row]
             weighed = partial(weigh, known, row, gate=settings.gate)
             update = running.update(slopes * uses[row, :, None], measured[row] - expected, std[row] ** 2, weighed)
             nis[row], accepted[row] = update.nis, update.believed
@@ -341,6 +347,7 @@ def _run(
             nis=nis[used, f],
             nees=nees[:, f, b],
             accepted=accepted[used, f],
+            delays=running.delays_at((f,), known[f].delays),
         )
 
     return {body: {name: track(f, b) for f, name in enumerate(filters)} for b, body in enumerate(team.bodies[:-1])}
@@ -365,6 +372,7 @@ def team_text(found: list[RelativePose], settings: TeamSettings) -> str:
         f"fixed standard deviations, {fixed.source}: raw {fixed.std_m['raw']:.3f} m, calibrated "
         f"{fixed.std_m['calibrated']:.3f} m; NEES should be {RelativeTrack.DEGREES}",
     ]
+    lines += [delay_line(found[0].source, found[0].delays)] if found[0].delays else []
     for end, less in _reductions(rows).items():
         changes = ", ".join(f"{name} {-100 * share:+.0f} %" for name, share in less.items())
         lines.append(f"position errors by listening, against {end}: {changes}; arXiv 2304.03837: up to -48 %")
@@ -375,6 +383,7 @@ def team_json(found: list[RelativePose]) -> dict[str, Any]:
     """Return what `calib localize --model team --json` prints: figures by body and filter, and their means."""
     rows = [
         {"recording": one.source, "body": one.body, "reference": one.reference, "filters": for_json(_figures([one]))}
+        | delays_json(one.delays)
         for one in found
     ]
     summary = _figures(found)

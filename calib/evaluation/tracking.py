@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar, Final
 
@@ -17,15 +17,8 @@ import numpy as np
 
 from calib.data.ranges import Ranges
 from calib.data.sources import Flight, require_arrivals
-from calib.evaluation.filters import (
-    GaussianFilters,
-    RangeErrors,
-    RangeUpdate,
-    gated_update,
-    mixture_update,
-    multilaterate,
-    squared_over,
-)
+from calib.evaluation.filters import GaussianFilters, multilaterate, squared_over
+from calib.online import FIXED_DELAYS, DelayStates, RangeErrors, WeighedInnovation, gated_update, mixture_update
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
@@ -35,7 +28,7 @@ from uwblink.settings import setting
 Trajectory = tuple[Ints, Floats, Floats]
 """Times in ns (n,), positions in metres (n, 3), attitudes x y z w (n, 4)."""
 
-FILTERS: Final = ("raw", "calibrated", "variance", "robust")
+FILTERS: Final = ("raw", "calibrated", "variance", "robust", "online")
 
 PATIENCE_S: Final = 10.0
 """Most seconds for which a filter that explained its ranges is trusted while it does not.
@@ -57,7 +50,8 @@ class Settings(CheckedSettings):
     (`multilaterate`) once the time in which it explained its ranges, 10 s at most, is used up by time in which it did
     not, and half of `reopen_s` besides. `seeds` are runs with other noise, each body and flight with its own; tracks
     are those of the first, `seed`. `use` is "exchanges", a body's ranges, or "receptions", with all that it overheard
-    and others overheard of it. Raises `BadInputError` that names the setting.
+    and others overheard of it. With `online` one more filter has delays as states (`calib.online.DelayStates`). Raises
+    `BadInputError` that names the setting.
     """
 
     velocity_std_mps: float = 0.3
@@ -70,6 +64,7 @@ class Settings(CheckedSettings):
     seed: int = 0
     seeds: int = 3
     use: str = setting("exchanges", "What is used.", names=("exchanges", "receptions"))
+    online: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -79,7 +74,7 @@ class Track:
     `std_m` (n,) is the standard deviation by the filter itself: the root of the sum of its three variances. `nees` (n,)
     are the squared errors over their covariance, which should be `DEGREES`. Truth and `nees` are NaN where poses do not
     say. `nis` (measurements,) are the squared innovations over their variance, and `accepted` (measurements,) which are
-    within the gate.
+    within the gate. `delays` are those at the end and their standard deviations by tag, in ns, where they are states.
     """
 
     DEGREES: ClassVar[int] = 3
@@ -92,6 +87,7 @@ class Track:
     nis: Floats
     nees: Floats
     accepted: Bools
+    delays: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def known(self) -> Bools:
@@ -299,7 +295,8 @@ class FilterRanges:
     """What a filter measures (n,), the standard deviation of each measurement's own error, and its error model, if any.
 
     Ranges of a pair share an error with a standard deviation of `shared_m`, which lasts for `lasting_s`: (n, k) by the
-    distances in a measurement, with their signs. Measurements of an exchange share one of `common_m` (n,).
+    distances in a measurement, with their signs. Measurements of an exchange share one of `common_m` (n,). Where delays
+    are states, `delay_slopes` (n, tags) are the derivatives by them.
     """
 
     measured_m: Floats
@@ -308,39 +305,52 @@ class FilterRanges:
     shared_m: Floats
     lasting_s: float = np.inf
     errors: RangeErrors | None = None
+    delays: DelayStates = FIXED_DELAYS
+    delay_slopes: Floats | None = None
 
     def at(self, rows: Ints) -> FilterRanges:
         """Return some measurements."""
-        measured, std, common, shared = (x[rows] for x in (self.measured_m, self.std_m, self.common_m, self.shared_m))
-        errors = None if self.errors is None else self.errors.at(rows)
-        return FilterRanges(measured, std, common, shared, self.lasting_s, errors)
+        names = ("measured_m", "std_m", "common_m", "shared_m", "delay_slopes")
+        some = {name: x[rows] for name in names if (x := getattr(self, name)) is not None}
+        return replace(self, **some, errors=None if self.errors is None else self.errors.at(rows))
 
 
-def weigh(known: list[FilterRanges], row: int, innovation_m: Floats, variance_m2: Floats, gate: float) -> RangeUpdate:
+def weigh(
+    known: list[FilterRanges], row: int, innovation_m: Floats, variance_m2: Floats, gate: float
+) -> WeighedInnovation:
     """Return the updates of filters (filters, ...) by their measurement `row`: by a gate, or by an error model."""
     update = gated_update(innovation_m, variance_m2, gate)
     for f, one in enumerate(known):
         if one.errors is not None:
             own = mixture_update(innovation_m[f], variance_m2[f], one.errors.at(row))
-            update.noise_m[f], update.variance_m2[f], update.believed[f] = own.noise_m, own.variance_m2, own.believed
+            for name in ("noise_m", "variance_m2", "believed", "tail"):
+                getattr(update, name)[f] = getattr(own, name)
     return update
 
 
 def side_by_side(filters: Sequence[FilterRanges]) -> Iterator[Floats]:
     """Yield what filters measure, the standard deviations of own errors and of those of an exchange (n, filters), and
-    of errors that pairs share (n, filters, k)."""
+    of errors that pairs share (n, filters, k), and derivatives by states of delays (n, filters, tags)."""
     for name in ("measured_m", "std_m", "common_m", "shared_m"):
         yield np.stack([getattr(one, name) for one in filters], axis=1)
+    fixed = np.zeros((len(filters[0].measured_m), len(delay_states(filters).tags)))
+    yield np.stack([fixed if one.delay_slopes is None else one.delay_slopes for one in filters], axis=1)
+
+
+def delay_states(filters: Sequence[FilterRanges]) -> DelayStates:
+    """Return the states of delays that some of the filters have, of no tag where none has any."""
+    return next((one.delays for one in filters if one.delays.tags), FIXED_DELAYS)
 
 
 def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: Settings) -> dict[str, list[Track]]:
     """Run filters on the ranges of a body with every noise; return the tracks of each, one for each noise.
 
     A state is the position, for each pair of tags the error that its ranges share, in units of `shared_m`, and the
-    error that measurements of one exchange share, in units of `common_m`. Arrays are (filters, seeds, ...).
+    error that measurements of one exchange share, in units of `common_m`; then the delays, which a restart keeps.
+    Arrays are (filters, seeds, ...).
     """
     count, known, pair, elapsed_s = len(problem), list(ranges.values()), problem.pair, problem.elapsed_s
-    measured, std, common, shared = side_by_side(known)
+    measured, std, common, shared, slopes = side_by_side(known)
     noises = [problem.noisy(settings, settings.seed + k) for k in range(settings.seeds)]
     moves, spread = np.stack([moves for _, moves in noises], axis=1), problem.velocity_spread(settings)
     moved, shape, size = moves.cumsum(axis=0), (len(known), settings.seeds), 5 + int(pair.max())
@@ -351,6 +361,7 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
     prior = np.diag(np.where(np.arange(size) < 3, settings.initial_std_m**2, 1.0))
     running = GaussianFilters(np.zeros((*shape, size)), np.tile(prior, (*shape, 1, 1)), 3)
     running.state[..., place] = [start for start, _ in noises]
+    delays, own = running.append(delay_states(known)), slice(size)
     estimate, (std_m, nis, nees) = np.empty((count, *shape, 3)), np.empty((3, count, *shape))
     accepted = np.empty((count, *shape), dtype=bool)
     # Twelve unexplained ranges at least, four for each coordinate, before a filter begins anew.
@@ -359,13 +370,14 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
         running.decay(kept[k][:, None])
         running.state[..., place] += moves[k]
         running.add_variance(place, spread[k])
+        running.wander(elapsed_s[k])
         towards = running.state[..., None, place] + problem.arm[k] - problem.other[k]
         distance = np.linalg.norm(towards, axis=-1)
         h = np.zeros_like(running.state)
         h[..., place] = np.sum(towards * (problem.sign[k] / np.maximum(distance, 1e-6))[..., None], axis=-2)
-        for which, own in enumerate((3 + pair[k]).tolist()):
-            h[..., own] += shared[k, :, which, None]
-        h[..., -1] = common[k][:, None]
+        for which, shares in enumerate((3 + pair[k]).tolist()):
+            h[..., shares] += shared[k, :, which, None]
+        h[..., size - 1], h[..., delays] = common[k][:, None], slopes[k][:, None]
         expected = problem.known_m[k] + distance @ problem.sign[k]
         weighed = partial(weigh, known, k, gate=settings.gate)
         update = running.update(h, measured[k][:, None] - expected, std[k][:, None] ** 2, weighed)
@@ -375,9 +387,11 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
             rows = slice(np.searchsorted(problem.time_ns, problem.time_ns[k] - settings.reopen_s * 1e9), k + 1)
             # The body moved since these ranges: so do their anchors.
             anchors = problem.other[rows] - problem.arm[rows] + (moved[k] - moved[rows])[:, lost[1], None]
-            fix = multilaterate(measured[rows, lost[0]] - problem.known_m[rows], anchors, 0.0, sign=problem.sign[rows])
-            running.state[lost], running.covariance[lost], explained_s[lost] = 0.0, prior, 0.0
-            running.state[lost][place], running.covariance[lost][place, place] = fix.place_m, fix.covariance_m2
+            known_m = problem.known_m[rows] + slopes[rows, lost[0]] @ running.state[lost][delays]
+            fix = multilaterate(measured[rows, lost[0]] - known_m, anchors, 0.0, sign=problem.sign[rows])
+            state, covariance, explained_s[lost] = running.state[lost], running.covariance[lost], 0.0
+            state[own], covariance[own], covariance[:, own], covariance[own, own] = 0.0, 0.0, 0.0, prior
+            state[place], covariance[place, place] = fix.place_m, fix.covariance_m2
         covariance = running.covariance[..., place, place]
         estimate[k], accepted[k], nis[k] = running.state[..., place], update.believed, update.nis
         std_m[k] = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
@@ -394,6 +408,7 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
             nis=nis[:, f, seed],
             nees=nees[:, f, seed],
             accepted=accepted[:, f, seed],
+            delays=running.delays_at((f, seed), known[f].delays),
         )
 
     return {name: [track(f, seed) for seed in range(settings.seeds)] for f, name in enumerate(ranges)}

@@ -23,6 +23,7 @@ FILTER_STYLES: Final[dict[str, tuple[str, str, Any, str]]] = {
     "calibrated": ("calibrated", WINE, (0, (5, 1.5)), "////"),
     "variance": ("calibrated, with variance", BLUE, "-", ""),
     "robust": ("calibrated, with reflections", GREY, (0, (6, 1.5, 1.5, 1.5)), "xxxx"),
+    "online": ("delays as states", MUTED, (0, (3, 1.0)), "...."),
 }
 """Name, colour, dashes and hatches of each filter."""
 
@@ -39,8 +40,8 @@ def rmse_bars(width_in: float, found: list[Localization]) -> Figure:
     heights = {stage: [float(one.rmse_m[stage].mean()) for one in shown] + [mean[stage]] for stage in mean}
     for k, (stage, own) in enumerate(heights.items()):
         name, colour, _, hatch = FILTER_STYLES[stage]
-        place = np.arange(len(names)) + 0.21 * (k - (len(mean) - 1) / 2)
-        axes.bar(place, own, 0.19, color=colour, hatch=hatch, ec="white", lw=0, label=name)
+        place = np.arange(len(names)) + 0.84 * ((k + 0.5) / len(mean) - 0.5)
+        axes.bar(place, own, 0.76 / len(mean), color=colour, hatch=hatch, ec="white", lw=0, label=name)
     every = np.concatenate(list(heights.values()))
     # A filter that diverged leaves the picture.
     if every.max() > 4 * np.quantile(every, 0.9):

@@ -9,7 +9,6 @@ import pytest
 from calib import BadInputError, Calibration, UnanswerableError, fit, sample_flight
 from calib.calibration.power_curves import Curve
 from calib.data.sources import Flight, load_flight
-from calib.evaluation.filters import RangeErrors, gated_update, mixture_update
 from calib.evaluation.localization import (
     fixed_std,
     localization_json,
@@ -19,6 +18,7 @@ from calib.evaluation.localization import (
     write_tum,
 )
 from calib.evaluation.tracking import Settings
+from calib.online import RangeErrors, gated_update, mixture_update
 from calib.report.figures import rmse_bars
 from tests.shared_data import ROOT
 from uwblink.pages.figures import style

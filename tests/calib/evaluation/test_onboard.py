@@ -12,9 +12,10 @@ from calib.calibration.error_model import ErrorModel
 from calib.calibration.formats import read_miluv
 from calib.calibration.power_curves import Curve
 from calib.data.samples import stamped
-from calib.evaluation.filters import Fix, InertialFilter, ProcessNoise, RangeErrors, multilaterate
+from calib.evaluation.filters import Fix, InertialFilter, ProcessNoise, multilaterate
 from calib.evaluation.localization import write_tum
 from calib.evaluation.onboard import onboard_json, onboard_text
+from calib.online import RangeErrors
 from tests.shared_data import shared
 from uwblink import Contents, Exchanges, Poses, Tag
 from uwblink.importers import read_source

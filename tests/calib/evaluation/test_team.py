@@ -368,7 +368,7 @@ def test_poses_after_the_start_only_judge(known):
 
 
 def test_the_filter_knows_what_listeners_of_an_exchange_share(known, monkeypatch):
-    def drawn(ranges, *_):
+    def drawn(ranges, *_, **__):
         rng, heard, count = np.random.default_rng(8), ranges.arrivals, len(ranges)
         truth, nothing = np.append(ranges.truth_m, heard.truth_m), 0 * distances_in(ranges)[1]
         wrong = np.append(0.2 * rng.normal(size=count), 0.05 * rng.normal(size=count)[heard.exchange])
@@ -451,3 +451,13 @@ def test_the_command_prints_writes_and_refuses(known, tmp_path):
     assert "bare.uwb" in processes.refuse(*words[:2], bare, *words[3:], status=1, runner=processes.call, naming=["imu"])
     processes.refuse(*words, "--imu", "wooden", runner=processes.call, naming=["industrial"])
     processes.refuse(*words, "--start-std", "0", "1", "1", runner=processes.call, naming=["--start-std:"])
+
+
+def test_delays_that_a_calibration_has_wrong_within_its_errors_are_corrected_on_the_way():
+    off = dict(zip(ARMS, [0.4, -0.3, 0.5, 0.3, -0.4, 0.3], strict=True))
+    known = replace(calibration(), delays_ns=off, delays_std_ns=dict.fromkeys(ARMS, 0.4))
+    for found in localize_team(flight(6.0), known, replace(CLOSE, online=True)):
+        assert found.rmse_m["online"].mean() < 0.7 * found.rmse_m["variance"].mean()
+        wrong = np.array([delay / std for delay, std in found.delays.values()])
+        assert np.abs(wrong).max() < 3.5
+        assert np.sum([delay**2 for delay, _ in found.delays.values()]) < 0.3 * np.sum(np.square([*off.values()]))
