@@ -234,7 +234,7 @@ OWN = [
         ("{", ["not JSON"]),
         ("[]", ["not a calibration"]),
         ('{"schema_version": 99}', ["99"]),
-        ('{"schema_version": 7}', ["schema version 7", "reads 1 to 6"]),
+        ('{"schema_version": 8}', ["schema version 8", "reads 1 to 7"]),
         ('{"schema_version": 1}', ["missing"]),
         ('{"schema_version": 1, "lift": "up"}', ["mean-of-lifted"]),
     )),
