@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -153,11 +154,11 @@ def test_a_pattern_needs_directions_and_enough_ranges():
 @pytest.mark.parametrize(
     "settings", [{"sequential": True}, {"constants": "pair"}, {"use": "receptions"}], ids=lambda one: next(iter(one))
 )
-def test_fits_that_cannot_have_a_pattern_or_slope_refuse_it(settings, name):
+def test_fits_that_cannot_have_a_pattern_or_slope_refuse_it(settings: dict[str, Any], name: str):
     with pytest.raises(BadInputError, match=next(iter(settings))):
-        calib.FitSettings(**{name: "shared"}, **settings)
+        calib.FitSettings(**settings | {name: "shared"})
     with pytest.raises(BadInputError, match=name):
-        calib.fit_from_ranges(flown(TEN, 5)[0], **{name: "shared"})
+        calib.fit_from_ranges(flown(TEN, 5)[0], **dict[str, Any]({name: "shared"}))
 
 
 def test_a_range_is_corrected_by_two_directions_and_says_what_is_missing_without():
@@ -208,8 +209,9 @@ def test_the_report_draws_patterns_with_their_bands_at_the_level_of_flight():
     *lines, zero = axes.lines
     up = np.radians([float(line.get_label()[10:-1].replace("−", "-")) for line in lines])
     level = np.quantile(seen(flown_ranges, (1, 2, 3, 4))[:, 2], (0.5, 0.1, 0.9))
-    assert (np.sin(up), zero.get_ydata().any()) == (pytest.approx(level, abs=0.01), False)
-    around = lines[0].get_xdata()
+    assert np.sin(up) == pytest.approx(level, abs=0.01)
+    assert not np.any(zero.get_ydata())
+    around = np.asarray(lines[0].get_xdata())
     for line, one in zip(lines, up, strict=True):
         toward = [np.cos(around) * np.cos(one), np.sin(around) * np.cos(one), np.full(len(around), np.sin(one))]
         values = pattern.values(np.transpose(toward))

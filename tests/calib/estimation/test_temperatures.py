@@ -84,7 +84,7 @@ def test_a_warmer_flight_is_corrected_by_its_readings(tmp_path):
 @pytest.mark.parametrize(("celsius", "why"), [(None, "no temperature is known"), (30.0, "vary too little")])
 def test_a_slope_that_readings_do_not_determine_is_refused_and_said(tmp_path, celsius, why):
     read = flown(WARM, 3)[0].temperature
-    flat = read | {"temperature_c": np.full(len(read["tag"]), celsius)} if celsius else {}
+    flat = {**read, "temperature_c": np.full(len(read["tag"]), celsius)} if celsius else {}
     path = written(tmp_path / "a.uwb", WARM, 3, temperature=flat)
     done = call("calib", "fit", path, "-o", tmp_path / "x.json", "--temperature", "shared")
     assert (done.returncode, why in done.stderr, done.stderr.count("\n")) == (1, True, 1)
