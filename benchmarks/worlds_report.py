@@ -167,7 +167,7 @@ def _samples() -> str:
 
 
 TOO_SHORT = "independent"
-EXPLAINED = "distance explains"
+EXPLAINED = "power and distance are confounded"
 
 SAMPLES_TEXT = """
 **The paper's samples** (17 118 of ICRA 2023, not shipped), assigned to three tags at random; a part is held back from the fit. The cubic is a least-squares polynomial.
@@ -179,7 +179,7 @@ TEXT = """`make worlds`, {date}: {seeds} seeds of each of [these worlds](../benc
 
 {table}
 
-**False alarms**: {alarms} of {doubted} fits of sound worlds of up to 240 s gave a warning, {explained} of them that distance explains most of the power's variance, as it does there; {short} more warned of errors that last too long for so short a recording, which is true there.
+**False alarms**: {alarms} of {doubted} fits of sound worlds of up to 240 s gave a warning, {explained} of them that power and distance are confounded, as they are there; {short} more warned of errors that last too long for so short a recording, which is true there.
 
 **Planted faults** (wrong units, offsets and drifts of tags and pairs, wrong signs and roles), {plantings} seeds each. "Right" is within three printed standard errors without a warning.
 

@@ -84,11 +84,13 @@ class Covariate:
         centre, span = np.zeros(known.shape[1]), np.zeros((2, known.shape[1]))
         if len(known):
             centre, span = known.mean(axis=0), np.array([known.min(axis=0), known.max(axis=0)])
+            known -= centre
             # In a flight on one level, what goes with elevation stays unknown, and is not extrapolated.
-            values[some] = np.where(np.mean((known - centre) ** 2, axis=0) < least_square, 0.0, known - centre)
+            known[:, np.einsum("nk,nk->k", known, known) < least_square * len(known)] = 0.0
+            values[some] = known
+        square = known.T @ known / max(len(known), 1)
         first = np.where(ranges.initiator < ranges.target, 0, 1)
         lower, higher = (values[np.arange(len(ranges)), side] for side in (first, 1 - first))
-        square = values[some].T @ values[some] / max(len(known), 1)
         tags, bodies = tuple(np.unique(ends[some]).tolist()), dict(ranges.bodies)
         return cls(tags=tags, centre=centre, lower=lower, higher=higher, square=square, span=span, bodies=bodies)
 
