@@ -89,6 +89,8 @@ class Covariate:
             known[:, np.einsum("nk,nk->k", known, known) < least_square * len(known)] = 0.0
             values[some] = known
         square = known.T @ known / max(len(known), 1)
+        # Of millions of ranges these are gigabytes.
+        del known
         first = np.where(ranges.initiator < ranges.target, 0, 1)
         lower, higher = (values[np.arange(len(ranges)), side] for side in (first, 1 - first))
         tags, bodies = tuple(np.unique(ends[some]).tolist()), dict(ranges.bodies)
