@@ -94,9 +94,11 @@ def _with(
         kinds = {"shared": WARMTH, "tag": OWN_WARMTH}
     tested = plain.slopes.tests([_family(plain, covariate, kind) for kind in kinds.values()]) if covariate.tags else []
     vague = _vague(name, covariate, tested[asked == "tag"]) if tested else []
-    needed = RANGES_AN_UNKNOWN * len(covariate.entries(COVARIATES[name][1]["tag"][-1], model.pairs)[0])
-    if len(vague) == len(covariate.tags) or len(model.ranges) < needed:
-        why = _why(name, covariate, model.ranges, needed if len(vague) < len(covariate.tags) else 0)
+    needed = 0
+    if len(vague) < len(covariate.tags):
+        needed = RANGES_AN_UNKNOWN * len(covariate.entries(COVARIATES[name][1]["tag"][-1], model.pairs)[0])
+    if not needed or len(model.ranges) < needed:
+        why = _why(name, covariate, model.ranges, needed)
         if asked != "auto":
             raise UnanswerableError(f"{ranges.source}: {why}", parameter=name)
         return plain, _told(name, covariate, why.rpartition(": ")[2].partition(";")[0]), []
