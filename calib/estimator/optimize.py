@@ -55,7 +55,7 @@ class Optimum:
         return {kind: self.x[where] for kind, where in self.layout.where.items()}
 
 
-def maximize(
+def maximize(  # noqa: PLR0913 - a search has that many sides
     rows: Sequence[Rows],
     priors: Priors,
     x: Floats,
@@ -65,10 +65,12 @@ def maximize(
     evidence_steps: int = EVIDENCE_STEPS,
     asked: Ints | None = None,
     longest: Callable[[Floats], float] | None = None,
+    longer: float = LONGER,
 ) -> Optimum:
     """Search from unknowns (p,) for the likeliest ones; those that are `asked` for settle more closely.
 
-    `longest` returns which share of a step (p,) may be taken at most, where unknowns are not linear.
+    `longest` returns which share of a step (p,) may be taken at most, where unknowns are not linear; `longer` limits
+    corrected steps, as `LONGER` says.
 
     Squared slopes are not quite the curvature: their inverse is corrected by the changes of slopes over the last steps
     (L-BFGS: Nocedal and Wright 2006, algorithm 7.4), and for steps by `_with_logarithms`. A likelihood that falls
@@ -100,10 +102,10 @@ def maximize(
         known = sums.information + precision
         slope = sums.gradient + priors.pull(x)
         bent = [(moved, _damped(moved, fell + precision @ moved, known @ moved)) for moved, fell in changes]
-        quick = inverse_of(_with_logarithms(known, layout, sums.gradient), free)
+        quick = inverse_of(_with_logarithms(known, layout, sums.gradient, longer), free)
         step = _corrected(quick, slope, bent)
         reach = float(slope @ (quick @ slope)) / max(float(step @ known @ step), 1e-300)
-        step *= min(1.0, LONGER * reach**0.5) if reach > 0 else 1.0
+        step *= min(1.0, longer * reach**0.5) if reach > 0 else 1.0
         gain, best = float(slope @ step), value
         settled = gain < tolerance
         if asked is not None:
@@ -123,14 +125,14 @@ def maximize(
     return Optimum(layout, priors, best_x, inverse_of(known, free), sums.information, best, taken, settled)
 
 
-def _with_logarithms(known: Matrix, layout: Layout, slope: Floats) -> Matrix:
+def _with_logarithms(known: Matrix, layout: Layout, slope: Floats, longer: float) -> Matrix:
     """Return what is known (p, p) with the curvature that logarithms have from a `slope` (p,) of the likelihood.
 
     The curvature by a share or a length is about its squared slopes. By its logarithm the slope is taken off, so that
-    none falls by more than a factor e a step; by how much one grows is limited by `LONGER`. Without it a share of
+    none falls by more than a factor e a step; by how much one grows is limited by `longer`. Without it a share of
     nothing, whose squares are small, shortens most steps.
     """
-    more = np.where(layout.logarithms(), np.maximum(-slope, slope / LONGER), 0.0)
+    more = np.where(layout.logarithms(), np.maximum(-slope, slope / longer), 0.0)
     if sparse.issparse(known):
         return sparse.csc_matrix(known + sparse.diags(more))
     return np.asarray(known + np.diag(more))

@@ -18,7 +18,7 @@ from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data, antenna_delays_of, each, opened
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimator.optimize import maximize
+from calib.estimator.optimize import LONGER, maximize
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, Part
 from calib.estimator.unknowns import Prior, Priors, Unknown
@@ -276,7 +276,9 @@ def _locations(ranges: Ranges, groups: Pairs) -> tuple[Floats, Floats, Floats]:
     )
     part = Part(parameter=RESIDUAL, kind="mean", columns=group[:, None], values=np.full((len(group), 1), -1.0))
     layout, rows = model.build(residual, errors, (mean, *unknowns), (part, *parts), only=())
-    found = maximize([rows], Priors(layout), layout.start())
+    # The likelihood has several maxima: with a moved board, that of shorter steps was less by 140.
+    searches = (maximize([rows], Priors(layout), layout.start(), longer=longer) for longer in (LONGER, 2 * LONGER))
+    found = max(searches, key=lambda one: one.value)
     values = rows.values(found.x)
     slope = errors.slopes(values)[1][RESIDUAL]
     number = np.concatenate([np.arange(n) * PARTS // n for n in count.tolist()])
