@@ -159,7 +159,7 @@ class DelayStates:
         """
         if calibration.pair_offsets:
             raise BadInputError(
-                "the calibration has constants of pairs and no delays that could change; fit it with `constants` none"
+                "the calibration has constants of pairs and no delays that could change; fit it with `constants` tag"
             )
         known, metres_a_ns = calibration.uncertainty, 1e-9 * calibration.speed_of_light
         std_ns = np.array([calibration.delays_std_ns.get(tag, math.nan) for tag in tags])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from scipy.special import chdtrc
@@ -24,11 +24,12 @@ class CalibrationComparison:
 
     A shift common to all delays and a constant of the curve are the same thing, so only together do they mean anything:
     `offset_m` is what the second calibration adds to every range beyond the first, at equal power. What a calibration's
-    `undetermined_splits` leave open is taken out, too. Where both have patterns over direction, delays are those of the
-    directions that the first was fitted to, `pattern_rms_m` is the difference of the patterns over all directions, and
-    `pattern_probability` that of a larger one by chance; NaN where there are none. `std_ns` is NaN for tags of which a
-    calibration states no standard error, as published ones; `chi_square` has `degrees` of freedom, and where there are
-    none, nothing can be tested, and `chi_square` and `probability` are NaN.
+    `undetermined_splits` leave open is taken out, too. Where both have slopes over temperature or patterns over
+    direction, delays are those at the reference temperature and in the average direction of the first.
+    `pattern_rms_m` is the difference of the patterns over all directions, and `pattern_probability` that of a larger
+    one by chance; NaN where there are none. `std_ns` is NaN for tags of which a calibration states no standard error,
+    as published ones; `chi_square` has `degrees` of freedom, and where there are none, nothing can be tested, and
+    `chi_square` and `probability` are NaN.
     """
 
     difference_ns: dict[int, float]
@@ -91,8 +92,8 @@ def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationC
     """Test whether the delays of two calibrations differ by more than their standard errors explain, by chi-square.
 
     Differences in ns are second minus first, less what is common to all delays and what undetermined splits leave open.
-    Raises `UnanswerableError` where fewer than two tags have a determined delay in both, and where one of them has
-    a pattern over direction in one of both only.
+    Raises `UnanswerableError` where fewer than two tags have a determined delay in both, and where one of them has a
+    pattern over direction or a slope over temperature in one of both only.
 
     >>> import calib
     >>> first, second = (calib.fit(calib.sample_flight(seed=seed)).calibration for seed in (1, 2))
@@ -110,7 +111,8 @@ def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationC
         )
     stated = [t for t in common if all(_is_stated(c, t) for c in both)]
     tags = stated if len(stated) > 1 else common
-    moved_ns, moved_ns2, *patterns = _by_direction(first, second, common)
+    moves = [_moved(first, second, common, name) for name in DEPENDENCES]
+    moved_ns, moved_ns2 = (np.sum(of_all, axis=0) for of_all in zip(*moves, strict=True))
     delta = np.array([second.delays_ns[t] - first.delays_ns[t] for t in common]) - moved_ns
     loose = loose_shifts(both, common)
     rows = np.isin(common, tags)
@@ -143,44 +145,59 @@ def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationC
         chi_square=score,
         degrees=max(degrees, 0),
         probability=probability,
-        pattern_rms_m=patterns[0],
-        pattern_probability=patterns[1],
+        **_apart(first, second, common),
         only_first=tuple(sorted(set(first.delays_ns) - set(common))),
         only_second=tuple(sorted(set(second.delays_ns) - set(common))),
     )
 
 
-def _by_direction(first: Calibration, second: Calibration, tags: list[int]) -> tuple[Floats, Floats, float, float]:
-    """Return by how much delays (tags,) of the second are longer in its average direction than in that of the first.
+DEPENDENCES: Final = {
+    "patterns": ("pattern over direction", "directions", "pattern"),
+    "temperatures": ("slope over temperature", "temperatures", "temperature"),
+}
+"""What delays depend on, by the field of a calibration: what it is called, on what it depends, and its setting."""
 
-    That is in ns, with its covariance; then come the rms of the difference of patterns, and its probability.
+
+def _moved(first: Calibration, second: Calibration, tags: list[int], name: str) -> tuple[Floats, Floats]:
+    """Return by how much delays (tags,) of the second are longer where it states them than where the first does.
+
+    That is in the second's average direction, or at its reference temperature; in ns, with its covariance. Raises
+    `UnanswerableError` where a tag has a dependence in one of both only.
     """
-    centre, apart = np.zeros((2, len(tags), HARMONICS))
-    members, covariance = np.zeros((2, len(tags)), dtype=bool), np.zeros((len(tags) * HARMONICS,) * 2)
+    centres = {tag: one.centre for one in getattr(first, name) for tag in one.tags}
+    later = {tag for one in getattr(second, name) for tag in one.tags}
+    if lone := [tag for tag in tags if (tag in centres) != (tag in later)]:
+        what, where, setting = DEPENDENCES[name]
+        raise UnanswerableError(
+            f"tags {first_few(map(str, lone))} have a {what} in one of the calibrations only: their delays are those "
+            f"of other {where}; fit both with the same `{setting}`"
+        )
     moved_ns, moved_ns2 = np.zeros(len(tags)), np.zeros((len(tags),) * 2)
-    for side, calibration in enumerate((first, second)):
+    for one in getattr(second, name):
+        own = np.isin(tags, one.tags)[:, None]
+        # A range has half of a delay, with the other sign.
+        away = 2e9 / SPEED_OF_LIGHT * own * (np.array([centres.get(t, one.centre) for t in tags]) - one.centre)
+        moved_ns = moved_ns + away @ np.array(one.coefficients_m)
+        moved_ns2 = moved_ns2 + away @ np.array(one.covariance_m2) @ away.T
+    return moved_ns, moved_ns2
+
+
+def _apart(first: Calibration, second: Calibration, tags: list[int]) -> dict[str, float]:
+    """Return the rms of the difference of patterns over direction, and the probability of a larger one by chance."""
+    apart, covariance = np.zeros((len(tags), HARMONICS)), np.zeros((len(tags) * HARMONICS,) * 2)
+    members = np.zeros(len(tags), dtype=bool)
+    for sign, calibration in ((-1, first), (1, second)):
         for pattern in calibration.patterns:
             own = np.isin(tags, pattern.tags)
-            members[side] |= own
-            factors, known = np.array(pattern.coefficients_m), np.array(pattern.covariance_m2)
-            apart += (2 * side - 1) * np.outer(own, factors)
-            covariance += np.kron(np.outer(own, own), known)
-            if not side:
-                centre += np.outer(own, pattern.centre)
-                continue
-            # A range has half of a delay, with the other sign.
-            away = 2e9 / SPEED_OF_LIGHT * own[:, None] * (centre - pattern.centre)
-            moved_ns, moved_ns2 = moved_ns + away @ factors, moved_ns2 + away @ known @ away.T
-    if (lone := np.flatnonzero(members[0] != members[1])).size:
-        raise UnanswerableError(
-            f"tags {first_few(str(tags[k]) for k in lone)} have a pattern over direction in one of the calibrations "
-            "only: their delays are those of other directions; fit both with the same `pattern`"
-        )
+            members |= own
+            apart += sign * np.outer(own, pattern.coefficients_m)
+            covariance += np.kron(np.outer(own, own), np.array(pattern.covariance_m2))
     if not members.any():
-        return moved_ns, moved_ns2, np.nan, np.nan
+        return {"pattern_rms_m": np.nan, "pattern_probability": np.nan}
     score = float(apart.ravel() @ np.linalg.pinv(covariance, hermitian=True) @ apart.ravel())
     probability = float(chdtrc(np.linalg.matrix_rank(covariance, hermitian=True), score))
-    return moved_ns, moved_ns2, float(np.sqrt(np.mean(np.sum(apart**2, axis=1)[members[0]]))), probability
+    rms_m = float(np.sqrt(np.mean(np.sum(apart**2, axis=1)[members])))
+    return {"pattern_rms_m": rms_m, "pattern_probability": probability}
 
 
 def loose_shifts(calibrations: Iterable[Calibration], tags: list[int]) -> Floats:

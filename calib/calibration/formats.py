@@ -318,6 +318,33 @@ static inline int uwb_correct_toward(double range_m, double fpp1_dbm, double fpp
         *corrected_m -= uwb_pattern(initiator, target, toward_initiator, toward_target, &unknown_m2);
     return status;
 }
+
+/* By how much the temperatures of both tags, in degrees Celsius, make a range longer, in metres: subtract it from what
+   uwb_correct() gives. NaN where one is not known. *unknown_m2 is the variance of what is unknown: add it to the square
+   of what uwb_errors() gives. */
+static inline double uwb_warmth(int initiator, int target, double initiator_c, double target_c, double *unknown_m2)
+{
+    double longer = 0.0;
+    int s, end, k;
+    *unknown_m2 = 0.0;
+    for (s = 0; s < UWB_SLOPES; s++) {
+        double kelvin = 0.0;
+        for (end = 0; end < 2; end++) {
+            const double celsius = end ? target_c : initiator_c;
+            for (k = 0; k < UWB_TAGS; k++) {
+                if (!uwb_slope_has[s][k] || uwb_tag[k] != (end ? target : initiator))
+                    continue;
+                if (celsius == celsius)
+                    kelvin += celsius - uwb_slope[s][2];
+                else
+                    *unknown_m2 += uwb_slope[s][3] * uwb_slope[s][3];
+            }
+        }
+        longer += uwb_slope[s][0] * kelvin;
+        *unknown_m2 += uwb_slope[s][1] * kelvin * uwb_slope[s][1] * kelvin;
+    }
+    return longer;
+}
 """
 
 _C_ERRORS: Final = """
@@ -398,36 +425,12 @@ def c_header(calibration: Calibration) -> str:
         f"static const double uwb_delay_m[UWB_TAGS] = {{{_numbers(metres)}}};",
         *_c_curve("bias", bias),
         *_c_curve("sigma", calibration.sigma_curve),
-        *_c_patterns(calibration.patterns, tags),
+        *_c_dependences(calibration, tags),
     ]
     text = "\n".join(lines) + _C_CODE
-    if calibration.temperatures:
-        text += "\n" + _c_temperatures(calibration.temperatures)
     if calibration.errors:
         text += "\n" + "\n".join(_c_errors(calibration.errors, bias)) + _C_ERRORS
     return text + "#endif\n"
-
-
-def _c_temperatures(slopes: Sequence[TemperatureSlope]) -> str:
-    """Return tables of slopes over temperature, and a function that takes one."""
-    each = [(str(tag), one) for one in slopes for tag in one.tags]
-    return f"""\
-#define UWB_TEMPERATURE_TAGS {len(each)}
-static const int uwb_temperature_tag[] = {{{", ".join(tag for tag, _ in each)}}};
-static const double uwb_m_per_k[] = {{{_numbers(one.m_per_k for _, one in each)}}};
-static const double uwb_reference_c[] = {{{_numbers(one.reference_c for _, one in each)}}};
-
-/* By how much a range is longer, in metres, because a tag at one of its ends has this temperature (degrees Celsius):
-   subtract that of both ends from what uwb_correct() gives. 0 for NaN and for a tag of which it is not known. */
-static inline double uwb_warmth(int tag, double temperature_c)
-{{
-    int k;
-    for (k = 0; k < UWB_TEMPERATURE_TAGS; k++)
-        if (uwb_temperature_tag[k] == tag && !isnan(temperature_c))
-            return uwb_m_per_k[k] * (temperature_c - uwb_reference_c[k]);
-    return 0.0;
-}}
-"""
 
 
 def _c_errors(model: ErrorModel, bias: Curve) -> list[str]:
@@ -459,18 +462,28 @@ def _c_errors(model: ErrorModel, bias: Curve) -> list[str]:
     ]
 
 
-def _c_patterns(patterns: Sequence[Pattern], tags: list[int]) -> list[str]:
-    """Return patterns over direction, and a row of zeros after the last."""
+def _c_dependences(calibration: Calibration, tags: list[int]) -> list[str]:
+    """Return patterns over direction and slopes over temperature, and a row of zeros after the last of each."""
+
+    def owners(several: Sequence[Pattern | TemperatureSlope]) -> list[str]:
+        return [", ".join(str(int(tag in one.tags)) for tag in tags) for one in several]
+
+    patterns, slopes = calibration.patterns, calibration.temperatures
     tables = {
-        "int uwb_pattern_has[][UWB_TAGS]": [", ".join(str(int(tag in p.tags)) for tag in tags) for p in patterns],
+        "int uwb_pattern_has[][UWB_TAGS]": owners(patterns),
         "double uwb_pattern_rms_m[][1]": [_number(p.rms_m) for p in patterns],
         "double uwb_pattern_m[][8]": [_numbers(p.coefficients_m) for p in patterns],
         "double uwb_pattern_centre[][8]": [_numbers(p.centre) for p in patterns],
         "double uwb_pattern_m2[][64]": [_numbers(chain(*p.covariance_m2)) for p in patterns],
+        "int uwb_slope_has[][UWB_TAGS]": owners(slopes),
+        "double uwb_slope[][4]": [_numbers((s.m_per_k, s.std_m_per_k, s.reference_c, s.rms_m)) for s in slopes],
     }
     return [
-        "/* Patterns over direction: whether a tag has one, root mean square, factors of harmonics, covariance. */",
+        "/* Patterns over direction: whether a tag has one, root mean square, factors of harmonics, covariance.",
+        "   Slopes over temperature: whether a tag has one; m/K, its standard error, reference in degrees Celsius, and",
+        "   the root mean square in m. */",
         f"#define UWB_PATTERNS {len(patterns)}",
+        f"#define UWB_SLOPES {len(slopes)}",
         *(
             "\n".join([f"static const {name} = {{", *(f"    {{{row}}}," for row in [*rows, "0"]), "};"])
             for name, rows in tables.items()

@@ -44,13 +44,14 @@ from calib.calibration.document import (
     write,
 )
 from calib.calibration.error_model import CheckedErrors
-from calib.calibration.patterns import CheckedPattern, TemperatureSlope, dependences_m
+from calib.calibration.patterns import CheckedPattern, CheckedSlope, dependences_m
 from calib.calibration.power_curves import LIFTS, BiasCurve, SigmaCurve, basis, lifted_power
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats
 from uwblink.display import as_html, as_text, first_few
+from uwblink.errors import raising
 from uwblink.output import write_text
 from uwblink.recording.antenna_delays import REGISTER_MAX, AntennaDelay
 from uwblink.text_files import read_text
@@ -146,7 +147,7 @@ class Calibration:
     uncertainty: Uncertainty | None = None
     undetermined_splits: tuple[Split, ...] = ()
     patterns: tuple[CheckedPattern, ...] = ()
-    temperatures: tuple[TemperatureSlope, ...] = ()
+    temperatures: tuple[CheckedSlope, ...] = ()
 
     @property
     def sides(self) -> dict[int, int]:
@@ -555,11 +556,21 @@ def rests_on(provenance: Mapping[str, Any]) -> str:
     return ", ".join(filter(None, parts))
 
 
+MISSHAPEN: Final = (KeyError, TypeError, ValueError)
+"""What reading a table of the provenance raises that is not as a fit writes it: that table is not checked on loading.
+"""
+
+
 def held_out_line(calibration: Calibration) -> str:
     """Return how a fit without the ranges that were held out did on them, "" where none were."""
     told = calibration.provenance.get("held_out")
     if not isinstance(told, Mapping):
         return ""
+    with raising(BadInputError, "provenance: held_out: not as `calib fit` writes it", *MISSHAPEN):
+        return _held_out(told)
+
+
+def _held_out(told: Mapping[str, Any]) -> str:
     inside = "" if told["inside_95"] is None else f", {100 * told['inside_95']:.0f} % within their 95 % intervals"
     return (
         f"judged on {told['ranges']} ranges held out by {told['fold']}: median {100 * told['raw_median_m']:+.1f} to "
@@ -573,6 +584,11 @@ def age_line(calibration: Calibration) -> str:
     told = calibration.provenance.get("drift")
     if not isinstance(told, Mapping):
         return ""
+    with raising(BadInputError, "provenance: drift: not as `calib fit` writes it", *MISSHAPEN):
+        return _age(told)
+
+
+def _age(told: Mapping[str, Any]) -> str:
     least, likeliest, most = ((0.02 / TWO_SIDED_95) ** 2 / max(rate, 1e-12) for rate in told["m2_per_day"][::-1])
     within = "95 % of delays change ranges by less than 2 cm for"
     days = f"{within} {likeliest:.0f} days ({least:.0f} to {most:.0f}, 95 %)"

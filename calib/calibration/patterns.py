@@ -92,6 +92,16 @@ class TemperatureSlope:
         return (self.m_per_k,)
 
     @property
+    def centre(self) -> tuple[float]:
+        """Return the reference, likewise."""
+        return (self.reference_c,)
+
+    @property
+    def covariance_m2(self) -> tuple[tuple[float]]:
+        """Return the variance of the slope, likewise."""
+        return ((self.std_m_per_k**2,),)
+
+    @property
     def rms_m(self) -> float:
         """Return the standard deviation of an end whose temperature is not known: the slope times the fitted span."""
         return math.hypot(self.m_per_k, self.std_m_per_k) * (self.span_c[1] - self.span_c[0])
@@ -103,6 +113,13 @@ class TemperatureSlope:
     def std_m(self, values: Floats) -> Floats:
         """Return the standard error of the slope times such values (n, 1), or sums of them."""
         return np.asarray(self.std_m_per_k * np.abs(values[:, 0]))
+
+
+def _wrong_span(slope: TemperatureSlope) -> str:
+    return "" if slope.span_c[0] <= slope.span_c[1] else "expected the lowest of `span_c` before the highest"
+
+
+CheckedSlope = Annotated[TemperatureSlope, joint(_wrong_span)]
 
 
 def dependences_m(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Floats]:

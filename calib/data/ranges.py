@@ -62,7 +62,8 @@ class Ranges(ColumnTable):
     `antenna_delays` are those programmed into the tags, as far as known; `arrivals` is what other tags overheard of
     these exchanges, None without any. `toward` (n, 2, 3) are unit vectors from the antennas of initiator and target to
     each other, in the frames of their bodies, NaN where attitudes are not known; `turning` are tags whose bodies turn.
-    `temperature_c` (n, 2) are the temperatures of initiator and target, NaN where no reading is near in time.
+    `temperature_c` (n, 2) are the temperatures of initiator and target, NaN where no reading is near in time;
+    `supply_v_per_k` is by how much the supply of a tag changes with its temperature, where it reads both.
 
     A row with a `listener` (-1 elsewhere) is a difference of arrival without stamps: by how much farther from the
     target than from the initiator the listener is. The weight of its initiator is negative.
@@ -92,6 +93,7 @@ class Ranges(ColumnTable):
     toward: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2, 3), dtype=np.float32))
     turning: tuple[int, ...] = ()
     temperature_c: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.float32))
+    supply_v_per_k: tuple[tuple[int, float], ...] = ()
     listener: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
@@ -136,6 +138,7 @@ class Ranges(ColumnTable):
         if temperature:
             ends = np.column_stack([exchanges.initiator, exchanges.target])
             seen["temperature_c"] = read_c(temperature, ends, exchanges.time_ns)
+            seen["supply_v_per_k"] = _supply_v_per_k(temperature)
         of_initiator, of_target = delay_weights(exchanges)
         bare = without_stamps(exchanges)
         return cls(
@@ -195,8 +198,8 @@ class Ranges(ColumnTable):
         angles = {"azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
         both = {"temperature_c": temperature_c} | angles
         for name, pair in ({"weights": weights} | both).items():
-            if len(pair) != 2:
-                raise BadInputError(f"found {len(pair)}, expected those of initiator and target", parameter=name)
+            if (count := len(pair) if hasattr(pair, "__len__") else 1) != 2:
+                raise BadInputError(f"found {count}, expected those of initiator and target", parameter=name)
         floats = {
             "raw_m": range_m,
             "truth_m": truth_m,
@@ -380,6 +383,18 @@ def read_c(table: Mapping[str, NDArray[Any]], ids: Ints, time_ns: Ints) -> NDArr
     return found
 
 
+def _supply_v_per_k(table: Mapping[str, NDArray[Any]]) -> tuple[tuple[int, float], ...]:
+    """Return by how much the supply of tags changes with their temperature, V/K, by least squares over readings."""
+    celsius, volts = measured_c(table["temperature_c"]).astype(np.float64), table["supply_v"]
+    found = []
+    for tag in np.unique(table["tag"]).tolist():
+        some = (table["tag"] == tag) & np.isfinite(celsius) & np.isfinite(volts)
+        warmer = celsius[some] - np.mean(celsius[some]) if some.any() else np.zeros(0)
+        if (square := float(warmer @ warmer)) > 0:
+            found.append((tag, float(warmer @ volts[some]) / square))
+    return tuple(found)
+
+
 def measured_c(temperature_c: Floats) -> NDArray[np.float32]:
     """Return temperatures in degrees Celsius, NaN where the number cannot be that of a board."""
     return np.where(np.abs(temperature_c) < 300.0, temperature_c, np.nan).astype(np.float32)
@@ -411,6 +426,7 @@ def concatenate(parts: Sequence[Ranges]) -> Ranges:
         # A tag that changes its body belongs to none.
         bodies=tuple(sorted(bodies)) if len({tag for tag, _ in bodies}) == len(bodies) else (),
         turning=tuple(sorted({tag for part in parts for tag in part.turning})),
+        supply_v_per_k=tuple(sorted({tag: slope for part in parts for tag, slope in part.supply_v_per_k}.items())),
         session=session,
         sessions=names,
         antenna_delays=_antenna_delays_of_all(parts),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from scipy import sparse
 
 from calib.calibration.model import Calibration
-from calib.calibration.patterns import HARMONICS, Pattern, harmonics
+from calib.calibration.patterns import HARMONICS, Pattern, TemperatureSlope, harmonics
 from calib.data.ranges import LEAST_TURN_RAD, Ranges
 from calib.errors import UnanswerableError
 from calib.estimator.covariates import (
@@ -48,7 +49,7 @@ MISSING = {
         "which the robot turns once around in several places",
     ),
     "temperature": (
-        "no temperature is known; a slope needs readings within 30 s of ranges (table `temperature`)",
+        "no temperature is known; a slope needs readings of tags within 30 s of ranges",
         "temperatures vary too little to tell what they do to ranges; record while the boards warm up",
     ),
 }
@@ -129,6 +130,26 @@ def _with(
     if best is nothing:
         return plain, _told(name, covariate, "{:+.2f} ± {:.2f} mm/K are no evidence of one".format(*slopes[0])), []
     return best
+
+
+SUPPLY_M_A_V = 0.0535
+"""By how much a range grows with the supply of a tag, m/V (DW1000 user manual, section 8.3.1)."""
+
+
+def supply_warnings(slopes: Sequence[TemperatureSlope], ranges: Ranges) -> list[str]:
+    """Return a warning for each slope over temperature that a supply which changed with it may have moved by more than
+    a standard error."""
+    changes, said = dict(ranges.supply_v_per_k), []
+    for one in slopes:
+        known = [changes[tag] for tag in one.tags if tag in changes]
+        moved = SUPPLY_M_A_V * float(np.mean(known)) if known else 0.0
+        if abs(moved) > one.std_m_per_k:
+            said.append(
+                f"tags {first_few(map(str, one.tags))}: their supply changes by {1e3 * np.mean(known):+.1f} mV/K as "
+                f"they warm, which may be {1e3 * moved:+.2f} mm/K of their slope over temperature (5.35 cm/V: DW1000 "
+                "user manual); keep the supply constant while boards warm up"
+            )
+    return said
 
 
 def _as_lasting(tested: Tested, known: Persistence) -> Tested:

@@ -38,7 +38,7 @@ from calib.estimator.known_distances import KnownDistances
 from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
-from calib.fitting.covariates import fit_with_covariates, with_new_tag
+from calib.fitting.covariates import fit_with_covariates, supply_warnings, with_new_tag
 from calib.fitting.drift import drift_of
 from calib.fitting.passive_listeners import MIN_OF_DELAY
 from calib.fitting.result import FitResult, HeldOut
@@ -119,7 +119,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         settings=settings,
         fixed=fixed,
         first=_hints(calibration, heard if settings.use == "exchanges" else 0),
-        more=[*vague, *_stopped(found, settings.loss)],
+        more=[*vague, *supply_warnings(calibration.temperatures, ranges), *_stopped(found, settings.loss)],
     )
     return replace(result, held_out=held)
 
@@ -175,7 +175,7 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
     joined = with_new_tag(joined, tag, some)
     applied = joined.apply(some)
     straight = replace(some, raw_m=some.raw_m + applied.corrected_m - applied.delay_corrected_m)
-    partners = replace(calibration, undetermined_splits=())
+    partners = replace(calibration, undetermined_splits=(), patterns=(), temperatures=())
     settings = FitSettings(
         loss=loss,
         delays_from=partners,
@@ -238,6 +238,12 @@ def _taken_over(known: Calibration | None, ranges: Ranges, *, curve: bool) -> di
     if known.undetermined_splits:
         text = f"{split_text(known.undetermined_splits)}; fit its recordings together with these"
         raise BadInputError(text, parameter="delays_from")
+    if known.patterns or known.temperatures:
+        raise BadInputError(
+            "its delays are those in average directions or at a reference temperature; fit its recordings together "
+            "with these, or take over a fit with `pattern` and `temperature` none",
+            parameter="delays_from",
+        )
     found = {tag: known.delays_ns[tag] for tag in ranges.tags() if tag in known.delays_ns}
     if not found:
         there, here = (", ".join(map(str, sorted(tags))) for tags in (known.delays_ns, ranges.tags()))

@@ -12,9 +12,10 @@ import pytest
 import calib
 import uwblink
 from benchmarks.directions import Recipe, flight
+from calib.calibration import held_out_line
 from calib.calibration.patterns import TemperatureSlope
 from calib.data.ranges import read_c
-from calib.errors import BadInputError, TemperatureWarning
+from calib.errors import BadInputError, TemperatureWarning, UnanswerableError
 from tests.calib import overhearing
 from tests.processes import call, run
 
@@ -112,8 +113,43 @@ def test_the_file_keeps_slopes_and_older_programs_refuse_it():
     assert (calib.Calibration.from_json(text), json.loads(text)["schema_version"]) == (known, 7)
     with pytest.raises(BadInputError, match=r"here: temperatures.*span_c"):
         calib.Calibration.from_json(text.replace('"span_c": [', '"span_c": [-500, '), "here")
+    table = json.loads(text)
+    table["temperatures"][0]["span_c"].reverse()
+    with pytest.raises(BadInputError, match="the lowest of `span_c` before the highest"):
+        calib.Calibration.from_json(json.dumps(table), "here")
+    with pytest.raises(BadInputError, match=r"`temperature_c`: found 1, expected those of initiator and target"):
+        known.correct(3.0, -85.0, -86.0, 1, 2, temperature_c=25.0)
     with pytest.raises(BadInputError, match="slopes over temperature"):
         calib.export(known, "ros-yaml")
+
+
+def test_delays_are_compared_at_one_temperature_or_not_at_all(tmp_path):
+    known, hotter = fitted(WARM, 3), fitted(replace(WARM, start_c=35.0), 3, temperature="shared")
+    assert hotter.temperatures[0].reference_c - known.temperatures[0].reference_c > 12
+    assert calib.compare(known, hotter).same
+    # As they are stated, delays differ by 12 K of 5 mm/K: by 0.4 ns, and so do none of the shapes.
+    blind = [replace(one, temperatures=()) for one in (known, hotter)]
+    assert abs(calib.compare(*blind).offset_m) > abs(calib.compare(known, hotter).offset_m) + 0.1
+    with pytest.raises(UnanswerableError, match=r"tags 1, 2.* slope over temperature in one of the calibrations only"):
+        calib.compare(known, blind[1])
+    with pytest.raises(BadInputError, match=r"`delays_from`.*reference temperature"):
+        calib.fit(flown(WARM, 3, 1)[0], delays_from=known)
+
+
+@pytest.mark.parametrize(
+    ("broken", "why"),
+    [
+        ({"drift": {}}, "provenance: drift"),
+        ({"drift": {"sessions": 2, "days": "x", "m2_per_day": [0, 1, 2], "told": 1, "by_age": 1}}, "provenance: drift"),
+    ],
+)
+def test_what_a_stranger_wrote_into_the_provenance_is_refused_in_a_line(tmp_path, broken, why):
+    table = json.loads(fitted(WARM, 3).to_json())
+    (tmp_path / "c.json").write_text(json.dumps(table | {"provenance": table["provenance"] | broken}))
+    done = call("calib", "show", tmp_path / "c.json")
+    assert (done.returncode, why in done.stderr, done.stderr.count("\n")) == (2, True, 1)
+    with pytest.raises(BadInputError, match="provenance: held_out"):
+        held_out_line(replace(fitted(WARM, 3), provenance={"held_out": broken}))
 
 
 MAIN = """
@@ -121,10 +157,15 @@ MAIN = """
 #include "calibration.h"
 int main(void)
 {
-    double x;
+    const double celsius[][2] = {{30.0, 24.5}, {30.0, NAN}, {NAN, NAN}};
+    double x, unknown, longer;
+    int k;
     (void)uwb_correct(1, 0, 0, 1, 2, &x, 0);
     (void)uwb_errors(0, 0, 1, 2, &x, &x, &x);
-    printf("%.17g %g %g\\n", uwb_warmth(3, 40.0), uwb_warmth(3, NAN), uwb_warmth(9, 40.0));
+    for (k = 0; k < 3; k++) {
+        longer = uwb_warmth(1, 3, celsius[k][0], celsius[k][1], &unknown);
+        printf("%.17g %.17g ", longer, unknown);
+    }
     return 0;
 }
 """
@@ -138,8 +179,14 @@ def test_the_c_header_tells_what_temperatures_add(tmp_path):
     strict = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
     subprocess.run([compiler, *strict, "main.c", "-o", "main", "-lm"], cwd=tmp_path, check=True)
     found = subprocess.run(["./main"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout.split()
-    (slope,) = fitted(WARM, 3).temperatures
-    assert list(map(float, found)) == pytest.approx([slope.m_per_k * (40 - slope.reference_c), 0, 0], abs=1e-12)
+    known, blind = fitted(WARM, 3), replace(fitted(WARM, 3), temperatures=())
+    at = (3.0, -85.0, -86.0, 1, 3)
+    plain, expected = blind.correct(*at), list[float]()
+    for celsius in ((30.0, 24.5), (30.0, np.nan), (np.nan, np.nan)):
+        seen = known.correct(*at, temperature_c=celsius)
+        expected += [plain.range_m - seen.range_m, seen.sigma_total_m**2 - plain.sigma_total_m**2]
+    # Temperatures are kept in single precision: 2e-6 K of 30.
+    assert list(map(float, found)) == pytest.approx(expected, abs=1e-8, rel=1e-5)
 
 
 def test_temperatures_lie_between_readings_and_end_half_a_minute_after_the_last():
