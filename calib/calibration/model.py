@@ -556,17 +556,12 @@ def rests_on(provenance: Mapping[str, Any]) -> str:
     return ", ".join(filter(None, parts))
 
 
-MISSHAPEN: Final = (KeyError, TypeError, ValueError)
-"""What reading a table of the provenance raises that is not as a fit writes it: that table is not checked on loading.
-"""
-
-
 def held_out_line(calibration: Calibration) -> str:
     """Return how a fit without the ranges that were held out did on them, "" where none were."""
     told = calibration.provenance.get("held_out")
     if not isinstance(told, Mapping):
         return ""
-    with raising(BadInputError, "provenance: held_out: not as `calib fit` writes it", *MISSHAPEN):
+    with raising(BadInputError, "provenance: held_out: not as `calib fit` writes it", KeyError, TypeError, ValueError):
         return _held_out(told)
 
 
@@ -584,7 +579,7 @@ def age_line(calibration: Calibration) -> str:
     told = calibration.provenance.get("drift")
     if not isinstance(told, Mapping):
         return ""
-    with raising(BadInputError, "provenance: drift: not as `calib fit` writes it", *MISSHAPEN):
+    with raising(BadInputError, "provenance: drift: not as `calib fit` writes it", KeyError, TypeError, ValueError):
         return _age(told)
 
 

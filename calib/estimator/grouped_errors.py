@@ -24,7 +24,7 @@ than 0.01 standard errors (`python -m benchmarks.constants`)."""
 DETOUR_M, DETOUR_WORTH, LEAST_DETOUR_M = 0.35, 5.0, 0.03
 """Prior of the mean of exponential detours, the number of reflections that it counts for, and the least detour
 (published detours are 0.1 to 0.5 m: MILUV, STAR-loc). Half or twice the number, or the least detour, moves delays of
-worlds by 0.01 standard errors (`python -m benchmarks.constants`)."""
+worlds by 0.02 standard errors (`python -m benchmarks.constants`)."""
 
 SHARED_LEVELS = {
     "noise": ("noise level", np.log(NOISE_M), (2 * NOISE_WORTH) ** -0.5),

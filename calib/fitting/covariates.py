@@ -132,17 +132,14 @@ def _with(
     return best
 
 
-SUPPLY_M_A_V = 0.0535
-"""By how much a range grows with the supply of a tag, m/V (DW1000 user manual, section 8.3.1)."""
-
-
 def supply_warnings(slopes: Sequence[TemperatureSlope], ranges: Ranges) -> list[str]:
     """Return a warning for each slope over temperature that a supply which changed with it may have moved by more than
     a standard error."""
     changes, said = dict(ranges.supply_v_per_k), []
     for one in slopes:
         known = [changes[tag] for tag in one.tags if tag in changes]
-        moved = SUPPLY_M_A_V * float(np.mean(known)) if known else 0.0
+        # A range grows by 5.35 cm/V with the supply of a tag (DW1000 user manual, section 8.3.1).
+        moved = 0.0535 * float(np.mean(known)) if known else 0.0
         if abs(moved) > one.std_m_per_k:
             said.append(
                 f"tags {first_few(map(str, one.tags))}: their supply changes by {1e3 * np.mean(known):+.1f} mV/K as "
@@ -183,11 +180,15 @@ def _beside_power(plain: KnownDistances, covariate: Covariate, kind: str) -> Tes
 
 
 def with_new_tag(calibration: Calibration, tag: int, ranges: Ranges) -> Calibration:
-    """Return a calibration in which a tag on a body that turns has a pattern, chosen by its `ranges`.
+    """Return a calibration in which a tag has the dependences of others, chosen by its `ranges`.
 
-    That is one which others share, if errors scatter less with it; else one that is unknown and as large as theirs, so
-    that total sigmas contain it.
+    A tag that reads its temperature shares a slope that others share. On a body that turns it has the pattern which
+    others share, if errors scatter less with it; else one that is unknown and as large as theirs, so that total sigmas
+    contain it.
     """
+    if np.isfinite(ranges.temperature_c[np.column_stack([ranges.initiator, ranges.target]) == tag]).all():
+        slopes = [replace(o, tags=(*o.tags, tag)) if len(o.tags) > 1 else o for o in calibration.temperatures]
+        calibration = replace(calibration, temperatures=tuple(slopes))
     patterns = calibration.patterns
     if tag not in ranges.turning or not patterns:
         return calibration

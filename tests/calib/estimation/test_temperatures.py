@@ -136,6 +136,18 @@ def test_delays_are_compared_at_one_temperature_or_not_at_all(tmp_path):
         calib.fit(flown(WARM, 3, 1)[0], delays_from=known)
 
 
+def test_an_added_tag_shares_the_slope_of_the_others():
+    whole, (hot, _) = fitted(WARM, 3), flown(replace(WARM, start_c=35.0), 3)
+    others = {tag: delay for tag, delay in whole.delays_ns.items() if tag != 1}
+    (slope,) = whole.temperatures
+    known = replace(whole, delays_ns=others, temperatures=(replace(slope, tags=(2, 3, 4)),))
+    with pytest.warns(TemperatureWarning):
+        added = calib.add_tag(hot, known, 1).calibration
+    assert added.temperatures == (replace(slope, tags=(2, 3, 4, 1)),)
+    # At 35 to 50 degrees, 15 K above the reference: without the slope the delay would be 0.5 ns shorter.
+    assert added.delays_ns[1] == pytest.approx(whole.delays_ns[1], abs=0.06)
+
+
 @pytest.mark.parametrize(
     ("broken", "why"),
     [
