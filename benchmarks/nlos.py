@@ -1,4 +1,4 @@
-"""Which ranges went by a detour, told from impulse responses: what simulated rooms teach of a real flight.
+"""Which ranges went by a detour, told by features of their receptions: simulated rooms left out, and a real flight.
 
 Run as a script it prints figures of docs/accuracy.md; the tests use the same functions.
 """
@@ -8,57 +8,35 @@ from __future__ import annotations
 import os
 import tarfile
 import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import roc_auc_score
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
 
+import calib
 import uwbsim
 from calib.calibration.formats import read_miluv
-from calib.data.ranges import Ranges
-from uwblink.arrays import Bools, Floats, Ints
+from calib.data.ranges import FEATURES, Ranges
+from uwblink.arrays import Bools, Floats
 from uwblink.importers import import_recording
 from uwblink.recording.contents import Contents, load
-from uwblink.recording.distances import distances_m
-from uwblink.recording.schema import CirRow
-from uwblink.twr import raw_range
 
 ROOT = Path(__file__).parents[1]
 SHARED = Path(os.environ.get("UWBCAL_DATA", ROOT.parent / "shared" / "data"))
 FLIGHT = "miluv_cirObstacles_3_random_0.tar.xz"
 DETOUR_M = 0.3
-TRAINING, HELD_OUT = range(12), range(12, 24)
-"""Numbers of rooms."""
+ROOMS = range(300, 324)
+"""Numbers of rooms: others than those with which features were chosen (0 to 23, 200 to 215)."""
 
-TAPS_BEFORE, TAPS_AFTER = 20, 100
-QUIET = 50
-"""From this tap on, up to well before the first path, there is only noise."""
+BLOCKS = 6
+"""Parts of the real flight, in order of time, of which each is left out once."""
 
-RISEN = 5.0
-EARLY_NS, LATE_NS = 10_000_000, 400_000_000
+VENDOR_DB = 6.0
+"""Total less first-path power from which a range counts as reflected (DW1000 user manual, section 4.7.1)."""
 
-
-def features(row: CirRow) -> tuple[float, float]:
-    """Return what tells a detour: total less first-path power in dB, and the first path's rise time in taps.
-
-    It rises from where the response leaves the noise (five standard deviations of a part) to its own peak: a direct
-    path too weak for the chip's threshold makes it longer.
-    """
-    taps, first = np.array(row.magnitudes, dtype=float), int(row.first_path_index)
-    own = taps[first + 1 : first + 4]
-    near = taps[first - TAPS_BEFORE : first + TAPS_AFTER]
-    noise = np.sqrt(np.mean(taps[QUIET : first - 2 * TAPS_BEFORE] ** 2) / 2)
-    begins = int(np.argmax(near > RISEN * noise)) - TAPS_BEFORE
-    return float(10 * np.log10(np.sum(near**2) / np.sum(own**2))), float(1 + np.argmax(own) - begins)
-
-
-def classifier() -> Any:
-    """Return a logistic regression on the two features."""
-    return make_pipeline(StandardScaler(), LogisticRegression())
+RESPONSE, RISE = FEATURES.index("response_db"), FEATURES.index("rise_taps")
 
 
 def room(seed: int, duration_s: float) -> uwbsim.Scenario:
@@ -93,17 +71,11 @@ def room(seed: int, duration_s: float) -> uwbsim.Scenario:
     )
 
 
-def of_room(seed: int, duration_s: float = 15.0) -> tuple[Floats, Bools]:
-    """Return features (n, 2) of a simulated room's responses, and which of the ranges went by a detour, (n,)."""
-    flight = uwbsim.simulate(room(seed, duration_s), contention=False)
-    residual = raw_range(flight.exchanges) - flight.truth_m
-    return np.array([features(row) for row in flight.cirs]), residual > DETOUR_M
-
-
-def of_rooms(seeds: range, duration_s: float = 15.0) -> tuple[Floats, Bools]:
-    """Return those of several rooms, one after the other."""
-    found, detours = zip(*(of_room(seed, duration_s) for seed in seeds), strict=True)
-    return np.concatenate(found), np.concatenate(detours)
+def of_room(seed: int, duration_s: float = 15.0) -> Ranges:
+    """Return the ranges of a simulated room's robots, with the features of their responses."""
+    found = calib.load_ranges(uwbsim.simulate(room(seed, duration_s), contention=False))
+    flying = (found.initiator >= 10) | (found.target >= 10)
+    return replace(found[flying], source=f"room {seed}", recordings=())
 
 
 def real_flight(folder: Path) -> Contents:
@@ -116,51 +88,102 @@ def real_flight(folder: Path) -> Contents:
         return load(Path(scratch) / "f.uwb")
 
 
-def of_real_flight(folder: Path) -> tuple[Floats, Floats]:
-    """Return features (n, 2) of a real flight's responses at the boards that ranged, and residuals (n,) in metres.
+def of_real_flight(folder: Path) -> Ranges:
+    """Return the ranges of the real flight; those with responses have features."""
+    return calib.load_ranges(real_flight(folder))
 
-    Residuals are those of ranges corrected with the calibration published for the boards, less their median.
+
+def published_error_m(ranges: Ranges, folder: Path) -> Floats:
+    """Return the errors (n,) of ranges corrected by the calibration published for the boards, less their median."""
+    error = read_miluv(folder / "miluv_published_calibration.json").apply(ranges).corrected_m - ranges.truth_m
+    return np.asarray(error - np.median(error))
+
+
+def without_features(ranges: Ranges) -> Ranges:
+    """Return ranges of which only powers are known."""
+    return replace(ranges, features=np.full_like(ranges.features, np.nan))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Told:
+    """What was told of ranges (n,) that were left out: their probability of a reflection, before they were measured.
+
+    `afterwards` (n,) is that probability by the same calibration and the error of the range, `long` (n,) whether it is
+    more than `DETOUR_M` too long.
     """
-    flight = real_flight(folder)
-    e = flight.exchanges
-    calibrated = read_miluv(folder / "miluv_published_calibration.json").apply(Ranges.from_exchanges(e)).corrected_m
-    residual = calibrated - distances_m(flight.poses, flight.tags, e.initiator, e.target, e.time_ns)
-    residual = residual - np.median(residual)
-    rows, which = matched(flight.cirs, e.initiator, e.target, e.time_ns)
-    return np.array([features(row) for row in rows]), residual[which]
+
+    probability: Floats
+    afterwards: Floats
+    long: Bools
+
+    @classmethod
+    def left_out(cls, parts: Sequence[Ranges]) -> Told:
+        """Fit all parts but one, and tell of that one; of each in turn."""
+        found = []
+        for k, part in enumerate(parts):
+            applied = calib.fit([one for j, one in enumerate(parts) if j != k]).calibration.apply(part)
+            error = applied.corrected_m - part.truth_m
+            found.append((applied.tail_share, applied.tail_probability, error - np.median(error) > DETOUR_M))
+        probability, afterwards, long = map(np.concatenate, zip(*found, strict=True))
+        return cls(probability=probability, afterwards=afterwards, long=long)
+
+    @property
+    def auc(self) -> float:
+        """The area under the curve of hits over false alarms, for ranges that are too long."""
+        return float(roc_auc_score(self.long, self.probability))
+
+    @property
+    def brier(self) -> float:
+        """The mean square of probability less reflection."""
+        return float(np.mean(self.afterwards * (1 - self.probability) ** 2 + (1 - self.afterwards) * self.probability**2))
+
+    def reliability(self) -> list[tuple[int, float, float]]:
+        """Return number, mean probability and share of reflections of ranges in ten bins of probability."""
+        number = np.minimum((10 * self.probability).astype(np.int64), 9)
+        bins = [number == k for k in range(10) if np.any(number == k)]
+        return [(int(b.sum()), float(self.probability[b].mean()), float(self.afterwards[b].mean())) for b in bins]
+
+    @property
+    def unreliability(self) -> float:
+        """The mean distance between probability and share of reflections, over the ranges."""
+        return sum(count * abs(told - found) for count, told, found in self.reliability()) / len(self.long)
 
 
-def matched(cirs: list[CirRow], initiator: Ints, target: Ints, time_ns: Ints) -> tuple[list[CirRow], Ints]:
-    """Return the responses that boards of an exchange printed after it, and which exchange.
-
-    The dataset gives a response 0.13 s after its exchange in the median, when it has been printed.
-    """
-    rows, which = [], []
-    for row in cirs:
-        same = np.flatnonzero((initiator == row.initiator) & (target == row.target))
-        late_ns = row.time_ns - time_ns[same]
-        near = same[(late_ns > -EARLY_NS) & (late_ns < LATE_NS)]
-        if row.board in (row.initiator, row.target) and len(near) == 1:
-            rows.append(row)
-            which.append(int(near[0]))
-    return rows, np.array(which, dtype=np.int64)
+def vendor_rule(parts: Sequence[Ranges], as_told: Told) -> Told:
+    """Return the rule by 6 dB as probabilities: of each part the shares of reflections among the flagged ranges of the
+    others, and among theirs that are not."""
+    flagged = np.concatenate([one.features[:, RESPONSE] > VENDOR_DB for one in parts])
+    part = np.repeat(np.arange(len(parts)), [len(one) for one in parts])
+    probability = np.zeros(len(part))
+    for k in range(len(parts)):
+        for group in (flagged, ~flagged):
+            probability[(part == k) & group] = np.mean(as_told.afterwards[(part != k) & group])
+    return replace(as_told, probability=probability)
 
 
-def auc(model: Any, found: Floats, detours: Bools) -> float:
-    """Return the area under the curve of hits over false alarms."""
-    return float(roc_auc_score(detours, model.predict_proba(found)[:, 1]))
+def show(name: str, parts: Sequence[Ranges]) -> None:
+    """Print what is told of parts that are left out, by all features, by power alone, and by the vendor's rule."""
+    told = Told.left_out(parts)
+    several = {
+        "features": told,
+        "power alone": Told.left_out([without_features(one) for one in parts]),
+        f"rule of {VENDOR_DB:.0f} dB": vendor_rule(parts, told),
+    }
+    for how, one in several.items():
+        print(
+            f"{name}, {how}: AUC {one.auc:.2f}, Brier score {one.brier:.3f}, probabilities off by "
+            f"{one.unreliability:.3f} on average"
+        )
+    print("  " + ", ".join(f"{p:.2f}: {found:.2f} ({count})" for count, p, found in told.reliability()))
 
 
 def main() -> None:
-    model = classifier().fit(*of_rooms(TRAINING))
-    found, detours = of_rooms(HELD_OUT)
-    print(f"held-out rooms: AUC {auc(model, found, detours):.2f}; {100 * detours.mean():.0f} % detours")
+    show("rooms", [of_room(seed) for seed in ROOMS])
     if (SHARED / FLIGHT).exists():
-        found, residual = of_real_flight(SHARED)
-        late = residual > DETOUR_M
-        print(f"real flight: AUC {auc(model, found, late):.2f}; {np.sum(late)} of {len(late)} detours")
-        each = [float(roc_auc_score(late, found[:, k])) for k in range(2)]
-        print(f"  total less first-path power alone {each[0]:.2f}, rise time alone {each[1]:.2f}")
+        flight = of_real_flight(SHARED)
+        flight = flight[np.isfinite(flight.features[:, RISE])]
+        edges = np.linspace(0, len(flight), BLOCKS + 1).astype(np.int64)
+        show("MILUV", [flight[int(a) : int(b)] for a, b in zip(edges[:-1], edges[1:], strict=True)])
 
 
 if __name__ == "__main__":

@@ -59,7 +59,7 @@ def range_errors(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Rang
         share, detour_m = np.repeat([[0.1], [0.3]], len(ranges), axis=1)
         unknown = RangeErrors(share=share, least_m=0.0, detour_m=detour_m, outlier=0.01, outlier_m=3.0)
         return noise_m(calibration, ranges), unknown
-    shapes = model.shapes(lifted, ranges.initiator, ranges.target)
+    shapes = model.shapes(lifted, ranges.initiator, ranges.target, model.log_odds_of(ranges.features))
     errors = RangeErrors(
         share=shapes.tail_share,
         least_m=model.least_m,

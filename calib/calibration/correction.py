@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from calib.calibration.applying import CorrectedRanges, columns_of, determined, within_text
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration, load_calibration
 from calib.data.arrivals import arrivals_of
+from calib.data.features import features_of
 from calib.data.ranges import Ranges
+from calib.data.sources import RecordedSource
 from calib.errors import BadInputError, LeftOutWarning
 from uwblink.arrays import Floats
 from uwblink.corrections import Columns, Correction
@@ -85,14 +87,23 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
                 f"{source}: holds {bare} differences of arrival and no ranges; `calib localize` corrects them as it "
                 "uses them, with `use` receptions"
             )
-        warm = recording.columns("temperature")
+        warm, features, first = recording.columns("temperature"), None, 0
+        if calibration.errors and calibration.errors.features:
+            # A response may belong to an exchange of the block before.
+            features = features_of(recording.exchanges(), RecordedSource(recording))
         tags, counts, left_out, why = recording.tags(), np.zeros(3, dtype=np.int64), 0, ""
         meta = {"calibration": calibration.provenance}
         with recording.copying(output, without=("exchanges", "corrected"), meta=meta, force=force) as written:
             for exchanges, poses in exchanges_with_poses(recording):
                 ranges = Ranges.from_exchanges(
-                    exchanges, poses=poses, tags=tags, source=Path(source).name, temperature=warm
+                    exchanges,
+                    poses=poses,
+                    tags=tags,
+                    source=Path(source).name,
+                    temperature=warm,
+                    features=None if features is None else features[first : first + len(exchanges)],
                 )
+                first += len(exchanges)
                 good = determined(calibration, ranges)
                 if not good.all():
                     left_out, why = left_out + int(np.count_nonzero(~good)), within_text(calibration, ranges, good)

@@ -93,6 +93,17 @@ CALIBRATION_KEYS: Final = (
     FileKey("errors.lasting.own_variance", "number, above 0", "needed", "Variance of what each range has of its own."),
     FileKey("errors.lasting.lasting_variance", "number, above 0", "needed", "Variance of what ranges of a pair share."),
     FileKey("errors.lasting.time_s", "number, s", "needed", "Time in which that part forgets."),
+    FileKey(
+        "errors.features.NAME.log_odds",
+        "number",
+        "no features",
+        "What a feature (`excess_db`, `response_db`, `rise_taps`) adds to the log odds of a reflection for each unit.",
+    ),
+    FileKey("errors.features.NAME.centre", "number, dB or taps", "needed", "Where it adds nothing."),
+    FileKey("errors.features.NAME.bounds", "2 numbers, dB or taps", "needed", "Beyond them it adds as much as at them."),
+    FileKey(
+        "errors.known_log_odds", "number", "0", "Log odds that ranges with a known feature have besides `tail_share`."
+    ),
     FileKey("errors.pairs.PAIR.noise", "number, above 0", "1", "Factor of a pair, as 1-2, on the noise."),
     FileKey("errors.pairs.PAIR.odds", "number, above 0", "1", "Its factor on the odds of a reflection."),
     FileKey("errors.pairs.PAIR.detour", "number, above 0", "1", "Its factor on the mean detour."),

@@ -18,11 +18,12 @@ from itertools import pairwise
 from typing import Annotated, Any, Final
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 from scipy.optimize.elementwise import find_root
 from scipy.special import gammainc, log_ndtr, ndtr
 
-from calib.calibration.document import Metres, Number, OpenShare, PairName, Positive, Share, StdM, joint, pair_name
-from calib.data.ranges import Ranges
+from calib.calibration.document import Metres, Number, OpenShare, PairName, Positive, Share, StdM, joint, one_of, pair_name
+from calib.data.ranges import FEATURES, Ranges
 from calib.errors import BadInputError
 from calib.pairs import Pairs, pairs_of
 from calib.range_errors.densities import ROOT_2PI, LongDetours, densities
@@ -30,6 +31,12 @@ from uwblink.arrays import Floats, Ints
 
 GATE: Final = 10.83
 """99.9 % quantile of chi-square with one degree of freedom: filters take ranges whose squared errors are below it."""
+
+
+ODDS_NODES: Final = 17
+"""Number of log odds at which quantiles are computed: between two, of a span of 8, they change by a factor of 1.6."""
+
+FeatureName = Annotated[str, one_of(FEATURES)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +59,15 @@ class PairErrors:
     detour: Positive
 
 
+@dataclass(frozen=True, slots=True)
+class FeatureSlope:
+    """What a feature adds to the log odds of a reflection for each unit above `centre`, between two `bounds`."""
+
+    log_odds: Number
+    centre: Number
+    bounds: tuple[Number, Number]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorShapes:
     """Parameters of each range (n,), or of one: noise, share of reflections, mean of their exponential detour, m."""
@@ -72,6 +88,8 @@ class ErrorModel:
     others. Without one there is one kind, as in calibrations of uwbcal up to 0.2.0. Of the noise `between_m` is what
     stays in the ranges of a pair for a recording, or a spell of it, and changes by the next; the uncertainty of delays
     and curve is in the noise, too.
+    `features` says what else tells reflections; ranges of which a feature is known have the log odds
+    `known_log_odds` besides, because `tail_share` is the share of ranges of which none is.
     `lasting` says how long errors within the gate of a filter last; None where that is not known.
     """
 
@@ -90,6 +108,20 @@ class ErrorModel:
     between_m: StdM = 0.0
     pairs: dict[PairName, PairErrors] = field(default_factory=dict)
     lasting: LastingErrors | None = None
+    features: dict[FeatureName, FeatureSlope] = field(default_factory=dict)
+    known_log_odds: Number = 0.0
+
+    def log_odds_of(self, features: Floats) -> Floats:
+        """Return what `FEATURES` (n, 3) of ranges add to the log odds of a reflection (n,), 0 where all are unknown.
+
+        One that is unknown beside others counts as at its centre.
+        """
+        found, known = np.zeros(len(features)), np.zeros(len(features), dtype=bool)
+        for name, slope in self.features.items():
+            values = features[:, FEATURES.index(name)].astype(np.float64)
+            known |= np.isfinite(values)
+            found += slope.log_odds * (np.clip(np.nan_to_num(values, nan=slope.centre), *slope.bounds) - slope.centre)
+        return found + self.known_log_odds * known
 
     def between(self, between_m: float, correction_m: Floats | float = 0.0) -> ErrorModel:
         """Return the model for other recordings, in which pairs differ by `between_m`.
@@ -129,10 +161,15 @@ class ErrorModel:
             for k, factor in zip(*powers, strict=True)
         )
 
-    def shapes(self, lifted: Floats, initiator: Ints, target: Ints) -> ErrorShapes:
-        """Return the shape of the errors of ranges (n,) at lifted powers between two tags, in either direction."""
+    def shapes(
+        self, lifted: Floats, initiator: Ints, target: Ints, log_odds: Floats | float = 0.0
+    ) -> ErrorShapes:
+        """Return the shape of the errors of ranges (n,) at lifted powers between two tags, in either direction.
+
+        `log_odds` (n,) are those that features add (`log_odds_of`).
+        """
         pairs = pairs_of(initiator, target)
-        return self._shapes(lifted, self._factors_of(pairs)[pairs.number])
+        return self._shapes(lifted, _with_odds(self._factors_of(pairs)[pairs.number], log_odds))
 
     def _shapes(self, lifted: Floats, factors: Floats) -> ErrorShapes:
         """Return shapes at lifted powers (...), from logarithms of factors (..., 3)."""
@@ -183,21 +220,33 @@ class ErrorModel:
         wild = ndtr(error / max(self.outlier_m, 1e-9))
         return np.asarray((1 - self.outlier_share) * inside + self.outlier_share * wild)
 
-    def quantiles(self, probabilities: Sequence[float], lifted: Floats, initiator: Ints, target: Ints) -> Floats:
+    def quantiles(
+        self,
+        probabilities: Sequence[float],
+        lifted: Floats,
+        initiator: Ints,
+        target: Ints,
+        log_odds: Floats | float = 0.0,
+    ) -> Floats:
         """Return the quantiles (n, k) of errors at shares (k,), for ranges (n,); NaN without a power.
 
-        They are computed at the model's powers for each pair, and interpolated linearly.
+        They are computed at the model's powers for each pair, and at some of the `log_odds` (n,) that features add, and
+        interpolated linearly.
         """
         given = np.asarray(probabilities, dtype=np.float64)
         if given.ndim != 1 or not len(given) or not np.all((given > 0) & (given < 1)):
             raise BadInputError(f"found {probabilities!r:.60}, expected shares between 0 and 1", parameter="shares")
         pairs = pairs_of(initiator, target)
-        tables = self._table(self._own_levels(given), self._factors_of(pairs))
+        odds = np.broadcast_to(log_odds, len(lifted))
+        low, high = (odds.min(), odds.max()) if len(odds) else (0.0, 0.0)
+        at_odds = np.linspace(low, high, ODDS_NODES) if high > low else np.array([low, low + 1.0])
+        factors = _with_odds(self._factors_of(pairs)[:, None], at_odds)
+        tables = self._table(self._own_levels(given), factors.reshape(-1, 3))
+        at = np.column_stack([odds, np.clip(lifted, self.lifted[0], self.lifted[-1])])
         found = np.full((len(lifted), len(given)), np.nan)
-        for pair, table in enumerate(tables):
+        for pair, table in enumerate(tables.reshape(len(factors), len(at_odds), len(self.lifted), -1)):
             rows = np.flatnonzero((pairs.number == pair) & np.isfinite(lifted))
-            for k, column in enumerate(table.T):
-                found[rows, k] = np.interp(lifted[rows], self.lifted, column)
+            found[rows] = RegularGridInterpolator((at_odds, self.lifted), table)(at[rows])
         return found
 
     def tail_given(self, error_m: Floats, shapes: ErrorShapes) -> tuple[Floats, Floats]:
@@ -235,6 +284,13 @@ class ErrorModel:
             return probabilities
         found, own = np.array(self.levels).T
         return np.asarray(np.interp(probabilities, [0.0, *found, 1.0], [0.0, *own, 1.0]))
+
+
+def _with_odds(factors: Floats, log_odds: Floats | float) -> Floats:
+    """Return logarithms of factors (..., 3) with more log odds (...)."""
+    more = np.zeros((*np.broadcast_shapes(factors.shape[:-1], np.shape(log_odds)), 3))
+    more[..., 1] = log_odds
+    return np.asarray(factors + more)
 
 
 def _mistake(model: ErrorModel) -> str:

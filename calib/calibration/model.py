@@ -240,7 +240,7 @@ class Calibration:
     def quantiles(self, ranges: Ranges, shares: Sequence[float] = (0.025, 0.975)) -> Floats:
         """Return the errors (n, k), in metres, below which shares (k,) of the errors of such corrected ranges lie.
 
-        By pair and power; the truth lies with 95 % between a corrected range less its 97.5 % and less its 2.5 %
+        By pair, power and features; the truth lies with 95 % between a corrected range less its 97.5 % and less its 2.5 %
         quantile. NaN without a power. Raises `UnanswerableError` for a calibration without `errors`, `BadInputError`
         for shares that are not between 0 and 1.
 
@@ -254,8 +254,9 @@ class Calibration:
         if self.errors is None:
             raise UnanswerableError("the calibration does not say what errors are made of; fit anew from a recording")
         lifted = self.lifted(ranges)
-        found = self.errors.quantiles(shares, lifted, ranges.initiator, ranges.target)
-        total = self.errors.total_m(self.errors.shapes(lifted, ranges.initiator, ranges.target))
+        where = (lifted, ranges.initiator, ranges.target, self.errors.log_odds_of(ranges.features))
+        found = self.errors.quantiles(shares, *where)
+        total = self.errors.total_m(self.errors.shapes(*where))
         more = np.hypot(self.bias_curve.beyond(lifted), dependences_m(self, ranges)[1])
         return np.asarray(found * np.hypot(1, more / total)[:, None])
 
@@ -446,6 +447,7 @@ def _tables(calibration: Calibration) -> dict[str, list[tuple[str, ...]]]:
         "Constants": [("pair", "constant (cm)", "interval"), *pair_rows(calibration)],
         "Patterns over direction": [("tags", "rms (cm)", "most"), *pattern_rows(calibration)],
         "Slopes over temperature": [("tags", "slope", "interval"), *temperature_rows(calibration)],
+        "Odds of a reflection": [("feature", "factor per unit", "between"), *feature_rows(calibration)],
     }
     most = 40  # tags or pairs that are printed, about a screen
     tables: dict[str, list[tuple[str, ...]]] = {
@@ -515,6 +517,15 @@ def temperature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
         for one in calibration.temperatures
     ]
     return rows + [("all", "none", f"{why}")] * bool(why)
+
+
+def feature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
+    """Return each feature that tells reflections, by which factor a unit changes their odds, and its bounds."""
+    known = calibration.errors.features if calibration.errors else {}
+    return [
+        (name, f"{math.exp(one.log_odds):.2f}", f"{one.bounds[0]:.1f} and {one.bounds[1]:.1f} {name.split('_')[1]}")
+        for name, one in known.items()
+    ]
 
 
 def curve_rows(calibration: Calibration) -> list[tuple[str, ...]]:

@@ -37,6 +37,14 @@ NO_STAMPS: Final = "range"
 STATIC: Final = "static"
 """The reason for which `without_static` leaves ranges out."""
 
+FEATURES: Final = ("excess_db", "response_db", "rise_taps")
+"""What tells reflected ranges beside the first-path power: total less first-path power as the chip reads them; the same
+of an impulse response; and the taps in which the first path rises from the noise to its peak. Each is the mean of the
+receptions of an exchange that have it.
+
+The distance beside the power was tried, too: in rooms left out it made predictions worse (docs/accuracy.md).
+"""
+
 MAX_RANGE_M: Final = 1e4
 """Ranges beyond this come from impossible stamps: no ultra-wideband radio reaches a tenth of it."""
 
@@ -63,6 +71,7 @@ class Ranges(ColumnTable):
     these exchanges, None without any. `toward` (n, 2, 3) are unit vectors from the antennas of initiator and target to
     each other, in the frames of their bodies, NaN where attitudes are not known; `turning` are tags whose bodies turn.
     `temperature_c` (n, 2) are the temperatures of initiator and target, NaN where no reading is near in time;
+    `features` (n, 3) are the `FEATURES` of their receptions, NaN where unknown.
     `supply_v_per_k` is by how much the supply of a tag changes with its temperature, where it reads both.
 
     A row with a `listener` (-1 elsewhere) is a difference of arrival without stamps: by how much farther from the
@@ -94,15 +103,16 @@ class Ranges(ColumnTable):
     turning: tuple[int, ...] = ()
     temperature_c: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.float32))
     supply_v_per_k: tuple[tuple[int, float], ...] = ()
+    features: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, len(FEATURES)), dtype=np.float32))
     listener: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
-        """Put all ranges into one session, and take directions and temperatures for unknown, where none are given."""
+        """Put all ranges into one session, and take what is known of their ends for unknown, where nothing is given."""
         if len(self.listener) != len(self.time_ns):
             object.__setattr__(self, "listener", np.full(len(self.time_ns), -1))
         if len(self.session) != len(self.time_ns):
             object.__setattr__(self, "session", np.zeros(len(self.time_ns), dtype=np.int32))
-        for name, shape in (("toward", (2, 3)), ("temperature_c", (2,))):
+        for name, shape in (("toward", (2, 3)), ("temperature_c", (2,)), ("features", (len(FEATURES),))):
             if len(getattr(self, name)) != len(self.time_ns):
                 object.__setattr__(self, name, np.broadcast_to(np.float32(np.nan), (len(self.time_ns), *shape)))
 
@@ -118,12 +128,13 @@ class Ranges(ColumnTable):
         source: str = IN_MEMORY,
         antenna_delays: AntennaDelays | None = None,
         temperature: Mapping[str, NDArray[Any]] | None = None,
+        features: NDArray[np.float32] | None = None,
     ) -> Ranges:
         """Return a row for every exchange, usable or not (`usable` leaves out those that a fit cannot use).
 
         True distances are `truth_m` (n,), or those of the exchanges; where neither is finite they come from `poses` and
         the lever arms of `tags`. A power that cannot have been measured is NaN. `temperature` are readings, the columns
-        of a recording's table. Raises `BadInputError` where `truth_m` has another length than the exchanges.
+        of a recording's table, and `features` (n, 3) the `FEATURES`. Raises `BadInputError` where `truth_m` has another length than the exchanges.
         """
         truth = exchanges.truth_m if truth_m is None else np.asarray(truth_m, dtype=np.float64)
         if truth.shape != (len(exchanges),):
@@ -135,6 +146,8 @@ class Ranges(ColumnTable):
             truth = np.where(np.isfinite(truth), truth, distance)
             turning = {body for body, track in tracks.items() if track.turn_rad() > LEAST_TURN_RAD}
             seen = {"toward": toward.astype(np.float32), "turning": tuple(t.tag for t in tags if t.body in turning)}
+        if features is not None:
+            seen["features"] = features
         if temperature:
             ends = np.column_stack([exchanges.initiator, exchanges.target])
             seen["temperature_c"] = read_c(temperature, ends, exchanges.time_ns)
@@ -178,6 +191,7 @@ class Ranges(ColumnTable):
         azimuth_deg: tuple[ArrayLike, ArrayLike] = (math.nan, math.nan),
         elevation_deg: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
         temperature_c: tuple[ArrayLike, ArrayLike] = (math.nan, math.nan),
+        features: Mapping[str, ArrayLike] | None = None,
         source: str = IN_MEMORY,
     ) -> Ranges:
         """Return a row for every range of arrays (n,), metres and dBm; a single number serves all rows.
@@ -186,8 +200,8 @@ class Ranges(ColumnTable):
         range is `fpp1_dbm`. `weights` are those of the two delays (`uwblink.twr.delay_weights`): by default halves, as
         if both clocks ran alike, which changes no range by more than a hundredth of a millimetre. `azimuth_deg` and
         `elevation_deg` are the directions from the antennas of initiator and target to each other, in the frames of
-        their bodies; only a direction pattern needs them. `temperature_c` are the temperatures of both. Raises
-        `BadInputError` where the arrays do not fit each other.
+        their bodies; only a direction pattern needs them. `temperature_c` are the temperatures of both, `features` any of
+        `FEATURES` by name. Raises `BadInputError` where the arrays do not fit each other, and for unknown features.
 
         >>> from calib import Ranges
         >>> len(Ranges.from_arrays([3.1, 4.2], initiator=1, target=[2, 3], fpp1_dbm=-85.0))
@@ -195,6 +209,9 @@ class Ranges(ColumnTable):
         """
         if protocol not in PROTOCOLS:
             raise BadInputError(f"found {protocol!r:.40}, allowed: {', '.join(PROTOCOLS)}", parameter="protocol")
+        told = dict.fromkeys(FEATURES, math.nan) | dict(features or {})
+        if len(told) > len(FEATURES):
+            raise BadInputError(f"found {[*told][-1]!r:.40}, allowed: {', '.join(FEATURES)}", parameter="features")
         angles = {"azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
         both = {"temperature_c": temperature_c} | angles
         for name, pair in ({"weights": weights} | both).items():
@@ -207,6 +224,7 @@ class Ranges(ColumnTable):
             "fpp2_dbm": math.nan if fpp2_dbm is None else fpp2_dbm,
             **dict(zip(("weight_initiator", "weight_target"), weights, strict=True)),
             **{f"{name} {end}": pair[end] for name, pair in both.items() for end in (0, 1)},
+            **told,
         }
         ints = {"initiator": initiator, "target": target, "time_ns": time_ns}
         with raising(BadInputError, "arrays of ranges do not fit each other", TypeError, ValueError):
@@ -224,6 +242,7 @@ class Ranges(ColumnTable):
         warm, around, up = (np.array([columns.pop(f"{name} {end}") for end in (0, 1)]).T for name in both)
         columns["temperature_c"], around, up = measured_c(warm), np.radians(around), np.radians(up)
         toward = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1)
+        columns["features"] = np.array([columns.pop(name) for name in FEATURES], dtype=np.float32).T
         found = cls(source=source, protocol=np.full(len(rows[0]), protocol), excluded={}, planted=None, **columns)
         if not np.isfinite(around).any():
             return found
@@ -299,8 +318,8 @@ class Ranges(ColumnTable):
         return found if self.arrivals is None else replace(found, arrivals=self.arrivals.of_exchanges(rows, len(self)))
 
     def to_dict(self) -> dict[str, NDArray[Any]]:
-        """Return the columns by name, (n,) each, without directions, temperatures and listeners."""
-        hidden = ("toward", "temperature_c", "listener")
+        """Return the columns by name, (n,) each, without directions, temperatures, features and listeners."""
+        hidden = ("toward", "temperature_c", "features", "listener")
         return {name: column for name, column in self._columns().items() if name not in hidden}
 
     def _title(self) -> str:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline
 
 from calib.data.arrivals import arrivals_of
+from calib.data.features import features_of
 from calib.data.ranges import (
     FAINTEST_DBM,
     IN_MEMORY,
@@ -43,7 +44,7 @@ class Source(Protocol):
 
     A simulation's result has these attributes. Used where they exist: `planted`, what a simulation put in, which is
     shown and never used (or `meta` with that entry, and with the programmed antenna delays); `faults`; `overheard`,
-    `temperature` and `differences`, columns of the recording's tables.
+    `temperature`, `powers` and `differences`, columns of the recording's tables; `cirs`, impulse responses.
     """
 
     @property
@@ -71,7 +72,7 @@ READERS: Final[dict[str, Callable[[Recording], Any]]] = {
     "faults": Recording.faults,
     **{
         table: partial(Recording.columns, table=table)
-        for table in ("overheard", "imu", "height", "temperature", "differences")
+        for table in ("overheard", "imu", "height", "temperature", "powers", "differences")
     },
     "arrangements": Recording.arrangements,
     "known_distances": Recording.known_distances,
@@ -337,6 +338,7 @@ def load_flight(
             source=name,
             antenna_delays=antenna_delays_of(source, name),
             temperature=getattr(source, "temperature", None),
+            features=features_of(exchanges, source),
         )
         heard = getattr(source, "overheard", None)
         if heard and len(heard["time_ns"]):

@@ -20,6 +20,7 @@ from calib.estimator.covariates import COVARIATES, Covariate
 from calib.estimator.grouped_errors import error_unknowns, logarithms, scattered
 from calib.estimator.identifiability import free_directions
 from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
+from calib.estimator.reflection_features import ReflectionFeatures
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Unknown
 from calib.pairs import Pairs, pairs_of
@@ -244,6 +245,10 @@ class RangeModel:
                         logarithms(kind, several, np.zeros(len(several)), rough, Prior.of_deviation(deviation))
                     )
                     parts.append(Part(parameter=parameter, kind=kind, columns=self.noise.columns, values=values))
+        if (features := ReflectionFeatures.of(self.ranges)) is not None:
+            unknown, part = features.block()
+            unknowns.append(unknown)
+            parts.append(part)
         return Mixture(), tuple(unknowns), tuple(parts)
 
     def build(

@@ -22,6 +22,7 @@ from calib.estimator.covariates import COMMON, OF_PLACES, OWN, OWN_WARMTH, WARMT
 from calib.estimator.known_distances import LARGEST_SPREAD_M, DescribedErrors, KnownDistances, described_errors
 from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel, SplineValues
 from calib.estimator.range_rows import RESIDUAL
+from calib.estimator.reflection_features import KIND, ReflectionFeatures
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
 from calib.range_errors.densities import LONG_FACTOR, LongDetours
 from calib.spread import robust_spread
@@ -281,6 +282,9 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
             )
         },
     )
+    if (features := ReflectionFeatures.of(model.ranges)) is not None:
+        share = stated.shapes(model.lifted, model.ranges.initiator, model.ranges.target).tail_share
+        stated = features.state(stated, values[KIND], share)
     return _with_quantiles(stated, model, residual)
 
 
@@ -368,7 +372,8 @@ def _with_quantiles(model: ErrorModel, of: RangeModel, residual: Floats) -> Erro
     # More than 20 000 ranges change nothing.
     rows = np.linspace(0, len(residual) - 1, min(20_000, len(residual))).astype(np.int64)
     error = residual[rows]
-    shapes = model.shapes(of.lifted[rows], of.ranges.initiator[rows], of.ranges.target[rows])
+    some = of.ranges[rows]
+    shapes = model.shapes(of.lifted[rows], some.initiator, some.target, model.log_odds_of(some.features))
     level = np.quantile(model.below(error, shapes), QUANTILE_SHARES)
     away = error - model.mean_m(shapes)
     within = np.abs(away) < BEYOND_MEANS * (model.least_m + model.long.longest * shapes.detour_m)

@@ -1,0 +1,121 @@
+"""Features of receptions beside the first-path power, which tell direct ranges from reflected ones.
+
+Total powers come from the table `powers`, impulse responses from `cirs`. A direct path too weak for the chip's
+threshold lies before the first path that the chip found: energy comes later, and the response rises more slowly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.data.ranges import FEATURES, measured_powers
+from uwblink.arrays import Floats, Ints
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import CirRow
+from uwblink.twr import Exchanges
+
+TAPS_BEFORE, TAPS_AFTER, QUIET_FROM = 20, 100, 50
+"""Taps around the first path that count, and the tap from which there is only noise up to well before it. A response of
+100 taps (100 ns) contains detours of 30 m."""
+
+RISEN = 5.0
+"""A tap has left the noise from so many standard deviations of a part of it: of 20 taps one in 10,000 by chance."""
+
+PRINTED_EARLY_NS, PRINTED_LATE_NS = 10_000_000, 400_000_000
+"""An impulse response belongs to the last exchange of its pair in this time: boards print it afterwards, in MILUV 0.13 s
+in the median."""
+
+Columns = Mapping[str, NDArray[Any]]
+
+
+def response_features(magnitudes: Iterable[int], first_path_index: float) -> tuple[float, float]:
+    """Return the energy of an impulse response over that of its first path in dB, and the rise time in taps.
+
+    Both are NaN where the first path lies too near to the ends of the response.
+    """
+    taps = np.asarray(magnitudes, dtype=np.float64)
+    inside = QUIET_FROM + 3 * TAPS_BEFORE <= first_path_index <= len(taps) - TAPS_AFTER
+    first = int(first_path_index) if inside else 0
+    own = taps[first + 1 : first + 4]
+    if not inside or not own.any():
+        return np.nan, np.nan
+    near = taps[first - TAPS_BEFORE : first + TAPS_AFTER]
+    noise = np.sqrt(np.mean(taps[QUIET_FROM : first - 2 * TAPS_BEFORE] ** 2) / 2)
+    begins = int(np.argmax(near > RISEN * noise)) - TAPS_BEFORE
+    return float(10 * np.log10(np.sum(near**2) / np.sum(own**2))), float(1 + np.argmax(own) - begins)
+
+
+def features_of(exchanges: Exchanges, source: object) -> NDArray[np.float32] | None:
+    """Return the `FEATURES` (n, 3) of exchanges by the tables `powers` and `cirs` of a source, NaN where unknown.
+
+    None where the source has neither.
+    """
+    totals: Columns = getattr(source, "powers", None) or {}
+    found = np.full((len(exchanges), len(FEATURES)), np.nan, dtype=np.float32)
+    if len(totals.get("time_ns", ())):
+        rows, which = _exchange_of(exchanges, totals, 0, 0)
+        first_paths = np.column_stack([exchanges.fpp1_dbm, exchanges.fpp2_dbm])[which]
+        total = np.column_stack([totals["rxp1_dbm"], totals["rxp2_dbm"]])[rows]
+        excess = measured_powers(total) - measured_powers(first_paths)
+        found[:, 0] = _means(which, excess, len(exchanges))
+    for some in _responses(source):
+        of_ends = (some["board"] == some["initiator"]) | (some["board"] == some["target"])
+        some = {name: column[of_ends] for name, column in some.items()}
+        rows, which = _exchange_of(exchanges, some, PRINTED_EARLY_NS, PRINTED_LATE_NS)
+        told = [response_features(some["magnitudes"][row], some["first_path_index"][row]) for row in rows]
+        for k, values in enumerate(np.array(told).reshape(-1, 2).T, 1):
+            means = _means(which, values[:, None], len(exchanges))
+            found[:, k] = np.where(np.isfinite(means), means, found[:, k])
+    return found if np.isfinite(found).any() else None
+
+
+def _responses(source: object) -> Iterable[Columns]:
+    """Yield the impulse responses of a source as columns, those of a recording some at a time: each has 2 kB."""
+    recording = getattr(source, "recording", None)
+    if isinstance(recording, Recording):
+        edges = recording.dividing_times("cirs", 2000)
+        for start_ns, end_ns in pairwise([*edges[:-1], edges[-1] + 1] if edges else []):
+            yield recording.columns("cirs", start_ns, end_ns)
+    elif rows := getattr(source, "cirs", None):
+        yield {name: _column([getattr(row, name) for row in rows]) for name in CirRow.__dataclass_fields__}
+
+
+def _column(values: list[Any]) -> NDArray[Any]:
+    column = np.empty(len(values), dtype=object if isinstance(values[0], tuple) else type(values[0]))
+    column[:] = values
+    return column
+
+
+def _exchange_of(exchanges: Exchanges, rows: Columns, early_ns: int, late_ns: int) -> tuple[Ints, Ints]:
+    """Return which rows belong to an exchange (m,), and the exchange of each: the last one of their pair before them.
+
+    It lies up to `late_ns` before a row, and up to `early_ns` after it.
+    """
+    pairs, time_ns = _pairs(exchanges.initiator, exchanges.target), exchanges.time_ns
+    order = np.lexsort((time_ns, pairs))
+    own = _pairs(rows["initiator"], rows["target"])
+    found = np.full(len(own), -1)
+    for pair in np.unique(own).tolist():
+        some, mine = order[pairs[order] == pair], np.flatnonzero(own == pair)
+        before = np.searchsorted(time_ns[some], rows["time_ns"][mine] + early_ns, side="right") - 1
+        found[mine] = np.where(before >= 0, some[before] if len(some) else -1, -1)
+    late = rows["time_ns"] - time_ns[found] > late_ns if len(time_ns) else True
+    belongs = np.flatnonzero((found >= 0) & ~late)
+    return belongs, found[belongs]
+
+
+def _pairs(initiator: Ints, target: Ints) -> Ints:
+    return np.asarray(initiator).astype(np.int64) << 16 | np.asarray(target).astype(np.int64)
+
+
+def _means(which: Ints, values: Floats, count: int) -> Floats:
+    """Return the mean of finite values (m, k) by the exchange that they belong to (count,), NaN without any."""
+    known = np.isfinite(values)
+    total = np.bincount(which, np.where(known, values, 0.0).sum(axis=1), count)
+    number = np.bincount(which, known.sum(axis=1), count)
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
