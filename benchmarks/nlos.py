@@ -10,6 +10,7 @@ import tarfile
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -118,10 +119,12 @@ class Told:
 
     @classmethod
     def left_out(cls, parts: Sequence[Ranges]) -> Told:
-        """Fit all parts but one, and tell of that one; of each in turn."""
+        """Fit all parts but one, and tell of that one; of each in turn. Parts of one source are of one recording."""
+        whole = len({part.source for part in parts}) == 1
         found = []
         for k, part in enumerate(parts):
-            applied = calib.fit([one for j, one in enumerate(parts) if j != k]).calibration.apply(part)
+            others = [one for j, one in enumerate(parts) if j != k]
+            applied = calib.fit(Ranges.concatenate(others) if whole else others).calibration.apply(part)
             error = applied.corrected_m - part.truth_m
             found.append((applied.tail_share, applied.tail_probability, error - np.median(error) > DETOUR_M))
         probability, afterwards, long = map(np.concatenate, zip(*found, strict=True))
@@ -135,7 +138,9 @@ class Told:
     @property
     def brier(self) -> float:
         """The mean square of probability less reflection."""
-        return float(np.mean(self.afterwards * (1 - self.probability) ** 2 + (1 - self.afterwards) * self.probability**2))
+        return float(
+            np.mean(self.afterwards * (1 - self.probability) ** 2 + (1 - self.afterwards) * self.probability**2)
+        )
 
     def reliability(self) -> list[tuple[int, float, float]]:
         """Return number, mean probability and share of reflections of ranges in ten bins of probability."""
@@ -182,8 +187,8 @@ def main() -> None:
     if (SHARED / FLIGHT).exists():
         flight = of_real_flight(SHARED)
         flight = flight[np.isfinite(flight.features[:, RISE])]
-        edges = np.linspace(0, len(flight), BLOCKS + 1).astype(np.int64)
-        show("MILUV", [flight[int(a) : int(b)] for a, b in zip(edges[:-1], edges[1:], strict=True)])
+        edges = np.linspace(0, len(flight), BLOCKS + 1).astype(int).tolist()
+        show("MILUV", [flight[a:b] for a, b in pairwise(edges)])
 
 
 if __name__ == "__main__":

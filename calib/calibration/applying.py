@@ -28,8 +28,8 @@ class CorrectedRanges(ColumnTable):
     """Ranges in three stages, metres, and what is known of them, shape (n,).
 
     `sigma_m` is the noise of direct ranges. `sigma_total_m` is the standard deviation of all of them, reflected ones
-    included, about a mean of `mean_error_m`; `tail_share` is the share of such ranges that are
-    reflected: of this pair at this power, with these features. `tail_probability` is the same given the range itself, where its true distance is known, and
+    included, about a mean of `mean_error_m`; `tail_share` is the probability of a reflection by pair,
+    power and features. `tail_probability` is the same given the range itself, where its true distance is known, and
     `outlier` marks what is then neither noise nor a reflection; elsewhere it equals `tail_share`, and nothing is
     marked. `clamped` marks lifted powers at which the curves had no data and are held constant; `sigma_total_m` grows
     there by the slope of the curve at its end, and by what directions and temperatures leave open. All but `sigma_m`

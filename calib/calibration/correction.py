@@ -87,10 +87,10 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
                 f"{source}: holds {bare} differences of arrival and no ranges; `calib localize` corrects them as it "
                 "uses them, with `use` receptions"
             )
-        warm, features, first = recording.columns("temperature"), None, 0
-        if calibration.errors and calibration.errors.features:
-            # A response may belong to an exchange of the block before.
-            features = features_of(recording.exchanges(), RecordedSource(recording))
+        warm, first = recording.columns("temperature"), 0
+        told = calibration.errors.features if calibration.errors else {}
+        # A response may belong to an exchange of the block before.
+        features = features_of(recording.exchanges(), RecordedSource(recording)) if told else None
         tags, counts, left_out, why = recording.tags(), np.zeros(3, dtype=np.int64), 0, ""
         meta = {"calibration": calibration.provenance}
         with recording.copying(output, without=("exchanges", "corrected"), meta=meta, force=force) as written:
@@ -101,8 +101,9 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
                     tags=tags,
                     source=Path(source).name,
                     temperature=warm,
-                    features=None if features is None else features[first : first + len(exchanges)],
                 )
+                if features is not None:
+                    ranges = replace(ranges, features=features[first : first + len(exchanges)])
                 first += len(exchanges)
                 good = determined(calibration, ranges)
                 if not good.all():

@@ -100,7 +100,9 @@ CALIBRATION_KEYS: Final = (
         "What a feature (`excess_db`, `response_db`, `rise_taps`) adds to the log odds of a reflection for each unit.",
     ),
     FileKey("errors.features.NAME.centre", "number, dB or taps", "needed", "Where it adds nothing."),
-    FileKey("errors.features.NAME.bounds", "2 numbers, dB or taps", "needed", "Beyond them it adds as much as at them."),
+    FileKey(
+        "errors.features.NAME.bounds", "2 numbers, dB or taps", "needed", "Beyond them it adds as much as at them."
+    ),
     FileKey(
         "errors.known_log_odds", "number", "0", "Log odds that ranges with a known feature have besides `tail_share`."
     ),

@@ -18,11 +18,23 @@ from itertools import pairwise
 from typing import Annotated, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.optimize.elementwise import find_root
 from scipy.special import gammainc, log_ndtr, ndtr
 
-from calib.calibration.document import Metres, Number, OpenShare, PairName, Positive, Share, StdM, joint, one_of, pair_name
+from calib.calibration.document import (
+    Metres,
+    Number,
+    OpenShare,
+    PairName,
+    Positive,
+    Share,
+    StdM,
+    joint,
+    one_of,
+    pair_name,
+)
 from calib.data.ranges import FEATURES, Ranges
 from calib.errors import BadInputError
 from calib.pairs import Pairs, pairs_of
@@ -32,9 +44,6 @@ from uwblink.arrays import Floats, Ints
 GATE: Final = 10.83
 """99.9 % quantile of chi-square with one degree of freedom: filters take ranges whose squared errors are below it."""
 
-
-ODDS_NODES: Final = 17
-"""Number of log odds at which quantiles are computed: between two, of a span of 8, they change by a factor of 1.6."""
 
 FeatureName = Annotated[str, one_of(FEATURES)]
 
@@ -111,7 +120,7 @@ class ErrorModel:
     features: dict[FeatureName, FeatureSlope] = field(default_factory=dict)
     known_log_odds: Number = 0.0
 
-    def log_odds_of(self, features: Floats) -> Floats:
+    def log_odds_of(self, features: NDArray[np.floating]) -> Floats:
         """Return what `FEATURES` (n, 3) of ranges add to the log odds of a reflection (n,), 0 where all are unknown.
 
         One that is unknown beside others counts as at its centre.
@@ -161,9 +170,7 @@ class ErrorModel:
             for k, factor in zip(*powers, strict=True)
         )
 
-    def shapes(
-        self, lifted: Floats, initiator: Ints, target: Ints, log_odds: Floats | float = 0.0
-    ) -> ErrorShapes:
+    def shapes(self, lifted: Floats, initiator: Ints, target: Ints, log_odds: Floats | float = 0.0) -> ErrorShapes:
         """Return the shape of the errors of ranges (n,) at lifted powers between two tags, in either direction.
 
         `log_odds` (n,) are those that features add (`log_odds_of`).
@@ -239,7 +246,8 @@ class ErrorModel:
         pairs = pairs_of(initiator, target)
         odds = np.broadcast_to(log_odds, len(lifted))
         low, high = (odds.min(), odds.max()) if len(odds) else (0.0, 0.0)
-        at_odds = np.linspace(low, high, ODDS_NODES) if high > low else np.array([low, low + 1.0])
+        # Between two of 17 nodes of a span of 8, odds change by a factor of 1.6.
+        at_odds = np.linspace(low, high, 17) if high > low else np.array([low, low + 1.0])
         factors = _with_odds(self._factors_of(pairs)[:, None], at_odds)
         tables = self._table(self._own_levels(given), factors.reshape(-1, 3))
         at = np.column_stack([odds, np.clip(lifted, self.lifted[0], self.lifted[-1])])

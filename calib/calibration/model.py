@@ -240,9 +240,9 @@ class Calibration:
     def quantiles(self, ranges: Ranges, shares: Sequence[float] = (0.025, 0.975)) -> Floats:
         """Return the errors (n, k), in metres, below which shares (k,) of the errors of such corrected ranges lie.
 
-        By pair, power and features; the truth lies with 95 % between a corrected range less its 97.5 % and less its 2.5 %
-        quantile. NaN without a power. Raises `UnanswerableError` for a calibration without `errors`, `BadInputError`
-        for shares that are not between 0 and 1.
+        By pair, power and features; the truth lies with 95 % between a corrected range less its 97.5 % and less its
+        2.5 % quantile. NaN without a power. Raises `UnanswerableError` for a calibration without `errors`,
+        `BadInputError` for shares that are not between 0 and 1.
 
         >>> import calib
         >>> known = calib.fit(calib.sample_flight()).calibration
@@ -523,7 +523,11 @@ def feature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
     """Return each feature that tells reflections, by which factor a unit changes their odds, and its bounds."""
     known = calibration.errors.features if calibration.errors else {}
     return [
-        (name, f"{math.exp(one.log_odds):.2f}", f"{one.bounds[0]:.1f} and {one.bounds[1]:.1f} {name.split('_')[1]}")
+        (
+            name,
+            f"{math.exp(one.log_odds):.2f}",
+            "{:.1f} and {:.1f} {}".format(*one.bounds, "taps" if name == "rise_taps" else "dB"),
+        )
         for name, one in known.items()
     ]
 

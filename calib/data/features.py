@@ -23,13 +23,6 @@ TAPS_BEFORE, TAPS_AFTER, QUIET_FROM = 20, 100, 50
 """Taps around the first path that count, and the tap from which there is only noise up to well before it. A response of
 100 taps (100 ns) contains detours of 30 m."""
 
-RISEN = 5.0
-"""A tap has left the noise from so many standard deviations of a part of it: of 20 taps one in 10,000 by chance."""
-
-PRINTED_EARLY_NS, PRINTED_LATE_NS = 10_000_000, 400_000_000
-"""An impulse response belongs to the last exchange of its pair in this time: boards print it afterwards, in MILUV 0.13 s
-in the median."""
-
 Columns = Mapping[str, NDArray[Any]]
 
 
@@ -46,19 +39,17 @@ def response_features(magnitudes: Iterable[int], first_path_index: float) -> tup
         return np.nan, np.nan
     near = taps[first - TAPS_BEFORE : first + TAPS_AFTER]
     noise = np.sqrt(np.mean(taps[QUIET_FROM : first - 2 * TAPS_BEFORE] ** 2) / 2)
-    begins = int(np.argmax(near > RISEN * noise)) - TAPS_BEFORE
+    # Magnitudes of noise are Rayleigh-distributed: of 20 taps one in 10,000 is above five deviations of a part.
+    begins = int(np.argmax(near > 5 * noise)) - TAPS_BEFORE
     return float(10 * np.log10(np.sum(near**2) / np.sum(own**2))), float(1 + np.argmax(own) - begins)
 
 
-def features_of(exchanges: Exchanges, source: object) -> NDArray[np.float32] | None:
-    """Return the `FEATURES` (n, 3) of exchanges by the tables `powers` and `cirs` of a source, NaN where unknown.
-
-    None where the source has neither.
-    """
+def features_of(exchanges: Exchanges, source: object) -> NDArray[np.float32]:
+    """Return the `FEATURES` (n, 3) of exchanges by the tables `powers` and `cirs` of a source, NaN where unknown."""
     totals: Columns = getattr(source, "powers", None) or {}
     found = np.full((len(exchanges), len(FEATURES)), np.nan, dtype=np.float32)
     if len(totals.get("time_ns", ())):
-        rows, which = _exchange_of(exchanges, totals, 0, 0)
+        rows, which = _exchange_of(exchanges, totals, early_ns=0, late_ns=0)
         first_paths = np.column_stack([exchanges.fpp1_dbm, exchanges.fpp2_dbm])[which]
         total = np.column_stack([totals["rxp1_dbm"], totals["rxp2_dbm"]])[rows]
         excess = measured_powers(total) - measured_powers(first_paths)
@@ -66,12 +57,13 @@ def features_of(exchanges: Exchanges, source: object) -> NDArray[np.float32] | N
     for some in _responses(source):
         of_ends = (some["board"] == some["initiator"]) | (some["board"] == some["target"])
         some = {name: column[of_ends] for name, column in some.items()}
-        rows, which = _exchange_of(exchanges, some, PRINTED_EARLY_NS, PRINTED_LATE_NS)
+        # Boards print a response after its exchange, in MILUV 0.13 s in the median.
+        rows, which = _exchange_of(exchanges, some, early_ns=10_000_000, late_ns=400_000_000)
         told = [response_features(some["magnitudes"][row], some["first_path_index"][row]) for row in rows]
         for k, values in enumerate(np.array(told).reshape(-1, 2).T, 1):
             means = _means(which, values[:, None], len(exchanges))
             found[:, k] = np.where(np.isfinite(means), means, found[:, k])
-    return found if np.isfinite(found).any() else None
+    return found
 
 
 def _responses(source: object) -> Iterable[Columns]:
@@ -91,7 +83,7 @@ def _column(values: list[Any]) -> NDArray[Any]:
     return column
 
 
-def _exchange_of(exchanges: Exchanges, rows: Columns, early_ns: int, late_ns: int) -> tuple[Ints, Ints]:
+def _exchange_of(exchanges: Exchanges, rows: Columns, *, early_ns: int, late_ns: int) -> tuple[Ints, Ints]:
     """Return which rows belong to an exchange (m,), and the exchange of each: the last one of their pair before them.
 
     It lies up to `late_ns` before a row, and up to `early_ns` after it.

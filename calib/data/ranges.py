@@ -128,13 +128,12 @@ class Ranges(ColumnTable):
         source: str = IN_MEMORY,
         antenna_delays: AntennaDelays | None = None,
         temperature: Mapping[str, NDArray[Any]] | None = None,
-        features: NDArray[np.float32] | None = None,
     ) -> Ranges:
         """Return a row for every exchange, usable or not (`usable` leaves out those that a fit cannot use).
 
         True distances are `truth_m` (n,), or those of the exchanges; where neither is finite they come from `poses` and
         the lever arms of `tags`. A power that cannot have been measured is NaN. `temperature` are readings, the columns
-        of a recording's table, and `features` (n, 3) the `FEATURES`. Raises `BadInputError` where `truth_m` has another length than the exchanges.
+        of a recording's table. Raises `BadInputError` where `truth_m` has another length than the exchanges.
         """
         truth = exchanges.truth_m if truth_m is None else np.asarray(truth_m, dtype=np.float64)
         if truth.shape != (len(exchanges),):
@@ -146,8 +145,6 @@ class Ranges(ColumnTable):
             truth = np.where(np.isfinite(truth), truth, distance)
             turning = {body for body, track in tracks.items() if track.turn_rad() > LEAST_TURN_RAD}
             seen = {"toward": toward.astype(np.float32), "turning": tuple(t.tag for t in tags if t.body in turning)}
-        if features is not None:
-            seen["features"] = features
         if temperature:
             ends = np.column_stack([exchanges.initiator, exchanges.target])
             seen["temperature_c"] = read_c(temperature, ends, exchanges.time_ns)
@@ -200,8 +197,8 @@ class Ranges(ColumnTable):
         range is `fpp1_dbm`. `weights` are those of the two delays (`uwblink.twr.delay_weights`): by default halves, as
         if both clocks ran alike, which changes no range by more than a hundredth of a millimetre. `azimuth_deg` and
         `elevation_deg` are the directions from the antennas of initiator and target to each other, in the frames of
-        their bodies; only a direction pattern needs them. `temperature_c` are the temperatures of both, `features` any of
-        `FEATURES` by name. Raises `BadInputError` where the arrays do not fit each other, and for unknown features.
+        their bodies; only a direction pattern needs them. `temperature_c` are the temperatures of both, `features` some
+        of `FEATURES` by name. Raises `BadInputError` where the arrays do not fit each other, and for unknown features.
 
         >>> from calib import Ranges
         >>> len(Ranges.from_arrays([3.1, 4.2], initiator=1, target=[2, 3], fpp1_dbm=-85.0))

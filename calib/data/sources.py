@@ -338,8 +338,8 @@ def load_flight(
             source=name,
             antenna_delays=antenna_delays_of(source, name),
             temperature=getattr(source, "temperature", None),
-            features=features_of(exchanges, source),
         )
+        found = replace(found, features=features_of(exchanges, source))
         heard = getattr(source, "overheard", None)
         if heard and len(heard["time_ns"]):
             arrivals = arrivals_of(exchanges, found.raw_m, heard, source.poses, source.tags, need_truth=need_truth)

@@ -19,7 +19,7 @@ from calib.estimator.unknowns import Prior, Unknown
 from uwblink.arrays import Floats
 
 KIND = "odds of feature"
-UNITS = np.array([3.0, 3.0, 2.0])
+UNIT_OF_PRIOR = np.array([3.0, 3.0, 2.0])
 """Changes of `FEATURES` (dB, dB, taps) that may well change the odds of a reflection by a factor of e: the standard
 deviation of the prior of a slope is one a unit. Chips' makers take 6 dB for a sign of a reflection (DW1000 user manual,
 section 4.7.1 and APS006), two of these."""
@@ -47,7 +47,7 @@ class ReflectionFeatures:
         found = np.column_stack(list(varied.values()))
         centre, bounds = np.nanmean(found, axis=0), np.array([np.nanmin(found, axis=0), np.nanmax(found, axis=0)])
         unknown = ~np.isfinite(found).any(axis=1)
-        values = np.column_stack([np.nan_to_num((found - centre) / UNITS[[*varied]]), unknown])
+        values = np.column_stack([np.nan_to_num((found - centre) / UNIT_OF_PRIOR[[*varied]]), unknown])
         return cls(number=[*varied], centre=centre, bounds=bounds, values=values)
 
     def block(self) -> tuple[Unknown, Part]:
@@ -65,7 +65,7 @@ class ReflectionFeatures:
         base, mean = logit(share), float(np.mean(expit(logit(share) + self.values @ slopes)))
         shift = float(brentq(lambda more: np.mean(expit(base + more)) - mean, -50.0, 50.0))
         features = {
-            FEATURES[k]: FeatureSlope(float(slope / UNITS[k]), float(centre), (float(low), float(high)))
+            FEATURES[k]: FeatureSlope(float(slope / UNIT_OF_PRIOR[k]), float(centre), (float(low), float(high)))
             for k, slope, centre, low, high in zip(self.number, slopes, self.centre, *self.bounds, strict=False)
         }
         tail_share = tuple(np.clip(expit(logit(stated.tail_share) + shift), 1e-4, 1 - 1e-4).tolist())
