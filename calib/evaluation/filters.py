@@ -10,7 +10,8 @@ One body in a room is a case of it (`InertialFilter`): a room is a reference who
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -20,6 +21,9 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from calib.calibration.model import Calibration
+from calib.calibration.patterns import Pattern
+from calib.data.ranges import Ranges
 from calib.online import FIXED_DELAYS, DelayStates, RangeErrors, WeighedInnovation, gated_update, mixture_update
 from uwblink.arrays import Floats, Ints
 
@@ -182,6 +186,37 @@ class GaussianFilters:
         self.state += by
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class EndPattern:
+    """A pattern over direction at an `end` (0 or 1) of a distance in a measurement; `axes` (3, 3) are those of the
+    antenna's body in the axes of the body that the filter knows."""
+
+    pattern: Pattern
+    distance: int
+    end: int
+    axes: Floats
+
+
+def end_patterns(
+    calibration: Calibration, ends: Ints, sign: Floats, axes: Mapping[int, Floats]
+) -> list[list[EndPattern]]:
+    """Return the patterns of measurements (n,) of distances between tags `ends` (n, k, 2) with a `sign` (n, k).
+
+    `axes` are those of tags whose bodies the filter does not turn.
+    """
+    found: list[list[EndPattern]] = [[] for _ in ends]
+    for one in calibration.patterns:
+        for row, distance, end in np.argwhere(np.isin(ends, one.tags) & (sign != 0)[..., None]).tolist():
+            own = axes.get(int(ends[row, distance, end]), np.eye(3))
+            found[row].append(EndPattern(one, distance, end, own))
+    return found
+
+
+def without_directions(ranges: Ranges) -> Ranges:
+    """Return ranges without the directions that true poses give: filters take those of their own estimates."""
+    return replace(ranges, toward=np.full_like(ranges.toward, np.nan))
+
+
 class RelativeFilter(GaussianFilters):
     """Poses of bodies in the frame of a reference: a room, or one more body with an IMU (`moving`).
 
@@ -262,9 +297,8 @@ class RelativeFilter(GaussianFilters):
         Means and standard deviations have the terms of second order (Bar-Shalom, Li and Kirubarajan 2001, section
         10.3.2): a tag that is 0.3 m off across the line of sight changes 3 m by 1.5 cm.
         """
-        places = np.concatenate([self.own[..., P], np.zeros((len(self.state), 1, 3))], axis=1)
         attitude, size = self.attitude[:, bodies], BODY * self.bodies
-        points = places[:, bodies] + np.einsum("fkeij,kej->fkei", attitude, arm_m)
+        points = self._points(bodies, arm_m)
         between, turns = points[:, :, 0] - points[:, :, 1], -attitude @ _cross(arm_m)
         distance = np.maximum(np.linalg.norm(between, axis=-1), 1e-6)
         along = between / distance[..., None]
@@ -280,6 +314,25 @@ class RelativeFilter(GaussianFilters):
         bend = (np.eye(3) - along[..., None] * along[..., None, :]) @ spread / distance[..., None, None]
         expected = (distance + np.trace(bend, axis1=2, axis2=3) / 2) @ sign
         return expected, row, np.sqrt(np.einsum("fkij,fkji->fk", bend, bend) / 2)
+
+    def _points(self, bodies: Ints, arm_m: Floats) -> Floats:
+        """Return points `arm_m` (k, 2, 3) of bodies (k, 2) in the axes of the reference (filters, k, 2, 3)."""
+        places = np.concatenate([self.own[..., P], np.zeros((len(self.state), 1, 3))], axis=1)
+        return np.asarray(places[:, bodies] + np.einsum("fkeij,kej->fkei", self.attitude[:, bodies], arm_m))
+
+    def longer_m(self, bodies: Ints, arm_m: Floats, sign: Floats, patterns: Iterable[EndPattern]) -> Floats:
+        """Return by how much patterns make a sum of distances longer (filters,), by the estimated poses.
+
+        Arguments are those of `distances`. What errors of the poses change of it is left out.
+        """
+        longer = np.zeros(len(self.state))
+        for one in patterns:
+            points = self._points(bodies[[one.distance]], arm_m[[one.distance]])[:, 0]
+            away = points[:, 1 - one.end] - points[:, one.end]
+            axes = self.attitude[:, bodies[one.distance, one.end]] @ one.axes
+            toward = np.einsum("fji,fj->fi", axes, away) / np.maximum(np.linalg.norm(away, axis=1), 1e-6)[:, None]
+            longer += sign[one.distance] * (one.pattern.values(toward) @ np.array(one.pattern.coefficients_m))
+        return longer
 
     def _move(self, by: Floats) -> None:
         super()._move(by)
@@ -340,17 +393,22 @@ class InertialFilter(RelativeFilter):
         anchor_m: Floats,
         sign: Floats,
         shared: Floats | float,
+        patterns: Sequence[EndPattern] = (),
     ) -> WeighedInnovation:
         """Update by a sum of distances with a `sign` (k,) to anchors (k, 3): one in a range, two in a difference.
 
         `shared` are the standard deviation in metres of the error that measurements of an exchange share, and the
-        derivatives by delays, where these are states. Returns the update.
+        derivatives by delays, where these are states. `patterns` have the body at end 0. Returns the update.
         """
         points = np.stack([np.tile(arm_m if self.inertial else arm_m * (0.0, 0.0, 1.0), (len(sign), 1)), anchor_m], 1)
-        expected, row, bent_m = self.distances(np.tile([0, 1], (len(sign), 1)), points, sign)
+        bodies = np.tile([0, 1], (len(sign), 1))
+        expected, row, bent_m = self.distances(bodies, points, sign)
         if not self.inertial:
-            # Heading is unknown: a lever arm may point anywhere.
+            # Heading is unknown: a lever arm may point anywhere, and the body's pattern, too.
             noise_m = float(np.hypot(noise_m, np.linalg.norm(row[0, P]) * np.hypot(arm_m[0], arm_m[1]) / np.sqrt(2)))
+            noise_m = math.hypot(noise_m, *(one.pattern.rms_m for one in patterns if one.end == 0))
+            patterns = [one for one in patterns if one.end]
+        expected += self.longer_m(bodies, points, sign, patterns)
         row[:, E:] = shared
         variance = noise_m**2 + np.sum((sign * bent_m) ** 2, axis=1)
         update = self.update(row, measured_m - expected, variance, partial(mixture_update, errors=errors))

@@ -28,12 +28,15 @@ from calib.data.sources import Data, load_flight, require_times, sensor_rows
 from calib.errors import BadInputError, UnanswerableError
 from calib.evaluation.filters import (
     GRAVITY_M_S2,
+    EndPattern,
     Fix,
     InertialFilter,
     P,
     ProcessNoise,
+    end_patterns,
     multilaterate,
     squared_over,
+    without_directions,
 )
 from calib.evaluation.localization import MeasuredReceptions, delay_line, delays_json, with_delays
 from calib.evaluation.tracking import (
@@ -155,7 +158,7 @@ class _Readings:
     Of the k distances in a measurement `sign` (n, k) is 0 for those between anchors, which are taken off what is
     `measured`; the others are from the antenna at `arm_m` (n, 3) to `anchor_m` (n, k, 3). Times are seconds since
     `began_ns`, the first exchange. `imu` are angular velocities in rad/s and specific forces in m/s^2 (m, 6) in the
-    axes of the body. `truth` are its poses, or None.
+    axes of the body. `patterns` are those of measurements, the body at end 0. `truth` are its poses, or None.
     """
 
     source: str
@@ -171,6 +174,7 @@ class _Readings:
     imu: Floats
     height_s: Floats
     height_m: Floats
+    patterns: list[list[EndPattern]]
     truth: Poses | None
     began_ns: int
 
@@ -181,11 +185,17 @@ def _readings(data: Data, calibration: Calibration, settings: OnboardSettings) -
     use = settings.use
     flight = load_flight(data, need_power=calibration.needs_power, need_truth=False, use=use, sensors=("imu", "height"))
     name, (imu, heights) = flight.ranges.source, flight.sensors.values()
-    poses, tags, ranges = flight.poses, flight.tags, used_part(keep_determined(calibration, flight.ranges), use)
+    poses, tags = flight.poses, flight.tags
+    ranges = without_directions(used_part(keep_determined(calibration, flight.ranges), use))
     places = {body: poses.position_m[poses.body == body] for body in np.unique(poses.body).tolist()}
     still_m = 0.1  # poses of a body that stands still have some noise
     anchors = {body: np.median(some, axis=0) for body, some in places.items() if np.ptp(some, axis=0).max() <= still_m}
     fixed = {tag.tag: anchors[tag.body] + tag.lever_arm_m for tag in tags if tag.body in anchors}
+    turned = {
+        tag.tag: Rotation.from_quat(poses.quaternion[poses.body == tag.body][0]).as_matrix()
+        for tag in tags
+        if tag.body in anchors
+    }
     if len(fixed) < MIN_ANCHORS:
         raise UnanswerableError(
             f"{name}: {len(fixed)} tags stay in one place by its poses, at least {MIN_ANCHORS} are needed as "
@@ -228,6 +238,7 @@ def _readings(data: Data, calibration: Calibration, settings: OnboardSettings) -
                 imu=inertial,
                 height_s=height_s,
                 height_m=height.ravel(),
+                patterns=end_patterns(calibration, np.where(mine, rows.ends, rows.ends[..., ::-1]), free, turned),
                 truth=poses[known] if known.any() else None,
                 began_ns=began,
             )
@@ -355,7 +366,8 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
                 running.begin_exchange()
             measured, noise_m = numbers[number]
             geometry = one.arm_m[number], one.anchor_m[number], one.sign[number]
-            update = running.update_range(measured, noise_m, one.errors.at(number), *geometry, shared[number])
+            more = shared[number], one.patterns[number]
+            update = running.update_range(measured, noise_m, one.errors.at(number), *geometry, *more)
             updates.append((now, float(update.nis[best]), bool(update.believed[best])))
             # As in `tracking.run_filters`, but explained ranges earn no trust: this filter drifts.
             lasted_s = min(now - heard, settings.reopen_s / 2 / MIN_RANGES_PER_FIX)

@@ -25,7 +25,18 @@ from calib.calibration.model import CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, load_flight, require_times
 from calib.errors import BadInputError, UnanswerableError, WeakHeadingWarning
-from calib.evaluation.filters import BODY, A, P, ProcessNoise, RelativeFilter, V, squared_over
+from calib.evaluation.filters import (
+    BODY,
+    A,
+    EndPattern,
+    P,
+    ProcessNoise,
+    RelativeFilter,
+    V,
+    end_patterns,
+    squared_over,
+    without_directions,
+)
 from calib.evaluation.localization import Localization, consistency, delay_line, delays_json, filter_ranges, fixed_std
 from calib.evaluation.onboard import inertial_readings, mean_readings
 from calib.evaluation.tracking import (
@@ -185,7 +196,7 @@ def localize_team(
     ranges = keep_determined(calibration, flight.ranges)
     team = _team(ranges, flight.poses, flight.tags, flight.sensors["imu"], chosen)
     fixed = fixed_std(calibration, Settings())
-    every = filter_ranges(team.ranges, calibration, fixed, online=chosen.online)
+    every = filter_ranges(without_directions(team.ranges), calibration, fixed, online=chosen.online)
     measured = {name: one.at(team.rows) for name, one in every.items()}
     heard = team.heard
     filters = {"dead reckoning": (measured["raw"], np.zeros_like(heard))}
@@ -205,7 +216,7 @@ def localize_team(
             simulated=ranges.planted is not None,
             arrivals=int(np.count_nonzero(heard)),
         )
-        for body, tracks in _run(team, filters, chosen).items()
+        for body, tracks in _run(team, filters, end_patterns(calibration, team.ends, team.sign, {}), chosen).items()
     ]
 
 
@@ -283,13 +294,18 @@ def _start(team: _Team, settings: TeamSettings, filters: int) -> RelativeFilter:
 
 
 def _run(
-    team: _Team, filters: Mapping[str, tuple[FilterRanges, Bools]], settings: TeamSettings
+    team: _Team,
+    filters: Mapping[str, tuple[FilterRanges, Bools]],
+    patterns: list[list[EndPattern]],
+    settings: TeamSettings,
 ) -> dict[str, dict[str, RelativeTrack]]:
     """Run filters on the measurements that each uses (n,); return the tracks of each body by filter.
 
     States beside those of `RelativeFilter` are errors in units of their standard deviation: as in `run_filters` of
     pairs of tags and of an exchange, and of pairs of bodies what is not linear in their distances.
     """
+    raw = filters["dead reckoning"][0]
+    corrected = np.array([one is not raw for one, _ in filters.values()])
     known, uses = [one for one, _ in filters.values()], np.stack([used for _, used in filters.values()], axis=1)
     measured, std, common, shared, changes = side_by_side(known)
     running = _start(team, settings, len(known))
@@ -321,6 +337,9 @@ def _run(
                 running.wander(time_s[k] - max(last_s, 0.0))
                 exchange, last_s = team.exchange[row], time_s[k]
             expected, slopes, bent_m = running.distances(team.body[row], team.arm[row], team.sign[row])
+            if patterns[row]:
+                geometry = team.body[row], team.arm[row], team.sign[row]
+                expected += corrected * running.longer_m(*geometry, patterns[row])
             for which, (pair, sides) in enumerate((running.known + team.shares[row]).tolist()):
                 slopes[:, pair] += shared[row, :, which]
                 slopes[:, sides] += team.sign[row, which] * bent_m[:, which]

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from calib import BadInputError, Calibration, OnboardSettings, UnanswerableError, localize_onboard
 from calib.calibration.error_model import ErrorModel
 from calib.calibration.formats import read_miluv
+from calib.calibration.patterns import Pattern
 from calib.calibration.power_curves import Curve
 from calib.data.samples import stamped
 from calib.evaluation.filters import Fix, InertialFilter, ProcessNoise, multilaterate
@@ -19,6 +20,7 @@ from calib.online import RangeErrors
 from tests.shared_data import shared
 from uwblink import Contents, Exchanges, Poses, Tag
 from uwblink.importers import read_source
+from uwblink.twr import raw_range
 
 ANCHORS = np.array([[3, 3, 0.3], [-3, 3, 2.2], [-3, -3, 0.4], [3, -3, 2.4], [0, 3.5, 1.2], [3.5, 0, 1.4]])
 ARMS = {10: (0.15, -0.15, -0.05), 11: (-0.15, 0.15, -0.05)}
@@ -225,6 +227,51 @@ def test_no_truth_is_needed(tmp_path):
     np.testing.assert_allclose(truth[:, 1:4], place(t), atol=1e-3)
     # Attitudes are those of the nearest pose, 5 ms away at most.
     assert (attitude(t).inv() * Rotation.from_quat(truth[:, 4:])).magnitude().max() < 0.005
+
+
+def with_patterns(found, size_m):
+    """Return a flight whose anchors are turned and whose antennas at the robot and at anchor 2 delay by direction, and
+    the calibration that knows it: `size_m` to the front, as much less to the back."""
+    turned = Rotation.from_euler("ZYX", [1.2, 0.2, -0.1])
+    poses, x = found.poses, found.exchanges
+    quaternion = np.where((poses.body == "anchor2")[:, None], turned.as_quat(), poses.quaternion)
+    t = (x.time_ns - 10**12) * 1e-9
+    drone = np.where(np.isin(x.initiator, [10, 11]), x.initiator, x.target)
+    anchor = x.initiator + x.target - drone
+    antenna = place(t) + attitude(t).apply(np.array([ARMS[k] for k in drone.tolist()]))
+    away = ANCHORS[anchor] - antenna
+    away /= np.linalg.norm(away, axis=1)[:, None]
+    longer = size_m * attitude(t).inv().apply(away)[:, 0]
+    longer += np.where(anchor == 2, size_m * turned.inv().apply(-away)[:, 0], 0.0)
+    power = np.full((2, len(t)), -85.0)
+    exchanges = stamped(x.time_ns, np.column_stack([x.initiator, x.target]), raw_range(x) + longer, power)
+    front = (size_m / np.sqrt(3), *[0.0] * 7)
+    pattern = Pattern((2, 10, 11), front, (0.0,) * 8, ((0.0,) * 8,) * 8, size_m / np.sqrt(3))
+    there = replace(found, exchanges=exchanges, poses=replace(poses, quaternion=quaternion))
+    return there, replace(calibration(), patterns=(pattern,))
+
+
+def test_patterns_are_corrected_by_the_estimated_pose():
+    plain = flight(seed=5)
+    turned, known = with_patterns(plain, 0.25)
+    (free,), (corrected,), (wrong,) = (
+        localize_onboard(*both) for both in ((plain, calibration()), (turned, known), (turned, calibration()))
+    )
+    errors = [np.sqrt(np.mean(errors_of(one, 5.0) ** 2)) for one in (free, corrected, wrong)]
+    assert errors[1] < 1.2 * errors[0]
+    assert errors[1] < 0.5 * errors[2]
+    # Poses of the body serve as truth alone: without them the estimate is the same.
+    some = turned.poses[turned.poses.body != "drone"]
+    (alone,) = localize_onboard(replace(turned, poses=some), known)
+    np.testing.assert_array_equal(alone.estimate_m, corrected.estimate_m)
+
+
+def test_without_a_heading_a_pattern_is_noise():
+    turned, known = with_patterns(flight(seed=5), 0.25)
+    settings = OnboardSettings(model="constant-velocity")
+    (unsure,), (sure,) = (localize_onboard(turned, one, settings) for one in (known, calibration()))
+    assert np.median(unsure.std_m) > 1.1 * np.median(sure.std_m)
+    assert np.mean(unsure.nees) < 0.5 * np.mean(sure.nees)
 
 
 def test_what_cannot_be_localized():

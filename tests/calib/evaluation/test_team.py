@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 import calib
 import uwbsim
 from calib import BadInputError, Calibration, TeamSettings, UnanswerableError, localize_team
+from calib.calibration.patterns import Pattern
 from calib.calibration.power_curves import Curve
 from calib.data.samples import stamped
 from calib.errors import WeakHeadingWarning
@@ -384,6 +385,33 @@ def test_the_filter_knows_what_listeners_of_an_exchange_share(known, monkeypatch
     figures = team_json([one for each in flights for one in localize_team(each, known, ungated)])["summary"]
     assert 4.5 < figures["variance"]["nees"] < 7
     assert figures["raw"]["nees"] > 1.3 * figures["variance"]["nees"]
+
+
+def test_patterns_are_corrected_by_the_estimated_poses():
+    """Antennas of all robots delay by 20 cm to the front: exact ranges, corrected, stay exact."""
+    t, ends, measured = ranging(4.0, 2)
+    longer = np.zeros(len(t))
+    for k, (i, j) in enumerate(ends.tolist()):
+        for near, far in ((i, j), (j, i)):
+            away = antenna(far, t[k]) - antenna(near, t[k])
+            longer[k] += 0.2 * attitude((near - 1) // 2, t[k]).inv().apply(away / np.linalg.norm(away))[0]
+    plain = flight(seed=2)
+    exchanges = stamped((t * 1e9).astype(np.int64) + NS, ends, measured + longer, np.full((2, len(t)), -85.0))
+    front = (0.2 / np.sqrt(3), *[0.0] * 7)
+    known = replace(
+        calibration(), patterns=(Pattern(tuple(ARMS), front, (0.0,) * 8, ((0.0,) * 8,) * 8, 0.2 / np.sqrt(3)),)
+    )
+    found = [
+        one.tracks["calibrated"].rmse_m
+        for data, by in ((plain, calibration()), (replace(plain, exchanges=exchanges), known))
+        for one in localize_team(data, by, CLOSE)
+    ]
+    assert max(found[2:]) < 1.3 * max(found[:2])
+    without = [
+        one.tracks["calibrated"].rmse_m
+        for one in localize_team(replace(plain, exchanges=exchanges), calibration(), CLOSE)
+    ]
+    assert max(without) > 2 * max(found[2:])
 
 
 def test_one_tag_and_missing_sensors_are_named():
