@@ -521,15 +521,12 @@ def temperature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 def feature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
     """Return each feature that tells reflections, by which factor a unit changes their odds, and its bounds."""
-    known = calibration.errors.features if calibration.errors else {}
-    return [
-        (
-            name,
-            f"{math.exp(one.log_odds):.2f}",
-            "{:.1f} and {:.1f} {}".format(*one.bounds, "taps" if name == "rise_taps" else "dB"),
-        )
-        for name, one in known.items()
-    ]
+    rows = []
+    for name, one in (calibration.errors.features if calibration.errors else {}).items():
+        low, high = one.bounds
+        unit = "taps" if name == "rise_taps" else "dB"
+        rows.append((name, f"{math.exp(one.log_odds):.2f}", f"{low:.1f} and {high:.1f} {unit}"))
+    return rows
 
 
 def curve_rows(calibration: Calibration) -> list[tuple[str, ...]]:
