@@ -5,18 +5,17 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
 from uwblink.protocols.table import ON_BOARDS, PROTOCOLS, RangingProtocol
-from uwblink.recording.file import Recording
-from uwblink.recording.schema import CirRow, Fault, FrameRow, Poses, Tag
+from uwblink.recording.contents import Contents
+from uwblink.recording.schema import FrameRow, Tag
 from uwblink.ticks import COUNTER_BITS, SPEED_OF_LIGHT, TICK_S, UUS_TICKS, elapsed
-from uwblink.twr import Exchanges, raw_range
+from uwblink.twr import raw_range
 from uwblink.wire.codec import Decoder, encode, exchanges_of
 from uwblink.wire.messages import REPORTS, RangeReport
 from uwbsim.errors import ScenarioError
@@ -43,17 +42,15 @@ from uwbsim.world.trajectories import sensor_readings
 from uwbsim.world.world import SampledWorld, World
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Simulated:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Simulated(Contents):
     """A simulated flight in memory: the contents of its recording, and the true distances, which are not recorded.
 
-    `exchanges` are n exchanges in order of time and `truth_m` (n,) their true distances in metres, each the mean over
-    the first two messages, of broadcasts that at the poll; `poses` are those of motion capture; `tags` are the tags
-    with their bodies and lever arms; `faults` are the exchanges that failed. `overheard` are the columns of what
-    passive tags received, `receptions` those of all broadcasts, `cirs` impulse responses (time_ns, board, initiator,
-    target, first path in taps, 1016 magnitudes). `meta` is the recording's provenance. `temperature` are the columns of
-    the tags' readings of temperature and supply voltage, `imu` and `height` those of the bodies' inertial and height
-    sensors.
+    `truth_m` (n,) are the true distances of the n exchanges in metres, each the mean over the first two messages, of
+    broadcasts that at the poll; a selection (`select`) is without them. `poses` are those of motion capture, `faults`
+    the exchanges that failed, `overheard` what passive tags received, `receptions` all received broadcasts,
+    `temperature` the tags' readings of temperature and supply voltage, `imu` and `height` those of the bodies' sensors.
+    `meta` is the recording's provenance.
 
     >>> import uwbsim
     >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
@@ -73,18 +70,7 @@ class Simulated:
     >>> flight.save("two.uwb")
     """
 
-    exchanges: Exchanges
-    poses: Poses
-    tags: list[Tag]
-    faults: list[Fault]
-    overheard: dict[str, NDArray[Any]]
-    cirs: list[CirRow]
     truth_m: Floats
-    meta: dict[str, Any]
-    temperature: dict[str, NDArray[Any]] = field(default_factory=dict)
-    imu: dict[str, NDArray[Any]] = field(default_factory=dict)
-    height: dict[str, NDArray[Any]] = field(default_factory=dict)
-    receptions: dict[str, NDArray[Any]] = field(default_factory=dict)
 
     @property
     def planted(self) -> dict[str, Any]:
@@ -92,26 +78,12 @@ class Simulated:
         planted: dict[str, Any] = self.meta["planted"]
         return planted
 
-    def save(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        frames: Sequence[FrameRow] = (),
-        force: bool = False,
-    ) -> None:
+    def save(self, path: str | os.PathLike[str], *, frames: Sequence[FrameRow] = (), force: bool = False) -> None:
         """Write a recording (.uwb); `frames` are the bytes of the boards, from `through_wire`.
 
         Raises `RecordingExistsError` if the file exists, unless `force` is set.
         """
-        with Recording.create(path, meta=self.meta, force=force) as recording:
-            recording.append_tags(self.tags)
-            recording.append_poses(self.poses)
-            recording.append_exchanges(self.exchanges)
-            recording.append("faults", self.faults)
-            for table in ("overheard", "temperature", "imu", "height", "receptions"):
-                recording.append(table, getattr(self, table))
-            recording.append("cirs", self.cirs)
-            recording.append("frames", frames)
+        Contents.save(replace(self, frames=list(frames)), path, force=force)
 
     def __repr__(self) -> str:
         """Return a few lines: counts, errors of the raw ranges, and failures."""

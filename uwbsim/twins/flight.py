@@ -25,7 +25,6 @@ from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S, UUS_TICKS
 from uwblink.twr import Exchanges, intervals, without_stamps
 from uwbsim.errors import ScenarioError, TooFewDataError
 from uwbsim.random_streams import stream
-from uwbsim.simulation.run import Simulated
 
 if TYPE_CHECKING:
     from uwbsim.twins.range_errors import KnownDevices
@@ -135,11 +134,11 @@ def lag_one(value: Floats, group: Ints) -> tuple[float, float]:
     return r, float(np.std(term) / np.sqrt(effective_size(term, sorted_group[rows])))
 
 
-RecordingSource = str | os.PathLike[str] | Contents | Simulated
+RecordingSource = str | os.PathLike[str] | Contents
 """A recording: its file (.uwb), or its contents in memory."""
 
 
-def read_flight(source: RecordingSource) -> tuple[Contents | Simulated, str]:
+def read_flight(source: RecordingSource) -> tuple[Contents, str]:
     """Return the contents of a recording and its name in messages; raises what `Recording.open` raises."""
     if not isinstance(source, str | os.PathLike):
         if not all(hasattr(source, name) for name in ("exchanges", "tags", "poses", "faults")):
@@ -216,9 +215,7 @@ class TwinFlight:
         return np.array([self.exchanges.fpp1_dbm, self.exchanges.fpp2_dbm])
 
     @classmethod
-    def of(
-        cls, flown: Contents | Simulated, known: KnownDevices, where: str = "recording", *, fewest: int = 100
-    ) -> Self:
+    def of(cls, flown: Contents, known: KnownDevices, where: str = "recording", *, fewest: int = 100) -> Self:
         """Return the columns of a recording; raises `ScenarioError` where no twin can be fitted.
 
         That is with less than `fewest` exchanges: of 100, the quantiles of residuals are wrong by a tenth of their
