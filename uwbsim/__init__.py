@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from uwbsim.errors import ParameterError, ScenarioError, UwbsimError
     from uwbsim.pages.documents import show
     from uwbsim.protocols.comparison import ProtocolComparison, compare, optimum
-    from uwbsim.protocols.fleet import FleetFigures, predict_fleet
-    from uwbsim.protocols.prediction import Prediction, State, predict_state
+    from uwbsim.protocols.prediction import FleetFigures, Prediction, State, predict_fleet, predict_state
     from uwbsim.scenario.loading import load, shipped_scenarios
     from uwbsim.scenario.model import Scenario
     from uwbsim.simulation.run import Simulated, preview, simulate, through_wire
@@ -60,7 +59,7 @@ __all__ = [
 ]
 
 _homes = {
-    "FleetFigures": "uwbsim.protocols.fleet",
+    "FleetFigures": "uwbsim.protocols.prediction",
     "ParameterError": "uwbsim.errors",
     "Prediction": "uwbsim.protocols.prediction",
     "ProtocolComparison": "uwbsim.protocols.comparison",
@@ -77,7 +76,7 @@ _homes = {
     "load_design": "uwbsim.sweep.design",
     "load_faults": "uwbsim.boards.server",
     "optimum": "uwbsim.protocols.comparison",
-    "predict_fleet": "uwbsim.protocols.fleet",
+    "predict_fleet": "uwbsim.protocols.prediction",
     "predict_state": "uwbsim.protocols.prediction",
     "preview": "uwbsim.simulation.run",
     "register_channel_effect": "uwbsim.world.channel",

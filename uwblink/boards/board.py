@@ -20,8 +20,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final, Self, TypeVar
 
-from uwblink.boards.ports import SerialPort, Transport
-from uwblink.closing import Closing
+from uwblink.boards.ports import Closing, SerialPort, Transport
 from uwblink.errors import BoardError, NoAnswerError, RangingFailedError, RefusedError
 from uwblink.protocols.table import ON_BOARDS
 from uwblink.wire.codec import Decoder, Event, encode

@@ -20,7 +20,7 @@ from uwbsim.errors import ScenarioError
 from uwbsim.pages import figures
 from uwbsim.protocols.comparison import BestDelay, ProtocolComparison, ProtocolErrors, over_reply, over_skew, over_state
 from uwbsim.protocols.conditions import conditions_of
-from uwbsim.protocols.fleet import FleetFigures
+from uwbsim.protocols.prediction import FleetFigures
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import preview

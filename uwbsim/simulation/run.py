@@ -23,14 +23,16 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import NO_BROADCASTS, Scenario
 from uwbsim.scenario.ranging import before_marker_s
-from uwbsim.simulation import air, broadcasts
+from uwbsim.simulation import air
 from uwbsim.simulation.air import Schedule, schedule
 from uwbsim.simulation.timestamps import (
     Draws,
     Stamped,
     draw,
+    one_departure,
     overhear,
     provenance,
+    reported_broadcasts,
     reported_exchanges,
     reported_faults,
     responses,
@@ -140,7 +142,7 @@ def simulate(
     world, plan = World(scenario), schedule(scenario)
     medium, draws = Medium(scenario, world), draw(scenario, len(plan.start), len(protocol.messages))
     if broadcast:
-        draws = broadcasts.one_departure(draws, len(scenario.tags) - 1)
+        draws = one_departure(draws, len(scenario.tags) - 1)
     slots = _slots(medium, world, protocol, plan, draws)
     if contention and not broadcast:
         sampled = SampledWorld(world)
@@ -151,13 +153,13 @@ def simulate(
     else:
         outcomes = _undisturbed(scenario, slots)
         if contention:
-            outcomes = broadcasts.with_collisions(medium, plan, outcomes)
+            outcomes = air.with_collisions_of_broadcasts(medium, plan, outcomes)
     begun, lost = np.array(outcomes.start, dtype=np.int64), np.array(outcomes.lost)
     kept = np.flatnonzero(lost < 0)
     kept = kept[np.argsort(begun[kept], kind="stable")]
     rows = replace(plan[kept], start=begun[kept])
     stamped = stamp(medium, protocol, rows, draws[kept])
-    reported = broadcasts.reported if broadcast else _reported
+    reported = reported_broadcasts if broadcast else _reported
     found = reported(medium, kept, len(plan.start), rows, stamped)
     return Simulated(
         **found,

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
 from uwblink.protocols.table import RangingProtocol
+from uwblink.receptions import Receptions, exchanges_in
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, meta_of_delays
 from uwblink.recording.schema import CirRow, Fault
 from uwblink.ticks import (
     ANTENNA_DELAY_TICKS,
+    COUNTER_BITS,
     DELAYED_TX_GRID,
     REPORT_BITS,
     TICK_S,
@@ -86,6 +88,11 @@ def draw(scenario: Scenario, count: int, messages: int) -> Draws:
         reply_s=draw_reply_s(scenario, stream(seed, "reply latency"), count),
         excess_m=excess,
     )
+
+
+def one_departure(draws: Draws, listeners: int) -> Draws:
+    """Return draws with the same noise of departure in all rows of a frame."""
+    return replace(draws, transmit=np.repeat(draws.transmit[:, ::listeners], listeners, axis=1))
 
 
 def draw_reply_s(scenario: Scenario, rng: np.random.Generator, count: int) -> Floats:
@@ -173,6 +180,32 @@ def reported_exchanges(medium: Medium, kept: Ints, planned: int, rows: Schedule,
     )
     printed = board_range if medium.scenario.radio.quantize else raw_range
     return replace(found, range_m=printed(found))
+
+
+def reported_broadcasts(medium: Medium, kept: Ints, planned: int, rows: Schedule, stamped: Stamped) -> dict[str, Any]:
+    """Return what tags report of the `kept` rows (n,), of all `planned`: receptions, and the exchanges that they make.
+
+    Stamps are the chip's whole ones. `truth_m` are the distances at the polls, which ranges measure (`range_ns`).
+    """
+    ids = np.array([tag.id for tag in medium.scenario.tags], dtype=np.int64)
+    fpp, skew = printed_readings(medium, 1, kept, planned, stamped)
+    tx, rx = (stamped.stamps[name] & ((1 << COUNTER_BITS) - 1) for name in ("tx1", "rx1"))
+    receptions = Receptions(
+        time_ns=time_ns(stamped.frames[0].departure),
+        frame=kept // (len(ids) - 1),
+        sender=ids[rows.initiator],
+        listener=ids[rows.target],
+        tx=tx,
+        rx=rx,
+        fpp_dbm=fpp,
+        rxp_dbm=np.full(len(kept), np.nan),
+        skew_ppm=skew,
+    )
+    exchanges, overheard = exchanges_in(receptions)
+    i, j = (np.argmax(ends[:, None] == ids, axis=1) for ends in (exchanges.initiator, exchanges.target))
+    poll = np.rint(exchanges.time_ns * (SUBTICKS_PER_SECOND / NS_PER_S)).astype(np.int64)
+    truth_m = medium.links.link(i, j, poll).distance_m
+    return {"exchanges": exchanges, "overheard": overheard, "receptions": receptions.to_dict(), "truth_m": truth_m}
 
 
 def time_ns(departure: Ints) -> Ints:
