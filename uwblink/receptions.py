@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import median
 
 from uwblink import arrays
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
@@ -298,11 +299,7 @@ def _shorter_replies(initiator: Ints, target: Ints, reply: Ints) -> Bools:
     """Return which exchanges (n,) have the roles with which their pair has the shorter replies."""
     key = (initiator << 16) | target
     ends, number = np.unique(key, return_inverse=True)
-    order = np.argsort(reply)
-    counts = np.bincount(number)
-    middle = np.zeros(len(ends))
-    for own in range(len(ends)):
-        middle[own] = reply[order[number[order] == own][counts[own] // 2]]
+    middle = np.asarray(median(reply, number, np.arange(len(ends))))
     other = ((ends & 0xFFFF) << 16) | (ends >> 16)
     place = np.clip(np.searchsorted(ends, other), 0, max(len(ends) - 1, 0))
     of_other = np.where(ends[place] == other, middle[place], np.inf)

@@ -42,11 +42,11 @@ FITTING_SHARE: Final = 0.9
 
 def clocks(protocol: str) -> tuple[tuple[str, ...], ...]:
     """Return the stamps of an exchange by clock, those of the initiator first."""
-    third = PROTOCOLS[protocol].third_sender
-    if third is None:
-        return ("tx1", "rx2"), ("rx1", "tx2")
-    mine, other = ("tx3", "rx3") if third == "initiator" else ("rx3", "tx3")
-    return ("tx1", "rx2", mine), ("rx1", "tx2", other)
+    numbered = list(enumerate(PROTOCOLS[protocol].messages, 1))
+    return tuple(
+        tuple(f"{'tx' if message.sender == side else 'rx'}{number}" for number, message in numbered)
+        for side in ("initiator", "target")
+    )
 
 
 def stamps_of(protocol: str) -> tuple[str, ...]:

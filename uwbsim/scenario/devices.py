@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from uwblink.errors import PlanError
+from uwblink.errors import PlanError, restating
 from uwblink.recording.antenna_delays import REGISTER_MAX, delay_of, load_antenna_delays
 from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S, TX_SHARE
 from uwbsim.errors import ScenarioError
@@ -307,10 +307,8 @@ class ScenarioTag(Section):
 
 def with_antenna_delays(tags: tuple[ScenarioTag, ...], path: Path) -> tuple[ScenarioTag, ...]:
     """Return tags with the antenna delays of a file programmed into them; raises `ScenarioError`."""
-    try:
+    with restating(ScenarioError, PlanError):
         delays = load_antenna_delays(path)
-    except PlanError as error:
-        raise ScenarioError(str(error)) from error
     found = {tag.id: delay_of(delays, tag.id) for tag in tags}
     programmed = {tag: Programmed(**one._asdict()) for tag, one in found.items() if one is not None}
     return tuple(tag.model_copy(update={"antenna_delay": programmed.get(tag.id, tag.antenna_delay)}) for tag in tags)
