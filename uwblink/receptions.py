@@ -210,10 +210,8 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
         bits=r.bits,
         **stamps,
     )
-    parts = [_heard_by(k, receptions, links, rows, exchanges) for k in np.unique(r.listener).tolist()]
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    order = np.argsort(columns["time_ns"], kind="stable")
-    return exchanges, {name: column[order] for name, column in columns.items()}
+    heard_by = [_heard_by(k, receptions, links, rows, exchanges) for k in np.unique(r.listener).tolist()]
+    return exchanges, arrays.in_time_order(heard_by)
 
 
 def _without_drift(r: Receptions, links: _Links, second: Ints, third: Ints, reply: Ints) -> Ints:

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from uwblink.database import write_tables
 from uwblink.output import check_folder, check_output, made_folder, write_bytes, write_files, write_text
 from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text, to_html
 from uwblink.pages.figures import picture
@@ -26,7 +27,6 @@ from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import preview
 from uwbsim.sweep.design import SweepDesign
 from uwbsim.sweep.runner import STORE, ResultStore
-from uwbsim.tables import write_tables
 from uwbsim.twins import TWIN_LEVEL, Compared, Twin
 
 

@@ -12,7 +12,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Floats, Ints, in_time_order
 from uwblink.protocols.table import RangingProtocol
 from uwblink.receptions import Receptions, exchanges_in
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, meta_of_delays
@@ -30,7 +30,6 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation import air
 from uwbsim.simulation.air import Schedule
-from uwbsim.tables import in_time_order
 from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, Link
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.impulse_response import INDEX_STEPS, impulse_response

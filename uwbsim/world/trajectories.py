@@ -10,12 +10,11 @@ import numpy as np
 from scipy.interpolate import BSpline, CubicHermiteSpline, CubicSpline, PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, in_time_order
 from uwbsim.random_streams import stream
 from uwbsim.scenario.bodies import Carried, Figure, Height, Imu, RandomFlight, Recorded, Static, Waypoints
 from uwbsim.scenario.model import Scenario
-from uwbsim.tables import Columns, in_time_order
-from uwbsim.world.clocks import NS_PER_S
+from uwbsim.world.clocks import NS_PER_S, Columns
 
 Draw = Callable[[str], np.random.Generator]
 """Returns the random stream of a body, or of a pair of tags, for a purpose."""
