@@ -189,11 +189,11 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
         & (np.abs(round_trip - reply) <= MAX_SKEW * reply + farthest)
     )
     rows, reply = rows[steady], reply[steady]
-    rows = rows[_shorter_replies(r.sender[rows[:, 0]], r.sender[rows[:, 1]], reply)]
     if not len(rows):
         raise ArgumentError(
             f"{len(r)} receptions make no exchange: two tags must hear each other, and one of them twice in a row"
         )
+    rows = rows[_shorter_replies(r.sender[rows[:, 0]], r.sender[rows[:, 1]], reply)]
     rows = rows[np.argsort(r.time_ns[rows[:, 0]], kind="stable")]
     p, s, f = rows.T
     rx3 = _without_drift(r, links, s, f, elapsed(r.tx[s], r.rx[p], r.bits))
@@ -299,7 +299,7 @@ def _shorter_replies(initiator: Ints, target: Ints, reply: Ints) -> Bools:
     ends, number = np.unique(key, return_inverse=True)
     middle = np.asarray(median(reply, number, np.arange(len(ends))))
     other = ((ends & 0xFFFF) << 16) | (ends >> 16)
-    place = np.clip(np.searchsorted(ends, other), 0, max(len(ends) - 1, 0))
+    place = np.clip(np.searchsorted(ends, other), 0, len(ends) - 1)
     of_other = np.where(ends[place] == other, middle[place], np.inf)
     return np.asarray(((middle < of_other) | ((middle == of_other) & (ends < other)))[number])
 

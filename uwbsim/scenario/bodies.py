@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from itertools import pairwise
 from typing import Annotated, ClassVar, Final, Literal, Self
 
@@ -197,7 +196,7 @@ class Material(Section):
     index: Annotated[float, Field(ge=1)] = Field(1.0, description="Refractive index.")
 
 
-KnownMaterial = Annotated[str | Material, AfterValidator(partial(known_in, MATERIALS))]
+KnownMaterial = Annotated[str | Material, AfterValidator(lambda material: known_in(MATERIALS, material))]
 
 
 class Obstacle(Box):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import Annotated, Final, Literal, Self
 
 import numpy as np
@@ -101,9 +100,10 @@ def exchange_costs(
     }
 
 
+# No `partial`: pydantic shows it with the whole table, and to list that loads plug-ins.
 ProtocolName = Annotated[
     str,
-    AfterValidator(partial(known_in, PROTOCOLS)),
+    AfterValidator(lambda name: known_in(PROTOCOLS, name)),
     Field(json_schema_extra=lambda schema: schema.update(enum=sorted(PROTOCOLS))),
 ]
 
