@@ -17,7 +17,7 @@ def homes_in(file: str) -> dict[str, str]:
     Constants come first, then classes and functions. Type checkers read the same stub.
     """
     tree = ast.parse(Path(file).with_suffix(".pyi").read_text(encoding="utf-8"))
-    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom) and "." in (node.module or "")]
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and "." in (node.module or "")]
     homes = {alias.name: str(node.module) for node in imports for alias in node.names}
     return {name: homes[name] for name in sorted(homes, key=lambda n: (not n.isupper(), n.islower(), n))}
 

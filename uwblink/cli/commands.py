@@ -124,19 +124,22 @@ def _importing(row: Importer) -> Callable[..., None]:
         if row.name == "bag" and "poses" not in done.counts and (found := uwblink.importers.pose_topics(table)):
             typer.echo(_pose_command(found, quote(str(output)), table))
 
+    def without_map(table: Any, output: Path, force: bool = False) -> None:
+        run(table, output, force=force)
+
     what = f"File to import ({' or '.join(row.suffixes)})." if row.suffixes else "Folder to import."
     several = typer.Argument(help=f"{what} Several are one table.")
     one = typer.Argument(help=what)
-    # Without a map of its own an importer refuses one.
-    map_option = typer.Option("--map", help=row.map_help, hidden=row.map_help is None)
-    run.__doc__ = escape(row.help)
-    run.__annotations__ |= {
+    command = run if row.map_help else without_map
+    command.__doc__ = escape(row.help)
+    command.__annotations__ |= {
         "table": Annotated[list[Path], several] if row.several else Annotated[Path, one],
         "output": Annotated[Path, output("Recording to write (.uwb).")],
-        "map_file": Annotated[Path | None, map_option],
         "force": Force,
     }
-    return run
+    if row.map_help:
+        command.__annotations__["map_file"] = Annotated[Path | None, typer.Option("--map", help=row.map_help)]
+    return command
 
 
 def show(

@@ -284,7 +284,7 @@ class ColumnMap:
     headerless: bool = False
     registers: dict[str, dict[str, str]] = field(default_factory=dict)
     wide: dict[str, str | dict[str, str]] = field(default_factory=dict)
-    units: dict[str, str | float] = field(default_factory=dict)
+    units: dict[str, Any] = field(default_factory=dict)
     topics: dict[str, dict[str, float | str]] = field(default_factory=dict)
 
     def header(self, name: str) -> str:

@@ -259,7 +259,7 @@ def through_wire(simulated: Simulated) -> tuple[Simulated, list[FrameRow]]:
     heard = ((frame.time_ns, board, event) for board, frame in by_board for event in decoder.feed(frame.data))
     exchanges = exchanges_of(heard).in_time_order()
     ports = {str(board): f"board {board}" for board in np.unique(e.initiator).tolist()}
-    return replace(simulated, exchanges=exchanges, meta=simulated.meta | {"ports": ports}), frames
+    return replace(simulated, exchanges=exchanges, meta={**simulated.meta, "ports": ports}), frames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
