@@ -23,8 +23,7 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import NO_BROADCASTS, Scenario
 from uwbsim.scenario.ranging import before_marker_s
-from uwbsim.simulation import air
-from uwbsim.simulation.air import Schedule, schedule
+from uwbsim.simulation.air import WEAK, Air, Outcomes, Schedule, Slots, schedule, with_collisions_of_broadcasts
 from uwbsim.simulation.timestamps import (
     Draws,
     Stamped,
@@ -146,14 +145,14 @@ def simulate(
     slots = _slots(medium, world, protocol, plan, draws)
     if contention and not broadcast:
         sampled = SampledWorld(world)
-        execution = air.Air(
+        execution = Air(
             protocol, slots, lambda tag, time: sampled.from_sender(tag, max(time, 0)).power_dbm, scenario.radio
         )
         outcomes = execution.execute(progress)
     else:
         outcomes = _undisturbed(scenario, slots)
         if contention:
-            outcomes = air.with_collisions_of_broadcasts(medium, plan, outcomes)
+            outcomes = with_collisions_of_broadcasts(medium, plan, outcomes)
     begun, lost = np.array(outcomes.start, dtype=np.int64), np.array(outcomes.lost)
     kept = np.flatnonzero(lost < 0)
     kept = kept[np.argsort(begun[kept], kind="stable")]
@@ -181,7 +180,7 @@ def _reported(medium: Medium, kept: Ints, planned: int, rows: Schedule, stamped:
     return {"exchanges": exchanges, "overheard": overhear(medium, stamped, exchanges), "truth_m": truth_m}
 
 
-def _slots(medium: Medium, world: World, protocol: RangingProtocol, plan: Schedule, draws: Draws) -> air.Slots:
+def _slots(medium: Medium, world: World, protocol: RangingProtocol, plan: Schedule, draws: Draws) -> Slots:
     """Return the plan with the nominal delays of its messages, and whether each is strong enough.
 
     Power noise makes the limit soft. In a common list an initiator waits longer for an exchange that it cannot hear.
@@ -207,15 +206,15 @@ def _slots(medium: Medium, world: World, protocol: RangingProtocol, plan: Schedu
             power = world.link(*(ends if message.sender == "initiator" else ends[::-1]), time).power_dbm
         powers.append(power)
     noise = stream(scenario.run.seed, "fading").normal(size=(len(messages), len(time)))
-    return air.Slots(plan, pause, medium.heard(np.array(powers), noise), delay)
+    return Slots(plan, pause, medium.heard(np.array(powers), noise), delay)
 
 
-def _undisturbed(scenario: Scenario, slots: air.Slots) -> air.Outcomes:
+def _undisturbed(scenario: Scenario, slots: Slots) -> Outcomes:
     """Return the outcomes of exchanges without contention: only messages below the sensitivity are lost."""
     lost = np.where(slots.heard.all(axis=0), -1, np.argmin(slots.heard, axis=0))
     marker = round(before_marker_s(scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)
-    reasons = [air.WEAK if k >= 0 else "" for k in lost.tolist()]
-    return air.Outcomes((slots.plan.start + marker).tolist(), lost.tolist(), reasons)
+    reasons = [WEAK if k >= 0 else "" for k in lost.tolist()]
+    return Outcomes((slots.plan.start + marker).tolist(), lost.tolist(), reasons)
 
 
 def through_wire(simulated: Simulated) -> tuple[Simulated, list[FrameRow]]:

@@ -28,8 +28,7 @@ from uwblink.ticks import (
 from uwblink.twr import STAMPS, Exchanges, board_range, raw_range
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
-from uwbsim.simulation import air
-from uwbsim.simulation.air import Schedule
+from uwbsim.simulation.air import WEAK, Outcomes, Schedule
 from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, Link
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.impulse_response import INDEX_STEPS, impulse_response
@@ -220,7 +219,7 @@ def printed_readings(medium: Medium, number: int, kept: Ints, planned: int, stam
     return medium.readings(stamped.frames[number - 1], stamped.links[number - 1].power_dbm, power_noise, skew_noise)
 
 
-def reported_faults(scenario: Scenario, plan: Schedule, outcomes: air.Outcomes) -> list[Fault]:
+def reported_faults(scenario: Scenario, plan: Schedule, outcomes: Outcomes) -> list[Fault]:
     """Return the failed exchanges, with their reasons and initiators."""
     ids, failed = np.array([tag.id for tag in scenario.tags]), np.flatnonzero(np.array(outcomes.lost) >= 0)
     tags = zip(ids[plan.initiator[failed]].tolist(), ids[plan.target[failed]].tolist(), strict=True)
@@ -229,7 +228,7 @@ def reported_faults(scenario: Scenario, plan: Schedule, outcomes: air.Outcomes) 
         Fault(
             round(outcomes.start[k] * (NS_PER_S / SUBTICKS_PER_SECOND)),
             str(a),
-            "lost frame" if outcomes.reason[k] == air.WEAK else outcomes.reason[k],
+            "lost frame" if outcomes.reason[k] == WEAK else outcomes.reason[k],
             f"{what.format(a, b, outcomes.lost[k] + 1)} {outcomes.reason[k]}",
             a,
             b,
