@@ -20,7 +20,7 @@ CONFINED = {
     "pypdf": lambda path: path == "uwblink/pages/pdf.py",
     "typer": lambda path: "/cli/" in path,
     "rich": lambda path: "/cli/" in path,
-    "duckdb": lambda path: path.startswith("uwblink/") or path in {"uwbsim/sweep/runner.py", "uwbsim/tables.py"},
+    "duckdb": lambda path: path.startswith("uwblink/") or path == "uwbsim/sweep/runner.py",
     "pydantic": lambda path: path.startswith(("uwbsim/", "calib/calibration/")),
     "threadpoolctl": lambda path: (
         path

@@ -87,6 +87,15 @@ class ColumnTable:
         return as_html(self._title(), excerpt(self._shown()))
 
 
+def in_time_order(parts: Sequence[dict[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+    """Return the rows of several tables of columns as one, in order of `time_ns`; no columns for no tables."""
+    if not parts:
+        return {}
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    order = np.argsort(columns["time_ns"], kind="stable")
+    return {name: column[order] for name, column in columns.items()}
+
+
 def is_frame(value: object) -> bool:
     """Return whether an object is a data frame, or a table that others can read by Arrow's interface in C."""
     return hasattr(value, "__arrow_c_stream__") or hasattr(value, "__dataframe__")

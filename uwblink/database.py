@@ -6,14 +6,15 @@ module opens DuckDB, which a test checks.
 
 from __future__ import annotations
 
+import csv
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-from uwblink.errors import RecordingError
-from uwblink.output import interrupts_held
+from uwblink.errors import OutputError, RecordingError, raising
+from uwblink.output import interrupts_held, is_utf8, whole
 
 with interrupts_held():  # an interrupt within this import ends the process in C++
     import duckdb as duckdb
@@ -68,6 +69,24 @@ def connect(
     for name, value in _LOCKED.items():
         db.execute(f"SET {name} = {str(value).lower()}")
     return db
+
+
+def write_tables(table: Path, parquet: Path, rows: Iterable[Mapping[str, Any]], *, force: bool) -> None:
+    """Write rows as CSV and as Parquet, both or neither; raises what `whole` raises.
+
+    The rows can be iterated over more than once; the columns are those of all of them.
+    """
+    if not is_utf8(parquet):
+        raise OutputError(f"{parquet}: its name and those of its folders must be UTF-8; give another one")
+    with whole(table, force=force) as text, whole(parquet, force=force) as packed:
+        columns = dict.fromkeys(key for row in rows for key in row)
+        with text.open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.DictWriter(stream, list(columns), restval="")
+            writer.writeheader()
+            writer.writerows(rows)
+        wrong = raising(OutputError, f"{parquet}: cannot be written", duckdb.IOException)
+        with connect(paths=[text, packed]) as db, wrong:
+            db.read_csv(str(text), header=True, sample_size=-1).write_parquet(str(packed))
 
 
 def log_of(path: Path) -> Path:

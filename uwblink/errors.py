@@ -106,6 +106,15 @@ class RefusedError(BoardError, ValueError):
     """A command that would harm the board or is unknown to it; nothing was sent."""
 
 
+@contextmanager
+def restating(error: Callable[[str], Exception], *kinds: type[Exception], where: str = "") -> Iterator[None]:
+    """Raise `error` with the text of exceptions of `kinds`, which begins with `where`."""
+    try:
+        yield
+    except kinds as problem:
+        raise error(f"{where}{problem}") from problem
+
+
 def first_line(error: Exception) -> str:
     """Return the first line of an error's text, 200 characters at most."""
     return (str(error).splitlines() or [""])[0][:200]

@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+import ast
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
+
+
+def homes_in(file: str) -> dict[str, str]:
+    """Return the modules of a package's public names: what the stub (.pyi) beside its `file` imports from modules.
+
+    Constants come first, then classes and functions. Type checkers read the same stub.
+    """
+    tree = ast.parse(Path(file).with_suffix(".pyi").read_text(encoding="utf-8"))
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and "." in (node.module or "")]
+    homes = {alias.name: str(node.module) for node in imports for alias in node.names}
+    return {name: homes[name] for name in sorted(homes, key=lambda n: (not n.isupper(), n.islower(), n))}
 
 
 def offer(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:

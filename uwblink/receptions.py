@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import median
 
 from uwblink import arrays
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
@@ -188,11 +189,11 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
         & (np.abs(round_trip - reply) <= MAX_SKEW * reply + farthest)
     )
     rows, reply = rows[steady], reply[steady]
-    rows = rows[_shorter_replies(r.sender[rows[:, 0]], r.sender[rows[:, 1]], reply)]
     if not len(rows):
         raise ArgumentError(
             f"{len(r)} receptions make no exchange: two tags must hear each other, and one of them twice in a row"
         )
+    rows = rows[_shorter_replies(r.sender[rows[:, 0]], r.sender[rows[:, 1]], reply)]
     rows = rows[np.argsort(r.time_ns[rows[:, 0]], kind="stable")]
     p, s, f = rows.T
     rx3 = _without_drift(r, links, s, f, elapsed(r.tx[s], r.rx[p], r.bits))
@@ -209,10 +210,8 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[A
         bits=r.bits,
         **stamps,
     )
-    parts = [_heard_by(k, receptions, links, rows, exchanges) for k in np.unique(r.listener).tolist()]
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    order = np.argsort(columns["time_ns"], kind="stable")
-    return exchanges, {name: column[order] for name, column in columns.items()}
+    heard_by = [_heard_by(k, receptions, links, rows, exchanges) for k in np.unique(r.listener).tolist()]
+    return exchanges, arrays.in_time_order(heard_by)
 
 
 def _without_drift(r: Receptions, links: _Links, second: Ints, third: Ints, reply: Ints) -> Ints:
@@ -298,13 +297,9 @@ def _shorter_replies(initiator: Ints, target: Ints, reply: Ints) -> Bools:
     """Return which exchanges (n,) have the roles with which their pair has the shorter replies."""
     key = (initiator << 16) | target
     ends, number = np.unique(key, return_inverse=True)
-    order = np.argsort(reply)
-    counts = np.bincount(number)
-    middle = np.zeros(len(ends))
-    for own in range(len(ends)):
-        middle[own] = reply[order[number[order] == own][counts[own] // 2]]
+    middle = np.asarray(median(reply, number, np.arange(len(ends))))
     other = ((ends & 0xFFFF) << 16) | (ends >> 16)
-    place = np.clip(np.searchsorted(ends, other), 0, max(len(ends) - 1, 0))
+    place = np.clip(np.searchsorted(ends, other), 0, len(ends) - 1)
     of_other = np.where(ends[place] == other, middle[place], np.inf)
     return np.asarray(((middle < of_other) | ((middle == of_other) & (ends < other)))[number])
 

@@ -10,9 +10,9 @@ import typer
 import uwbsim
 from uwblink import Recording
 from uwblink.cli.shared import with_flags
+from uwblink.database import write_tables
 from uwblink.twr import COLUMNS
 from uwbsim.cli.commands import UWBSIM_FLAGS, app
-from uwbsim.tables import write_tables
 
 NOISELESS = Path(__file__).parents[2] / "scenarios" / "noiseless.toml"
 SHORT = {"run.duration_s": 2.0}

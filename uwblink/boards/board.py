@@ -20,9 +20,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final, Self, TypeVar
 
-from uwblink.boards.ports import SerialPort, Transport
-from uwblink.closing import Closing
-from uwblink.errors import BoardError, NoAnswerError, RangingFailedError, RefusedError
+from uwblink.boards.ports import Closing, SerialPort, Transport
+from uwblink.errors import BoardError, NoAnswerError, RangingFailedError, RefusedError, restating
 from uwblink.protocols.table import ON_BOARDS
 from uwblink.wire.codec import Decoder, Event, encode
 from uwblink.wire.messages import (
@@ -195,10 +194,8 @@ def checked(command: Message) -> bytes:
     )
     if isinstance(command, Broadcast) and len(command.data) > 57:
         raise RefusedError(f"a broadcast of {len(command.data)} bytes: at most 57 fit; {why}")
-    try:
+    with restating(RefusedError, ValueError):
         data = encode(command)
-    except ValueError as error:
-        raise RefusedError(str(error)) from error
     if len(data) > 64:
         raise RefusedError(f"{kind} of {len(data)} bytes: {why}")
     return data

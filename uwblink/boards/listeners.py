@@ -22,14 +22,13 @@ function that corrects exchanges.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import entry_points
 from pathlib import Path
 
 from uwblink.corrections import Columns, Correction
-from uwblink.errors import PlanError
+from uwblink.errors import PlanError, restating
 from uwblink.recording.antenna_delays import AntennaDelays, delays_differ
 from uwblink.recording.schema import Fault
 from uwblink.recording.summary import counted
@@ -331,20 +330,13 @@ def load_correction(path: Path) -> Correction:
     found = sorted(entry_points(group="uwbcal.corrections"), key=lambda entry: entry.name)
     if not found:
         raise PlanError(f"{path}: no installed distribution corrects ranges (entry points of uwbcal.corrections)")
-    translated = _as_plan_errors()
-    with _as_plan_errors():
+    kinds = (ValueError, OSError, ImportError)
+    translated = restating(PlanError, *kinds)
+    with restating(PlanError, *kinds):
         made = found[0].load()(path)
     known = made if isinstance(made, Correction) else Correction(made)
     differences = known.differences and translated(known.differences)
     return replace(known, ranges=translated(known.ranges), differences=differences)
-
-
-@contextmanager
-def _as_plan_errors() -> Iterator[None]:
-    try:
-        yield
-    except (ValueError, OSError, ImportError) as error:
-        raise PlanError(str(error)) from error
 
 
 def delays_warning(correct: Correction | None, delays: AntennaDelays, tags: Iterable[int] | None = None) -> str:

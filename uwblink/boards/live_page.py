@@ -24,7 +24,7 @@ from typing import Final
 import numpy as np
 
 from uwblink.boards.listeners import Listener, Pair, Progress, check_pairs
-from uwblink.closing import Closing
+from uwblink.boards.ports import Closing
 from uwblink.corrections import Columns
 from uwblink.database import log_of
 from uwblink.errors import PortError, raising

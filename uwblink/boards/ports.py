@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, Self
 
 import serial
 from serial.tools import list_ports
@@ -31,6 +31,23 @@ except ImportError:  # pragma: no cover - Windows has no pseudo-terminals
 
 POLL_S: Final = 0.002
 """How long a port without a descriptor is waited for before others are asked; an exchange takes 4 ms."""
+
+
+class Closing:
+    """Base of classes with a method `close`: leaving a `with` block calls it."""
+
+    __slots__ = ()
+
+    def close(self) -> None:
+        """Close; a derived class says what."""
+
+    def __enter__(self) -> Self:
+        """Return the object itself."""
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        """Close."""
+        self.close()
 
 
 class Transport(Protocol):

@@ -27,7 +27,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from uwblink.errors import PlanError
+from uwblink.errors import PlanError, restating
 from uwblink.protocols.table import ON_BOARDS
 from uwblink.recording.antenna_delays import (
     ANTENNA_DELAY_KEYS,
@@ -138,10 +138,8 @@ def load_plan(path: Path) -> RangingPlan:
     file.check("pairs", pairs, pairs == "all" or bool(listed), '"all" or [[initiator, target], ...] of ids')
     given["pairs"] = tuple(map(tuple, pairs)) if listed else "all"
     tags, delays = read_tags(file), read_antenna_delays(file)
-    try:
+    with restating(PlanError, PlanError, where=f"{path}: "):
         return RangingPlan(**given, tags=tags, antenna_delays=delays)
-    except PlanError as error:
-        raise PlanError(f"{path}: {error}") from error
 
 
 def _is_pair(pair: Any) -> bool:

@@ -17,10 +17,9 @@ import numpy as np
 
 from uwblink.boards.board import Board
 from uwblink.boards.listeners import DelayCheck, Heard, Listener, Pair, Progress, WrongDelayError, as_listeners
-from uwblink.boards.ports import Ports, SerialPorts
+from uwblink.boards.ports import Closing, Ports, SerialPorts
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.recorder import Recorder
-from uwblink.closing import Closing
 from uwblink.database import log_of
 from uwblink.errors import PlanError, RecordingError
 from uwblink.output import check_output

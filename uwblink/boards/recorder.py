@@ -13,9 +13,8 @@ from typing import Final
 
 from uwblink.boards.board import FENCE, QUIET_AFTER_CIR_S, QUIET_TARGET_S, Board, CommandOutcome, Connection
 from uwblink.boards.listeners import Heard, Listener, Pair, PairState, Progress, ReportCheck, Turn
-from uwblink.boards.ports import Ports, SerialPorts, Transport, serial_number
+from uwblink.boards.ports import Closing, Ports, SerialPorts, Transport, serial_number
 from uwblink.boards.ranging_plan import RangingPlan
-from uwblink.closing import Closing
 from uwblink.errors import BoardError, PortError, PortLostError
 from uwblink.recording.schema import Fault
 from uwblink.wire.codec import LONGEST_LINE, Event

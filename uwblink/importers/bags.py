@@ -181,7 +181,7 @@ def bag_to_table(sources: Sequence[Path], map_file: Path | None, folder: Path) -
     if first is None:
         raise ImportTableError(f"{source}: no message on the topics of the map")
     # Times are in nanoseconds unless the map says otherwise.
-    column_map = replace(column_map, time_unit=column_map.time_unit or "ns")
+    column_map = replace(column_map, units={"time": "ns"} | column_map.units)
     if "time_s" in column_map.columns or "time_s" in column_map.constants:
         return [table], column_map
     stamped = isinstance(first.get("header"), dict) and "stamp" in first["header"]
@@ -202,8 +202,8 @@ def _with_topics(bag: Bag, column_map: ColumnMap) -> ColumnMap:
         return replace(column_map, topics=topics)
     for kind, template, columns in _OWN:
         if own := matching_topics(template, (topic for topic, one in bag.kinds.items() if one == kind)):
-            columns, unit = columns | column_map.columns, column_map.distance_unit or "m"
-            return replace(column_map, topics=own, columns=columns, distance_unit=unit)
+            columns, units = columns | column_map.columns, {"distance": "m"} | column_map.units
+            return replace(column_map, topics=own, columns=columns, units=units)
     if len(bag.kinds) == 1:
         return replace(column_map, topics={topic: {} for topic in bag.kinds})
     raise ImportTableError(

@@ -46,6 +46,7 @@ fpp2 = -80
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -88,12 +89,26 @@ TIME_UNITS: Final = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 DISTANCE_UNITS: Final = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "in": 0.0254}
 FLIGHT_UNITS: Final = {unit: STAMP_UNITS[unit] * METRES_PER_TICK for unit in STAMP_UNITS}
 """Units of times of flight, which are ranges, too."""
-RANGE_UNITS: Final = DISTANCE_UNITS | FLIGHT_UNITS
-UNITS_OF_DISTANCES: Final = dict.fromkeys(DISTANCES, DISTANCE_UNITS) | dict.fromkeys(
-    ("range_m", "difference_m"), RANGE_UNITS
-)
 POWERS: Final = ("fpp1", "fpp2", "rxp1", "rxp2", "fpp", "rxp")
 SKEWS: Final = ("skew1", "skew2", "skew")
+KINDS: Final = (
+    dict.fromkeys(NAMES, "number")
+    | {"time_s": "time", "message": "message", "event": "event"}
+    | dict.fromkeys(ALL_IDS, "id")
+    | dict.fromkeys((*STAMPS, "tx", "rx", "stamp"), "stamps")
+    | dict.fromkeys(DISTANCES, "distance")
+    | dict.fromkeys(POWERS, "power")
+    | dict.fromkeys(SKEWS, "skew")
+)
+"""The kind of each column; those with units have the name of their key in `units`."""
+
+UNITS: Final[dict[str, Mapping[str, float]]] = (
+    {"stamps": STAMP_UNITS, "time": TIME_UNITS | {"iso": 1.0}, "skew": CHIPS["other"].skew_ppm}
+    | dict.fromkeys(("distance", *DISTANCES), DISTANCE_UNITS)
+    | dict.fromkeys(("range_m", "difference_m"), DISTANCE_UNITS | FLIGHT_UNITS)
+    | {name: {"dBm": 1.0, "-dBm": -1.0} for name in ("power", *POWERS)}
+)
+"""Units by key of `units`, for a kind of columns or one column: what a unit is in ticks, ns, m, dBm or ppm."""
 MAP_KEYS: Final = (
     FileKey(
         "layout",
@@ -246,7 +261,7 @@ MAP_KEYS: Final = (
 class ColumnMap:
     """How to read a table; fields that are None are determined from the table.
 
-    `ticks_per_unit` converts stamps into ticks. `antenna_delays` are the programmed delays by device, in ticks.
+    `units` are by column, or by kind of columns. `antenna_delays` are the programmed delays by device, in ticks.
     """
 
     layout: str | None = None
@@ -257,10 +272,6 @@ class ColumnMap:
     decimal: str | None = None
     within_s: float = 1.0
     columns: dict[str, str] = field(default_factory=dict)
-    ticks_per_unit: float = 1.0
-    time_unit: str | None = None
-    distance_unit: str | None = None
-    power_unit: str | None = None
     constants: dict[str, float | str] = field(default_factory=dict)
     ids: dict[str, int] = field(default_factory=dict)
     antenna_delays: AntennaDelays = field(default_factory=dict)
@@ -273,20 +284,22 @@ class ColumnMap:
     headerless: bool = False
     registers: dict[str, dict[str, str]] = field(default_factory=dict)
     wide: dict[str, str | dict[str, str]] = field(default_factory=dict)
-    units: dict[str, str] = field(default_factory=dict)
+    units: dict[str, Any] = field(default_factory=dict)
     topics: dict[str, dict[str, float | str]] = field(default_factory=dict)
 
     def header(self, name: str) -> str:
         """Return the table's name of a column of `NAMES`."""
         return self.columns.get(name, name)
 
-    def distance_of(self, name: str) -> str | None:
-        """Return the unit of a column of `DISTANCES`; None if the map does not state it."""
-        return self.units.get(name, self.distance_unit)
+    def unit_of(self, name: str) -> Any:
+        """Return the unit of a column of `NAMES`; None if the map does not state it."""
+        return self.units.get(name, "dBm" if name in self.registers else self.units.get(KINDS[name]))
 
-    def power_of(self, name: str) -> str | None:
-        """Return the unit of a column of `POWERS`; None if the map does not state it."""
-        return self.units.get(name, "dBm" if name in self.registers else self.power_unit)
+    def factor(self, name: str) -> float:
+        """Return what a column of `NAMES` is multiplied by, so that it is in ticks, m, dBm or ppm."""
+        units = CHIPS[self.chip or "other"].skew_ppm if name in SKEWS else UNITS.get(name, UNITS.get(KINDS[name], {}))
+        unit = self.unit_of(name)
+        return unit * TICKS_PER_SECOND if is_number(unit) else units.get(unit, 1.0)
 
 
 JSON_LINE: Final = "{json}"
@@ -296,9 +309,7 @@ JSON_LINE: Final = "{json}"
 def map_of_lines(name: str) -> ColumnMap:
     """Return the map of a form of `LINES`."""
     known = LINES[name]
-    return ColumnMap(
-        line=known["line"], each=known.get("each"), wide=known.get("wide", {}), distance_unit=known["units"]["distance"]
-    )
+    return ColumnMap(line=known["line"], each=known.get("each"), wide=known.get("wide", {}), units=known["units"])
 
 
 def load_map(path: Path) -> ColumnMap:
@@ -323,12 +334,15 @@ def load_map(path: Path) -> ColumnMap:
     for text in (*(table[name] for name in templates), *file.section("topics")):
         for place in places(Template(text)):
             _place(place, columns, units)
-    file.known(units, ("stamps", "time", "distance", "power", "skew", *DISTANCES, *POWERS), "units.")
+    file.known(units, UNITS, "units.")
     chip = file.choice("chip", table.get("chip"), (None, *CHIPS))
     _check_columns(file, columns, wide, chip)
     _check_values(file, ids)
     registers = {name: value for name, value in columns.items() if isinstance(value, dict)}
-    stamps = units.get("stamps", "ticks")
+    allowed = UNITS | {"skew": CHIPS[chip or "other"].skew_ppm}
+    for name, unit in units.items():
+        if name != "stamps" or not is_number(unit) or unit <= 0:  # the length of a unit of stamps in seconds
+            file.choice(f"units.{name}", unit, allowed[name])
     return ColumnMap(
         layout=file.choice(
             "layout",
@@ -342,12 +356,6 @@ def load_map(path: Path) -> ColumnMap:
         decimal=file.choice("decimal", table.get("decimal"), (None, ".", ",")),
         within_s=float(table.get("within_s", 1.0)),
         columns={name: str(value) for name, value in columns.items() if name not in registers},
-        ticks_per_unit=float(stamps * TICKS_PER_SECOND)
-        if is_number(stamps) and stamps > 0
-        else STAMP_UNITS[file.choice("units.stamps", stamps, STAMP_UNITS)],
-        time_unit=file.choice("units.time", units.get("time"), (None, "iso", *TIME_UNITS)),
-        distance_unit=file.choice("units.distance", units.get("distance"), (None, *DISTANCE_UNITS)),
-        power_unit=file.choice("units.power", units.get("power"), (None, "dBm", "-dBm")),
         constants={name: v if isinstance(v, str) else float(v) for name, v in constants.items()},
         ids=ids,
         antenna_delays=read_antenna_delays(file, {name: STAMP_UNITS[name] for name in ("ticks", "ns")}),
@@ -360,7 +368,7 @@ def load_map(path: Path) -> ColumnMap:
         headerless=any(type(value) is int for value in columns.values()),
         registers=registers,
         wide=wide,
-        units=_units_of_columns(file, units, chip),
+        units=units,
         topics=file.section("topics"),
     )
 
@@ -405,21 +413,13 @@ def _check_values(file: TomlReader, ids: dict[str, Any]) -> None:
 
 def _place(place: str, columns: dict[str, Any], units: dict[str, Any]) -> None:
     """State which column a place such as `gt_range_cm` is, and its unit."""
-    known = UNITS_OF_DISTANCES | {"time_s": TIME_UNITS}
-    for name, units_of in known.items():
-        stem, unit = place.rpartition("_")[::2]
-        if stem == name.rpartition("_")[0] and unit in units_of:
+    stem, _, unit = place.rpartition("_")
+    for name in ("time_s", *DISTANCES):
+        if stem == name.rpartition("_")[0] and unit in UNITS[name if name in UNITS else "time"]:
             columns.setdefault(name, place)
             if place == name and "distance" in units:
                 continue  # our own name, whose unit is stated
             units.setdefault(name if name != "time_s" else "time", unit)
-
-
-def _units_of_columns(file: TomlReader, units: dict[str, Any], chip: str | None) -> dict[str, str]:
-    """Return the units of single columns, and of skews."""
-    allowed: dict[str, Any] = UNITS_OF_DISTANCES | dict.fromkeys(POWERS, ("dBm", "-dBm"))
-    allowed["skew"] = CHIPS[chip or "other"].skew_ppm
-    return {name: file.choice(f"units.{name}", unit, allowed[name]) for name, unit in units.items() if name in allowed}
 
 
 def _constants(file: TomlReader, where: str, values: dict[str, Any]) -> None:

@@ -24,7 +24,7 @@ from uwblink.importers.column_map import (
     POSITIONS,
     POWERS,
     TIME_UNITS,
-    UNITS_OF_DISTANCES,
+    UNITS,
     ColumnMap,
     map_of_lines,
 )
@@ -286,18 +286,18 @@ def units_of(form: ColumnMap, columns: dict[str, str], cells: dict[str, Floats])
     found: Entries = {}
     if "time_s" in columns:
         found["time"] = _time_unit(columns["time_s"], cells["time_s"])
-        if found["time"][0] == ASKED and form.time_unit:
-            found["time"] = form.time_unit, "as times in bags"
+        if found["time"][0] == ASKED and "time" in form.units:
+            found["time"] = form.units["time"], "as times in bags"
     named = {name: _header(form, name, columns[name]) for name in DISTANCES if name in columns}
-    units = {name: unit for name, header in named.items() if (unit := unit_in(header, UNITS_OF_DISTANCES[name]))}
+    units = {name: unit for name, header in named.items() if (unit := unit_in(header, UNITS[name]))}
     alike, value = set(units.values()), "difference_m" if "difference_m" in cells else "range_m"
-    if form.line and form.distance_unit:
-        found["distance"] = form.distance_unit, "as these boards print"
+    if form.line and "distance" in form.units:
+        found["distance"] = form.units["distance"], "as these boards print"
     elif len(alike) == 1 and not alike & FLIGHT_UNITS.keys() and (value in units or value not in cells):
         found["distance"] = next(iter(units.values())), "by the columns' names"
         units = {}
     elif value in cells and value not in units and (why := reason_against_metres(cells[value])):
-        listed = ", ".join(UNITS_OF_DISTANCES[value])
+        listed = ", ".join(UNITS[value])
         found["distance" if value == "range_m" else value] = ASKED, f"{why}: write {listed}"
     found |= {name: (unit, "by the column's name") for name, unit in units.items()}
     if "range_m" in named and "range_m" not in units and re.search("tof|flight", named["range_m"].lower()):

@@ -190,7 +190,7 @@ def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Map
             top["each"] = each, "a line has a list of them"
     given = {*given, *(n for text in (form.line, form.each) if text for n in places(Template(text)) if n in NAMES)}
     given |= {"to_id", *wide, *(["from_id"] if "{from_id}" in str(wide) else [])} if wide else set()
-    form = replace(form, wide=wide, each=form.each or each, time_unit="ns" if is_bag(path) else None)
+    form = replace(form, wide=wide, each=form.each or each, units=form.units | ({"time": "ns"} if is_bag(path) else {}))
     with open_table(file, form) as table:
         # Fields of the elements of a list are called by their own names.
         short = {name.removeprefix(f"{form.each}."): name for name in table.names}
@@ -379,7 +379,7 @@ def _exchange_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> Stamp
         bits, kind = counter_format(rows[name] * scale for name in stamps)
         for without, name in product(undelayed, protocols):
             reading = Reading(name, bits, undelayed=without)
-            trials.append((unit, kind, try_reading(rows, ColumnMap(ticks_per_unit=scale), reading)))
+            trials.append((unit, kind, try_reading(rows, ColumnMap(units={"stamps": unit}), reading)))
     unit, kind, best = max(trials, key=lambda found: round(found[2].plausible, 2))
     known = best.plausible >= ACCEPTED_SHARE
     check = "" if best.plausible >= FITTING_SHARE else "; check columns and units"

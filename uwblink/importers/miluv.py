@@ -17,7 +17,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 import yaml
 
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, in_time_order
 from uwblink.errors import ImportTableError, raising
 from uwblink.importers.plausibility import clocks, to_ticks
 from uwblink.importers.poses import in_order
@@ -161,15 +161,14 @@ def _read(
         parts.append({n: column[~bad] for n, column in columns.items() if n != "body" or not ids})
     if not sum(len(part["time_ns"]) for part in parts):
         return {}
-    joined = {n: np.concatenate([part[n] for part in parts]) for n in parts[0]}
+    joined = in_time_order(parts)
     joined["time_ns"] += flight.start_ns
-    order = np.argsort(joined["time_ns"], kind="stable")
-    if ids:
-        key = ["time_ns", *ids, *(n for n in ("tx1", "rx1") if n in joined)]
-        first = np.sort(np.unique(np.column_stack([joined[n][order] for n in key]), axis=0, return_index=True)[1])
-        flight.doubled[name] = len(order) - len(first)
-        order = order[first]
-    return {n: column[order] for n, column in joined.items()}
+    if not ids:
+        return joined
+    key = ["time_ns", *ids, *(n for n in ("tx1", "rx1") if n in joined)]
+    first = np.sort(np.unique(np.column_stack([joined[n] for n in key]), axis=0, return_index=True)[1])
+    flight.doubled[name] = len(joined["time_ns"]) - len(first)
+    return {n: column[first] for n, column in joined.items()}
 
 
 def _cell(name: str, text: str) -> str:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import DISTANCE_UNITS, IDS, POSITIONS, POWERS, RANGE_UNITS, ColumnMap
+from uwblink.importers.column_map import DISTANCE_UNITS, IDS, POSITIONS, POWERS, ColumnMap
 from uwblink.importers.devices import CHIPS
 from uwblink.importers.tables import Columns
 from uwblink.protocols.table import PROTOCOLS
@@ -42,11 +42,11 @@ FITTING_SHARE: Final = 0.9
 
 def clocks(protocol: str) -> tuple[tuple[str, ...], ...]:
     """Return the stamps of an exchange by clock, those of the initiator first."""
-    third = PROTOCOLS[protocol].third_sender
-    if third is None:
-        return ("tx1", "rx2"), ("rx1", "tx2")
-    mine, other = ("tx3", "rx3") if third == "initiator" else ("rx3", "tx3")
-    return ("tx1", "rx2", mine), ("rx1", "tx2", other)
+    numbered = list(enumerate(PROTOCOLS[protocol].messages, 1))
+    return tuple(
+        tuple(f"{'tx' if message.sender == side else 'rx'}{number}" for number, message in numbered)
+        for side in ("initiator", "target")
+    )
 
 
 def stamps_of(protocol: str) -> tuple[str, ...]:
@@ -235,7 +235,7 @@ def exchanges_of(column_map: ColumnMap, rows: Columns, reading: Reading | None, 
     stamps: dict[str, Any] = dict.fromkeys(STAMPS, np.zeros(count, dtype=np.int64))
     protocol, bits = (reading.protocol, reading.bits) if reading else ("ss", 32)
     if reading:
-        stamps |= to_ticks(rows, clocks(protocol), column_map.ticks_per_unit, bits)
+        stamps |= to_ticks(rows, clocks(protocol), column_map.factor("tx1"), bits)
     return Exchanges(
         time_ns=rows.get("time_ns", np.arange(before, before + count) * ROW_PERIOD_NS),
         initiator=rows["from_id"], target=rows["to_id"], reporter=rows["from_id"], protocol=np.full(count, protocol),
@@ -348,17 +348,17 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
     reasons, limits = dict[str, tuple[str, str]](), CHIPS[column_map.chip or "other"].power_dbm
     for name in POWERS:
         remedy = 'units.power in the map: "-dBm" if they lack their sign'
-        if column_map.power_of(name) is None:
+        if column_map.unit_of(name) is None:
             reasons[name] = reason_against_dbm(optional(rows, name)), remedy
         elif column_map.chip and (why := reason_against_limits(optional(rows, name), limits)):
             reasons[name] = why, f"another unit, chip or prf than {column_map.chip!r} and {column_map.prf} in the map"
     for name in ("range_m", "gt_range_m") if raw_m is None else ():
-        factor = RANGE_UNITS[column_map.distance_of(name) or "m"]
+        factor = column_map.factor(name)
         for value, share in sentinels(np.round(optional(rows, name) / factor, 6)).items():
             why = f"{share:.1%} of its numbers are {value:.10g}, which is no distance"
             reasons[name] = why, f"missing = [{value:.10g}] in the map"
     for name in ("range_m", "difference_m"):
-        if column_map.distance_of(name) is None and name not in reasons:
+        if column_map.unit_of(name) is None and name not in reasons:
             reasons[name] = reason_against_metres(optional(rows, name)), f"units.distance or units.{name} in the map"
     for name, (why, remedy) in reasons.items():
         if why:
@@ -370,6 +370,6 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
     if found:
         beside = "the others" if raw_m is None else "its stamps"
         raise ImportTableError(
-            f"{path}: {found} by {beside}, and in {column_map.distance_unit or 'm'} by the map; "
+            f"{path}: {found} by {beside}, and in {column_map.units.get('distance', 'm')} by the map; "
             'units.distance is for all of them, and [units] range_m = "mm" for one column'
         )

@@ -448,11 +448,11 @@ def _plain(path: Path, head: Lines, body: str | None, stated: ColumnMap) -> Pose
     (time, time_unit), unit = found["time_s"], next(iter(units))
     first = head[1][time] if len(head) > 1 and time < len(head[1]) else ""
     iso = math.isnan(_number(first)) and _iso_ns(first) != first
-    time_unit = "ns" if iso else stated.time_unit or time_unit or "s"
+    time_unit = "ns" if iso else stated.units.get("time") or time_unit or "s"
     return PoseLayout(
         form="", names=names, time=time, ns=TIME_UNITS[time_unit], iso=iso,
         bodies={"": [found[name][0] for name in needed]}, header=1, gaps=False,
-        metres=DISTANCE_UNITS[stated.distance_unit or unit or "m"], body=None if body else found["body"][0],
+        metres=DISTANCE_UNITS[stated.units.get("distance") or unit or "m"], body=None if body else found["body"][0],
     )  # fmt: skip
 
 

@@ -24,13 +24,12 @@ import numpy as np
 from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.importers.column_map import (
     ALL_IDS,
-    DISTANCES,
     IDS,
+    KINDS,
     NAMES,
     POWERS,
-    RANGE_UNITS,
     SKEWS,
-    TIME_UNITS,
+    UNITS,
     ColumnMap,
 )
 from uwblink.importers.devices import CHIPS, power_sql
@@ -276,23 +275,21 @@ def _is_missing(table: SourceTable, text: str) -> str:
 
 def _cell(table: SourceTable, name: str, text: str) -> str:
     """Return SQL of a cell in SI units, from its text."""
-    column_map = table.column_map
-    if name in ALL_IDS:
+    kind, column_map = KINDS[name], table.column_map
+    if kind == "id":
         return f"trim({text})"
-    if name == "time_s":
-        return time_ns(text, column_map.time_unit, TIME_UNITS.get(column_map.time_unit or "s", 1.0))
-    if name == "message":
+    if kind == "time":
+        unit = column_map.unit_of(name)
+        return time_ns(text, unit, UNITS["time"][unit or "s"])
+    if kind == "message":
         return message_number(text)
-    if name == "event":
+    if kind == "event":
         first = f"lower(left(trim({text}), 1))"
         return f"CASE WHEN {first} IN ('t', 's') THEN 1.0 WHEN {first} = 'r' THEN 2.0 END"
-    if name in (*STAMPS, "tx", "rx", "stamp") and column_map.ticks_per_unit == 1.0:
-        return whole_number(text)
-    factor = RANGE_UNITS[column_map.distance_of(name) or "m"] if name in DISTANCES else 1.0
-    if name in POWERS and column_map.power_of(name) == "-dBm":
-        factor = -1.0
-    if name in SKEWS:
-        factor = CHIPS[column_map.chip or "other"].skew_ppm[column_map.units.get("skew", "ppm")]
+    # Stamps in other units become ticks later, all of an exchange together (`plausibility.to_ticks`).
+    factor = column_map.factor(name)
+    if kind == "stamps":
+        return whole_number(text) if factor == 1.0 else number(text)
     value = number(text) + (f" * {factor!r}" if factor != 1.0 else "")
     if column_map.missing and name in ("range_m", "difference_m", "gt_range_m", *POWERS, *SKEWS):
         return f"CASE WHEN NOT {_is_missing(table, text)} THEN {value} END"
@@ -430,7 +427,7 @@ def usable_exchanges(
     Also returns the number of repetitions, and width and format of the counter.
     """
     column_map, sample = staging.column_map, rows.sample(SAMPLE_ROWS)
-    scale = column_map.ticks_per_unit
+    scale = column_map.factor("tx1")
     bits, counter = counter_format((sample[name] * scale for name in stamps), column_map.bits, column_map.counter)
     low = 0 if counter == "wrapped" else -(1 << (bits - 1))
     expected = "a whole number" if scale == 1.0 else "a stamp in ticks"
@@ -518,7 +515,7 @@ def broadcast_exchanges(staging: Staging, faults: Faults, notes: list[str]) -> t
     The receptions, and what third tags overheard of the exchanges, are put beside. Raises `ImportTableError`.
     """
     staging.require(staging.rows, ("tx", "rx", "sequence", "heard"))
-    if staging.column_map.ticks_per_unit != 1.0:
+    if staging.column_map.factor("tx") != 1.0:
         raise ImportTableError(f"{staging.paths[0]}: units.stamps: broadcasts need ticks")
     whole = [Condition(name, "a whole number", f"{name} IS NULL") for name in ("tx", "rx", "sequence", "heard")]
     rows = faults.reject(staging.rows, [*SOUND_IDS, *time_conditions(staging.rows), *whole])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -102,14 +102,15 @@ class Contents:
             for name in _COLUMNS
             if (columns := getattr(self, name))
         }
-        return replace(
-            self,
+        return Contents(
             exchanges=self.exchanges[chosen(self.exchanges.to_dict())],
+            tags=self.tags,
             poses=poses_around(tracks_of(self.poses), first_ns, end_ns),
             cirs=rows(self.cirs, "initiator", "target"),
             frames=rows(self.frames),
             faults=rows(self.faults),
             arrangements=[row for row in self.arrangements if row.start_ns < end_ns and first_ns <= row.end_ns],
+            known_distances=self.known_distances,
             meta={**self.meta, "selected": {key: value for key, value in kept.items() if value is not None}},
             **cut,
         )

@@ -25,7 +25,7 @@ from http.client import HTTPException, parse_headers
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from uwblink.closing import Closing
+from uwblink.boards.ports import Closing
 from uwblink.errors import ArgumentError, PortError, raising
 from uwblink.exporters.mcap import RANGE, SCHEMAS, stamped
 from uwblink.streaming.sources import StreamedRange

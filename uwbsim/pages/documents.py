@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from uwblink.database import write_tables
 from uwblink.output import check_folder, check_output, made_folder, write_bytes, write_files, write_text
 from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text, to_html
 from uwblink.pages.figures import picture
@@ -20,13 +21,12 @@ from uwbsim.errors import ScenarioError
 from uwbsim.pages import figures
 from uwbsim.protocols.comparison import BestDelay, ProtocolComparison, ProtocolErrors, over_reply, over_skew, over_state
 from uwbsim.protocols.conditions import conditions_of
-from uwbsim.protocols.fleet import FleetFigures
+from uwbsim.protocols.prediction import FleetFigures
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import preview
 from uwbsim.sweep.design import SweepDesign
 from uwbsim.sweep.runner import STORE, ResultStore
-from uwbsim.tables import write_tables
 from uwbsim.twins import TWIN_LEVEL, Compared, Twin
 
 

@@ -14,8 +14,7 @@ from uwblink.arrays import Floats
 from uwblink.protocols.table import RangingProtocol
 from uwbsim.errors import ParameterError
 from uwbsim.protocols.conditions import Conditions, Protocols, calibrated, chosen, conditions_of, range_errors_m
-from uwbsim.protocols.fleet import FleetFigures, fleet_figures
-from uwbsim.protocols.prediction import predict
+from uwbsim.protocols.prediction import FleetFigures, fleet_figures, predict
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.ranging import TURNAROUND_S, exchange_costs

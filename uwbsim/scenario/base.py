@@ -47,6 +47,12 @@ def limit_of(key: str) -> tuple[float, str]:
     return BY_UNIT[max(filter(key.endswith, BY_UNIT), key=len)]
 
 
+def require(met: object, text: str) -> None:
+    """Raise `ValueError` with a text, of the key and of what was found, unless a condition is met."""
+    if not met:
+        raise ValueError(text)
+
+
 def check_limits(key: str, value: Any) -> None:
     """Raise `ValueError` for a number beyond the limit of its key, alone or in tuples; anything else passes."""
     if isinstance(value, tuple):
@@ -58,15 +64,15 @@ def check_limits(key: str, value: Any) -> None:
 
 
 def _increasing(values: Sequence[float]) -> Sequence[float]:
-    if any(b <= a for a, b in pairwise(values)):
-        raise ValueError("found a value that is not above the one before; they must increase")
+    rising = all(a < b for a, b in pairwise(values))
+    require(rising, "found a value that is not above the one before; they must increase")
     return values
 
 
 def not_decreasing(values: Sequence[float]) -> Sequence[float]:
     """Raise `ValueError` for values that do not increase or stay."""
-    if any(b < a for a, b in pairwise(values)):
-        raise ValueError("found a value that is below the one before; they must not decrease")
+    rising = all(a <= b for a, b in pairwise(values))
+    require(rising, "found a value that is below the one before; they must not decrease")
     return values
 
 
@@ -74,9 +80,15 @@ def look_up(known: Mapping[str, Any], value: Any) -> Any:
     """Return what a name stands for, and any other value as it is; raises `ValueError` for an unknown name."""
     if not isinstance(value, str):
         return value
-    if value not in known:
+    if value not in known:  # to list the names of a table would load its plug-ins
         raise ValueError(f"found {value!r}, known are {', '.join(known)}")
     return known[value]
+
+
+def known_in(known: Mapping[str, Any], value: Any) -> Any:
+    """Return a value as it is; raises `ValueError` for a name that is none of `known`."""
+    look_up(known, value)
+    return value
 
 
 Positive = Annotated[float, Field(gt=0)]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, Final, Literal, Self
+from typing import Annotated, ClassVar, Final, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from uwbsim.scenario.base import Increasing, NotNegative, Positive, Section, Vector, look_up
+from uwbsim.scenario.base import Increasing, NotNegative, Positive, Section, Vector, known_in, require
 
 
 class Box(Section):
@@ -19,8 +19,8 @@ class Box(Section):
     @model_validator(mode="after")
     def _check_corners(self) -> Self:
         low, high = (f"{self.corner}{end}_m" for end in ("min", "max"))
-        if any(lo >= hi for lo, hi in zip(getattr(self, low), getattr(self, high), strict=True)):
-            raise ValueError(f"{low}: must be below {high} in every direction")
+        sides = zip(getattr(self, low), getattr(self, high), strict=True)
+        require(all(lo < hi for lo, hi in sides), f"{low}: must be below {high} in every direction")
         return self
 
 
@@ -55,14 +55,13 @@ class Waypoints(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if (self.times_s is None) == (self.speed_mps is None):
-            raise ValueError("times_s: give either times_s or speed_mps")
+        require((self.times_s is None) != (self.speed_mps is None), "times_s: give either times_s or speed_mps")
         if self.times_s is not None and len(self.times_s) != len(self.points_m):
             raise ValueError(
                 f"points_m: found {len(self.points_m)} points at {len(self.times_s)} times, give one time each"
             )
-        if self.times_s is None and any(a == b for a, b in pairwise(self.points_m)):
-            raise ValueError("points_m: found the same point twice in a row")
+        apart = self.times_s is not None or all(a != b for a, b in pairwise(self.points_m))
+        require(apart, "points_m: found the same point twice in a row")
         return self
 
 
@@ -197,12 +196,7 @@ class Material(Section):
     index: Annotated[float, Field(ge=1)] = Field(1.0, description="Refractive index.")
 
 
-def _known(material: Any) -> Any:
-    look_up(MATERIALS, material)
-    return material
-
-
-KnownMaterial = Annotated[str | Material, AfterValidator(_known)]
+KnownMaterial = Annotated[str | Material, AfterValidator(lambda material: known_in(MATERIALS, material))]
 
 
 class Obstacle(Box):

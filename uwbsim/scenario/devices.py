@@ -8,11 +8,11 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from uwblink.errors import PlanError
+from uwblink.errors import PlanError, restating
 from uwblink.recording.antenna_delays import REGISTER_MAX, delay_of, load_antenna_delays
 from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S, TX_SHARE
 from uwbsim.errors import ScenarioError
-from uwbsim.scenario.base import Increasing, NotNegative, Positive, Section, TagId, Vector
+from uwbsim.scenario.base import Increasing, NotNegative, Positive, Section, TagId, Vector, require
 from uwbsim.scenario.bodies import Height, Imu, Motion, Shadow
 
 
@@ -63,8 +63,8 @@ class ProfileTable(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if not self.times_s or len(self.times_s) != len(self.values):
-            raise ValueError(f"values: found {len(self.values)} at {len(self.times_s)} times, give one a time")
+        matched = self.times_s and len(self.times_s) == len(self.values)
+        require(matched, f"values: found {len(self.values)} at {len(self.times_s)} times, give one a time")
         return self
 
 
@@ -156,15 +156,14 @@ def check_grid(
         ("azimuth_deg", azimuth_deg, -180.0, 180.0),
         ("elevation_deg", elevation_deg, -90.0, 90.0),
     ):
-        if len(values) < 2 or any(b <= a for a, b in itertools.pairwise(values)):
-            raise ValueError(f"{axis}: must increase, and hold two values or more")
-        if values[0] != low or values[-1] != high:
-            raise ValueError(f"{axis}: runs from {values[0]:g} to {values[-1]:g}, expected {low:g} to {high:g}")
-    if len(rows) != len(azimuth_deg):
-        raise ValueError(f"{name}: found {len(rows)} rows, the azimuths are {len(azimuth_deg)}")
+        rising = all(a < b for a, b in itertools.pairwise(values))
+        require(len(values) > 1 and rising, f"{axis}: must increase, and hold two values or more")
+        ends = f"{axis}: runs from {values[0]:g} to {values[-1]:g}, expected {low:g} to {high:g}"
+        require((values[0], values[-1]) == (low, high), ends)
+    require(len(rows) == len(azimuth_deg), f"{name}: found {len(rows)} rows, the azimuths are {len(azimuth_deg)}")
+    count = len(elevation_deg)
     for k, row in enumerate(rows):
-        if len(row) != len(elevation_deg):
-            raise ValueError(f"{name}[{k}]: found {len(row)} values, the elevations are {len(elevation_deg)}")
+        require(len(row) == count, f"{name}[{k}]: found {len(row)} values, the elevations are {count}")
 
 
 Register = Annotated[int, Field(ge=0, le=REGISTER_MAX)]
@@ -286,10 +285,10 @@ class ScenarioTag(Section):
     @model_validator(mode="after")
     def _check(self) -> Self:
         parts = (self.tx_delay_ns is not None, self.rx_delay_ns is not None)
-        if parts[0] != parts[1] or (parts[0] and self.delay_ns is not None):
-            raise ValueError("delay_ns: give it alone, or both tx_delay_ns and rx_delay_ns instead")
-        if len(self.pattern_db) not in (0, 1, 4, 9, 16, 25):
-            raise ValueError(f"pattern_db: found {len(self.pattern_db)} coefficients, expected 1, 4, 9, 16, 25 or none")
+        either = not any(parts) or (all(parts) and self.delay_ns is None)
+        require(either, "delay_ns: give it alone, or both tx_delay_ns and rx_delay_ns instead")
+        found = f"pattern_db: found {len(self.pattern_db)} coefficients"
+        require(len(self.pattern_db) in (0, 1, 4, 9, 16, 25), f"{found}, expected 1, 4, 9, 16, 25 or none")
         return self
 
     def delays_ns(self) -> tuple[float, float]:
@@ -308,10 +307,8 @@ class ScenarioTag(Section):
 
 def with_antenna_delays(tags: tuple[ScenarioTag, ...], path: Path) -> tuple[ScenarioTag, ...]:
     """Return tags with the antenna delays of a file programmed into them; raises `ScenarioError`."""
-    try:
+    with restating(ScenarioError, PlanError):
         delays = load_antenna_delays(path)
-    except PlanError as error:
-        raise ScenarioError(str(error)) from error
     found = {tag.id: delay_of(delays, tag.id) for tag in tags}
     programmed = {tag: Programmed(**one._asdict()) for tag, one in found.items() if one is not None}
     return tuple(tag.model_copy(update={"antenna_delay": programmed.get(tag.id, tag.antenna_delay)}) for tag in tags)

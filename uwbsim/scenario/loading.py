@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from uwblink.errors import UwblinkError
+from uwblink.errors import UwblinkError, restating
 from uwblink.output import made_folder, whole
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import SUFFIX
@@ -169,10 +169,8 @@ def _table(source: Source) -> tuple[dict[str, Any], Path]:
 
 def parse_toml(text: str, path: Path) -> dict[str, Any]:
     """Return the tables of a TOML text; raises `ScenarioError` that names its file."""
-    try:
-        return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ScenarioError(f"{path}: not valid TOML: {error}") from error
+    with restating(ScenarioError, tomllib.TOMLDecodeError, RecursionError, where=f"{path}: not valid TOML: "):
+        return dict(tomllib.loads(text))
 
 
 def _split(text: str) -> tuple[str, Any]:
@@ -384,14 +382,12 @@ def _trajectory(path: Path, _key: str, named: Mapping[str, Any]) -> dict[str, An
     from uwblink.importers.poses import read_poses
 
     body = named.get("body")
-    try:
+    with restating(ScenarioError, UwblinkError):
         if path.suffix == SUFFIX:
             with Recording.open(path) as recording:
                 poses = recording.poses()
         else:
             poses = read_poses(path, body if path.suffix in (".tum", ".txt") else None)
-    except UwblinkError as error:
-        raise ScenarioError(str(error)) from error
     names = sorted(set(poses.body.tolist()))
     body = names[0] if body is None and len(names) == 1 else body
     if body not in names:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, Self
 from pydantic import Field, model_validator
 
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwbsim.scenario.base import NotNegative, Positive, Section, Vector
+from uwbsim.scenario.base import NotNegative, Positive, Section, Vector, require
 from uwbsim.scenario.bodies import Motion, Obstacle, Recorded, Room
 from uwbsim.scenario.devices import Body, Devices, ScenarioTag
 from uwbsim.scenario.radio import GeometricMultipath, Radio, Spline, TwoStateMultipath
@@ -73,31 +73,25 @@ class Scenario(Section):
         names = [body.name for body in self.bodies]
         ids = [tag.id for tag in self.tags]
         for k, name in enumerate(names):
-            if name in names[:k]:
-                raise ValueError(f"bodies[{k}].name: found a second {name!r}, names must differ")
+            require(name not in names[:k], f"bodies[{k}].name: found a second {name!r}, names must differ")
         for k, tag in enumerate(self.tags):
-            if tag.id in ids[:k]:
-                raise ValueError(f"tags[{k}].id: found a second {tag.id}, ids must differ")
-            if tag.body not in names:
-                raise ValueError(f"tags[{k}].body: found {tag.body!r}, the bodies are {', '.join(names)}")
+            require(tag.id not in ids[:k], f"tags[{k}].id: found a second {tag.id}, ids must differ")
+            require(tag.body in names, f"tags[{k}].body: found {tag.body!r}, the bodies are {', '.join(names)}")
         self._check_tags(ids)
         self._check_geometric()
         self._check_places()
         self._check_plan()
         fastest = self.ranging.fastest_hz(self.radio.preamble_symbols, len(self.senders()))
-        if self.ranging.plan != "aloha" and self.ranging.rate_hz > fastest:
-            why = (
-                f"frames of {len(self.senders())} tags"
-                if self.ranging.plan == "broadcast"
-                else "this response_delay_uus"
-            )
-            raise ValueError(
-                f"ranging.rate_hz: found {self.ranging.rate_hz:g}, at {why} the air allows at most {fastest:.0f}"
-            )
-        if not self.pairs():
-            raise ValueError(
-                "ranging.pairs: no two tags sit on different bodies, or send broadcasts, so no exchange is possible"
-            )
+        broadcast, rate = self.ranging.plan == "broadcast", self.ranging.rate_hz
+        why = f"frames of {len(self.senders())} tags" if broadcast else "this response_delay_uus"
+        require(
+            self.ranging.plan == "aloha" or rate <= fastest,
+            f"ranging.rate_hz: found {rate:g}, at {why} the air allows at most {fastest:.0f}",
+        )
+        require(
+            self.pairs(),
+            "ranging.pairs: no two tags sit on different bodies, or send broadcasts, so no exchange is possible",
+        )
         return self
 
     def _check_tags(self, ids: list[int]) -> None:
@@ -123,21 +117,21 @@ class Scenario(Section):
                 f"room.reflection_loss_db: found {self.room.reflection_loss_db:g}, but in the geometric model surfaces "
                 "reflect as room.material does; leave it out"
             )
-        if model.scatterers and self.room is None:
-            raise ValueError(
-                f"radio.multipath.scatterers: found {model.scatterers} and no room to put them into; give room, or 0"
-            )
+        require(
+            self.room or not model.scatterers,
+            f"radio.multipath.scatterers: found {model.scatterers} and no room to put them into; give room, or 0",
+        )
 
     def _check_places(self) -> None:
         """Bodies must be inside the room, and recorded for the whole run; their tags a wavelength apart or more."""
         for k, body in enumerate(self.bodies):
             if isinstance(body.motion, Recorded):
                 lasts_s = max(body.motion.times_s, default=0.0)
-                if lasts_s < self.run.duration_s:
-                    raise ValueError(
-                        f"bodies[{k}].motion.file: its trajectory lasts {lasts_s:.1f} s and does not cover the run of "
-                        f"{self.run.duration_s:g} s"
-                    )
+                require(
+                    lasts_s >= self.run.duration_s,
+                    f"bodies[{k}].motion.file: its trajectory lasts {lasts_s:.1f} s and does not cover the run of "
+                    f"{self.run.duration_s:g} s",
+                )
             for key, point in _named_points(body.motion):
                 if self.room and any(
                     not lo <= v <= hi for lo, v, hi in zip(self.room.min_m, point, self.room.max_m, strict=True)
@@ -159,21 +153,21 @@ class Scenario(Section):
         if self.ranging.plan == "broadcast":
             for key in ("protocol", "pairs", "get_cir"):
                 found, only = getattr(self.ranging, key), Ranging.model_fields[key].default
-                if found != only:
-                    raise ValueError(f"ranging.{key}: found {found!r}, but plan broadcast allows only {only!r}")
+                require(found == only, f"ranging.{key}: found {found!r}, but plan broadcast allows only {only!r}")
         if isinstance(self.ranging.plan, str):
             return
         for k, (time_s, initiator, target) in enumerate(self.ranging.plan.slots):
+            # Without texts for the good ones: there may be a million.
             if initiator == target:
                 raise ValueError(f"ranging.plan: slot {k + 1} is of tag {initiator} with itself")
             if not time_s >= 0:
                 raise ValueError(f"ranging.plan: slot {k + 1} is at {time_s:g} s, before the start")
         first = min(time_s for time_s, _, _ in self.ranging.plan.slots)
-        if first > self.run.duration_s:
-            raise ValueError(
-                f"ranging.plan: its first slot is at {first:g} s, after the end of the run (run.duration_s = "
-                f"{self.run.duration_s:g}); fly longer"
-            )
+        require(
+            first <= self.run.duration_s,
+            f"ranging.plan: its first slot is at {first:g} s, after the end of the run (run.duration_s = "
+            f"{self.run.duration_s:g}); fly longer",
+        )
 
     def pairs(self) -> list[tuple[int, int]]:
         """Return the (initiator, target) pairs in the order in which they range; of broadcasts, in either role."""

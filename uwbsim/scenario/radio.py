@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from uwblink.arrays import Bools, Floats, Ints
-from uwbsim.scenario.base import NotDecreasing, NotNegative, Positive, Section, Share, TagId, look_up
+from uwbsim.scenario.base import NotDecreasing, NotNegative, Positive, Section, Share, TagId, look_up, require
 from uwbsim.scenario.devices import GroupDelay, check_grid
 
 # Knots of the splines published with the paper (campaigns 2022-08 and 2022-07, decargroup/uwb_calibration).
@@ -130,16 +130,16 @@ class TwoStateMultipath(Section):
             raise ValueError(
                 f"share_std: found {self.share_std:g}, with a mean of {self.share:g} it is below {most:.3g}"
             )
-        if self.total_loss_db > self.first_path_loss_db:
-            raise ValueError(
-                f"total_loss_db: found {self.total_loss_db:g}, at most first_path_loss_db ({self.first_path_loss_db:g})"
-            )
+        require(
+            self.total_loss_db <= self.first_path_loss_db,
+            f"total_loss_db: found {self.total_loss_db:g}, at most first_path_loss_db ({self.first_path_loss_db:g})",
+        )
         known = [frozenset(pair.tags) for pair in self.pairs]
         for k, pair in enumerate(known):
-            if len(pair) < 2 or pair in known[:k]:
-                raise ValueError(
-                    f"pairs[{k}].tags: found {list(self.pairs[k].tags)}, give two tags, and each pair once"
-                )
+            require(
+                len(pair) == 2 and pair not in known[:k],
+                f"pairs[{k}].tags: found {list(self.pairs[k].tags)}, give two tags, and each pair once",
+            )
         return self
 
 
@@ -159,10 +159,8 @@ class Fading(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if len(self.levels_db) == 1:
-            raise ValueError("levels_db: found one, give two or more")
-        if self.levels_db and self.std_db:
-            raise ValueError("levels_db: give either levels_db or std_db")
+        require(len(self.levels_db) != 1, "levels_db: found one, give two or more")
+        require(not (self.levels_db and self.std_db), "levels_db: give either levels_db or std_db")
         return self
 
 
@@ -236,13 +234,12 @@ class Spline(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if len(self.knots) != len(self.coefficients) + self.degree + 1:
-            raise ValueError(
-                f"knots: found {len(self.knots)}, a spline of degree {self.degree} with "
-                f"{len(self.coefficients)} coefficients has {len(self.coefficients) + self.degree + 1}"
-            )
-        if self.knots[0] == self.knots[-1]:
-            raise ValueError("knots: must span a range")
+        require(
+            len(self.knots) == len(self.coefficients) + self.degree + 1,
+            f"knots: found {len(self.knots)}, a spline of degree {self.degree} with "
+            f"{len(self.coefficients)} coefficients has {len(self.coefficients) + self.degree + 1}",
+        )
+        require(self.knots[0] != self.knots[-1], "knots: must span a range")
         return self
 
 
@@ -263,12 +260,12 @@ class BiasTable(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if len(self.power_dbm) != len(self.bias_m) or len(self.power_dbm) < 2:
-            raise ValueError(
-                f"bias_m: found {len(self.bias_m)} values at {len(self.power_dbm)} powers, give two or more of each"
-            )
-        if len({b > a for a, b in pairwise(self.power_dbm)}) > 1 or len(set(self.power_dbm)) < len(self.power_dbm):
-            raise ValueError("power_dbm: must go one way")
+        require(
+            len(self.power_dbm) == len(self.bias_m) > 1,
+            f"bias_m: found {len(self.bias_m)} values at {len(self.power_dbm)} powers, give two or more of each",
+        )
+        rises = {b > a for a, b in pairwise(self.power_dbm)}
+        require(len(rises) == 1 and len(set(self.power_dbm)) == len(self.power_dbm), "power_dbm: must go one way")
         return self
 
 

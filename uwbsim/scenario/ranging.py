@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from uwblink.arrays import Floats
 from uwblink.protocols.table import PROTOCOLS, RangingProtocol
-from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, look_up, not_decreasing
+from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, known_in, not_decreasing, require
 
 PREAMBLE_SYMBOL_S: Final = 508 / 499.2e6
 """Of a preamble at a pulse repetition frequency of 64 MHz (DW1000 User Manual, section 10)."""
@@ -100,13 +100,11 @@ def exchange_costs(
     }
 
 
-def _known(name: str) -> str:
-    look_up(PROTOCOLS, name)
-    return name
-
-
+# No `partial`: pydantic shows it with the whole table, and to list that loads plug-ins.
 ProtocolName = Annotated[
-    str, AfterValidator(_known), Field(json_schema_extra=lambda schema: schema.update(enum=sorted(PROTOCOLS)))
+    str,
+    AfterValidator(lambda name: known_in(PROTOCOLS, name)),
+    Field(json_schema_extra=lambda schema: schema.update(enum=sorted(PROTOCOLS))),
 ]
 
 
@@ -195,11 +193,9 @@ class Ranging(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.pairs == ():
-            raise ValueError("pairs: found none, give at least one [initiator, target]")
-        for pair in self.pairs if self.pairs != "between-bodies" else ():
-            if pair[0] == pair[1]:
-                raise ValueError(f"pairs: tag {pair[0]} cannot range with itself")
+        require(self.pairs, "pairs: found none, give at least one [initiator, target]")
+        for one, other in self.pairs if self.pairs != "between-bodies" else ():
+            require(one != other, f"pairs: tag {one} cannot range with itself")
         return self
 
     @property

@@ -32,9 +32,11 @@ from uwbsim.scenario.ranging import (
     TURNAROUND_S,
     after_marker_s,
     before_marker_s,
+    broadcast_s,
     message_bytes,
 )
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
+from uwbsim.world.reception import Medium
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,6 +268,30 @@ class Air:
             elif k and other.start >= since:
                 return FOREIGN  # a board that waits for an answer receives the first frame that arrives
         return ""
+
+
+def with_collisions_of_broadcasts(medium: Medium, plan: Schedule, alone: Outcomes) -> Outcomes:
+    """Return outcomes of broadcasts with the losses by overlap: a collision, or a listener that sends itself.
+
+    The rows of a frame follow each other. Slots depend on nothing that is received: there is no event loop.
+    """
+    scenario = medium.scenario
+    radio, listeners = scenario.radio, len(scenario.tags) - 1
+    begin = plan.start[::listeners]
+    duration = broadcast_s(len(scenario.senders()), radio.preamble_symbols) * SUBTICKS_PER_SECOND
+    if not (np.diff(begin) < duration).any():
+        return alone
+    # A sender's own frame is stronger than any that it could receive.
+    power, frame = np.full((len(begin), listeners + 1), np.inf), np.arange(len(plan.start)) // listeners
+    power[frame, plan.target] = medium.links.link(plan.initiator, plan.target, plan.start).power_dbm
+    why, apart = np.full(power.shape, "", dtype=object), 1
+    while len(first := np.flatnonzero(begin[apart:] - begin[:-apart] < duration)):
+        for mine, other in ((first, first + apart), (first + apart, first)):
+            lost = radio.loses(power[mine], begin[mine, None], power[other], begin[other, None])
+            why[mine] = np.where(lost, np.where(np.isinf(power[other]), BUSY, COLLIDED), why[mine])
+        apart += 1
+    reason = [own or other for own, other in zip(alone.reason, why[frame, plan.target].tolist(), strict=True)]
+    return Outcomes(alone.start, [0 if text else -1 for text in reason], reason)
 
 
 def _subticks(seconds: float) -> int:

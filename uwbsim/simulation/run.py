@@ -5,18 +5,17 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
 from uwblink.protocols.table import ON_BOARDS, PROTOCOLS, RangingProtocol
-from uwblink.recording.file import Recording
-from uwblink.recording.schema import CirRow, Fault, FrameRow, Poses, Tag
+from uwblink.recording.contents import Contents
+from uwblink.recording.schema import FrameRow, Tag
 from uwblink.ticks import COUNTER_BITS, SPEED_OF_LIGHT, TICK_S, UUS_TICKS, elapsed
-from uwblink.twr import Exchanges, raw_range
+from uwblink.twr import raw_range
 from uwblink.wire.codec import Decoder, encode, exchanges_of
 from uwblink.wire.messages import REPORTS, RangeReport
 from uwbsim.errors import ScenarioError
@@ -24,14 +23,15 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import NO_BROADCASTS, Scenario
 from uwbsim.scenario.ranging import before_marker_s
-from uwbsim.simulation import air, broadcasts
-from uwbsim.simulation.air import Schedule, schedule
+from uwbsim.simulation.air import WEAK, Air, Outcomes, Schedule, Slots, schedule, with_collisions_of_broadcasts
 from uwbsim.simulation.timestamps import (
     Draws,
     Stamped,
     draw,
+    one_departure,
     overhear,
     provenance,
+    reported_broadcasts,
     reported_exchanges,
     reported_faults,
     responses,
@@ -43,17 +43,15 @@ from uwbsim.world.trajectories import sensor_readings
 from uwbsim.world.world import SampledWorld, World
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Simulated:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Simulated(Contents):
     """A simulated flight in memory: the contents of its recording, and the true distances, which are not recorded.
 
-    `exchanges` are n exchanges in order of time and `truth_m` (n,) their true distances in metres, each the mean over
-    the first two messages, of broadcasts that at the poll; `poses` are those of motion capture; `tags` are the tags
-    with their bodies and lever arms; `faults` are the exchanges that failed. `overheard` are the columns of what
-    passive tags received, `receptions` those of all broadcasts, `cirs` impulse responses (time_ns, board, initiator,
-    target, first path in taps, 1016 magnitudes). `meta` is the recording's provenance. `temperature` are the columns of
-    the tags' readings of temperature and supply voltage, `imu` and `height` those of the bodies' inertial and height
-    sensors.
+    `truth_m` (n,) are the true distances of the n exchanges in metres, each the mean over the first two messages, of
+    broadcasts that at the poll; a selection (`select`) is without them. `poses` are those of motion capture, `faults`
+    the exchanges that failed, `overheard` what passive tags received, `receptions` all received broadcasts,
+    `temperature` the tags' readings of temperature and supply voltage, `imu` and `height` those of the bodies' sensors.
+    `meta` is the recording's provenance.
 
     >>> import uwbsim
     >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
@@ -73,18 +71,7 @@ class Simulated:
     >>> flight.save("two.uwb")
     """
 
-    exchanges: Exchanges
-    poses: Poses
-    tags: list[Tag]
-    faults: list[Fault]
-    overheard: dict[str, NDArray[Any]]
-    cirs: list[CirRow]
     truth_m: Floats
-    meta: dict[str, Any]
-    temperature: dict[str, NDArray[Any]] = field(default_factory=dict)
-    imu: dict[str, NDArray[Any]] = field(default_factory=dict)
-    height: dict[str, NDArray[Any]] = field(default_factory=dict)
-    receptions: dict[str, NDArray[Any]] = field(default_factory=dict)
 
     @property
     def planted(self) -> dict[str, Any]:
@@ -92,26 +79,12 @@ class Simulated:
         planted: dict[str, Any] = self.meta["planted"]
         return planted
 
-    def save(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        frames: Sequence[FrameRow] = (),
-        force: bool = False,
-    ) -> None:
+    def save(self, path: str | os.PathLike[str], *, frames: Sequence[FrameRow] = (), force: bool = False) -> None:
         """Write a recording (.uwb); `frames` are the bytes of the boards, from `through_wire`.
 
         Raises `RecordingExistsError` if the file exists, unless `force` is set.
         """
-        with Recording.create(path, meta=self.meta, force=force) as recording:
-            recording.append_tags(self.tags)
-            recording.append_poses(self.poses)
-            recording.append_exchanges(self.exchanges)
-            recording.append("faults", self.faults)
-            for table in ("overheard", "temperature", "imu", "height", "receptions"):
-                recording.append(table, getattr(self, table))
-            recording.append("cirs", self.cirs)
-            recording.append("frames", frames)
+        Contents.save(replace(self, frames=list(frames)), path, force=force)
 
     def __repr__(self) -> str:
         """Return a few lines: counts, errors of the raw ranges, and failures."""
@@ -168,24 +141,24 @@ def simulate(
     world, plan = World(scenario), schedule(scenario)
     medium, draws = Medium(scenario, world), draw(scenario, len(plan.start), len(protocol.messages))
     if broadcast:
-        draws = broadcasts.one_departure(draws, len(scenario.tags) - 1)
+        draws = one_departure(draws, len(scenario.tags) - 1)
     slots = _slots(medium, world, protocol, plan, draws)
     if contention and not broadcast:
         sampled = SampledWorld(world)
-        execution = air.Air(
+        execution = Air(
             protocol, slots, lambda tag, time: sampled.from_sender(tag, max(time, 0)).power_dbm, scenario.radio
         )
         outcomes = execution.execute(progress)
     else:
         outcomes = _undisturbed(scenario, slots)
         if contention:
-            outcomes = broadcasts.with_collisions(medium, plan, outcomes)
+            outcomes = with_collisions_of_broadcasts(medium, plan, outcomes)
     begun, lost = np.array(outcomes.start, dtype=np.int64), np.array(outcomes.lost)
     kept = np.flatnonzero(lost < 0)
     kept = kept[np.argsort(begun[kept], kind="stable")]
     rows = replace(plan[kept], start=begun[kept])
     stamped = stamp(medium, protocol, rows, draws[kept])
-    reported = broadcasts.reported if broadcast else _reported
+    reported = reported_broadcasts if broadcast else _reported
     found = reported(medium, kept, len(plan.start), rows, stamped)
     return Simulated(
         **found,
@@ -207,7 +180,7 @@ def _reported(medium: Medium, kept: Ints, planned: int, rows: Schedule, stamped:
     return {"exchanges": exchanges, "overheard": overhear(medium, stamped, exchanges), "truth_m": truth_m}
 
 
-def _slots(medium: Medium, world: World, protocol: RangingProtocol, plan: Schedule, draws: Draws) -> air.Slots:
+def _slots(medium: Medium, world: World, protocol: RangingProtocol, plan: Schedule, draws: Draws) -> Slots:
     """Return the plan with the nominal delays of its messages, and whether each is strong enough.
 
     Power noise makes the limit soft. In a common list an initiator waits longer for an exchange that it cannot hear.
@@ -233,15 +206,15 @@ def _slots(medium: Medium, world: World, protocol: RangingProtocol, plan: Schedu
             power = world.link(*(ends if message.sender == "initiator" else ends[::-1]), time).power_dbm
         powers.append(power)
     noise = stream(scenario.run.seed, "fading").normal(size=(len(messages), len(time)))
-    return air.Slots(plan, pause, medium.heard(np.array(powers), noise), delay)
+    return Slots(plan, pause, medium.heard(np.array(powers), noise), delay)
 
 
-def _undisturbed(scenario: Scenario, slots: air.Slots) -> air.Outcomes:
+def _undisturbed(scenario: Scenario, slots: Slots) -> Outcomes:
     """Return the outcomes of exchanges without contention: only messages below the sensitivity are lost."""
     lost = np.where(slots.heard.all(axis=0), -1, np.argmin(slots.heard, axis=0))
     marker = round(before_marker_s(scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)
-    reasons = [air.WEAK if k >= 0 else "" for k in lost.tolist()]
-    return air.Outcomes((slots.plan.start + marker).tolist(), lost.tolist(), reasons)
+    reasons = [WEAK if k >= 0 else "" for k in lost.tolist()]
+    return Outcomes((slots.plan.start + marker).tolist(), lost.tolist(), reasons)
 
 
 def through_wire(simulated: Simulated) -> tuple[Simulated, list[FrameRow]]:
@@ -285,7 +258,7 @@ def through_wire(simulated: Simulated) -> tuple[Simulated, list[FrameRow]]:
     heard = ((frame.time_ns, board, event) for board, frame in by_board for event in decoder.feed(frame.data))
     exchanges = exchanges_of(heard).in_time_order()
     ports = {str(board): f"board {board}" for board in np.unique(e.initiator).tolist()}
-    return replace(simulated, exchanges=exchanges, meta=simulated.meta | {"ports": ports}), frames
+    return replace(simulated, exchanges=exchanges, meta={**simulated.meta, "ports": ports}), frames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

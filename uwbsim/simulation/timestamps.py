@@ -12,12 +12,14 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Floats, Ints, in_time_order
 from uwblink.protocols.table import RangingProtocol
+from uwblink.receptions import Receptions, exchanges_in
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, meta_of_delays
 from uwblink.recording.schema import CirRow, Fault
 from uwblink.ticks import (
     ANTENNA_DELAY_TICKS,
+    COUNTER_BITS,
     DELAYED_TX_GRID,
     REPORT_BITS,
     TICK_S,
@@ -26,9 +28,7 @@ from uwblink.ticks import (
 from uwblink.twr import STAMPS, Exchanges, board_range, raw_range
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
-from uwbsim.simulation import air
-from uwbsim.simulation.air import Schedule
-from uwbsim.tables import in_time_order
+from uwbsim.simulation.air import WEAK, Outcomes, Schedule
 from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, Link
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.impulse_response import INDEX_STEPS, impulse_response
@@ -86,6 +86,11 @@ def draw(scenario: Scenario, count: int, messages: int) -> Draws:
         reply_s=draw_reply_s(scenario, stream(seed, "reply latency"), count),
         excess_m=excess,
     )
+
+
+def one_departure(draws: Draws, listeners: int) -> Draws:
+    """Return draws with the same noise of departure in all rows of a frame."""
+    return replace(draws, transmit=np.repeat(draws.transmit[:, ::listeners], listeners, axis=1))
 
 
 def draw_reply_s(scenario: Scenario, rng: np.random.Generator, count: int) -> Floats:
@@ -175,6 +180,32 @@ def reported_exchanges(medium: Medium, kept: Ints, planned: int, rows: Schedule,
     return replace(found, range_m=printed(found))
 
 
+def reported_broadcasts(medium: Medium, kept: Ints, planned: int, rows: Schedule, stamped: Stamped) -> dict[str, Any]:
+    """Return what tags report of the `kept` rows (n,), of all `planned`: receptions, and the exchanges that they make.
+
+    Stamps are the chip's whole ones. `truth_m` are the distances at the polls, which ranges measure (`range_ns`).
+    """
+    ids = np.array([tag.id for tag in medium.scenario.tags], dtype=np.int64)
+    fpp, skew = printed_readings(medium, 1, kept, planned, stamped)
+    tx, rx = (stamped.stamps[name] & ((1 << COUNTER_BITS) - 1) for name in ("tx1", "rx1"))
+    receptions = Receptions(
+        time_ns=time_ns(stamped.frames[0].departure),
+        frame=kept // (len(ids) - 1),
+        sender=ids[rows.initiator],
+        listener=ids[rows.target],
+        tx=tx,
+        rx=rx,
+        fpp_dbm=fpp,
+        rxp_dbm=np.full(len(kept), np.nan),
+        skew_ppm=skew,
+    )
+    exchanges, overheard = exchanges_in(receptions)
+    i, j = (np.argmax(ends[:, None] == ids, axis=1) for ends in (exchanges.initiator, exchanges.target))
+    poll = np.rint(exchanges.time_ns * (SUBTICKS_PER_SECOND / NS_PER_S)).astype(np.int64)
+    truth_m = medium.links.link(i, j, poll).distance_m
+    return {"exchanges": exchanges, "overheard": overheard, "receptions": receptions.to_dict(), "truth_m": truth_m}
+
+
 def time_ns(departure: Ints) -> Ints:
     """Return true times (n,) in nanoseconds."""
     return np.asarray(np.rint(departure * (NS_PER_S / SUBTICKS_PER_SECOND)).astype(np.int64))
@@ -188,7 +219,7 @@ def printed_readings(medium: Medium, number: int, kept: Ints, planned: int, stam
     return medium.readings(stamped.frames[number - 1], stamped.links[number - 1].power_dbm, power_noise, skew_noise)
 
 
-def reported_faults(scenario: Scenario, plan: Schedule, outcomes: air.Outcomes) -> list[Fault]:
+def reported_faults(scenario: Scenario, plan: Schedule, outcomes: Outcomes) -> list[Fault]:
     """Return the failed exchanges, with their reasons and initiators."""
     ids, failed = np.array([tag.id for tag in scenario.tags]), np.flatnonzero(np.array(outcomes.lost) >= 0)
     tags = zip(ids[plan.initiator[failed]].tolist(), ids[plan.target[failed]].tolist(), strict=True)
@@ -197,7 +228,7 @@ def reported_faults(scenario: Scenario, plan: Schedule, outcomes: air.Outcomes) 
         Fault(
             round(outcomes.start[k] * (NS_PER_S / SUBTICKS_PER_SECOND)),
             str(a),
-            "lost frame" if outcomes.reason[k] == air.WEAK else outcomes.reason[k],
+            "lost frame" if outcomes.reason[k] == WEAK else outcomes.reason[k],
             f"{what.format(a, b, outcomes.lost[k] + 1)} {outcomes.reason[k]}",
             a,
             b,

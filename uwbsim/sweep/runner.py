@@ -20,14 +20,13 @@ from typing import Any, Final, Self
 import duckdb
 
 import uwblink
-from uwblink.database import connect
+from uwblink.database import connect, write_tables
 from uwblink.errors import UwblinkError, first_line
 from uwblink.output import check_folder, is_utf8
 from uwblink.recording.store import check_tables
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.sweep.design import SweepDesign
 from uwbsim.sweep.executors import Chunk, Evaluate, Result, Work, Workers, evaluator, workers_for
-from uwbsim.tables import write_tables
 
 STORE: Final = "results.duckdb"
 """Name of the file that keeps the results of a sweep, in its folder."""

@@ -12,20 +12,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from uwblink.arrays import Floats, Ints
 from uwblink.protocols.table import PROTOCOLS, RangingProtocol
 from uwblink.recording.contents import Contents
-from uwblink.recording.distances import antennas_m
+from uwblink.recording.distances import sights
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S, UUS_TICKS
 from uwblink.twr import Exchanges, intervals, without_stamps
 from uwbsim.errors import ScenarioError, TooFewDataError
 from uwbsim.random_streams import stream
-from uwbsim.simulation.run import Simulated
 
 if TYPE_CHECKING:
     from uwbsim.twins.range_errors import KnownDevices
@@ -135,11 +133,11 @@ def lag_one(value: Floats, group: Ints) -> tuple[float, float]:
     return r, float(np.std(term) / np.sqrt(effective_size(term, sorted_group[rows])))
 
 
-RecordingSource = str | os.PathLike[str] | Contents | Simulated
+RecordingSource = str | os.PathLike[str] | Contents
 """A recording: its file (.uwb), or its contents in memory."""
 
 
-def read_flight(source: RecordingSource) -> tuple[Contents | Simulated, str]:
+def read_flight(source: RecordingSource) -> tuple[Contents, str]:
     """Return the contents of a recording and its name in messages; raises what `Recording.open` raises."""
     if not isinstance(source, str | os.PathLike):
         if not all(hasattr(source, name) for name in ("exchanges", "tags", "poses", "faults")):
@@ -216,9 +214,7 @@ class TwinFlight:
         return np.array([self.exchanges.fpp1_dbm, self.exchanges.fpp2_dbm])
 
     @classmethod
-    def of(
-        cls, flown: Contents | Simulated, known: KnownDevices, where: str = "recording", *, fewest: int = 100
-    ) -> Self:
+    def of(cls, flown: Contents, known: KnownDevices, where: str = "recording", *, fewest: int = 100) -> Self:
         """Return the columns of a recording; raises `ScenarioError` where no twin can be fitted.
 
         That is with less than `fewest` exchanges: of 100, the quantiles of residuals are wrong by a tenth of their
@@ -249,21 +245,18 @@ class TwinFlight:
         lacking = ", ".join(str(tag) for tag in ids if tag not in {tag.tag for tag in flown.tags})
         require(not lacking, f"does not say on which body tag {lacking} sits; give tags with 'uwblink poses --tags'")
         known.require(ids)
-        spots = np.array([antennas_m(flown.poses, list(flown.tags), end, x.time_ns) for end in (x.initiator, x.target)])
-        good &= np.isfinite(spots).all(axis=(0, 2)) & ~without_stamps(x) & (x.initiator != x.target)
+        distance, towards = sights(flown.poses, list(flown.tags), x.initiator, x.target, x.time_ns)
+        good &= np.isfinite(distance) & ~without_stamps(x) & (x.initiator != x.target)
         require(
             np.count_nonzero(good) >= fewest,
             f"{np.count_nonzero(good)} of {len(good)} exchanges have stamps, both powers and poses around them, a twin "
             f"needs {fewest} or more; record longer, and with motion capture all the time",
         )
-        x, way = x[good], spots[1, good] - spots[0, good]
+        x, distance = x[good], distance[good]
         # In order of their numbers, so that places in it can be searched.
         tags = tuple(sorted((tag for tag in flown.tags if tag.tag in ids), key=lambda tag: tag.tag))
         ends = np.searchsorted([tag.tag for tag in tags], [x.initiator, x.target])
-        distance = np.linalg.norm(way, axis=1)
-        unit = way / np.maximum(distance, 1e-9)[:, None]
         pairs, pair = np.unique(np.sort(ends, axis=0), axis=1, return_inverse=True)
-        bodies = np.array([tag.body for tag in tags])
         return cls(
             where=where,
             tags=tags,
@@ -275,24 +268,10 @@ class TwinFlight:
             pair=pair.ravel(),
             pairs=tuple((tags[a].tag, tags[b].tag) for a, b in pairs.T),
             distance_m=distance,
-            towards=np.array(
-                [
-                    _into_body(flown.poses, bodies[end], x.time_ns, sign * unit)
-                    for end, sign in zip(ends, (1, -1), strict=True)
-                ]
-            ),
+            towards=towards[good].swapaxes(0, 1),
             residual_m=known.corrected_m(x) - distance,
             ratio_ppm=_ratio_ppm(x, row),
         )
-
-
-def _into_body(poses: Poses, body: NDArray[np.str_], time_ns: Ints, way: Floats) -> Floats:
-    """Return vectors (n, 3) of the world in the frames of bodies (n,)."""
-    turned = way.copy()
-    for name in np.unique(body).tolist():
-        rows = np.flatnonzero(body == name)
-        turned[rows] = attitude(poses, name, time_ns[rows]).apply(way[rows], inverse=True)
-    return turned
 
 
 def attitude(poses: Poses, body: str, time_ns: Ints) -> Rotation:

@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from uwblink.arrays import Floats
+from uwblink.errors import restating
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import Exchanges, intervals
 from uwbsim.errors import ScenarioError, TooFewDataError
@@ -61,11 +62,9 @@ def read_calibration(source: CalibrationSource) -> KnownDevices:
     where = str(source) if isinstance(source, str | os.PathLike) else "calibration"
     if not isinstance(source, str | os.PathLike | Mapping | Calibration):
         raise ScenarioError(f"calibration: found {source!r:.60}, expected a file (.json) or a calibration")
-    try:
+    with restating(ScenarioError, CalibError):
         known = Calibration.from_json(json.dumps(source), where) if isinstance(source, Mapping) else source
         found = known if isinstance(known, Calibration) else load_calibration(known)
-    except CalibError as error:
-        raise ScenarioError(str(error)) from error
     for key, text in (
         ("groups", "its tags have curves by group, and a scenario has one; fit one curve for all tags"),
         ("pair_offsets", "it knows constants of pairs, and a scenario has delays of tags; fit delays"),
@@ -124,11 +123,9 @@ def fit_range_errors(flight: TwinFlight, receive_noise_s: Floats) -> FittedRange
         time_ns=x.time_ns,
         source=flight.where,
     )
-    try:
+    with restating(TooFewDataError, CalibError):
         # The twin has the errors of this recording: what pairs differ by between recordings is left out.
         found = fit(ranges, between_m=0.0).calibration
-    except CalibError as error:
-        raise TooFewDataError(str(error)) from error
     if found.errors is None:
         raise TooFewDataError(f"{flight.where}: the errors of its ranges have no spread")
     applied = found.apply(ranges)

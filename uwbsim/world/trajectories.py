@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from scipy.interpolate import BSpline, CubicSpline, PchipInterpolator
+from scipy.interpolate import BSpline, CubicHermiteSpline, CubicSpline, PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, in_time_order
 from uwbsim.random_streams import stream
 from uwbsim.scenario.bodies import Carried, Figure, Height, Imu, RandomFlight, Recorded, Static, Waypoints
 from uwbsim.scenario.model import Scenario
-from uwbsim.tables import Columns, in_time_order
-from uwbsim.world.clocks import NS_PER_S
+from uwbsim.world.clocks import NS_PER_S, Columns
 
 Draw = Callable[[str], np.random.Generator]
 """Returns the random stream of a body, or of a pair of tags, for a purpose."""
@@ -72,18 +71,11 @@ def _static(motion: Static, _duration_s: float, _draw: Draw) -> Trajectory:
 
 
 def _carried(motion: Carried, _duration_s: float, _draw: Draw) -> Trajectory:
-    places = np.array(motion.places_m)
-    cycle = motion.stay_s + motion.carry_s
-
-    def position(time_s: Floats) -> Floats:
-        leg = np.clip(np.floor(time_s / cycle).astype(np.int64), 0, len(places) - 1)
-        share = np.clip((time_s - leg * cycle - motion.stay_s) / motion.carry_s, 0, 1)
-        # From standstill to standstill.
-        smooth = share**2 * (3 - 2 * share)
-        after = np.minimum(leg + 1, len(places) - 1)
-        return np.asarray(places[leg] + smooth[:, None] * (places[after] - places[leg]))
-
-    return Trajectory(position, _level)
+    # Each place twice, when the body comes and when it goes: from standstill to standstill.
+    places = np.repeat(np.array(motion.places_m), 2, axis=0)
+    arrivals = np.arange(len(motion.places_m)) * (motion.stay_s + motion.carry_s)
+    times = np.column_stack([arrivals, arrivals + motion.stay_s]).ravel()
+    return Trajectory(_held(CubicHermiteSpline(times, places, np.zeros_like(places)), times), _level)
 
 
 def _waypoints(motion: Waypoints, _duration_s: float, _draw: Draw) -> Trajectory:
@@ -91,9 +83,12 @@ def _waypoints(motion: Waypoints, _duration_s: float, _draw: Draw) -> Trajectory
     if motion.times_s is None:
         return Trajectory(_straight(points, motion.speed_mps or 1.0, motion.acceleration_mps2), _level)
     times = np.array(motion.times_s)
-    path = CubicSpline(times, points, bc_type="clamped")
-    # Before the first and after the last point the body does not move.
-    return Trajectory(lambda t: np.asarray(path(np.clip(t, times[0], times[-1]))), _level)
+    return Trajectory(_held(CubicSpline(times, points, bc_type="clamped"), times), _level)
+
+
+def _held(path: Callable[[Floats], Any], times: Floats) -> Callable[[Floats], Floats]:
+    """Return a path through points at some times, without motion before the first and after the last."""
+    return lambda t: np.asarray(path(np.clip(t, times[0], times[-1])))
 
 
 def _level(time_s: Floats) -> Floats:
@@ -146,10 +141,7 @@ def _recorded(motion: Recorded, _duration_s: float, _draw: Draw) -> Trajectory:
     times = np.array(motion.times_s)
     path = PchipInterpolator(times, np.array(motion.positions_m))
     turns = Slerp(times, Rotation.from_quat(np.array(motion.quaternions)))
-    return Trajectory(
-        lambda t: np.asarray(path(np.clip(t, times[0], times[-1]))),
-        lambda t: np.asarray(turns(np.clip(t, times[0], times[-1])).as_quat()),
-    )
+    return Trajectory(_held(path, times), _held(lambda t: turns(t).as_quat(), times))
 
 
 def _random_flight(motion: RandomFlight, duration_s: float, draw: Draw) -> Trajectory:

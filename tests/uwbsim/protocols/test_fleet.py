@@ -11,7 +11,7 @@ from uwblink import raw_range
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, elapsed
 from uwbsim.protocols.comparison import compare
 from uwbsim.protocols.conditions import calibrated, conditions_of
-from uwbsim.protocols.fleet import broadcast_variances_m2
+from uwbsim.protocols.prediction import broadcast_variances_m2
 
 PLACES = {1: (0.0, 0.0, 0.5), 2: (5.0, 0.3, 0.0), 3: (1.0, 6.0, 1.0), 4: (4.5, 5.5, 2.0), 5: (-3.0, 4.0, 1.0)}
 LISTENER = (2.0, 2.5, 1.5)
