@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import BadInputError, Calibration, OnboardSettings, UnanswerableError, localize_onboard
+from calib import BadInputError, OnboardSettings, UnanswerableError, localize_onboard
 from calib.calibration.error_model import ErrorModel
 from calib.calibration.formats import read_miluv
-from calib.calibration.power_curves import Curve
 from calib.data.samples import stamped
 from calib.evaluation.filters import Fix, InertialFilter, ProcessNoise, multilaterate
 from calib.evaluation.localization import write_tum
 from calib.evaluation.onboard import onboard_json, onboard_text
 from calib.online import RangeErrors
+from tests.calib import synthetic
 from tests.shared_data import shared
 from uwblink import Contents, Exchanges, Poses, Tag
 from uwblink.importers import read_source
@@ -138,16 +138,11 @@ def listening(seconds=20.0, seed=1, rate=50.0):
 
 def calibration(share=0.001):
     tags = [*range(len(ANCHORS)), *ARMS]
-    zero, sigma = (Curve((0.0,) * 4 + (9.0,) * 4, (v,) * 4, 3, (0.0, 9.0)) for v in (0.0, NOISE_M))
     errors = ErrorModel(
         lifted=(0.1, 1.0), noise_m=(NOISE_M,) * 2, tail_share=(share,) * 2, least_m=0.0, detour_m=0.35,
         outlier_share=1e-4, outlier_m=3.0,
     )  # fmt: skip
-    return Calibration(
-        delays_ns=dict.fromkeys(tags, 0.0), delays_std_ns=dict.fromkeys(tags, 0.0), loss="mixture", scale_ns=0.1,
-        lift="mean-of-lifted", alpha_dbm=-82.0, speed_of_light=299702547.0, bias_curve=zero, sigma_curve=sigma,
-        errors=errors,
-    )  # fmt: skip
+    return synthetic.calibration(dict.fromkeys(tags, 0.0), NOISE_M, loss="mixture", errors=errors)
 
 
 def errors_of(track, after_s=0.0):

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import calib
 import uwbsim
-from calib import BadInputError, Calibration, TeamSettings, UnanswerableError, localize_team
-from calib.calibration.power_curves import Curve
+from calib import BadInputError, TeamSettings, UnanswerableError, localize_team
 from calib.data.samples import stamped
 from calib.errors import WeakHeadingWarning
 from calib.evaluation import team
@@ -20,6 +19,7 @@ from calib.evaluation.filters import IMUS, ProcessNoise, RelativeFilter
 from calib.evaluation.team import team_json, team_text
 from calib.evaluation.tracking import FilterRanges, distances_in
 from tests import processes
+from tests.calib.synthetic import calibration
 from uwblink import Contents, Poses, Tag
 
 ROBOTS = ("a", "b", "c")
@@ -97,21 +97,14 @@ def flight(seconds=4.0, seed=1, bias=1.0, **changes):
     return replace(made, **changes)
 
 
-def calibration(sigma_m=NOISE_M):
-    zero, sigma = (Curve((0.0,) * 4 + (9.0,) * 4, (v,) * 4, 3, (0.0, 9.0)) for v in (0.0, sigma_m))
-    return Calibration(
-        delays_ns=dict.fromkeys(ARMS, 0.0), delays_std_ns=dict.fromkeys(ARMS, 0.0), loss="cauchy", scale_ns=0.1,
-        lift="mean-of-lifted", alpha_dbm=-82.0, speed_of_light=299702547.0, bias_curve=zero, sigma_curve=sigma,
-    )  # fmt: skip
-
-
+PLANTED = calibration(dict.fromkeys(ARMS, 0.0), NOISE_M)
 CLOSE = TeamSettings(noise=EXACT, start_std_m=0.02, start_std_deg=0.5, start_std_m_s=0.02, gate=1e9)
 
 
 def test_without_errors_dead_reckoning_is_the_relative_motion():
     still = replace(EXACT, force_start=1e-6, gyro_start=1e-6)
     exact = replace(CLOSE, noise=still, start_std_m=1e-6, start_std_deg=1e-5, start_std_m_s=1e-6)
-    found = localize_team(flight(bias=0.0), calibration(), exact)
+    found = localize_team(flight(bias=0.0), PLANTED, exact)
     assert [(one.body, one.reference) for one in found] == [("b", "a"), ("c", "a")]
     for robot, one in enumerate(found, 1):
         track = one.tracks["dead reckoning"]
@@ -121,7 +114,7 @@ def test_without_errors_dead_reckoning_is_the_relative_motion():
         assert (Rotation.from_quat(track.attitude).inv() * turned).magnitude().max() < 5e-4
         np.testing.assert_allclose(track.truth_m, where, atol=1e-4)
     # Another frame: poses of a in that of c are the inverses.
-    back = {one.body: one for one in localize_team(flight(bias=0.0), calibration(), replace(exact, reference="c"))}
+    back = {one.body: one for one in localize_team(flight(bias=0.0), PLANTED, replace(exact, reference="c"))}
     here, there = back["a"].tracks["dead reckoning"], found[1].tracks["dead reckoning"]
     undone = -Rotation.from_quat(there.attitude).inv().apply(there.estimate_m)
     assert np.abs(here.estimate_m - undone).max() < 0.03
@@ -287,7 +280,7 @@ def batch(contents, t, ends, measured, start):
 def test_at_the_end_it_is_a_batch_of_least_squares_in_a_world(seed):
     contents = flight(4.0, seed)
     t, ends, measured = ranging(4.0, seed)
-    found = localize_team(contents, calibration(), CLOSE)
+    found = localize_team(contents, PLANTED, CLOSE)
     tracks = [one.tracks["variance"] for one in found]
     # Both begin at the same noisy poses and velocities, those of dead reckoning.
     start: list[Any] = [None]
@@ -389,25 +382,25 @@ def test_the_filter_knows_what_listeners_of_an_exchange_share(known, monkeypatch
 def test_one_tag_and_missing_sensors_are_named():
     contents = flight(2.0)
     with pytest.raises(UnanswerableError, match=r"memory: inertial readings of 0 bodies with tags \(none\)"):
-        localize_team(replace(contents, imu={}), calibration(), CLOSE)
+        localize_team(replace(contents, imu={}), PLANTED, CLOSE)
     only = contents.imu["body"] == "a"
     with pytest.raises(UnanswerableError, match=r"of 1 bodies with tags \(a\), .* two or more"):
-        localize_team(replace(contents, imu={k: v[only] for k, v in contents.imu.items()}), calibration(), CLOSE)
+        localize_team(replace(contents, imu={k: v[only] for k, v in contents.imu.items()}), PLANTED, CLOSE)
     late = (contents.imu["body"] != "b") | (contents.imu["time_ns"] < NS + 10**9)
     with pytest.raises(UnanswerableError, match=r"inertial readings of b cover -0.1 to 1.0 s .* to 2.0 s"):
-        localize_team(replace(contents, imu={k: v[late] for k, v in contents.imu.items()}), calibration(), CLOSE)
+        localize_team(replace(contents, imu={k: v[late] for k, v in contents.imu.items()}), PLANTED, CLOSE)
     with pytest.raises(UnanswerableError, match="no listener overheard"):
-        localize_team(contents, calibration(), replace(CLOSE, use="receptions"))
+        localize_team(contents, PLANTED, replace(CLOSE, use="receptions"))
     with pytest.raises(BadInputError, match="`reference`: found 'd', memory has a, b, c"):
-        localize_team(contents, calibration(), replace(CLOSE, reference="d"))
+        localize_team(contents, PLANTED, replace(CLOSE, reference="d"))
     with pytest.raises(BadInputError, match="`start_std_deg`"):
         TeamSettings(start_std_deg=-1.0)
     blind = contents.poses[np.flatnonzero(contents.poses.body != "c")]
     with pytest.raises(UnanswerableError, match="no poses of c"):
-        localize_team(replace(contents, poses=blind), calibration(), CLOSE)
+        localize_team(replace(contents, poses=blind), PLANTED, CLOSE)
     two = (contents.exchanges.initiator != 6) & (contents.exchanges.target != 6)
     with pytest.warns(WeakHeadingWarning, match="memory: c has one tag that ranges"):
-        found = localize_team(replace(contents, exchanges=contents.exchanges[two]), calibration(), CLOSE)
+        found = localize_team(replace(contents, exchanges=contents.exchanges[two]), PLANTED, CLOSE)
     assert found[1].tracks["variance"].rmse_m < 0.2
 
 
@@ -455,7 +448,7 @@ def test_the_command_prints_writes_and_refuses(known, tmp_path):
 
 def test_delays_that_a_calibration_has_wrong_within_its_errors_are_corrected_on_the_way():
     off = dict(zip(ARMS, [0.4, -0.3, 0.5, 0.3, -0.4, 0.3], strict=True))
-    known = replace(calibration(), delays_ns=off, delays_std_ns=dict.fromkeys(ARMS, 0.4))
+    known = replace(PLANTED, delays_ns=off, delays_std_ns=dict.fromkeys(ARMS, 0.4))
     for found in localize_team(flight(6.0), known, replace(CLOSE, online=True)):
         assert found.rmse_m["online"].mean() < 0.7 * found.rmse_m["variance"].mean()
         wrong = np.array([delay / std for delay, std in found.delays.values()])
