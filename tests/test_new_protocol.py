@@ -71,7 +71,7 @@ def test_prediction_and_monte_carlo_agree_with_each_other_and_with_the_formula(r
 
 def test_run_show_and_fit(row, tmp_path):
     flight, fitted = tmp_path / "flight.uwb", tmp_path / "c.json"
-    settings = ["--set", f"ranging.protocol={row.name}", "--set", "run.duration_s=60"]
+    settings = ["--set", f"ranging.protocol={row.name}", "--set", "run.duration_s=60", "--no-contention"]
     command("uwbsim", "run", SCENARIO, "-o", flight, *settings)
     assert set(json.loads(command("uwblink", "show", flight, "--json"))["protocols"]) == {row.name}
     command("calib", "fit", flight, "-o", fitted)

@@ -69,11 +69,3 @@ def test_it_draws_into_axes(result):
     own = result.plot_delays()
     assert own.figure in [pyplot.figure(number) for number in pyplot.get_fignums()]
     pyplot.close("all")
-
-
-def test_it_saves(result, tmp_path):
-    result.save(tmp_path / "c.json")
-    assert calib.load_calibration(tmp_path / "c.json") == result.calibration
-    with pytest.raises(FileExistsError):
-        result.save(tmp_path / "c.json")
-    result.save(tmp_path / "c.json", force=True)

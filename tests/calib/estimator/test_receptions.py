@@ -141,16 +141,18 @@ def test_two_messages_take_the_rate_from_the_carrier():
         assert delay_ns == pytest.approx(found.planted["delays_ns"][str(tag)], abs=0.05)
 
 
-def test_what_cannot_be_fitted_is_refused():
-    data, _ = flight(7500, count=300)
-    deaf = replace(data, overheard={})
-    with pytest.raises(UnanswerableError, match="no listener overheard"):
-        calib.fit(deaf, use="receptions")
-    for setting in ({"sequential": True}, {"constants": "pair"}):
-        with pytest.raises(BadInputError, match=next(iter(setting))):
-            calib.fit(data, use="receptions", **setting)
-    with pytest.raises(BadInputError, match="allowed: exchanges, receptions"):
-        calib.fit(data, use="everything")
+@pytest.mark.parametrize(
+    ("change", "settings", "error", "said"),
+    [
+        ({"overheard": {}}, {}, UnanswerableError, "no listener overheard"),
+        ({}, {"sequential": True}, BadInputError, "sequential"),
+        ({}, {"constants": "pair"}, BadInputError, "constants"),
+        ({}, {"use": "everything"}, BadInputError, "allowed: exchanges, receptions"),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused(change, settings, error, said):
+    with pytest.raises(error, match=said):
+        calib.fit(replace(flight(7500, count=300)[0], **change), **{"use": "receptions"} | settings)
 
 
 def test_the_command_says_how_many_were_fitted(tmp_path):

@@ -379,25 +379,45 @@ def test_the_filter_knows_what_listeners_of_an_exchange_share(known, monkeypatch
     assert figures["raw"]["nees"] > 1.3 * figures["variance"]["nees"]
 
 
-def test_one_tag_and_missing_sensors_are_named():
+def kept(imu, rows):
+    return {"imu": {name: column[rows(imu)] for name, column in imu.items()}}
+
+
+@pytest.mark.parametrize(
+    ("change", "settings", "error", "said"),
+    [
+        (lambda _: {"imu": {}}, {}, UnanswerableError, r"memory: inertial readings of 0 bodies with tags \(none\)"),
+        (
+            lambda flown: kept(flown.imu, lambda imu: imu["body"] == "a"),
+            {},
+            UnanswerableError,
+            r"of 1 bodies with tags \(a\), .* two or more",
+        ),
+        (
+            lambda flown: kept(flown.imu, lambda imu: (imu["body"] != "b") | (imu["time_ns"] < NS + 10**9)),
+            {},
+            UnanswerableError,
+            r"inertial readings of b cover -0.1 to 1.0 s .* to 2.0 s",
+        ),
+        (
+            lambda flown: {"poses": flown.poses[np.flatnonzero(flown.poses.body != "c")]},
+            {},
+            UnanswerableError,
+            "no poses of c",
+        ),
+        (lambda _: {}, {"use": "receptions"}, UnanswerableError, "no listener overheard"),
+        (lambda _: {}, {"reference": "d"}, BadInputError, "`reference`: found 'd', memory has a, b, c"),
+        (lambda _: {}, {"start_std_deg": -1.0}, BadInputError, "`start_std_deg`"),
+    ],
+)
+def test_missing_sensors_are_named(change, settings, error, said):
     contents = flight(2.0)
-    with pytest.raises(UnanswerableError, match=r"memory: inertial readings of 0 bodies with tags \(none\)"):
-        localize_team(replace(contents, imu={}), PLANTED, CLOSE)
-    only = contents.imu["body"] == "a"
-    with pytest.raises(UnanswerableError, match=r"of 1 bodies with tags \(a\), .* two or more"):
-        localize_team(replace(contents, imu={k: v[only] for k, v in contents.imu.items()}), PLANTED, CLOSE)
-    late = (contents.imu["body"] != "b") | (contents.imu["time_ns"] < NS + 10**9)
-    with pytest.raises(UnanswerableError, match=r"inertial readings of b cover -0.1 to 1.0 s .* to 2.0 s"):
-        localize_team(replace(contents, imu={k: v[late] for k, v in contents.imu.items()}), PLANTED, CLOSE)
-    with pytest.raises(UnanswerableError, match="no listener overheard"):
-        localize_team(contents, PLANTED, replace(CLOSE, use="receptions"))
-    with pytest.raises(BadInputError, match="`reference`: found 'd', memory has a, b, c"):
-        localize_team(contents, PLANTED, replace(CLOSE, reference="d"))
-    with pytest.raises(BadInputError, match="`start_std_deg`"):
-        TeamSettings(start_std_deg=-1.0)
-    blind = contents.poses[np.flatnonzero(contents.poses.body != "c")]
-    with pytest.raises(UnanswerableError, match="no poses of c"):
-        localize_team(replace(contents, poses=blind), PLANTED, CLOSE)
+    with pytest.raises(error, match=said):
+        localize_team(replace(contents, **change(contents)), PLANTED, replace(CLOSE, **settings))
+
+
+def test_a_body_with_one_tag_is_named():
+    contents = flight(2.0)
     two = (contents.exchanges.initiator != 6) & (contents.exchanges.target != 6)
     with pytest.warns(WeakHeadingWarning, match="memory: c has one tag that ranges"):
         found = localize_team(replace(contents, exchanges=contents.exchanges[two]), PLANTED, CLOSE)
