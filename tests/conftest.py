@@ -15,7 +15,6 @@ LONGEST: Final = (
     "tests/calib/checks/test_examine.py",
     "tests/calib/checks/test_surveys.py",
     "tests/calib/surveys/test_surveying.py",
-    "tests/calib/trajectories/test_real_flight.py",
     "tests/calib/trajectories/test_known.py",
     "tests/calib/report/test_files.py",
     "tests/test_bad_input.py",
@@ -34,7 +33,6 @@ LONGEST: Final = (
     "tests/test_security.py",
     "tests/loop/test_without_motion_capture.py",
     "tests/test_plugins.py",
-    "tests/calib/trajectories/test_inertial.py",
     "tests/loop/test_scenarios_of_the_world.py",
     "tests/calib/evaluation/test_onboard.py",
 )

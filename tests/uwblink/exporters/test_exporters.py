@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 import calib
-from tests.uwblink.recording.test_copy import full, rows  # noqa: F401 - full is a fixture
+from tests.uwblink.recording.test_contents import full, rows  # noqa: F401 - full is a fixture
 from uwblink import Contents, Exchanges, Recording, import_recording, load
 from uwblink.errors import ArgumentError, ImportTableError, RecordingError, RecordingExistsError, RecordingMissingError
 from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
