@@ -1,7 +1,6 @@
 """The errors that a fit predicts, held against flights that it did not see: worlds of foreign code, and samples."""
 
 import json
-import tarfile
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,7 @@ from benchmarks.worlds import CLEAN, Recipe, make
 from calib.calibration.formats import read_miluv
 from calib.calibration.power_curves import ALPHA_DBM
 from calib.errors import BadInputError
-from tests.shared_data import shared
+from tests.shared_data import miluv, shared
 from uwblink.importers import read_source
 
 
@@ -138,9 +137,7 @@ def test_few_ranges_settle(seed):
 
 @pytest.mark.slow
 def test_a_real_flight_among_obstacles_agrees_with_the_published_delays(tmp_path):
-    with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
-        archive.extractall(tmp_path, filter="data")
-    ranges = calib.load_ranges(read_source(tmp_path / "cirObstacles_3_random_0", importer="miluv"))
+    ranges = calib.load_ranges(read_source(miluv(tmp_path), importer="miluv"))
     published = read_miluv(shared("miluv_published_calibration.json"))
     known = calib.fit(ranges, loss="cauchy").calibration
     tags = list(known.uncertainty.tags)

@@ -1,6 +1,5 @@
 """What listeners overhear, fitted beside ranges: by worlds of NumPy alone, and by the simulator without noise."""
 
-import tarfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import calib
 from calib.errors import BadInputError, UnanswerableError
 from tests.calib.overhearing import bound_ns2, flight, least_squares_ns
 from tests.processes import call
-from tests.shared_data import shared
+from tests.shared_data import miluv
 from uwblink import Tag
 from uwblink.importers import read_source
 from uwbsim import simulate
@@ -165,9 +164,7 @@ def test_the_command_says_how_many_were_fitted(tmp_path):
 
 
 def test_a_real_flight_has_narrower_intervals_and_the_same_delays(tmp_path):
-    with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
-        archive.extractall(tmp_path, filter="data")
-    flown = read_source(tmp_path / "cirObstacles_3_random_0", importer="miluv")
+    flown = read_source(miluv(tmp_path), importer="miluv")
     (delays, std), (heard, narrow) = (fitted(flown, use) for use in ("exchanges", "receptions"))
     # 317 ranges, and some 700 differences of arrival at the five other tags.
     assert (narrow < 0.85 * std).all()

@@ -1,6 +1,5 @@
 """Localization by what is on board: flights written down as formulas, whose readings share no code with the filter."""
 
-import tarfile
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,7 @@ from calib.evaluation.localization import write_tum
 from calib.evaluation.onboard import onboard_json, onboard_text
 from calib.online import RangeErrors
 from tests.calib import synthetic
-from tests.shared_data import shared
+from tests.shared_data import miluv, shared
 from uwblink import Contents, Exchanges, Poses, Tag
 from uwblink.importers import read_source
 
@@ -319,9 +318,7 @@ def test_multilateration_is_exact_and_leaves_a_reflection_out():
 
 def test_a_real_flight_by_imu_height_and_ranges_alone(tmp_path):
     """The dataset's own flight among obstacles: a range to an anchor in 1.2 s, gaps of 6 s, published calibration."""
-    with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
-        archive.extractall(tmp_path, filter="data")
-    contents = read_source(tmp_path / "cirObstacles_3_random_0", importer="miluv")
+    contents = read_source(miluv(tmp_path), importer="miluv")
     tracks = localize_onboard(contents, read_miluv(shared("miluv_published_calibration.json")))
     rmse = {track.body: track.rmse_m for track in tracks}
     assert sorted(rmse) == ["ifo001", "ifo002", "ifo003"]

@@ -1,7 +1,6 @@
 """What is known beside ranges and poses, tapes and heights; and flights that are not what a fit takes them for."""
 
 import re
-import tarfile
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -16,7 +15,7 @@ from calib.trajectories.samples import Attitude, tapes_of
 from calib.trajectories.scene import scene_from
 from calib.trajectories.start import interpolated, resolve_headings
 from tests.calib.trajectories.sines import DELAYS_NS, flight, scores
-from tests.shared_data import shared
+from tests.shared_data import miluv
 from uwblink import Arrangement, KnownDistance
 from uwblink.importers import read_source
 
@@ -171,10 +170,7 @@ def test_walls_between_bodies_are_named_and_in_the_intervals(between_m):
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("miluv")
-    with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
-        archive.extractall(folder, filter="data")
-    return read_source(folder / "cirObstacles_3_random_0", importer="miluv")
+    return read_source(miluv(tmp_path_factory.mktemp("miluv")), importer="miluv")
 
 
 def joint_scores(found, flown):
