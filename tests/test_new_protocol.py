@@ -69,6 +69,7 @@ def test_run_show_and_fit(row, tmp_path):
     assert found == pytest.approx(planted, abs=5e-3)
 
 
+@pytest.mark.parametrize("row", [SYMMETRIC], indirect=True)
 def test_compare_optimum_and_predict_know_it_without_being_told(row, tmp_path, monkeypatch):
     monkeypatch.setattr("uwblink.pages.figures.drawn", pages.outline)
     compared = json.loads(command("uwbsim", "compare", SCENARIO, "-o", tmp_path / "out", "-n", 4096, "--json"))

@@ -42,6 +42,7 @@ def test_each_listener_alone_finds_each_targets_delay_without_noise():
         assert -np.mean(own) / METRES_A_NS == pytest.approx(found.planted["delays_ns"][str(tag)], abs=1.2e-3)
 
 
+@pytest.mark.slow
 def test_listeners_gain_what_theory_predicts_and_intervals_hold():
     pairs = [(i, j) for i in range(6) for j in range(6) if i != j]
     alone, bound = (np.sqrt(np.diag(bound_ns2(pairs, 6, listening=on)).mean()) for on in (False, True))

@@ -175,6 +175,7 @@ def test_a_wrong_start_is_left_by_differences_alone(known, heard):
         assert off[track.time_ns > track.time_ns[0] + 2 * 10**9].max() < 0.5
 
 
+@pytest.mark.slow
 def test_what_is_overheard_helps_a_robot_that_ranges(known):
     """Its tags hear the anchors, the anchors hear it, and each of its tags hears the other's exchanges."""
     all_hear = flight(3120, 15.0, pairs="between-bodies", passive=DELAYS_NS)
@@ -206,6 +207,7 @@ def test_a_robot_on_board_is_helped_by_what_is_overheard(known, tmp_path):
     assert 0.7 < found[1]["nis"] < 1.1
 
 
+@pytest.mark.slow
 def test_reflections_that_last_and_pass_the_gate_are_counted():
     """A gate of 3.3 standard deviations of a difference lets half a metre pass, with plus and with minus."""
     lasting = {"model": "two-state", "share": 0.14, "mean_excess_m": 0.35, "life_s": 0.15, "first_path_loss_db": 0.4,

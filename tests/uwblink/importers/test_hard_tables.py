@@ -273,7 +273,12 @@ class Bag:
 
 
 @pytest.mark.parametrize(
-    ("form", "at_once", "grown"), [("exchanges", 1_000, 216_000), ("messages", 2_000, 144_000), ("bag", 500, 450_000)]
+    ("form", "at_once", "grown"),
+    [
+        ("exchanges", 1_000, 216_000),
+        pytest.param("messages", 2_000, 144_000, marks=pytest.mark.slow),
+        pytest.param("bag", 500, 450_000, marks=pytest.mark.slow),
+    ],
 )
 def test_memory_does_not_grow_with_what_is_read(tmp_path, monkeypatch, form, at_once, grown):
     """A column of 8 bytes a row that stayed, or the exchanges of a bag, would be so many bytes more."""

@@ -182,7 +182,7 @@ def wrong(found, of_stamps):
 MAKERS = (mutated_long, mutated_long, mutated_wide, mutated_wide, mutated_stamps, mutated_log, mutated_json)
 
 
-@pytest.mark.parametrize("part", range(4))
+@pytest.mark.parametrize("part", [0, *(pytest.param(part, marks=pytest.mark.slow) for part in (1, 2, 3))])
 def test_no_mutated_file_comes_in_wrong(tmp_path, part):
     outcomes = {"asked": 0, "refused": 0, "right": 0}
     for k in range(50):
