@@ -177,7 +177,7 @@ def test_the_other_sign_is_noticed_by_poses(folder, words):
 
 
 def test_the_other_sign_is_doubted_without_poses(folder):
-    rows = flown(4, 8.0)
+    rows = flown(4, 4.0)
     doubted = imported(folder / "blind", rows, swapped=True, mocap=False)
     believed = imported(folder / "right", rows, mocap=False)
     words = ("-c", folder / "fit.json", "--use", "receptions", "--model", "constant-velocity")

@@ -162,7 +162,7 @@ def test_imu_height_and_ranges_find_place_and_heading():
     assert track.restarts_s == ()
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_it_knows_how_good_it_is(seed):
     (track,) = localize_onboard(flight(seed=seed), calibration(), OnboardSettings(noise=IMU))
     late = track.time_ns > track.time_ns[0] + 5_000_000_000
@@ -244,7 +244,7 @@ def test_what_cannot_be_localized(change, settings, error, said):
         localize_onboard(replace(contents, **change(contents)), calibration(), OnboardSettings(**settings))
 
 
-@pytest.mark.parametrize("seed", [41, 42, 43])
+@pytest.mark.parametrize("seed", [41, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (42, 43))])
 def test_a_body_that_only_listens_knows_where_it_is_and_how_well(seed):
     settings = OnboardSettings(noise=IMU, use="receptions")
     (track,) = localize_onboard(listening(seed=seed), calibration(), settings)

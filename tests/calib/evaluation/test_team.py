@@ -276,7 +276,7 @@ def batch(contents, t, ends, measured, start):
     return poses
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_at_the_end_it_is_a_batch_of_least_squares_in_a_world(seed):
     contents = flight(4.0, seed)
     t, ends, measured = ranging(4.0, seed)
