@@ -22,7 +22,11 @@ ROBOTS_AND_ANCHORS = [(0, 1), (0, 2), (0, 3), (4, 1), (4, 2), (4, 3)]
 
 
 def fitted(data, use, **settings):
-    found = calib.fit(data, use=use, between_m=0.0, **settings)
+    return by_tag(calib.fit(data, use=use, between_m=0.0, **settings))
+
+
+def by_tag(found):
+    """Delays and their standard deviations (2, tags)."""
     names = sorted(found.calibration.delays_ns)
     return np.array([[c[tag] for tag in names] for c in (found.calibration.delays_ns, found.calibration.delays_std_ns)])
 
@@ -166,14 +170,15 @@ def test_the_command_says_how_many_were_fitted(tmp_path):
 
 def test_a_real_flight_has_narrower_intervals_and_the_same_delays(tmp_path):
     flown = read_source(miluv(tmp_path), importer="miluv")
-    (delays, std), (heard, narrow) = (fitted(flown, use) for use in ("exchanges", "receptions"))
+    found = [calib.fit(flown, use=use, between_m=0.0) for use in ("exchanges", "receptions")]
+    (delays, std), (heard, narrow) = map(by_tag, found)
     # 317 ranges, and some 700 differences of arrival at the five other tags.
     assert (narrow < 0.85 * std).all()
     # What the receptions add is independent, so the change has the difference of both variances (Hausman 1978).
     change = (heard - delays) / np.sqrt(std**2 - narrow**2)
     assert np.abs(change).max() < 3
     # The doctor says what contradicts: two tags of one robot, a lever arm apart, hear each other's frames too early.
-    said = [w for w in calib.fit(flown, use="receptions").warnings if "overheard" in w]
+    said = [w for w in found[1].warnings if "overheard" in w]
     assert all(w.startswith(("path 10-11", "path 20-21", "path 30-31")) for w in said), said
 
 
