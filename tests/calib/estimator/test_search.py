@@ -53,17 +53,16 @@ def test_a_search_ends_at_least_squares_and_finds_the_weight_of_its_prior(most, 
 # The end of a search: the same from wherever near it a search starts.
 
 
-def world():
-    return calib.load_ranges(make(Recipe(seconds=60, share=(0, 0.5)), FIRST_REPORTED).ranges)
-
-
-def listeners():
-    return calib.load_ranges(flight(7100, reflected=0.15, bias_m=0.1)[0])
-
-
-@pytest.mark.parametrize("ranges", [world, listeners])
-def test_a_search_ends_at_one_optimum_of_unknowns_and_weights(ranges):
-    found = fit_known_distances(ranges(), calib.FitSettings())
+@pytest.mark.parametrize(
+    "data",
+    [
+        lambda: make(Recipe(seconds=60, share=(0, 0.5)), FIRST_REPORTED).ranges,
+        lambda: flight(7100, reflected=0.15, bias_m=0.1)[0],
+    ],
+    ids=["world", "listeners"],
+)
+def test_a_search_ends_at_one_optimum_of_unknowns_and_weights(data):
+    found = fit_known_distances(calib.load_ranges(data()), calib.FitSettings())
     search, optimum = found.searches[0], found.searches[0].optimum
     rows = [own for own in (search.rows, search.heard, *search.gauge) if own is not None]
     asked = optimum.layout.indices([unknown.kind for unknown in found.model.unknowns])

@@ -128,10 +128,6 @@ FORMS = {
 }
 
 
-def written(tmp_path, write, topics):
-    return write(tmp_path / ("b.bag" if write is ros1 else "b"), topics)
-
-
 def by_guess(tmp_path, bag, asked=()):
     """What comes in by the guess, with 7 in place of what it asks."""
     guess = guess_map(bag)
@@ -143,7 +139,7 @@ def by_guess(tmp_path, bag, asked=()):
 @pytest.mark.parametrize("name", FORMS)
 def test_ranges_of_a_bag_come_in_by_its_guess(tmp_path, name):
     write, topics, template, asked = FORMS[name]
-    bag = written(tmp_path, write, topics)
+    bag = write(tmp_path / ("b.bag" if write is ros1 else "b"), topics)
     found = by_guess(tmp_path, bag, asked)
     text = (tmp_path / "map.toml").read_text()
     assert f"[topics.{json.dumps(template)}]\n" in text

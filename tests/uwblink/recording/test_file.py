@@ -149,24 +149,21 @@ def test_a_recording_that_this_program_is_writing_says_so(tmp_path):
         Recording.open(tmp_path / "live.uwb")
 
 
-def short(e):
-    return replace(e, range_m=e.range_m[:3])
-
-
-def stray(e):
-    return replace(e, initiator=e.initiator + 70_000)
-
-
-def text(e):
-    return replace(e, tx1=np.full(50, "early"))
-
-
 @pytest.mark.parametrize(
     ("write", "expected"),
     [
-        (lambda r: r.append_exchanges(stray(random_exchanges())), "table exchanges: values that do not fit"),
-        (lambda r: r.append_exchanges(text(random_exchanges())), "table exchanges: values that do not fit"),
-        (lambda r: r.append_exchanges(short(random_exchanges())), "table exchanges: columns of different lengths"),
+        (
+            lambda r: r.append_exchanges(replace(random_exchanges(), initiator=np.full(50, 70_000))),
+            "table exchanges: values that do not fit",
+        ),
+        (
+            lambda r: r.append_exchanges(replace(random_exchanges(), tx1=np.full(50, "early"))),
+            "table exchanges: values that do not fit",
+        ),
+        (
+            lambda r: r.append_exchanges(replace(random_exchanges(), range_m=np.ones(3))),
+            "table exchanges: columns of different lengths",
+        ),
         (lambda r: r.append_tags([Tag(-1, "a", (0, 0, 0))]), "table tags: values that do not fit"),
         (lambda r: r.append("cirs", [CirRow(1, 1, 1, 2, 0.0, (70_000,))]), "table cirs: values that do not fit"),
         (lambda r: r.append_meta({"bad": float("nan")}), "meta 'bad': cannot be stored as JSON"),
