@@ -1,4 +1,4 @@
-"""What packages and rooms offer: complete, cheap to import, and all that commands call."""
+"""What packages offer and import: doors that are complete and cheap, rooms in layers, and every name once."""
 
 import ast
 import doctest
@@ -6,10 +6,13 @@ import importlib
 import pkgutil
 import subprocess
 import sys
+from collections import defaultdict
+from graphlib import CycleError
+from pathlib import Path
 
 import pytest
 
-from tests.rooms import PACKAGES, ROOT
+from tests.rooms import PACKAGES, ROOT, floors, imports, rooms
 
 HEAVY = ("numpy", "scipy", "duckdb", "matplotlib", "pydantic", "simpy", "typer", "rich", "serial")
 
@@ -139,3 +142,157 @@ def test_the_example_at_the_head_of_a_package_runs_and_importing_it_loads_nothin
     assert doctest.testmod(importlib.import_module(package)).failed == 0
     code = f"import sys, {package}; print(*(m for m in {HEAVY} if m in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split() == []
+
+
+# One word means one thing: the names of public classes and of constants, in all packages together.
+
+
+def defined(source):
+    """Yield the names of public classes and constants that a module defines, those in tuples included."""
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.ClassDef):
+            yield node.name
+        for part in ast.walk(node) if isinstance(node, ast.Assign | ast.AnnAssign) else ():
+            if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store) and part.id.isupper():
+                yield part.id
+
+
+def twice(sources):
+    """Return the names that several modules define, with the modules."""
+    found = defaultdict(list)
+    for path, source in sources.items():
+        for name in defined(source):
+            found[name].append(path)
+    return {name: paths for name, paths in found.items() if len(paths) > 1 and not name.startswith("_")}
+
+
+def test_no_two_modules_give_one_name_to_a_class_or_a_constant():
+    assert twice({path: path.read_text() for package in PACKAGES for path in (ROOT / package).rglob("*.py")}) == {}
+
+
+def test_a_name_of_two_things_is_seen():
+    sources = {
+        "uwblink/a.py": "class Track: ...\nclass _Own: ...\nLEAST, MOST = 1, 2",
+        "calib/b.py": "class Track: ...\nclass _Own: ...\nMOST: Final = 5\nTABLE[LEAST] = 1",
+    }
+    assert twice(sources) == {"Track": [*sources], "MOST": [*sources]}
+
+
+# What stands in one place only: constants and the robust spread.
+
+
+FILES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
+
+# Numbers that every formula takes from one module: in air, in a vacuum, and what makes a median deviation a sigma.
+HOMES = {
+    299_702_547.0: "uwblink/ticks.py",
+    299_792_458.0: "calib/checks/columns.py",
+    1.4826: "calib/spread.py",
+}
+
+
+def numbers(source):
+    return {
+        node.value for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Constant) and node.value in HOMES
+    }
+
+
+def test_constants_are_written_once():
+    found = [(number, path) for path in FILES for number in numbers(path.read_text(encoding="utf-8"))]
+    assert sorted((number, path.relative_to(ROOT).as_posix()) for number, path in found) == sorted(HOMES.items())
+
+
+# The import rule of docs/architecture.md, held by walking every import statement.
+
+
+FORBIDDEN = {
+    "uwblink": {"uwbsim", "calib"},
+    "uwbsim": {"calib"},
+    "calib": {"uwbsim"},
+}
+# A library that belongs to certain files only.
+CONFINED = {
+    "serial": lambda path: path == "uwblink/boards/ports.py",
+    "simpy": lambda path: path.startswith("uwbsim/"),
+    "matplotlib": lambda path: "figures" in Path(path).name or path == "uwblink/pages/pdf.py",
+    "pypdf": lambda path: path == "uwblink/pages/pdf.py",
+    "typer": lambda path: "/cli/" in path,
+    "rich": lambda path: "/cli/" in path,
+    "duckdb": lambda path: path.startswith("uwblink/") or path == "uwbsim/sweep/runner.py",
+    "pydantic": lambda path: path.startswith(("uwbsim/", "calib/calibration/")),
+    "threadpoolctl": lambda path: (
+        path
+        in {
+            "calib/checks/examine.py",
+            "calib/fitting/fitting.py",
+            "calib/planning/flights.py",
+            "calib/surveys/survey.py",
+            "calib/trajectories/fitting.py",
+            "uwbsim/sweep/executors.py",
+            "uwbsim/twins/fitting.py",
+        }
+    ),
+    "yaml": lambda path: path in {"uwblink/importers/miluv.py", "calib/calibration/formats.py"},
+    "mcap": lambda path: path in {"uwblink/importers/bags.py", "uwblink/exporters/mcap.py"},
+    "rosbags": lambda path: path in {"uwblink/importers/bags.py", "uwblink/exporters/mcap.py"},
+    "foxglove": lambda path: path == "uwblink/streaming/senders.py",
+    "gtsam": lambda path: path == "calib/factors.py",
+    "pandas": lambda path: path == "uwblink/arrays.py",
+    "distributed": lambda path: path == "uwbsim/sweep/executors.py",
+}
+NEVER = {"pickle", "pyarrow"}
+
+
+def violations(package: str, path: str, source: str) -> list[str]:
+    names = {name.split(".")[0] for name in imports(source)}
+    # A twin reads a calibration through calib's door.
+    forbidden = FORBIDDEN[package] - ({"calib"} if path == "uwbsim/twins/range_errors.py" else set())
+    wrong = names & (forbidden | NEVER)
+    wrong |= {lib for lib, allowed in CONFINED.items() if lib in names and not allowed(path)}
+    return [f"{path} imports {name}" for name in sorted(wrong)]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_package_keeps_the_import_rule(package):
+    files = sorted((ROOT / package).rglob("*.py"))
+    assert files, f"no modules found in {package}"
+    found = [
+        line for file in files for line in violations(package, file.relative_to(ROOT).as_posix(), file.read_text())
+    ]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    ("package", "path", "source"),
+    [
+        ("uwblink", "uwblink/x.py", "import calib.fitting.fitting"),
+        ("calib", "calib/x.py", "def f():\n    from uwbsim import clock"),
+        ("calib", "calib/x.py", "import simpy"),
+        ("uwbsim", "uwbsim/x.py", "from matplotlib.figure import Figure"),
+        ("uwblink", "uwblink/x.py", "import pickle"),
+    ],
+)
+def test_the_walk_sees_a_violation(package, path, source):
+    assert violations(package, path, source)
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_rooms_import_each_other_in_a_circle(package):
+    assert floors(rooms(package))
+
+
+def test_a_circle_is_seen(tmp_path):
+    sources = {
+        "__init__": "from calib.fits.x import a",
+        "errors": "",
+        "fits/x": "import calib.errors\nfrom calib.report import y",
+        "report/y": "def f():\n    from calib.fits.x import g",
+    }
+    for name, source in sources.items():
+        path = tmp_path / "calib" / f"{name}.py"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(source)
+    graph = rooms("calib", tmp_path)
+    assert graph == {"errors": set(), "fits": {"errors", "report"}, "report": {"fits"}}
+    with pytest.raises(CycleError, match="fits"):
+        floors(graph)

@@ -14,6 +14,7 @@ from rich.text import Text
 from typer import rich_utils
 
 import calib
+import uwblink
 import uwbsim
 from calib.cli.commands import app as calib_app
 from calib.cli.judging import spread_tests
@@ -163,3 +164,46 @@ def test_help_is_printed_before_anything_heavy_is_imported(package):
     for words, (length, loaded) in zip(called, seen, strict=True):
         assert length > 100, words
         assert set(loaded) <= ({"numpy", "scipy", "duckdb"} if words[1:2] == ["import"] else set()), words
+
+
+# The three commands: versions, usage errors, Ctrl-C while they begin; and they behave in forks as in new processes.
+
+
+@pytest.mark.parametrize("command", ["uwbsim", "uwblink", "calib"])
+def test_usage_errors_have_status_2(command):
+    assert processes.run(command, "--nonsense").returncode == 2
+    assert processes.run(command, "nonsense").returncode == 2
+    assert processes.succeed(command, "--version").stdout.splitlines()[0] == f"{command} {uwblink.__version__}"
+
+
+@pytest.mark.parametrize("package", ["uwbsim", "uwblink", "calib"])
+@pytest.mark.parametrize("module", ["typer", "uwblink.cli.shared"])
+def test_interrupted_while_it_is_imported(package, module):
+    code = (
+        "import os, signal, sys\n"
+        "class Interrupting:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name == {module!r}:\n"
+        "            os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Interrupting())\n"
+        f"from {package}.cli import main\n"
+        "main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("uwbsim", "validate", "scenarios/noiseless.toml"),
+        ("calib", "fit", "nowhere.uwb", "-o", "c.json"),
+        ("uwblink", "nonsense"),
+        ("calib", "--help"),
+    ],
+)
+def test_status_and_output_of_a_fork_are_those_of_a_new_process(words, monkeypatch):
+    monkeypatch.chdir(processes.ROOT)
+    plain = subprocess.run([processes.BIN / words[0], *words[1:]], capture_output=True, text=True)
+    forked = processes.run(*words)
+    assert (forked.returncode, forked.stdout, forked.stderr) == (plain.returncode, plain.stdout, plain.stderr)

@@ -8,9 +8,10 @@ import pytest
 
 from tests import pages
 from tests.uwblink.test_register_protocol import SYMMETRIC, TARGETS
+from tests.uwbsim.simulation.test_protocols import bench
 from uwblink import PROTOCOLS, SPEED_OF_LIGHT, Recording, register_protocol
 from uwblink.twr import delay_weights, raw_range
-from uwbsim import Scenario, simulate
+from uwbsim import simulate
 from uwbsim.protocols.conditions import Conditions, range_errors_m
 from uwbsim.protocols.prediction import predict
 
@@ -29,27 +30,12 @@ def row(request):
     PROTOCOLS.remove(request.param.name)
 
 
-def bench(row, skews, delays):
-    """Two tags 3.1234 m apart that do not move, without noise, bias or grids in their stamps."""
-    radio = {"rx_noise_ps": 0.0, "skew_noise_ppm": 0.0, "skew_bias_ppm": 0.0, "quantize": False}
-    places = (0, 0, 1), (3.1234, 0, 1)
-    return Scenario.model_validate(
-        {
-            "run": {"seed": 3, "duration_s": 2.0},
-            "ranging": {"protocol": row.name, "rate_hz": 50.0},
-            "radio": radio,
-            "bodies": [{"name": "ab"[k], "motion": {"model": "static", "position_m": places[k]}} for k in (0, 1)],
-            "tags": [{"id": k + 1, "body": "ab"[k], "skew_ppm": skews[k], "delay_ns": delays[k]} for k in (0, 1)],
-        }
-    )
-
-
 @pytest.mark.parametrize("delays", [(0.0, 0.0), (0.8, 0.0), (0.0, -0.5)])
 def test_simulated_ranges_are_exact_up_to_skew_and_planted_delays(row, delays):
-    result = simulate(bench(row, (5.0, -5.0), delays))
+    result = simulate(bench(row.name, (5.0, -5.0), delays=delays, n=200))
     weights = delay_weights(result.exchanges)
     calibrated = raw_range(result.exchanges) + SPEED_OF_LIGHT * 1e-9 * (weights[0] * delays[0] + weights[1] * delays[1])
-    assert len(result.exchanges) == 100
+    assert len(result.exchanges) == 200
     # Whole ticks of 4.7 mm, weighted by up to 1.2 and averaged in part; a flight of 10 ns is 5e-14 s long by its skew.
     assert np.abs(calibrated - result.truth_m).max() < 0.012
     assert abs(np.mean(calibrated - result.truth_m)) < 0.0015
@@ -71,7 +57,7 @@ def test_prediction_and_monte_carlo_agree_with_each_other_and_with_the_formula(r
 
 def test_run_show_and_fit(row, tmp_path):
     flight, fitted = tmp_path / "flight.uwb", tmp_path / "c.json"
-    settings = ["--set", f"ranging.protocol={row.name}", "--set", "run.duration_s=60"]
+    settings = ["--set", f"ranging.protocol={row.name}", "--set", "run.duration_s=60", "--no-contention"]
     command("uwbsim", "run", SCENARIO, "-o", flight, *settings)
     assert set(json.loads(command("uwblink", "show", flight, "--json"))["protocols"]) == {row.name}
     command("calib", "fit", flight, "-o", fitted)
@@ -83,6 +69,7 @@ def test_run_show_and_fit(row, tmp_path):
     assert found == pytest.approx(planted, abs=5e-3)
 
 
+@pytest.mark.parametrize("row", [SYMMETRIC], indirect=True)
 def test_compare_optimum_and_predict_know_it_without_being_told(row, tmp_path, monkeypatch):
     monkeypatch.setattr("uwblink.pages.figures.drawn", pages.outline)
     compared = json.loads(command("uwbsim", "compare", SCENARIO, "-o", tmp_path / "out", "-n", 4096, "--json"))

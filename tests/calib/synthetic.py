@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from calib.calibration.model import Calibration
+from calib.calibration.power_curves import Curve
 from calib.data.ranges import Ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -37,6 +39,19 @@ def ranges(n=6000, noise_m=0.05, tail=0.1, seed=1, k=1.00001, bias=bias_m):
         excluded={},
         planted=None,
     )
+
+
+def constant_curve(value_m):
+    return Curve((0.0,) * 4 + (9.0,) * 4, (value_m,) * 4, 3, (0.0, 9.0))
+
+
+def calibration(delays_ns, sigma_m, **more):
+    """Return a calibration with the same noise at every power, no bias, and delays that are known exactly."""
+    known = {"delays_std_ns": dict.fromkeys(delays_ns, 0.0), "loss": "cauchy", "scale_ns": 0.1} | more
+    return Calibration(
+        delays_ns=delays_ns, lift="mean-of-lifted", alpha_dbm=-82.0, speed_of_light=SPEED_OF_LIGHT,
+        bias_curve=constant_curve(0.0), sigma_curve=constant_curve(sigma_m), **known,
+    )  # fmt: skip
 
 
 def design(some, tags):

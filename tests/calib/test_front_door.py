@@ -65,6 +65,9 @@ def test_what_is_no_calibration_is_refused_by_its_parameter(tmp_path):
     assert list(tmp_path.iterdir()) == []
     # A result and the path of a calibration are as good as the calibration.
     result.save(tmp_path / "c.json")
+    with pytest.raises(FileExistsError):
+        result.save(tmp_path / "c.json")
+    result.save(tmp_path / "c.json", force=True)
     for given in (result, tmp_path / "c.json", str(tmp_path / "c.json")):
         assert calib.evaluate(flight, given).to_dict() == calib.evaluate(flight, result.calibration).to_dict()
         assert calib.compare(given, result).same

@@ -31,11 +31,11 @@ def range_often(ports, command, count, listening=()):
 
 def test_the_initiator_s_final_can_be_lost_too():
     ports = VirtualPorts(bench_scenario(), lost_share=0.4)
-    range_often(ports, b"C05|2|1|1|0\r", 600)
+    range_often(ports, b"C05|2|1|1|0\r", 300)
     reports, theirs = len(said(ports, 1, b"R05")), len(said(ports, 2, b"S05"))
-    # The firmware at 40 % loss: 209 S05 to 341 R05. Each R05 has its S05 with 0.6; three sigma of 300.
-    assert reports > 250
-    assert theirs / reports == pytest.approx(0.6, abs=0.085)
+    # The firmware at 40 % loss: 209 S05 to 341 R05. Each R05 has its S05 with 0.6; three sigma of 170.
+    assert reports > 125
+    assert theirs / reports == pytest.approx(0.6, abs=0.113)
     alike = {data[6:] for _, data in said(ports, 1, b"R05")}
     assert {data[6:] for _, data in said(ports, 2, b"S05")} <= alike
 

@@ -5,7 +5,6 @@ import json
 import math
 import shutil
 import subprocess
-import tarfile
 import tomllib
 from dataclasses import replace
 
@@ -17,7 +16,7 @@ from calib import BadInputError, Calibration, Ranges, fit, sample_flight
 from calib.calibration.formats import programmed, read_miluv, registers
 from calib.calibration.patterns import Pattern
 from tests.calib.synthetic import DELAYS_NS, ranges
-from tests.shared_data import shared
+from tests.shared_data import miluv, shared
 from uwblink.importers import read_source
 from uwblink.recording.antenna_delays import AntennaDelay
 from uwblink.recording.contents import Contents
@@ -160,9 +159,7 @@ def test_miluv_is_read_and_given_back_unchanged():
 
 def test_the_published_calibration_gives_the_published_ranges(tmp_path):
     """Within what a fault of the authors' code adds: it corrects the last stamp with the wrong tag's delay."""
-    with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
-        archive.extractall(tmp_path, filter="data")
-    folder = tmp_path / "cirObstacles_3_random_0"
+    folder = miluv(tmp_path)
     e = read_source(folder, importer="miluv").exchanges
     published = {}
     for path in folder.glob("*/uwb_range.csv"):

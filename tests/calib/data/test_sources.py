@@ -337,15 +337,30 @@ def test_a_frame_with_plain_names_needs_no_map_and_says_what_it_assumed():
         assert calib.fit(plain.set_index("stamp")).calibration.delays_ns == result.calibration.delays_ns
 
 
-def test_a_frame_that_does_not_tell_everything_is_refused_with_what_is_missing(tmp_path):
-    with pytest.raises(calib.BadInputError, match=r"data frame: state to_id in `map`.*\n(.*\n)*.*\[columns\]"):
-        calib.Ranges.from_dataframe(frame().drop(columns="to_id"))
-    with pytest.raises(calib.BadInputError, match="no column whose name is known"):
-        calib.fit(pd.DataFrame({"a": [1.0], "b": [2.0]}))
-    with pytest.raises(calib.BadInputError, match=r"columns\.nonsense"):
-        calib.Ranges.from_dataframe(frame(), {"columns": {"nonsense": "a"}})
-    with pytest.raises(ArgumentError, match="map_file"):
-        uwblink.import_recording(tmp_path / "t.csv", tmp_path / "t.uwb", map_file=MAP)
+@pytest.mark.parametrize(
+    ("call", "error", "said"),
+    [
+        (
+            lambda _: calib.Ranges.from_dataframe(frame().drop(columns="to_id")),
+            BadInputError,
+            r"data frame: state to_id in `map`.*\n(.*\n)*.*\[columns\]",
+        ),
+        (lambda _: calib.fit(pd.DataFrame({"a": [1.0], "b": [2.0]})), BadInputError, "no column whose name is known"),
+        (
+            lambda _: calib.Ranges.from_dataframe(frame(), {"columns": {"nonsense": "a"}}),
+            BadInputError,
+            r"columns\.nonsense",
+        ),
+        (
+            lambda folder: uwblink.import_recording(folder / "t.csv", folder / "t.uwb", map_file=MAP),
+            ArgumentError,
+            "map_file",
+        ),
+    ],
+)
+def test_a_frame_that_does_not_tell_everything_is_refused_with_what_is_missing(tmp_path, call, error, said):
+    with pytest.raises(error, match=said):
+        call(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 

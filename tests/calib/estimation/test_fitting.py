@@ -1,14 +1,19 @@
 """Delays and curves together: planted truth, the gauge, and what cannot be answered."""
 
+import math
 from dataclasses import replace
+from typing import Any
 
+import matplotlib
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from calib.errors import UnanswerableError
-from calib.fitting.fitting import fit
-from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
+import calib
+from calib.errors import BadInputError, UnanswerableError
+from calib.estimator.losses import LOSSES, register_loss
+from calib.fitting.fitting import add_tag, fit
+from tests.calib.synthetic import DELAYS_NS, bias_m, design, ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 
 
@@ -189,3 +194,228 @@ def test_what_is_not_known_of_the_smoothness_is_in_the_band_of_the_curve(monkeyp
     monkeypatch.setattr("calib.estimator.covariance.of_weights", lambda _, keep: np.zeros((len(keep),) * 2))
     without = fit(some, loss="cauchy").calibration.uncertainty.bias_m2
     assert np.trace(whole) > 1.02 * np.trace(without)
+
+
+# What a fit's parameters may be: every mistake names the parameter, before anything is computed.
+
+
+@pytest.mark.parametrize(
+    ("parameter", "value"),
+    [
+        ("loss", "arctan"),
+        ("reference_power_dbm", math.nan),
+        ("scale_ns", -1),
+        ("scale_ns", 0.0),
+        ("scale_ns", math.nan),
+        ("scale_ns", "auto"),
+        ("lift", "up"),
+        ("constants", "board"),
+        ("alpha_dbm", math.inf),
+        ("fixed_ns", {1: math.nan}),
+        ("fixed_ns", {1.5: 0.1}),
+        ("fixed_ns", {99: 0.1}),
+        ("groups", {"a": [1, 2], "b": [2, 3, 7]}),
+        ("groups", {"a": "12"}),
+        ("groups", {"a": []}),
+        ("groups", {"a": [1, 2]}),
+        ("groups", {"a": [1, 2, 3, 7], "b": [8]}),
+    ],
+)
+def test_a_mistake_names_its_parameter(parameter, value):
+    with pytest.raises(BadInputError) as caught:
+        fit(ranges(300), **{parameter: value})
+    assert caught.value.parameter == parameter
+    assert str(caught.value).startswith(f"`{parameter}`: ")
+    assert "--" not in str(caught.value)
+
+
+def test_the_mixture_is_not_fitted_sequentially():
+    with pytest.raises(BadInputError) as caught:
+        fit(ranges(300), sequential=True, loss="mixture")
+    assert caught.value.parameter == "sequential"
+
+
+def test_numpy_numbers_are_numbers():
+    r = ranges(600)
+    plain = fit(r, scale_ns=0.1, fixed_ns={1: -0.36}, groups={"a": (1, 2), "b": (3, 7)})
+    numbers: dict[str, Any] = {
+        "scale_ns": np.float64(0.1),
+        "fixed_ns": {np.int64(1): np.float64(-0.36)},
+        "groups": {"a": np.array([1, 2]), "b": np.array([3, 7])},
+    }
+    numpy = fit(r, **numbers)
+    assert numpy.calibration.to_json() == plain.calibration.to_json()
+
+
+@pytest.mark.parametrize(("tag", "loss", "parameter"), [(-1, "l2", "tag"), (7, "arctan", "loss"), (1, "l2", "tag")])
+def test_a_new_tag_is_checked(tag, loss, parameter):
+    r = ranges(1200)
+    known = fit(r[(r.initiator != 7) & (r.target != 7)]).calibration
+    with pytest.raises(BadInputError) as caught:
+        add_tag(r, known, tag, loss)
+    assert caught.value.parameter == parameter
+
+
+# A new tag from calibrated ones.
+
+
+@pytest.fixture(scope="module")
+def known():
+    r = ranges(8000)
+    three = r[(r.initiator != 7) & (r.target != 7)]
+    return fit(three).calibration
+
+
+def test_its_delay_is_found_and_nothing_else_moves(known):
+    added = add_tag(ranges(3000, seed=5), known, 7).calibration
+    assert {t: d for t, d in added.delays_ns.items() if t != 7} == known.delays_ns
+    assert added.bias_curve == known.bias_curve
+    # The fitted delays of the others share a shift with the curve, and the new one has it, too.
+    shift = np.mean([known.delays_ns[t] - DELAYS_NS[t] for t in known.delays_ns])
+    assert added.delays_ns[7] - shift == pytest.approx(DELAYS_NS[7], abs=0.05)
+    assert 0.002 < added.delays_std_ns[7] < 0.03
+
+
+def test_one_calibrated_tag_is_enough(known):
+    r = ranges(3000, seed=6)
+    added = add_tag(r[(r.initiator == 1) & (r.target == 7)], known, 7).calibration
+    shift = known.delays_ns[1] - DELAYS_NS[1]
+    assert added.delays_ns[7] - shift == pytest.approx(DELAYS_NS[7], abs=0.08)
+
+
+def test_what_cannot_be_added(known):
+    r = ranges(3000)
+    with pytest.raises(BadInputError, match="does not range"):
+        add_tag(r, known, 42)
+    strangers = replace(known, delays_ns={99: 0.0})
+    with pytest.raises(UnanswerableError, match="too few"):
+        add_tag(r, strangers, 7)
+
+
+# Robust losses: their weights and slopes, and losses of one's own.
+
+
+@pytest.mark.parametrize("loss", ["cauchy", "huber", "soft_l1", "l2"])
+def test_weight_and_slope_are_derivatives_of_one_score(loss):
+    u = np.array([-4.0, -1.5, -0.5, 0.0, 0.3, 0.9, 2.5])
+    weight, slope = LOSSES[loss].weights(u)
+    step = 1e-6
+    score = [(LOSSES[loss].weights(u + s)[0]) * (u + s) for s in (-step, step)]
+    np.testing.assert_allclose((score[1] - score[0]) / (2 * step), slope, atol=1e-6)
+    assert np.all(weight > 0)
+
+
+def welsch(u):
+    weight = np.exp(-(u**2) / 2)
+    return weight, weight * (1 - u**2)
+
+
+@pytest.fixture
+def own_loss():
+    register_loss("welsch", welsch)
+    yield "welsch"
+    LOSSES.remove("welsch")
+
+
+def test_a_loss_of_ones_own_is_fitted_with(own_loss):
+    r = ranges(3000)
+    result = fit(r, loss=own_loss)
+    assert result.calibration.loss == "welsch"
+    matrix, alone = design(r, r.tags()), fit(r, loss=own_loss, scale_ns=0.1, delays_only=True)
+    u = alone.residuals_m / (0.1 * SPEED_OF_LIGHT * 1e-9)
+    # At the optimum of this loss, and of no other, its scores cancel.
+    assert np.abs(matrix.T @ (u * np.exp(-(u**2) / 2))).max() < 0.1 * np.abs(matrix.T @ (u / (1 + u**2))).max()
+    found = np.array([result.calibration.delays_ns[tag] for tag in DELAYS_NS])
+    away = found - list(DELAYS_NS.values())
+    # A shift common to all is the curve's constant; 50 ps are five standard errors.
+    np.testing.assert_allclose(away - away.mean(), 0, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "loss", "fragment"),
+    [
+        ("cauchy", welsch, "project's own"),
+        ("mixture", welsch, "project's own"),
+        ("wrong-slope", lambda u: (1 / (1 + u**2), 1 / (1 + u**2)), "slope at u"),
+        ("one-array", lambda u: 1 / (1 + u**2), "two arrays"),
+        ("numbers", lambda u: (1.0, 1.0), "one for each"),
+        ("half", lambda u: (0.5 + 0 * u, 0.5 + 0 * u), "u = 0"),
+        ("nan", lambda u: (u / 0.0 * 0, u), "finite"),
+    ],
+)
+def test_a_loss_that_cannot_be_one_is_refused(name, loss, fragment):
+    with np.errstate(all="ignore"), pytest.raises(BadInputError, match=fragment):
+        register_loss(name, loss)
+    assert name not in set(LOSSES) - {"cauchy"}
+
+
+def test_a_registered_loss_is_replaced_only_when_asked(own_loss):
+    with pytest.raises(BadInputError, match="registered already"):
+        register_loss(own_loss, welsch)
+    register_loss(own_loss, LOSSES["cauchy"].weights, replace=True)
+    np.testing.assert_array_equal(LOSSES[own_loss].weights(np.ones(1)), LOSSES["cauchy"].weights(np.ones(1)))
+
+
+# What a fit returns: it prints on a screen, plots itself and saves.
+
+
+matplotlib.use("Agg")
+
+
+@pytest.fixture(scope="module")
+def result():
+    return replace(calib.fit(ranges(2000)), warnings=["<b>beware</b> of the dog"])
+
+
+def test_it_prints_on_a_screen(result):
+    text = repr(result)
+    lines = text.splitlines()
+    assert len(lines) < 20
+    assert max(map(len, lines)) < 120
+    for tag, delay in result.calibration.delays_ns.items():
+        (line,) = [line for line in lines if line.split()[:1] == [str(tag)]]
+        assert f"{delay:+.4f}" in line
+        assert f"± {1.959964 * result.calibration.delays_std_ns[tag]:.4f}" in line
+    assert "2000 ranges of synthetic: converged after" in lines[0]
+    assert lines[-1] == "warning: <b>beware</b> of the dog"
+    assert repr(result.calibration) in text
+
+
+def test_a_calibration_prints_as_its_table(result):
+    known = result.calibration
+    assert len(repr(known)) < 1500
+    assert "undetermined" in repr(replace(known, delays_std_ns=dict.fromkeys(DELAYS_NS, np.inf)))
+    assert "pinned" in repr(replace(known, delays_std_ns=dict.fromkeys(DELAYS_NS, 0.0)))
+    many = replace(known, delays_ns=dict.fromkeys(range(500), 0.1))
+    assert "460 more" in repr(many)
+    assert len(repr(many).splitlines()) < 60
+    low, high = known.bias_curve.range
+    shown = np.linspace(low, high, 6)
+    assert f"{100 * known.bias_curve(shown)[0]:+.1f}" in repr(known)
+
+
+def test_groups_have_a_row_each():
+    groups = {"round": (1, 2), "flat": (3, 7)}
+    text = repr(calib.fit(ranges(2000), groups=groups).calibration)
+    assert "bias (cm) round" in text
+    assert "sigma (cm) flat" in text
+
+
+def test_html_is_escaped(result):
+    page = result._repr_html_()
+    assert "<b>beware" not in page
+    assert "&lt;b&gt;beware" in page
+    assert page.count("<tr>") == page.count("</tr>") == 1 + len(DELAYS_NS) + 3
+
+
+def test_it_draws_into_axes(result):
+    from matplotlib import pyplot
+
+    for draw in (result.plot_bias, result.plot_sigma, result.plot_residuals, result.plot_delays):
+        axes = pyplot.figure().subplots()
+        assert draw(axes) is axes
+        assert axes.get_xlabel()
+        assert axes.get_legend()
+    own = result.plot_delays()
+    assert own.figure in [pyplot.figure(number) for number in pyplot.get_fignums()]
+    pyplot.close("all")

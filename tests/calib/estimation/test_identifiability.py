@@ -12,18 +12,8 @@ from calib.errors import BadInputError, LeftOutWarning, UnanswerableError
 from calib.estimator.range_model import MIN_RANGES_OF_GROUP as FEWEST
 from calib.evaluation.statistics import evaluate
 from calib.fitting.fitting import fit
-from calib.pairs import pairs_of
 from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
 from uwblink.ticks import SPEED_OF_LIGHT
-
-
-def test_pairs_are_numbered_by_their_tags_and_a_single_range_makes_one():
-    initiator, target = np.array([9, 2, 5, 2, 5]), np.array([2, 9, 2, 9, 9])
-    found = pairs_of(initiator, target)
-    assert found.ends.tolist() == [[2, 5], [2, 9], [5, 9]]
-    assert found.number.tolist() == [1, 1, 0, 1, 2]
-    assert found.names == ("2-5", "2-9", "5-9")
-    assert pairs_of(np.array([1, 3]), np.array([3, 7])).number.tolist() == [0, 1]
 
 
 @pytest.mark.parametrize(

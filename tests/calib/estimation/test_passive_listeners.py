@@ -1,17 +1,15 @@
 """Delays from overheard exchanges: one target at a time, whatever the graph of pairs, and never a split."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import uwblink
-from calib.calibration.model import Calibration
-from calib.calibration.power_curves import Curve
 from calib.data.sources import load_ranges
 from calib.fitting.fitting import fit
 from calib.fitting.passive_listeners import heard_delays
+from tests.calib.synthetic import calibration
 from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT
 from uwbsim import simulate
 from uwbsim.scenario.loading import load
@@ -26,20 +24,13 @@ def recorded(tmp_path, scenario, *settings):
     return path
 
 
-def nothing(tags):
-    flat = Curve((0.0,) * 4 + (9.0,) * 4, (0.0,) * 4, 3, (0.0, 9.0))
-    one = replace(flat, coefficients=(0.1,) * 4)
-    zero = dict.fromkeys(tags, 0.0)
-    return Calibration(
-        delays_ns=zero, delays_std_ns=zero, loss="cauchy", scale_ns=0.1, lift="mean-of-lifted", alpha_dbm=-82.0,
-        speed_of_light=299702547.0, bias_curve=flat, sigma_curve=one,
-    )  # fmt: skip
+NOTHING = calibration(dict.fromkeys(range(1, 7), 0.0), 0.1)
 
 
 def test_without_noise_they_are_what_was_planted(tmp_path):
     path = recorded(tmp_path, "noiseless.toml", "run.duration_s=20", *PASSIVE)
     planted = load_ranges(path).planted["delays_ns"]
-    heard = heard_delays(path, nothing(range(1, 7)))
+    heard = heard_delays(path, NOTHING)
     assert len(heard) >= 3
     for tag, found in heard.items():
         # Stamps are whole ticks of 15.6 ps, five of them; hundreds of exchanges average them to under a picosecond, but
@@ -60,7 +51,7 @@ def test_they_agree_with_the_fit_of_a_noisy_flight(tmp_path):
 
 def test_no_listeners_no_delays(tmp_path):
     path = recorded(tmp_path, "icra2023/train.toml", "run.duration_s=5")
-    assert heard_delays(path, nothing(range(1, 7))) == {}
+    assert heard_delays(path, NOTHING) == {}
 
 
 def test_the_split_leaves_no_trace_in_what_anyone_computes(tmp_path):
@@ -80,7 +71,7 @@ def test_the_split_leaves_no_trace_in_what_anyone_computes(tmp_path):
         ]
         path = tmp_path / f"{share}-{more_ns}.uwb"
         simulate(scenario.model_copy(update={"tags": tuple(tags)})).save(path)
-        return load_ranges(path), heard_delays(path, nothing(range(1, 7)))
+        return load_ranges(path), heard_delays(path, NOTHING)
 
     (first, heard), (second, heard_again), (longer, heard_longer) = flown(0.2, 1.0), flown(0.8, 1.0), flown(0.2, 1.6)
     # A range is half of four rounded stamps.

@@ -101,6 +101,7 @@ def test_a_flight_predicts_the_errors_of_another_day(starloc, one, other):
     assert of_tags == pytest.approx(sum(found.delays_ns.values()) - of_tags, abs=0.01)
 
 
+@pytest.mark.slow
 def test_delays_of_150_ranges_of_a_real_flight_agree_with_those_of_all(starloc):
     whole = calib.fit(starloc[0]).calibration
     tags, scores = list(whole.delays_ns), []

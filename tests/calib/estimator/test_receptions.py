@@ -1,6 +1,5 @@
 """What listeners overhear, fitted beside ranges: by worlds of NumPy alone, and by the simulator without noise."""
 
-import tarfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import calib
 from calib.errors import BadInputError, UnanswerableError
 from tests.calib.overhearing import bound_ns2, flight, least_squares_ns
 from tests.processes import call
-from tests.shared_data import shared
+from tests.shared_data import miluv
 from uwblink import Tag
 from uwblink.importers import read_source
 from uwbsim import simulate
@@ -23,7 +22,11 @@ ROBOTS_AND_ANCHORS = [(0, 1), (0, 2), (0, 3), (4, 1), (4, 2), (4, 3)]
 
 
 def fitted(data, use, **settings):
-    found = calib.fit(data, use=use, between_m=0.0, **settings)
+    return by_tag(calib.fit(data, use=use, between_m=0.0, **settings))
+
+
+def by_tag(found):
+    """Delays and their standard deviations (2, tags)."""
     names = sorted(found.calibration.delays_ns)
     return np.array([[c[tag] for tag in names] for c in (found.calibration.delays_ns, found.calibration.delays_std_ns)])
 
@@ -43,6 +46,7 @@ def test_each_listener_alone_finds_each_targets_delay_without_noise():
         assert -np.mean(own) / METRES_A_NS == pytest.approx(found.planted["delays_ns"][str(tag)], abs=1.2e-3)
 
 
+@pytest.mark.slow
 def test_listeners_gain_what_theory_predicts_and_intervals_hold():
     pairs = [(i, j) for i in range(6) for j in range(6) if i != j]
     alone, bound = (np.sqrt(np.diag(bound_ns2(pairs, 6, listening=on)).mean()) for on in (False, True))
@@ -141,16 +145,18 @@ def test_two_messages_take_the_rate_from_the_carrier():
         assert delay_ns == pytest.approx(found.planted["delays_ns"][str(tag)], abs=0.05)
 
 
-def test_what_cannot_be_fitted_is_refused():
-    data, _ = flight(7500, count=300)
-    deaf = replace(data, overheard={})
-    with pytest.raises(UnanswerableError, match="no listener overheard"):
-        calib.fit(deaf, use="receptions")
-    for setting in ({"sequential": True}, {"constants": "pair"}):
-        with pytest.raises(BadInputError, match=next(iter(setting))):
-            calib.fit(data, use="receptions", **setting)
-    with pytest.raises(BadInputError, match="allowed: exchanges, receptions"):
-        calib.fit(data, use="everything")
+@pytest.mark.parametrize(
+    ("change", "settings", "error", "said"),
+    [
+        ({"overheard": {}}, {}, UnanswerableError, "no listener overheard"),
+        ({}, {"sequential": True}, BadInputError, "sequential"),
+        ({}, {"constants": "pair"}, BadInputError, "constants"),
+        ({}, {"use": "everything"}, BadInputError, "allowed: exchanges, receptions"),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused(change, settings, error, said):
+    with pytest.raises(error, match=said):
+        calib.fit(replace(flight(7500, count=300)[0], **change), **{"use": "receptions"} | settings)
 
 
 def test_the_command_says_how_many_were_fitted(tmp_path):
@@ -163,17 +169,16 @@ def test_the_command_says_how_many_were_fitted(tmp_path):
 
 
 def test_a_real_flight_has_narrower_intervals_and_the_same_delays(tmp_path):
-    with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
-        archive.extractall(tmp_path, filter="data")
-    flown = read_source(tmp_path / "cirObstacles_3_random_0", importer="miluv")
-    (delays, std), (heard, narrow) = (fitted(flown, use) for use in ("exchanges", "receptions"))
+    flown = read_source(miluv(tmp_path), importer="miluv")
+    found = [calib.fit(flown, use=use, between_m=0.0) for use in ("exchanges", "receptions")]
+    (delays, std), (heard, narrow) = map(by_tag, found)
     # 317 ranges, and some 700 differences of arrival at the five other tags.
     assert (narrow < 0.85 * std).all()
     # What the receptions add is independent, so the change has the difference of both variances (Hausman 1978).
     change = (heard - delays) / np.sqrt(std**2 - narrow**2)
     assert np.abs(change).max() < 3
     # The doctor says what contradicts: two tags of one robot, a lever arm apart, hear each other's frames too early.
-    said = [w for w in calib.fit(flown, use="receptions").warnings if "overheard" in w]
+    said = [w for w in found[1].warnings if "overheard" in w]
     assert all(w.startswith(("path 10-11", "path 20-21", "path 30-31")) for w in said), said
 
 

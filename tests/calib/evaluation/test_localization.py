@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib import BadInputError, Calibration, UnanswerableError, fit, sample_flight
-from calib.calibration.power_curves import Curve
+from calib import BadInputError, UnanswerableError, fit, sample_flight
 from calib.data.sources import Flight, load_flight
 from calib.evaluation.localization import (
     fixed_std,
@@ -20,6 +19,7 @@ from calib.evaluation.localization import (
 from calib.evaluation.tracking import Settings
 from calib.online import RangeErrors, gated_update, mixture_update
 from calib.report.figures import rmse_bars
+from tests.calib.synthetic import calibration, constant_curve
 from tests.shared_data import ROOT
 from uwblink.pages.figures import style
 from uwbsim import load, simulate
@@ -45,22 +45,13 @@ def beginning(flight, seconds):
     return replace(flight, ranges=flight.ranges[early])
 
 
-def flat(value):
-    return Curve((0.0,) * 4 + (9.0,) * 4, (value,) * 4, 3, (0.0, 9.0))
-
-
-def clean(flight: Flight, sigma_m=0.08) -> tuple[Flight, Calibration]:
+def clean(flight: Flight, sigma_m=0.08):
     """True distances with Gaussian noise and nothing else, and a calibration that says so."""
     rng = np.random.default_rng(4)
     ranges = flight.ranges
     raw = ranges.truth_m + rng.normal(size=len(ranges)) * sigma_m
-    tags = ranges.tags()
-    calibration = Calibration(
-        delays_ns=dict.fromkeys(tags, 0.0), delays_std_ns=dict.fromkeys(tags, 0.0), loss="cauchy", scale_ns=0.1,
-        lift="mean-of-lifted", alpha_dbm=-82.0, speed_of_light=299702547.0, bias_curve=flat(0.0),
-        sigma_curve=flat(sigma_m),
-    )  # fmt: skip
-    return replace(flight, ranges=replace(ranges, raw_m=raw)), calibration
+    known = calibration(dict.fromkeys(ranges.tags(), 0.0), sigma_m)
+    return replace(flight, ranges=replace(ranges, raw_m=raw)), known
 
 
 def test_the_filter_is_consistent_on_clean_ranges(flights):
@@ -76,31 +67,31 @@ def test_the_filter_is_consistent_on_clean_ranges(flights):
 
 
 def test_a_body_that_ranges_only_where_its_place_is_unknown_is_left_out(flights):
-    flight, calibration = clean(beginning(flights["test1"], 2))
+    flight, known = clean(beginning(flights["test1"], 2))
     bodies = sorted({tag.body for tag in flight.tags})
     last = flights["test1"].ranges.time_ns.max()
     # One body's poses come after all ranges.
     late = flight.poses.body == bodies[0]
     time = np.where(late, flight.poses.time_ns + last, flight.poses.time_ns)
     poses = replace(flight.poses, time_ns=time)[np.argsort(time, kind="stable")]
-    found = localize(replace(flight, poses=poses), calibration, Settings(seeds=1))
+    found = localize(replace(flight, poses=poses), known, Settings(seeds=1))
     assert {one.body for one in found} == set(bodies[1:])
 
 
 def test_a_filter_that_trusts_its_ranges_too_much_is_found_out(flights):
-    flight, calibration = clean(beginning(flights["test1"], 20))
-    found = summarize(localize(flight, replace(calibration, sigma_curve=flat(0.05)), Settings(gate=1e9, seeds=1)))
+    flight, known = clean(beginning(flights["test1"], 20))
+    found = summarize(localize(flight, replace(known, sigma_curve=constant_curve(0.05)), Settings(gate=1e9, seeds=1)))
     assert found.nis > found.nis_bounds[1]
     assert found.nees > found.nees_bounds[1]
 
 
 def test_what_cannot_be_localized_or_summed_up(flights):
-    flight, calibration = clean(beginning(flights["test1"], 1))
+    flight, known = clean(beginning(flights["test1"], 1))
     with pytest.raises(UnanswerableError, match="ifo001"):
-        summarize(localize(flight, calibration, Settings(gate=1e-12, seeds=1)))
+        summarize(localize(flight, known, Settings(gate=1e-12, seeds=1)))
     still = replace(flight, poses=replace(flight.poses, position_m=flight.poses.position_m * 0))
     with pytest.raises(UnanswerableError, match=r"test1\.uwb"):
-        localize(still, calibration)
+        localize(still, known)
 
 
 @pytest.mark.slow
@@ -125,8 +116,8 @@ def test_a_calibration_is_worth_at_least_a_third_of_the_error(flights, fitted):
 
 def test_fixed_variances_are_those_of_the_training_flight(flights, fitted):
     """Of noise of 8 cm values of the grid near it err least."""
-    flight, calibration = clean(beginning(flights["test1"], 20))
-    found = fixed_std(calibration, Settings(seeds=1), flight)
+    flight, known = clean(beginning(flights["test1"], 20))
+    found = fixed_std(known, Settings(seeds=1), flight)
     assert found.std_m["calibrated"] in (0.07, 0.1, 0.14)
     assert "tuned on" in found.source
     known = fixed_std(fitted, Settings())
@@ -139,14 +130,14 @@ def test_fixed_variances_are_those_of_the_training_flight(flights, fitted):
 
 
 def test_each_body_and_flight_has_noise_of_its_own(flights):
-    flight, calibration = clean(beginning(flights["test1"], 6))
-    one, two = localize(flight, calibration, Settings(seeds=2, gate=1e9))[:2]
+    flight, known = clean(beginning(flights["test1"], 6))
+    one, two = localize(flight, known, Settings(seeds=2, gate=1e9))[:2]
     errors = [t.estimate_m - t.truth_m for t in (one.tracks["raw"], one.tracks["variance"], two.tracks["raw"])]
     *first, second = (np.diff(error[:200], axis=0) for error in errors)
     assert np.corrcoef(first[0].ravel(), first[1].ravel())[0, 1] > 0.8, "filters of a body see the same noise"
     assert abs(np.corrcoef(first[0].ravel(), second.ravel())[0, 1]) < 0.5
     assert one.rmse_m["raw"][0] != one.rmse_m["raw"][1]
-    again = localize(flight, calibration, Settings(seeds=1, seed=1, gate=1e9))[0]
+    again = localize(flight, known, Settings(seeds=1, seed=1, gate=1e9))[0]
     assert again.rmse_m["raw"][0] == one.rmse_m["raw"][1]
 
 
@@ -163,12 +154,12 @@ def test_a_wrong_start_is_left_within_two_seconds(flights, fitted, offset):
 @pytest.mark.slow
 @pytest.mark.parametrize(("far_m", "offset"), [(3.0, (0.0, -10.0, 0.0)), (10.0, (0.0, 0.0, 5.0))])
 def test_wrong_ranges_do_not_lock_the_filter_out(flights, far_m, offset):
-    flight, calibration = clean(beginning(flights["test1"], 12))
+    flight, known = clean(beginning(flights["test1"], 12))
     # Metres wrong, with a stated decimetre, and a start that no range agrees with: the gate refuses everything until
     # the filter begins anew, first where the wrong ranges put it, then where the right ones do.
     early = flight.ranges.time_ns < flight.ranges.time_ns.min() + 2_000_000_000
     flight.ranges.raw_m[early] += far_m
-    for one in localize(flight, calibration, Settings(seed=3, seeds=1, initial_offset_m=offset)):
+    for one in localize(flight, known, Settings(seed=3, seeds=1, initial_offset_m=offset)):
         track = one.tracks["variance"]
         wrong = np.linalg.norm(track.estimate_m - track.truth_m, axis=1)
         wrong = wrong[track.time_ns > track.time_ns.min() + 4_000_000_000]
@@ -185,9 +176,9 @@ def test_settings_that_no_filter_can_run_with(name, value):
 
 
 def test_text_and_json_state_what_they_rest_on(flights):
-    flight, calibration = clean(beginning(flights["test1"], 2))
+    flight, known = clean(beginning(flights["test1"], 2))
     settings = Settings(seeds=2, velocity_std_mps=0.2)
-    found = localize(flight, calibration, settings)
+    found = localize(flight, known, settings)
     text = localization_text(found, settings)
     assert all(part in text for part in ("0.2 m/s", "2 seeds", "simulated flights"))
     document = json.loads(json.dumps(localization_json(found)))
@@ -196,8 +187,8 @@ def test_text_and_json_state_what_they_rest_on(flights):
 
 
 def test_trajectories_are_written_in_tum_form_with_their_attitudes(flights, tmp_path):
-    flight, calibration = clean(beginning(flights["test1"], 2))
-    found = localize(flight, calibration, Settings(seeds=1))
+    flight, known = clean(beginning(flights["test1"], 2))
+    found = localize(flight, known, Settings(seeds=1))
     track = found[0].tracks["raw"]
     write_tum(found, tmp_path)
     lines = (tmp_path / f"test1_uwb-{found[0].body}-raw.tum").read_text().splitlines()

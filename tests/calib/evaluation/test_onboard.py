@@ -1,23 +1,22 @@
 """Localization by what is on board: flights written down as formulas, whose readings share no code with the filter."""
 
-import tarfile
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import BadInputError, Calibration, OnboardSettings, UnanswerableError, localize_onboard
+from calib import BadInputError, OnboardSettings, UnanswerableError, localize_onboard
 from calib.calibration.error_model import ErrorModel
 from calib.calibration.formats import read_miluv
 from calib.calibration.patterns import Pattern
-from calib.calibration.power_curves import Curve
 from calib.data.samples import stamped
 from calib.evaluation.filters import Fix, InertialFilter, ProcessNoise, multilaterate
 from calib.evaluation.localization import write_tum
 from calib.evaluation.onboard import onboard_json, onboard_text
 from calib.online import RangeErrors
-from tests.shared_data import shared
+from tests.calib import synthetic
+from tests.shared_data import miluv, shared
 from uwblink import Contents, Exchanges, Poses, Tag
 from uwblink.importers import read_source
 from uwblink.twr import raw_range
@@ -140,16 +139,11 @@ def listening(seconds=20.0, seed=1, rate=50.0):
 
 def calibration(share=0.001):
     tags = [*range(len(ANCHORS)), *ARMS]
-    zero, sigma = (Curve((0.0,) * 4 + (9.0,) * 4, (v,) * 4, 3, (0.0, 9.0)) for v in (0.0, NOISE_M))
     errors = ErrorModel(
         lifted=(0.1, 1.0), noise_m=(NOISE_M,) * 2, tail_share=(share,) * 2, least_m=0.0, detour_m=0.35,
         outlier_share=1e-4, outlier_m=3.0,
     )  # fmt: skip
-    return Calibration(
-        delays_ns=dict.fromkeys(tags, 0.0), delays_std_ns=dict.fromkeys(tags, 0.0), loss="mixture", scale_ns=0.1,
-        lift="mean-of-lifted", alpha_dbm=-82.0, speed_of_light=299702547.0, bias_curve=zero, sigma_curve=sigma,
-        errors=errors,
-    )  # fmt: skip
+    return synthetic.calibration(dict.fromkeys(tags, 0.0), NOISE_M, loss="mixture", errors=errors)
 
 
 def errors_of(track, after_s=0.0):
@@ -170,7 +164,7 @@ def test_imu_height_and_ranges_find_place_and_heading():
     assert track.restarts_s == ()
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_it_knows_how_good_it_is(seed):
     (track,) = localize_onboard(flight(seed=seed), calibration(), OnboardSettings(noise=IMU))
     late = track.time_ns > track.time_ns[0] + 5_000_000_000
@@ -274,20 +268,30 @@ def test_without_a_heading_a_pattern_is_noise():
     assert np.mean(unsure.nees) < 0.5 * np.mean(sure.nees)
 
 
-def test_what_cannot_be_localized():
+FEW = [f"anchor{k}" for k in range(4)]
+
+
+@pytest.mark.parametrize(
+    ("change", "settings", "error", "said"),
+    [
+        (lambda _: {"imu": {}}, {}, UnanswerableError, "no inertial readings of drone; choose the model constant-vel"),
+        (
+            lambda flown: {"poses": flown.poses[np.flatnonzero(~np.isin(flown.poses.body, FEW))]},
+            {},
+            UnanswerableError,
+            "2 tags stay in one place",
+        ),
+        (lambda _: {}, {"model": "magic"}, BadInputError, "`model`: found 'magic', allowed: imu, constant-velocity"),
+        (lambda _: {}, {"start_m": (0.0, np.nan, 1.0)}, BadInputError, "`start_m`"),
+    ],
+)
+def test_what_cannot_be_localized(change, settings, error, said):
     contents = flight(3.0)
-    with pytest.raises(UnanswerableError, match="no inertial readings of drone; choose the model constant-velocity"):
-        localize_onboard(replace(contents, imu={}), calibration())
-    few = contents.poses[np.flatnonzero(~np.isin(contents.poses.body, ["anchor0", "anchor1", "anchor2", "anchor3"]))]
-    with pytest.raises(UnanswerableError, match="2 tags stay in one place"):
-        localize_onboard(replace(contents, poses=few), calibration())
-    with pytest.raises(BadInputError, match="`model`: found 'magic', allowed: imu, constant-velocity"):
-        OnboardSettings(model="magic")
-    with pytest.raises(BadInputError, match="`start_m`"):
-        OnboardSettings(start_m=(0.0, np.nan, 1.0))
+    with pytest.raises(error, match=said):
+        localize_onboard(replace(contents, **change(contents)), calibration(), OnboardSettings(**settings))
 
 
-@pytest.mark.parametrize("seed", [41, 42, 43])
+@pytest.mark.parametrize("seed", [41, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (42, 43))])
 def test_a_body_that_only_listens_knows_where_it_is_and_how_well(seed):
     settings = OnboardSettings(noise=IMU, use="receptions")
     (track,) = localize_onboard(listening(seed=seed), calibration(), settings)
@@ -361,9 +365,7 @@ def test_multilateration_is_exact_and_leaves_a_reflection_out():
 
 def test_a_real_flight_by_imu_height_and_ranges_alone(tmp_path):
     """The dataset's own flight among obstacles: a range to an anchor in 1.2 s, gaps of 6 s, published calibration."""
-    with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
-        archive.extractall(tmp_path, filter="data")
-    contents = read_source(tmp_path / "cirObstacles_3_random_0", importer="miluv")
+    contents = read_source(miluv(tmp_path), importer="miluv")
     tracks = localize_onboard(contents, read_miluv(shared("miluv_published_calibration.json")))
     rmse = {track.body: track.rmse_m for track in tracks}
     assert sorted(rmse) == ["ifo001", "ifo002", "ifo003"]

@@ -151,7 +151,7 @@ def smoothed(ranges, known, anchors_m, moves_m, std_m):
 
 def test_gtsam_finds_the_optimum_of_the_filter_run_forward_and_back(known):
     pytest.importorskip("gtsam", reason=NO_GTSAM)
-    made, antenna_m = flight(8, 8.0, rate_hz=25, drift_m={1: 0.1}, only=1)
+    made, antenna_m = flight(8, 5.0, rate_hz=25, drift_m={1: 0.1}, only=1)
     ranges, anchors_m = load_ranges(made), dict(zip(range(11, 17), PLACES, strict=True))
     noise_m = np.random.default_rng(5).normal(0, 0.03, antenna_m.shape)
     given = ranges, known, anchors_m, np.diff(antenna_m, axis=0, prepend=0.0) + noise_m, 0.03

@@ -130,15 +130,12 @@ def test_one_session_cannot_be_held_out():
 # Whoever judges a calibration on what it was fitted to is told so.
 
 
-def saved(path, flight):
-    Contents(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags).save(path)
-
-
 def test_the_recording_is_known_by_what_it_holds_and_not_by_its_name(tmp_path):
     train, test = calib.sample_flight(), calib.sample_flight(seed=2)
     for folder, flight in (("a", train), ("b", test), ("c", train)):
         (tmp_path / folder).mkdir()
-        saved(tmp_path / folder / "flight.uwb", flight)
+        contents = Contents(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags)
+        contents.save(tmp_path / folder / "flight.uwb")
     found = calib.fit(tmp_path / "a" / "flight.uwb")
     assert calib.evaluate(tmp_path / "c" / "flight.uwb", found.calibration).seen == ("flight.uwb",)
     assert calib.evaluate(tmp_path / "b" / "flight.uwb", found.calibration).seen == ()

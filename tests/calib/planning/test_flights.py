@@ -40,10 +40,6 @@ def mean_ns(seen, **given):
     return math.sqrt(np.trace(covariance) / len(covariance))
 
 
-def half_ns(plan):
-    return float(np.sqrt(np.mean(np.square(list(plan.open_ns.values())))))
-
-
 def test_noise_alone_informs_by_its_inverse_variance_and_reflected_ranges_by_less():
     plain = ExpectedErrors(noise_m=0.05, reflected=0.0).informed()
     assert plain == pytest.approx(0.05**-2, rel=1e-3)
@@ -135,7 +131,8 @@ def test_an_accelerometer_bridges_few_ranges_and_a_good_one_more():
     # A grade is the noise of a tenth of a second, and what propellers leave.
     graded = 3 * math.hypot(3e-3 / math.sqrt(0.1), 0.2)
     good, poor, none = (mean_ns(seen, poses_until_s=4.0, force=force) for force in (0.02, graded, None))
-    assert half_ns(plan) == pytest.approx(1.96 * poor, rel=1e-4)
+    half_ns = np.sqrt(np.mean(np.square(list(plan.open_ns.values()))))
+    assert half_ns == pytest.approx(1.96 * poor, rel=1e-4)
     assert good < 0.97 * none
     assert good < poor < 1.05 * none
 

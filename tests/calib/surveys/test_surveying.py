@@ -19,13 +19,13 @@ import calib
 from benchmarks.standing import standing_boards
 from calib.cli.commands import app
 from calib.cli.shared import CALIB_FLAGS
-from calib.data.samples import ANCHOR_DELAYS_NS
+from calib.data.samples import ANCHOR_DELAYS_NS, stamped
 from calib.errors import BadInputError, UnanswerableError
 from calib.surveys.knowledge import load_knowledge
-from uwblink import Arrangement, Contents, Exchanges
+from uwblink import Arrangement, Contents
 from uwblink.cli.shared import run
 from uwblink.recording.schema import KnownDistance, load_places
-from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
+from uwblink.ticks import SPEED_OF_LIGHT
 
 
 def in_order(*orders):
@@ -373,11 +373,8 @@ def recording(tmp_path_factory):
     folder, ranges = tmp_path_factory.mktemp("sample"), calib.sample_arrangements(4)
     for k in range(4):
         r = ranges[ranges.time_ns // 40_000_000_000 == k]
-        start = np.zeros(len(r), dtype=np.int64)
-        back = np.rint(2 * r.raw_m / SPEED_OF_LIGHT / TICK_S).astype(np.int64) + 20_000_000
-        x = Exchanges.from_arrays(
-            r.initiator, r.target, tx1=start, rx1=start, tx2=start + 20_000_000, rx2=back, time_ns=r.time_ns
-        )
+        silent = np.full((2, len(r)), np.nan)
+        x = stamped(r.time_ns, np.column_stack([r.initiator, r.target]), r.raw_m, silent)
         marks = [Arrangement("ABCD"[k], int(r.time_ns[0]), int(r.time_ns[-1]) + 1, "line")]
         Contents(exchanges=x, arrangements=marks).save(folder / f"{k}.uwb")
     return [str(folder / f"{k}.uwb") for k in range(4)]

@@ -1,6 +1,7 @@
 """What is known beside ranges and poses, tapes and heights; and flights that are not what a fit takes them for."""
 
 import re
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -8,9 +9,15 @@ import numpy as np
 import pytest
 
 import calib
-from calib.trajectories.samples import tapes_of
+import uwbsim
+from calib.settings import FlightSettings
+from calib.trajectories.samples import Attitude, tapes_of
+from calib.trajectories.scene import scene_from
+from calib.trajectories.start import interpolated, resolve_headings
 from tests.calib.trajectories.sines import DELAYS_NS, flight, scores
+from tests.shared_data import miluv
 from uwblink import Arrangement, KnownDistance
+from uwblink.importers import read_source
 
 pytestmark = pytest.mark.slow
 
@@ -155,3 +162,149 @@ def test_walls_between_bodies_are_named_and_in_the_intervals(between_m):
     assert np.abs(np.array(errors) / list(found.delays_std_ns.values())).max() < 2.5
     # Walls of 5 cm put delays off by some 100 ps; without them they are known to half of that.
     assert (np.max(np.abs(errors)) > 0.08) == (between_m > 0)
+
+
+# A recorded flight (MILUV: three robots, six anchors, 317 exchanges), with little or none of its motion capture; and a
+# simulated one whose tags range with anchors only.
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    return read_source(miluv(tmp_path_factory.mktemp("miluv")), importer="miluv")
+
+
+def joint_scores(found, flown):
+    """Differences from a fit with all of the motion capture over joint standard errors, of all boards."""
+    whole = calib.fit(flown, loss="cauchy").calibration
+    std = np.sqrt(np.diag(found.uncertainty.delays_ns2))
+    tags = found.uncertainty.tags
+    differ = np.array([found.delays_ns[tag] - whole.delays_ns[tag] for tag in tags])
+    return differ / np.hypot(std, [whole.delays_std_ns[tag] for tag in tags])
+
+
+@pytest.mark.slow
+def test_ten_seconds_of_motion_capture_an_imu_and_heights_follow_a_real_flight(flown):
+    found = calib.fit_from_ranges(flown, poses_until_s=10.0, attitudes="imu")
+    truth = calib.load_ranges(flown)
+    away = found.ranges.truth_m - truth.truth_m[np.searchsorted(truth.time_ns, found.ranges.time_ns)]
+    # Four ranges a second for three robots: accelerometer and height bridge what is between them.
+    assert abs(np.median(away)) < 0.03
+    assert np.median(np.abs(away)) < 0.1
+    assert sum(map(np.isfinite, found.calibration.delays_std_ns.values())) >= 10
+    scores = joint_scores(found.calibration, flown)
+    assert np.sqrt(np.mean(scores**2)) < 1.5
+    assert np.abs(scores).max() < 2.5
+
+
+@pytest.mark.slow
+def test_anchors_alone_leave_the_delays_open_and_intervals_say_how_far(flown):
+    found = calib.fit_from_ranges(flown, poses_until_s=0.0, minimum_norm=True)
+    assert "the ranges determine no delay" in found.warnings[0]
+    assert np.isinf(list(found.calibration.delays_std_ns.values())).all()
+    assert np.abs(joint_scores(found.calibration, flown)).max() < 2.5
+
+
+@pytest.mark.slow
+def test_tags_that_range_with_anchors_only_leave_delays_open_whatever_the_skews_of_clocks():
+    flown = uwbsim.simulate(uwbsim.load("anchors_and_tag/bipartite", {"run.duration_s": 10.0}))
+    given: dict[str, Any] = {"poses_until_s": 6.0, "delays_only": True}
+    # What all delays have in common is not determined, either, and no number is given for it.
+    words = r"ranges between two sides are known to ± [4-6] cm"
+    with pytest.raises(calib.UnanswerableError, match=words) as raised:
+        calib.fit_from_ranges(flown, **given)
+    assert raised.value.undetermined == [[0, 1, 2, 3, 4, 5, 10, 11]]
+    found = calib.fit_from_ranges(flown, minimum_norm=True, **given).calibration
+    assert found.undetermined_splits == (((0, 1, 2, 3, 4, 5), (10, 11)),)
+    assert np.isinf(list(found.delays_std_ns.values())).all()
+    of_tags = found.delays_ns[10] + found.delays_ns[11]
+    assert of_tags == pytest.approx(sum(found.delays_ns.values()) - of_tags, abs=0.01)
+
+
+# Attitudes out of gyroscopes, and a fit that has nothing else: flights of the simulator, which shares none of it.
+
+
+BOXES = {"a": ([-2.6, -2.6, 0.4], [-0.4, -0.2, 2.6]), "b": ([0.4, -2.6, 0.4], [2.6, -0.2, 2.6])}
+TWO_S = np.array([2.0])
+IMU = {"grade": "consumer", "vibration_mps2": 1.0}
+
+
+@pytest.fixture(scope="module")
+def flown_with_imus():
+    bodies = [
+        {"name": name, "motion": {"model": "random-flight", "box_min_m": low, "box_max_m": high}, "imu": IMU}
+        for name, (low, high) in BOXES.items()
+    ]
+    corners = [(3.5, 3.5, 0.3), (-3.5, 3.5, 2.6), (-3.5, -3.5, 0.5), (3.5, -3.5, 2.5)]
+    bodies += [
+        {"name": f"anchor{k}", "motion": {"model": "static", "position_m": place}} for k, place in enumerate(corners)
+    ]
+    arms = {1: ("a", 0.17), 2: ("a", -0.17), 3: ("b", 0.17), 4: ("b", -0.17)}
+    tags = [{"id": t, "body": b, "lever_arm_m": [x, -x, -0.05], "delay_ns": 0.1 * t} for t, (b, x) in arms.items()]
+    tags += [{"id": 11 + k, "body": f"anchor{k}", "delay_ns": -0.1 * k} for k in range(4)]
+    return uwbsim.simulate(
+        {
+            "run": {"duration_s": 16.0, "seed": 5},
+            "ranging": {"rate_hz": 160.0, "pairs": "between-bodies"},
+            "bodies": bodies,
+            "tags": tags,
+        }
+    )
+
+
+@pytest.mark.slow
+def test_attitudes_by_gyroscope_stay_near_those_of_motion_capture(flown_with_imus):
+    began = flown_with_imus.exchanges.time_ns[0] * 1e-9
+    scene = scene_from(flown_with_imus, FlightSettings(poses_until_s=4.0, attitudes="imu"))
+    time = np.arange(0.5, 15.0, 0.5)
+    for body in BOXES:
+        poses = flown_with_imus.poses[flown_with_imus.poses.body == body]
+        true = Attitude(
+            time_s=poses.time_ns * 1e-9 - began,
+            quaternion=poses.quaternion,
+            std_rad=np.zeros(3),
+            wander_rad=np.zeros(3),
+        )
+        off = (scene.attitudes[body].at(time) * true.at(time).inv()).as_rotvec()
+        # A bias of half a degree a second would be 5 degrees off after ten; it is told from the first four seconds.
+        assert np.degrees(np.abs(off)).max() < 3.5
+    felt = scene.inertial["a"]
+    assert np.mean(felt.force_m_s2, axis=0) == pytest.approx([0, 0, 9.81], abs=0.5)
+
+
+@pytest.mark.slow
+def test_a_heading_that_is_wrong_by_a_right_angle_is_found_over_the_flight(flown_with_imus):
+    scene = scene_from(flown_with_imus, FlightSettings(poses_until_s=0.0, attitudes="imu")).between(0.0, 4.0)
+    known = scene_from(flown_with_imus, FlightSettings(poses_until_s=4.0)).between(0.0, 4.0)
+
+    def off(turned):
+        turns = [turned.attitudes[body].at(TWO_S) * known.attitudes[body].at(TWO_S).inv() for body in BOXES]
+        return np.array([turn.as_euler("ZYX")[0, 0] for turn in turns])
+
+    # Integrated from an unknown heading; "b" is put a right angle off, where a first window may have left it.
+    scene = scene.turned_by(dict(zip(BOXES, (-off(scene) + [0.0, np.pi / 2]).tolist(), strict=True)))
+    a = replace(scene.attitudes["a"], heading_known=True)
+    scene = replace(scene, attitudes={**scene.attitudes, "a": a})
+    state = interpolated(known.places, np.arange(0.0, 4.0, 0.1), 2).state(scene, np.zeros((0, 3)))
+    found, _, unsure = resolve_headings(scene, state)
+    assert np.degrees(np.abs(off(scene))).max() > 80
+    assert np.degrees(np.abs(off(found))).max() < 16
+    assert unsure == ""
+
+
+@pytest.mark.slow
+def test_inertial_readings_and_anchors_are_enough(flown_with_imus):
+    found = calib.fit_from_ranges(flown_with_imus, poses_until_s=0.0, attitudes="imu")
+    truth = calib.load_ranges(flown_with_imus)
+    away = found.ranges.truth_m - truth.truth_m[np.searchsorted(truth.time_ns, found.ranges.time_ns)]
+    # Neither a place nor a heading of a robot was given.
+    assert np.std(away) < 0.03
+    assert abs(np.mean(away)) < 0.01
+    planted = np.array([flown_with_imus.planted["delays_ns"][str(tag)] for tag in found.calibration.delays_ns])
+    error = np.array(list(found.calibration.delays_ns.values())) - planted
+    assert np.std(error) < 0.06
+
+
+@pytest.mark.slow
+def test_a_body_without_inertial_readings_is_named():
+    with pytest.raises(calib.UnanswerableError, match="robot0"):
+        calib.fit_from_ranges(flight(seconds=4.0), attitudes="imu")

@@ -21,7 +21,6 @@ from uwblink.importers.devices import LINES
 
 # What each board prints for a range of one metre to one device and of two metres to another; made from descriptions.
 BOTH = "from: 6018\t Range: 1.00 m\t RX power: -78.50 dBm\r\nfrom: 6019\t Range: 2.00 m\t RX power: -80.00 dBm\r\n"
-LISTED = "DIST,2,AN0,D91B,0.0,0.0,0.0,1.00,AN1,4C1A,3.0,0.0,0.0,2.00,POS,1.0,1.0,0.0,90\r\n"
 FORMS = {
     "dwm1001-lec": (
         "DIST,2,AN0,D91B,0.0,0.0,0.0,1.00,AN1,4C1A,3.0,0.0,0.0,2.00,POS,1.0,1.0,0.0,90\r\n",
@@ -29,10 +28,7 @@ FORMS = {
     ),
     "dwm1001-les": (" D91B[0.00,0.00,0.00]=1.00 4C1A[3.00,0.00,0.00]=2.00 le_us=2563\r\n", ("D91B", "4C1A")),
     "at-range": ("AT+RANGE=tid:7,mask:03,seq:9,range:(100,200,0,0,0,0,0,0)\r\n", (0, 1)),
-    "arduino": (
-        "from: 6018\t Range: 1.00 m\t RX power: -78.50 dBm\r\nfrom: 6019\t Range: 2.00 m\t RX power: -80.00 dBm\r\n",
-        (6018, 6019),
-    ),
+    "arduino": (BOTH, (6018, 6019)),
     "trek-corrected": ("mc 03 000003e8 000007d0 00000bb8 00000000 095f c1 00024bed a7:0\r\n", (0, 1)),
 }
 
@@ -113,14 +109,7 @@ def test_what_a_board_prints_is_recorded(tmp_path, name):
 
 def test_a_map_of_lines_serves_as_for_logs_and_a_stream_is_corrected(tmp_path):
     (tmp_path / "m.toml").write_text('line = "{from_id}->{to_id}: {range_m} ({rxp2})"\n[units]\ndistance = "cm"\n')
-    own = calib.Ranges.from_arrays(
-        np.tile([1.25, 2.25, 3.25], 40),
-        initiator=1,
-        target=2,
-        truth_m=np.tile([1.0, 2.0, 3.0], 40),
-        time_ns=np.arange(120) * 10**8,
-    )
-    calib.fit(own, constants="pair", delays_only=True).save(tmp_path / "c.json")
+    calibrated(tmp_path, 1, 2)
     (tmp_path / "board.log").write_text("1->2: 150 (-80.5)\n" * 5)
     uwblink.import_recording(tmp_path / "board.log", tmp_path / "log.uwb", importer="csv", map_file=tmp_path / "m.toml")
     assert set(uwblink.load(tmp_path / "log.uwb").exchanges.range_m.tolist()) == {1.5}
@@ -224,11 +213,11 @@ def test_a_dialect_of_ones_own_comes_by_an_entry_point_and_words_get_numbers_of_
         DIALECTS.register(Dialect("bad", "No function.", None))  # type: ignore[arg-type]
 
 
-def calibrated(folder, target):
-    """Write a calibration that takes 25 cm off ranges of 40 and a target."""
+def calibrated(folder, initiator, target):
+    """Write a calibration that takes 25 cm off ranges of a pair."""
     own = calib.Ranges.from_arrays(
         np.tile([1.25, 2.25, 3.25], 40),
-        initiator=40,
+        initiator=initiator,
         target=target,
         truth_m=np.tile([1.0, 2.0, 3.0], 40),
         time_ns=np.arange(120) * 10**8,
@@ -238,7 +227,7 @@ def calibrated(folder, target):
 
 
 def test_the_page_shows_printed_ranges_and_their_corrections(tmp_path):
-    correct = load_correction(calibrated(tmp_path, 6018))
+    correct = load_correction(calibrated(tmp_path, 40, 6018))
     one, other = BOTH.splitlines(keepends=True)
     with printing(one) as port, LivePage(tmp_path / "r.uwb", correct=correct) as page:
         how: dict[str, Any] = {"ids": [40], "duration_s": 1.5, "watch": page.watch, "listeners": [page]}
@@ -260,7 +249,7 @@ def test_the_page_shows_printed_ranges_and_their_corrections(tmp_path):
 
 
 def test_a_stream_is_recorded_as_well_and_the_command_serves_the_page(tmp_path):
-    calibrated(tmp_path, 6018)
+    calibrated(tmp_path, 40, 6018)
     with printing(BOTH.splitlines(keepends=True)[0]) as port:
         words = ("--dialect", "arduino", "--ids", "40", "-c", "c.json", "--duration", "1.5", "-o")
         streamed = succeed("uwblink", "stream", port, *words, "s.uwb", cwd=tmp_path)

@@ -19,18 +19,21 @@ from uwblink.wire import messages as m
 from uwblink.wire.codec import encode
 
 
-def test_what_cannot_be_opened(tmp_path):
-    with pytest.raises(PortMissingError, match="no such port; `uwblink ports`"):
-        SerialPort("/dev/nothing")
-    with pytest.raises(PortError, match="not a serial port"):
-        SerialPort("/dev/null")
+@pytest.mark.parametrize(
+    ("name", "error", "said"),
+    [
+        ("/dev/nothing", PortMissingError, "no such port; `uwblink ports`"),
+        ("/dev/null", PortError, "not a serial port"),
+        ("{here}/file", PortError, "not a serial port"),
+        ("{here}/", PortError, "{here}: is a folder; name the ports in it, as with {here}/[*]"),
+        ("nonsense://x", PortError, "not a port"),
+        ("socket://127.0.0.1:1", PortError, "cannot be opened"),
+    ],
+)
+def test_what_cannot_be_opened(tmp_path, name, error, said):
     (tmp_path / "file").write_text("x")
-    with pytest.raises(PortError, match="not a serial port"):
-        SerialPort(str(tmp_path / "file"))
-    with pytest.raises(PortError, match=f"{tmp_path}: is a folder; name the ports in it, as with {tmp_path}/[*]"):
-        SerialPort(f"{tmp_path}/")
-    with pytest.raises(PortError, match="not a port"):
-        SerialPort("nonsense://x")
+    with pytest.raises(error, match=said.format(here=tmp_path)):
+        SerialPort(name.format(here=tmp_path))
 
 
 def test_the_list_of_ports_as_json():
@@ -87,11 +90,6 @@ def test_a_port_can_be_a_socket(answerer):
         assert board.id == 77
         with pytest.raises(PortLostError):
             board.request(m.GetMaxFrame())
-
-
-def test_nobody_at_a_socket_is_a_clear_error():
-    with pytest.raises(PortError, match="cannot be opened"):
-        Board.open("socket://127.0.0.1:1")
 
 
 def test_bytes_from_before_the_opening_are_not_taken_for_answers():

@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 import calib
-from tests.uwblink.recording.test_copy import full, rows  # noqa: F401 - full is a fixture
+from tests.uwblink.recording.test_contents import full, rows  # noqa: F401 - full is a fixture
 from uwblink import Contents, Exchanges, Recording, import_recording, load
 from uwblink.errors import ArgumentError, ImportTableError, RecordingError, RecordingExistsError, RecordingMissingError
 from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
@@ -62,12 +62,13 @@ def test_trajectories(tmp_path):
 
 def test_what_cannot_be_exported_leaves_nothing(whole, tmp_path):
     before = sorted(tmp_path.iterdir())
-    with pytest.raises(ArgumentError, match="`to`: found 'xls', allowed: csv, parquet, tum, mcap, rosbag2"):
-        export_recording(whole, tmp_path / "out", to="xls")
-    with pytest.raises(RecordingMissingError, match="no such recording"):
-        export_recording(tmp_path / "no.uwb", tmp_path / "out", to="csv")
-    with pytest.raises(RecordingError, match="does not exist"):
-        export_recording(whole, tmp_path / "no" / "out", to="csv")
+    for error, said, path, out, to in (
+        (ArgumentError, "`to`: found 'xls', allowed: csv, parquet, tum, mcap, rosbag2", whole, "out", "xls"),
+        (RecordingMissingError, "no such recording", tmp_path / "no.uwb", "out", "csv"),
+        (RecordingError, "does not exist", whole, "no/out", "csv"),
+    ):
+        with pytest.raises(error, match=said):
+            export_recording(path, tmp_path / out, to=to)
     assert sorted(tmp_path.iterdir()) == before
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").write_text("mine")
@@ -265,31 +266,24 @@ def test_every_message_is_there_in_order_of_time(recording, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("time_ns", "x", "said"), [(-5, 1.0, "before 1970"), (5, np.nan, "a number that is not finite")]
+    ("to", "time_ns", "range_m", "x", "said"),
+    [
+        ("mcap", -5, 3.0, 1.0, "before 1970"),
+        ("rosbag2", -5, 3.0, 1.0, "before 1970"),
+        ("mcap", 5, 3.0, np.nan, "a number that is not finite"),
+        ("rosbag2", 5, 1e39, 1.0, r"r\.uwb: /uwb/range_1_2: has a number that is .*too large"),
+    ],
 )
-def test_what_json_cannot_say_is_one_line(tmp_path, time_ns, x, said):
-    sample = Exchanges.from_arrays([1], [2], time_ns=[time_ns], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
+def test_what_messages_cannot_say_is_one_line(tmp_path, to, time_ns, range_m, x, said):
+    sample = Exchanges.from_arrays([1], [2], time_ns=[time_ns], range_m=[range_m], tx1=[0], rx1=[5], tx2=[9], rx2=[30])
     poses = Poses(np.array([9]), np.array(["drone"]), np.array([[x, 1.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))
     Contents(exchanges=sample, poses=poses).save(tmp_path / "r.uwb")
     with pytest.raises(RecordingError, match=said):
-        export_recording(tmp_path / "r.uwb", tmp_path / "out", to="mcap")
+        export_recording(tmp_path / "r.uwb", tmp_path / "out", to=to)
     assert not (tmp_path / "out").exists()
 
 
-def test_ranges_beyond_what_a_message_of_ros_holds_are_refused(tmp_path):
-    far = Exchanges.from_arrays([1], [2], time_ns=[5], range_m=[1e39], tx1=[0], rx1=[5], tx2=[9], rx2=[30])
-    Contents(exchanges=far).save(tmp_path / "far.uwb")
-    with pytest.raises(RecordingError, match=r"far\.uwb: /uwb/range_1_2: has a number that is .*too large"):
-        export_recording(tmp_path / "far.uwb", tmp_path / "out", to="rosbag2")
-    assert not (tmp_path / "out").exists()
-
-
-def test_bags_without_the_extra_and_times_before_1970_are_refused(recording, tmp_path, monkeypatch):
-    Contents(exchanges=Exchanges.from_arrays([1], [2], time_ns=[-5], tx1=[0], rx1=[5], tx2=[9], rx2=[30])).save(
-        tmp_path / "old.uwb"
-    )
-    with pytest.raises(RecordingError, match="before 1970"):
-        export_recording(tmp_path / "old.uwb", tmp_path / "out", to="rosbag2")
+def test_bags_without_the_extra_are_refused(recording, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag2", None)
     with pytest.raises(RecordingError, match=r"pip install 'uwbcal\[bags\]'"):
         export_recording(recording, tmp_path / "out", to="rosbag2")

@@ -182,7 +182,14 @@ def test_halves_of_a_run_agree_within_their_intervals(recorded, run, first):
     assert stage["inside_95"] > 0.89
 
 
-@pytest.mark.parametrize(("run", "use"), [(90, "exchanges"), (90, "receptions"), (70, "exchanges")])
+@pytest.mark.parametrize(
+    ("run", "use"),
+    [
+        pytest.param(90, "exchanges", marks=pytest.mark.slow),
+        (90, "receptions"),
+        (70, "exchanges"),
+    ],
+)
 def test_a_geometry_that_was_made_up_is_refuted(recorded, tmp_path, run, use):
     shutil.copy(recorded[run], tmp_path / "q.uwb")
     grid = (f"[[anchors]]\nid = {k + 1}\nposition_m = [{k % 2}, {k // 2}, 1.0]\n" for k in range(7))

@@ -118,33 +118,38 @@ def test_a_list_of_ranges_in_each_message_of_one_topic_of_several(tmp_path):
     assert found.powers["rxp2_dbm"][:2].tolist() == [-79.5, -78.5]
 
 
-def test_what_a_bag_does_not_hold_is_said(tmp_path):
-    bag = ros2(tmp_path / "b", RANGED)
-    for text, said in (
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
         ("", r"`map_file` must name the topics.*there are /tag/ranges \(uwb_msgs/msg/Ranges\), /uwb"),
         ('[topics."/none"]\n', "no topic '/none'; there are /tag/ranges"),
         ('each = "ranges"\n[topics."/uwb"]\n', "a message of /uwb has no list 'ranges'"),
         ('[topics."/uwb"]\n', "column 'from_id' is missing; there are header.stamp, header.frame_id, a, b, stamps"),
         ('[topics."/uwb"]\nfrom_id = [1]\n', r"topics\./uwb\.from_id"),
         ("each = 3\n", "each: found 3"),
-    ):
-        (tmp_path / "m.toml").write_text(text)
-        with pytest.raises(ImportTableError, match=said):
-            read_source(bag, importer="bag", map_file=tmp_path / "m.toml")
+    ],
+)
+def test_what_a_bag_does_not_hold_is_said(tmp_path, text, said):
+    (tmp_path / "m.toml").write_text(text)
+    with pytest.raises(ImportTableError, match=said):
+        read_source(ros2(tmp_path / "b", RANGED), importer="bag", map_file=tmp_path / "m.toml")
+
+
+def test_what_is_no_bag_is_said(tmp_path):
     (tmp_path / "no.bag").write_bytes(b"nothing")
-    with pytest.raises(ImportTableError, match="cannot be read as a bag"):
-        read_source(tmp_path / "no.bag")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(ImportTableError, match="cannot be read as a bag"):
-        read_source(tmp_path / "folder", importer="bag")
-    with pytest.raises(ImportTableError, match="no such bag"):
-        read_source(tmp_path / "absent.mcap")
     (tmp_path / "t.csv").write_text("from_id,to_id,range_m\n1,2,3\n")
     (tmp_path / "m.toml").write_text('each = "x"\n')
-    with pytest.raises(ImportTableError, match="each is of JSON lines, bags and logs"):
-        read_source(tmp_path / "t.csv", map_file=tmp_path / "m.toml")
+    for name, more, said in (
+        ("no.bag", {}, "cannot be read as a bag"),
+        ("folder", {"importer": "bag"}, "cannot be read as a bag"),
+        ("absent.mcap", {}, "no such bag"),
+        ("t.csv", {"map_file": tmp_path / "m.toml"}, "each is of JSON lines, bags and logs"),
+    ):
+        with pytest.raises(ImportTableError, match=said):
+            read_source(tmp_path / name, **more)
     with pytest.raises(ArgumentError, match="takes one file, found 2"):
-        read_source([bag, bag], importer="bag")
+        read_source([tmp_path / "no.bag"] * 2, importer="bag")
 
 
 def test_a_kind_that_the_bag_does_not_define_is_named(tmp_path):

@@ -1,17 +1,33 @@
 """Tables, maps and plug-ins that go wrong: one line, soon, and nothing left behind."""
 
 import gzip
+import json
+import random
 import subprocess
 import sys
+import tracemalloc
+from contextlib import nullcontext
 from functools import partial
+from typing import ClassVar
 
+import numpy as np
 import pytest
 
+import uwblink
 from tests import processes
-from tests.uwblink.importers.test_table_forms import flights, wrapped, write
+from tests.uwblink.importers.test_table_forms import as_messages, flights, mapped, read_table, repeated, wrapped, write
 from uwblink.errors import ImportTableError, RecordingError
 from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
-from uwblink.importers import IMPORTERS, Importer, import_file, import_recording, read_source, register_importer
+from uwblink.importers import (
+    IMPORTERS,
+    Importer,
+    bags,
+    import_file,
+    import_recording,
+    read_source,
+    register_importer,
+    staging,
+)
 
 LINE = "0.5,1,2,3.25\n"
 HEAD = "time_s,from_id,to_id,range_m\n"
@@ -142,3 +158,143 @@ def test_an_interrupted_import_leaves_nothing(tmp_path):
             import_file(source, tmp_path / "o.uwb", force=True, watch=interrupted)
         assert sorted(p.name for p in tmp_path.iterdir()) == ["o.uwb", "t.csv"]
         assert (tmp_path / "o.uwb").read_bytes() == before
+
+
+# A table comes in as a whole or a few rows at a time, and what is in memory does not grow with it.
+
+
+SPOILT = ("", "nan", "x", "-1", "7.5", "99999999999999999999")
+
+
+def spoilt(share, **more):
+    """Rows of which some hold what cannot be used, and positions of antennas of which one moves."""
+    chance = random.Random(3)
+    rows = [row | {"from_x_m": k % 5, "from_y_m": 1, "from_z_m": 0, "to_x_m": 3} for k, row in enumerate(flights())]
+    rows = [dict(row) | {"to_y_m": 0, "to_z_m": 2, "rxp1": -80.5, **more} for row in wrapped(rows)]
+    for row in rows:
+        if chance.random() < share:
+            row[chance.choice(list(row))] = chance.choice(SPOILT)
+    return rows
+
+
+def told(contents):
+    columns = [contents.exchanges.to_dict(), contents.poses.to_dict(), contents.powers]
+    listed = [{name: np.asarray(column).tolist() for name, column in part.items()} for part in columns]
+    return json.dumps([listed, contents.meta, list(map(str, contents.tags + contents.faults))], default=str)
+
+
+def few_at_once(monkeypatch, count=20):
+    monkeypatch.setattr(staging, "ROWS_PER_BLOCK", count)
+    monkeypatch.setattr(staging, "FAULTS_AT_ONCE", 5)
+
+
+@pytest.mark.parametrize("more", [{}, {"from_id": "a tag"}], ids=["numbers", "words"])
+def test_a_table_is_the_same_a_few_rows_at_a_time(tmp_path, monkeypatch, more):
+    table = write(tmp_path / "t.csv", spoilt(0.2, **more))
+    whole = read_table(table)
+    few_at_once(monkeypatch)
+    assert told(read_table(table)) == told(whole)
+    said = []
+    done = import_file(table, tmp_path / "t.uwb", watch=lambda what, _: said.append(what))
+    assert list(dict.fromkeys(said)) == ["reading", "checking", "writing"]
+    assert (done.counts, done.notes) == (whole.counts(), whole.meta["notes"])
+    written = uwblink.load(tmp_path / "t.uwb")
+    assert written.faults == sorted(whole.faults, key=lambda fault: fault.time_ns)
+    assert len(written.poses) == len(whole.poses) > len(whole.exchanges) / 2
+    np.testing.assert_array_equal(written.exchanges.rx3, whole.exchanges.rx3)
+
+
+def lines_of(layout):
+    """Exchanges as rows in any order, some lost and some that nobody can use."""
+    rows = flights(80)
+    plain = wrapped(rows)
+    if layout == "messages":
+        lines = as_messages(plain)
+    elif layout == "stamps":
+        lines = [
+            {n: v for n, v in line.items() if n not in ("tx", "rx")} | {"event": kind, "stamp": line[kind]}
+            for line in as_messages(plain)
+            for kind in ("tx", "rx")
+        ]
+    else:
+        common = ("time_s", "from_id", "to_id")
+        ours = [{n: row[n] for n in (*common, "tx1", "rx2", "rx3")} | {"seq": k} for k, row in enumerate(plain)]
+        theirs = [{n: row[n] for n in (*common, "rx1", "tx2", "tx3")} | {"seq": k} for k, row in enumerate(plain)]
+        names = dict.fromkeys(n for line in (ours[0], theirs[0]) for n in line)
+        lines = [dict.fromkeys(names, "") | line for line in ours + theirs]
+    np.random.default_rng(2).shuffle(lines)
+    del lines[5]
+    lines[8] = lines[8] | {"from_id": "?"}
+    return lines
+
+
+@pytest.mark.parametrize("layout", ["messages", "stamps", "parts"])
+def test_a_long_table_is_the_same_a_few_rows_at_a_time(tmp_path, monkeypatch, layout):
+    table = write(tmp_path / "t.csv", lines_of(layout))
+    text = mapped(tmp_path, f'layout = "{layout}"\nwithin_s = 0.1\n[columns]\nsequence = "seq"\n')
+    whole = read_table(table, text)
+    assert 70 < len(whole.exchanges) < 80
+    few_at_once(monkeypatch, 50)
+    assert told(read_table(table, text)) == told(whole)
+    said = []
+    done = import_file(table, tmp_path / "t.uwb", map_file=text, watch=lambda *one: said.append(one))
+    assert done.counts == whole.counts()
+    assert list(dict.fromkeys(what for what, _ in said)) == ["reading", "sorting", "grouping", "checking", "writing"]
+    assert all(0 <= share <= 1 for _, share in said)
+
+
+@pytest.mark.parametrize("layout", ["messages", "stamps", "parts"])
+def test_a_table_without_any_device_says_so(tmp_path, layout):
+    lines = [line | {"from_id": "", "message": 1} for line in lines_of(layout)]
+    text = mapped(tmp_path, f'layout = "{layout}"\n[columns]\nsequence = "seq"\n')
+    with pytest.raises(ImportTableError, match="row 2, column 'from_id'"):
+        read_table(write(tmp_path / "t.csv", lines), text)
+
+
+@pytest.mark.parametrize(("layout", "missing"), [("messages", "tx"), ("stamps", "event")])
+def test_what_a_layout_needs_is_said(tmp_path, layout, missing):
+    lines = [{n: v for n, v in line.items() if n != missing} for line in lines_of(layout)]
+    with pytest.raises(ImportTableError, match=f"column '{missing}' is missing"):
+        read_table(write(tmp_path / "t.csv", lines), mapped(tmp_path, f'layout = "{layout}"'))
+
+
+class Bag:
+    """Messages as if they were read from a bag, one at a time."""
+
+    kinds: ClassVar = {"/uwb": "uwb"}
+
+    def __init__(self, path, rows):
+        self.path, self.rows = path, rows
+
+    def messages(self, _):
+        for k, whole in enumerate(self.rows):
+            (row,) = wrapped([whole])
+            yield "/uwb", "uwb", 1_000_000 * k, {n: v for n, v in row.items() if n != "time_s"}
+
+
+@pytest.mark.parametrize(
+    ("form", "at_once", "grown"),
+    [
+        ("exchanges", 1_000, 216_000),
+        pytest.param("messages", 2_000, 144_000, marks=pytest.mark.slow),
+        pytest.param("bag", 500, 450_000, marks=pytest.mark.slow),
+    ],
+)
+def test_memory_does_not_grow_with_what_is_read(tmp_path, monkeypatch, form, at_once, grown):
+    """A column of 8 bytes a row that stayed, or the exchanges of a bag, would be so many bytes more."""
+    monkeypatch.setattr(staging, "ROWS_PER_BLOCK", at_once)
+    text = mapped(tmp_path, 'within_s = 0.1\n[columns]\nsequence = "seq"\n') if form == "messages" else None
+    few, many = {"exchanges": (150, 600), "messages": (40, 140), "bag": (42, 92)}[form]
+    peaks = []
+    for times in (10, few, many):  # the first is for what is only made once
+        rows = [row | {"time_s": row["time_s"] + 100 * (k // 60)} for k, row in enumerate(repeated(flights(), times))]
+        path = tmp_path / (f"{times}.mcap" if form == "bag" else f"{times}.csv")
+        path.touch()
+        monkeypatch.setattr(bags, "open_bag", lambda path, rows=rows: nullcontext(Bag(path, rows)))
+        if form != "bag":
+            write(path, as_messages(wrapped(rows)) if form == "messages" else wrapped(rows))
+        tracemalloc.start()
+        import_file(path, tmp_path / f"{times}.uwb", map_file=text)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[2] - peaks[1] < 0.7 * grown

@@ -2,13 +2,12 @@
 
 import csv
 import json
-import tarfile
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.shared_data import shared
+from tests.shared_data import miluv
 from uwblink.errors import ImportTableError
 from uwblink.importers import import_recording
 from uwblink.recording.contents import load
@@ -210,10 +209,7 @@ def test_a_constellation_that_is_not_there(flight, tmp_path):
 
 @pytest.fixture(scope="module")
 def real(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("miluv")
-    with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
-        archive.extractall(folder, filter="data")
-    return folder / "cirObstacles_3_random_0"
+    return miluv(tmp_path_factory.mktemp("miluv"))
 
 
 def test_the_real_flight_gives_the_ranges_of_its_boards(real, tmp_path):

@@ -182,11 +182,11 @@ def wrong(found, of_stamps):
 MAKERS = (mutated_long, mutated_long, mutated_wide, mutated_wide, mutated_stamps, mutated_log, mutated_json)
 
 
-@pytest.mark.parametrize("part", range(4))
-def test_no_mutated_file_comes_in_wrong(tmp_path, part):
+@pytest.mark.parametrize("seeds", [range(20), pytest.param(range(20, 200), marks=pytest.mark.slow)], ids=str)
+def test_no_mutated_file_comes_in_wrong(tmp_path, seeds):
     outcomes = {"asked": 0, "refused": 0, "right": 0}
-    for k in range(50):
-        rng = random.Random(50 * part + k)
+    for k in seeds:
+        rng = random.Random(k)
         maker = rng.choice(MAKERS)
         folder = tmp_path / str(k)
         folder.mkdir()
@@ -201,7 +201,7 @@ def test_no_mutated_file_comes_in_wrong(tmp_path, part):
         except ImportTableError:
             outcomes["refused"] += 1
             continue
-        assert not wrong(found, maker is mutated_stamps), (k, part, path.read_bytes()[:300], guess.text)
+        assert not wrong(found, maker is mutated_stamps), (k, path.read_bytes()[:300], guess.text)
         outcomes["right"] += 1
     # Files that people have are mostly understood.
-    assert outcomes["right"] >= 12, outcomes
+    assert outcomes["right"] >= len(seeds) // 4, outcomes

@@ -113,9 +113,8 @@ def test_trajectories_of_several_bodies_and_anchors(recording, tmp_path):
     np.testing.assert_allclose(true_m[1], np.hypot(3.0, 0.1))
 
 
-@pytest.mark.parametrize(
-    ("text", "fragment"),
-    [
+def test_anchors_that_cannot_be(recording, tmp_path):
+    for text, fragment in (
         ("[[anchors]]\nid = 9\n", "anchors[0].position_m"),
         ("[[anchors]]\nid = 9\nposition_m = [1, 2]\n", "three numbers"),
         ("[[anchors]]\nid = 9\nposition_m = [1, 2, 3]\n" * 2, "found 9, expected another id"),
@@ -123,11 +122,9 @@ def test_trajectories_of_several_bodies_and_anchors(recording, tmp_path):
         ("[[anchors]]\nid = 9\nplace = [1, 2, 3]\n", "unknown key"),
         ("anchors = 3\n", "expected tables [[anchors]]"),
         ("a = 3\n", "a: unknown key"),
-    ],
-)
-def test_anchors_that_cannot_be(recording, tmp_path, text, fragment):
-    (tmp_path / "places.toml").write_text(text)
-    with pytest.raises(PlanError) as caught:
-        add_poses(recording, tmp_path / "car.tum", body="car", tags_from=tmp_path / "places.toml")
-    assert fragment in str(caught.value)
+    ):
+        (tmp_path / "places.toml").write_text(text)
+        with pytest.raises(PlanError) as caught:
+            add_poses(recording, tmp_path / "car.tum", body="car", tags_from=tmp_path / "places.toml")
+        assert fragment in str(caught.value)
     assert not load(recording).poses

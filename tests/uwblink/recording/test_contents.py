@@ -1,13 +1,140 @@
-"""A whole recording in memory: everything comes in, parts can be cut out, and everything goes out again."""
+"""A copy holds every row of every table, except what was put in its place."""
 
+import duckdb
 import numpy as np
 import pytest
 
-from tests.uwblink.recording.test_copy import full, rows  # noqa: F401 - a fixture
-from uwblink.errors import ArgumentError, RecordingExistsError
+from tests.uwblink.recording.test_file import random_exchanges
+from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError
 from uwblink.recording.contents import Contents, load
-from uwblink.recording.schema import TABLES, CirRow, Fault, FrameRow, Poses, Tag
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import TABLES, Arrangement, CirRow, Fault, FrameRow, KnownDistance, Poses, Tag
 from uwblink.twr import COLUMNS, Exchanges
+
+HEARD = {name: 7.5 if kind == "DOUBLE" else 3 for name, kind in TABLES["overheard"].items()}
+CIRS = [
+    CirRow(5, 1, 1, 2, 3.25, (0, 65535, 7)),
+    CirRow(4, 1, 1, 2, 3.5, (1, 2, 3)),
+    CirRow(6, 2, 2, 1, 0.0, ()),
+]
+INSTEAD = {
+    "tags": [Tag(9, "z", (0.0, 0.0, 1.0))],
+    "poses": Poses(np.array([1]), np.array(["z"]), np.zeros((1, 3)), np.ones((1, 4))),
+    "exchanges": random_exchanges(3, seed=2),
+    "overheard": {name: np.array([value, value]) for name, value in HEARD.items()},
+    "cirs": CIRS[:1],
+    "frames": [FrameRow(1, "1", "in", b"R01|1\r\n")],
+    "faults": [],
+    "imu": {
+        "time_ns": np.array([3]),
+        "body": np.array(["z"]),
+        **{n: np.ones(1) for n in TABLES["imu"] if n[0] in "wa"},
+    },
+    "powers": {name: np.array([1.0]) for name in TABLES["powers"]},
+    "quality": {name: np.array([1.0]) for name in TABLES["quality"]},
+    "temperature": {name: np.array([2.0]) for name in TABLES["temperature"]},
+    "receptions": {name: np.array([3.0]) for name in TABLES["receptions"]},
+    "differences": {name: np.array([3.0]) for name in TABLES["differences"]},
+    "corrected": {name: np.array([1.0]) for name in TABLES["corrected"]},
+    "height": {"time_ns": np.array([3]), "body": np.array(["z"]), "height_m": np.array([np.nan])},
+    "arrangements": [Arrangement("Z", 1, 2, "plane")],
+    "distances": [],
+}
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory):
+    """A recording with rows in every table, not in order of time, and missing values where a stranger left them."""
+    path = tmp_path_factory.mktemp("full") / "full.uwb"
+    with Recording.create(path, meta={"seed": 7, "planted": {"a": [1.5]}}) as r:
+        r.append_exchanges(random_exchanges())
+        r.append_tags([Tag(3, "b", (0.1, 0.2, 0.3)), Tag(1, "a", (0, 0, 0))])
+        r.append_poses(Poses(np.array([6, 5]), np.array(["a", "b"]), np.ones((2, 3)), np.zeros((2, 4))))
+        r.append("overheard", [HEARD, HEARD | {"time_ns": 1, "fpp3_dbm": np.nan, "skew3_ppm": np.nan}])
+        r.append("cirs", CIRS)
+        r.append("frames", [FrameRow(9, "1", "in", bytes(range(256))), FrameRow(8, "2", "out", b"C01\r")])
+        readings = {"time_ns": np.array([7, 6]), "body": np.array(["a", "b"])}
+        r.append("imu", {name: np.array([1.5, 2.5]) for name in TABLES["imu"]} | readings)
+        r.append("powers", {name: np.array([2, 1]) for name in TABLES["powers"]})
+        r.append("quality", {name: np.array([2, 1]) for name in TABLES["quality"]})
+        celsius = {"temperature_c": np.array([25.5, 26.0]), "supply_v": np.array([3.3, np.nan])}
+        r.append("temperature", {"time_ns": np.array([4, 3]), "tag": np.array([1, 3])} | celsius)
+        r.append("corrected", {name: np.array([1, 0]) for name in TABLES["corrected"] if name != "sigma_m"})
+        r.append("receptions", {name: np.array([2, 1]) for name in TABLES["receptions"]})
+        r.append("differences", {name: np.array([2, 1]) for name in TABLES["differences"]})
+        r.append("height", {"height_m": np.array([0.5, 0.25])} | readings)
+        r.append("arrangements", [Arrangement("B", 5, 9, "line"), Arrangement("A", 1, 4)])
+        r.append("distances", [KnownDistance(1, 2, 3.06, 0.005, "A"), KnownDistance(1, 3, 2.5, 0.01)])
+        r.append("faults", [Fault(9, "1", "time-out", "no answer"), Fault(2, "2", "failed exchange", "é", 2, 1)])
+    with duckdb.connect(str(path)) as db:
+        db.execute("INSERT INTO exchanges (time_ns, initiator, target, protocol) VALUES (1, 2, 3, 'ds')")
+        db.execute("DELETE FROM exchanges WHERE rowid = 5")
+    return path
+
+
+def test_arrangements_and_distances_come_back_in_order(full):
+    with Recording.open(full) as source:
+        assert source.arrangements() == [Arrangement("A", 1, 4), Arrangement("B", 5, 9, "line")]
+        assert source.known_distances() == [KnownDistance(1, 2, 3.06, 0.005, "A"), KnownDistance(1, 3, 2.5, 0.01)]
+
+
+def rows(path):
+    with duckdb.connect(str(path), read_only=True) as db:
+        # As text, so that NaN is not different from itself.
+        return {
+            table: [str(row) for row in db.execute(f"SELECT {', '.join(columns)} FROM {table}").fetchall()]
+            for table, columns in TABLES.items()
+        }
+
+
+@pytest.mark.parametrize("at_a_time", [1_000_000, 7])
+def test_a_copy_has_every_row_of_every_table(full, tmp_path, monkeypatch, at_a_time):
+    blocks = Recording._blocks
+    monkeypatch.setattr(Recording, "_blocks", lambda self, table, _: blocks(self, table, at_a_time))
+    with Recording.open(full) as source:
+        source.copy(tmp_path / "copy.uwb")
+    before, after = rows(full), rows(tmp_path / "copy.uwb")
+    before["meta"].sort(), after["meta"].sort()
+    assert all(before.values()), "the test needs rows in every table"
+    assert after == before
+
+
+@pytest.mark.parametrize("table", [name for name in TABLES if name != "meta"])
+def test_only_what_is_replaced_differs(full, tmp_path, table):
+    with Recording.open(full) as source:
+        source.copy(tmp_path / "copy.uwb", replacing={table: INSTEAD[table]})
+    expected, found = rows(full), rows(tmp_path / "copy.uwb")
+    assert found[table] != expected[table]
+    assert len(found.pop(table)) == len(
+        INSTEAD[table]["time_ns"] if isinstance(INSTEAD[table], dict) else INSTEAD[table]
+    )
+    del expected[table]
+    assert found | {"meta": sorted(found["meta"])} == expected | {"meta": sorted(expected["meta"])}
+
+
+def test_entries_of_meta_are_added_or_replaced(full, tmp_path):
+    with Recording.open(full) as source:
+        source.copy(tmp_path / "more.uwb", meta={"seed": 8, "calibration": {"x": 1}})
+        source.copy(tmp_path / "other.uwb", replacing={"meta": {"note": "bare"}})
+        before = source.meta()
+    with Recording.open(tmp_path / "more.uwb") as r:
+        assert r.meta() == before | {"seed": 8, "calibration": {"x": 1}}
+    with Recording.open(tmp_path / "other.uwb") as r:
+        assert r.meta()["note"] == "bare"
+        assert not {"seed", "planted"} & set(r.meta())
+
+
+def test_mistakes_are_one_line_and_leave_nothing(full, tmp_path):
+    with Recording.open(full) as source:
+        with pytest.raises(RecordingError, match="no table 'ranges' in a recording; there are meta, tags"):
+            source.copy(tmp_path / "copy.uwb", replacing={"ranges": []})
+        with pytest.raises(RecordingExistsError):
+            source.copy(full)
+    assert [p.name for p in tmp_path.iterdir()] == []
+
+
+# A whole recording in memory: everything comes in, parts can be cut out, and everything goes out again.
+
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
@@ -39,7 +166,7 @@ def made():
     )
 
 
-def test_what_is_loaded_and_saved_is_the_same(full, tmp_path):  # noqa: F811
+def test_what_is_loaded_and_saved_is_the_same(full, tmp_path):
     load(full).save(tmp_path / "again.uwb")
     before, after = rows(full), rows(tmp_path / "again.uwb")
     for table in set(TABLES) - {"exchanges"}:  # in which the fixture leaves values out

@@ -11,7 +11,7 @@ import pytest
 
 from uwblink.errors import RecordingError, RecordingExistsError
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import CirRow, Fault, Poses, Tag
+from uwblink.recording.schema import TABLES, CirRow, Fault, Poses, Tag
 from uwblink.twr import COLUMNS, Exchanges
 
 
@@ -149,24 +149,21 @@ def test_a_recording_that_this_program_is_writing_says_so(tmp_path):
         Recording.open(tmp_path / "live.uwb")
 
 
-def short(e):
-    return replace(e, range_m=e.range_m[:3])
-
-
-def stray(e):
-    return replace(e, initiator=e.initiator + 70_000)
-
-
-def text(e):
-    return replace(e, tx1=np.full(50, "early"))
-
-
 @pytest.mark.parametrize(
     ("write", "expected"),
     [
-        (lambda r: r.append_exchanges(stray(random_exchanges())), "table exchanges: values that do not fit"),
-        (lambda r: r.append_exchanges(text(random_exchanges())), "table exchanges: values that do not fit"),
-        (lambda r: r.append_exchanges(short(random_exchanges())), "table exchanges: columns of different lengths"),
+        (
+            lambda r: r.append_exchanges(replace(random_exchanges(), initiator=np.full(50, 70_000))),
+            "table exchanges: values that do not fit",
+        ),
+        (
+            lambda r: r.append_exchanges(replace(random_exchanges(), tx1=np.full(50, "early"))),
+            "table exchanges: values that do not fit",
+        ),
+        (
+            lambda r: r.append_exchanges(replace(random_exchanges(), range_m=np.ones(3))),
+            "table exchanges: columns of different lengths",
+        ),
         (lambda r: r.append_tags([Tag(-1, "a", (0, 0, 0))]), "table tags: values that do not fit"),
         (lambda r: r.append("cirs", [CirRow(1, 1, 1, 2, 0.0, (70_000,))]), "table cirs: values that do not fit"),
         (lambda r: r.append_meta({"bad": float("nan")}), "meta 'bad': cannot be stored as JSON"),
@@ -184,3 +181,61 @@ def test_what_does_not_fit_is_one_line_and_leaves_the_rest_of_a_transaction_out(
         r.append_exchanges(random_exchanges(2))
     with Recording.open(tmp_path / "f.uwb") as r:
         assert r.count("exchanges") == 9
+
+
+# Files that are older than some of the tables.
+
+
+LATER = ("imu", "height", "powers", "quality", "temperature", "receptions", "differences", "corrected")
+
+
+@pytest.fixture
+def older(tmp_path):
+    path = tmp_path / "older.uwb"
+    with Recording.create(path) as recording:
+        recording.append_tags([Tag(1, "drone", (0.0, 0.0, 0.0))])
+    with duckdb.connect(str(path)) as db:
+        for table in LATER:
+            db.execute(f"DROP TABLE {table}")
+    return path
+
+
+def test_tables_that_came_later_are_empty(older):
+    with Recording.open(older) as recording:
+        for table in LATER:
+            assert recording.count(table) == 0
+            assert {name: len(column) for name, column in recording.columns(table).items()} == dict.fromkeys(
+                TABLES[table], 0
+            )
+            assert recording.show().counts[table] == 0
+
+
+def test_an_older_file_is_copied_and_added_to(older, tmp_path):
+    with Recording.open(older) as recording:
+        recording.copy(tmp_path / "copy.uwb")
+    height = {"time_ns": np.array([5]), "body": np.array(["drone"]), "height_m": np.array([0.25])}
+    with Recording.open(older, update=True) as recording:
+        recording.append("height", height)
+    for path, count in ((older, 1), (tmp_path / "copy.uwb", 0)):
+        with Recording.open(path) as recording:
+            assert recording.tags()[0].body == "drone"
+            assert recording.count("height") == count
+
+
+def test_a_table_that_was_always_there_is_missed(older):
+    with duckdb.connect(str(older)) as db:
+        db.execute("DROP TABLE poses")
+    with pytest.raises(RecordingError, match="table poses lacks"):
+        Recording.open(older)
+
+
+@pytest.mark.parametrize("table", LATER)
+def test_a_table_that_came_later_came_whole(tmp_path, table):
+    path = tmp_path / "f.uwb"
+    with Recording.create(path):
+        pass
+    column = list(TABLES[table])[-1]
+    with duckdb.connect(str(path)) as db:
+        db.execute(f"ALTER TABLE {table} DROP COLUMN {column}")
+    with pytest.raises(RecordingError, match=f"table {table} lacks {column}"):
+        Recording.open(path)

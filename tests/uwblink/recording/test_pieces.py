@@ -129,3 +129,10 @@ def test_exchanges_come_with_the_poses_that_they_need(path, monkeypatch, rows):
 def _in_blocks_of(rows):
     blocks = Recording.exchange_blocks
     return lambda recording: blocks(recording, rows)
+
+
+def test_a_recording_without_exchanges_has_no_stretches(tmp_path):
+    with Recording.create(tmp_path / "empty.uwb") as recording:
+        assert recording.dividing_times("exchanges", 50) == []
+    with Recording.open(tmp_path / "empty.uwb") as recording:
+        assert recording.show().span_s == 0.0

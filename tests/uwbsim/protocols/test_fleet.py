@@ -44,7 +44,7 @@ def differences_m(heard):
     return ticks * (TICK_S * SPEED_OF_LIGHT) - way
 
 
-@pytest.mark.parametrize("white", [0.0, 0.003])
+@pytest.mark.parametrize("white", [pytest.param(0.0, marks=pytest.mark.slow), 0.003])
 def test_broadcasts_and_differences_err_as_predicted(white):
     """20 s have 25 000 frames of five tags, a tenth as many for each pair: a deviation is known to 1 %."""
     scenario = fleet_world(white)

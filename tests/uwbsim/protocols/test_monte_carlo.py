@@ -8,7 +8,6 @@ import pytest
 from scipy.interpolate import BSpline
 
 import uwbsim
-from tests import processes
 from tests.uwbsim.simulation.test_protocols import bench
 from uwblink import PROTOCOLS, SPEED_OF_LIGHT, Board
 from uwblink.twr import COLUMNS, raw_range
@@ -38,19 +37,6 @@ def test_without_contention_the_stamps_are_those_of_the_event_loop(name):
     for column in COLUMNS:
         np.testing.assert_array_equal(getattr(loop.exchanges, column), getattr(columns.exchanges, column), column)
     np.testing.assert_array_equal(loop.truth_m, columns.truth_m)
-
-
-def test_the_command_can_do_without_contention(tmp_path):
-    from uwblink.recording.file import Recording
-
-    found = []
-    for option in ("--contention", "--no-contention"):
-        words: list[str | Path] = ["uwbsim", "run", SCENARIOS / "noiseless.toml", option]
-        words += ["-o", tmp_path / f"{option}.uwb", "--set", "run.duration_s=3", "--set", "ranging.rate_hz=100"]
-        assert processes.run(*words).returncode == 0
-        with Recording.open(tmp_path / f"{option}.uwb") as recording:
-            found.append(recording.exchanges())
-    np.testing.assert_array_equal(found[0].rx3, found[1].rx3)
 
 
 @pytest.mark.parametrize("name", NAMES)

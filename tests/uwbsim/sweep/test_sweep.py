@@ -204,13 +204,17 @@ def test_what_it_raises_fails_its_run_only(tmp_path, stranger):
 
 
 def test_functions_that_other_processes_cannot_import_are_refused(tmp_path, stranger):
-    p = plan(tmp_path, CALIBRATE)
-    with pytest.raises(ParameterError, match=r"^`evaluate`: found <function .*lambda.* cannot import"):
-        run_sweep(p, tmp_path / "out", workers=2, evaluate=lambda flight: {})
-    with pytest.raises(ParameterError, match=r"^`workers`: found 0"):
-        run_sweep(p, tmp_path / "out", workers=0, evaluate=stranger.figures)
-    with pytest.raises(ParameterError, match=r"^`evaluate`: goes with sweeps of flights"):
-        run_sweep(plan(tmp_path), tmp_path / "out", evaluate=stranger.figures)
+    for text, more, said in (
+        (
+            (CALIBRATE,),
+            {"workers": 2, "evaluate": lambda flight: {}},
+            "`evaluate`: found <function .*lambda.* cannot import",
+        ),
+        ((CALIBRATE,), {"workers": 0, "evaluate": stranger.figures}, "`workers`: found 0"),
+        ((), {"evaluate": stranger.figures}, "`evaluate`: goes with sweeps of flights"),
+    ):
+        with pytest.raises(ParameterError, match=f"^{said}"):
+            run_sweep(plan(tmp_path, *text), tmp_path / "out", **more)
     assert not (tmp_path / "out").exists()
 
 
@@ -223,19 +227,17 @@ def test_without_a_function_and_without_a_distribution_that_offers_one(tmp_path,
 
 def test_folders_and_files_that_do_not_fit_are_refused(alone, tmp_path):
     p, out = alone
-    with pytest.raises(ScenarioError, match=r"^`resume`: .* holds results of this sweep"):
-        run_sweep(p, out, workers=1)
-    with pytest.raises(ScenarioError, match=r"another sweep, plan\.toml"):
-        run_sweep(plan(tmp_path, name="other.toml"), out, workers=1, resume=True)
-    changed = plan(tmp_path, HEAD + "ranges = 3001\nseeds = 2\n" + GRID)
-    with pytest.raises(ScenarioError, match="has changed"):
-        run_sweep(changed, out, workers=1, resume=True)
-    with pytest.raises(ScenarioError, match="holds no sweep"):
-        run_sweep(p, tmp_path / "new", workers=1, resume=True)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "x").write_text("mine")
-    with pytest.raises(ScenarioError, match="other files"):
-        run_sweep(p, tmp_path / "full", workers=1)
+    for design, folder, resume, said in (
+        (p, out, False, r"^`resume`: .* holds results of this sweep"),
+        (plan(tmp_path, name="other.toml"), out, True, r"another sweep, plan\.toml"),
+        (plan(tmp_path, HEAD + "ranges = 3001\nseeds = 2\n" + GRID), out, True, "has changed"),
+        (p, tmp_path / "new", True, "holds no sweep"),
+        (p, tmp_path / "full", False, "other files"),
+    ):
+        with pytest.raises(ScenarioError, match=said):
+            run_sweep(design, folder, workers=1, resume=resume)
     assert run_sweep(p, out, workers=1, resume=True).done == 0
 
 

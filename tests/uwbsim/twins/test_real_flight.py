@@ -4,14 +4,12 @@
 autocorrelations; powers in dB, of which 10 % would say nothing. What is not met stands in docs/accuracy.md.
 """
 
-import tarfile
-
 import numpy as np
 import pytest
 
 import uwbsim
 from calib.calibration.formats import read_miluv
-from tests.shared_data import shared
+from tests.shared_data import miluv, shared
 from uwblink.importers import read_source
 
 pytestmark = pytest.mark.slow
@@ -19,10 +17,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("miluv")
-    with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
-        archive.extractall(folder, filter="data")
-    flight = read_source(next(folder.iterdir()), importer="miluv")
+    flight = read_source(miluv(tmp_path_factory.mktemp("miluv")), importer="miluv")
     twin = uwbsim.twin(flight, read_miluv(shared("miluv_published_calibration.json")))
     return twin, {one.name: one for one in twin.compare(seeds=5)}
 

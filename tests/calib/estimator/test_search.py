@@ -4,11 +4,15 @@ import numpy as np
 import pytest
 from scipy import sparse
 
+import calib
+from benchmarks.worlds import FIRST_REPORTED, Recipe, make
 from calib.estimator import rows, unknowns
 from calib.estimator.inverse import SparseInverse, inverse_of, trace_of_product
+from calib.estimator.known_distances import fit_known_distances
 from calib.estimator.optimize import maximize
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Priors, Unknown
+from tests.calib.overhearing import flight
 
 
 def test_an_arrow_is_inverted_as_the_dense_matrix_is():
@@ -44,3 +48,33 @@ def test_a_search_ends_at_least_squares_and_finds_the_weight_of_its_prior(most, 
     assert priors.deviation("path") == pytest.approx(0.5, rel=0.15)
     precision = priors.weights[0] * (steps.T @ steps).toarray() + np.eye(200) / 0.01
     assert found.x == pytest.approx(np.linalg.solve(precision, seen / 0.01), abs=1e-4)
+
+
+# The end of a search: the same from wherever near it a search starts.
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        lambda: make(Recipe(seconds=60, share=(0, 0.5)), FIRST_REPORTED).ranges,
+        lambda: flight(7100, reflected=0.15, bias_m=0.1)[0],
+    ],
+    ids=["world", "listeners"],
+)
+def test_a_search_ends_at_one_optimum_of_unknowns_and_weights(data):
+    found = fit_known_distances(calib.load_ranges(data()), calib.FitSettings())
+    search, optimum = found.searches[0], found.searches[0].optimum
+    rows = [own for own in (search.rows, search.heard, *search.gauge) if own is not None]
+    asked = optimum.layout.indices([unknown.kind for unknown in found.model.unknowns])
+    std = np.sqrt(np.diag(found.covariances["delay"]))
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        known = zip(optimum.priors.weights, optimum.priors.all, strict=True)
+        weights = [w if prior.bounds is None else w * np.exp(rng.normal()) for w, (_, prior) in known]
+        # By a standard error each, logarithms by a half at most: farther away there may be other optima.
+        away = np.minimum(np.sqrt(np.diag(np.asarray(optimum.covariance))), 0.5) * rng.normal(size=len(optimum.x))
+        again = maximize(rows, Priors(optimum.layout, weights), optimum.x + away, asked=asked)
+        assert again.success
+        assert again.steps < 25
+        # Searches end where a step promises 0.01 of log likelihood, a tenth of a standard error at most: both of two.
+        assert np.abs((again.of("delay") - optimum.of("delay")) / std).max() < 0.2
