@@ -18,7 +18,7 @@ from uwblink.arrays import Bools, Floats
 from uwblink.pages.colours import BLUE, GRID, INK, MUTED, PALE, SERIES, VERMILION, Look, look
 from uwblink.pages.figures import NARROW_IN, label, legend, mark, outlines, series, sheet
 from uwblink.protocols.table import PROTOCOLS, RangingProtocol
-from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S
+from uwblink.ticks import ANTENNA_DELAY_TICKS, METRES_PER_TICK, TICK_S
 from uwbsim.protocols.comparison import BestDelay, ErrorCurve
 from uwbsim.protocols.conditions import Conditions, exchange, interval_stamps
 from uwbsim.scenario.bodies import Obstacle, Room
@@ -26,6 +26,11 @@ from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.ranging import after_marker_s, before_marker_s, message_bytes
 from uwbsim.twins import Compared
 from uwbsim.world.world import World
+
+
+def three_digits(value: float) -> str:
+    """Return a number with three digits, or all before the point: 0.123, 17.9, 1012."""
+    return f"{value:#.3g}".rstrip(".") if abs(value) < 999.5 else f"{value:.0f}"
 
 
 def _plain_ticks(axis: Axis) -> None:
@@ -37,14 +42,25 @@ def _plain_ticks(axis: Axis) -> None:
 
 
 def histograms(width_in: float, samples: Mapping[str, Floats]) -> Figure:
-    """Draw errors of raw ranges, one outline a protocol; the outermost bins hold everything beyond them."""
+    """Draw errors of raw ranges, one outline a protocol; the outermost bins hold everything beyond them.
+
+    Errors about medians farther apart than the narrowest distribution is wide are drawn less their medians.
+    """
     figure, (axes,) = sheet(width_in, height_in=2.9)
+    medians = {name: float(np.median(errors)) for name, errors in samples.items()}
     best = min((np.quantile(e, (0.005, 0.995)) for e in samples.values()), key=np.ptp)
+    apart = np.ptp([*medians.values()]) > np.ptp(best) > 0
+    if apart:
+        samples = {name: errors - medians[name] for name, errors in samples.items()}
+        best = min((np.quantile(e, (0.005, 0.995)) for e in samples.values()), key=np.ptp)
     margin = 0.25 * np.ptp(best) + 1e-4
-    edges = 100 * np.linspace(best[0] - margin, best[1] + margin, 81)
-    looks = {name: look(k).line(marker=False) | {"label": name} for k, name in enumerate(samples)}
+    # Single-sided ranges at one distance are whole half ticks: bins of as many of these each show no spikes.
+    width = METRES_PER_TICK / 2 * np.ceil((np.ptp(best) + 2 * margin) / 40 / METRES_PER_TICK)
+    edges = 100 * np.arange(best[0] - margin, best[1] + margin + width, width)
+    titles = {name: f"{name}, median {100 * medians[name]:+.1f} cm" if apart else name for name in samples}
+    looks = {name: look(k).line(marker=False) | {"label": titles[name]} for k, name in enumerate(samples)}
     outlines(axes, {name: 100 * errors for name, errors in samples.items()}, edges, looks)
-    label(axes, "range error (cm)", "ranges (%)")
+    label(axes, "range error less its median (cm)" if apart else "range error (cm)", "ranges (%)")
     legend(figure)
     return figure
 
@@ -71,7 +87,7 @@ def error_over(width_in: float, curves: Mapping[str, ErrorCurve], x: str, *, log
         right.set_yscale("log")
         _plain_ticks(right.yaxis)
     else:
-        right.set_ylim(bottom=0)
+        right.set_ylim(0, 1.1 * spreads.max())
     for axes in (left, right):
         if logarithmic:
             axes.set_xscale("log")
@@ -283,7 +299,7 @@ def _maps(
         axes.pcolormesh(cells[1], cells[0], values, cmap="cividis", vmin=low, vmax=high)
         for (up, right), value in np.ndenumerate(values if values.shape[1] <= MAX_NUMBERS else values[:0]):
             colour = "white" if value < (low + high) / 2 else "black"
-            axes.text(right, up, f"{value:#.3g}".replace("-", "−"), ha="center", va="center", color=colour)
+            axes.text(right, up, three_digits(value).replace("-", "−"), ha="center", va="center", color=colour)
         for axis, own in ((axes.xaxis, x), (axes.yaxis, y)):
             kept = np.arange(len(own))[:: max(1, len(own) // 6)]
             axis.set_ticks(kept, labels=[f"{value:g}" for value in own[kept]])
