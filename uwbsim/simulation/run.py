@@ -6,6 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -112,6 +113,10 @@ class Simulated:
                 recording.append(table, getattr(self, table))
             recording.append("cirs", self.cirs)
             recording.append("frames", frames)
+
+    def _repr_html_(self) -> str:
+        """Return these lines and the first exchanges for a notebook."""
+        return f"<pre>{escape(repr(self))}</pre>{self.exchanges._repr_html_()}"
 
     def __repr__(self) -> str:
         """Return a few lines: counts, errors of the raw ranges, and failures."""
