@@ -147,24 +147,33 @@ def room(width_in: float, scenario: Scenario) -> Figure:
                 axes.text(middle_x, middle_y, text, ha="center", va="center", rotation=turned, color=INK)
         for k, body in enumerate(scenario.bodies):
             own = {tag.id: tags[tag.id][[x, y]] for tag in scenario.tags if tag.body == body.name}
-            _draw_body(axes, body.name, paths[body.name][:, [x, y]], own, look(k), middle[[x, y]])
+            _draw_body(axes, body.name, paths[body.name][:, [x, y]], own, look(k))
+            if axes is panels[0] and own:
+                _number_tags(axes, own, middle[[x, y]])
         limits: dict[str, Any] = {"xlim": (low[x], high[x]), "ylim": (low[y], high[y]), "aspect": "equal"}
         axes.set(title=name, xlabel=f"{'xyz'[x]} (m)", ylabel=f"{'xyz'[y]} (m)", axisbelow=True, **limits)
         axes.grid(True)
     legend(figure, panels[0])
+    figure.draw_without_rendering()  # only a second layout knows the sizes that equal scales leave
     return figure
 
 
-def _draw_body(axes: Axes, name: str, path: Floats, tags: Mapping[int, Floats], own: Look, middle: Floats) -> None:
-    """Draw a path (n, 2), and tags with their numbers at the first, towards `middle` (2,)."""
+def _draw_body(axes: Axes, name: str, path: Floats, tags: Mapping[int, Floats], own: Look) -> None:
+    """Draw a path (n, 2), and tags."""
     axes.plot(*path.T, color=own.colour, lw=0.6, alpha=0.6)
     spots = np.array(list(tags.values())).reshape(-1, 2)
-    mark(axes.plot(*spots.T, own.marker, color=own.colour, ms=4, label=name)[0], name)
-    if tags:
-        left, down = (spots[0] > middle).tolist()
-        place: dict[str, Any] = {"ha": "right" if left else "left", "va": "top" if down else "bottom", "color": INK}
-        away = (-4 if left else 4, -4 if down else 4)
-        axes.annotate(", ".join(map(str, tags)), tuple(spots[0]), away, textcoords="offset points", **place)
+    mark(axes.plot(*spots.T, own.marker, color=own.colour, ms=4, label=name, zorder=10)[0], name)
+
+
+def _number_tags(axes: Axes, tags: Mapping[int, Floats], middle: Floats) -> None:
+    """Write the numbers of a body's tags at the first, towards `middle` (2,), above all paths."""
+    first = next(iter(tags.values()))
+    left, down = (first > middle).tolist()
+    place: dict[str, Any] = {"ha": "right" if left else "left", "va": "top" if down else "bottom", "color": INK}
+    ground = {"boxstyle": "round,pad=0.15", "fc": GRID, "ec": "none", "alpha": 0.85}
+    away = (-6 if left else 6, -6 if down else 6)
+    text = ", ".join(map(str, tags))
+    axes.annotate(text, tuple(first), away, textcoords="offset points", bbox=ground, zorder=9, **place)
 
 
 def timing(width_in: float, scenario: Scenario, name: str) -> Figure:

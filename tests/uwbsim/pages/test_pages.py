@@ -37,6 +37,7 @@ def test_a_room_is_to_scale_within_its_walls(width):
     low, high = np.array(scenario.room.min_m), np.array(scenario.room.max_m)
     scales = []
     for axes, (x, y) in zip(figure.axes, ((0, 1), (0, 2)), strict=True):
+        assert axes.get_tightbbox().y0 > 0, "its label lies in the picture"
         box = axes.get_window_extent()
         scales += [box.width / np.ptp(axes.get_xlim()), box.height / np.ptp(axes.get_ylim())]
         for limits, k in ((axes.get_xlim(), x), (axes.get_ylim(), y)):
