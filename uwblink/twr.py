@@ -91,8 +91,10 @@ class Exchanges(ColumnTable):
         2
         """
         given = {"tx1": tx1, "rx1": rx1, "tx2": tx2, "rx2": rx2, "tx3": tx3, "rx3": rx3}
-        bare = range_m is not None and all(values is None for values in given.values())
-        count = arrays.length("range_m", range_m) if bare else arrays.length("tx1", tx1)
+        bare = all(values is None for values in given.values())
+        if (first := range_m if tx1 is None else tx1) is None:
+            raise ArgumentError("tx1: is not given; give the stamps, or `range_m` where a device has none")
+        count = arrays.length("range_m" if tx1 is None else "tx1", first)
         if bits not in BITS:
             raise ArgumentError(f"bits: found {bits!r:.40}, allowed: {', '.join(map(str, BITS))}")
         ends = {"initiator": initiator, "target": target, "reporter": initiator if reporter is None else reporter}

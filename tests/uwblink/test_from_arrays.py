@@ -36,8 +36,11 @@ def test_ranges_without_stamps_are_those_of_a_table_without_stamps(tmp_path):
     )
     for name in COLUMNS:
         np.testing.assert_array_equal(getattr(mine, name), getattr(table, name), err_msg=name)
-    with pytest.raises(ArgumentError, match="rx1: is not given"):
-        Exchanges.from_arrays(1, 2, tx1=[3], range_m=[3.1])
+    for stamps, missing in (({"tx1": [3]}, "rx1"), ({"rx1": [3]}, "tx1")):
+        with pytest.raises(ArgumentError, match=f"{missing}: is not given"):
+            Exchanges.from_arrays(1, 2, **stamps, range_m=[3.1])
+    with pytest.raises(ArgumentError, match="tx1: is not given; give the stamps, or `range_m`"):
+        Exchanges.from_arrays(1, 2)
 
 
 def test_every_column_goes_to_its_place_and_comes_back():

@@ -225,7 +225,8 @@ def add_poses(
             )
         bodies = set(names_in(poses.body))
         with_poses = [tag for tag in placed if tag.body in bodies]
-        known = np.isin([first, second], [tag.tag for tag in with_poses]).all(axis=0)
+        ids = [tag.tag for tag in with_poses]
+        known = np.isin(first, ids) & np.isin(second, ids)
         if not known.any():
             found = ", ".join(sorted({tag.body for tag in placed})) or "none"
             raise ImportTableError(

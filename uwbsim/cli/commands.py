@@ -288,9 +288,12 @@ def predict(
         float, typer.Option(rich_help_panel="Noise", help="Bias of the carrier integrator's reading.")
     ] = 0.0,
     delay_initiator_ns: Annotated[
-        float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the initiator; a positive one shortens ranges.")
+        float,
+        typer.Option(rich_help_panel="Tags", help="Antenna delay of the initiator; a positive one shortens ranges."),
     ] = 0.0,
-    delay_target_ns: Annotated[float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the target, likewise.")] = 0.0,
+    delay_target_ns: Annotated[
+        float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the target, likewise.")
+    ] = 0.0,
     whole_ticks: Annotated[
         bool,
         typer.Option("--whole-ticks", rich_help_panel="Noise", help="Round stamps to ticks of 15.65 ps."),
