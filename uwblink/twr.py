@@ -58,10 +58,10 @@ class Exchanges(ColumnTable):
         initiator: ArrayLike,
         target: ArrayLike,
         *,
-        tx1: ArrayLike,
-        rx1: ArrayLike,
-        tx2: ArrayLike,
-        rx2: ArrayLike,
+        tx1: ArrayLike | None = None,
+        rx1: ArrayLike | None = None,
+        tx2: ArrayLike | None = None,
+        rx2: ArrayLike | None = None,
         tx3: ArrayLike | None = None,
         rx3: ArrayLike | None = None,
         protocol: ArrayLike | None = None,
@@ -77,17 +77,24 @@ class Exchanges(ColumnTable):
     ) -> Exchanges:
         """Return exchanges from columns, each a list, an array, a data-frame column, or one value for all rows.
 
-        `tx1` gives the number of rows n. Defaults: `protocol` is "ds" if `tx3` and `rx3` are given and "ss" otherwise,
-        `time_ns` is 0, `reporter` the initiator, `range_m` the range by the protocol's formula, and powers, skews and
-        `truth_m` are NaN. Stamps of a third message are 0 if the protocol has none.
-        `bits` is 32 or 40. Raises `ArgumentError`, which names the column and the row.
+        `tx1` gives the number of rows n; `range_m` does if there are ranges and no stamps, which are 0 then. Defaults:
+        `protocol` is "ds" if `tx3` and `rx3` are given and "ss" otherwise, `time_ns` is 0, `reporter` the initiator,
+        `range_m` the range by the protocol's formula, and powers, skews and `truth_m` are NaN. Stamps of a third
+        message are 0 if the protocol has none. `bits` is 32 or 40. Raises `ArgumentError`, which names the column and
+        the row.
 
         >>> from uwblink import Exchanges
         >>> x = Exchanges.from_arrays([1, 1], 2, tx1=[0, 9], rx1=[5, 3], tx2=[1005, 1003], rx2=[3000, 3009])
         >>> x.protocol.tolist(), x.range_m.round(3).tolist()
         (['ss', 'ss'], [4.69, 4.69])
+        >>> len(Exchanges.from_arrays(1, 2, range_m=[3.1, 3.2], fpp2_dbm=[-82.0, -83.0]))
+        2
         """
-        count = arrays.length("tx1", tx1)
+        given = {"tx1": tx1, "rx1": rx1, "tx2": tx2, "rx2": rx2, "tx3": tx3, "rx3": rx3}
+        bare = all(values is None for values in given.values())
+        if (first := range_m if tx1 is None else tx1) is None:
+            raise ArgumentError("tx1: is not given; give the stamps, or `range_m` where a device has none")
+        count = arrays.length("range_m" if tx1 is None else "tx1", first)
         if bits not in BITS:
             raise ArgumentError(f"bits: found {bits!r:.40}, allowed: {', '.join(map(str, BITS))}")
         ends = {"initiator": initiator, "target": target, "reporter": initiator if reporter is None else reporter}
@@ -102,11 +109,10 @@ class Exchanges(ColumnTable):
         messages = np.zeros(count, dtype=np.int64)
         for row, rows in _rows_by_protocol(names):
             messages[rows] = len(row.messages)
-        given = {"tx1": tx1, "rx1": rx1, "tx2": tx2, "rx2": rx2, "tx3": tx3, "rx3": rx3}
         hint = f"; stamps of {BITS[-1]} bits need bits={BITS[-1]}" if bits < BITS[-1] else ""
         for name, values in given.items():
             needed = messages >= int(name[-1])
-            if values is None and needed.any():
+            if values is None and needed.any() and not bare:
                 raise ArgumentError(f"{name}: is not given, but protocol {str(names[int(np.argmax(needed))])!r} has it")
             found = arrays.whole_numbers(name, 0 if values is None else values, count, 0, (1 << bits) - 1, hint)
             chosen[name] = np.where(needed, found, 0)

@@ -280,7 +280,10 @@ CHECKS: Final = (
         "structure",
         "Do the pairs determine all delays?",
         "null space of the design", CERTAIN,
-        {"too few pairs": "record three tags that all range with each other, or pin a known delay with `fixed_ns`"},
+        {
+            "too few pairs": "nothing if ranges stay between these sides; else record three tags that all range with "
+            "each other, or pin a known delay with `fixed_ns`"
+        },
         columns.undetermined,
     ),
     Check(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections import ChainMap
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -273,19 +272,17 @@ def report(
     force: Force = False,
 ) -> None:
     """Fit, judge on other recordings, localize, and write everything as one page with tables and figures."""
-    from rich.console import Console
-
     check_report(output, figures, pdf=pdf, force=force)
-    with Console(file=sys.stderr).status("loading") as status:
+    with waiting("loading") as progress:
         campaign = calib.run_campaign(
             recordings,
             tests or [],
             trim_static=trim_static,
-            progress=status.update,
+            progress=progress,
             command=command_line(),
             settings=settings,
         )
-        campaign.write(output, pdf, figures, force=force, progress=status.update)
+        campaign.write(output, pdf, figures, force=force, progress=progress)
     if as_json:
         typer.echo(json.dumps(campaign.to_dict(), indent=1))
     else:

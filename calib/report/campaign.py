@@ -142,7 +142,7 @@ def write_checked(made: Document, output: Path | None, figures: Path | None = No
     write_document(made, output, None, figures, force=force)
 
 
-Progress = Callable[[str], None]
+Progress = Callable[[str | float], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,12 +168,18 @@ class Campaign(Results):
         """Write the report as one HTML page, as PDF, and its figures at paper size (PDF and SVG) into a folder.
 
         Figures come at two widths, a column's (3.5 inch) and a page's (7.16 inch). A `html` that ends in .pdf is a PDF.
-        `progress` is told what is being done. Raises the errors of `check_output` before anything is drawn.
+        `progress` is called with what is being done, and with the share that is done of this and of the fit and
+        evaluation before it. Raises the errors of `check_output` before anything is drawn.
         """
         output, *more = (None if place is None else Path(place) for place in (html, pdf, figures))
         check_places(output, *more, force=force)
         made = document(self, "Calibration of ultra-wideband ranges")
-        write_document(made, output, *more, force=force, progress=progress)
+
+        def tell(step: str | float) -> None:
+            # Shares are of the processor time for the flights of ICRA 2023, most of which goes into figures and tracks.
+            progress(step if isinstance(step, str) else 0.65 + 0.35 * step)
+
+        write_document(made, output, *more, force=force, progress=tell)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `calib report --json` prints."""
@@ -215,8 +221,8 @@ def run_campaign(
     second fit is judged on a part of the training that is held out from it (`FitSettings.hold_out`, 0.3 by default);
     where that is too short, the training itself is judged. The report says which. `Ranges` alone are fitted and
     judged, but neither examined nor localized: that takes a recording. `trim_static` leaves out of the training where
-    nothing moves; `progress` is called with what is being done; `command` is the command line that the report states.
-    Raises what `load_ranges` and `fit` raise.
+    nothing moves; `progress` is called with what is being done, and with the share of a report's time that is over;
+    `command` is the command line that the report states. Raises what `load_ranges` and `fit` raise.
 
     >>> import calib
     >>> campaign = calib.run_campaign(calib.sample_flight(), calib.sample_flight(300, seed=2), loss="huber")
@@ -226,19 +232,23 @@ def run_campaign(
     settings = replace(settings or FitSettings(), **changes)
     given = each(training), each(tests) if tests else []
     progress("loading")
+    progress(0.0)
     with ExitStack() as stack:
         recordings, judged = ([stack.enter_context(held_open(one)) for one in some] for some in given)
         need_power = not settings.delays_only
         fitted = load_each(recordings, trim_static=trim_static, need_power=need_power)
         testing = load_each(judged, need_power=need_power) if judged else []
         progress("fitting")
+        progress(0.05)
         ranges = concatenate(fitted)
         found = fit(ranges, settings) if testing else _fit_and_hold_out(ranges, settings)
         held = None if testing else found.held_out
         known = found.calibration
         progress("examining")
+        progress(0.12)
         findings = [finding for one in (*recordings, *judged) for finding in _findings(one)]
         progress("localizing")
+        progress(0.2)
         whole = [data for data in recordings if not isinstance(data, Ranges)]
         return Campaign(
             calibration=known,

@@ -8,6 +8,7 @@ import pytest
 
 from tests.uwblink.recording.test_file import random_exchanges
 from uwblink.errors import ArgumentError, UwblinkError
+from uwblink.importers import read_source
 from uwblink.recording.schema import Poses
 from uwblink.twr import COLUMNS, Exchanges
 
@@ -24,6 +25,22 @@ def test_only_ends_and_stamps_are_needed():
     assert np.isnan(x.truth_m).all()
     # (3000 - 1000) / 2 = 1000 ticks of 4.69 mm.
     np.testing.assert_allclose(x.range_m, 4.690357, rtol=1e-6)
+
+
+def test_ranges_without_stamps_are_those_of_a_table_without_stamps(tmp_path):
+    """An importer of one's own for a device that prints ranges needs no stamps."""
+    (tmp_path / "t.csv").write_text("time_s,from_id,to_id,range_m,fpp2\n0.5,1,7,3.1,-82.5\n0.6,2,7,3.2,-83.0\n")
+    table = read_source(tmp_path / "t.csv").exchanges
+    mine = Exchanges.from_arrays(
+        [1, 2], 7, range_m=[3.1, 3.2], fpp2_dbm=[-82.5, -83.0], time_ns=table.time_ns, reporter=table.reporter
+    )
+    for name in COLUMNS:
+        np.testing.assert_array_equal(getattr(mine, name), getattr(table, name), err_msg=name)
+    for stamps, missing in (({"tx1": [3]}, "rx1"), ({"rx1": [3]}, "tx1")):
+        with pytest.raises(ArgumentError, match=f"{missing}: is not given"):
+            Exchanges.from_arrays(1, 2, **stamps, range_m=[3.1])
+    with pytest.raises(ArgumentError, match="tx1: is not given; give the stamps, or `range_m`"):
+        Exchanges.from_arrays(1, 2)
 
 
 def test_every_column_goes_to_its_place_and_comes_back():

@@ -218,6 +218,7 @@ def poses(
     typer.echo(
         f"{recording}: {found.poses} poses of {', '.join(found.bodies)}, offset {found.offset_s:+.4f} s; "
         f"{found.covered} of {found.exchanges} measurements have a true distance"
+        + (f"; no poses of {', '.join(found.missing)}" if found.missing else "")
     )
 
 

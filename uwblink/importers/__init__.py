@@ -37,6 +37,7 @@ from uwblink.recording.store import decode_json
 
 __all__ = [
     "IMPORTERS",
+    "ColumnMap",
     "Imported",
     "Importer",
     "add_poses",

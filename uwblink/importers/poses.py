@@ -174,13 +174,14 @@ def _field(message: Any, path: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class AddedPoses:
-    """Added poses: their number, bodies and offset, and the number of exchanges that they cover."""
+    """Added poses: their number, bodies and offset, the number of exchanges that they cover; bodies that lack poses."""
 
     poses: int
     bodies: tuple[str, ...]
     offset_s: float
     exchanges: int
     covered: int
+    missing: tuple[str, ...]
 
 
 def add_poses(
@@ -224,7 +225,9 @@ def add_poses(
             )
         bodies = set(names_in(poses.body))
         with_poses = [tag for tag in placed if tag.body in bodies]
-        if len(with_poses) < 2:
+        ids = [tag.tag for tag in with_poses]
+        known = np.isin(first, ids) & np.isin(second, ids)
+        if not known.any():
             found = ", ".join(sorted({tag.body for tag in placed})) or "none"
             raise ImportTableError(
                 f"{what}: its bodies are {', '.join(sorted(bodies))}, those of the tags {found}; "
@@ -237,7 +240,7 @@ def add_poses(
             )
         if shift_ns is None:
             _check_units(what, exchanges, poses, placed, int(exchanges.time_ns.min() - poses.time_ns.min()))
-            shift_ns = find_offset(exchanges, poses, placed)
+            shift_ns = find_offset(exchanges[known], poses, placed)
         moved = replace(poses, time_ns=poses.time_ns + shift_ns)
         truth = distances_m(moved, placed, first, second, time_ns)
         covered = int(np.count_nonzero(np.isfinite(truth)))
@@ -250,7 +253,8 @@ def add_poses(
             _check_units(what, exchanges, moved, placed)
         meta = {"poses_from": ", ".join(path.name for path in files.values()), "poses_offset_s": shift_ns * 1e-9}
         opened.replace_poses(moved, meta, placed if tags_from else None)
-    return AddedPoses(len(poses), tuple(sorted(bodies)), shift_ns * 1e-9, len(time_ns), covered)
+    missing = tuple(sorted({tag.body for tag in placed} - bodies))
+    return AddedPoses(len(poses), tuple(sorted(bodies)), shift_ns * 1e-9, len(time_ns), covered, missing)
 
 
 def _check_units(what: str, exchanges: Exchanges, poses: Poses, tags: Sequence[Tag], shift_ns: int = 0) -> None:

@@ -195,16 +195,18 @@ class Document:
 
 
 def draw_figures(
-    document: Document, kinds: Mapping[str, Sequence[str]], progress: Callable[[str], None] = lambda _: None
+    document: Document, kinds: Mapping[str, Sequence[str]], progress: Callable[[str | float], None] = lambda _: None
 ) -> dict[str, bytes]:
     """Draw each figure of a document once at each width; returns files such as "errors-page.svg".
 
-    `kinds` are the kinds of files by width, "page" or "column".
+    `kinds` are the kinds of files by width, "page" or "column". `progress` is called with the present step, and with
+    the share of the figures that are drawn.
     """
     from uwblink.pages.figures import WIDTHS, drawn
 
     files: dict[str, bytes] = {}
-    for one in document.pictures():
+    for k, one in enumerate(document.pictures()):
+        progress(k / len(document.pictures()))
         progress(f"drawing {one.name}")
         for width, width_in in WIDTHS.items():
             made = drawn(one.draw, width_in, kinds[width], salt=f"{one.name} {width}") if kinds[width] else {}
@@ -269,12 +271,12 @@ def write_document(
     figures: Path | None = None,
     *,
     force: bool = False,
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str | float], None] = lambda _: None,
 ) -> None:
     """Write a document as HTML (as PDF where `output` ends in .pdf), as PDF, and its figures into a folder.
 
     Each figure is drawn once at each width; the folder has PDF and SVG of both. `progress` is called with the present
-    step. Raises what `uwblink.output.check_output` raises.
+    step, and the share that is drawn. Raises what `uwblink.output.check_output` raises.
     """
     page = output if output is not None and output.suffix.lower() != ".pdf" else None
     papers = [path for path in (output if page is None else None, pdf) if path is not None]

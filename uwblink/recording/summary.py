@@ -69,12 +69,13 @@ def single_reports(exchanges: Exchanges) -> SingleReports:
 def repeated_rows(exchanges: Exchanges) -> Bools:
     """Return which exchanges (n,) repeat another row of the same pair and reporter in all stamps and readings.
 
-    Ranges without stamps must also have nearly the same time.
+    Ranges without stamps must also have the same time, to a millisecond: readings of a centimetre and a decibel are
+    soon equal by chance.
     """
     e = exchanges
     columns = [e.initiator, e.target, e.reporter, *(getattr(e, name) for name in COMPARED)]
     before, row = _neighbours(e, [np.nan_to_num(column, nan=-1e300) for column in columns])
-    same = ~without_stamps(e)[row] | (e.time_ns[row] - e.time_ns[before] < APART_NS)
+    same = ~without_stamps(e)[row] | (e.time_ns[row] - e.time_ns[before] < 1_000_000)
     again = np.zeros(len(e), dtype=bool)
     again[row[same]] = True
     return again

@@ -20,6 +20,7 @@ from uwblink.cli.shared import (
     AsJson,
     CalibrationFile,
     Duration,
+    Figures,
     Force,
     LinkDir,
     Seed,
@@ -200,6 +201,7 @@ def compare(
     count: Annotated[int, typer.Option("-n", "--ranges", help="Ranges with each protocol.")] = 1_000_000,
     overrides: Overrides = None,
     allow_files: AllowFiles = None,
+    figures: Figures = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -207,9 +209,10 @@ def compare(
     rows = _rows(protocols)
     loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
     check_folder(output, uwbsim.pages.FILES, force=force)
+    _check_figures(figures, force=force)
     with waiting(loaded.run.name) as report:
         found = uwbsim.compare(loaded, rows, count, report)
-    uwbsim.pages.write_comparison(found, output, force=force)
+    uwbsim.pages.write_comparison(found, output, figures=figures, force=force)
     if as_json:
         print_json(found.to_dict())
         return
@@ -217,6 +220,12 @@ def compare(
     _print_table([[name.strip(), *map(show, found.outcomes)] for name, show in uwbsim.pages.COMPARISON_COLUMNS.items()])
     _print_fleet(found.fleet)
     typer.echo(f"{output / uwbsim.pages.FILES[0]}, {', '.join(uwbsim.pages.FILES[1:])}")
+
+
+def _check_figures(folder: Path | None, *, force: bool) -> None:
+    """Check the folder of figures before anything is computed: without `force` it holds none yet."""
+    if folder is not None:
+        check_folder(folder, [path.name for path in folder.glob("*.svg")], force=force)
 
 
 def _print_fleet(found: Sequence[uwbsim.FleetFigures]) -> None:
@@ -279,9 +288,12 @@ def predict(
         float, typer.Option(rich_help_panel="Noise", help="Bias of the carrier integrator's reading.")
     ] = 0.0,
     delay_initiator_ns: Annotated[
-        float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the initiator.")
+        float,
+        typer.Option(rich_help_panel="Tags", help="Antenna delay of the initiator; a positive one shortens ranges."),
     ] = 0.0,
-    delay_target_ns: Annotated[float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the target.")] = 0.0,
+    delay_target_ns: Annotated[
+        float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the target, likewise.")
+    ] = 0.0,
     whole_ticks: Annotated[
         bool,
         typer.Option("--whole-ticks", rich_help_panel="Noise", help="Round stamps to ticks of 15.65 ps."),
@@ -353,9 +365,11 @@ def sweep(
     scheduler: Annotated[str | None, typer.Option(help="Address of a running Dask scheduler.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue a sweep that was interrupted.")] = False,
     allow_files: AllowFiles = None,
+    figures: Figures = None,
 ) -> None:
     """Run a scenario many times with varied settings and seeds; an interrupted sweep can be resumed."""
     loaded = uwbsim.load_design(plan, allow_files=allow_files or ())
+    _check_figures(figures, force=resume)
     with interrupts() as stop, waiting(loaded.name) as report:
 
         def go_on(share: float) -> None:
@@ -370,7 +384,7 @@ def sweep(
         except KeyboardInterrupt:
             typer.echo(f"{output}: interrupted; what was done is kept, and --resume goes on with it")
             raise typer.Exit(INTERRUPTED) from None
-    page = uwbsim.pages.write_sweep_page(loaded, output)
+    page = uwbsim.pages.write_sweep_page(loaded, output, figures=figures)
     typer.echo(
         f"{output}: {summary.done} runs of {loaded.total}, {summary.failed} failed, {summary.skipped} were there "
         f"already; results.csv, results.parquet, {page.name}"

@@ -14,7 +14,7 @@ import numpy as np
 
 from uwblink.database import write_tables
 from uwblink.output import check_folder, check_output, made_folder, write_bytes, write_files, write_text
-from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text, to_html
+from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text, to_html, write_document
 from uwblink.pages.figures import picture
 from uwblink.protocols.table import PROTOCOLS
 from uwbsim.errors import ScenarioError
@@ -113,7 +113,7 @@ FLEET_COLUMNS: Final[dict[str, Callable[[FleetFigures], str]]] = {
     "RMSE (cm)": lambda o: f"{100 * o.rmse_m:.2f}",
     "air (µs)": lambda o: f"{1e6 * o.air_s:.0f}",
     "radio on (µs)": lambda o: f"{1e6 * o.radio_on_s:.0f}",
-    "updates (1/s)": lambda o: f"{o.update_hz:.3g}",
+    "updates (1/s)": lambda o: figures.three_digits(o.update_hz),
 }
 """Columns of tables of ways of ranging in a fleet; air and radio are per range, or difference of arrival."""
 
@@ -121,17 +121,19 @@ FILES: Final = ("compare.html", "compare.csv", "compare.parquet")
 """Names of the files of `write_comparison`."""
 
 
-def write_comparison(found: ProtocolComparison, folder: Path, *, force: bool = False) -> None:
+def write_comparison(
+    found: ProtocolComparison, folder: Path, *, figures: Path | None = None, force: bool = False
+) -> None:
     """Write a comparison as page and tables (`FILES`) into a folder, which is made where it is missing.
 
-    Raises what `check_folder` raises.
+    `figures` is a folder for its figures at paper size (PDF and SVG). Raises what `check_folder` raises.
     """
     check_folder(folder, FILES, force=force)
-    text, rows = to_html(comparison(found)), [one.to_dict() for one in found.outcomes]
     html, table, packed = (folder / name for name in FILES)
     with made_folder(folder):
-        write_tables(table, packed, rows, force=force)  # first, because Parquet asks most of the folder's name
-        write_text(html, text, force=force)
+        # First, because Parquet asks most of the folder's name.
+        write_tables(table, packed, [one.to_dict() for one in found.outcomes], force=force)
+        write_document(comparison(found), html, figures=figures, force=force)
 
 
 def comparison(found: ProtocolComparison) -> Document:
@@ -215,9 +217,12 @@ def comparison(found: ProtocolComparison) -> Document:
     ]
     blocks += [
         Picture(
-            f"over {x}", partial(figures.error_over, curves=curves, x=x, logarithmic=x.startswith("delay")), caption
+            f"over {x.partition(' (')[0]}".replace(" ", "-"),
+            partial(figures.error_over, curves=curves, x=x, logarithmic=x.startswith("delay")),
+            caption,
         )
         for curves, x, caption in over
+        if any(np.ptp(c.x) > 0 for c in curves.values())  # of boards that stand still there is one distance
     ]
     return Document(f"Protocols in {scenario.run.name}", blocks)
 
@@ -269,10 +274,10 @@ def _spelled(name: str, units: Mapping[str, str] = UNITS) -> str:
     return f"{stem} ({units[unit]})" if stem and unit in units else f"{stem} {unit}".strip()
 
 
-def write_sweep_page(plan: SweepDesign, folder: Path) -> Path:
+def write_sweep_page(plan: SweepDesign, folder: Path, *, figures: Path | None = None) -> Path:
     """Write the page of a sweep into the folder of its results, replacing an earlier one; return its path.
 
-    Raises `TableError` where the folder has no results.
+    `figures` is a folder for its figures at paper size. Raises `TableError` where the folder has no results.
     """
     most = 200_000  # rows of which a page is made; the tables have all
     with ResultStore.open(folder / STORE) as store:
@@ -280,7 +285,7 @@ def write_sweep_page(plan: SweepDesign, folder: Path) -> Path:
     path, document = folder / "results.html", _swept(plan, rows)
     if len(rows) > most:
         document.blocks.append(Text(f"Only the first {most:,} rows are drawn; the tables have all.", "warning"))
-    write_text(path, to_html(document), force=True)
+    write_document(document, path, figures=figures, force=True)
     return path
 
 

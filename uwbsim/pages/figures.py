@@ -18,7 +18,7 @@ from uwblink.arrays import Bools, Floats
 from uwblink.pages.colours import BLUE, GRID, INK, MUTED, PALE, SERIES, VERMILION, Look, look
 from uwblink.pages.figures import NARROW_IN, label, legend, mark, outlines, series, sheet
 from uwblink.protocols.table import PROTOCOLS, RangingProtocol
-from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S
+from uwblink.ticks import ANTENNA_DELAY_TICKS, METRES_PER_TICK, TICK_S
 from uwbsim.protocols.comparison import BestDelay, ErrorCurve
 from uwbsim.protocols.conditions import Conditions, exchange, interval_stamps
 from uwbsim.scenario.bodies import Obstacle, Room
@@ -26,6 +26,11 @@ from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.ranging import after_marker_s, before_marker_s, message_bytes
 from uwbsim.twins import Compared
 from uwbsim.world.world import World
+
+
+def three_digits(value: float) -> str:
+    """Return a number with three digits, or all before the point: 0.123, 17.9, 1012."""
+    return f"{value:#.3g}".rstrip(".") if abs(value) < 999.5 else f"{value:.0f}"
 
 
 def _plain_ticks(axis: Axis) -> None:
@@ -37,14 +42,25 @@ def _plain_ticks(axis: Axis) -> None:
 
 
 def histograms(width_in: float, samples: Mapping[str, Floats]) -> Figure:
-    """Draw errors of raw ranges, one outline a protocol; the outermost bins hold everything beyond them."""
+    """Draw errors of raw ranges, one outline a protocol; the outermost bins hold everything beyond them.
+
+    Errors about medians farther apart than the narrowest distribution is wide are drawn less their medians.
+    """
     figure, (axes,) = sheet(width_in, height_in=2.9)
+    medians = {name: float(np.median(errors)) for name, errors in samples.items()}
     best = min((np.quantile(e, (0.005, 0.995)) for e in samples.values()), key=np.ptp)
+    apart = np.ptp([*medians.values()]) > np.ptp(best) > 0
+    if apart:
+        samples = {name: errors - medians[name] for name, errors in samples.items()}
+        best = min((np.quantile(e, (0.005, 0.995)) for e in samples.values()), key=np.ptp)
     margin = 0.25 * np.ptp(best) + 1e-4
-    edges = 100 * np.linspace(best[0] - margin, best[1] + margin, 81)
-    looks = {name: look(k).line(marker=False) | {"label": name} for k, name in enumerate(samples)}
+    # Single-sided ranges at one distance are whole half ticks: bins of as many of these each show no spikes.
+    width = METRES_PER_TICK / 2 * np.ceil((np.ptp(best) + 2 * margin) / 40 / METRES_PER_TICK)
+    edges = 100 * np.arange(best[0] - margin, best[1] + margin + width, width)
+    titles = {name: f"{name}, median {100 * medians[name]:+.1f} cm" if apart else name for name in samples}
+    looks = {name: look(k).line(marker=False) | {"label": titles[name]} for k, name in enumerate(samples)}
     outlines(axes, {name: 100 * errors for name, errors in samples.items()}, edges, looks)
-    label(axes, "range error (cm)", "ranges (%)")
+    label(axes, "range error less its median (cm)" if apart else "range error (cm)", "ranges (%)")
     legend(figure)
     return figure
 
@@ -71,7 +87,7 @@ def error_over(width_in: float, curves: Mapping[str, ErrorCurve], x: str, *, log
         right.set_yscale("log")
         _plain_ticks(right.yaxis)
     else:
-        right.set_ylim(bottom=0)
+        right.set_ylim(0, 1.1 * spreads.max())
     for axes in (left, right):
         if logarithmic:
             axes.set_xscale("log")
@@ -131,24 +147,33 @@ def room(width_in: float, scenario: Scenario) -> Figure:
                 axes.text(middle_x, middle_y, text, ha="center", va="center", rotation=turned, color=INK)
         for k, body in enumerate(scenario.bodies):
             own = {tag.id: tags[tag.id][[x, y]] for tag in scenario.tags if tag.body == body.name}
-            _draw_body(axes, body.name, paths[body.name][:, [x, y]], own, look(k), middle[[x, y]])
+            _draw_body(axes, body.name, paths[body.name][:, [x, y]], own, look(k))
+            if axes is panels[0] and own:
+                _number_tags(axes, own, middle[[x, y]])
         limits: dict[str, Any] = {"xlim": (low[x], high[x]), "ylim": (low[y], high[y]), "aspect": "equal"}
         axes.set(title=name, xlabel=f"{'xyz'[x]} (m)", ylabel=f"{'xyz'[y]} (m)", axisbelow=True, **limits)
         axes.grid(True)
     legend(figure, panels[0])
+    figure.draw_without_rendering()  # only a second layout knows the sizes that equal scales leave
     return figure
 
 
-def _draw_body(axes: Axes, name: str, path: Floats, tags: Mapping[int, Floats], own: Look, middle: Floats) -> None:
-    """Draw a path (n, 2), and tags with their numbers at the first, towards `middle` (2,)."""
+def _draw_body(axes: Axes, name: str, path: Floats, tags: Mapping[int, Floats], own: Look) -> None:
+    """Draw a path (n, 2), and tags."""
     axes.plot(*path.T, color=own.colour, lw=0.6, alpha=0.6)
     spots = np.array(list(tags.values())).reshape(-1, 2)
-    mark(axes.plot(*spots.T, own.marker, color=own.colour, ms=4, label=name)[0], name)
-    if tags:
-        left, down = (spots[0] > middle).tolist()
-        place: dict[str, Any] = {"ha": "right" if left else "left", "va": "top" if down else "bottom", "color": INK}
-        away = (-4 if left else 4, -4 if down else 4)
-        axes.annotate(", ".join(map(str, tags)), tuple(spots[0]), away, textcoords="offset points", **place)
+    mark(axes.plot(*spots.T, own.marker, color=own.colour, ms=4, label=name, zorder=10)[0], name)
+
+
+def _number_tags(axes: Axes, tags: Mapping[int, Floats], middle: Floats) -> None:
+    """Write the numbers of a body's tags at the first, towards `middle` (2,), above all paths."""
+    first = next(iter(tags.values()))
+    left, down = (first > middle).tolist()
+    place: dict[str, Any] = {"ha": "right" if left else "left", "va": "top" if down else "bottom", "color": INK}
+    ground = {"boxstyle": "round,pad=0.15", "fc": GRID, "ec": "none", "alpha": 0.85}
+    away = (-6 if left else 6, -6 if down else 6)
+    text = ", ".join(map(str, tags))
+    axes.annotate(text, tuple(first), away, textcoords="offset points", bbox=ground, zorder=9, **place)
 
 
 def timing(width_in: float, scenario: Scenario, name: str) -> Figure:
@@ -283,7 +308,7 @@ def _maps(
         axes.pcolormesh(cells[1], cells[0], values, cmap="cividis", vmin=low, vmax=high)
         for (up, right), value in np.ndenumerate(values if values.shape[1] <= MAX_NUMBERS else values[:0]):
             colour = "white" if value < (low + high) / 2 else "black"
-            axes.text(right, up, f"{value:#.3g}".replace("-", "−"), ha="center", va="center", color=colour)
+            axes.text(right, up, three_digits(value).replace("-", "−"), ha="center", va="center", color=colour)
         for axis, own in ((axes.xaxis, x), (axes.yaxis, y)):
             kept = np.arange(len(own))[:: max(1, len(own) // 6)]
             axis.set_ticks(kept, labels=[f"{value:g}" for value in own[kept]])

@@ -6,6 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -85,6 +86,10 @@ class Simulated(Contents):
         Raises `RecordingExistsError` if the file exists, unless `force` is set.
         """
         Contents.save(replace(self, frames=list(frames)), path, force=force)
+
+    def _repr_html_(self) -> str:
+        """Return these lines and the first exchanges for a notebook."""
+        return f"<pre>{escape(repr(self))}</pre>{self.exchanges._repr_html_()}"
 
     def __repr__(self) -> str:
         """Return a few lines: counts, errors of the raw ranges, and failures."""

@@ -123,6 +123,16 @@ def test_markers_that_are_other_radios_are_seen(starloc, tmp_path, marker_of, wr
     }
 
 
+def test_coarse_ranges_that_follow_fast_are_not_doubled_exchanges(tmp_path):
+    """At 33 Hz a pair, in centimetres and whole decibels, one row in fifty equals the pair's last."""
+    numbers = RNG(1).normal((3.0, -80.0), (0.04, 1.0), (3000, 2))
+    ends = ("1,2", "1,3", "2,3")
+    lines = [f"{k / 100:.2f},{ends[k % 3]},{r:.2f},{p:.0f},3.0" for k, (r, p) in enumerate(numbers)]
+    (tmp_path / "t.csv").write_text("\n".join(["time_s,from_id,to_id,range_m,fpp1,gt_range_m", *lines, ""]))
+    import_recording(tmp_path / "t.csv", tmp_path / "t.uwb")
+    assert [finding.fault for finding in calib.examine(tmp_path / "t.uwb")] == ["static data"]
+
+
 def test_logs_of_both_robots_are_doubled_exchanges(tmp_path):
     with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as tar:
         logs = [one for one in tar.getnames() if one.endswith("uwb_range.csv")]

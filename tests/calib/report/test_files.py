@@ -64,13 +64,17 @@ def test_a_campaign_is_what_the_command_makes(folder, tmp_path, monkeypatch, sec
         return whole(path, **kwargs)
 
     monkeypatch.setattr(Recording, "open", noted)
-    told: list[str] = []
+    told: list[str | float] = []
     campaign = calib.run_campaign(folder / "a.uwb", folder / "b.uwb", loss="huber", progress=told.append)
     assert opened == ["a.uwb", "b.uwb"], "each is opened once, and looked at whole whenever it is opened"
-    assert (told, len(campaign.tracks)) == (["loading", "fitting", "examining", "localizing"], 3)
+    assert (told[::2], len(campaign.tracks)) == (["loading", "fitting", "examining", "localizing"], 3)
     assert repr(campaign).splitlines()[-1] == "judged on b.uwb"
     campaign = replace(campaign, origin=replace(campaign.origin, files={}))
-    campaign.write(tmp_path / "python.html")
+    campaign.write(tmp_path / "python.html", progress=told.append)
+    # The time left follows from the share that is done, of the fit and the drawing together.
+    shares = [one for one in told if not isinstance(one, str)]
+    assert (shares, shares[0], sum(share >= 0.65 for share in shares)) == (sorted(set(shares)), 0.0, 1)
+    assert [one for one in told if isinstance(one, str)][4:] == ["drawing delays", "writing the page"]
     monkeypatch.chdir(folder)
     words = "report a.uwb --tests b.uwb -o command.html --loss huber --json --figures drawn"
     done = CliRunner().invoke(app, words.split(), catch_exceptions=False)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests import processes
 from uwblink.errors import ImportTableError, PlanError
 from uwblink.exporters import export_recording
 from uwblink.importers import add_poses
@@ -95,6 +96,18 @@ def recording(tmp_path):
         (tmp_path / "tum" / name).rename(tmp_path / name)
     Contents(exchanges=e, tags=tags).save(tmp_path / "r.uwb")
     return tmp_path / "r.uwb"
+
+
+def test_bodies_without_poses_are_named_whether_some_or_no_ranges_have_both_ends(recording, tmp_path):
+    """Of pairs 1-2, 1-9 and 2-9 the car's and the drone's have poses, or none."""
+    places, files = tmp_path / "places.toml", ["--from", f"car={tmp_path / 'car.tum'}"]
+    done = processes.run("uwblink", "poses", recording, *files, "--from", f"drone={tmp_path / 'drone.tum'}")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "5 of 15 measurements have a true distance; no poses of tag9" in done.stdout
+    places.write_text("".join(f'[[tags]]\nid = {k}\nbody = "{name}"\n' for k, name in ((1, "Car"), (2, "car"))))
+    done = processes.run("uwblink", "poses", recording, *files, "--tags", places, "--offset", "auto", "--force")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "bodies are car, those of the tags Car, car" in done.stderr
 
 
 def test_trajectories_of_several_bodies_and_anchors(recording, tmp_path):

@@ -14,8 +14,9 @@ from tests.browser import lies_well
 from tests.shared_data import ROOT
 from uwblink import PROTOCOLS
 from uwblink.pages.figures import picture, style
+from uwblink.ticks import METRES_PER_TICK
 from uwbsim.pages import write_sweep_page
-from uwbsim.pages.figures import error_over, result_over_keys, room, timing
+from uwbsim.pages.figures import error_over, histograms, result_over_keys, room, timing
 from uwbsim.protocols.comparison import ErrorCurve
 
 SCENARIOS = ROOT / "scenarios"
@@ -36,6 +37,7 @@ def test_a_room_is_to_scale_within_its_walls(width):
     low, high = np.array(scenario.room.min_m), np.array(scenario.room.max_m)
     scales = []
     for axes, (x, y) in zip(figure.axes, ((0, 1), (0, 2)), strict=True):
+        assert axes.get_tightbbox().y0 > 0, "its label lies in the picture"
         box = axes.get_window_extent()
         scales += [box.width / np.ptp(axes.get_xlim()), box.height / np.ptp(axes.get_ylim())]
         for limits, k in ((axes.get_xlim(), x), (axes.get_ylim(), y)):
@@ -79,7 +81,8 @@ def folder(tmp_path_factory):
     processes.succeed("uwbsim", "show", NLOS_OFFICE, "-o", folder / "scene.html")
     (folder / "out").mkdir()
     (folder / "out" / "compare.csv").write_text("old")
-    done = processes.succeed("uwbsim", "compare", BENCH, "-o", folder / "out", "-n", 3000, "--force", "--json")
+    more = ["--force", "--json", "--figures", folder / "paper"]
+    done = processes.succeed("uwbsim", "compare", BENCH, "-o", folder / "out", "-n", 3000, *more)
     (folder / "told.json").write_text(done.stdout)
     return folder
 
@@ -89,7 +92,8 @@ def folder(tmp_path_factory):
 def test_pages_lie_well(width, name, folder, tmp_path):
     page = (folder / f"{name}.html").read_text()
     lies_well(page, width, tmp_path)
-    assert (page.count("<figure>"), page.count("src='http")) == (5, 0)
+    # Boards on a bench have one distance and one power, so nothing is drawn over these.
+    assert (page.count("<figure>"), page.count("src='http")) == (5 if name == "scene" else 3, 0)
     assert ("log axis" in page) == ("logarithmic beyond" in page) == (name == "out/compare")
 
 
@@ -100,6 +104,30 @@ def test_a_comparison_has_tables_and_json_and_takes_the_place_of_no_other(folder
     with (folder / "out" / "compare.csv").open(newline="") as stream:
         assert [float(row["std_m"]) for row in csv.DictReader(stream)] == [row["std_m"] for row in said]
     processes.refuse("uwbsim", "compare", BENCH, "-o", folder / "out", "-n", 10, naming=["--force"])
+
+
+def test_figures_for_a_paper_stand_in_a_folder_of_their_own(folder):
+    names = ("errors", "over-relative-skew-of-the-clocks", "over-delay-of-the-scheduled-message")
+    files = {f"{name}-{form}" for name in names for form in ("page.svg", "page.pdf", "column.svg", "column.pdf")}
+    assert {path.name for path in (folder / "paper").iterdir()} == files
+    more = ["-n", 10, "--figures", folder / "paper"]
+    processes.refuse("uwbsim", "compare", BENCH, "-o", folder / "new", *more, naming=["paper", "--force"])
+    assert not (folder / "new").exists()
+
+
+def test_protocols_far_apart_are_drawn_about_their_medians_and_whole_half_ticks_as_one_hill():
+    half = METRES_PER_TICK / 2
+    ticks = np.rint(np.random.default_rng(1).normal(0.0, 8.0, 20_000))
+    shown = histograms(7.16, {"ss": 2.8 + half * ticks, "ds": 0.05 + half * (ticks + 0.3)}).axes[0]
+    heights = shown.patches[0].get_data().values
+    # A normal density of 8 half ticks changes by 8 % of its top, at most, over one; a bin with one more by all of it.
+    assert np.abs(np.diff(heights)).max() < 0.2 * heights.max()
+    texts = [text.get_text() for text in shown.figure.legends[0].get_texts()]
+    assert (texts, shown.get_xlabel()) == (
+        ["ss, median +280.0 cm", "ds, median +5.1 cm"], "range error less its median (cm)"
+    )  # fmt: skip
+    alike = histograms(7.16, {"ss": half * ticks, "ds": half * (ticks + 3)})
+    assert alike.axes[0].get_xlabel() == "range error (cm)"
 
 
 def judged(flight):
@@ -140,11 +168,11 @@ def test_bands_over_seeds_reach_from_the_least_to_the_largest():
 
 def test_two_keys_make_a_map_of_medians_over_seeds():
     keys: dict[str, list[object]] = {"a": [1.0, 1.0, 2.0, 2.0] * 2, "b": [10.0, 20.0] * 4}
-    result = np.array([1.0, 2.0, 3.0, 4.0, 3.0, 4.0, 5.0, 6.0])
+    result = np.array([1.0, 2.0, 300.0, 4.0, 3.0, 4.0, 500.0, 2020.0])
     (axes,) = result_over_keys(7.16, keys, ["ds"] * 8, result, "figure").axes
-    assert axes.collections[0].get_array().tolist() == [[2.0, 4.0], [3.0, 5.0]]
+    assert axes.collections[0].get_array().tolist() == [[2.0, 400.0], [3.0, 1012.0]]
     numbers = {text.get_position(): text.get_text() for text in axes.texts}
-    assert numbers == {(0, 0): "2.00", (1, 0): "4.00", (0, 1): "3.00", (1, 1): "5.00"}
+    assert numbers == {(0, 0): "2.00", (1, 0): "400", (0, 1): "3.00", (1, 1): "1012"}
 
 
 def test_words_and_many_keys_are_drawn_key_by_key():
