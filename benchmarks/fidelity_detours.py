@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.metrics import roc_auc_score
 
 from benchmarks.fidelity_errors import DATA, PREDICTED, TUNED, Row
 from benchmarks.nlos import DETOUR_M, RESPONSE, RISE, ROOMS, of_real_flight, of_room, published_error_m
@@ -40,12 +39,6 @@ def detour_rows() -> list[Row]:
             "their ranges more than 30 cm too long",
             f"{np.sum(beyond[known])} of {np.sum(known)}",
             f"{100 * late.mean():.0f} %",
-            PREDICTED,
-        ),
-        (
-            "AUC of each alone for these",
-            ", ".join(f"{roc_auc_score(beyond[known], real[known, k]):.2f}" for k in (RESPONSE, RISE)),
-            ", ".join(f"{roc_auc_score(late, simulated[:, k]):.2f}" for k in (RESPONSE, RISE)),
             PREDICTED,
         ),
     ]

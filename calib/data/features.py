@@ -19,9 +19,8 @@ from uwblink.recording.file import Recording
 from uwblink.recording.schema import CirRow
 from uwblink.twr import Exchanges
 
-TAPS_BEFORE, TAPS_AFTER, QUIET_FROM = 20, 100, 50
-"""Taps around the first path that count, and the tap from which there is only noise up to well before it. A response of
-100 taps (100 ns) contains detours of 30 m."""
+TAPS_BEFORE, TAPS_AFTER = 20, 100
+"""Taps around the first path that count. A response of 100 taps (100 ns) contains detours of 30 m."""
 
 Columns = Mapping[str, NDArray[Any]]
 
@@ -32,13 +31,13 @@ def response_features(magnitudes: Iterable[int], first_path_index: float) -> tup
     Both are NaN where the first path lies too near to the ends of the response.
     """
     taps = np.asarray(magnitudes, dtype=np.float64)
-    inside = QUIET_FROM + 3 * TAPS_BEFORE <= first_path_index <= len(taps) - TAPS_AFTER
-    first = int(first_path_index) if inside else 0
-    own = taps[first + 1 : first + 4]
-    if not inside or not own.any():
+    first = int(first_path_index) if 0 <= first_path_index <= len(taps) - TAPS_AFTER else 0
+    # From tap 50 on, up to well before the first path, there is only noise.
+    quiet, own = taps[50 : max(first - 2 * TAPS_BEFORE, 0)], taps[first + 1 : first + 4]
+    if len(quiet) < TAPS_BEFORE or not own.any():
         return np.nan, np.nan
     near = taps[first - TAPS_BEFORE : first + TAPS_AFTER]
-    noise = np.sqrt(np.mean(taps[QUIET_FROM : first - 2 * TAPS_BEFORE] ** 2) / 2)
+    noise = np.sqrt(np.mean(quiet**2) / 2)
     # Magnitudes of noise are Rayleigh-distributed: of 20 taps one in 10,000 is above five deviations of a part.
     begins = int(np.argmax(near > 5 * noise)) - TAPS_BEFORE
     return float(10 * np.log10(np.sum(near**2) / np.sum(own**2))), float(1 + np.argmax(own) - begins)

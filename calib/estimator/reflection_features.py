@@ -18,7 +18,6 @@ from calib.estimator.range_rows import Part
 from calib.estimator.unknowns import Prior, Unknown
 from uwblink.arrays import Floats
 
-KIND = "odds of feature"
 UNIT_OF_PRIOR = np.array([3.0, 3.0, 2.0])
 """Changes of `FEATURES` (dB, dB, taps) that may well change the odds of a reflection by a factor of e: the standard
 deviation of the prior of a slope is one a unit. Chips' makers take 6 dB for a sign of a reflection (DW1000 user manual,
@@ -53,8 +52,10 @@ class ReflectionFeatures:
     def block(self) -> tuple[Unknown, Part]:
         """Return the slopes of the log odds as unknowns, and the part that ranges have in them."""
         names = (*(FEATURES[k] for k in self.number), "unknown")
-        unknown = logarithms(KIND, names, np.zeros(len(names)), Prior.of_deviation(1.0))
-        return unknown, Part(parameter="odds", kind=KIND, columns=np.arange(len(names))[None], values=self.values)
+        unknown = logarithms("odds of feature", names, np.zeros(len(names)), Prior.of_deviation(1.0))
+        return unknown, Part(
+            parameter="odds", kind="odds of feature", columns=np.arange(len(names))[None], values=self.values
+        )
 
     def state(self, stated: ErrorModel, slopes: Floats, share: Floats) -> ErrorModel:
         """Return an error model with the features whose `slopes` (k + 1,) were fitted.

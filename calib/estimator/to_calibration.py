@@ -22,7 +22,7 @@ from calib.estimator.covariates import COMMON, OF_PLACES, OWN, OWN_WARMTH, WARMT
 from calib.estimator.known_distances import LARGEST_SPREAD_M, DescribedErrors, KnownDistances, described_errors
 from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel, SplineValues
 from calib.estimator.range_rows import RESIDUAL
-from calib.estimator.reflection_features import KIND, ReflectionFeatures
+from calib.estimator.reflection_features import ReflectionFeatures
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
 from calib.range_errors.densities import LONG_FACTOR, LongDetours
 from calib.spread import robust_spread
@@ -284,7 +284,7 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
     )
     if (features := ReflectionFeatures.of(model.ranges)) is not None:
         share = stated.shapes(model.lifted, model.ranges.initiator, model.ranges.target).tail_share
-        stated = features.state(stated, values[KIND], share)
+        stated = features.state(stated, values["odds of feature"], share)
     return _with_quantiles(stated, model, residual)
 
 
