@@ -28,7 +28,7 @@ from uwbsim.twins import Compared
 from uwbsim.world.world import World
 
 
-def three_digits(value: float) -> str:
+def three_digits(value: Any) -> str:
     """Return a number with three digits, or all before the point: 0.123, 17.9, 1012."""
     return f"{value:#.3g}".rstrip(".") if abs(value) < 999.5 else f"{value:.0f}"
 
