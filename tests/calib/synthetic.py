@@ -1,5 +1,7 @@
 """Ranges with planted delays and curve, made without the simulator."""
 
+from typing import Any
+
 import numpy as np
 
 from calib.calibration.model import Calibration
@@ -45,9 +47,9 @@ def constant_curve(value_m):
     return Curve((0.0,) * 4 + (9.0,) * 4, (value_m,) * 4, 3, (0.0, 9.0))
 
 
-def calibration(delays_ns, sigma_m, **more):
+def calibration(delays_ns: dict[int, float], sigma_m: float, **more: Any) -> Calibration:
     """Return a calibration with the same noise at every power, no bias, and delays that are known exactly."""
-    known = {"delays_std_ns": dict.fromkeys(delays_ns, 0.0), "loss": "cauchy", "scale_ns": 0.1} | more
+    known: dict[str, Any] = {"delays_std_ns": dict.fromkeys(delays_ns, 0.0), "loss": "cauchy", "scale_ns": 0.1} | more
     return Calibration(
         delays_ns=delays_ns, lift="mean-of-lifted", alpha_dbm=-82.0, speed_of_light=SPEED_OF_LIGHT,
         bias_curve=constant_curve(0.0), sigma_curve=constant_curve(sigma_m), **known,

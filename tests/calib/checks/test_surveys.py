@@ -19,7 +19,7 @@ def save(world, path, known="line", distances=(), power_dbm=None):
     """Write a world as a recording of double-sided exchanges, its arrangements marked."""
     r, count = world.ranges, len(world.places)
     power = r.fpp1_dbm if power_dbm is None else np.full(len(r), power_dbm)
-    x = stamped(r.time_ns, np.column_stack([r.initiator, r.target]), r.raw_m, (power, power))
+    x = stamped(r.time_ns, np.column_stack([r.initiator, r.target]), r.raw_m, np.stack([power, power]))
     marks = [Arrangement("ABCDEFGH"[k], HELD_NS * k, HELD_NS * (k + 1) - 5 * 10**9, known) for k in range(count)]
     Contents(exchanges=x, arrangements=marks, known_distances=list(distances)).save(path)
     return path

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib import BadInputError, UnanswerableError, fit, sample_flight
+from calib import BadInputError, Calibration, UnanswerableError, fit, sample_flight
 from calib.data.sources import Flight, load_flight
 from calib.evaluation.localization import (
     fixed_std,
@@ -45,7 +45,7 @@ def beginning(flight, seconds):
     return replace(flight, ranges=flight.ranges[early])
 
 
-def clean(flight: Flight, sigma_m=0.08):
+def clean(flight: Flight, sigma_m=0.08) -> tuple[Flight, Calibration]:
     """True distances with Gaussian noise and nothing else, and a calibration that says so."""
     rng = np.random.default_rng(4)
     ranges = flight.ranges
@@ -116,8 +116,8 @@ def test_a_calibration_is_worth_at_least_a_third_of_the_error(flights, fitted):
 
 def test_fixed_variances_are_those_of_the_training_flight(flights, fitted):
     """Of noise of 8 cm values of the grid near it err least."""
-    flight, known = clean(beginning(flights["test1"], 20))
-    found = fixed_std(known, Settings(seeds=1), flight)
+    flight, exact = clean(beginning(flights["test1"], 20))
+    found = fixed_std(exact, Settings(seeds=1), flight)
     assert found.std_m["calibrated"] in (0.07, 0.1, 0.14)
     assert "tuned on" in found.source
     known = fixed_std(fitted, Settings())
