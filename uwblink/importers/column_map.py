@@ -102,7 +102,7 @@ KINDS: Final = (
 )
 """The kind of each column; those with units have the name of their key in `units`."""
 
-UNITS: Final[dict[str, Mapping[str, float]]] = (
+UNITS_BY_KEY: Final[dict[str, Mapping[str, float]]] = (
     {"stamps": STAMP_UNITS, "time": TIME_UNITS | {"iso": 1.0}, "skew": CHIPS["other"].skew_ppm}
     | dict.fromkeys(("distance", *DISTANCES), DISTANCE_UNITS)
     | dict.fromkeys(("range_m", "difference_m"), DISTANCE_UNITS | FLIGHT_UNITS)
@@ -297,8 +297,8 @@ class ColumnMap:
 
     def factor(self, name: str) -> float:
         """Return what a column of `NAMES` is multiplied by, so that it is in ticks, m, dBm or ppm."""
-        units = CHIPS[self.chip or "other"].skew_ppm if name in SKEWS else UNITS.get(name, UNITS.get(KINDS[name], {}))
-        unit = self.unit_of(name)
+        known = UNITS_BY_KEY | {"skew": CHIPS[self.chip or "other"].skew_ppm}
+        units, unit = known.get(name, known.get(KINDS[name], {})), self.unit_of(name)
         return unit * TICKS_PER_SECOND if is_number(unit) else units.get(unit, 1.0)
 
 
@@ -334,12 +334,12 @@ def load_map(path: Path) -> ColumnMap:
     for text in (*(table[name] for name in templates), *file.section("topics")):
         for place in places(Template(text)):
             _place(place, columns, units)
-    file.known(units, UNITS, "units.")
+    file.known(units, UNITS_BY_KEY, "units.")
     chip = file.choice("chip", table.get("chip"), (None, *CHIPS))
     _check_columns(file, columns, wide, chip)
     _check_values(file, ids)
     registers = {name: value for name, value in columns.items() if isinstance(value, dict)}
-    allowed = UNITS | {"skew": CHIPS[chip or "other"].skew_ppm}
+    allowed = UNITS_BY_KEY | {"skew": CHIPS[chip or "other"].skew_ppm}
     for name, unit in units.items():
         if name != "stamps" or not is_number(unit) or unit <= 0:  # the length of a unit of stamps in seconds
             file.choice(f"units.{name}", unit, allowed[name])
@@ -415,7 +415,7 @@ def _place(place: str, columns: dict[str, Any], units: dict[str, Any]) -> None:
     """State which column a place such as `gt_range_cm` is, and its unit."""
     stem, _, unit = place.rpartition("_")
     for name in ("time_s", *DISTANCES):
-        if stem == name.rpartition("_")[0] and unit in UNITS[name if name in UNITS else "time"]:
+        if stem == name.rpartition("_")[0] and unit in UNITS_BY_KEY[name if name in UNITS_BY_KEY else "time"]:
             columns.setdefault(name, place)
             if place == name and "distance" in units:
                 continue  # our own name, whose unit is stated

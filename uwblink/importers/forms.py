@@ -24,7 +24,7 @@ from uwblink.importers.column_map import (
     POSITIONS,
     POWERS,
     TIME_UNITS,
-    UNITS,
+    UNITS_BY_KEY,
     ColumnMap,
     map_of_lines,
 )
@@ -289,7 +289,7 @@ def units_of(form: ColumnMap, columns: dict[str, str], cells: dict[str, Floats])
         if found["time"][0] == ASKED and "time" in form.units:
             found["time"] = form.units["time"], "as times in bags"
     named = {name: _header(form, name, columns[name]) for name in DISTANCES if name in columns}
-    units = {name: unit for name, header in named.items() if (unit := unit_in(header, UNITS[name]))}
+    units = {name: unit for name, header in named.items() if (unit := unit_in(header, UNITS_BY_KEY[name]))}
     alike, value = set(units.values()), "difference_m" if "difference_m" in cells else "range_m"
     if form.line and "distance" in form.units:
         found["distance"] = form.units["distance"], "as these boards print"
@@ -297,7 +297,7 @@ def units_of(form: ColumnMap, columns: dict[str, str], cells: dict[str, Floats])
         found["distance"] = next(iter(units.values())), "by the columns' names"
         units = {}
     elif value in cells and value not in units and (why := reason_against_metres(cells[value])):
-        listed = ", ".join(UNITS[value])
+        listed = ", ".join(UNITS_BY_KEY[value])
         found["distance" if value == "range_m" else value] = ASKED, f"{why}: write {listed}"
     found |= {name: (unit, "by the column's name") for name, unit in units.items()}
     if "range_m" in named and "range_m" not in units and re.search("tof|flight", named["range_m"].lower()):

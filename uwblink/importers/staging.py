@@ -29,7 +29,7 @@ from uwblink.importers.column_map import (
     NAMES,
     POWERS,
     SKEWS,
-    UNITS,
+    UNITS_BY_KEY,
     ColumnMap,
 )
 from uwblink.importers.devices import CHIPS, power_sql
@@ -280,7 +280,7 @@ def _cell(table: SourceTable, name: str, text: str) -> str:
         return f"trim({text})"
     if kind == "time":
         unit = column_map.unit_of(name)
-        return time_ns(text, unit, UNITS["time"][unit or "s"])
+        return time_ns(text, unit, UNITS_BY_KEY["time"][unit or "s"])
     if kind == "message":
         return message_number(text)
     if kind == "event":
