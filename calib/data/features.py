@@ -19,9 +19,6 @@ from uwblink.recording.file import Recording
 from uwblink.recording.schema import CirRow
 from uwblink.twr import Exchanges
 
-TAPS_BEFORE, TAPS_AFTER = 20, 100
-"""Taps around the first path that count. A response of 100 taps (100 ns) contains detours of 30 m."""
-
 Columns = Mapping[str, NDArray[Any]]
 
 
@@ -31,15 +28,17 @@ def response_features(magnitudes: Iterable[int], first_path_index: float) -> tup
     Both are NaN where the first path lies too near to the ends of the response.
     """
     taps = np.asarray(magnitudes, dtype=np.float64)
-    first = int(first_path_index) if 0 <= first_path_index <= len(taps) - TAPS_AFTER else 0
+    # Taps around the first path that count: 100 of them (100 ns) contain detours of 30 m.
+    before, after = 20, 100
+    first = int(first_path_index) if 0 <= first_path_index <= len(taps) - after else 0
     # From tap 50 on, up to well before the first path, there is only noise.
-    quiet, own = taps[50 : max(first - 2 * TAPS_BEFORE, 0)], taps[first + 1 : first + 4]
-    if len(quiet) < TAPS_BEFORE or not own.any():
+    quiet, own = taps[50 : max(first - 2 * before, 0)], taps[first + 1 : first + 4]
+    if len(quiet) < before or not own.any():
         return np.nan, np.nan
-    near = taps[first - TAPS_BEFORE : first + TAPS_AFTER]
+    near = taps[first - before : first + after]
     noise = np.sqrt(np.mean(quiet**2) / 2)
     # Magnitudes of noise are Rayleigh-distributed: of 20 taps one in 10,000 is above five deviations of a part.
-    begins = int(np.argmax(near > 5 * noise)) - TAPS_BEFORE
+    begins = int(np.argmax(near > 5 * noise)) - before
     return float(10 * np.log10(np.sum(near**2) / np.sum(own**2))), float(1 + np.argmax(own) - begins)
 
 

@@ -4,6 +4,7 @@ import csv
 import json
 import re
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -119,7 +120,8 @@ def test_protocols_far_apart_are_drawn_about_their_medians_and_whole_half_ticks_
     half = METRES_PER_TICK / 2
     ticks = np.rint(np.random.default_rng(1).normal(0.0, 8.0, 20_000))
     shown = histograms(7.16, {"ss": 2.8 + half * ticks, "ds": 0.05 + half * (ticks + 0.3)}).axes[0]
-    heights = shown.patches[0].get_data().values
+    hill: Any = shown.patches[0]
+    heights = hill.get_data().values
     # A normal density of 8 half ticks changes by 8 % of its top, at most, over one; a bin with one more by all of it.
     assert np.abs(np.diff(heights)).max() < 0.2 * heights.max()
     texts = [text.get_text() for text in shown.figure.legends[0].get_texts()]
