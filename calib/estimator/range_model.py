@@ -51,9 +51,6 @@ change nothing (the study of `make accuracy`)."""
 MIN_RANGES_OF_GROUP = 20
 """Minimum number of ranges for the curve of a group."""
 
-SAME_POWER = 1e-6
-"""Lifted powers that differ by less count as equal."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SplineValues:
@@ -121,7 +118,8 @@ class RangeModel:
         lifted = np.where(powered, lifted, np.median(lifted[powered]) if powered.any() else 1.0)
         ordered = np.sort(lifted)
         low, high = populated(ordered)
-        varied = high - low > SAME_POWER
+        # Lifted powers that differ by less are rounding errors of one.
+        varied = high - low > 1e-6
         curve = varied and not settings.delays_only
         if curve and trimmed:
             inside = (lifted >= low) & (lifted <= high)
