@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 import typer
 
@@ -36,7 +37,7 @@ def flat(table, above=""):
     """Every key of a JSON document, dotted; names that people or data choose in capitals."""
     for key, value in table.items():
         free = dict.fromkeys(("delays_ns", "delays_std_ns", "antenna_delays"), "TAG")
-        free |= {"groups": "NAME", "provenance": "KEY"}
+        free |= {"groups": "NAME", "errors.features": "NAME", "provenance": "KEY"}
         name = free.get(above, key)
         name = "PAIR" if above in ("errors.pairs", "pair_offsets") else name
         dotted = f"{above}.{name}".strip(".")
@@ -60,7 +61,9 @@ def test_the_reference_of_calibrations_has_every_key_of_files_and_no_other():
     slopes = (TemperatureSlope((1,), 0.002, 0.0, 20.0, (10.0, 30.0)),)
     found |= set(flat(json.loads(dataclasses.replace(calibration, patterns=patterns, temperatures=slopes).to_json())))
     ranges = calib.load_ranges(flight)
-    found |= set(flat(json.loads(calib.fit(ranges[ranges.initiator == 1]).calibration.to_json())))
+    rising = np.random.default_rng(1).poisson(2.0, (len(ranges), 3)).astype(np.float32)
+    for some in (ranges[ranges.initiator == 1], dataclasses.replace(ranges, features=rising)):
+        found |= set(flat(json.loads(calib.fit(some).calibration.to_json())))
     assert found == {key.name for key in CALIBRATION}
 
 

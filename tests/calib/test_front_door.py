@@ -20,7 +20,7 @@ from uwblink.pages.figures import style
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in calib.__all__ if not name.endswith("Error")])
+@pytest.mark.parametrize("name", [name for name in dir(calib) if not name.endswith("Error")])
 def test_the_examples_run(name, monkeypatch):
     monkeypatch.setattr(figures, "drawn", pages.outline)
     losses, sections = set(LOSSES), dict(SECTIONS)
