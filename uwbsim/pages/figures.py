@@ -60,6 +60,17 @@ def histograms(width_in: float, samples: Mapping[str, Floats]) -> Figure:
     titles = {name: f"{name}, median {100 * medians[name]:+.1f} cm" if apart else name for name in samples}
     looks = {name: look(k).line(marker=False) | {"label": titles[name]} for k, name in enumerate(samples)}
     outlines(axes, {name: 100 * errors for name, errors in samples.items()}, edges, looks)
+    hills: list[Any] = list(axes.patches)
+    heights = [hill.get_data().values for hill in hills]
+    top = 1.15 * max(inside[1:-1].max() for inside in heights)
+    for edge, side, at in ((0, "left", edges[1]), (-1, "right", edges[-2])):
+        if (share := max(inside[edge] for inside in heights)) > top > 0:
+            # A distribution that is far wider than the others would flatten them.
+            axes.set_ylim(0, top)
+            axes.annotate(
+                f"{share:.0f} %", (at, top), xytext=(4 if side == "left" else -4, -2), textcoords="offset points",
+                ha=side, va="top", fontsize="small",
+            )  # fmt: skip
     label(axes, "range error less its median (cm)" if apart else "range error (cm)", "ranges (%)")
     legend(figure)
     return figure

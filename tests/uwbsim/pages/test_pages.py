@@ -124,6 +124,13 @@ def test_protocols_far_apart_are_drawn_about_their_medians_and_whole_half_ticks_
     heights = hill.get_data().values
     # A normal density of 8 half ticks changes by 8 % of its top, at most, over one; a bin with one more by all of it.
     assert np.abs(np.diff(heights)).max() < 0.2 * heights.max()
+    # A protocol that is far wider fills the outermost bins, which do not flatten the others.
+    wide = {"ss": np.random.default_rng(2).normal(0.0, 2.0, 20_000), "ds": half * ticks}
+    drawn = histograms(7.16, wide).axes[0]
+    assert drawn.get_ylim()[1] < 8
+    # Beyond some 7 cm on either side lie 48.5 % of errors of 2 m.
+    assert {text.get_text() for text in drawn.texts} <= {"48 %", "49 %"}
+    assert len(drawn.texts) == 2
     texts = [text.get_text() for text in shown.figure.legends[0].get_texts()]
     assert (texts, shown.get_xlabel()) == (
         ["ss, median +280.0 cm", "ds, median +5.1 cm"], "range error less its median (cm)"
