@@ -32,6 +32,7 @@ from calib.calibration.document import (
     Share,
     StdM,
     joint,
+    number,
     one_of,
     pair_name,
 )
@@ -46,6 +47,7 @@ GATE: Final = 10.83
 
 
 FeatureName = Annotated[str, one_of(FEATURES)]
+LogOdds = Annotated[float, number(-50.0, 50.0, "a logarithm of odds, -50 to 50")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +74,16 @@ class PairErrors:
 class FeatureSlope:
     """What a feature adds to the log odds of a reflection for each unit above `centre`, between two `bounds`."""
 
-    log_odds: Number
+    log_odds: LogOdds
     centre: Number
     bounds: tuple[Number, Number]
+
+
+def _wrong_bounds(slope: FeatureSlope) -> str:
+    return "" if slope.bounds[0] <= slope.bounds[1] else "bounds: expected the lower before the upper"
+
+
+CheckedFeature = Annotated[FeatureSlope, joint(_wrong_bounds)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,8 +126,8 @@ class ErrorModel:
     between_m: StdM = 0.0
     pairs: dict[PairName, PairErrors] = field(default_factory=dict)
     lasting: LastingErrors | None = None
-    features: dict[FeatureName, FeatureSlope] = field(default_factory=dict)
-    known_log_odds: Number = 0.0
+    features: dict[FeatureName, CheckedFeature] = field(default_factory=dict)
+    known_log_odds: LogOdds = 0.0
 
     def log_odds_of(self, features: NDArray[np.floating]) -> Floats:
         """Return what `FEATURES` (n, 3) of ranges add to the log odds of a reflection (n,), 0 where all are unknown.

@@ -116,7 +116,7 @@ class TemperatureSlope:
 
 
 def _wrong_span(slope: TemperatureSlope) -> str:
-    return "" if slope.span_c[0] <= slope.span_c[1] else "expected the lowest of `span_c` before the highest"
+    return "" if slope.span_c[0] <= slope.span_c[1] else "span_c: expected the lowest before the highest"
 
 
 CheckedSlope = Annotated[TemperatureSlope, joint(_wrong_span)]

@@ -130,14 +130,20 @@ def test_filters_are_given_the_probability_of_each_range():
 def test_files_keep_the_slopes_and_refuse_others(tmp_path):
     known = fitted(71)
     assert calib.Calibration.from_json(known.to_json()).errors == known.errors
-    table = json.loads(known.to_json())
-    table["errors"]["features"]["colour"] = table["errors"]["features"].pop("rise_taps")
-    (tmp_path / "c.json").write_text(json.dumps(table))
-    done = call("calib", "show", tmp_path / "c.json")
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert "features" in done.stderr
-    assert "rise_taps" in done.stderr
+    good = {"log_odds": 1.0, "centre": 2.0, "bounds": [1.0, 9.0]}
+    for name, change in (
+        ("colour", {}),
+        ("rise_taps", {"bounds": [9.0, 1.0]}),
+        ("rise_taps", {"log_odds": 1e9}),
+        ("rise_taps", {"bounds": 3.0}),
+    ):
+        table = json.loads(known.to_json())
+        table["errors"]["features"] = {name: good | change}
+        (tmp_path / "c.json").write_text(json.dumps(table))
+        done = call("calib", "show", tmp_path / "c.json")
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+        for word in ("features", "rise_taps", *change):
+            assert word in done.stderr
     with pytest.raises(BadInputError, match="colour"):
         calib.Ranges.from_arrays([3.0], initiator=1, target=2, features={"colour": 1.0})
 
