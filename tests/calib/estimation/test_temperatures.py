@@ -115,7 +115,7 @@ def test_the_file_keeps_slopes_and_older_programs_refuse_it():
         calib.Calibration.from_json(text.replace('"span_c": [', '"span_c": [-500, '), "here")
     table = json.loads(text)
     table["temperatures"][0]["span_c"].reverse()
-    with pytest.raises(BadInputError, match="the lowest of `span_c` before the highest"):
+    with pytest.raises(BadInputError, match="span_c: expected the lowest before the highest"):
         calib.Calibration.from_json(json.dumps(table), "here")
     with pytest.raises(BadInputError, match=r"`temperature_c`: found 1, expected those of initiator and target"):
         known.correct(3.0, -85.0, -86.0, 1, 2, temperature_c=25.0)
