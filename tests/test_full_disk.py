@@ -96,6 +96,8 @@ COMMANDS = (
 )
 
 SAME = {
+    "uwbsim compare --figures": "calib compare --figures",
+    "uwbsim sweep --figures": "calib compare --figures",
     # One function writes what is drawn (uwblink.pages.blocks), and drawing takes seconds.
     "calib localize --figures": "calib compare --figures",
     "calib evaluate --figures": "calib compare --figures",

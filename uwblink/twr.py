@@ -93,7 +93,7 @@ class Exchanges(ColumnTable):
         given = {"tx1": tx1, "rx1": rx1, "tx2": tx2, "rx2": rx2, "tx3": tx3, "rx3": rx3}
         bare = all(values is None for values in given.values())
         if (first := range_m if tx1 is None else tx1) is None:
-            raise ArgumentError("tx1: is not given; give the stamps, or `range_m` where a device has none")
+            raise ArgumentError("tx1: is not given; give the stamps, or range_m where a device has none")
         count = arrays.length("range_m" if tx1 is None else "tx1", first)
         if bits not in BITS:
             raise ArgumentError(f"bits: found {bits!r:.40}, allowed: {', '.join(map(str, BITS))}")

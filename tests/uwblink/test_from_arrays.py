@@ -40,7 +40,7 @@ def test_ranges_without_stamps_are_those_of_a_table_without_stamps(tmp_path):
     for stamps, missing in cases:
         with pytest.raises(ArgumentError, match=f"{missing}: is not given"):
             Exchanges.from_arrays(1, 2, **stamps, range_m=[3.1])
-    with pytest.raises(ArgumentError, match="tx1: is not given; give the stamps, or `range_m`"):
+    with pytest.raises(ArgumentError, match="tx1: is not given; give the stamps, or range_m"):
         Exchanges.from_arrays(1, 2)
 
 

@@ -227,7 +227,9 @@ def add_poses(
         with_poses = [tag for tag in placed if tag.body in bodies]
         ids = [tag.tag for tag in with_poses]
         known = np.isin(first, ids) & np.isin(second, ids)
-        if not known.any():
+        # Places of anchors alone serve robots whose poses nobody knows; poses of a body that carries no tag do not.
+        strange = parts and bodies.isdisjoint(tag.body for tag in placed if tag.tag not in anchors)
+        if len(ids) < 2 or strange or not (known.any() or shift_ns is not None):
             found = ", ".join(sorted({tag.body for tag in placed})) or "none"
             raise ImportTableError(
                 f"{what}: its bodies are {', '.join(sorted(bodies))}, those of the tags {found}; "

@@ -33,8 +33,10 @@ ONLY_FROM_PYTHON = {
     # Named by the command itself, as its own option.
     *("seconds", "speed_m_s", "apart_m", "still_s", "noise_m", "size_m", "rate_hz", "tape_sigma_m", "anchor_sigma_m"),
     *("anchor_places", "reference"),
-    # A part of the error of differences of arrival.
-    "side",
+    # Parts of the error of ranges and of differences of arrival.
+    *("side", "odds"),
+    # Of ranges from arrays.
+    "features",
 }
 
 
