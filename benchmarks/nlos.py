@@ -35,7 +35,8 @@ BLOCKS = 6
 """Parts of the real flight, in order of time, of which each is left out once."""
 
 VENDOR_DB = 6.0
-"""Total less first-path power from which a range counts as reflected (DW1000 user manual, section 4.7.1)."""
+"""Total less first-path power from which a range counts as reflected (APS006, part 3): here the energy of the response,
+of which the chip makes its total power."""
 
 RESPONSE, RISE = FEATURES.index("response_db"), FEATURES.index("rise_taps")
 

@@ -96,11 +96,7 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
         with recording.copying(output, without=("exchanges", "corrected"), meta=meta, force=force) as written:
             for exchanges, poses in exchanges_with_poses(recording):
                 ranges = Ranges.from_exchanges(
-                    exchanges,
-                    poses=poses,
-                    tags=tags,
-                    source=Path(source).name,
-                    temperature=warm,
+                    exchanges, poses=poses, tags=tags, source=Path(source).name, temperature=warm
                 )
                 if features is not None:
                     ranges = replace(ranges, features=features[first : first + len(exchanges)])

@@ -97,7 +97,7 @@ CALIBRATION_KEYS: Final = (
         "errors.features.NAME.log_odds",
         "number",
         "no features",
-        "What a feature (`excess_db`, `response_db`, `rise_taps`) adds to the log odds of a reflection for each unit.",
+        "What a feature (`response_db`, `rise_taps`) adds to the log odds of a reflection for each unit.",
     ),
     FileKey("errors.features.NAME.centre", "number, dB or taps", "needed", "Where it adds nothing."),
     FileKey(

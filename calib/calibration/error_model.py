@@ -106,8 +106,8 @@ class ErrorModel:
     others. Without one there is one kind, as in calibrations of uwbcal up to 0.2.0. Of the noise `between_m` is what
     stays in the ranges of a pair for a recording, or a spell of it, and changes by the next; the uncertainty of delays
     and curve is in the noise, too.
-    `features` says what else tells reflections; ranges of which a feature is known have the log odds
-    `known_log_odds` besides, because `tail_share` is the share of ranges of which none is.
+    `features` are slopes of the log odds of a reflection. A range with a known feature has `known_log_odds` besides,
+    because `tail_share` is the share of reflections among ranges without.
     `lasting` says how long errors within the gate of a filter last; None where that is not known.
     """
 
@@ -130,7 +130,7 @@ class ErrorModel:
     known_log_odds: LogOdds = 0.0
 
     def log_odds_of(self, features: NDArray[np.floating]) -> Floats:
-        """Return what `FEATURES` (n, 3) of ranges add to the log odds of a reflection (n,), 0 where all are unknown.
+        """Return what `FEATURES` (n, 2) of ranges add to the log odds of a reflection (n,), 0 where all are unknown.
 
         One that is unknown beside others counts as at its centre.
         """

@@ -1,7 +1,7 @@
-"""Features of receptions beside the first-path power, which tell direct ranges from reflected ones.
+"""Features of impulse responses that indicate a reflection, from the table `cirs`.
 
-Total powers come from the table `powers`, impulse responses from `cirs`. A direct path too weak for the chip's
-threshold lies before the first path that the chip found: energy comes later, and the response rises more slowly.
+A direct path that is too weak for the chip's threshold lies before the first path that the chip found. Then more energy
+comes later, and the response rises more slowly.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.data.ranges import FEATURES, measured_powers
+from calib.data.ranges import FEATURES
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import CirRow
@@ -27,7 +27,7 @@ def response_features(magnitudes: Iterable[int], first_path_index: float) -> tup
 
     Both are NaN where the first path lies too near to the ends of the response.
     """
-    taps = np.asarray(magnitudes, dtype=np.float64)
+    taps = np.atleast_1d(np.asarray(magnitudes, dtype=np.float64))
     # Taps around the first path that count: 100 of them (100 ns) contain detours of 30 m.
     before, after = 20, 100
     first = int(first_path_index) if 0 <= first_path_index <= len(taps) - after else 0
@@ -43,23 +43,15 @@ def response_features(magnitudes: Iterable[int], first_path_index: float) -> tup
 
 
 def features_of(exchanges: Exchanges, source: object) -> NDArray[np.float32]:
-    """Return the `FEATURES` (n, 3) of exchanges by the tables `powers` and `cirs` of a source, NaN where unknown."""
-    totals: Columns = getattr(source, "powers", None) or {}
+    """Return the `FEATURES` (n, 2) of exchanges by the table `cirs` of a source, NaN where unknown."""
     found = np.full((len(exchanges), len(FEATURES)), np.nan, dtype=np.float32)
-    if len(totals.get("time_ns", ())):
-        rows, which = _exchange_of(exchanges, totals, early_ns=0, late_ns=0)
-        first_paths = np.column_stack([exchanges.fpp1_dbm, exchanges.fpp2_dbm])[which]
-        total = np.column_stack([totals["rxp1_dbm"], totals["rxp2_dbm"]])[rows]
-        excess = measured_powers(total) - measured_powers(first_paths)
-        found[:, 0] = _means(which, excess, len(exchanges))
     for some in _responses(source):
         of_ends = (some["board"] == some["initiator"]) | (some["board"] == some["target"])
         some = {name: column[of_ends] for name, column in some.items()}
-        # Boards print a response after its exchange, in MILUV 0.13 s in the median.
-        rows, which = _exchange_of(exchanges, some, early_ns=10_000_000, late_ns=400_000_000)
+        rows, which = _exchange_of(exchanges, some)
         told = [response_features(some["magnitudes"][row], some["first_path_index"][row]) for row in rows]
-        for k, values in enumerate(np.array(told).reshape(-1, 2).T, 1):
-            means = _means(which, values[:, None], len(exchanges))
+        for k, values in enumerate(np.array(told).reshape(-1, 2).T):
+            means = _means(which, values, len(exchanges))
             found[:, k] = np.where(np.isfinite(means), means, found[:, k])
     return found
 
@@ -81,10 +73,10 @@ def _column(values: list[Any]) -> NDArray[Any]:
     return column
 
 
-def _exchange_of(exchanges: Exchanges, rows: Columns, *, early_ns: int, late_ns: int) -> tuple[Ints, Ints]:
+def _exchange_of(exchanges: Exchanges, rows: Columns) -> tuple[Ints, Ints]:
     """Return which rows belong to an exchange (m,), and the exchange of each: the last one of their pair before them.
 
-    It lies up to `late_ns` before a row, and up to `early_ns` after it.
+    Boards print a response after its exchange, in MILUV 0.13 s in the median: it may be 0.4 s late, and 10 ms early.
     """
     pairs, time_ns = _pairs(exchanges.initiator, exchanges.target), exchanges.time_ns
     order = np.lexsort((time_ns, pairs))
@@ -92,9 +84,9 @@ def _exchange_of(exchanges: Exchanges, rows: Columns, *, early_ns: int, late_ns:
     found = np.full(len(own), -1)
     for pair in np.unique(own).tolist():
         some, mine = order[pairs[order] == pair], np.flatnonzero(own == pair)
-        before = np.searchsorted(time_ns[some], rows["time_ns"][mine] + early_ns, side="right") - 1
+        before = np.searchsorted(time_ns[some], rows["time_ns"][mine] + 10_000_000, side="right") - 1
         found[mine] = np.where(before >= 0, some[before] if len(some) else -1, -1)
-    late = rows["time_ns"] - time_ns[found] > late_ns if len(time_ns) else True
+    late = rows["time_ns"] - time_ns[found] > 400_000_000 if len(time_ns) else True
     belongs = np.flatnonzero((found >= 0) & ~late)
     return belongs, found[belongs]
 
@@ -104,8 +96,7 @@ def _pairs(initiator: Ints, target: Ints) -> Ints:
 
 
 def _means(which: Ints, values: Floats, count: int) -> Floats:
-    """Return the mean of finite values (m, k) by the exchange that they belong to (count,), NaN without any."""
+    """Return the mean of finite values (m,) by the exchange that they belong to (count,), NaN without any."""
     known = np.isfinite(values)
-    total = np.bincount(which, np.where(known, values, 0.0).sum(axis=1), count)
-    number = np.bincount(which, known.sum(axis=1), count)
+    total, number = np.bincount(which[known], values[known], count), np.bincount(which[known], minlength=count)
     return np.where(number > 0, total / np.maximum(number, 1), np.nan)

@@ -37,12 +37,13 @@ NO_STAMPS: Final = "range"
 STATIC: Final = "static"
 """The reason for which `without_static` leaves ranges out."""
 
-FEATURES: Final = ("excess_db", "response_db", "rise_taps")
-"""What tells reflected ranges beside the first-path power: total less first-path power as the chip reads them; the same
-of an impulse response; and the taps in which the first path rises from the noise to its peak. Each is the mean of the
-receptions of an exchange that have it.
+FEATURES: Final = ("response_db", "rise_taps")
+"""Features of impulse responses that indicate a reflection: their energy over that of the first path, in dB, and the
+number of taps in which the first path rises from the noise to its peak. Of an exchange they are means over receptions.
 
-The distance beside the power was tried, too: in 24 simulated rooms left out one by one it made predictions worse.
+Two others were tried. The distance beside the power made predictions worse in 24 simulated rooms left out one by one.
+Total less first-path power by the chip had a slope of the wrong sign in the public table that has both (Hanyang), and
+made predictions of its held-out ranges worse.
 """
 
 MAX_RANGE_M: Final = 1e4
@@ -71,7 +72,7 @@ class Ranges(ColumnTable):
     these exchanges, None without any. `toward` (n, 2, 3) are unit vectors from the antennas of initiator and target to
     each other, in the frames of their bodies, NaN where attitudes are not known; `turning` are tags whose bodies turn.
     `temperature_c` (n, 2) are the temperatures of initiator and target, NaN where no reading is near in time;
-    `features` (n, 3) are the `FEATURES` of their receptions, NaN where unknown.
+    `features` (n, 2) are the `FEATURES` of their receptions, NaN where unknown.
     `supply_v_per_k` is by how much the supply of a tag changes with its temperature, where it reads both.
 
     A row with a `listener` (-1 elsewhere) is a difference of arrival without stamps: by how much farther from the

@@ -44,7 +44,7 @@ class Source(Protocol):
 
     A simulation's result has these attributes. Used where they exist: `planted`, what a simulation put in, which is
     shown and never used (or `meta` with that entry, and with the programmed antenna delays); `faults`; `overheard`,
-    `temperature`, `powers` and `differences`, columns of the recording's tables; `cirs`, impulse responses.
+    `temperature` and `differences`, columns of the recording's tables; `cirs`, impulse responses.
     """
 
     @property
@@ -72,7 +72,7 @@ READERS: Final[dict[str, Callable[[Recording], Any]]] = {
     "faults": Recording.faults,
     **{
         table: partial(Recording.columns, table=table)
-        for table in ("overheard", "imu", "height", "temperature", "powers", "differences")
+        for table in ("overheard", "imu", "height", "temperature", "differences")
     },
     "arrangements": Recording.arrangements,
     "known_distances": Recording.known_distances,

@@ -18,10 +18,10 @@ from calib.estimator.range_rows import Part
 from calib.estimator.unknowns import Prior, Unknown
 from uwblink.arrays import Floats
 
-UNIT_OF_PRIOR = np.array([3.0, 3.0, 2.0])
-"""Changes of `FEATURES` (dB, dB, taps) that may well change the odds of a reflection by a factor of e: the standard
-deviation of the prior of a slope is one a unit. Chips' makers take 6 dB for a sign of a reflection (DW1000 user manual,
-section 4.7.1 and APS006), two of these."""
+UNIT_OF_PRIOR = np.array([3.0, 2.0])
+"""Changes of `FEATURES` (dB, taps) by which the odds of a reflection may change by a factor of e: the standard
+deviation of the prior of a slope is 1 for each. A judgement; makers of chips take 6 dB for a sign of a reflection
+(APS006, part 3), two of these."""
 
 
 @dataclass(frozen=True, kw_only=True)
