@@ -213,7 +213,7 @@ def end_patterns(
 
 
 def without_directions(ranges: Ranges) -> Ranges:
-    """Return ranges without the directions that true poses give: filters take those of their own estimates."""
+    """Return ranges without the directions by true poses, because filters use those by their own estimates."""
     return replace(ranges, toward=np.full_like(ranges.toward, np.nan))
 
 

@@ -304,6 +304,7 @@ def _run(
     States beside those of `RelativeFilter` are errors in units of their standard deviation: as in `run_filters` of
     pairs of tags and of an exchange, and of pairs of bodies what is not linear in their distances.
     """
+    # Raw ranges are not corrected, neither for patterns.
     raw = filters["dead reckoning"][0]
     corrected = np.array([one is not raw for one, _ in filters.values()])
     known, uses = [one for one, _ in filters.values()], np.stack([used for _, used in filters.values()], axis=1)
