@@ -21,12 +21,12 @@ from calib.calibration.comparison import CalibrationComparison
 from calib.calibration.model import Calibration
 from calib.data.ranges import Ranges
 from calib.estimator.grouped_errors import fit_grouped_errors
-from calib.evaluation.statistics import CORRECTION_STAGES, compare_with_planted, pair_rows, planted_curve
+from calib.evaluation.statistics import CORRECTION_STAGES, Evaluation, compare_with_planted, pair_rows, planted_curve
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 from uwblink.display import first_few
 from uwblink.pages.colours import BLUE, GREEN, GRID, INK, MUTED, PALE, VERMILION, WINE, look
-from uwblink.pages.figures import NARROW_IN, WIDTHS, label, legend, mark, outlines, series, sheet
+from uwblink.pages.figures import NARROW_IN, WIDTHS, bulk, dots, label, legend, mark, outlines, series, sheet
 from uwblink.ticks import SPEED_OF_LIGHT
 
 STAGE_LINES: Final[dict[str, dict[str, Any]]] = {
@@ -359,8 +359,7 @@ def residuals(width_in: float, ranges: Ranges, applied: CorrectedRanges, alpha_d
     power = 10 * np.log10(np.maximum(applied.lifted, 1e-9)) + alpha_dbm
     over = ((ranges.truth_m, "true distance (m)"), (power, "lifted power, in dBm"))
     for panel, (x, name) in zip(panels, over, strict=True):
-        every = slice(None, None, max(len(x) // 3000, 1))  # more points show nothing more
-        panel.plot(x[every], error[every], ".", ms=1.2, color=PALE, rasterized=True, zorder=0)
+        dots(panel, x, error, color=PALE, zorder=0)
         groups = np.array_split(np.argsort(x), max(1, min(16, len(x) // 40)))
         middle = np.array([np.median(x[rows]) for rows in groups])
         low, median, high = np.array([np.quantile(error[rows], (0.16, 0.5, 0.84)) for rows in groups]).T
@@ -371,7 +370,7 @@ def residuals(width_in: float, ranges: Ranges, applied: CorrectedRanges, alpha_d
         # Labels like -97.5 are wide: there is room for fewer than by default.
         panel.locator_params(axis="x", nbins=7, steps=[1, 2, 5, 10])
         label(panel, name, "calibrated error (cm)" if panel is panels[0] or width_in < NARROW_IN else "")
-    panels[0].set_ylim(*_reach_cm(error))
+    panels[0].set_ylim(*bulk(error))
     legend(figure, panels[0])
     return figure
 
@@ -395,17 +394,30 @@ def over_time(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figu
         panel.plot(time[some], applied.sigma_m[some, None] * [-196, 196], color=INK, lw=0.6)
         panel.set_title(f"tags {name}", pad=2)
         label(panel, "", "")
-    panels[0].set_ylim(*_reach_cm(error))
+    panels[0].set_ylim(*bulk(error))
     figure.supxlabel("time (s)", fontsize="medium")
     figure.supylabel("calibrated error (cm)", fontsize="medium")
     return figure
 
 
-def _reach_cm(error: Floats) -> tuple[float, float]:
-    """Return the limits of errors in cm: all but the outermost hundredth."""
-    low, high = np.quantile(error, (0.003, 0.985))
-    margin = 0.1 * float(high - low) + 0.1
-    return float(low) - margin, float(high) + margin
+def errors_by_pair(width_in: float, found: Evaluation) -> Figure:
+    """Draw the median error of each pair before and after correction, with bars of one robust standard deviation.
+
+    Of more than 24 pairs those whose raw medians are farthest off are drawn.
+    """
+    figure, (axes,) = sheet(width_in, height_in=2.2)
+    farthest = sorted(found.pairs, key=lambda name: -abs(found.pairs[name].raw.median_m))[:MOST_PAIRS]
+    names = [name for name in found.pairs if name in farthest]
+    for beside, stage in ((-0.12, "raw"), (0.12, "full")):
+        errors = [getattr(found.pairs[name], stage) for name in names]
+        middle, bars = 100 * np.array([(one.median_m, one.robust_std_m) for one in errors]).reshape(-1, 2).T
+        line = {key: STAGE_LINES[stage][key] for key in ("color", "label")}
+        axes.errorbar(np.arange(len(names)) + beside, middle, bars, fmt="o", ms=3.5, capsize=2.5, **line)
+    axes.axhline(0, color=PALE, lw=0.7, zorder=0)
+    axes.set_xticks(range(len(names)), names, rotation=90 if len(names) > 12 else 0)
+    label(axes, "tags", "range error (cm)")
+    legend(figure)
+    return figure
 
 
 def differences(width_in: float, found: CalibrationComparison) -> Figure:

@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -327,6 +328,15 @@ class Ranges(ColumnTable):
     def __repr__(self) -> str:
         """Return how many ranges of which tags there are, and what was left out."""
         return f"<{self._title()}>"
+
+    def _repr_html_(self) -> str:
+        """Return the table, and a figure of the errors over time, or of the ranges where no truth is known."""
+        from uwblink.pages.figures import notebook_image, values_over_time
+
+        errors, name = 100 * (self.raw_m - self.truth_m), "raw range less truth (cm)"
+        values, name = (errors, name) if np.isfinite(errors).any() else (self.raw_m, "raw range (m)")
+        draw = partial(values_over_time, time_ns=self.time_ns, values=values, name=name)
+        return ColumnTable._repr_html_(self) + notebook_image(draw, f"{name} over time")
 
     def tags(self) -> list[int]:
         """Return the ids of the tags that range, in order."""

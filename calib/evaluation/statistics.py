@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from scipy.interpolate import BSpline
 
+import calib
 from calib.calibration.applying import CorrectedRanges, keep_determined
 from calib.calibration.comparison import loose_shifts
 from calib.calibration.document import for_json, pair_name
@@ -132,8 +134,11 @@ class Evaluation:
         return "\n".join([TITLE, *lines])
 
     def _repr_html_(self) -> str:
-        """Return the same as HTML, for notebooks."""
-        return as_html(TITLE, self._rows())
+        """Return the same as HTML, and a figure of the errors by pair, for notebooks."""
+        from uwblink.pages.figures import notebook_image
+
+        draw = partial(calib.figures.errors_by_pair, found=self)
+        return as_html(TITLE, self._rows()) + notebook_image(draw, "errors by pair, raw and corrected")
 
     def _rows(self) -> list[list[str]]:
         above = ["", "", "raw", "", "", "delay", "", "", "full", "", "", "chi2", "total", "in"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import calib
@@ -74,3 +75,12 @@ class FitResult(CalibrationResult):
     def plot_delays(self, axes: Axes | None = None) -> Axes:
         """Draw the antenna delays in ns with their 95 % intervals."""
         return calib.figures.delays(self.calibration, axes=axes)
+
+    def _repr_html_(self) -> str:
+        """Return the calibration as HTML, and a figure of the errors that it leaves, for notebooks."""
+        from uwblink.pages.figures import notebook_image
+
+        applied = self.calibration.apply(self.ranges)
+        draw = partial(calib.figures.distribution, ranges=self.ranges, applied=applied)
+        drawn = notebook_image(draw, "errors of the fitted ranges, raw and corrected")
+        return CalibrationResult._repr_html_(self) + drawn

@@ -53,7 +53,7 @@ def test_a_notebook_shows_the_tags_of_a_scenario():
     tag = scenario.tags[1]
     expected = [str(tag.id), tag.body, "random-flight", *(f"{x:g}" for x in (*tag.lever_arm_m, tag.delay_ns)), "1.5"]
     assert (rows[2], len(rows), "12 pairs" in page) == (expected, 7, True)
-    assert "&lt;b&gt;" in page
+    assert ("&lt;b&gt;" in page, page.count("data:image/png")) == (True, 1)
 
 
 def test_what_a_flight_prints_and_saves_is_true(tmp_path):
@@ -62,7 +62,7 @@ def test_what_a_flight_prints_and_saves_is_true(tmp_path):
     assert (2 <= len(lines) <= 6, max(map(len, lines)) <= 100) == (True, True)
     assert "320 exchanges (ds) of 6 tags on 3 bodies in 2 s" in lines[0]
     page = flight._repr_html_()
-    assert (lines[1].strip() in page, page.count("<tr>")) == (True, 8)
+    assert (lines[1].strip() in page, page.count("<tr>"), page.count("data:image/png")) == (True, 8, 1)
     flight.save(tmp_path / "f.uwb")
     with Recording.open(tmp_path / "f.uwb") as recording:
         np.testing.assert_array_equal(recording.exchanges().rx2, flight.exchanges.rx2)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from html import escape
 from typing import Any, Final
 
 import matplotlib
@@ -14,8 +16,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from uwblink.arrays import Floats
-from uwblink.pages.colours import GRID, INK, MUTED
+from uwblink.arrays import Floats, Ints
+from uwblink.pages.colours import BLUE, GRID, INK, MUTED
 
 WIDTHS: Final = {"column": 3.5, "page": 7.16}
 """Widths at which figures are printed, inches: a column and both columns of an IEEE page."""
@@ -150,6 +152,37 @@ def series(
     mark(axes.plot(x, y, **line)[0], line["label"])
 
 
+def dots(axes: Axes, x: Floats, y: Floats, **line: Any) -> None:
+    """Draw points (n,), smaller where there are many: of more than 3000 a part, because more show nothing more."""
+    every = slice(None, None, max(len(x) // 3000, 1))
+    size = float(np.clip(66 / np.sqrt(max(len(x), 1)), 1.2, 4.0))
+    axes.plot(x[every], y[every], ".", ms=size, rasterized=True, **line)
+
+
+def bulk(values: Floats) -> tuple[float, float]:
+    """Return limits of an axis that shows values (n,) but for the outermost: reflections reach far on one side."""
+    low, high = np.quantile(values, (0.003, 0.985))
+    margin = 0.1 * float(high - low) + 0.1
+    return float(low) - margin, float(high) + margin
+
+
+def values_over_time(width_in: float, time_ns: Ints, values: Floats, name: str) -> Figure:
+    """Draw values (n,), some NaN, over their times in ns (n,), or over their numbers where all times are the same."""
+    figure, (axes,) = sheet(width_in, height_in=1.9)
+    rows = np.flatnonzero(np.isfinite(values))
+    timed = len(rows) > 0 and np.ptp(time_ns[rows]) > 0
+    dots(
+        axes,
+        (time_ns[rows] - time_ns[rows].min()) * 1e-9 if timed else rows.astype(np.float64),
+        values[rows],
+        color=BLUE,
+    )
+    if len(rows):
+        axes.set_ylim(*bulk(values[rows]))
+    label(axes, "time (s)" if timed else "number of the range", name)
+    return figure
+
+
 def mark(artist: Any, text: str) -> None:
     """Give a line or points a name that a page shows under the pointer."""
     artist.set_gid(f"series-{text}")
@@ -176,6 +209,12 @@ def drawn(draw: Draw, width_in: float, kinds: Iterable[str], salt: str = "") -> 
 def picture(draw: Draw, kind: str, width_in: float = WIDTHS["page"]) -> bytes:
     """Return a figure as the bytes of a "png", "svg" or "pdf" file."""
     return drawn(draw, width_in, [kind])[kind]
+
+
+def notebook_image(draw: Draw, text: str) -> str:
+    """Return a figure as an image in HTML, for notebooks; `text` stands in its place where images are not shown."""
+    data = base64.b64encode(picture(draw, "png")).decode()
+    return f'<img alt="{escape(text)}" style="width: 100%; max-width: 44em" src="data:image/png;base64,{data}">'
 
 
 def _file(figure: Figure, kind: str) -> bytes:

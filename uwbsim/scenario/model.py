@@ -7,12 +7,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from itertools import combinations
 from operator import sub
 from typing import Annotated, Any, Final, Self
 
 from pydantic import Field, model_validator
 
+import uwbsim
 from uwblink.display import as_html
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.base import NotNegative, Positive, Section, Vector, require
@@ -71,16 +73,19 @@ class Scenario(Section):
     tags: Annotated[tuple[ScenarioTag, ...], Field(min_length=2)] = Field(description="The boards, two or more.")
 
     def _repr_html_(self) -> str:
-        """Return what is simulated, and a row for each tag, for a notebook."""
+        """Return what is simulated, a row for each tag, and the room as a figure, for a notebook."""
         motions = {body.name: body.motion.model for body in self.bodies}
         rows = [
             [str(tag.id), tag.body, motions[tag.body]]
             + [f"{x:.4g}" for x in (*tag.lever_arm_m, sub(*tag.delays_ns()), tag.skew_ppm)]
             for tag in self.tags
         ]
+        from uwblink.pages.figures import notebook_image
+
         names = ["tag", "body", "motion", "x (m)", "y (m)", "z (m)", "delay (ns)", "skew (ppm)"]
         plan = f"{self.ranging.protocol}, {self.run.duration_s:g} s, {len(self.pairs())} pairs"
-        return as_html(f"Scenario {self.run.name!r}: {plan}", [names, *rows])
+        drawn = notebook_image(partial(uwbsim.pages.figures.room, scenario=self), "paths of bodies, tags and walls")
+        return as_html(f"Scenario {self.run.name!r}: {plan}", [names, *rows]) + drawn
 
     @model_validator(mode="after")
     def _check(self) -> Self:

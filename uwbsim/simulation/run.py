@@ -6,6 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from html import escape
 from typing import Any
 
@@ -88,8 +89,13 @@ class Simulated(Contents):
         Contents.save(replace(self, frames=list(frames)), path, force=force)
 
     def _repr_html_(self) -> str:
-        """Return these lines and the first exchanges for a notebook."""
-        return f"<pre>{escape(repr(self))}</pre>{self.exchanges._repr_html_()}"
+        """Return these lines, the first exchanges, and a figure of the errors over time, for a notebook."""
+        from uwblink.pages.figures import notebook_image, values_over_time
+
+        errors, name = 100 * (raw_range(self.exchanges) - self.truth_m), "raw range less truth (cm)"
+        draw = partial(values_over_time, time_ns=self.exchanges.time_ns, values=errors, name=name)
+        drawn = notebook_image(draw, f"{name} over time")
+        return f"<pre>{escape(repr(self))}</pre>{self.exchanges._repr_html_()}{drawn}"
 
     def __repr__(self) -> str:
         """Return a few lines: counts, errors of the raw ranges, and failures."""

@@ -372,6 +372,7 @@ def test_results_become_frames():
     corrected = result.calibration.apply(ranges)
     assert corrected.to_pandas().corrected_m.to_numpy() == pytest.approx(corrected.corrected_m)
     assert "corrected_m" in corrected._repr_html_()
+    assert ranges._repr_html_().count("data:image/png") == ranges[:0]._repr_html_().count("data:image/png") == 1
     judged = calib.evaluate(flight, result)
     rows = judged.to_pandas().set_index("pair")
     assert rows.loc["1-2", "full_median_m"] == judged.pairs["1-2"].full.median_m

@@ -406,6 +406,7 @@ def test_html_is_escaped(result):
     assert "<b>beware" not in page
     assert "&lt;b&gt;beware" in page
     assert page.count("<tr>") == page.count("</tr>") == 1 + len(DELAYS_NS) + 3
+    assert page.count("data:image/png") == 1
 
 
 def test_it_draws_into_axes(result):

@@ -9,6 +9,7 @@ from scipy.stats import norm
 import calib
 from calib.data.ranges import Ranges, concatenate
 from calib.evaluation.statistics import evaluate, split_error
+from calib.figures import errors_by_pair
 from calib.fitting.fitting import fit
 from tests import processes
 from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
@@ -85,7 +86,23 @@ def test_an_evaluation_prints_on_a_screen():
     cells, full = lines[-1].split(), found.overall.full
     assert cells[:2] == ["all", "2000"]
     assert cells[8:11] == [f"{100 * value:.1f}" for value in (full.mean_m, full.median_m, full.robust_std_m)]
-    assert found._repr_html_().count("<tr>") == 3 + 6
+    page = found._repr_html_()
+    assert (page.count("<tr>"), page.count("data:image/png")) == (3 + 6, 1)
+
+
+def test_a_figure_has_the_errors_of_each_pair_and_of_many_pairs_the_farthest():
+    r = ranges(2000)
+    found = evaluate(r, fit(r).calibration)
+    axes = errors_by_pair(7.0, found).axes[0]
+    assert [text.get_text() for text in axes.get_xticklabels()] == list(found.pairs)
+    for (line, _, (bars,)), stage in zip(axes.containers, ("raw", "full"), strict=True):
+        own = [getattr(group, stage) for group in found.pairs.values()]
+        np.testing.assert_allclose(line.get_ydata(), [100 * one.median_m for one in own])
+        half = [np.ptp(path.vertices[:, 1]) / 2 for path in bars.get_paths()]
+        np.testing.assert_allclose(half, [100 * one.robust_std_m for one in own])
+    groups = {f"1-{k}": replace(found.overall, raw=replace(found.overall.raw, median_m=k)) for k in range(2, 30)}
+    names = [text.get_text() for text in errors_by_pair(7.0, replace(found, pairs=groups)).axes[0].get_xticklabels()]
+    assert names == [f"1-{k}" for k in range(6, 30)]
 
 
 # A fit judged on a part of its own ranges, which a second fit has not seen.

@@ -1,5 +1,6 @@
 """Figures at paper size, and drawings as parts of pages."""
 
+import base64
 import io
 import itertools
 import json
@@ -26,7 +27,17 @@ from uwblink.pages.blocks import (
     to_html,
 )
 from uwblink.pages.colours import BLUE, DARK, GRID, INK, MUTED, PALE, SERIES, look
-from uwblink.pages.figures import WIDTHS, drawn, label, legend, mark, picture, sheet
+from uwblink.pages.figures import (
+    WIDTHS,
+    drawn,
+    label,
+    legend,
+    mark,
+    notebook_image,
+    picture,
+    sheet,
+    values_over_time,
+)
 
 
 def two_panels(width_in):
@@ -111,6 +122,27 @@ def test_a_picture_is_on_white():
         return Figure(figsize=(width_in, 1))
 
     assert np.all(imread(io.BytesIO(picture(draw, "png"))) == 1)
+
+
+def test_known_values_are_drawn_over_time_and_far_ones_leave_the_rest_visible():
+    time_ns = np.arange(2000, dtype=np.int64) * 10_000_000 + 5_000_000_000
+    values = np.sin(np.arange(2000.0))
+    values[7], values[11] = np.nan, 400.0
+    axes = values_over_time(7.0, time_ns, values, "error (cm)").axes[0]
+    (line,) = axes.lines
+    drawn_values = np.column_stack([line.get_xdata(), line.get_ydata()])
+    np.testing.assert_allclose(drawn_values, np.delete(np.column_stack([np.arange(2000) * 0.01, values]), 7, 0))
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("time (s)", "error (cm)")
+    assert axes.get_ylim()[1] < 2
+    untimed = values_over_time(7.0, np.zeros(2000, dtype=np.int64), values, "").axes[0]
+    assert ("number" in untimed.get_xlabel(), untimed.lines[0].get_xdata()[:8].tolist()) == (True, [*range(7), 8])
+    assert values_over_time(7.0, time_ns[:0], values[:0], "").axes[0].lines[0].get_xdata().size == 0
+
+
+def test_an_image_of_a_notebook_is_the_picture_and_its_text_is_escaped():
+    page = notebook_image(two_panels, 'a "<b>"')
+    assert base64.b64decode(re.search('base64,([^"]*)', page)[1]) == picture(two_panels, "png")
+    assert 'alt="a &quot;&lt;b&gt;&quot;"' in page
 
 
 def test_cells_of_words_say_what_they_are_where_no_heading_is_above_them():
