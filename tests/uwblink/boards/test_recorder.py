@@ -1,5 +1,6 @@
 """The recorder on served boards: everything in the file, whatever happens to boards, disk and process."""
 
+import re
 import signal
 import subprocess
 import time
@@ -215,7 +216,10 @@ def test_ctrl_c_ends_cleanly_and_completely(tmp_path):
     assert process.returncode == 0, err
     assert "Traceback" not in err
     exchanges, _, _, _ = stored(path)
-    assert f"{len(exchanges)} of " in out
+    good, late = (int((re.search(pattern, out) or [0, 0])[1]) for pattern in (r"(\d+) of ", r"time-out (\d+)"))
+    # On a busy machine a report may come after its time-out: it is stored, and its turn has failed.
+    assert good <= len(exchanges) <= good + late
+    assert good > 0
     assert not Path(f"{path}.wal").exists()
 
 
