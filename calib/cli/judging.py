@@ -320,7 +320,8 @@ def _remarks(evaluation: Evaluation) -> Iterator[str]:
     planted = evaluation.planted
     if planted:
         rms = (sum(d**2 for d in planted.delay_error_ns.values()) / len(planted.delay_error_ns)) ** 0.5
-        yield (
-            f"from what was planted: delays {rms:.4f} ns rms, bias curve {100 * planted.curve_rms_m:.2f} cm, "
-            f"whole correction {100 * planted.correction_rms_m:.2f} cm rms"
+        curve_cm, whole_cm = 100 * planted.curve_rms_m, 100 * planted.correction_rms_m
+        curve = (
+            f", bias curve {curve_cm:.2f} cm, whole correction {whole_cm:.2f} cm rms" if curve_cm == curve_cm else ""
         )
+        yield f"from what was planted: delays {rms:.4f} ns rms{curve}"

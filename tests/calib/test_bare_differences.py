@@ -5,6 +5,7 @@ planted, and logs by how much farther it is from one anchor than from another.
 """
 
 import json
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -108,6 +109,14 @@ def test_the_fit_names_what_stays_free(folder):
     assert not pinned.undetermined_splits
     for tag in range(2, 9):
         assert abs(pinned.delays_ns[tag] - DELAYS_NS[tag - 1]) < 4 * pinned.delays_std_ns[tag] < 0.13
+
+
+def test_they_are_shown_and_not_streamed(folder):
+    assert re.search(
+        r"d\.uwb: 9600 differences in (59\.9|60\.0) s\n",
+        processes.succeed("uwblink", "show", folder / "fit/d.uwb").stdout,
+    )
+    processes.refuse("uwblink", "stream", folder / "fit/d.uwb", naming=["d.uwb", "9600 differences", "no ranges"])
 
 
 def test_what_is_not_determined_is_not_corrected(folder):

@@ -216,8 +216,9 @@ class Summary:
     """Summary of a recording: rows by table, tags, pairs, exchanges by protocol, faults by kind, poses by body.
 
     An exchange counts once: `reported_twice` is the number of exchanges with reports of both ends, `contradictory` that
-    of those with different reports. `span_s` is the time from the first to the last exchange; `provenance` are the
-    entries of `meta` without scenario and planted values. `skews` are those of pairs with double-sided exchanges.
+    of those with different reports. `span_s` is the time from the first to the last exchange, or difference of arrival;
+    `provenance` are the entries of `meta` without scenario and planted values. `skews` are those of pairs with
+    double-sided exchanges.
     """
 
     file: str
@@ -239,11 +240,10 @@ class Summary:
         return asdict(self) | {"tags": tags, "pairs": [asdict(pair) for pair in self.pairs]}
 
     def headline(self) -> str:
-        """Return file, number of exchanges, span and protocols in one line."""
-        return (
-            f"{printable(self.file)}: {self.counts['exchanges']} exchanges in {self.span_s:.1f} s, "
-            f"protocols {counted(self.protocols)}"
-        )
+        """Return file, number of exchanges (or differences, where there is none), span and protocols in one line."""
+        kind = "differences" if self.counts["differences"] and not self.counts["exchanges"] else "exchanges"
+        protocols = f", protocols {counted(self.protocols)}" if kind == "exchanges" else ""
+        return f"{printable(self.file)}: {self.counts[kind]} {kind} in {self.span_s:.1f} s{protocols}"
 
     def tables(self) -> list[list[list[str]]]:
         """Return tags, pairs and clock skews as tables of texts, each with its header."""
@@ -317,6 +317,7 @@ def summarize(recording: Tables) -> Summary:
             yield e
 
     skews = clock_skews(counting())
+    times = times or recording.columns("differences")["time_ns"].tolist()
     span_s = (max(times) - min(times)) * 1e-9 if times else 0.0
     failed = recording.tally("faults", "initiator", "target")
     return Summary(

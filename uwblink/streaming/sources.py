@@ -313,6 +313,8 @@ def _recorded(path: Path, correct: Correction | None, *, listening: bool) -> tup
     with Recording.open(path) as recording:
         if correct and "calibration" in recording.meta():
             raise ArgumentError(f"{path}: its ranges are corrected already; stream it without `calibration`")
+        if (differences := recording.count("differences")) and not recording.count("exchanges"):
+            raise ArgumentError(f"{path}: holds {differences} differences of arrival, but no ranges to stream")
         found, heard = recording.exchanges(), recording.columns("overheard") if listening else {}
     if listening and not len(heard["time_ns"]):
         raise ArgumentError(f"{path}: nothing was overheard; record with passive boards", parameter="use")
