@@ -80,6 +80,15 @@ def inverse_of(matrix: Matrix, free: Ints) -> Inverse:
     return found
 
 
+def diagonal_of(matrix: sparse.csr_matrix, inverse: Inverse) -> Floats:
+    """Return the diagonal (n,) of M C M' for rows M (n, p) and an inverse C (p, p), estimated for a sparse one."""
+    if isinstance(inverse, SparseInverse):
+        # Twice as many random vectors as for traces: 14 % of each (Bekas, Kokiopoulou and Saad 2007).
+        probes = np.random.default_rng(0).choice([-1.0, 1.0], (matrix.shape[0], 2 * PROBES))
+        return np.asarray(np.mean(probes * (matrix @ (inverse @ (matrix.T @ probes))), axis=1))
+    return np.asarray(matrix.multiply(matrix @ inverse).sum(axis=1)).ravel()
+
+
 def trace_of_product(inverse: Inverse, matrix: Matrix, where: slice = slice(None)) -> float:
     """Return the trace of the block `where` of an inverse times a symmetric matrix (k, k), estimated for a sparse one.
 

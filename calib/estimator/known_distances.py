@@ -277,9 +277,10 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted, heard: ArrivalMod
         return [] if heard is None or whole is None else [heard.sample(whole, chosen)]
 
     found, steps = _maximize_by_samples(rows, gauge, layout, layout.start(pilot.optimum.by_kind()), asked, beside)
+    rows, *of_arrivals = (own for own in found.rows if isinstance(own, RangeRows))
     return Fitted(
         rows=rows,
-        heard=whole,
+        heard=next(iter(of_arrivals), None),
         arrivals=heard,
         gauge=gauge,
         optimum=found,

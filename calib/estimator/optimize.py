@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from calib.estimator.inverse import Inverse, Matrix, inverse_of
-from calib.estimator.rows import Rows, Sums, sum_rows
+from calib.estimator.rows import RestrictedRows, Rows, Sums, sum_rows
 from calib.estimator.unknowns import Layout, Priors
 from uwblink.arrays import Floats, Ints
 
@@ -36,7 +36,10 @@ worlds by 0.02 standard errors, and changes these by 8 % (`python -m benchmarks.
 
 @dataclass(frozen=True)
 class Optimum:
-    """Where a search ended: unknowns `x` (p,), inverse of information and priors, and the rows' own information."""
+    """Where a search ended: unknowns `x` (p,), inverse of information and priors, and the rows' own information.
+
+    `rows` are those whose likelihood is largest there.
+    """
 
     layout: Layout
     priors: Priors
@@ -46,6 +49,7 @@ class Optimum:
     value: float
     steps: int
     success: bool
+    rows: tuple[Rows, ...] = ()
 
     def of(self, kind: str) -> Floats:
         """Return the unknowns of a kind."""
@@ -114,16 +118,29 @@ def maximize(  # noqa: PLR0913 - a search has that many sides
             settled = abs(float(slope[asked] @ step[asked])) < tolerance and gain < max(0.3, tolerance)
         near += gain < len(free)
         if near < evidence_steps:
-            before = list(priors.weights)
+            weights = list(priors.weights)
             # At the start nothing has moved yet, and says nothing of how far it may.
             priors.update(x + step, inverse_of(known, free))
-            change = [abs(np.log(a / b)) for a, b in zip(priors.weights, before, strict=True)]
+            change = [abs(np.log(a / b)) for a, b in zip(priors.weights, weights, strict=True)]
             settled = settled and max(change, default=0.0) < 0.05
+            if (informed := _with_uncertainty(rows, priors, x)) is not rows:
+                rows = informed
+                sums = sum_rows(rows, x)
             best = sums.value + priors.value(x)
         step *= 1.0 if longest is None else min(1.0, longest(step))
         promised = float(slope @ step)
         x = best_x + step
-    return Optimum(layout, priors, best_x, inverse_of(known, free), sums.information, best, taken, settled)
+    return Optimum(layout, priors, best_x, inverse_of(known, free), sums.information, best, taken, settled, tuple(rows))
+
+
+def _with_uncertainty(rows: Sequence[Rows], priors: Priors, x: Floats) -> Sequence[Rows]:
+    """Return rows whose likelihood depends on it with the variances of their residuals, or the same rows."""
+    own = {k: one for k, one in enumerate(rows) if isinstance(one, RestrictedRows) and one.restricted}
+    if not own:
+        return rows
+    expecting = [own[k].expecting() if k in own else one for k, one in enumerate(rows)]
+    covariance = inverse_of(sum_rows(expecting, x).information + priors.precision(), priors.layout.free())
+    return [own[k].with_uncertainty(x, covariance) if k in own else one for k, one in enumerate(rows)]
 
 
 def _with_logarithms(known: Matrix, layout: Layout, slope: Floats, longer: float) -> Matrix:

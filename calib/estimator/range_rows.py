@@ -13,8 +13,10 @@ from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
+from scipy import sparse
 from scipy.interpolate import CubicHermiteSpline, PPoly
 
+from calib.estimator.inverse import Inverse, diagonal_of
 from calib.estimator.losses import Weights
 from calib.estimator.rows import ROWS_AT_ONCE, Terms
 from calib.estimator.unknowns import Layout
@@ -83,21 +85,16 @@ class Mixture:
     """Direct, reflected or an outlier (`calib.range_errors.densities`): the likelihood of ranges.
 
     With `expected` what a residual tells is what the model says on average (Fisher's information), not the square of
-    its slope: where few ranges determine an unknown, such as a place on a path, their squares are too unsteady. `used`
-    is the share of the ranges that such unknowns use up: noise is estimated as larger by it (restricted likelihood).
+    its slope: where few ranges determine an unknown, such as a place on a path, their squares are too unsteady.
     """
 
     expected: bool = False
-    used: float = 0.0
     dispersion: float = 1.0
     parameters: tuple[str, ...] = OF_ERRORS
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
         """Return log densities (n,) and slopes by each parameter (n,)."""
         found = error_slopes(values[RESIDUAL], values)
-        if self.used:
-            more = found.by | {"noise": found.by["noise"] + self.used}
-            found = replace(found, log_density=found.log_density + self.used * values["noise"], by=more)
         if not self.expected:
             return found.log_density, found.by, None
         typical = {name: np.atleast_1d(np.median(values[name])) for name in self.parameters}
@@ -165,7 +162,8 @@ class RangeRows:
     """Ranges whose residuals are `residual` (n,) plus the parts of the unknowns, less what `geometry` makes of them.
 
     Rows are kept sorted by `key`; `order` (n,) says which of the given rows each is. Log likelihoods are divided by
-    the dispersion of the errors.
+    the dispersion of the errors. `unsure_m2` (n,), in this order, are variances of the residuals of direct ranges, by
+    which squared residuals are too small (`with_uncertainty`).
     """
 
     residual: Floats
@@ -175,6 +173,7 @@ class RangeRows:
     starts: Ints
     parts: tuple[Part, ...]
     geometry: Geometry | None = None
+    unsure_m2: Floats | None = None
 
     @classmethod
     def of(
@@ -227,12 +226,67 @@ class RangeRows:
             order=self.order[rows],
             starts=np.append(starts[:-1][there], len(rows)),
             parts=parts,
+            unsure_m2=None if self.unsure_m2 is None else self.unsure_m2[rows],
         )
+
+    @property
+    def restricted(self) -> bool:
+        """Whether their noise depends on how well residuals are known.
+
+        A robust loss has no such noise, and where unknowns are fewer than a fiftieth of the ranges, noise is right to
+        1 % without.
+        """
+        kinds = {part.kind for part in self.parts if part.parameter == RESIDUAL}
+        count = sum(self.layout.where[kind].stop - self.layout.where[kind].start for kind in kinds)
+        return isinstance(self.errors, Mixture) and 50 * count > len(self)
+
+    def expecting(self) -> RangeRows:
+        """Return these rows of a mixture with expected information, not squares of slopes."""
+        return replace(
+            self, errors=Mixture(expected=True, dispersion=self.errors.dispersion, parameters=self.errors.parameters)
+        )
+
+    def with_uncertainty(self, x: Floats, covariance: Inverse) -> RangeRows:
+        """Return these rows with the variances that their residuals have by the covariance (p, p) of unknowns (p,).
+
+        The square of a residual is too small by its variance, because unknowns follow the ranges. Noise is the mean of
+        both together (restricted likelihood, by the E step of Dempster, Laird and Rubin 1977), so that offsets which
+        few ranges determine do not bring it to zero. The covariance must be that of expected information: by squares of
+        slopes variances grow with the fourth power of noise, and there may be no end to that.
+        """
+        found = np.empty(len(self))
+        for blocks, rows, values, moved in self._pieces(x):
+            errors = error_slopes(values[RESIDUAL], values)
+            matrix = self._derivatives(blocks, rows, moved)
+            found[rows] = (errors.inlier - errors.reflected) * diagonal_of(matrix, covariance)
+        return replace(self, unsure_m2=found)
+
+    def _derivatives(self, blocks: slice, rows: slice, moved: Any) -> sparse.csr_matrix:
+        """Return the derivatives of some residuals by all unknowns, sparse (m, p)."""
+        starts, count = self.starts[blocks.start : blocks.stop + 1], rows.stop - rows.start
+        columns, entries = [], []
+        for part in self.parts:
+            if part.parameter == RESIDUAL:
+                own = (
+                    part.columns if len(part.columns) == 1 else np.repeat(part.columns[blocks], np.diff(starts), axis=0)
+                )
+                columns.append(np.broadcast_to(own + self.layout.where[part.kind].start, (count, own.shape[1])))
+                values = 1.0 if part.values is None else part.values[:, rows].T
+                entries.append(np.broadcast_to(values, columns[-1].shape))
+        if moved is not None and self.geometry is not None:
+            columns.append(self.geometry.columns[self.order[rows]])
+            entries.append(-moved)
+        beside, across = np.concatenate(columns, axis=1), np.concatenate(entries, axis=1)
+        bounds = np.arange(count + 1) * across.shape[1]
+        return sparse.csr_matrix((across.ravel(), beside.ravel(), bounds), shape=(count, self.layout.size))
 
     def terms(self, x: Floats) -> Iterator[Terms]:
         """Yield all ranges, some blocks at a time."""
         for blocks, rows, values, moved in self._pieces(x):
             log_density, by, tells = self.errors.slopes(values)
+            if self.unsure_m2 is not None:
+                over = self.unsure_m2[rows] * np.exp(-2 * values["noise"])
+                log_density, by = log_density - 0.5 * over, by | {"noise": by["noise"] + over}
             share = 1 / self.errors.dispersion
             by = {name: share * slope for name, slope in by.items()} if share != 1 else by
             tells = None if tells is None else share * tells

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from scipy import sparse
 
-from calib.estimator.inverse import MOST_DENSE, Matrix
+from calib.estimator.inverse import MOST_DENSE, Inverse, Matrix
 from uwblink.arrays import Floats, Ints
 
 ROWS_AT_ONCE = 16_384
@@ -58,6 +58,24 @@ class Rows(Protocol):
 
     def terms(self, x: Floats) -> Iterable[Terms]:
         """Yield all rows at unknowns (p,), some at a time."""
+        ...
+
+
+@runtime_checkable
+class RestrictedRows(Rows, Protocol):
+    """Rows whose likelihood depends on how well residuals are known."""
+
+    @property
+    def restricted(self) -> bool:
+        """Whether that matters."""
+        ...
+
+    def expecting(self) -> Rows:
+        """Return the rows with the information that they have on average, in place of squares of slopes."""
+        ...
+
+    def with_uncertainty(self, x: Floats, covariance: Inverse) -> Rows:
+        """Return the rows with the variances of their residuals at unknowns (p,) of a covariance (p, p)."""
         ...
 
 

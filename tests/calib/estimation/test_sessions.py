@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import calib
-from benchmarks.worlds import LIGHT_M_PER_NS, Recipe, make
+from benchmarks.worlds import LIGHT_M_PER_NS, Recipe, make, sigma_m
 from calib.cli.commands import app
 from tests.processes import call
 from uwblink import Contents
@@ -49,6 +49,22 @@ def test_neither_hours_between_sessions_nor_times_that_begin_at_zero_change_anyt
     for apart in (calib.fit([monday, tuesday]), calib.fit(at_zero)):
         np.testing.assert_allclose(numbers(apart), numbers(adjacent), rtol=1e-6, atol=1e-9)
         assert apart.warnings == adjacent.warnings
+
+
+def test_five_short_recordings_of_many_tags_are_one_fit():
+    # 66 pairs in five recordings have more offsets than there are ranges, which noise must survive.
+    recipe, seed = Recipe(tags=12, seconds=6, per_second=10), 20_003
+    parts = [make(recipe, seed, flight).ranges for flight in range(5)]
+    parts = [replace(part, time_ns=part.time_ns + k * HOUR_NS, source=f"{k}.uwb") for k, part in enumerate(parts)]
+    found = calib.fit(parts)
+    assert found.warnings == []
+    known, planted = found.calibration, make(recipe, seed).delays_ns
+    lifted = np.median(np.concatenate([known.lifted(part) for part in parts]))
+    # 300 ranges, half of which the unknowns use up, know their noise to 6 %; power has a part in it.
+    assert known.sigma_curve(lifted) == pytest.approx(sigma_m(lifted, recipe.noise_m), rel=0.25)
+    apart = np.eye(12) - 1 / 12
+    error = apart @ [known.delays_ns[tag] - delay for tag, delay in planted.items()]
+    assert np.all(np.abs(error) < 3 * np.sqrt(np.diag(apart @ np.array(known.uncertainty.delays_ns2) @ apart)))
 
 
 def test_a_pause_within_a_recording_changes_nothing():

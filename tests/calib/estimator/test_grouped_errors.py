@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import optimize
 
 from calib.estimator.grouped_errors import fit_grouped_errors
+from calib.estimator.optimize import maximize
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows
 from calib.estimator.rows import sum_rows
-from calib.estimator.unknowns import Layout, Unknown
+from calib.estimator.unknowns import Layout, Prior, Priors, Unknown
 
 
 def mixed(n=40_000, share=0.12, mean_m=0.35, outlier=0.0, seed=3):
@@ -73,10 +75,34 @@ def test_the_model_tells_on_average_what_squares_of_slopes_do(drawn):
         assert expected.information[k, j] == pytest.approx(squares.information[k, j], abs=0.03 * size)
 
 
-def test_noise_is_larger_by_the_share_that_other_unknowns_use_up(drawn):
-    layout, rows = drawn
-    plain, used = (
-        sum_rows([replace(rows, errors=Mixture(used=share))], layout.start()).gradient[layout.where["noise"].start]
-        for share in (0.0, 0.1)
-    )
-    assert used - plain == pytest.approx(0.1 * len(rows))
+@pytest.mark.parametrize("spread_m", [100.0, 0.03])
+def test_noise_is_that_of_restricted_likelihood_however_many_offsets_there_are(spread_m):
+    # Six ranges for each of 100 offsets; without a prior that is the pooled variance, else an analysis of variance.
+    rng = np.random.default_rng(4)
+    offset, noise = 0.03 * rng.normal(size=(100, 1)), 0.05 * rng.normal(size=(100, 6))
+    group, error = np.repeat(np.arange(100), 6), (offset + noise).ravel()
+    blocks = [
+        Unknown(kind=kind, names=("",), start=np.array([at]), known=np.array([kind != "noise"]))
+        for kind, at in (VALUES | {"long": -30.0, "odds": -40.0, "outliers": -40.0, "noise": -5.0}).items()
+    ]
+    prior = Prior.of_deviation(spread_m)
+    blocks.append(Unknown(kind="offset", names=("",) * 100, start=np.zeros(100), priors=(prior,)))
+    parts = [Part(parameter=b.kind, kind=b.kind, columns=np.zeros((1, 1), dtype=np.int64)) for b in blocks[:-1]]
+    parts.append(Part(parameter=RESIDUAL, kind="offset", columns=group[:, None], values=np.full((600, 1), -1.0)))
+    layout = Layout(tuple(blocks))
+    rows = RangeRows.of(error, group, parts, Mixture(), layout)
+    found = maximize([rows], Priors(layout), layout.start(), evidence_steps=60)
+    within = float(np.mean(np.var(error.reshape(100, 6), axis=1, ddof=1)))
+    means = error.reshape(100, 6).mean(axis=1)
+
+    def unlikely(log_noise):
+        noise_m2 = np.exp(2 * log_noise)
+        between = spread_m**2 + noise_m2 / 6
+        return 500 * log_noise + 250 * within / noise_m2 + np.sum(np.log(between) + means**2 / between) / 2
+
+    best = optimize.minimize_scalar(unlikely, bounds=(-5, -1), method="bounded").x
+    assert found.of("noise")[0] == pytest.approx(best, abs=0.005)
+    assert np.exp(best) == pytest.approx(0.05, rel=0.08)
+    # The joint likelihood has it smaller, by up to a tenth.
+    joint = maximize([rows], Priors(layout), layout.start(), evidence_steps=0).of("noise")[0]
+    assert joint < best - 0.03
