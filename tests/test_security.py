@@ -240,7 +240,7 @@ PRINTING = (
     "calib fit hostile.uwb -o out.json",
     "calib evaluate hostile.uwb -c c.json",
     "calib localize hostile.uwb -c c.json --tum out",
-    "calib report hostile.uwb -o out.html",
+    pytest.param("calib report hostile.uwb -o out.html", marks=pytest.mark.slow),  # pages: tests/calib/report
 )
 
 
