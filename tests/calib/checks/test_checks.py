@@ -95,7 +95,7 @@ def starloc():
 @pytest.mark.parametrize(
     ("marker_of", "wrong"),
     [
-        (RADIOS, set()),
+        pytest.param(RADIOS, set(), marks=pytest.mark.slow),
         # Radio 11 is 1.25 m above its marker then, which the rig, which keeps its height, does not determine.
         ({radio: radio for radio in RADIOS}, {"tag10", "tag12"}),
         pytest.param(

@@ -91,7 +91,7 @@ def starloc(tmp_path_factory):
     return flights
 
 
-@pytest.mark.parametrize(("one", "other"), [(0, 1), (1, 0)])
+@pytest.mark.parametrize(("one", "other"), [(0, 1), pytest.param(1, 0, marks=pytest.mark.slow)])
 def test_a_flight_predicts_the_errors_of_another_day(starloc, one, other):
     found = calib.fit(starloc[one]).calibration
     # STAR-loc chose none of the model's constants.

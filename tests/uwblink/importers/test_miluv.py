@@ -211,6 +211,7 @@ def real(tmp_path_factory):
     return miluv(tmp_path_factory.mktemp("miluv"))
 
 
+@pytest.mark.slow
 def test_the_real_flight_gives_the_ranges_of_its_boards(real, tmp_path):
     found = imported(real, tmp_path)
     assert found.counts() == {

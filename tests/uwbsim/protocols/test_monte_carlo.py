@@ -55,7 +55,9 @@ def test_means_and_variances_are_those_of_integer_stamps(name):
     assert exact.var() == pytest.approx(fast.var(), rel=0.06)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in ("ss", "ds") else pytest.mark.slow) for name in NAMES]
+)
 @pytest.mark.parametrize(
     "values",
     [
