@@ -12,6 +12,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("uwblink", "uwbsim", "calib")
+parsed = cache(ast.parse)
 
 
 Rooms = dict[str, set[str]]
@@ -21,7 +22,7 @@ Rooms = dict[str, set[str]]
 def imports(source: str) -> frozenset[str]:
     """Return the dotted names that a module imports, those under `if TYPE_CHECKING` among them."""
     found: set[str] = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.rooms import PACKAGES, ROOT, floors, imports, rooms
+from tests.rooms import PACKAGES, ROOT, floors, imports, parsed, rooms
 
 HEAVY = ("numpy", "scipy", "duckdb", "matplotlib", "pydantic", "simpy", "typer", "rich", "serial")
 
@@ -45,7 +45,7 @@ def offered(module):
 
 def used(source):
     """Yield module and name of everything that a module takes from the three packages; "" for a module itself."""
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Import):
             yield from ((alias.name, "") for alias in node.names if alias.name.split(".")[0] in PACKAGES)
         elif isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in PACKAGES:
@@ -149,7 +149,7 @@ def test_the_example_at_the_head_of_a_package_runs_and_importing_it_loads_nothin
 
 def defined(source):
     """Yield the names of public classes and constants that a module defines, those in tuples included."""
-    for node in ast.parse(source).body:
+    for node in parsed(source).body:
         if isinstance(node, ast.ClassDef):
             yield node.name
         for part in ast.walk(node) if isinstance(node, ast.Assign | ast.AnnAssign) else ():
@@ -192,9 +192,7 @@ HOMES = {
 
 
 def numbers(source):
-    return {
-        node.value for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Constant) and node.value in HOMES
-    }
+    return {node.value for node in ast.walk(parsed(source)) if isinstance(node, ast.Constant) and node.value in HOMES}
 
 
 def test_constants_are_written_once():

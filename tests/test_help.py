@@ -152,6 +152,7 @@ print(json.dumps(seen))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", COMMANDS)
 def test_help_is_printed_before_anything_heavy_is_imported(package):
     """`uwblink import` lists the table of importers, plug-ins included, so its commands may import three of them."""

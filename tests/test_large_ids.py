@@ -25,7 +25,7 @@ def folder(tmp_path_factory):
         (ROOT / "scenarios/noiseless.toml").read_text(),
         flags=re.M,
     )
-    (folder / "s.toml").write_text(text.replace("duration_s = 60.0", "duration_s = 10.0"))
+    (folder / "s.toml").write_text(text.replace("duration_s = 60.0", "duration_s = 4.0"))
     succeed("uwbsim", "run", "s.toml", "-o", "flight.uwb", cwd=folder)
     return folder
 

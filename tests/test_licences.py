@@ -56,6 +56,7 @@ def test_links_of_the_page_of_the_package_are_absolute_and_lead_to_files_of_the_
     assert sum(found is not None for found in own) > 10
 
 
+@pytest.mark.slow
 def test_two_builds_are_the_same_bytes_wherever_the_tree_lies(archives, tmp_path):
     with tarfile.open(archives[1]) as archive:
         archive.extractall(tmp_path, filter="data")

@@ -140,7 +140,7 @@ def test_the_tag_is_where_it_is(folder):
 
 @pytest.mark.parametrize("model", ["constant-velocity", "imu"])
 def test_the_tag_is_tracked_on_board(folder, model):
-    contents = uwblink.load(folder / "fly/d.uwb").select(stop_s=10.0)
+    contents = uwblink.load(folder / "fly/d.uwb").select(stop_s=6.0)
     time_s = np.arange(0, 20.0, 0.01)
     rates = np.array([0.5, 0.37, 0.29])
     swing = np.column_stack([2.5 * np.sin(0.5 * time_s), 2.2 * np.cos(0.37 * time_s), 0.7 * np.sin(0.29 * time_s)])

@@ -79,7 +79,7 @@ def test_obstacles_and_echoes_lengthen_ranges(tmp_path):
         ("icra2023/test2.toml", []),
         ("noiseless.toml", []),
         ("anchors_and_tag/anchors_and_tag.toml", []),
-        ("day30/train.toml", ["run.duration_s=60"]),
+        pytest.param("day30/train.toml", ["run.duration_s=60"], marks=pytest.mark.slow),
         ("nlos_office/office.toml", []),
         ("wrap/wrap.toml", []),
     ],
@@ -107,6 +107,7 @@ def test_the_true_delays_leave_nothing_at_either_reply(tmp_path, reply_uus):
         assert abs(np.median(error[rows])) < 0.001, pair
 
 
+@pytest.mark.slow
 def test_a_fit_of_boards_that_warm_up_says_that_delays_moved(tmp_path):
     """Ranges grow by 2.15 mm/K for each of two tags, and shrink by 5.35 cm/V as batteries sag."""
     path = tmp_path / "warm.uwb"
@@ -128,6 +129,7 @@ def test_a_fit_of_boards_that_warm_up_says_that_delays_moved(tmp_path):
     assert f"{5.35e-2 * per_k:+.2f}"[:4] in said
 
 
+@pytest.mark.slow
 def test_a_calibration_holds_less_where_boards_are_mounted_differently(tmp_path):
     before, after = (ranges(tmp_path, f"mounted_differently/{day}.toml") for day in ("before", "after"))
     calibration = fit(before).calibration

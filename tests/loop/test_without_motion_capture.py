@@ -106,6 +106,7 @@ def test_delays_against_their_mean_are_within_the_promise(done):
     assert abs(error.mean()) < 2 * np.sqrt(spread.mean())
 
 
+@pytest.mark.slow
 def test_one_distance_by_tape_settles_what_all_share(done):
     folder, _ = done
     error, spread = errors_ns(folder / "taped.json")
@@ -118,6 +119,7 @@ def test_one_distance_by_tape_settles_what_all_share(done):
     assert tape.distance_m == pytest.approx(abs(motion["stand4"] - motion["stand5"]))
 
 
+@pytest.mark.slow
 def test_the_survey_prints_what_the_page_shows(done):
     _, said = done
     (shown,) = blocks("text survey")
@@ -126,6 +128,7 @@ def test_the_survey_prints_what_the_page_shows(done):
     assert "from the geometry of boards that stood still" in said["show"]
 
 
+@pytest.mark.slow
 def test_the_commands_are_those_of_the_plan_and_the_boards_stand_as_planned(done):
     _, said = done
     planned = [line.strip() for line in said["plan"].splitlines() if line.startswith("  u") or "calib survey" in line]
@@ -138,6 +141,7 @@ def test_the_commands_are_those_of_the_plan_and_the_boards_stand_as_planned(done
         assert line.split("--order ")[1].split()[0] == ",".join(map(str, sorted(where, key=lambda tag: where[tag])))
 
 
+@pytest.mark.slow
 def test_recordings_carry_what_was_said_of_their_arrangement(done):
     folder, _ = done
     (mark,) = uwblink.load(folder / "B.uwb").arrangements

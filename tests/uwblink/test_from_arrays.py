@@ -114,7 +114,7 @@ def test_rows_are_chosen_by_number_slice_and_mask():
     assert len(x[x.protocol == "ss"]) == np.count_nonzero(x.protocol == "ss")
 
 
-@pytest.mark.parametrize("count", [0, 1, 6, 7, 100_000])
+@pytest.mark.parametrize("count", [0, 1, 6, 7, 10_000])
 def test_what_is_printed_fits_on_a_screen(count):
     stamps: Any = {name: np.arange(count) + 2**31 for name in SS}
     x = Exchanges.from_arrays(1, 2, **stamps, time_ns=2**60)

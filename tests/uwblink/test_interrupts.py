@@ -79,6 +79,7 @@ def flight(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_report_that_is_interrupted_says_so_and_leaves_no_half(flight, tmp_path):
     process = started("calib", "report", str(flight), "-o", str(tmp_path / "page.html"))
     wait_for(lambda: is_working(process), process)
@@ -91,6 +92,7 @@ def test_a_report_that_is_interrupted_says_so_and_leaves_no_half(flight, tmp_pat
     assert files(flight.parent) == ["f.uwb"]
 
 
+@pytest.mark.slow
 def test_an_import_that_is_interrupted_is_one_line_and_leaves_nothing(tmp_path):
     row = "{0}.25,{1},9,{2:.3f},-80.5,-81.5\n"
     with (tmp_path / "t.csv").open("w") as file:

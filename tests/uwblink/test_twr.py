@@ -109,10 +109,6 @@ def test_truncation_is_towards_zero_and_keeps_what_has_four_decimals():
     assert truncate4(np.array([1.23459, -1.23459, -87.6187, 0.0001])).tolist() == [1.2345, -1.2345, -87.6187, 0.0001]
 
 
-def test_a_tick_is_4_69_mm():
-    assert pytest.approx(4.690357e-3, rel=1e-6) == METRES_PER_TICK
-
-
 def test_stamps_belong_to_the_clocks_of_the_paper():
     # ICRA 2023, fig. 2, and the course in which the initiator sends the third message.
     assert initiator_stamps("ss") == initiator_stamps("ss-cfo") == ("tx1", "rx2")

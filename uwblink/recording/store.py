@@ -52,7 +52,7 @@ _REFUSED: Final = (
         "duckdb_columns() WHERE NOT internal AND column_default IS NOT NULL",
     ),
     # What runs when somebody writes to a table; triggers came with DuckDB 2.0.
-    ("a trigger", "trigger_name", "duckdb_triggers()"),
+    *([("a trigger", "trigger_name", "duckdb_triggers()")] if not duckdb.__version__.startswith("1.") else []),
     ("a constraint", "constraint_text", "duckdb_constraints()"),
     ("an index", "index_name", "duckdb_indexes()"),
 )
@@ -76,10 +76,8 @@ IMPORTED_AS: Final = {
 
 def check_tables(ask: Ask, path: Path, size: int, tables: Mapping[str, Mapping[str, str]]) -> None:
     """Raise `RecordingError` for a file of `size` bytes that holds programs, or other columns than `tables` have."""
-    known = {name for (name,) in ask("SELECT function_name FROM system.main.duckdb_functions() WHERE internal")}
     for word, column, source in _REFUSED:
-        found = ask(f"SELECT {column} FROM system.main.{source}") if source.partition("(")[0] in known else []  # noqa: S608 - constants
-        if found:
+        if found := ask(f"SELECT {column} FROM system.main.{source}"):  # noqa: S608 - constants
             raise RecordingError(
                 f"{path}: holds {word}, {printable(str(found[0][0]))}, and such files consist of tables alone; "
                 "it is not read, because such objects are programs"
@@ -362,17 +360,16 @@ class Store:
             raise
 
     def _create(self) -> None:
-        """Create the tables and columns that the file does not have: all in a new one, later ones in an older one."""
-        for table, columns in TABLES.items():
-            spec = ", ".join(f"{name} {kind}" for name, kind in columns.items())
-            self._execute(f"CREATE TABLE IF NOT EXISTS {table} ({spec})")
-            for name in ADDED_LATER.get(table, ()):
-                self._execute(f"ALTER TABLE {table} ADD COLUMN IF NOT EXISTS {name} {columns[name]}")
+        """Create the tables that the file does not have: all in a new one, later ones in an older one."""
+        with self.transaction():
+            for table, columns in TABLES.items():
+                spec = ", ".join(f"{name} {kind}" for name, kind in columns.items())
+                self._execute(f"CREATE TABLE IF NOT EXISTS {table} ({spec})")
 
     def _check_tables(self) -> None:
         """Raise `RecordingError` where the file lacks a table or column that every recording has.
 
-        Later ones are read as empty ones in memory.
+        Later ones are read as empty ones in memory; a file that is written gets its later columns.
         """
         present: dict[str, set[str]] = {table: set() for table in TABLES}
         for table, column, _kind in self._fetch(COLUMNS_OF_FILE):
@@ -387,6 +384,8 @@ class Store:
                 values = ", ".join(f"NULL::{columns[n]} AS {n}" if n in missing else n for n in columns)
                 rows = f"FROM {table}" if present[table] else "LIMIT 0"
                 self._execute(f"CREATE TEMP TABLE {table} AS SELECT {values} {rows}")
+            for name in missing if self._writes and present[table] else ():
+                self._execute(f"ALTER TABLE {table} ADD COLUMN {name} {columns[name]}")
 
 
 def _value(name: str, kind: str, column: NDArray[Any], arrays: dict[str, NDArray[Any]], bound: list[Any]) -> str:

@@ -157,6 +157,7 @@ def test_miluv_is_read_and_given_back_unchanged():
     assert np.isfinite(found.apply(r).corrected_m).all()
 
 
+@pytest.mark.slow
 def test_the_published_calibration_gives_the_published_ranges(tmp_path):
     """Within what a fault of the authors' code adds: it corrects the last stamp with the wrong tag's delay."""
     folder = miluv(tmp_path)

@@ -381,6 +381,7 @@ def test_shares_that_are_none(error_fitted, shares):
 # Two calibrations side by side.
 
 
+@pytest.mark.slow
 def test_fits_of_the_same_tags_are_the_same_nineteen_times_in_twenty():
     fits = [fit(ranges(3000, seed=seed)).calibration for seed in range(9)]
     found = [compare(a, b) for a, b in itertools.pairwise(fits)]
@@ -423,7 +424,7 @@ def test_nothing_in_common_cannot_be_compared():
 
 def test_of_pairs_that_are_not_determined_the_others_are_corrected_and_they_are_named(tmp_path):
     """Two tags and two anchors; in the second flight the tags range with each other, too."""
-    flight = calib.sample_flight()
+    flight = calib.sample_flight(300)
     e = flight.exchanges
     lower = np.sort(np.unique(np.append(e.initiator, e.target)))[0]
     across = (e.initiator == lower) ^ (e.target == lower)

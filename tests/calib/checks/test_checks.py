@@ -95,10 +95,14 @@ def starloc():
 @pytest.mark.parametrize(
     ("marker_of", "wrong"),
     [
-        (RADIOS, set()),
+        pytest.param(RADIOS, set(), marks=pytest.mark.slow),
         # Radio 11 is 1.25 m above its marker then, which the rig, which keeps its height, does not determine.
         ({radio: radio for radio in RADIOS}, {"tag10", "tag12"}),
-        (dict(zip(sorted(RADIOS), sorted(RADIOS.values()), strict=True)), {"tag4", "tag5", "tag6", "tag9", "tag11"}),
+        pytest.param(
+            dict(zip(sorted(RADIOS), sorted(RADIOS.values()), strict=True)),
+            {"tag4", "tag5", "tag6", "tag9", "tag11"},
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["right", "by number", "by order"],
 )
@@ -133,6 +137,7 @@ def test_coarse_ranges_that_follow_fast_are_not_doubled_exchanges(tmp_path):
     assert [finding.fault for finding in calib.examine(tmp_path / "t.uwb")] == ["static data"]
 
 
+@pytest.mark.slow
 def test_logs_of_both_robots_are_doubled_exchanges(tmp_path):
     with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as tar:
         logs = [one for one in tar.getnames() if one.endswith("uwb_range.csv")]
@@ -168,6 +173,7 @@ def test_power_and_distance_are_not_confounded_outdoors(tmp_path):
     }
 
 
+@pytest.mark.slow
 def test_a_fit_in_a_room_settles():
     """Steps by the information alone do not settle here in a hundred."""
     import uwbsim

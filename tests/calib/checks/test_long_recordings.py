@@ -16,25 +16,30 @@ PLAN = Plan(seconds=300, per_second=80)
 EXAMINED_EXCHANGES, EXAMINED_STRETCHES = 6_000, 12
 
 
+@pytest.fixture(autouse=True)
+def short_stretches(monkeypatch):
+    monkeypatch.setattr(recording_view, "EXAMINED_EXCHANGES", EXAMINED_EXCHANGES)
+    monkeypatch.setattr(recording_view, "EXAMINED_STRETCHES", EXAMINED_STRETCHES)
+
+
+def write(path, flight, late_ns=0):
+    poses = replace(flight.poses, time_ns=flight.poses.time_ns + late_ns)
+    Contents(exchanges=flight.exchanges, tags=flight.tags, poses=poses).save(path)
+    return path
+
+
 @pytest.fixture(scope="module")
 def flight():
     return fly(PLAN, 51)
 
 
-@pytest.fixture
-def written(tmp_path, monkeypatch):
-    monkeypatch.setattr(recording_view, "EXAMINED_EXCHANGES", EXAMINED_EXCHANGES)
-    monkeypatch.setattr(recording_view, "EXAMINED_STRETCHES", EXAMINED_STRETCHES)
-
-    def write(flight):
-        Contents(exchanges=flight.exchanges, tags=flight.tags, poses=flight.poses).save(tmp_path / "long.uwb")
-        return tmp_path / "long.uwb"
-
-    return write
+@pytest.fixture(scope="module")
+def path(flight, tmp_path_factory):
+    return write(tmp_path_factory.mktemp("long") / "long.uwb", flight)
 
 
-def test_stretches_are_over_all_of_the_time_and_their_distances_are_those_of_all_poses(flight, written):
-    with Recording.open(written(flight)) as recording:
+def test_stretches_are_over_all_of_the_time_and_their_distances_are_those_of_all_poses(flight, path):
+    with Recording.open(path) as recording:
         looked = recording_view.looked_at(RecordedSource(recording))
     x, every = looked.exchanges, flight.exchanges
     assert len(every) == 24_000
@@ -48,24 +53,21 @@ def test_stretches_are_over_all_of_the_time_and_their_distances_are_those_of_all
     )
 
 
-def test_nothing_is_found_where_nothing_was_planted_and_it_is_said_what_was_looked_at(flight, written):
-    path = written(flight)
+def test_nothing_is_found_where_nothing_was_planted_and_it_is_said_what_was_looked_at(path):
     assert calib.examine(path) == []
     assert examined_part(24_000) == (
         "about 6000 of its 24000 exchanges were looked at, in 12 stretches over all of its time"
     )
 
 
-def test_poses_that_are_late_are_found_by_how_much(flight, written):
-    late = replace(flight, poses=replace(flight.poses, time_ns=flight.poses.time_ns + 400_000_000))
-    (finding,) = calib.examine(written(late))
+def test_poses_that_are_late_are_found_by_how_much(flight, tmp_path):
+    (finding,) = calib.examine(write(tmp_path / "late.uwb", flight, 400_000_000))
     assert finding.fault == "pose time offset"
     assert "-0.400 s" in finding.evidence or "-0.39" in finding.evidence
 
 
-def test_a_short_recording_is_looked_at_as_a_whole(flight, written, monkeypatch):
+def test_a_short_recording_is_looked_at_as_a_whole(path, monkeypatch):
     monkeypatch.setattr(recording_view, "EXAMINED_EXCHANGES", 24_000)
-    path = written(flight)
     with Recording.open(path) as recording:
         assert len(recording_view.looked_at(RecordedSource(recording)).exchanges) == 24_000
     assert examined_part(24_000) == ""

@@ -85,7 +85,7 @@ def test_a_fit_repeats_its_settings(tmp_path):
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     path = tmp_path_factory.mktemp("flight") / "f.uwb"
-    flown = flight(seconds=14.0)
+    flown = flight(seconds=9.0)
     Contents(exchanges=flown.exchanges, poses=flown.poses, tags=flown.tags).save(path)
     return path
 

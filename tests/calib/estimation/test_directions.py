@@ -51,7 +51,7 @@ def spread(ranges, calibration):
     return float(np.std(calibration.apply(ranges).corrected_m - ranges.truth_m))
 
 
-@pytest.mark.parametrize("size_m", [0.05, 0.1, 0.2])
+@pytest.mark.parametrize("size_m", [0.1, *(pytest.param(size, marks=pytest.mark.slow) for size in (0.05, 0.2))])
 @pytest.mark.parametrize("own", [False, True])
 def test_a_planted_pattern_is_found_within_its_intervals(size_m, own):
     recipe = Recipe(pattern_m=size_m, own=own)
@@ -74,7 +74,7 @@ def test_a_planted_pattern_is_found_within_its_intervals(size_m, own):
     assert max(error) < (0.008 if own else 0.004)
 
 
-@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("own", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_another_flight_is_corrected_by_directions_from_its_poses(own, tmp_path):
     recipe = replace(TEN, own=own)
     first, second = written(tmp_path / "a.uwb", recipe, 3), written(tmp_path / "b.uwb", recipe, 3, 1)
@@ -100,12 +100,11 @@ SOUND = {
 }
 
 
+@pytest.mark.parametrize("seed", [21, pytest.param(22, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("recipe", SOUND.values(), ids=SOUND)
-def test_sound_flights_have_no_pattern(recipe):
-    for seed in (21, 22):
-        found = fitted(recipe, seed).calibration
-        assert found.patterns == ()
-        assert json.loads(found.to_json())["schema_version"] < 6
+def test_sound_flights_have_no_pattern(recipe, seed):
+    found = fitted(recipe, seed).calibration
+    assert (found.patterns, json.loads(found.to_json())["schema_version"] < 6) == ((), True)
 
 
 def test_what_belongs_to_places_does_not_pass_for_the_antennas():

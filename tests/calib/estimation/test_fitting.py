@@ -219,20 +219,15 @@ def test_what_is_not_known_of_the_smoothness_is_in_the_band_of_the_curve(monkeyp
         ("groups", {"a": []}),
         ("groups", {"a": [1, 2]}),
         ("groups", {"a": [1, 2, 3, 7], "b": [8]}),
+        ("sequential", True),  # of the mixture, which follows
     ],
 )
 def test_a_mistake_names_its_parameter(parameter, value):
     with pytest.raises(BadInputError) as caught:
-        fit(ranges(300), **{parameter: value})
+        fit(ranges(300), **{"loss": "mixture", parameter: value})
     assert caught.value.parameter == parameter
     assert str(caught.value).startswith(f"`{parameter}`: ")
     assert "--" not in str(caught.value)
-
-
-def test_the_mixture_is_not_fitted_sequentially():
-    with pytest.raises(BadInputError) as caught:
-        fit(ranges(300), sequential=True, loss="mixture")
-    assert caught.value.parameter == "sequential"
 
 
 def test_numpy_numbers_are_numbers():

@@ -133,6 +133,7 @@ def test_one_power_makes_a_flat_curve_and_says_so():
     assert "never changes (-91.0 dBm): the curve is flat" in told(result, "never changes")
 
 
+@pytest.mark.slow
 def test_real_ranges_whose_power_follows_their_distance(tmp_path):
     """Two boards on tripods, 2 to 60 m apart: no delays, and a curve known to centimetres; one constant can be had."""
     from tests.shared_data import ROOT, shared

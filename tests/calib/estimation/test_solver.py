@@ -10,7 +10,7 @@ from calib.calibration.comparison import compare
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import basis, curvature, lifted_power
 from calib.data.ranges import without_static
-from calib.errors import BadInputError, UnanswerableError
+from calib.errors import UnanswerableError
 from calib.estimator import known_distances
 from calib.fitting.fitting import fit
 from tests.calib.synthetic import DELAYS_NS, bias_m, design, ranges
@@ -73,13 +73,6 @@ def test_groups_of_tags_get_their_own_curves():
     mixed = np.isin(r.initiator, (1, 2)) != np.isin(r.target, (1, 2))
     taken = (applied.delay_corrected_m - applied.corrected_m)[mixed]
     assert np.std(taken) < 0.006
-
-
-def test_ranges_of_no_group_of_the_calibration_are_refused():
-    c = fit(grouped(ranges(3000), {"second": (3, 7)}), groups={"first": (1, 2), "second": (3, 7)}).calibration
-    lonely = replace(c, groups={"first": c.groups["first"]})
-    with pytest.raises(BadInputError, match="none of the calibration's groups"):
-        lonely.apply(ranges(10))
 
 
 def test_a_single_pair_gets_the_smallest_delays():

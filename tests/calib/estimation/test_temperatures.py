@@ -39,7 +39,12 @@ def written(path, recipe, seed, number=0, **more):
 
 
 @pytest.mark.parametrize(
-    ("mm_per_k", "apart", "pattern_m"), [(2, 0, 0), (20, 0, 0), (2, 4, 0), (20, 8, 0), (2, 0, 0.1)]
+    ("mm_per_k", "apart", "pattern_m"),
+    [
+        (2, 0, 0),
+        (2, 4, 0),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in ((20, 0, 0), (20, 8, 0), (2, 0, 0.1))),
+    ],
 )
 def test_planted_slopes_are_found_within_their_intervals(mm_per_k, apart, pattern_m):
     recipe = Recipe(pattern_m=pattern_m, warmer_k=15.0, mm_per_k=mm_per_k, apart_mm_per_k=apart)
@@ -56,7 +61,7 @@ def test_planted_slopes_are_found_within_their_intervals(mm_per_k, apart, patter
     [Recipe(pattern_m=0.0, warmer_k=15.0), Recipe(pattern_m=0.0, warmer_k=2.0, wander_m=0.03)],
     ids=["plain", "little warmth, errors that last"],
 )
-@pytest.mark.parametrize("seed", [306, 315, 316])
+@pytest.mark.parametrize("seed", [306, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (315, 316))])
 def test_sound_flights_have_no_slope_and_say_how_little_they_show(recipe, seed):
     found = fitted(recipe, seed)
     assert (found.temperatures, json.loads(found.to_json())["schema_version"] < 7) == ((), True)

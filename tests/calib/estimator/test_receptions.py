@@ -65,6 +65,7 @@ def test_listeners_gain_what_theory_predicts_and_intervals_hold():
     assert inside.mean() > 0.9
 
 
+@pytest.mark.slow
 def test_intervals_hold_among_reflections_with_a_curve():
     """Contrasts of delays: a constant of the curve is theirs."""
     errors, stated = [], []
@@ -168,6 +169,7 @@ def test_the_command_says_how_many_were_fitted(tmp_path):
     assert calib.load_calibration(tmp_path / "c.json").provenance["settings"]["use"] == "receptions"
 
 
+@pytest.mark.slow
 def test_a_real_flight_has_narrower_intervals_and_the_same_delays(tmp_path):
     flown = read_source(miluv(tmp_path), importer="miluv")
     found = [calib.fit(flown, use=use, between_m=0.0) for use in ("exchanges", "receptions")]

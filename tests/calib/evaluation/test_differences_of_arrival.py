@@ -137,18 +137,20 @@ def test_two_listeners_of_an_exchange_share_what_is_stated(known, heard):
     assert np.mean(np.concatenate(squares)) == pytest.approx(np.mean(np.concatenate(stated)), rel=0.08)
 
 
-def test_a_robot_that_never_sends_is_localized(known, heard):
-    found = [one for each in heard for one in calib.localize(each, known, LISTEN)]
+@pytest.mark.parametrize(("flights", "widest"), [(1, 1.7), pytest.param(3, 1.0, marks=pytest.mark.slow)])
+def test_a_robot_that_never_sends_is_localized(known, heard, flights, widest):
+    found = [one for each in heard[:flights] for one in calib.localize(each, known, LISTEN)]
     total = summarize(found)
-    assert [one.body for one in found] == ["robot"] * 3
+    assert [one.body for one in found] == ["robot"] * flights
     assert total.rmse_m["raw"] > 0.09
     assert total.rmse_m["variance"] < 0.045
     assert total.rmse_m["robust"] < 0.045
     # 95 % of a chi-square over its degrees: three a value, over as many values as are independent.
     assert total.nees_bounds[0] < total.nees < total.nees_bounds[1]
-    assert total.nees_bounds[1] - total.nees_bounds[0] < 1
-    assert localization_text(found, LISTEN).splitlines()[-1] == f"by 0 ranges and {3 * 6400} differences of arrival"
-    assert [one["arrivals"] for one in localization_json(found)["scenarios"]] == [6400] * 3
+    assert total.nees_bounds[1] - total.nees_bounds[0] < widest
+    said = f"by 0 ranges and {flights * 6400} differences of arrival"
+    assert localization_text(found, LISTEN).splitlines()[-1] == said
+    assert [one["arrivals"] for one in localization_json(found)["scenarios"]] == [6400] * flights
 
 
 def test_the_filter_knows_what_listeners_of_an_exchange_share(heard):
@@ -166,9 +168,9 @@ def test_the_filter_knows_what_listeners_of_an_exchange_share(heard):
     assert means[1] > 1.3 * means[0]
 
 
-def test_a_wrong_start_is_left_by_differences_alone(known, heard):
+def test_a_wrong_start_is_left_by_differences_alone(known):
     settings = replace(LISTEN, initial_offset_m=(0.0, -8.0, 0.0), seeds=1)
-    (found,) = calib.localize(heard[0], known, settings)
+    (found,) = calib.localize(flight(3104, 5.0), known, settings)
     for track in found.tracks.values():
         off = np.linalg.norm(track.estimate_m - track.truth_m, axis=1)
         assert off[0] > 5

@@ -191,7 +191,7 @@ def test_a_wrong_start_is_left_within_two_seconds(model, away):
 
 
 def test_a_velocity_that_lasts_does_without_an_imu():
-    contents = flight(reflected=0.1)
+    contents = flight(12.0, reflected=0.1)
     settings = OnboardSettings(model="constant-velocity")
     (track,) = localize_onboard(replace(contents, imu={}), calibration(0.1), settings)
     assert track.used == "ranges, height"
@@ -246,7 +246,7 @@ def with_patterns(found, size_m):
 
 
 def test_patterns_are_corrected_by_the_estimated_pose():
-    plain = flight(seed=5)
+    plain = flight(12.0, seed=5)
     turned, known = with_patterns(plain, 0.25)
     (free,), (corrected,), (wrong,) = (
         localize_onboard(*both) for both in ((plain, calibration()), (turned, known), (turned, calibration()))
@@ -261,7 +261,7 @@ def test_patterns_are_corrected_by_the_estimated_pose():
 
 
 def test_without_a_heading_a_pattern_is_noise():
-    turned, known = with_patterns(flight(seed=5), 0.25)
+    turned, known = with_patterns(flight(10.0, seed=5), 0.25)
     settings = OnboardSettings(model="constant-velocity")
     (unsure,), (sure,) = (localize_onboard(turned, one, settings) for one in (known, calibration()))
     assert np.median(unsure.std_m) > 1.1 * np.median(sure.std_m)
@@ -363,6 +363,7 @@ def test_multilateration_is_exact_and_leaves_a_reflection_out():
     assert low.place_m[2] > 1.0
 
 
+@pytest.mark.slow
 def test_a_real_flight_by_imu_height_and_ranges_alone(tmp_path):
     """The dataset's own flight among obstacles: a range to an anchor in 1.2 s, gaps of 6 s, published calibration."""
     contents = read_source(miluv(tmp_path), importer="miluv")

@@ -61,6 +61,7 @@ def test_with_everything_known_a_plan_is_a_fit_with_known_distances():
     assert found.covariance_ns2 == pytest.approx(expected, rel=0.02, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_what_a_fit_says_is_what_was_promised():
     """One flight: the intervals of the fit, which estimates errors and smoothness, are within a fifth."""
     seen = flight(seconds=12.0, seed=1, wander_deg=3.0, tilt_deg=1.0, place_noise_m=0.02)

@@ -6,6 +6,7 @@ import re
 import shutil
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from calib.report import Heading, Picture, Table, Text, check_places
 from calib.report.figures import arrangement
 from calib.report.sections import SECTIONS
 from tests import pages, processes
+from tests.calib.report.test_report import fonts_of
 from uwblink import Contents, Recording, UwblinkError
 from uwblink.pages import figures
 from uwblink.pages.blocks import Document, write_document
@@ -135,13 +137,23 @@ def weather(campaign):
 
 
 def test_a_section_of_ones_own_is_in_the_report(campaign, tmp_path, sections):
+    sections |= {"delays": SECTIONS["delays"]}
     calib.register_report_section("weather", weather, before="determined")
     campaign.write(tmp_path / "r.html", tmp_path / "r.pdf")
     page = (tmp_path / "r.html").read_text()
     titles = re.findall("<h2 id='s[0-9]+'>(.*?)</h2>", page)
     assert titles[titles.index("Weather") + 1] == "Is it determined?"
     assert "Dry over 270 ranges; &lt;wet&gt; tomorrow." in page
-    assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")
+    printed = PdfReader(tmp_path / "r.pdf")
+    outline: list[Any] = printed.outline
+    begin = {item["/Title"]: printed.get_destination_page_number(item) for item in outline}
+    assert list(begin) == titles
+    texts = [one.extract_text() for one in printed.pages]
+    assert all(name in texts[place] for name, place in begin.items())
+    assert all(f"{number} / {len(texts)}" in text for number, text in enumerate(texts, 1))
+    assert any("antenna delay (ns)" in text for text in texts), "the words inside a figure are words"
+    kinds = {kind for one in printed.pages for kind in fonts_of(one["/Resources"], set())}
+    assert kinds <= {"/Type0", "/CIDFontType2", "/TrueType"}
 
 
 @pytest.mark.parametrize(

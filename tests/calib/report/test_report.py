@@ -28,13 +28,13 @@ TEST = "<script>alert(1)<script>"
 
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory):
-    """A training flight with passive listeners, a test flight, and the report of both as a page, as PDF and as JSON."""
+    """A training flight with passive listeners, a test flight, and the report of both as a page and as JSON."""
     folder = tmp_path_factory.mktemp("campaign")
     for name, seed in (("train", 1), (TEST, 2)):
         settings = [f"run.seed={seed}", "run.duration_s=6", "tags.0.passive=true"]
         options = [word for setting in settings for word in ("--set", setting)]
         run("uwbsim", "run", ROOT / "scenarios/icra2023/train.toml", "-o", f"{name}.uwb", *options, cwd=folder)
-    words = f"report train.uwb --tests {TEST}.uwb -o r.html --pdf r.pdf --json"
+    words = f"report train.uwb --tests {TEST}.uwb -o r.html --json"
     (folder / "r.json").write_text(run("calib", *words.split(), cwd=folder).stdout)
     return folder
 
@@ -86,7 +86,9 @@ def fonts_of(resources, seen):
             yield from fonts_of(form["/Resources"].get_object(), seen)
 
 
+@pytest.mark.slow
 def test_the_pdf_has_numbered_pages_an_outline_and_figures_that_are_drawings(campaign):
+    run("calib", "report", "train.uwb", "--tests", f"{TEST}.uwb", "-o", "p.html", "--pdf", "r.pdf", cwd=campaign)
     reader = PdfReader(campaign / "r.pdf")
     assert 5 <= len(reader.pages) <= 20
     texts, sizes, kinds = [], set(), set()
@@ -119,7 +121,7 @@ def test_the_json_tells_what_the_page_tells(campaign):
     assert document["evaluation"]["planted"]["correction_rms_m"] < 0.02
 
 
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("width", [pytest.param(1280, marks=pytest.mark.slow), 390])
 def test_a_browser_shows_it(campaign, tmp_path, width):
     picture = tmp_path / "page.png"
     words = (f"--window-size={width},2400", f"--screenshot={picture}", (campaign / "r.html").as_uri())

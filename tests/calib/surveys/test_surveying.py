@@ -72,7 +72,9 @@ def assert_sound(world, result):
     assert np.mean([abs(d - world.delays_ns[t]) for t, d in result.calibration.delays_ns.items()]) < 0.1
 
 
-@pytest.mark.parametrize(("shape", "boards", "count"), [("line", 4, 7), ("space", 7, 5)])
+@pytest.mark.parametrize(
+    ("shape", "boards", "count"), [("line", 4, 7), pytest.param("space", 7, 5, marks=pytest.mark.slow)]
+)
 def test_planted_delays_lie_within_their_intervals(shape, boards, count):
     world = standing_boards(3, shape, boards=boards, arrangements=count)
     assert_sound(world, calib.survey(world.ranges, known="" if shape == "space" else shape))
@@ -127,6 +129,7 @@ def test_a_curve_over_power_is_found_along_with_the_delays():
     assert float(curve(np.array([low]))[0] - curve(np.array([high]))[0]) > 0.05
 
 
+@pytest.mark.slow
 def test_what_delays_share_is_inside_its_interval_where_the_curve_is_not_monotone():
     world = standing_boards(1002, boards=5, arrangements=8, wave_size_m=0.05, board_power_db=1.0)
     length = float(np.linalg.norm(world.places[0][0] - world.places[0][1]))

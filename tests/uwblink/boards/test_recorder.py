@@ -232,6 +232,7 @@ def held_up_s(process):
     return sum(int(text.split()[1]) for text in texts) * 1e-9
 
 
+@pytest.mark.slow
 def test_kill_9_loses_nothing_older_than_a_quarter_of_a_second(tmp_path):
     path, ages = tmp_path / "f.uwb", []
     # Besides the processor, the recorder waits for a disk that others use, too: one try in four must keep the promise.
@@ -293,6 +294,7 @@ def test_a_full_disk_ends_with_a_clear_line_and_a_readable_file(tmp_path):
     assert len(exchanges) > 0
 
 
+@pytest.mark.slow
 def test_one_port_is_for_one_process(tmp_path):
     with served() as server:
         process = subprocess.Popen(command(tmp_path / "f.uwb", server, "--duration", "200"), stdout=subprocess.DEVNULL)

@@ -1,7 +1,5 @@
 """Exchanges in bags of ROS 1, ROS 2 and MCAP, of messages that are defined here, by a map of their fields."""
 
-from contextlib import closing
-
 import numpy as np
 import pytest
 
@@ -150,16 +148,6 @@ def test_what_is_no_bag_is_said(tmp_path):
             read_source(tmp_path / name, **more)
     with pytest.raises(ArgumentError, match="takes one file, found 2"):
         read_source([tmp_path / "no.bag"] * 2, importer="bag")
-
-
-def test_a_kind_that_the_bag_does_not_define_is_named(tmp_path):
-    bag = ros2(tmp_path / "b", EXCHANGES, StoragePlugin.SQLITE3)
-    import sqlite3
-
-    with closing(sqlite3.connect(bag / "b.db3")) as db, db:
-        db.execute("DELETE FROM message_definitions")
-    with pytest.raises(ImportTableError, match="has no definition of uwb_msgs/msg/Exchange"):
-        read_source(bag, importer="bag")
 
 
 def test_an_array_of_distances_is_a_column_an_anchor(tmp_path):

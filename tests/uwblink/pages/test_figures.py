@@ -100,7 +100,7 @@ def test_a_page_knows_what_each_panel_shows():
     assert at == pytest.approx(round(at / 20) * 20, abs=0.5)
 
 
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("width", [pytest.param(1280, marks=pytest.mark.slow), 390])
 def test_a_page_lies_well(width, tmp_path):
     header = ["pair", *(f"column {k}" for k in range(20))]
     blocks: list[Block] = [

@@ -100,8 +100,12 @@ def test_a_recording_from_before_faults_named_their_exchange_is_read(recording, 
     with Recording.open(recording) as r:
         assert r.faults() == [Fault(9, "1", "time-out", "no answer", None, None)]
         r.copy(tmp_path / "copy.uwb")
-    with Recording.open(tmp_path / "copy.uwb") as r:
-        assert r.faults() == [Fault(9, "1", "time-out", "no answer", None, None)]
+    later = Fault(10, "1", "time-out", "no answer", 1, 2)
+    with Recording.open(recording, update=True) as r:
+        r.append("faults", [later])
+    for path, added in ((tmp_path / "copy.uwb", []), (recording, [later])):
+        with Recording.open(path) as r:
+            assert r.faults() == [Fault(9, "1", "time-out", "no answer", None, None), *added]
 
 
 HOLDER = """

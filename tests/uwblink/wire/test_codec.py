@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.errors import one_line
 from tests.uwblink.wire import transcripts
 from uwblink.errors import ArgumentError, FrameError
 from uwblink.twr import board_range, raw_range
@@ -56,11 +57,6 @@ def test_every_captured_report_decodes_and_encodes_to_the_same_bytes(data):
         assert not isinstance(events[0], m.Skipped)
         assert as_bytes(events[0]) == data
         assert isinstance(events[0], m.REPORTS.get(data[:3], m.TextLine))
-
-
-def test_all_captured_reports_in_one_stream_byte_at_a_time():
-    stream = b"".join(REPORTED)
-    assert [as_bytes(e) for e in decode(stream, m.REPORTS, [1] * len(stream))] == REPORTED
 
 
 @pytest.mark.parametrize("data", COMMANDED, ids=lambda d: repr(d[:24]))
@@ -124,14 +120,6 @@ def test_a_payload_is_no_message_and_a_damaged_broadcast_does_not_answer():
     payload = m.BroadcastReceived(b"R00\r\nR01|3\r\n|S")
     assert decode(encode(payload), m.REPORTS) == [payload]
     assert understood(decode(b"X06|\x04\x00xR00y", m.REPORTS)) == []
-
-
-def test_endless_garbage_does_not_pile_up():
-    decoder = Decoder(m.REPORTS)
-    for _ in range(100):
-        decoder.feed(b"R05|" + b"1" * 4000)
-    assert len(decoder._buffer) <= 8192 + 4004
-    assert decoder.skipped_bytes > 300_000
 
 
 GARBAGE = [b"\x00", b"\r", b"\n"]
@@ -205,9 +193,8 @@ def test_printed_numbers_are_cut_towards_zero(value, stamp):
     ],
 )
 def test_values_that_do_not_fit_are_refused(message, text):
-    with pytest.raises(FrameError) as caught:
+    with pytest.raises(FrameError, match=one_line(text)):
         encode(message)
-    assert str(caught.value).startswith(text)
 
 
 # Where fields, lines and messages end: the last value that is taken, and the first that is not.
@@ -307,13 +294,6 @@ def test_texts_and_bytes_have_the_length_of_the_firmware_s_buffers():
             TEXT.read(text)
     with pytest.raises(FrameError):
         BOOL.write(1)
-
-
-def test_a_text_of_199_letters_comes_through_whole_and_in_pieces():
-    longest, longer = (b"C03|1|" + b"a" * n + b"|1|\x00\x00\x80?|\x01\x00x\r" for n in (199, 200))
-    for sizes in (None, [1] * len(longest)):
-        (message,) = decode(longest, m.COMMANDS, sizes)
-        assert (message.text, understood(decode(longer, m.COMMANDS, sizes))) == ("a" * 199, [])
 
 
 def test_numbers_are_printed_below_ten_billion_and_cut():

@@ -88,7 +88,7 @@ def folder(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("width", [pytest.param(1280, marks=pytest.mark.slow), 390])
 @pytest.mark.parametrize("name", ["scene", "out/compare"])
 def test_pages_lie_well(width, name, folder, tmp_path):
     page = (folder / f"{name}.html").read_text()

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import uwbsim
-from tests import processes
+from tests import pages, processes
 from uwblink import raw_range
+from uwblink.pages import figures
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, elapsed
 from uwbsim.protocols.comparison import compare
 from uwbsim.protocols.conditions import calibrated, conditions_of
@@ -44,27 +45,33 @@ def differences_m(heard):
     return ticks * (TICK_S * SPEED_OF_LIGHT) - way
 
 
-@pytest.mark.parametrize("white", [pytest.param(0.0, marks=pytest.mark.slow), 0.003])
-def test_broadcasts_and_differences_err_as_predicted(white):
-    """20 s have 25 000 frames of five tags, a tenth as many for each pair: a deviation is known to 1 %."""
-    scenario = fleet_world(white)
+@pytest.mark.parametrize(
+    ("white", "seconds", "part"),
+    [
+        (0.003, 4.0, 0.045),
+        *(pytest.param(white, 20.0, 0.02, marks=pytest.mark.slow) for white in (0.0, 0.003)),
+    ],
+)
+def test_broadcasts_and_differences_err_as_predicted(white, seconds, part):
+    """20 s have 25 000 frames of five tags, a tenth as many for each pair: deviations are known to 1 %, of 4 s to 2."""
+    scenario = fleet_world(white, seconds)
     flight = uwbsim.simulate(scenario)
     found = {one.method: one for one in compare(scenario, ["ds"], 1).fleet}
     assert list(found) == ["ds", "broadcast", "tdoa"]
     errors = raw_range(flight.exchanges) - flight.truth_m
-    assert np.std(errors) == pytest.approx(found["broadcast"].std_m, rel=0.02)
+    assert np.std(errors) == pytest.approx(found["broadcast"].std_m, rel=part)
     assert found["broadcast"].rmse_m == pytest.approx(found["broadcast"].std_m, rel=0.01)
     heard = {name: column[flight.overheard["listener"] == 9] for name, column in flight.overheard.items()}
-    assert np.std(differences_m(heard)) == pytest.approx(found["tdoa"].std_m, rel=0.02)
+    assert np.std(differences_m(heard)) == pytest.approx(found["tdoa"].std_m, rel=part)
     # Differences of neighbours in the round, alone: the reply is a slot of five.
     reply = elapsed(heard["tx2_n"], heard["rx1_n"], 40) * TICK_S
     slot = 1 / scenario.ranging.rate_hz
     near = {name: column[reply < 1.5 * slot] for name, column in heard.items()}
     world = calibrated(conditions_of(scenario, 100))
     expected = np.sqrt(broadcast_variances_m2(world, slot, 5 * slot)[1].mean())
-    assert np.std(differences_m(near)) == pytest.approx(expected, rel=0.02)
+    assert np.std(differences_m(near)) == pytest.approx(expected, rel=part)
     # Ten pairs a round; a range needs the round after it.
-    assert len(flight.exchanges) / 20.0 == pytest.approx(10 * found["broadcast"].update_hz, rel=0.001)
+    assert len(flight.exchanges) / seconds == pytest.approx(10 * found["broadcast"].update_hz, rel=0.02 / seconds)
     assert found["tdoa"].update_hz == found["broadcast"].update_hz
 
 
@@ -91,7 +98,8 @@ def test_costs_are_those_of_the_frames():
     assert {one.tags for one in fifty.values()} == {50}
 
 
-def test_predict_and_compare_print_the_fleet(tmp_path):
+def test_predict_and_compare_print_the_fleet(tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "drawn", pages.outline)
     words = ("predict", "--tags", "8", "--delay-initiator-ns", "3")
     found = json.loads(processes.succeed("uwbsim", *words, "--json").stdout)
     fleet = {row["method"]: row for row in found["fleet"]}
@@ -102,6 +110,6 @@ def test_predict_and_compare_print_the_fleet(tmp_path):
     processes.refuse("uwbsim", "predict", "--tags", "1", naming=["--tags"])
     with pytest.raises(uwbsim.UwbsimError, match="tags"):
         uwbsim.predict_fleet(uwbsim.State(), 300)
-    done = processes.succeed("uwbsim", "compare", "broadcast", "-o", tmp_path / "c", "--protocols", "ds", "-n", "1000")
+    done = processes.call("uwbsim", "compare", "broadcast", "-o", tmp_path / "c", "--protocols", "ds", "-n", "1000")
     assert "6 tags" in done.stdout
     assert "A fleet of 6 tags" in (tmp_path / "c" / "compare.html").read_text()

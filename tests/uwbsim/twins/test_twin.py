@@ -113,6 +113,7 @@ def test_what_persists_differently_is_not_alike(found):
     assert one.verdict == "differ"
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_scenario_and_a_page(tmp_path, monkeypatch):
     uwbsim.simulate(world(4.0), contention=False).save(tmp_path / "f.uwb")
     (tmp_path / "c.json").write_text(json.dumps(known(world())))
