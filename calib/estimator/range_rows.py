@@ -233,12 +233,12 @@ class RangeRows:
     def restricted(self) -> bool:
         """Whether their noise depends on how well residuals are known.
 
-        A robust loss has no such noise, and where unknowns are fewer than a fiftieth of the ranges, noise is right to
-        1 % without.
+        A robust loss has no such noise, and where unknowns are fewer than a twentieth of the ranges, noise is right to
+        2.5 % without.
         """
         kinds = {part.kind for part in self.parts if part.parameter == RESIDUAL}
         count = sum(self.layout.where[kind].stop - self.layout.where[kind].start for kind in kinds)
-        return isinstance(self.errors, Mixture) and 50 * count > len(self)
+        return isinstance(self.errors, Mixture) and 20 * count > len(self)
 
     def expecting(self) -> RangeRows:
         """Return these rows of a mixture with expected information, not squares of slopes."""
