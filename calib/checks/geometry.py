@@ -143,7 +143,7 @@ def _told(view: RecordingView, **said: Any) -> RecordingView:
 def _line(view: RecordingView, tag: Tag, away_m: Floats | float = 0.0) -> str:
     """Return a tag as it stands in a map: an anchor where its body stands, displaced by `away_m` (3,)."""
     if tag.body not in places_m(view):
-        return f'\n[[tags]]\nid = {tag.tag}\nbody = "{tag.body}"\nlever_arm_m = {list(tag.lever_arm_m)}'
+        return f"\n[[tags]]\nid = {tag.tag}\nbody = {tag.body!r}\nlever_arm_m = {list(tag.lever_arm_m)}"
     (place,) = antennas_m(view.poses, [tag], np.array([tag.tag]), view.poses.time_ns[view.poses.body == tag.body][:1])
     return f"\n[[anchors]]\nid = {tag.tag}\nposition_m = {(place + away_m).round(3).tolist()}"
 
