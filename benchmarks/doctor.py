@@ -246,11 +246,12 @@ def doubled(flight: Flight, rng: np.random.Generator) -> Flight:
     return replace(flight, exchanges=e[twice])
 
 
-def exchanged_anchors(flight: Flight, rng: np.random.Generator, *, given: bool) -> Flight:
-    """Give two anchors each other's place, in the poses or in `given` true distances."""
-    a, b = (f"anchor{k}" for k in rng.permutation(4)[:2])
-    body = flight.poses.body
-    wrong = replace(flight, poses=replace(flight.poses, body=np.where(body == a, b, np.where(body == b, a, body))))
+def exchanged_anchors(flight: Flight, rng: np.random.Generator, *, given: bool, count: int = 2) -> Flight:
+    """Give some anchors each the next one's place, in the poses or in `given` true distances."""
+    some = rng.permutation(4)[:count].tolist()
+    number = {f"anchor{a}": f"anchor{b}" for a, b in zip(some, [*some[1:], some[0]], strict=True)}
+    body = np.array([number.get(name, name) for name in flight.poses.body.tolist()])
+    wrong = replace(flight, poses=replace(flight.poses, body=body))
     if not given:
         return wrong
     truth = calib.Ranges.from_exchanges(wrong.exchanges, poses=wrong.poses, tags=wrong.tags).truth_m
@@ -395,9 +396,11 @@ FAULTS: Final = (
     Case("powers as losses, or times 100 or 256", BASE, other_powers, names("unit of the powers")),
     Case("a third of the rows twice", BASE, doubled, names("doubled exchanges")),
     Case("two anchors exchanged in the poses", RIG, partial(exchanged_anchors, given=False),
-         names("anchor stands elsewhere"), names(FEW)),
+         names("swapped tag ids"), names(FEW)),
     Case("two anchors exchanged in the true distances", RIG, partial(exchanged_anchors, given=True),
-         names("ranges that do not follow the distances"), names(FEW)),
+         names("swapped tag ids"), names(FEW)),
+    Case("four exchanged in a circle", RIG, partial(exchanged_anchors, given=False, count=4),
+         names("swapped tag ids"), names(FEW)),
     Case("nothing moves, and a pair is 45 cm long", BASE, still_open, names("pairs that do not close"),
          names("static data")),
     Case("power that follows distance, and noise", BASE, noisy_powers, names("power confounded with distance")),

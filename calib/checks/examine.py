@@ -168,18 +168,19 @@ CHECKS: Final = (
         {
             "lever arm sign": "change the sign of the lever arms of body {body}",
             "lever arm unit": "multiply the lever arms of body {body} by {length}",
-            "swapped tag ids": "exchange tags {a} and {b}",
             "wxyz quaternion": "quaternions are w x y z: reorder the columns to x y z w",
         },
         geometry.geometry,
     ),
     Check(
         "geometry",
-        "Does an anchor stand more than 5 cm elsewhere?",
-        "displacement that ranges ask for", "F(3, 9), variances by stretches of time, for all anchors",
+        "Are tags at places of others, or anchors more than 5 cm elsewhere?",
+        "log of the spread before over after, tags assigned to places; displacement that ranges ask for",
+        f"{OVER_STRETCHES}, for all exchanges; F(3, 9), variances by stretches of time, for all anchors",
         {
+            "swapped tag ids": "{remedy}",
             "anchor stands elsewhere": "measure the place of {body} again, and see whose number it has; these ranges "
-            "give position_m = {place}"
+            "give{lines}"
         },
         geometry.anchors,
     ),
@@ -217,8 +218,8 @@ CHECKS: Final = (
         "Is a pair more than 4 cm off what delays of tags explain?",
         "a pair's own offset, the largest", f"{OVER_BLOCKS}, for all pairs",
         {
-            "pairs that do not close": "look for a wall or a body between these two, and at their lever arms; record "
-            "the pair anew, or fit with `constants` pair"
+            "pairs that do not close": "look for a wall or a body between these two, and at their lever arms and "
+            "places; record the pair anew, or fit with `constants` pair"
         },
         residuals.closures,
     ),

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from heapq import nlargest
-from itertools import combinations
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-from scipy import optimize, special
+from scipy import ndimage, optimize, sparse, special
+from scipy.sparse.csgraph import connected_components
 
 from calib.checks.fitted import late
-from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
+from calib.checks.recording_view import QuickFit, RecordingView
 from calib.estimator.known_distances import ASTRAY_M
 from calib.estimator.score_tests import Tested
 from calib.findings import BUDGET, Candidate, positive, stretches
 from calib.information import LOOSEST
-from calib.spread import TWO_SIDED_95, less_medians, medians, robust_spread
+from calib.spread import medians, robust_spread
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.recording.distances import antennas_m, distances_m, find_offset
@@ -54,9 +54,6 @@ def _trials(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]
         for fault, length in [("lever arm sign", -1.0)] * bool(longest > 0) + units:
             seen = Candidate(fault, f"of body {body}: times {length:g}", words={"body": body, "length": length})
             yield seen, view.poses, _with_arms(view.tags, {tag: length * arm for tag, arm in arms.items()})
-        for a, b in combinations(arms, 2):
-            seen = Candidate("swapped tag ids", f"of tags {a} and {b}: undone", words={"a": a, "b": b})
-            yield seen, view.poses, _with_arms(view.tags, {a: arms[b], b: arms[a]})
     if len(view.poses):
         turned = replace(view.poses, quaternion=view.poses.quaternion[:, [1, 2, 3, 0]])
         yield Candidate("wxyz quaternion", "of the poses: undone"), turned, view.tags
@@ -109,14 +106,87 @@ def _gain(before_m: Floats, after_m: Floats) -> float:
 TOLERANCE_M: Final = 0.05
 """What a place by tape or markers is off by, with the antenna beside the marker: the size of a board."""
 
+PAIR_M: Final = 0.04
+"""What lever arms by a ruler and phase centres of antennas do to a pair: 2 cm at either end."""
+
 
 def anchors(view: RecordingView) -> Iterator[Candidate]:
-    """Anchors whose ranges ask for another place, which is `away_m` (3,) among the words."""
+    """Tags that are at each other's places; then anchors that stand elsewhere, `away_m` (3,) among the words."""
     # Where nothing moves, each pair has a level that is its own.
-    if view.posed and view.standing_m is None and view.quick_fit is not None:
-        places = places_m(view)
-        for body in places:
-            yield from _displaced(view, view.quick_fit, body, places)
+    if view.standing_m is not None or view.quick_fit is None:
+        return
+    moved, seen = _exchanged(view, view.quick_fit)
+    remedy = "exchange these numbers where the true distances come from"
+    if moved and view.posed:
+        by_number = {tag.tag: tag for tag in view.tags}
+        view = _told(view, tags=[replace(by_number[moved.get(number, number)], tag=number) for number in by_number])
+        lines = "".join(_line(view, tag) for tag in view.tags if tag.tag in moved)
+        remedy = (
+            f"in the file of uwblink poses --tags, replace those with these numbers; add poses with `force`:{lines}"
+        )
+    yield replace(seen, words={"remedy": remedy})
+    if view.posed and view.quick_fit is not None:
+        yield from _displaced(view, view.quick_fit)
+    elif len(view.poses):
+        # A table's own true distances are used, and its poses are what places tags when ranges are.
+        by_poses = anchors(_told(view, posed=True))
+        yield from (replace(one, evidence=f"by the poses, {one.evidence}") for one in by_poses)
+
+
+def _told(view: RecordingView, **said: Any) -> RecordingView:
+    """Return a view with other poses or tags, and true distances by them."""
+    told, e = replace(view, **said), view.exchanges
+    truth_m = distances_m(told.poses, told.tags, e.initiator, e.target, e.time_ns)
+    return replace(told, ranges=replace(view.ranges, truth_m=truth_m))
+
+
+def _line(view: RecordingView, tag: Tag, away_m: Floats | float = 0.0) -> str:
+    """Return a tag as it stands in a map: an anchor where its body stands, displaced by `away_m` (3,)."""
+    if tag.body not in places_m(view):
+        return f"\n[[tags]]\nid = {tag.tag}\nbody = {tag.body!r}\nlever_arm_m = {list(tag.lever_arm_m)}"
+    (place,) = antennas_m(view.poses, [tag], np.array([tag.tag]), view.poses.time_ns[view.poses.body == tag.body][:1])
+    return f"\n[[anchors]]\nid = {tag.tag}\nposition_m = {(place + away_m).round(3).tolist()}"
+
+
+def _exchanged(view: RecordingView, fit: QuickFit) -> tuple[dict[int, int], Candidate]:
+    """Return which tags are at places of which others, and the finding.
+
+    A tag a at the place of b ranges with c as far as b is from c, by the true distances of b and c, which are
+    interpolated. The logarithms of the pairs' spreads are the likelihood, were each scale its own: an assignment of
+    tags to places finds the likeliest exchange of any number of them. In each of its cycles one tag, of all at all
+    places, must pass a test of its own.
+    """
+    ranges, pairs, numbers = fit.model.ranges, fit.model.pairs, np.unique(fit.ends)
+    count, right, ends = len(numbers), np.arange(len(numbers)), np.searchsorted(numbers, pairs.ends).tolist()
+    rows = {both: np.flatnonzero(pairs.number == k) for k, (a, b) in enumerate(ends) for both in ((a, b), (b, a))}
+
+    def truth_m(own: Ints, other: Ints) -> Floats:
+        return np.interp(ranges.time_ns[own], ranges.time_ns[other], ranges.truth_m[other])
+
+    def undone(at: Ints) -> Candidate:
+        mended, moved = view.ranges.truth_m.copy(), at != right
+        for (a, c), own in rows.items():
+            mended[fit.rows[own]] = truth_m(own, rows.get((at[a], at[c]), own))
+        said = [f"{a} is where {b} is said to be" for a, b in zip(numbers[moved], numbers[at[moved]], strict=True)]
+        return _undone(view, Candidate("swapped tag ids", f"tag {', '.join(said)}: undone"), mended, tried=count**2)
+
+    known, spread, worse = sums = np.zeros((3, count, count))
+    for (a, c), own in rows.items():
+        usual = np.log(robust_spread(fit.error[own]) + 1e-6)
+        for b in right:
+            if (b, c) in rows:
+                there = np.log(robust_spread(ranges.raw_m[own] - truth_m(own, rows[b, c])) + 1e-6)
+                sums[:, a, b] += len(own) * np.array([1.0, there, there - usual])
+    # At its own place a tag's ranges are not astray, and what narrows them by a twentieth is not worth a word.
+    possible = (known > 0.25 * known.diagonal()[:, None]) & (spread < known * np.log(ASTRAY_M))
+    cost = np.where(possible, worse - known * np.log(0.95), np.inf)
+    np.fill_diagonal(cost, 0.0)
+    at = optimize.linear_sum_assignment(cost)[1]
+    p_values = np.array([undone(np.where(right == a, at, right)).p_value if at[a] != a else 1.0 for a in right])
+    cycle = connected_components(sparse.csr_matrix((np.ones(count), (right, at))))[1]
+    at = np.where([p_values[cycle == k].min() < BUDGET for k in cycle], at, right)
+    moved = {int(numbers[a]): int(numbers[at[a]]) for a in np.flatnonzero(at != right)}
+    return moved, replace(undone(at), p_value=float(p_values[at != right].min(initial=1.0)))
 
 
 def places_m(view: RecordingView) -> dict[str, Floats]:
@@ -126,76 +196,115 @@ def places_m(view: RecordingView) -> dict[str, Floats]:
     return {body: np.median(some, axis=0) for body, some in points.items() if np.ptp(some, axis=0).max() < 0.02}
 
 
-def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, Floats]) -> Iterator[Candidate]:
-    """Yield an anchor whose ranges fit another place, tested by the slopes of its distances at that place.
+def _displaced(view: RecordingView, fit: QuickFit) -> Iterator[Candidate]:
+    """Yield anchors whose ranges fit other places, tested by the slopes of all distances there together.
 
     In a direction that ranges hardly determine, as the height where robots keep theirs, some place far away always fits
     reflections better than the given one. So the direction must be determined at the given place, as an information
     matrix is judged (`calib.information`), unless ranges are astray there. Where slopes at the given place may be zero
     no other is searched for: distances are linear in centimetres, not in metres, so that a search cannot be spared.
     """
-    tags = [tag.tag for tag in view.tags if tag.body == body]
-    first, second = (np.isin(ends[fit.rows], tags) for ends in (view.exchanges.initiator, view.exchanges.target))
-    mine = first != second
-    own = view.chosen(fit.rows[mine])
-    here, there = (
-        antennas_m(view.poses, view.tags, ids, own.exchanges.time_ns)
-        for ids in (own.exchanges.initiator, own.exchanges.target)
-    )
-    apart = np.where(first[mine, None], here - there, there - here)
-    pair = np.unique(fit.model.pairs.number[mine], return_inverse=True)[1]
-    # With fewer, its slopes in 32 stretches of time would be of some ranges each, and far from normal.
-    if len(apart) < 200 or not np.isfinite(apart).all():
+    places = places_m(view)
+    sides, poses, away = _sides(view, fit, places), view.poses, dict[str, Floats]()
+    for body, own in _slopes(fit, sides).items():
+        mine = sides[body].any(axis=1)
+        # Where anchors are metres off, what power does is not known, and small beside that.
+        far = robust_spread(fit.residual[mine]) > ASTRAY_M
+        if far or _p_of_place(own, own.total) <= BUDGET:
+            error_m = (fit.error if far else fit.residual)[mine]
+            starts = [place - places[body] for place in places.values()]
+            away[body] = _place(sides[body][mine], error_m, fit.model.pairs.number[mine], starts)
+            there_m = np.where(poses.body[:, None] == body, poses.position_m + away[body], poses.position_m)
+            poses = replace(poses, position_m=there_m)
+    if not away or (moved := (told := _told(view, poses=poses)).quick_fit) is None:
         return
-    here_m = np.linalg.norm(apart, axis=1)
-    # Where anchors are metres off, what power does is not known, and small beside that.
-    astray = robust_spread(fit.residual[mine]) > ASTRAY_M
-    derivative = np.zeros((len(mine), 3))
-    derivative[mine] = outward = apart / here_m[:, None]
-    at_given = fit.test(derivative)
-    if not astray and _p_of_place(at_given, at_given.total) > BUDGET:
-        return
-    measured = here_m + (own.error_m if astray else fit.residual[mine])
-
-    def spread_at(away: Floats) -> float:
-        return robust_spread(less_medians(measured - np.linalg.norm(apart + away, axis=1), pair))
-
-    away = min((_place(apart, measured, pair, place - places[body]) for place in places.values()), key=spread_at)
-    before, after, size = spread_at(np.zeros(3)), spread_at(away), float(np.linalg.norm(away))
-    # The ranges of this anchor alone, at its other place: their noise is theirs, whatever else is wrong.
-    there_m = np.linalg.norm(apart + away, axis=1)
-    truth_m = own.ranges.truth_m + (there_m - here_m)
-    moved = quick_fit([replace(own, ranges=replace(own.ranges, truth_m=truth_m))])
-    gain = _gain(own.less_pairs(own.error_m), own.less_pairs(own.ranges.raw_m - truth_m))
-    # The spread of other ranges, and half of it more.
-    usual = 1.5 * robust_spread(fit.residual[~mine]) if not mine.all() else np.inf
-    if size <= TOLERANCE_M or gain <= 0 or after >= min(before, usual) or moved is None:
-        return
-    at_other = moved.test(((apart + away) / there_m[:, None])[moved.rows])
-    slope = at_other.information @ away * (1 - TOLERANCE_M / size)
-    p_value = _p_of_place(at_other, slope)
-    if not astray:
-        # Ranges at the other place: at the given one they hardly determine anything, so far off are they.
-        at_given = moved.test(outward[moved.rows])
-        direction = np.linalg.lstsq(at_given.information, away / size, rcond=1e-12)[0]
+    # What ranges, as they fit the other places, know of those, and of the given ones.
+    at_other, at_given = (_slopes(moved, some, levels=True) for some in (_sides(told, moved, places), sides))
+    before_m, after_m = (one.less_pairs(one.error_m)[fit.rows] for one in (view, told))
+    for body, there in away.items():
+        own, mine = at_other[body], sides[body].any(axis=1)
+        # The last step is that of the fit, whose slopes are tested; where they know nothing, there is none.
+        shift = there - np.linalg.solve(own.information + np.eye(3) / (LOOSEST * 0.5) ** 2, own.total)
+        size, gain = float(np.linalg.norm(shift)), _gain(before_m[mine], after_m[mine])
+        before, after = (robust_spread(errors[mine]) for errors in (before_m, after_m))
         # Without ranges a place is known to half a metre: a tape misread, a tripod moved.
-        if np.sqrt(direction @ at_given.covariance @ direction) > LOOSEST * 0.5:
-            return
-    # Places above and below each other are alike to robots that move in a plane; a displacement is known to a tenth.
-    near = {name: float(np.hypot(*(place - places[body] - away)[:2])) for name, place in places.items()}
-    others = " and ".join(name for name in places if name != body and near[name] < 0.3 + 0.1 * size)
-    inverse = np.linalg.pinv(at_other.information, rcond=1e-12, hermitian=True)
-    std = np.sqrt(np.diag(inverse @ at_other.covariance @ inverse))
-    axes = [f"{name} {one:+.2f} ± {TWO_SIDED_95 * far:.2f}" for name, one, far in zip("xyz", away, std, strict=True)]
-    yield Candidate(
-        "anchor stands elsewhere",
-        f"ranges with {body} fit a place {size:.2f} m away ({', '.join(axes)} m, 95 %): their "
-        f"spread is {100 * after:.1f} cm there instead of {100 * before:.1f} cm"
-        + (f"; there the recording has {others}: are numbers exchanged?" if others else ""),
-        min(1.0, p_value * len(places)),
-        {"body": body, "away_m": away, "place": [round(value, 2) for value in (places[body] + away).tolist()]},
-        gain,
-    )
+        direction = np.linalg.lstsq(at_given[body].information, shift / size, rcond=1e-12)[0]
+        known = robust_spread(fit.residual[mine]) > ASTRAY_M or (
+            direction @ at_given[body].covariance @ direction < (LOOSEST * 0.5) ** 2
+        )
+        # The spread of all ranges, and half of it more.
+        if size <= TOLERANCE_M or gain <= 0 or after >= 1.5 * robust_spread(after_m) or not known:
+            continue
+        inverse = np.linalg.pinv(own.information, rcond=1e-12, hermitian=True)
+        times = special.stdtrit(min(own.lasting.freedom, own.blocks - 3.0), 0.975)
+        wide = times * np.sqrt(np.diag(inverse @ own.covariance @ inverse))
+        axes = [f"{name} {one:+.2f} ± {of:.2f}" for name, one, of in zip("xyz", shift, wide, strict=True)]
+        loose = " and ".join(name for name, of in zip("xyz", wide, strict=True) if of > LOOSEST)
+        # Places above each other are alike to robots that move in a plane; a displacement is known to a tenth.
+        others = " and ".join(
+            name
+            for name, place in places.items()
+            if name != body and np.hypot(*(place - places[body] - shift)[:2]) < 0.3 + 0.1 * size
+        )
+        yield Candidate(
+            "anchor stands elsewhere",
+            f"ranges with {body} fit a place {size:.2f} m away ({', '.join(axes)} m, 95 %): their "
+            f"spread is {100 * after:.1f} cm there instead of {100 * before:.1f} cm"
+            + (f"; they hardly tell {loose} from delays" if loose else "")
+            + (f"; there the recording has {others}: are numbers exchanged?" if others else ""),
+            min(1.0, _p_of_place(own, own.information @ shift * (1 - TOLERANCE_M / size)) * len(sides)),
+            {
+                "body": body,
+                "away_m": shift,
+                "lines": "".join(_line(view, tag, shift) for tag in view.tags if tag.body == body),
+            },
+            gain,
+        )
+
+
+def _sides(view: RecordingView, fit: QuickFit, bodies: Iterable[str]) -> dict[str, Floats]:
+    """Return the vectors (n, 3) to bodies from the antennas at the other ends of ranges, zero for ranges of others.
+
+    Bodies with fewer than 200 ranges are left out: in 32 stretches of time slopes would be of some ranges each, and far
+    from normal.
+    """
+    e, found = view.exchanges[fit.rows], dict[str, Floats]()
+    here, there = (antennas_m(view.poses, view.tags, ids, e.time_ns) for ids in (e.initiator, e.target))
+    for body in bodies:
+        tags = [tag.tag for tag in view.tags if tag.body == body]
+        sign = np.isin(e.initiator, tags).astype(float) - np.isin(e.target, tags)
+        found |= {body: sign[:, None] * (here - there)} if np.count_nonzero(sign) >= 200 else {}
+    return found
+
+
+def _slopes(fit: QuickFit, sides: dict[str, Floats], levels: bool = False) -> dict[str, Tested]:
+    """Return the slopes by displacements of bodies, each beside those of the others; `sides` (n, 3) lead to them.
+
+    With `levels` the pairs' constants tell, too, by what they have beside the delays of tags, and `PAIR_M`, of their
+    own.
+    """
+    if not sides:
+        return {}
+    outward = np.hstack([side / np.maximum(np.linalg.norm(side, axis=1), 1e-9)[:, None] for side in sides.values()])
+    tested, pairs, whose = fit.test(outward), fit.model.pairs, np.repeat(np.arange(len(sides)), 3)
+    if levels:
+        free = fit.x.copy()
+        free[fit.start.optimum.layout.indices(["delay"])] = 0.0
+        level_m = medians(fit.ranges.residuals(free), pairs.number)
+        by_pair = np.column_stack([ndimage.mean(way, pairs.number, np.arange(len(level_m))) for way in outward.T])
+        ends = (pairs.ends[:, :, None] == fit.model.tags).sum(axis=1)
+        left = (np.eye(len(ends)) - ends @ np.linalg.pinv(ends)) @ by_pair / PAIR_M**2
+        known = by_pair.T @ left
+        tested = replace(
+            tested,
+            total=tested.total - left.T @ level_m,
+            information=tested.information + known,
+            covariance=tested.covariance + known,
+        )
+    return {
+        body: tested.beside(np.flatnonzero(whose != k).tolist()).turned(np.eye(len(whose))[whose == k])
+        for k, body in enumerate(sides)
+    }
 
 
 def _p_of_place(tested: Tested, slope: Floats) -> float:
@@ -204,18 +313,22 @@ def _p_of_place(tested: Tested, slope: Floats) -> float:
     return float(special.fdtrc(3, tested.blocks - 3.0, square / 3))
 
 
-def _place(apart: Floats, measured: Floats, pair: Ints, start: Floats) -> Floats:
+def _place(apart: Floats, error: Floats, pair: Ints, starts: Sequence[Floats]) -> Floats:
     """Return the displacement (3,) that ranges ask for, beside a constant of each pair, by robust least squares.
 
-    A thousandth of a range holds the place where ranges do not: robots that move in a plane do not see its height.
+    The best of searches from several starts (3,). A thousandth of a range holds the place where ranges do not: robots
+    that move in a plane do not see its height.
     """
     every = slice(None, None, max(len(apart) // 2000, 1))
-    apart, measured, pair = apart[every], measured[every], pair[every]
+    apart, pair = apart[every], np.unique(pair[every], return_inverse=True)[1]
+    measured = np.linalg.norm(apart, axis=1) + error[every]
 
     def residuals(x: Floats) -> Floats:
         rest = measured - np.linalg.norm(apart + x[:3], axis=1) - x[3:][pair]
         return np.append(rest, 1e-3 * len(rest) ** 0.5 * x[:3])
 
-    constants = medians(measured - np.linalg.norm(apart + start, axis=1), pair)
-    found = optimize.least_squares(residuals, np.append(start, constants), loss="soft_l1", f_scale=0.1)
-    return np.asarray(found.x[:3])
+    found = []
+    for start in starts:
+        constants = medians(measured - np.linalg.norm(apart + start, axis=1), pair)
+        found.append(optimize.least_squares(residuals, np.append(start, constants), loss="soft_l1", f_scale=0.1))
+    return np.asarray(min(found, key=lambda one: one.cost).x[:3])

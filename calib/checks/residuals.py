@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from scipy import sparse, special
 
-from calib.checks.geometry import anchors, places_m
+from calib.checks.geometry import PAIR_M, anchors, places_m
 from calib.checks.recording_view import Offsets, QuickFit, RecordingView, quick_fit
 from calib.data.clocks import PPM_TO_METRES, corrected
 from calib.estimator.known_distances import ASTRAY_M, FEWEST_RANGES
@@ -203,10 +203,6 @@ def _of_tags(fit: QuickFit, far: Bools) -> dict[int, float]:
     return {tag: p_value for tag, p_value in found.items() if p_value < BUDGET}
 
 
-PAIR_M: Final = 0.04
-"""What lever arms by a ruler and phase centres of antennas do to a pair: 2 cm at either end."""
-
-
 def closures(view: RecordingView) -> Iterator[Candidate]:
     """Pairs with an offset that the delays of their tags do not explain; those that explain it as well are named.
 
@@ -355,7 +351,10 @@ def _by_pair(fit: QuickFit, courses: Floats) -> sparse.csr_matrix:
 
 def compared(views: Sequence[RecordingView], level: float) -> Iterator[Candidate]:
     """What differs between recordings, each compared with the one before it; `level` is that of a check."""
-    displaced = [{one.words["body"]: one for one in anchors(view) if one.p_value < level} for view in views]
+    displaced = [
+        {one.words["body"]: one for one in anchors(view) if "body" in one.words and one.p_value < level}
+        for view in views
+    ]
     for (first, second), both in zip(pairwise(views), pairwise(displaced), strict=True):
         given, bodies = [places_m(view) for view in (first, second)], set().union(*both)
         for body in sorted(bodies.intersection(*given)):

@@ -1,6 +1,7 @@
 """The table of checks and its one budget of false alarms, real recordings, and the command."""
 
 import json
+import re
 import tarfile
 from collections import Counter
 from csv import DictReader, DictWriter
@@ -93,20 +94,22 @@ def starloc():
 
 
 @pytest.mark.parametrize(
-    ("marker_of", "wrong"),
+    ("marker_of", "wrong", "exchanged"),
     [
-        pytest.param(RADIOS, set(), marks=pytest.mark.slow),
+        pytest.param(RADIOS, set(), {}, marks=pytest.mark.slow),
         # Radio 11 is 1.25 m above its marker then, which the rig, which keeps its height, does not determine.
-        ({radio: radio for radio in RADIOS}, {"tag10", "tag12"}),
+        ({radio: radio for radio in RADIOS}, {"tag10", "tag12"}, {}),
+        # Radio 6 is where 12 should be, above 4, and 12 where 4 should be, above 6.
         pytest.param(
             dict(zip(sorted(RADIOS), sorted(RADIOS.values()), strict=True)),
-            {"tag4", "tag5", "tag6", "tag9", "tag11"},
+            set(),
+            {4: 9, 5: 11, 6: 4, 9: 5, 11: 6},
             marks=pytest.mark.slow,
         ),
     ],
     ids=["right", "by number", "by order"],
 )
-def test_markers_that_are_other_radios_are_seen(starloc, tmp_path, marker_of, wrong):
+def test_markers_that_are_other_radios_are_seen(starloc, tmp_path, marker_of, wrong, exchanged):
     ranges, markers = starloc
     names = [*STARLOC, *(f"{end}_{k}_m" for end in ("from", "to") for k in "xyz")]
     with (tmp_path / "t.csv").open("w") as out:
@@ -121,10 +124,11 @@ def test_markers_that_are_other_radios_are_seen(starloc, tmp_path, marker_of, wr
     import_recording(tmp_path / "t.csv", tmp_path / "t.uwb", map_file=tmp_path / "m.toml")
     found = calib.examine(tmp_path / "t.uwb")
     assert {one.evidence.split()[2] for one in found if one.fault == "anchor stands elsewhere"} == wrong
-    assert {one.fault for one in found} == {
-        "too few pairs",
-        "anchor stands elsewhere" if wrong else "reflections that last",
-    }
+    assert {"and z from delays" in one.evidence for one in found if " tag12 " in one.evidence} <= {True}
+    named = [re.findall(r"(\d+) is where (\d+)", one.evidence) for one in found if one.fault == "swapped tag ids"]
+    assert [{int(a): int(b) for a, b in one} for one in named] == [exchanged] * bool(exchanged)
+    other = "swapped tag ids" if exchanged else "anchor stands elsewhere" if wrong else "reflections that last"
+    assert {one.fault for one in found} == {"too few pairs", other}
 
 
 def test_coarse_ranges_that_follow_fast_are_not_doubled_exchanges(tmp_path):

@@ -1,7 +1,7 @@
 """Each fault is planted in a flight, and `calib.examine` names it, with its size and place, and nothing else."""
 
-import json
 import re
+import tomllib
 from dataclasses import replace
 from functools import partial
 
@@ -124,7 +124,7 @@ UNREAD = "single-sided without carrier readings"
         (SHORT, partial(planted.corrupt, share=0.01), "corrupted exchanges", ""),
         (SHORT, planted.dead, "dead or deaf tag", ""),
         (SHORT, planted.swapped_roles, "swapped roles", ""),
-        (SHORT, planted.swapped_tags, "swapped tag ids", "30 and 31"),
+        (SHORT, planted.swapped_tags, "swapped tag ids", "tag 30 is where 31 is said to be, 31"),
         (SHORT, planted.turned_arms, "lever arm sign", "drone3"),
         (SHORT, planted.arms_in_mm, "lever arm unit", "0.001"),
         (SHORT, planted.wxyz, "wxyz quaternion", ""),
@@ -263,31 +263,102 @@ def test_pairs_that_a_cabinet_hides_are_named():
     assert sorted(named) == ["1-30", "1-31"]
 
 
-def test_anchors_that_were_exchanged_are_named_with_each_other():
+def with_places(flight, places):
+    """Return a flight whose anchors stand elsewhere, by the names of their bodies."""
+    position_m = flight.poses.position_m.copy()
+    for body, place in places.items():
+        position_m[flight.poses.body == body] = place
+    return replace(flight, poses=replace(flight.poses, position_m=position_m))
+
+
+def lines_of(finding):
+    """Return what a remedy says that should stand in a map."""
+    return tomllib.loads(finding.remedy[finding.remedy.index("[[") :])
+
+
+@pytest.mark.parametrize(
+    ("given", "count", "per_second"), [(False, 2, 80), (False, 4, 80), (True, 2, 40), (True, 3, 80)]
+)
+def test_anchors_that_were_exchanged_are_one_finding_with_the_lines_that_mend_it(given, count, per_second):
+    flight = fly(replace(RIG, seconds=60, per_second=per_second), 97)
+    wrong = planted.exchanged_anchors(flight, RNG(5), given=given, count=count)
+    found = only(wrong, "swapped tag ids")
+    some = RNG(5).permutation(4)[:count]
+    exchanged = dict(zip(100 + some, 100 + np.roll(some, -1), strict=True))
+    assert {int(a): int(b) for a, b in re.findall(r"(\d+) is where (\d+)", found.evidence)} == exchanged
+    if given:
+        assert "come from" in found.remedy
+        return
+    places = {f"anchor{row['id'] - 100}": row["position_m"] for row in lines_of(found)["anchors"]}
+    for body, place in places.items():
+        np.testing.assert_allclose(place, flight.poses.position_m[flight.poses.body == body][0], atol=5e-4)
+    assert faults(with_places(wrong, places)) == ["too few pairs"]
+
+
+def test_tags_of_two_robots_that_were_exchanged_are_named_with_body_and_lever_arm():
+    flight = fly(SHORT, 97)
+    other = {10: 21, 21: 10}
+    by_number = {tag.tag: tag for tag in flight.tags}
+    found = only(
+        replace(flight, tags=[replace(by_number[other.get(k, k)], tag=k) for k in by_number]), "swapped tag ids"
+    )
+    assert "tag 10 is where 21 is said to be, 21 is where 10 is said to be" in found.evidence
+    rows = lines_of(found)["tags"]
+    assert [(row["id"], row["body"], tuple(row["lever_arm_m"])) for row in rows] == [
+        (k, by_number[k].body, by_number[k].lever_arm_m) for k in other
+    ]
+
+
+def test_places_that_the_true_distances_of_a_table_contradict_are_named():
     flight = fly(replace(RIG, seconds=60), 97)
-    body = flight.poses.body
-    other = np.where(body == "anchor1", "anchor4", np.where(body == "anchor4", "anchor1", body))
-    found = calib.examine(replace(flight, poses=replace(flight.poses, body=other)))
-    texts = [one.evidence for one in found if one.fault == "anchor stands elsewhere"]
-    assert [text.split()[2] for text in texts] == ["anchor1", "anchor4"]
-    assert [text.split("there the recording has ")[1].split(":")[0] for text in texts] == ["anchor4", "anchor1"]
+    truth_m = calib.Ranges.from_exchanges(flight.exchanges, poses=flight.poses, tags=flight.tags).truth_m
+    assert faults(planted.changed(flight, truth_m=truth_m + 0.01)) == ["too few pairs"]
+    wrong = planted.exchanged_anchors(flight, RNG(5), given=False)
+    found = only(planted.changed(wrong, truth_m=truth_m + 0.01), "swapped tag ids")
+    assert found.evidence.startswith("by the poses, tag 101 is where 103")
 
 
-def test_where_an_anchor_stands_is_told_with_an_interval_and_as_a_line_of_a_map():
+def test_true_distances_of_an_anchor_that_is_nobodys_place_are_named():
+    flight = fly(replace(RIG, seconds=60), 97)
+    wrong = with_places(flight, {"anchor2": [3.0, -4.0, 1.0]})
+    truth_m = calib.Ranges.from_exchanges(wrong.exchanges, poses=wrong.poses, tags=wrong.tags).truth_m
+    found = calib.examine(replace(planted.changed(flight, truth_m=truth_m), poses=flight.poses[:0]))
+    assert [one.fault for one in found] == ["ranges that do not follow the distances", "too few pairs"]
+    assert sorted(re.findall(r"\d+-\d+", found[0].evidence)) == ["10-102", "11-102"]
+
+
+def test_where_anchors_stand_is_told_with_intervals_and_as_lines_of_a_map():
+    """All four are 30 cm off at once."""
     scores = []
     for seed in range(90_100, 90_104):
-        rng = np.random.default_rng(seed)
-        away = rng.normal(size=3)
-        away *= 0.3 / np.linalg.norm(away)
-        flight = fly(ANCHORS, seed, 1, (2, away))
-        found = only(flight, "anchor stands elsewhere")
-        axes = np.array(re.findall(r"([-+][\d.]+) ± ([\d.]+)", found.evidence), dtype=float)
-        scores.append((axes[:, 0] - away) / axes[:, 1])
-        stated = np.median(flight.poses.position_m[flight.poses.body == "anchor2"], axis=0)
-        place = json.loads(found.remedy.split("position_m = ")[1])
-        np.testing.assert_allclose(place, stated + axes[:, 0], atol=0.011)
-    # Of twelve 95 % intervals at least ten hold in 98 % of such trials.
-    assert np.count_nonzero(np.abs(scores) < 1) >= 10
+        flight, rng = fly(ANCHORS, seed), RNG(seed)
+        true = {f"anchor{k}": flight.poses.position_m[flight.poses.body == f"anchor{k}"][0] for k in range(4)}
+        away = {body: rng.normal(size=3) for body in true}
+        wrong = {body: place - 0.3 * away[body] / np.linalg.norm(away[body]) for body, place in true.items()}
+        found = [one for one in calib.examine(with_places(flight, wrong)) if one.fault == "anchor stands elsewhere"]
+        assert [one.evidence.split()[2] for one in found] == [*true]
+        for one, body in zip(found, true, strict=True):
+            axes = np.array(re.findall(r"([-+][\d.]+) ± ([\d.]+)", one.evidence), dtype=float)
+            scores.append((axes[:, 0] - true[body] + wrong[body]) / axes[:, 1])
+            (line,) = lines_of(one)["anchors"]
+            assert line["id"] == 100 + int(body[6:])
+            np.testing.assert_allclose(line["position_m"], wrong[body] + axes[:, 0], atol=0.006)
+    # Of 48 95 % intervals at least 43 hold in 97 % of such trials.
+    assert np.count_nonzero(np.abs(scores) < 1) >= 43
+
+
+def test_ranges_between_anchors_tell_their_places_too():
+    """The tags that move say in which direction an anchor is off to 19 cm only."""
+    import uwbsim
+
+    flight = uwbsim.simulate(uwbsim.load("anchors_and_tag/anchors_and_tag", {"run.seed": 77_001}))
+    true, off = np.array([-2.96, 0.61, 1.66]), np.array([0.2, 0.1, 0.1])
+    found = only(with_places(flight, {"anchor4": true + off}), "anchor stands elsewhere")
+    axes = np.array(re.findall(r"([-+][\d.]+) ± ([\d.]+)", found.evidence), dtype=float)
+    assert (axes[:, 1] < 0.12).all()
+    assert (np.abs(axes[:, 0] + off) < axes[:, 1]).all()
+    (line,) = lines_of(found)["anchors"]
+    assert faults(with_places(flight, {"anchor4": line["position_m"]})) == []
 
 
 def test_an_anchor_that_moved_between_recordings_is_named():

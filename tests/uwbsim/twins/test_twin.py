@@ -96,6 +96,17 @@ def test_a_saved_twin_flies_the_same_ways(found, flight, tmp_path):
         found.save(tmp_path / "t.toml")
 
 
+def test_exchanges_that_were_logged_together_do_not_collide(tmp_path):
+    """Lines of a log that come every 30 ms have one time; none of the exchanges was lost."""
+    flight = uwbsim.simulate(world(12.0))
+    assert not flight.faults
+    times = -(-flight.exchanges.time_ns // 30_000_000) * 30_000_000
+    together = replace(flight, exchanges=replace(flight.exchanges, time_ns=times))
+    uwbsim.twin(together, known(world())).save(tmp_path / "t.toml")
+    again = uwbsim.simulate(tmp_path / "t.toml")
+    assert len(again.exchanges) > 0.98 * len(flight.exchanges)
+
+
 def test_a_twin_of_a_twin_is_alike(found):
     compared = {one.name: one for one in found.compare(1)}
     assert compared["sum of both carrier readings"].verdict == "alike"
