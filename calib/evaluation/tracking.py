@@ -47,8 +47,8 @@ class Settings(CheckedSettings):
     but for noise of `initial_std_m` and an `initial_offset_m` that they do not know of. A range is taken when its
     squared innovation over its variance is below `gate` (chi-square with one degree of freedom; 10.83 is its 99.9 %
     quantile); the robust filter has no gate. A filter begins anew where its last ranges say (`multilaterate`) once the
-    time in which ranges were within the gate, 10 s at most, is used up by time in which they were not, and half of
-    `reopen_s` besides. `seeds` are runs with other noise, each
+    time in which ranges were within the gate, 10 s at most, is used up by time in which they were not (half of it where
+    the robust filter takes them for reflected), and half of `reopen_s` besides. `seeds` are runs with other noise, each
     body and flight with its own; tracks are those of the first, `seed`. `use` is "exchanges", a body's ranges, or
     "receptions", with all that it overheard and others overheard of it. With `online` one more filter has delays as
     states (`calib.online.DelayStates`). Raises `BadInputError` that names the setting.
@@ -394,7 +394,9 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
         weighed = partial(weigh, known, reflections, pair[k], k, gate=settings.gate)
         update = running.update(h, measured[k][:, None] - expected, std[k][:, None] ** 2, weighed)
         lasted_s = min(elapsed_s[k], most_s)
-        explained_s = np.minimum(explained_s + np.where(update.nis < settings.gate, lasted_s, -lasted_s), PATIENCE_S)
+        # Of a body among two others, one behind something, half of the ranges are reflected: that is not being lost.
+        counts = np.where(update.nis < settings.gate, 1.0, np.where(update.believed, -0.5, -1.0))
+        explained_s = np.minimum(explained_s + counts * lasted_s, PATIENCE_S)
         for lost in zip(*np.nonzero(explained_s < -settings.reopen_s / 2), strict=True):
             rows = slice(np.searchsorted(problem.time_ns, problem.time_ns[k] - settings.reopen_s * 1e9), k + 1)
             # The body moved since these ranges: so do their anchors.
