@@ -32,7 +32,8 @@ class RangeErrors:
     Metres and shares of 1. Outliers have the share `outlier` and a size of about `outlier_m`. Of several ranges,
     `share` and `detour_m` are columns (n,), or (n, 2) of differences of arrival, which reflections of the one reception
     lengthen and of the other shorten. `detour_m` is the mean of both kinds of exponential detour, `long` their
-    proportions, `location_m` the centre of the noise of a range.
+    proportions, `location_m` the centre of the noise of a range. Of the `share`, `known` is that of reflections that
+    lengthened the range before by the same detour, and say no more of the distance.
     """
 
     share: Floats | float
@@ -42,6 +43,7 @@ class RangeErrors:
     outlier_m: float
     long: LongDetours = ONE_KIND
     location_m: float = 0.0
+    known: Floats | float = 0.0
 
     def at(self, rows: Any) -> RangeErrors:
         """Return the model of some of several ranges, or of one."""
@@ -77,7 +79,7 @@ class WeighedInnovation:
     """An update by a range: mean and variance of the noise in the innovation, and whether the range is accepted.
 
     `log_density` is that of the innovation, in 1/m; `nis` is its square over its variance with plain noise; `tail` is
-    the probability that the range was not direct.
+    the probability that the range was not direct. `reflected` (..., sides) are probabilities of a reflection.
     """
 
     noise_m: Floats
@@ -86,6 +88,7 @@ class WeighedInnovation:
     log_density: Floats
     nis: Floats
     tail: Floats
+    reflected: Floats
 
 
 def gated_update(innovation_m: Floats, variance_m2: Floats, gate: float) -> WeighedInnovation:
@@ -98,6 +101,7 @@ def gated_update(innovation_m: Floats, variance_m2: Floats, gate: float) -> Weig
         log_density=-0.5 * (innovation_m**2 / variance_m2 + np.log(2 * np.pi * variance_m2)),
         nis=innovation_m**2 / variance_m2,
         tail=np.where(believed, 0.0, 1.0),
+        reflected=np.zeros((*np.shape(innovation_m), 1)),
     )
 
 
@@ -110,18 +114,20 @@ def mixture_update(innovation_m: Floats, variance_m2: Floats, errors: RangeError
     """
     sigma_m, inside = np.sqrt(variance_m2), 1 - errors.outlier
     shares, detours_m = np.atleast_1d(errors.share, errors.detour_m)
+    known = np.broadcast_to(errors.known, shares.shape)
     direct, any_share = np.prod(1 - shares, axis=-1), np.maximum(shares.sum(axis=-1), 1e-300)
     wide = np.hypot(errors.outlier_m, sigma_m)
     wild = errors.outlier * np.exp(-0.5 * (innovation_m / wide) ** 2) / (wide * ROOT_2PI) + 1e-300
     core = np.exp(-0.5 * innovation_m**2 / variance_m2) / (sigma_m * ROOT_2PI) * (inside * direct)
     total, mean, square = core + wild, core * innovation_m, core * innovation_m**2 + wild * variance_m2
-    for sign, share, detour_m in zip((1.0, -1.0), shares.T, detours_m.T, strict=False):
-        if np.any(share):
-            found = densities(sign * innovation_m, sigma_m, errors.least_m, detour_m, errors.long)
-            tail = found.reflected * (inside * (1 - direct) * share / any_share)
-            noise = sign * found.noise_m()
-            total, mean = total + tail, mean + tail * noise
-            square = square + tail * (noise**2 + variance_m2 * found.noise_var())
+    tails = []
+    for sign, share, old, detour_m in zip((1.0, -1.0), shares.T, known.T, detours_m.T, strict=False):
+        found = densities(sign * innovation_m, sigma_m, errors.least_m, detour_m, errors.long)
+        each = found.reflected * (inside * (1 - direct) / any_share)
+        noise, new = sign * found.noise_m(), each * (share - old)
+        tails.append(each * share)
+        total, mean = total + tails[-1], mean + new * noise
+        square = square + new * (noise**2 + variance_m2 * found.noise_var()) + each * old * variance_m2
     mean, square, wild = mean / total, square / total, wild / total
     return WeighedInnovation(
         noise_m=mean,
@@ -130,7 +136,32 @@ def mixture_update(innovation_m: Floats, variance_m2: Floats, errors: RangeError
         log_density=np.log(total),
         nis=innovation_m**2 / variance_m2,
         tail=1 - core / total,
+        reflected=np.stack([one / total for one in tails], axis=-1) + wild[..., None] * shares,
     )
+
+
+class Reflections:
+    """Which pairs of tags are reflected, as filters (...) come to know: a renewal process of each pair.
+
+    After `renewal_s` on average it is drawn anew whether ranges of a pair are reflected, and by what detour.
+    """
+
+    def __init__(self, renewal_s: float, shape: tuple[int, ...]) -> None:
+        """Begin with nothing known of filters and pairs (..., pairs)."""
+        self.renewal_s, self.lasting = renewal_s, np.zeros((*shape, 2))
+
+    def decay(self, dt: float) -> None:
+        """Let `dt` seconds pass."""
+        self.lasting *= math.exp(-dt / self.renewal_s) if self.renewal_s else 0.0
+
+    def weigh(self, innovation_m: Floats, variance_m2: Floats, errors: RangeErrors, pair: Ints) -> WeighedInnovation:
+        """Return the `mixture_update` by what is known of the pairs (sides,) in a measurement, and learn from it."""
+        sides = pair[: np.count_nonzero(errors.share)]
+        reflected, direct = np.moveaxis(self.lasting[..., sides, :], -1, 0)
+        share = reflected + (1 - reflected - direct) * np.atleast_1d(errors.share)[: len(sides)]
+        found = mixture_update(innovation_m, variance_m2, replace(errors, share=share, known=reflected))
+        self.lasting[..., sides, :] = np.stack([found.reflected, 1 - found.reflected], axis=-1)
+        return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -93,6 +93,7 @@ CALIBRATION_KEYS: Final = (
     FileKey("errors.lasting.own_variance", "number, above 0", "needed", "Variance of what each range has of its own."),
     FileKey("errors.lasting.lasting_variance", "number, above 0", "needed", "Variance of what ranges of a pair share."),
     FileKey("errors.lasting.time_s", "number, s", "needed", "Time in which that part forgets."),
+    FileKey("errors.lasting.renewal_s", "number, s", "0", "Time after which reflections are drawn anew."),
     FileKey(
         "errors.features.NAME.log_odds",
         "number",

@@ -53,12 +53,14 @@ LogOdds = Annotated[float, number(-50.0, 50.0, "a logarithm of odds, -50 to 50")
 @dataclass(frozen=True, slots=True)
 class LastingErrors:
     """Errors of ranges within the gate of a filter, in units of sigma: mean, variance of the independent part, variance
-    of the lasting part, and the time constant of the latter."""
+    of the lasting part, and the time constant of the latter. After `renewal_s` on average it is drawn anew whether
+    ranges of a pair are reflected, and by what detour; 0: with each range."""
 
     mean: Metres
     own_variance: Positive
     lasting_variance: Positive
     time_s: Positive
+    renewal_s: StdM = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -319,18 +321,37 @@ def _mistake(model: ErrorModel) -> str:
 CheckedErrors = Annotated[ErrorModel, joint(_mistake)]
 
 
-def lasting_errors(ranges: Ranges, z: Floats) -> LastingErrors | None:
-    """Fit the autocovariance a exp(-lag / time) to errors over sigma (n,) by pair; None without enough products.
+def lasting_errors(ranges: Ranges, z: Floats, share: Floats, reflected: Floats) -> LastingErrors | None:
+    """Fit persistence to errors over sigma (n,), and to reflections, of which ranges have a share (n,) and, by their
+    errors, a probability (n,), by pair. None without enough products of errors within the gate.
+
+    Probabilities with variance v leave the variance w of what they say (1 or 0). Two of one reflection have the
+    covariance v v/(v + w) if the shares are right, and more otherwise.
+    """
+    inside = np.flatnonzero(z**2 < GATE)
+    mean, total = float(np.mean(z[inside])), float(np.var(z[inside]))
+    found = _persistence(ranges[inside], z[inside] - mean)
+    if found is None:
+        return None
+    lasting = min(max(found[0], 1e-6), 0.99 * total)
+    more = reflected - np.mean(reflected - share) - share
+    told = float(np.mean(more**2))
+    left = float(np.mean(reflected * (1 - reflected)))
+    renewal = _persistence(ranges, more, told**2 / max(told + left, 1e-12))
+    return LastingErrors(mean, total - lasting, lasting, found[1], renewal[1] if renewal else 0.0)
+
+
+def _persistence(ranges: Ranges, values: Floats, least: float = 0.0) -> tuple[float, float] | None:
+    """Return variance, `least` or more, and time of an autocovariance a exp(-lag / time) of values (n,) by pair.
+
+    None without enough products.
 
     The autocovariance is averaged in bins of the logarithm of the lag; bins with few products are left out.
     """
-    inside = np.flatnonzero(z**2 < GATE)
-    pairs = pairs_of(ranges.initiator[inside], ranges.target[inside])
-    pair = ranges.session[inside] * np.int64(len(pairs.ends)) + pairs.number
-    order = np.lexsort((ranges.time_ns[inside], pair))
-    pair, time_s = pair[order], ranges.time_ns[inside][order] * 1e-9
-    mean, total = float(np.mean(z[inside])), float(np.var(z[inside]))
-    away = z[inside][order] - mean
+    pairs = pairs_of(ranges.initiator, ranges.target)
+    pair = ranges.session * np.int64(len(pairs.ends)) + pairs.number
+    order = np.lexsort((ranges.time_ns, pair))
+    pair, time_s, away = pair[order], ranges.time_ns[order] * 1e-9, values[order]
     # A filter forgets its position within about a second; with lags up to a minute the fit describes the first second
     # less well, and positions in an office became 32 % worse instead of equal.
     longest_s = 2.0
@@ -351,6 +372,6 @@ def lasting_errors(ranges: Ranges, z: Floats) -> LastingErrors | None:
     covariance, lag = product[told] / count[told], lag[told] / count[told]
     times = np.geomspace(0.02, longest_s, 60)
     shapes = np.exp(-lag / times[:, None])
-    size = np.clip(shapes @ covariance / np.sum(shapes**2, axis=1), 1e-6, 0.99 * total)
+    size = np.maximum(shapes @ covariance / np.sum(shapes**2, axis=1), least)
     best = int(np.argmin(np.sum((size[:, None] * shapes - covariance) ** 2, axis=1)))
-    return LastingErrors(mean, total - float(size[best]), float(size[best]), float(times[best]))
+    return float(size[best]), float(times[best])

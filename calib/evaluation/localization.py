@@ -263,6 +263,7 @@ def filter_ranges(
                 std_m=own / unit * known.own_m(std),
                 shared_m=sign * np.sqrt((shared / unit)[:, None] ** 2 * std**2 + detours_m2),
                 lasting_s=lasting.time_s,
+                renewal_s=lasting.renewal_s,
             )
     return found | with_delays(found["robust"], ranges, calibration, online=online)
 

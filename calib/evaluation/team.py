@@ -51,6 +51,7 @@ from calib.evaluation.tracking import (
     used_part,
     weigh,
 )
+from calib.online import Reflections
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import first_few, printable
@@ -323,6 +324,8 @@ def _run(
     lasting = np.full((len(known), team.shares.max() + 2), 5.0)
     lasting[:, : team.shares[..., 1].min()] = [[one.lasting_s] for one in known]
     lasting[:, -1] = 1e-12
+    # The last learns from measurements that a filter does not use.
+    reflections = [Reflections(one.renewal_s, lasting[0].shape) for one in [*known, known[0]]]
     shape = len(time_ns), len(known), len(team.bodies) - 1
     place, attitude, std_m, nees = np.empty((*shape, 3)), np.empty((*shape, 3, 3)), np.empty(shape), np.empty(shape)
     nis, accepted = np.empty(std.shape), np.empty(std.shape, dtype=bool)
@@ -336,6 +339,8 @@ def _run(
                 kept = np.exp(-np.maximum(time_s[k] - last_s, 1e-9) / lasting)
                 running.decay(kept)
                 running.wander(time_s[k] - max(last_s, 0.0))
+                for one in reflections:
+                    one.decay(time_s[k] - max(last_s, 0.0))
                 exchange, last_s = team.exchange[row], time_s[k]
             expected, slopes, bent_m = running.distances(team.body[row], team.arm[row], team.sign[row])
             if patterns[row]:
@@ -345,7 +350,8 @@ def _run(
                 slopes[:, pair] += shared[row, :, which]
                 slopes[:, sides] += team.sign[row, which] * bent_m[:, which]
             slopes[:, last], slopes[:, delays] = common[row], changes[row]
-            weighed = partial(weigh, known, row, gate=settings.gate)
+            own = [one if used else reflections[-1] for one, used in zip(reflections, uses[row], strict=False)]
+            weighed = partial(weigh, known, own, team.shares[row, :, 0], row, gate=settings.gate)
             update = running.update(slopes * uses[row, :, None], measured[row] - expected, std[row] ** 2, weighed)
             nis[row], accepted[row] = update.nis, update.believed
         place[k], attitude[k] = running.own[..., P], running.attitude[:, :-1]

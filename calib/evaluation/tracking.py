@@ -18,7 +18,7 @@ import numpy as np
 from calib.data.ranges import Ranges
 from calib.data.sources import Flight, require_arrivals
 from calib.evaluation.filters import GaussianFilters, multilaterate, squared_over
-from calib.online import FIXED_DELAYS, DelayStates, RangeErrors, WeighedInnovation, gated_update, mixture_update
+from calib.online import FIXED_DELAYS, DelayStates, RangeErrors, Reflections, WeighedInnovation, gated_update
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
@@ -46,12 +46,12 @@ class Settings(CheckedSettings):
     noise. Percentages depend on it: the noisier velocity, the more the ranges decide. Filters begin at the true place,
     but for noise of `initial_std_m` and an `initial_offset_m` that they do not know of. A range is taken when its
     squared innovation over its variance is below `gate` (chi-square with one degree of freedom; 10.83 is its 99.9 %
-    quantile); the robust filter has no gate. A filter begins anew where its last ranges say
-    (`multilaterate`) once the time in which it explained its ranges, 10 s at most, is used up by time in which it did
-    not, and half of `reopen_s` besides. `seeds` are runs with other noise, each body and flight with its own; tracks
-    are those of the first, `seed`. `use` is "exchanges", a body's ranges, or "receptions", with all that it overheard
-    and others overheard of it. With `online` one more filter has delays as states (`calib.online.DelayStates`). Raises
-    `BadInputError` that names the setting.
+    quantile); the robust filter has no gate. A filter begins anew where its last ranges say (`multilaterate`) once the
+    time in which ranges were within the gate, 10 s at most, is used up by time in which they were not (half of it where
+    the robust filter takes them for reflected), and half of `reopen_s` besides. `seeds` are runs with other noise, each
+    body and flight with its own; tracks are those of the first, `seed`. `use` is "exchanges", a body's ranges, or
+    "receptions", with all that it overheard and others overheard of it. With `online` one more filter has delays as
+    states (`calib.online.DelayStates`). Raises `BadInputError` that names the setting.
     """
 
     velocity_std_mps: float = 0.3
@@ -295,8 +295,9 @@ class FilterRanges:
     """What a filter measures (n,), the standard deviation of each measurement's own error, and its error model, if any.
 
     Ranges of a pair share an error with a standard deviation of `shared_m`, which lasts for `lasting_s`: (n, k) by the
-    distances in a measurement, with their signs. Measurements of an exchange share one of `common_m` (n,). Where delays
-    are states, `delay_slopes` (n, tags) are the derivatives by them.
+    distances in a measurement, with their signs. Reflections last for `renewal_s` (`calib.online.Reflections`).
+    Measurements of an exchange share an error of `common_m` (n,). Where delays are states, `delay_slopes` (n, tags) are
+    the derivatives by them.
     """
 
     measured_m: Floats
@@ -304,6 +305,7 @@ class FilterRanges:
     common_m: Floats
     shared_m: Floats
     lasting_s: float = np.inf
+    renewal_s: float = 0.0
     errors: RangeErrors | None = None
     delays: DelayStates = FIXED_DELAYS
     delay_slopes: Floats | None = None
@@ -316,13 +318,20 @@ class FilterRanges:
 
 
 def weigh(
-    known: list[FilterRanges], row: int, innovation_m: Floats, variance_m2: Floats, gate: float
+    known: list[FilterRanges],
+    reflections: list[Reflections],
+    pair: Ints,
+    row: int,
+    innovation_m: Floats,
+    variance_m2: Floats,
+    gate: float,
 ) -> WeighedInnovation:
-    """Return the updates of filters (filters, ...) by their measurement `row`: by a gate, or by an error model."""
+    """Return the updates of filters (filters, ...) by their measurement `row`: by a gate, or by an error model and what
+    each knows of reflections of the pairs (k,) in it."""
     update = gated_update(innovation_m, variance_m2, gate)
     for f, one in enumerate(known):
         if one.errors is not None:
-            own = mixture_update(innovation_m[f], variance_m2[f], one.errors.at(row))
+            own = reflections[f].weigh(innovation_m[f], variance_m2[f], one.errors.at(row), pair)
             for name in ("noise_m", "variance_m2", "believed", "tail"):
                 getattr(update, name)[f] = getattr(own, name)
     return update
@@ -362,6 +371,7 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
     running = GaussianFilters(np.zeros((*shape, size)), np.tile(prior, (*shape, 1, 1)), 3)
     running.state[..., place] = [start for start, _ in noises]
     delays, own = running.append(delay_states(known)), slice(size)
+    reflections = [Reflections(one.renewal_s, (settings.seeds, size - 4)) for one in known]
     estimate, (std_m, nis, nees) = np.empty((count, *shape, 3)), np.empty((3, count, *shape))
     accepted = np.empty((count, *shape), dtype=bool)
     # Twelve unexplained ranges at least, four for each coordinate, before a filter begins anew.
@@ -379,10 +389,14 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
             h[..., shares] += shared[k, :, which, None]
         h[..., size - 1], h[..., delays] = common[k][:, None], slopes[k][:, None]
         expected = problem.known_m[k] + distance @ problem.sign[k]
-        weighed = partial(weigh, known, k, gate=settings.gate)
+        for one in reflections:
+            one.decay(elapsed_s[k])
+        weighed = partial(weigh, known, reflections, pair[k], k, gate=settings.gate)
         update = running.update(h, measured[k][:, None] - expected, std[k][:, None] ** 2, weighed)
         lasted_s = min(elapsed_s[k], most_s)
-        explained_s = np.minimum(explained_s + np.where(update.nis < settings.gate, lasted_s, -lasted_s), PATIENCE_S)
+        # Of a body among two others, one behind something, half of the ranges are reflected: that is not being lost.
+        counts = np.where(update.nis < settings.gate, 1.0, np.where(update.believed, -0.5, -1.0))
+        explained_s = np.minimum(explained_s + counts * lasted_s, PATIENCE_S)
         for lost in zip(*np.nonzero(explained_s < -settings.reopen_s / 2), strict=True):
             rows = slice(np.searchsorted(problem.time_ns, problem.time_ns[k] - settings.reopen_s * 1e9), k + 1)
             # The body moved since these ranges: so do their anchors.
@@ -392,6 +406,7 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
             state, covariance, explained_s[lost] = running.state[lost], running.covariance[lost], 0.0
             state[own], covariance[own], covariance[:, own], covariance[own, own] = 0.0, 0.0, 0.0, prior
             state[place], covariance[place, place] = fix.place_m, fix.covariance_m2
+            reflections[lost[0]].lasting[lost[1]] = 0.0
         covariance = running.covariance[..., place, place]
         estimate[k], accepted[k], nis[k] = running.state[..., place], update.believed, update.nis
         std_m[k] = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))

@@ -272,15 +272,16 @@ def result_of(
     `findings` are sentences of the checks of the fit; the warnings of a kind of fit are `first`, or `more` after the
     limits of the ranges.
     """
-    # The error model is not needed here.
-    applied = replace(calibration, errors=None).apply(ranges)
+    applied = calibration.apply(ranges)
     residuals = applied.corrected_m - ranges.truth_m
     over_sigma = residuals / applied.sigma_m
     inliers: Bools = np.asarray(np.abs(over_sigma) < 3.0)
     findings = [*findings, *one_way(ranges)]
     refuse_contradicted(float(np.mean(inliers)), ranges, findings)
     if calibration.errors is not None:
-        known = replace(calibration.errors, lasting=lasting_errors(ranges, over_sigma))
+        known = replace(
+            calibration.errors, lasting=lasting_errors(ranges, over_sigma, applied.tail_share, applied.tail_probability)
+        )
         calibration = replace(calibration, errors=known)
     warnings = [
         *([split_text(calibration.undetermined_splits)] if calibration.undetermined_splits else []),

@@ -372,6 +372,20 @@ def test_a_fit_says_how_long_errors_of_a_pair_last():
     assert calib.fit(flight).calibration.errors.lasting.lasting_variance < 0.05
 
 
+@pytest.mark.parametrize("renewal_s", [0.0, 0.3, 1.0])
+def test_a_fit_says_how_long_reflections_of_a_pair_last(renewal_s):
+    """A fifth of the ranges is reflected; ranges of a pair are 30 ms apart."""
+    flight = calib.load_ranges(calib.sample_flight(9000))
+    rng, detour_m = np.random.default_rng(6), np.zeros(len(flight))
+    renewed = rng.random(len(flight)) > (np.exp(-0.03 / renewal_s) if renewal_s else 0.0)
+    drawn = np.where(rng.random(len(flight)) < 0.2, rng.exponential(0.5, len(flight)), 0.0)
+    for pair in range(3):
+        rows = np.arange(pair, len(flight), 3)
+        detour_m[rows] = drawn[rows[np.maximum.accumulate(np.where(renewed[rows], np.arange(len(rows)), 0))]]
+    found = calib.fit(replace(flight, raw_m=flight.raw_m + detour_m)).calibration.errors.lasting.renewal_s
+    assert found == pytest.approx(renewal_s, rel=0.4, abs=0.03)
+
+
 @pytest.mark.parametrize("shares", [[], [0.0], [1.2], [[0.5]]])
 def test_shares_that_are_none(error_fitted, shares):
     with pytest.raises(calib.BadInputError, match=r"`shares`: .*between 0 and 1"):
