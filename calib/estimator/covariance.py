@@ -39,15 +39,19 @@ class Kept:
     freedom: float = np.inf
 
     @classmethod
-    def delays(cls, indices: Ints, each: float) -> Kept:
-        """Return delays; pairs have so many ranges `each`.
+    def delays(cls, indices: Ints, each: float, held: Floats) -> Kept:
+        """Return delays; pairs have so many ranges `each`, `held` (k, m) are directions that ranges do not determine.
 
-        Their common part is the constant of the curve and is excluded from the persistence. The parameters of a pair's
+        Their common part is the constant of the curve and is excluded from the persistence, unless ranges determine
+        nothing else, as those of one pair. The parameters of a pair's
         errors are known from its own ranges, so intervals are those of Student's t with as many degrees of freedom as a
         pair has ranges beyond one.
         """
         count = len(indices)
-        apart = np.eye(count) - (1 / count if count > 1 else 0.0)
+        told = np.eye(count) - (held @ np.linalg.pinv(held) if held.size else 0.0)
+        apart = told - told.mean(axis=0)
+        # Clock skews leave some 1e-5 of a difference that ranges of one pair do not determine.
+        apart = apart if np.linalg.norm(apart) > 1e-3 else told
         return cls(indices=indices, combinations=apart, independent=max(count - 1, 1), freedom=max(each - 1, 2.0))
 
     @classmethod

@@ -318,7 +318,7 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDis
     """Return a fit with the covariances of what was fitted."""
     layout = fitted.optimum.layout
     kept = {
-        "delay": Kept.delays(layout.indices(["delay"]), len(fitted.residuals) / len(model.pairs.ends)),
+        "delay": Kept.delays(layout.indices(["delay"]), len(fitted.residuals) / len(model.pairs.ends), model.held),
         "curve": Kept.curve(layout.indices(model.curve_kinds())),
         "noise": Kept.curve(layout.indices(noise_kinds(layout))),
         "pattern": Kept.curve(layout.indices([COMMON, OWN])),

@@ -31,7 +31,7 @@ def squares():
 def test_few_ranges_of_a_pair_have_students_intervals(squares):
     model, found, delays = squares
     cut = time_blocks(model.ranges.time_ns, model.ranges.session)
-    kept = {"few": Kept.delays(delays, 4), "many": Kept.delays(delays, 1e9)}
+    kept = {"few": Kept.delays(delays, 4, model.held), "many": Kept.delays(delays, 1e9, model.held)}
     (few, last), (many, _) = sandwich(Slopes(found.rows, found.optimum, cut), kept).values()
     assert last.freedom > 3
     assert np.sqrt(np.diag(few) / np.diag(many)) == pytest.approx(student.ppf(0.975, 3) / last.quantile95, rel=1e-6)
@@ -40,7 +40,7 @@ def test_few_ranges_of_a_pair_have_students_intervals(squares):
 def test_what_a_fit_uses_of_the_data_is_given_back(squares):
     model, found, delays = squares
     cut = time_blocks(model.ranges.time_ns, model.ranges.session)
-    kept = {"delay": Kept.delays(delays, 1e9)}
+    kept = {"delay": Kept.delays(delays, 1e9, model.held)}
     whole, lasting = sandwich(Slopes(found.rows, found.optimum, cut), kept)["delay"]
     # With NumPy alone: scores summed by block, the residual's share of degrees of freedom, and how long errors last.
     tags, ranges = np.array(model.tags), model.ranges
@@ -143,3 +143,10 @@ def test_blocks_are_short_and_leave_gaps_out():
     assert found.seconds == pytest.approx(19.98)
     # Blocks of a tenth of a second, however long the gap is.
     assert 199 <= found.count <= 202
+
+
+def test_the_interval_of_one_pair_does_not_hang_on_single_ranges():
+    # Of two tags only the sum of the delays is determined; their difference says nothing of how long errors last.
+    ranges = make(Recipe(tags=2, seconds=120, per_second=20, lasts_s=3.0, share=(0.3, 0.3)), 20_004).ranges
+    found = [calib.fit(ranges[first:]).calibration.std_of_sum_ns([1, 2]) for first in range(6)]
+    assert max(found) < 1.15 * min(found)
