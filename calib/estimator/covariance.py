@@ -49,7 +49,7 @@ class Kept:
         """
         count = len(indices)
         told = np.eye(count) - (held @ np.linalg.pinv(held) if held.size else 0.0)
-        apart = told - told.mean(axis=0)
+        apart = told - told.sum(axis=0) / max(count, 1)
         # Clock skews leave some 1e-5 of a difference that ranges of one pair do not determine.
         apart = apart if np.linalg.norm(apart) > 1e-3 else told
         return cls(indices=indices, combinations=apart, independent=max(count - 1, 1), freedom=max(each - 1, 2.0))
