@@ -127,8 +127,8 @@ class Lab:
 
 
 def first_clause(text: str) -> str:
-    """Return a text up to a colon or semicolon after what names the thing and the fault, which takes 34 characters."""
-    found = re.match(r".{34,}?(?=[:;] |$)", text)
+    """Return a text up to a colon or semicolon after what names the thing and the fault, which takes 31 characters."""
+    found = re.match(r".{31,}?(?=[:;] |$)", text)
     return found[0] if found else text
 
 
