@@ -85,16 +85,21 @@ class Mixture:
     """Direct, reflected or an outlier (`calib.range_errors.densities`): the likelihood of ranges.
 
     With `expected` what a residual tells is what the model says on average (Fisher's information), not the square of
-    its slope: where few ranges determine an unknown, such as a place on a path, their squares are too unsteady.
+    its slope: where few ranges determine an unknown, such as a place on a path, their squares are too unsteady. `used`
+    is the share of the ranges that such unknowns use up: noise is estimated as larger by it (restricted likelihood).
     """
 
     expected: bool = False
+    used: float = 0.0
     dispersion: float = 1.0
     parameters: tuple[str, ...] = OF_ERRORS
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
         """Return log densities (n,) and slopes by each parameter (n,)."""
         found = error_slopes(values[RESIDUAL], values)
+        if self.used:
+            more = found.by | {"noise": found.by["noise"] + self.used}
+            found = replace(found, log_density=found.log_density + self.used * values["noise"], by=more)
         if not self.expected:
             return found.log_density, found.by, None
         typical = {name: np.atleast_1d(np.median(values[name])) for name in self.parameters}
@@ -234,11 +239,11 @@ class RangeRows:
         """Whether their noise depends on how well residuals are known.
 
         A robust loss has no such noise, and where unknowns are fewer than a twentieth of the ranges, noise is right to
-        2.5 % without.
+        2.5 % without. Where distances are unknown, too, `Mixture.used` says what they use up.
         """
         kinds = {part.kind for part in self.parts if part.parameter == RESIDUAL}
         count = sum(self.layout.where[kind].stop - self.layout.where[kind].start for kind in kinds)
-        return isinstance(self.errors, Mixture) and 20 * count > len(self)
+        return isinstance(self.errors, Mixture) and self.geometry is None and 20 * count > len(self)
 
     def expecting(self) -> RangeRows:
         """Return these rows of a mixture with expected information, not squares of slopes."""

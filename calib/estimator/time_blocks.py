@@ -169,13 +169,10 @@ def persistence(slopes: Floats, time: TimeBlocks, independent: int, within: int 
 
 
 def _ratio(series: Floats, scale: int) -> float:
-    """Return the mean square of sums over `scale` blocks over that of single ones, times as many.
-
-    Sums overlap: where the first begins does not matter then.
-    """
-    run = np.cumsum(np.vstack([np.zeros(series.shape[1]), series]), axis=0)
-    sums = run[scale:] - run[:-scale]
-    return max(float(np.mean(sums**2) / max(scale * np.mean(series**2), 1e-300)), 1e-6)
+    """Return the mean square of sums over `scale` blocks over that of single ones, times as many."""
+    whole = len(series) // scale * scale
+    sums = series[:whole].reshape(-1, scale, series.shape[1]).sum(axis=1)
+    return max(float(np.sum(sums**2) / max(np.sum(series[:whole] ** 2), 1e-300)), 1e-6)
 
 
 def _expected(share: Floats, keep: Floats, factor: Floats, scale: int, blocks: int) -> Floats:

@@ -235,10 +235,9 @@ class Search:
                 break
         # The parameters of errors are unknowns as well: the covariance contains them.
         self.build(errors, unknowns, parts)
-        self.rows = replace(self.rows, errors=mixture).with_uncertainty(self.x, found.covariance)
         if not few:
-            self.optimize(mixture, tolerance=0.03, steps=20)
-        found = self.optimize(errors, tolerance=np.inf)
+            self.optimize(replace(mixture, used=float(np.mean(self.leverage))), tolerance=0.03, steps=20)
+        found = self.optimize(replace(errors, used=float(np.mean(self.leverage))), tolerance=np.inf)
         self.optimum = replace(found, success=settled)
 
     def missed_motion_m(self) -> float:

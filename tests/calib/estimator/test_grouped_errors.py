@@ -106,3 +106,12 @@ def test_noise_is_that_of_restricted_likelihood_however_many_offsets_there_are(s
     # The joint likelihood has it smaller, by up to a tenth.
     joint = maximize([rows], Priors(layout), layout.start(), evidence_steps=0).of("noise")[0]
     assert joint < best - 0.03
+
+
+def test_noise_is_larger_by_the_share_that_other_unknowns_use_up(drawn):
+    layout, rows = drawn
+    plain, used = (
+        sum_rows([replace(rows, errors=Mixture(used=share))], layout.start()).gradient[layout.where["noise"].start]
+        for share in (0.0, 0.1)
+    )
+    assert used - plain == pytest.approx(0.1 * len(rows))

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import t as student
 
 import calib
-from benchmarks.worlds import CLEAN, Recipe, make
+from benchmarks.worlds import CLEAN, LIGHT_M_PER_NS, Recipe, make
 from calib.estimator import known_distances
 from calib.estimator.covariance import Kept, sandwich
 from calib.estimator.known_distances import fit_known_distances, model_of, robust_fit
@@ -145,8 +145,10 @@ def test_blocks_are_short_and_leave_gaps_out():
     assert 199 <= found.count <= 202
 
 
-def test_the_interval_of_one_pair_does_not_hang_on_single_ranges():
+def test_the_delays_of_one_pair_are_known_as_well_as_its_constant():
     # Of two tags only the sum of the delays is determined; their difference says nothing of how long errors last.
     ranges = make(Recipe(tags=2, seconds=120, per_second=20, lasts_s=3.0, share=(0.3, 0.3)), 20_004).ranges
-    found = [calib.fit(ranges[first:]).calibration.std_of_sum_ns([1, 2]) for first in range(6)]
-    assert max(found) < 1.15 * min(found)
+    ranges = replace(ranges, weight_target=np.full(len(ranges), 0.5))
+    tags, pair = (calib.fit(ranges, constants=kind).calibration for kind in ("tag", "pair"))
+    constant_ns = 2 * pair.pair_offsets[1, 2].std_m / LIGHT_M_PER_NS
+    assert tags.std_of_sum_ns([1, 2]) == pytest.approx(constant_ns, rel=0.02)
