@@ -267,11 +267,11 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted, heard: ArrivalMod
         straight = heard.rows(pilot.optimum.layout, errors).residuals(pilot.optimum.x)
         of_heard, own, own_parts = heard.error_model(straight)
         unknowns = (*unknowns, *heard.unknowns, *own)
-    layout, rows = model.build(error, errors, unknowns, parts)
+    layout, rows = model.build(error, replace(errors, restricted=True), unknowns, parts)
     gauge = (*model.gauge_rows(layout), *model.held_rows(layout))
     asked = layout.indices([u.kind for u in model.unknowns])
 
-    whole = None if heard is None else heard.rows(layout, of_heard, own_parts)
+    whole = None if heard is None else heard.rows(layout, replace(of_heard, restricted=True), own_parts)
 
     def beside(chosen: Ints | None) -> list[RangeRows]:
         return [] if heard is None or whole is None else [heard.sample(whole, chosen)]

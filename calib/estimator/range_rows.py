@@ -87,10 +87,12 @@ class Mixture:
     With `expected` what a residual tells is what the model says on average (Fisher's information), not the square of
     its slope: where few ranges determine an unknown, such as a place on a path, their squares are too unsteady. `used`
     is the share of the ranges that such unknowns use up: noise is estimated as larger by it (restricted likelihood).
+    With `restricted` each range counts what unknowns use up of it (`RangeRows.with_uncertainty`).
     """
 
     expected: bool = False
     used: float = 0.0
+    restricted: bool = False
     dispersion: float = 1.0
     parameters: tuple[str, ...] = OF_ERRORS
 
@@ -238,12 +240,11 @@ class RangeRows:
     def restricted(self) -> bool:
         """Whether their noise depends on how well residuals are known.
 
-        A robust loss has no such noise, and where unknowns are fewer than a twentieth of the ranges, noise is right to
-        2.5 % without. Where distances are unknown, too, `Mixture.used` says what they use up.
+        Where unknowns are fewer than a twentieth of the ranges, noise is right to 2.5 % without.
         """
         kinds = {part.kind for part in self.parts if part.parameter == RESIDUAL}
         count = sum(self.layout.where[kind].stop - self.layout.where[kind].start for kind in kinds)
-        return isinstance(self.errors, Mixture) and self.geometry is None and 20 * count > len(self)
+        return isinstance(self.errors, Mixture) and self.errors.restricted and 20 * count > len(self)
 
     def expecting(self) -> RangeRows:
         """Return these rows of a mixture with expected information, not squares of slopes."""

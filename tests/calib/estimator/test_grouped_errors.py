@@ -90,7 +90,7 @@ def test_noise_is_that_of_restricted_likelihood_however_many_offsets_there_are(s
     parts = [Part(parameter=b.kind, kind=b.kind, columns=np.zeros((1, 1), dtype=np.int64)) for b in blocks[:-1]]
     parts.append(Part(parameter=RESIDUAL, kind="offset", columns=group[:, None], values=np.full((600, 1), -1.0)))
     layout = Layout(tuple(blocks))
-    rows = RangeRows.of(error, group, parts, Mixture(), layout)
+    rows = RangeRows.of(error, group, parts, Mixture(restricted=True), layout)
     found = maximize([rows], Priors(layout), layout.start(), evidence_steps=60)
     within = float(np.mean(np.var(error.reshape(100, 6), axis=1, ddof=1)))
     means = error.reshape(100, 6).mean(axis=1)
