@@ -43,9 +43,8 @@ class Kept:
         """Return delays; pairs have so many ranges `each`, `held` (k, m) are directions that ranges do not determine.
 
         Their common part is the constant of the curve and is excluded from the persistence, unless ranges determine
-        nothing else, as those of one pair. The parameters of a pair's
-        errors are known from its own ranges, so intervals are those of Student's t with as many degrees of freedom as a
-        pair has ranges beyond one.
+        nothing else, as those of one pair. The parameters of a pair's errors are known from its own ranges, so
+        intervals are those of Student's t with as many degrees of freedom as a pair has ranges beyond one.
         """
         count = len(indices)
         told = np.eye(count) - (held @ np.linalg.pinv(held) if held.size else 0.0)

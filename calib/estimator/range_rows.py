@@ -261,14 +261,13 @@ class RangeRows:
         slopes variances grow with the fourth power of noise, and there may be no end to that.
         """
         found = np.empty(len(self))
-        for blocks, rows, values, moved in self._pieces(x):
+        for blocks, rows, values, _ in self._pieces(x):
             errors = error_slopes(values[RESIDUAL], values)
-            matrix = self._derivatives(blocks, rows, moved)
-            found[rows] = (errors.inlier - errors.reflected) * diagonal_of(matrix, covariance)
+            found[rows] = (errors.inlier - errors.reflected) * diagonal_of(self._derivatives(blocks, rows), covariance)
         return replace(self, unsure_m2=found)
 
-    def _derivatives(self, blocks: slice, rows: slice, moved: Any) -> sparse.csr_matrix:
-        """Return the derivatives of some residuals by all unknowns, sparse (m, p)."""
+    def _derivatives(self, blocks: slice, rows: slice) -> sparse.csr_matrix:
+        """Return the derivatives of some residuals with known distances by all unknowns, sparse (m, p)."""
         starts, count = self.starts[blocks.start : blocks.stop + 1], rows.stop - rows.start
         columns, entries = [], []
         for part in self.parts:
@@ -279,9 +278,6 @@ class RangeRows:
                 columns.append(np.broadcast_to(own + self.layout.where[part.kind].start, (count, own.shape[1])))
                 values = 1.0 if part.values is None else part.values[:, rows].T
                 entries.append(np.broadcast_to(values, columns[-1].shape))
-        if moved is not None and self.geometry is not None:
-            columns.append(self.geometry.columns[self.order[rows]])
-            entries.append(-moved)
         beside, across = np.concatenate(columns, axis=1), np.concatenate(entries, axis=1)
         bounds = np.arange(count + 1) * across.shape[1]
         return sparse.csr_matrix((across.ravel(), beside.ravel(), bounds), shape=(count, self.layout.size))
