@@ -92,13 +92,16 @@ class WeighedInnovation:
 
 
 def gated_update(innovation_m: Floats, variance_m2: Floats, gate: float) -> WeighedInnovation:
-    """Accept an innovation if its square over its variance is below the gate; otherwise the state does not change."""
+    """Accept an innovation if its square over its variance is below the gate; otherwise the state does not change.
+
+    What is not accepted has the density at the gate.
+    """
     believed = innovation_m**2 < gate * variance_m2
     return WeighedInnovation(
         noise_m=np.where(believed, innovation_m, 0.0),
         variance_m2=np.where(believed, 0.0, variance_m2),
         believed=believed,
-        log_density=-0.5 * (innovation_m**2 / variance_m2 + np.log(2 * np.pi * variance_m2)),
+        log_density=-0.5 * (np.minimum(innovation_m**2 / variance_m2, gate) + np.log(2 * np.pi * variance_m2)),
         nis=innovation_m**2 / variance_m2,
         tail=np.where(believed, 0.0, 1.0),
         reflected=np.zeros((*np.shape(innovation_m), 1)),
@@ -212,10 +215,16 @@ class DelayStates:
         """Return derivatives of ranges by these states (n, tags), from those by the delays of both `ends` (n, 2)."""
         return np.asarray(np.einsum("ne,net->nt", slopes, ends[..., None] == np.array(self.tags, dtype=np.int64)))
 
-    def estimates(self, change_m: Floats, covariance_m2: Floats) -> dict[int, tuple[float, float]]:
-        """Return delays in ns and their standard deviations by tag, infinite where undetermined."""
+    def estimates(
+        self, change_m: Floats | float = 0.0, covariance_m2: Floats | None = None
+    ) -> dict[int, tuple[float, float]]:
+        """Return delays in ns and their standard deviations by tag, infinite where undetermined.
+
+        Without arguments they are those of the calibration.
+        """
+        known = self.covariance_m2 if covariance_m2 is None else covariance_m2
         metres_a_ns = 1e-9 * self.speed_of_light
-        std_ns = np.where(np.isinf(self.std_ns), np.inf, np.sqrt(np.diag(covariance_m2)) / metres_a_ns)
+        std_ns = np.where(np.isinf(self.std_ns), np.inf, np.sqrt(np.diag(known)) / metres_a_ns)
         both = zip((self.delays_ns + change_m / metres_a_ns).tolist(), std_ns.tolist(), strict=True)
         return dict(zip(self.tags, both, strict=True))
 

@@ -144,7 +144,10 @@ def localize(
     seeds: Annotated[int, _of_model("seeds", "Number of simulated runs, each with another seed.", min=1)] = 3,
     online: Annotated[
         bool,
-        typer.Option("--online", help="Compare with a filter whose delays are states, with the calibration as prior."),
+        typer.Option(
+            "--online",
+            help="Compare with a filter whose delays are states, where these are likelier than fixed ones.",
+        ),
     ] = False,
     tum: Annotated[
         Path | None, typer.Option(help="Folder for the estimated trajectories, one file per body and filter (.tum).")

@@ -141,10 +141,12 @@ class GaussianFilters:
         """Let delays change for `dt` seconds."""
         self.add_variance(self.changes, self.delays.walk_m**2 * dt)
 
-    def delays_at(self, filter_: tuple[int, ...], delays: DelayStates) -> dict[int, tuple[float, float]]:
-        """Return what one of the filters estimates of the delays that are its states (`DelayStates.estimates`)."""
-        change_m, own = self.state[filter_][self.changes], self.covariance[filter_][self.changes, self.changes]
-        return delays.estimates(change_m, own) if delays.tags else {}
+    def delays_at(self, filter_: tuple[int, ...], delays: DelayStates, *, drift: Any) -> dict[int, tuple[float, float]]:
+        """Return what one of the filters estimates of the delays that are its states, or those of the calibration where
+        delays do not `drift` (`DelayStates.estimates`)."""
+        if not (delays.tags and drift):
+            return delays.estimates()
+        return delays.estimates(self.state[filter_][self.changes], self.covariance[filter_][self.changes, self.changes])
 
     def decay(self, kept: Floats) -> None:
         """Let shared errors decay to shares `kept` (..., states) of what they were, at the same standard deviation."""
@@ -348,7 +350,8 @@ of one exchange share, in units of its standard deviation. Changes of delays fol
 class InertialFilter(RelativeFilter):
     """One body in a room, with several headings at once; updates by ranges to points of the room, and by heights.
 
-    Without an IMU the body is taken to be level, and its velocity wanders.
+    Without an IMU the body is taken to be level, and its velocity wanders. With delays as states each heading is there
+    twice: with fixed delays, and with delays that `drift` (filters,).
     """
 
     def __init__(
@@ -363,14 +366,15 @@ class InertialFilter(RelativeFilter):
     ) -> None:
         """Start at a fix with attitudes (headings, 3, 3), body to world."""
         count, spread = len(attitudes), np.zeros(BODY + 2)
-        self.inertial, self.likelihood = inertial, np.zeros(count)
+        self.drift = np.repeat([False, True], [count, count if delays.tags else 0])
+        self.inertial, self.likelihood = inertial, np.zeros(len(self.drift))
         if inertial:
             # Headings are those of a grid; other standard deviations are those of consumer sensors.
             spread[A], spread[G], spread[F] = (0.3, 0.3, np.pi / count), noise.gyro_start, noise.force_start
         else:
             noise = replace(noise, force=noise.acceleration, gyro=0.0, gyro_bias=0.0, force_bias=0.0)
         spread[H] = 0.15
-        super().__init__(fix.place_m, attitudes[:, None], spread, noise)
+        super().__init__(fix.place_m, np.resize(attitudes[:, None], (len(self.drift), 1, 3, 3)), spread, noise)
         self.append(delays)
         self.restart(fix, speed_m_s)
 
@@ -410,6 +414,7 @@ class InertialFilter(RelativeFilter):
             patterns = [one for one in patterns if one.end]
         expected += self.longer_m(bodies, points, sign, patterns)
         row[:, E:] = shared
+        row[~self.drift, E + 1 :] = 0.0
         variance = noise_m**2 + np.sum((sign * bent_m) ** 2, axis=1)
         update = self.update(row, measured_m - expected, variance, partial(mixture_update, errors=errors))
         self.likelihood = self.likelihood + update.log_density

@@ -414,7 +414,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         nis=np.array(nis),
         accepted=np.array(accepted),
         restarts_s=tuple(restarts),
-        delays=running.delays_at((best,), known.delays),
+        delays=running.delays_at((best,), known.delays, drift=running.drift[best]),
     )
 
 

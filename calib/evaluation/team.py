@@ -44,6 +44,7 @@ from calib.evaluation.tracking import (
     Measurements,
     Settings,
     Track,
+    choose_delays,
     delay_states,
     pair_numbers,
     ranges_among,
@@ -328,7 +329,7 @@ def _run(
     reflections = [Reflections(one.renewal_s, lasting[0].shape) for one in [*known, known[0]]]
     shape = len(time_ns), len(known), len(team.bodies) - 1
     place, attitude, std_m, nees = np.empty((*shape, 3)), np.empty((*shape, 3, 3)), np.empty(shape), np.empty(shape)
-    nis, accepted = np.empty(std.shape), np.empty(std.shape, dtype=bool)
+    nis, density, accepted = np.empty(std.shape), np.zeros(std.shape), np.empty(std.shape, dtype=bool)
     exchange, last_s = -1, -1.0
     for k in range(len(time_ns)):
         if k:
@@ -354,12 +355,19 @@ def _run(
             weighed = partial(weigh, known, own, team.shares[row, :, 0], row, gate=settings.gate)
             update = running.update(slopes * uses[row, :, None], measured[row] - expected, std[row] ** 2, weighed)
             nis[row], accepted[row] = update.nis, update.believed
+            density[row] = np.where(uses[row], update.log_density, 0.0)
         place[k], attitude[k] = running.own[..., P], running.attitude[:, :-1]
         covariance = running.covariance[:, pose[:, :, None], pose[:, None]]
         turns = Rotation.from_matrix((attitude[k].swapaxes(2, 3) @ turned[k]).reshape(-1, 3, 3)).as_rotvec()
         wrong = np.concatenate([truth[k] - place[k], turns.reshape(place[k].shape)], axis=-1)
         nees[k] = squared_over(wrong, covariance)
         std_m[k] = np.sqrt(np.trace(covariance[..., P, P], axis1=-2, axis2=-1))
+    drifts = choose_delays(known, density)
+    for f, better in drifts.items():
+        later = np.append(False, better)[firsts[1:]]
+        for fixed, some in ((~better, (nis, accepted)), (~later, (place, attitude, std_m, nees))):
+            for values in some:
+                values[fixed, f] = values[fixed, f - 1]
 
     def track(f: int, b: int) -> RelativeTrack:
         used = uses[:, f]
@@ -373,7 +381,7 @@ def _run(
             nis=nis[used, f],
             nees=nees[:, f, b],
             accepted=accepted[used, f],
-            delays=running.delays_at((f,), known[f].delays),
+            delays=running.delays_at((f,), known[f].delays, drift=f in drifts and drifts[f][-1]),
         )
 
     return {body: {name: track(f, b) for f, name in enumerate(filters)} for b, body in enumerate(team.bodies[:-1])}

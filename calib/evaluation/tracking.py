@@ -51,7 +51,8 @@ class Settings(CheckedSettings):
     the robust filter takes them for reflected), and half of `reopen_s` besides. `seeds` are runs with other noise, each
     body and flight with its own; tracks are those of the first, `seed`. `use` is "exchanges", a body's ranges, or
     "receptions", with all that it overheard and others overheard of it. With `online` one more filter has delays as
-    states (`calib.online.DelayStates`). Raises `BadInputError` that names the setting.
+    states (`calib.online.DelayStates`) where these are likelier than fixed delays. Raises
+    `BadInputError` that names the setting.
     """
 
     velocity_std_mps: float = 0.3
@@ -332,7 +333,7 @@ def weigh(
     for f, one in enumerate(known):
         if one.errors is not None:
             own = reflections[f].weigh(innovation_m[f], variance_m2[f], one.errors.at(row), pair)
-            for name in ("noise_m", "variance_m2", "believed", "tail"):
+            for name in ("noise_m", "variance_m2", "believed", "tail", "log_density"):
                 getattr(update, name)[f] = getattr(own, name)
     return update
 
@@ -351,12 +352,30 @@ def delay_states(filters: Sequence[FilterRanges]) -> DelayStates:
     return next((one.delays for one in filters if one.delays.tags), FIXED_DELAYS)
 
 
+def choose_delays(known: Sequence[FilterRanges], log_density: Floats) -> dict[int, Bools]:
+    """Return by filter with delays as states at which measurements (n, ...) it is likelier than the one before it,
+    which is the same with fixed delays.
+
+    `log_density` (n, filters, ...) is that of innovations. Neither filter falls below a probability of a thousandth, so
+    that delays may begin to drift late in a flight.
+    """
+    found = {}
+    for f in (f for f, one in enumerate(known) if one.delays.tags):
+        gains = log_density[:, f] - log_density[:, f - 1]
+        found[f], odds = np.empty(gains.shape, dtype=bool), np.zeros(gains.shape[1:])
+        for k, gain in enumerate(gains):
+            odds = np.clip(odds + gain, -np.log(1000), np.log(1000))
+            found[f][k] = odds > 0
+    return found
+
+
 def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: Settings) -> dict[str, list[Track]]:
     """Run filters on the ranges of a body with every noise; return the tracks of each, one for each noise.
 
     A state is the position, for each pair of tags the error that its ranges share, in units of `shared_m`, and the
-    error that measurements of one exchange share, in units of `common_m`; then the delays, which a restart keeps.
-    Arrays are (filters, seeds, ...).
+    error that measurements of one exchange share, in units of `common_m`; then the delays, which a restart keeps. A
+    filter with delays as states gives way to the one before it, which has none, where that is likelier. Arrays are
+    (filters, seeds, ...).
     """
     count, known, pair, elapsed_s = len(problem), list(ranges.values()), problem.pair, problem.elapsed_s
     measured, std, common, shared, slopes = side_by_side(known)
@@ -372,7 +391,7 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
     running.state[..., place] = [start for start, _ in noises]
     delays, own = running.append(delay_states(known)), slice(size)
     reflections = [Reflections(one.renewal_s, (settings.seeds, size - 4)) for one in known]
-    estimate, (std_m, nis, nees) = np.empty((count, *shape, 3)), np.empty((3, count, *shape))
+    estimate, (std_m, nis, nees, density) = np.empty((count, *shape, 3)), np.empty((4, count, *shape))
     accepted = np.empty((count, *shape), dtype=bool)
     # Twelve unexplained ranges at least, four for each coordinate, before a filter begins anew.
     explained_s, most_s = np.zeros(shape), settings.reopen_s / 2 / 12
@@ -409,8 +428,13 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
             reflections[lost[0]].lasting[lost[1]] = 0.0
         covariance = running.covariance[..., place, place]
         estimate[k], accepted[k], nis[k] = running.state[..., place], update.believed, update.nis
+        density[k] = update.log_density
         std_m[k] = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
         nees[k] = squared_over(estimate[k] - problem.place[k], covariance)
+    drifts = choose_delays(known, density)
+    for f, better in drifts.items():
+        for some in (estimate, std_m, nis, nees, accepted):
+            some[:, f][~better] = some[:, f - 1][~better]
 
     def track(f: int, seed: int) -> Track:
         return Track(
@@ -423,7 +447,7 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
             nis=nis[:, f, seed],
             nees=nees[:, f, seed],
             accepted=accepted[:, f, seed],
-            delays=running.delays_at((f, seed), known[f].delays),
+            delays=running.delays_at((f, seed), known[f].delays, drift=f in drifts and drifts[f][-1, seed]),
         )
 
     return {name: [track(f, seed) for seed in range(settings.seeds)] for f, name in enumerate(ranges)}
