@@ -100,9 +100,6 @@ ratios: setup ## fail where the packages take far longer than plain scripts (1 m
 bench-large: setup ## measure a calibration of 3.8 million exchanges (two minutes, 2 GB)
 	$(BIN)/python -m benchmarks.large
 
-bench-fifty: setup ## fit a recording of 50 million exchanges (half an hour, 25 GB of disk)
-	$(BIN)/python -m benchmarks.fifty_million
-
 bench-workbench: setup ## measure engines, workers and Dask (2 minutes)
 	$(BIN)/python -m benchmarks.workbench
 

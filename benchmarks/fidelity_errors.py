@@ -31,7 +31,7 @@ REJECTED = 3.9
 """What is further off than so many standard deviations is not in the published samples."""
 
 GAP_S = 0.42
-BUILT_IN, TUNED, PREDICTED = "built in", "tuned", "predicted"
+TUNED, PREDICTED = "tuned", "predicted"
 Row = tuple[str, str, str, str]
 """What, measured, simulated, and how it came about."""
 
