@@ -22,6 +22,9 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Complexes = NDArray[np.complex128]
 
+Columns = dict[str, NDArray[Any]]
+"""Columns (n,) by name."""
+
 
 class ColumnTable:
     """Base of dataclasses whose fields are columns of length n; fields that are no arrays hold for all rows.
@@ -32,7 +35,7 @@ class ColumnTable:
     __slots__ = ()
     time_ns: Ints
 
-    def _columns(self) -> dict[str, NDArray[Any]]:
+    def _columns(self) -> Columns:
         fields: dict[str, Any] = self.__dataclass_fields__  # type: ignore[attr-defined]
         found = {name: getattr(self, name) for name in fields}
         return {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
@@ -58,7 +61,7 @@ class ColumnTable:
         """Return the rows in ascending order of `time_ns`; rows of equal times stay in their order."""
         return self if np.all(np.diff(self.time_ns) >= 0) else self[np.argsort(self.time_ns, kind="stable")]
 
-    def to_dict(self) -> dict[str, NDArray[Any]]:
+    def to_dict(self) -> Columns:
         """Return the columns by name, (n,) each, as `pandas.DataFrame` and `polars.DataFrame` take them.
 
         >>> from uwblink import Exchanges
@@ -75,7 +78,7 @@ class ColumnTable:
     def _title(self) -> str:
         raise NotImplementedError
 
-    def _shown(self) -> dict[str, NDArray[Any]]:
+    def _shown(self) -> Columns:
         return self.to_dict()
 
     def __repr__(self) -> str:
@@ -87,7 +90,7 @@ class ColumnTable:
         return as_html(self._title(), excerpt(self._shown()))
 
 
-def in_time_order(parts: Sequence[dict[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+def in_time_order(parts: Sequence[Columns]) -> Columns:
     """Return the rows of several tables of columns as one, in order of `time_ns`; no columns for no tables."""
     if not parts:
         return {}

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from uwblink.arrays import Columns
 from uwblink.display import first_few
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import ALL_IDS, DISTANCES, IDS, POSITIONS, POWERS, SIGN, SKEWS, ColumnMap, load_map
@@ -45,7 +46,7 @@ from uwblink.importers.staging import (
     time_conditions,
     usable_exchanges,
 )
-from uwblink.importers.tables import Columns, connected
+from uwblink.importers.tables import connected
 from uwblink.importers.templates import Template
 from uwblink.recording.antenna_delays import AntennaDelay, meta_of_delays
 from uwblink.recording.file import Recording

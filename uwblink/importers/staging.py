@@ -21,6 +21,7 @@ from typing import Final, NamedTuple
 import duckdb
 import numpy as np
 
+from uwblink.arrays import Columns
 from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.importers.column_map import (
     ALL_IDS,
@@ -35,7 +36,6 @@ from uwblink.importers.column_map import (
 from uwblink.importers.devices import CHIPS, power_sql
 from uwblink.importers.plausibility import SAMPLE_ROWS, counter_format
 from uwblink.importers.tables import (
-    Columns,
     SourceTable,
     is_by_target,
     message_number,

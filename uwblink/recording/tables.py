@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from uwblink.arrays import Columns
 from uwblink.display import printable
 from uwblink.errors import RecordingError, raising
 from uwblink.protocols.table import PROTOCOLS
@@ -28,9 +29,6 @@ from uwblink.recording.schema import (
 from uwblink.recording.store import Store, decode_json
 from uwblink.ticks import REPORT_BITS
 from uwblink.twr import BITS, COLUMNS, Exchanges
-
-Columns = dict[str, NDArray[Any]]
-"""Columns of a table (n,) by name."""
 
 EXCHANGES_PER_BLOCK: Final = 131_072
 """Exchanges of a block: a little more than a row group of DuckDB (122880)."""
