@@ -26,14 +26,10 @@ Columns = dict[str, NDArray[Any]]
 """Columns (n,) by name."""
 
 
-class ColumnTable:
-    """Base of dataclasses whose fields are columns of length n; fields that are no arrays hold for all rows.
-
-    A derived class defines `to_dict`, which names its columns for data frames, and `_title`.
-    """
+class ArrayRows:
+    """Base of dataclasses whose arrays have n rows, along their first axis; other fields hold for all rows."""
 
     __slots__ = ()
-    time_ns: Ints
 
     def _columns(self) -> Columns:
         fields: dict[str, Any] = self.__dataclass_fields__  # type: ignore[attr-defined]
@@ -56,6 +52,16 @@ class ColumnTable:
         """Return the rows of one or more tables as one table; what holds for all rows is that of the first."""
         columns: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in parts]) for n in parts[0]._columns()}
         return replace(parts[0], **columns)  # type: ignore[type-var]
+
+
+class ColumnTable(ArrayRows):
+    """Base of dataclasses whose fields are columns of length n, in order of `time_ns`.
+
+    A derived class defines `to_dict`, which names its columns for data frames, and `_title`.
+    """
+
+    __slots__ = ()
+    time_ns: Ints
 
     def in_time_order(self) -> Self:
         """Return the rows in ascending order of `time_ns`; rows of equal times stay in their order."""

@@ -322,19 +322,11 @@ def reason_against_metres(ranges: Floats) -> str:
     return ""
 
 
-def reason_against_dbm(powers: Floats) -> str:
-    """Return why numbers (n,) cannot be received powers in dBm; empty text if they can."""
+def reason_against_dbm(powers: Floats, limits: tuple[float, float] = CHIPS["other"].power_dbm) -> str:
+    """Return why numbers (n,) cannot be received powers in dBm within a chip's limits; empty text if they can."""
     finite = powers[np.isfinite(powers) & (powers != 0)]  # boards print 0 for an unknown power
-    middle = float(np.median(finite)) if len(finite) else -1.0
-    # The legal limit of transmitted power is -41.3 dBm/MHz, -14 dBm in 500 MHz.
-    return f"the median power is {middle:+.4g}, and received powers are below 0 dBm" if middle > 0 else ""
-
-
-def reason_against_limits(powers: Floats, limits: tuple[float, float]) -> str:
-    """Return why powers (n,) in dBm cannot be a chip's, by its limits; empty text if they can."""
-    finite = powers[np.isfinite(powers) & (powers != 0)]
-    middle = float(np.median(finite)) if len(finite) else limits[0]
-    return "" if limits[0] <= middle <= limits[1] else f"the median power is {middle:+.4g} dBm"
+    middle, (low, high) = float(np.median(finite)) if len(finite) else limits[0], limits
+    return "" if low <= middle <= high else f"the median power is {middle:+.4g}, expected {low:g} to {high:g} dBm"
 
 
 def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats | None) -> None:
@@ -349,7 +341,7 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
         remedy = 'units.power in the map: "-dBm" if they lack their sign'
         if column_map.unit_of(name) is None:
             reasons[name] = reason_against_dbm(optional(rows, name)), remedy
-        elif column_map.chip and (why := reason_against_limits(optional(rows, name), limits)):
+        elif column_map.chip and (why := reason_against_dbm(optional(rows, name), limits)):
             reasons[name] = why, f"another unit, chip or prf than {column_map.chip!r} and {column_map.prf} in the map"
     for name in ("range_m", "gt_range_m") if raw_m is None else ():
         factor = column_map.factor(name)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,10 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import as_html, cut, first_few, printable
 from uwblink.protocols.table import PROTOCOLS, third_from_target
 from uwblink.recording.schema import TABLES, Fault, Tag
-from uwblink.recording.tables import EXCHANGES_PER_BLOCK, Tables
 from uwblink.twr import STAMPS, Exchanges, intervals, names_in, without_stamps
+
+if TYPE_CHECKING:
+    from uwblink.recording.file import Recording
 
 IMPOSSIBLE_PPM: Final = 1000.0
 """A larger skew is due to a damaged stamp: boards differ by up to 40 ppm (20 ppm each, DW1000 data sheet, table 7)."""
@@ -88,14 +90,14 @@ def _neighbours(e: Exchanges, columns: Sequence[NDArray[Any]]) -> tuple[Ints, In
     return order[:-1][same], order[1:][same]
 
 
-def single_report_blocks(recording: Tables, rows: int = EXCHANGES_PER_BLOCK) -> Iterator[SingleReports]:
-    """Yield the exchanges of a recording, each once, in blocks of about `rows`.
+def single_report_blocks(recording: Recording) -> Iterator[SingleReports]:
+    """Yield the exchanges of a recording, each once, in blocks.
 
     A recording with reports of targets is one block, because the two reports of an exchange can be apart.
     """
     ends = recording.tally("exchanges", "initiator", "target", "reporter")
     twice = any(reporter == target != initiator for initiator, target, reporter in ends)
-    return map(single_reports, [recording.exchanges()] if twice else recording.exchange_blocks(rows))
+    return map(single_reports, [recording.exchanges()] if twice else recording.exchange_blocks())
 
 
 def differences(exchanges: Exchanges, first: int, second: int) -> list[str]:
@@ -298,7 +300,7 @@ class Summary:
         return as_html("; ".join([self.headline(), *self.lines()]), pairs)
 
 
-def summarize(recording: Tables) -> Summary:
+def summarize(recording: Recording) -> Summary:
     """Return the summary of a recording, which is read in blocks; raises what its readers raise."""
     pairs, protocols, times = Counter[tuple[int, int]](), Counter[str](), list[int]()
     repeated = contradictory = 0
