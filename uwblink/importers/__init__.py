@@ -288,7 +288,7 @@ def _choose(
             f"{sources[0]}: no importer for such a file; known are {known}; or name one with importer="
         )
     if map_file is not None and row.map_help is None:
-        raise ArgumentError(f"map_file: importer {row.name!r} takes none")
+        raise ArgumentError(f"importer {row.name!r} takes none", parameter="map_file")
     if len(sources) > 1 and not row.several:
         raise ArgumentError(f"importer {row.name!r} takes one file, found {len(sources)}", parameter="source")
     return sources, row, None if map_file is None else Path(map_file)

@@ -245,11 +245,10 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
 def _layout(staging: Staging) -> str:
     """Return the layout that the columns suggest."""
     has = staging.rows.has
-    for layout, names in (("exchanges", STAMPS[:4]), ("messages", ("tx", "rx")), ("stamps", ("stamp", "event"))):
+    needed = {"exchanges": STAMPS[:4], "messages": ("tx", "rx"), "stamps": ("stamp", "event")}
+    needed |= {} if any(map(has, STAMPS)) else {"ranges": ("range_m",), "differences": ("difference_m",)}
+    for layout, names in needed.items():
         if all(map(has, names)):
-            return layout
-    for layout, name in (("ranges", "range_m"), ("differences", "difference_m")):
-        if has(name) and not any(map(has, STAMPS)):
             return layout
     raise staging.tables[0].missing(staging.column_map.header(next(name for name in STAMPS if not has(name))))
 
