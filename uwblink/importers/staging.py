@@ -147,10 +147,8 @@ class Staging:
             self.offsets.append(StagedRows(db, "staged", ()).count())
         if not self.offsets[-1]:
             raise ImportTableError(f"{paths[0]}: a header and no rows")
-        self.blanks = 0
+        (self.blanks,) = StagedRows(db, "staged", ()).values("count(*) FILTER (blank)")
         """Rows without a range, such as an empty cell of a wide table, that are left out."""
-        if "blank" in columns:
-            (self.blanks,) = StagedRows(db, "staged", ()).values("count(*) FILTER (blank)")
         self.beside: dict[str, Columns] = {}
         """Rows of other tables of a recording that were found on the way, by table."""
         self._filled = "NOT blank" if self.blanks else "true"
@@ -261,7 +259,7 @@ def staged_cells(table: SourceTable) -> dict[str, str]:
         found |= {
             n: f"CASE WHEN {turned} THEN {a} ELSE {b} END" for n, a, b in zip(IDS, (two, one), (one, two), strict=True)
         }
-    return found | ({"blank": f"coalesce({blank}, false)"} if blank else {})
+    return found | {"blank": f"coalesce({blank or 'false'}, false)"}
 
 
 def _is_missing(table: SourceTable, text: str) -> str:
@@ -440,12 +438,9 @@ def usable_exchanges(
             conditions.append(Condition(name, f"{expected} from {low} to {high - 1}", wrong))
     good = faults.reject(rows, conditions)
     # Two of 10 million different exchanges have the same hash of 64 bits once in 400,000 tables.
-    code, some = f"hash({', '.join([*IDS, *stamps])})", good.where(" OR ".join(f"{name} <> 0" for name in stamps))
-    within = f"FROM {rows.name} WHERE {some.condition}"
-    twice = f"SELECT {code} AS code, min(rowid) AS first {within} GROUP BY code HAVING count(*) > 1"
-    later = (
-        f"SELECT r.rowid FROM {rows.name} r JOIN ({twice}) ON {code} = code WHERE {some.condition} AND r.rowid > first"
-    )
+    some = good.where(" OR ".join(f"{name} <> 0" for name in stamps))
+    number = f"row_number() OVER (PARTITION BY hash({', '.join([*IDS, *stamps])}) ORDER BY rowid)"
+    later = f"SELECT rowid FROM {rows.name} WHERE {some.condition} QUALIFY {number} > 1"
     staging.db.execute(f"CREATE TABLE repeats AS {later}")
     (repeats,) = StagedRows(staging.db, "repeats", ()).values("count(*)")
     return good.where("rowid NOT IN (SELECT rowid FROM repeats)") if repeats else good, repeats, bits, counter

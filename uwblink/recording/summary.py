@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import as_html, cut, first_few, printable
-from uwblink.protocols.table import PROTOCOLS, third_from_target
 from uwblink.recording.schema import TABLES, Fault, Tag
-from uwblink.twr import STAMPS, Exchanges, intervals, names_in, without_stamps
+from uwblink.twr import STAMPS, Exchanges, intervals, names_in, of_protocol, without_stamps
 
 if TYPE_CHECKING:
     from uwblink.recording.file import Recording
@@ -147,7 +146,7 @@ def target_faster_ppm(exchanges: Exchanges) -> Floats:
     the second and the third if the target sends both, else the first and the third. Antenna delays cancel.
     """
     spans = intervals(exchanges)
-    from_target = np.isin(exchanges.protocol, third_from_target(names_in(exchanges.protocol)))
+    from_target = of_protocol(exchanges.protocol, lambda row: row.third_sender == "target")
     with np.errstate(all="ignore"):
         target = np.where(from_target, spans.dt53, spans.dt32 + spans.dt64)
         initiator = np.where(from_target, spans.dt64, spans.dt41 + spans.dt53)
@@ -161,8 +160,8 @@ def clock_skews(exchanges: Exchanges | Iterable[Exchanges]) -> list[ClockSkew]:
     """
     found = [np.empty((3, 0))]
     for some in [exchanges] if isinstance(exchanges, Exchanges) else exchanges:
-        double = [name for name in names_in(some.protocol) if PROTOCOLS[name].third_sender is not None]
-        e = some[np.isin(some.protocol, double) & ((some.tx3 | some.rx3) != 0)]
+        double = of_protocol(some.protocol, lambda row: row.third_sender is not None) > 0
+        e = some[double & ((some.tx3 | some.rx3) != 0)]
         low, high = np.sort([e.initiator, e.target], axis=0)
         sign = np.where(e.initiator == low, 1.0, -1.0)
         readings = sign * target_faster_ppm(e), sign * (e.skew1_ppm - e.skew2_ppm) / 2
