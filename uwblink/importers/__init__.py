@@ -18,7 +18,7 @@ from typing import Any, Final
 import duckdb
 
 from uwblink.arrays import is_frame
-from uwblink.database import connect
+from uwblink.database import connect, selected
 from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.importers.bags import BAG_SUFFIXES, bag_to_table
 from uwblink.importers.column_map import ColumnMap
@@ -133,8 +133,7 @@ def _query(db: duckdb.DuckDBPyConnection, table: str, source: Path) -> str:
     if table == "exchanges" and TRUTH_FROM in {row[0] for row in found}:
         # Distances by poses are left out, because the poses are imported, too.
         cells["truth_m"] = f"CASE WHEN {TRUTH_FROM} = '{BY_POSES}' THEN NULL ELSE {cells['truth_m']} END"
-    listed = ", ".join(f'{cell} AS "{name}"' for name, cell in cells.items())
-    return f"SELECT {listed} FROM {read}"  # noqa: S608 - keys of TABLES
+    return f"SELECT {selected(cells)} FROM {read}"  # noqa: S608 - keys of TABLES
 
 
 IMPORTERS: Final[Registry[Importer]] = Registry(

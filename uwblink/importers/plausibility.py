@@ -354,11 +354,12 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
     for name, (why, remedy) in reasons.items():
         if why:
             raise ImportTableError(f"{path}: column {column_map.header(name)!r}: {why}; state {remedy}")
-    if raw_m is None:
-        found = other_unit({"ranges": lambda f: ranges - true / f, "true distances": lambda f: ranges - f * true})
-    else:
-        found = other_unit({"ranges": lambda f: raw_m - f * ranges, "true distances": lambda f: raw_m - f * true})
-    if found:
+    errors: dict[str, Errors] = (
+        {"ranges": lambda f: ranges - true / f, "true distances": lambda f: ranges - f * true}
+        if raw_m is None
+        else {"ranges": lambda f: raw_m - f * ranges, "true distances": lambda f: raw_m - f * true}
+    )
+    if found := other_unit(errors):
         beside = "the others" if raw_m is None else "its stamps"
         raise ImportTableError(
             f"{path}: {found} by {beside}, and in {column_map.units.get('distance', 'm')} by the map; "

@@ -22,6 +22,7 @@ import duckdb
 import numpy as np
 
 from uwblink.arrays import Columns
+from uwblink.database import selected
 from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.importers.column_map import (
     ALL_IDS,
@@ -140,10 +141,9 @@ class Staging:
             if cells.keys() != (columns or cells.keys()):
                 raise ImportTableError(f"{path}: has other columns than {paths[0]}, so they are not one table")
             columns = cells.keys()
-            chosen = ", ".join(f"{cell} AS {name}" for name, cell in cells.items())
             with table.reading():
                 into = "INSERT INTO staged" if k else "CREATE TABLE staged AS"
-                db.execute(f"{into} SELECT {chosen} FROM {table.source}")
+                db.execute(f"{into} SELECT {selected(cells)} FROM {table.source}")
             self.offsets.append(StagedRows(db, "staged", ()).count())
         if not self.offsets[-1]:
             raise ImportTableError(f"{paths[0]}: a header and no rows")
@@ -153,7 +153,7 @@ class Staging:
         """Rows of other tables of a recording that were found on the way, by table."""
         self._filled = "NOT blank" if self.blanks else "true"
         others = tuple(name for name in columns if name not in (*ALL_IDS, "blank"))
-        ids = ", ".join(f"{cell} AS {name}" for name, cell in self._ids([n for n in ALL_IDS if n in columns]).items())
+        ids = selected(self._ids([n for n in ALL_IDS if n in columns]))
         listed = ", ".join(("CAST(rowid AS UINTEGER) AS origin", ids, *others))
         db.execute(f"CREATE TABLE rows AS SELECT {listed} FROM staged WHERE {self._filled}")
         db.execute("DROP TABLE staged")
@@ -561,10 +561,11 @@ def _group(rows: StagedRows, values: Mapping[str, str], follows: str, within_s: 
     kinds = {"sequence": "BIGINT", "message": "TINYINT"}
     cells |= {name: f"TRY_CAST(trunc({name}) AS {kind})" for name, kind in kinds.items() if name in cells}
     cells["link"] = "CAST(CAST(least(from_id, to_id) AS UINTEGER) * 65536 + greatest(from_id, to_id) AS UINTEGER)"
-    listed = ", ".join(f"{cell} AS {column}" for column, cell in cells.items())
     keys = ["link", *(name for name in ("sequence",) if name in cells)]
     order = ", ".join([*keys, *(name for name in ("time_ns",) if name in cells), "origin"])
-    rows.db.execute(f"CREATE TABLE sorted AS SELECT {listed} FROM {rows.name} WHERE {rows.condition} ORDER BY {order}")
+    rows.db.execute(
+        f"CREATE TABLE sorted AS SELECT {selected(cells)} FROM {rows.name} WHERE {rows.condition} ORDER BY {order}"
+    )
     same = [f"{key} IS NOT DISTINCT FROM lag({key}) OVER ()" for key in keys]
     if "time_ns" in cells:
         gap = "CAST(time_ns AS DOUBLE) - CAST(lag(time_ns) OVER () AS DOUBLE)"
@@ -574,7 +575,8 @@ def _group(rows: StagedRows, values: Mapping[str, str], follows: str, within_s: 
     # Windows without ORDER BY stream through the rows.
     start = "max(CASE WHEN first THEN serial END) OVER (ROWS UNBOUNDED PRECEDING)"
     placed = f"SELECT *, {start} AS start, serial - {start} + 1 AS place FROM ({marked})"
-    listed = ", ".join(f"{value} AS {column}" for column, value in values.items())
-    rows.db.execute(f"CREATE TABLE exchanges AS SELECT {listed} FROM ({placed}) GROUP BY start ORDER BY start")
+    rows.db.execute(
+        f"CREATE TABLE exchanges AS SELECT {selected(values)} FROM ({placed}) GROUP BY start ORDER BY start"
+    )
     rows.db.execute("DROP TABLE sorted")
     return StagedRows(rows.db, "exchanges", tuple(values))
