@@ -22,17 +22,16 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Complexes = NDArray[np.complex128]
 
+Columns = dict[str, NDArray[Any]]
+"""Columns (n,) by name."""
 
-class ColumnTable:
-    """Base of dataclasses whose fields are columns of length n; fields that are no arrays hold for all rows.
 
-    A derived class defines `to_dict`, which names its columns for data frames, and `_title`.
-    """
+class ArrayRows:
+    """Base of dataclasses whose arrays have n rows, along their first axis; other fields hold for all rows."""
 
     __slots__ = ()
-    time_ns: Ints
 
-    def _columns(self) -> dict[str, NDArray[Any]]:
+    def _columns(self) -> Columns:
         fields: dict[str, Any] = self.__dataclass_fields__  # type: ignore[attr-defined]
         found = {name: getattr(self, name) for name in fields}
         return {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
@@ -54,11 +53,21 @@ class ColumnTable:
         columns: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in parts]) for n in parts[0]._columns()}
         return replace(parts[0], **columns)  # type: ignore[type-var]
 
+
+class ColumnTable(ArrayRows):
+    """Base of dataclasses whose fields are columns of length n, in order of `time_ns`.
+
+    A derived class defines `to_dict`, which names its columns for data frames, and `_title`.
+    """
+
+    __slots__ = ()
+    time_ns: Ints
+
     def in_time_order(self) -> Self:
         """Return the rows in ascending order of `time_ns`; rows of equal times stay in their order."""
         return self if np.all(np.diff(self.time_ns) >= 0) else self[np.argsort(self.time_ns, kind="stable")]
 
-    def to_dict(self) -> dict[str, NDArray[Any]]:
+    def to_dict(self) -> Columns:
         """Return the columns by name, (n,) each, as `pandas.DataFrame` and `polars.DataFrame` take them.
 
         >>> from uwblink import Exchanges
@@ -75,7 +84,7 @@ class ColumnTable:
     def _title(self) -> str:
         raise NotImplementedError
 
-    def _shown(self) -> dict[str, NDArray[Any]]:
+    def _shown(self) -> Columns:
         return self.to_dict()
 
     def __repr__(self) -> str:
@@ -87,7 +96,7 @@ class ColumnTable:
         return as_html(self._title(), excerpt(self._shown()))
 
 
-def in_time_order(parts: Sequence[dict[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+def in_time_order(parts: Sequence[Columns]) -> Columns:
     """Return the rows of several tables of columns as one, in order of `time_ns`; no columns for no tables."""
     if not parts:
         return {}

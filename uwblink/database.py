@@ -71,6 +71,11 @@ def connect(
     return db
 
 
+def selected(cells: Mapping[str, str]) -> str:
+    """Return the columns of a SELECT: SQL expressions by name."""
+    return ", ".join(f'{cell} AS "{name}"' for name, cell in cells.items())
+
+
 def write_tables(table: Path, parquet: Path, rows: Iterable[Mapping[str, Any]], *, force: bool) -> None:
     """Write rows as CSV and as Parquet, both or neither; raises what `whole` raises.
 

@@ -18,12 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median
 
 from uwblink import arrays
-from uwblink.arrays import Bools, ColumnTable, Floats, Ints
+from uwblink.arrays import Bools, Columns, ColumnTable, Floats, Ints
 from uwblink.errors import ArgumentError
 from uwblink.ticks import ANTENNA_DELAY_TICKS, COUNTER_BITS, METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S, elapsed
 from uwblink.twr import BITS, LARGEST_ID, LATEST_NS, STAMPS, Exchanges
-
-Columns = Mapping[str, NDArray[Any]]
 
 MAX_SKEW: Final = 100e-6
 """Two clocks differ by 40 ppm at most (IEEE 802.15.4: 20 ppm each); more is a counter that restarted."""
@@ -155,7 +153,7 @@ def times_by_stamps(receptions: Receptions) -> Ints:
     return np.rint(np.array(found, dtype=np.float64) * TICK_S * 1e9).astype(np.int64)
 
 
-def exchanges_in(receptions: Receptions) -> tuple[Exchanges, dict[str, NDArray[Any]]]:
+def exchanges_in(receptions: Receptions) -> tuple[Exchanges, Columns]:
     """Return the exchanges that broadcasts make, and what third tags overheard of them, in order of time.
 
     A frame of i that j hears is a poll, j's first frame after it the response, j's next frame the final: an exchange of
@@ -304,13 +302,13 @@ def _shorter_replies(initiator: Ints, target: Ints, reply: Ints) -> Bools:
     return np.asarray(((middle < of_other) | ((middle == of_other) & (ends < other)))[number])
 
 
-def _heard_by(listener: int, r: Receptions, links: _Links, rows: Ints, exchanges: Exchanges) -> dict[str, NDArray[Any]]:
+def _heard_by(listener: int, r: Receptions, links: _Links, rows: Ints, exchanges: Exchanges) -> Columns:
     """Return the rows of the table `overheard` of one listener, from the frames of exchanges, as `rows` (n, 3)."""
     me = np.full(len(rows), listener)
     found = [links.find(r.sender[row], me, r.frame[row]) for row in rows.T]
     good = np.logical_and.reduce([there for _, there in found]) & (r.listener[rows[:, :2]] != listener).all(axis=1)
     e = exchanges[good]
-    columns: dict[str, NDArray[Any]] = {"time_ns": e.time_ns, "listener": me[good]}
+    columns: Columns = {"time_ns": e.time_ns, "listener": me[good]}
     columns |= {"initiator": e.initiator, "target": e.target} | {f"{name}_n": getattr(e, name) for name in STAMPS}
     first, second, third = (row[good] for row, _ in found)
     rx3 = _without_drift(r, links, second, third, elapsed(e.tx2, e.rx1, r.bits))
@@ -321,7 +319,7 @@ def _heard_by(listener: int, r: Receptions, links: _Links, rows: Ints, exchanges
     }
 
 
-def exchange_of(exchanges: Exchanges, overheard: Columns) -> Ints:
+def exchange_of(exchanges: Exchanges, overheard: Mapping[str, NDArray[Any]]) -> Ints:
     """Return the row of the exchange that each overheard one (n,) belongs to, -1 where it is not there.
 
     Both have the target's stamps of poll and response, which the frames of boards bring; those of the initiator may not

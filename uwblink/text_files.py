@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import stat
 import sys
@@ -13,7 +14,7 @@ from typing import Any, NamedTuple
 
 from uwblink.errors import raising
 
-__all__ = ["FileKey", "TomlReader", "heads", "is_number", "read_text", "require_regular"]
+__all__ = ["FileKey", "TomlReader", "heads", "is_number", "number_in", "read_text", "require_regular"]
 
 
 def require_regular(
@@ -110,6 +111,14 @@ class TomlReader:
         """Raise `error` if a value is not good."""
         if not good:
             raise self.error(f"{self.path}: {key}: found {value!r}, expected {expected}")
+
+
+def number_in(text: str) -> float:
+    """Return a text as a number, NaN if it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def is_number(value: Any) -> bool:

@@ -7,6 +7,7 @@ stamp of the third message are in the initiator's clock, the others in the targe
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
@@ -106,9 +107,7 @@ class Exchanges(ColumnTable):
             raise ArgumentError(f"{'tx3' if tx3 is None else 'rx3'}: is not given; a third message has both stamps")
         default = "ss" if tx3 is None else "ds"
         names = arrays.words("protocol", default if protocol is None else protocol, count)
-        messages = np.zeros(count, dtype=np.int64)
-        for row, rows in _rows_by_protocol(names):
-            messages[rows] = len(row.messages)
+        messages = of_protocol(names, lambda row: len(row.messages))
         hint = f"; stamps of {BITS[-1]} bits need bits={BITS[-1]}" if bits < BITS[-1] else ""
         for name, values in given.items():
             needed = messages >= int(name[-1])
@@ -159,9 +158,7 @@ def intervals(exchanges: Exchanges) -> Intervals:
     round trip. Raises `ArgumentError` for exchanges of a protocol that is not in `PROTOCOLS`.
     """
     e, bits = exchanges, exchanges.bits
-    target_sends = np.zeros(len(e), dtype=bool)
-    for row, rows in _rows_by_protocol(e.protocol):
-        target_sends[rows] = row.third_sender == "target"
+    target_sends = of_protocol(e.protocol, lambda row: row.third_sender == "target")
     before_tx3 = np.where(target_sends, e.tx2, e.rx2)
     before_rx3 = np.where(target_sends, e.rx2, e.tx2)
     return Intervals(
@@ -180,9 +177,8 @@ def range_ns(exchanges: Exchanges) -> Ints:
     the formulas give, to first order: (t1 + t2)/2 for two messages; t1 where the target sends the third, because the
     ratio of the clocks holds the Doppler shift; t2 where the initiator does (docs/theory.md, "Predicting a protocol").
     """
-    share = np.zeros(len(exchanges))
-    for row, rows in _rows_by_protocol(exchanges.protocol):
-        share[rows] = {None: 0.5, "target": 0.0, "initiator": 1.0}[row.third_sender]
+    shares = {None: 0.5, "target": 0.0, "initiator": 1.0}
+    share = of_protocol(exchanges.protocol, lambda row: shares[row.third_sender])
     return exchanges.time_ns + np.rint(intervals(exchanges).dt41 * share * (TICK_S * 1e9)).astype(np.int64)
 
 
@@ -251,6 +247,14 @@ def _rows_by_protocol(names: NDArray[np.str_]) -> list[tuple[RangingProtocol, Bo
         if name not in PROTOCOLS:
             raise ArgumentError(f"protocol: found {name[:40]!r}, allowed: {', '.join(PROTOCOLS)}")
         found.append((PROTOCOLS[name], np.asarray(names == name)))
+    return found
+
+
+def of_protocol(names: NDArray[np.str_], value: Callable[[RangingProtocol], float]) -> Floats:
+    """Return a property of the protocols with these names (n,); raises `ArgumentError` for an unknown one."""
+    found = np.zeros(len(names))
+    for row, rows in _rows_by_protocol(names):
+        found[rows] = value(row)
     return found
 
 

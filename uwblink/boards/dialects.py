@@ -70,7 +70,7 @@ def parser_of(known: ColumnMap) -> Callable[[Sequence[str]], list[PrintedRange]]
     @cache
     def prepared() -> tuple[SourceTable, dict[str, str], str]:
         table = SourceTable(connect(threads=1), Path("lines"), known, live=True)
-        cells = {"from_id": "''", "blank": "false"} | staged_cells(table)
+        cells = {"from_id": "''"} | staged_cells(table)
         if "range_m" not in cells:
             raise table.missing("range_m")
         power = next((cells[name] for name in ("fpp2", "rxp2", "fpp1", "rxp1") if name in cells), "NULL")

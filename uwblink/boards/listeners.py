@@ -21,6 +21,7 @@ function that corrects exchanges.
 
 from __future__ import annotations
 
+import os
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -322,19 +323,24 @@ class ReportCheck:
         return f"{whose}: {told}" if told else None
 
 
-def load_correction(path: Path) -> Correction:
-    """Return the correction of a calibration file; raises `PlanError`, also if no installed distribution corrects.
+CorrectionSource = str | os.PathLike[str] | Correction | Callable[[Exchanges], Columns]
+"""A calibration file, or a correction as an object or a function."""
 
-    The correction itself raises `PlanError`, too.
+
+def load_correction(source: CorrectionSource) -> Correction:
+    """Return a correction as it is, or that of a calibration file.
+
+    Raises `PlanError`, also if no installed distribution corrects; the correction of a file raises it, too.
     """
-    found = sorted(entry_points(group="uwbcal.corrections"), key=lambda entry: entry.name)
+    if not isinstance(source, str | os.PathLike):
+        return source if isinstance(source, Correction) else Correction(source)
+    path, found = Path(source), sorted(entry_points(group="uwbcal.corrections"), key=lambda entry: entry.name)
     if not found:
         raise PlanError(f"{path}: no installed distribution corrects ranges (entry points of uwbcal.corrections)")
     kinds = (ValueError, OSError, ImportError)
     translated = restating(PlanError, *kinds)
     with restating(PlanError, *kinds):
-        made = found[0].load()(path)
-    known = made if isinstance(made, Correction) else Correction(made)
+        known = load_correction(found[0].load()(path))
     differences = known.differences and translated(known.differences)
     return replace(known, ranges=translated(known.ranges), differences=differences)
 

@@ -23,7 +23,7 @@ import duckdb
 import numpy as np
 
 from uwblink.arrays import Floats, Ints
-from uwblink.database import check_log, connect, log_of
+from uwblink.database import check_log, connect, log_of, selected
 from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError, raising
 from uwblink.exporters.mcap import write_mcap, write_rosbag2
 from uwblink.output import place_beside, take_name
@@ -78,9 +78,8 @@ def _query(db: duckdb.DuckDBPyConnection, table: str, cells: Mapping[str, str], 
         columns["truth_m"] = f"coalesce({measured}, {by_poses})"
         origin = f"WHEN {measured} IS NOT NULL THEN 'measured' WHEN {by_poses} IS NOT NULL THEN '{BY_POSES}'"
         columns[TRUTH_FROM] = f"CASE {origin} END"
-    listed = ", ".join(f'{cell} AS "{name}"' for name, cell in columns.items())
     # DuckDB keeps the order of rows; ORDER BY would hold all of them in memory.
-    return f"SELECT {listed} FROM {source}"  # noqa: S608 - keys of TABLES
+    return f"SELECT {selected(columns)} FROM {source}"  # noqa: S608 - keys of TABLES
 
 
 def _literal(path: Path) -> str:

@@ -18,7 +18,7 @@ from typing import Any, Final
 import duckdb
 
 from uwblink.arrays import is_frame
-from uwblink.database import connect
+from uwblink.database import connect, selected
 from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.importers.bags import BAG_SUFFIXES, bag_to_table
 from uwblink.importers.column_map import ColumnMap
@@ -133,8 +133,7 @@ def _query(db: duckdb.DuckDBPyConnection, table: str, source: Path) -> str:
     if table == "exchanges" and TRUTH_FROM in {row[0] for row in found}:
         # Distances by poses are left out, because the poses are imported, too.
         cells["truth_m"] = f"CASE WHEN {TRUTH_FROM} = '{BY_POSES}' THEN NULL ELSE {cells['truth_m']} END"
-    listed = ", ".join(f'{cell} AS "{name}"' for name, cell in cells.items())
-    return f"SELECT {listed} FROM {read}"  # noqa: S608 - keys of TABLES
+    return f"SELECT {selected(cells)} FROM {read}"  # noqa: S608 - keys of TABLES
 
 
 IMPORTERS: Final[Registry[Importer]] = Registry(
@@ -288,7 +287,7 @@ def _choose(
             f"{sources[0]}: no importer for such a file; known are {known}; or name one with importer="
         )
     if map_file is not None and row.map_help is None:
-        raise ArgumentError(f"map_file: importer {row.name!r} takes none")
+        raise ArgumentError(f"importer {row.name!r} takes none", parameter="map_file")
     if len(sources) > 1 and not row.several:
         raise ArgumentError(f"importer {row.name!r} takes one file, found {len(sources)}", parameter="source")
     return sources, row, None if map_file is None else Path(map_file)

@@ -74,7 +74,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
         require_regular(part, ImportTableError, "part of a bag", folders=True)
     wrong = f"{path}: cannot be read as a bag"
     with raising(ImportTableError, wrong, OSError, ValueError):
-        if path.is_file() and _is_json(path):
+        is_mcap = path.is_file() and path.suffix.lower() == ".mcap"
+        if is_mcap and next((encoding == "json" for *_, encoding in _channels(path)), False):
             yield _json_bag(path)
             return
         needed = f"{path}: reading bags needs rosbags; pip install 'uwbcal[bags]'"
@@ -104,14 +105,6 @@ def _ros_bag(path: Path, reader: Any) -> Bag:
             yield connection.topic, connection.msgtype, int(time_ns), message
 
     return Bag(path, {connection.topic: connection.msgtype for connection in reader.connections}, messages)
-
-
-def _is_json(path: Path) -> bool:
-    """Return whether a file is MCAP and its first topic has JSON messages."""
-    with path.open("rb") as file:
-        if file.read(8) != b"\x89MCAP0\r\n":
-            return False
-    return next((encoding == "json" for *_, encoding in _channels(path)), False)
 
 
 def _json_bag(path: Path) -> Bag:

@@ -37,7 +37,7 @@ class Chip:
     gain_db: float = 0.0
     """Power for each step of the gain register."""
     power_dbm: tuple[float, float] = (-150.0, 0.0)
-    """Limits of received powers."""
+    """Limits of received powers; what is sent has -41.3 dBm/MHz by law, -14 dBm in 500 MHz."""
 
 
 _PPM: Final = {"ppm": 1.0, "-ppm": -1.0}

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from uwblink.arrays import Columns
 from uwblink.display import first_few
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import ALL_IDS, DISTANCES, IDS, POSITIONS, POWERS, SIGN, SKEWS, ColumnMap, load_map
@@ -45,7 +46,7 @@ from uwblink.importers.staging import (
     time_conditions,
     usable_exchanges,
 )
-from uwblink.importers.tables import Columns, connected
+from uwblink.importers.tables import connected
 from uwblink.importers.templates import Template
 from uwblink.recording.antenna_delays import AntennaDelay, meta_of_delays
 from uwblink.recording.file import Recording
@@ -244,11 +245,10 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
 def _layout(staging: Staging) -> str:
     """Return the layout that the columns suggest."""
     has = staging.rows.has
-    for layout, names in (("exchanges", STAMPS[:4]), ("messages", ("tx", "rx")), ("stamps", ("stamp", "event"))):
+    needed = {"exchanges": STAMPS[:4], "messages": ("tx", "rx"), "stamps": ("stamp", "event")}
+    needed |= {} if any(map(has, STAMPS)) else {"ranges": ("range_m",), "differences": ("difference_m",)}
+    for layout, names in needed.items():
         if all(map(has, names)):
-            return layout
-    for layout, name in (("ranges", "range_m"), ("differences", "difference_m")):
-        if has(name) and not any(map(has, STAMPS)):
             return layout
     raise staging.tables[0].missing(staging.column_map.header(next(name for name in STAMPS if not has(name))))
 

@@ -22,7 +22,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from uwblink.arrays import Floats
+from uwblink.arrays import Columns, Floats
 from uwblink.display import first_few
 from uwblink.errors import ImportTableError, raising
 from uwblink.importers.bags import Bag, fields_of, is_bag, matching_topics, open_bag
@@ -66,7 +66,7 @@ from uwblink.importers.plausibility import (
     try_reading,
 )
 from uwblink.importers.poses import pose_topics
-from uwblink.importers.tables import Columns, SourceTable, message_number, open_table
+from uwblink.importers.tables import SourceTable, message_number, open_table
 from uwblink.importers.templates import Template, places
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.text_files import require_regular

@@ -17,11 +17,11 @@ from typing import Any, Final, TypeVar
 import numpy as np
 import yaml
 
-from uwblink.arrays import Floats, in_time_order
+from uwblink.arrays import Columns, Floats, in_time_order
 from uwblink.errors import ImportTableError, raising
 from uwblink.importers.plausibility import clocks, to_ticks
 from uwblink.importers.poses import in_order
-from uwblink.importers.tables import Columns, number, open_table, time_ns, whole_number
+from uwblink.importers.tables import number, open_table, time_ns, whole_number
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import CirRow, Fault, Poses, Tag

@@ -17,11 +17,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Columns, Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import DISTANCE_UNITS, IDS, POSITIONS, POWERS, ColumnMap
 from uwblink.importers.devices import CHIPS
-from uwblink.importers.tables import Columns
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import REGISTER_MAX, AntennaDelay, delay_of
 from uwblink.ticks import ANTENNA_DELAY_TICKS, METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S
@@ -323,19 +322,11 @@ def reason_against_metres(ranges: Floats) -> str:
     return ""
 
 
-def reason_against_dbm(powers: Floats) -> str:
-    """Return why numbers (n,) cannot be received powers in dBm; empty text if they can."""
+def reason_against_dbm(powers: Floats, limits: tuple[float, float] = CHIPS["other"].power_dbm) -> str:
+    """Return why numbers (n,) cannot be received powers in dBm within a chip's limits; empty text if they can."""
     finite = powers[np.isfinite(powers) & (powers != 0)]  # boards print 0 for an unknown power
-    middle = float(np.median(finite)) if len(finite) else -1.0
-    # The legal limit of transmitted power is -41.3 dBm/MHz, -14 dBm in 500 MHz.
-    return f"the median power is {middle:+.4g}, and received powers are below 0 dBm" if middle > 0 else ""
-
-
-def reason_against_limits(powers: Floats, limits: tuple[float, float]) -> str:
-    """Return why powers (n,) in dBm cannot be a chip's, by its limits; empty text if they can."""
-    finite = powers[np.isfinite(powers) & (powers != 0)]
-    middle = float(np.median(finite)) if len(finite) else limits[0]
-    return "" if limits[0] <= middle <= limits[1] else f"the median power is {middle:+.4g} dBm"
+    middle, (low, high) = float(np.median(finite)) if len(finite) else limits[0], limits
+    return "" if low <= middle <= high else f"the median power is {middle:+.4g}, expected {low:g} to {high:g} dBm"
 
 
 def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats | None) -> None:
@@ -350,7 +341,7 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
         remedy = 'units.power in the map: "-dBm" if they lack their sign'
         if column_map.unit_of(name) is None:
             reasons[name] = reason_against_dbm(optional(rows, name)), remedy
-        elif column_map.chip and (why := reason_against_limits(optional(rows, name), limits)):
+        elif column_map.chip and (why := reason_against_dbm(optional(rows, name), limits)):
             reasons[name] = why, f"another unit, chip or prf than {column_map.chip!r} and {column_map.prf} in the map"
     for name in ("range_m", "gt_range_m") if raw_m is None else ():
         factor = column_map.factor(name)
@@ -363,11 +354,12 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
     for name, (why, remedy) in reasons.items():
         if why:
             raise ImportTableError(f"{path}: column {column_map.header(name)!r}: {why}; state {remedy}")
-    if raw_m is None:
-        found = other_unit({"ranges": lambda f: ranges - true / f, "true distances": lambda f: ranges - f * true})
-    else:
-        found = other_unit({"ranges": lambda f: raw_m - f * ranges, "true distances": lambda f: raw_m - f * true})
-    if found:
+    errors: dict[str, Errors] = (
+        {"ranges": lambda f: ranges - true / f, "true distances": lambda f: ranges - f * true}
+        if raw_m is None
+        else {"ranges": lambda f: raw_m - f * ranges, "true distances": lambda f: raw_m - f * true}
+    )
+    if found := other_unit(errors):
         beside = "the others" if raw_m is None else "its stamps"
         raise ImportTableError(
             f"{path}: {found} by {beside}, and in {column_map.units.get('distance', 'm')} by the map; "

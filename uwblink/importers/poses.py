@@ -35,7 +35,7 @@ from uwblink.importers.tables import reading
 from uwblink.recording.distances import distances_m, find_offset
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import POSE, Poses, Tag, load_places
-from uwblink.text_files import require_regular
+from uwblink.text_files import number_in, require_regular
 from uwblink.twr import LATEST_NS, Exchanges, names_in, raw_range
 
 MESSAGES: Final = {
@@ -355,7 +355,7 @@ def _from_text(path: Path, file: TextIO, body: str | None, stated: ColumnMap) ->
         for name, places in layout.bodies.items():
             texts = [cells[k] if k < len(cells) else "" for k in (layout.time, *places)]
             texts[0] = _iso_ns(texts[0]) if layout.iso else texts[0]
-            found = [_number(text) for text in texts]
+            found = [number_in(text) for text in texts]
             if layout.gaps and (not any(map(math.isfinite, found[1:])) or not any(found[1:])):
                 continue
             named = name or (body or cells[layout.body or 0].strip())
@@ -398,14 +398,6 @@ def _iso_ns(text: str) -> str:
         return text
     since = moment.replace(tzinfo=moment.tzinfo or UTC) - datetime(1970, 1, 1, tzinfo=UTC)
     return str(since // timedelta(microseconds=1) * 1000)
-
-
-def _number(cell: str) -> float:
-    """Return a cell as a number, NaN if it is none."""
-    try:
-        return float(cell)
-    except ValueError:
-        return math.nan
 
 
 def _single(path: Path, body: str | None, *, blanks: bool) -> PoseLayout:
@@ -453,7 +445,7 @@ def _plain(path: Path, head: Lines, body: str | None, stated: ColumnMap) -> Pose
         )
     (time, time_unit), unit = found["time_s"], next(iter(units))
     first = head[1][time] if len(head) > 1 and time < len(head[1]) else ""
-    iso = math.isnan(_number(first)) and _iso_ns(first) != first
+    iso = math.isnan(number_in(first)) and _iso_ns(first) != first
     time_unit = "ns" if iso else stated.units.get("time") or time_unit or "s"
     return PoseLayout(
         form="", names=names, time=time, ns=TIME_UNITS[time_unit], iso=iso,
@@ -500,7 +492,7 @@ def _motive(path: Path, head: Lines) -> PoseLayout:
 def _vicon(path: Path, head: Lines) -> PoseLayout:
     """Return the layout of Vicon's CSV: names, then axes, then units; RX, RY, RZ are a rotation vector without RW."""
     axes = _header(path, head, "Frame", "RX", "TX")
-    rate = next((value for cells in head[:axes] if cells and (value := _number(cells[0])) > 0), math.nan)
+    rate = next((value for cells in head[:axes] if cells and (value := number_in(cells[0])) > 0), math.nan)
     bodies: dict[str, dict[str, int]] = {}
     name = ""
     for k, axis in enumerate(head[axes]):
@@ -528,7 +520,7 @@ def _qualisys(path: Path, head: Lines) -> PoseLayout:
     # Position, three angles and the residual come before the matrix.
     fields = ("x", "y", "z", *(f"r{k}" for k in range(9)))
     places = [dict(zip(fields, (k - 7, k - 6, k - 5, *range(k, k + 9)), strict=True)) for k in starts]
-    timed, rate = head[first][1:2] == ["Time"], _number(next(iter(said.get("FREQUENCY", ())), "")) or math.nan
+    timed, rate = head[first][1:2] == ["Time"], number_in(next(iter(said.get("FREQUENCY", ())), "")) or math.nan
     layout = PoseLayout(
         form="Qualisys", names=head[first], time=int(timed), ns=1e9 if timed else 1e9 / rate, bodies={},
         header=first + 1, metres=DISTANCE_UNITS["mm"],

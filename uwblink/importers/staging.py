@@ -21,6 +21,8 @@ from typing import Final, NamedTuple
 import duckdb
 import numpy as np
 
+from uwblink.arrays import Columns
+from uwblink.database import selected
 from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.importers.column_map import (
     ALL_IDS,
@@ -35,7 +37,6 @@ from uwblink.importers.column_map import (
 from uwblink.importers.devices import CHIPS, power_sql
 from uwblink.importers.plausibility import SAMPLE_ROWS, counter_format
 from uwblink.importers.tables import (
-    Columns,
     SourceTable,
     is_by_target,
     message_number,
@@ -140,22 +141,19 @@ class Staging:
             if cells.keys() != (columns or cells.keys()):
                 raise ImportTableError(f"{path}: has other columns than {paths[0]}, so they are not one table")
             columns = cells.keys()
-            chosen = ", ".join(f"{cell} AS {name}" for name, cell in cells.items())
             with table.reading():
                 into = "INSERT INTO staged" if k else "CREATE TABLE staged AS"
-                db.execute(f"{into} SELECT {chosen} FROM {table.source}")
+                db.execute(f"{into} SELECT {selected(cells)} FROM {table.source}")
             self.offsets.append(StagedRows(db, "staged", ()).count())
         if not self.offsets[-1]:
             raise ImportTableError(f"{paths[0]}: a header and no rows")
-        self.blanks = 0
+        (self.blanks,) = StagedRows(db, "staged", ()).values("count(*) FILTER (blank)")
         """Rows without a range, such as an empty cell of a wide table, that are left out."""
-        if "blank" in columns:
-            (self.blanks,) = StagedRows(db, "staged", ()).values("count(*) FILTER (blank)")
         self.beside: dict[str, Columns] = {}
         """Rows of other tables of a recording that were found on the way, by table."""
         self._filled = "NOT blank" if self.blanks else "true"
         others = tuple(name for name in columns if name not in (*ALL_IDS, "blank"))
-        ids = ", ".join(f"{cell} AS {name}" for name, cell in self._ids([n for n in ALL_IDS if n in columns]).items())
+        ids = selected(self._ids([n for n in ALL_IDS if n in columns]))
         listed = ", ".join(("CAST(rowid AS UINTEGER) AS origin", ids, *others))
         db.execute(f"CREATE TABLE rows AS SELECT {listed} FROM staged WHERE {self._filled}")
         db.execute("DROP TABLE staged")
@@ -261,7 +259,7 @@ def staged_cells(table: SourceTable) -> dict[str, str]:
         found |= {
             n: f"CASE WHEN {turned} THEN {a} ELSE {b} END" for n, a, b in zip(IDS, (two, one), (one, two), strict=True)
         }
-    return found | ({"blank": f"coalesce({blank}, false)"} if blank else {})
+    return found | {"blank": f"coalesce({blank or 'false'}, false)"}
 
 
 def _is_missing(table: SourceTable, text: str) -> str:
@@ -440,12 +438,9 @@ def usable_exchanges(
             conditions.append(Condition(name, f"{expected} from {low} to {high - 1}", wrong))
     good = faults.reject(rows, conditions)
     # Two of 10 million different exchanges have the same hash of 64 bits once in 400,000 tables.
-    code, some = f"hash({', '.join([*IDS, *stamps])})", good.where(" OR ".join(f"{name} <> 0" for name in stamps))
-    within = f"FROM {rows.name} WHERE {some.condition}"
-    twice = f"SELECT {code} AS code, min(rowid) AS first {within} GROUP BY code HAVING count(*) > 1"
-    later = (
-        f"SELECT r.rowid FROM {rows.name} r JOIN ({twice}) ON {code} = code WHERE {some.condition} AND r.rowid > first"
-    )
+    some = good.where(" OR ".join(f"{name} <> 0" for name in stamps))
+    number = f"row_number() OVER (PARTITION BY hash({', '.join([*IDS, *stamps])}) ORDER BY rowid)"
+    later = f"SELECT rowid FROM {rows.name} WHERE {some.condition} QUALIFY {number} > 1"
     staging.db.execute(f"CREATE TABLE repeats AS {later}")
     (repeats,) = StagedRows(staging.db, "repeats", ()).values("count(*)")
     return good.where("rowid NOT IN (SELECT rowid FROM repeats)") if repeats else good, repeats, bits, counter
@@ -566,10 +561,11 @@ def _group(rows: StagedRows, values: Mapping[str, str], follows: str, within_s: 
     kinds = {"sequence": "BIGINT", "message": "TINYINT"}
     cells |= {name: f"TRY_CAST(trunc({name}) AS {kind})" for name, kind in kinds.items() if name in cells}
     cells["link"] = "CAST(CAST(least(from_id, to_id) AS UINTEGER) * 65536 + greatest(from_id, to_id) AS UINTEGER)"
-    listed = ", ".join(f"{cell} AS {column}" for column, cell in cells.items())
     keys = ["link", *(name for name in ("sequence",) if name in cells)]
     order = ", ".join([*keys, *(name for name in ("time_ns",) if name in cells), "origin"])
-    rows.db.execute(f"CREATE TABLE sorted AS SELECT {listed} FROM {rows.name} WHERE {rows.condition} ORDER BY {order}")
+    rows.db.execute(
+        f"CREATE TABLE sorted AS SELECT {selected(cells)} FROM {rows.name} WHERE {rows.condition} ORDER BY {order}"
+    )
     same = [f"{key} IS NOT DISTINCT FROM lag({key}) OVER ()" for key in keys]
     if "time_ns" in cells:
         gap = "CAST(time_ns AS DOUBLE) - CAST(lag(time_ns) OVER () AS DOUBLE)"
@@ -579,7 +575,8 @@ def _group(rows: StagedRows, values: Mapping[str, str], follows: str, within_s: 
     # Windows without ORDER BY stream through the rows.
     start = "max(CASE WHEN first THEN serial END) OVER (ROWS UNBOUNDED PRECEDING)"
     placed = f"SELECT *, {start} AS start, serial - {start} + 1 AS place FROM ({marked})"
-    listed = ", ".join(f"{value} AS {column}" for column, value in values.items())
-    rows.db.execute(f"CREATE TABLE exchanges AS SELECT {listed} FROM ({placed}) GROUP BY start ORDER BY start")
+    rows.db.execute(
+        f"CREATE TABLE exchanges AS SELECT {selected(values)} FROM ({placed}) GROUP BY start ORDER BY start"
+    )
     rows.db.execute("DROP TABLE sorted")
     return StagedRows(rows.db, "exchanges", tuple(values))

@@ -26,9 +26,8 @@ from typing import IO, Any, Final
 
 import duckdb
 import numpy as np
-from numpy.typing import NDArray
 
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Columns, Floats, Ints
 from uwblink.database import connect
 from uwblink.errors import ImportTableError, first_line, raising
 from uwblink.importers.column_map import JSON_LINE, ColumnMap
@@ -42,8 +41,6 @@ MAX_LINE_BYTES: Final = 4_000_000
 
 MAX_CELLS: Final = 4096
 """Cells of a row; an impulse response in cells of its own takes 2,032."""
-
-Columns = dict[str, NDArray[Any]]
 
 
 def open_file(path: Path) -> IO[bytes]:

@@ -6,7 +6,7 @@ from intervals, and what antenna delays do to it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
@@ -278,11 +278,3 @@ def single_sided() -> tuple[str, ...]:
 def is_single_sided(name: str) -> bool:
     """Return whether a protocol has two messages; one of the project's own is known without looking for others."""
     return name in PROTOCOLS and PROTOCOLS[name].third_sender is None
-
-
-def third_from_target(names: Iterable[str]) -> list[str]:
-    """Return those of some protocols whose third message the target sends.
-
-    Others of other distributions are looked for only where one of the names is not known so far.
-    """
-    return [name for name in names if name in PROTOCOLS and PROTOCOLS[name].third_sender == "target"]

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.errors import ImportTableError
-from uwblink.recording.schema import POSE, Poses, Tag
+from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import Exchanges, names_in, raw_range
 
 
@@ -74,17 +74,15 @@ def poses_around(tracks: Tracks, start_ns: int, end_ns: int) -> Poses:
     In between positions are those of all poses. Of a body that has no poses at these times there are none, of one
     that does not move there is its only one.
     """
-    times, bodies, columns = [np.empty(0, np.int64)], [np.empty(0, np.str_)], [np.empty((len(POSE), 0))]
+    parts = [Poses.from_arrays([], "", (0.0, 0.0, 0.0))]
     for body, track in tracks.items():
-        time = track.time_ns
+        time, columns = track.time_ns, track.columns.T
         low = max(int(np.searchsorted(time, start_ns, side="right")) - 1, 0)
         high = int(np.searchsorted(time, end_ns, side="left")) + 1
         if len(time) == 1 or (time[0] <= end_ns and time[-1] >= start_ns):
-            times.append(time[low:high])
-            bodies.append(np.full(len(times[-1]), body))
-            columns.append(track.columns[:, low:high])
-    found = np.concatenate(columns, axis=1).T
-    return Poses(np.concatenate(times), np.concatenate(bodies), found[:, :3], found[:, 3:]).in_time_order()
+            some = slice(low, high)
+            parts.append(Poses(time[some], np.full(len(time[some]), body), columns[some, :3], columns[some, 3:]))
+    return Poses.concatenate(parts).in_time_order()
 
 
 def distances_m(poses: Poses | Tracks, tags: Sequence[Tag], initiator: Ints, target: Ints, time_ns: Ints) -> Floats:

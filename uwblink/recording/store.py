@@ -20,6 +20,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from uwblink.arrays import Columns
 from uwblink.database import connect, duckdb, log_of
 from uwblink.display import printable
 from uwblink.errors import RecordingError, RecordingInUseError, first_line, raising
@@ -315,10 +316,10 @@ class Store:
             ) from error
         self._db.unregister("batch")
 
-    def _select(self, query: str, values: list[Any] | None = None) -> dict[str, NDArray[Any]]:
+    def _select(self, query: str) -> Columns:
         """Return the result of a query as columns, masked where values are missing; raises `RecordingError`."""
         with self._reading():
-            return dict(self._db.execute(query, values).fetchnumpy())
+            return dict(self._db.execute(query).fetchnumpy())
 
     def _fetch(self, query: str) -> list[tuple[Any, ...]]:
         """Return the result of a query as rows; raises `RecordingError`."""

@@ -10,17 +10,18 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import as_html, cut, first_few, printable
-from uwblink.protocols.table import PROTOCOLS, third_from_target
 from uwblink.recording.schema import TABLES, Fault, Tag
-from uwblink.recording.tables import EXCHANGES_PER_BLOCK, Tables
-from uwblink.twr import STAMPS, Exchanges, intervals, names_in, without_stamps
+from uwblink.twr import STAMPS, Exchanges, intervals, names_in, of_protocol, without_stamps
+
+if TYPE_CHECKING:
+    from uwblink.recording.file import Recording
 
 IMPOSSIBLE_PPM: Final = 1000.0
 """A larger skew is due to a damaged stamp: boards differ by up to 40 ppm (20 ppm each, DW1000 data sheet, table 7)."""
@@ -88,14 +89,14 @@ def _neighbours(e: Exchanges, columns: Sequence[NDArray[Any]]) -> tuple[Ints, In
     return order[:-1][same], order[1:][same]
 
 
-def single_report_blocks(recording: Tables, rows: int = EXCHANGES_PER_BLOCK) -> Iterator[SingleReports]:
-    """Yield the exchanges of a recording, each once, in blocks of about `rows`.
+def single_report_blocks(recording: Recording) -> Iterator[SingleReports]:
+    """Yield the exchanges of a recording, each once, in blocks.
 
     A recording with reports of targets is one block, because the two reports of an exchange can be apart.
     """
     ends = recording.tally("exchanges", "initiator", "target", "reporter")
     twice = any(reporter == target != initiator for initiator, target, reporter in ends)
-    return map(single_reports, [recording.exchanges()] if twice else recording.exchange_blocks(rows))
+    return map(single_reports, [recording.exchanges()] if twice else recording.exchange_blocks())
 
 
 def differences(exchanges: Exchanges, first: int, second: int) -> list[str]:
@@ -145,7 +146,7 @@ def target_faster_ppm(exchanges: Exchanges) -> Floats:
     the second and the third if the target sends both, else the first and the third. Antenna delays cancel.
     """
     spans = intervals(exchanges)
-    from_target = np.isin(exchanges.protocol, third_from_target(names_in(exchanges.protocol)))
+    from_target = of_protocol(exchanges.protocol, lambda row: row.third_sender == "target")
     with np.errstate(all="ignore"):
         target = np.where(from_target, spans.dt53, spans.dt32 + spans.dt64)
         initiator = np.where(from_target, spans.dt64, spans.dt41 + spans.dt53)
@@ -159,8 +160,8 @@ def clock_skews(exchanges: Exchanges | Iterable[Exchanges]) -> list[ClockSkew]:
     """
     found = [np.empty((3, 0))]
     for some in [exchanges] if isinstance(exchanges, Exchanges) else exchanges:
-        double = [name for name in names_in(some.protocol) if PROTOCOLS[name].third_sender is not None]
-        e = some[np.isin(some.protocol, double) & ((some.tx3 | some.rx3) != 0)]
+        double = of_protocol(some.protocol, lambda row: row.third_sender is not None) > 0
+        e = some[double & ((some.tx3 | some.rx3) != 0)]
         low, high = np.sort([e.initiator, e.target], axis=0)
         sign = np.where(e.initiator == low, 1.0, -1.0)
         readings = sign * target_faster_ppm(e), sign * (e.skew1_ppm - e.skew2_ppm) / 2
@@ -298,7 +299,7 @@ class Summary:
         return as_html("; ".join([self.headline(), *self.lines()]), pairs)
 
 
-def summarize(recording: Tables) -> Summary:
+def summarize(recording: Recording) -> Summary:
     """Return the summary of a recording, which is read in blocks; raises what its readers raise."""
     pairs, protocols, times = Counter[tuple[int, int]](), Counter[str](), list[int]()
     repeated = contradictory = 0

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from uwblink.boards.dialects import Dialect, printed_ranges
 from uwblink.boards.listeners import (
+    CorrectionSource,
     DelayCheck,
     Heard,
     Listener,
@@ -32,7 +33,7 @@ from uwblink.boards.ports import Ports, SerialPorts, wait_until
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.record import identify, overheard_row
 from uwblink.boards.recorder import Recorder
-from uwblink.corrections import Columns, Correction
+from uwblink.corrections import Correction
 from uwblink.errors import ArgumentError
 from uwblink.receptions import exchange_of
 from uwblink.recording.file import Recording
@@ -41,7 +42,6 @@ from uwblink.wire.codec import exchanges_of
 from uwblink.wire.messages import Overheard, RangeReport
 
 Stream = Generator["StreamedRange | StreamedDifference", None, None]
-CorrectionSource = str | os.PathLike[str] | Correction | Callable[[Exchanges], Columns]
 
 
 class Streamed:
@@ -182,7 +182,7 @@ def stream(  # noqa: PLR0913 - options by name
     for name, value in (("duration_s", duration_s), ("speed", speed)):
         if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
             raise ArgumentError(f"found {value!r:.40}, expected a number above 0", parameter=name)
-    correct = _correction(calibration)
+    correct = None if calibration is None else load_correction(calibration)
     if isinstance(source, str | os.PathLike):
         recorded = _recorded(Path(source), correct, listening=_check_use(use, correct))
         return _play(*recorded, correct, duration_s, speed, stop)
@@ -220,17 +220,11 @@ def stream_printed(
 
     `how` are other parameters of `uwblink.boards.printed_ranges`, which raises.
     """
-    correct = _correction(calibration)
+    correct = None if calibration is None else load_correction(calibration)
     for turns in printed_ranges(ports, dialect, **how):
         yield from streamed(
             exchanges_of((one.time_ns, one.pair[0], one.report) for one in turns if one.report), correct
         )
-
-
-def _correction(calibration: CorrectionSource | None) -> Correction | None:
-    if isinstance(calibration, str | os.PathLike):
-        return load_correction(Path(calibration))
-    return calibration if calibration is None or isinstance(calibration, Correction) else Correction(calibration)
 
 
 class RangeListener(Listener):
@@ -268,7 +262,7 @@ class RangeListener(Listener):
 
         With `use` "receptions" also with each `StreamedDifference` of boards that listen.
         """
-        self._callback, self._correct = callback, _correction(calibration)
+        self._callback, self._correct = callback, None if calibration is None else load_correction(calibration)
         self._came_ns: dict[int, int] = {}
         self._last: Exchanges | None = None
         # Boards that overhear may print before the one that reports; those of a few exchanges are kept.

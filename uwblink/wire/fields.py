@@ -84,10 +84,6 @@ def _integer(low: int, high: int) -> Kind:
     return _text(f"integer {low}..{high}", b"0|-?[1-9][0-9]{0,9}+", int, b"%d".__mod__, fits, expected)
 
 
-def _fits_buffer(value: Any) -> bool:
-    return len(value.encode()) <= LONGEST_TEXT and not any(mark in value for mark in "|\r\0")
-
-
 def _is_printable(value: Any) -> bool:
     return math.isfinite(value) and abs(value) < 1e10
 
@@ -95,10 +91,6 @@ def _is_printable(value: Any) -> bool:
 def _read_first_path(text: bytes) -> int:
     whole, milli = text.split(b"|")
     return 1000 * int(whole) + int(milli)
-
-
-def _are_taps(values: Any) -> bool:
-    return len(values) == TAPS and min(values) >= 0 and max(values) < 100_000
 
 
 def write_printed(value: float) -> bytes:
@@ -143,7 +135,7 @@ TEXT: Final = _text(
     b".*",
     bytes.decode,
     str.encode,
-    _fits_buffer,
+    lambda text: len(text.encode()) <= LONGEST_TEXT and not any(mark in text for mark in "|\r\0"),
     f"at most {LONGEST_TEXT} bytes of text without '|', a carriage return or a NUL",
 )
 NUMBER: Final = "a finite number below 1e10"
@@ -169,7 +161,7 @@ MAGNITUDES: Final = _text(
     rb"(?:(?:0|[1-9][0-9]{0,4})(?:\||$))+",
     lambda text: tuple(map(int, text.split(b"|"))),
     lambda taps: b"|".join(b"%d" % tap for tap in taps),
-    _are_taps,
+    lambda taps: len(taps) == TAPS and min(taps) >= 0 and max(taps) < 100_000,
     f"{TAPS} whole numbers from 0 to 99999",
     parts=TAPS,
 )

@@ -291,18 +291,17 @@ def write_sweep_page(plan: SweepDesign, folder: Path, *, figures: Path | None = 
 
 def _swept(plan: SweepDesign, rows: Sequence[Mapping[str, Any]]) -> Document:
     good = [row for row in rows if row.get("status") == "ok"]
-    keys = list(plan.axes) if plan.rows is None else list(dict.fromkeys(key for row in plan.rows for key in row))
-    varied = [key for key in keys if len({str(row.get(key)) for row in good}) > 1]
+    varied = [key for key in plan.keys if len({str(row.get(key)) for row in good}) > 1]
     failed = len({row["number"] for row in rows}) - len({row["number"] for row in good})
     blocks: list[Block] = [
         Text(
-            f"{plan.total:,} runs over {', '.join(keys) or 'nothing'}, {len(plan.seeds)} "
+            f"{plan.total:,} runs over {', '.join(plan.keys) or 'nothing'}, {len(plan.seeds)} "
             f"seed{'s' * (len(plan.seeds) > 1)} each, of which {failed:,} failed. Lines are medians, bands the full "
             "range over seeds and over all other keys; maps are medians over seeds. The tables beside this page have "
             "every run."
         ),
     ]
-    found = _results(good, keys) if varied else {}
+    found = _results(good, plan.keys) if varied else {}
     if not found:
         blocks.append(Text("Nothing to draw: no result of a run is a number that changes.", "warning"))
     protocols = [str(row.get("protocol", "")) for row in good]

@@ -344,13 +344,13 @@ def marginals(width_in: float, found: Sequence[Compared]) -> Figure:
     return figure
 
 
-def by_pair(width_in: float, found: Sequence[Compared], fewest: int = 5) -> Figure:
+def by_pair(width_in: float, found: Sequence[Compared]) -> Figure:
     """Draw medians, 90 % quantiles and autocorrelations of pairs, simulated over measured, one row a quantity."""
     figure, panels = sheet(width_in, 3 * len(found), across=1 if width_in < NARROW_IN else 3)
     columns = (("median", "median"), ("high", "90 %"), ("lag1", "to the next"))
     drawn = [(one, what, name) for one in found for what, name in columns]
     for axes, (one, what, name) in zip(panels, drawn, strict=True):
-        pairs = [pair for pair in one.pairs.values() if pair[0].count >= fewest]
+        pairs = [pair for pair in one.pairs.values() if pair[0].count >= 5]
         points = np.array([[getattr(side, what) for side in pair] for pair in pairs]).reshape(-1, 2)
         if np.isfinite(points).all(axis=1).any():
             ends = [np.nanmin(points), np.nanmax(points)]

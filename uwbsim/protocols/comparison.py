@@ -248,14 +248,12 @@ def _curve(
     return ErrorCurve(x, means, spreads, pooled[:, 0], np.sqrt(pooled[:, 1]))
 
 
-def over_state(
-    protocol: RangingProtocol, conditions: Conditions, values: Floats, errors: Floats, groups: int = 14
-) -> ErrorCurve:
+def over_state(protocol: RangingProtocol, conditions: Conditions, values: Floats, errors: Floats) -> ErrorCurve:
     """Return the error over a property of the states, `values` (states,), from `errors` of ranges in these in turn."""
     # Range k has the state k modulo their number: of few ranges some states have none.
     values = values[: len(errors)]
     rows = []
-    for states in np.array_split(np.argsort(values), min(groups, len(values))):
+    for states in np.array_split(np.argsort(values), min(14, len(values))):
         own = errors[np.isin(np.arange(len(errors)) % len(values), states)]
         bias, variance = predict(protocol, conditions[states]).pooled()
         rows.append((np.median(values[states]), own.mean(), own.std(), bias, np.sqrt(variance)))

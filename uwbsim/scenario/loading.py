@@ -29,7 +29,7 @@ from uwblink.errors import UwblinkError, restating
 from uwblink.output import made_folder, whole
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import SUFFIX
-from uwblink.text_files import read_text
+from uwblink.text_files import number_in, read_text
 from uwbsim.errors import ParameterError, ScenarioError, UnknownKeyError
 from uwbsim.scenario.model import Scenario
 
@@ -345,11 +345,7 @@ def _rows(path: Path, *columns: str) -> list[list[float]]:
 
 
 def _number(path: Path, line: int, column: str, cell: str | None) -> float:
-    try:
-        value = float(cell or "")
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
+    if not math.isfinite(value := number_in(cell or "")):
         raise ScenarioError(f"{path}: row {line}: column {column!r}: found {cell!r}, expected a number")
     return value
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import simpy
 
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import ArrayRows, Bools, Floats, Ints
 from uwblink.protocols.table import RangingProtocol
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
@@ -40,17 +40,13 @@ from uwbsim.world.reception import Medium
 
 
 @dataclass(frozen=True, slots=True)
-class Schedule:
+class Schedule(ArrayRows):
     """Planned exchanges (n,): true start in sub-ticks, indices of the tags, and the host that commands each."""
 
     start: Ints
     initiator: Ints
     target: Ints
     host: Ints
-
-    def __getitem__(self, rows: Ints) -> Schedule:
-        """Return the chosen exchanges."""
-        return Schedule(self.start[rows], self.initiator[rows], self.target[rows], self.host[rows])
 
 
 def schedule(scenario: Scenario) -> Schedule:

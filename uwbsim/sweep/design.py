@@ -110,15 +110,17 @@ class Run:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepDesign:
-    """A sweep as its file has it, and where its runs come from: `axes` of a grid, or `rows` one by one."""
+    """A sweep as its file has it, and where its runs come from: all combinations of a choice from each of the `axes`.
+
+    A choice is the values of some keys. A grid has an axis for each key; a list or a Latin hypercube is a single axis.
+    """
 
     path: Path
     settings: SweepSettings
     protocols: tuple[str, ...]
     scenario: Path
     seeds: tuple[int, ...]
-    axes: dict[str, list[Any]]
-    rows: list[dict[str, Any]] | None
+    axes: list[list[dict[str, Any]]]
     fingerprint: str
     allow_files: tuple[str | os.PathLike[str], ...] = ()
 
@@ -130,7 +132,12 @@ class SweepDesign:
     @property
     def points(self) -> int:
         """Return how many combinations of values there are."""
-        return len(self.rows) if self.rows is not None else math.prod(len(v) for v in self.axes.values())
+        return math.prod(map(len, self.axes))
+
+    @property
+    def keys(self) -> list[str]:
+        """Return the keys of the scenario that vary."""
+        return list(dict.fromkeys(key for axis in self.axes for choice in axis for key in choice))
 
     @property
     def total(self) -> int:
@@ -140,12 +147,9 @@ class SweepDesign:
     def run(self, number: int) -> Run:
         """Return a run by its number, 0 to `total` - 1; made when asked for, so that any number of runs fits."""
         point, seed = divmod(number, len(self.seeds))
-        if self.rows is not None:
-            values = self.rows[point]
-        else:
-            places = np.unravel_index(point, [len(v) for v in self.axes.values()])
-            values = {key: listed[int(k)] for (key, listed), k in zip(self.axes.items(), places, strict=True)}
-        return Run(number, values, self.seeds[seed])
+        places = np.unravel_index(point, [len(axis) for axis in self.axes])
+        choices = [axis[int(k)] for axis, k in zip(self.axes, places, strict=True)]
+        return Run(number, {key: value for choice in choices for key, value in choice.items()}, self.seeds[seed])
 
     def loaded(self, number: int) -> Run:
         """Return a run with its scenario; one that cannot be is an error that travels with it."""
@@ -194,7 +198,6 @@ def load_design(path: str | os.PathLike[str], *, allow_files: Folders = ()) -> S
     else:
         check_linked(scenario, f"{path}: sweep.scenario: found {settings.scenario!r}", path.parent, folders)
     known = read_text(scenario, ScenarioError, "scenario file (.toml)")
-    axes, rows = _points(path, file)
     seeds = settings.seeds
     plan = SweepDesign(
         path=path,
@@ -202,8 +205,7 @@ def load_design(path: str | os.PathLike[str], *, allow_files: Folders = ()) -> S
         protocols=settings.protocols or (tuple(PROTOCOLS) if settings.kind == "compare" else ("ds",)),
         scenario=scenario,
         seeds=tuple(range(1, seeds + 1)) if isinstance(seeds, int) else seeds,
-        axes=axes,
-        rows=rows,
+        axes=_axes(path, file),
         # What a result depends on besides its number: the plan's text and the scenario's.
         fingerprint=hashlib.sha256(text.encode() + b"\0" + known.encode()).hexdigest(),
         allow_files=folders,
@@ -214,19 +216,19 @@ def load_design(path: str | os.PathLike[str], *, allow_files: Folders = ()) -> S
     return plan
 
 
-def _points(path: Path, file: SweepFile) -> tuple[dict[str, list[Any]], list[dict[str, Any]] | None]:
+def _axes(path: Path, file: SweepFile) -> list[list[dict[str, Any]]]:
     if file.sweep.design == "list":
         if file.vary or not file.points:
             raise ScenarioError(f"{path}: a list needs tables [[list]], and no [vary]")
-        return {}, file.points
+        return [file.points]
     if file.points:
         raise ScenarioError(f'{path}: list: goes with design = "list"')
     if file.sweep.design == "latin-hypercube":
-        return {}, _hypercube(path, file)
+        return [_hypercube(path, file)]
     for key, values in file.vary.items():
         if not isinstance(values, list) or not values:
             raise ScenarioError(f"{path}: vary: {key}: found {values!r}, expected a list of values")
-    return file.vary, None
+    return [[{key: value} for value in values] for key, values in file.vary.items()]
 
 
 def _hypercube(path: Path, file: SweepFile) -> list[dict[str, Any]]:
@@ -257,9 +259,7 @@ def _hypercube(path: Path, file: SweepFile) -> list[dict[str, Any]]:
 def _check_keys(plan: SweepDesign) -> None:
     """Load the scenario with one value of each key, so that a key which is not there is found before anything runs."""
     load(plan.scenario, allow_files=plan.allow_files)
-    first = {key: listed[0] for key, listed in plan.axes.items()}
-    for row in reversed(plan.rows or []):
-        first |= row
+    first = {key: value for axis in plan.axes for choice in reversed(axis) for key, value in choice.items()}
     for key, value in first.items():
         try:
             load(plan.scenario, {key: value}, allow_files=plan.allow_files)

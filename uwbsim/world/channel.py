@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import ArrayRows, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.scenario.bodies import Room, Shadow
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class Link(ArrayRows):
     """n links between two antennas each, (n,).
 
     `distance_m` is the length of the straight line, `excess_m` the apparent additional length of the first detected
@@ -44,21 +44,6 @@ class Link:
     paths_m: Floats
     paths_dbm: Floats
     noise_s: Floats | None = None
-
-    @classmethod
-    def concatenate(cls, parts: Sequence[Link]) -> Link:
-        """Return the links of one or more parts, which have the same columns."""
-        columns = {
-            column.name: np.concatenate([getattr(part, column.name) for part in parts])
-            for column in fields(cls)
-            if getattr(parts[0], column.name) is not None
-        }
-        return cls(**columns)
-
-    def __getitem__(self, rows: Ints) -> Link:
-        """Return the chosen links."""
-        columns = {column.name: getattr(self, column.name) for column in fields(self)}
-        return replace(self, **{name: column[rows] for name, column in columns.items() if column is not None})
 
     def weaker(self, loss_db: Floats) -> Link:
         """Return the links with a loss (n,) on all their paths."""

@@ -19,13 +19,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from uwblink.arrays import Floats, Ints, in_time_order
+from uwblink.arrays import Columns, Floats, Ints, in_time_order
 from uwblink.ticks import COUNTER_BITS, TICKS_PER_SECOND
 from uwbsim.random_streams import stream
 from uwbsim.scenario.devices import Devices, Profile, ProfileTable, Ramp, ScenarioTag, WarmUp
@@ -57,8 +57,6 @@ LONGEST_RUN_S: Final = 36 * 3600.0
 """Chosen below the 39 hours that 63 bits of sub-ticks last."""
 
 Words = NDArray[np.uint64]
-Columns = dict[str, NDArray[Any]]
-"""A table of a recording as columns by name."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.interpolate import BSpline, CubicHermiteSpline, CubicSpline, PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
-from uwblink.arrays import Floats, in_time_order
+from uwblink.arrays import Columns, Floats, in_time_order
 from uwbsim.random_streams import stream
 from uwbsim.scenario.bodies import Carried, Figure, Height, Imu, RandomFlight, Recorded, Static, Waypoints
 from uwbsim.scenario.model import Scenario
-from uwbsim.world.clocks import NS_PER_S, Columns
+from uwbsim.world.clocks import NS_PER_S
 
 Draw = Callable[[str], np.random.Generator]
 """Returns the random stream of a body, or of a pair of tags, for a purpose."""
