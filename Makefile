@@ -134,6 +134,9 @@ worlds: setup ## fits in worlds that share nothing with the simulator, into docs
 places: setup ## fits where errors belong to places, into docs/accuracy.md (20 minutes)
 	$(BIN)/python -m benchmarks.rooms --write
 
+dependences: setup ## patterns, slopes over temperature and drifts, into docs/accuracy.md (20 minutes)
+	$(BIN)/python -W ignore -m benchmarks.dependences --write
+
 surveys: setup ## survey worlds of standing boards, 50 seeds each, into docs/accuracy.md (10 minutes)
 	$(BIN)/python -m benchmarks.surveys --write
 

@@ -1,12 +1,11 @@
-"""Flights whose antennas delay by direction, by a generator that shares no code with fits, and what fits make of them.
+"""Flights whose antennas delay by direction and temperature, by a generator that shares no code with fits.
 
 Robots fly on sums of sines and turn about all axes; each carries a tag. What an antenna adds is a sum of waves over
-azimuth, faded towards its poles, and no spherical harmonic. `python -m benchmarks.directions` prints what fits find.
+azimuth, faded towards its poles, and no spherical harmonic. `benchmarks.dependences` says what fits find.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, Final
@@ -14,7 +13,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-import calib
 from calib.data.samples import SampleFlight, stamped
 from uwblink.recording.schema import Poses, Tag
 
@@ -233,20 +231,3 @@ PLANTED: Final = {
     for own in (False, True)
     for size_m in (0.05, 0.1, 0.2)
 }
-
-
-def main() -> None:
-    """Print by recipe which patterns fits find, and the spread of another flight's errors with over without them."""
-    for name, recipe in (SOUND | PLANTED).items():
-        found, ratios = Counter[str](), []
-        for seed in range(100, 108):
-            (first, _), (second, _) = flight(recipe, seed), flight(recipe, seed, 1)
-            fits = [calib.fit(first, between_m=0.0, pattern=pattern) for pattern in ("none", "auto")]
-            found[fits[1].calibration.provenance.get("pattern", {}).get("kind", "none")] += 1
-            without, known = (calib.evaluate(second, one).overall.full.robust_std_m for one in fits)
-            ratios.append(known / without)
-        print(f"{name}: {dict(found)}, spread {np.mean(ratios):.2f}", flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -184,12 +184,13 @@ class DelayStates:
     speed_of_light: float = 1.0
 
     @classmethod
-    def of(cls, calibration: Calibration, tags: Sequence[int], *, walk_m: float = 0.0028) -> DelayStates:
+    def of(cls, calibration: Calibration, tags: Sequence[int], *, walk_m: float = 0.005) -> DelayStates:
         """Return those of some tags.
 
-        The covariance is that of the calibration. The default walk is that of boards that warm up by 10 K within four
-        time constants of a minute, with twice 2.15 mm/K (DW1000 user manual, section 8.3.1: that of a range). Raises
-        `BadInputError` for a calibration without delays of single tags.
+        The covariance is that of the calibration. With the default walk the errors of filters are as large as they say
+        where ranges of one tag or of two drift by 2 cm/K over 10 K in two minutes (`benchmarks/dependences.py`), and
+        those of all others by 2.15 mm/K (DW1000 user manual, section 8.3.1). Raises `BadInputError` for a calibration
+        without delays of single tags.
         """
         if calibration.pair_offsets:
             raise BadInputError(

@@ -1,0 +1,168 @@
+"""What delays depend on: planted patterns over direction, slopes over temperature, drifts, and what is found of them.
+
+The worlds share no code with the packages: `benchmarks.directions`, and those of the tests of sessions and filters.
+`make dependences` writes the table in docs/accuracy.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.progress import track
+
+import calib
+from benchmarks.directions import PLANTED, SOUND, Recipe, flight, pattern_m
+from calib.evaluation import Settings
+from calib.evaluation.localization import consistency
+from tests.calib.estimation.test_sessions import drifting
+from tests.calib.evaluation import drifting_flight
+from uwblink.arrays import Floats
+
+PAGE = Path(__file__).parents[1] / "docs" / "accuracy.md"
+FIRST_SEED = 700
+"""Others than those with which anything was chosen (41 to 316)."""
+
+TWO_SIDED_95 = 1.96
+KINDS: dict[str, list[Recipe]] = {
+    f"no pattern, {len(SOUND)} kinds of flights": [*SOUND.values()],
+    "shared pattern of 5, 10, 20 cm": [one for name, one in PLANTED.items() if "shared" in name],
+    "each antenna's own": [one for name, one in PLANTED.items() if "own" in name],
+    "no slope, 15 K": [Recipe(pattern_m=0.0, warmer_k=15.0)],
+    "2.15, 20 mm/K": [Recipe(pattern_m=0.0, warmer_k=15.0, mm_per_k=slope) for slope in (2.15, 20.0)],
+    "5 mm/K, tags differ by 4": [Recipe(pattern_m=0.0, warmer_k=15.0, mm_per_k=5.0, apart_mm_per_k=4.0)],
+    "2.15 mm/K, pattern of 10 cm": [Recipe(pattern_m=0.1, warmer_k=15.0, mm_per_k=2.15)],
+}
+RATES_M2 = (0.0, 1e-5, 1e-4)
+DRIFTS_M: tuple[dict[int, float], ...] = (
+    {},
+    dict.fromkeys(drifting_flight.DELAYS_NS, 0.0215) | {1: 0.2},
+    {1: 0.2, 2: 0.2},
+)
+"""In a filter: nothing drifts; one tag by 2 cm/K over 10 K, others by 2.15 mm/K; both tags of the robot."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """What is found in a world: whether there is something, by how much errors of another flight change by knowing it,
+    and which shares of what was planted are within 95 % intervals."""
+
+    found: bool
+    change: float = np.nan
+    inside: tuple[float, ...] = ()
+
+
+def flown(recipe: Recipe, seed: int) -> Outcome:
+    """Return what a fit finds of a pattern or slope; where tags warm up, another flight is 15 K warmer."""
+    warm = recipe.warmer_k > 0
+    warmer = replace(recipe, start_c=recipe.start_c + recipe.warmer_k)
+    (first, planted), (second, _) = flight(recipe, seed), flight(warmer, seed, 1)
+    pattern = "auto" if recipe.pattern_m or not warm else "none"
+    fits = ((pattern if warm else "none", "none"), (pattern, "auto" if warm else "none"))
+    without, known = (
+        calib.fit(first, between_m=0.0, pattern=one, temperature=other).calibration for one, other in fits
+    )
+    inside = _slopes_inside(known, planted["mm_per_k"]) if warm else []
+    if recipe.pattern_m:
+        inside += _patterns_inside(known, calib.load_ranges(first), planted["waves"], recipe.pattern_m)
+    change = _error_m(second, known) / _error_m(second, without) - 1
+    return Outcome(found=bool(known.temperatures if warm else known.patterns), change=change, inside=tuple(inside))
+
+
+def _error_m(flown: Any, known: calib.Calibration) -> float:
+    """Return the size of errors of corrected ranges, of which reflections are not a part."""
+    found = calib.evaluate(flown, known).overall.full
+    return float(np.hypot(found.median_m, found.robust_std_m))
+
+
+def _patterns_inside(known: calib.Calibration, ranges: calib.Ranges, waves: Floats, size_m: float) -> list[float]:
+    """Return for each fitted pattern the share of fitted directions in whose 95 % interval the planted one is.
+
+    Both are about their means over these directions, because delays contain what is the same in all.
+    """
+    ends, shares = np.column_stack([ranges.initiator, ranges.target]), []
+    for one in known.patterns:
+        toward = np.asarray(ranges.toward, dtype=np.float64)[np.isin(ends, one.tags)]
+        planted, values = pattern_m(toward, waves[one.tags[0]], size_m), one.values(toward)
+        values = values - values.mean(axis=0)
+        off = values @ np.array(one.coefficients_m) - (planted - planted.mean())
+        shares.append(float(np.mean(np.abs(off) <= TWO_SIDED_95 * one.std_m(values))))
+    return shares
+
+
+def _slopes_inside(known: calib.Calibration, mm_per_k: Floats) -> list[float]:
+    """Return 1 for each fitted slope in whose 95 % interval the planted one is, else 0."""
+    off = [(one.m_per_k - 1e-3 * mm_per_k[one.tags[0]]) / one.std_m_per_k for one in known.temperatures]
+    return [float(abs(one) <= TWO_SIDED_95) for one in off]
+
+
+def sessions(rate_m2: float, seed: int) -> Outcome:
+    """Return what a fit of sessions on some days finds of a walk of delays with a variance a day."""
+    days = np.cumsum([0, *np.random.default_rng([seed, 5]).uniform(2, 15, 2 + seed % 4)])
+    one = calib.fit(drifting(seed, days, rate_m2)).calibration.provenance["drift"]
+    low, _, high = one["m2_per_day"]
+    return Outcome(found=one["told"], inside=(float(low <= rate_m2 <= high),))
+
+
+def filtered(drifts_m: Sequence[dict[int, float]], seeds: Sequence[int]) -> list[str]:
+    """Return a row on filters with delays as states: NEES with its bounds, and RMSE beside fixed delays."""
+    known, cells = calib.fit(drifting_flight.flight(100, 60.0)[0]).calibration, []
+    for drift_m in drifts_m:
+        flights = [drifting_flight.flight(seed, drift_m=drift_m)[0] for seed in seeds]
+        found = [calib.localize(one, known, Settings(seeds=1, online=True))[0] for one in flights]
+        ratios = [one.tracks["online"].rmse_m / one.tracks["robust"].rmse_m - 1 for one in found]
+        nees, (low, high), _ = consistency([one.tracks["online"] for one in found])
+        cells.append((f"{nees:.1f} ({low:.1f} to {high:.1f})", f"{100 * np.mean(ratios):+.1f}"))
+    texts = [", ".join(some) for some in zip(*cells, strict=True)]
+    return ["in a filter: no drift, one tag, two tags", f"NEES {texts[0]}", f"{texts[1]} %", ""]
+
+
+def row(name: str, cases: Sequence[Sequence[Outcome]]) -> list[str]:
+    """Return a row on cases, each with its outcomes in several worlds."""
+    found = [sum(one.found for one in worlds) for worlds in cases]
+    changes = [100 * np.mean([one.change for one in worlds]) for worlds in cases]
+    inside = [100 * np.mean(every) for worlds in cases if (every := [part for one in worlds for part in one.inside])]
+    return [
+        name,
+        f"{', '.join(map(str, found))} of {len(cases[0])}",
+        f"{', '.join(f'{one:+.0f}' for one in changes)} %" if inside and np.isfinite(changes).all() else "",
+        f"{', '.join(f'{one:.0f}' for one in inside)} %" if inside else "",
+    ]
+
+
+def main() -> None:
+    """Print the table, and write it into docs/accuracy.md if asked to."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=20, help="worlds of each kind")
+    parser.add_argument("--write", action="store_true", help="write docs/accuracy.md")
+    args = parser.parse_args()
+    seeds = range(FIRST_SEED, FIRST_SEED + args.seeds)
+    lines = ["| planted | found | another flight | inside 95 % |", "|---|---|---|---|"]
+    for name, recipes in track(KINDS.items(), description="worlds"):
+        planted = bool(recipes[0].pattern_m or recipes[0].mm_per_k)
+        # Flights of all kinds without anything are one case.
+        cases = [[one] for one in recipes] if planted else [recipes]
+        lines.append(_line(row(name, [[flown(*world) for world in product(case, seeds)] for case in cases])))
+    walks = [[sessions(rate_m2, seed) for seed in seeds] for rate_m2 in RATES_M2]
+    lines.append(_line(row("from day to day: none, 3, 10 mm a root of a day", walks)))
+    lines.append(_line(filtered(DRIFTS_M, seeds[:8])))
+    if args.write:
+        table = "\n".join(["<!-- dependences -->", *lines, "<!-- end of dependences -->"])
+        page = PAGE.read_text()
+        PAGE.write_text(re.sub("<!-- dependences -->.*<!-- end of dependences -->", lambda _: table, page, flags=re.S))
+
+
+def _line(cells: list[str]) -> str:
+    line = f"| {' | '.join(cells)} |"
+    print(line, flush=True)
+    return line
+
+
+if __name__ == "__main__":
+    main()
