@@ -240,6 +240,8 @@ class Ranges(ColumnTable):
         columns |= {name: measured_powers(columns[name]) for name in ("fpp1_dbm", "fpp2_dbm")}
         warm, around, up = (np.array([columns.pop(f"{name} {end}") for end in (0, 1)]).T for name in both)
         columns["temperature_c"], around, up = measured_c(warm), np.radians(around), np.radians(up)
+        if len(lost := warm[~np.isnan(warm) & np.isnan(columns["temperature_c"])]):
+            raise BadInputError(f"found {lost[0]:g}, expected degrees Celsius, -65 to 150", parameter="temperature_c")
         toward = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1)
         columns["features"] = np.array([columns.pop(name) for name in FEATURES], dtype=np.float32).T
         found = cls(source=source, protocol=np.full(len(rows[0]), protocol), excluded={}, planted=None, **columns)
@@ -423,8 +425,8 @@ def _supply_v_per_k(table: Mapping[str, NDArray[Any]]) -> tuple[tuple[int, float
 
 
 def measured_c(temperature_c: Floats) -> NDArray[np.float32]:
-    """Return temperatures in degrees Celsius, NaN where the number cannot be that of a board."""
-    return np.where(np.abs(temperature_c) < 300.0, temperature_c, np.nan).astype(np.float32)
+    """Return temperatures in degrees Celsius, NaN where no chip can even be stored (DW1000 data sheet)."""
+    return np.where(np.abs(temperature_c - 42.5) <= 107.5, temperature_c, np.nan).astype(np.float32)
 
 
 def measured_powers(fpp_dbm: Floats) -> Floats:

@@ -18,7 +18,18 @@ import numpy as np
 
 from uwblink.display import first_few
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import ALL_IDS, DISTANCES, IDS, POSITIONS, POWERS, SIGN, SKEWS, ColumnMap, load_map
+from uwblink.importers.column_map import (
+    ALL_IDS,
+    DISTANCES,
+    IDS,
+    POSITIONS,
+    POWERS,
+    SIGN,
+    SKEWS,
+    TEMPERATURES,
+    ColumnMap,
+    load_map,
+)
 from uwblink.importers.plausibility import (
     MIN_ROWS,
     ROW_PERIOD_NS,
@@ -165,7 +176,7 @@ def _beside(exchanges: Exchanges, block: Columns) -> Iterator[tuple[str, Columns
         if columns.keys() & block.keys():
             ends = {name: getattr(exchanges, name) for name in ("time_ns", "initiator", "target")}
             yield table, ends | {kept: optional(block, name) for name, kept in columns.items()}
-    for end, name in (("initiator", "from_temperature_c"), ("target", "to_temperature_c")):
+    for end, name in zip(("initiator", "target"), TEMPERATURES, strict=True):
         if name in block:
             read = {"time_ns": exchanges.time_ns, "tag": getattr(exchanges, end), "temperature_c": block[name]}
             read |= {"supply_v": np.full(len(exchanges), np.nan)}
@@ -204,10 +215,14 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
         protocol = protocol or found
     else:
         rows = faults.reject(staging.rows, SOUND_IDS)
+    if layout not in ("exchanges", "ranges", "parts") and any(map(staging.rows.has, TEMPERATURES)):
+        notes.append(f"temperatures are read where a row is an exchange, and not of {layout}")
     total = rows.count() + len(faults)
     watch("checking", 0.0)
     value = {"ranges": "range_m", "differences": "difference_m"}.get(layout)
-    notes += staging.words_in(name for name in (*DISTANCES, *POWERS, *SKEWS) if name != value)
+    notes += staging.words_in(
+        name for name in (*DISTANCES, *POWERS, *SKEWS, *TEMPERATURES, *_BESIDE["quality"]) if name != value
+    )
     if not any(map(rows.has, ("fpp1", "fpp2"))) and any(map(rows.has, ("rxp1", "rxp2"))):
         notes.append("there is no first-path power; the received power serves in its place")
     if value:
