@@ -363,10 +363,17 @@ class Calibration:
 
 
 def _misfit(calibration: Calibration) -> str:
-    """Return the mistake in splits or in the sizes of covariance matrices, "" if there is none."""
-    split = [tag for sides in calibration.undetermined_splits for tags in sides for tag in tags]
-    if len(set(split)) < len(split) or not calibration.delays_ns.keys() >= set(split):
-        return "undetermined_splits: expected sides of calibrated tags, each of which has one side"
+    """Return the mistake in splits, dependences or the sizes of covariance matrices, "" if there is none."""
+    parts = {
+        "undetermined_splits": [tags for sides in calibration.undetermined_splits for tags in sides],
+        "patterns": [one.tags for one in calibration.patterns],
+        "temperatures": [one.tags for one in calibration.temperatures],
+    }
+    for key, some in parts.items():
+        named = [tag for tags in some for tag in tags]
+        if len(set(named)) < len(named) or not calibration.delays_ns.keys() >= set(named):
+            return f"{key}: expected calibrated tags, each of them once"
+    age_line(calibration)
     known = calibration.uncertainty
     if known is None:
         return ""
@@ -591,7 +598,7 @@ def age_line(calibration: Calibration) -> str:
     told = calibration.provenance.get("drift")
     if not isinstance(told, Mapping):
         return ""
-    with raising(BadInputError, "provenance: drift: not as `calib fit` writes it", KeyError, TypeError, ValueError):
+    with raising(ValueError, "provenance: drift: not as `calib fit` writes it", KeyError, TypeError, ValueError):
         return _age(told)
 
 
