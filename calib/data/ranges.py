@@ -289,6 +289,8 @@ class Ranges(ColumnTable):
                 f"{source}: differences of arrival name anchor {lost[0]}, which has no place: state it with "
                 "`uwblink poses --tags`, or leave it out of the log"
             )
+        if (itself := first == second).any():
+            raise BadInputError(f"{source}: differences of arrival are of anchor {first[itself][0]} with itself")
         away, across = (distances_m(poses, tags, ends, table["listener"], table["time_ns"]) for ends in (second, first))
         found = cls.from_arrays(
             np.where(table["minus"] == first, 1.0, -1.0) * table["difference_m"],

@@ -58,9 +58,9 @@ from uwblink.importers.staging import (
 )
 from uwblink.importers.tables import Columns, connected
 from uwblink.importers.templates import Template
-from uwblink.recording.antenna_delays import AntennaDelay, meta_of_delays
+from uwblink.recording.antenna_delays import ALL, AntennaDelay, meta_of_delays
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Poses, Tag
+from uwblink.recording.schema import Poses, Tag, standard_meta
 from uwblink.twr import STAMPS, Exchanges, raw_range
 
 TABLE_SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".parquet", ".jsonl", ".ndjson", ".jsonl.gz")
@@ -130,6 +130,8 @@ def import_tables(
         meta = {**meta, "timestamp_bits": reading.bits if reading else 32, **meta_of_delays(delays)}
         meta |= {"tag_names": names} if names else {}
         meta |= {"chip": column_map.chip} if column_map.chip else {}
+        if rows.has("difference_m") and not delays:  # without stamps: what was programmed is not in them
+            meta = {key: value for key, value in standard_meta().items() if key != ALL} | meta
         with Recording.create(output, meta=meta, force=force, memory_mb=250) as recording:
             ids = [name for name in ALL_IDS if rows.has(name)]
             ends = " UNION ".join(f"SELECT {name} AS id FROM {rows.name} WHERE {rows.condition}" for name in ids)
