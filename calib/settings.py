@@ -291,6 +291,10 @@ class FitSettings(CheckedSettings):
     def __post_init__(self) -> None:
         """Check the settings; whether a loss is known, the fit checks."""
         CheckedSettings.__post_init__(self)
+        if self.fold != "time" and not self.hold_out:
+            raise BadInputError(
+                f"{self.fold} says what is held out, and `hold_out` holds out nothing", parameter="fold"
+            )
         if self.sequential and self.loss == "mixture":
             raise BadInputError(
                 "goes with a loss, not with the mixture; leave one of the two away", parameter="sequential"

@@ -10,6 +10,7 @@ list (`each`), and columns that differ by a device (`wide`) become rows, and val
 
 from __future__ import annotations
 
+import codecs
 import csv
 import gzip
 import io
@@ -73,6 +74,8 @@ def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, boo
     delimiter, decimal = column_map.delimiter, column_map.decimal
     with reading(path), open_file(path) as file:
         raw = file.read(65_536)
+        if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            raise ImportTableError(f"{path}: is text in UTF-16; save it in UTF-8")
         # A letter of several bytes may be cut in two at the end of what was read.
         lines = raw.decode("utf-8-sig", errors="strict" if len(raw) < 65_536 else "ignore").splitlines()
         first = next((k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
