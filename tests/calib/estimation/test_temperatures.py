@@ -279,3 +279,12 @@ def test_temperatures_of_rows_that_are_messages_are_named_as_not_read(tmp_path):
     write(tmp_path / "m.csv", [row | {"from_temperature_c": 25} for row in as_messages(wrapped(flights()))])
     said = call("uwblink", "import", "csv", "m.csv", "-o", "m.uwb", cwd=tmp_path).stdout
     assert "temperatures are read where a row is an exchange" in said
+
+
+@pytest.mark.parametrize(("tag", "later_s"), [(99, 0), (1, 3600)])
+def test_readings_that_are_of_no_range_are_named(tag, later_s):
+    flight = calib.sample_flight()
+    readings = {"time_ns": flight.exchanges.time_ns + later_s * 10**9, "tag": np.full(len(flight.exchanges), tag)}
+    readings |= {name: np.full(len(flight.exchanges), 25.0) for name in ("temperature_c", "supply_v")}
+    with pytest.warns(TemperatureWarning, match="memory: no reading .* none is used"):
+        calib.load_ranges(replace(flight, temperature=readings))
