@@ -145,6 +145,10 @@ class Ranges(ColumnTable):
             tracks = tracks_of(poses)
             distance, toward = sights(tracks, tags, exchanges.initiator, exchanges.target, range_ns(exchanges))
             truth = np.where(np.isfinite(truth), truth, distance)
+            # Tables of places have no attitudes: those of their poses are (0, 0, 0, 1) throughout.
+            placed = [tag for tag in tags if tag.body in tracks and not any(tag.lever_arm_m)]
+            blind = [tag.tag for tag in placed if not tracks[tag.body].columns[3:6].any()]
+            toward[np.isin(np.column_stack([exchanges.initiator, exchanges.target]), blind)] = np.nan
             turning = {body for body, track in tracks.items() if track.turn_rad() > LEAST_TURN_RAD}
             seen = {"toward": toward.astype(np.float32), "turning": tuple(t.tag for t in tags if t.body in turning)}
         if temperature:
