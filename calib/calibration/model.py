@@ -159,6 +159,18 @@ class Calibration:
             for tag in tags
         }
 
+    def interval_std_ns(self) -> dict[int, float]:
+        """Return the standard errors of the delays that are not only known as parts of pairs.
+
+        Of delays of which only differences are known those are of the delays less their mean.
+        """
+        alone = {tag for sides in self.undetermined_splits if not all(sides) for tags in sides for tag in tags}
+        return {
+            tag: self.std_of_sum_ns([tag]) if tag in alone else self.delays_std_ns.get(tag, math.nan)
+            for tag in sorted(self.delays_ns)
+            if tag in alone or tag not in self.sides
+        }
+
     @property
     def pair_constants(self) -> dict[tuple[int, int], PairOffset]:
         """Return by how much ranges of a pair are too long, where constants of pairs are known and delays are not.
@@ -485,15 +497,13 @@ def delay_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
     """
     if calibration.pair_offsets and not any(calibration.delays_ns.values()):
         return []
-    std_ns = calibration.delays_std_ns
-    alone = {tag for sides in calibration.undetermined_splits if not all(sides) for tags in sides for tag in tags}
-    hidden = calibration.sides.keys() - alone
     return [
-        (str(tag), f"{delay:+.4f}", f"{interval(calibration.std_of_sum_ns([tag]))}, less the mean of all")
-        if tag in alone
-        else (str(tag), f"{delay:+.4f}", interval(std_ns.get(tag, math.nan)))
-        for tag, delay in sorted(calibration.delays_ns.items())
-        if tag not in hidden
+        (
+            str(tag),
+            f"{calibration.delays_ns[tag]:+.4f}",
+            interval(std) + ", less the mean of all" * (tag in calibration.sides),
+        )
+        for tag, std in calibration.interval_std_ns().items()
     ]
 
 

@@ -270,3 +270,11 @@ def test_a_recording_keeps_them(folder):
     assert len(some["time_ns"]) == 160
     assert some["time_ns"][0] == contents.differences["time_ns"][0] + 5 * 10**9
     assert "also: differences 3200" in processes.succeed("uwblink", "show", "fly/d.uwb", cwd=folder).stdout
+
+
+def test_delays_less_their_mean_are_drawn_with_their_intervals(folder):
+    found = calib.fit(folder / "fit/d.uwb", use="receptions", delays_only=True)
+    axes = found.plot_delays()
+    assert [label.get_text() for label in axes.get_xticklabels()] == [str(tag) for tag in range(1, 9)]
+    (bars,) = axes.containers
+    assert np.allclose(bars.lines[0].get_ydata(), [found.calibration.delays_ns[tag] for tag in range(1, 9)])
