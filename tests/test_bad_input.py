@@ -220,6 +220,8 @@ OWN = [
     ("uwblink import csv {r_csv} -o o.uwb --map own.toml", ["own.toml", "from"], "[columns]\nfrom = 'a'\n"),
     ("uwblink import csv {r_csv} -o o.uwb --map own.toml", ["own.toml", "transmit"],
      "[antenna_delays]\ntransmit = 3\n"),
+    ("uwblink import csv {r_csv} -o o.uwb --map own.toml", ["own.toml", "from_temperature_c", "400", "-65 to 150"],
+     "[constants]\nfrom_temperature_c = 400\n"),
     ("uwbsim sweep own.toml -o o", ["own.toml", "seed"], "[sweep]\nscenario = 'noiseless'\nseed = 3\n"),
     ("uwbsim sweep own.toml -o o", ["own.toml", "rx_noise"],
      "sweep = {scenario = 'noiseless', design = 'list', protocols = ['ds'], ranges = 10}\n"

@@ -429,4 +429,6 @@ def _constants(file: TomlReader, where: str, values: dict[str, Any]) -> None:
         is_word = name in ALL_IDS and isinstance(value, str) and value != ASKED
         of_id = f"{ALL_IDS.get(name)}: a number or a word; or name its column in [columns]"
         expected = of_id if name in ALL_IDS else "a finite number"
-        file.check(f"{where}.{name}", value, is_number(value) or is_word, expected)
+        expected += ", degrees Celsius from -65 to 150" if name in TEMPERATURES else ""
+        good = is_number(value) and (name not in TEMPERATURES or -65 <= value <= 150)
+        file.check(f"{where}.{name}", value, good or is_word, expected)
