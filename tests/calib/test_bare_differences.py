@@ -276,5 +276,5 @@ def test_delays_less_their_mean_are_drawn_with_their_intervals(folder):
     found = calib.fit(folder / "fit/d.uwb", use="receptions", delays_only=True)
     axes = found.plot_delays()
     assert [label.get_text() for label in axes.get_xticklabels()] == [str(tag) for tag in range(1, 9)]
-    (bars,) = axes.containers
-    assert np.allclose(bars.lines[0].get_ydata(), [found.calibration.delays_ns[tag] for tag in range(1, 9)])
+    points = axes.get_lines()[0].get_ydata()
+    assert np.allclose(points, [found.calibration.delays_ns[tag] for tag in range(1, 9)])
