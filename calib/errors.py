@@ -28,7 +28,7 @@ class LeftOutWarning(PlainWarning):
 
 
 class TemperatureWarning(PlainWarning):
-    """Tags that are used at temperatures at which a calibration was not fitted; names the tags."""
+    """Tags at temperatures at which a calibration was not fitted, or readings that are of none of them; names them."""
 
 
 class WeakHeadingWarning(PlainWarning):

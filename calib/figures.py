@@ -20,6 +20,7 @@ from calib.calibration.applying import CorrectedRanges
 from calib.calibration.comparison import CalibrationComparison
 from calib.calibration.model import Calibration
 from calib.data.ranges import Ranges
+from calib.errors import UnanswerableError
 from calib.estimator.grouped_errors import fit_grouped_errors
 from calib.evaluation.statistics import CORRECTION_STAGES, Evaluation, compare_with_planted, pair_rows, planted_curve
 from calib.spread import TWO_SIDED_95
@@ -199,14 +200,16 @@ def delays(
 ) -> Axes:
     """Draw delays in ns with 95 % intervals, and planted delays moved by the common shift.
 
-    A delay far from all others is written at the edge; one without an interval is a circle; tags of undetermined splits
-    are left out.
+    A delay far from all others is written at the edge; one without an interval is a circle; tags of which only sums are
+    determined are left out. Raises `UnanswerableError` where none is left.
     """
-    axes = axes or new_axes()
-    tags = sorted(calibration.delays_ns.keys() - calibration.sides.keys())
+    known_std = calibration.interval_std_ns()
+    if not known_std:
+        raise UnanswerableError("the delay of no single tag is determined, so that there is none to draw")
+    axes, tags = axes or new_axes(), [*known_std]
     place = np.arange(len(tags), dtype=np.float64)
     values = np.array([calibration.delays_ns[tag] for tag in tags])
-    half = TWO_SIDED_95 * np.array([calibration.delays_std_ns.get(tag, np.nan) for tag in tags])
+    half = TWO_SIDED_95 * np.array([*known_std.values()])
     inside = within_fence(values)
     bounded = inside & np.isfinite(half) & (half > 0)
     beside = 0.12 if planted_ns else 0.0

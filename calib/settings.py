@@ -291,21 +291,35 @@ class FitSettings(CheckedSettings):
     def __post_init__(self) -> None:
         """Check the settings; whether a loss is known, the fit checks."""
         CheckedSettings.__post_init__(self)
-        if self.sequential and self.loss == "mixture":
-            raise BadInputError(
-                "goes with a loss, not with the mixture; leave one of the two away", parameter="sequential"
-            )
-        if self.use == "receptions" and (self.sequential or self.constants == "pair"):
-            other = "sequential" if self.sequential else "constants"
-            raise BadInputError(
-                f"receptions go with delays of tags that are fitted at once, not with `{other}`", parameter="use"
-            )
-        for name in ("pattern", "temperature"):
-            mode = getattr(self, name)
-            if mode in ("shared", "tag") and self.excludes_patterns:
-                raise BadInputError(
-                    f"{mode} goes with delays of tags by ranges, not with `{self.excludes_patterns}`", parameter=name
+        beside = self.excludes_patterns
+        clashes: list[tuple[object, str, str]] = [
+            (
+                self.fold != "time" and not self.hold_out,
+                "fold",
+                f"{self.fold} says what is held out, and `hold_out` holds out nothing",
+            ),
+            (
+                self.sequential and self.loss == "mixture",
+                "sequential",
+                "goes with a loss, not with the mixture; leave one of the two away",
+            ),
+            (
+                self.use == "receptions" and beside != "use",
+                "use",
+                f"receptions go with delays of tags that are fitted at once, not with `{beside}`",
+            ),
+            *(
+                (
+                    mode in ("shared", "tag") and beside,
+                    name,
+                    f"{mode} goes with delays of tags by ranges, not with `{beside}`",
                 )
+                for name, mode in (("pattern", self.pattern), ("temperature", self.temperature))
+            ),
+        ]
+        for is_clash, parameter, why in clashes:
+            if is_clash:
+                raise BadInputError(why, parameter=parameter)
         seen: dict[int, str] = {}
         for name, tags in (self.groups or {}).items():
             listed = list(tags) if isinstance(tags, Iterable) and not isinstance(tags, str) else []

@@ -55,6 +55,8 @@ def seeds(tmp_path_factory):
     broken = gzip.compress((HEADER + "\n" + (GOOD + "\n") * 5000).encode(), mtime=0)
     (folder / "t.csv.gz").write_bytes(broken[:40] + broken[60:80] * 100 + broken[40:])
     (folder / "r.csv").write_text("time_s,from_id,to_id,range_m\n0.0,1,2,3.0\n")
+    (folder / "log.toml").write_text('line = "{range_m} m"\n[constants]\nfrom_id = 1\nto_id = 2\n')
+    (folder / "wide.csv").write_text((folder / "r.csv").read_text(), "utf-16")
     (folder / f"{NO_UTF8}.uwb").write_bytes(whole)
     (folder / f"{NO_UTF8}.csv").write_text((folder / "r.csv").read_text())
     (folder / "poses.csv").write_text("time_s,body,x,y,z,qx,qy,qz,qw\n0.0,robot1,0,0,0,0,0,0,1\n")
@@ -127,6 +129,11 @@ WORDS = [
     ("calib fit {f_uwb} -o c.json --scale -1", ["--scale", "-1"]),
     ("calib fit {f_uwb} -o c.json --lift up", ["--lift", "up"]),
     ("calib fit {f_uwb} -o c.json --fix 1", ["--fix", "'1'", "TAG=NS"]),
+    ("calib fit {f_uwb} -o c.json --fold pair", ["--fold", "pair", "--hold-out"]),
+    ("uwbsim run icra2023/train -o o.uwb --set tags.6.body=ifo001", ["tags.6.body", "0 to 5", "id 6 has index 5"]),
+    ("uwblink import csv {wide_csv} -o o.uwb", ["wide.csv", "UTF-16", "UTF-8"]),
+    ("uwblink import guess {wide_csv}", ["wide.csv", "UTF-16", "UTF-8"]),
+    ("uwblink import csv {wide_csv} --map {log_toml} -o o.uwb", ["wide.csv", "UTF-16", "UTF-8"]),
     ("calib apply {f_uwb} -c {c_json} -o mine", ["mine", "--force"]),
     ("calib evaluate {f_uwb} -c {c_json} --report mine", ["mine", "--force"]),
     ("calib report {f_uwb} -o r.html --pdf mine", ["mine", "--force"]),
@@ -215,6 +222,8 @@ OWN = [
     ("uwblink import csv {r_csv} -o o.uwb --map own.toml", ["own.toml", "from"], "[columns]\nfrom = 'a'\n"),
     ("uwblink import csv {r_csv} -o o.uwb --map own.toml", ["own.toml", "transmit"],
      "[antenna_delays]\ntransmit = 3\n"),
+    ("uwblink import csv {r_csv} -o o.uwb --map own.toml", ["own.toml", "from_temperature_c", "400", "-65 to 150"],
+     "[constants]\nfrom_temperature_c = 400\n"),
     ("uwbsim sweep own.toml -o o", ["own.toml", "seed"], "[sweep]\nscenario = 'noiseless'\nseed = 3\n"),
     ("uwbsim sweep own.toml -o o", ["own.toml", "rx_noise"],
      "sweep = {scenario = 'noiseless', design = 'list', protocols = ['ds'], ranges = 10}\n"

@@ -316,9 +316,13 @@ def read(adapter: TypeAdapter[Value], text: str, where: str) -> Value:
     if table["schema_version"] not in range(1, 8):
         raise BadInputError(f"{where}: schema version {table['schema_version']!r}, this uwbcal reads 1 to 7")
     try:
-        return adapter.validate_python(table)
+        found = adapter.validate_python(table)
+        adapter.dump_python(found, mode="json")  # what is nested too deeply could not be written again
+        return found
     except ValidationError as error:
         raise BadInputError(f"{where}: {_explained(error.errors(include_url=False))}") from None
+    except ValueError as error:
+        raise BadInputError(f"{where}: nested too deeply ({error})") from None
 
 
 def _explained(errors: list[ErrorDetails]) -> str:

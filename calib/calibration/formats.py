@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence, Sized
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
@@ -553,24 +553,28 @@ def export(
     calibration = given_calibration(calibration)
     if to not in FORMATS:
         raise BadInputError(f"found {to!r}, allowed: {', '.join(FORMATS)}", parameter="to")
-    if calibration.pair_offsets and to != "json":
-        raise BadInputError(f"{to} has no place for constants of pairs; export it as json", parameter="to")
-    if calibration.temperatures and to in ("miluv", "ros-yaml"):
-        raise BadInputError(
-            f"{to} has no place for slopes over temperature; export it as json, or fit with `temperature` none",
-            parameter="to",
-        )
-    if calibration.patterns and to in ("miluv", "ros-yaml"):
-        raise BadInputError(
-            f"{to} has no place for patterns over direction; export it as json, or fit with `pattern` none",
-            parameter="to",
-        )
-    if calibration.groups and to in ("miluv", "ros-yaml", "c-header"):
-        raise BadInputError(
-            f"{to} has one curve for all tags, this calibration one for each of the groups "
-            f"{', '.join(calibration.groups)}; export it as json",
-            parameter="to",
-        )
+    lacking: tuple[tuple[Sized, Collection[str], str], ...] = (
+        (calibration.pair_offsets, FORMATS.keys() - {"json"}, "no place for constants of pairs; export it as json"),
+        (
+            calibration.temperatures,
+            ("miluv", "ros-yaml"),
+            "no place for slopes over temperature; export it as json, or fit with `temperature` none",
+        ),
+        (
+            calibration.patterns,
+            ("miluv", "ros-yaml"),
+            "no place for patterns over direction; export it as json, or fit with `pattern` none",
+        ),
+        (
+            calibration.groups,
+            ("miluv", "ros-yaml", "c-header"),
+            f"one curve for all tags, this calibration one for each of the groups {', '.join(calibration.groups)}; "
+            "export it as json",
+        ),
+    )
+    for there, forms, why in lacking:
+        if there and to in forms:
+            raise BadInputError(f"{to} has {why}", parameter="to")
     text = FORMATS[to](calibration, base)
     if path is not None:
         write_text(Path(path), text, force=force)

@@ -159,6 +159,18 @@ class Calibration:
             for tag in tags
         }
 
+    def interval_std_ns(self) -> dict[int, float]:
+        """Return the standard errors of the delays that are not only known as parts of pairs.
+
+        Of delays of which only differences are known those are of the delays less their mean.
+        """
+        alone = {tag for sides in self.undetermined_splits if not all(sides) for tags in sides for tag in tags}
+        return {
+            tag: self.std_of_sum_ns([tag]) if tag in alone else self.delays_std_ns.get(tag, math.nan)
+            for tag in sorted(self.delays_ns)
+            if tag in alone or tag not in self.sides
+        }
+
     @property
     def pair_constants(self) -> dict[tuple[int, int], PairOffset]:
         """Return by how much ranges of a pair are too long, where constants of pairs are known and delays are not.
@@ -363,10 +375,17 @@ class Calibration:
 
 
 def _misfit(calibration: Calibration) -> str:
-    """Return the mistake in splits or in the sizes of covariance matrices, "" if there is none."""
-    split = [tag for sides in calibration.undetermined_splits for tags in sides for tag in tags]
-    if len(set(split)) < len(split) or not calibration.delays_ns.keys() >= set(split):
-        return "undetermined_splits: expected sides of calibrated tags, each of which has one side"
+    """Return the mistake in splits, dependences or the sizes of covariance matrices, "" if there is none."""
+    parts = {
+        "undetermined_splits": [tags for sides in calibration.undetermined_splits for tags in sides],
+        "patterns": [one.tags for one in calibration.patterns],
+        "temperatures": [one.tags for one in calibration.temperatures],
+    }
+    for key, some in parts.items():
+        named = [tag for tags in some for tag in tags]
+        if len(set(named)) < len(named) or not calibration.delays_ns.keys() >= set(named):
+            return f"{key}: expected calibrated tags, each of them once"
+    age_line(calibration)
     known = calibration.uncertainty
     if known is None:
         return ""
@@ -478,15 +497,13 @@ def delay_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
     """
     if calibration.pair_offsets and not any(calibration.delays_ns.values()):
         return []
-    std_ns = calibration.delays_std_ns
-    alone = {tag for sides in calibration.undetermined_splits if not all(sides) for tags in sides for tag in tags}
-    hidden = calibration.sides.keys() - alone
     return [
-        (str(tag), f"{delay:+.4f}", f"{interval(calibration.std_of_sum_ns([tag]))}, less the mean of all")
-        if tag in alone
-        else (str(tag), f"{delay:+.4f}", interval(std_ns.get(tag, math.nan)))
-        for tag, delay in sorted(calibration.delays_ns.items())
-        if tag not in hidden
+        (
+            str(tag),
+            f"{calibration.delays_ns[tag]:+.4f}",
+            interval(std) + ", less the mean of all" * (tag in calibration.sides),
+        )
+        for tag, std in calibration.interval_std_ns().items()
     ]
 
 
@@ -591,7 +608,7 @@ def age_line(calibration: Calibration) -> str:
     told = calibration.provenance.get("drift")
     if not isinstance(told, Mapping):
         return ""
-    with raising(BadInputError, "provenance: drift: not as `calib fit` writes it", KeyError, TypeError, ValueError):
+    with raising(ValueError, "provenance: drift: not as `calib fit` writes it", KeyError, TypeError, ValueError):
         return _age(told)
 
 

@@ -46,7 +46,8 @@ MIN_VALUES_OF_UNIT: Final = 20
 def empty(view: RecordingView) -> Iterator[Candidate]:
     """Recordings without an exchange."""
     if not len(view.exchanges):
-        yield Candidate("empty", "the recording holds no exchanges")
+        alone = f"{view.differences} differences of arrival and " if view.differences else ""
+        yield Candidate("differences alone" if alone else "empty", f"the recording holds {alone}no exchanges")
 
 
 def ticks(view: RecordingView) -> Iterator[Candidate]:

@@ -236,8 +236,8 @@ def _weighed(
     covariance, matter, said = plain + places_ns2, dict[tuple[str, tuple[str, ...]], FoundOffset](), of_places
     for one in findings:
         moved, large = _moved(one, plain), abs(one.offset_m) > SMALLEST_M
-        # True distances of another time than ranges move ranges, and hardly delays.
-        cause = one.kind == "shared" and (bool(of_places) or (large and (moved > MATTERS or "late" in one.names)))
+        # True distances of another time or scale than ranges move ranges, and hardly delays.
+        cause = one.kind == "shared" and (bool(of_places) or large)
         if moved > MATTERS:
             covariance = covariance + one.spread_ns2
         if cause and "late" in one.names:
@@ -284,7 +284,7 @@ SENTENCES = {
     "places of the listeners, or fit with `use` exchanges",
     "path": "{whose}: overheard frames travel {size} too {way}, which moves {worst}; see to the places of both tags",
     "scale": "ranges grow with the distance by {size} too {way} over the recorded distances, which moves {worst}; see "
-    "to the unit and the lever arms of the true distances",
+    "to the scale, the unit and the lever arms of the true distances",
     "late": "ranges change by {size} with the speed at which true distances change (root mean square): motion capture "
     "and ranges are not of the same time; see to the clocks (`calib doctor` says by how much)",
 }

@@ -42,7 +42,7 @@ class RecordingView:
     `reported_twice` exchanges were reported by both ends, and `contradictions` are the differences of such reports;
     `doubled` rows repeated another one. A recording is `posed` if true distances come from poses, and `standing` if it
     was made for a survey: arrangements of boards, without poses and true distances. `warming` are the tags that read
-    their temperature.
+    their temperature, `differences` the number of differences of arrival without stamps.
     """
 
     name: str
@@ -57,6 +57,7 @@ class RecordingView:
     posed: bool
     standing: bool
     warming: frozenset[int] = frozenset()
+    differences: int = 0
 
     @cached_property
     def quick_fit(self) -> QuickFit | None:
@@ -120,6 +121,7 @@ def view_of(name: str, source: Source) -> RecordingView:
         contradictions=[", ".join(differences(both, a, b)) for a, b in reports.differing.tolist()],
         doubled=int(np.count_nonzero(again)),
         posed=posed,
+        differences=len((getattr(source, "differences", None) or {"time_ns": ()})["time_ns"]),
         warming=frozenset((getattr(source, "temperature", None) or {"tag": np.zeros(0)})["tag"].tolist()),
         standing=bool(getattr(source, "arrangements", ())) and not len(looked.poses) and not np.isfinite(truth_m).any(),
     )

@@ -145,6 +145,10 @@ class Ranges(ColumnTable):
             tracks = tracks_of(poses)
             distance, toward = sights(tracks, tags, exchanges.initiator, exchanges.target, range_ns(exchanges))
             truth = np.where(np.isfinite(truth), truth, distance)
+            # Tables of places have no attitudes: those of their poses are (0, 0, 0, 1) throughout.
+            placed = [tag for tag in tags if tag.body in tracks and not any(tag.lever_arm_m)]
+            blind = [tag.tag for tag in placed if not tracks[tag.body].columns[3:6].any()]
+            toward[np.isin(np.column_stack([exchanges.initiator, exchanges.target]), blind)] = np.nan
             turning = {body for body, track in tracks.items() if track.turn_rad() > LEAST_TURN_RAD}
             seen = {"toward": toward.astype(np.float32), "turning": tuple(t.tag for t in tags if t.body in turning)}
         if temperature:
@@ -240,6 +244,8 @@ class Ranges(ColumnTable):
         columns |= {name: measured_powers(columns[name]) for name in ("fpp1_dbm", "fpp2_dbm")}
         warm, around, up = (np.array([columns.pop(f"{name} {end}") for end in (0, 1)]).T for name in both)
         columns["temperature_c"], around, up = measured_c(warm), np.radians(around), np.radians(up)
+        if len(lost := warm[~np.isnan(warm) & np.isnan(columns["temperature_c"])]):
+            raise BadInputError(f"found {lost[0]:g}, expected degrees Celsius, -65 to 150", parameter="temperature_c")
         toward = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1)
         columns["features"] = np.array([columns.pop(name) for name in FEATURES], dtype=np.float32).T
         found = cls(source=source, protocol=np.full(len(rows[0]), protocol), excluded={}, planted=None, **columns)
@@ -287,6 +293,8 @@ class Ranges(ColumnTable):
                 f"{source}: differences of arrival name anchor {lost[0]}, which has no place: state it with "
                 "`uwblink poses --tags`, or leave it out of the log"
             )
+        if (itself := first == second).any():
+            raise BadInputError(f"{source}: differences of arrival are of anchor {first[itself][0]} with itself")
         away, across = (distances_m(poses, tags, ends, table["listener"], table["time_ns"]) for ends in (second, first))
         found = cls.from_arrays(
             np.where(table["minus"] == first, 1.0, -1.0) * table["difference_m"],
@@ -423,8 +431,8 @@ def _supply_v_per_k(table: Mapping[str, NDArray[Any]]) -> tuple[tuple[int, float
 
 
 def measured_c(temperature_c: Floats) -> NDArray[np.float32]:
-    """Return temperatures in degrees Celsius, NaN where the number cannot be that of a board."""
-    return np.where(np.abs(temperature_c) < 300.0, temperature_c, np.nan).astype(np.float32)
+    """Return temperatures in degrees Celsius, NaN where no chip can even be stored (DW1000 data sheet)."""
+    return np.where(np.abs(temperature_c - 42.5) <= 107.5, temperature_c, np.nan).astype(np.float32)
 
 
 def measured_powers(fpp_dbm: Floats) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -27,7 +28,7 @@ from calib.data.ranges import (
     measured_powers,
     without_static,
 )
-from calib.errors import BadInputError, UnanswerableError
+from calib.errors import BadInputError, TemperatureWarning, UnanswerableError
 from uwblink.arrays import Floats, is_frame
 from uwblink.display import printable
 from uwblink.recording.antenna_delays import AntennaDelays, delays_in_meta
@@ -329,7 +330,7 @@ def load_flight(
     `UnanswerableError` where no range can be used.
     """
     with opened(data) as (name, source):
-        exchanges = single_reports(source.exchanges).exchanges
+        exchanges, warm = single_reports(source.exchanges).exchanges, getattr(source, "temperature", None)
         found = Ranges.from_exchanges(
             exchanges,
             poses=source.poses,
@@ -337,8 +338,11 @@ def load_flight(
             planted=planted_of(source, name),
             source=name,
             antenna_delays=antenna_delays_of(source, name),
-            temperature=getattr(source, "temperature", None),
+            temperature=warm,
         )
+        if len(found) and warm and len(warm["tag"]) and not np.isfinite(found.temperature_c).any():
+            text = f"{name}: no reading of a temperature is of a tag that ranges, within 30 s of it: none is used"
+            warnings.warn(text, TemperatureWarning, stacklevel=1)
         found = replace(found, features=features_of(exchanges, source))
         heard = getattr(source, "overheard", None)
         if heard and len(heard["time_ns"]):
@@ -373,7 +377,7 @@ def _with_differences(
     if not len(found):
         raise UnanswerableError(
             f"{found.source}: holds {len(bare['time_ns'])} differences of arrival and no exchanges: only `calib fit` "
-            "and `calib localize` use them, with `use` receptions"
+            "and `calib localize` (not with `model` team) use them, with `use` receptions"
         )
     return found
 

@@ -325,7 +325,7 @@ def _held_out(ranges: Ranges, settings: FitSettings) -> HeldOut:
     Raises `UnanswerableError` where the others do not determine how to correct them.
     """
     rows = held_out(ranges, settings.hold_out, settings.fold)
-    known = fit(ranges[~rows], settings, hold_out=0.0).calibration
+    known = fit(ranges[~rows], settings, hold_out=0.0, fold="time").calibration
     try:
         known.apply(ranges[rows])
     except BadInputError as error:

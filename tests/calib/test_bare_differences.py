@@ -117,6 +117,22 @@ def test_they_are_shown_and_not_streamed(folder):
         processes.succeed("uwblink", "show", folder / "fit/d.uwb").stdout,
     )
     processes.refuse("uwblink", "stream", folder / "fit/d.uwb", naming=["d.uwb", "9600 differences", "no ranges"])
+    said = processes.succeed("calib", "doctor", folder / "fit/d.uwb").stdout
+    assert re.search(r"(?s)alone.*9600 differences of arrival and no exchanges.*calib fit --use receptions", said)
+
+
+def test_no_antenna_delays_are_made_up(folder):
+    contents = uwblink.load(folder / "fly/d.uwb")
+    contents.save(folder / "written.uwb", force=True)
+    for name in ("fly/d.uwb", "written.uwb"):
+        assert "antenna_delay" not in processes.succeed("uwblink", "show", folder / name).stdout
+
+
+def test_an_anchor_with_itself_is_named(folder):
+    contents = uwblink.load(folder / "fly/d.uwb")
+    same = {**contents.differences, "plus": contents.differences["minus"]}
+    replace(contents, differences=same).save(folder / "same.uwb", force=True)
+    processes.refuse("calib", "fit", "same.uwb", "-o", "x.json", *FIT, cwd=folder, naming=["same.uwb", "with itself"])
 
 
 def test_what_is_not_determined_is_not_corrected(folder):
@@ -254,3 +270,11 @@ def test_a_recording_keeps_them(folder):
     assert len(some["time_ns"]) == 160
     assert some["time_ns"][0] == contents.differences["time_ns"][0] + 5 * 10**9
     assert "also: differences 3200" in processes.succeed("uwblink", "show", "fly/d.uwb", cwd=folder).stdout
+
+
+def test_delays_less_their_mean_are_drawn_with_their_intervals(folder):
+    found = calib.fit(folder / "fit/d.uwb", use="receptions", delays_only=True)
+    axes = found.plot_delays()
+    assert [label.get_text() for label in axes.get_xticklabels()] == [str(tag) for tag in range(1, 9)]
+    points = axes.get_lines()[0].get_ydata()
+    assert np.allclose(points, [found.calibration.delays_ns[tag] for tag in range(1, 9)])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
@@ -251,7 +252,12 @@ def import_file(
             watch("reading", 0.0)
             paths, column_map = row.tables(sources, explained, Path(folder))
             meta = {"source": f"import {row.name}", "imported_from": ", ".join(path.name for path in sources)}
-            return import_tables(paths, column_map, Path(output), meta, watch, force=force)
+            try:
+                return import_tables(paths, column_map, Path(output), meta, watch, force=force)
+            except ImportTableError as error:
+                named = ", ".join(map(str, sources))  # in place of what was written for the import
+                error.args = (re.sub(rf"{re.escape(folder)}[^:]*", lambda _: named, str(error)),)
+                raise
         read: Any = row.read
         contents = read(sources[0], explained)
         if not isinstance(contents, Contents):

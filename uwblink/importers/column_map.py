@@ -63,6 +63,7 @@ from uwblink.twr import BITS, LARGEST_ID, STAMPS
 
 POSITIONS: Final = tuple(f"{end}_{axis}_m" for end in ("from", "to") for axis in "xyz")
 DISTANCES: Final = ("range_m", "gt_range_m", "difference_m", *POSITIONS)
+TEMPERATURES: Final = ("from_temperature_c", "to_temperature_c")
 IDS: Final = {"from_id": "the initiator of each exchange", "to_id": "its target"}
 ALL_IDS: Final = IDS | {"at_id": "the tag at which a difference of arrival was measured"}
 SIGN: Final = "a difference is taken for the distance of at_id to to_id less that to from_id"
@@ -73,7 +74,7 @@ ASKED: Final = "?"
 
 NAMES: Final = (
     "time_s", *ALL_IDS, *STAMPS, "fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2", "sts1", "sts2", *DISTANCES,
-    "from_temperature_c", "to_temperature_c",
+    *TEMPERATURES,
     "sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "sts", "stamp", "event", "heard",
 )  # fmt: skip
 """The columns of tables; `event` has words that tell whether a stamp is of transmission or of reception."""
@@ -428,4 +429,6 @@ def _constants(file: TomlReader, where: str, values: dict[str, Any]) -> None:
         is_word = name in ALL_IDS and isinstance(value, str) and value != ASKED
         of_id = f"{ALL_IDS.get(name)}: a number or a word; or name its column in [columns]"
         expected = of_id if name in ALL_IDS else "a finite number"
-        file.check(f"{where}.{name}", value, is_number(value) or is_word, expected)
+        expected += ", degrees Celsius from -65 to 150" if name in TEMPERATURES else ""
+        good = is_number(value) and (name not in TEMPERATURES or -65 <= value <= 150)
+        file.check(f"{where}.{name}", value, good or is_word, expected)

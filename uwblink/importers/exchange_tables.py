@@ -19,7 +19,18 @@ import numpy as np
 from uwblink.arrays import Columns
 from uwblink.display import first_few
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import ALL_IDS, DISTANCES, IDS, POSITIONS, POWERS, SIGN, SKEWS, ColumnMap, load_map
+from uwblink.importers.column_map import (
+    ALL_IDS,
+    DISTANCES,
+    IDS,
+    POSITIONS,
+    POWERS,
+    SIGN,
+    SKEWS,
+    TEMPERATURES,
+    ColumnMap,
+    load_map,
+)
 from uwblink.importers.plausibility import (
     MIN_ROWS,
     ROW_PERIOD_NS,
@@ -48,9 +59,9 @@ from uwblink.importers.staging import (
 )
 from uwblink.importers.tables import connected
 from uwblink.importers.templates import Template
-from uwblink.recording.antenna_delays import AntennaDelay, meta_of_delays
+from uwblink.recording.antenna_delays import ALL, AntennaDelay, meta_of_delays
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Poses, Tag
+from uwblink.recording.schema import Poses, Tag, standard_meta
 from uwblink.twr import STAMPS, Exchanges, raw_range
 
 TABLE_SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".parquet", ".jsonl", ".ndjson", ".jsonl.gz")
@@ -120,6 +131,8 @@ def import_tables(
         meta = {**meta, "timestamp_bits": reading.bits if reading else 32, **meta_of_delays(delays)}
         meta |= {"tag_names": names} if names else {}
         meta |= {"chip": column_map.chip} if column_map.chip else {}
+        if rows.has("difference_m") and not delays:  # without stamps: what was programmed is not in them
+            meta = {key: value for key, value in standard_meta().items() if key != ALL} | meta
         with Recording.create(output, meta=meta, force=force, memory_mb=250) as recording:
             ids = [name for name in ALL_IDS if rows.has(name)]
             ends = " UNION ".join(f"SELECT {name} AS id FROM {rows.name} WHERE {rows.condition}" for name in ids)
@@ -166,7 +179,7 @@ def _beside(exchanges: Exchanges, block: Columns) -> Iterator[tuple[str, Columns
         if columns.keys() & block.keys():
             ends = {name: getattr(exchanges, name) for name in ("time_ns", "initiator", "target")}
             yield table, ends | {kept: optional(block, name) for name, kept in columns.items()}
-    for end, name in (("initiator", "from_temperature_c"), ("target", "to_temperature_c")):
+    for end, name in zip(("initiator", "target"), TEMPERATURES, strict=True):
         if name in block:
             read = {"time_ns": exchanges.time_ns, "tag": getattr(exchanges, end), "temperature_c": block[name]}
             read |= {"supply_v": np.full(len(exchanges), np.nan)}
@@ -205,10 +218,14 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
         protocol = protocol or found
     else:
         rows = faults.reject(staging.rows, SOUND_IDS)
+    if layout not in ("exchanges", "ranges", "parts") and any(map(staging.rows.has, TEMPERATURES)):
+        notes.append(f"temperatures are read where a row is an exchange, and not of {layout}")
     total = rows.count() + len(faults)
     watch("checking", 0.0)
     value = {"ranges": "range_m", "differences": "difference_m"}.get(layout)
-    notes += staging.words_in(name for name in (*DISTANCES, *POWERS, *SKEWS) if name != value)
+    notes += staging.words_in(
+        name for name in (*DISTANCES, *POWERS, *SKEWS, *TEMPERATURES, *_BESIDE["quality"]) if name != value
+    )
     if not any(map(rows.has, ("fpp1", "fpp2"))) and any(map(rows.has, ("rxp1", "rxp2"))):
         notes.append("there is no first-path power; the received power serves in its place")
     if value:

@@ -50,12 +50,15 @@ WORDS: Final = {
     "made": r"(raw|filt(er)?(ered)?|corrected|corr|kalman|smooth(ed)?)",
     "true": (
         r"(gt|true|truth|ground_?truth|ref|reference|nominal|mocap|vicon|actual|tape(_?measured?)?|"
-        r"laser|soll|wahr(er)?|referenz)"
+        r"laser|soll|wahre?r?|referenz)"
     ),
-    "fpp": r"(fpp?|(fp|first_?path)_?(power|pwr|rssi|level|leistung)|first_?path|(rssi|power)_?(fp|first_?path))",
+    "fpp": (
+        r"(fpp?|(fp|first_?path)_?(power|pwr|rssi|level|leistung)|first_?path|(rssi|power|leistung)_?(fp|first_?path))"
+    ),
     "rxp": r"(rxp|rx_?(power|pwr|level)|rssi|total_?power|pr)",
     "skew": r"(skew|cfo|carrier|clock_?offset)",
     "sts": r"sts(_?(q|qual|quality))?(_?(idx|index))?",
+    "temperature": r"(temp(eratur(e)?)?|t_?celsius)(_?(deg_?)?c(elsius)?)?",
     "of_time": r"((t|ts|time|stamp|timestamp|zeit)_)?",
     "from": r"(from|src|source|initiator|tag|my|sender|tx|requester|robot|rover|mobile|node_?a|id_?1)",
     "to": r"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|beacon|node_?b|id_?2)",
@@ -104,6 +107,8 @@ PATTERNS: Final = {
     "range_m": r"({made}_?|device_?|measured?_?|uwb_?|est(imated)?_?)?{range}(_?{made})?",
     "sequence": r"(seq|sequence|exchange|laufnummer)(_?(no|num|nr|number|id))?",
     "message": r"(msg|message|frame|nachricht)(_?(no|num|nr|number|type|id))?",
+    "from_temperature_c": r"(device_?)?({from}|von|a|i)_?{temperature}|{temperature}_?(at_|of_)?({from}|von|a|i)(_c)?",
+    "to_temperature_c": r"(device_?)?({to}|nach|b|j|r)_?{temperature}|{temperature}_?(at_|of_)?({to}|nach|b|j|r)(_c)?",
     "tx": r"tx",
     "rx": r"rx",
     "fpp": r"{fpp}",

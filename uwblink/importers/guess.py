@@ -37,6 +37,7 @@ from uwblink.importers.column_map import (
     POWERS,
     SIGN,
     STAMP_UNITS,
+    TEMPERATURES,
     ColumnMap,
 )
 from uwblink.importers.exchange_tables import tables_in
@@ -130,7 +131,7 @@ def _receptions(short: Mapping[str, str], each: str, found: Mapping[str, str]) -
     return columns if columns.keys() == wanted.keys() else {}
 
 
-_OF_EXCHANGES: Final = (*STAMPS, "fpp1", "fpp2", "rxp1", "rxp2", "skew1", "skew2", "sts1", "sts2")
+_OF_EXCHANGES: Final = (*STAMPS, "fpp1", "fpp2", "rxp1", "rxp2", "skew1", "skew2", "sts1", "sts2", *TEMPERATURES)
 
 _LAYOUTS: Final = {
     "exchanges": (STAMPS[:4], OF_MESSAGES, "a row has the stamps of a whole exchange"),
@@ -142,7 +143,11 @@ _LAYOUTS: Final = {
     "messages": (("tx", "rx"), _OF_EXCHANGES, "a row has one stamp of a sender and one of a receiver"),
     "stamps": (("message",), _OF_EXCHANGES, "a row has one stamp, and says whether it is of sending or of receiving"),
     "ranges": (("range_m",), (*OF_MESSAGES, *STAMPS), "there are ranges and no stamps"),
-    "differences": (("difference_m",), (*OF_MESSAGES, *STAMPS, "range_m"), f"{SIGN}: exchange the two if it is not"),
+    "differences": (
+        ("difference_m",),
+        (*OF_MESSAGES, *TEMPERATURES, *STAMPS, "range_m"),
+        f"{SIGN}: exchange the two if it is not",
+    ),
     "nothing": ((), OF_MESSAGES, "neither stamps nor ranges were recognised: rename columns below"),
 }
 """The layouts that are recognised: the columns that each needs, those that it does not have, and the reason."""
@@ -397,12 +402,6 @@ def _are_whole(stamps: dict[str, Floats]) -> bool:
     return all(np.array_equal(column, np.rint(column), equal_nan=True) for column in stamps.values())
 
 
-NO_POSES: Final = (
-    "no poses and no true distances: ranges alone give delays of boards that stood still (`calib survey`); a flight "
-    "also needs attitudes, and anchors or first positions (calib.fit_from_ranges); constants of pairs need true "
-    "distances (docs/without-motion-capture.md)"
-)
-
 _NUMBERS: Final = r"std_msgs/msg/(Float|U?Int)[0-9]+(MultiArray)?"
 _OTHERS: Final = (
     r"^((geometry|nav|tf2|rosgraph|diagnostic|visualization|actionlib)_msgs|rcl_interfaces)/|"
@@ -444,7 +443,13 @@ def _of_bag(path: Path) -> Guess:
         found, key=lambda one: (len({*STAMPS, *POWERS} & {*one[0].columns}), -len(one[0].asked), len(one[0].columns))
     )
     poses = pose_topics(path)
-    advice = "" if poses or {"gt_range_m", *POSITIONS} & {*best.columns} else NO_POSES
+    advice = ""
+    if not poses and not {"gt_range_m", *POSITIONS} & {*best.columns}:
+        advice = (
+            "no poses and no true distances: ranges alone give delays of boards that stood still (`calib survey`); a "
+            "flight also needs attitudes, and anchors or first positions (calib.fit_from_ranges); constants of pairs "
+            "need true distances (docs/without-motion-capture.md)"
+        )
     others = [json.dumps(topic) for _, some in found if some is not chosen for topic in some]
     remarks = ["topics of the bag:", *(f"  {one}" for one in listed)]
     remarks += [f"also with ranges, for maps of their own: {', '.join(others)}"] if others else []

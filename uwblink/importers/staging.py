@@ -31,6 +31,7 @@ from uwblink.importers.column_map import (
     NAMES,
     POWERS,
     SKEWS,
+    TEMPERATURES,
     UNITS_BY_KEY,
     ColumnMap,
 )
@@ -176,12 +177,13 @@ class Staging:
             for table in self.tables:
                 text = table.text(header, numeric=True)
                 kept = f"WHERE lower(trim({text})) NOT IN ({none}) AND NOT {_is_missing(table, text)}"
-                is_word = f"TRY_CAST({text} AS DOUBLE) IS NULL"
+                is_word = f"{_cell(table, name, text)} IS NULL"
                 found = table.read({"first": f"any_value({text})", "n": "count(*)", "w": is_word}, f"{kept} GROUP BY 3")
                 cells += zip(found["first"].tolist(), found["n"].tolist(), found["w"].tolist(), strict=True)
             words = [cell for cell in cells if cell[2]]
             count, total = sum(n for _, n, _ in words), sum(n for _, n, _ in cells)
-            said = f"{count} of {total} cells of column {header[:60]!r} are no numbers"
+            what = "plain degrees Celsius (-65 to 150)" if name in TEMPERATURES else "numbers"
+            said = f"{count} of {total} cells of column {header[:60]!r} are no {what}"
             if words and 2 * count >= total:
                 first = json.dumps(words[0][0][:40])
                 remedy = f"name another column for {name} in the map, or state missing = [{first}]"
@@ -289,6 +291,8 @@ def _cell(table: SourceTable, name: str, text: str) -> str:
     if kind == "stamps":
         return whole_number(text) if factor == 1.0 else number(text)
     value = number(text) + (f" * {factor!r}" if factor != 1.0 else "")
+    if name in TEMPERATURES:  # no chip that is stored at others reads again (DW1000 data sheet, maximum ratings)
+        return f"CASE WHEN {value} BETWEEN -65 AND 150 THEN {value} END"
     if column_map.missing and name in ("range_m", "difference_m", "gt_range_m", *POWERS, *SKEWS):
         return f"CASE WHEN NOT {_is_missing(table, text)} THEN {value} END"
     return value

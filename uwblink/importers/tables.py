@@ -10,6 +10,7 @@ list (`each`), and columns that differ by a device (`wide`) become rows, and val
 
 from __future__ import annotations
 
+import codecs
 import csv
 import gzip
 import io
@@ -60,6 +61,11 @@ def reading(path: Path) -> Iterator[None]:
         yield
 
 
+def _refuse_utf16(path: Path, raw: bytes) -> None:
+    if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise ImportTableError(f"{path}: is text in UTF-16; save it in UTF-8")
+
+
 def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, bool, int]:
     """Return the dialect of a CSV file by its first 64 KiB, as far as the map does not state it.
 
@@ -70,6 +76,7 @@ def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, boo
     delimiter, decimal = column_map.delimiter, column_map.decimal
     with reading(path), open_file(path) as file:
         raw = file.read(65_536)
+        _refuse_utf16(path, raw)
         # A letter of several bytes may be cut in two at the end of what was read.
         lines = raw.decode("utf-8-sig", errors="strict" if len(raw) < 65_536 else "ignore").splitlines()
         first = next((k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
@@ -117,6 +124,7 @@ def check_lines(path: Path, delimiter: str) -> None:
     line, length, cells = 1, 0, 0
     with reading(path), open_file(path) as file:
         while piece := file.read(8192):
+            _refuse_utf16(path, piece if line == 1 else b"")
             ends = piece.count(b"\n")
             line += ends
             # Only lines that fill whole pieces are measured, so that short ones take no time.

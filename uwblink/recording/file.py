@@ -112,7 +112,9 @@ class Recording(Store):
         with raising(RecordingError, f"{final}: cannot be written"):
             with ExitStack() as place:
                 recording = cls._open_to_write(final, place.enter_context(place_beside(final)), memory_mb)
-                recording.append_meta(standard_meta() | dict(meta or {}))
+                # A recording that is written again has all of it.
+                given = dict(meta or {})
+                recording.append_meta(given if "format_version" in given else standard_meta() | given)
                 if not live:
                     recording._place = place.pop_all()
                     return recording

@@ -198,7 +198,9 @@ def _override(table: dict[str, Any], key: str, value: Any) -> None:
         node = node.setdefault(place, {}) if isinstance(node, dict) else node[place]
         if isinstance(node, list):
             if not (step.isdecimal() and len(step) < 9 and int(step) < len(node)):
-                raise UnknownKeyError(f"{key}: found {step!r}, expected an index 0 to {len(node) - 1}")
+                ids = [str(one.get("id")) for one in node if isinstance(one, dict)]
+                meant = f"; id {step} has index {ids.index(step)}" if step in ids else ""
+                raise UnknownKeyError(f"{key}: found {step!r}, expected an index 0 to {len(node) - 1}{meant}")
         elif not isinstance(node, dict):
             raise UnknownKeyError(f"{key}: {keys[k - 1]} is not a table")
         place = int(step) if isinstance(node, list) else step

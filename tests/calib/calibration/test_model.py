@@ -98,6 +98,9 @@ def test_a_tag_in_no_group_is_named(fitted):
         replace(fitted, groups={"a": TagGroup((1, 2, 3), fitted.bias_curve, fitted.sigma_curve)}).apply(ranges(10))
 
 
+SLOPE = '{"tags": [%d], "m_per_k": 0.002, "std_m_per_k": 0.0, "reference_c": 25.0, "span_c": [20, 30]}'
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [
@@ -111,6 +114,10 @@ def test_a_tag_in_no_group_is_named(fitted):
         ('"tags": [', '"tags": [9, '),
         ('"provenance": {', '"provenance": {"added": 1e400, '),
         ('"provenance": {', '"provenance": {"added": -Infinity, '),
+        ('"provenance": {', f'"provenance": {{"added": {"[" * 300}{"]" * 300}, '),
+        ('"provenance": {', '"provenance": {"drift": {"m2_per_day": "fast"}, '),
+        ('"provenance": {', f'"temperatures": [{SLOPE % 9}], "provenance": {{'),
+        ('"provenance": {', f'"temperatures": [{SLOPE % 1}, {SLOPE % 1}], "provenance": {{'),
     ],
 )
 def test_a_damaged_file_is_one_clear_error(fitted, old, new):

@@ -36,7 +36,7 @@ ONLY_FROM_PYTHON = {
     # Parts of the error of ranges and of differences of arrival.
     *("side", "odds"),
     # Of ranges from arrays.
-    "features",
+    *("features", "temperature_c"),
 }
 
 

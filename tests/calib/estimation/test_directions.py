@@ -18,7 +18,7 @@ from calib.report.sections import SECTIONS
 from tests.processes import call
 from uwblink.pages.figures import drawn
 from uwblink.recording.contents import Contents
-from uwblink.recording.distances import sights
+from uwblink.recording.distances import antennas_m, sights
 from uwblink.recording.schema import Poses, Tag
 
 TEN = Recipe(reflected=0.0, noise_m=0.04)
@@ -299,3 +299,21 @@ def test_directions_are_those_in_the_frames_of_the_bodies():
     assert distance == pytest.approx([5, 5, np.nan], nan_ok=True)
     assert toward[:2] == pytest.approx(np.array([[ahead, back], [back, ahead]]), abs=1e-12)
     assert np.isnan(toward[2]).all()
+
+
+def test_places_without_attitudes_tell_no_direction():
+    """Bodies that are antennas, as tables with their places give: what their attitudes leave open is in sigma."""
+    known, (found, _) = fitted(TEN, 41).calibration, flown(TEN, 41, 1)
+    when = np.unique(found.poses.time_ns)
+    places = {
+        f"tag{one.tag}": antennas_m(found.poses, found.tags, np.full(len(when), one.tag), when) for one in found.tags
+    }
+    names, straight = np.repeat([*places], len(when)), np.tile([0.0, 0.0, 0.0, 1.0], (len(when) * len(places), 1))
+    poses = Poses(np.tile(when, len(places)), names, np.concatenate([*places.values()]), straight).in_time_order()
+    tags = [Tag(one.tag, f"tag{one.tag}", (0.0, 0.0, 0.0)) for one in found.tags]
+    ranges = calib.load_ranges(Contents(exchanges=found.exchanges, poses=poses, tags=tags))
+    corrected, (pattern,) = known.apply(ranges), known.patterns
+    blind = known.apply(replace(ranges, toward=np.full_like(ranges.toward, np.nan)))
+    assert np.array_equal(corrected.corrected_m, blind.corrected_m)
+    missing = np.sqrt(corrected.sigma_total_m**2 - known.apply(calib.load_ranges(found)).sigma_total_m ** 2)
+    assert np.median(missing) == pytest.approx(np.sqrt(2) * pattern.rms_m, rel=0.1)

@@ -33,6 +33,7 @@ NAMED = {
     "a tag short by 20 cm for a tenth": "tag 4",
     "a tag's delay goes with power": "tag 1",
     "uncorrected skew": "clock skew",
+    "truth 2 % short": "grow with the distance",
     "antenna delays of 514 ns not configured": "more than boards differ by",
 }
 """What the first sentences must name; the others need only be right, or doubted."""

@@ -65,7 +65,7 @@ def test_ranges_between_two_sides_are_corrected_and_others_refused_by_name(tmp_p
     assert yaml_text["undetermined_splits"] == [[[1, 2], [3, 7]]]
     assert "tx_antenna_delay" not in str(yaml_text["tags"])
     wrong = known.to_json().replace("[1, 2]", "[1, 9]").replace("[1, 2, 3, 7]", "[1, 2, 3, 7]")
-    with pytest.raises(BadInputError, match="undetermined_splits: expected sides of calibrated tags"):
+    with pytest.raises(BadInputError, match="undetermined_splits: expected calibrated tags, each of them once"):
         calib.Calibration.from_json(wrong)
 
 

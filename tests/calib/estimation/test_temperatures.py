@@ -17,7 +17,9 @@ from calib.calibration.patterns import TemperatureSlope
 from calib.data.ranges import read_c
 from calib.errors import BadInputError, TemperatureWarning, UnanswerableError
 from tests.calib import overhearing
-from tests.processes import call, run
+from tests.processes import call, refuse, run
+from tests.uwblink.importers.test_table_forms import as_messages, flights, wrapped, write
+from uwblink.importers.guess import guess_map
 
 WARM = Recipe(pattern_m=0.0, reflected=0.0, noise_m=0.04, warmer_k=15.0, mm_per_k=5.0)
 """Boards warm up by 15 K in a minute, and ranges grow by 5 mm a kelvin of either end: by 15 cm."""
@@ -230,11 +232,59 @@ def test_differences_of_arrival_are_corrected_for_the_temperature_of_their_targe
     assert by_slope.correct_arrivals(warm).corrected_m == expected
 
 
-def test_temperatures_come_from_columns_of_a_table(tmp_path):
-    rows = [f"{k},1,2,{3 + 0.01 * k},{20 + k},{'' if k == 5 else 40}" for k in range(60)]
-    (tmp_path / "t.csv").write_text("\n".join(["time_s,from_id,to_id,range_m,t_a,to_temperature_c", *rows]))
-    (tmp_path / "m.toml").write_text('[columns]\nfrom_temperature_c = "t_a"\n')
-    call("uwblink", "import", "csv", tmp_path / "t.csv", "--map", tmp_path / "m.toml", "-o", tmp_path / "t.uwb")
+@pytest.mark.parametrize(
+    ("header", "answered"),
+    [
+        ("time_s,from_id,to_id,range_m,from_temperature_c,to_temperature_c", None),
+        ("t,tag,anchor,range,tag_temp,anchor_temp", None),
+        ("Zeit,Von,Nach,Entfernung,Temperatur von [°C],Temperatur nach [°C]", None),
+        ("time,initiator,responder,dist,t_celsius_i,t_celsius_r", None),
+        ("time_s,from_id,to_id,range_m,inside,to_temperature_c", '[columns]\nfrom_temperature_c = "inside"\n'),
+    ],
+)
+def test_temperatures_come_from_columns_of_a_table(tmp_path, header, answered):
+    rows = [f"{k}.25,1,2,{3 + 0.01 * k},{20 + k},{'' if k == 5 else 40}" for k in range(60)]
+    table = tmp_path / "t.csv"
+    table.write_text("\n".join([header, *rows]))
+    (tmp_path / "m.toml").write_text(answered or guess_map(table).text)
+    call("uwblink", "import", "csv", table, "--map", tmp_path / "m.toml", "-o", tmp_path / "t.uwb")
     read = uwblink.load(tmp_path / "t.uwb").temperature
     expected = [(k, 1, 20.0 + k) for k in range(60)] + [(k, 2, 40.0) for k in range(60) if k != 5]
     assert sorted(zip(read["time_ns"] // 10**9, read["tag"], read["temperature_c"], strict=True)) == sorted(expected)
+
+
+@pytest.mark.parametrize(("cell", "every"), [("hot", 3), ("-127", 3), ("24.5 C", 1), ("298.1", 2)])
+def test_cells_that_are_no_temperature_are_named(tmp_path, cell, every):
+    rows = [f"{k},1,2,3.{k},{cell if k % every == 0 else 25}" for k in range(60)]
+    (tmp_path / "t.csv").write_text("\n".join(["time_s,from_id,to_id,range_m,from_temperature_c", *rows]))
+    words, said = (
+        ("uwblink", "import", "csv", "t.csv", "-o", "t.uwb"),
+        "column 'from_temperature_c' are no plain degrees",
+    )
+    if every > 2:
+        assert f"20 of 60 cells of {said}" in call(*words, cwd=tmp_path).stdout
+        assert len(uwblink.load(tmp_path / "t.uwb").temperature["tag"]) == 40
+    else:
+        refuse(*words, cwd=tmp_path, naming=["t.csv", said, cell], runner=call)
+        assert not (tmp_path / "t.uwb").exists()
+
+
+def test_a_number_that_is_no_temperature_of_a_board_is_refused():
+    known = calib.fit(calib.sample_flight()).calibration
+    with pytest.raises(BadInputError, match="`temperature_c`: found 300, expected degrees Celsius"):
+        known.correct(3.0, fpp1_dbm=-84.0, fpp2_dbm=-84.0, initiator=1, target=3, temperature_c=(300.0, 25.0))
+
+
+def test_temperatures_of_rows_that_are_messages_are_named_as_not_read(tmp_path):
+    write(tmp_path / "m.csv", [row | {"from_temperature_c": 25} for row in as_messages(wrapped(flights()))])
+    said = call("uwblink", "import", "csv", "m.csv", "-o", "m.uwb", cwd=tmp_path).stdout
+    assert "temperatures are read where a row is an exchange" in said
+
+
+@pytest.mark.parametrize(("tag", "later_s"), [(99, 0), (1, 3600)])
+def test_readings_that_are_of_no_range_are_named(tag, later_s):
+    flight = calib.sample_flight()
+    readings = {"time_ns": flight.exchanges.time_ns + later_s * 10**9, "tag": np.full(len(flight.exchanges), tag)}
+    readings |= {name: np.full(len(flight.exchanges), 25.0) for name in ("temperature_c", "supply_v")}
+    with pytest.warns(TemperatureWarning, match="memory: no reading .* none is used"):
+        calib.load_ranges(replace(flight, temperature=readings))

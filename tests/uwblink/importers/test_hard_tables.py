@@ -20,6 +20,7 @@ from uwblink.errors import ImportTableError, RecordingError
 from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
 from uwblink.importers import (
     IMPORTERS,
+    ColumnMap,
     Importer,
     bags,
     import_file,
@@ -138,6 +139,20 @@ def test_a_plug_in_that_fails_is_one_line_with_its_name(tmp_path):
     finally:
         EXPORTERS.remove("flux")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.flux", "t.csv", "t.uwb"]
+
+
+def test_the_file_that_was_given_is_named_and_not_what_a_plug_in_made_of_it(tmp_path):
+    def tables(_sources, _map, folder):
+        (folder / "flux.csv").write_text(HEAD)
+        return [folder / "flux.csv"], ColumnMap()
+
+    (tmp_path / "a.flux").touch()
+    register_importer(Importer("flux", (".flux",), None, "Import flux.", tables=tables))
+    try:
+        with pytest.raises(ImportTableError, match=rf"^{tmp_path}/a.flux: a header and no rows$"):
+            import_recording(tmp_path / "a.flux", tmp_path / "o.uwb")
+    finally:
+        IMPORTERS.remove("flux")
 
 
 def test_an_interrupted_import_leaves_nothing(tmp_path):
