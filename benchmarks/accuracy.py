@@ -32,7 +32,6 @@ class Outcome:
     delays_ps: float
     curve_mm: float
     correction_mm: float
-    rejected: float
 
 
 def one(share: float, seed: int, duration_s: float | None = None) -> dict[str, Outcome]:
@@ -60,7 +59,6 @@ def one(share: float, seed: int, duration_s: float | None = None) -> dict[str, O
             1e3 * float(np.sqrt(np.mean(error**2))),
             1e3 * judged.planted.curve_rms_m,
             1e3 * judged.planted.correction_rms_m,
-            judged.overall.rejected,
         )
     return found
 
@@ -69,8 +67,8 @@ def table(outcomes: dict[float, list[dict[str, Outcome]]]) -> str:
     """Return the rows of the page."""
     rows = [
         "| reflections | loss | delays, rms (ps; median / 95 % of seeds) | 95 % intervals that hold | "
-        "bias curve, rms (mm) | whole correction, rms | chi-square rejects |",
-        "|---|---|---|---|---|---|---|",
+        "bias curve, rms (mm) | whole correction, rms |",
+        "|---|---|---|---|---|---|",
     ]
     for share, runs in outcomes.items():
         for loss in LOSSES:
@@ -78,11 +76,9 @@ def table(outcomes: dict[float, list[dict[str, Outcome]]]) -> str:
             scores = np.abs(np.concatenate([o.scores for o in some]))
             delays = np.array([o.delays_ps for o in some])
             curve, whole = (np.median([getattr(o, name) for o in some]) for name in ("curve_mm", "correction_mm"))
-            rejected = np.array([o.rejected for o in some])
             rows.append(
                 f"| {100 * share:.0f} % | {loss} | {np.median(delays):.1f} / {np.quantile(delays, 0.95):.1f} | "
-                f"{100 * np.mean(scores < 1.959964):.1f} % | {curve:.1f} | {whole:.1f} | "
-                f"{100 * np.mean(rejected):.2f} ± {100 * np.std(rejected):.2f} % |"
+                f"{100 * np.mean(scores < 1.959964):.1f} % | {curve:.1f} | {whole:.1f} |"
             )
     return "\n".join(rows)
 

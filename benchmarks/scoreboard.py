@@ -47,9 +47,7 @@ Public flights, calibrated and judged by the commands below (`make scoreboard DA
 | ranges | calibration | count | median (cm) | robust deviation (cm) | in 95 % (%) | localization (m) |
 |---|---|---|---|---|---|---|
 """
-DOUBTED: Final = (
-    "\n## What was refused or doubted\n\nFindings, warnings and errors, each shortened to its first clause.\n"
-)
+DOUBTED: Final = "\n## What was refused or doubted\n\nFindings, warnings and errors, each once, and its first clause.\n"
 RECIPES: Final = "\n## Recipes\n\nA and B are flights; every command is also run with A and B exchanged.\n"
 
 
@@ -128,7 +126,7 @@ class Lab:
 
 def first_clause(text: str) -> str:
     """Return a text up to a colon or semicolon after what names the thing and the fault, which takes 31 characters."""
-    found = re.match(r".{31,}?(?=[:;] |$)", text)
+    found = re.match(r".{31,}?(?<!\.uwb)(?=[:;] |$)", text)
     return found[0] if found else text
 
 
@@ -258,14 +256,21 @@ uwblink poses A.uwb --from A-rig.csv --tags rig.toml
 calib doctor A.uwb
 calib fit A.uwb -o A.json
 calib fit A.uwb -o A-same.json --between 0
+calib fit A.uwb -o A-turned.json --pattern shared
 calib fit A-few.uwb -o A-few.json
 calib evaluate B.uwb -c A.json
 calib localize B.uwb -c A.json
 calib evaluate B.uwb -c A-same.json
+calib evaluate B.uwb -c A-turned.json
 calib evaluate B.uwb -c A-few.json
 calib localize B.uwb -c A-few.json
 """,
-        {"A.json": "ours, by A", "A-same.json": "with `--between 0`", "A-few.json": "every 50th range of A"},
+        {
+            "A.json": "ours, by A",
+            "A-same.json": "with `--between 0`",
+            "A-turned.json": "with a pattern",
+            "A-few.json": "every 50th range of A",
+        },
         starloc_authors,
     ),
     DataSet(
@@ -280,6 +285,7 @@ calib import miluv uwb_calib.json -o published.json
 calib doctor A.uwb
 calib fit A.uwb -o A.json --hold-out 0.3
 calib fit A.uwb -o A-heard.json --hold-out 0.3 --use receptions
+calib fit A.uwb -o A-turned.json --hold-out 0.3 --pattern shared
 calib evaluate A.uwb -c published.json
 calib localize A.uwb -c published.json
 calib evaluate B.uwb -c A.json
@@ -361,7 +367,8 @@ def figures(lab: Lab, data: DataSet, flights: list[str]) -> list[Row]:
         flight, file = words[2].removesuffix(".uwb"), words[4]
         if words[1] == "fit":
             name, how = f"{flight}, held out", [key for word, key in FITS.items() if word in command]
-            found = held_out(name, answer["provenance"]["held_out"], ", ".join(["ours, by the rest", *how]))
+            title = ", ".join(["ours, by the rest", *how]) + pattern_size(lab.folder / file)
+            found = held_out(name, answer["provenance"]["held_out"], title)
             there = rows.setdefault(name, {} if data.made_up else {"none": found["none"]})
             there[file] = found["ours"]
         elif words[1] == "localize":
@@ -372,8 +379,14 @@ def figures(lab: Lab, data: DataSet, flights: list[str]) -> list[Row]:
             there = rows.setdefault(flight, before(flight, overall["raw"], lab, data))
             # A calibration without reflections states its intervals by sigma alone.
             inside = overall["coverage"]["95"] if overall["inside_95"] is None else overall["inside_95"]
-            there[file] = row_of(flight, labels[file], overall["full"], inside)
+            there[file] = row_of(flight, labels[file] + pattern_size(lab.folder / file), overall["full"], inside)
     return [row for there in rows.values() for row in there.values()]
+
+
+def pattern_size(calibration: Path) -> str:
+    """Return how large a calibration's pattern over direction is, "" if it has none."""
+    found = json.loads(calibration.read_text(encoding="utf-8")).get("patterns", [])
+    return "".join(f" of {100 * one['rms_m']:.1f} cm" for one in found)
 
 
 def row_of(flight: str, calibration: str, found: dict[str, Any], inside: float | None = None) -> Row:
@@ -393,7 +406,7 @@ def before(flight: str, raw: dict[str, Any], lab: Lab, data: DataSet) -> dict[st
     return rows
 
 
-FITS: Final = {"--use receptions": "with receptions", "--constants pair": "by pair"}
+FITS: Final = {"--use receptions": "with receptions", "--constants pair": "by pair", "--pattern": "with a pattern"}
 """What is said of a fit whose command has such options."""
 
 
@@ -407,11 +420,13 @@ def held_out(name: str, held: dict[str, Any], calibration: str) -> dict[str, Row
 
 
 def doubts(said: dict[str, list[str]], flights: list[str]) -> list[str]:
-    """Return a line per command that said something that no other had said, but for the flight's name."""
+    """Return a line per command that said something that no other had said, but for the flight's name; of warnings also
+    but for sizes."""
     seen: set[str] = set()
     lines = []
     for command, notes in said.items():
-        alike = [re.sub("|".join(flights), "", note) for note in notes]
+        sizes = [r"[0-9.]+ (%|cm|ps)"] * (not any(note.startswith("error: ") for note in notes))
+        alike = [re.sub("|".join([*sizes, *flights]), "", note) for note in notes]
         new = [note for note, key in zip(notes, alike, strict=True) if key not in seen]
         seen.update(alike)
         lines += [f"- `{re.sub(' -o [^ ]+', '', command)}`: {'; '.join(new)}"] if new else []
