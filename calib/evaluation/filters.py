@@ -142,8 +142,8 @@ class GaussianFilters:
         self.add_variance(self.changes, self.delays.walk_m**2 * dt)
 
     def delays_at(self, filter_: tuple[int, ...], delays: DelayStates, *, drift: Any) -> dict[int, tuple[float, float]]:
-        """Return what one of the filters estimates of the delays that are its states, or those of the calibration where
-        delays do not `drift` (`DelayStates.estimates`)."""
+        """Return the delays that one of the filters estimates as its states (`DelayStates.estimates`), or those of the
+        calibration if its delays do not `drift`."""
         if not (delays.tags and drift):
             return delays.estimates()
         return delays.estimates(self.state[filter_][self.changes], self.covariance[filter_][self.changes, self.changes])

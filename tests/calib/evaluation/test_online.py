@@ -105,8 +105,9 @@ def test_a_drift_of_2_cm_a_kelvin_over_10_kelvin_is_followed(known):
         assert one.tracks["online"].rmse_m < 0.8 * one.tracks["robust"].rmse_m
         assert np.abs(wrong_m({tag: delay for tag, (delay, _) in one.delays.items()}, DRIFT_M)).max() < 0.03
     nees, (low, high), _ = consistency([one.tracks["online"] for one in found])
-    # Bounds of 99 %, 1.31 times as wide: those of 95 % refuse one right filter in twenty.
-    assert abs(nees - 3) < 1.31 * (high - low) / 2 < 0.33
+    # No more than the 95 % bound of a filter that is right. Below, the bound of 99 % (1.31 times as far away): the walk
+    # is a little too wide for one drifting tag, so that two of a robot do not make the filter overconfident.
+    assert 3 - 1.31 * (3 - low) < nees < high < low + 0.5
     assert consistency([one.tracks["robust"] for one in found])[0] > 5
 
 
