@@ -4,6 +4,7 @@ A wall, a partition or a thing nearby lengthens all ranges between two bodies to
 they are. Part of it comes and goes as bodies move, and shows as residuals of different pairs of tags that go together.
 Part of it stays for the whole flight, and delays take up what they can of that. What they cannot shows where there are
 more pairs of bodies than bodies; where there are not, what stays is taken to be about as large as what comes and goes.
+Trajectories that are estimated from ranges absorb both; reflections of different pairs then still come together.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from scipy import special
 
 from calib.estimator.known_distances import KnownDistances
 from calib.estimator.score_tests import Slopes, Tested
+from calib.estimator.time_blocks import TimeBlocks
 from calib.findings import SMALLEST_NS
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
@@ -43,30 +45,38 @@ def of_places(found: KnownDistances, slopes: Slopes, pairs: Tested, before_ns2: 
     variance, deviation = _moving(found, slopes, sums)
     # How surely something stays, as deviations of one normal value.
     stays = -float(special.ndtri(special.chdtrc(max(len(values), 1), float(values @ values))))
-    moves = deviation > WIDENING_DEVIATION
-    if not moves and stays <= WIDENING_DEVIATION:
+    together = _reflected_together(found, group)
+    certain = max(deviation, stays) > CERTAIN_DEVIATION
+    if max(deviation, stays, together) <= WIDENING_DEVIATION:
         return nothing
     spread = 1 + reach[:, None] * SIZES_M**2
     likely = -0.5 * np.sum(np.log(spread) + values[:, None] ** 2 / spread, axis=0)
     # A partition or two that are always in between add 2 cm, to a factor of e.
-    # What stays is as large as what comes and goes, to 0.8 logarithms (a factor of 2.2, a judgement): in rooms of the
-    # simulator it was 1.2 to 4 times as large, in smooth fields of errors a sixth to two thirds.
-    middle, width = (np.sqrt(variance), 0.8) if moves else (0.02, 1.0)
+    middle, width = 0.02, 1.0
+    if deviation > WIDENING_DEVIATION:
+        # What stays is as large as what comes and goes, to 0.8 logarithms (a factor of 2.2, a judgement): in rooms of
+        # the simulator it was 1.2 to 4 times as large, in smooth fields of errors a sixth to two thirds.
+        middle, width = np.sqrt(variance), 0.8
+    elif stays <= WIDENING_DEVIATION:
+        # Trajectories followed reflections by 0.4 to 1.9 cm (three flights in a hall of metal, eight of tests).
+        middle, width = 0.01, 0.8
     effects = _as_one(likely - 0.5 * (np.log(SIZES_M / middle) / width) ** 2) * pairs.effects @ sums.T
     widening = effects @ effects.T
     # What all delays have in common hangs on the curve as well, and is less known by far.
     apart = np.eye(len(before_ns2)) - 1 / max(len(before_ns2), 1)
     own, more = (np.diag(apart @ one @ apart) for one in (before_ns2, widening))
-    if max(deviation, stays) <= CERTAIN_DEVIATION or not np.any(more > np.maximum(own, SMALLEST_NS**2)):
+    if max(deviation, stays, together) <= CERTAIN_DEVIATION or not np.any(more > np.maximum(own, SMALLEST_NS**2)):
         return widening, []
-    directions = "pattern" not in found.model.covariates
+    near, directions = "as walls and things near them make it", "pattern" not in found.model.covariates
+    wrong, check = f"reflected together, {near}, and trajectories may have followed them", ""
+    if certain:
+        other = ", or an antenna whose delay depends on the direction" * directions
+        wrong, check = f"wrong together, {near}, or a wrong lever arm{other}", "check the lever arms, then "
     return widening, [
-        f"errors belong to places{' or directions' * directions}: ranges between the same two bodies are wrong "
-        "together, as walls and things near them make it, or a wrong lever arm"
-        f"{', or an antenna whose delay depends on the direction' * directions}, "
-        f"which may move differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals are widened for "
-        "it; check the lever arms, then record elsewhere too, or farther from walls: what all ranges are too long "
-        "by in common no range shows"
+        f"errors belong to places{' or directions' * (certain and directions)}: ranges between the same two bodies are "
+        f"{wrong}, which may move differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals are widened "
+        f"for it; {check}record elsewhere too, or farther from walls: what all ranges are too long by in common no "
+        "range shows"
     ]
 
 
@@ -112,11 +122,9 @@ def _moving(found: KnownDistances, slopes: Slopes, sums: Floats) -> tuple[float,
     Of the slopes that different pairs of a group have in the same second, products are summed: noise, and reflections
     that belong to a pair, leave nothing of them on average.
     """
-    blocks, pair = found.blocks, found.model.pairs.number[slopes.order]
-    # Bodies are in the same places for about a second.
-    each = max(round(1.0 * blocks.count / max(blocks.seconds, 1e-9)), 1)
-    count, size = (blocks.count - 1) // each + 1, sums.shape[1]
-    where = blocks.number[slopes.order] // each * size + pair
+    pair, second = found.model.pairs.number[slopes.order], _seconds(found.blocks)
+    count, size = int(second[-1]) + 1, sums.shape[1]
+    where = second[slopes.order] * size + pair
     slope, known = (
         np.bincount(where, values, count * size).reshape(count, size) for values in (slopes.score, slopes.tells)
     )
@@ -130,3 +138,45 @@ def _moving(found: KnownDistances, slopes: Slopes, sums: Floats) -> tuple[float,
     if not spread > 0 or not reach > 0:
         return 0.0, 0.0
     return float(product.sum()) / reach, float(product.sum()) / spread
+
+
+def _seconds(blocks: TimeBlocks) -> Ints:
+    """Return the second of each range (n,): bodies are in the same places for about a second."""
+    each = max(round(1.0 * blocks.count / max(blocks.seconds, 1e-9)), 1)
+    return np.asarray(blocks.number // each)
+
+
+def _reflected_together(found: KnownDistances, group: Ints) -> float:
+    """Return how surely reflections of different pairs of a group (pairs,) come together, in standard deviations.
+
+    Estimated trajectories follow an error that all ranges between two bodies have, which then leaves no residuals. The
+    ranges that look reflected still come together. The value is 0 where distances are known.
+    """
+    fitted, pair = found.searches[-1], found.model.pairs.number
+    if fitted.rows.geometry is None:
+        return 0.0
+    looks = fitted.rows.error_slopes(fitted.optimum.x, ("odds",))
+    second, count = _seconds(found.blocks), np.bincount(pair)
+    reflected, by_power = (
+        values - (np.bincount(pair, values) / count)[pair]
+        for values in (looks.reflected, looks.reflected - looks.by["odds"])
+    )
+    # Reflections weaken powers, and powers of all pairs change with distance: the weaker of what is seen with and
+    # without what power explains counts.
+    explained = by_power * (by_power @ reflected) / max(float(by_power @ by_power), 1e-300)
+    return min(_together(values, second, pair, group) for values in (reflected, reflected - explained))
+
+
+def _together(values: Floats, second: Ints, pair: Ints, group: Ints) -> float:
+    """Return by how many standard deviations sums of values (n,) by second go together in pairs of a group.
+
+    Products of two pairs are compared with those of the same two at every other lag (circular shifts), so that each
+    may persist.
+    """
+    seconds, pairs = int(second[-1]) + 1, len(group)
+    sums = np.bincount(second * pairs + pair, values, seconds * pairs).reshape(seconds, pairs)
+    waves = np.fft.rfft(sums - sums.mean(axis=0), axis=0)
+    a, b = np.nonzero(np.triu(group[:, None] == group, 1))
+    at_lags = np.fft.irfft(waves[:, a] * np.conj(waves[:, b]), n=seconds, axis=0)
+    spread = float(np.sqrt(np.sum(np.mean(at_lags**2, axis=0))))
+    return float(at_lags[0].sum()) / spread if spread > 0 else 0.0

@@ -99,6 +99,7 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
     arm_m=ARM,
     shaken=(0.0, 1.0),
     late_m=None,
+    blocked=None,
 ):
     """A flight whose poses have noise in places, and headings and tilts that are off by sines of so many degrees.
 
@@ -106,6 +107,8 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
     each tag in turn. With
     `height_off_m` bodies read their heights, wrong by that and by 3 cm of noise; for `standing_s` all stand.
     `shaken` bodies move beside by so many metres, so many times a second; ranges of a pair in `late_m` are too long.
+    Most ranges of a pair are half a metre too long in spells of two seconds, together with those of the same two bodies
+    where `blocked` are "bodies", or on their own with "pairs".
     `antennas(tags, seconds)` of the flight says where antennas are.
     """
     rng = np.random.default_rng(seed)
@@ -141,6 +144,10 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
     lifted = np.mean(10 ** ((fpp + 82) / 10), axis=0)
     error = curve(lifted) - curve(1.0) + noise_m * rng.normal(size=n)
     error += np.where(rng.random(n) < reflected, rng.exponential(0.3, n), 0)
+    if blocked:
+        both = np.sort((pair - 1) // 2 if blocked == "bodies" else pair, axis=1)
+        spell = [hash((seed, *ends)) % 7 == 0 for ends in np.column_stack([both, t // 2]).astype(int).tolist()]
+        error += np.where(np.array(spell) & (rng.random(n) < 0.8), rng.exponential(0.5, n), 0)
     for ends, late in (late_m or {}).items():
         error += late * (np.sort(pair, axis=1) == ends).all(axis=1)
     measured = distance + error - 0.5e-9 * SPEED_OF_LIGHT * (delay[pair[:, 0]] + delay[pair[:, 1]])

@@ -164,6 +164,17 @@ def test_walls_between_bodies_are_named_and_in_the_intervals(between_m):
     assert (np.max(np.abs(errors)) > 0.08) == (between_m > 0)
 
 
+@pytest.mark.parametrize("blocked", ["bodies", "pairs"])
+def test_reflections_that_two_bodies_share_are_named_though_trajectories_follow_them(blocked):
+    flown = flight(seconds=20.0, rate=120, seed=3, blocked=blocked)
+    result = calib.fit_from_ranges(flown, poses_until_s=5.0, heading_std_deg=0.0, minimum_norm=True)
+    said = [text for text in result.warnings if "are reflected together" in text]
+    assert bool(said) == (blocked == "bodies")
+    found = result.calibration
+    errors = np.array([found.delays_ns[tag] - delay for tag, delay in DELAYS_NS.items()])
+    assert np.abs(errors / list(found.delays_std_ns.values())).max() < 2.5
+
+
 # A recorded flight (MILUV: three robots, six anchors, 317 exchanges), with little or none of its motion capture; and a
 # simulated one whose tags range with anchors only.
 
