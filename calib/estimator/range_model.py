@@ -17,10 +17,9 @@ from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, kn
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.covariates import COVARIATES, Covariate
-from calib.estimator.grouped_errors import error_unknowns, logarithms, scattered
+from calib.estimator.grouped_errors import ReflectionFeatures, error_unknowns, logarithms, scattered
 from calib.estimator.identifiability import free_directions
 from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
-from calib.estimator.reflection_features import ReflectionFeatures
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Unknown
 from calib.pairs import Pairs, pairs_of

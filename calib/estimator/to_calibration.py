@@ -19,10 +19,10 @@ from calib.calibration.model import Calibration, PairOffset, TagGroup, Uncertain
 from calib.calibration.patterns import HARMONICS, Pattern, TemperatureSlope
 from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, flat_curve
 from calib.estimator.covariates import COMMON, OF_PLACES, OWN, OWN_WARMTH, WARMTH
+from calib.estimator.grouped_errors import ReflectionFeatures
 from calib.estimator.known_distances import LARGEST_SPREAD_M, DescribedErrors, KnownDistances, described_errors
 from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel, SplineValues
 from calib.estimator.range_rows import RESIDUAL
-from calib.estimator.reflection_features import ReflectionFeatures
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
 from calib.range_errors.densities import LONG_FACTOR, LongDetours
 from calib.spread import robust_spread

@@ -38,8 +38,7 @@ from calib.estimator.known_distances import KnownDistances
 from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
-from calib.fitting.covariates import fit_with_covariates, supply_warnings, with_new_tag
-from calib.fitting.drift import drift_of
+from calib.fitting.covariates import drift_of, fit_with_covariates, supply_warnings, with_new_tag
 from calib.fitting.passive_listeners import MIN_OF_DELAY
 from calib.fitting.result import FitResult, HeldOut
 from calib.settings import FitSettings, check_tag
