@@ -164,10 +164,11 @@ class Slopes:
         self.score, self.tells = np.empty(len(rows)), np.zeros(len(rows))
         self.own = np.zeros((blocks.count, size))
         for which, terms in self._pieces():
-            self.own += (blocks.summing(self.order[which]) @ terms.as_matrix(terms.slopes, size)).toarray()
+            slopes = terms.as_matrix(terms.slopes, terms.columns, size)
+            self.own += (blocks.summing(self.order[which]) @ slopes).toarray()
             self.score[which] = terms.score
-            for part, weight in _weighed(terms):
-                self.tells[which] += weight if part.residual is None else weight * part.residual
+            for part in terms.squares:
+                self.tells[which] += part.residual * part.weight * part.residual
         self.count = len(rows)
 
     def _pieces(self) -> Iterator[tuple[slice, Terms]]:
@@ -192,7 +193,7 @@ class Slopes:
         With derivatives of the ranges by one offset `more` (n,), each family has that one as its last.
         """
         sums = self._sums([family.derivative for family in families], more)
-        return [self._tested(family, own) for family, own in zip(families, sums, strict=True)]
+        return [self._tested(family, *own) for family, own in zip(families, sums, strict=True)]
 
     def _sums(
         self, derivatives: Sequence[Derivative | sparse.csr_matrix], more: Floats | None = None
@@ -205,26 +206,23 @@ class Slopes:
         (blocks, size), counts = self.own.shape, [each.shape[1] + (more is not None) for each in derivatives]
         sums = [[np.zeros(shape) for shape in ((blocks, k), (blocks, k), (k, k), (k, size))] for k in counts]
         for which, terms in self._pieces():
-            in_block = self.blocks.summing(self.order[which])
-            matrices = [
-                part.as_matrix(weight * (part.slopes if part.entries is None else part.entries), size)
-                for part, weight in _weighed(terms)
+            rows = self.order[which]
+            in_block, told = self.blocks.summing(rows), sparse.diags(self.tells[which])
+            shared = [
+                terms.as_matrix(part.residual * part.weight * part.entries, part.columns, size)
+                for part in terms.squares
             ]
+            last = [] if more is None else [sparse.csr_matrix(more[rows, None])]
             for own, derivative in zip(sums, derivatives, strict=True):
-                kept = derivative[self.order[which]]
-                if more is not None:
-                    last = sparse.csr_matrix(more[self.order[which], None])
-                    kept = sparse.csr_matrix(sparse.hstack([kept, last]))
-                told = sparse.diags(self.tells[which])
+                kept = sparse.csr_matrix(sparse.hstack([derivative[rows], *last]))
                 own[0] += (in_block @ sparse.diags(self.score[which]) @ kept).toarray()
                 own[1] += (in_block @ told @ kept.power(2)).toarray()
                 own[2] += (kept.T @ told @ kept).toarray()
-                for matrix in matrices:
+                for matrix in shared:
                     own[3] += (kept.T @ matrix).toarray()
         return sums
 
-    def _tested(self, family: Family, sums: Sequence[Floats]) -> Tested:
-        plain, known, square, link = sums
+    def _tested(self, family: Family, plain: Floats, known: Floats, square: Floats, link: Floats) -> Tested:
         taken = self._taken(link, family.fitted)
         efficient, information = plain - self.own @ taken.T, square - taken @ link.T
         whole = max(float(np.diag(square)[: family.derivative.shape[1]].max()), 1e-300)
@@ -260,14 +258,6 @@ class Slopes:
             taken = taken - columns @ np.linalg.solve(columns[fitted], taken[fitted])
             taken[fitted] = 0.0
         return taken.T
-
-
-def _weighed(terms: Terms) -> Iterator[tuple[Terms, Floats]]:
-    """Yield rows and what is beside them, with the weight (n,) by which a unit offset of each goes with its entries."""
-    for part in (terms, terms.beside):
-        if part is not None:
-            unit = np.ones(part.slopes.shape[1]) if part.residual is None else part.residual
-            yield part, unit * part.weight
 
 
 def search(tested: Sequence[Tested], rate: float) -> list[FoundOffset]:
