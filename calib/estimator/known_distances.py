@@ -6,7 +6,7 @@ Delays, curves, offsets of pairs and sessions, and the parameters of errors are 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -206,16 +206,17 @@ def robust_fit(  # noqa: PLR0913 - a search has that many sides
     if sample is not None and sample < len(error):
         # A fixed random choice: a regular one could coincide with the schedule of pairs.
         chosen = np.sort(np.random.default_rng(0).permutation(len(error))[:sample])
-    rows, effects = [every if chosen is None else every.sample(chosen)], [1.0, heard.design_effect if heard else 1.0]
+    rows, effects = [every], [1.0]
     if heard is not None:
-        rows.append(heard.sample(heard.rows(layout, every.errors), chosen))
+        rows, effects = [every, heard.rows(layout, every.errors)], [1.0, heard.design_effect]
+    rows = rows if chosen is None else [each.sample(chosen) for each in rows]
     priors, steps = Priors(layout), 0
     for turn in range(2 if start is not None else 4):
         residuals = [each.residuals(x) for each in rows]
         scales = [scale_m or max(SCALE_OF_SPREAD * robust_spread(r), LEAST_SCALE_M) for r in residuals]
         errors = [
             Robust(weights=weights, scale_m=s).tempered(r, effect)
-            for s, r, effect in zip(scales, residuals, effects, strict=False)
+            for s, r, effect in zip(scales, residuals, effects, strict=True)
         ]
         rows = [replace(each, errors=own) for each, own in zip(rows, errors, strict=True)]
         found = maximize([*rows, *gauge], priors, x, steps=15, evidence_steps=15 * (turn > 0))
@@ -225,7 +226,7 @@ def robust_fit(  # noqa: PLR0913 - a search has that many sides
         x, steps = found.x, steps + found.steps
         final = [
             replace(each, errors=replace(own.tempered(each.residuals(x), effect), least=None))
-            for each, own, effect in zip(rows, errors, effects, strict=False)
+            for each, own, effect in zip(rows, errors, effects, strict=True)
         ]
         ended = maximize([*final, *gauge], priors, x, steps=20, evidence_steps=0)
         # With few ranges most may lie where the loss is concave; weights then stay in the place of the curvature.
@@ -267,24 +268,20 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted, heard: ArrivalMod
         straight = heard.rows(pilot.optimum.layout, errors).residuals(pilot.optimum.x)
         of_heard, own, own_parts = heard.error_model(straight)
         unknowns = (*unknowns, *heard.unknowns, *own)
-    layout, rows = model.build(error, replace(errors, restricted=True), unknowns, parts)
+    layout, of_ranges = model.build(error, replace(errors, restricted=True), unknowns, parts)
     gauge = (*model.gauge_rows(layout), *model.held_rows(layout))
-    asked = layout.indices([u.kind for u in model.unknowns])
-
-    whole = None if heard is None else heard.rows(layout, replace(of_heard, restricted=True), own_parts)
-
-    def beside(chosen: Ints | None) -> list[RangeRows]:
-        return [] if heard is None or whole is None else [heard.sample(whole, chosen)]
-
-    found, steps = _maximize_by_samples(rows, gauge, layout, layout.start(pilot.optimum.by_kind()), asked, beside)
-    rows, *of_arrivals = (own for own in found.rows if isinstance(own, RangeRows))
+    asked, rows = layout.indices([u.kind for u in model.unknowns]), [of_ranges]
+    if heard is not None:
+        rows.append(heard.rows(layout, replace(of_heard, restricted=True), own_parts))
+    found, steps = _maximize_by_samples(rows, gauge, layout, layout.start(pilot.optimum.by_kind()), asked)
+    of_ranges, *of_arrivals = (own for own in found.rows if isinstance(own, RangeRows))
     return Fitted(
-        rows=rows,
+        rows=of_ranges,
         heard=next(iter(of_arrivals), None),
         arrivals=heard,
         gauge=gauge,
         optimum=found,
-        residuals=rows.residuals(found.x),
+        residuals=of_ranges.residuals(found.x),
         loss=MIXTURE,
         scale_m=pilot.scale_m,
         steps=pilot.steps + steps,
@@ -292,25 +289,17 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted, heard: ArrivalMod
 
 
 def _maximize_by_samples(
-    rows: RangeRows,
-    gauge: Sequence[NormalRows],
-    layout: Layout,
-    x: Floats,
-    asked: Ints | None = None,
-    beside: Callable[[Ints | None], Sequence[Rows]] = lambda chosen: (),
+    rows: Sequence[RangeRows], gauge: Sequence[NormalRows], layout: Layout, x: Floats, asked: Ints | None = None
 ) -> tuple[Optimum, int]:
-    """Return the optimum of rows, found on samples of growing size and then on all of them, and the steps taken.
-
-    `beside` returns the rows that belong to some ranges, or to all.
-    """
-    order, priors = np.random.default_rng(0).permutation(len(rows)), Priors(layout)
-    size, steps = FIRST_SAMPLE, 0
-    while 2 * size < len(rows):
-        chosen = np.sort(order[:size])
-        some = [rows.sample(chosen), *beside(chosen), *gauge]
-        found = maximize(some, priors, x, tolerance=1.0, asked=asked)
+    """Return the optimum of rows, the first those of ranges, found on samples of growing size and then on all of them,
+    and the steps taken."""
+    count, priors, size, steps = len(rows[0]), Priors(layout), FIRST_SAMPLE, 0
+    order = np.random.default_rng(0).permutation(count)
+    while 2 * size < count:
+        some = [one.sample(np.sort(order[:size])) for one in rows]
+        found = maximize([*some, *gauge], priors, x, tolerance=1.0, asked=asked)
         x, size, steps = found.x, size * SAMPLE_GROWTH, steps + found.steps
-    found = maximize([rows, *beside(None), *gauge], priors, x, asked=asked)
+    found = maximize([*rows, *gauge], priors, x, asked=asked)
     return found, steps + found.steps
 
 
@@ -417,7 +406,7 @@ def described_errors(found: KnownDistances) -> DescribedErrors:
         centre = Unknown(kind="centre", names=("",), start=np.array([-float(np.median(found.residuals))]))
         everyone = Part(parameter=RESIDUAL, kind="centre", columns=np.zeros((1, 1), dtype=np.int64))
         layout, rows = model.build(found.residuals, mixture, [centre, *unknowns], [everyone, *parts], only=())
-        optimum, _ = _maximize_by_samples(rows, (), layout, layout.start())
+        optimum, _ = _maximize_by_samples([rows], (), layout, layout.start())
         x, location, values = optimum.x, -float(optimum.of("centre")[0]), optimum.by_kind()
         own = layout.indices(noise_kinds(layout))
         noise = optimum.covariance[:, own][own]

@@ -169,7 +169,8 @@ class RangeRows:
 
     Rows are kept sorted by `key`; `order` (n,) says which of the given rows each is. Log likelihoods are divided by
     the dispersion of the errors. `unsure_m2` (n,), in this order, are variances of the residuals of direct ranges, by
-    which squared residuals are too small (`with_uncertainty`).
+    which squared residuals are too small (`with_uncertainty`). `exchange` (n,) is the number of the exchange that each
+    given row belongs to; None where a row is an exchange.
     """
 
     residual: Floats
@@ -180,6 +181,7 @@ class RangeRows:
     parts: tuple[Part, ...]
     geometry: Geometry | None = None
     unsure_m2: Floats | None = None
+    exchange: Ints | None = None
 
     @classmethod
     def of(
@@ -190,6 +192,7 @@ class RangeRows:
         errors: Errors,
         layout: Layout,
         geometry: Geometry | None = None,
+        exchange: Ints | None = None,
     ) -> RangeRows:
         """Return rows from residuals (n,) and keys (n,), given in any order."""
         order = np.argsort(key, kind="stable")
@@ -205,6 +208,7 @@ class RangeRows:
             starts=starts,
             parts=kept,
             geometry=geometry,
+            exchange=exchange,
         )
 
     def __len__(self) -> int:
@@ -212,10 +216,9 @@ class RangeRows:
         return len(self.residual)
 
     def sample(self, chosen: Ints) -> RangeRows:
-        """Return some of the given rows."""
-        keep = np.zeros(len(self), dtype=bool)
-        keep[chosen] = True
-        rows = np.flatnonzero(keep[self.order])
+        """Return the rows of some exchanges."""
+        exchange = self.order if self.exchange is None else self.exchange[self.order]
+        rows = np.flatnonzero(np.isin(exchange, chosen))
         starts = np.searchsorted(rows, self.starts)
         there = np.diff(starts) > 0
         parts = tuple(
