@@ -135,6 +135,10 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> KnownDistances
     in the ranges.
     """
     model = model_of(ranges, settings)
+    if model.curve is None and model.pinned:
+        raise BadInputError(
+            "every tag is pinned and no curve is fitted, so nothing is left to fit", parameter="fixed_ns"
+        )
     error = model.ranges.raw_m - model.ranges.truth_m
     blocks = time_blocks(model.ranges.time_ns, model.ranges.session)
     loss = settings.loss or (ROBUST_LOSS if settings.sequential or settings.delays_only else MIXTURE)
@@ -167,18 +171,16 @@ def _weighed(
     return heard.weighed(of_heard, of_ranges, model.pairs.number, blocks)
 
 
-def model_of(ranges: Ranges, settings: FitSettings, *, trimmed: bool = True) -> RangeModel:
-    """Return the model of ranges in order of time; raises what `fit_known_distances` raises."""
+def model_of(ranges: Ranges, settings: FitSettings, *, offsets: bool = True, trimmed: bool = True) -> RangeModel:
+    """Return the model of ranges in order of time.
+
+    Raises `UnanswerableError` if there are too few ranges, and what `RangeModel.of` raises.
+    """
     if len(ranges) < FEWEST_RANGES:
         raise UnanswerableError(
             f"{ranges.source}: {len(ranges)} usable exchanges are too few, at least {FEWEST_RANGES} are needed"
         )
-    model = RangeModel.of(in_order(ranges), settings, trimmed=trimmed)
-    if model.curve is None and model.pinned:
-        raise BadInputError(
-            "every tag is pinned and no curve is fitted, so nothing is left to fit", parameter="fixed_ns"
-        )
-    return model
+    return RangeModel.of(in_order(ranges), settings, offsets=offsets, trimmed=trimmed)
 
 
 def robust_fit(  # noqa: PLR0913 - a search has that many sides

@@ -196,15 +196,20 @@ class RangeModel:
                 key = key * spline.size + spline.first
         return key
 
-    def gauge_rows(self, layout: Layout) -> list[NormalRows]:
-        """Return rows that set curves to zero at the reference power, where delays can take the constant."""
+    def _carried(self) -> list[tuple[str, Floats, SplineValues]]:
+        """Return kind and carrier of each curve whose constant delays can take, and its splines at the reference
+        power."""
         if self.curve is None or self.reference is None:
             return []
-        at, zero, std = SplineValues.at(np.array([self.reference]), self.curve.knots), np.zeros(1), np.full(1, HELD_M)
+        at, curves = SplineValues.at(np.array([self.reference]), self.curve.knots), self.curve_kinds()
+        return [(kind, one, at) for kind, one in zip(curves, self.carriers, strict=True) if one is not None]
+
+    def gauge_rows(self, layout: Layout) -> list[NormalRows]:
+        """Return rows that set curves to zero at the reference power, where delays can take the constant."""
+        zero, std = np.zeros(1), np.full(1, HELD_M)
         return [
             NormalRows(value=zero, std=std, entries=at.values, columns=at.columns + layout.where[kind].start)
-            for kind, carrier in zip(self.curve_kinds(), self.carriers, strict=True)
-            if carrier is not None
+            for kind, _, at in self._carried()
         ]
 
     def held_rows(self, layout: Layout) -> list[NormalRows]:
@@ -218,14 +223,10 @@ class RangeModel:
     def at_reference(self, values: Mapping[str, Floats]) -> dict[str, Floats]:
         """Return unknowns by kind with curves that are zero at the reference power: delays take over the constants."""
         stated = dict(values)
-        if self.curve is None or self.reference is None:
-            return stated
-        at = SplineValues.at(np.array([self.reference]), self.curve.knots)
-        for kind, carrier in zip(self.curve_kinds(), self.carriers, strict=True):
-            if carrier is not None:
-                constant_m = float(at.values[0] @ values[kind][at.columns[0]])
-                stated[kind] = values[kind] - constant_m
-                stated["delay"] = stated["delay"] - carrier * constant_m / METRES_A_NS
+        for kind, carrier, at in self._carried():
+            constant_m = float(at.values[0] @ values[kind][at.columns[0]])
+            stated[kind] = values[kind] - constant_m
+            stated["delay"] = stated["delay"] - carrier * constant_m / METRES_A_NS
         return stated
 
     def error_model(self, residual: Floats) -> tuple[Mixture, tuple[Unknown, ...], tuple[Part, ...]]:

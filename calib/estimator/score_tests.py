@@ -74,9 +74,9 @@ class Family:
 class FoundOffset:
     """An alternative that the residuals ask for: its kind, whose it may be, the offset, and what it does to delays.
 
-    `effect_ns` (tags,) is by how much the delays would change, `deviation` how many standard errors the offset is from
-    none, `p_value` how likely so much is by chance in any of the tests. An offset of one session may as well be the
-    opposite one of all others: `otherwise_ns` (tags,) is what that does, `sessions` are that session and the others.
+    `deviation` is how many standard errors the offset is from none, `p_value` how likely so much is by chance in any of
+    the tests. `effects_ns` (1 or 2 of (tags,)) are by how much the delays would change: an offset of one session may as
+    well be the opposite one of all others, which does the second; `sessions` are that session and the others.
     """
 
     kind: str
@@ -84,15 +84,9 @@ class FoundOffset:
     offset_m: float
     deviation: float
     p_value: float
-    effect_ns: Floats
-    otherwise_ns: Floats | None = None
+    effects_ns: tuple[Floats, ...]
     sessions: tuple[str, str] = ("", "")
     fitted: bool = False
-
-    @property
-    def effects_ns(self) -> list[Floats]:
-        """Return what the offset may do to the delays, by whichever side of a difference is off."""
-        return [self.effect_ns] if self.otherwise_ns is None else [self.effect_ns, self.otherwise_ns]
 
     @property
     def spread_ns2(self) -> Floats:
@@ -101,7 +95,7 @@ class FoundOffset:
         Where offsets are fitted delays lie halfway between both sides, and their variance is in the intervals already.
         """
         if self.fitted:
-            apart = np.zeros_like(self.effect_ns) if self.otherwise_ns is None else self.effect_ns - self.otherwise_ns
+            apart = self.effects_ns[0] - self.effects_ns[-1]
             return np.asarray(np.outer(apart, apart) / 4)
         return np.asarray(np.mean([np.outer(effect, effect) for effect in self.effects_ns], axis=0))
 
@@ -287,21 +281,21 @@ def findings(tested: Tested, several: int, rate: float, tolerance_m: float = 0.0
         offset = float(total[top] / information[top, top])
         alike = np.abs(covariance[top] / (std[top] * std)) > SAME
         close = alike & known & (np.abs(deviation) > SAME * abs(deviation[top]))
-        otherwise, sessions = None, ("", "")
+        effects, sessions = [tested.effects[:, top] * offset], ("", "")
         count = len(family.sessions)
         if count > 1:
             first = top - top % count
             others = [k for k in range(first, first + count) if k != top]
             rest = family.sessions[1 - top % count] if count == 2 else "the other recordings"
-            otherwise, sessions = -tested.effects[:, others].sum(axis=1) * offset, (family.sessions[top % count], rest)
+            effects.append(-tested.effects[:, others].sum(axis=1) * offset)
+            sessions = (family.sessions[top % count], rest)
         yield FoundOffset(
             kind=family.kind,
             names=tuple(dict.fromkeys(family.names[k] for k in np.flatnonzero(close).tolist())),
             offset_m=-offset,
             deviation=float(deviation[top]),
             p_value=p_value,
-            effect_ns=tested.effects[:, top] * offset,
-            otherwise_ns=otherwise,
+            effects_ns=tuple(effects),
             sessions=sessions,
             fitted=len(family.fitted) > 0,
         )

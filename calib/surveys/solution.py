@@ -148,7 +148,7 @@ class Solution:
     @cached_property
     def linear(self) -> Linear:
         """The network about the unknowns."""
-        return self.network.at(self.x, self.case)
+        return Linear(self.network, self.x, self.case)
 
     @property
     def freedom(self) -> float:
@@ -184,7 +184,7 @@ def of_spreads(network: Network, x: Floats, case: Case) -> float:
     """Return -2 log likelihood near an optimum, integrated over the unknowns, with the prior density of the spreads."""
     pairs = PAIR_PRIOR_FREEDOM * (2 * math.log(case.pair_m) + (PAIR_STD_M / case.pair_m) ** 2)
     curve = (math.log(case.curve_m / CURVE_STD_M) / math.log(CURVE_FACTOR)) ** 2
-    return network.at(x, case).unlikely() + pairs + curve
+    return Linear(network, x, case).unlikely() + pairs + curve
 
 
 def unlikelihood(network: Network, x: Floats, case: Case) -> float:
@@ -281,7 +281,7 @@ def averaged(found: Solution) -> Solution:
 
 def _mixed(found: Solution, cases: Sequence[Case], weight: Floats) -> tuple[Floats, Floats]:
     """Return the mean step over cases, linear, and what their covariance is more than that of one case, not below 0."""
-    every = [found.network.at(found.x, case) for case in cases]
+    every = [Linear(found.network, found.x, case) for case in cases]
     steps = np.array([one.step for one in every])
     mean = weight @ steps
     around = steps - mean
