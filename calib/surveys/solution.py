@@ -67,11 +67,9 @@ def first_start(network: Network, delays: Floats | None = None) -> Floats:
     for k, boards in enumerate(network.arrangements):
         here = network.seats(k)
         rows = np.flatnonzero(np.isin(network.ends[: len(network.means.range_m), 0], here))
-        first, second = np.searchsorted(here, network.ends[rows]).T
-        length = np.full((len(here), len(here)), np.inf)
-        length[first, second] = length[second, first] = np.maximum(measured[rows], 0.01)
+        ends, length = np.searchsorted(here, network.ends[rows]), np.maximum(measured[rows], 0.01)
         # A derivative by a coordinate of which all are zero would be zero.
-        found = scaled_places(length, boards.dimensions, least_m2=1e-6)
+        found = scaled_places(ends, length, len(here), boards.dimensions, least_m2=1e-6)
         known = [n for n, point in enumerate(here.tolist()) if point in network.known_places]
         if known:
             goal, mine = np.array([network.known_places[here[n]][0] for n in known]), found[known]
