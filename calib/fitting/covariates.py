@@ -91,10 +91,9 @@ def _with(
 ) -> tuple[KnownDistances, dict[str, Any], list[str]]:
     """Return a fit with the dependence `name` beside those of a `plain` fit, if there is evidence or it is `asked`."""
     model, nothing = plain.model, (plain, dict[str, Any](), list[str]())
-    covariate, kinds = COVARIATES[name][0](model.ranges), {"shared": COMMON, "tag": OWN}
+    covariate = COVARIATES[name][0](model.ranges)
+    kinds = {"shared": COMMON, "tag": OWN} if name == "pattern" else {"shared": WARMTH, "tag": OWN_WARMTH}
     changes: dict[str, dict[str, Any]] = {mode: {name: mode} for mode in kinds}
-    if name == "temperature":
-        kinds = {"shared": WARMTH, "tag": OWN_WARMTH}
     tested = plain.slopes.tests([_family(plain, covariate, kind) for kind in kinds.values()]) if covariate.tags else []
     vague = _vague(name, covariate, tested[asked == "tag"]) if tested else []
     needed = 0
