@@ -149,7 +149,13 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> KnownDistances
     first = ("delay", *model.curve_kinds(), COMMON, OWN, WARMTH, OWN_WARMTH)
     pilot = robust_fit(model, error, robust, scale_m, first, sample=PILOT, heard=heard)
     if heard is not None and pilot.heard is not None:
-        heard = _weighed(heard, model, pilot.heard, pilot, blocks)
+        own = heard.rows(pilot.optimum.layout, pilot.heard.errors).residuals(pilot.optimum.x)
+        of_heard, of_ranges = (
+            errors.slopes({RESIDUAL: residual})[1][RESIDUAL]
+            for errors, residual in ((pilot.heard.errors, own), (pilot.rows.errors, pilot.residuals))
+        )
+        # Differences of arrival weigh beside ranges by their slopes at the end of the first search.
+        heard = heard.weighed(of_heard, of_ranges, model.pairs.number, blocks)
     if loss == MIXTURE and LEAST_SCALE_M < robust_spread(pilot.residuals) < LARGEST_SPREAD_M:
         likely = likeliest(model, error, pilot, heard)
         if _farthest_pair(model, likely.residuals) <= ASTRAY_M + 3 * _farthest_pair(model, pilot.residuals):
@@ -157,18 +163,6 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> KnownDistances
     kinds = [u.kind for u in model.unknowns]
     fitted = robust_fit(model, error, robust, scale_m, kinds, start=pilot, heard=heard)
     return described(model, fitted, blocks)
-
-
-def _weighed(
-    heard: ArrivalModel, model: RangeModel, rows: RangeRows, pilot: Fitted, blocks: TimeBlocks
-) -> ArrivalModel:
-    """Return differences of arrival with their weight beside ranges, by their slopes at the end of a first search."""
-    own = heard.rows(pilot.optimum.layout, rows.errors).residuals(pilot.optimum.x)
-    of_heard, of_ranges = (
-        errors.slopes({RESIDUAL: residual})[1][RESIDUAL]
-        for errors, residual in ((rows.errors, own), (pilot.rows.errors, pilot.residuals))
-    )
-    return heard.weighed(of_heard, of_ranges, model.pairs.number, blocks)
 
 
 def model_of(ranges: Ranges, settings: FitSettings, *, offsets: bool = True, trimmed: bool = True) -> RangeModel:
@@ -191,17 +185,18 @@ def robust_fit(  # noqa: PLR0913 - a search has that many sides
     kinds: Sequence[str],
     sample: int | None = None,
     start: Fitted | None = None,
-    weight: Bools | None = None,
+    inside: Bools | None = None,
     heard: ArrivalModel | None = None,
 ) -> Fitted:
     """Return the optimum of a robust loss of errors (n,), and of differences of arrival, by some kinds of unknowns.
 
-    The scale follows the residuals of a few steps, unless it is given, and then stands. Slopes are divided by their
-    dispersion, so that priors weigh against them as against a likelihood.
+    It is that of a random `sample` of so many ranges, of those `inside` (n,), or of all. The scale follows the
+    residuals of a few steps, unless it is given (`scale_m`), and then stands. Slopes are divided by their dispersion,
+    so that priors weigh against them as against a likelihood.
     """
     weights = LOSSES[loss].weights
     layout, whole = model.build(error, Robust(weights=weights, scale_m=1.0), only=kinds)
-    every = whole if weight is None else whole.sample(np.flatnonzero(weight))
+    every = whole if inside is None else whole.sample(np.flatnonzero(inside))
     gauge = (*model.gauge_rows(layout), *model.held_rows(layout))
     x = layout.start(start.optimum.by_kind() if start is not None else None)
     chosen = None
@@ -371,7 +366,7 @@ def _in_sequence(
     kinds = free.curve_kinds()
     # Few ranges have the outer powers, and they would bend the curve: it is fitted to the others.
     inside = (free.lifted >= free.span[0]) & (free.lifted <= free.span[1])
-    second = robust_fit(free, first.residuals, loss, first.searches[0].scale_m, kinds, weight=inside)
+    second = robust_fit(free, first.residuals, loss, first.searches[0].scale_m, kinds, inside=inside)
     curves = described(free, second, blocks)
     return replace(
         first,

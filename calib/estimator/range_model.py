@@ -19,7 +19,7 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.covariates import COVARIATES, Covariate
 from calib.estimator.grouped_errors import ReflectionFeatures, error_unknowns, logarithms, scattered
 from calib.estimator.identifiability import free_directions
-from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
+from calib.estimator.range_rows import RESIDUAL, Errors, Mixture, Part, RangeRows
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Unknown
 from calib.pairs import Pairs, pairs_of
@@ -29,6 +29,8 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
 METRES_A_NS = SPEED_OF_LIGHT * 1e-9
+"""Metres that light travels in a nanosecond."""
+
 DELAY_NS = 600.0
 """Prior standard deviation of a delay: a board without a programmed delay has 514 ns. The prior decides only
 combinations that no range determines, and chooses the smallest delays there."""
@@ -255,15 +257,15 @@ class RangeModel:
         errors: Errors,
         more: Sequence[Unknown] = (),
         parts: Sequence[Part] = (),
-        geometry: Geometry | None = None,
         only: Sequence[str] | None = None,
     ) -> tuple[Layout, RangeRows]:
-        """Return the layout of all unknowns, and the rows of ranges with residuals (n,) less unknown distances."""
+        """Return the layout of the model's unknowns, or those of some kinds, and of others after them, and the rows of
+        ranges with residuals (n,)."""
         unknowns = [u for u in self.unknowns if only is None or u.kind in only]
         kinds = {u.kind for u in unknowns}
         layout = Layout((*unknowns, *more))
         used = [*(p for p in self.parts if p.kind in kinds), *parts]
-        return layout, RangeRows.of(residual, self.key(), used, errors, layout, geometry)
+        return layout, RangeRows.of(residual, self.key(), used, errors, layout)
 
 
 def _free_directions(ranges: Ranges, tags: list[int], settings: FitSettings) -> tuple[Floats, list[Split]]:
