@@ -69,9 +69,11 @@ class ArrivalModel:
         row = arrivals.exchange
         ends = np.column_stack([ranges.initiator[row], ranges.target[row]])
         weights = np.column_stack([-ranges.weight_initiator[row], 1 - ranges.weight_target[row]])
-        parts.append(_delays(model, ends, weights))
+        tags = np.searchsorted(model.tags, ends)
+        parts.append(Part(parameter=RESIDUAL, kind="delay", columns=tags, values=METRES_A_NS * weights))
         listeners, listener = np.unique(arrivals.listener, return_inverse=True)
-        paths, number = _paths(ends, arrivals.listener)
+        pairs = pairs_of(ends.ravel(), np.repeat(arrivals.listener, 2))
+        paths, number = tuple(f"path {name}" for name in pairs.names), pairs.number.reshape(-1, 2)
         signs = np.broadcast_to(PATH_SIGNS, number.shape)
         parts.append(Part(parameter=RESIDUAL, kind=OFFSET_OF_PATH, columns=number, values=signs))
         key = np.unique(ends[:, 0] << 32 | ends[:, 1] << 16 | arrivals.listener, return_inverse=True)[1]
@@ -104,11 +106,7 @@ class ArrivalModel:
     def rows(self, layout: Layout, errors: Errors, more: Sequence[Part] = ()) -> RangeRows:
         """Return the rows of all differences of arrival, with the parts whose unknowns a layout has."""
         used = [part for part in (*self.parts, *more) if part.kind in layout.where]
-        return RangeRows.of(self.residual, self.key, used, errors, layout)
-
-    def sample(self, rows: RangeRows, chosen: Ints | None) -> RangeRows:
-        """Return those rows that belong to some exchanges, all for None."""
-        return rows if chosen is None else rows.sample(np.flatnonzero(np.isin(self.exchange, chosen)))
+        return RangeRows.of(self.residual, self.key, used, errors, layout, exchange=self.exchange)
 
     def weighed(self, own: Floats, of_ranges: Floats, pairs: Ints, blocks: TimeBlocks) -> ArrivalModel:
         """Return the model with the weight of a difference of arrival beside a range.
@@ -121,18 +119,6 @@ class ArrivalModel:
         target = np.unique(self.targets, return_inverse=True)[1]
         lasting = lasting_in_pairs(own, target, replace(blocks, number=blocks.number[self.exchange]))
         return replace(self, design_effect=max(lasting / lasting_in_pairs(of_ranges, pairs, blocks), 1.0))
-
-
-def _delays(model: RangeModel, ends: Ints, weights: Floats) -> Part:
-    """Return the part of the delays of both ends (n, 2), in metres."""
-    columns = np.searchsorted(model.tags, ends)
-    return Part(parameter=RESIDUAL, kind="delay", columns=columns, values=METRES_A_NS * weights)
-
-
-def _paths(ends: Ints, listener: Ints) -> tuple[tuple[str, ...], Ints]:
-    """Return the names of the paths to listeners, and the numbers (n, 2) of those from the initiator and the target."""
-    paths = pairs_of(ends.ravel(), np.repeat(listener, 2))
-    return tuple(f"path {name}" for name in paths.names), paths.number.reshape(-1, 2)
 
 
 def _curve_parts(model: RangeModel, spline: SplineValues, arrivals: Arrivals, lifted: list[Floats]) -> Iterator[Part]:

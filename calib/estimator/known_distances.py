@@ -6,7 +6,7 @@ Delays, curves, offsets of pairs and sessions, and the parameters of errors are 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -135,6 +135,10 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> KnownDistances
     in the ranges.
     """
     model = model_of(ranges, settings)
+    if model.curve is None and model.pinned:
+        raise BadInputError(
+            "every tag is pinned and no curve is fitted, so nothing is left to fit", parameter="fixed_ns"
+        )
     error = model.ranges.raw_m - model.ranges.truth_m
     blocks = time_blocks(model.ranges.time_ns, model.ranges.session)
     loss = settings.loss or (ROBUST_LOSS if settings.sequential or settings.delays_only else MIXTURE)
@@ -145,7 +149,13 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> KnownDistances
     first = ("delay", *model.curve_kinds(), COMMON, OWN, WARMTH, OWN_WARMTH)
     pilot = robust_fit(model, error, robust, scale_m, first, sample=PILOT, heard=heard)
     if heard is not None and pilot.heard is not None:
-        heard = _weighed(heard, model, pilot.heard, pilot, blocks)
+        own = heard.rows(pilot.optimum.layout, pilot.heard.errors).residuals(pilot.optimum.x)
+        of_heard, of_ranges = (
+            errors.slopes({RESIDUAL: residual})[1][RESIDUAL]
+            for errors, residual in ((pilot.heard.errors, own), (pilot.rows.errors, pilot.residuals))
+        )
+        # Differences of arrival weigh beside ranges by their slopes at the end of the first search.
+        heard = heard.weighed(of_heard, of_ranges, model.pairs.number, blocks)
     if loss == MIXTURE and LEAST_SCALE_M < robust_spread(pilot.residuals) < LARGEST_SPREAD_M:
         likely = likeliest(model, error, pilot, heard)
         if _farthest_pair(model, likely.residuals) <= ASTRAY_M + 3 * _farthest_pair(model, pilot.residuals):
@@ -155,30 +165,16 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> KnownDistances
     return described(model, fitted, blocks)
 
 
-def _weighed(
-    heard: ArrivalModel, model: RangeModel, rows: RangeRows, pilot: Fitted, blocks: TimeBlocks
-) -> ArrivalModel:
-    """Return differences of arrival with their weight beside ranges, by their slopes at the end of a first search."""
-    own = heard.rows(pilot.optimum.layout, rows.errors).residuals(pilot.optimum.x)
-    of_heard, of_ranges = (
-        errors.slopes({RESIDUAL: residual})[1][RESIDUAL]
-        for errors, residual in ((rows.errors, own), (pilot.rows.errors, pilot.residuals))
-    )
-    return heard.weighed(of_heard, of_ranges, model.pairs.number, blocks)
+def model_of(ranges: Ranges, settings: FitSettings, *, offsets: bool = True, trimmed: bool = True) -> RangeModel:
+    """Return the model of ranges in order of time.
 
-
-def model_of(ranges: Ranges, settings: FitSettings, *, trimmed: bool = True) -> RangeModel:
-    """Return the model of ranges in order of time; raises what `fit_known_distances` raises."""
+    Raises `UnanswerableError` if there are too few ranges, and what `RangeModel.of` raises.
+    """
     if len(ranges) < FEWEST_RANGES:
         raise UnanswerableError(
             f"{ranges.source}: {len(ranges)} usable exchanges are too few, at least {FEWEST_RANGES} are needed"
         )
-    model = RangeModel.of(in_order(ranges), settings, trimmed=trimmed)
-    if model.curve is None and model.pinned:
-        raise BadInputError(
-            "every tag is pinned and no curve is fitted, so nothing is left to fit", parameter="fixed_ns"
-        )
-    return model
+    return RangeModel.of(in_order(ranges), settings, offsets=offsets, trimmed=trimmed)
 
 
 def robust_fit(  # noqa: PLR0913 - a search has that many sides
@@ -189,33 +185,35 @@ def robust_fit(  # noqa: PLR0913 - a search has that many sides
     kinds: Sequence[str],
     sample: int | None = None,
     start: Fitted | None = None,
-    weight: Bools | None = None,
+    inside: Bools | None = None,
     heard: ArrivalModel | None = None,
 ) -> Fitted:
     """Return the optimum of a robust loss of errors (n,), and of differences of arrival, by some kinds of unknowns.
 
-    The scale follows the residuals of a few steps, unless it is given, and then stands. Slopes are divided by their
-    dispersion, so that priors weigh against them as against a likelihood.
+    It is that of a random `sample` of so many ranges, of those `inside` (n,), or of all. The scale follows the
+    residuals of a few steps, unless it is given (`scale_m`), and then stands. Slopes are divided by their dispersion,
+    so that priors weigh against them as against a likelihood.
     """
     weights = LOSSES[loss].weights
     layout, whole = model.build(error, Robust(weights=weights, scale_m=1.0), only=kinds)
-    every = whole if weight is None else whole.sample(np.flatnonzero(weight))
+    every = whole if inside is None else whole.sample(np.flatnonzero(inside))
     gauge = (*model.gauge_rows(layout), *model.held_rows(layout))
     x = layout.start(start.optimum.by_kind() if start is not None else None)
     chosen = None
     if sample is not None and sample < len(error):
         # A fixed random choice: a regular one could coincide with the schedule of pairs.
         chosen = np.sort(np.random.default_rng(0).permutation(len(error))[:sample])
-    rows, effects = [every if chosen is None else every.sample(chosen)], [1.0, heard.design_effect if heard else 1.0]
+    rows, effects = [every], [1.0]
     if heard is not None:
-        rows.append(heard.sample(heard.rows(layout, every.errors), chosen))
+        rows, effects = [every, heard.rows(layout, every.errors)], [1.0, heard.design_effect]
+    rows = rows if chosen is None else [each.sample(chosen) for each in rows]
     priors, steps = Priors(layout), 0
     for turn in range(2 if start is not None else 4):
         residuals = [each.residuals(x) for each in rows]
         scales = [scale_m or max(SCALE_OF_SPREAD * robust_spread(r), LEAST_SCALE_M) for r in residuals]
         errors = [
             Robust(weights=weights, scale_m=s).tempered(r, effect)
-            for s, r, effect in zip(scales, residuals, effects, strict=False)
+            for s, r, effect in zip(scales, residuals, effects, strict=True)
         ]
         rows = [replace(each, errors=own) for each, own in zip(rows, errors, strict=True)]
         found = maximize([*rows, *gauge], priors, x, steps=15, evidence_steps=15 * (turn > 0))
@@ -225,7 +223,7 @@ def robust_fit(  # noqa: PLR0913 - a search has that many sides
         x, steps = found.x, steps + found.steps
         final = [
             replace(each, errors=replace(own.tempered(each.residuals(x), effect), least=None))
-            for each, own, effect in zip(rows, errors, effects, strict=False)
+            for each, own, effect in zip(rows, errors, effects, strict=True)
         ]
         ended = maximize([*final, *gauge], priors, x, steps=20, evidence_steps=0)
         # With few ranges most may lie where the loss is concave; weights then stay in the place of the curvature.
@@ -267,24 +265,20 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted, heard: ArrivalMod
         straight = heard.rows(pilot.optimum.layout, errors).residuals(pilot.optimum.x)
         of_heard, own, own_parts = heard.error_model(straight)
         unknowns = (*unknowns, *heard.unknowns, *own)
-    layout, rows = model.build(error, replace(errors, restricted=True), unknowns, parts)
+    layout, of_ranges = model.build(error, replace(errors, restricted=True), unknowns, parts)
     gauge = (*model.gauge_rows(layout), *model.held_rows(layout))
-    asked = layout.indices([u.kind for u in model.unknowns])
-
-    whole = None if heard is None else heard.rows(layout, replace(of_heard, restricted=True), own_parts)
-
-    def beside(chosen: Ints | None) -> list[RangeRows]:
-        return [] if heard is None or whole is None else [heard.sample(whole, chosen)]
-
-    found, steps = _maximize_by_samples(rows, gauge, layout, layout.start(pilot.optimum.by_kind()), asked, beside)
-    rows, *of_arrivals = (own for own in found.rows if isinstance(own, RangeRows))
+    asked, rows = layout.indices([u.kind for u in model.unknowns]), [of_ranges]
+    if heard is not None:
+        rows.append(heard.rows(layout, replace(of_heard, restricted=True), own_parts))
+    found, steps = _maximize_by_samples(rows, gauge, layout, layout.start(pilot.optimum.by_kind()), asked)
+    of_ranges, *of_arrivals = (own for own in found.rows if isinstance(own, RangeRows))
     return Fitted(
-        rows=rows,
+        rows=of_ranges,
         heard=next(iter(of_arrivals), None),
         arrivals=heard,
         gauge=gauge,
         optimum=found,
-        residuals=rows.residuals(found.x),
+        residuals=of_ranges.residuals(found.x),
         loss=MIXTURE,
         scale_m=pilot.scale_m,
         steps=pilot.steps + steps,
@@ -292,25 +286,17 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted, heard: ArrivalMod
 
 
 def _maximize_by_samples(
-    rows: RangeRows,
-    gauge: Sequence[NormalRows],
-    layout: Layout,
-    x: Floats,
-    asked: Ints | None = None,
-    beside: Callable[[Ints | None], Sequence[Rows]] = lambda chosen: (),
+    rows: Sequence[RangeRows], gauge: Sequence[NormalRows], layout: Layout, x: Floats, asked: Ints | None = None
 ) -> tuple[Optimum, int]:
-    """Return the optimum of rows, found on samples of growing size and then on all of them, and the steps taken.
-
-    `beside` returns the rows that belong to some ranges, or to all.
-    """
-    order, priors = np.random.default_rng(0).permutation(len(rows)), Priors(layout)
-    size, steps = FIRST_SAMPLE, 0
-    while 2 * size < len(rows):
-        chosen = np.sort(order[:size])
-        some = [rows.sample(chosen), *beside(chosen), *gauge]
-        found = maximize(some, priors, x, tolerance=1.0, asked=asked)
+    """Return the optimum of rows, the first those of ranges, found on samples of growing size and then on all of them,
+    and the steps taken."""
+    count, priors, size, steps = len(rows[0]), Priors(layout), FIRST_SAMPLE, 0
+    order = np.random.default_rng(0).permutation(count)
+    while 2 * size < count:
+        some = [one.sample(np.sort(order[:size])) for one in rows]
+        found = maximize([*some, *gauge], priors, x, tolerance=1.0, asked=asked)
         x, size, steps = found.x, size * SAMPLE_GROWTH, steps + found.steps
-    found = maximize([rows, *beside(None), *gauge], priors, x, asked=asked)
+    found = maximize([*rows, *gauge], priors, x, asked=asked)
     return found, steps + found.steps
 
 
@@ -380,7 +366,7 @@ def _in_sequence(
     kinds = free.curve_kinds()
     # Few ranges have the outer powers, and they would bend the curve: it is fitted to the others.
     inside = (free.lifted >= free.span[0]) & (free.lifted <= free.span[1])
-    second = robust_fit(free, first.residuals, loss, first.searches[0].scale_m, kinds, weight=inside)
+    second = robust_fit(free, first.residuals, loss, first.searches[0].scale_m, kinds, inside=inside)
     curves = described(free, second, blocks)
     return replace(
         first,
@@ -417,7 +403,7 @@ def described_errors(found: KnownDistances) -> DescribedErrors:
         centre = Unknown(kind="centre", names=("",), start=np.array([-float(np.median(found.residuals))]))
         everyone = Part(parameter=RESIDUAL, kind="centre", columns=np.zeros((1, 1), dtype=np.int64))
         layout, rows = model.build(found.residuals, mixture, [centre, *unknowns], [everyone, *parts], only=())
-        optimum, _ = _maximize_by_samples(rows, (), layout, layout.start())
+        optimum, _ = _maximize_by_samples([rows], (), layout, layout.start())
         x, location, values = optimum.x, -float(optimum.of("centre")[0]), optimum.by_kind()
         own = layout.indices(noise_kinds(layout))
         noise = optimum.covariance[:, own][own]

@@ -17,10 +17,9 @@ from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, kn
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.covariates import COVARIATES, Covariate
-from calib.estimator.grouped_errors import error_unknowns, logarithms, scattered
+from calib.estimator.grouped_errors import ReflectionFeatures, error_unknowns, logarithms, scattered
 from calib.estimator.identifiability import free_directions
-from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
-from calib.estimator.reflection_features import ReflectionFeatures
+from calib.estimator.range_rows import RESIDUAL, Errors, Mixture, Part, RangeRows
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Unknown
 from calib.pairs import Pairs, pairs_of
@@ -30,6 +29,8 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
 METRES_A_NS = SPEED_OF_LIGHT * 1e-9
+"""Metres that light travels in a nanosecond."""
+
 DELAY_NS = 600.0
 """Prior standard deviation of a delay: a board without a programmed delay has 514 ns. The prior decides only
 combinations that no range determines, and chooses the smallest delays there."""
@@ -197,15 +198,20 @@ class RangeModel:
                 key = key * spline.size + spline.first
         return key
 
-    def gauge_rows(self, layout: Layout) -> list[NormalRows]:
-        """Return rows that set curves to zero at the reference power, where delays can take the constant."""
+    def _carried(self) -> list[tuple[str, Floats, SplineValues]]:
+        """Return kind and carrier of each curve whose constant delays can take, and its splines at the reference
+        power."""
         if self.curve is None or self.reference is None:
             return []
-        at, zero, std = SplineValues.at(np.array([self.reference]), self.curve.knots), np.zeros(1), np.full(1, HELD_M)
+        at, curves = SplineValues.at(np.array([self.reference]), self.curve.knots), self.curve_kinds()
+        return [(kind, one, at) for kind, one in zip(curves, self.carriers, strict=True) if one is not None]
+
+    def gauge_rows(self, layout: Layout) -> list[NormalRows]:
+        """Return rows that set curves to zero at the reference power, where delays can take the constant."""
+        zero, std = np.zeros(1), np.full(1, HELD_M)
         return [
             NormalRows(value=zero, std=std, entries=at.values, columns=at.columns + layout.where[kind].start)
-            for kind, carrier in zip(self.curve_kinds(), self.carriers, strict=True)
-            if carrier is not None
+            for kind, _, at in self._carried()
         ]
 
     def held_rows(self, layout: Layout) -> list[NormalRows]:
@@ -219,14 +225,10 @@ class RangeModel:
     def at_reference(self, values: Mapping[str, Floats]) -> dict[str, Floats]:
         """Return unknowns by kind with curves that are zero at the reference power: delays take over the constants."""
         stated = dict(values)
-        if self.curve is None or self.reference is None:
-            return stated
-        at = SplineValues.at(np.array([self.reference]), self.curve.knots)
-        for kind, carrier in zip(self.curve_kinds(), self.carriers, strict=True):
-            if carrier is not None:
-                constant_m = float(at.values[0] @ values[kind][at.columns[0]])
-                stated[kind] = values[kind] - constant_m
-                stated["delay"] = stated["delay"] - carrier * constant_m / METRES_A_NS
+        for kind, carrier, at in self._carried():
+            constant_m = float(at.values[0] @ values[kind][at.columns[0]])
+            stated[kind] = values[kind] - constant_m
+            stated["delay"] = stated["delay"] - carrier * constant_m / METRES_A_NS
         return stated
 
     def error_model(self, residual: Floats) -> tuple[Mixture, tuple[Unknown, ...], tuple[Part, ...]]:
@@ -255,15 +257,15 @@ class RangeModel:
         errors: Errors,
         more: Sequence[Unknown] = (),
         parts: Sequence[Part] = (),
-        geometry: Geometry | None = None,
         only: Sequence[str] | None = None,
     ) -> tuple[Layout, RangeRows]:
-        """Return the layout of all unknowns, and the rows of ranges with residuals (n,) less unknown distances."""
+        """Return the layout of the model's unknowns, or those of some kinds, and of others after them, and the rows of
+        ranges with residuals (n,)."""
         unknowns = [u for u in self.unknowns if only is None or u.kind in only]
         kinds = {u.kind for u in unknowns}
         layout = Layout((*unknowns, *more))
         used = [*(p for p in self.parts if p.kind in kinds), *parts]
-        return layout, RangeRows.of(residual, self.key(), used, errors, layout, geometry)
+        return layout, RangeRows.of(residual, self.key(), used, errors, layout)
 
 
 def _free_directions(ranges: Ranges, tags: list[int], settings: FitSettings) -> tuple[Floats, list[Split]]:

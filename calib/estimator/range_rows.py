@@ -13,12 +13,11 @@ from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
-from scipy import sparse
 from scipy.interpolate import CubicHermiteSpline, PPoly
 
 from calib.estimator.inverse import Inverse, diagonal_of
 from calib.estimator.losses import Weights
-from calib.estimator.rows import ROWS_AT_ONCE, Terms
+from calib.estimator.rows import ROWS_AT_ONCE, Squares, Terms
 from calib.estimator.unknowns import Layout
 from calib.range_errors.densities import ErrorSlopes, error_slopes
 from uwblink.arrays import Floats, Ints
@@ -170,7 +169,8 @@ class RangeRows:
 
     Rows are kept sorted by `key`; `order` (n,) says which of the given rows each is. Log likelihoods are divided by
     the dispersion of the errors. `unsure_m2` (n,), in this order, are variances of the residuals of direct ranges, by
-    which squared residuals are too small (`with_uncertainty`).
+    which squared residuals are too small (`with_uncertainty`). `exchange` (n,) is the number of the exchange that each
+    given row belongs to; None where a row is an exchange.
     """
 
     residual: Floats
@@ -181,6 +181,7 @@ class RangeRows:
     parts: tuple[Part, ...]
     geometry: Geometry | None = None
     unsure_m2: Floats | None = None
+    exchange: Ints | None = None
 
     @classmethod
     def of(
@@ -191,6 +192,7 @@ class RangeRows:
         errors: Errors,
         layout: Layout,
         geometry: Geometry | None = None,
+        exchange: Ints | None = None,
     ) -> RangeRows:
         """Return rows from residuals (n,) and keys (n,), given in any order."""
         order = np.argsort(key, kind="stable")
@@ -206,6 +208,7 @@ class RangeRows:
             starts=starts,
             parts=kept,
             geometry=geometry,
+            exchange=exchange,
         )
 
     def __len__(self) -> int:
@@ -213,10 +216,9 @@ class RangeRows:
         return len(self.residual)
 
     def sample(self, chosen: Ints) -> RangeRows:
-        """Return some of the given rows."""
-        keep = np.zeros(len(self), dtype=bool)
-        keep[chosen] = True
-        rows = np.flatnonzero(keep[self.order])
+        """Return the rows of some exchanges."""
+        exchange = self.order if self.exchange is None else self.exchange[self.order]
+        rows = np.flatnonzero(np.isin(exchange, chosen))
         starts = np.searchsorted(rows, self.starts)
         there = np.diff(starts) > 0
         parts = tuple(
@@ -243,7 +245,7 @@ class RangeRows:
         Where unknowns are fewer than a twentieth of the ranges, noise is right to 2.5 % without.
         """
         kinds = {part.kind for part in self.parts if part.parameter == RESIDUAL}
-        count = sum(self.layout.where[kind].stop - self.layout.where[kind].start for kind in kinds)
+        count = len(self.layout.indices(list(kinds)))
         return isinstance(self.errors, Mixture) and self.errors.restricted and 20 * count > len(self)
 
     def expecting(self) -> RangeRows:
@@ -262,25 +264,11 @@ class RangeRows:
         """
         found = np.empty(len(self))
         for blocks, rows, values, _ in self._pieces(x):
-            errors = error_slopes(values[RESIDUAL], values)
-            found[rows] = (errors.inlier - errors.reflected) * diagonal_of(self._derivatives(blocks, rows), covariance)
+            errors, unit = error_slopes(values[RESIDUAL], values), np.ones(rows.stop - rows.start)
+            by_unknowns = self._as_terms(blocks, rows, 0.0, {RESIDUAL: unit}, None, None)
+            derivatives = by_unknowns.as_matrix(by_unknowns.slopes, by_unknowns.columns, self.layout.size)
+            found[rows] = (errors.inlier - errors.reflected) * diagonal_of(derivatives, covariance)
         return replace(self, unsure_m2=found)
-
-    def _derivatives(self, blocks: slice, rows: slice) -> sparse.csr_matrix:
-        """Return the derivatives of some residuals with known distances by all unknowns, sparse (m, p)."""
-        starts, count = self.starts[blocks.start : blocks.stop + 1], rows.stop - rows.start
-        columns, entries = [], []
-        for part in self.parts:
-            if part.parameter == RESIDUAL:
-                own = (
-                    part.columns if len(part.columns) == 1 else np.repeat(part.columns[blocks], np.diff(starts), axis=0)
-                )
-                columns.append(np.broadcast_to(own + self.layout.where[part.kind].start, (count, own.shape[1])))
-                values = 1.0 if part.values is None else part.values[:, rows].T
-                entries.append(np.broadcast_to(values, columns[-1].shape))
-        beside, across = np.concatenate(columns, axis=1), np.concatenate(entries, axis=1)
-        bounds = np.arange(count + 1) * across.shape[1]
-        return sparse.csr_matrix((across.ravel(), beside.ravel(), bounds), shape=(count, self.layout.size))
 
     def terms(self, x: Floats) -> Iterator[Terms]:
         """Yield all ranges, some blocks at a time."""
@@ -369,34 +357,20 @@ class RangeRows:
             starts = np.arange(count + 1)
             entries.append(-moved.T)
             names.append(RESIDUAL)
-        slopes, first = np.empty((sum(map(len, entries)), count)), 0
-        for name, values in zip(names, entries, strict=True):
-            np.multiply(by[name], values, out=slopes[first : first + len(values)])
-            first += len(values)
         stacked = np.concatenate(columns, axis=1)
-        of_residual = [k for k, name in enumerate(names) if name == RESIDUAL]
-        score = by[RESIDUAL]
-        weight = self.errors.dispersion
-        found = Terms(
-            value=value, slopes=slopes, columns=stacked, starts=starts, weight=weight, score=score, residual=score
-        )
-        if tells is None:
-            return found
-        unit = np.ones(count)
-        if len(of_residual) == len(names):
-            return replace(found, weight=tells, entries=np.concatenate(entries), residual=unit)
-        shared = [by[SHARED if name == RESIDUAL else name] * one for name, one in zip(names, entries, strict=True)]
-        residual = np.concatenate([entries[k] for k in of_residual])
-        beside = Terms(
-            value=0.0,
-            slopes=np.zeros_like(residual),
-            columns=np.concatenate([columns[k] for k in of_residual], axis=1),
-            starts=starts,
-            weight=tells,
-            entries=residual,
-            residual=unit,
-        )
-        return replace(found, entries=np.concatenate(shared), residual=by[SHARED], beside=beside)
+        slopes = np.concatenate([by[name] * one for name, one in zip(names, entries, strict=True)])
+        score, weight = by[RESIDUAL], self.errors.dispersion
+        squares = [Squares(columns=stacked, entries=slopes, residual=score, weight=weight)]
+        if tells is not None:
+            chosen = [k for k, name in enumerate(names) if name == RESIDUAL]
+            by_residual = np.concatenate([columns[k] for k in chosen], axis=1)
+            of_residual = np.concatenate([entries[k] for k in chosen])
+            squares = [Squares(columns=by_residual, entries=of_residual, residual=np.ones(count), weight=tells)]
+            if len(chosen) < len(names):
+                beside = by | {RESIDUAL: by[SHARED]}
+                shared = np.concatenate([beside[name] * one for name, one in zip(names, entries, strict=True)])
+                squares = [Squares(columns=stacked, entries=shared, residual=by[SHARED], weight=weight), *squares]
+        return Terms(value=value, slopes=slopes, score=score, columns=stacked, starts=starts, squares=squares)
 
 
 def _sorted(part: Part, order: Ints, starts: Ints) -> Part:

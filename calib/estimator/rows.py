@@ -25,32 +25,40 @@ LONG_BLOCKS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Squares:
+    """Information of rows (n,): the sum of `weight`, one or (n,), times the outer square of `entries` (K, n).
+
+    The entries are those of the unknowns `columns` (blocks, K). `residual` (n,) are the entries that a unit offset of
+    each row's residual would have.
+    """
+
+    columns: Ints
+    entries: Floats
+    residual: Floats
+    weight: Floats | float = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Terms:
     """Some rows (n,) of which each touches K unknowns: blocks of rows that follow each other touch the same ones.
 
-    `slopes` (K, n) are derivatives of a row's log likelihood by the unknowns `columns` (blocks, K); `starts`
-    (blocks + 1,) bound the blocks. The information of the rows is the sum over rows of `weight`, one or (n,), times the
-    outer square of `entries` (K, n); None stands for the slopes themselves (Berndt, Hall, Hall, Hausman 1974).
-    Information `beside` that is added. Where rows have residuals, `score` (n,) are their slopes by the residual, and
-    `residual` (n,) the entries that a unit offset of each row would have.
+    `slopes` (K, n) are derivatives of a row's log likelihood by the unknowns `columns` (blocks, K), `score` (n,) those
+    by its residual; `starts` (blocks + 1,) bound the blocks. The information of the rows is the sum of `squares`: of
+    the slopes themselves (Berndt, Hall, Hall, Hausman 1974), or what rows tell on average.
     """
 
     value: float
     slopes: Floats
+    score: Floats
     columns: Ints
     starts: Ints
-    weight: Floats | float = 1.0
-    entries: Floats | None = None
-    score: Floats | None = None
-    residual: Floats | None = None
-    beside: Terms | None = None
+    squares: Sequence[Squares]
 
-    def as_matrix(self, values: Floats, size: int) -> sparse.csr_matrix:
-        """Return values (K, n) at the rows' columns as a sparse matrix (n, size)."""
-        count = values.shape[1]
-        columns = np.repeat(self.columns, np.diff(self.starts), axis=0)
-        bounds = np.arange(count + 1) * len(values)
-        return sparse.csr_matrix((values.T.ravel(), columns.ravel(), bounds), shape=(count, size))
+    def as_matrix(self, values: Floats, columns: Ints, size: int) -> sparse.csr_matrix:
+        """Return values (K, n) at the columns (blocks, K) of the rows as a sparse matrix (n, size)."""
+        bounds = np.arange(values.shape[1] + 1) * len(values)
+        each = np.repeat(columns, np.diff(self.starts), axis=0)
+        return sparse.csr_matrix((values.T.ravel(), each.ravel(), bounds), shape=(values.shape[1], size))
 
 
 class Rows(Protocol):
@@ -99,16 +107,15 @@ def sum_rows(rows: Sequence[Rows], x: Floats) -> Sums:
             value += terms.value
             sums = np.add.reduceat(terms.slopes, terms.starts[:-1], axis=1)
             gradient += np.bincount(terms.columns.ravel(), sums.T.ravel(), size)
-            for part in (terms, terms.beside):
-                if part is None:
-                    continue
-                entries = part.slopes if part.entries is None else part.entries
+            for part in terms.squares:
                 # One weight of all rows is that of their products, which are fewer.
-                weighed, times = (entries, part.weight) if np.ndim(part.weight) == 0 else (entries * part.weight, 1.0)
-                if entries.shape[1] < LONG_BLOCKS * len(part.columns):
-                    loose.append(part.as_matrix(weighed, size).T @ part.as_matrix(entries, size) * times)
+                one = np.ndim(part.weight) == 0
+                weighed, times = (part.entries, part.weight) if one else (part.entries * part.weight, 1.0)
+                if part.entries.shape[1] < LONG_BLOCKS * len(part.columns):
+                    left, right = (terms.as_matrix(each, part.columns, size) for each in (weighed, part.entries))
+                    loose.append(left.T @ right * times)
                     continue
-                products = _block_products(weighed, entries, part.starts).ravel() * times
+                products = _block_products(weighed, part.entries, terms.starts).ravel() * times
                 place = (part.columns[:, :, None] * size + part.columns[:, None, :]).ravel()
                 if many:
                     loose.append(sparse.csr_matrix((products, divmod(place, size)), shape=(size, size)))
@@ -162,7 +169,8 @@ def normal_terms(left: Floats, std: Floats, derivative: Floats, columns: Ints) -
     return Terms(
         value=-0.5 * float(z @ z),
         slopes=derivative * (z / std),
+        score=-z / std,
         columns=columns,
         starts=np.arange(len(left) + 1),
-        entries=derivative / std,
+        squares=[Squares(columns=columns, entries=derivative / std, residual=-1 / std)],
     )

@@ -5,20 +5,24 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse.csgraph import floyd_warshall
 
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, Ints
 
 
-def scaled_places(length_m: Floats, dimensions: int, *, most_m: float = np.inf, least_m2: float = 0.0) -> Floats:
-    """Return places (n, 3) about their centre, in so many dimensions, from lengths (n, n), infinite where unknown.
+def scaled_places(
+    ends: Ints, length_m: Floats, count: int, dimensions: int, *, most_m: float = np.inf, least_m2: float = 0.0
+) -> Floats:
+    """Return `count` places (n, 3) about their centre, in so many dimensions, from lengths (k,) between `ends` (k, 2).
 
     Classical scaling (Torgerson 1952). What has no length is as far apart as the shortest path over others, or as the
     longest of these where there is none; all are `most_m` at most. Eigenvalues are `least_m2` at least.
     """
-    apart = np.minimum(floyd_warshall(length_m, directed=False), most_m)
+    known = np.full((count, count), np.inf)
+    known[ends[:, 0], ends[:, 1]] = known[ends[:, 1], ends[:, 0]] = length_m
+    apart = np.minimum(floyd_warshall(known, directed=False), most_m)
     apart = np.where(np.isfinite(apart), apart, apart[np.isfinite(apart)].max(initial=1.0))
-    centring = np.eye(len(apart)) - 1 / len(apart)
+    centring = np.eye(count) - 1 / count
     values, vectors = np.linalg.eigh(-0.5 * centring @ apart**2 @ centring)
     top = np.argsort(values)[::-1][:dimensions]
-    found = np.zeros((len(apart), 3))
+    found = np.zeros((count, 3))
     found[:, : len(top)] = vectors[:, top] * np.sqrt(np.maximum(values[top], least_m2))
     return found

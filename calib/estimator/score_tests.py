@@ -74,9 +74,9 @@ class Family:
 class FoundOffset:
     """An alternative that the residuals ask for: its kind, whose it may be, the offset, and what it does to delays.
 
-    `effect_ns` (tags,) is by how much the delays would change, `deviation` how many standard errors the offset is from
-    none, `p_value` how likely so much is by chance in any of the tests. An offset of one session may as well be the
-    opposite one of all others: `otherwise_ns` (tags,) is what that does, `sessions` are that session and the others.
+    `deviation` is how many standard errors the offset is from none, `p_value` how likely so much is by chance in any of
+    the tests. `effects_ns` (1 or 2 of (tags,)) are by how much the delays would change: an offset of one session may as
+    well be the opposite one of all others, which does the second; `sessions` are that session and the others.
     """
 
     kind: str
@@ -84,15 +84,9 @@ class FoundOffset:
     offset_m: float
     deviation: float
     p_value: float
-    effect_ns: Floats
-    otherwise_ns: Floats | None = None
+    effects_ns: tuple[Floats, ...]
     sessions: tuple[str, str] = ("", "")
     fitted: bool = False
-
-    @property
-    def effects_ns(self) -> list[Floats]:
-        """Return what the offset may do to the delays, by whichever side of a difference is off."""
-        return [self.effect_ns] if self.otherwise_ns is None else [self.effect_ns, self.otherwise_ns]
 
     @property
     def spread_ns2(self) -> Floats:
@@ -101,7 +95,7 @@ class FoundOffset:
         Where offsets are fitted delays lie halfway between both sides, and their variance is in the intervals already.
         """
         if self.fitted:
-            apart = np.zeros_like(self.effect_ns) if self.otherwise_ns is None else self.effect_ns - self.otherwise_ns
+            apart = self.effects_ns[0] - self.effects_ns[-1]
             return np.asarray(np.outer(apart, apart) / 4)
         return np.asarray(np.mean([np.outer(effect, effect) for effect in self.effects_ns], axis=0))
 
@@ -164,10 +158,11 @@ class Slopes:
         self.score, self.tells = np.empty(len(rows)), np.zeros(len(rows))
         self.own = np.zeros((blocks.count, size))
         for which, terms in self._pieces():
-            self.own += (blocks.summing(self.order[which]) @ terms.as_matrix(terms.slopes, size)).toarray()
+            slopes = terms.as_matrix(terms.slopes, terms.columns, size)
+            self.own += (blocks.summing(self.order[which]) @ slopes).toarray()
             self.score[which] = terms.score
-            for part, weight in _weighed(terms):
-                self.tells[which] += weight if part.residual is None else weight * part.residual
+            for part in terms.squares:
+                self.tells[which] += part.residual * part.weight * part.residual
         self.count = len(rows)
 
     def _pieces(self) -> Iterator[tuple[slice, Terms]]:
@@ -192,7 +187,7 @@ class Slopes:
         With derivatives of the ranges by one offset `more` (n,), each family has that one as its last.
         """
         sums = self._sums([family.derivative for family in families], more)
-        return [self._tested(family, own) for family, own in zip(families, sums, strict=True)]
+        return [self._tested(family, *own) for family, own in zip(families, sums, strict=True)]
 
     def _sums(
         self, derivatives: Sequence[Derivative | sparse.csr_matrix], more: Floats | None = None
@@ -205,26 +200,23 @@ class Slopes:
         (blocks, size), counts = self.own.shape, [each.shape[1] + (more is not None) for each in derivatives]
         sums = [[np.zeros(shape) for shape in ((blocks, k), (blocks, k), (k, k), (k, size))] for k in counts]
         for which, terms in self._pieces():
-            in_block = self.blocks.summing(self.order[which])
-            matrices = [
-                part.as_matrix(weight * (part.slopes if part.entries is None else part.entries), size)
-                for part, weight in _weighed(terms)
+            rows = self.order[which]
+            in_block, told = self.blocks.summing(rows), sparse.diags(self.tells[which])
+            shared = [
+                terms.as_matrix(part.residual * part.weight * part.entries, part.columns, size)
+                for part in terms.squares
             ]
+            last = [] if more is None else [sparse.csr_matrix(more[rows, None])]
             for own, derivative in zip(sums, derivatives, strict=True):
-                kept = derivative[self.order[which]]
-                if more is not None:
-                    last = sparse.csr_matrix(more[self.order[which], None])
-                    kept = sparse.csr_matrix(sparse.hstack([kept, last]))
-                told = sparse.diags(self.tells[which])
+                kept = sparse.csr_matrix(sparse.hstack([derivative[rows], *last]))
                 own[0] += (in_block @ sparse.diags(self.score[which]) @ kept).toarray()
                 own[1] += (in_block @ told @ kept.power(2)).toarray()
                 own[2] += (kept.T @ told @ kept).toarray()
-                for matrix in matrices:
+                for matrix in shared:
                     own[3] += (kept.T @ matrix).toarray()
         return sums
 
-    def _tested(self, family: Family, sums: Sequence[Floats]) -> Tested:
-        plain, known, square, link = sums
+    def _tested(self, family: Family, plain: Floats, known: Floats, square: Floats, link: Floats) -> Tested:
         taken = self._taken(link, family.fitted)
         efficient, information = plain - self.own @ taken.T, square - taken @ link.T
         whole = max(float(np.diag(square)[: family.derivative.shape[1]].max()), 1e-300)
@@ -262,14 +254,6 @@ class Slopes:
         return taken.T
 
 
-def _weighed(terms: Terms) -> Iterator[tuple[Terms, Floats]]:
-    """Yield rows and what is beside them, with the weight (n,) by which a unit offset of each goes with its entries."""
-    for part in (terms, terms.beside):
-        if part is not None:
-            unit = np.ones(part.slopes.shape[1]) if part.residual is None else part.residual
-            yield part, unit * part.weight
-
-
 def search(tested: Sequence[Tested], rate: float) -> list[FoundOffset]:
     """Return what stands out of all families, the gravest first; of sound fits the share `rate` has any finding."""
     several = sum(len(one.family.names) for one in tested)
@@ -297,21 +281,21 @@ def findings(tested: Tested, several: int, rate: float, tolerance_m: float = 0.0
         offset = float(total[top] / information[top, top])
         alike = np.abs(covariance[top] / (std[top] * std)) > SAME
         close = alike & known & (np.abs(deviation) > SAME * abs(deviation[top]))
-        otherwise, sessions = None, ("", "")
+        effects, sessions = [tested.effects[:, top] * offset], ("", "")
         count = len(family.sessions)
         if count > 1:
             first = top - top % count
             others = [k for k in range(first, first + count) if k != top]
             rest = family.sessions[1 - top % count] if count == 2 else "the other recordings"
-            otherwise, sessions = -tested.effects[:, others].sum(axis=1) * offset, (family.sessions[top % count], rest)
+            effects.append(-tested.effects[:, others].sum(axis=1) * offset)
+            sessions = (family.sessions[top % count], rest)
         yield FoundOffset(
             kind=family.kind,
             names=tuple(dict.fromkeys(family.names[k] for k in np.flatnonzero(close).tolist())),
             offset_m=-offset,
             deviation=float(deviation[top]),
             p_value=p_value,
-            effect_ns=tested.effects[:, top] * offset,
-            otherwise_ns=otherwise,
+            effects_ns=tuple(effects),
             sessions=sessions,
             fitted=len(family.fitted) > 0,
         )

@@ -17,12 +17,12 @@ from scipy.special import expit
 from calib.calibration.error_model import ErrorModel, PairErrors
 from calib.calibration.model import Calibration, PairOffset, TagGroup, Uncertainty, matrix_of
 from calib.calibration.patterns import HARMONICS, Pattern, TemperatureSlope
-from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, flat_curve
+from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, basis, flat_curve
 from calib.estimator.covariates import COMMON, OF_PLACES, OWN, OWN_WARMTH, WARMTH
+from calib.estimator.grouped_errors import ReflectionFeatures
 from calib.estimator.known_distances import LARGEST_SPREAD_M, DescribedErrors, KnownDistances, described_errors
-from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel, SplineValues
+from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel
 from calib.estimator.range_rows import RESIDUAL
-from calib.estimator.reflection_features import ReflectionFeatures
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
 from calib.range_errors.densities import LONG_FACTOR, LongDetours
 from calib.spread import robust_spread
@@ -171,22 +171,15 @@ def sigma_curves(
     level = float(values["noise level"][0])
     if model.noise is None:
         return _flat_sigma(model, math.exp(level), float(covariance[0, 0]))
-    knots = model.noise.knots
-    lifted = np.linspace(knots[0], knots[-1], 8 * model.noise.size)
-    at = SplineValues.at(lifted, knots)
-    splines = np.zeros((len(lifted), model.noise.size))
-    np.put_along_axis(splines, at.columns, at.values, axis=1)
-    through, names = np.linalg.pinv(splines), list(model.settings.groups) or [""]
-    curves, slope = {}, np.zeros((model.noise.size, len(covariance)))
-    for k, name in enumerate(names):
-        sigma = np.exp(level + splines @ values[f"noise curve {name}".strip()])
-        coefficients = np.maximum(through @ sigma, SIGMA_FLOOR_M)
-        curves[name] = Curve(
-            tuple(knots.tolist()), tuple(coefficients.tolist()), DEGREE, (float(knots[0]), float(knots[-1]))
-        )
-        slope[:, 0] += through @ sigma / len(names)
-        own = slice(1 + k * model.noise.size, 1 + (k + 1) * model.noise.size)
-        slope[:, own] += through @ (sigma[:, None] * splines) / len(names)
+    knots, names = model.noise.knots, list(model.settings.groups) or [""]
+    splines = basis(np.linspace(knots[0], knots[-1], 8 * model.noise.size), knots)
+    through = np.linalg.pinv(splines)
+    sigma = [np.exp(level + splines @ values[f"noise curve {name}".strip()]) for name in names]
+    by_level, by_curve = through @ sum(sigma), [through @ (own[:, None] * splines) for own in sigma]
+    slope = np.column_stack([by_level, *by_curve]) / len(names)
+    place, span = tuple(knots.tolist()), (float(knots[0]), float(knots[-1]))
+    kept = [tuple(np.maximum(through @ own, SIGMA_FLOOR_M).tolist()) for own in sigma]
+    curves = {name: Curve(place, own, DEGREE, span) for name, own in zip(names, kept, strict=True)}
     return curves, np.asarray(slope @ covariance @ slope.T)
 
 
@@ -216,9 +209,8 @@ def _correction_std(found: KnownDistances, delays_ns2: Floats, lifted: Floats) -
         of_pairs = of_pairs + np.var(left)
     variance = np.full(len(lifted), float(np.mean(of_pairs)))
     if model.curve is not None:
-        at = SplineValues.at(lifted, model.curve.knots)
-        known = _bias_covariance(found)[at.columns[:, :, None], at.columns[:, None, :]]
-        variance += np.einsum("ki,kij,kj->k", at.values, known, at.values)
+        splines = basis(lifted, model.curve.knots)
+        variance += np.sum(splines @ _bias_covariance(found) * splines, axis=1)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
@@ -333,12 +325,12 @@ def _at_nodes(model: RangeModel, values: dict[str, Floats]) -> tuple[Floats, Flo
     if model.noise is None:
         return np.array([0.999, 1.001]) * np.median(model.lifted), np.full(2, np.exp(level)), np.zeros(2)
     nodes = np.quantile(model.lifted, (np.arange(NODES) + 0.5) / NODES) + 1e-9 * np.arange(NODES)
-    at, several = SplineValues.at(nodes, model.noise.knots), list(model.settings.groups) or [""]
-    curves = {}
-    for parameter in ("noise", "odds"):
-        mean = np.mean([values[f"{parameter} curve {name}".strip()] for name in several], axis=0)
-        curves[parameter] = np.sum(at.values * mean[at.columns], axis=1)
-    return nodes, np.exp(level + curves["noise"]), curves["odds"]
+    splines, several = basis(nodes, model.noise.knots), list(model.settings.groups) or [""]
+    noise, odds = (
+        splines @ np.mean([values[f"{parameter} curve {name}".strip()] for name in several], axis=0)
+        for parameter in ("noise", "odds")
+    )
+    return nodes, np.exp(level + noise), odds
 
 
 def _shrunk_to_mean(value: Floats, variance: Floats, widest: float) -> tuple[Floats, Floats, float, float]:

@@ -38,8 +38,7 @@ from calib.estimator.known_distances import KnownDistances
 from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
-from calib.fitting.covariates import fit_with_covariates, supply_warnings, with_new_tag
-from calib.fitting.drift import drift_of
+from calib.fitting.covariates import drift_of, fit_with_covariates, supply_warnings, with_new_tag
 from calib.fitting.passive_listeners import MIN_OF_DELAY
 from calib.fitting.result import FitResult, HeldOut
 from calib.settings import FitSettings, check_tag
@@ -71,8 +70,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     """
     settings = replace(settings or FitSettings(), **changes)
     check_loss(settings.loss)
-    given = settings.delays_from
-    source = None if given is None else given_calibration(given, "delays_from")
+    source = None if settings.delays_from is None else given_calibration(settings.delays_from, "delays_from")
     ranges = load_ranges(data, need_power=not settings.delays_only, use=settings.use)
     if ranges.differences.any() and not ranges.differences.all():
         raise UnanswerableError(
@@ -97,6 +95,8 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     taken = {tag: std for tag, std in source.delays_std_ns.items() if tag in given} if source else {}
     stated = {tag: std for tag, std in calibration.delays_std_ns.items() if tag not in given}
     calibration = replace(calibration, delays_std_ns=stated | taken)
+    # Differences of arrival determine delays that ranges between two sides leave open.
+    unused = heard if settings.use == "exchanges" and calibration.undetermined_splits else 0
     held = _held_out(ranges, settings) if settings.hold_out else None
     provenance = {
         **({} if found.model.reference_dbm is None else {"reference_power_dbm": found.model.reference_dbm}),
@@ -118,7 +118,11 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         findings,
         settings=settings,
         fixed=fixed,
-        first=_hints(calibration, heard if settings.use == "exchanges" else 0),
+        first=[
+            f"{unused} differences of arrival at other tags determine the delays of targets: fit with `use` receptions"
+        ]
+        if unused
+        else [],
         more=[*vague, *supply_warnings(calibration.temperatures, ranges), *_stopped(found, settings.loss)],
     )
     return replace(result, held_out=held)
@@ -347,13 +351,6 @@ def _judged(held: HeldOut, settings: FitSettings) -> dict[str, Any]:
         "inside_95": found.inside_95,
     }
     return {name: for_json(value) for name, value in judged.items()}
-
-
-def _hints(calibration: Calibration, unused: int) -> list[str]:
-    """Return what determines the delays that a fit leaves open, where so many differences of arrival were not used."""
-    if not (calibration.undetermined_splits and unused):
-        return []
-    return [f"{unused} differences of arrival at other tags determine the delays of targets: fit with `use` receptions"]
 
 
 def _stopped(found: KnownDistances, asked_for: str | None) -> list[str]:

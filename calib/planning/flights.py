@@ -187,12 +187,11 @@ class Information:
         if not pairs:
             return None
         rows = np.zeros((len(pairs), self.layout.size))
-        for row, pair in zip(rows, pairs, strict=True):
-            tapes = self.flight.taped([pair], still_s, sigma_m).scene.tapes
-            time_s = np.nan_to_num(tapes.time_s, nan=scene.time_s[0])
-            geometry = Distances.of(self.motion, self.layout, (tapes.first, tapes.second), time_s)
-            moved = geometry.distances(self.x)[1]
-            np.add.at(row, geometry.columns, moved / len(moved))
+        tapes = self.flight.taped(pairs, still_s, sigma_m).scene.tapes
+        time_s = np.nan_to_num(tapes.time_s, nan=scene.time_s[0])
+        geometry = Distances.of(self.motion, self.layout, (tapes.first, tapes.second), time_s)
+        moved = geometry.distances(self.x)[1] / np.bincount(tapes.number)[tapes.number, None]
+        np.add.at(rows, (tapes.number[:, None], geometry.columns), moved)
         reach = self.covariance @ rows.T
         gain = np.sum(reach[self.delays] ** 2, axis=0) / (np.einsum("kp,pk->k", rows, reach) + sigma_m**2)
         # Rounded, so that of equal pairs every machine takes the first.

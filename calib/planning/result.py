@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Generic
 
 import numpy as np
@@ -75,8 +75,9 @@ class Precision(Generic[Value]):
 class _Plan:
     """What plans of both kinds say: half an interval of 95 % of each delay (ns), infinite where it stays open.
 
-    `common_ns` is the half interval of what all delays share, to which every absolute distance owes as much. `verdict`
-    says what is determined, `next_best` what one more measurement would bring, the best one first.
+    `open_ns` may have half an interval of those that stay open as well. `common_ns` is the half interval of what all
+    delays share, to which every absolute distance owes as much. `verdict` says what is determined, `next_best` what one
+    more measurement would bring, the best one first.
     """
 
     half_ns: Mapping[int, float]
@@ -84,6 +85,7 @@ class _Plan:
     verdict: Verdict
     next_best: tuple[NextBest, ...]
     reflected: float
+    open_ns: Mapping[int, float] = field(default_factory=dict)
 
     @property
     def undetermined(self) -> tuple[int, ...]:
@@ -105,12 +107,14 @@ class _Plan:
     def __str__(self) -> str:
         """Return the steps and the intervals."""
         assumed, shared = self._promise()
+        wide = {tag: f"undetermined (± {half:.2f} ns)" for tag, half in self.open_ns.items()}
         lines = [
             *self.steps,
             "",
             f"Promised, if {assumed}:",
             *(
-                f"  tag {tag:3d}  " + (f"± {half:.3f} ns (95 %)" if math.isfinite(half) else self._open(tag))
+                f"  tag {tag:3d}  "
+                + (f"± {half:.3f} ns (95 %)" if math.isfinite(half) else wide.get(tag, "undetermined"))
                 for tag, half in self.half_ns.items()
             ),
             *shared,
@@ -122,10 +126,6 @@ class _Plan:
             ),
         ]
         return "\n".join(lines)
-
-    def _open(self, tag: int) -> str:
-        """Return what is said of a delay that stays open."""
-        return "undetermined"
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as JSON takes it; null where nothing is determined."""
@@ -222,7 +222,7 @@ class Plan(_Plan):
 class FlightPlan(_Plan):
     """A plan of a flight.
 
-    `open_ns` is half an interval of every delay, of those that stay open as well. `common_ns` and `apart_ns`, how well
+    `open_ns` has every delay. `common_ns` and `apart_ns`, how well
     each delay is known against the mean of all, are of the delays that are determined, or of all where none is.
     `path_m` (k, bodies, 3) is where the moving `bodies` are, `stands` where others stand.
 
@@ -236,7 +236,6 @@ class FlightPlan(_Plan):
     ranges: int
     seconds: float
     source: str
-    open_ns: Mapping[int, float]
     apart_ns: float
     taped: tuple[tuple[int, int], ...]
     path_m: Floats
@@ -272,9 +271,6 @@ class FlightPlan(_Plan):
             (True, "Fit delays, curve and trajectories together."),
         ]
         return [text for needed, text in steps if needed]
-
-    def _open(self, tag: int) -> str:
-        return f"undetermined (± {self.open_ns[tag]:.2f} ns)"
 
     def _promise(self) -> tuple[str, list[str]]:
         which = "" if len(self.undetermined) in (0, len(self.half_ns)) else " of those that are determined"

@@ -24,7 +24,7 @@ from calib.planning.result import NextBest, Plan, PlannedArrangement, Precision,
 from calib.planning.settings import ROOMS_M, SurveyPlanSettings
 from calib.spread import TWO_SIDED_95
 from calib.surveys.knowledge import KnownPosition
-from calib.surveys.network import Boards, Case, CurvePrior, Network
+from calib.surveys.network import Boards, Case, CurvePrior, Linear, Network
 from calib.surveys.outcome import students_factor, verdict_on_delays
 from calib.surveys.recordings import PairMeans
 from uwblink.arrays import Bools, Floats
@@ -109,7 +109,9 @@ def delay_information(
         network.layout.free(),
     )
     cases = [Case(none + marks > 0, inputs.pair_error_m, PLANNED_CURVE_STD_M) for marks in reflected]
-    return np.array([reduced(network.at(x, case).known[np.ix_(free, free)], free >= 3 * len(boards)) for case in cases])
+    return np.array(
+        [reduced(Linear(network, x, case).known[np.ix_(free, free)], free >= 3 * len(boards)) for case in cases]
+    )
 
 
 def predict(

@@ -346,10 +346,6 @@ class Network:
         found.weights = [1.0, 1.0, curve_m**-2][: len(self.layout.blocks)]
         return found
 
-    def at(self, x: Floats, case: Case) -> Linear:
-        """Return the network about unknowns (p,) in a case."""
-        return Linear(self, x, case)
-
     def alone(self, arrangement: int) -> Network:
         """Return the network of the means of one arrangement, in which only its places are sought."""
         rows, unknowns = self.means.arrangement == arrangement, np.arange(self.layout.size)

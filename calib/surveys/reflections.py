@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import betaln, ndtr
 
-from calib.surveys.network import EXTRA_M, EXTRA_STD_M, Case, Network
+from calib.surveys.network import EXTRA_M, EXTRA_STD_M, Case, Linear, Network
 from uwblink.arrays import Bools, Floats
 
 REFLECTED, STRAIGHT = 1.0, 30.0
@@ -51,7 +51,7 @@ class Marks:
     @classmethod
     def at(cls, network: Network, x: Floats, case: Case) -> Marks:
         """Return the marks of a case, linear about unknowns (p,)."""
-        here, count = network.at(x, case), len(case.marks)
+        here, count = Linear(network, x, case), len(case.marks)
         rows, std = here.jacobian[:count], here.std[:count]
         inverse = (np.eye(count) - rows @ here.covariance @ rows.T) / std[:, None] / std
         return cls(case.marks, inverse, (here.left[:count] - rows @ here.step) / std)

@@ -67,11 +67,9 @@ def first_start(network: Network, delays: Floats | None = None) -> Floats:
     for k, boards in enumerate(network.arrangements):
         here = network.seats(k)
         rows = np.flatnonzero(np.isin(network.ends[: len(network.means.range_m), 0], here))
-        first, second = np.searchsorted(here, network.ends[rows]).T
-        length = np.full((len(here), len(here)), np.inf)
-        length[first, second] = length[second, first] = np.maximum(measured[rows], 0.01)
+        ends, length = np.searchsorted(here, network.ends[rows]), np.maximum(measured[rows], 0.01)
         # A derivative by a coordinate of which all are zero would be zero.
-        found = scaled_places(length, boards.dimensions, least_m2=1e-6)
+        found = scaled_places(ends, length, len(here), boards.dimensions, least_m2=1e-6)
         known = [n for n, point in enumerate(here.tolist()) if point in network.known_places]
         if known:
             goal, mine = np.array([network.known_places[here[n]][0] for n in known]), found[known]
@@ -148,7 +146,7 @@ class Solution:
     @cached_property
     def linear(self) -> Linear:
         """The network about the unknowns."""
-        return self.network.at(self.x, self.case)
+        return Linear(self.network, self.x, self.case)
 
     @property
     def freedom(self) -> float:
@@ -184,7 +182,7 @@ def of_spreads(network: Network, x: Floats, case: Case) -> float:
     """Return -2 log likelihood near an optimum, integrated over the unknowns, with the prior density of the spreads."""
     pairs = PAIR_PRIOR_FREEDOM * (2 * math.log(case.pair_m) + (PAIR_STD_M / case.pair_m) ** 2)
     curve = (math.log(case.curve_m / CURVE_STD_M) / math.log(CURVE_FACTOR)) ** 2
-    return network.at(x, case).unlikely() + pairs + curve
+    return Linear(network, x, case).unlikely() + pairs + curve
 
 
 def unlikelihood(network: Network, x: Floats, case: Case) -> float:
@@ -281,7 +279,7 @@ def averaged(found: Solution) -> Solution:
 
 def _mixed(found: Solution, cases: Sequence[Case], weight: Floats) -> tuple[Floats, Floats]:
     """Return the mean step over cases, linear, and what their covariance is more than that of one case, not below 0."""
-    every = [found.network.at(found.x, case) for case in cases]
+    every = [Linear(found.network, found.x, case) for case in cases]
     steps = np.array([one.step for one in every])
     mean = weight @ steps
     around = steps - mean

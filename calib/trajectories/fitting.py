@@ -19,7 +19,7 @@ from calib.checks.limits import refuse_refuted
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.inverse import Matrix, inverse_of
-from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described
+from calib.estimator.known_distances import Fitted, KnownDistances, described, model_of
 from calib.estimator.losses import MIXTURE
 from calib.estimator.range_model import BOARD_DELAY_STD_NS, METRES_A_NS, RangeModel
 from calib.estimator.rows import sum_rows
@@ -126,13 +126,9 @@ def _settings(
 
 def range_model(scene: Scene, settings: FitSettings, *, curve: bool, offsets: bool = True) -> tuple[RangeModel, Scene]:
     """Return the model of delays, curves and offsets, and the scene with the ranges that the model keeps."""
-    if len(scene.ranges) < FEWEST_RANGES:
-        raise UnanswerableError(
-            f"{scene.source}: {len(scene.ranges)} usable exchanges are too few, at least {FEWEST_RANGES} are needed"
-        )
     # The truth is not known. In its place stands the number of the row, which says what rows the model keeps.
     numbered = replace(scene.ranges, truth_m=np.arange(len(scene.ranges), dtype=np.float64))
-    model = RangeModel.of(numbered, replace(settings, delays_only=not curve), offsets=offsets)
+    model = model_of(numbered, replace(settings, delays_only=not curve), offsets=offsets)
     return model, scene.only(model.ranges.truth_m.astype(np.int64))
 
 

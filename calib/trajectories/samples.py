@@ -266,6 +266,7 @@ def windows(readings: Readings, attitude: Attitude, last_s: float) -> Inertial:
     mean_turn = np.add.reduceat(turn, starts) / count[:, None, None]
     # Larger mean accelerations are impacts, not flight.
     flown = np.linalg.norm(mean_force - (0, 0, GRAVITY_M_S2), axis=1) < 4.0
+    # The mean of a window that lacks a third of its readings is not that of its middle.
     kept = flown & (count >= 0.7 * readings.per_window)
     return Inertial((slot[kept] + 0.5) * SAMPLE_S, mean_force[kept], mean_turn[kept])
 

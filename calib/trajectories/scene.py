@@ -68,11 +68,7 @@ class Scene:
     @property
     def without_heading(self) -> list[str]:
         """Return the bodies whose first heading is unknown."""
-        return [
-            body
-            for body, known in self.attitudes.items()
-            if not np.isfinite(known.std_rad[2]) and not known.heading_known
-        ]
+        return [body for body, known in self.attitudes.items() if not known.heading_known]
 
     def turned_by(self, heading: Mapping[str, float]) -> Scene:
         """Return the scene with attitudes of some bodies rotated about the vertical."""

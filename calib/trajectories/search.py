@@ -290,11 +290,10 @@ def leverages(rows: RangeRows, found: Optimum) -> Floats:
     """
     size, parts, values = found.layout.size, [], rows.values(found.x)
     for terms in rows.terms(found.x):
-        part = terms.beside or terms
-        weight = np.atleast_1d(part.weight)
-        if part is not terms and terms.residual is not None:
-            weight = weight + np.mean(terms.residual**2)
-        parts.append((part.as_matrix(part.slopes if part.entries is None else part.entries, size), weight))
+        *shared, part = terms.squares
+        weight = part.weight + sum(np.mean(one.residual**2) for one in shared)
+        matrix = terms.as_matrix(part.entries, part.columns, size)
+        parts.append((matrix, np.broadcast_to(weight, matrix.shape[0])))
     weight = np.concatenate([known for _, known in parts])
     if "noise" in values:
         # The information of a residual is at most that of normal errors (Stam 1959).

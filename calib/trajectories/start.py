@@ -12,6 +12,7 @@ from functools import reduce
 import numpy as np
 
 from calib.estimator.scaling import scaled_places
+from calib.pairs import pairs_of
 from calib.trajectories.motion import Motion
 from calib.trajectories.samples import SAMPLE_S, Places, Samples
 from calib.trajectories.scene import Scene
@@ -144,6 +145,7 @@ def _stand(fitted: MotionFit) -> Floats:
 def _carried_on(near: Trajectories, time_s: Floats, sign: int) -> Floats:
     """Return extrapolated positions (k, bodies, 3) of bodies that slow down, forwards or backwards (`sign` -1)."""
     time, place = near.time_s[::sign][-4:], near.position_m[::sign][-4:]
+    # They stop within two seconds (time constant 0.7 s), a judgement: windows overlap, and the next one corrects it.
     speed = (place[-1] - place[0]) / (time[-1] - time[0]) if len(time) > 1 else np.zeros_like(place[0])
     return np.asarray(place[-1] + speed * (np.tanh((time_s - time[-1]) / 0.7) * 0.7)[:, None, None])
 
@@ -206,16 +208,13 @@ def _shape(scene: Scene) -> Floats:
     """Return relative positions of bodies (moving, then sought) by scaling of their mean ranges."""
     bodies = [*scene.moving, *scene.sought]
     number = {tag: bodies.index(body) for tag, (body, _) in scene.arms.items() if body in bodies}
-    ends = [[number.get(tag, -1) for tag in ids.tolist()] for ids in (scene.ranges.initiator, scene.ranges.target)]
-    i, j = np.array(ends)
-    total, times = np.zeros((2, len(bodies), len(bodies)))
-    between = (i >= 0) & (j >= 0)
-    np.add.at(total, (i[between], j[between]), scene.ranges.raw_m[between])
-    np.add.at(times, (i[between], j[between]), 1.0)
-    total, times = total + total.T, times + times.T
+    ranges = scene.ranges[np.isin(scene.ranges.initiator, [*number]) & np.isin(scene.ranges.target, [*number])]
+    pairs = pairs_of(
+        *(np.array([number[tag] for tag in ids.tolist()], np.int64) for ids in (ranges.initiator, ranges.target))
+    )
+    mean = np.bincount(pairs.number, ranges.raw_m) / np.bincount(pairs.number)
     # A distance of zero would be no link, and delays can make a range negative. Twenty metres are a large hall.
-    mean = np.where(times > 0, np.maximum(total / np.maximum(times, 1.0), 1e-3), np.inf)
-    return scaled_places(mean, 3, most_m=20.0)
+    return scaled_places(pairs.ends, np.maximum(mean, 1e-3), len(bodies), 3, most_m=20.0)
 
 
 def _initial_anchors(scene: Scene, seed: Trajectories) -> Floats:

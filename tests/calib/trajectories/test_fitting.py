@@ -56,6 +56,16 @@ def test_planted_delays_are_found_from_a_known_start(flown, fitted):
     assert shares[-1] == 1.0
 
 
+def test_ranges_of_a_flight_that_are_worked_on_in_several_pieces_give_the_same_delays(monkeypatch):
+    flown = flight(seconds=8.0, seed=3)
+    whole = calib.fit_from_ranges(flown, poses_until_s=5.0).calibration
+    monkeypatch.setattr("calib.estimator.range_rows.ROWS_AT_ONCE", 250)
+    pieces = calib.fit_from_ranges(flown, poses_until_s=5.0).calibration
+    # The mean information of a range is that of its piece, which only changes the steps of a search.
+    for tag, std in whole.delays_std_ns.items():
+        assert pieces.delays_ns[tag] == pytest.approx(whole.delays_ns[tag], abs=0.01 * std)
+
+
 def test_it_corrects_ranges_of_another_flight_as_any_calibration(known):
     other = flight(seed=9)
     applied = known.apply(calib.load_ranges(other))
