@@ -165,24 +165,23 @@ def one_of(allowed: Iterable[str]) -> PlainValidator:
 
 def expect(what: str, good: Callable[[Any], bool], kind: Callable[[Any], Any] = lambda value: value) -> PlainValidator:
     """Return the check of a value that is `good`, which errors call `what`; `kind` makes of it what is kept."""
+    return PlainValidator(_checker(good, f"expected {what}", kind))
 
+
+def joint(good: Callable[[Any], bool], mistake: str) -> AfterValidator:
+    """Return the check of a dataclass whose fields fit each other; errors state the `mistake` after the key's name."""
+    return AfterValidator(_checker(good, mistake))
+
+
+def _checker(
+    good: Callable[[Any], bool], mistake: str, kind: Callable[[Any], Any] = lambda value: value
+) -> Callable[[Any], Any]:
     def check(value: Any) -> Any:
         if not good(value):
-            raise ValueError(f"expected {what}")
+            raise ValueError(mistake)
         return kind(value)
 
-    return PlainValidator(check)
-
-
-def joint(check: Callable[[Any], str]) -> AfterValidator:
-    """Return a check of values that must fit each other; `check` returns the mistake after the key's name, or ""."""
-
-    def checked(value: Any) -> Any:
-        if wrong := check(value):
-            raise ValueError(wrong)
-        return value
-
-    return AfterValidator(checked)
+    return check
 
 
 def is_tag(text: object) -> bool:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import PlainSerializer, TypeAdapter
+from pydantic import AfterValidator, PlainSerializer, TypeAdapter
 
 from calib.calibration.applying import (
     CorrectedArrivals,
@@ -37,7 +37,6 @@ from calib.calibration.document import (
     TagKey,
     Tags,
     expect,
-    joint,
     one_of,
     pair_name,
     read,
@@ -374,8 +373,8 @@ class Calibration:
         return read(_ADAPTER, text, where)
 
 
-def _misfit(calibration: Calibration) -> str:
-    """Return the mistake in splits, dependences or the sizes of covariance matrices, "" if there is none."""
+def _checked(calibration: Calibration) -> Calibration:
+    """Return a calibration; raises `ValueError` where splits, dependences or sizes of covariances do not fit."""
     parts = {
         "undetermined_splits": [tags for sides in calibration.undetermined_splits for tags in sides],
         "patterns": [one.tags for one in calibration.patterns],
@@ -384,11 +383,11 @@ def _misfit(calibration: Calibration) -> str:
     for key, some in parts.items():
         named = [tag for tags in some for tag in tags]
         if len(set(named)) < len(named) or not calibration.delays_ns.keys() >= set(named):
-            return f"{key}: expected calibrated tags, each of them once"
+            raise ValueError(f"{key}: expected calibrated tags, each of them once")
     age_line(calibration)
     known = calibration.uncertainty
     if known is None:
-        return ""
+        return calibration
     sizes = {
         "delays_ns2": len(known.tags),
         "bias_m2": len(calibration.bias_curve.coefficients),
@@ -398,11 +397,11 @@ def _misfit(calibration: Calibration) -> str:
         rows = getattr(known, name)
         # A variance of 0 may come out of a decomposition a little below 0.
         if len(rows) != size or any(len(row) != size or row[k] < -1e-9 for k, row in enumerate(rows)):
-            return f"uncertainty: {name}: expected {size} rows of {size} numbers, and no variance below 0"
-    return ""
+            raise ValueError(f"uncertainty: {name}: expected {size} rows of {size} numbers, and no variance below 0")
+    return calibration
 
 
-_ADAPTER: Final[TypeAdapter[Calibration]] = TypeAdapter(Annotated[Calibration, joint(_misfit)])
+_ADAPTER: Final[TypeAdapter[Calibration]] = TypeAdapter(Annotated[Calibration, AfterValidator(_checked)])
 
 
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:

@@ -36,13 +36,6 @@ def harmonics(toward: Floats | NDArray[np.float32]) -> Floats:
     return np.asarray(np.concatenate([first, second]).T)
 
 
-def _misfit(pattern: Pattern) -> str:
-    sizes = {len(pattern.coefficients_m), len(pattern.centre), *map(len, pattern.covariance_m2)}
-    rows = pattern.covariance_m2
-    good = sizes == {HARMONICS} and len(rows) == HARMONICS and all(row[k] >= 0 for k, row in enumerate(rows))
-    return "" if good else f"expected {HARMONICS} coefficients and centres, and as many rows and columns of covariance"
-
-
 @dataclass(frozen=True, slots=True)
 class Pattern:
     """By how much ranges of some tags are longer in a direction than on average over the fitted ones.
@@ -68,7 +61,16 @@ class Pattern:
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-CheckedPattern = Annotated[Pattern, joint(_misfit)]
+def _sizes_fit(pattern: Pattern) -> bool:
+    rows = pattern.covariance_m2
+    sizes = {len(pattern.coefficients_m), len(pattern.centre), len(rows), *map(len, rows)}
+    return sizes == {HARMONICS} and all(row[k] >= 0 for k, row in enumerate(rows))
+
+
+CheckedPattern = Annotated[
+    Pattern,
+    joint(_sizes_fit, f"expected {HARMONICS} coefficients and centres, and as many rows and columns of covariance"),
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,11 +117,10 @@ class TemperatureSlope:
         return np.asarray(self.std_m_per_k * np.abs(values[:, 0]))
 
 
-def _wrong_span(slope: TemperatureSlope) -> str:
-    return "" if slope.span_c[0] <= slope.span_c[1] else "span_c: expected the lowest before the highest"
-
-
-CheckedSlope = Annotated[TemperatureSlope, joint(_wrong_span)]
+CheckedSlope = Annotated[
+    TemperatureSlope,
+    joint(lambda slope: slope.span_c[0] <= slope.span_c[1], "span_c: expected the lowest before the highest"),
+]
 
 
 def dependences_m(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Floats]:
