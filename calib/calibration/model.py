@@ -190,6 +190,19 @@ class Calibration:
         own = np.isin(self.uncertainty.tags, list(tags))
         return math.sqrt(max(float(own @ np.array(self.uncertainty.delays_ns2) @ own), 0.0))
 
+    def covariance_ns2(self, tags: Sequence[int]) -> Floats:
+        """Return the covariance of some delays (tags, tags), zero where nothing is stated.
+
+        It is that of the fit where it is known, else has the squares of the standard errors alone.
+        """
+        std_ns = np.array([self.delays_std_ns.get(tag, math.nan) for tag in tags])
+        found = np.diag(np.where(np.isfinite(std_ns), std_ns, 0.0) ** 2)
+        if self.uncertainty is not None:
+            rows = np.flatnonzero(np.isin(tags, self.uncertainty.tags))
+            own = [self.uncertainty.tags.index(tag) for tag in tags if tag in self.uncertainty.tags]
+            found[np.ix_(rows, rows)] = np.array(self.uncertainty.delays_ns2)[np.ix_(own, own)]
+        return found
+
     @property
     def stopped(self) -> bool:
         """Whether the fit behind it stopped before it settled, so that delays and intervals are not final."""
