@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -535,8 +535,7 @@ def pattern_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 def temperature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
     """Return the tags of each slope over temperature, the slope, and its interval in words and where delays hold."""
-    told = calibration.provenance.get("temperature")
-    why = told.get("why") if isinstance(told, Mapping) else None
+    why = _sentence(calibration, "temperature", lambda told: told.get("why") or "", BadInputError)
     rows = [
         (
             first_few(map(str, one.tags)),
@@ -599,11 +598,18 @@ def rests_on(provenance: Mapping[str, Any]) -> str:
 
 def held_out_line(calibration: Calibration) -> str:
     """Return how a fit without the ranges that were held out did on them, "" where none were."""
-    told = calibration.provenance.get("held_out")
-    if not isinstance(told, Mapping):
+    return _sentence(calibration, "held_out", _held_out, BadInputError)
+
+
+def _sentence(
+    calibration: Calibration, key: str, told: Callable[[Mapping[str, Any]], str], error: type[Exception]
+) -> str:
+    """Return what is `told` of an entry of the provenance, "" without one; raises an error where it cannot be."""
+    entry = calibration.provenance.get(key)
+    if not isinstance(entry, Mapping):
         return ""
-    with raising(BadInputError, "provenance: held_out: not as `calib fit` writes it", KeyError, TypeError, ValueError):
-        return _held_out(told)
+    with raising(error, f"provenance: {key}: not as `calib fit` writes it", KeyError, TypeError, ValueError):
+        return told(entry)
 
 
 def _held_out(told: Mapping[str, Any]) -> str:
@@ -617,11 +623,7 @@ def _held_out(told: Mapping[str, Any]) -> str:
 
 def age_line(calibration: Calibration) -> str:
     """Return in how many days 95 % of delays change ranges by less than 2 cm, "" without several dated sessions."""
-    told = calibration.provenance.get("drift")
-    if not isinstance(told, Mapping):
-        return ""
-    with raising(ValueError, "provenance: drift: not as `calib fit` writes it", KeyError, TypeError, ValueError):
-        return _age(told)
+    return _sentence(calibration, "drift", _age, ValueError)
 
 
 def _age(told: Mapping[str, Any]) -> str:
