@@ -46,13 +46,13 @@ from calib.evaluation.tracking import (
     Track,
     choose_delays,
     delay_states,
-    pair_numbers,
     ranges_among,
     side_by_side,
     used_part,
     weigh,
 )
 from calib.online import Reflections
+from calib.pairs import pairs_of
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import first_few, printable
@@ -267,7 +267,7 @@ def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, A
         bodies=bodies,
         body=body,
         arm=arms[found.ends],
-        shares=np.stack([pairs, pairs.max() + 1 + pair_numbers(body)], axis=-1),
+        shares=np.stack([pairs, pairs.max() + 1 + pairs_of(*np.moveaxis(body, 2, 0)).number], axis=-1),
         readings=readings,
         poses=poses,
     )

@@ -19,6 +19,7 @@ from calib.data.ranges import Ranges
 from calib.data.sources import Flight, require_arrivals
 from calib.evaluation.filters import GaussianFilters, multilaterate, squared_over
 from calib.online import FIXED_DELAYS, DelayStates, RangeErrors, Reflections, WeighedInnovation, gated_update
+from calib.pairs import pairs_of
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
@@ -142,25 +143,31 @@ class Measurements(ColumnTable):
             sign=sign[rows],
         )
 
+    @classmethod
+    def of_body(cls, ranges: Ranges, own: Sequence[int]) -> tuple[Measurements, Floats]:
+        """Return those of a body with `own` tags, and the signs (n, k) of the distances in which it has no part.
+
+        Distances in which it has a part begin with its tag in `ends`; the `sign` of others is 0.
+        """
+
+        def unknown(ends: Ints) -> Bools:
+            inside = np.isin(ends, own)
+            return np.asarray(inside[..., 0] ^ inside[..., 1])
+
+        found = cls.of(ranges_about(ranges, own), unknown)
+        ends = np.where(np.isin(found.ends[..., :1], own), found.ends, found.ends[..., ::-1])
+        sign = np.where(unknown(ends), found.sign, 0.0)
+        return replace(found, ends=ends, sign=sign), found.sign - sign
+
     @property
     def pair(self) -> Ints:
         """The numbers (n, k), from 0, of the pairs of tags."""
-        return pair_numbers(self.ends)
+        return pairs_of(*np.moveaxis(self.ends, 2, 0)).number
 
     @property
     def heard(self) -> Bools:
         """Which measurements (n,) are differences of arrival."""
         return np.asarray((self.rows >= len(self.ranges)) | self.ranges.differences[self.exchange])
-
-
-def apart(own: Sequence[int]) -> Callable[[Ints], Bools]:
-    """Return a function that tells which pairs of tags (..., 2) have one of some `own` tags and another one."""
-
-    def told(ends: Ints) -> Bools:
-        inside = np.isin(ends, own)
-        return np.asarray(inside[..., 0] ^ inside[..., 1])
-
-    return told
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -205,37 +212,29 @@ def problems(flight: Flight) -> list[Problem]:
     """Return a problem for every body of a flight that moves, and ranges or listens while its place is known."""
     found = []
     for body in flight.moving_bodies():
-        mine = [tag.tag for tag in flight.tags if tag.body == body]
-        unknown = apart(mine)
-        measured = Measurements.of(ranges_about(flight.ranges, mine), unknown)
+        measured, others = Measurements.of_body(flight.ranges, [tag.tag for tag in flight.tags if tag.body == body])
         if not len(measured):
             continue
-        ends, sign, time, free = measured.ends, measured.sign, measured.time_ns, unknown(measured.ends)
-        place, sides, first = bodies_m(flight.poses, body, time), np.moveaxis(ends, 2, 0), np.isin(ends[..., 0], mine)
+        time, shape = measured.time_ns, measured.sign.shape
+        place = bodies_m(flight.poses, body, time)
         antenna, away = (
-            antennas_m(flight.poses, flight.tags, ids.ravel(), np.repeat(time, sign.shape[1])).reshape(*sign.shape, 3)
-            for ids in np.where(first, sides, sides[::-1])
+            antennas_m(flight.poses, flight.tags, ids.ravel(), np.repeat(time, shape[1])).reshape(*shape, 3)
+            for ids in np.moveaxis(measured.ends, 2, 0)
         )
         problem = Problem(
-            **(measured.to_dict() | {"sign": np.where(free, sign, 0.0)}),
+            **measured.to_dict(),
             ranges=measured.ranges,
             body=body,
             attitude=nearest_attitude(flight.poses, body, time),
             place=place,
             arm=antenna - place[:, None],
             other=away,
-            known_m=np.sum(np.where(free, 0.0, sign * np.linalg.norm(antenna - away, axis=2)), axis=1),
+            known_m=np.sum(others * np.linalg.norm(antenna - away, axis=2), axis=1),
         )
         known = np.flatnonzero(np.isfinite(problem.arm + problem.other).all(axis=(1, 2)))
         if len(known):
             found.append(problem[known])
     return found
-
-
-def pair_numbers(ends: Ints) -> Ints:
-    """Return the numbers, from 0, of the pairs of tags (n, k) that are the ends (n, k, 2) of distances."""
-    pairs = ends.min(axis=2) * 2**16 + ends.max(axis=2)
-    return np.asarray(np.unique(pairs, return_inverse=True)[1]).reshape(pairs.shape)
 
 
 def ranges_among(ranges: Ranges, tags: list[int]) -> Ranges:
@@ -258,7 +257,7 @@ def used_part(ranges: Ranges, use: str) -> Ranges:
     return replace(ranges, arrivals=None)
 
 
-def ranges_about(ranges: Ranges, tags: list[int]) -> Ranges:
+def ranges_about(ranges: Ranges, tags: Sequence[int]) -> Ranges:
     """Return the ranges of some tags with others, and those that these or others overheard, with their arrivals."""
     needed, heard = np.isin(ranges.initiator, tags) ^ np.isin(ranges.target, tags), ranges.arrivals
     needed |= np.isin(ranges.listener, tags)
