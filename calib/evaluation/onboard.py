@@ -38,7 +38,7 @@ from calib.evaluation.filters import (
     squared_over,
     without_directions,
 )
-from calib.evaluation.localization import MeasuredReceptions, delay_line, delays_json, with_delays
+from calib.evaluation.localization import MeasuredReceptions, delay_lines, delays_json, with_delays
 from calib.evaluation.tracking import (
     PATIENCE_S,
     FilterRanges,
@@ -334,7 +334,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
     """Process ranges, steps and heights in order of time, and return the track of the likeliest heading."""
     (first, running), known = _begin(one, settings), one.measured
     now = heard = float(one.time_s[first])
-    states, updates, restarts, exchange = list[Any](), list[tuple[float, float, bool]](), list[float](), -1
+    states, updates, restarts, exchange = list[Any](), list[tuple[float, float, bool, bool]](), list[float](), -1
     unexplained_s, numbers = 0.0, np.column_stack([known.measured_m, known.std_m]).tolist()
     *_, common, _, slopes = side_by_side([known])
     shared = np.column_stack([common, slopes[:, 0]])
@@ -356,7 +356,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
             geometry = one.arm_m[number], one.anchor_m[number], one.sign[number]
             more = shared[number], one.patterns[number]
             update = running.update_range(measured, noise_m, one.errors.at(number), *geometry, *more)
-            updates.append((now, float(update.nis[best]), bool(update.believed[best])))
+            updates.append((now, float(update.nis[best]), bool(update.believed[best]), bool(running.drift[best])))
             # As in `tracking.run_filters`, but explained ranges earn no trust: this filter drifts.
             lasted_s = min(now - heard, settings.reopen_s / 2 / MIN_RANGES_PER_FIX)
             unexplained_s = max(unexplained_s + (lasted_s if update.nis[best] > GATE else -lasted_s / 3), 0.0)
@@ -373,7 +373,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         return one.began_ns + np.rint(np.array(seconds) * 1e9).astype(np.int64)
 
     times, places, attitudes, covariances = zip(*states, strict=True)
-    heard_s, nis, accepted = zip(*updates, strict=True)
+    heard_s, nis, accepted, drifts = zip(*updates, strict=True)
     time_ns, place, covariance = nanoseconds(times), np.array(places), np.array(covariances)
     truth, turned = np.full_like(place, np.nan), np.full((len(place), 4), np.nan)
     if one.truth is not None:
@@ -401,6 +401,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         range_time_ns=nanoseconds(heard_s),
         nis=np.array(nis),
         accepted=np.array(accepted),
+        drifts=np.array(drifts),
         restarts_s=tuple(restarts),
         delays=running.delays_at((best,), known.delays, drift=running.drift[best]),
     )
@@ -434,7 +435,7 @@ def onboard_text(found: list[OnboardTrack], settings: OnboardSettings) -> str:
         if settings.model == "imu"
         else f"velocity wanders by {noise.acceleration:g} m/s^2 a root of Hz"
     )
-    lines += [delay_line(f"{one.source} {one.body}", one.delays) for one in found if one.delays]
+    lines += [line for one in found for line in delay_lines(f"{one.source} {one.body}", one)]
     return "\n".join([*lines, f"used: {found[0].used}; process noise: {moves}, speed about {settings.speed_m_s:g} m/s"])
 
 
@@ -451,7 +452,7 @@ def onboard_json(found: list[OnboardTrack]) -> list[dict[str, Any]]:
             "nis": float(np.mean(one.nis)),
             "believed": float(np.mean(one.accepted)),
             "restarts_s": list(one.restarts_s),
-            **delays_json(one.delays),
+            **delays_json(one),
         }
         for one in found
     ]

@@ -37,7 +37,7 @@ from calib.evaluation.filters import (
     squared_over,
     without_directions,
 )
-from calib.evaluation.localization import Localization, consistency, delay_line, delays_json, filter_ranges, fixed_std
+from calib.evaluation.localization import Localization, consistency, delay_lines, delays_json, filter_ranges, fixed_std
 from calib.evaluation.onboard import inertial_readings, mean_readings
 from calib.evaluation.tracking import (
     FilterRanges,
@@ -362,26 +362,24 @@ def _run(
         wrong = np.concatenate([truth[k] - place[k], turns.reshape(place[k].shape)], axis=-1)
         nees[k] = squared_over(wrong, covariance)
         std_m[k] = np.sqrt(np.trace(covariance[..., P, P], axis1=-2, axis2=-1))
-    drifts = choose_delays(known, density)
-    for f, better in drifts.items():
-        later = np.append(False, better)[firsts[1:]]
-        for fixed, some in ((~better, (nis, accepted)), (~later, (place, attitude, std_m, nees))):
-            for values in some:
-                values[fixed, f] = values[fixed, f - 1]
+    counts_for = choose_delays(known, density)
 
     def track(f: int, b: int) -> RelativeTrack:
-        used = uses[:, f]
+        rows = np.flatnonzero(uses[:, f])
+        measured = rows, counts_for[rows, f]
+        at = np.arange(len(time_ns)), counts_for[firsts[1:] - 1, f], b
         return RelativeTrack(
             time_ns=time_ns,
-            attitude=Rotation.from_matrix(attitude[:, f, b]).as_quat(),
-            estimate_m=place[:, f, b],
+            attitude=Rotation.from_matrix(attitude[at]).as_quat(),
+            estimate_m=place[at],
             truth_m=truth[:, b],
             true_attitude=np.where(np.isfinite(truth[:, b, :1]), Rotation.from_matrix(turned[:, b]).as_quat(), np.nan),
-            std_m=std_m[:, f, b],
-            nis=nis[used, f],
-            nees=nees[:, f, b],
-            accepted=accepted[used, f],
-            delays=running.delays_at((f,), known[f].delays, drift=f in drifts and drifts[f][-1]),
+            std_m=std_m[at],
+            nis=nis[measured],
+            nees=nees[at],
+            accepted=accepted[measured],
+            drifts=counts_for[rows, f] == f,
+            delays=running.delays_at((f,), known[f].delays, drift=counts_for[-1, f] == f),
         )
 
     return {body: {name: track(f, b) for f, name in enumerate(filters)} for b, body in enumerate(team.bodies[:-1])}
@@ -406,7 +404,7 @@ def team_text(found: list[RelativePose], settings: TeamSettings) -> str:
         f"fixed standard deviations, {fixed.source}: raw {fixed.std_m['raw']:.3f} m, calibrated "
         f"{fixed.std_m['calibrated']:.3f} m; NEES should be {RelativeTrack.DEGREES}",
     ]
-    lines += [delay_line(found[0].source, found[0].delays)] if found[0].delays else []
+    lines += delay_lines(found[0].source, found[0].tracks.get("online"))
     for end, less in _reductions(rows).items():
         changes = ", ".join(f"{name} {-100 * share:+.0f} %" for name, share in less.items())
         lines.append(f"position errors by listening, against {end}: {changes}; arXiv 2304.03837: up to -48 %")
@@ -417,7 +415,7 @@ def team_json(found: list[RelativePose]) -> dict[str, Any]:
     """Return what `calib localize --model team --json` prints: figures by body and filter, and their means."""
     rows = [
         {"recording": one.source, "body": one.body, "reference": one.reference, "filters": for_json(_figures([one]))}
-        | delays_json(one.delays)
+        | delays_json(one.tracks.get("online"))
         for one in found
     ]
     summary = _figures(found)

@@ -76,7 +76,8 @@ class Track:
     `std_m` (n,) is the standard deviation by the filter itself: the root of the sum of its three variances. `nees` (n,)
     are the squared errors over their covariance, which should be `DEGREES`. Truth and `nees` are NaN where poses do not
     say. `nis` (measurements,) are the squared innovations over their variance, and `accepted` (measurements,) which are
-    within the gate. `delays` are those at the end and their standard deviations by tag, in ns, where they are states.
+    within the gate. `delays` are those at the end and their standard deviations by tag, in ns, where they are states:
+    `drifts` (measurements,) then tells where delays that drift were likelier than those of the calibration.
     """
 
     DEGREES: ClassVar[int] = 3
@@ -89,6 +90,7 @@ class Track:
     nis: Floats
     nees: Floats
     accepted: Bools
+    drifts: Bools
     delays: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
     @property
@@ -351,20 +353,20 @@ def delay_states(filters: Sequence[FilterRanges]) -> DelayStates:
     return next((one.delays for one in filters if one.delays.tags), FIXED_DELAYS)
 
 
-def choose_delays(known: Sequence[FilterRanges], log_density: Floats) -> dict[int, Bools]:
-    """Return by filter with delays as states at which measurements (n, ...) it is likelier than the one before it,
-    which is the same with fixed delays.
+def choose_delays(known: Sequence[FilterRanges], log_density: Floats) -> Ints:
+    """Return which filter counts for each after each measurement (n, filters, ...), by their numbers.
 
-    `log_density` (n, filters, ...) is that of innovations. Neither filter falls below a probability of a thousandth, so
-    that delays may begin to drift late in a flight.
+    A filter with delays as states gives way to the one before it, the same with fixed delays, where that is likelier.
+    `log_density` (n, filters, ...) is that of innovations. Neither falls below a probability of a thousandth, so that
+    delays may begin to drift late in a flight.
     """
-    found = {}
+    found = np.zeros(log_density.shape, dtype=np.int64)
+    np.moveaxis(found, 1, -1)[:] = np.arange(len(known))
     for f in (f for f, one in enumerate(known) if one.delays.tags):
-        gains = log_density[:, f] - log_density[:, f - 1]
-        found[f], odds = np.empty(gains.shape, dtype=bool), np.zeros(gains.shape[1:])
-        for k, gain in enumerate(gains):
+        odds = np.zeros(log_density.shape[2:])
+        for k, gain in enumerate(log_density[:, f] - log_density[:, f - 1]):
             odds = np.clip(odds + gain, -np.log(1000), np.log(1000))
-            found[f][k] = odds > 0
+            found[k, f] -= odds <= 0
     return found
 
 
@@ -430,23 +432,22 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
         density[k] = update.log_density
         std_m[k] = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
         nees[k] = squared_over(estimate[k] - problem.place[k], covariance)
-    drifts = choose_delays(known, density)
-    for f, better in drifts.items():
-        for some in (estimate, std_m, nis, nees, accepted):
-            some[:, f][~better] = some[:, f - 1][~better]
+    counts_for = choose_delays(known, density)
 
     def track(f: int, seed: int) -> Track:
+        own = np.arange(count), counts_for[:, f, seed], seed
         return Track(
             time_ns=problem.time_ns,
             attitude=problem.attitude,
-            estimate_m=estimate[:, f, seed],
+            estimate_m=estimate[own],
             truth_m=problem.place,
             true_attitude=problem.attitude,
-            std_m=std_m[:, f, seed],
-            nis=nis[:, f, seed],
-            nees=nees[:, f, seed],
-            accepted=accepted[:, f, seed],
-            delays=running.delays_at((f, seed), known[f].delays, drift=f in drifts and drifts[f][-1, seed]),
+            std_m=std_m[own],
+            nis=nis[own],
+            nees=nees[own],
+            accepted=accepted[own],
+            drifts=counts_for[:, f, seed] == f,
+            delays=running.delays_at((f, seed), known[f].delays, drift=counts_for[-1, f, seed] == f),
         )
 
     return {name: [track(f, seed) for seed in range(settings.seeds)] for f, name in enumerate(ranges)}
