@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.calibration.document import Celsius, Matrix, Metres, Number, StdM, Tags, joint
-from calib.errors import TemperatureWarning
-from uwblink.arrays import Floats
+from calib.errors import DirectionWarning, TemperatureWarning
+from uwblink.arrays import Bools, Floats
 from uwblink.display import first_few
 
 if TYPE_CHECKING:
@@ -143,6 +143,24 @@ def dependences_m(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Flo
         longer += values @ np.array(one.coefficients_m)
         variance += one.std_m(values) ** 2
     return longer, np.sqrt(variance)
+
+
+def lack_direction(calibration: Calibration, ranges: Ranges) -> Bools:
+    """Return which ranges (n,) have an end with a pattern over direction whose direction is not known."""
+    tags = [tag for one in calibration.patterns for tag in one.tags]
+    ends = np.column_stack([ranges.initiator, ranges.target])
+    return np.asarray((np.isin(ends, tags) & np.isnan(ranges.toward).any(axis=2)).any(axis=1))
+
+
+def warn_of_directions(lacking: int, count: int, source: str) -> None:
+    """Give a `DirectionWarning` where some of `count` ranges are `lacking` directions that a calibration asks for."""
+    if lacking:
+        warnings.warn(
+            f"{source}: {100 * lacking / count:.3g} % of the ranges lack the directions that patterns depend on: they "
+            "are corrected without these, and their total sigma is larger",
+            DirectionWarning,
+            stacklevel=3,
+        )
 
 
 def warn_of_temperatures(calibration: Calibration, ranges: Ranges, beyond_k: float = 5.0) -> None:
