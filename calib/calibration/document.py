@@ -184,7 +184,7 @@ def _checker(
     return check
 
 
-def is_tag(text: object) -> bool:
+def is_tag_key(text: object) -> bool:
     """Whether a text is the id of a tag, as keys of calibrations are."""
     return isinstance(text, str) and text.isascii() and text.isdecimal() and len(text) < 9 and int(text) <= LARGEST_ID
 
@@ -192,7 +192,7 @@ def is_tag(text: object) -> bool:
 def is_pair(text: object) -> bool:
     """Whether a text names a pair of tags, as 1-2."""
     ends = str(text).split("-")
-    return len(ends) == 2 and all(map(is_tag, ends))
+    return len(ends) == 2 and all(map(is_tag_key, ends))
 
 
 def ends_of(name: str) -> tuple[int, int]:
@@ -272,7 +272,7 @@ Matrix = tuple[tuple[Number, ...], ...]
 
 Tags = tuple[Annotated[int, number(0, LARGEST_ID, "the id of a tag", int)], ...]
 Split = tuple[Tags, Tags]
-TagKey = Annotated[int, expect("tag ids as keys", is_tag, int)]
+TagKey = Annotated[int, expect("tag ids as keys", is_tag_key, int)]
 PairKey = Annotated[
     tuple[int, int], expect("two tag ids as keys, as in 1-2", is_pair, ends_of), PlainSerializer(pair_name)
 ]

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.calibration.applying import keep_determined
 from calib.calibration.document import for_json
+from calib.calibration.error_model import GATE
 from calib.calibration.model import CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, load_flight, require_times
@@ -86,7 +87,7 @@ class TeamSettings(CheckedSettings):
     start_std_deg: float = 3.0
     start_std_m_s: float = 0.1
     rate_hz: float = 50.0
-    gate: float = 10.83
+    gate: float = GATE
     seed: int = 0
     online: bool = False
     noise: ProcessNoise = field(default_factory=ProcessNoise)

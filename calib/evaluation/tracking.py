@@ -15,6 +15,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
+from calib.calibration.error_model import GATE
 from calib.data.ranges import Ranges
 from calib.data.sources import Flight, require_arrivals
 from calib.evaluation.filters import GaussianFilters, multilaterate, squared_over
@@ -46,14 +47,14 @@ class Settings(CheckedSettings):
     The velocity input comes at `velocity_rate_hz` with white noise of `velocity_std_mps` an axis; that is the process
     noise. Percentages depend on it: the noisier velocity, the more the ranges decide. Filters begin at the true place,
     but for noise of `initial_std_m` and an `initial_offset_m` that they do not know of. A range is taken when its
-    squared innovation over its variance is below `gate` (chi-square with one degree of freedom; 10.83 is its 99.9 %
-    quantile); the robust filter has no gate. A filter begins anew where its last ranges say (`multilaterate`) once the
-    time in which ranges were within the gate, 10 s at most, is used up by time in which they were not (half of it where
-    the robust filter takes them for reflected), and half of `reopen_s` besides. `seeds` are runs with other noise, each
-    body and flight with its own; tracks are those of the first, `seed`. `use` is "exchanges", a body's ranges, or
-    "receptions", with all that it overheard and others overheard of it. With `online` one more filter has delays as
-    states (`calib.online.DelayStates`) where these are likelier than fixed delays. Raises
-    `BadInputError` that names the setting.
+    squared innovation over its variance is below `gate` (the default is the 99.9 % quantile of chi-square with one
+    degree of freedom); the robust filter has no gate. A filter begins anew where its last ranges say (`multilaterate`)
+    once the time in which ranges were within the gate, 10 s at most, is used up by time in which they were not (half of
+    it where the robust filter takes them for reflected), and half of `reopen_s` besides. `seeds` are runs with other
+    noise, each body and flight with its own; tracks are those of the first, `seed`. `use` is "exchanges", a body's
+    ranges, or "receptions", with all that it overheard and others overheard of it. With `online` one more filter has
+    delays as states (`calib.online.DelayStates`) where these are likelier than fixed delays. Raises `BadInputError`
+    that names the setting.
     """
 
     velocity_std_mps: float = 0.3
@@ -61,7 +62,7 @@ class Settings(CheckedSettings):
     initial_std_m: float = 0.1
     initial_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     fixed_std_m: float | None = None
-    gate: float = 10.83
+    gate: float = GATE
     reopen_s: float = 1.0
     seed: int = 0
     seeds: int = 3
