@@ -3,6 +3,9 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # so that mypy follows other imports first
+    from calib import calibration as calibration
+    from calib import data as data
+    from calib import evaluation as evaluation
     from calib.calibration.applying import CorrectedRanges as CorrectedRanges
     from calib.calibration.comparison import compare as compare
     from calib.calibration.correction import apply as apply

@@ -27,6 +27,10 @@ class LeftOutWarning(PlainWarning):
     """Measurements that are not corrected: ranges of pairs that a calibration does not determine, differences."""
 
 
+class DirectionWarning(PlainWarning):
+    """Ranges whose directions are not known, of tags with a pattern over direction; names the recording."""
+
+
 class TemperatureWarning(PlainWarning):
     """Tags at temperatures at which a calibration was not fitted, or readings that are of none of them; names them."""
 

@@ -196,18 +196,11 @@ class DelayStates:
             raise BadInputError(
                 "the calibration has constants of pairs and no delays that could change; fit it with `constants` tag"
             )
-        known, metres_a_ns = calibration.uncertainty, 1e-9 * calibration.speed_of_light
-        std_ns = np.array([calibration.delays_std_ns.get(tag, math.nan) for tag in tags])
-        covariance = np.diag(np.where(np.isfinite(std_ns), std_ns, 0.0) ** 2)
-        if known is not None:
-            own = [known.tags.index(tag) for tag in tags if tag in known.tags]
-            rows = np.flatnonzero(np.isin(tags, known.tags))
-            covariance[np.ix_(rows, rows)] = np.array(known.delays_ns2)[np.ix_(own, own)]
         return cls(
             tags=tuple(tags),
-            covariance_m2=metres_a_ns**2 * covariance,
+            covariance_m2=(1e-9 * calibration.speed_of_light) ** 2 * calibration.covariance_ns2(tags),
             delays_ns=np.array([calibration.delays_ns.get(tag, math.nan) for tag in tags]),
-            std_ns=std_ns,
+            std_ns=np.array([calibration.delays_std_ns.get(tag, math.nan) for tag in tags]),
             walk_m=walk_m,
             speed_of_light=calibration.speed_of_light,
         )

@@ -118,7 +118,7 @@ def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationC
     rows = np.isin(common, tags)
     covariance = np.eye(len(tags))
     if len(stated) > 1:
-        covariance = sum(_covariance_ns2(c, stated) for c in both) + 1e-12 * np.eye(len(stated))
+        covariance = sum(c.covariance_ns2(stated) for c in both) + 1e-12 * np.eye(len(stated))
         covariance = covariance + moved_ns2[np.ix_(rows, rows)]
     # Most likely values of what is loose; what is left has a covariance of as many ranks less.
     precision = np.linalg.inv(covariance)
@@ -211,16 +211,3 @@ def _is_stated(calibration: Calibration, tag: int) -> bool:
     """Return whether a calibration states how well it knows a delay."""
     covered = calibration.uncertainty is not None and tag in calibration.uncertainty.tags
     return covered or np.isfinite(calibration.delays_std_ns.get(tag, np.nan))
-
-
-def _covariance_ns2(calibration: Calibration, tags: list[int]) -> Floats:
-    """Covariance of some tags' delays: as fitted where it is known, else from the standard errors alone."""
-    found = np.diag([calibration.delays_std_ns[tag] ** 2 for tag in tags])
-    known = calibration.uncertainty
-    if known is None:
-        return found
-    place = {tag: k for k, tag in enumerate(known.tags)}
-    rows = [k for k, tag in enumerate(tags) if tag in place]
-    inside = [place[tags[k]] for k in rows]
-    found[np.ix_(rows, rows)] = np.array(known.delays_ns2)[np.ix_(inside, inside)]
-    return found

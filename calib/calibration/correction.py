@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from calib.calibration.applying import CorrectedRanges, columns_of, determined, within_text
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration, load_calibration
+from calib.calibration.patterns import lack_direction, warn_of_directions
 from calib.data.arrivals import arrivals_of
 from calib.data.features import features_of
 from calib.data.ranges import Ranges
@@ -91,7 +92,8 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
         told = calibration.errors.features if calibration.errors else {}
         # A response may belong to an exchange of the block before.
         features = features_of(recording.exchanges(), RecordedSource(recording)) if told else None
-        tags, counts, left_out, why = recording.tags(), np.zeros(3, dtype=np.int64), 0, ""
+        # Corrected ranges, and of these the clamped ones, those without power, and those that lack a direction.
+        tags, counts, left_out, why = recording.tags(), np.zeros(4, dtype=np.int64), 0, ""
         meta = {"calibration": calibration.provenance}
         with recording.copying(output, without=("exchanges", "corrected"), meta=meta, force=force) as written:
             for exchanges, poses in exchanges_with_poses(recording):
@@ -105,14 +107,17 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
                 if not good.all():
                     left_out, why = left_out + int(np.count_nonzero(~good)), within_text(calibration, ranges, good)
                 if good.any():
-                    counts += _append(written, exchanges[good], calibration.apply(ranges[good]))
+                    lacking = int(np.count_nonzero(lack_direction(calibration, ranges[good])))
+                    counts += (*_append(written, exchanges[good], calibration.apply(ranges[good])), lacking)
             if left_out and not counts[0]:
                 raise BadInputError(why)
+    *applied, lacking = counts.tolist()
+    warn_of_directions(lacking, applied[0], Path(source).name)
     if left_out:
         warnings.warn(f"{why}; {left_out} ranges are left out", LeftOutWarning, stacklevel=3)
     if bare:
         warnings.warn(f"{bare} differences of arrival without stamps stay as they were", LeftOutWarning, stacklevel=3)
-    return Applied(*counts.tolist())
+    return Applied(*applied)
 
 
 def _append(written: Recording, exchanges: Exchanges, applied: CorrectedRanges) -> tuple[int, int, int]:

@@ -165,27 +165,26 @@ def one_of(allowed: Iterable[str]) -> PlainValidator:
 
 def expect(what: str, good: Callable[[Any], bool], kind: Callable[[Any], Any] = lambda value: value) -> PlainValidator:
     """Return the check of a value that is `good`, which errors call `what`; `kind` makes of it what is kept."""
+    return PlainValidator(_checker(good, f"expected {what}", kind))
 
+
+def joint(good: Callable[[Any], bool], mistake: str) -> AfterValidator:
+    """Return the check of a dataclass whose fields fit each other; errors state the `mistake` after the key's name."""
+    return AfterValidator(_checker(good, mistake))
+
+
+def _checker(
+    good: Callable[[Any], bool], mistake: str, kind: Callable[[Any], Any] = lambda value: value
+) -> Callable[[Any], Any]:
     def check(value: Any) -> Any:
         if not good(value):
-            raise ValueError(f"expected {what}")
+            raise ValueError(mistake)
         return kind(value)
 
-    return PlainValidator(check)
+    return check
 
 
-def joint(check: Callable[[Any], str]) -> AfterValidator:
-    """Return a check of values that must fit each other; `check` returns the mistake after the key's name, or ""."""
-
-    def checked(value: Any) -> Any:
-        if wrong := check(value):
-            raise ValueError(wrong)
-        return value
-
-    return AfterValidator(checked)
-
-
-def is_tag(text: object) -> bool:
+def is_tag_key(text: object) -> bool:
     """Whether a text is the id of a tag, as keys of calibrations are."""
     return isinstance(text, str) and text.isascii() and text.isdecimal() and len(text) < 9 and int(text) <= LARGEST_ID
 
@@ -193,7 +192,7 @@ def is_tag(text: object) -> bool:
 def is_pair(text: object) -> bool:
     """Whether a text names a pair of tags, as 1-2."""
     ends = str(text).split("-")
-    return len(ends) == 2 and all(map(is_tag, ends))
+    return len(ends) == 2 and all(map(is_tag_key, ends))
 
 
 def ends_of(name: str) -> tuple[int, int]:
@@ -273,7 +272,7 @@ Matrix = tuple[tuple[Number, ...], ...]
 
 Tags = tuple[Annotated[int, number(0, LARGEST_ID, "the id of a tag", int)], ...]
 Split = tuple[Tags, Tags]
-TagKey = Annotated[int, expect("tag ids as keys", is_tag, int)]
+TagKey = Annotated[int, expect("tag ids as keys", is_tag_key, int)]
 PairKey = Annotated[
     tuple[int, int], expect("two tag ids as keys, as in 1-2", is_pair, ends_of), PlainSerializer(pair_name)
 ]

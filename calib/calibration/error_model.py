@@ -81,11 +81,10 @@ class FeatureSlope:
     bounds: tuple[Number, Number]
 
 
-def _wrong_bounds(slope: FeatureSlope) -> str:
-    return "" if slope.bounds[0] <= slope.bounds[1] else "bounds: expected the lower before the upper"
-
-
-CheckedFeature = Annotated[FeatureSlope, joint(_wrong_bounds)]
+CheckedFeature = Annotated[
+    FeatureSlope,
+    joint(lambda slope: slope.bounds[0] <= slope.bounds[1], "bounds: expected the lower before the upper"),
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -312,13 +311,14 @@ def _with_odds(factors: Floats, log_odds: Floats | float) -> Floats:
     return np.asarray(factors + more)
 
 
-def _mistake(model: ErrorModel) -> str:
+def _nodes_fit(model: ErrorModel) -> bool:
     sizes = len(model.lifted) == len(model.noise_m) == len(model.tail_share) > 1
-    good = sizes and all(one < two for one, two in pairwise(model.lifted))
-    return "" if good else "lifted: expected ascending powers, with as many noises and shares"
+    return sizes and all(one < two for one, two in pairwise(model.lifted))
 
 
-CheckedErrors = Annotated[ErrorModel, joint(_mistake)]
+CheckedErrors = Annotated[
+    ErrorModel, joint(_nodes_fit, "lifted: expected ascending powers, with as many noises and shares")
+]
 
 
 def lasting_errors(ranges: Ranges, z: Floats, share: Floats, reflected: Floats) -> LastingErrors | None:

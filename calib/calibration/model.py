@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import PlainSerializer, TypeAdapter
+from pydantic import AfterValidator, PlainSerializer, TypeAdapter
 
 from calib.calibration.applying import (
     CorrectedArrivals,
@@ -37,7 +37,6 @@ from calib.calibration.document import (
     TagKey,
     Tags,
     expect,
-    joint,
     one_of,
     pair_name,
     read,
@@ -190,6 +189,19 @@ class Calibration:
             return math.nan
         own = np.isin(self.uncertainty.tags, list(tags))
         return math.sqrt(max(float(own @ np.array(self.uncertainty.delays_ns2) @ own), 0.0))
+
+    def covariance_ns2(self, tags: Sequence[int]) -> Floats:
+        """Return the covariance of some delays (tags, tags), zero where nothing is stated.
+
+        It is that of the fit where it is known, else has the squares of the standard errors alone.
+        """
+        std_ns = np.array([self.delays_std_ns.get(tag, math.nan) for tag in tags])
+        found = np.diag(np.where(np.isfinite(std_ns), std_ns, 0.0) ** 2)
+        if self.uncertainty is not None:
+            rows = np.flatnonzero(np.isin(tags, self.uncertainty.tags))
+            own = [self.uncertainty.tags.index(tag) for tag in tags if tag in self.uncertainty.tags]
+            found[np.ix_(rows, rows)] = np.array(self.uncertainty.delays_ns2)[np.ix_(own, own)]
+        return found
 
     @property
     def stopped(self) -> bool:
@@ -374,8 +386,8 @@ class Calibration:
         return read(_ADAPTER, text, where)
 
 
-def _misfit(calibration: Calibration) -> str:
-    """Return the mistake in splits, dependences or the sizes of covariance matrices, "" if there is none."""
+def _checked(calibration: Calibration) -> Calibration:
+    """Return a calibration; raises `ValueError` where splits, dependences or sizes of covariances do not fit."""
     parts = {
         "undetermined_splits": [tags for sides in calibration.undetermined_splits for tags in sides],
         "patterns": [one.tags for one in calibration.patterns],
@@ -384,11 +396,11 @@ def _misfit(calibration: Calibration) -> str:
     for key, some in parts.items():
         named = [tag for tags in some for tag in tags]
         if len(set(named)) < len(named) or not calibration.delays_ns.keys() >= set(named):
-            return f"{key}: expected calibrated tags, each of them once"
+            raise ValueError(f"{key}: expected calibrated tags, each of them once")
     age_line(calibration)
     known = calibration.uncertainty
     if known is None:
-        return ""
+        return calibration
     sizes = {
         "delays_ns2": len(known.tags),
         "bias_m2": len(calibration.bias_curve.coefficients),
@@ -398,11 +410,11 @@ def _misfit(calibration: Calibration) -> str:
         rows = getattr(known, name)
         # A variance of 0 may come out of a decomposition a little below 0.
         if len(rows) != size or any(len(row) != size or row[k] < -1e-9 for k, row in enumerate(rows)):
-            return f"uncertainty: {name}: expected {size} rows of {size} numbers, and no variance below 0"
-    return ""
+            raise ValueError(f"uncertainty: {name}: expected {size} rows of {size} numbers, and no variance below 0")
+    return calibration
 
 
-_ADAPTER: Final[TypeAdapter[Calibration]] = TypeAdapter(Annotated[Calibration, joint(_misfit)])
+_ADAPTER: Final[TypeAdapter[Calibration]] = TypeAdapter(Annotated[Calibration, AfterValidator(_checked)])
 
 
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:
@@ -523,8 +535,7 @@ def pattern_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 def temperature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
     """Return the tags of each slope over temperature, the slope, and its interval in words and where delays hold."""
-    told = calibration.provenance.get("temperature")
-    why = told.get("why") if isinstance(told, Mapping) else None
+    why = _sentence(calibration, "temperature", lambda told: told.get("why") or "", BadInputError)
     rows = [
         (
             first_few(map(str, one.tags)),
@@ -587,11 +598,18 @@ def rests_on(provenance: Mapping[str, Any]) -> str:
 
 def held_out_line(calibration: Calibration) -> str:
     """Return how a fit without the ranges that were held out did on them, "" where none were."""
-    told = calibration.provenance.get("held_out")
-    if not isinstance(told, Mapping):
+    return _sentence(calibration, "held_out", _held_out, BadInputError)
+
+
+def _sentence(
+    calibration: Calibration, key: str, told: Callable[[Mapping[str, Any]], str], error: type[Exception]
+) -> str:
+    """Return what is `told` of an entry of the provenance, "" without one; raises an error where it cannot be."""
+    entry = calibration.provenance.get(key)
+    if not isinstance(entry, Mapping):
         return ""
-    with raising(BadInputError, "provenance: held_out: not as `calib fit` writes it", KeyError, TypeError, ValueError):
-        return _held_out(told)
+    with raising(error, f"provenance: {key}: not as `calib fit` writes it", KeyError, TypeError, ValueError):
+        return told(entry)
 
 
 def _held_out(told: Mapping[str, Any]) -> str:
@@ -605,11 +623,7 @@ def _held_out(told: Mapping[str, Any]) -> str:
 
 def age_line(calibration: Calibration) -> str:
     """Return in how many days 95 % of delays change ranges by less than 2 cm, "" without several dated sessions."""
-    told = calibration.provenance.get("drift")
-    if not isinstance(told, Mapping):
-        return ""
-    with raising(ValueError, "provenance: drift: not as `calib fit` writes it", KeyError, TypeError, ValueError):
-        return _age(told)
+    return _sentence(calibration, "drift", _age, ValueError)
 
 
 def _age(told: Mapping[str, Any]) -> str:

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.calibration.document import Celsius, Matrix, Metres, Number, StdM, Tags, joint
-from calib.errors import TemperatureWarning
-from uwblink.arrays import Floats
+from calib.errors import DirectionWarning, TemperatureWarning
+from uwblink.arrays import Bools, Floats
 from uwblink.display import first_few
 
 if TYPE_CHECKING:
@@ -34,13 +34,6 @@ def harmonics(toward: Floats | NDArray[np.float32]) -> Floats:
     first = np.sqrt(3) * np.array([x, y, z])
     second = np.sqrt(15) * np.array([x * y, y * z, x * z, (x * x - y * y) / 2, (z * z - 1 / 3) * np.sqrt(3) / 2])
     return np.asarray(np.concatenate([first, second]).T)
-
-
-def _misfit(pattern: Pattern) -> str:
-    sizes = {len(pattern.coefficients_m), len(pattern.centre), *map(len, pattern.covariance_m2)}
-    rows = pattern.covariance_m2
-    good = sizes == {HARMONICS} and len(rows) == HARMONICS and all(row[k] >= 0 for k, row in enumerate(rows))
-    return "" if good else f"expected {HARMONICS} coefficients and centres, and as many rows and columns of covariance"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +61,16 @@ class Pattern:
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-CheckedPattern = Annotated[Pattern, joint(_misfit)]
+def _sizes_fit(pattern: Pattern) -> bool:
+    rows = pattern.covariance_m2
+    sizes = {len(pattern.coefficients_m), len(pattern.centre), len(rows), *map(len, rows)}
+    return sizes == {HARMONICS} and all(row[k] >= 0 for k, row in enumerate(rows))
+
+
+CheckedPattern = Annotated[
+    Pattern,
+    joint(_sizes_fit, f"expected {HARMONICS} coefficients and centres, and as many rows and columns of covariance"),
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,11 +117,10 @@ class TemperatureSlope:
         return np.asarray(self.std_m_per_k * np.abs(values[:, 0]))
 
 
-def _wrong_span(slope: TemperatureSlope) -> str:
-    return "" if slope.span_c[0] <= slope.span_c[1] else "span_c: expected the lowest before the highest"
-
-
-CheckedSlope = Annotated[TemperatureSlope, joint(_wrong_span)]
+CheckedSlope = Annotated[
+    TemperatureSlope,
+    joint(lambda slope: slope.span_c[0] <= slope.span_c[1], "span_c: expected the lowest before the highest"),
+]
 
 
 def dependences_m(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Floats]:
@@ -142,6 +143,24 @@ def dependences_m(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Flo
         longer += values @ np.array(one.coefficients_m)
         variance += one.std_m(values) ** 2
     return longer, np.sqrt(variance)
+
+
+def lack_direction(calibration: Calibration, ranges: Ranges) -> Bools:
+    """Return which ranges (n,) have an end with a pattern over direction whose direction is not known."""
+    tags = [tag for one in calibration.patterns for tag in one.tags]
+    ends = np.column_stack([ranges.initiator, ranges.target])
+    return np.asarray((np.isin(ends, tags) & np.isnan(ranges.toward).any(axis=2)).any(axis=1))
+
+
+def warn_of_directions(lacking: int, count: int, source: str) -> None:
+    """Give a `DirectionWarning` where some of `count` ranges are `lacking` directions that a calibration asks for."""
+    if lacking:
+        warnings.warn(
+            f"{source}: {100 * lacking / count:.3g} % of the ranges lack the directions that patterns depend on: they "
+            "are corrected without these, and their total sigma is larger",
+            DirectionWarning,
+            stacklevel=3,
+        )
 
 
 def warn_of_temperatures(calibration: Calibration, ranges: Ranges, beyond_k: float = 5.0) -> None:

@@ -95,19 +95,19 @@ class Curve:
         return np.asarray(np.abs(np.where(away < 0, ends[1] - ends[0], ends[3] - ends[2]) / step * away))
 
 
-def _curve_mistake(curve: Curve) -> str:
+def _is_spline(curve: Curve) -> bool:
     fits = len(curve.knots) == len(curve.coefficients) + curve.degree + 1 and list(curve.knots) == sorted(curve.knots)
-    good = fits and len(curve.coefficients) > curve.degree and curve.range[0] < curve.range[1]
-    return "" if good else "knots, coefficients, degree, range do not fit"
+    return fits and len(curve.coefficients) > curve.degree and curve.range[0] < curve.range[1]
 
 
-def _negative(curve: Curve) -> str:
-    good = min(curve.coefficients) >= 0 or bool(np.all(curve(np.linspace(*curve.range, 200)) >= 0))
-    return "" if good else "coefficients: expected a standard deviation that is nowhere below 0 m"
-
-
-BiasCurve = Annotated[Curve, joint(_curve_mistake)]
-SigmaCurve = Annotated[BiasCurve, joint(_negative)]
+BiasCurve = Annotated[Curve, joint(_is_spline, "knots, coefficients, degree, range do not fit")]
+SigmaCurve = Annotated[
+    BiasCurve,
+    joint(
+        lambda curve: min(curve.coefficients) >= 0 or bool(np.all(curve(np.linspace(*curve.range, 200)) >= 0)),
+        "coefficients: expected a standard deviation that is nowhere below 0 m",
+    ),
+]
 
 
 def flat_curve(value_m: float, span: tuple[float, float]) -> Curve:

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 import calib
+import uwblink
 from calib.cli.shared import (
     STOPPED,
     NewCalibration,
@@ -114,8 +115,6 @@ def fit(
 
 def _print_fit(result: calib.FitResult, output: Path, *, as_json: bool) -> None:
     """Print what was fitted and the warnings; end with another status where the fit stopped before it settled."""
-    from calib.calibration import held_out_line
-
     found, left_out = result.calibration, result.ranges.excluded.items()
     if as_json:
         typer.echo(found.to_json(), nl=False)
@@ -125,7 +124,7 @@ def _print_fit(result: calib.FitResult, output: Path, *, as_json: bool) -> None:
         used = f"{found.provenance['exchanges']} exchanges{also}"
         typer.echo(f"{output}: {used}, {result.message}, scale {found.scale_ns:.3f} ns")
         lines = [*delay_lines(found), *(f"  left out: {number} exchanges, {reason}" for reason, number in left_out)]
-        typer.echo("\n".join(filter(str.strip, [*lines, f"  {held_out_line(found)}"])))
+        typer.echo("\n".join(filter(str.strip, [*lines, f"  {calib.calibration.held_out_line(found)}"])))
         for warning in result.warnings:
             warn(warning)
     if not result.success:
@@ -157,12 +156,12 @@ def _fit_from_ranges(
 
 def delay_lines(found: calib.Calibration) -> list[str]:
     """Return a line per pair with a constant, per tag, per pattern and per slope, each with its 95 % interval."""
-    from calib.calibration import delay_rows, pair_rows, pattern_rows, temperature_rows
-
-    lines = [f"  pair {pair:>7}  ranges {value} cm too long  {interval}" for pair, value, interval in pair_rows(found)]
-    lines += [f"  tag {tag:>3}  delay {value} ns  {interval}" for tag, value, interval in delay_rows(found)]
-    lines += [f"  tags {tags}  {rms} cm rms over direction, {most}" for tags, rms, most in pattern_rows(found)]
-    return lines + [f"  tags {tags}  {slope} over temperature, {more}" for tags, slope, more in temperature_rows(found)]
+    tables = calib.calibration
+    lines = [f"  pair {pair:>7}  ranges {cm} cm too long  {interval}" for pair, cm, interval in tables.pair_rows(found)]
+    lines += [f"  tag {tag:>3}  delay {value} ns  {interval}" for tag, value, interval in tables.delay_rows(found)]
+    lines += [f"  tags {tags}  {rms} cm rms over direction, {most}" for tags, rms, most in tables.pattern_rows(found)]
+    slopes = tables.temperature_rows(found)
+    return lines + [f"  tags {tags}  {slope} over temperature, {more}" for tags, slope, more in slopes]
 
 
 def add_tag(
@@ -214,9 +213,8 @@ def survey(
             result.save_picture(plot, force=force)
     result.save(output, force=force)
     if report:
-        from calib.report import origin_of, write_survey_report
-
-        write_survey_report(report, result.calibration, origin=origin_of(recordings, command_line()), force=force)
+        origin = calib.report.origin_of(recordings, command_line())
+        calib.report.write_survey_report(report, result.calibration, origin=origin, force=force)
     if as_json:
         typer.echo(json.dumps(_survey_figures(result), indent=1))
         return
@@ -265,18 +263,16 @@ def show(
     calibration: Annotated[Path, typer.Argument(help="Calibration to show (.json).")], as_json: AsJson = False
 ) -> None:
     """Print a calibration: delays, curves, the data of its fit, and its limits."""
-    from calib.calibration import age_line, rests_on
-
     known = calib.load_calibration(calibration)
     if as_json:
         typer.echo(known.to_json(), nl=False)
         return
-    made, distances = known.provenance, rests_on(known.provenance)
+    made, distances = known.provenance, calib.calibration.rests_on(known.provenance)
     told = {name: made.get(name) for name in ("fitted", "gauge", "recordings", "settings")}
     lines = [
         *(f"{name}: {_listed(value)}" for name, value in told.items() if value),
         *([f"distances: {distances}"] if distances else _survey_lines(made.get("rests_on"))),
-        *([f"age: {age}"] if (age := age_line(known)) else []),
+        *([f"age: {age}"] if (age := calib.calibration.age_line(known)) else []),
     ]
     warnings = (f"warning: {with_flags(str(text))}" for text in made.get("warnings", []))
     typer.echo("\n".join([repr(known), *(f"  {line}" for line in lines), *warnings]))
@@ -308,12 +304,10 @@ def sample(
     force: Force = False,
 ) -> None:
     """Write a small flight with known delays, to try the other commands with; no simulator is needed for it."""
-    from uwblink import Contents
-
     check_output(output, force=force, recording=True)
     seed = 1 if seed is None else seed
     flight = calib.sample_flight(count, seed=seed, anchors=with_anchors)
     meta = {"planted": flight.planted, "source": "sample", "seed": seed}
-    contents = Contents(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags, meta=meta)
+    contents = uwblink.Contents(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags, meta=meta)
     contents.save(output, force=force)
     typer.echo(f"{output}: {count} exchanges of tags {', '.join(str(tag.tag) for tag in flight.tags)}, known delays")

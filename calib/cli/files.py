@@ -8,6 +8,7 @@ from typing import Annotated, Final
 import typer
 
 import calib
+import uwblink
 from calib.cli.shared import known_calibration, warn
 from uwblink.cli.shared import CalibrationFile, Force, Group, add, choice, epilog, output, waiting
 
@@ -22,9 +23,7 @@ imports = typer.Typer(
 
 
 def _exporters() -> list[str]:
-    from uwblink.exporters import EXPORTERS
-
-    return list(EXPORTERS)
+    return list(uwblink.exporters.EXPORTERS)
 
 
 def add_to(app: typer.Typer) -> None:
@@ -85,13 +84,11 @@ def export(
     force: Force = False,
 ) -> None:
     """Write a calibration as register values, CSV, MILUV's JSON, YAML for ROS or a C header."""
-    from calib.calibration import free_delays, programmed
-
-    registers = programmed(antenna_delays) if antenna_delays else None
+    registers = calib.calibration.programmed(antenna_delays) if antenna_delays else None
     known = known_calibration(calibration)
     text = calib.export(known, to, output, base=registers, force=force)
     # These forms hold delays without their standard errors, and all but MILUV's have the splits.
-    free = [tag for tag in free_delays(known) if to == "miluv" or tag not in known.sides]
+    free = [tag for tag in calib.calibration.free_delays(known) if to == "miluv" or tag not in known.sides]
     if free and to in ("miluv", "ros-yaml", "c-header"):
         warn(f"{to} does not say that the data leave the delay of tag {', '.join(map(str, free))} free")
     if output is None:
@@ -106,8 +103,6 @@ def import_miluv(
     force: Force = False,
 ) -> None:
     """Turn the calibration published with the MILUV dataset into one that apply and evaluate take."""
-    from calib.calibration import read_miluv
-
-    found = read_miluv(source)
+    found = calib.calibration.read_miluv(source)
     found.save(output, force=force)
     typer.echo(f"{output}: {len(found.delays_ns)} tags")

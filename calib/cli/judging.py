@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 from collections import ChainMap
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 import typer
 
 import calib
+import uwblink
 from calib.cli.shared import (
     STOPPED,
     Recordings,
@@ -25,9 +27,6 @@ from calib.cli.shared import (
 )
 from calib.settings import FitSettings, check_choice
 from uwblink.cli.shared import AsJson, CalibrationFile, Figures, Force, ReportFile, add, choice, output, waiting
-
-if TYPE_CHECKING:
-    from calib.evaluation import Evaluation
 
 
 def add_to(app: typer.Typer) -> None:
@@ -52,18 +51,14 @@ def evaluate(
     force: Force = False,
 ) -> None:
     """Compare raw, delay-corrected and fully corrected ranges with the true distances, in cm, pair by pair."""
-    from calib.calibration import keep_determined
-    from calib.data import load_each
-
     check_report(report, figures, force=force)
     known = known_calibration(calibration, recordings)
     with waiting("evaluating"):
-        parts = [keep_determined(known, part) for part in load_each(recordings, need_power=known.needs_power)]
+        loaded = calib.data.load_each(recordings, need_power=known.needs_power)
+        parts = [calib.calibration.keep_determined(known, part) for part in loaded]
         evaluation = calib.evaluate(parts, known)
         if report or figures:
-            from calib.report import origin_of
-
-            origin = origin_of([*recordings, calibration], command_line())
+            origin = calib.report.origin_of([*recordings, calibration], command_line())
             calib.write_report(report, parts, known, figures=figures, evaluation=evaluation, origin=origin, force=force)
     _warn_of_seen(evaluation)
     written = [f"report: {path}" for path in (report, figures) if path]
@@ -71,7 +66,7 @@ def evaluate(
     typer.echo(json.dumps(evaluation.to_dict(), indent=1) if as_json else text)
 
 
-def _warn_of_seen(evaluation: Evaluation) -> None:
+def _warn_of_seen(evaluation: calib.evaluation.Evaluation) -> None:
     """Warn where a calibration was judged on what it was fitted to."""
     if evaluation.seen:
         warn(
@@ -157,34 +152,31 @@ def localize(
     force: Force = False,
 ) -> None:
     """Track each moving body by its ranges or what it hears, with and without calibration, and print the RMSE in m."""
-    from calib.evaluation import IMUS, MODELS, write_tum
-
-    check_choice("model", model, MODELS)
-    check_choice("imu", imu, IMUS)
-    for option, models in OF_MODELS.items():
-        if model not in models:
-            refuse_given(context, [option], f"goes with `model` {' or '.join(models)}, not with {model}")
+    models = calib.evaluation.MODELS
+    check_choice("model", model, models)
+    check_choice("imu", imu, calib.evaluation.IMUS)
+    for option, own in OF_MODELS.items():
+        if model not in own:
+            refuse_given(context, [option], f"goes with `model` {' or '.join(own)}, not with {model}")
     check_report(None, figures, force=force)
     fields: dict[str, dict[str, Any]] = {
         "process_noise": {"velocity_std_mps": process_noise},
         "seeds": {"seeds": seeds},
-        "imu": {"noise": IMUS[imu]},
+        "imu": {"noise": calib.evaluation.IMUS[imu]},
         "start_std": dict(zip(("start_std_m", "start_std_deg", "start_std_m_s"), start_std, strict=True)),
     }
     used = [values for option, values in fields.items() if model in OF_MODELS[option]]
-    settings = MODELS[model].settings(use=use, online=online, **dict(ChainMap(*used)))
-    track = partial(MODELS[model].localize, **({} if training is None else {"training": training}))
+    settings = models[model].settings(use=use, online=online, **dict(ChainMap(*used)))
+    track = partial(models[model].localize, **({} if training is None else {"training": training}))
     known = known_calibration(calibration, recordings)
     with waiting("localizing"):
         found = [one for path in recordings for one in track(path, known, settings)]
         # The text first: where it cannot be made, nothing is written.
-        table, text = MODELS[model].table(found), MODELS[model].text(found, settings)
+        table, text = models[model].table(found), models[model].text(found, settings)
     if tum:
-        write_tum(found, tum, force=force)
+        calib.evaluation.write_tum(found, tum, force=force)
     if figures:
-        from calib.report import write_track_figures
-
-        write_track_figures(found, figures, force=force)
+        calib.report.write_track_figures(found, figures, force=force)
     typer.echo(json.dumps(table, indent=1) if as_json else text)
 
 
@@ -195,19 +187,14 @@ def doctor(
     as_json: AsJson = False,
 ) -> None:
     """Find faults in recordings, each with evidence and remedy, and compare the clocks of pairs."""
-    from dataclasses import asdict, replace
-
-    from calib.checks import examined_part
-    from uwblink import Recording
-    from uwblink.recording import clock_skews
 
     skews, looked_at = dict[str, list[Any]](), dict[str, str]()
     with waiting("examining"):
         found = calib.examine(recordings)
         for path in recordings:
-            with Recording.open(path) as recording:
-                skews[str(path)] = clock_skews(recording.exchange_blocks())
-                looked_at[str(path)] = examined_part(recording.count("exchanges"))
+            with uwblink.Recording.open(path) as recording:
+                skews[str(path)] = uwblink.recording.clock_skews(recording.exchange_blocks())
+                looked_at[str(path)] = calib.checks.examined_part(recording.count("exchanges"))
     parts = {name: part for name, part in looked_at.items() if part}
     findings = [replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in found]
     if as_json:
@@ -239,9 +226,7 @@ def compare(
     known = [known_calibration(path) for path in (first, second)]
     found = calib.compare(*known)
     if figures:
-        from calib.report import write_comparison_figures
-
-        write_comparison_figures(found, known, [first.stem, second.stem], figures, force=force)
+        calib.report.write_comparison_figures(found, known, [first.stem, second.stem], figures, force=force)
     text = found.table(str(first), str(second))
     typer.echo(json.dumps(found.to_dict(), indent=1) if as_json else text)
 
@@ -299,7 +284,7 @@ def report(
         raise typer.Exit(STOPPED)
 
 
-def _remarks(evaluation: Evaluation) -> Iterator[str]:
+def _remarks(evaluation: calib.evaluation.Evaluation) -> Iterator[str]:
     """Yield lines below the table: quantiles, coverage, errors against planted values."""
     group = evaluation.overall
     yield (

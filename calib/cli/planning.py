@@ -119,8 +119,6 @@ def _finish(
     """Write the page and the figures, and print the plan and the commands that follow it."""
     commands = list(following)
     if output or figures:
-        from calib.report import write_plan
-
-        write_plan(found, output, figures, commands=commands, force=force)
+        calib.report.write_plan(found, output, figures, commands=commands, force=force)
     text = "\n".join([str(found), "", "Commands, one after the other:", *(f"  {line}" for line in commands)])
     typer.echo(json.dumps(found.to_dict(), indent=1) if as_json else text)

@@ -67,9 +67,7 @@ def refuse_given(context: typer.Context, options: Iterable[str], why: str) -> No
 def check_report(report: Path | None, figures: Path | None, *, pdf: Path | None = None, force: bool) -> None:
     """Check the files of a report, if there are any, before anything is computed."""
     if report or figures:
-        from calib.report import check_places
-
-        check_places(report, pdf, figures, force=force)
+        calib.report.check_places(report, pdf, figures, force=force)
 
 
 def command_line() -> str:
@@ -82,12 +80,10 @@ def known_calibration(path: Path, recordings: Iterable[Path] = ()) -> calib.Cali
 
     Warns, too, where other antenna delays were programmed into the tags of recordings than where it was fitted.
     """
-    from calib.calibration import antenna_delays_warning
-
     known = calib.load_calibration(path)
     if known.stopped:
         warn(f"{path}: its fit stopped before it settled: delays and intervals are not final")
     for recording in recordings:
-        if warning := antenna_delays_warning(known, recording):
+        if warning := calib.calibration.antenna_delays_warning(known, recording):
             warn(f"{recording}: {path}: {warning}")
     return known

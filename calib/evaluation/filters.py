@@ -62,6 +62,7 @@ def multilaterate(
     starts = [middle, *(middle + 0.4 * reach * np.array(signs) for signs in product((-1, 1), repeat=3))]
     found = min((least_squares(misfit, start, loss="cauchy") for start in starts), key=lambda one: float(one.cost))
     slopes = np.asarray(found.jac, dtype=np.float64)
+    # A direction that ranges leave open counts as known to 30 m, about the size of a hall.
     return Fix(np.asarray(found.x), np.asarray(np.linalg.inv(slopes.T @ slopes + 1e-3 * np.eye(3))))
 
 
@@ -79,11 +80,13 @@ REST: Final = np.array([0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY_M_S2])
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProcessNoise:
-    """Process noise of the filter: accelerometer and gyro (per root of Hz), their biases, and motion without an IMU.
+    """Process noise of the filter: accelerometer `force` (m/s^2 per root of Hz) and `gyro` (rad/s per root of Hz).
 
-    The defaults are those of a consumer IMU on a small vibrating drone. `force_start` and `gyro_start` are the standard
-    deviations of the biases at the start, in m/s^2 and rad/s. `acceleration` (m/s^2 per root of Hz) is the
-    random walk of velocity without an IMU.
+    Their biases are random walks of `force_bias` (m/s^2 per root of a second) and `gyro_bias` (rad/s per root of a
+    second), which begin with standard deviations of `force_start` (m/s^2) and `gyro_start` (rad/s). The defaults are
+    those of a consumer IMU on a small vibrating drone. `acceleration` (m/s^2 per root of Hz) is the random walk of
+    velocity without an IMU. Readings of heights have noise of `height_m` (m), and an offset that is a random walk of
+    `height_offset` (m per root of a second).
     """
 
     force: float = 0.05

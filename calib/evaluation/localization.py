@@ -434,7 +434,7 @@ def localization_text(found: list[Localization], settings: Settings) -> str:
         f"with the calibrated variance: NIS {summary.nis:.2f} (1 expected, 95 % bounds {summary.nis_bounds[0]:.2f} to "
         f"{summary.nis_bounds[1]:.2f}), NEES {summary.nees:.2f} (3 expected, {summary.nees_bounds[0]:.2f} to "
         f"{summary.nees_bounds[1]:.2f}), {100 * summary.accepted:.1f} % of the ranges pass the gate",
-        *(delay_line(f"{one.source} {one.body}", one.delays) for one in found if one.delays),
+        *(line for one in found for line in delay_lines(f"{one.source} {one.body}", one.tracks.get("online"))),
     ]
     if arrivals := sum(one.arrivals for one in found):
         every = sum(len(one.tracks["raw"].time_ns) for one in found)
@@ -454,23 +454,33 @@ def localization_json(found: list[Localization]) -> dict[str, Any]:
             "fixed_std_source": one.fixed.source,
             "simulated": one.simulated,
             "arrivals": one.arrivals,
-            **delays_json(one.delays),
+            **delays_json(one.tracks.get("online")),
         }
         for one in found
     ]
     return {"scenarios": rows, "summary": for_json(asdict(summarize(found)))}
 
 
-def delay_line(title: str, delays: Mapping[int, tuple[float, float]]) -> str:
-    """Return the delays at the end of a flight on a line, with 95 % intervals."""
-    each = ", ".join(f"{tag}: {delay:+.3f} {interval(std, 3)}" for tag, (delay, std) in delays.items())
-    return f"delays at the end of {printable(title)} (ns): {each}"
+def delay_lines(title: str, track: Track | None) -> list[str]:
+    """Return a line with delays at the end of a track and 95 % intervals, and one that says where fixed delays are
+    likelier; none where delays are no states."""
+    if track is None or not track.delays:
+        return []
+    each = ", ".join(f"{tag}: {delay:+.3f} {interval(std, 3)}" for tag, (delay, std) in track.delays.items())
+    kind, share = "drifting" if track.drifts[-1] else "fixed", 100 * float(np.mean(track.drifts))
+    return [
+        f"delays at the end of {printable(title)} (ns): {each}",
+        f"  {kind} delays are likelier at its end, drifting ones after {share:.0f} % of the measurements",
+    ]
 
 
-def delays_json(delays: Mapping[int, tuple[float, float]]) -> dict[str, Any]:
-    """Return delays at the end as JSON has them; nothing where they are no states."""
-    rows = {str(tag): {"delay_ns": one, "std_ns": for_json(std)} for tag, (one, std) in delays.items()}
-    return {"delays": rows} if rows else {}
+def delays_json(track: Track | None) -> dict[str, Any]:
+    """Return delays at the end, and the share of measurements at which drifting ones are likelier, as JSON has them;
+    nothing where they are no states."""
+    if track is None or not track.delays:
+        return {}
+    rows = {str(tag): {"delay_ns": one, "std_ns": for_json(std)} for tag, (one, std) in track.delays.items()}
+    return {"delays": rows, "drifting": float(np.mean(track.drifts))}
 
 
 def write_tum(found: Sequence[Localization | OnboardTrack], folder: Path, *, force: bool = False) -> None:

@@ -38,15 +38,13 @@ from calib.evaluation.filters import (
     squared_over,
     without_directions,
 )
-from calib.evaluation.localization import MeasuredReceptions, delay_line, delays_json, with_delays
+from calib.evaluation.localization import MeasuredReceptions, delay_lines, delays_json, with_delays
 from calib.evaluation.tracking import (
     PATIENCE_S,
     FilterRanges,
     Measurements,
     Track,
-    apart,
     nearest_attitude,
-    ranges_about,
     ranges_among,
     side_by_side,
     used_part,
@@ -57,6 +55,7 @@ from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import bodies_m
 from uwblink.recording.schema import Poses
 from uwblink.settings import setting
+from uwblink.twr import names_in
 
 MIN_ANCHORS: Final = 3
 """Anchors of a fix: fewer leave the position ambiguous; a start needs one more, because three leave its mirror image.
@@ -151,8 +150,8 @@ def localize_onboard(
     return [_track(one, chosen) for one in _readings(data, calibration, chosen)]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Readings:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Readings(Measurements):
     """One body's: measurements (n,), inertial readings, heights.
 
     Of the k distances in a measurement `sign` (n, k) is 0 for those between anchors, which are taken off what is
@@ -161,13 +160,10 @@ class _Readings:
     axes of the body. `patterns` are those of measurements, the body at end 0. `truth` are its poses, or None.
     """
 
-    source: str
     body: str
     time_s: Floats
-    exchange: Ints
     measured: FilterRanges
     errors: RangeErrors
-    sign: Floats
     arm_m: Floats
     anchor_m: Floats
     imu_s: Floats
@@ -187,15 +183,10 @@ def _readings(data: Data, calibration: Calibration, settings: OnboardSettings) -
     name, (imu, heights) = flight.ranges.source, flight.sensors.values()
     poses, tags = flight.poses, flight.tags
     ranges = without_directions(used_part(keep_determined(calibration, flight.ranges), use))
-    places = {body: poses.position_m[poses.body == body] for body in np.unique(poses.body).tolist()}
-    still_m = 0.1  # poses of a body that stands still have some noise
-    anchors = {body: np.median(some, axis=0) for body, some in places.items() if np.ptp(some, axis=0).max() <= still_m}
-    fixed = {tag.tag: anchors[tag.body] + tag.lever_arm_m for tag in tags if tag.body in anchors}
-    turned = {
-        tag.tag: Rotation.from_quat(poses.quaternion[poses.body == tag.body][0]).as_matrix()
-        for tag in tags
-        if tag.body in anchors
-    }
+    anchors = {body: poses[poses.body == body] for body in set(names_in(poses.body)) - set(flight.moving_bodies())}
+    mounted = [tag for tag in tags if tag.body in anchors]
+    fixed = {tag.tag: np.median(anchors[tag.body].position_m, axis=0) + tag.lever_arm_m for tag in mounted}
+    turned = {tag.tag: Rotation.from_quat(anchors[tag.body].quaternion[0]).as_matrix() for tag in mounted}
     if len(fixed) < MIN_ANCHORS:
         raise UnanswerableError(
             f"{name}: {len(fixed)} tags stay in one place by its poses, at least {MIN_ANCHORS} are needed as "
@@ -206,43 +197,36 @@ def _readings(data: Data, calibration: Calibration, settings: OnboardSettings) -
     found = []
     for body in sorted({tag.body for tag in tags if tag.body not in anchors}):
         arms = {tag.tag: np.array(tag.lever_arm_m) for tag in tags if tag.body == body}
-        unknown = apart(list(arms))
-        some = ranges_about(ranges_among(ranges, [*arms, *fixed]), list(arms))
-        rows = Measurements.of(some, unknown)
+        rows, others = Measurements.of_body(ranges_among(ranges, [*arms, *fixed]), list(arms))
         if not len(rows):
             continue
-        free = np.where(unknown(rows.ends), rows.sign, 0.0)
         place = np.full((max(*arms, *fixed) + 1, 3), np.nan)
-        for tag, at in (fixed | arms).items():
-            place[tag] = at
-        first, second = np.moveaxis(place[rows.ends], 2, 0)
-        between_m = np.sum((rows.sign - free) * np.linalg.norm(first - second, axis=2), axis=1)
-        mine = np.isin(rows.ends[..., :1], list(arms))
-        own, other = (np.where(mine, *both) for both in ((first, second), (second, first)))
-        every, _, errors = MeasuredReceptions.of(some, calibration).robust(calibration)
+        place[[*fixed, *arms]] = [*fixed.values(), *arms.values()]
+        own, other = np.moveaxis(place[rows.ends], 2, 0)
+        between_m = np.sum(others * np.linalg.norm(own - other, axis=2), axis=1)
+        every, _, errors = MeasuredReceptions.of(rows.ranges, calibration).robust(calibration)
         imu_s, inertial = inertial_readings(imu, body, began)
         height_s, height = sensor_rows(heights, body, ("height_m",), began)
         known = poses.body == body
         found += [
             _Readings(
-                source=ranges.source,
+                **rows.to_dict(),
+                ranges=rows.ranges,
                 body=body,
                 time_s=np.asarray((rows.time_ns - began) * 1e-9, dtype=np.float64),
-                exchange=rows.exchange,
                 measured=replace(measured, measured_m=measured.measured_m - between_m),
                 errors=errors.at(rows.rows),
-                sign=free,
-                arm_m=own[np.arange(len(rows)), np.argmax(free != 0, axis=1)],
+                arm_m=own[np.arange(len(rows)), np.argmax(rows.sign != 0, axis=1)],
                 anchor_m=other,
                 imu_s=imu_s,
                 imu=inertial,
                 height_s=height_s,
                 height_m=height.ravel(),
-                patterns=end_patterns(calibration, np.where(mine, rows.ends, rows.ends[..., ::-1]), free, turned),
+                patterns=end_patterns(calibration, rows.ends, rows.sign, turned),
                 truth=poses[known] if known.any() else None,
                 began_ns=began,
             )
-            for kind in (every, *with_delays(every, some, calibration, online=settings.online).values())
+            for kind in (every, *with_delays(every, rows.ranges, calibration, online=settings.online).values())
             for measured in (kind.at(rows.rows),)
         ]
     if not found:
@@ -262,7 +246,9 @@ def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilt
     """Return the index of the range at which the filter starts, and the filter."""
     inertial, first = settings.model == "imu", 0
     if inertial and len(one.imu_s) < 2:
-        raise UnanswerableError(f"{one.source}: no inertial readings of {one.body}; choose the model constant-velocity")
+        raise UnanswerableError(
+            f"{one.ranges.source}: no inertial readings of {one.body}; choose the model constant-velocity"
+        )
     if settings.start_m is not None:
         fix = Fix(np.array(settings.start_m, dtype=np.float64), np.eye(3) * settings.start_std_m**2)
     else:
@@ -270,7 +256,9 @@ def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilt
         enough = (k for k in counts if _determined(one, np.arange(k)))
         first = next(enough, 0) - 1
         if first < 0:
-            raise UnanswerableError(f"{one.source}: {one.body} ranges with too few anchors for a start; give it one")
+            raise UnanswerableError(
+                f"{one.ranges.source}: {one.body} ranges with too few anchors for a start; give it one"
+            )
         fix = _fix(one, np.arange(first + 1), settings)
     near = np.abs(one.imu_s - float(one.time_s[first])) < 0.25  # s: the first tilt is that of half a second
     force = one.imu[near, 3:].mean(axis=0) if near.any() else np.array([0.0, 0.0, GRAVITY_M_S2])
@@ -346,7 +334,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
     """Process ranges, steps and heights in order of time, and return the track of the likeliest heading."""
     (first, running), known = _begin(one, settings), one.measured
     now = heard = float(one.time_s[first])
-    states, updates, restarts, exchange = list[Any](), list[tuple[float, float, bool]](), list[float](), -1
+    states, updates, restarts, exchange = list[Any](), list[tuple[float, float, bool, bool]](), list[float](), -1
     unexplained_s, numbers = 0.0, np.column_stack([known.measured_m, known.std_m]).tolist()
     *_, common, _, slopes = side_by_side([known])
     shared = np.column_stack([common, slopes[:, 0]])
@@ -368,7 +356,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
             geometry = one.arm_m[number], one.anchor_m[number], one.sign[number]
             more = shared[number], one.patterns[number]
             update = running.update_range(measured, noise_m, one.errors.at(number), *geometry, *more)
-            updates.append((now, float(update.nis[best]), bool(update.believed[best])))
+            updates.append((now, float(update.nis[best]), bool(update.believed[best]), bool(running.drift[best])))
             # As in `tracking.run_filters`, but explained ranges earn no trust: this filter drifts.
             lasted_s = min(now - heard, settings.reopen_s / 2 / MIN_RANGES_PER_FIX)
             unexplained_s = max(unexplained_s + (lasted_s if update.nis[best] > GATE else -lasted_s / 3), 0.0)
@@ -385,7 +373,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         return one.began_ns + np.rint(np.array(seconds) * 1e9).astype(np.int64)
 
     times, places, attitudes, covariances = zip(*states, strict=True)
-    heard_s, nis, accepted = zip(*updates, strict=True)
+    heard_s, nis, accepted, drifts = zip(*updates, strict=True)
     time_ns, place, covariance = nanoseconds(times), np.array(places), np.array(covariances)
     truth, turned = np.full_like(place, np.nan), np.full((len(place), 4), np.nan)
     if one.truth is not None:
@@ -399,7 +387,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         "height": settings.height and len(one.height_s) > 0,
     }
     return OnboardTrack(
-        source=one.source,
+        source=one.ranges.source,
         body=one.body,
         model=settings.model,
         used=", ".join(name for name, there in used.items() if there),
@@ -413,6 +401,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         range_time_ns=nanoseconds(heard_s),
         nis=np.array(nis),
         accepted=np.array(accepted),
+        drifts=np.array(drifts),
         restarts_s=tuple(restarts),
         delays=running.delays_at((best,), known.delays, drift=running.drift[best]),
     )
@@ -446,7 +435,7 @@ def onboard_text(found: list[OnboardTrack], settings: OnboardSettings) -> str:
         if settings.model == "imu"
         else f"velocity wanders by {noise.acceleration:g} m/s^2 a root of Hz"
     )
-    lines += [delay_line(f"{one.source} {one.body}", one.delays) for one in found if one.delays]
+    lines += [line for one in found for line in delay_lines(f"{one.source} {one.body}", one)]
     return "\n".join([*lines, f"used: {found[0].used}; process noise: {moves}, speed about {settings.speed_m_s:g} m/s"])
 
 
@@ -463,7 +452,7 @@ def onboard_json(found: list[OnboardTrack]) -> list[dict[str, Any]]:
             "nis": float(np.mean(one.nis)),
             "believed": float(np.mean(one.accepted)),
             "restarts_s": list(one.restarts_s),
-            **delays_json(one.delays),
+            **delays_json(one),
         }
         for one in found
     ]

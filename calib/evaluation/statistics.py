@@ -15,6 +15,7 @@ from calib.calibration.applying import CorrectedRanges, keep_determined
 from calib.calibration.comparison import loose_shifts
 from calib.calibration.document import for_json, pair_name
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
+from calib.calibration.patterns import lack_direction, warn_of_directions
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, load_ranges
 from calib.pairs import pairs_of
@@ -184,7 +185,8 @@ def evaluate(data: Data | Iterable[Data], calibration: CalibrationSource) -> Eva
     """Compare raw, delay-corrected and fully corrected ranges with the truth, for all ranges and for each pair of tags.
 
     `data` is what `load_ranges` takes: paths of recordings, simulations in memory, `Ranges`, one or several. Errors are
-    in metres. Ranges of pairs that the calibration does not determine are left out, with a `LeftOutWarning`. Raises
+    in metres. Ranges of pairs that the calibration does not determine are left out, with a `LeftOutWarning`; a
+    `DirectionWarning` states the share whose directions are needed and not known. Raises
     what `load_ranges` and `Calibration.apply` raise.
 
     >>> import calib
@@ -195,6 +197,7 @@ def evaluate(data: Data | Iterable[Data], calibration: CalibrationSource) -> Eva
     """
     calibration = given_calibration(calibration)
     ranges = keep_determined(calibration, load_ranges(data, need_power=calibration.needs_power))
+    warn_of_directions(int(np.count_nonzero(lack_direction(calibration, ranges))), len(ranges), ranges.source)
     applied = calibration.apply(ranges)
     everything = np.ones(len(ranges), dtype=bool)
     inside = _between_quantiles(ranges, applied, calibration)

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.calibration.applying import keep_determined
 from calib.calibration.document import for_json
+from calib.calibration.error_model import GATE
 from calib.calibration.model import CalibrationSource, given_calibration
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, load_flight, require_times
@@ -37,7 +38,7 @@ from calib.evaluation.filters import (
     squared_over,
     without_directions,
 )
-from calib.evaluation.localization import Localization, consistency, delay_line, delays_json, filter_ranges, fixed_std
+from calib.evaluation.localization import Localization, consistency, delay_lines, delays_json, filter_ranges, fixed_std
 from calib.evaluation.onboard import inertial_readings, mean_readings
 from calib.evaluation.tracking import (
     FilterRanges,
@@ -46,13 +47,13 @@ from calib.evaluation.tracking import (
     Track,
     choose_delays,
     delay_states,
-    pair_numbers,
     ranges_among,
     side_by_side,
     used_part,
     weigh,
 )
 from calib.online import Reflections
+from calib.pairs import pairs_of
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import first_few, printable
@@ -86,7 +87,7 @@ class TeamSettings(CheckedSettings):
     start_std_deg: float = 3.0
     start_std_m_s: float = 0.1
     rate_hz: float = 50.0
-    gate: float = 10.83
+    gate: float = GATE
     seed: int = 0
     online: bool = False
     noise: ProcessNoise = field(default_factory=ProcessNoise)
@@ -267,7 +268,7 @@ def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, A
         bodies=bodies,
         body=body,
         arm=arms[found.ends],
-        shares=np.stack([pairs, pairs.max() + 1 + pair_numbers(body)], axis=-1),
+        shares=np.stack([pairs, pairs.max() + 1 + pairs_of(*np.moveaxis(body, 2, 0)).number], axis=-1),
         readings=readings,
         poses=poses,
     )
@@ -362,26 +363,24 @@ def _run(
         wrong = np.concatenate([truth[k] - place[k], turns.reshape(place[k].shape)], axis=-1)
         nees[k] = squared_over(wrong, covariance)
         std_m[k] = np.sqrt(np.trace(covariance[..., P, P], axis1=-2, axis2=-1))
-    drifts = choose_delays(known, density)
-    for f, better in drifts.items():
-        later = np.append(False, better)[firsts[1:]]
-        for fixed, some in ((~better, (nis, accepted)), (~later, (place, attitude, std_m, nees))):
-            for values in some:
-                values[fixed, f] = values[fixed, f - 1]
+    counts_for = choose_delays(known, density)
 
     def track(f: int, b: int) -> RelativeTrack:
-        used = uses[:, f]
+        rows = np.flatnonzero(uses[:, f])
+        measured = rows, counts_for[rows, f]
+        at = np.arange(len(time_ns)), counts_for[firsts[1:] - 1, f], b
         return RelativeTrack(
             time_ns=time_ns,
-            attitude=Rotation.from_matrix(attitude[:, f, b]).as_quat(),
-            estimate_m=place[:, f, b],
+            attitude=Rotation.from_matrix(attitude[at]).as_quat(),
+            estimate_m=place[at],
             truth_m=truth[:, b],
             true_attitude=np.where(np.isfinite(truth[:, b, :1]), Rotation.from_matrix(turned[:, b]).as_quat(), np.nan),
-            std_m=std_m[:, f, b],
-            nis=nis[used, f],
-            nees=nees[:, f, b],
-            accepted=accepted[used, f],
-            delays=running.delays_at((f,), known[f].delays, drift=f in drifts and drifts[f][-1]),
+            std_m=std_m[at],
+            nis=nis[measured],
+            nees=nees[at],
+            accepted=accepted[measured],
+            drifts=counts_for[rows, f] == f,
+            delays=running.delays_at((f,), known[f].delays, drift=counts_for[-1, f] == f),
         )
 
     return {body: {name: track(f, b) for f, name in enumerate(filters)} for b, body in enumerate(team.bodies[:-1])}
@@ -406,7 +405,7 @@ def team_text(found: list[RelativePose], settings: TeamSettings) -> str:
         f"fixed standard deviations, {fixed.source}: raw {fixed.std_m['raw']:.3f} m, calibrated "
         f"{fixed.std_m['calibrated']:.3f} m; NEES should be {RelativeTrack.DEGREES}",
     ]
-    lines += [delay_line(found[0].source, found[0].delays)] if found[0].delays else []
+    lines += delay_lines(found[0].source, found[0].tracks.get("online"))
     for end, less in _reductions(rows).items():
         changes = ", ".join(f"{name} {-100 * share:+.0f} %" for name, share in less.items())
         lines.append(f"position errors by listening, against {end}: {changes}; arXiv 2304.03837: up to -48 %")
@@ -417,7 +416,7 @@ def team_json(found: list[RelativePose]) -> dict[str, Any]:
     """Return what `calib localize --model team --json` prints: figures by body and filter, and their means."""
     rows = [
         {"recording": one.source, "body": one.body, "reference": one.reference, "filters": for_json(_figures([one]))}
-        | delays_json(one.delays)
+        | delays_json(one.tracks.get("online"))
         for one in found
     ]
     summary = _figures(found)

@@ -15,10 +15,12 @@ from typing import ClassVar, Final
 
 import numpy as np
 
+from calib.calibration.error_model import GATE
 from calib.data.ranges import Ranges
 from calib.data.sources import Flight, require_arrivals
 from calib.evaluation.filters import GaussianFilters, multilaterate, squared_over
 from calib.online import FIXED_DELAYS, DelayStates, RangeErrors, Reflections, WeighedInnovation, gated_update
+from calib.pairs import pairs_of
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
@@ -45,14 +47,14 @@ class Settings(CheckedSettings):
     The velocity input comes at `velocity_rate_hz` with white noise of `velocity_std_mps` an axis; that is the process
     noise. Percentages depend on it: the noisier velocity, the more the ranges decide. Filters begin at the true place,
     but for noise of `initial_std_m` and an `initial_offset_m` that they do not know of. A range is taken when its
-    squared innovation over its variance is below `gate` (chi-square with one degree of freedom; 10.83 is its 99.9 %
-    quantile); the robust filter has no gate. A filter begins anew where its last ranges say (`multilaterate`) once the
-    time in which ranges were within the gate, 10 s at most, is used up by time in which they were not (half of it where
-    the robust filter takes them for reflected), and half of `reopen_s` besides. `seeds` are runs with other noise, each
-    body and flight with its own; tracks are those of the first, `seed`. `use` is "exchanges", a body's ranges, or
-    "receptions", with all that it overheard and others overheard of it. With `online` one more filter has delays as
-    states (`calib.online.DelayStates`) where these are likelier than fixed delays. Raises
-    `BadInputError` that names the setting.
+    squared innovation over its variance is below `gate` (the default is the 99.9 % quantile of chi-square with one
+    degree of freedom); the robust filter has no gate. A filter begins anew where its last ranges say (`multilaterate`)
+    once the time in which ranges were within the gate, 10 s at most, is used up by time in which they were not (half of
+    it where the robust filter takes them for reflected), and half of `reopen_s` besides. `seeds` are runs with other
+    noise, each body and flight with its own; tracks are those of the first, `seed`. `use` is "exchanges", a body's
+    ranges, or "receptions", with all that it overheard and others overheard of it. With `online` one more filter has
+    delays as states (`calib.online.DelayStates`) where these are likelier than fixed delays. Raises `BadInputError`
+    that names the setting.
     """
 
     velocity_std_mps: float = 0.3
@@ -60,7 +62,7 @@ class Settings(CheckedSettings):
     initial_std_m: float = 0.1
     initial_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     fixed_std_m: float | None = None
-    gate: float = 10.83
+    gate: float = GATE
     reopen_s: float = 1.0
     seed: int = 0
     seeds: int = 3
@@ -75,7 +77,8 @@ class Track:
     `std_m` (n,) is the standard deviation by the filter itself: the root of the sum of its three variances. `nees` (n,)
     are the squared errors over their covariance, which should be `DEGREES`. Truth and `nees` are NaN where poses do not
     say. `nis` (measurements,) are the squared innovations over their variance, and `accepted` (measurements,) which are
-    within the gate. `delays` are those at the end and their standard deviations by tag, in ns, where they are states.
+    within the gate. `delays` are those at the end and their standard deviations by tag, in ns, where they are states:
+    `drifts` (measurements,) then tells where delays that drift were likelier than those of the calibration.
     """
 
     DEGREES: ClassVar[int] = 3
@@ -88,6 +91,7 @@ class Track:
     nis: Floats
     nees: Floats
     accepted: Bools
+    drifts: Bools
     delays: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
     @property
@@ -142,25 +146,31 @@ class Measurements(ColumnTable):
             sign=sign[rows],
         )
 
+    @classmethod
+    def of_body(cls, ranges: Ranges, own: Sequence[int]) -> tuple[Measurements, Floats]:
+        """Return those of a body with `own` tags, and the signs (n, k) of the distances in which it has no part.
+
+        Distances in which it has a part begin with its tag in `ends`; the `sign` of others is 0.
+        """
+
+        def unknown(ends: Ints) -> Bools:
+            inside = np.isin(ends, own)
+            return np.asarray(inside[..., 0] ^ inside[..., 1])
+
+        found = cls.of(ranges_about(ranges, own), unknown)
+        ends = np.where(np.isin(found.ends[..., :1], own), found.ends, found.ends[..., ::-1])
+        sign = np.where(unknown(ends), found.sign, 0.0)
+        return replace(found, ends=ends, sign=sign), found.sign - sign
+
     @property
     def pair(self) -> Ints:
         """The numbers (n, k), from 0, of the pairs of tags."""
-        return pair_numbers(self.ends)
+        return pairs_of(*np.moveaxis(self.ends, 2, 0)).number
 
     @property
     def heard(self) -> Bools:
         """Which measurements (n,) are differences of arrival."""
         return np.asarray((self.rows >= len(self.ranges)) | self.ranges.differences[self.exchange])
-
-
-def apart(own: Sequence[int]) -> Callable[[Ints], Bools]:
-    """Return a function that tells which pairs of tags (..., 2) have one of some `own` tags and another one."""
-
-    def told(ends: Ints) -> Bools:
-        inside = np.isin(ends, own)
-        return np.asarray(inside[..., 0] ^ inside[..., 1])
-
-    return told
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -205,37 +215,29 @@ def problems(flight: Flight) -> list[Problem]:
     """Return a problem for every body of a flight that moves, and ranges or listens while its place is known."""
     found = []
     for body in flight.moving_bodies():
-        mine = [tag.tag for tag in flight.tags if tag.body == body]
-        unknown = apart(mine)
-        measured = Measurements.of(ranges_about(flight.ranges, mine), unknown)
+        measured, others = Measurements.of_body(flight.ranges, [tag.tag for tag in flight.tags if tag.body == body])
         if not len(measured):
             continue
-        ends, sign, time, free = measured.ends, measured.sign, measured.time_ns, unknown(measured.ends)
-        place, sides, first = bodies_m(flight.poses, body, time), np.moveaxis(ends, 2, 0), np.isin(ends[..., 0], mine)
+        time, shape = measured.time_ns, measured.sign.shape
+        place = bodies_m(flight.poses, body, time)
         antenna, away = (
-            antennas_m(flight.poses, flight.tags, ids.ravel(), np.repeat(time, sign.shape[1])).reshape(*sign.shape, 3)
-            for ids in np.where(first, sides, sides[::-1])
+            antennas_m(flight.poses, flight.tags, ids.ravel(), np.repeat(time, shape[1])).reshape(*shape, 3)
+            for ids in np.moveaxis(measured.ends, 2, 0)
         )
         problem = Problem(
-            **(measured.to_dict() | {"sign": np.where(free, sign, 0.0)}),
+            **measured.to_dict(),
             ranges=measured.ranges,
             body=body,
             attitude=nearest_attitude(flight.poses, body, time),
             place=place,
             arm=antenna - place[:, None],
             other=away,
-            known_m=np.sum(np.where(free, 0.0, sign * np.linalg.norm(antenna - away, axis=2)), axis=1),
+            known_m=np.sum(others * np.linalg.norm(antenna - away, axis=2), axis=1),
         )
         known = np.flatnonzero(np.isfinite(problem.arm + problem.other).all(axis=(1, 2)))
         if len(known):
             found.append(problem[known])
     return found
-
-
-def pair_numbers(ends: Ints) -> Ints:
-    """Return the numbers, from 0, of the pairs of tags (n, k) that are the ends (n, k, 2) of distances."""
-    pairs = ends.min(axis=2) * 2**16 + ends.max(axis=2)
-    return np.asarray(np.unique(pairs, return_inverse=True)[1]).reshape(pairs.shape)
 
 
 def ranges_among(ranges: Ranges, tags: list[int]) -> Ranges:
@@ -258,7 +260,7 @@ def used_part(ranges: Ranges, use: str) -> Ranges:
     return replace(ranges, arrivals=None)
 
 
-def ranges_about(ranges: Ranges, tags: list[int]) -> Ranges:
+def ranges_about(ranges: Ranges, tags: Sequence[int]) -> Ranges:
     """Return the ranges of some tags with others, and those that these or others overheard, with their arrivals."""
     needed, heard = np.isin(ranges.initiator, tags) ^ np.isin(ranges.target, tags), ranges.arrivals
     needed |= np.isin(ranges.listener, tags)
@@ -352,20 +354,20 @@ def delay_states(filters: Sequence[FilterRanges]) -> DelayStates:
     return next((one.delays for one in filters if one.delays.tags), FIXED_DELAYS)
 
 
-def choose_delays(known: Sequence[FilterRanges], log_density: Floats) -> dict[int, Bools]:
-    """Return by filter with delays as states at which measurements (n, ...) it is likelier than the one before it,
-    which is the same with fixed delays.
+def choose_delays(known: Sequence[FilterRanges], log_density: Floats) -> Ints:
+    """Return which filter counts for each after each measurement (n, filters, ...), by their numbers.
 
-    `log_density` (n, filters, ...) is that of innovations. Neither filter falls below a probability of a thousandth, so
-    that delays may begin to drift late in a flight.
+    A filter with delays as states gives way to the one before it, the same with fixed delays, where that is likelier.
+    `log_density` (n, filters, ...) is that of innovations. Neither falls below a probability of a thousandth, so that
+    delays may begin to drift late in a flight.
     """
-    found = {}
+    found = np.zeros(log_density.shape, dtype=np.int64)
+    np.moveaxis(found, 1, -1)[:] = np.arange(len(known))
     for f in (f for f, one in enumerate(known) if one.delays.tags):
-        gains = log_density[:, f] - log_density[:, f - 1]
-        found[f], odds = np.empty(gains.shape, dtype=bool), np.zeros(gains.shape[1:])
-        for k, gain in enumerate(gains):
+        odds = np.zeros(log_density.shape[2:])
+        for k, gain in enumerate(log_density[:, f] - log_density[:, f - 1]):
             odds = np.clip(odds + gain, -np.log(1000), np.log(1000))
-            found[f][k] = odds > 0
+            found[k, f] -= odds <= 0
     return found
 
 
@@ -431,23 +433,22 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
         density[k] = update.log_density
         std_m[k] = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
         nees[k] = squared_over(estimate[k] - problem.place[k], covariance)
-    drifts = choose_delays(known, density)
-    for f, better in drifts.items():
-        for some in (estimate, std_m, nis, nees, accepted):
-            some[:, f][~better] = some[:, f - 1][~better]
+    counts_for = choose_delays(known, density)
 
     def track(f: int, seed: int) -> Track:
+        own = np.arange(count), counts_for[:, f, seed], seed
         return Track(
             time_ns=problem.time_ns,
             attitude=problem.attitude,
-            estimate_m=estimate[:, f, seed],
+            estimate_m=estimate[own],
             truth_m=problem.place,
             true_attitude=problem.attitude,
-            std_m=std_m[:, f, seed],
-            nis=nis[:, f, seed],
-            nees=nees[:, f, seed],
-            accepted=accepted[:, f, seed],
-            delays=running.delays_at((f, seed), known[f].delays, drift=f in drifts and drifts[f][-1, seed]),
+            std_m=std_m[own],
+            nis=nis[own],
+            nees=nees[own],
+            accepted=accepted[own],
+            drifts=counts_for[:, f, seed] == f,
+            delays=running.delays_at((f, seed), known[f].delays, drift=counts_for[-1, f, seed] == f),
         )
 
     return {name: [track(f, seed) for seed in range(settings.seeds)] for f, name in enumerate(ranges)}

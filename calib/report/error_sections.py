@@ -73,8 +73,6 @@ def patterns(results: Results) -> list[Block]:
 
 def before_after(results: Results) -> list[Block]:
     """Return errors by pair and stage, their coverage by sigma, and figures."""
-    if not results.recordings:
-        return []
     evaluation, overall = results.evaluation, results.evaluation.overall
     groups = [*evaluation.pairs.items(), ("all", overall)]
     header = [
@@ -141,8 +139,6 @@ def _error_cells(group: ErrorStatistics) -> list[str]:
 
 def outliers(results: Results) -> list[Block]:
     """Return the error model of calibrated ranges by pair."""
-    if not results.recordings:
-        return []
     ranges, applied = results.judged, results.corrected
     error = applied.corrected_m - ranges.truth_m
     z = error / applied.sigma_m
@@ -241,7 +237,7 @@ def track_name(source: str, body: str) -> str:
 
 def over_time(results: Results) -> list[Block]:
     """Return a figure of the calibrated errors over time for each recording."""
-    blocks: list[Block] = [Heading("Over time")] if results.recordings else []
+    blocks: list[Block] = [Heading("Over time")]
     for k, recording in enumerate(results.recordings):
         caption = f"{recording.source}: calibrated errors, and lines between which 95 % should lie without reflections."
         pairs, most = len(pair_rows(recording)), figures.MOST_PAIRS

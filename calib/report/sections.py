@@ -32,6 +32,11 @@ Section = Callable[[Results], list[Block]]
 """Returns the blocks of a section, heading included; nothing if it does not apply."""
 
 
+def of_recordings(section: Section) -> Section:
+    """Return a section that has no blocks where no recording judges the calibration."""
+    return lambda results: section(results) if results.recordings else []
+
+
 def _verdict(results: Results) -> list[Block]:
     unjudged = (
         "Nothing of this was compared with a true distance. If a recording has true distances, evaluate the "
@@ -81,8 +86,6 @@ def _warnings(results: Results) -> list[Block]:
 
 def _recordings(results: Results) -> list[Block]:
     """Return one row a recording, with the beginning of the SHA-256 of its file."""
-    if not results.recordings:
-        return []
     digests = {Path(path).name: digest[:12] for path, digest in results.origin.files.items()}
     tested = "test" if results.part is None else "held out"
     uses = [("fit", r) for r in results.training] + [(tested, r) for r in results.tests]
@@ -275,16 +278,16 @@ def _provenance(results: Results) -> list[Block]:
 SECTIONS: Final[dict[str, Section]] = {
     "verdict": _verdict,
     "warnings": _warnings,
-    "recordings": _recordings,
+    "recordings": of_recordings(_recordings),
     "foundations": _foundations,
     "determined": _determined,
     "delays": _delays,
     "curves": error_sections.curves,
     "patterns": error_sections.patterns,
-    "before and after": error_sections.before_after,
-    "outliers": error_sections.outliers,
+    "before and after": of_recordings(error_sections.before_after),
+    "outliers": of_recordings(error_sections.outliers),
     "localization": error_sections.localization,
-    "over time": error_sections.over_time,
+    "over time": of_recordings(error_sections.over_time),
     "provenance": _provenance,
 }
 """The sections of a report, in order; `register_report_section` adds to it."""
@@ -316,11 +319,8 @@ def register_report_section(name: str, section: Section, *, before: str = "prove
     if not callable(section):
         raise BadInputError(f"found {section!r}, expected a function of a campaign", parameter="section")
 
-    def of_recordings(results: Results) -> list[Block]:
-        return section(results) if results.recordings else []
-
     below = list(SECTIONS)[list(SECTIONS).index(before) :]
-    SECTIONS[name] = of_recordings
+    SECTIONS[name] = of_recordings(section)
     for one in below:
         SECTIONS[one] = SECTIONS.pop(one)
 

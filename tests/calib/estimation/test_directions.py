@@ -11,7 +11,7 @@ import pytest
 import calib
 import uwblink
 from benchmarks.directions import Recipe, flight, pattern_m
-from calib.errors import BadInputError, UnanswerableError
+from calib.errors import BadInputError, DirectionWarning, UnanswerableError
 from calib.report import Picture
 from calib.report.results import Results
 from calib.report.sections import SECTIONS
@@ -87,8 +87,12 @@ def test_another_flight_is_corrected_by_directions_from_its_poses(own, tmp_path)
     # Of 6 cm, 4 are noise.
     assert spread(there, known) < 0.75 * spread(there, without)
     assert 0.92 < calib.evaluate(second, known).overall.inside_95 < 0.98
-    assert call("calib", "apply", second, "-c", tmp_path / "auto.json", "-o", tmp_path / "c.uwb").returncode == 0
+    done = call("calib", "apply", second, "-c", tmp_path / "auto.json", "-o", tmp_path / "c.uwb")
+    assert (done.returncode, done.stderr) == (0, "")
     assert uwblink.load(tmp_path / "c.uwb").exchanges.range_m == pytest.approx(known.apply(there).corrected_m, abs=1e-9)
+    Contents(exchanges=uwblink.load(second).exchanges).save(tmp_path / "blind.uwb")
+    with pytest.warns(DirectionWarning, match="^blind.uwb: 100 % of the ranges lack the directions"):
+        calib.apply(tmp_path / "blind.uwb", known, tmp_path / "d.uwb")
 
 
 SOUND = {
@@ -180,6 +184,9 @@ def test_a_range_is_corrected_by_two_directions_and_says_what_is_missing_without
     bare = replace(there, toward=np.full_like(there.toward, np.nan))
     low, high = known.quantiles(bare, (0.025, 0.975)).T
     assert 0.92 < np.mean((error > low) & (error < high)) < 0.98
+    some = np.where(np.arange(500)[:, None, None] < 300, bare.toward, there.toward)
+    with pytest.warns(DirectionWarning, match="^memory: 60 % of the ranges lack the directions"):
+        calib.evaluate(replace(there, toward=some), known)
     with pytest.raises(BadInputError, match="azimuth_deg"):
         known.correct(3.0, -85.0, -86.0, 1, 2, azimuth_deg=(1.0, 2.0, 3.0))
 

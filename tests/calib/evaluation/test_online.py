@@ -48,13 +48,15 @@ def test_the_command_compares_states_with_fixed_delays_and_prints_their_end(know
     assert np.abs(wrong_m(delays, drift_m)).max() < 0.03 < np.abs(wrong_m(known.delays_ns, drift_m)).min() - 0.02
     # Without motion capture: a track of each kind.
     fixed, online = json.loads(succeed(*words, "--model", "constant-velocity", "--json").stdout)
-    assert (fixed.keys() ^ online.keys(), online["rmse_m"] < fixed["rmse_m"]) == ({"delays"}, True)
+    assert (fixed.keys() ^ online.keys(), online["rmse_m"] < fixed["rmse_m"]) == ({"delays", "drifting"}, True)
+    assert min(row["drifting"], online["drifting"]) > 0.5
     delays = {int(tag): one["delay_ns"] for tag, one in online["delays"].items()}
     assert np.abs(wrong_m(delays, drift_m)).max() < 0.05
     flight(7, 2.0)[0].save(tmp_path / "test.uwb", force=True)
     text = succeed(*words, "--seeds", 1).stdout
     assert re.search(r"raw +calibrated +variance +robust +online", text)
     assert re.search(r"delays at the end of test.uwb robot \(ns\): 1: [+-]0\.\d+ ± 0\.\d+ \(95 %\), 2: ", text)
+    assert re.search(r"(fixed|drifting) delays are likelier at its end, drifting ones after \d+ % of the meas", text)
 
 
 def test_constants_of_pairs_have_no_delays_to_follow(tmp_path):
