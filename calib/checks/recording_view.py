@@ -20,7 +20,7 @@ from calib.estimator.known_distances import FEWEST_RANGES, PILOT, Fitted, likeli
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import METRES_A_NS, RangeModel
 from calib.estimator.range_rows import RESIDUAL, Part, RangeRows, Robust
-from calib.estimator.score_tests import REACHED, Derivative, Family, Slopes, Tested
+from calib.estimator.score_tests import REACHED, Family, Slopes, Tested
 from calib.estimator.time_blocks import TimeBlocks, time_blocks
 from calib.estimator.unknowns import Priors, Unknown
 from calib.findings import exceeds
@@ -228,6 +228,12 @@ class QuickFit:
         return np.asarray(self.model.pairs.ends[self.model.pairs.number])
 
     @cached_property
+    def by_pair(self) -> sparse.csr_matrix:
+        """Whether each range is of each pair (n, pairs)."""
+        number, names = self.model.pairs.number, self.model.pairs.names
+        return sparse.csr_matrix((np.ones(len(number)), number, np.arange(len(number) + 1)), (len(number), len(names)))
+
+    @cached_property
     def residual(self) -> Floats:
         """Measured less fitted (n,), metres."""
         return self.ranges.residuals(self.x)
@@ -281,21 +287,26 @@ class QuickFit:
         """Return the slopes of the residuals by offsets, of which each range has some (n, k)."""
         return self.slopes.test(Family(kind="", names=(), derivative=sparse.csr_matrix(derivative)))
 
-    def test_constants(self) -> Tested:
-        """Return the slopes by an offset of each pair, in metres, beside the delays of all tags.
+    def test_constants(self, more: Floats | None = None) -> Tested:
+        """Return the slopes by an offset of each pair, and by `more` (n, k), in metres, beside the delays of all tags.
 
         The fit has a constant of each pair, which is what all of these would make of it. It is that by the error model,
         because a third of a pair's ranges that is reflected moves a robust mean by centimetres.
         """
-        fitted = self.likeliest.optimum.layout.indices(["delay"])
-        derivative = Derivative(self.model.pairs.number[:, None], np.ones((1, 1)), len(fitted))
-        slopes = Slopes(self.likeliest.rows, self.likeliest.optimum, self.blocks)
-        found = slopes.test(Family(kind="pair", names=self.model.pairs.names, derivative=derivative, fitted=fitted))
-        ends = (self.model.pairs.ends[:, :, None] == self.model.tags).sum(axis=1)
+        optimum, pairs, tags = self.likeliest.optimum, self.model.pairs, self.model.tags
+        derivative = (
+            self.by_pair if more is None else sparse.csr_matrix(sparse.hstack([self.by_pair, sparse.csr_matrix(more)]))
+        )
+        fitted = optimum.layout.indices(["delay"])
+        family = Family(kind="pair", names=pairs.names, derivative=derivative, fitted=fitted)
+        found = Slopes(self.likeliest.rows, optimum, self.blocks).test(family)
+        # Constants are in ns.
+        metres = (METRES_A_NS - 1) * found.information[:, : len(fitted)] @ optimum.x[fitted]
+        ends = np.zeros((len(found.total), len(tags)))
+        ends[: len(fitted)] = np.equal.outer(pairs.ends, tags).sum(axis=1)
         taken = found.information @ ends
         left = np.eye(len(ends)) - taken @ np.linalg.pinv(ends.T @ taken, rcond=1e-9, hermitian=True) @ ends.T
-        # Constants are in ns.
-        return replace(found, total=METRES_A_NS * found.total).turned(left)
+        return replace(found, total=found.total + metres).turned(left)
 
     def offset(self, derivative: Floats, *, tolerance: float = 0.0, tried: int = 1) -> tuple[float, float]:
         """Return an offset of which each range has so much (n,), and the p-value if it is the tolerance at most.

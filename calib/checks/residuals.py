@@ -6,14 +6,14 @@ Offsets are those of a pair, or of a tag from some time on.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 from scipy import sparse, special
 
-from calib.checks.geometry import PAIR_M, anchors, places_m
+from calib.checks.geometry import PAIR_M, anchors, beside_places, places_m
 from calib.checks.recording_view import Offsets, QuickFit, RecordingView, quick_fit
 from calib.data.clocks import PPM_TO_METRES, corrected
 from calib.estimator.known_distances import ASTRAY_M, FEWEST_RANGES
@@ -113,10 +113,10 @@ def _by_direction(single: RecordingView) -> Iterator[Candidate]:
     if fit is None:
         return
     signs = np.where(single.exchanges.initiator < single.exchanges.target, 0.5, -0.5)[fit.rows]
-    ways = np.where(np.equal.outer(fit.model.pairs.number, np.arange(len(fit.model.pairs.ends))), signs[:, None], 0.0)
+    ways = _by_pair(fit, signs[:, None])
     seen = Offsets.of(fit.test(ways), np.eye(len(fit.model.pairs.ends)))
     worst = int(np.argmax((np.abs(seen.size) - ONE_WAY_M) / seen.std))
-    size, p_value = fit.offset(ways[:, worst], tolerance=ONE_WAY_M, tried=len(fit.model.pairs.ends))
+    size, p_value = fit.offset(ways[:, [worst]].toarray().ravel(), tolerance=ONE_WAY_M, tried=len(fit.model.pairs.ends))
     yield Candidate(
         LEFT,
         f"ranges of pair {fit.model.pairs.names[worst]} differ by {100 * abs(size):.0f} cm by who initiates, the "
@@ -223,14 +223,25 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
     tolerance = max(PAIR_M, float(special.ndtri(1 - BUDGET / (2 * several))) * spread_m) + (
         0.2 if view.standing_m is not None else 0.0
     )
-    for one in findings(tested, several, BUDGET, tolerance):
-        yield Candidate(
-            "pairs that do not close",
-            f"ranges of pair {' or pair '.join(one.names)} are {100 * abs(one.offset_m):.1f} cm too "
-            f"{'long' if one.offset_m > 0 else 'short'} for the delays of their tags, by closed loops of the other "
-            "pairs",
-            one.p_value,
-        )
+    found = list(findings(tested, several, BUDGET, tolerance))
+    if not found:
+        return
+    # Anchors at wrong places leave offsets of pairs as well, and these none beside places.
+    offsets, places = beside_places(view, fit, top)
+    sure = {name for one in findings(offsets, several, BUDGET, tolerance) for name in one.names}
+    # That anything is wrong offsets of pairs say; the places' own value says only what it is.
+    elsewhere = [replace(seen, p_value=found[0].p_value) for seen in places if seen.p_value < BUDGET]
+    yield from elsewhere
+    for one in found:
+        certain = not sure.isdisjoint(one.names)
+        if certain or not elsewhere:
+            yield Candidate(
+                "pairs that do not close",
+                f"ranges of pair {' or pair '.join(one.names)} are {100 * abs(one.offset_m):.1f} cm too "
+                f"{'long' if one.offset_m > 0 else 'short'} for the delays of their tags, by closed loops of the other "
+                f"pairs{'' if certain else '; or anchors stand elsewhere, which ranges do not tell from it'}",
+                one.p_value,
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -343,10 +354,7 @@ def _change(
 
 def _by_pair(fit: QuickFit, courses: Floats) -> sparse.csr_matrix:
     """Return courses (n, k) as those of each pair (n, k * pairs)."""
-    whose = sparse.csr_matrix(
-        np.equal.outer(fit.model.pairs.number, np.arange(len(fit.model.pairs.ends))).astype(float)
-    )
-    return sparse.csr_matrix(sparse.hstack([whose.multiply(course[:, None]) for course in courses.T]))
+    return sparse.csr_matrix(sparse.hstack([fit.by_pair.multiply(course[:, None]) for course in courses.T]))
 
 
 def compared(views: Sequence[RecordingView], level: float) -> Iterator[Candidate]:
