@@ -200,10 +200,9 @@ def places_m(view: RecordingView) -> dict[str, Floats]:
 def _displaced(view: RecordingView, fit: QuickFit) -> Iterator[Candidate]:
     """Yield anchors whose ranges fit other places, tested by the slopes of all distances there together.
 
-    In a direction that ranges hardly determine, as the height where robots keep theirs, some place far away always fits
-    reflections better than the given one. So the direction must be determined at the given place, as an information
-    matrix is judged (`calib.information`), unless ranges are astray there. Where slopes at the given place may be zero
-    no other is searched for: distances are linear in centimetres, not in metres, so that a search cannot be spared.
+    Where slopes at the given place may be zero no other is searched for: distances are linear in centimetres, not in
+    metres, so that a search cannot be spared. Slopes at the other place are those of the error model, because
+    reflections move a robust loss in directions that ranges hardly determine, as the height where robots keep theirs.
     """
     places = places_m(view)
     sides, poses, away = _sides(view, fit, places), view.poses, dict[str, Floats]()
@@ -222,12 +221,9 @@ def _displaced(view: RecordingView, fit: QuickFit) -> Iterator[Candidate]:
             poses = replace(poses, position_m=there_m)
     if not away or (moved := (told := _told(view, poses=poses)).quick_fit) is None:
         return
-    # What ranges, as they fit the other places, know of those, and of the given ones.
-    pairs = len(moved.model.pairs.names)
-    at_other, at_given = (
-        _apart(_beside_pairs(moved.test_constants(_outward(some)), pairs), sides)
-        for some in (_sides(told, moved, places), sides)
-    )
+    # What ranges know of the other places, as they fit these.
+    tested = moved.test_constants(_outward(_sides(told, moved, places)))
+    at_other = _apart(_beside_pairs(tested, len(moved.model.pairs.names)), sides)
     before_m, after_m = (one.less_pairs(one.error_m)[fit.rows] for one in (view, told))
     for body, there in away.items():
         own, mine = at_other[body], sides[body].any(axis=1)
@@ -235,12 +231,8 @@ def _displaced(view: RecordingView, fit: QuickFit) -> Iterator[Candidate]:
         shift = there - _step(own)
         size, gain = float(np.linalg.norm(shift)), _gain(before_m[mine], after_m[mine])
         before, after = (robust_spread(errors[mine]) for errors in (before_m, after_m))
-        direction = np.linalg.lstsq(at_given[body].information, shift / size, rcond=1e-12)[0]
-        known = robust_spread(fit.residual[mine]) > ASTRAY_M or (
-            direction @ at_given[body].covariance @ direction < (LOOSEST * 0.5) ** 2
-        )
         # The spread of all ranges, and half of it more.
-        if size <= TOLERANCE_M or gain <= 0 or after >= 1.5 * robust_spread(after_m) or not known:
+        if size <= TOLERANCE_M or gain <= 0 or after >= 1.5 * robust_spread(after_m):
             continue
         axes, loose = _axes(own, shift)
         # Places above each other are alike to robots that move in a plane; a displacement is known to a tenth.
@@ -337,7 +329,7 @@ def beside_places(view: RecordingView, fit: QuickFit, pairs: Sequence[int]) -> t
         "places that do not close",
         f"ranges contradict the places of {', '.join(sides)} together; they fit best with {'; '.join(said)}",
         _p_of_place(together, together.total),
-        {"body": " and ".join(alone), "lines": "".join(lines)},
+        {"lines": "".join(lines)},
     )
     return offsets, [seen]
 
