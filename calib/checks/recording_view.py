@@ -280,10 +280,9 @@ class QuickFit:
         rest = QuickFit.of(self.model, self.error - size * derivative, self.rows, self.start, x[:-1])
         tested = rest.test(sparse.csr_matrix(self.by_pair.multiply(course[:, None])))
         known, alone = float(pairs @ tested.information @ pairs), np.diag(tested.covariance) * pairs
-        if known <= REACHED * tested.whole:
-            return size, 1.0, rest
         # Errors of different pairs hardly go together, so that each tells of their variance (Welch and Satterthwaite).
-        std = np.sqrt(max(float(pairs @ tested.covariance @ pairs), float(alone.sum()))) / known
+        variance = max(float(pairs @ tested.covariance @ pairs), float(alone.sum()))
+        std = float(np.sqrt(variance)) / known if known > REACHED * tested.whole else np.inf
         freedom = min(tested.lasting.freedom, tested.blocks - 1.0) * alone.sum() ** 2 / max(np.sum(alone**2), 1e-300)
         return size, exceeds(size, std, float(freedom), tolerance=tolerance, tried=tried), rest
 
