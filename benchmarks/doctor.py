@@ -174,6 +174,16 @@ def moved_anchor(flight: Flight, rng: np.random.Generator, *, plan: Plan, both: 
     return [named(fly(plan, seed, 1), "first"), named(second, "second")] if both else second
 
 
+def all_anchors_off(flight: Any, rng: np.random.Generator) -> Any:
+    """Let each anchor stand 10 cm from where the recording says, in any direction."""
+    position_m = flight.poses.position_m.copy()
+    for body in np.unique(flight.poses.body):
+        away = rng.normal(size=3)
+        if body.startswith("anchor"):
+            position_m[flight.poses.body == body] += 0.1 * away / np.linalg.norm(away)
+    return replace(flight, poses=replace(flight.poses, position_m=position_m))
+
+
 def named(flight: Flight, name: str) -> Flight:
     """Return a flight with a name."""
     return replace(flight, name=name)
@@ -378,6 +388,8 @@ FAULTS: Final = (
          partial(simulated, settings=("radio.multipath.share=0.5",)), names("reflections")),
     Case("an anchor 20 to 60 cm elsewhere", ANCHORS, partial(moved_anchor, plan=ANCHORS, both=False),
          names("anchor stands elsewhere")),
+    Case("six that range with each other, all 10 cm off", replace(RIG, among_anchors=True), all_anchors_off,
+         names("anchor stands elsewhere", "places that do not close")),
     Case("an anchor moved between two recordings", ANCHORS, partial(moved_anchor, plan=ANCHORS, both=True),
          names("anchor moved between recordings")),
     Case("a delay of 0.5 to 1.2 ns more in the second", ONE, partial(other_delay, plan=ONE),
@@ -399,6 +411,8 @@ FAULTS: Final = (
          names("swapped tag ids"), names(FEW)),
     Case("two anchors exchanged in the true distances", RIG, partial(exchanged_anchors, given=True),
          names("swapped tag ids"), names(FEW)),
+    Case("the same, 20 ranges a second for 60 s", replace(RIG, seconds=60, per_second=20),
+         partial(exchanged_anchors, given=True), names("swapped tag ids"), names(FEW)),
     Case("four exchanged in a circle", RIG, partial(exchanged_anchors, given=False, count=4),
          names("swapped tag ids"), names(FEW)),
     Case("nothing moves, and a pair is 45 cm long", BASE, still_open, names("pairs that do not close"),

@@ -45,6 +45,7 @@ class Plan:
     turning_db: float = 4.0
     skew_ppm: float = 4.0
     carriers: bool = True
+    among_anchors: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,7 @@ def fly(plan: Plan, seed: int, boards: int | None = None, moved: tuple[int, Floa
     own = np.random.default_rng([seed if boards is None else boards, 1174])
     tags = _tags(plan)
     count = int(plan.seconds * plan.per_second)
-    pairs = _pairs(tags)
+    pairs = _pairs(tags, among_anchors=plan.among_anchors)
     which = rng.integers(0, len(pairs), count)
     ends = pairs[which]
     ends = np.where((rng.random(count) < 0.5)[:, None], ends[:, ::-1], ends)
@@ -98,11 +99,11 @@ def _tags(plan: Plan) -> list[Tag]:
     return found + [Tag(100 + k, f"anchor{k}", (0.0, 0.0, 0.0)) for k in range(plan.anchors)]
 
 
-def _pairs(tags: list[Tag]) -> NDArray[np.int64]:
-    """Every two tags of different bodies of which one moves."""
+def _pairs(tags: list[Tag], *, among_anchors: bool) -> NDArray[np.int64]:
+    """Every two tags of different bodies, of which one moves unless anchors range with each other."""
     return np.array([
         (a.tag, b.tag) for k, a in enumerate(tags) for b in tags[k + 1 :]
-        if a.body != b.body and not (a.tag >= 100 and b.tag >= 100)
+        if a.body != b.body and (among_anchors or a.tag < 100 or b.tag < 100)
     ])  # fmt: skip
 
 

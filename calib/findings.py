@@ -119,8 +119,8 @@ def more_often(count: int, of: int, chance: float, *, tried: float = 1) -> float
     return min(1.0, tried * float(special.bdtrc(count - 1, of, chance))) if count > 0 else 1.0
 
 
-def stretches(count: int) -> list[slice]:
-    """Return stretches of equal count of `count` rows in order of time, none where there are too few rows."""
-    some = min(STRETCHES, count // 30)
+def stretches(count: int, fewest: int = 30) -> list[slice]:
+    """Return stretches of equal count of `count` rows in order of time, none where they have less than the `fewest`."""
+    some = min(STRETCHES, count // fewest)
     edges = np.linspace(0, count, some + 1).astype(int) if some >= STRETCHES // 2 else np.zeros(1, dtype=int)
     return [slice(a, b) for a, b in pairwise(edges.tolist())]

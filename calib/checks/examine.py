@@ -220,11 +220,13 @@ CHECKS: Final = (
     ),
     Check(
         "radio",
-        "Is a pair more than 4 cm off what delays of tags explain?",
-        "a pair's own offset, the largest", f"{OVER_BLOCKS}, for all pairs",
+        "Is a pair more than 4 cm off what delays of tags explain, and places of anchors not?",
+        "a pair's own offset, the largest; places beside it (F)", f"{OVER_BLOCKS}, for all pairs",
         {
             "pairs that do not close": "look for a wall or a body between these two, and at their lever arms and "
-            "places; record the pair anew, or fit with `constants` pair"
+            "places; record the pair anew, or fit with `constants` pair",
+            "places that do not close": "measure the places of anchors again, all from one point; these ranges "
+            "give{lines}",
         },
         residuals.closures,
     ),
@@ -354,7 +356,7 @@ CHECKS: Final = (
 FINDING_LEVEL: Final = (BUDGET - OF_A_FIT) / sum(not check.certain for check in CHECKS)
 """p-value below which a candidate is a finding: checks have equal shares of the budget, beside that of a fit."""
 
-OF_PAIRS: Final = {"pairs that do not close", "reflections", "reflections that last"}
+OF_PAIRS: Final = {"pairs that do not close", "places that do not close", "reflections", "reflections that last"}
 IMPLIED: Final = {
     # Where nothing moves, every pair has one distance and one power, and the one explains the other.
     "static data": {"power confounded with distance"},

@@ -23,7 +23,7 @@ from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes,
 from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.estimator.to_calibration import bias_curves
 from calib.findings import NAMED_DETOUR_M, OF_A_FIT, SMALLEST_NS
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
 OFFSET_SPANS, SPAN_S = 6, 20.0
@@ -191,14 +191,12 @@ def late(model: RangeModel) -> dict[str, Floats]:
     order = np.argsort(pair, kind="stable")
     time_s, truth_m = ranges.time_ns[order] * 1e-9, ranges.truth_m[order]
     same = (np.diff(pair[order]) == 0) & (np.diff(ranges.session[order]) == 0)
-    step = np.diff(time_s)
     # Two ranges of a pair further apart say nothing of a speed: bodies turn round within seconds.
-    usual = same & (step > 0) & (step < 1.0)
-    rate = np.where(usual, np.diff(truth_m) / np.where(usual, step, 1.0), 0.0)
-    # The mean of both sides, or the one that there is.
-    sides = np.add(np.append(usual, False), np.insert(usual, 0, False), dtype=np.float64)
+    near = same & (np.diff(time_s) > 0) & (np.diff(time_s) < 1.0)
+    # From the neighbour before to the one after, or what there is of both.
+    run, way = (np.convolve(np.where(near, np.diff(one), 0.0), [1.0, 1.0]) for one in (time_s, truth_m))
     speeds = np.empty(len(order))
-    speeds[order] = (np.append(rate, 0.0) + np.insert(rate, 0, 0.0)) / np.maximum(sides, 1.0)
+    speeds[order] = way / np.where(run > 0, run, 1.0)
     size = _root_mean_square(speeds)
     return {"late": speeds / size} if size > 0 else {}
 
@@ -307,27 +305,22 @@ def sentence_of(finding: FoundOffset) -> str:
     return "; or ".join(SENTENCES[name].format(**words) for name in names)
 
 
-def reflected_pairs(found: KnownDistances) -> tuple[Floats, Floats, Bools]:
-    """Return the share of reflected ranges of each pair (k,), their mean detour in metres, and where most surely are.
+def _reflected(found: KnownDistances) -> Iterator[str]:
+    """Name the pairs of which hardly a range is direct, or else a tag about half of whose ranges are not.
 
-    The log odds are held against their standard errors, with errors that last; all are 0 where they are not fitted.
+    The log odds of a pair are held against their standard errors, with errors that last.
     """
-    values, optimum, count = found.values, found.searches[-1].optimum, len(found.model.pairs.ends)
+    values, optimum, ends = found.values, found.searches[-1].optimum, found.model.pairs.ends
     if not isinstance(found.searches[-1].rows.errors, Mixture) or "odds of pair" not in values:
-        return np.zeros(count), np.zeros(count), np.zeros(count, dtype=bool)
-    which = np.zeros((len(optimum.x), count))
-    which[optimum.layout.where["odds level"]], which[optimum.layout.where["odds of pair"]] = 1.0, np.eye(count)
+        return
+    which = np.zeros((len(optimum.x), len(ends)))
+    which[optimum.layout.where["odds level"]], which[optimum.layout.where["odds of pair"]] = 1.0, np.eye(len(ends))
     odds = which.T @ optimum.x
     variance = found.persistence.factor * np.einsum("pk,pk->k", which, np.asarray(optimum.covariance @ which))
-    detour = np.exp(values["least detour"]) + np.exp(values["detour level"] + values["detour of pair"])
-    return expit(odds), detour, np.asarray(count * ndtr(-odds / np.sqrt(variance)) < OF_A_FIT)
-
-
-def _reflected(found: KnownDistances) -> Iterator[str]:
-    """Name the pairs of which hardly a range is direct, or else a tag about half of whose ranges are not."""
-    share, detour_m, most = reflected_pairs(found)
-    ends, far = found.model.pairs.ends, detour_m > NAMED_DETOUR_M
-    hidden, tags = np.flatnonzero((share > HIDDEN) & far & most).tolist(), np.unique(ends).tolist()
+    detour_m = np.exp(values["least detour"]) + np.exp(values["detour level"] + values["detour of pair"])
+    share, far = expit(odds), detour_m > NAMED_DETOUR_M
+    most = len(ends) * ndtr(-odds / np.sqrt(variance)) < OF_A_FIT
+    hidden, tags = np.flatnonzero((share > HIDDEN) & far & most).tolist(), found.model.tags
     for number in hidden:
         a, b = ends[number].tolist()
         others = [tag for tag in tags if tag not in (a, b)]

@@ -8,7 +8,7 @@ from heapq import nlargest
 from typing import Any, Final
 
 import numpy as np
-from scipy import ndimage, optimize, sparse, special
+from scipy import optimize, sparse, special
 from scipy.sparse.csgraph import connected_components
 
 from calib.checks.fitted import late
@@ -85,7 +85,8 @@ def _undone(view: RecordingView, seen: Candidate, truth_m: Floats, *, tried: int
     known = np.isfinite(before) & np.isfinite(after)
     rows = np.flatnonzero(known & (np.abs(view.ranges.truth_m - truth_m) > 1e-3))
     rows = rows[np.argsort(view.exchanges.time_ns[rows], kind="stable")]
-    cuts = [rows[cut] for cut in stretches(len(rows))]
+    # A tag that ranges with two others has 80 ranges in a quick fit: eight stretches of ten.
+    cuts = [rows[cut] for cut in stretches(len(rows), fewest=10)]
     if not cuts:
         return replace(seen, p_value=1.0)
     old, new = ([max(robust_spread(errors[cut], 0.0), 1e-6) for cut in cuts] for errors in (before, after))
@@ -199,18 +200,20 @@ def places_m(view: RecordingView) -> dict[str, Floats]:
 def _displaced(view: RecordingView, fit: QuickFit) -> Iterator[Candidate]:
     """Yield anchors whose ranges fit other places, tested by the slopes of all distances there together.
 
-    In a direction that ranges hardly determine, as the height where robots keep theirs, some place far away always fits
-    reflections better than the given one. So the direction must be determined at the given place, as an information
-    matrix is judged (`calib.information`), unless ranges are astray there. Where slopes at the given place may be zero
-    no other is searched for: distances are linear in centimetres, not in metres, so that a search cannot be spared.
+    Where slopes at the given place may be zero no other is searched for: distances are linear in centimetres, not in
+    metres, so that a search cannot be spared. Slopes at the other place are those of the error model, because
+    reflections move a robust loss in directions that ranges hardly determine, as the height where robots keep theirs.
     """
     places = places_m(view)
     sides, poses, away = _sides(view, fit, places), view.poses, dict[str, Floats]()
-    for body, own in _slopes(fit, sides).items():
+    if not sides:
+        return
+    for body, own in _apart(fit.test(_outward(sides)), sides).items():
         mine = sides[body].any(axis=1)
         # Where anchors are metres off, what power does is not known, and small beside that.
         far = robust_spread(fit.residual[mine]) > ASTRAY_M
-        if far or _p_of_place(own, own.total) <= BUDGET:
+        # One of twenty right places costs time; the slopes at the other one are tested.
+        if far or _p_of_place(own, own.total) <= 0.05:
             error_m = (fit.error if far else fit.residual)[mine]
             starts = [place - places[body] for place in places.values()]
             away[body] = _place(sides[body][mine], error_m, fit.model.pairs.number[mine], starts)
@@ -218,28 +221,20 @@ def _displaced(view: RecordingView, fit: QuickFit) -> Iterator[Candidate]:
             poses = replace(poses, position_m=there_m)
     if not away or (moved := (told := _told(view, poses=poses)).quick_fit) is None:
         return
-    # What ranges, as they fit the other places, know of those, and of the given ones.
-    at_other, at_given = (_slopes(moved, some, levels=True) for some in (_sides(told, moved, places), sides))
+    # What ranges know of the other places, as they fit these.
+    tested = moved.test_constants(_outward(_sides(told, moved, places)))
+    at_other = _apart(_beside_pairs(tested, len(moved.model.pairs.names)), sides)
     before_m, after_m = (one.less_pairs(one.error_m)[fit.rows] for one in (view, told))
     for body, there in away.items():
         own, mine = at_other[body], sides[body].any(axis=1)
-        # The last step is that of the fit, whose slopes are tested; where they know nothing, there is none.
-        shift = there - np.linalg.solve(own.information + np.eye(3) / (LOOSEST * 0.5) ** 2, own.total)
+        # The last step is that of the fit, whose slopes are tested.
+        shift = there - _step(own)
         size, gain = float(np.linalg.norm(shift)), _gain(before_m[mine], after_m[mine])
         before, after = (robust_spread(errors[mine]) for errors in (before_m, after_m))
-        # Without ranges a place is known to half a metre: a tape misread, a tripod moved.
-        direction = np.linalg.lstsq(at_given[body].information, shift / size, rcond=1e-12)[0]
-        known = robust_spread(fit.residual[mine]) > ASTRAY_M or (
-            direction @ at_given[body].covariance @ direction < (LOOSEST * 0.5) ** 2
-        )
         # The spread of all ranges, and half of it more.
-        if size <= TOLERANCE_M or gain <= 0 or after >= 1.5 * robust_spread(after_m) or not known:
+        if size <= TOLERANCE_M or gain <= 0 or after >= 1.5 * robust_spread(after_m):
             continue
-        inverse = np.linalg.pinv(own.information, rcond=1e-12, hermitian=True)
-        times = special.stdtrit(min(own.lasting.freedom, own.blocks - 3.0), 0.975)
-        wide = times * np.sqrt(np.diag(inverse @ own.covariance @ inverse))
-        axes = [f"{name} {one:+.2f} ± {of:.2f}" for name, one, of in zip("xyz", shift, wide, strict=True)]
-        loose = " and ".join(name for name, of in zip("xyz", wide, strict=True) if of > LOOSEST)
+        axes, loose = _axes(own, shift)
         # Places above each other are alike to robots that move in a plane; a displacement is known to a tenth.
         others = " and ".join(
             name
@@ -248,7 +243,7 @@ def _displaced(view: RecordingView, fit: QuickFit) -> Iterator[Candidate]:
         )
         yield Candidate(
             "anchor stands elsewhere",
-            f"ranges with {body} fit a place {size:.2f} m away ({', '.join(axes)} m, 95 %): their "
+            f"ranges with {body} fit a place {size:.2f} m away {axes}: their "
             f"spread is {100 * after:.1f} cm there instead of {100 * before:.1f} cm"
             + (f"; they hardly tell {loose} from delays" if loose else "")
             + (f"; there the recording has {others}: are numbers exchanged?" if others else ""),
@@ -277,40 +272,84 @@ def _sides(view: RecordingView, fit: QuickFit, bodies: Iterable[str]) -> dict[st
     return found
 
 
-def _slopes(fit: QuickFit, sides: dict[str, Floats], levels: bool = False) -> dict[str, Tested]:
-    """Return the slopes by displacements of bodies, each beside those of the others; `sides` (n, 3) lead to them.
+def _outward(sides: dict[str, Floats]) -> Floats:
+    """Return by how much ranges (n, 3 * bodies) shrink as bodies move along the axes; `sides` (n, 3) lead to them."""
+    return np.hstack([side / np.maximum(np.linalg.norm(side, axis=1), 1e-9)[:, None] for side in sides.values()])
 
-    With `levels` the pairs' constants tell, too, by what they have beside the delays of tags, and `PAIR_M`, of their
-    own.
-    """
-    if not sides:
-        return {}
-    outward = np.hstack([side / np.maximum(np.linalg.norm(side, axis=1), 1e-9)[:, None] for side in sides.values()])
-    tested, pairs, whose = fit.test(outward), fit.model.pairs, np.repeat(np.arange(len(sides)), 3)
-    if levels:
-        free = fit.x.copy()
-        free[fit.start.optimum.layout.indices(["delay"])] = 0.0
-        level_m = medians(fit.ranges.residuals(free), pairs.number)
-        by_pair = np.column_stack([ndimage.mean(way, pairs.number, np.arange(len(level_m))) for way in outward.T])
-        ends = (pairs.ends[:, :, None] == fit.model.tags).sum(axis=1)
-        left = (np.eye(len(ends)) - ends @ np.linalg.pinv(ends)) @ by_pair / PAIR_M**2
-        known = by_pair.T @ left
-        tested = replace(
-            tested,
-            total=tested.total - left.T @ level_m,
-            information=tested.information + known,
-            covariance=tested.covariance + known,
-        )
+
+def _apart(tested: Tested, bodies: Iterable[str]) -> dict[str, Tested]:
+    """Return the slopes by displacements of each body, beside those of the others."""
+    axes = np.arange(len(tested.total)) // 3
     return {
-        body: tested.beside(np.flatnonzero(whose != k).tolist()).turned(np.eye(len(whose))[whose == k])
-        for k, body in enumerate(sides)
+        body: tested.beside(np.flatnonzero(axes != k).tolist()).turned(np.eye(len(axes))[axes == k])
+        for k, body in enumerate(bodies)
     }
 
 
+def _beside_pairs(tested: Tested, pairs: int) -> Tested:
+    """Return slopes by what comes after offsets of pairs, where each pair has an offset of its own, about `PAIR_M`."""
+    own = tested.information[:pairs, :pairs]
+    taken = -np.linalg.solve(own + np.eye(pairs) / PAIR_M**2, tested.information[:pairs, pairs:])
+    step = np.hstack([taken.T, np.eye(len(tested.total) - pairs)])
+    found, left = tested.turned(step), step @ tested.information
+    # Offsets of pairs are in the slopes as well, as far as they are not taken off.
+    offsets = PAIR_M * left[:, :pairs]
+    return replace(found, information=left[:, pairs:], covariance=found.covariance + offsets @ offsets.T)
+
+
 def _p_of_place(tested: Tested, slope: Floats) -> float:
-    """Return the p-value of slopes (3,) by a place, whose mean is zero if the place is right (Hotelling)."""
-    square = float(slope @ np.linalg.lstsq(tested.covariance, slope, rcond=1e-12)[0])
-    return float(special.fdtrc(3, tested.blocks - 3.0, square / 3))
+    """Return the p-value of slopes (k,) by places, whose mean is zero if the places are right (Hotelling)."""
+    solved, _, rank, _ = np.linalg.lstsq(tested.covariance, slope, rcond=1e-12)
+    count = max(int(rank), 1)
+    freedom = max(min(tested.lasting.freedom, tested.blocks) - count, 1.0)
+    return float(special.fdtrc(count, freedom, float(slope @ solved) / count))
+
+
+def beside_places(view: RecordingView, fit: QuickFit, pairs: Sequence[int]) -> tuple[Tested, list[Candidate]]:
+    """Return the slopes by offsets of all pairs beside places of anchors, and these places beside offsets of `pairs`.
+
+    Places that ranges contradict whatever the offsets of these pairs are one candidate, as anchors that range with each
+    other tell how they stand together, and hardly which one is elsewhere.
+    """
+    count, places = len(fit.model.pairs.names), places_m(view)
+    sides = _sides(view, fit, places) if view.posed and view.standing_m is None else {}
+    tested = fit.test_constants(_outward(sides) if sides else None)
+    offsets = tested.beside(range(count, len(tested.total))).turned(np.eye(count, len(tested.total)))
+    if not sides:
+        return offsets, []
+    together = _beside_pairs(tested.beside(pairs), count)
+    each, said, lines = _apart(together, sides), list[str](), list[str]()
+    # Those that are off wherever the others stand, or else all.
+    alone = [body for body, own in each.items() if _p_of_place(own, own.total) < BUDGET] or [*sides]
+    for body in alone:
+        shift = -_step(each[body])
+        said.append(f"{body} {_axes(each[body], shift)[0]}")
+        lines += [_line(view, tag, shift) for tag in view.tags if tag.body == body]
+    seen = Candidate(
+        "places that do not close",
+        f"ranges contradict the places of {', '.join(sides)} together; they fit best with {'; '.join(said)}",
+        _p_of_place(together, together.total),
+        {"lines": "".join(lines)},
+    )
+    return offsets, [seen]
+
+
+def _step(own: Tested) -> Floats:
+    """Return the displacement (3,) that slopes ask for; without ranges a place is known to half a metre.
+
+    So much a tape misread or a tripod moved does. Where slopes know nothing, there is no displacement.
+    """
+    return np.asarray(np.linalg.solve(own.information + np.eye(3) / (LOOSEST * 0.5) ** 2, own.total))
+
+
+def _axes(own: Tested, shift: Floats) -> tuple[str, str]:
+    """Return a displacement (3,) with intervals of 95 %, and the axes that ranges hardly tell from delays, in words."""
+    inverse = np.linalg.pinv(own.information, rcond=1e-12, hermitian=True)
+    times = special.stdtrit(min(own.lasting.freedom, own.blocks - 3.0), 0.975)
+    wide = times * np.sqrt(np.diag(inverse @ own.covariance @ inverse))
+    axes = [f"{name} {one:+.2f} ± {of:.2f}" for name, one, of in zip("xyz", shift, wide, strict=True)]
+    loose = " and ".join(name for name, of in zip("xyz", wide, strict=True) if of > LOOSEST)
+    return f"({', '.join(axes)} m, 95 %)", loose
 
 
 def _place(apart: Floats, error: Floats, pair: Ints, starts: Sequence[Floats]) -> Floats:

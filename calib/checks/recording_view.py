@@ -20,7 +20,7 @@ from calib.estimator.known_distances import FEWEST_RANGES, PILOT, Fitted, likeli
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import METRES_A_NS, RangeModel
 from calib.estimator.range_rows import RESIDUAL, Part, RangeRows, Robust
-from calib.estimator.score_tests import REACHED, Derivative, Family, Slopes, Tested
+from calib.estimator.score_tests import REACHED, Family, Slopes, Tested
 from calib.estimator.time_blocks import TimeBlocks, time_blocks
 from calib.estimator.unknowns import Priors, Unknown
 from calib.findings import exceeds
@@ -157,41 +157,6 @@ def examined_part(count: int) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Offsets:
-    """Offsets (k,) that residuals ask for, with their standard errors (k,) and degrees of freedom.
-
-    Standard errors contain errors that last; they are infinite for offsets of which nothing is known. `known` (k,) is
-    the information, which does not.
-    """
-
-    size: Floats
-    known: Floats
-    std: Floats
-    dof: float
-
-    @classmethod
-    def of(cls, tested: Tested, groups: Floats, courses: int = 1) -> Offsets:
-        """Return the offsets that all members of a group share, of each of `groups` (k, m) in each course.
-
-        Tested are the m members in each course, those of a course side by side; so are the k groups that are returned.
-        """
-        total = tested.total.reshape(courses, -1)
-        known, variance = (
-            np.einsum("km,cmn,kn->ck", groups, np.einsum("cmcn->cmn", every.reshape(total.shape * 2)), groups).ravel()
-            for every in (tested.information, tested.covariance)
-        )
-        known = np.where(known > REACHED * tested.whole, known, 0.0)
-        with np.errstate(divide="ignore"):
-            std = np.sqrt(np.maximum(variance, 1e-300)) / known
-        return cls(
-            size=-(total @ groups.T).ravel() / np.where(known > 0, known, np.inf),
-            known=known,
-            std=std,
-            dof=min(tested.lasting.freedom, tested.blocks - 1.0),
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
 class QuickFit:
     """A robust fit to the ranges (n,) of all pairs with enough of them, by session and time.
 
@@ -228,6 +193,12 @@ class QuickFit:
         return np.asarray(self.model.pairs.ends[self.model.pairs.number])
 
     @cached_property
+    def by_pair(self) -> sparse.csr_matrix:
+        """Whether each range is of each pair (n, pairs)."""
+        number, names = self.model.pairs.number, self.model.pairs.names
+        return sparse.csr_matrix((np.ones(len(number)), number, np.arange(len(number) + 1)), (len(number), len(names)))
+
+    @cached_property
     def residual(self) -> Floats:
         """Measured less fitted (n,), metres."""
         return self.ranges.residuals(self.x)
@@ -249,24 +220,6 @@ class QuickFit:
         bounds = np.unique(np.append(short.bounds[:-1] * count // short.count, count))
         return Slopes(ranges, self._search(ranges, self.x, steps=1), replace(short, number=number, bounds=bounds))
 
-    def without(self, derivative: Floats) -> tuple[float, QuickFit]:
-        """Return an offset of which each range has so much (n,), and a fit to ranges without it.
-
-        What an offset leaves in residuals is no noise: its standard error is that of the fit without it.
-        """
-        offset = Unknown(kind="offset", names=("",), start=np.zeros(1))
-        part = Part(
-            parameter=RESIDUAL,
-            kind="offset",
-            columns=np.zeros((len(derivative), 1), dtype=np.int64),
-            values=derivative[:, None],
-        )
-        kinds = tuple(self.start.optimum.layout.where)
-        _, ranges = self.model.build(self.error, self.start.rows.errors, [offset], [part], only=kinds)
-        x = self._search(ranges, np.append(self.x, 0.0), steps=20).x
-        size = -float(x[-1])
-        return size, QuickFit.of(self.model, self.error - size * derivative, self.rows, self.start, x[:-1])
-
     @cached_property
     def reflected(self) -> Floats:
         """The probability (n,) that each range is reflected, by the likeliest error model beside all else."""
@@ -281,30 +234,57 @@ class QuickFit:
         """Return the slopes of the residuals by offsets, of which each range has some (n, k)."""
         return self.slopes.test(Family(kind="", names=(), derivative=sparse.csr_matrix(derivative)))
 
-    def test_constants(self) -> Tested:
-        """Return the slopes by an offset of each pair, in metres, beside the delays of all tags.
+    def test_constants(self, more: Floats | None = None) -> Tested:
+        """Return the slopes by an offset of each pair, and by `more` (n, k), in metres, beside the delays of all tags.
 
         The fit has a constant of each pair, which is what all of these would make of it. It is that by the error model,
         because a third of a pair's ranges that is reflected moves a robust mean by centimetres.
         """
-        fitted = self.likeliest.optimum.layout.indices(["delay"])
-        derivative = Derivative(self.model.pairs.number[:, None], np.ones((1, 1)), len(fitted))
-        slopes = Slopes(self.likeliest.rows, self.likeliest.optimum, self.blocks)
-        found = slopes.test(Family(kind="pair", names=self.model.pairs.names, derivative=derivative, fitted=fitted))
-        ends = (self.model.pairs.ends[:, :, None] == self.model.tags).sum(axis=1)
+        optimum, pairs, tags = self.likeliest.optimum, self.model.pairs, self.model.tags
+        derivative = (
+            self.by_pair if more is None else sparse.csr_matrix(sparse.hstack([self.by_pair, sparse.csr_matrix(more)]))
+        )
+        fitted = optimum.layout.indices(["delay"])
+        family = Family(kind="pair", names=pairs.names, derivative=derivative, fitted=fitted)
+        found = Slopes(self.likeliest.rows, optimum, self.blocks).test(family)
+        # Constants are in ns.
+        metres = (METRES_A_NS - 1) * found.information[:, : len(fitted)] @ optimum.x[fitted]
+        ends = np.zeros((len(found.total), len(tags)))
+        ends[: len(fitted)] = np.equal.outer(pairs.ends, tags).sum(axis=1)
         taken = found.information @ ends
         left = np.eye(len(ends)) - taken @ np.linalg.pinv(ends.T @ taken, rcond=1e-9, hermitian=True) @ ends.T
-        # Constants are in ns.
-        return replace(found, total=METRES_A_NS * found.total).turned(left)
+        return replace(found, total=found.total + metres).turned(left)
 
-    def offset(self, derivative: Floats, *, tolerance: float = 0.0, tried: int = 1) -> tuple[float, float]:
-        """Return an offset of which each range has so much (n,), and the p-value if it is the tolerance at most.
+    def offset(
+        self, course: Floats, pairs: Floats | None = None, *, tolerance: float = 0.0, tried: int = 1
+    ) -> tuple[float, float, QuickFit]:
+        """Return an offset of pairs (k,), or of all, in a course (n,), its p-value, and a fit to ranges without it.
 
-        It is one of so many that were `tried`.
+        The p-value is that of an offset of the tolerance at most, one of so many that were `tried`. Slopes at no offset
+        say too little of a large one, so it is fitted; what it leaves in residuals is no noise, so its standard error
+        is that of the fit without it.
         """
-        size, rest = self.without(derivative)
-        found = Offsets.of(rest.test(derivative[:, None]), np.ones((1, 1)))
-        return size, exceeds(size, float(found.std[0]), found.dof, tolerance=tolerance, tried=tried)
+        pairs = np.ones(len(self.model.pairs.names)) if pairs is None else pairs
+        derivative = pairs[self.model.pairs.number] * course
+        offset = Unknown(kind="offset", names=("",), start=np.zeros(1))
+        part = Part(
+            parameter=RESIDUAL,
+            kind="offset",
+            columns=np.zeros((len(derivative), 1), dtype=np.int64),
+            values=derivative[:, None],
+        )
+        kinds = tuple(self.start.optimum.layout.where)
+        _, ranges = self.model.build(self.error, self.start.rows.errors, [offset], [part], only=kinds)
+        x = self._search(ranges, np.append(self.x, 0.0), steps=20).x
+        size = -float(x[-1])
+        rest = QuickFit.of(self.model, self.error - size * derivative, self.rows, self.start, x[:-1])
+        tested = rest.test(sparse.csr_matrix(self.by_pair.multiply(course[:, None])))
+        known, alone = float(pairs @ tested.information @ pairs), np.diag(tested.covariance) * pairs
+        # Errors of different pairs hardly go together, so that each tells of their variance (Welch and Satterthwaite).
+        variance = max(float(pairs @ tested.covariance @ pairs), float(alone.sum()))
+        std = float(np.sqrt(variance)) / known if known > REACHED * tested.whole else np.inf
+        freedom = min(tested.lasting.freedom, tested.blocks - 1.0) * alone.sum() ** 2 / max(np.sum(alone**2), 1e-300)
+        return size, exceeds(size, std, float(freedom), tolerance=tolerance, tried=tried), rest
 
 
 def quick_fit(views: Sequence[RecordingView], constants: str = "pair", ranges_a_pair: int = 40) -> QuickFit | None:

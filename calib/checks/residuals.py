@@ -6,19 +6,19 @@ Offsets are those of a pair, or of a tag from some time on.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 from scipy import sparse, special
 
-from calib.checks.geometry import PAIR_M, anchors, places_m
-from calib.checks.recording_view import Offsets, QuickFit, RecordingView, quick_fit
+from calib.checks.geometry import PAIR_M, anchors, beside_places, places_m
+from calib.checks.recording_view import QuickFit, RecordingView, quick_fit
 from calib.data.clocks import PPM_TO_METRES, corrected
-from calib.estimator.known_distances import ASTRAY_M, FEWEST_RANGES
-from calib.estimator.score_tests import findings
-from calib.findings import BUDGET, NAMED_DETOUR_M, Candidate, exceeds, more_often, positive, stretches
+from calib.estimator.known_distances import ASTRAY_M
+from calib.estimator.score_tests import REACHED, findings
+from calib.findings import BUDGET, NAMED_DETOUR_M, Candidate, more_often, positive, stretches
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats
 from uwblink.protocols.table import single_sided
@@ -85,22 +85,16 @@ def skew(view: RecordingView) -> Iterator[Candidate]:
     if len(taken) != 1:
         return
     known = single & np.isfinite(e.skew2_ppm) & (e.skew2_ppm != 0)
-    if np.count_nonzero(known) < FEWEST_RANGES:
-        yield from _by_direction(view.chosen(single))
-        return
     # Delays are the same both ways, and do not follow skews, so that pairs that range one way tell of it as well.
     fit = quick_fit([view.chosen(known)], constants="tag")
     if fit is None:
+        yield from _by_direction(view.chosen(single))
         return
     some = e[known][fit.rows]
     # A target's reply lasts longer by the clock of a faster initiator, and so does the range.
     expected = PPM_TO_METRES * some.skew2_ppm * intervals(some).dt32 * TICK_S
-    reach = float(np.ptp(np.percentile(expected, (5, 95))))
-    # Skew must be expected to change ranges by more, for it to be seen in them.
-    if reach < 0.03:
-        return
-    slope, p_value = fit.offset(expected, tolerance=0.5)
-    evidence = f"errors grow by {slope:.2f} m in a metre of c/2 times carrier's skew times reply, over {reach:.2f} m"
+    slope, p_value, _ = fit.offset(expected, tolerance=0.5)
+    evidence = f"errors grow by {slope:.2f} m in a metre of c/2 times carrier's skew times reply"
     for at, fault, remedy in SLOPES[taken.pop()]:
         # Halfway between the slopes of sound and of faulty ranges.
         if abs(slope - at) < 0.5:
@@ -113,10 +107,11 @@ def _by_direction(single: RecordingView) -> Iterator[Candidate]:
     if fit is None:
         return
     signs = np.where(single.exchanges.initiator < single.exchanges.target, 0.5, -0.5)[fit.rows]
-    ways = np.where(np.equal.outer(fit.model.pairs.number, np.arange(len(fit.model.pairs.ends))), signs[:, None], 0.0)
-    seen = Offsets.of(fit.test(ways), np.eye(len(fit.model.pairs.ends)))
-    worst = int(np.argmax((np.abs(seen.size) - ONE_WAY_M) / seen.std))
-    size, p_value = fit.offset(ways[:, worst], tolerance=ONE_WAY_M, tried=len(fit.model.pairs.ends))
+    tested = fit.test(_by_pair(fit, signs[:, None]))
+    beyond = np.abs(tested.total) - ONE_WAY_M * np.diag(tested.information)
+    worst = int(np.argmax(beyond / np.sqrt(np.maximum(np.diag(tested.covariance), 1e-300))))
+    own = np.eye(len(fit.model.pairs.ends))[worst]
+    size, p_value, _ = fit.offset(signs, own, tolerance=ONE_WAY_M, tried=len(own))
     yield Candidate(
         LEFT,
         f"ranges of pair {fit.model.pairs.names[worst]} differ by {100 * abs(size):.0f} cm by who initiates, the "
@@ -144,9 +139,12 @@ def reflections(view: RecordingView) -> Iterator[Candidate]:
     evidence, remedy = f"about {_in_words(fit, long)} on average", "move antennas away from bodies and walls"
     if view.quick_fit is None:
         remedy = "see what stands near these antennas; pairs have too few ranges to say more: record for longer"
-        for tag, own in _of_tags(fit, far).items():
-            p_value = min(p_value, own)
-            evidence += f"; tag {tag}: {_in_words(fit, long, (fit.ends == tag).any(axis=1))}"
+        for tag in (tags := np.unique(fit.ends).tolist()):
+            mine = (fit.ends == tag).any(axis=1)
+            usual = min(float(np.mean(far[~mine] if not mine.all() else far)) + MANY_SHARE, 1.0)
+            own = more_often(int(far[mine].sum()), int(mine.sum()), usual, tried=len(tags))
+            if own < BUDGET:
+                p_value, evidence = min(p_value, own), f"{evidence}; tag {tag}: {_in_words(fit, long, mine)}"
     yield Candidate("reflections", evidence, p_value, {"more": remedy})
 
 
@@ -192,17 +190,6 @@ def _life_s(reflected: Floats, step_s: float) -> float:
     return float(min(1 / max(rate * (1 - reflected.mean()), 1e-9), step_s * len(reflected) / 4))
 
 
-def _of_tags(fit: QuickFit, far: Bools) -> dict[int, float]:
-    """Return the p-values of tags of whose ranges more are reflected than the others' share and the tolerance."""
-    found, tags = {}, np.unique(fit.ends).tolist()
-    for tag in tags:
-        mine = (fit.ends == tag).any(axis=1)
-        others = far[~mine] if not mine.all() else far
-        usual = min(float(np.mean(others)) + MANY_SHARE, 1.0)
-        found[tag] = more_often(int(far[mine].sum()), int(mine.sum()), usual, tried=len(tags))
-    return {tag: p_value for tag, p_value in found.items() if p_value < BUDGET}
-
-
 def closures(view: RecordingView) -> Iterator[Candidate]:
     """Pairs with an offset that the delays of their tags do not explain; those that explain it as well are named.
 
@@ -223,14 +210,25 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
     tolerance = max(PAIR_M, float(special.ndtri(1 - BUDGET / (2 * several))) * spread_m) + (
         0.2 if view.standing_m is not None else 0.0
     )
-    for one in findings(tested, several, BUDGET, tolerance):
-        yield Candidate(
-            "pairs that do not close",
-            f"ranges of pair {' or pair '.join(one.names)} are {100 * abs(one.offset_m):.1f} cm too "
-            f"{'long' if one.offset_m > 0 else 'short'} for the delays of their tags, by closed loops of the other "
-            "pairs",
-            one.p_value,
-        )
+    found = list(findings(tested, several, BUDGET, tolerance))
+    if not found:
+        return
+    # Anchors at wrong places leave offsets of pairs as well, and these none beside places.
+    offsets, places = beside_places(view, fit, top)
+    sure = {name for one in findings(offsets, several, BUDGET, tolerance) for name in one.names}
+    # That anything is wrong offsets of pairs say; the places' own value says only what it is.
+    elsewhere = [replace(seen, p_value=found[0].p_value) for seen in places if seen.p_value < BUDGET]
+    yield from elsewhere
+    for one in found:
+        certain = not sure.isdisjoint(one.names)
+        if certain or not elsewhere:
+            yield Candidate(
+                "pairs that do not close",
+                f"ranges of pair {' or pair '.join(one.names)} are {100 * abs(one.offset_m):.1f} cm too "
+                f"{'long' if one.offset_m > 0 else 'short'} for the delays of their tags, by closed loops of the other "
+                f"pairs{'' if certain else '; or anchors stand elsewhere, which ranges do not tell from it'}",
+                one.p_value,
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -306,47 +304,33 @@ def _changes(fit: QuickFit, courses: Floats) -> list[Change]:
     whose, found = [None, *(tags[k] for k in kept), *[None] * pairs], list[Change]()
     groups = np.vstack([np.ones(pairs), own[kept], np.eye(pairs)])
     while len(found) < 3:
-        offsets = Offsets.of(fit.test(_by_pair(fit, courses)), groups, width)
-        gain = (offsets.size**2 * offsets.known).reshape(width, len(groups)).T
+        tested = fit.test(_by_pair(fit, courses))
+        of_course = (width, pairs, width, pairs)
+        known, variance = (
+            np.einsum("gp,cpcq,gq->gc", groups, every.reshape(of_course), groups)
+            for every in (tested.information, tested.covariance)
+        )
+        known = np.where(known > REACHED * tested.whole, known, np.inf)
+        gain = (groups @ tested.total.reshape(width, pairs).T) ** 2 / known
         # By how much variances exceed those of slopes that are a likelihood's, for most changes.
-        told = offsets.known > 0
-        excess = float(np.median(offsets.std[told] ** 2 * offsets.known[told])) if told.any() else np.inf
+        excess = float(np.median((variance / known)[np.isfinite(known)])) if np.isfinite(known).any() else np.inf
         # Of these standard errors; a finding needs five of its own, which may be smaller.
         likely = [k for k in np.argsort(-gain.max(axis=1))[:4].tolist() if gain[k].max() > 3**2 * excess]
-        trials = (
-            _change(fit, whose[k], groups[k], courses, int(np.argmax(gain[k])), len(tags) * width) for k in likely
-        )
-        best = next(((change, rest) for change, rest in trials if change.p_value < BUDGET), None)
-        if best is None:
+        for k in likely:
+            course = int(np.argmax(gain[k]))
+            # What temperature does to the delay of a sound board: 2.15 mm a degree (DW1000 user manual), ten degrees.
+            size, p_value, rest = fit.offset(courses[:, course], groups[k], tolerance=0.02, tried=len(tags) * width)
+            if p_value < BUDGET:
+                found, fit = [*found, Change(tag=whose[k], course=course, size_m=size, p_value=p_value)], rest
+                break
+        else:
             break
-        found, fit = [*found, best[0]], best[1]
     return found
-
-
-def _change(
-    fit: QuickFit, tag: int | None, pairs: Floats, courses: Floats, course: int, tried: int
-) -> tuple[Change, QuickFit]:
-    """Return the change of some pairs (k,), those of a tag or others, in a course, and a fit without it.
-
-    Slopes at no offset say too little of a large one, so it is fitted.
-    """
-    size, rest = fit.without(pairs[fit.model.pairs.number] * courses[:, course])
-    tested = rest.test(_by_pair(fit, courses[:, [course]]))
-    left, alone = Offsets.of(tested, pairs[None]), np.diag(tested.covariance) * pairs
-    # Errors of different pairs hardly go together, so that each tells of their variance (Welch and Satterthwaite).
-    std = max(float(left.std[0]), float(np.sqrt(alone.sum())) / max(float(left.known[0]), 1e-300))
-    dof = left.dof * alone.sum() ** 2 / max(float(np.sum(alone**2)), 1e-300)
-    # What temperature does to the delay of a sound board: 2.15 mm a degree (DW1000 user manual), ten degrees.
-    p_value = exceeds(size, std, dof, tolerance=0.02, tried=tried)
-    return Change(tag=tag, course=course, size_m=size, p_value=p_value), rest
 
 
 def _by_pair(fit: QuickFit, courses: Floats) -> sparse.csr_matrix:
     """Return courses (n, k) as those of each pair (n, k * pairs)."""
-    whose = sparse.csr_matrix(
-        np.equal.outer(fit.model.pairs.number, np.arange(len(fit.model.pairs.ends))).astype(float)
-    )
-    return sparse.csr_matrix(sparse.hstack([whose.multiply(course[:, None]) for course in courses.T]))
+    return sparse.csr_matrix(sparse.hstack([fit.by_pair.multiply(course[:, None]) for course in courses.T]))
 
 
 def compared(views: Sequence[RecordingView], level: float) -> Iterator[Candidate]:
