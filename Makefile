@@ -5,9 +5,9 @@ STAMP := .venv/.installed
 PYTHONS ?= python3.12 python3.13
 LOCKED := --progress-bar off --disable-pip-version-check --no-deps --require-hashes -r requirements-dev.lock
 # Tests run in many processes: what the first compiles, the others need not (an empty value counts as none).
-TESTS := -m pytest -n 4 --dist loadfile --no-loadscope-reorder
+TESTS := -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 test test-all coverage lowest newest pythons: export PYTHONDONTWRITEBYTECODE :=
-# Threads of linear algebra in four processes compete for two cores.
+# Threads of linear algebra in three processes compete for two cores.
 test test-all coverage lowest newest pythons: export OPENBLAS_NUM_THREADS := 1
 ITSELF := --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 
@@ -35,7 +35,7 @@ demo: setup ## simulate three flights, fit, evaluate, localize; writes demo/repo
 	$(BIN)/calib evaluate demo/test1.uwb demo/test2.uwb -c demo/calibration.json
 	$(BIN)/calib report demo/train.uwb --tests demo/test1.uwb demo/test2.uwb -o demo/report.html --force
 
-test: setup ## run the tests but the slow ones; four processes, for two cores: many tests wait for boards
+test: setup ## run the tests but the slow ones; three processes, for two cores: many tests wait for boards
 	$(BIN)/python $(TESTS) -m "not slow"
 
 test-all: setup ## run the whole test suite, slow tests too (a quarter of an hour on two cores)
