@@ -20,6 +20,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
+import duckdb
 import numpy as np
 
 from uwblink.arrays import Columns, Floats
@@ -67,7 +68,7 @@ from uwblink.importers.plausibility import (
     try_reading,
 )
 from uwblink.importers.poses import pose_topics
-from uwblink.importers.tables import SourceTable, message_number, open_table
+from uwblink.importers.tables import SourceTable, connected, message_number
 from uwblink.importers.templates import Template, places
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.text_files import require_regular
@@ -184,23 +185,31 @@ def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Map
     `given` are columns that have our names, `meanings` recognisable names of columns.
     """
     require_regular(file, ImportTableError, "table")
+    with connected([file]) as db:
+        return _of_connected(db, path, file, given, meanings)
+
+
+def _of_connected(
+    db: duckdb.DuckDBPyConnection, path: Path, file: Path, given: Collection[str], meanings: Mapping[str, str]
+) -> Guess:
+    """Return the map of a table, which is opened again in each form that its columns show it to have."""
     form, top = form_of(file)
-    with open_table(file, form) as table:
-        if form.headerless:
-            return _numbered(path, table)
-        is_log = form.line not in (None, JSON_LINE)
-        columns = {} if is_log else with_stamp_and_event(table, named_columns(table.names))
-        wide = form.wide or wide_columns(table.names, columns)
-        if each := None if is_log or wide or "range_m" in columns else next(iter(table.lists), None):
-            top["each"] = each, "a line has a list of them"
+    table = SourceTable(db, file, form)
+    if form.headerless:
+        return _numbered(path, table)
+    is_log = form.line not in (None, JSON_LINE)
+    columns = {} if is_log else with_stamp_and_event(table, named_columns(table.names))
+    wide = form.wide or wide_columns(table.names, columns)
+    if each := None if is_log or wide or "range_m" in columns else next(iter(table.lists), None):
+        top["each"] = each, "a line has a list of them"
     given = {*given, *(n for text in (form.line, form.each) if text for n in places(Template(text)) if n in NAMES)}
     given |= {"to_id", *wide, *(["from_id"] if "{from_id}" in str(wide) else [])} if wide else set()
     form = replace(form, wide=wide, each=form.each or each, units=form.units | ({"time": "ns"} if is_bag(path) else {}))
-    with open_table(file, form) as table:
-        # Fields of the elements of a list are called by their own names.
-        short = {name.removeprefix(f"{form.each}."): name for name in table.names}
-        short |= {meaning: name for name, meaning in meanings.items() if name in short}
-        found = with_stamp_and_event(table, {ours: short[name] for ours, name in named_columns(short).items()})
+    table = SourceTable(db, file, form, 1)
+    # Fields of the elements of a list are called by their own names.
+    short = {name.removeprefix(f"{form.each}."): name for name in table.names}
+    short |= {meaning: name for name, meaning in meanings.items() if name in short}
+    found = with_stamp_and_event(table, {ours: short[name] for ours, name in named_columns(short).items()})
     for ours, letters in (("to_id", ("id", "A", "a", "addr")), ("range_m", ("R", "r", "D", "d"))) if form.each else ():
         if ours not in found and (letter := next((name for name in letters if name in short), None)):
             found[ours] = short[letter]
@@ -217,13 +226,13 @@ def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Map
     if template := name_template(file.name, {"from_id", "to_id", "gt_range_m"} - columns.keys()):
         top["from_name"] = template, "by the names of the files"
         form = replace(form, from_name=template)
-    with open_table(file, form) as table:
-        columns |= named_columns(places(Template(template))) if template else {}
-        cells = table.numbers({header for name, header in columns.items() if name != "event"}, limit=100_000)
-        if "message" in columns:
-            number = {"message": message_number(table.text(columns["message"]))}
-            cells |= {columns["message"]: np.ma.filled(table.read(number, "LIMIT 100000")["message"], np.nan)}
-        names = table.names
+    table = SourceTable(db, file, form, 2)
+    columns |= named_columns(places(Template(template))) if template else {}
+    cells = table.numbers({header for name, header in columns.items() if name != "event"}, limit=100_000)
+    if "message" in columns:
+        number = {"message": message_number(table.text(columns["message"]))}
+        cells |= {columns["message"]: np.ma.filled(table.read(number, "LIMIT 100000")["message"], np.nan)}
+    names = table.names
     return _proposal(path, form, top, given, columns, cells, names)
 
 

@@ -21,7 +21,7 @@ from uwblink.arrays import Columns, Floats, in_time_order
 from uwblink.errors import ImportTableError, raising
 from uwblink.importers.plausibility import clocks, to_ticks
 from uwblink.importers.poses import in_order
-from uwblink.importers.tables import number, open_table, time_ns, whole_number
+from uwblink.importers.tables import SourceTable, connected, number, time_ns, whole_number
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import CirRow, Fault, Poses, Tag
@@ -140,7 +140,8 @@ def _read(
     for robot in flight.robots:
         if not (robot / name).exists():
             continue
-        with open_table(robot / name) as table:
+        with connected([robot / name]) as db:
+            table = SourceTable(db, robot / name)
             raw = "_raw" if any("_raw" in header for header in table.names) else ""
             headers = {n: header.format(raw=raw) for n, header in {"time_ns": "timestamp", **needed}.items()}
             there = headers | {n: header for n, header in optional.items() if header in table.names}

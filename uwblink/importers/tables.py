@@ -158,13 +158,6 @@ def connected(paths: Sequence[Path]) -> Iterator[duckdb.DuckDBPyConnection]:
         yield db
 
 
-@contextmanager
-def open_table(path: Path, column_map: ColumnMap | None = None) -> Iterator[SourceTable]:
-    """Open one table for the duration of the block; a map says what its rows are."""
-    with connected([path]) as db:
-        yield SourceTable(db, path, column_map)
-
-
 def number(text: str) -> str:
     """Return SQL of a text as finite DOUBLE, NULL if it is no number."""
     value = f"TRY_CAST({text} AS DOUBLE)"
