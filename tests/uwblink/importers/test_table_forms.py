@@ -437,11 +437,12 @@ def test_no_text_of_a_map_is_a_program(tmp_path, monkeypatch):
 
 
 def test_duckdb_may_open_the_named_file_only(tmp_path):
-    from uwblink.importers.tables import open_table
+    from uwblink.importers.tables import SourceTable, connected
 
     write(tmp_path / "t.csv", wrapped(flights()))
     (tmp_path / "secret.csv").write_text("a\n1\n")
-    with open_table(tmp_path / "t.csv") as table:
+    with connected([tmp_path / "t.csv"]) as db:
+        table = SourceTable(db, tmp_path / "t.csv")
         for query in (f"SELECT * FROM read_csv('{tmp_path}/secret.csv')", f"COPY (SELECT 1) TO '{tmp_path}/x.csv'"):
             with pytest.raises(duckdb.Error):
                 table.db.execute(query)
