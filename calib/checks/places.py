@@ -58,7 +58,7 @@ def of_places(found: KnownDistances, slopes: Slopes, pairs: Tested, before_ns2: 
         # the simulator it was 1.2 to 4 times as large, in smooth fields of errors a sixth to two thirds.
         middle, width = np.sqrt(variance), 0.8
     elif stays <= WIDENING_DEVIATION:
-        # Trajectories followed reflections by 0.4 to 1.9 cm (three flights in a hall of metal, eight of tests).
+        # Trajectories followed reflections by 0.4 to 1.9 cm (three flights in a hall of metal, six of tests).
         middle, width = 0.01, 0.8
     effects = _as_one(likely - 0.5 * (np.log(SIZES_M / middle) / width) ** 2) * pairs.effects @ sums.T
     widening = effects @ effects.T
