@@ -124,7 +124,8 @@ def mixture_update(innovation_m: Floats, variance_m2: Floats, errors: RangeError
     core = np.exp(-0.5 * innovation_m**2 / variance_m2) / (sigma_m * ROOT_2PI) * (inside * direct)
     total, mean, square = core + wild, core * innovation_m, core * innovation_m**2 + wild * variance_m2
     tails = []
-    for sign, share, old, detour_m in zip((1.0, -1.0), shares.T, known.T, detours_m.T, strict=False):
+    sides = (np.moveaxis(one, -1, 0) for one in (shares, known, detours_m))
+    for sign, share, old, detour_m in zip((1.0, -1.0), *sides, strict=False):
         found = densities(sign * innovation_m, sigma_m, errors.least_m, detour_m, errors.long)
         each = found.reflected * (inside * (1 - direct) / any_share)
         noise, new = sign * found.noise_m(), each * (share - old)
@@ -157,13 +158,19 @@ class Reflections:
         """Let `dt` seconds pass."""
         self.lasting *= math.exp(-dt / self.renewal_s) if self.renewal_s else 0.0
 
-    def weigh(self, innovation_m: Floats, variance_m2: Floats, errors: RangeErrors, pair: Ints) -> WeighedInnovation:
-        """Return the `mixture_update` by what is known of the pairs (sides,) in a measurement, and learn from it."""
+    def weigh(
+        self, innovation_m: Floats, variance_m2: Floats, errors: RangeErrors, pair: Ints, used: Bools
+    ) -> WeighedInnovation:
+        """Return the `mixture_update` by what is known of the pairs (sides,) in a measurement.
+
+        Filters (...) that have `used` it learn from it.
+        """
         sides = pair[: np.count_nonzero(errors.share)]
         reflected, direct = np.moveaxis(self.lasting[..., sides, :], -1, 0)
         share = reflected + (1 - reflected - direct) * np.atleast_1d(errors.share)[: len(sides)]
         found = mixture_update(innovation_m, variance_m2, replace(errors, share=share, known=reflected))
-        self.lasting[..., sides, :] = np.stack([found.reflected, 1 - found.reflected], axis=-1)
+        learned = np.stack([found.reflected, 1 - found.reflected], axis=-1)
+        self.lasting[..., sides, :] = np.where(used[..., None, None], learned, self.lasting[..., sides, :])
         return found
 
 

@@ -260,14 +260,14 @@ class RelativeFilter(GaussianFilters):
         still = reference - (self.state[:, fixed] if moving else 0.0 * self.state[:, :6])
         turn, pull, rate = readings[:, :3] - own[..., G], readings[:, 3:] - own[..., F], still[:, None, :3]
         # Forces count in the attitude at the middle of the step.
-        middle, back, half = _turned(turn * (dt / 2)), _turned(-rate * dt), _turned(rate * (dt / 2))
+        middle, back, half = turned_by(turn * (dt / 2)), turned_by(-rate * dt), turned_by(rate * (dt / 2))
         pull, attitude = np.einsum("fbij,fbj->fbi", middle, pull), self.attitude[:, :-1]
         force = np.einsum("fbij,fbj->fbi", attitude, pull) - np.einsum("fbij,fbj->fbi", half, still[:, None, 3:])
         place = own[..., P] + own[..., V] * dt + 0.5 * force * dt**2
         own[..., P] = np.einsum("fbij,fbj->fbi", back, place)
         own[..., V] = np.einsum("fbij,fbj->fbi", back, own[..., V] + force * dt)
         tilt, axes = -back @ attitude @ _cross(pull) * dt, -back @ attitude @ middle * dt
-        turned = _turned(turn * dt)
+        turned = turned_by(turn * dt)
         self.attitude[:, :-1] = back @ attitude @ turned
         step, q = np.tile(np.eye(self.known), (len(self.state), 1, 1)), np.zeros(self.known)
         towards = self.attitude[:, :-1].transpose(0, 1, 3, 2) * dt
@@ -341,7 +341,7 @@ class RelativeFilter(GaussianFilters):
 
     def _move(self, by: Floats) -> None:
         super()._move(by)
-        self.attitude[:, :-1] = self.attitude[:, :-1] @ _turned(self.own[..., A])
+        self.attitude[:, :-1] = self.attitude[:, :-1] @ turned_by(self.own[..., A])
         self.own[..., A] = 0.0
 
 
@@ -380,6 +380,12 @@ class InertialFilter(RelativeFilter):
         super().__init__(fix.place_m, np.resize(attitudes[:, None], (len(self.drift), 1, 3, 3)), spread, noise)
         self.append(delays)
         self.restart(fix, speed_m_s)
+
+    @property
+    def drifts(self) -> float:
+        """The probability that delays drift."""
+        odds = np.exp(self.likelihood - self.likelihood.max())
+        return float(odds[self.drift].sum() / odds.sum())
 
     def step(self, dt: float, readings: Floats) -> None:
         """Predict over `dt` seconds by mean readings (6,); without an IMU they are ignored."""
@@ -466,6 +472,6 @@ CROSS: Final = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1).reshap
 """The cross-product matrices of the three axes."""
 
 
-def _turned(angles: Floats) -> Floats:
+def turned_by(angles: Floats) -> Floats:
     """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3)."""
     return np.asarray(Rotation.from_rotvec(angles.reshape(-1, 3)).as_matrix()).reshape(*angles.shape, 3)

@@ -22,9 +22,9 @@ from calib.calibration.model import Calibration, CalibrationSource, given_calibr
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, Flight, load_flight, require_times
 from calib.errors import UnanswerableError
+from calib.evaluation.models import FilterRanges
 from calib.evaluation.tracking import (
     FILTERS,
-    FilterRanges,
     Settings,
     Track,
     Trajectory,
@@ -231,7 +231,8 @@ def filter_ranges(
 ) -> dict[str, FilterRanges]:
     """Return what each of `FILTERS` measures by ranges and then by arrivals.
 
-    The robust one needs an error model; the one with `online` delays is the robust one, or that with a variance.
+    The robust one needs an error model, and has a rival with what differs between flights by pair. The one with
+    `online` delays is the robust one, or that with a variance.
     """
     known, model = MeasuredReceptions.of(ranges, calibration), calibration.errors
     corrected, sign, common = known.corrected_m, known.sign, known.common_m
@@ -265,6 +266,9 @@ def filter_ranges(
                 lasting_s=lasting.time_s,
                 renewal_s=lasting.renewal_s,
             )
+    if model.between_m:
+        found["robust without offsets"] = replace(found.pop("robust"), shown=False)
+        found["robust"] = replace(found["robust without offsets"], offset_m=model.between_m, rivals=1, shown=True)
     return found | with_delays(found["robust"], ranges, calibration, online=online)
 
 
@@ -276,7 +280,8 @@ def with_delays(
         return {}
     states = DelayStates.of(calibration, ranges.tags())
     slopes = states.slopes(ends_of(ranges), delay_slopes(ranges))
-    return {"online": replace(measured, delays=states, delay_slopes=slopes)}
+    one = replace(measured, offset_m=0.0, delays=states, delay_slopes=slopes, rivals=measured.rivals + 1)
+    return {"online": one}
 
 
 def fixed_std(calibration: Calibration, settings: Settings, training: Data | Flight | None = None) -> FixedStd:
@@ -434,6 +439,7 @@ def localization_text(found: list[Localization], settings: Settings) -> str:
         f"with the calibrated variance: NIS {summary.nis:.2f} (1 expected, 95 % bounds {summary.nis_bounds[0]:.2f} to "
         f"{summary.nis_bounds[1]:.2f}), NEES {summary.nees:.2f} (3 expected, {summary.nees_bounds[0]:.2f} to "
         f"{summary.nees_bounds[1]:.2f}), {100 * summary.accepted:.1f} % of the ranges pass the gate",
+        *(line for one in found for line in offset_lines(f"{one.source} {one.body}", one.tracks.get("robust"))),
         *(line for one in found for line in delay_lines(f"{one.source} {one.body}", one.tracks.get("online"))),
     ]
     if arrivals := sum(one.arrivals for one in found):
@@ -454,6 +460,7 @@ def localization_json(found: list[Localization]) -> dict[str, Any]:
             "fixed_std_source": one.fixed.source,
             "simulated": one.simulated,
             "arrivals": one.arrivals,
+            **({"pair_offsets": float(np.mean(one.tracks["robust"].offsets))} if "robust" in one.tracks else {}),
             **delays_json(one.tracks.get("online")),
         }
         for one in found
@@ -462,21 +469,32 @@ def localization_json(found: list[Localization]) -> dict[str, Any]:
 
 
 def delay_lines(title: str, track: Track | None) -> list[str]:
-    """Return a line with delays at the end of a track and 95 % intervals, and one that says where fixed delays are
-    likelier; none where delays are no states."""
+    """Return a line with delays at the end of a track and 95 % intervals, and one with the probability that they drift;
+    none where delays are no states."""
     if track is None or not track.delays:
         return []
     each = ", ".join(f"{tag}: {delay:+.3f} {interval(std, 3)}" for tag, (delay, std) in track.delays.items())
-    kind, share = "drifting" if track.drifts[-1] else "fixed", 100 * float(np.mean(track.drifts))
+    end, mean = 100 * track.drifts[-1], 100 * np.mean(track.drifts)
     return [
         f"delays at the end of {printable(title)} (ns): {each}",
-        f"  {kind} delays are likelier at its end, drifting ones after {share:.0f} % of the measurements",
+        f"  they drift with a probability of {end:.0f} % at the end, {mean:.0f} % on average",
+    ]
+
+
+def offset_lines(title: str, track: Track | None) -> list[str]:
+    """Return a line where it is likelier than not that pairs have constants in a flight which the calibration's had
+    not."""
+    if track is None or not len(track.offsets) or track.offsets[-1] < 0.5:
+        return []
+    return [
+        f"pairs of {printable(title)} differ from the calibration by constants with a probability of "
+        f"{100 * track.offsets[-1]:.0f} % at the end, {100 * np.mean(track.offsets):.0f} % on average"
     ]
 
 
 def delays_json(track: Track | None) -> dict[str, Any]:
-    """Return delays at the end, and the share of measurements at which drifting ones are likelier, as JSON has them;
-    nothing where they are no states."""
+    """Return delays at the end, and the mean probability that they drift, as JSON has them; nothing where they are no
+    states."""
     if track is None or not track.delays:
         return {}
     rows = {str(tag): {"delay_ns": one, "std_ns": for_json(std)} for tag, (one, std) in track.delays.items()}

@@ -39,16 +39,8 @@ from calib.evaluation.filters import (
     without_directions,
 )
 from calib.evaluation.localization import MeasuredReceptions, delay_lines, delays_json, with_delays
-from calib.evaluation.tracking import (
-    PATIENCE_S,
-    FilterRanges,
-    Measurements,
-    Track,
-    nearest_attitude,
-    ranges_among,
-    side_by_side,
-    used_part,
-)
+from calib.evaluation.models import FilterRanges, side_by_side
+from calib.evaluation.tracking import PATIENCE_S, Measurements, Track, nearest_attitude, ranges_among, used_part
 from calib.online import RangeErrors
 from calib.settings import CheckedSettings
 from uwblink.arrays import Floats, Ints
@@ -334,7 +326,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
     """Process ranges, steps and heights in order of time, and return the track of the likeliest heading."""
     (first, running), known = _begin(one, settings), one.measured
     now = heard = float(one.time_s[first])
-    states, updates, restarts, exchange = list[Any](), list[tuple[float, float, bool, bool]](), list[float](), -1
+    states, updates, restarts, exchange = list[Any](), list[tuple[float, float, bool, float]](), list[float](), -1
     unexplained_s, numbers = 0.0, np.column_stack([known.measured_m, known.std_m]).tolist()
     *_, common, _, slopes = side_by_side([known])
     shared = np.column_stack([common, slopes[:, 0]])
@@ -356,7 +348,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
             geometry = one.arm_m[number], one.anchor_m[number], one.sign[number]
             more = shared[number], one.patterns[number]
             update = running.update_range(measured, noise_m, one.errors.at(number), *geometry, *more)
-            updates.append((now, float(update.nis[best]), bool(update.believed[best]), bool(running.drift[best])))
+            updates.append((now, float(update.nis[best]), bool(update.believed[best]), running.drifts))
             # As in `tracking.run_filters`, but explained ranges earn no trust: this filter drifts.
             lasted_s = min(now - heard, settings.reopen_s / 2 / MIN_RANGES_PER_FIX)
             unexplained_s = max(unexplained_s + (lasted_s if update.nis[best] > GATE else -lasted_s / 3), 0.0)

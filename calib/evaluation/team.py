@@ -36,23 +36,13 @@ from calib.evaluation.filters import (
     V,
     end_patterns,
     squared_over,
+    turned_by,
     without_directions,
 )
 from calib.evaluation.localization import Localization, consistency, delay_lines, delays_json, filter_ranges, fixed_std
+from calib.evaluation.models import FilterRanges, ModelAverage, Weighing, delay_states, side_by_side
 from calib.evaluation.onboard import inertial_readings, mean_readings
-from calib.evaluation.tracking import (
-    FilterRanges,
-    Measurements,
-    Settings,
-    Track,
-    choose_delays,
-    delay_states,
-    ranges_among,
-    side_by_side,
-    used_part,
-    weigh,
-)
-from calib.online import Reflections
+from calib.evaluation.tracking import Measurements, Settings, Track, ranges_among, used_part
 from calib.pairs import pairs_of
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, Floats, Ints
@@ -130,9 +120,9 @@ class RelativePose(Localization):
 class _Team(Measurements):
     """A recording: bodies with IMUs, the reference last, and measurements (n,) between them.
 
-    `body` (n, k, 2) and `arm` (n, k, 2, 3) are those of the ends of distances. `shares` (n, k, 2) are the states of
-    errors that they share: of pairs of tags, and then of pairs of bodies. `readings` are times in seconds and inertial
-    readings of each body.
+    `body` (n, k, 2) and `arm` (n, k, 2, 3) are those of the ends of distances. `shares` (n, k, 3) are the states of
+    errors that they share: of pairs of tags, those that last and those that stay, and then of pairs of bodies.
+    `readings` are times in seconds and inertial readings of each body.
     """
 
     bodies: list[str]
@@ -261,14 +251,15 @@ def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, A
                 f"{name}: inertial readings of {one} cover {time_s[0]:.1f} to {time_s[-1]:.1f} s after the first "
                 f"exchange, not all exchanges to {last_s:.1f} s"
             )
-    pairs = found.pair
+    pairs, of_bodies = found.pair, pairs_of(*np.moveaxis(body, 2, 0)).number
+    count = pairs.max() + 1
     return _Team(
         **found.to_dict(),
         ranges=ranges,
         bodies=bodies,
         body=body,
         arm=arms[found.ends],
-        shares=np.stack([pairs, pairs.max() + 1 + pairs_of(*np.moveaxis(body, 2, 0)).number], axis=-1),
+        shares=np.stack([pairs, count + pairs, 2 * count + of_bodies], axis=-1),
         readings=readings,
         poses=poses,
     )
@@ -323,14 +314,16 @@ def _run(
     pose = BODY * np.arange(len(team.bodies) - 1)[:, None] + np.r_[P, A]
     # How long the shared errors last: of pairs of tags; of pairs of bodies, 5 s, as errors of the state across the line
     # of sight do; of an exchange.
-    lasting = np.full((len(known), team.shares.max() + 2), 5.0)
+    lasting = np.full((len(known), team.shares.max() + 2), np.inf)
+    lasting[:, team.shares[..., 2].min() : -1] = 5.0
     lasting[:, : team.shares[..., 1].min()] = [[one.lasting_s] for one in known]
     lasting[:, -1] = 1e-12
-    # The last learns from measurements that a filter does not use.
-    reflections = [Reflections(one.renewal_s, lasting[0].shape) for one in [*known, known[0]]]
-    shape = len(time_ns), len(known), len(team.bodies) - 1
+    offset_m = np.array([one.offset_m for one in known])
+    weighing = Weighing(known, settings.gate, lasting[0].shape)
+    average = ModelAverage(known)
+    shape = len(time_ns), len(average.shown), len(team.bodies) - 1
     place, attitude, std_m, nees = np.empty((*shape, 3)), np.empty((*shape, 3, 3)), np.empty(shape), np.empty(shape)
-    nis, density, accepted = np.empty(std.shape), np.zeros(std.shape), np.empty(std.shape, dtype=bool)
+    nis, accepted, offsets, drifts = np.empty((4, len(std), len(average.shown)))
     exchange, last_s = -1, -1.0
     for k in range(len(time_ns)):
         if k:
@@ -341,49 +334,56 @@ def _run(
                 kept = np.exp(-np.maximum(time_s[k] - last_s, 1e-9) / lasting)
                 running.decay(kept)
                 running.wander(time_s[k] - max(last_s, 0.0))
-                for one in reflections:
-                    one.decay(time_s[k] - max(last_s, 0.0))
+                weighing.reflections.decay(time_s[k] - max(last_s, 0.0))
                 exchange, last_s = team.exchange[row], time_s[k]
             expected, slopes, bent_m = running.distances(team.body[row], team.arm[row], team.sign[row])
             if patterns[row]:
                 geometry = team.body[row], team.arm[row], team.sign[row]
                 expected += corrected * running.longer_m(*geometry, patterns[row])
-            for which, (pair, sides) in enumerate((running.known + team.shares[row]).tolist()):
+            for which, (pair, offset, sides) in enumerate((running.known + team.shares[row]).tolist()):
                 slopes[:, pair] += shared[row, :, which]
+                slopes[:, offset] += team.sign[row, which] * offset_m
                 slopes[:, sides] += team.sign[row, which] * bent_m[:, which]
             slopes[:, last], slopes[:, delays] = common[row], changes[row]
-            own = [one if used else reflections[-1] for one, used in zip(reflections, uses[row], strict=False)]
-            weighed = partial(weigh, known, own, team.shares[row, :, 0], row, gate=settings.gate)
+            weighed = partial(weighing.update, row, team.shares[row, :, 0], uses[row])
             update = running.update(slopes * uses[row, :, None], measured[row] - expected, std[row] ** 2, weighed)
-            nis[row], accepted[row] = update.nis, update.believed
-            density[row] = np.where(uses[row], update.log_density, 0.0)
-        place[k], attitude[k] = running.own[..., P], running.attitude[:, :-1]
-        covariance = running.covariance[:, pose[:, :, None], pose[:, None]]
+            average.learn(np.where(uses[row], update.log_density, 0.0))
+            nis[row], accepted[row] = average.mean(update.nis), average.mean(update.believed)
+            offsets[row], drifts[row] = average.mean(average.offset), average.mean(average.drifting)
+        # Attitudes are averaged as rotation vectors from those of the likeliest model.
+        bodies, likeliest = running.attitude[:, :-1], average.weights.argmax(axis=1)
+        away = Rotation.from_matrix((bodies[likeliest, None].swapaxes(-1, -2) @ bodies).reshape(-1, 3, 3)).as_rotvec()
+        places = np.broadcast_to(running.own[..., P], (len(likeliest), *running.own.shape[:2], 3))
+        state, covariance = average.moments(
+            np.concatenate([places, away.reshape(places.shape)], axis=-1),
+            running.covariance[:, pose[:, :, None], pose[:, None]],
+        )
+        place[k], attitude[k] = state[..., :3], bodies[likeliest] @ turned_by(state[..., 3:])
         turns = Rotation.from_matrix((attitude[k].swapaxes(2, 3) @ turned[k]).reshape(-1, 3, 3)).as_rotvec()
         wrong = np.concatenate([truth[k] - place[k], turns.reshape(place[k].shape)], axis=-1)
         nees[k] = squared_over(wrong, covariance)
         std_m[k] = np.sqrt(np.trace(covariance[..., P, P], axis1=-2, axis2=-1))
-    counts_for = choose_delays(known, density)
+    changes_m, covariance = average.delays(running)
 
     def track(f: int, b: int) -> RelativeTrack:
-        rows = np.flatnonzero(uses[:, f])
-        measured = rows, counts_for[rows, f]
-        at = np.arange(len(time_ns)), counts_for[firsts[1:] - 1, f], b
+        rows, states = np.flatnonzero(uses[:, average.shown[f]]), known[average.shown[f]].delays
         return RelativeTrack(
             time_ns=time_ns,
-            attitude=Rotation.from_matrix(attitude[at]).as_quat(),
-            estimate_m=place[at],
+            attitude=Rotation.from_matrix(attitude[:, f, b]).as_quat(),
+            estimate_m=place[:, f, b],
             truth_m=truth[:, b],
             true_attitude=np.where(np.isfinite(truth[:, b, :1]), Rotation.from_matrix(turned[:, b]).as_quat(), np.nan),
-            std_m=std_m[at],
-            nis=nis[measured],
-            nees=nees[at],
-            accepted=accepted[measured],
-            drifts=counts_for[rows, f] == f,
-            delays=running.delays_at((f,), known[f].delays, drift=counts_for[-1, f] == f),
+            std_m=std_m[:, f, b],
+            nis=nis[rows, f],
+            nees=nees[:, f, b],
+            accepted=accepted[rows, f] > 0.5,
+            offsets=offsets[rows, f],
+            drifts=drifts[rows, f],
+            delays=states.estimates(changes_m[f], covariance[f]) if states.tags else {},
         )
 
-    return {body: {name: track(f, b) for f, name in enumerate(filters)} for b, body in enumerate(team.bodies[:-1])}
+    names = [name for name, (one, _) in filters.items() if one.shown]
+    return {body: {name: track(f, b) for f, name in enumerate(names)} for b, body in enumerate(team.bodies[:-1])}
 
 
 def team_text(found: list[RelativePose], settings: TeamSettings) -> str:

@@ -8,7 +8,7 @@ range, two of a difference of arrival (`calib.data.arrivals`), of which those be
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar, Final
@@ -19,7 +19,7 @@ from calib.calibration.error_model import GATE
 from calib.data.ranges import Ranges
 from calib.data.sources import Flight, require_arrivals
 from calib.evaluation.filters import GaussianFilters, multilaterate, squared_over
-from calib.online import FIXED_DELAYS, DelayStates, RangeErrors, Reflections, WeighedInnovation, gated_update
+from calib.evaluation.models import FilterRanges, ModelAverage, Weighing, delay_states, side_by_side
 from calib.pairs import pairs_of
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
@@ -77,8 +77,9 @@ class Track:
     `std_m` (n,) is the standard deviation by the filter itself: the root of the sum of its three variances. `nees` (n,)
     are the squared errors over their covariance, which should be `DEGREES`. Truth and `nees` are NaN where poses do not
     say. `nis` (measurements,) are the squared innovations over their variance, and `accepted` (measurements,) which are
-    within the gate. `delays` are those at the end and their standard deviations by tag, in ns, where they are states:
-    `drifts` (measurements,) then tells where delays that drift were likelier than those of the calibration.
+    within the gate. `offsets` (measurements,) are the probabilities that pairs have constants in this flight, `drifts`
+    (measurements,) those that delays drift. `delays` are those at the end and their standard deviations by tag, in ns,
+    where they are states.
     """
 
     DEGREES: ClassVar[int] = 3
@@ -91,7 +92,8 @@ class Track:
     nis: Floats
     nees: Floats
     accepted: Bools
-    drifts: Bools
+    drifts: Floats
+    offsets: Floats = field(default_factory=lambda: np.zeros(0))
     delays: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
     @property
@@ -293,108 +295,32 @@ def nearest_attitude(poses: Poses, body: str, time_ns: Ints) -> Floats:
     return np.asarray(poses.quaternion[rows[np.rint(place).astype(np.int64)]])
 
 
-@dataclass(frozen=True, slots=True)
-class FilterRanges:
-    """What a filter measures (n,), the standard deviation of each measurement's own error, and its error model, if any.
-
-    Ranges of a pair share an error with a standard deviation of `shared_m`, which lasts for `lasting_s`: (n, k) by the
-    distances in a measurement, with their signs. Reflections last for `renewal_s` (`calib.online.Reflections`).
-    Measurements of an exchange share an error of `common_m` (n,). Where delays are states, `delay_slopes` (n, tags) are
-    the derivatives by them.
-    """
-
-    measured_m: Floats
-    std_m: Floats
-    common_m: Floats
-    shared_m: Floats
-    lasting_s: float = np.inf
-    renewal_s: float = 0.0
-    errors: RangeErrors | None = None
-    delays: DelayStates = FIXED_DELAYS
-    delay_slopes: Floats | None = None
-
-    def at(self, rows: Ints) -> FilterRanges:
-        """Return some measurements."""
-        names = ("measured_m", "std_m", "common_m", "shared_m", "delay_slopes")
-        some = {name: x[rows] for name in names if (x := getattr(self, name)) is not None}
-        return replace(self, **some, errors=None if self.errors is None else self.errors.at(rows))
-
-
-def weigh(
-    known: list[FilterRanges],
-    reflections: list[Reflections],
-    pair: Ints,
-    row: int,
-    innovation_m: Floats,
-    variance_m2: Floats,
-    gate: float,
-) -> WeighedInnovation:
-    """Return the updates of filters (filters, ...) by their measurement `row`: by a gate, or by an error model and what
-    each knows of reflections of the pairs (k,) in it."""
-    update = gated_update(innovation_m, variance_m2, gate)
-    for f, one in enumerate(known):
-        if one.errors is not None:
-            own = reflections[f].weigh(innovation_m[f], variance_m2[f], one.errors.at(row), pair)
-            for name in ("noise_m", "variance_m2", "believed", "tail", "log_density"):
-                getattr(update, name)[f] = getattr(own, name)
-    return update
-
-
-def side_by_side(filters: Sequence[FilterRanges]) -> Iterator[Floats]:
-    """Yield what filters measure, the standard deviations of own errors and of those of an exchange (n, filters), and
-    of errors that pairs share (n, filters, k), and derivatives by states of delays (n, filters, tags)."""
-    for name in ("measured_m", "std_m", "common_m", "shared_m"):
-        yield np.stack([getattr(one, name) for one in filters], axis=1)
-    fixed = np.zeros((len(filters[0].measured_m), len(delay_states(filters).tags)))
-    yield np.stack([fixed if one.delay_slopes is None else one.delay_slopes for one in filters], axis=1)
-
-
-def delay_states(filters: Sequence[FilterRanges]) -> DelayStates:
-    """Return the states of delays that some of the filters have, of no tag where none has any."""
-    return next((one.delays for one in filters if one.delays.tags), FIXED_DELAYS)
-
-
-def choose_delays(known: Sequence[FilterRanges], log_density: Floats) -> Ints:
-    """Return which filter counts for each after each measurement (n, filters, ...), by their numbers.
-
-    A filter with delays as states gives way to the one before it, the same with fixed delays, where that is likelier.
-    `log_density` (n, filters, ...) is that of innovations. Neither falls below a probability of a thousandth, so that
-    delays may begin to drift late in a flight.
-    """
-    found = np.zeros(log_density.shape, dtype=np.int64)
-    np.moveaxis(found, 1, -1)[:] = np.arange(len(known))
-    for f in (f for f, one in enumerate(known) if one.delays.tags):
-        odds = np.zeros(log_density.shape[2:])
-        for k, gain in enumerate(log_density[:, f] - log_density[:, f - 1]):
-            odds = np.clip(odds + gain, -np.log(1000), np.log(1000))
-            found[k, f] -= odds <= 0
-    return found
-
-
 def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: Settings) -> dict[str, list[Track]]:
     """Run filters on the ranges of a body with every noise; return the tracks of each, one for each noise.
 
-    A state is the position, for each pair of tags the error that its ranges share, in units of `shared_m`, and the
-    error that measurements of one exchange share, in units of `common_m`; then the delays, which a restart keeps. A
-    filter with delays as states gives way to the one before it, which has none, where that is likelier. Arrays are
+    A state is the position, for each pair of tags the error that its ranges share, in units of `shared_m`, the error
+    that measurements of one exchange share, in units of `common_m`, and for each pair its constant, in units of
+    `offset_m`; then the delays, which a restart keeps. Tracks are averages over a filter and its rivals. Arrays are
     (filters, seeds, ...).
     """
     count, known, pair, elapsed_s = len(problem), list(ranges.values()), problem.pair, problem.elapsed_s
     measured, std, common, shared, slopes = side_by_side(known)
     noises = [problem.noisy(settings, settings.seed + k) for k in range(settings.seeds)]
     moves, spread = np.stack([moves for _, moves in noises], axis=1), problem.velocity_spread(settings)
-    moved, shape, size = moves.cumsum(axis=0), (len(known), settings.seeds), 5 + int(pair.max())
-    kept = np.exp(-elapsed_s[:, None, None] / [[one.lasting_s] for one in known])
-    kept = np.broadcast_to(kept, (count, len(known), size - 3)).copy()
+    offset_m, pairs = np.array([one.offset_m for one in known]), 1 + int(pair.max())
+    moved, shape, size = moves.cumsum(axis=0), (len(known), settings.seeds), 4 + pairs * (2 if offset_m.any() else 1)
+    kept = np.empty((count, len(known), pairs + 1))
+    kept[..., :pairs] = np.exp(-elapsed_s[:, None, None] / [[one.lasting_s] for one in known])
     kept[..., -1] = np.diff(problem.exchange, prepend=-1)[:, None] == 0
     place = slice(0, 3)
     prior = np.diag(np.where(np.arange(size) < 3, settings.initial_std_m**2, 1.0))
     running = GaussianFilters(np.zeros((*shape, size)), np.tile(prior, (*shape, 1, 1)), 3)
     running.state[..., place] = [start for start, _ in noises]
     delays, own = running.append(delay_states(known)), slice(size)
-    reflections = [Reflections(one.renewal_s, (settings.seeds, size - 4)) for one in known]
-    estimate, (std_m, nis, nees, density) = np.empty((count, *shape, 3)), np.empty((4, count, *shape))
-    accepted = np.empty((count, *shape), dtype=bool)
+    weighing, used = Weighing(known, settings.gate, (settings.seeds, pairs)), np.ones(shape, dtype=bool)
+    average = ModelAverage(known, shape[1:])
+    averaged = count, len(average.shown), settings.seeds
+    estimate, (std_m, nis, nees, accepted, offsets, drifts) = np.empty((*averaged, 3)), np.empty((6, *averaged))
     # Twelve unexplained ranges at least, four for each coordinate, before a filter begins anew.
     explained_s, most_s = np.zeros(shape), settings.reopen_s / 2 / 12
     for k in range(count):
@@ -408,11 +334,12 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
         h[..., place] = np.sum(towards * (problem.sign[k] / np.maximum(distance, 1e-6))[..., None], axis=-2)
         for which, shares in enumerate((3 + pair[k]).tolist()):
             h[..., shares] += shared[k, :, which, None]
-        h[..., size - 1], h[..., delays] = common[k][:, None], slopes[k][:, None]
+            if size > 4 + pairs:
+                h[..., 1 + pairs + shares] += problem.sign[k, which] * offset_m[:, None]
+        h[..., 3 + pairs], h[..., delays] = common[k][:, None], slopes[k][:, None]
         expected = problem.known_m[k] + distance @ problem.sign[k]
-        for one in reflections:
-            one.decay(elapsed_s[k])
-        weighed = partial(weigh, known, reflections, pair[k], k, gate=settings.gate)
+        weighing.reflections.decay(elapsed_s[k])
+        weighed = partial(weighing.update, k, pair[k], used)
         update = running.update(h, measured[k][:, None] - expected, std[k][:, None] ** 2, weighed)
         lasted_s = min(elapsed_s[k], most_s)
         # Of a body among two others, one behind something, half of the ranges are reflected: that is not being lost.
@@ -427,16 +354,17 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
             state, covariance, explained_s[lost] = running.state[lost], running.covariance[lost], 0.0
             state[own], covariance[own], covariance[:, own], covariance[own, own] = 0.0, 0.0, 0.0, prior
             state[place], covariance[place, place] = fix.place_m, fix.covariance_m2
-            reflections[lost[0]].lasting[lost[1]] = 0.0
-        covariance = running.covariance[..., place, place]
-        estimate[k], accepted[k], nis[k] = running.state[..., place], update.believed, update.nis
-        density[k] = update.log_density
+            weighing.forget(lost)
+        average.learn(update.log_density)
+        estimate[k], covariance = average.moments(running.state[..., place], running.covariance[..., place, place])
+        nis[k], accepted[k] = average.mean(update.nis), average.mean(update.believed)
+        offsets[k], drifts[k] = average.mean(average.offset), average.mean(average.drifting)
         std_m[k] = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
         nees[k] = squared_over(estimate[k] - problem.place[k], covariance)
-    counts_for = choose_delays(known, density)
+    changes_m, covariance = average.delays(running)
 
     def track(f: int, seed: int) -> Track:
-        own = np.arange(count), counts_for[:, f, seed], seed
+        own, states = (slice(None), f, seed), known[average.shown[f]].delays
         return Track(
             time_ns=problem.time_ns,
             attitude=problem.attitude,
@@ -446,9 +374,11 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
             std_m=std_m[own],
             nis=nis[own],
             nees=nees[own],
-            accepted=accepted[own],
-            drifts=counts_for[:, f, seed] == f,
-            delays=running.delays_at((f, seed), known[f].delays, drift=counts_for[-1, f, seed] == f),
+            accepted=accepted[own] > 0.5,
+            offsets=offsets[own],
+            drifts=drifts[own],
+            delays=states.estimates(changes_m[f, seed], covariance[f, seed]) if states.tags else {},
         )
 
-    return {name: [track(f, seed) for seed in range(settings.seeds)] for f, name in enumerate(ranges)}
+    names = [name for name, one in ranges.items() if one.shown]
+    return {name: [track(f, seed) for seed in range(settings.seeds)] for f, name in enumerate(names)}

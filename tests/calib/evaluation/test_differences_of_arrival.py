@@ -11,7 +11,8 @@ from scipy.interpolate import BSpline
 import calib
 from calib.data.sources import load_flight
 from calib.evaluation import Settings, localization_json, localization_text, summarize
-from calib.evaluation.tracking import FilterRanges, problems, run_filters
+from calib.evaluation.models import FilterRanges
+from calib.evaluation.tracking import problems, run_filters
 from tests import processes
 from tests.calib.synthetic import calibration
 from uwbsim import simulate

@@ -298,7 +298,9 @@ def test_what_is_known_of_reflections_is_that_of_all_their_histories():
             moved = [kept[j] * (history[j] == history[j - 1]) + (1 - kept[j]) * odds[j] for j in range(1, k + 1)]
             found[history[-1]] += odds[0] * np.prod(moved) * np.prod(density[history, range(k + 1)])
         tracked.decay(float(steps_s[k]))
-        told = tracked.weigh(innovation[[k]], np.array([STD**2]), replace(ERRORS, share=np.array([share])), pair)
+        told = tracked.weigh(
+            innovation[[k]], np.array([STD**2]), replace(ERRORS, share=np.array([share])), pair, np.ones(1, bool)
+        )
         assert told.reflected[0, 0] == pytest.approx(found[1] / found.sum(), rel=1e-9)
     assert not tracked.lasting[0, 0].any()
 

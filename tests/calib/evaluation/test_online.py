@@ -27,7 +27,8 @@ NO_GTSAM = "GTSAM is not installed here: pip install 'uwbcal[gtsam]'"
 
 @pytest.fixture(scope="module")
 def known():
-    return fit(flight(100, 60.0)[0]).calibration
+    # Nothing differs between flights: the robust filter has no constants of pairs, which would follow drifts, too.
+    return fit(flight(100, 60.0)[0], between_m=0.0).calibration
 
 
 def wrong_m(delays_ns, drift_m):
@@ -56,7 +57,7 @@ def test_the_command_compares_states_with_fixed_delays_and_prints_their_end(know
     text = succeed(*words, "--seeds", 1).stdout
     assert re.search(r"raw +calibrated +variance +robust +online", text)
     assert re.search(r"delays at the end of test.uwb robot \(ns\): 1: [+-]0\.\d+ ± 0\.\d+ \(95 %\), 2: ", text)
-    assert re.search(r"(fixed|drifting) delays are likelier at its end, drifting ones after \d+ % of the meas", text)
+    assert re.search(r"they drift with a probability of \d+ % at the end, \d+ % on average", text)
 
 
 def test_constants_of_pairs_have_no_delays_to_follow(tmp_path):
@@ -119,8 +120,7 @@ def test_where_nothing_drifts_the_filter_is_as_good_as_with_fixed_delays(known):
     online, fixed = (np.mean([one.tracks[name].rmse_m for one in found]) for name in ("online", "robust"))
     # A walk that is assumed and is not there costs 2 to 5 %; that it is less likely shows within seconds.
     assert online < 1.005 * fixed
-    same = [np.mean(one.tracks["online"].estimate_m == one.tracks["robust"].estimate_m) for one in found]
-    assert np.mean(same) > 0.7
+    assert np.mean([one.tracks["online"].drifts.mean() for one in found]) < 0.3
 
 
 def test_delays_may_begin_to_drift_late(known):
@@ -129,11 +129,10 @@ def test_delays_may_begin_to_drift_late(known):
     more_m = 0.1 * np.clip(after_s / 20, 0, 1) * ((ranges.initiator == 1) | (ranges.target == 1))
     made = replace(found, exchanges=replace(ranges, range_m=ranges.range_m + more_m))
     (one,) = localize(made, known, Settings(seeds=1, online=True))
-    online, fixed = (one.tracks[name] for name in ("online", "robust"))
-    same = (online.estimate_m == fixed.estimate_m).all(axis=1)
+    online = one.tracks["online"]
     time_s = 1e-9 * (online.time_ns - online.time_ns[0])
-    assert same[time_s < 30].mean() > 0.7
-    assert not same[time_s > 45].any()
+    assert online.drifts[time_s < 30].mean() < 0.3
+    assert online.drifts[time_s > 45].min() > 0.9
     delays = {tag: delay for tag, (delay, _) in one.delays.items()}
     before, after = (np.abs(wrong_m(some, {1: 0.1})).max() for some in (known.delays_ns, delays))
     assert after < 0.5 * before

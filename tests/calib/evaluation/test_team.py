@@ -17,8 +17,9 @@ from calib.data.samples import stamped
 from calib.errors import WeakHeadingWarning
 from calib.evaluation import team
 from calib.evaluation.filters import IMUS, ProcessNoise, RelativeFilter
+from calib.evaluation.models import FilterRanges
 from calib.evaluation.team import team_json, team_text
-from calib.evaluation.tracking import FilterRanges, distances_in
+from calib.evaluation.tracking import distances_in
 from tests import processes
 from tests.calib.synthetic import calibration
 from uwblink import Contents, Poses, Tag

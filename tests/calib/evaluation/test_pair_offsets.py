@@ -1,0 +1,120 @@
+"""What differs between flights by pair: filters follow constants of pairs where a flight has them."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib import fit, localize, localize_team
+from calib.calibration.error_model import ErrorModel
+from calib.data.samples import stamped
+from calib.evaluation import Settings
+from calib.evaluation.localization import consistency
+from calib.evaluation.models import FilterRanges, ModelAverage
+from calib.evaluation.tracking import Track
+from tests.calib.evaluation import test_team
+from tests.calib.evaluation.drifting_flight import flight
+from tests.calib.evaluation.test_team import CLOSE, NOISE_M, PLANTED, ranging
+from tests.processes import succeed
+
+OFFSET_M = 0.05
+ONE = Settings(seeds=1)
+
+
+@pytest.fixture(scope="module")
+def known():
+    found = fit(flight(100, 60.0)[0]).calibration
+    assert found.errors.between_m == OFFSET_M, "the default of one flight, as planted here"
+    return found
+
+
+def offsets_m(initiator, target, seed):
+    """Constants of pairs, for each range."""
+    pairs, number = np.unique(np.sort([initiator, target], axis=0), axis=1, return_inverse=True)
+    return np.random.default_rng([11, seed]).normal(0, OFFSET_M, pairs.shape[1])[number.ravel()]
+
+
+def with_offsets(contents, seed):
+    """The recording with a constant of each pair of tags added to its ranges, 5 cm (standard deviation)."""
+    rows = contents.exchanges
+    return replace(
+        contents, exchanges=replace(rows, range_m=rows.range_m + offsets_m(rows.initiator, rows.target, seed))
+    )
+
+
+def without(known):
+    """The calibration with errors that are the same in all flights."""
+    errors = known.errors
+    return replace(known, errors=replace(errors, noise_m=tuple(errors.within_m(np.array(errors.noise_m))), between_m=0))
+
+
+def robust(contents, known) -> Track:
+    return localize(contents, known, ONE)[0].tracks["robust"]
+
+
+def test_constants_of_pairs_are_followed(known):
+    flights = [with_offsets(flight(seed, 40.0)[0], seed) for seed in (21, 22, 23, 24)]
+    own, fixed = ([robust(one, by) for one in flights] for by in (known, without(known)))
+    # One prior for both: 14 constants are found from 40 s of ranges to about 2 cm.
+    assert np.mean([one.rmse_m for one in own]) < 0.75 * np.mean([one.rmse_m for one in fixed])
+    assert min(one.offsets[-1] for one in own) > 0.99
+    nees, (low, high), _ = consistency(own)
+    # Within the bounds of a filter that is right, at 99 %: 1.31 times as far away as those at 95 %.
+    assert 3 - 1.31 * (3 - low) < nees < 3 + 1.31 * (high - 3)
+    assert consistency(fixed)[0] > 6
+
+
+def test_without_constants_the_filter_is_as_good_as_one_that_has_none(known):
+    flights = [flight(seed, 40.0)[0] for seed in (31, 32, 33, 34)]
+    own, fixed = ([robust(one, by) for one in flights] for by in (known, without(known)))
+    assert np.mean([one.rmse_m for one in own]) < 1.005 * np.mean([one.rmse_m for one in fixed])
+    assert np.mean([one.offsets.mean() for one in own]) < 0.2
+
+
+def test_the_command_says_that_pairs_differ(known, tmp_path):
+    known.save(tmp_path / "known.json")
+    said = {}
+    for name, contents in (("same", flight(41, 20.0)[0]), ("differs", with_offsets(flight(41, 20.0)[0], 41))):
+        contents.save(tmp_path / f"{name}.uwb")
+        words = ("calib", "localize", tmp_path / f"{name}.uwb", "-c", tmp_path / "known.json", "--seeds", 1)
+        said[name] = succeed(*words).stdout, json.loads(succeed(*words, "--json").stdout)["scenarios"][0]
+    line = "pairs of differs.uwb robot differ from the calibration by constants with a probability of 100 % at the end"
+    assert (line in said["differs"][0], "pairs of same.uwb" in said["same"][0]) == (True, False)
+    assert said["same"][1]["pair_offsets"] < 0.3 < 0.7 < said["differs"][1]["pair_offsets"]
+
+
+def test_the_average_over_models_has_the_moments_of_their_mixture():
+    rng, nothing = np.random.default_rng(3), np.zeros(1)
+    one = FilterRanges(measured_m=nothing, std_m=nothing, common_m=nothing, shared_m=nothing[:, None])
+    models = [one, replace(one, shown=False), replace(one, rivals=1)]
+    average, densities = ModelAverage(models, (1,)), np.log([[[7.0], [0.3], [0.5]], [[9.0], [0.8], [0.1]]])
+    for density in densities:
+        average.learn(density)
+    odds = np.array([0.3 * 0.8, 0.5 * 0.1])
+    np.testing.assert_allclose(average.weights[:, :, 0], [[1, 0, 0], [0, *(odds / odds.sum())]])
+    states, roots = rng.normal(size=(3, 1, 2)), rng.normal(size=(3, 1, 2, 2))
+    means, covariances = average.moments(states, roots @ roots.swapaxes(-1, -2))
+    which = 1 + (rng.random(400_000) < odds[1] / odds.sum())
+    draws = states[which, 0] + np.einsum("nij,nj->ni", roots[which, 0], rng.normal(size=(len(which), 2)))
+    np.testing.assert_allclose(means[:, 0], [states[0, 0], draws.mean(axis=0)], atol=0.01)
+    np.testing.assert_allclose(covariances[1, 0], np.cov(draws.T), atol=0.03)
+    # No model is lost: it can be the likeliest again.
+    for _ in range(40):
+        average.learn(densities[1])
+    assert average.weights[1, 2, 0] == pytest.approx(1e-3, rel=0.01)
+
+
+def test_a_team_follows_constants_of_pairs():
+    noise_m = float(np.hypot(NOISE_M, OFFSET_M))
+    errors = ErrorModel(lifted=(0.0,), noise_m=(noise_m,), tail_share=(1e-3,), least_m=0.0, detour_m=0.3,
+                        outlier_share=0.0, outlier_m=0.0, between_m=OFFSET_M)  # fmt: skip
+    known, (_, ends, measured_m) = replace(PLANTED, errors=errors), ranging(20.0, 1)
+    made = test_team.flight(20.0)
+    measured_m = measured_m + offsets_m(ends[:, 0], ends[:, 1], 5)
+    exchanges = stamped(made.exchanges.time_ns, ends, measured_m, np.full((2, len(ends)), -85.0))
+    made = replace(made, exchanges=exchanges)
+    own, fixed = ([one.tracks["robust"] for one in localize_team(made, by, CLOSE)] for by in (known, without(known)))
+    assert np.mean([one.rmse_m for one in own]) < 0.75 * np.mean([one.rmse_m for one in fixed])
+    assert min(one.offsets[-1] for one in own) > 0.99
+    assert consistency(own)[0] < 0.5 * consistency(fixed)[0]
