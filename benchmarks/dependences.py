@@ -46,6 +46,8 @@ DRIFTS_M: tuple[dict[int, float], ...] = (
     {1: 0.2, 2: 0.2},
 )
 """In a filter: nothing drifts; one tag by 2 cm/K over 10 K, others by 2.15 mm/K; both tags of the robot."""
+OFFSETS_M = (0.0, 0.02, 0.05)
+"""In a filter: constants of pairs, standard deviations in metres."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,17 +112,25 @@ def sessions(rate_m2: float, seed: int) -> Outcome:
     return Outcome(found=one["told"], inside=(float(low <= rate_m2 <= high),))
 
 
-def filtered(drifts_m: Sequence[dict[int, float]], seeds: Sequence[int]) -> list[str]:
-    """Return a row on filters with delays as states: NEES with its bounds, and RMSE beside fixed delays."""
-    known, cells = calib.fit(drifting_flight.flight(100, 60.0)[0]).calibration, []
-    for drift_m in drifts_m:
-        flights = [drifting_flight.flight(seed, drift_m=drift_m)[0] for seed in seeds]
-        found = [calib.localize(one, known, Settings(seeds=1, online=True))[0] for one in flights]
-        ratios = [one.tracks["online"].rmse_m / one.tracks["robust"].rmse_m - 1 for one in found]
-        nees, (low, high), _ = consistency([one.tracks["online"] for one in found])
-        cells.append((f"{nees:.1f} ({low:.1f} to {high:.1f})", f"{100 * np.mean(ratios):+.1f}"))
+def filtered(name: str, kind: str, cases: Sequence[dict[str, Any]], seeds: Sequence[int]) -> list[str]:
+    """Return a row on filters of a `kind` in flights of some cases: NEES with its bounds, and RMSE beside a filter
+    with fixed delays and without constants of pairs."""
+    fixed, known = (
+        calib.fit(drifting_flight.flight(100, 60.0)[0], between_m=value).calibration for value in (0.0, None)
+    )
+    cells = []
+    for case in cases:
+        flights = [drifting_flight.flight(seed, **case)[0] for seed in seeds]
+        # Delays as states are judged alone.
+        by, online = fixed if kind == "online" else known, Settings(seeds=1, online=kind == "online")
+        found = [calib.localize(one, by, online)[0].tracks[kind] for one in flights]
+        beside = [calib.localize(one, fixed, Settings(seeds=1))[0].tracks["robust"] for one in flights]
+        change = np.mean([one.rmse_m / other.rmse_m - 1 for one, other in zip(found, beside, strict=True)])
+        nees, (low, high), _ = consistency(found)
+        cells.append((f"{nees:.1f}", f"{100 * change:+.1f}"))
     texts = [", ".join(some) for some in zip(*cells, strict=True)]
-    return ["in a filter: no drift, one tag, two tags", f"NEES {texts[0]}", f"{texts[1]} %", ""]
+    # Flights of one length: bounds of all cases are about those of the last.
+    return [name, f"NEES {texts[0]} ({low:.1f} to {high:.1f})", f"{texts[1]} %", ""]
 
 
 def row(name: str, cases: Sequence[Sequence[Outcome]]) -> list[str]:
@@ -151,7 +161,9 @@ def main() -> None:
         lines.append(_line(row(name, [[flown(*world) for world in product(case, seeds)] for case in cases])))
     walks = [[sessions(rate_m2, seed) for seed in seeds] for rate_m2 in RATES_M2]
     lines.append(_line(row("from day to day: none, 3, 10 mm a root of a day", walks)))
-    lines.append(_line(filtered(DRIFTS_M, seeds[:8])))
+    drifts, offsets = [{"drift_m": one} for one in DRIFTS_M], [{"offset_m": one} for one in OFFSETS_M]
+    lines.append(_line(filtered("in a filter: no drift, one tag, two tags", "online", drifts, seeds[:8])))
+    lines.append(_line(filtered("constants of pairs of 0, 2, 5 cm", "robust", offsets, seeds[:8])))
     if args.write:
         table = "\n".join(["<!-- dependences -->", *lines, "<!-- end of dependences -->"])
         page = PAGE.read_text()

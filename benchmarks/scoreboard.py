@@ -42,7 +42,7 @@ EVERY: Final = 50
 HEAD: Final = """\
 # Real data
 
-Public flights, calibrated and judged by the commands below (`make scoreboard DATA=folder`), never on ranges that a calibration of ours was fitted to. Errors are ranges minus true distances; "in 95 %" are ranges within their stated 95 % interval. Localization is the position RMSE of `calib localize` with each range's variance; of raw ranges with a fixed one.
+Public flights, calibrated and judged by the commands below (`make scoreboard DATA=folder`), never on ranges that a calibration of ours was fitted to. Errors are ranges minus true distances; "in 95 %" are ranges within their stated 95 % interval. Localization is the position RMSE of `calib localize`: by the robust filter, of authors' calibrations with each range's variance, of raw ranges with a fixed one.
 
 | ranges | calibration | count | median (cm) | robust deviation (cm) | in 95 % (%) | localization (m) |
 |---|---|---|---|---|---|---|
@@ -373,7 +373,8 @@ def figures(lab: Lab, data: DataSet, flights: list[str]) -> list[Row]:
             there[file] = found["ours"]
         elif words[1] == "localize":
             rmse = answer["summary"]["rmse_m"]
-            rows[flight]["none"].rmse_m, rows[flight][file].rmse_m = rmse["raw"], rmse["variance"]
+            # Calibrations without an error model have no robust filter.
+            rows[flight]["none"].rmse_m, rows[flight][file].rmse_m = rmse["raw"], rmse.get("robust", rmse["variance"])
         else:
             overall = answer["overall"]
             there = rows.setdefault(flight, before(flight, overall["raw"], lab, data))

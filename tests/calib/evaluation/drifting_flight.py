@@ -19,11 +19,12 @@ def place(time_s, seed):
     return [3.4, 2.9, 1.3] + wave @ [[2.3, 0, 0], [0, 2.1, 0], [0, 0, 0.7], [0.3, 0, 0.1], [0, 0.3, 0]]
 
 
-def flight(seed, last_s=120.0, rate_hz=100, drift_m=None, only=None):
+def flight(seed, last_s=120.0, rate_hz=100, drift_m=None, only=None, offset_m=0.0):
     """A recording, and the antenna's place (n, 3) that begins each exchange: of the robot, or one in five of an anchor.
 
     Ranges have noise of 6 cm; a tenth is reflected, by 35 cm on average. Those of a tag drift linearly, by `drift_m` at
-    the end. `only` is the robot's tag that ranges, by default both and anchors.
+    the end. `only` is the robot's tag that ranges, by default both and anchors. Ranges of a pair have a constant of
+    `offset_m` (standard deviation).
     """
     rng, count = np.random.default_rng(seed), int(last_s * rate_hz)
     time_s, rows = 1 + np.arange(count) / rate_hz, np.arange(count)
@@ -36,6 +37,8 @@ def flight(seed, last_s=120.0, rate_hz=100, drift_m=None, only=None):
     longer -= np.array([*DELAYS_NS.values()]) * LIGHT / 2
     range_m = np.linalg.norm(points[rows, own] - points[rows, other], axis=1) + 0.06 * rng.normal(size=count)
     range_m += longer[rows, own] + longer[rows, other] + (rng.random(count) < 0.1) * rng.exponential(0.35, count)
+    offsets_m = offset_m * np.triu(np.random.default_rng([seed, 11]).normal(size=(8, 8)))
+    range_m += (offsets_m + offsets_m.T)[own, other]
     columns = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(count, dtype=int)) | {"range_m": range_m}
     pose_s = np.arange(0.5, last_s + 1.5, 0.01)
     return Contents(

@@ -1,6 +1,7 @@
 """What differs between flights by pair: filters follow constants of pairs where a flight has them."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -29,20 +30,6 @@ def known():
     return found
 
 
-def offsets_m(initiator, target, seed):
-    """Constants of pairs, for each range."""
-    pairs, number = np.unique(np.sort([initiator, target], axis=0), axis=1, return_inverse=True)
-    return np.random.default_rng([11, seed]).normal(0, OFFSET_M, pairs.shape[1])[number.ravel()]
-
-
-def with_offsets(contents, seed):
-    """The recording with a constant of each pair of tags added to its ranges, 5 cm (standard deviation)."""
-    rows = contents.exchanges
-    return replace(
-        contents, exchanges=replace(rows, range_m=rows.range_m + offsets_m(rows.initiator, rows.target, seed))
-    )
-
-
 def without(known):
     """The calibration with errors that are the same in all flights."""
     errors = known.errors
@@ -53,8 +40,9 @@ def robust(contents, known) -> Track:
     return localize(contents, known, ONE)[0].tracks["robust"]
 
 
+@pytest.mark.slow
 def test_constants_of_pairs_are_followed(known):
-    flights = [with_offsets(flight(seed, 40.0)[0], seed) for seed in (21, 22, 23, 24)]
+    flights = [flight(seed, 40.0, offset_m=OFFSET_M)[0] for seed in (21, 22, 23, 24)]
     own, fixed = ([robust(one, by) for one in flights] for by in (known, without(known)))
     # One prior for both: 14 constants are found from 40 s of ranges to about 2 cm.
     assert np.mean([one.rmse_m for one in own]) < 0.75 * np.mean([one.rmse_m for one in fixed])
@@ -65,6 +53,7 @@ def test_constants_of_pairs_are_followed(known):
     assert consistency(fixed)[0] > 6
 
 
+@pytest.mark.slow
 def test_without_constants_the_filter_is_as_good_as_one_that_has_none(known):
     flights = [flight(seed, 40.0)[0] for seed in (31, 32, 33, 34)]
     own, fixed = ([robust(one, by) for one in flights] for by in (known, without(known)))
@@ -75,12 +64,15 @@ def test_without_constants_the_filter_is_as_good_as_one_that_has_none(known):
 def test_the_command_says_that_pairs_differ(known, tmp_path):
     known.save(tmp_path / "known.json")
     said = {}
-    for name, contents in (("same", flight(41, 20.0)[0]), ("differs", with_offsets(flight(41, 20.0)[0], 41))):
+    for name, contents in (("same", flight(41, 20.0)[0]), ("differs", flight(41, 20.0, offset_m=OFFSET_M)[0])):
         contents.save(tmp_path / f"{name}.uwb")
         words = ("calib", "localize", tmp_path / f"{name}.uwb", "-c", tmp_path / "known.json", "--seeds", 1)
         said[name] = succeed(*words).stdout, json.loads(succeed(*words, "--json").stdout)["scenarios"][0]
-    line = "pairs of differs.uwb robot differ from the calibration by constants with a probability of 100 % at the end"
-    assert (line in said["differs"][0], "pairs of same.uwb" in said["same"][0]) == (True, False)
+    line = (
+        r"pairs of differs.uwb robot differ from the calibration by constants with a probability of (9\d|100) % at the"
+    )
+    assert re.search(line, said["differs"][0])
+    assert "pairs of same.uwb" not in said["same"][0]
     assert said["same"][1]["pair_offsets"] < 0.3 < 0.7 < said["differs"][1]["pair_offsets"]
 
 
@@ -111,7 +103,8 @@ def test_a_team_follows_constants_of_pairs():
                         outlier_share=0.0, outlier_m=0.0, between_m=OFFSET_M)  # fmt: skip
     known, (_, ends, measured_m) = replace(PLANTED, errors=errors), ranging(20.0, 1)
     made = test_team.flight(20.0)
-    measured_m = measured_m + offsets_m(ends[:, 0], ends[:, 1], 5)
+    offsets_m = np.triu(np.random.default_rng(5).normal(0, OFFSET_M, (7, 7)))
+    measured_m = measured_m + (offsets_m + offsets_m.T)[ends[:, 0], ends[:, 1]]
     exchanges = stamped(made.exchanges.time_ns, ends, measured_m, np.full((2, len(ends)), -85.0))
     made = replace(made, exchanges=exchanges)
     own, fixed = ([one.tracks["robust"] for one in localize_team(made, by, CLOSE)] for by in (known, without(known)))
