@@ -124,8 +124,8 @@ def mixture_update(innovation_m: Floats, variance_m2: Floats, errors: RangeError
     core = np.exp(-0.5 * innovation_m**2 / variance_m2) / (sigma_m * ROOT_2PI) * (inside * direct)
     total, mean, square = core + wild, core * innovation_m, core * innovation_m**2 + wild * variance_m2
     tails = []
-    sides = (np.moveaxis(one, -1, 0) for one in (shares, known, detours_m))
-    for sign, share, old, detour_m in zip((1.0, -1.0), *sides, strict=False):
+    for side, sign in zip(range(shares.shape[-1]), (1.0, -1.0), strict=False):
+        share, old, detour_m = shares[..., side], known[..., side], detours_m[..., side]
         found = densities(sign * innovation_m, sigma_m, errors.least_m, detour_m, errors.long)
         each = found.reflected * (inside * (1 - direct) / any_share)
         noise, new = sign * found.noise_m(), each * (share - old)
@@ -166,11 +166,12 @@ class Reflections:
         Filters (...) that have `used` it learn from it.
         """
         sides = pair[: np.count_nonzero(errors.share)]
-        reflected, direct = np.moveaxis(self.lasting[..., sides, :], -1, 0)
+        before = self.lasting[..., sides, :]
+        reflected, direct = before[..., 0], before[..., 1]
         share = reflected + (1 - reflected - direct) * np.atleast_1d(errors.share)[: len(sides)]
         found = mixture_update(innovation_m, variance_m2, replace(errors, share=share, known=reflected))
         learned = np.stack([found.reflected, 1 - found.reflected], axis=-1)
-        self.lasting[..., sides, :] = np.where(used[..., None, None], learned, self.lasting[..., sides, :])
+        self.lasting[..., sides, :] = np.where(used[..., None, None], learned, before)
         return found
 
 

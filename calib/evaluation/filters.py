@@ -184,7 +184,8 @@ class GaussianFilters:
         update = weigh(innovation, variance)
         gain = reach / variance[..., None]
         self._move(gain * update.noise_m[..., None])
-        self.covariance += gain[..., None] * gain[..., None, :] * (update.variance_m2 - variance)[..., None, None]
+        change = gain * (update.variance_m2 - variance)[..., None]
+        self.covariance += gain[..., None] * change[..., None, :]
         return update
 
     def _move(self, by: Floats) -> None:

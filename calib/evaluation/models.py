@@ -103,24 +103,23 @@ class ModelAverage:
     def __init__(self, known: Sequence[FilterRanges], shape: tuple[int, ...] = ()) -> None:
         """Begin with no innovation of filters (filters, *shape)."""
         self.shown = [f for f, one in enumerate(known) if one.shown]
-        own = np.array([[0 <= f - k <= known[f].rivals for k in range(len(known))] for f in self.shown])
-        self.models = np.broadcast_to(own.reshape(*own.shape, *(1 for _ in shape)), (*own.shape, *shape))
-        self.weights = self.models / self.models.sum(axis=1, keepdims=True)
+        rivals = np.array([[0 <= f - k <= known[f].rivals for k in range(len(known))] for f in self.shown])
+        self.least = np.where(rivals, np.log(LEAST_ODDS), -np.inf).reshape(*rivals.shape, *(1 for _ in shape))
+        self.log_odds = np.broadcast_to(np.where(np.isinf(self.least), -np.inf, 0.0), (*rivals.shape, *shape))
         self.drifting = np.array([len(one.delays.tags) > 0 for one in known])
         self.offset = np.array([one.offset_m > 0 for one in known])
+        self.learn(np.zeros((len(known), *shape)))
 
     def learn(self, log_density: Floats) -> None:
         """Learn from the densities of innovations (filters, ...)."""
-        with np.errstate(divide="ignore"):
-            log_odds = np.log(self.weights) + log_density
-        odds = np.exp(log_odds - log_odds.max(axis=1, keepdims=True))
-        odds = np.maximum(odds, LEAST_ODDS) * self.models
+        log_odds = self.log_odds + log_density
+        self.log_odds = np.maximum(log_odds - log_odds.max(axis=1, keepdims=True), self.least)
+        odds = np.exp(self.log_odds)
         self.weights = odds / odds.sum(axis=1, keepdims=True)
 
     def mean(self, values: Floats | Bools) -> Floats:
         """Return averages of values (filters, ...), or of one for each filter (filters,)."""
-        shape = (len(values), *(1 for _ in self.weights.shape[values.ndim + 1 :]), *values.shape[1:])
-        return np.asarray(np.sum(self.weights * values.reshape(shape), axis=1))
+        return np.asarray(np.einsum("gf...,f...->g...", self.weights, values))
 
     def moments(self, state: Floats, covariance: Floats) -> tuple[Floats, Floats]:
         """Return means (shown, ..., n) and covariances (shown, ..., n, n) of states with covariances.
@@ -128,11 +127,12 @@ class ModelAverage:
         States are (filters, ..., n), or (shown, filters, ..., n) where they differ by average.
         """
         state = state if state.ndim > covariance.ndim - 1 else state[None]
-        weights = self.weights.reshape(*self.weights.shape, *(1 for _ in state.shape[self.weights.ndim :]))
-        mean = np.sum(weights * state, axis=1)
+        mean = np.einsum(
+            "gf...,gf...n->g...n", self.weights, np.broadcast_to(state, (len(self.shown), *state.shape[1:]))
+        )
         away = state - mean[:, None]
-        spread = covariance + away[..., None] * away[..., None, :]
-        return mean, np.sum(weights[..., None] * spread, axis=1)
+        within = np.einsum("gf...,f...nm->g...nm", self.weights, covariance)
+        return mean, within + np.einsum("gf...,gf...n,gf...m->g...nm", self.weights, away, away)
 
     def delays(self, running: GaussianFilters) -> tuple[Floats, Floats]:
         """Return means and covariances of the changes of delays, which are zero in filters with fixed delays."""
