@@ -52,7 +52,7 @@ def spread(ranges, calibration):
 
 
 @pytest.mark.parametrize("size_m", [0.1, *(pytest.param(size, marks=pytest.mark.slow) for size in (0.05, 0.2))])
-@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("own", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_planted_pattern_is_found_within_its_intervals(size_m, own):
     recipe = Recipe(pattern_m=size_m, own=own)
     result, waves = fitted(recipe, 11), flown(recipe, 11)[1]["waves"]
@@ -244,7 +244,7 @@ def test_a_stream_knows_no_directions_and_its_total_sigma_contains_the_pattern(t
         uwblink.stream(path, use="receptions", **how)
 
 
-@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("own", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_tag_that_is_added_has_the_pattern_that_others_share_or_one_that_is_unknown(own, tmp_path):
     recipe = replace(TEN, own=own, robots=5)
     ranges, there = (calib.load_ranges(flown(recipe, 3, k)[0]) for k in (0, 1))

@@ -75,7 +75,7 @@ def test_the_model_tells_on_average_what_squares_of_slopes_do(drawn):
         assert expected.information[k, j] == pytest.approx(squares.information[k, j], abs=0.03 * size)
 
 
-@pytest.mark.parametrize("spread_m", [100.0, 0.03])
+@pytest.mark.parametrize("spread_m", [0.03, pytest.param(100.0, marks=pytest.mark.slow)])
 def test_noise_is_that_of_restricted_likelihood_however_many_offsets_there_are(spread_m):
     # Six ranges for each of 100 offsets; without a prior that is the pooled variance, else an analysis of variance.
     rng = np.random.default_rng(4)

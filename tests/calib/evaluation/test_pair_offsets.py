@@ -64,7 +64,7 @@ def test_without_constants_the_filter_is_as_good_as_one_that_has_none(known):
 def test_the_command_says_that_pairs_differ(known, tmp_path):
     known.save(tmp_path / "known.json")
     said = {}
-    for name, contents in (("same", flight(41, 20.0)[0]), ("differs", flight(41, 20.0, offset_m=OFFSET_M)[0])):
+    for name, contents in (("same", flight(41, 12.0)[0]), ("differs", flight(41, 12.0, offset_m=OFFSET_M)[0])):
         contents.save(tmp_path / f"{name}.uwb")
         words = ("calib", "localize", tmp_path / f"{name}.uwb", "-c", tmp_path / "known.json", "--seeds", 1)
         said[name] = succeed(*words).stdout, json.loads(succeed(*words, "--json").stdout)["scenarios"][0]
@@ -101,8 +101,8 @@ def test_a_team_follows_constants_of_pairs():
     noise_m = float(np.hypot(NOISE_M, OFFSET_M))
     errors = ErrorModel(lifted=(0.0,), noise_m=(noise_m,), tail_share=(1e-3,), least_m=0.0, detour_m=0.3,
                         outlier_share=0.0, outlier_m=0.0, between_m=OFFSET_M)  # fmt: skip
-    known, (_, ends, measured_m) = replace(PLANTED, errors=errors), ranging(20.0, 1)
-    made = test_team.flight(20.0)
+    known, (_, ends, measured_m) = replace(PLANTED, errors=errors), ranging(10.0, 1)
+    made = test_team.flight(10.0)
     offsets_m = np.triu(np.random.default_rng(5).normal(0, OFFSET_M, (7, 7)))
     measured_m = measured_m + (offsets_m + offsets_m.T)[ends[:, 0], ends[:, 1]]
     exchanges = stamped(made.exchanges.time_ns, ends, measured_m, np.full((2, len(ends)), -85.0))
