@@ -315,7 +315,8 @@ def fixed_std(calibration: Calibration, settings: Settings, training: Data | Fli
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalizationSummary:
-    """Over all bodies of all recordings: mean RMSE by filter, its reduction, mean NIS and NEES of the variance filter.
+    """Over all bodies of all recordings: mean RMSE by filter, its reduction, mean NEES by filter, and for the variance
+    filter mean NIS and NEES with their bounds.
 
     `rmse_m` are means over seeds, too, `spread_m` standard deviations over seeds of the mean over bodies (NaN of one
     seed). `nis` is over accepted ranges, of which a gate at 99.9 % leaves 0.99; `nees` should be 3, a state's size.
@@ -327,6 +328,7 @@ class LocalizationSummary:
     rmse_m: dict[str, float]
     spread_m: dict[str, float]
     reduction: dict[str, float]
+    nees_by_filter: dict[str, float]
     nis: float
     nis_bounds: tuple[float, float]
     nis_inside: float
@@ -353,6 +355,12 @@ def rmse_rows(
     return [*rows, ["against raw", "", *(f"{-100 * less:+.0f} %" for less in total.reduction.values())]]
 
 
+def nees_row(total: LocalizationSummary) -> list[str]:
+    """Return a row of the mean NEES by filter."""
+    values = ("-" if value != value else f"{value:.1f}" for value in total.nees_by_filter.values())
+    return ["mean NEES (3 expected)", *values]
+
+
 def summarize(found: list[Localization]) -> LocalizationSummary:
     """Return means over bodies and recordings, with equal weights as in the paper.
 
@@ -371,6 +379,7 @@ def summarize(found: list[Localization]) -> LocalizationSummary:
         rmse_m=rmse,
         spread_m={name: float(np.std(over, ddof=1)) if len(over) > 1 else np.nan for name, over in means.items()},
         reduction={name: 1 - rmse[name] / rmse["raw"] for name in filters[1:]},
+        nees_by_filter={name: consistency([one.tracks[name] for one in found])[0] for name in filters},
         nis=float(np.mean(nis)),
         nis_bounds=_mean_bounds(len(nis), 1),
         nis_inside=_inside(nis, 1),
@@ -423,7 +432,7 @@ def localization_text(found: list[Localization], settings: Settings) -> str:
     """Return the table that `calib localize` prints, a row per body, with the settings below."""
     summary, fixed = summarize(found), found[0].fixed
     numbers = rmse_rows(found, summary, f"its spread over {settings.seeds} seeds")
-    rows = [["RMSE of the position (m)", *summary.rmse_m], *numbers]
+    rows = [["RMSE of the position (m)", *summary.rmse_m], *numbers, nees_row(summary)]
     first = max(30, *(len(row[0]) + 1 for row in rows))
     table = [f"{printable(name):{first}s}" + "".join(f"{cell:>12s}" for cell in cells) for name, *cells in rows]
     paper = ", ".join(f"{value:.3f}" for value in PAPER_RMSE_M.values())

@@ -10,7 +10,7 @@ import numpy as np
 from calib import figures
 from calib.calibration.model import curve_rows, pattern_rows
 from calib.estimator.grouped_errors import fit_grouped_errors
-from calib.evaluation.localization import PAPER_RMSE_M, Localization, rmse_rows, summarize
+from calib.evaluation.localization import PAPER_RMSE_M, Localization, nees_row, rmse_rows, summarize
 from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, pair_rows, stage_cells
 from calib.evaluation.tracking import Settings
 from calib.report.figures import FILTER_STYLES, rmse_bars, track
@@ -183,6 +183,7 @@ def localization(results: Results) -> list[Block]:
     rows = [
         *rmse_rows(found, total),
         ["ICRA 2023, its own flights", *(f"{PAPER_RMSE_M[n]:.3f}" if n in PAPER_RMSE_M else "" for n in names)],
+        nees_row(total),
     ]
     (nis_low, nis_high), (nees_low, nees_high) = total.nis_bounds, total.nees_bounds
     meaning = (

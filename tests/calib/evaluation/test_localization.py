@@ -187,6 +187,12 @@ def test_text_and_json_state_what_they_rest_on(flights):
     document = json.loads(json.dumps(localization_json(found)))
     assert len(document["scenarios"][0]["rmse_by_seed_m"]["raw"]) == 2
     assert set(document["summary"]["rmse_m"]) == {"raw", "calibrated", "variance"}, "reflections are unknown"
+    nees = [
+        np.mean(np.concatenate([one.tracks[name].nees for one in found])) for name in ("raw", "calibrated", "variance")
+    ]
+    assert list(document["summary"]["nees_by_filter"].values()) == pytest.approx(nees)
+    (row,) = (line for line in text.splitlines() if line.startswith("mean NEES (3 expected)"))
+    assert [float(cell) for cell in row.split()[4:]] == pytest.approx(nees, abs=0.06)
 
 
 def test_trajectories_are_written_in_tum_form_with_their_attitudes(flights, tmp_path):
