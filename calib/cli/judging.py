@@ -141,7 +141,7 @@ def localize(
         bool,
         typer.Option(
             "--online",
-            help="Compare with a filter whose delays are states, where these are likelier than fixed ones.",
+            help="Compare with a filter that averages over fixed delays and delays that drift.",
         ),
     ] = False,
     tum: Annotated[

@@ -1,8 +1,8 @@
 """Localization with and without a calibration: each body is tracked from its ranges to the others.
 
 Four filters use the same ranges and the same velocity noise: raw and calibrated ranges with fixed variances, calibrated
-ranges with the variance of the sigma curve, and calibrated ranges with the whole error model, reflections included
-(`calib.evaluation.tracking`). `calib.evaluation.onboard` needs no motion capture.
+ranges with the variance of the sigma curve, and calibrated ranges with the whole error model, that is reflections and
+what differs between flights (`calib.evaluation.tracking`). `calib.evaluation.onboard` needs no motion capture.
 """
 
 from __future__ import annotations

@@ -52,9 +52,9 @@ class Settings(CheckedSettings):
     once the time in which ranges were within the gate, 10 s at most, is used up by time in which they were not (half of
     it where the robust filter takes them for reflected), and half of `reopen_s` besides. `seeds` are runs with other
     noise, each body and flight with its own; tracks are those of the first, `seed`. `use` is "exchanges", a body's
-    ranges, or "receptions", with all that it overheard and others overheard of it. With `online` one more filter has
-    delays as states (`calib.online.DelayStates`) where these are likelier than fixed delays. Raises `BadInputError`
-    that names the setting.
+    ranges, or "receptions", with all that it overheard and others overheard of it. With `online` one more filter
+    averages over fixed delays and delays that drift (`calib.online.DelayStates`). Raises `BadInputError` that names the
+    setting.
     """
 
     velocity_std_mps: float = 0.3
