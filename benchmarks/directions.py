@@ -13,7 +13,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.data.samples import SampleFlight, stamped
+from calib.data.samples import stamped
+from uwblink.recording.antenna_delays import AntennaDelay, meta_of_delays
+from uwblink.recording.contents import Contents
 from uwblink.recording.schema import Poses, Tag
 
 Floats = NDArray[np.float64]
@@ -68,7 +70,7 @@ def pattern_m(direction: Floats, wave: Floats, size_m: float) -> Floats:
     return np.asarray(0.5 * size_m * around * level)
 
 
-def flight(recipe: Recipe, seed: int, number: int = 0) -> tuple[SampleFlight, dict[str, Any]]:
+def flight(recipe: Recipe, seed: int, number: int = 0) -> tuple[Contents, dict[str, Any]]:
     """Return a flight as a recording would hold it, and what was planted; flights of one seed have the same boards."""
     boards, rng = np.random.default_rng([seed, 5_150]), np.random.default_rng([seed, 5_150, number + 1])
     count, tags = int(recipe.seconds * recipe.per_second), recipe.robots + recipe.anchors
@@ -132,12 +134,12 @@ def flight(recipe: Recipe, seed: int, number: int = 0) -> tuple[SampleFlight, di
         "temperature_c": celsius(read[1], read[0]) + warmth.normal(0, 0.2, len(read[0])),
         "supply_v": np.full(len(read[0]), np.nan),
     }
-    found = SampleFlight(
-        stamped(time_ns, ends, distance + error, power),
-        poses,
-        carried,
-        known,
+    found = Contents(
+        exchanges=stamped(time_ns, ends, distance + error, power),
+        tags=carried,
+        poses=poses,
         temperature=readings if recipe.warmer_k else {},
+        meta={"planted": known, **meta_of_delays({None: AntennaDelay()})},
     )
     return found, {"waves": wave, "mm_per_k": slopes}
 

@@ -307,7 +307,7 @@ def sample(
     check_output(output, force=force, recording=True)
     seed = 1 if seed is None else seed
     flight = calib.sample_flight(count, seed=seed, anchors=with_anchors)
-    meta = {"planted": flight.planted, "source": "sample", "seed": seed}
+    meta = {"planted": flight.meta["planted"], "source": "sample", "seed": seed}
     contents = uwblink.Contents(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags, meta=meta)
     contents.save(output, force=force)
     typer.echo(f"{output}: {count} exchanges of tags {', '.join(str(tag.tag) for tag in flight.tags)}, known delays")

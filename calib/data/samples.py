@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.recording.antenna_delays import AntennaDelay, meta_of_delays
+from uwblink.recording.contents import Contents
 from uwblink.recording.schema import Poses, Tag
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import Exchanges
@@ -22,25 +21,7 @@ REPLY_TICKS: Final = 20_000_000
 """Reply times, 0.3 ms: about those of the boards."""
 
 
-@dataclass(frozen=True, slots=True)
-class SampleFlight:
-    """What `fit`, `evaluate`, `localize`, `localize_onboard` and `examine` take instead of a recording."""
-
-    exchanges: Exchanges
-    poses: Poses
-    tags: list[Tag]
-    planted: dict[str, Any]
-    imu: Mapping[str, Any] = field(default_factory=dict)
-    height: Mapping[str, Any] = field(default_factory=dict)
-    temperature: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def meta(self) -> dict[str, Any]:
-        """Return what a recording of it would say: that the boards' usual antenna delays were programmed."""
-        return {"planted": self.planted, **meta_of_delays({None: AntennaDelay()})}
-
-
-def sample_flight(count: int = 900, *, seed: int = 1, anchors: bool = False) -> SampleFlight:
+def sample_flight(count: int = 900, *, seed: int = 1, anchors: bool = False) -> Contents:
     """Return `count` exchanges of three tags that move about a room, 100 a second, as a recording would hold them.
 
     With `anchors` tag 1 alone moves, and tags 2 to 5 stand fixed and range among themselves, too. Antenna delays are
@@ -65,6 +46,8 @@ def sample_flight(count: int = 900, *, seed: int = 1, anchors: bool = False) -> 
     measured_m = measured_m - 0.5e-9 * SPEED_OF_LIGHT * (delay[initiator] + delay[target])
     tags = [Tag(int(tag), f"robot{tag}", (0.0, 0.0, 0.0)) for tag in np.unique(pair)]
     planted = {"delays_ns": {str(tag.tag): ANCHOR_DELAYS_NS[tag.tag] for tag in tags}}
+    # The boards' usual antenna delays were programmed.
+    meta = {"planted": planted, **meta_of_delays({None: AntennaDelay()})}
     # Poses 100 times a second, until a second after the last range.
     pose_ns = np.arange(0, int(time_ns[-1]) + 1_000_000_000, 10_000_000)
     poses = Poses(
@@ -73,7 +56,7 @@ def sample_flight(count: int = 900, *, seed: int = 1, anchors: bool = False) -> 
         np.concatenate([_place(np.full(len(pose_ns), tag.tag), pose_ns, fixed) for tag in tags]),
         np.tile([0.0, 0.0, 0.0, 1.0], (len(tags) * len(pose_ns), 1)),
     )
-    return SampleFlight(stamped(time_ns, pair, measured_m, power), poses, tags, planted)
+    return Contents(exchanges=stamped(time_ns, pair, measured_m, power), tags=tags, poses=poses, meta=meta)
 
 
 def stamped(time_ns: Any, pair: Any, measured_m: Floats, power: Floats) -> Exchanges:

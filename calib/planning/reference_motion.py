@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
-from calib.data.samples import SampleFlight, stamped
+from calib.data.samples import stamped
 from calib.evaluation.filters import GRAVITY_M_S2
 from calib.planning.settings import FlightPlanSettings
 from uwblink.arrays import Floats, Ints
+from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
 
 
-def reference_motion(flown: FlightPlanSettings) -> SampleFlight:
+def reference_motion(flown: FlightPlanSettings) -> Contents:
     """Return a flight without errors or delays; the same for the same seed."""
     rng = np.random.default_rng(flown.seed)
     bodies = {f"robot{k + 1}": _motion(flown, k, rng) for k in range(len(flown.robots))}
@@ -36,7 +37,7 @@ def reference_motion(flown: FlightPlanSettings) -> SampleFlight:
     # As in free space, -80 dBm at 2 m, with 3 dB of fading.
     power = -80.0 - 20 * np.log10(distance / 2) + rng.normal(0, 3.0, (2, len(time_ns)))
     imu = _readings(bodies, flown.seconds) if flown.inertial else {}
-    return SampleFlight(stamped(time_ns, pair, distance, power), poses, tags, {}, imu)
+    return Contents(exchanges=stamped(time_ns, pair, distance, power), tags=tags, poses=poses, imu=imu)
 
 
 def _ns(time_s: Floats) -> Ints:

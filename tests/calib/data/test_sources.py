@@ -35,7 +35,7 @@ def written(place, flight, planted):
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     flight = sample_flight()
-    return written(tmp_path_factory.mktemp("source") / "sample.uwb", flight, flight.planted)
+    return written(tmp_path_factory.mktemp("source") / "sample.uwb", flight, flight.meta["planted"])
 
 
 def assert_same(one, other):
@@ -158,7 +158,7 @@ SPLINE = {"knots": [0, 0, 1, 1], "degree": 1, "coefficients": [0.0, 0.1]}
 
 def test_planted_values_have_their_form(tmp_path):
     flight = sample_flight(10)
-    assert load_ranges(replace(flight, planted={"bias_curve": SPLINE, "sigma_curve": None})).planted
+    assert load_ranges(replace(flight, meta={"planted": {"bias_curve": SPLINE, "sigma_curve": None}})).planted
     wrong: list[dict[str, Any]] = [
         {"delays_ns": "abc"},
         {"delays_ns": []},
@@ -177,7 +177,7 @@ def test_planted_values_have_their_form(tmp_path):
     ]
     for planted in wrong:
         with pytest.raises(BadInputError, match=rf"^memory: planted: {next(iter(planted))}: "):
-            load_ranges(replace(flight, planted=planted))
+            load_ranges(replace(flight, meta={"planted": planted}))
     with pytest.raises(BadInputError, match=r"^f\.uwb: planted: delays_ns: "):
         load_ranges(written(tmp_path / "f.uwb", flight, wrong[0]))
 

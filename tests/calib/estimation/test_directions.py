@@ -254,7 +254,7 @@ def test_a_tag_that_is_added_has_the_pattern_that_others_share_or_one_that_is_un
     second = written(tmp_path / "second.uwb", recipe, 3, 1)
     done = call("calib", "add-tag", second, "-c", tmp_path / "known.json", "--tag", 5, "-o", tmp_path / "five.json")
     assert (done.returncode, "tag 5: its pattern over direction" in done.stderr) == (0, own)
-    added, planted = calib.load_calibration(tmp_path / "five.json"), flown(recipe, 3)[0].planted["delays_ns"]
+    added, planted = calib.load_calibration(tmp_path / "five.json"), flown(recipe, 3)[0].meta["planted"]["delays_ns"]
     off = [added.delays_ns[tag] - planted[str(tag)] for tag in (1, 2, 3, 4, 5)]
     # What all delays share goes with the curve; of the rest 10 ps are 1.5 mm of a range.
     assert off[4] - np.mean(off) == pytest.approx(0, abs=0.02 + 0.1 * own)
