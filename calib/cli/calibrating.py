@@ -6,13 +6,13 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 import calib
-import uwblink
 from calib.cli.shared import (
     STOPPED,
     NewCalibration,
@@ -308,6 +308,5 @@ def sample(
     seed = 1 if seed is None else seed
     flight = calib.sample_flight(count, seed=seed, anchors=with_anchors)
     meta = {"planted": flight.meta["planted"], "source": "sample", "seed": seed}
-    contents = uwblink.Contents(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags, meta=meta)
-    contents.save(output, force=force)
+    replace(flight, meta=meta).save(output, force=force)
     typer.echo(f"{output}: {count} exchanges of tags {', '.join(str(tag.tag) for tag in flight.tags)}, known delays")

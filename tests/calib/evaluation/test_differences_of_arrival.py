@@ -169,6 +169,20 @@ def test_the_filter_knows_what_listeners_of_an_exchange_share(heard):
     assert means[1] > 1.3 * means[0]
 
 
+def test_constants_of_both_pairs_in_a_difference_are_followed(heard):
+    (problem,), rng = problems(load_flight(heard[0])), np.random.default_rng(6)
+    true_m, zero = problem.ranges.arrivals.truth_m[problem.rows - len(problem.ranges)], np.zeros(len(problem))
+    offsets_m = np.sum(problem.sign * rng.normal(0, 0.1, problem.pair.max() + 1)[problem.pair], axis=1)
+    one = FilterRanges(true_m + offsets_m + rng.normal(0, 0.05, len(zero)), zero + 0.05, zero, 0 * problem.sign)
+    tracks = run_filters(
+        problem, {"fixed": one, "own": replace(one, offset_m=0.1, rivals=1)}, replace(LISTEN, gate=1e9)
+    )
+    own, fixed = (np.mean([track.rmse_m for track in tracks[name]]) for name in ("own", "fixed"))
+    assert own < 0.5 * fixed
+    assert np.mean([track.nees.mean() for track in tracks["own"]]) < 4.5
+    assert min(track.offsets[-1] for track in tracks["own"]) > 0.99
+
+
 def test_a_wrong_start_is_left_by_differences_alone(known):
     settings = replace(LISTEN, initial_offset_m=(0.0, -8.0, 0.0), seeds=1)
     (found,) = calib.localize(flight(3104, 5.0), known, settings)
