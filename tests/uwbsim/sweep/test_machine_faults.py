@@ -119,7 +119,7 @@ SCHEDULER = """
 import sys
 from distributed import LocalCluster
 if __name__ == "__main__":
-    quiet = {"dashboard_address": None, "silence_logs": 50}
+    quiet = {"dashboard_address": "127.0.0.1:0", "silence_logs": 50}
     with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", **quiet) as c:
         print(c.scheduler_address, flush=True)
         sys.stdin.read()

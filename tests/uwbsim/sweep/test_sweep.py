@@ -121,7 +121,7 @@ def test_a_dask_cluster_survives_the_death_of_a_worker(tmp_path):
             assert fraction < 0.9, "there is nothing left to do"
             os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
 
-    quiet = {"dashboard_address": None, "silence_logs": 50}
+    quiet = {"dashboard_address": "127.0.0.1:0", "silence_logs": 50}
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, **quiet) as cluster:
         summary = run_sweep(p, tmp_path / "out", scheduler=cluster.scheduler_address, progress=kill_one)
     assert (summary.done, summary.failed, len(seen) > 2) == (24, 0, True)
