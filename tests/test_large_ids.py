@@ -30,6 +30,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_flights_fits_and_corrections_take_them(folder):
     ids = {*range(LARGEST - 5, LARGEST + 1)}
     succeed("calib", "fit", "flight.uwb", "-o", "c.json", cwd=folder)

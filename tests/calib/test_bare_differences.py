@@ -201,6 +201,7 @@ def test_the_other_sign_is_noticed_by_poses(folder, words):
     assert not (folder / "swapped" / "x.json").exists()
 
 
+@pytest.mark.slow
 def test_the_other_sign_is_doubted_without_poses(folder):
     rows = flown(4, 4.0)
     doubted = imported(folder / "blind", rows, swapped=True, mocap=False)
@@ -237,6 +238,7 @@ def test_an_anchor_without_a_place_is_named(folder, words):
     processes.refuse("calib", words[0], "lost.uwb", *words[1:], cwd=folder, naming=naming, status=2)
 
 
+@pytest.mark.slow
 def test_ranges_and_differences_are_used_together_and_fitted_apart(folder):
     contents = uwblink.load(folder / "fly/d.uwb")
     time_s = np.arange(0.1, 19.0, 0.1)

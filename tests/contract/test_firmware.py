@@ -29,6 +29,7 @@ def range_often(ports, command, count, listening=()):
     bench.advance(10 * NS_PER_MS + count * EVERY)
 
 
+@pytest.mark.slow
 def test_the_initiator_s_final_can_be_lost_too():
     ports = VirtualPorts(bench_scenario(), lost_share=0.4)
     range_often(ports, b"C05|2|1|1|0\r", 300)

@@ -178,6 +178,7 @@ def test_programmed_boards_are_not_recorded_as_if_they_were_not(loop, tmp_path):
         load_antenna_delays(tmp_path / "unclear.toml")
 
 
+@pytest.mark.slow
 def test_a_calibration_of_other_delays_is_told_wherever_it_is_used(loop, tmp_path):
     second, first = loop / "second.uwb", loop / "first.json"
     for words in (

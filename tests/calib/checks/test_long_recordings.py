@@ -60,6 +60,7 @@ def test_nothing_is_found_where_nothing_was_planted_and_it_is_said_what_was_look
     )
 
 
+@pytest.mark.slow
 def test_poses_that_are_late_are_found_by_how_much(flight, tmp_path):
     (finding,) = calib.examine(write(tmp_path / "late.uwb", flight, 400_000_000))
     assert finding.fault == "pose time offset"

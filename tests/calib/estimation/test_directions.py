@@ -118,6 +118,7 @@ def test_what_belongs_to_places_does_not_pass_for_the_antennas():
     assert pattern.rms_m < 0.03
 
 
+@pytest.mark.slow
 def test_power_that_explains_what_looks_like_direction_is_named():
     ranges = calib.load_ranges(flown(replace(TEN, pattern_m=0.0), 3)[0])
     azimuth = np.arctan2(ranges.toward[:, :, 1], ranges.toward[:, :, 0])
@@ -244,7 +245,8 @@ def test_a_stream_knows_no_directions_and_its_total_sigma_contains_the_pattern(t
         uwblink.stream(path, use="receptions", **how)
 
 
-@pytest.mark.parametrize("own", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("own", [False, True])
 def test_a_tag_that_is_added_has_the_pattern_that_others_share_or_one_that_is_unknown(own, tmp_path):
     recipe = replace(TEN, own=own, robots=5)
     ranges, there = (calib.load_ranges(flown(recipe, 3, k)[0]) for k in (0, 1))
@@ -266,6 +268,7 @@ def test_a_tag_that_is_added_has_the_pattern_that_others_share_or_one_that_is_un
         calib.add_tag(replace(there, toward=np.full_like(there.toward, np.nan)), known, 5)
 
 
+@pytest.mark.slow
 def test_delays_of_calibrations_with_patterns_are_compared_for_the_same_directions(tmp_path):
     known, again = (calib.fit(flown(TEN, 3, k)[0], between_m=0.0).calibration for k in (0, 1))
     found, (pattern,) = calib.compare(known, again), known.patterns

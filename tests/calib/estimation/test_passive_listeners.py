@@ -38,6 +38,7 @@ def test_without_noise_they_are_what_was_planted(tmp_path):
         assert found.delay_ns == pytest.approx(planted[str(tag)], abs=0.005), tag
 
 
+@pytest.mark.slow
 def test_they_agree_with_the_fit_of_a_noisy_flight(tmp_path):
     path = recorded(tmp_path, "icra2023/train.toml", "run.duration_s=60", *PASSIVE)
     found = fit(load_ranges(path)).calibration

@@ -30,6 +30,7 @@ def test_least_squares_is_least_squares():
     assert np.mean(found.residuals_m[inside]) == pytest.approx(0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_joint_fit_is_better_where_power_goes_with_the_pair():
     # Delays alone take for a delay what a pair's own power does to its ranges.
     slope = 0.2

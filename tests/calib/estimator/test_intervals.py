@@ -53,6 +53,7 @@ def test_what_a_fit_uses_of_the_data_is_given_back(squares):
     np.testing.assert_allclose(whole, plain * lasting.factor * (lasting.quantile95 / 1.959964) ** 2, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_reflections_of_another_shape_are_in_the_intervals(monkeypatch):
     shape = known_distances._of_another_shape
     traces = {}

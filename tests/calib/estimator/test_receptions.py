@@ -184,6 +184,7 @@ def test_a_real_flight_has_narrower_intervals_and_the_same_delays(tmp_path):
     assert all(w.startswith(("path 10-11", "path 20-21", "path 30-31")) for w in said), said
 
 
+@pytest.mark.slow
 def test_a_report_fits_receptions_as_well(tmp_path):
     data, _ = flight(7700, count=600)
     campaign = calib.run_campaign(data, use="receptions")

@@ -57,7 +57,7 @@ def test_a_search_ends_at_least_squares_and_finds_the_weight_of_its_prior(most, 
     "data",
     [
         lambda: make(Recipe(seconds=60, share=(0, 0.5)), FIRST_REPORTED).ranges,
-        lambda: flight(7100, reflected=0.15, bias_m=0.1)[0],
+        pytest.param(lambda: flight(7100, reflected=0.15, bias_m=0.1)[0], marks=pytest.mark.slow),
     ],
     ids=["world", "listeners"],
 )

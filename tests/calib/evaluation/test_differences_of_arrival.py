@@ -138,22 +138,23 @@ def test_two_listeners_of_an_exchange_share_what_is_stated(known, heard):
     assert np.mean(np.concatenate(squares)) == pytest.approx(np.mean(np.concatenate(stated)), rel=0.08)
 
 
-@pytest.mark.parametrize(("flights", "widest"), [(1, 1.7), pytest.param(3, 1.0, marks=pytest.mark.slow)])
-def test_a_robot_that_never_sends_is_localized(known, heard, flights, widest):
-    found = [one for each in heard[:flights] for one in calib.localize(each, known, LISTEN)]
+@pytest.mark.slow
+def test_a_robot_that_never_sends_is_localized(known, heard):
+    found = [one for each in heard for one in calib.localize(each, known, LISTEN)]
     total = summarize(found)
-    assert [one.body for one in found] == ["robot"] * flights
+    assert [one.body for one in found] == ["robot"] * 3
     assert total.rmse_m["raw"] > 0.09
     assert total.rmse_m["variance"] < 0.045
     assert total.rmse_m["robust"] < 0.045
     # 95 % of a chi-square over its degrees: three a value, over as many values as are independent.
     assert total.nees_bounds[0] < total.nees < total.nees_bounds[1]
-    assert total.nees_bounds[1] - total.nees_bounds[0] < widest
-    said = f"by 0 ranges and {flights * 6400} differences of arrival"
+    assert total.nees_bounds[1] - total.nees_bounds[0] < 1.0
+    said = f"by 0 ranges and {3 * 6400} differences of arrival"
     assert localization_text(found, LISTEN).splitlines()[-1] == said
-    assert [one["arrivals"] for one in localization_json(found)["scenarios"]] == [6400] * flights
+    assert [one["arrivals"] for one in localization_json(found)["scenarios"]] == [6400] * 3
 
 
+@pytest.mark.slow
 def test_the_filter_knows_what_listeners_of_an_exchange_share(heard):
     (problem,), rng = problems(load_flight(heard[0])), np.random.default_rng(5)
     true_m = problem.ranges.arrivals.truth_m[problem.rows - len(problem.ranges)]
@@ -208,6 +209,7 @@ def test_what_is_overheard_helps_a_robot_that_ranges(known):
     assert total.nees_bounds[0] < total.nees < total.nees_bounds[1]
 
 
+@pytest.mark.slow
 def test_a_robot_on_board_is_helped_by_what_is_overheard(known, tmp_path):
     """Its own tags, those that hear it and those that it hears, and one of its tags the exchanges of the other."""
     all_hear = flight(3121, 5.0, pairs="between-bodies", passive=DELAYS_NS)

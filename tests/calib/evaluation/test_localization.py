@@ -81,6 +81,7 @@ def test_a_body_that_ranges_only_where_its_place_is_unknown_is_left_out(flights)
     assert {one.body for one in found} == set(bodies[1:])
 
 
+@pytest.mark.slow
 def test_a_filter_that_trusts_its_ranges_too_much_is_found_out(flights):
     flight, known = clean(beginning(flights["test1"], 20))
     found = summarize(localize(flight, replace(known, sigma_curve=constant_curve(0.05)), Settings(gate=1e9, seeds=1)))

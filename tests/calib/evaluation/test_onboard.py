@@ -245,6 +245,7 @@ def with_patterns(found, size_m):
     return there, replace(calibration(), patterns=(pattern,))
 
 
+@pytest.mark.slow
 def test_patterns_are_corrected_by_the_estimated_pose():
     plain = flight(12.0, seed=5)
     turned, known = with_patterns(plain, 0.25)

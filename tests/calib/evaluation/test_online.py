@@ -181,6 +181,7 @@ def smoothed(ranges, known, anchors_m, moves_m, std_m):
     return found, np.sqrt(np.diag(after[-1][1]))
 
 
+@pytest.mark.slow
 def test_gtsam_finds_the_optimum_of_the_filter_run_forward_and_back(known):
     pytest.importorskip("gtsam", reason=NO_GTSAM)
     made, antenna_m = flight(8, 5.0, rate_hz=25, drift_m={1: 0.1}, only=1)

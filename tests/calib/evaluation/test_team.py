@@ -346,6 +346,7 @@ def test_three_quadcopters_know_where_the_others_are_and_how_well(heard):
     assert "against own ranges: raw" in text
 
 
+@pytest.mark.slow
 def test_poses_after_the_start_only_judge(known):
     whole = simulated(304, 0.8)
     off = np.array([5.0, -3.0, 1.0]) * (whole.poses.body == "robot2")[:, None] * (whole.poses.time_ns > 3e8)[:, None]

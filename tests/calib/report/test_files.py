@@ -55,6 +55,7 @@ def sections(monkeypatch):
     return few
 
 
+@pytest.mark.slow
 def test_a_campaign_is_what_the_command_makes(folder, tmp_path, monkeypatch, sections):
     # Figures are rendered in test_report.py.
     monkeypatch.setattr(figures, "drawn", pages.outline)

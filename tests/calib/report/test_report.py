@@ -121,7 +121,8 @@ def test_the_json_tells_what_the_page_tells(campaign):
     assert document["evaluation"]["planted"]["correction_rms_m"] < 0.02
 
 
-@pytest.mark.parametrize("width", [pytest.param(1280, marks=pytest.mark.slow), 390])
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1280, 390])
 def test_a_browser_shows_it(campaign, tmp_path, width):
     picture = tmp_path / "page.png"
     words = (f"--window-size={width},2400", f"--screenshot={picture}", (campaign / "r.html").as_uri())

@@ -56,6 +56,7 @@ def test_planted_delays_are_found_from_a_known_start(flown, fitted):
     assert shares[-1] == 1.0
 
 
+@pytest.mark.slow
 def test_ranges_of_a_flight_that_are_worked_on_in_several_pieces_give_the_same_delays(monkeypatch):
     flown = flight(seconds=8.0, seed=3)
     whole = calib.fit_from_ranges(flown, poses_until_s=5.0).calibration

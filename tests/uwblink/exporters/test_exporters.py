@@ -37,7 +37,7 @@ def in_order(path):
     return {table: found if table == "exchanges" else sorted(found) for table, found in rows(path).items()}
 
 
-@pytest.mark.parametrize("form", ["csv", "parquet"])
+@pytest.mark.parametrize("form", [pytest.param("csv", marks=pytest.mark.slow), "parquet"])
 def test_every_column_of_every_table_comes_back(whole, tmp_path, form):
     folder = tmp_path / "it's; DROP TABLE x"
     counts = export_recording(whole, folder, to=form)
@@ -317,7 +317,7 @@ def corrected(tmp_path_factory):
     return folder, flight.exchanges, known, known.apply(calib.load_ranges(folder / "f.uwb"))
 
 
-@pytest.mark.parametrize("form", ["csv", "parquet"])
+@pytest.mark.parametrize("form", ["csv", pytest.param("parquet", marks=pytest.mark.slow)])
 def test_corrected_ranges_leave_with_what_is_known_of_each(corrected, tmp_path, form):
     folder, exchanges, known, applied = corrected
     calib.apply(folder / "f.uwb", known, tmp_path / "out", to=form)

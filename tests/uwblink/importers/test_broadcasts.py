@@ -46,6 +46,7 @@ def key(columns):
     return {*zip(*(columns[n].tolist() for n in ("sender", "listener", "tx", "rx")), strict=True)}
 
 
+@pytest.mark.slow
 def test_every_reception_comes_from_the_lists_and_exchanges_from_receptions(tmp_path):
     planted = broadcasts(rounds=1000, slot_s=0.02)  # 80 s, so that counters of 40 bits wrap
     (tmp_path / "swarm.log").write_text(printed(planted))
@@ -186,7 +187,7 @@ def test_halves_of_a_run_agree_within_their_intervals(recorded, run, first):
     ("run", "use"),
     [
         pytest.param(90, "exchanges", marks=pytest.mark.slow),
-        (90, "receptions"),
+        pytest.param(90, "receptions", marks=pytest.mark.slow),
         (70, "exchanges"),
     ],
 )

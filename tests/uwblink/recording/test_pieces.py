@@ -100,7 +100,9 @@ def test_corrections_of_other_exchanges_are_left_out(tmp_path):
         assert all(not held.corrected for held in pieces(recording, 50))
 
 
-@pytest.mark.parametrize(("to", "module"), [("mcap", mcap), ("tum", exporters), ("rosbag2", mcap)])
+@pytest.mark.parametrize(
+    ("to", "module"), [("mcap", mcap), ("tum", exporters), pytest.param("rosbag2", mcap, marks=pytest.mark.slow)]
+)
 def test_an_export_does_not_depend_on_the_pieces(path, tmp_path, monkeypatch, to, module):
     as_one = export_recording(path, tmp_path / "one", to=to)
     monkeypatch.setattr(module, "pieces", partial(pieces, rows=120))

@@ -80,7 +80,7 @@ def test_ranges_come_one_at_a_time_and_closing_closes_the_ports():
     assert next(uwblink.stream(list(ports.names.values()), using=ports)).time_ns > first.time_ns
 
 
-@pytest.mark.parametrize("protocol", ["ss", "ds"])
+@pytest.mark.parametrize("protocol", [pytest.param("ss", marks=pytest.mark.slow), "ds"])
 def test_ranges_are_corrected_live_and_played_as_apply_corrects_them(tmp_path, calibration, protocol):
     """The stamps say more than the range that a board prints, which in SS-TWR is a whole number of ticks."""
     live: list[uwblink.StreamedRange] = []

@@ -149,7 +149,9 @@ def judged(flight):
     ("kind", "more", "caption"),
     [
         ("'calibrate'", "", "Figure 1. spread (cm)."),
-        ("'calibrate'", "'radio.tx_noise_ps' = [0.0, 90.0]", "Figure 1. spread (cm)."),
+        pytest.param(
+            "'calibrate'", "'radio.tx_noise_ps' = [0.0, 90.0]", "Figure 1. spread (cm).", marks=pytest.mark.slow
+        ),
         ("'compare', ranges = 50", "", "Figure 3. bias (cm): mean error of raw ranges."),
     ],
 )
