@@ -44,6 +44,24 @@ def test_the_commands_and_the_lines_of_python_of_the_readme_print_what_it_says()
                 assert float(one) == pytest.approx(float(other), abs=1.5 * digit), (printed, said)
 
 
+def test_figures_of_real_flights_are_those_of_their_page():
+    page = (pages.DOCS / "real-data.md").read_text(encoding="utf-8")
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")]
+    found = {(row[0], row[1]): [float(cell or "nan") for cell in row[2:]] for row in rows if row[0] in ("s2", "half2")}
+    text = README.replace("−", "-")
+    raw, ours, authors = found["s2", "none"], found["s2", "ours, by s1"], found["s2", "authors'"]
+    (first,) = re.findall(
+        r"changes from (\S+) to (\S+) cm, (\d+) % of the ranges .* error falls from (\S+) to (\S+) m", text
+    )
+    assert [*map(float, first)] == [raw[1], ours[1], round(ours[3]), raw[4], ours[4]]
+    (flights,) = re.findall(
+        r"STAR-loc, other flight: .*\| (\S+) cm, (\S+) cm, (\S+) % .* (\S+) cm, (\S+) cm, (\S+) % \|", text
+    )
+    assert [*map(float, flights)] == [*ours[1:4], *authors[1:4]]
+    (samples,) = re.findall(r"paper's samples, other half: .*\| (\S+) cm, (\S+) % \| (\S+) cm, (\S+) % \|", text)
+    assert [*map(float, samples)] == [*found["half2", "ours, by half1"][2:4], *found["half2", "authors'"][2:4]]
+
+
 @pytest.mark.slow
 def test_the_script_that_the_readme_names_simulates_fits_corrects_and_judges(folder):
     assert len(SCRIPT.splitlines()) <= 25
