@@ -16,8 +16,10 @@ from scipy.special import expit, ndtr
 from calib.calibration.power_curves import basis
 from calib.checks.places import of_places
 from calib.estimator.arrival_rows import OFFSET_OF_PATH, PATH_SIGNS
+from calib.estimator.covariance import of_few_draws
+from calib.estimator.inverse import positive_part
 from calib.estimator.known_distances import KnownDistances
-from calib.estimator.range_model import RangeModel
+from calib.estimator.range_model import METRES_A_NS, TYPICAL_OFFSET_M, RangeModel
 from calib.estimator.range_rows import Mixture
 from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes, search, widening
 from calib.estimator.time_blocks import FEWEST_STRETCHES
@@ -71,7 +73,17 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
         pairs = next(one for one in tested if one.family.kind == "pair")
         places_ns2, said = of_places(found, slopes, pairs, plain)
     covariance, sentences = _weighed(plain, findings, places_ns2, said)
-    return covariance, [*sentences, *_reflected(found), *_short(found), *_confounded(found, slopes)]
+    # Few pairs tell little of how large their offsets are. What findings added already is not added again.
+    optimum = found.searches[0].optimum
+    few_ns2 = of_few_draws(optimum, optimum.layout.indices(["delay"]))
+    covariance = covariance + positive_part(few_ns2 - (covariance - found.covariances["delay"]))
+    return covariance, [
+        *sentences,
+        *_reflected(found),
+        *_short(found),
+        *_saturated(found.model),
+        *_confounded(found, slopes),
+    ]
 
 
 def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> Iterator[Family]:
@@ -344,6 +356,23 @@ def _short(found: KnownDistances) -> Iterator[str]:
             f"errors last for {lasting.stretch_s:.1f} s, so the recording holds only {lasting.stretches:.0f} "
             f"independent stretches of time; intervals are widened for it, and a guess below {FEWEST_STRETCHES:.0f}: "
             "record for longer"
+        )
+
+
+def _saturated(model: RangeModel) -> Iterator[str]:
+    """Say where so few pairs range that offsets of pairs pass for delays."""
+    pairs = model.pairs.ends
+    if (
+        model.settings.constants == "tag"
+        and len(pairs) > 2
+        and not any(u.kind == "offset of pair" for u in model.unknowns)
+    ):
+        ends = 0.5 * METRES_A_NS * (pairs[:, :, None] == np.array(model.tags)).any(axis=1)
+        moved_ns = TYPICAL_OFFSET_M * float(np.linalg.norm(np.linalg.pinv(ends), axis=1).max())
+        yield (
+            f"{len(pairs)} pairs determine the delays and nothing beside them: offsets of pairs of "
+            f"{100 * TYPICAL_OFFSET_M:.1f} cm, as walls make them, would move delays by up to {1e3 * moved_ns:.0f} ps, "
+            "which intervals do not contain; record more tags, or anchors"
         )
 
 

@@ -112,3 +112,13 @@ def of_weights(optimum: Optimum, keep: Ints) -> Floats:
             free = priors.ranks[k] - weight * trace_of_product(optimum.covariance, structure, where)
             found += np.outer(pull, pull) * (2 / max(free, 1.0))
     return found
+
+
+def of_few_draws(optimum: Optimum, keep: Ints) -> Floats:
+    """Return the covariance (k, k) by which that of some unknowns (k,) is wider, because few values tell the variance
+    of a prior: its part of the covariance is that of Student's t instead of a normal distribution."""
+    found, priors, reach = np.zeros((len(keep),) * 2), optimum.priors, optimum.covariance[:, keep]
+    for (where, prior), weight, structure in zip(priors.all, priors.weights, priors.structures, strict=True):
+        width = float(stdtrit(prior.freedom, 0.975)) / TWO_SIDED_95
+        found += (width**2 - 1) * weight * reach[where].T @ (structure @ reach[where])
+    return found

@@ -83,9 +83,11 @@ def logarithms(kind: str, names: tuple[str, ...], start: Floats, *priors: Prior)
     return Unknown(kind=kind, names=names, start=start, priors=priors, logarithm=True)
 
 
-def scattered(kind: str, names: tuple[str, ...], spread: tuple[float, float, float]) -> Unknown:
+def scattered(
+    kind: str, names: tuple[str, ...], spread: tuple[float, float, float], freedom: float = np.inf
+) -> Unknown:
     """Return unknowns about zero whose standard deviation is estimated: its first value and bounds are `spread`."""
-    return Unknown(kind=kind, names=names, start=np.zeros(len(names)), priors=(Prior.of_spread(*spread),))
+    return Unknown(kind=kind, names=names, start=np.zeros(len(names)), priors=(Prior.of_spread(*spread, freedom),))
 
 
 UNIT_OF_PRIOR = np.array([3.0, 2.0])

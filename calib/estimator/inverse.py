@@ -80,6 +80,12 @@ def inverse_of(matrix: Matrix, free: Ints) -> Inverse:
     return found
 
 
+def positive_part(matrix: Floats) -> Floats:
+    """Return a symmetric matrix (k, k) with its negative eigenvalues set to zero."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
 def diagonal_of(matrix: sparse.csr_matrix, inverse: Inverse) -> Floats:
     """Return the diagonal (n,) of M C M' for rows M (n, p) and an inverse C (p, p), estimated for a sparse one."""
     if isinstance(inverse, SparseInverse):

@@ -141,7 +141,7 @@ class RangeModel:
         if powered.all() and varied:
             noise = SplineValues.at(lifted, knots_for(ordered, SIGMA_SEGMENTS, (low, high)))
         if offsets:
-            blocks += _offsets(ranges, pairs, tags, of_pairs=_offsets_identifiable(pairs, tags, settings, carriers))
+            blocks += _offsets(ranges, pairs, tags, freedom=_offsets_determined(pairs, tags, settings, carriers))
         covariates = {}
         for name, (read, kinds) in COVARIATES.items():
             if (asked := getattr(settings, name)) in kinds:
@@ -316,12 +316,12 @@ OFFSETS = (0.01, 1e-4, 1.0)
 """Standard deviation of other constants in the ranges of a pair, such as a wall: start and bounds, m."""
 
 
-def _offsets(ranges: Ranges, pairs: Pairs, tags: list[int], *, of_pairs: bool) -> Iterator[tuple[Unknown, Part]]:
-    """Yield offsets of pairs, and of pairs and tags in each of several sessions."""
+def _offsets(ranges: Ranges, pairs: Pairs, tags: list[int], *, freedom: int) -> Iterator[tuple[Unknown, Part]]:
+    """Yield offsets of pairs, if ranges determine some, and of pairs and tags in each of several sessions."""
     number, count = pairs.number[:, None], len(ranges.sessions)
-    if of_pairs:
+    if freedom > 0:
         kind = "offset of pair"
-        yield scattered(kind, pairs.names, OFFSETS), Part(parameter=RESIDUAL, kind=kind, columns=number)
+        yield scattered(kind, pairs.names, OFFSETS, freedom), Part(parameter=RESIDUAL, kind=kind, columns=number)
     if count < 2:
         return
     ends = np.searchsorted(tags, pairs.ends)[pairs.number]
@@ -340,12 +340,12 @@ def _free_ends(pairs: Pairs, tags: list[int], settings: FitSettings) -> Floats:
     return np.asarray((pairs.ends[:, :, None] == np.array(tags)).sum(axis=1) * free, dtype=np.float64)
 
 
-def _offsets_identifiable(
-    pairs: Pairs, tags: list[int], settings: FitSettings, carriers: Sequence[Floats | None]
-) -> bool:
-    """Return whether ranges determine offsets of pairs beside delays and constants of curves."""
-    taken = np.linalg.matrix_rank(_free_ends(pairs, tags, settings))
-    return settings.constants == "tag" and len(pairs.ends) > taken + sum(one is None for one in carriers)
+def _offsets_determined(pairs: Pairs, tags: list[int], settings: FitSettings, carriers: Sequence[Floats | None]) -> int:
+    """Return how many offsets of pairs ranges determine beside delays and constants of curves."""
+    taken = (
+        len(pairs.ends) if settings.constants == "pair" else np.linalg.matrix_rank(_free_ends(pairs, tags, settings))
+    )
+    return int(len(pairs.ends) - taken - sum(one is None for one in carriers))
 
 
 def _carrier(pairs: Pairs, tags: list[int], settings: FitSettings, group: tuple[int, ...] | None) -> Floats | None:

@@ -7,6 +7,7 @@ variance of offsets between pairs and between sessions, and the spread of error 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -23,7 +24,8 @@ class Prior:
     """A Gaussian prior with the precision `weight` times `structure` (k, k), about `centre` (k,).
 
     `structure` None is the identity; that of many unknowns is sparse, and made of as many independent rows as `rows`
-    says. With `bounds` the weight is estimated between them, starting at `weight`.
+    says. With `bounds` the weight is estimated between them, starting at `weight`, by data with so many degrees of
+    `freedom`.
     """
 
     weight: float
@@ -31,6 +33,7 @@ class Prior:
     centre: Floats | float = 0.0
     bounds: tuple[float, float] | None = None
     rows: int | None = None
+    freedom: float = math.inf
 
     @classmethod
     def of_deviation(cls, deviation: float, centre: Floats | float = 0.0) -> Prior:
@@ -38,9 +41,9 @@ class Prior:
         return cls(weight=deviation**-2, centre=centre)
 
     @classmethod
-    def of_spread(cls, start: float, least: float, most: float) -> Prior:
+    def of_spread(cls, start: float, least: float, most: float, freedom: float = math.inf) -> Prior:
         """Return independent priors about zero, whose standard deviation is estimated between `least` and `most`."""
-        return cls(weight=start**-2, bounds=(most**-2, least**-2))
+        return cls(weight=start**-2, bounds=(most**-2, least**-2), freedom=freedom)
 
     def matrix(self, size: int) -> Matrix:
         """Return the structure as a matrix, the identity (size, size) where it is None."""

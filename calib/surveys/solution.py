@@ -23,6 +23,7 @@ import numpy as np
 from scipy.linalg import orthogonal_procrustes
 from scipy.optimize import minimize_scalar
 
+from calib.estimator.inverse import positive_part
 from calib.estimator.optimize import maximize
 from calib.estimator.scaling import scaled_places
 from calib.surveys.network import Boards, Case, Lengths, Linear, Network
@@ -284,8 +285,7 @@ def _mixed(found: Solution, cases: Sequence[Case], weight: Floats) -> tuple[Floa
     mean = weight @ steps
     around = steps - mean
     wider = sum(w * one.covariance for w, one in zip(weight, every, strict=True)) - found.linear.covariance
-    values, vectors = np.linalg.eigh(wider + (around.T * weight) @ around)
-    return mean, (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return mean, positive_part(wider + (around.T * weight) @ around)
 
 
 def solve(network: Network, *, moves: int = 6) -> tuple[Solution, SecondBest | None]:

@@ -417,7 +417,7 @@ def test_fits_of_the_same_tags_are_the_same_nineteen_times_in_twenty():
 
 def test_a_delay_that_moved_is_seen():
     a = fit(ranges(6000)).calibration
-    found = compare(a, replace(a, delays_ns=a.delays_ns | {3: a.delays_ns[3] + 0.1}))
+    found = compare(a, replace(a, delays_ns=a.delays_ns | {3: a.delays_ns[3] + 0.2}))
     assert not found.same
     assert max(found.difference_ns, key=lambda t: abs(found.difference_ns[t])) == 3
     assert f"{found.difference_ns[3]:+.4f} ns" in str(found)

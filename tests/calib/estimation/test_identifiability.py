@@ -76,7 +76,7 @@ def test_calibrations_of_two_sides_are_compared_by_what_they_determine():
     found = calib.compare(whole, part)
     # Four delays less a common shift and the split.
     assert (found.same, found.degrees) == (True, 2)
-    moved = replace(part, delays_ns=part.delays_ns | {3: part.delays_ns[3] + 0.2})
+    moved = replace(part, delays_ns=part.delays_ns | {3: part.delays_ns[3] + 0.4})
     assert not calib.compare(whole, moved).same
     shifted = {1: 0.5, 2: 0.5, 3: -0.5, 7: -0.5}
     split = replace(part, delays_ns={tag: delay + shifted[tag] for tag, delay in part.delays_ns.items()})
