@@ -34,7 +34,8 @@ class Recipe:
 
     `share` is the share of reflected ranges, or bounds between which each pair draws its own. A reflection lasts
     `lasts_s` on average (0: each range on its own). `by_power` is how much of the share goes with weak power (0 to 1).
-    By `lever_m` the antenna of tag 2 stands elsewhere on its body than true distances say.
+    By `lever_m` the antenna of tag 2 stands elsewhere on its body than true distances say. Ranges of a pair have a
+    constant error with a standard deviation of `offset_m`.
     """
 
     tags: int = 5
@@ -51,6 +52,7 @@ class Recipe:
     noise_m: float = 0.06
     unequal_noise: float = 0.0
     lever_m: float = 0.0
+    offset_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,6 +98,7 @@ def make(recipe: Recipe, seed: int, flight: int = 0) -> World:
     shares = known.get("shares", rng.uniform(*recipe.share, len(pairs)))
     error += _detours(rng, recipe, time_s, which, shares, lifted)
     error += _wander(rng, recipe, time_s, which, len(pairs))
+    error += recipe.offset_m * np.random.default_rng([seed, 35]).normal(size=len(pairs))[which]
     raw = truth + error - LIGHT_M_PER_NS * (0.5 * delays[first] + 0.5 * ratio * delays[second])
     ranges = Ranges(
         source=f"world {seed}",
@@ -229,6 +232,9 @@ CLEAN: Final[dict[str, Recipe]] = {
     "three tags": Recipe(tags=3),
     "unequal noise": Recipe(unequal_noise=0.4),
     "a lever arm 2 cm off": Recipe(lever_m=0.02),
+    "offsets of pairs of 3 cm, four tags": Recipe(tags=4, offset_m=0.03),
+    "offsets of pairs of 3 cm, five tags": Recipe(offset_m=0.03),
+    "offsets of pairs of 3 cm, eight tags": Recipe(tags=8, offset_m=0.03),
     "twelve tags, six ranges a pair": Recipe(tags=12, seconds=78, per_second=5, share=(0, 0.5)),
 }
 
