@@ -419,7 +419,8 @@ def onboard_text(found: list[OnboardTrack], settings: OnboardSettings) -> str:
         if len(one.restarts_s) > max(lasts_s / PATIENCE_S, 3):
             lines.append(
                 f"  began anew {len(one.restarts_s)} times in {lasts_s:.0f} s: what was measured contradicts the "
-                "anchors' places, or differences without stamps have the other sign (from_id and to_id of the import)"
+                "anchors' places, or differences without stamps have another unit or the other sign (from_id and to_id "
+                "of the import)"
             )
     noise = settings.noise
     moves = (
