@@ -239,7 +239,8 @@ def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilt
     inertial, first = settings.model == "imu", 0
     if inertial and len(one.imu_s) < 2:
         raise UnanswerableError(
-            f"{one.ranges.source}: no inertial readings of {one.body}; choose the model constant-velocity"
+            f"{one.ranges.source}: no inertial readings of {one.body}; put imu.csv into an export (`uwblink import "
+            "exported`), or choose the model constant-velocity"
         )
     if settings.start_m is not None:
         fix = Fix(np.array(settings.start_m, dtype=np.float64), np.eye(3) * settings.start_std_m**2)
