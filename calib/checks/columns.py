@@ -336,7 +336,7 @@ def confounded(view: RecordingView) -> Iterator[Candidate]:
         within, between = float(np.mean([np.var(one) for one in parts])), float(np.var([np.mean(one) for one in parts]))
         if between > within:
             share = between / (between + max(within - noise, 0.0))
-            shares.append(1 - (1 - share) * (alone - 1) / max(alone - groups, 1))
+            shares.append(1 - (1 - share) * max(alone - 1, groups) / max(alone - groups, 1))
     # Beyond, what is fitted over power has ten times its own variance (variance inflation, Marquardt 1970).
     if max(shares) > 0.9:
         yield Candidate(
