@@ -51,7 +51,7 @@ def arrivals(view: RecordingView) -> Iterator[Candidate]:
         try:
             Ranges.from_differences(view.differences, poses=view.poses, tags=view.tags, source=view.name)
         except BadInputError as error:
-            yield Candidate("wrong differences of arrival", str(error))
+            yield Candidate("wrong differences of arrival", str(error).removeprefix(f"{view.name}: "))
 
 
 def empty(view: RecordingView) -> Iterator[Candidate]:
