@@ -324,7 +324,7 @@ PLANTED: Final[dict[str, Callable[[World], World]]] = {
     "truth in feet": lambda w: remade(w, truth_m=w.ranges.truth_m / 0.3048),
     "carrier with the opposite sign": lambda w: _skewed(w, 1.5e-3, 2.0),
     "third leg longer than a wrap": _wrapped,
-    "88 % left out": lambda w: remade(w, excluded={"impossible stamps": 8 * len(w.ranges)}),
+    "88 % left out": lambda w: remade(w, excluded={"no power": 8 * len(w.ranges)}),
     "transmissions and receptions swapped": _swapped,
     "half of a tag's ranges reflected": _reflected,
     "a tag 3 dB high": _louder,

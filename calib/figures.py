@@ -149,12 +149,12 @@ def curve_over_power(
     axes.plot([], [], color=PALE, lw=0.8, label="each pair")
     text = "mean of all pairs" if squares else "core of all pairs"
     axes.plot(everything.lifted, values["all"], "o", color=INK, ms=3, label=text, zorder=4)
-    keep_strays_out(axes, np.concatenate(list(values.values())))
+    curve = calibration.bias_curve if bias else calibration.sigma_curve
+    grid = np.linspace(*curve.range, 300)
+    keep_strays_out(axes, np.concatenate([*values.values(), 100 * curve(grid)]))
     if bias and not squares:
         medians = 100 * everything.median_m
         axes.plot(everything.lifted, medians, "_", color=MUTED, ms=6, label="medians, reflections included")
-    curve = calibration.bias_curve if bias else calibration.sigma_curve
-    grid = np.linspace(*curve.range, 300)
     _curve(axes, calibration, which, grid, 100 * curve(grid), color=BLUE, lw=1.6, label="fitted", zorder=3)
     planted = planted_curve(ranges, f"{which}_curve", grid)
     if planted is not None:

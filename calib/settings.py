@@ -25,7 +25,7 @@ NUMBERS: Final = {
     "scale_ns": (POSITIVE, math.inf, "a positive number of ns"),
     "between_m": (0.0, math.nextafter(1.0, 0.0), "metres, 0 to 1"),
     "alpha_dbm": (-math.inf, math.inf, "a power in dBm"),
-    "reference_power_dbm": (-math.inf, math.inf, "a power in dBm"),
+    "reference_power_dbm": (-200.0, 0.0, "a power in dBm, -200 to 0"),
     "hold_out": (0.0, 0.9, "a share, 0 to 0.9"),
     "poses_until_s": (0.0, math.inf, "a number of 0 or more"),
     "heading_std_deg": (0.0, math.inf, "a number of 0 or more"),

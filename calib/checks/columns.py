@@ -12,6 +12,8 @@ from calib.calibration.document import known_of_splits
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.checks.recording_view import RecordingView
 from calib.data.clocks import left_skew
+from calib.data.ranges import Ranges
+from calib.errors import BadInputError
 from calib.estimator.identifiability import free_directions
 from calib.findings import Candidate, exceeds, more_often
 from calib.pairs import pairs_of
@@ -43,10 +45,20 @@ MIN_VALUES_OF_UNIT: Final = 20
 (`calib.spread.STD_OF_MEDIAN` over the root of their number), and units differ by a factor of two or more."""
 
 
+def arrivals(view: RecordingView) -> Iterator[Candidate]:
+    """Differences of arrival without stamps that no fit takes: another unit or sign, anchors without places."""
+    if len(view.differences.get("time_ns", ())):
+        try:
+            Ranges.from_differences(view.differences, poses=view.poses, tags=view.tags, source=view.name)
+        except BadInputError as error:
+            yield Candidate("wrong differences of arrival", str(error).removeprefix(f"{view.name}: "))
+
+
 def empty(view: RecordingView) -> Iterator[Candidate]:
     """Recordings without an exchange."""
     if not len(view.exchanges):
-        alone = f"{view.differences} differences of arrival and " if view.differences else ""
+        count = len(view.differences.get("time_ns", ()))
+        alone = f"{count} differences of arrival and " if count else ""
         yield Candidate("differences alone" if alone else "empty", f"the recording holds {alone}no exchanges")
 
 
@@ -324,7 +336,7 @@ def confounded(view: RecordingView) -> Iterator[Candidate]:
         within, between = float(np.mean([np.var(one) for one in parts])), float(np.var([np.mean(one) for one in parts]))
         if between > within:
             share = between / (between + max(within - noise, 0.0))
-            shares.append(1 - (1 - share) * (alone - 1) / max(alone - groups, 1))
+            shares.append(1 - (1 - share) * max(alone - 1, groups) / max(alone - groups, 1))
     # Beyond, what is fitted over power has ten times its own variance (variance inflation, Marquardt 1970).
     if max(shares) > 0.9:
         yield Candidate(

@@ -67,11 +67,18 @@ OVER_BLOCKS: Final = "Student's t, variances by stretches of time"
 CHECKS: Final = (
     Check(
         "reading",
+        "Have differences of arrival places of their anchors, and the unit and sign of these?",
+        "growth with the true differences, outside of 0.75 to 1.35", CERTAIN,
+        {"wrong differences of arrival": "mend the map or the places, and import them again"},
+        columns.arrivals,
+    ),
+    Check(
+        "reading",
         "Does the recording hold exchanges?",
         "number of exchanges", CERTAIN,
         {
             "empty": "record or import some",
-            "differences alone": "`calib fit --use receptions --delays-only` tests their sign, places and errors",
+            "differences alone": "`calib fit --use receptions --delays-only` tests their errors",
         },
         columns.empty,
     ),

@@ -14,7 +14,7 @@ from calib.calibration.model import Calibration
 from calib.calibration.power_curves import ALPHA_DBM, equal_bins, lifted_power
 from calib.checks.residuals import ONE_WAY_M
 from calib.data.clocks import as_length, corrected
-from calib.data.ranges import NO_STAMPS, STATIC, Ranges
+from calib.data.ranges import NO_STAMPS, STATIC, Ranges, growth_fault, look_like
 from calib.errors import UnanswerableError
 from calib.estimator.known_distances import KnownDistances
 from calib.findings import SMALLEST_NS
@@ -119,12 +119,8 @@ def _impossible(ranges: Ranges) -> Iterator[str]:
     if len(ranges) > 1 and not any(np.ptp(ranges.time_ns[ranges.session == number]) for number in sessions):
         yield "all ranges have the same time, so nothing says how long errors last; give their times"
     # How ranges and true distances spread: a unit or two columns may be wrong.
-    slope = _robust_slope(ranges.truth_m, ranges.raw_m)
-    rest = robust_spread(ranges.raw_m - slope * ranges.truth_m)
-    # A foot is 0.305 m, and ranges that follow other distances grow by anything.
-    if not 0.75 < slope < 1.35 and abs(slope) * robust_spread(ranges.truth_m) >= 3.0 * rest:
-        guess = _looks_like(slope)
-        yield (f"ranges grow by {slope:.3g} m in a metre of true distance; {guess and guess + '; '}give both in metres")
+    if fault := growth_fault("ranges", ranges.raw_m, ranges.truth_m):
+        yield f"{fault}; give both in metres"
     # Clock ratios that no crystals have: stamps that wrapped, or columns in the wrong order.
     weight = ranges.weight_target[ranges.protocol == "ds"]
     skew = 1e6 * float(np.median(np.abs(2 * weight - 1))) if len(weight) else 0.0
@@ -134,24 +130,6 @@ def _impossible(ranges: Ranges) -> Iterator[str]:
             f"clocks differ by {skew:.0f} ppm by their third messages, crystals by 40 at most; the third leg is longer "
             "than stamps count before they wrap, or the columns of stamps are in another order"
         )
-
-
-def _looks_like(ratio: float) -> str:
-    """Return what ranges that are so many times the true distances look like, an empty text where no unit is near."""
-    whose, smaller = ("true distances", ratio) if ratio < 1 else ("ranges", 1 / ratio)
-    # Units are apart by factors of three or more, and delays change a range of metres by less than a fifth.
-    units = {0.001: "millimetres", 0.01: "centimetres", 0.3048: "feet"}
-    near = (f"{whose} look like {unit}" for own, unit in units.items() if abs(np.log(max(smaller, 1e-9) / own)) < 0.2)
-    return next(near, "")
-
-
-def _robust_slope(x: Floats, y: Floats) -> float:
-    """Return how y (n,) grows with x (n,): the median slope between thirds (Tukey's line)."""
-    order = np.argsort(x, kind="stable")
-    third = max(len(x) // 3, 1)
-    low, high = order[:third], order[-third:]
-    run = float(np.median(x[high]) - np.median(x[low]))
-    return float(np.median(y[high]) - np.median(y[low])) / run if run > 0 else 1.0
 
 
 def one_way(ranges: Ranges) -> Iterator[str]:
@@ -199,7 +177,7 @@ def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: 
     if largest < REGISTER_NS and spread < max(typical, LOUD_M):
         return
     ratio = typical / max(float(np.median(np.abs(ranges.truth_m))), 1e-9)
-    guess = _looks_like(ratio) or "they may be in another unit, or of other tags"
+    guess = look_like("ranges", ratio) or "they may be in another unit, or of other tags"
     raise UnanswerableError(
         f"{ranges.source}: no radio has a delay of {largest:.0f} ns (registers hold {REGISTER_NS:.0f}) or errors that "
         f"spread by {spread:.3g} m in ranges of {typical:.3g} m; check the units of the true distances and of the "

@@ -6,12 +6,13 @@ thousand exchanges. Stretches are taken, and not single exchanges, because error
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Final, cast
+from typing import Any, Final, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from calib.data.ranges import Ranges, concatenate
@@ -42,7 +43,7 @@ class RecordingView:
     `reported_twice` exchanges were reported by both ends, and `contradictions` are the differences of such reports;
     `doubled` rows repeated another one. A recording is `posed` if true distances come from poses, and `standing` if it
     was made for a survey: arrangements of boards, without poses and true distances. `warming` are the tags that read
-    their temperature, `differences` the number of differences of arrival without stamps.
+    their temperature, `differences` the columns of differences of arrival without stamps.
     """
 
     name: str
@@ -57,7 +58,7 @@ class RecordingView:
     posed: bool
     standing: bool
     warming: frozenset[int] = frozenset()
-    differences: int = 0
+    differences: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     @cached_property
     def quick_fit(self) -> QuickFit | None:
@@ -121,7 +122,7 @@ def view_of(name: str, source: Source) -> RecordingView:
         contradictions=[", ".join(differences(both, a, b)) for a, b in reports.differing.tolist()],
         doubled=int(np.count_nonzero(again)),
         posed=posed,
-        differences=len((getattr(source, "differences", None) or {"time_ns": ()})["time_ns"]),
+        differences=getattr(source, "differences", None) or {},
         warming=frozenset((getattr(source, "temperature", None) or {"tag": np.zeros(0)})["tag"].tolist()),
         standing=bool(getattr(source, "arrangements", ())) and not len(looked.poses) and not np.isfinite(truth_m).any(),
     )

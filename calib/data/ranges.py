@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from calib.data.arrivals import Arrivals
+from calib.data.arrivals import LARGEST_ERROR_M, Arrivals
 from calib.data.clocks import ClocksApart, LeftSkew, clocks_apart, left_skew
 from calib.errors import BadInputError, UnanswerableError
 from calib.pairs import pairs_of
+from calib.spread import less_medians, robust_spread
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.errors import ArgumentError, ImportTableError, raising
 from uwblink.protocols.table import PROTOCOLS
@@ -48,7 +49,7 @@ made predictions of its held-out ranges worse.
 """
 
 MAX_RANGE_M: Final = 1e4
-"""Ranges beyond this come from impossible stamps: no ultra-wideband radio reaches a tenth of it."""
+"""Longer ranges come from impossible stamps or another unit: no ultra-wideband radio reaches a tenth of it."""
 
 LEAST_TURN_RAD: Final = math.radians(45.0)
 """Angle by which the attitudes of a body differ that turns: a hovering drone tilts by less (a judgement)."""
@@ -283,7 +284,7 @@ class Ranges(ColumnTable):
         It depends on half the difference of both anchors' delays, as with stamps (`calib.data.arrivals`): anchors that
         keep a common time measure their distances with the same delays, and a delay is half of transmission. The
         smaller id is the initiator. Raises `BadInputError` for an anchor without a place, and where `poses` show that
-        all differences have the other sign.
+        all differences have the other sign or another unit.
         """
         first, second = np.minimum(table["minus"], table["plus"]), np.maximum(table["minus"], table["plus"])
         places = set(names_in(poses.body))
@@ -305,12 +306,17 @@ class Ranges(ColumnTable):
             weights=(-0.5, 0.5),
             source=source,
         )
-        right, swapped = (np.abs(found.raw_m + sign * found.truth_m) for sign in (-1, 1))
-        if (known := np.isfinite(right)).any() and np.median(right[known]) > 2 * np.median(swapped[known]):
+        beyond_m = np.abs(found.raw_m) - distances_m(poses, tags, first, second, table["time_ns"])
+        # Within pairs, because constants of a few pairs may follow their differences.
+        pair, known = pairs_of(first, second).number, np.isfinite(found.raw_m) & np.isfinite(found.truth_m)
+        within = (less_medians(lengths[known], pair[known]) for lengths in (found.raw_m, found.truth_m))
+        fault = growth_fault("differences of arrival", *within)
+        # Without poses of the listener: no difference is longer than the way between both anchors.
+        if fault or np.count_nonzero(beyond_m > LARGEST_ERROR_M) > len(found) / 2:
             raise BadInputError(
-                f"{source}: by its poses the differences of arrival have the other sign (their median error is "
-                f"{np.median(right[known]):.2f} m, and {np.median(swapped[known]):.2f} m with that): exchange from_id "
-                "and to_id in the map of their import"
+                f"{source}: by its poses {fault or 'differences of arrival are longer than their anchors are apart'}; "
+                "mend it in the map of their import (another unit as difference_m in [units], from_id and to_id "
+                "exchanged for the other sign)"
             )
         return replace(found, protocol=np.full(len(found), NO_STAMPS), listener=table["listener"].astype(np.int64))
 
@@ -353,7 +359,7 @@ class Ranges(ColumnTable):
     def usable(
         self, why_no_truth: str = "", why_no_power: str = "", *, need_power: bool = True, need_truth: bool = True
     ) -> Ranges:
-        """Leave out and count ranges of a tag with itself, without true distance, without power, of impossible stamps.
+        """Leave out and count ranges of a tag with itself, without true distance, without power, beyond 10 km.
 
         A range counts for the first of these. Without `need_power`, ranges without power stay, and without
         `need_truth` those without true distance. Raises `UnanswerableError` where nothing is left, with `why_no_truth`
@@ -363,7 +369,7 @@ class Ranges(ColumnTable):
             "a tag with itself": self.initiator != self.target,
             "no true distance": np.isfinite(self.truth_m) | (not need_truth),
             "no power": np.isfinite(self.fpp1_dbm) | np.isfinite(self.fpp2_dbm) | (not need_power),
-            "impossible stamps": np.abs(self.raw_m) < MAX_RANGE_M,
+            f"a range beyond {MAX_RANGE_M / 1000:.0f} km": np.abs(self.raw_m) < MAX_RANGE_M,
         }
         keep, excluded = np.ones(len(self), dtype=bool), dict[str, int]()
         for reason, rows in good.items():
@@ -384,6 +390,39 @@ class Ranges(ColumnTable):
         most = max(excluded, key=lambda reason: excluded[reason])
         hint = f"; {hints[most]}" if most in hints else ""
         raise UnanswerableError(f"{self.source}: none of its {len(self)} exchanges can be used: {most}{hint}")
+
+
+def growth_fault(what: str, raw_m: Floats, truth_m: Floats) -> str:
+    """Return why lengths (n,), called `what`, cannot have these true values: another unit or sign; else ""."""
+    # The line of a few points is chance.
+    if len(raw_m) < 20:
+        return ""
+    slope = _robust_slope(truth_m, raw_m)
+    rest = robust_spread(raw_m - slope * truth_m)
+    # A foot is 0.305 m, and ranges that follow other distances grow by anything.
+    if 0.75 < slope < 1.35 or abs(slope) * robust_spread(truth_m) < 3.0 * rest:
+        return ""
+    guesses = ["they have the other sign" if slope < 0 else "", look_like("they", abs(slope))]
+    return "; ".join(filter(None, [f"{what} grow by {slope:.3g} m in a metre of true distance", *guesses]))
+
+
+def look_like(what: str, ratio: float) -> str:
+    """Return what lengths that are so many times the true ones look like, an empty text where no unit is near."""
+    whose, smaller = ("true distances", ratio) if ratio < 1 else (what, 1 / ratio)
+    # Units are apart by factors of three or more, and delays change a range of metres by less than a fifth.
+    # A nanosecond of flight is 0.300 m.
+    units = {0.001: "millimetres", 0.01: "centimetres", 0.3: "feet or nanoseconds"}
+    near = (f"{whose} look like {unit}" for own, unit in units.items() if abs(np.log(max(smaller, 1e-9) / own)) < 0.2)
+    return next(near, "")
+
+
+def _robust_slope(x: Floats, y: Floats) -> float:
+    """Return how y (n,) grows with x (n,): the median slope between thirds (Tukey's line)."""
+    order = np.argsort(x, kind="stable")
+    third = max(len(x) // 3, 1)
+    low, high = order[:third], order[-third:]
+    run = float(np.median(x[high]) - np.median(x[low]))
+    return float(np.median(y[high]) - np.median(y[low])) / run if run > 0 else 1.0
 
 
 def contents_of_frame(frame: Any, map_source: MapSource | None = None) -> Contents:

@@ -343,6 +343,12 @@ def load_flight(
         if len(found) and warm and len(warm["tag"]) and not np.isfinite(found.temperature_c).any():
             text = f"{name}: no reading of a temperature is of a tag that ranges, within 30 s of it: none is used"
             warnings.warn(text, TemperatureWarning, stacklevel=1)
+        celsius = found.temperature_c[np.isfinite(found.temperature_c)]
+        # Boards in rooms are colder, and 45 °F are 7 °C.
+        if len(celsius) and celsius.min() > 45:
+            read = f"{name}: temperatures are {celsius.min():.0f} to {celsius.max():.0f} °C"
+            text = f"{read}; if they are degrees Fahrenheit, import them again as (F - 32) / 1.8"
+            warnings.warn(text, TemperatureWarning, stacklevel=1)
         found = replace(found, features=features_of(exchanges, source))
         heard = getattr(source, "overheard", None)
         if heard and len(heard["time_ns"]):

@@ -141,8 +141,8 @@ def localize(
     bodies = problems(flight)
     if not bodies:
         raise UnanswerableError(
-            f"{flight.ranges.source}: no body moves among poses and ranges, so there is nothing to localize; one that "
-            "only listens needs `use` receptions"
+            f"{flight.ranges.source}: no body moves among {len(flight.poses)} poses and ranges, so there is "
+            "nothing to localize; add poses (`uwblink poses`), one that only listens needs `use` receptions"
         )
     found = []
     for problem in bodies:

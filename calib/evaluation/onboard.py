@@ -239,7 +239,8 @@ def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilt
     inertial, first = settings.model == "imu", 0
     if inertial and len(one.imu_s) < 2:
         raise UnanswerableError(
-            f"{one.ranges.source}: no inertial readings of {one.body}; choose the model constant-velocity"
+            f"{one.ranges.source}: no inertial readings of {one.body}; put imu.csv into an export (`uwblink import "
+            "exported`), or choose the model constant-velocity"
         )
     if settings.start_m is not None:
         fix = Fix(np.array(settings.start_m, dtype=np.float64), np.eye(3) * settings.start_std_m**2)
@@ -419,7 +420,8 @@ def onboard_text(found: list[OnboardTrack], settings: OnboardSettings) -> str:
         if len(one.restarts_s) > max(lasts_s / PATIENCE_S, 3):
             lines.append(
                 f"  began anew {len(one.restarts_s)} times in {lasts_s:.0f} s: what was measured contradicts the "
-                "anchors' places, or differences without stamps have the other sign (from_id and to_id of the import)"
+                "anchors' places, or differences without stamps have another unit or the other sign (from_id and to_id "
+                "of the import)"
             )
     noise = settings.noise
     moves = (

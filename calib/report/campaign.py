@@ -278,7 +278,8 @@ def _findings(data: Data) -> list[tuple[str, Finding]]:
     if isinstance(data, Ranges):
         return []
     with opened(data) as (name, _):
-        return [(name, finding) for finding in examine(data)]
+        # What pairs leave open is a warning of the fit already.
+        return [(name, finding) for finding in examine(data) if finding.fault != "too few pairs"]
 
 
 def _tracks(data: Data, calibration: Calibration) -> list[Localization]:

@@ -220,7 +220,7 @@ def _delays(results: Results) -> list[Block]:
     of_pairs: list[Block] = []
     if calibration.pair_constants:
         rows = [list(row) for row in offset_rows(calibration)]
-        of_pairs = [Table(["pair", "ranges too long by (cm)", "95 %"], rows)]
+        of_pairs = [Table(["pair", "ranges too long by (cm)", "interval"], rows)]
     if calibration.pair_offsets or len(calibration.sides) == len(calibration.delays_ns):
         return [Heading("Antenna delays"), *of_pairs]
     planted = results.planted if results.recordings else None

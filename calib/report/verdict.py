@@ -96,7 +96,7 @@ def _of_uses(results: Results) -> Iterator[Criterion]:
         yield Criterion(
             "Do positions become better?",
             "RMSE of the position not larger than with raw ranges",
-            f"from {raw:.3f} to {best:.3f} m over {len(results.tracks)} tracks",
+            f"from {raw:.3f} to {best:.3f} m over {len(results.tracks)} track{'s' * (len(results.tracks) > 1)}",
             _graded(bool(best < raw), False),
             f"positions go from {100 * raw:.0f} to {100 * best:.0f} cm RMSE",
         )

@@ -201,6 +201,37 @@ def test_the_other_sign_is_noticed_by_poses(folder, words):
     assert not (folder / "swapped" / "x.json").exists()
 
 
+@pytest.mark.parametrize(
+    ("factor", "blind", "words"),
+    [
+        (-1.0, False, "the other sign"),
+        (1 / METRES_A_NS, False, "nanoseconds"),
+        (100.0, False, "centimetres"),
+        (100.0, True, "longer than their anchors are apart"),
+    ],
+)
+def test_another_unit_or_sign_is_found_before_a_fit(folder, factor, blind, words):
+    some = uwblink.load(folder / "fly/d.uwb")
+    some = replace(some, poses=some.poses[some.poses.body != "tag20"]) if blind else some
+    assert [one.fault for one in calib.examine(some)] == ["differences alone"]
+    other = {**some.differences, "difference_m": factor * some.differences["difference_m"]}
+    (found,) = calib.examine(replace(some, differences=other))
+    assert found.fault == "wrong differences of arrival"
+    assert re.match(f"by its poses .*{words}", found.evidence)
+    with pytest.raises(calib.CalibError, match=words):
+        calib.load_ranges(replace(some, differences=other), need_power=False, use="receptions")
+
+
+def test_numbers_that_are_no_differences_are_left_out_and_counted(folder):
+    some = uwblink.load(folder / "fly/d.uwb")
+    other = some.differences["difference_m"].copy()
+    other[::50] = np.resize([1e300, -1e300, np.nan], len(other[::50]))
+    found = calib.load_ranges(
+        replace(some, differences={**some.differences, "difference_m": other}), need_power=False, use="receptions"
+    )
+    assert found.excluded["a range beyond 10 km"] == 64
+
+
 @pytest.mark.slow
 def test_the_other_sign_is_doubted_without_poses(folder):
     rows = flown(4, 4.0)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 import calib
 from calib.estimator.losses import LOSSES
-from calib.figures import binned, cumulative, delays, histogram, within_fence
+from calib.figures import binned, cumulative, curve_over_power, delays, histogram, within_fence
 from calib.fitting.fitting import fit
 from calib.report.sections import SECTIONS
 from tests import pages
@@ -123,6 +123,14 @@ def test_the_drawn_curve_goes_through_the_drawn_points(fitted):
     (top,) = axes.child_axes  # first-path powers in dBm
     for place, text in zip(top.get_xticks(), top.get_xticklabels(), strict=True):
         assert 10 ** ((float(text.get_text().replace("−", "-")) + 82) / 10) == pytest.approx(place)
+
+
+def test_the_curve_is_drawn_whole_where_its_points_are_few(fitted):
+    faint = fitted.ranges[fitted.ranges.fpp1_dbm < np.median(fitted.ranges.fpp1_dbm)]
+    known = fitted.calibration
+    axes = axes_of(lambda a: curve_over_power(faint, known.apply(faint), known, "bias", a))
+    (low, high), drawn = axes.get_ylim(), labelled(axes, "fitted").get_ydata()
+    assert low < drawn.min() < drawn.max() < high
 
 
 def test_the_sigma_curve_goes_through_its_points(fitted):

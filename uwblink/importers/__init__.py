@@ -131,7 +131,12 @@ def _query(db: duckdb.DuckDBPyConnection, table: str, source: Path) -> str:
     if is_csv:
         cells |= {name: f'unhex("{name}")' for name, kind in TABLES[table].items() if kind == "BLOB"}
     found = db.execute(f"DESCRIBE SELECT * FROM {read}", [str(source)]).fetchall()  # noqa: S608 - nothing of a file
-    if table == "exchanges" and TRUTH_FROM in {row[0] for row in found}:
+    names = {row[0] for row in found}
+    if lacking := [name for name in TABLES[table] if name not in names]:
+        raise ImportTableError(
+            f"{source}: lacks the columns {', '.join(lacking)}; {table} has {', '.join(TABLES[table])}"
+        )
+    if table == "exchanges" and TRUTH_FROM in names:
         # Distances by poses are left out, because the poses are imported, too.
         cells["truth_m"] = f"CASE WHEN {TRUTH_FROM} = '{BY_POSES}' THEN NULL ELSE {cells['truth_m']} END"
     return f"SELECT {selected(cells)} FROM {read}"  # noqa: S608 - keys of TABLES

@@ -104,10 +104,12 @@ PATTERNS: Final = {
     "sts1": r"{sts}_?1",
     "sts2": r"{sts}_?2?",
     "gt_range_m": r"{true}_?{range}?|{range}_?{true}",
-    "range_m": r"({made}_?|device_?|measured?_?|uwb_?|est(imated)?_?)?{range}(_?{made})?",
+    "range_m": r"({made}_?|device_?|measured?_?|uwb_?|est(imated)?_?)?{range}(_?{made})?|measured",
     "sequence": r"(seq|sequence|exchange|laufnummer)(_?(no|num|nr|number|id))?",
     "message": r"(msg|message|frame|nachricht)(_?(no|num|nr|number|type|id))?",
-    "from_temperature_c": r"(device_?)?({from}|von|a|i)_?{temperature}|{temperature}_?(at_|of_)?({from}|von|a|i)(_c)?",
+    "from_temperature_c": (
+        r"((device_?)?({from}|von|a|i)_?)?{temperature}|{temperature}_?(at_|of_)?({from}|von|a|i)(_c)?"
+    ),
     "to_temperature_c": r"(device_?)?({to}|nach|b|j|r)_?{temperature}|{temperature}_?(at_|of_)?({to}|nach|b|j|r)(_c)?",
     "tx": r"tx",
     "rx": r"rx",
@@ -122,8 +124,8 @@ _OF_DIFFERENCES: Final = PATTERNS | {
     "time_s": rf"{PATTERNS['time_s']}|t_?tdoa",
     "difference_m": r".*({difference}).*",
     "at_id": r"(at|tag|listener|robot|drone|mobile|receiver|rx|ziel){id}",
-    "from_id": r"(from|minus|src|source){id}|(anchor|anker|node)_?from{id}",
-    "to_id": r"(to|plus|dst|target){id}|(anchor|anker|node)_?to{id}",
+    "from_id": r"((anchor|anker|node)_?)?(from|minus|src|source){id}",
+    "to_id": r"((anchor|anker|node)_?)?(to|plus|dst|target){id}",
 }
 """Patterns of names in tables of differences of arrival, whose ids have other roles than those of ranges."""
 

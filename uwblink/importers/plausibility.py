@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from uwblink.arrays import Columns, Floats, Ints
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import DISTANCE_UNITS, IDS, POSITIONS, POWERS, ColumnMap
+from uwblink.importers.column_map import DISTANCE_UNITS, FLIGHT_UNITS, IDS, POSITIONS, POWERS, ColumnMap
 from uwblink.importers.devices import CHIPS
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import REGISTER_MAX, AntennaDelay, delay_of
@@ -274,9 +274,9 @@ def other_unit(errors: Mapping[str, Errors]) -> str:
     best, found = 0.0, ""
     for name, of in errors.items():
         plain = _remaining(of(1.0))
-        for unit, factor in DISTANCE_UNITS.items():
+        for unit, factor in (DISTANCE_UNITS | (FLIGHT_UNITS if "ranges" in name else {})).items():
             gain = np.log(plain / max(_remaining(of(factor)), METRES_PER_TICK)) if plain > 0 else 0.0
-            if factor != 1.0 and gain > max(best, -np.log(factor) / 2):
+            if factor < 1.0 and gain > max(best, -np.log(factor) / 2):
                 best, found = gain, f"{name} are in {unit}"
     return found
 

@@ -231,9 +231,10 @@ def add_poses(
         strange = parts and bodies.isdisjoint(tag.body for tag in placed if tag.tag not in anchors)
         if len(ids) < 2 or strange or not (known.any() or shift_ns is not None):
             found = ", ".join(sorted({tag.body for tag in placed})) or "none"
+            lost = ", ".join(map(str, np.setdiff1d(np.append(first, second), [tag.tag for tag in placed])))
             raise ImportTableError(
                 f"{what}: its bodies are {', '.join(sorted(bodies))}, those of the tags {found}; "
-                "give the bodies of the tags with `tags_from`"
+                f"give the bodies of {f'tags {lost}, which range,' if lost else 'the tags'} with `tags_from`"
             )
         if held := [tag for tag in with_poses if tag.body in unturned and any(tag.lever_arm_m)]:
             raise ImportTableError(
@@ -274,7 +275,7 @@ def _check_units(what: str, exchanges: Exchanges, poses: Poses, tags: Sequence[T
         "its positions": lambda factor: ranges - distances(factor, 1.0),
         "lever arms": lambda factor: ranges - distances(1.0, factor),
         "its positions and the lever arms": lambda factor: ranges - distances(factor, factor),
-        "the ranges": lambda factor: ranges - distances(1.0, 1.0) / factor,
+        "the ranges of the recording": lambda factor: ranges - distances(1.0, 1.0) / factor,
     }
     if found := other_unit(errors):
         raise ImportTableError(f"{what}: {found}, not metres, by comparison of ranges and distances; convert them")

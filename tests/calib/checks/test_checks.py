@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import calib
+import uwblink
 from benchmarks import doctor as planted
 from benchmarks.flights import Flight, Plan, fly
 from calib.checks.examine import CHECKS, FINDING_LEVEL, IMPLIED
@@ -19,6 +20,7 @@ from docs.site import checks
 from tests import processes
 from tests.shared_data import ROOT, shared
 from uwblink.importers import import_recording
+from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
 
 RNG = np.random.default_rng
@@ -175,6 +177,18 @@ def test_power_and_distance_are_not_confounded_outdoors(tmp_path):
         "single-sided without carrier readings",
         "reflections that last",
     }
+
+
+def test_two_seconds_of_one_pair_say_nothing_of_power_and_distance():
+    """Distance explains three fifths of the power, directions the rest; of 2 s, which count as one value, no share."""
+    random, rows = np.random.default_rng(4), 1200
+    truth_m = 3 + np.sin(np.linspace(0, 60, rows))
+    power_dbm = -76 - 3 * truth_m + 2.5 * np.sin(np.linspace(0, 37, rows)) + 0.3 * random.standard_normal(rows)
+    e = uwblink.Exchanges.from_arrays(
+        1, 7, range_m=truth_m + 0.05 * random.standard_normal(rows), truth_m=truth_m, fpp2_dbm=power_dbm,
+        time_ns=np.arange(rows) * 10**6,
+    )  # fmt: skip
+    assert [one.fault for one in calib.examine(Contents(exchanges=e))] == ["too few pairs"]
 
 
 @pytest.mark.slow

@@ -204,6 +204,7 @@ def test_what_is_not_known_of_the_smoothness_is_in_the_band_of_the_curve(monkeyp
     [
         ("loss", "arctan"),
         ("reference_power_dbm", math.nan),
+        ("reference_power_dbm", 1e9),
         ("scale_ns", -1),
         ("scale_ns", 0.0),
         ("scale_ns", math.nan),

@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+import warnings
 from dataclasses import replace
 from functools import cache
 
@@ -288,3 +289,15 @@ def test_readings_that_are_of_no_range_are_named(tag, later_s):
     readings |= {name: np.full(len(flight.exchanges), 25.0) for name in ("temperature_c", "supply_v")}
     with pytest.warns(TemperatureWarning, match="memory: no reading .* none is used"):
         calib.load_ranges(replace(flight, temperature=readings))
+
+
+@pytest.mark.parametrize(("celsius", "doubted"), [(46.0, False), (72.0, True)])
+def test_degrees_fahrenheit_are_doubted(celsius, doubted):
+    flight = calib.sample_flight()
+    count = len(flight.exchanges)
+    readings = {"time_ns": flight.exchanges.time_ns, "tag": np.full(count, 1), "supply_v": np.full(count, np.nan)}
+    readings["temperature_c"] = np.linspace(celsius - 10, celsius + 10, count)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        calib.load_ranges(replace(flight, temperature=readings))
+    assert ["Fahrenheit" in str(one.message) for one in caught] == [True] * doubted

@@ -275,7 +275,12 @@ FEW = [f"anchor{k}" for k in range(4)]
 @pytest.mark.parametrize(
     ("change", "settings", "error", "said"),
     [
-        (lambda _: {"imu": {}}, {}, UnanswerableError, "no inertial readings of drone; choose the model constant-vel"),
+        (
+            lambda _: {"imu": {}},
+            {},
+            UnanswerableError,
+            r"no inertial readings of drone; put imu.csv .*model constant-vel",
+        ),
         (
             lambda flown: {"poses": flown.poses[np.flatnonzero(~np.isin(flown.poses.body, FEW))]},
             {},

@@ -133,6 +133,16 @@ def test_ranges_too_few_to_hold_out_are_judged_themselves(folder):
         calib.run_campaign(few, loss="l2", hold_out=0.3)
 
 
+def test_what_pairs_leave_open_is_one_warning_whatever_the_recordings(tmp_path, sections):
+    """One tag ranges with all others."""
+    flights = [sample_flight(seed=seed) for seed in (1, 2)]
+    stars = [replace(one, exchanges=one.exchanges[one.exchanges.initiator == 1]) for one in flights]
+    assert [one.fault for one in calib.examine(stars[1])] == ["too few pairs"]
+    campaign = calib.run_campaign(stars[0], tests=stars[1], loss="huber")
+    assert campaign.findings == []
+    assert [text for text in campaign.fit.warnings if "are determined" in text]
+
+
 def weather(campaign):
     return [Heading("Weather"), Text(f"Dry over {len(campaign.judged)} ranges; <wet> tomorrow.")]
 

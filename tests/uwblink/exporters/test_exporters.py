@@ -86,8 +86,13 @@ def test_a_folder_that_is_no_export(whole, tmp_path):
     with pytest.raises(ImportTableError, match=r"holds no exchanges\.csv"):
         import_recording(tmp_path, tmp_path / "o.uwb", importer="exported")
     export_recording(whole, tmp_path / "out", to="csv")
-    path = tmp_path / "out" / "exchanges.csv"
-    path.write_text(path.read_text().replace(",", ",x", 1).replace("\n", "\nx", 1))
+    imu, path = tmp_path / "out" / "imu.csv", tmp_path / "out" / "exchanges.csv"
+    kept = imu.read_text()
+    imu.write_text(kept.replace("wx", "gyro_x", 1))
+    with pytest.raises(ImportTableError, match=r"imu\.csv: lacks the columns wx; imu has time_ns, body, wx, wy"):
+        import_recording(tmp_path / "out", tmp_path / "o.uwb", importer="exported")
+    imu.write_text(kept)
+    path.write_text(path.read_text().replace("\n", "\nx", 1))
     with pytest.raises(ImportTableError, match="not in the form of 'uwblink export'"):
         import_recording(tmp_path / "out", tmp_path / "o.uwb", importer="exported")
     assert not (tmp_path / "o.uwb").exists()

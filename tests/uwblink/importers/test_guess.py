@@ -336,6 +336,17 @@ def test_third_stamps_of_the_initiator_in_exchanged_columns_are_not_those_of_the
     assert 'protocol = "ds-alt"' in guess_map(write(tmp_path / "alternative.csv", noisy)).text
 
 
+def test_one_temperature_a_row_is_of_the_initiator(tmp_path):
+    rows = [f"{k / 10},7,{k % 3},{300 + k},{290 + k},{20 + k / 50}" for k in range(60)]
+    text = "\n".join(["time_s,tag,anchor,measured_cm,true_cm,temperature", *rows])
+    (tmp_path / "t.csv").write_text(text)
+    found = guessed(tmp_path, tmp_path / "t.csv")
+    assert found.exchanges.range_m == pytest.approx(3 + np.arange(60) / 100)
+    warm = found.temperature
+    assert set(warm["tag"].tolist()) == {7}
+    assert warm["temperature_c"] == pytest.approx(20 + np.arange(60) / 50)
+
+
 OWN = {"time_s": "time_s", "at_id": "tag", "from_id": "anchor_a", "to_id": "anchor_b", "difference_m": "difference_m"}
 
 
@@ -350,11 +361,13 @@ OWN = {"time_s": "time_s", "at_id": "tag", "from_id": "anchor_a", "to_id": "anch
             {},
         ),
         ("time,from_id,to_id,distanceDiff", {"time_s": "time", "difference_m": "distanceDiff"}, {}),
+        ("time_s,tag,anchor_plus,anchor_minus,tdoa_m", {"from_id": "anchor_minus", "to_id": "anchor_plus"}, {}),
     ],
 )
 def test_differences_of_arrival_without_stamps_are_read(tmp_path, header, named, units):
     """Of a table with the columns of the public set UTIL, and of others; what their sign is taken for is said."""
     cells = {"tag": "9", "anchor_a": "1", "idA": "1", "from_id": "1", "anchor_b": "2", "idB": "2", "to_id": "2"}
+    cells |= {"anchor_minus": "1", "anchor_plus": "2"}
     rows = "".join(
         ",".join(cells.get(name, f"{1.37 + k / 50:.2f}") for name in header.split(",")) + "\n" for k in range(30)
     )

@@ -177,10 +177,11 @@ def test_lever_arms_and_ranges_in_other_units_are_refused(flight, copied, tmp_pa
     with pytest.raises(ImportTableError, match="lever arms are in mm"):
         add_poses(copied, flight / "p.csv", offset="-3.21", tags_from=tmp_path / "tags.toml")
     none: dict[str, Any] = dict.fromkeys(STAMPS, np.zeros(len(held), dtype=np.int64))
-    bare = replace(held, range_m=1000 * held.range_m, **none)
-    Contents(exchanges=bare, tags=tags).save(tmp_path / "mm.uwb")
-    with pytest.raises(ImportTableError, match="ranges are in mm"):
-        add_poses(tmp_path / "mm.uwb", flight / "p.csv", offset="-3.21")
+    for unit, factor in (("mm", 1000.0), ("ns", 1 / 0.299702547)):
+        bare = replace(held, range_m=factor * held.range_m, **none)
+        Contents(exchanges=bare, tags=tags).save(tmp_path / "other.uwb", force=True)
+        with pytest.raises(ImportTableError, match=f"ranges of the recording are in {unit}"):
+            add_poses(tmp_path / "other.uwb", flight / "p.csv", offset="-3.21")
 
 
 def test_boards_that_stand_still_are_not_taken_for_ranges_in_another_unit(tmp_path):
