@@ -79,7 +79,9 @@ def clean(name: str, seed: int) -> Outcome:
 
 def alarmed(seed: int) -> list[str]:
     """Return the warnings of a fit to a sound world, of a kind that goes by the seed."""
-    kinds = [name for name, one in CLEAN.items() if one.seconds <= 240 and one.tags == 5 and not one.lever_m + one.offset_m]
+    kinds = [
+        name for name, one in CLEAN.items() if one.seconds <= 240 and one.tags == 5 and not one.lever_m + one.offset_m
+    ]
     world = make(CLEAN[kinds[seed % len(kinds)]], FIRST_REPORTED + 20_000 + seed)
     return calib.fit(world.ranges).warnings
 
