@@ -232,9 +232,8 @@ CLEAN: Final[dict[str, Recipe]] = {
     "three tags": Recipe(tags=3),
     "unequal noise": Recipe(unequal_noise=0.4),
     "a lever arm 2 cm off": Recipe(lever_m=0.02),
-    "offsets of pairs of 3 cm, four tags": Recipe(tags=4, offset_m=0.03),
-    "offsets of pairs of 3 cm, five tags": Recipe(offset_m=0.03),
-    "offsets of pairs of 3 cm, eight tags": Recipe(tags=8, offset_m=0.03),
+    "pairs off by 3 cm, four tags": Recipe(tags=4, offset_m=0.03),
+    "pairs off by 3 cm, eight tags": Recipe(tags=8, offset_m=0.03),
     "twelve tags, six ranges a pair": Recipe(tags=12, seconds=78, per_second=5, share=(0, 0.5)),
 }
 
