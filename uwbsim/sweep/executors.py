@@ -178,10 +178,14 @@ class Workers:
     died: type[Exception] = BrokenProcessPool
     """Raised by the future of a chunk whose worker died."""
 
+    patience_s: float | None = None
+    """Seconds without a chunk that is done, after which workers are looked after; None for those that tell."""
+
     def __init__(self, size: int, work: Work) -> None:
         """`size` is how many chunks are worked on at once."""
         self.size, self._work = size, work
         self._running: dict[Future[tuple[list[Result], float]], Chunk] = {}
+        self._lost: list[Done] = []
         self._pool = self._start_pool()
 
     def _start_pool(self) -> Any:  # an `Executor`, of whatever kind
@@ -193,14 +197,20 @@ class Workers:
 
     def finished(self) -> Sequence[Done]:
         """Wait until a chunk is done, and return all chunks that are."""
-        found: list[Done] = []
-        for future in wait(self._running, return_when=FIRST_COMPLETED).done:
-            chunk = self._running.pop(future)
-            try:
-                found.append((chunk, *future.result()))
-            except self.died:
-                found.append((chunk, None, 0.0))
+        found, self._lost = self._lost, []
+        while not found:
+            for future in wait(self._running, self.patience_s, return_when=FIRST_COMPLETED).done:
+                chunk = self._running.pop(future)
+                try:
+                    found.append((chunk, *future.result()))
+                except self.died:
+                    found.append((chunk, None, 0.0))
+            found = found or self._replace()
         return found
+
+    def _replace(self) -> list[Done]:
+        """Replace workers that died without a word, and return the chunks that they had."""
+        return []
 
     def close(self) -> None:
         """Release the workers, without waiting for running chunks."""
@@ -213,6 +223,8 @@ class Processes(Workers):
     They end with this process, even if it is killed: each watches a pipe that this process holds open. Raises
     `ParameterError` for plug-ins that they could not import, and `WorkersLostError` where they end as they begin.
     """
+
+    patience_s = 5.0
 
     def _start_pool(self) -> Any:
         self._work.check()
@@ -235,8 +247,22 @@ class Processes(Workers):
         try:
             super().submit(chunk)
         except BrokenProcessPool:
-            self._pool = self._start_pool()
+            self._lost += self._replace()
             super().submit(chunk)
+
+    def _replace(self) -> list[Done]:
+        """Start new processes if one has died, and return the chunks of the others.
+
+        A pool that is handed a chunk while it notices the death never reports that chunk (CPython 3.11:
+        `terminate_broken` does not hold the lock of `submit`).
+        """
+        try:
+            self._pool.submit(abs, 0)
+        except BrokenProcessPool:
+            silent = [future for future in self._running if not future.done()]
+            self._pool = self._start_pool()
+            return [(self._running.pop(future), None, 0.0) for future in silent]
+        return []
 
     def close(self) -> None:
         """End the processes, without waiting for running chunks."""

@@ -5,7 +5,9 @@ import importlib
 import os
 import signal
 import sys
+from concurrent.futures import Future
 from dataclasses import replace
+from typing import Any
 
 import duckdb
 import numpy as np
@@ -109,6 +111,28 @@ def test_a_process_that_dies_is_replaced_and_several_give_the_same_bytes(alone, 
     assert (tmp_path / "out" / "results.csv").read_bytes() == (out / "results.csv").read_bytes()
 
 
+def test_a_chunk_that_a_broken_pool_never_reports_is_done_again(alone, tmp_path, monkeypatch):
+    p, out = alone
+
+    class Silent(Processes):
+        patience_s = 0.2
+        silent: Future[Any] | None = None
+
+        def submit(self, chunk):
+            super().submit(chunk)
+            if self.silent is None:
+                # As in the race: the pool knows nothing of the chunk, and breaks.
+                (last,) = self._running
+                self.silent = Future()
+                self._running = {self.silent: self._running[last]}
+                for process in list(self._pool._processes.values()):
+                    process.kill()
+
+    monkeypatch.setattr("uwbsim.sweep.runner.workers_for", lambda count, scheduler, known: Silent(2, known))
+    assert run_sweep(p, tmp_path / "out").done == 12
+    assert (tmp_path / "out" / "results.csv").read_bytes() == (out / "results.csv").read_bytes()
+
+
 @pytest.mark.slow
 def test_a_dask_cluster_survives_the_death_of_a_worker(tmp_path):
     distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
@@ -143,6 +167,7 @@ CALIBRATE = HEAD.replace('["ss-cfo", "ds"]', '["ds"]') + 'kind = "calibrate"\n[v
 
 STRANGER = """
 from dataclasses import replace
+from typing import Any
 import numpy as np
 
 def figures(flight):
