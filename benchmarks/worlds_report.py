@@ -80,7 +80,9 @@ def clean(name: str, seed: int) -> Outcome:
 def alarmed(seed: int) -> list[str]:
     """Return the warnings of a fit to a sound world, of a kind that goes by the seed."""
     kinds = [
-        name for name, one in CLEAN.items() if one.seconds <= 240 and one.tags == 5 and not one.lever_m + one.offset_m
+        name
+        for name, one in CLEAN.items()
+        if one.seconds <= 240 and one.tags == 5 and not (one.lever_m or one.offset_m)
     ]
     world = make(CLEAN[kinds[seed % len(kinds)]], FIRST_REPORTED + 20_000 + seed)
     return calib.fit(world.ranges).warnings
@@ -99,6 +101,11 @@ def planted(name: str, seed: int) -> str:
     return "right" if np.all(np.abs(outcome.errors_ps) < 3 * np.array(outcome.std_ps)) else "SILENT"
 
 
+def _two_digits(value: float) -> str:
+    """Return a number with two significant digits, and without an exponent."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
 def table(outcomes: dict[str, list[Outcome]]) -> list[str]:
     """Return the rows of sound worlds."""
     rows = [
@@ -110,7 +117,7 @@ def table(outcomes: dict[str, list[Outcome]]) -> list[str]:
         errors = np.concatenate([outcome.errors_ps for outcome in some])
         std = np.concatenate([outcome.std_ps for outcome in some])
         rows.append(
-            f"| {name} | {float(f'{np.sqrt(np.mean(errors**2)):.2g}'):g} | "
+            f"| {name} | {_two_digits(np.sqrt(np.mean(errors**2)))} | "
             f"{100 * np.mean(np.abs(errors) < 1.96 * std):.0f} | "
             f"{np.mean([outcome.curve_mm for outcome in some]):.1f} | "
             f"{100 * np.mean([outcome.band_holds for outcome in some]):.0f} | "

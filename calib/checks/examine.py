@@ -67,9 +67,9 @@ OVER_BLOCKS: Final = "Student's t, variances by stretches of time"
 CHECKS: Final = (
     Check(
         "reading",
-        "Have differences of arrival places of their anchors, and the unit and sign of these?",
+        "Do differences of arrival fit the places of their anchors, in unit and sign?",
         "growth with the true differences, outside of 0.75 to 1.35", CERTAIN,
-        {"wrong differences of arrival": "mend the map or the places, and import them again"},
+        {"wrong differences of arrival": "correct their map or the places of anchors, and import them again"},
         columns.arrivals,
     ),
     Check(

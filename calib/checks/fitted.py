@@ -19,7 +19,7 @@ from calib.estimator.arrival_rows import OFFSET_OF_PATH, PATH_SIGNS
 from calib.estimator.covariance import of_few_draws
 from calib.estimator.inverse import positive_part
 from calib.estimator.known_distances import KnownDistances
-from calib.estimator.range_model import METRES_A_NS, TYPICAL_OFFSET_M, RangeModel
+from calib.estimator.range_model import METRES_A_NS, TYPICAL_OFFSET_M, RangeModel, free_ends
 from calib.estimator.range_rows import Mixture
 from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes, search, widening
 from calib.estimator.time_blocks import FEWEST_STRETCHES
@@ -361,16 +361,12 @@ def _short(found: KnownDistances) -> Iterator[str]:
 
 def _saturated(model: RangeModel) -> Iterator[str]:
     """Say where so few pairs range that offsets of pairs pass for delays."""
-    pairs = model.pairs.ends
-    if (
-        model.settings.constants == "tag"
-        and len(pairs) > 2
-        and not any(u.kind == "offset of pair" for u in model.unknowns)
-    ):
-        ends = 0.5 * METRES_A_NS * (pairs[:, :, None] == np.array(model.tags)).any(axis=1)
-        moved_ns = TYPICAL_OFFSET_M * float(np.linalg.norm(np.linalg.pinv(ends), axis=1).max())
+    count, told = len(model.pairs.ends), any(unknown.kind == "offset of pair" for unknown in model.unknowns)
+    if model.settings.constants == "tag" and count > 2 and not told:
+        slopes = 0.5 * METRES_A_NS * free_ends(model.pairs, model.tags, model.settings)
+        moved_ns = TYPICAL_OFFSET_M * float(np.linalg.norm(np.linalg.pinv(slopes), axis=1).max())
         yield (
-            f"{len(pairs)} pairs determine the delays and nothing beside them: offsets of pairs of "
+            f"{count} pairs determine the delays and nothing beside them: offsets of pairs of "
             f"{100 * TYPICAL_OFFSET_M:.1f} cm, as walls make them, would move delays by up to {1e3 * moved_ns:.0f} ps, "
             "which intervals do not contain; record more tags, or anchors"
         )

@@ -359,7 +359,7 @@ class Ranges(ColumnTable):
     def usable(
         self, why_no_truth: str = "", why_no_power: str = "", *, need_power: bool = True, need_truth: bool = True
     ) -> Ranges:
-        """Leave out and count ranges of a tag with itself, without true distance, without power, beyond 10 km.
+        """Leave out and count ranges of a tag with itself, without true distance, power, or a range within 10 km.
 
         A range counts for the first of these. Without `need_power`, ranges without power stay, and without
         `need_truth` those without true distance. Raises `UnanswerableError` where nothing is left, with `why_no_truth`
@@ -369,7 +369,7 @@ class Ranges(ColumnTable):
             "a tag with itself": self.initiator != self.target,
             "no true distance": np.isfinite(self.truth_m) | (not need_truth),
             "no power": np.isfinite(self.fpp1_dbm) | np.isfinite(self.fpp2_dbm) | (not need_power),
-            f"a range beyond {MAX_RANGE_M / 1000:.0f} km": np.abs(self.raw_m) < MAX_RANGE_M,
+            f"no range within {MAX_RANGE_M / 1000:.0f} km": np.abs(self.raw_m) < MAX_RANGE_M,
         }
         keep, excluded = np.ones(len(self), dtype=bool), dict[str, int]()
         for reason, rows in good.items():

@@ -334,7 +334,7 @@ def _offsets(ranges: Ranges, pairs: Pairs, tags: list[int], *, freedom: int) -> 
         yield scattered(kind, names, OFFSETS), Part(parameter=RESIDUAL, kind=kind, columns=own)
 
 
-def _free_ends(pairs: Pairs, tags: list[int], settings: FitSettings) -> Floats:
+def free_ends(pairs: Pairs, tags: list[int], settings: FitSettings) -> Floats:
     """Return which of the tags (tags,) with unknown delays each pair has, as 0 and 1 (pairs, tags)."""
     free = np.array([tag not in settings.fixed_ns for tag in tags])
     return np.asarray((pairs.ends[:, :, None] == np.array(tags)).sum(axis=1) * free, dtype=np.float64)
@@ -342,9 +342,7 @@ def _free_ends(pairs: Pairs, tags: list[int], settings: FitSettings) -> Floats:
 
 def _offsets_determined(pairs: Pairs, tags: list[int], settings: FitSettings, carriers: Sequence[Floats | None]) -> int:
     """Return how many offsets of pairs ranges determine beside delays and constants of curves."""
-    taken = (
-        len(pairs.ends) if settings.constants == "pair" else np.linalg.matrix_rank(_free_ends(pairs, tags, settings))
-    )
+    taken = len(pairs.ends) if settings.constants == "pair" else np.linalg.matrix_rank(free_ends(pairs, tags, settings))
     return int(len(pairs.ends) - taken - sum(one is None for one in carriers))
 
 
@@ -354,7 +352,7 @@ def _carrier(pairs: Pairs, tags: list[int], settings: FitSettings, group: tuple[
     aim = np.ones(len(pairs.ends)) if group is None else 0.5 * np.isin(pairs.ends, group).sum(axis=1)
     if settings.constants == "pair":
         return aim
-    ends = 0.5 * _free_ends(pairs, tags, settings)
+    ends = 0.5 * free_ends(pairs, tags, settings)
     weights = np.asarray(np.linalg.lstsq(ends, aim, rcond=None)[0])
     left = aim - ends @ weights
     return weights if left @ left < 1e-4 * (aim @ aim) else None

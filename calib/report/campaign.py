@@ -278,7 +278,7 @@ def _findings(data: Data) -> list[tuple[str, Finding]]:
     if isinstance(data, Ranges):
         return []
     with opened(data) as (name, _):
-        # What pairs leave open is a warning of the fit already.
+        # The fit warns of it already.
         return [(name, finding) for finding in examine(data) if finding.fault != "too few pairs"]
 
 

@@ -229,7 +229,7 @@ def test_numbers_that_are_no_differences_are_left_out_and_counted(folder):
     found = calib.load_ranges(
         replace(some, differences={**some.differences, "difference_m": other}), need_power=False, use="receptions"
     )
-    assert found.excluded["a range beyond 10 km"] == 64
+    assert found.excluded["no range within 10 km"] == 64
 
 
 @pytest.mark.slow

@@ -264,17 +264,18 @@ In this unit noise does not depend on the factor; otherwise ranges of boards at 
 """
 
 
-def other_unit(errors: Mapping[str, Errors]) -> str:
+def other_unit(errors: Mapping[str, Errors], ranges: str) -> str:
     """Return which lengths are evidently in which other unit, such as "ranges are in mm"; "" if all are in metres.
 
-    `errors` are by the name of the lengths that are multiplied. The residuals of the errors from a constant (antenna
-    delays) are compared: a unit is found if they are smaller by more than the square root of its factor. Residuals of
-    distances that are unrelated to the ranges shrink to the spread of the ranges, by at most the square root of two.
+    `errors` are by the name of the lengths that are multiplied; those called `ranges` may be times of flight. The
+    residuals of the errors from a constant (antenna delays) are compared: a unit is found if they are smaller by more
+    than the square root of its factor. Residuals of distances that are unrelated to the ranges shrink to the spread of
+    the ranges, by at most the square root of two.
     """
     best, found = 0.0, ""
     for name, of in errors.items():
         plain = _remaining(of(1.0))
-        for unit, factor in (DISTANCE_UNITS | (FLIGHT_UNITS if "ranges" in name else {})).items():
+        for unit, factor in (DISTANCE_UNITS | (FLIGHT_UNITS if name == ranges else {})).items():
             gain = np.log(plain / max(_remaining(of(factor)), METRES_PER_TICK)) if plain > 0 else 0.0
             if factor < 1.0 and gain > max(best, -np.log(factor) / 2):
                 best, found = gain, f"{name} are in {unit}"
@@ -359,7 +360,7 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
         if raw_m is None
         else {"ranges": lambda f: raw_m - f * ranges, "true distances": lambda f: raw_m - f * true}
     )
-    if found := other_unit(errors):
+    if found := other_unit(errors, "ranges"):
         beside = "the others" if raw_m is None else "its stamps"
         raise ImportTableError(
             f"{path}: {found} by {beside}, and in {column_map.units.get('distance', 'm')} by the map; "

@@ -277,7 +277,7 @@ def _check_units(what: str, exchanges: Exchanges, poses: Poses, tags: Sequence[T
         "its positions and the lever arms": lambda factor: ranges - distances(factor, factor),
         "the ranges of the recording": lambda factor: ranges - distances(1.0, 1.0) / factor,
     }
-    if found := other_unit(errors):
+    if found := other_unit(errors, "the ranges of the recording"):
         raise ImportTableError(f"{what}: {found}, not metres, by comparison of ranges and distances; convert them")
 
 

@@ -179,7 +179,7 @@ class Workers:
     """Raised by the future of a chunk whose worker died."""
 
     patience_s: float | None = None
-    """Seconds without a chunk that is done, after which workers are looked after; None for those that tell."""
+    """Seconds to wait for a chunk before `_replace` is asked; None where a future always tells that its worker died."""
 
     def __init__(self, size: int, work: Work) -> None:
         """`size` is how many chunks are worked on at once."""
@@ -209,7 +209,7 @@ class Workers:
         return found
 
     def _replace(self) -> list[Done]:
-        """Replace workers that died without a word, and return the chunks that they had."""
+        """Replace workers whose death no future told, and return their chunks."""
         return []
 
     def close(self) -> None:
@@ -224,7 +224,7 @@ class Processes(Workers):
     `ParameterError` for plug-ins that they could not import, and `WorkersLostError` where they end as they begin.
     """
 
-    patience_s = 5.0
+    patience_s = 5.0  # chunks take about a second
 
     def _start_pool(self) -> Any:
         self._work.check()
@@ -251,10 +251,10 @@ class Processes(Workers):
             super().submit(chunk)
 
     def _replace(self) -> list[Done]:
-        """Start new processes if one has died, and return the chunks of the others.
+        """Start a new pool if a process has died, and return the chunks that the old pool did not report.
 
-        A pool that is handed a chunk while it notices the death never reports that chunk (CPython 3.11:
-        `terminate_broken` does not hold the lock of `submit`).
+        CPython 3.11 never reports a chunk that is submitted while the pool handles the death of a process, because
+        `terminate_broken` does not take the lock of `submit`.
         """
         try:
             self._pool.submit(abs, 0)

@@ -192,3 +192,19 @@ def test_offsets_of_few_pairs_widen_intervals_as_in_regression(count):
     # What the noise of a mean, 1 mm, and the search leave.
     np.testing.assert_allclose(1.96 * np.sqrt(np.diag(mine)), half, rtol=0.03)
     assert not seen
+
+
+def test_where_delays_are_stated_offsets_move_the_others():
+    rng, target = np.random.default_rng(1), 2 + np.arange(600) % 3
+    true_m = rng.uniform(1, 6, 600)
+    ranges = calib.Ranges.from_arrays(
+        true_m + 0.03 * rng.normal(size=600),
+        initiator=1,
+        target=target,
+        fpp1_dbm=rng.uniform(-92, -80, 600),
+        truth_m=true_m,
+        time_ns=np.arange(600) * 50_000_000,
+    )
+    # Tag 1 is known, so an offset of 3.5 cm is one of twice 3.5 cm / c in the other tag's delay.
+    (said,) = [one for one in calib.fit(ranges, fixed_ns={1: 0.0}).warnings if "intervals do not contain" in one]
+    assert "by up to 234 ps" in said
