@@ -367,7 +367,7 @@ FIT = "calib fit {here}/bad.uwb -o c.json"
     [
         (nothing("fpp1_dbm", "fpp2_dbm"), FIT, ["bad.uwb", "no power"]),
         ({"fpp1_dbm": np.zeros(COUNT), "fpp2_dbm": np.full(COUNT, 3.0)}, FIT, ["bad.uwb", "no power", "+3 dBm"]),
-        ({"rx2": SAMPLE.rx2 + 2**30 & 2**32 - 1}, FIT, ["bad.uwb", "none of its", "beyond 10 km"]),
+        ({"rx2": SAMPLE.rx2 + 2**30 & 2**32 - 1}, FIT, ["bad.uwb", "none of its", "no range within 10 km"]),
         ({"poses": late_poses()}, FIT, ["poses cover 0.0 to 11.0 s", "exchanges -99.0 to -90.0 s", "--offset"]),
         ({"poses": late_poses()[:0]}, FIT, ["bad.uwb", "no true distance"]),
         # Two pairs do not determine three delays.
