@@ -274,7 +274,7 @@ def table(rows, above=()):
 def test_on_paper_a_table_is_not_parted_and_stands_below_its_heading(filled, told):
     lines = [Text(f"A line of text, the {k}th.") for k in range(filled)]
     text = paper(*lines, Heading("Before"), *told, table(16, [("", 1), ("raw", 1)]))
-    ends = [k for k, one in enumerate(text) if "row-0 " in one or "row-15" in one]
+    ends = [k for k, one in enumerate(text) if re.search(r"row-(0|15)\b", one)]
     assert len(ends) == 1, "all rows stand on one page"
     assert sum(one.count("Before") for one in text) == 1
     if not told:
@@ -283,7 +283,7 @@ def test_on_paper_a_table_is_not_parted_and_stands_below_its_heading(filled, tol
 
 def test_on_paper_a_long_table_goes_on_from_where_it_stands_and_a_wide_one_is_cut():
     first, *others = paper(Text("A line of text."), Heading("Before"), table(120))
-    assert "row-0 " in first
+    assert re.search(r"row-0\b", first)
     assert len(others) == 2
     assert all("pair" in page for page in others), "headings come again"
     wide = Table(["pair", *(f"column-{k}" for k in range(20))], [["1-2", *(f"cell-{k}" for k in range(20))]])
