@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from functools import partial
+from typing import Any, Final
 
 import numpy as np
 
@@ -43,36 +44,6 @@ class FilterRanges:
         names = ("measured_m", "std_m", "common_m", "shared_m", "delay_slopes")
         some = {name: x[rows] for name in names if (x := getattr(self, name)) is not None}
         return replace(self, **some, errors=None if self.errors is None else self.errors.at(rows))
-
-
-class Weighing:
-    """Updates of filters (filters, ...) by measurements (n,): by a gate, or by the error model, with reflections that
-    last.
-
-    Filters with an error model have the same, that of a calibration.
-    """
-
-    def __init__(self, known: Sequence[FilterRanges], gate: float, shape: tuple[int, ...]) -> None:
-        """Begin with nothing known of reflections of filters and pairs (filters, *shape)."""
-        self.robust = [f for f, one in enumerate(known) if one.errors is not None]
-        self.gate, first = gate, known[self.robust[0]] if self.robust else known[0]
-        self.errors = first.errors
-        self.reflections = Reflections(first.renewal_s, (len(self.robust), *shape))
-
-    def update(self, row: int, pair: Ints, used: Bools, innovation_m: Floats, variance_m2: Floats) -> WeighedInnovation:
-        """Return the updates by measurement `row` between pairs (k,), which some filters (filters, ...) have `used`."""
-        update, robust = gated_update(innovation_m, variance_m2, self.gate), self.robust
-        if self.errors is not None:
-            given = innovation_m[robust], variance_m2[robust], self.errors.at(row), pair, used[robust]
-            own = self.reflections.weigh(*given)
-            for name in ("noise_m", "variance_m2", "believed", "tail", "log_density"):
-                getattr(update, name)[robust] = getattr(own, name)
-        return update
-
-    def forget(self, lost: tuple[int, ...]) -> None:
-        """Forget what a filter that begins anew knew of reflections."""
-        if lost[0] in self.robust:
-            self.reflections.lasting[self.robust.index(lost[0]), *lost[1:]] = 0.0
 
 
 def side_by_side(filters: Sequence[FilterRanges]) -> Iterator[Floats]:
@@ -140,3 +111,76 @@ class ModelAverage:
         fixed = np.broadcast_to(running.delays.covariance_m2, running.covariance[..., which, which].shape)
         covariance = np.where(own[..., None], running.covariance[..., which, which], fixed)
         return self.moments(np.where(own, running.state[..., which], 0.0), covariance)
+
+
+class FilterBank:
+    """Filters at once on the same measurements (n,), and what their averages come to.
+
+    `running` are filters (filters, ...), to whose states those of delays are appended (`delays`). `uses` (n, filters)
+    are the measurements of each, of `pairs` pairs of tags. They update by a gate, or by an error model with reflections
+    that last. `common`, `shared` and `slopes` are those of `side_by_side`; `measured` is (n, filters, ...).
+    """
+
+    def __init__(
+        self, known: Sequence[FilterRanges], running: GaussianFilters, gate: float, uses: Bools, pairs: int
+    ) -> None:
+        """Begin with nothing known of errors."""
+        self.known, self.running, shape = known, running, running.state.shape[1:-1]
+        measured, std, self.common, self.shared, self.slopes = side_by_side(known)
+        around = (..., *(None for _ in shape))
+        self.measured, self.variance, self.uses = (
+            np.broadcast_to(one[around], (*one.shape, *shape)) for one in (measured, std**2, uses)
+        )
+        self.delays = running.append(delay_states(known))
+        # Filters with an error model have the same, that of a calibration.
+        self.gate, self.average = gate, ModelAverage(known, shape)
+        self.robust = [f for f, one in enumerate(known) if one.errors is not None]
+        first = known[self.robust[0]] if self.robust else known[0]
+        self.errors, self.reflections = first.errors, Reflections(first.renewal_s, (len(self.robust), *shape, pairs))
+        self.judged = np.empty((4, len(uses), len(self.average.shown), *shape))
+
+    def observe(self, row: int, slopes: Floats, expected: Floats, pair: Ints) -> WeighedInnovation:
+        """Update the filters that use measurement `row` between pairs (k,); return the updates of all.
+
+        `expected` (filters, ...) is what they expect of it, with derivatives `slopes` (filters, ..., states).
+        """
+        used, innovation = self.uses[row], self.measured[row] - expected
+        weigh = partial(self._weigh, row, pair)
+        update = self.running.update(slopes * used[..., None], innovation, self.variance[row], weigh)
+        self.average.learn(np.where(used, update.log_density, 0.0))
+        values = update.nis, update.believed, self.average.offset, self.average.drifting
+        self.judged[:, row] = [self.average.mean(one) for one in values]
+        return update
+
+    def _weigh(self, row: int, pair: Ints, innovation_m: Floats, variance_m2: Floats) -> WeighedInnovation:
+        """Weigh innovations (filters, ...) by the gate, or by the error model."""
+        update, robust = gated_update(innovation_m, variance_m2, self.gate), self.robust
+        if self.errors is not None:
+            used = self.uses[row][robust]
+            own = self.reflections.weigh(innovation_m[robust], variance_m2[robust], self.errors.at(row), pair, used)
+            for name in ("noise_m", "variance_m2", "believed", "tail", "log_density"):
+                getattr(update, name)[robust] = getattr(own, name)
+        return update
+
+    def pass_time(self, dt: float) -> None:
+        """Let delays drift, and reflections be forgotten, for `dt` seconds."""
+        self.running.wander(dt)
+        self.reflections.decay(dt)
+
+    def forget_reflections(self, lost: tuple[int, ...]) -> None:
+        """Forget what a filter that begins anew knew of reflections."""
+        if lost[0] in self.robust:
+            self.reflections.lasting[self.robust.index(lost[0]), *lost[1:]] = 0.0
+
+    def outcome(self, *which: Any) -> dict[str, Any]:
+        """Return fields of the `Track` of one average: of the measurements that it uses, and of delays at the end."""
+        f, (changes_m, covariance) = self.average.shown[which[0]], self.average.delays(self.running)
+        nis, accepted, offsets, drifts = self.judged[:, self.uses[(slice(None), f, *which[1:])]][(..., *which)]
+        states = self.known[f].delays
+        return {
+            "nis": nis,
+            "accepted": accepted > 0.5,
+            "offsets": offsets,
+            "drifts": drifts,
+            "delays": states.estimates(changes_m[which], covariance[which]) if states.tags else {},
+        }

@@ -13,7 +13,6 @@ import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -40,7 +39,7 @@ from calib.evaluation.filters import (
     without_directions,
 )
 from calib.evaluation.localization import Localization, consistency, delay_lines, delays_json, filter_ranges, fixed_std
-from calib.evaluation.models import FilterRanges, ModelAverage, Weighing, delay_states, side_by_side
+from calib.evaluation.models import FilterBank, FilterRanges
 from calib.evaluation.onboard import inertial_readings, mean_readings
 from calib.evaluation.tracking import Measurements, Settings, Track, ranges_among, used_part
 from calib.pairs import pairs_of
@@ -302,9 +301,10 @@ def _run(
     raw = filters["dead reckoning"][0]
     corrected = np.array([one is not raw for one, _ in filters.values()])
     known, uses = [one for one, _ in filters.values()], np.stack([used for _, used in filters.values()], axis=1)
-    measured, std, common, shared, changes = side_by_side(known)
     running = _start(team, settings, len(known))
-    last, delays = running.state.shape[1] - 1, running.append(delay_states(known))
+    last = running.state.shape[1] - 1
+    bank = FilterBank(known, running, settings.gate, uses, last + 1)
+    average = bank.average
     steps = np.arange(team.time_ns[0], team.time_ns[-1], round(1e9 / settings.rate_hz))
     time_ns = np.unique(np.concatenate([team.time_ns, steps]))
     time_s = (time_ns - time_ns[0]) * 1e-9
@@ -319,11 +319,8 @@ def _run(
     lasting[:, : team.shares[..., 1].min()] = [[one.lasting_s] for one in known]
     lasting[:, -1] = 1e-12
     offset_m = np.array([one.offset_m for one in known])
-    weighing = Weighing(known, settings.gate, lasting[0].shape)
-    average = ModelAverage(known)
     shape = len(time_ns), len(average.shown), len(team.bodies) - 1
     place, attitude, std_m, nees = np.empty((*shape, 3)), np.empty((*shape, 3, 3)), np.empty(shape), np.empty(shape)
-    nis, accepted, offsets, drifts = np.empty((4, len(std), len(average.shown)))
     exchange, last_s = -1, -1.0
     for k in range(len(time_ns)):
         if k:
@@ -333,23 +330,18 @@ def _run(
                 # Two exchanges at one time share no error, either.
                 kept = np.exp(-np.maximum(time_s[k] - last_s, 1e-9) / lasting)
                 running.decay(kept)
-                running.wander(time_s[k] - max(last_s, 0.0))
-                weighing.reflections.decay(time_s[k] - max(last_s, 0.0))
+                bank.pass_time(time_s[k] - max(last_s, 0.0))
                 exchange, last_s = team.exchange[row], time_s[k]
             expected, slopes, bent_m = running.distances(team.body[row], team.arm[row], team.sign[row])
             if patterns[row]:
                 geometry = team.body[row], team.arm[row], team.sign[row]
                 expected += corrected * running.longer_m(*geometry, patterns[row])
             for which, (pair, offset, sides) in enumerate((running.known + team.shares[row]).tolist()):
-                slopes[:, pair] += shared[row, :, which]
+                slopes[:, pair] += bank.shared[row, :, which]
                 slopes[:, offset] += team.sign[row, which] * offset_m
                 slopes[:, sides] += team.sign[row, which] * bent_m[:, which]
-            slopes[:, last], slopes[:, delays] = common[row], changes[row]
-            weighed = partial(weighing.update, row, team.shares[row, :, 0], uses[row])
-            update = running.update(slopes * uses[row, :, None], measured[row] - expected, std[row] ** 2, weighed)
-            average.learn(np.where(uses[row], update.log_density, 0.0))
-            nis[row], accepted[row] = average.mean(update.nis), average.mean(update.believed)
-            offsets[row], drifts[row] = average.mean(average.offset), average.mean(average.drifting)
+            slopes[:, last], slopes[:, bank.delays] = bank.common[row], bank.slopes[row]
+            bank.observe(row, slopes, expected, team.shares[row, :, 0])
         # Attitudes are averaged as rotation vectors from those of the likeliest model.
         bodies, likeliest = running.attitude[:, :-1], average.weights.argmax(axis=1)
         away = Rotation.from_matrix((bodies[likeliest, None].swapaxes(-1, -2) @ bodies).reshape(-1, 3, 3)).as_rotvec()
@@ -363,10 +355,8 @@ def _run(
         wrong = np.concatenate([truth[k] - place[k], turns.reshape(place[k].shape)], axis=-1)
         nees[k] = squared_over(wrong, covariance)
         std_m[k] = np.sqrt(np.trace(covariance[..., P, P], axis1=-2, axis2=-1))
-    changes_m, covariance = average.delays(running)
 
     def track(f: int, b: int) -> RelativeTrack:
-        rows, states = np.flatnonzero(uses[:, average.shown[f]]), known[average.shown[f]].delays
         return RelativeTrack(
             time_ns=time_ns,
             attitude=Rotation.from_matrix(attitude[:, f, b]).as_quat(),
@@ -374,12 +364,8 @@ def _run(
             truth_m=truth[:, b],
             true_attitude=np.where(np.isfinite(truth[:, b, :1]), Rotation.from_matrix(turned[:, b]).as_quat(), np.nan),
             std_m=std_m[:, f, b],
-            nis=nis[rows, f],
             nees=nees[:, f, b],
-            accepted=accepted[rows, f] > 0.5,
-            offsets=offsets[rows, f],
-            drifts=drifts[rows, f],
-            delays=states.estimates(changes_m[f], covariance[f]) if states.tags else {},
+            **bank.outcome(f),
         )
 
     names = [name for name, (one, _) in filters.items() if one.shown]

@@ -10,7 +10,6 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import ClassVar, Final
 
 import numpy as np
@@ -19,7 +18,7 @@ from calib.calibration.error_model import GATE
 from calib.data.ranges import Ranges
 from calib.data.sources import Flight, require_arrivals
 from calib.evaluation.filters import GaussianFilters, multilaterate, squared_over
-from calib.evaluation.models import FilterRanges, ModelAverage, Weighing, delay_states, side_by_side
+from calib.evaluation.models import FilterBank, FilterRanges
 from calib.pairs import pairs_of
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
@@ -304,7 +303,6 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
     (filters, seeds, ...).
     """
     count, known, pair, elapsed_s = len(problem), list(ranges.values()), problem.pair, problem.elapsed_s
-    measured, std, common, shared, slopes = side_by_side(known)
     noises = [problem.noisy(settings, settings.seed + k) for k in range(settings.seeds)]
     moves, spread = np.stack([moves for _, moves in noises], axis=1), problem.velocity_spread(settings)
     offset_m, pairs = np.array([one.offset_m for one in known]), 1 + int(pair.max())
@@ -312,35 +310,30 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
     kept = np.empty((count, len(known), pairs + 1))
     kept[..., :pairs] = np.exp(-elapsed_s[:, None, None] / [[one.lasting_s] for one in known])
     kept[..., -1] = np.diff(problem.exchange, prepend=-1)[:, None] == 0
-    place = slice(0, 3)
+    place, own = slice(0, 3), slice(size)
     prior = np.diag(np.where(np.arange(size) < 3, settings.initial_std_m**2, 1.0))
     running = GaussianFilters(np.zeros((*shape, size)), np.tile(prior, (*shape, 1, 1)), 3)
     running.state[..., place] = [start for start, _ in noises]
-    delays, own = running.append(delay_states(known)), slice(size)
-    weighing, used = Weighing(known, settings.gate, (settings.seeds, pairs)), np.ones(shape, dtype=bool)
-    average = ModelAverage(known, shape[1:])
-    averaged = count, len(average.shown), settings.seeds
-    estimate, (std_m, nis, nees, accepted, offsets, drifts) = np.empty((*averaged, 3)), np.empty((6, *averaged))
+    bank = FilterBank(known, running, settings.gate, np.ones((count, len(known)), dtype=bool), pairs)
+    averaged = count, len(bank.average.shown), settings.seeds
+    estimate, (std_m, nees) = np.empty((*averaged, 3)), np.empty((2, *averaged))
     # Twelve unexplained ranges at least, four for each coordinate, before a filter begins anew.
     explained_s, most_s = np.zeros(shape), settings.reopen_s / 2 / 12
     for k in range(count):
         running.decay(kept[k][:, None])
         running.state[..., place] += moves[k]
         running.add_variance(place, spread[k])
-        running.wander(elapsed_s[k])
+        bank.pass_time(elapsed_s[k])
         towards = running.state[..., None, place] + problem.arm[k] - problem.other[k]
         distance = np.linalg.norm(towards, axis=-1)
         h = np.zeros_like(running.state)
         h[..., place] = np.sum(towards * (problem.sign[k] / np.maximum(distance, 1e-6))[..., None], axis=-2)
         for which, shares in enumerate((3 + pair[k]).tolist()):
-            h[..., shares] += shared[k, :, which, None]
+            h[..., shares] += bank.shared[k, :, which, None]
             if size > 4 + pairs:
                 h[..., 1 + pairs + shares] += problem.sign[k, which] * offset_m[:, None]
-        h[..., 3 + pairs], h[..., delays] = common[k][:, None], slopes[k][:, None]
-        expected = problem.known_m[k] + distance @ problem.sign[k]
-        weighing.reflections.decay(elapsed_s[k])
-        weighed = partial(weighing.update, k, pair[k], used)
-        update = running.update(h, measured[k][:, None] - expected, std[k][:, None] ** 2, weighed)
+        h[..., 3 + pairs], h[..., bank.delays] = bank.common[k][:, None], bank.slopes[k][:, None]
+        update = bank.observe(k, h, problem.known_m[k] + distance @ problem.sign[k], pair[k])
         lasted_s = min(elapsed_s[k], most_s)
         # Of a body among two others, one behind something, half of the ranges are reflected: that is not being lost.
         counts = np.where(update.nis < settings.gate, 1.0, np.where(update.believed, -0.5, -1.0))
@@ -349,22 +342,18 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
             rows = slice(np.searchsorted(problem.time_ns, problem.time_ns[k] - settings.reopen_s * 1e9), k + 1)
             # The body moved since these ranges: so do their anchors.
             anchors = problem.other[rows] - problem.arm[rows] + (moved[k] - moved[rows])[:, lost[1], None]
-            known_m = problem.known_m[rows] + slopes[rows, lost[0]] @ running.state[lost][delays]
-            fix = multilaterate(measured[rows, lost[0]] - known_m, anchors, 0.0, sign=problem.sign[rows])
+            known_m = problem.known_m[rows] + bank.slopes[rows, lost[0]] @ running.state[lost][bank.delays]
+            fix = multilaterate(bank.measured[(rows, *lost)] - known_m, anchors, 0.0, sign=problem.sign[rows])
             state, covariance, explained_s[lost] = running.state[lost], running.covariance[lost], 0.0
             state[own], covariance[own], covariance[:, own], covariance[own, own] = 0.0, 0.0, 0.0, prior
             state[place], covariance[place, place] = fix.place_m, fix.covariance_m2
-            weighing.forget(lost)
-        average.learn(update.log_density)
-        estimate[k], covariance = average.moments(running.state[..., place], running.covariance[..., place, place])
-        nis[k], accepted[k] = average.mean(update.nis), average.mean(update.believed)
-        offsets[k], drifts[k] = average.mean(average.offset), average.mean(average.drifting)
+            bank.forget_reflections(lost)
+        estimate[k], covariance = bank.average.moments(running.state[..., place], running.covariance[..., place, place])
         std_m[k] = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
         nees[k] = squared_over(estimate[k] - problem.place[k], covariance)
-    changes_m, covariance = average.delays(running)
 
     def track(f: int, seed: int) -> Track:
-        own, states = (slice(None), f, seed), known[average.shown[f]].delays
+        own = slice(None), f, seed
         return Track(
             time_ns=problem.time_ns,
             attitude=problem.attitude,
@@ -372,12 +361,8 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
             truth_m=problem.place,
             true_attitude=problem.attitude,
             std_m=std_m[own],
-            nis=nis[own],
             nees=nees[own],
-            accepted=accepted[own] > 0.5,
-            offsets=offsets[own],
-            drifts=drifts[own],
-            delays=states.estimates(changes_m[f, seed], covariance[f, seed]) if states.tags else {},
+            **bank.outcome(f, seed),
         )
 
     names = [name for name, one in ranges.items() if one.shown]
