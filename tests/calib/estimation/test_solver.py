@@ -14,9 +14,6 @@ from calib.errors import UnanswerableError
 from calib.estimator import known_distances
 from calib.fitting.fitting import fit
 from tests.calib.synthetic import DELAYS_NS, bias_m, design, ranges
-from uwblink.ticks import SPEED_OF_LIGHT
-
-METRES_A_NS = SPEED_OF_LIGHT * 1e-9
 
 
 def test_least_squares_is_least_squares():
