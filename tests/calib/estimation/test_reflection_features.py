@@ -14,7 +14,7 @@ from benchmarks.nlos import room
 from calib.data.features import response_features
 from calib.errors import BadInputError
 from calib.online import range_errors
-from tests.processes import call, succeed
+from tests.processes import run, succeed
 from uwblink.recording.schema import CirRow
 from uwbsim import simulate
 
@@ -140,7 +140,7 @@ def test_files_keep_the_slopes_and_refuse_others(tmp_path):
         table = json.loads(known.to_json())
         table["errors"]["features"] = {name: good | change}
         (tmp_path / "c.json").write_text(json.dumps(table))
-        done = call("calib", "show", tmp_path / "c.json")
+        done = run("calib", "show", tmp_path / "c.json")
         assert (done.returncode, done.stderr.count("\n")) == (2, 1)
         for word in ("features", "rise_taps", *change):
             assert word in done.stderr

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import calib
 from benchmarks.worlds import LIGHT_M_PER_NS, Recipe, make, sigma_m
 from calib.cli.commands import app
-from tests.processes import call
+from tests.processes import run
 from uwblink import Contents
 
 HOUR_NS = 3_600_000_000_000
@@ -241,7 +241,7 @@ def test_show_says_how_old_a_calibration_may_get(tmp_path, rate_m2, days, says):
     result = calib.fit(drifting(10_003, days, rate_m2))
     result.save(tmp_path / "known.json")
     low, likeliest, high = result.calibration.provenance["drift"]["m2_per_day"]
-    printed = re.search(f"age: {says}", call("calib", "show", tmp_path / "known.json").stdout).groups()
+    printed = re.search(f"age: {says}", run("calib", "show", tmp_path / "known.json").stdout).groups()
     rates = np.array([likeliest, high, low] if low else [high])[: len(printed)]
     # 1.96 times the root of the rate and the days is 2 cm.
     assert [*map(int, printed)] == pytest.approx(0.02**2 / 1.96**2 / rates, abs=0.6)

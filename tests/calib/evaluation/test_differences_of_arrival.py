@@ -218,7 +218,7 @@ def test_a_robot_on_board_is_helped_by_what_is_overheard(known, tmp_path):
     found = []
     for use in ("exchanges", "receptions"):
         words = f"calib localize robot.uwb -c c.json --model constant-velocity --json --use {use}".split()
-        (one,) = json.loads(processes.call(*words, cwd=tmp_path).stdout)
+        (one,) = json.loads(processes.run(*words, cwd=tmp_path).stdout)
         found.append(one)
     assert [one["used"] for one in found] == ["ranges", "ranges, differences of arrival"]
     assert found[1]["rmse_m"] < 0.9 * found[0]["rmse_m"]

@@ -374,7 +374,7 @@ def test_a_body_with_one_tag_is_named():
 def test_an_option_of_another_model_is_refused(option, used_by, tmp_path):
     for model in ("poses", "imu", "constant-velocity", "team"):
         words = "calib", "localize", "a.uwb", "-c", tmp_path / "c.json", "--model", model, *option
-        said = processes.refuse(*words, runner=processes.call, naming=["c.json"] if model in used_by else used_by)
+        said = processes.refuse(*words, naming=["c.json"] if model in used_by else used_by)
         assert said.startswith(f"error: {option[0]}: goes with --model ") == (model not in used_by)
 
 
@@ -383,12 +383,12 @@ def test_the_command_prints_writes_and_refuses(known, tmp_path):
     simulated(307, 1.0).save(recording)
     known.save(document)
     words = "calib", "localize", recording, "-c", document, "--model", "team"
-    said = json.loads(processes.call(*words, "--use", "receptions", "--imu", "industrial", "--json").stdout)
+    said = json.loads(processes.run(*words, "--use", "receptions", "--imu", "industrial", "--json").stdout)
     assert [(one["body"], one["reference"]) for one in said["bodies"]] == [("robot2", "robot1"), ("robot3", "robot1")]
     assert said["summary"]["dead reckoning"]["accepted"] is None
     for less in (said["reduction_by_listening"][against] for against in ("own ranges", "ranges only")):
         assert set(less) == {"raw", "calibrated", "variance", "robust"}
-    text = processes.call(*words, "--start-std", "0.02", "1", "0.05", "--tum", tmp_path / "tum").stdout
+    text = processes.run(*words, "--start-std", "0.02", "1", "0.05", "--tum", tmp_path / "tum").stdout
     assert "start: relative poses within 0.02 m, 1 deg and 0.05 m/s" in text
     assert "by listening" not in text
     assert (tmp_path / "tum" / "three_uwb-robot2-from-robot1-dead-reckoning.tum").exists()
@@ -398,9 +398,9 @@ def test_the_command_prints_writes_and_refuses(known, tmp_path):
     assert np.abs(np.sum(truth[:, 4:] * close[:, 4:], axis=1)).min() > np.cos(np.radians(5) / 2)
     bare = tmp_path / "bare.uwb"
     replace(simulated(307, 1.0), imu={}).save(bare)
-    assert "bare.uwb" in processes.refuse(*words[:2], bare, *words[3:], status=1, runner=processes.call, naming=["imu"])
-    processes.refuse(*words, "--imu", "wooden", runner=processes.call, naming=["industrial"])
-    processes.refuse(*words, "--start-std", "0", "1", "1", runner=processes.call, naming=["--start-std:"])
+    assert "bare.uwb" in processes.refuse(*words[:2], bare, *words[3:], status=1, naming=["imu"])
+    processes.refuse(*words, "--imu", "wooden", naming=["industrial"])
+    processes.refuse(*words, "--start-std", "0", "1", "1", naming=["--start-std:"])
 
 
 def test_delays_that_a_calibration_has_wrong_within_its_errors_are_corrected_on_the_way():
