@@ -183,24 +183,6 @@ def test_messages_that_are_counted_from_zero(tmp_path, third):
         ]
 
 
-def test_messages_that_are_words_are_told_by_their_order(tmp_path):
-    rows = flights()
-    lines = as_messages(wrapped(rows))
-    words = [row | {"message": ("poll", "resp", "final")[row["message"] - 1]} for row in lines]
-    found = guessed(tmp_path, write(tmp_path / "m.csv", renamed(words, {"message": "msg"}))).exchanges
-    expected = {row["tx1"] % 2**32: row for row in rows}
-    assert len(found) == len(rows)
-    for k, row in enumerate(expected[int(tx1)] for tx1 in found.tx1):
-        assert [int(getattr(found, n)[k]) for n in HEADER[3:9]] == [row[n] % 2**32 for n in HEADER[3:9]]
-    found = guessed(tmp_path, write(tmp_path / "m.csv", words)).exchanges
-    assert [[int(getattr(found, n)[k]) for n in HEADER[3:9]] for k in range(len(rows))] == [
-        [row[n] % 2**32 for n in HEADER[3:9]] for row in sorted(rows, key=lambda row: row["time_s"])
-    ]
-    other = guess_map(write(tmp_path / "m.csv", [row | {"message": "red"} for row in words]))
-    assert not other.complete
-    assert "# a column of numbers is still needed: message" in other.text
-
-
 @pytest.mark.parametrize(
     ("ids", "todo"),
     [({"src": 1, "dst": 2}, "check it"), ({"src": 1}, "set to_id in it"), ({}, "set from_id and to_id")],
@@ -334,17 +316,6 @@ def test_third_stamps_of_the_initiator_in_exchanged_columns_are_not_those_of_the
     ]
     assert 'protocol = "ds"' in guess_map(write(tmp_path / "plain.csv", wrapped(skewed))).text
     assert 'protocol = "ds-alt"' in guess_map(write(tmp_path / "alternative.csv", noisy)).text
-
-
-def test_one_temperature_a_row_is_of_the_initiator(tmp_path):
-    rows = [f"{k / 10},7,{k % 3},{300 + k},{290 + k},{20 + k / 50}" for k in range(60)]
-    text = "\n".join(["time_s,tag,anchor,measured_cm,true_cm,temperature", *rows])
-    (tmp_path / "t.csv").write_text(text)
-    found = guessed(tmp_path, tmp_path / "t.csv")
-    assert found.exchanges.range_m == pytest.approx(3 + np.arange(60) / 100)
-    warm = found.temperature
-    assert set(warm["tag"].tolist()) == {7}
-    assert warm["temperature_c"] == pytest.approx(20 + np.arange(60) / 50)
 
 
 OWN = {"time_s": "time_s", "at_id": "tag", "from_id": "anchor_a", "to_id": "anchor_b", "difference_m": "difference_m"}
