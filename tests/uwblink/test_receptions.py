@@ -10,7 +10,7 @@ import uwbsim
 from uwblink import raw_range
 from uwblink.errors import ArgumentError
 from uwblink.receptions import Receptions, contradicted, exchange_of, exchanges_in, times_by_stamps
-from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S, elapsed
+from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 
 PLACES = np.array([[0.0, 0, 0], [5, 0, 0], [0, 7, 0], [4, 6, 1]])
 RATE = 1 + np.array([3.0, -8.0, 12.0, -1.0]) * 1e-6
@@ -48,20 +48,6 @@ def test_broadcasts_in_turn_range_every_pair_and_overhear_it(bits):
     assert (exchange_of(exchanges, overheard) >= 0).all()
     assert not (overheard["listener"] == overheard["initiator"]).any()
     assert not (overheard["listener"] == overheard["target"]).any()
-
-
-def test_clocks_that_warm_up_change_no_range_and_no_difference_of_arrival():
-    """The rate after the response is not that before it: by the final alone, ranges here would be 0.1 to 0.4 m off."""
-    r = broadcasts(slot_s=0.08, drift_ppm_per_s=(0.0, 0.12, -0.03, 0.05))
-    exchanges, overheard = exchanges_in(r)
-    first = exchanges.time_ns < 2e9  # of two roles one has no frame before its response
-    assert np.abs(errors_m(exchanges[~first])).max() < 0.015
-    h = {name: column[overheard["time_ns"] > 2e9] for name, column in overheard.items()}
-    i, j, k = (h[name] - 10 for name in ("initiator", "target", "listener"))
-    rate = elapsed(h["rx3"], h["rx2"], 40) / elapsed(h["tx3_n"], h["tx2_n"], 40)
-    late = elapsed(h["rx2"], h["rx1"], 40) - rate * elapsed(h["tx2_n"], h["rx1_n"], 40)
-    away = [np.linalg.norm(PLACES[a] - PLACES[b], axis=1) for a, b in ((i, j), (j, k), (i, k))]
-    assert np.abs(late * METRES_PER_TICK - away[0] - away[1] + away[2]).max() < 0.03
 
 
 def test_lost_frames_cost_their_exchanges_and_no_others_become_wrong():
