@@ -15,17 +15,6 @@ SS: dict[str, Any] = {"tx1": [0, 9], "rx1": [5, 3], "tx2": [1005, 1003], "rx2": 
 DS: dict[str, Any] = SS | {"tx3": [99_005, 99_003], "rx3": [101_000, 101_009]}
 
 
-def test_only_ends_and_stamps_are_needed():
-    x = Exchanges.from_arrays([1, 2], [3, 4], **SS)
-    assert x.initiator.tolist() == x.reporter.tolist() == [1, 2]
-    assert x.protocol.tolist() == ["ss", "ss"]
-    assert x.time_ns.tolist() == x.tx3.tolist() == x.rx3.tolist() == [0, 0]
-    assert all(np.isnan(getattr(x, name)).all() for name in COLUMNS if name.endswith(("_dbm", "_ppm")))
-    assert np.isnan(x.truth_m).all()
-    # (3000 - 1000) / 2 = 1000 ticks of 4.69 mm.
-    np.testing.assert_allclose(x.range_m, 4.690357, rtol=1e-6)
-
-
 def test_ranges_without_stamps_are_those_of_a_table_without_stamps(tmp_path):
     """An importer of one's own for a device that prints ranges needs no stamps."""
     (tmp_path / "t.csv").write_text("time_s,from_id,to_id,range_m,fpp2\n0.5,1,7,3.1,-82.5\n0.6,2,7,3.2,-83.0\n")
