@@ -1,4 +1,4 @@
-"""Runs `uwblink`, `uwbsim` and `calib` as processes of their own, forked from one that has imported everything.
+"""Runs `uwblink`, `uwbsim` and `calib`: in the process of the tests, or forked from one that has imported everything.
 
 A command takes 0.4 s to import what it needs and often less to do its work, and the suite calls hundreds.
 """
@@ -17,14 +17,14 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Callable, Iterable, Mapping
+import warnings
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
-Runner = Callable[..., subprocess.CompletedProcess[str]]
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(
     [__name__, "matplotlib.backends.backend_agg", "matplotlib.backends.backend_svg", "matplotlib.figure"]
@@ -38,7 +38,26 @@ CONTEXT.set_forkserver_preload(
 )
 
 
-def run(
+def run(*words: object, cwd: str | os.PathLike[str] | None = None, **how: Any) -> subprocess.CompletedProcess[str]:
+    """Run a command as `subprocess.run` does with captured text, its first word the name of the command.
+
+    It runs in this process, unless `how` says what `fork` can do for it.
+    """
+    if how:
+        return fork(*words, cwd=cwd, **how)
+    argv, status = list(map(str, words)), 0
+    out, err = io.StringIO(), io.StringIO()
+    printed = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
+    caught = warnings.catch_warnings(action="default")
+    with contextlib.chdir(cwd or Path.cwd()), printed[0], printed[1], caught, mock.patch.object(sys, "argv", argv):
+        try:
+            importlib.import_module(f"{argv[0]}.cli").main()
+        except SystemExit as end:
+            status = end.code if isinstance(end.code, int) else int(end.code is not None)
+    return subprocess.CompletedProcess(argv, status, out.getvalue(), err.getvalue())
+
+
+def fork(
     *words: object,
     cwd: str | os.PathLike[str] | None = None,
     env: Mapping[str, str] | None = None,
@@ -47,7 +66,7 @@ def run(
     limits: Mapping[int, int] | None = None,
     user: int | None = None,
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command as `subprocess.run` does with captured text, its first word the name of the command.
+    """Run a command as `run` does, in a process of its own.
 
     `env` is the whole environment; of what is set there for the time of importing only PYTHONPATH has an effect. No
     file that the command writes may be longer than `most_bytes`, as on a full disk; `limits` are others of `resource`.
@@ -68,19 +87,6 @@ def run(
         return subprocess.CompletedProcess(argv, process.exitcode, *(path.read_text("utf-8") for path in printed))
 
 
-def call(*words: object, cwd: str | os.PathLike[str] | None = None, **_: Any) -> subprocess.CompletedProcess[str]:
-    """Run a command as `run` does, in this process: a refusal takes a quarter of the time there."""
-    argv, status = list(map(str, words)), 0
-    out, err = io.StringIO(), io.StringIO()
-    printed = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
-    with contextlib.chdir(cwd or Path.cwd()), printed[0], printed[1], mock.patch.object(sys, "argv", argv):
-        try:
-            importlib.import_module(f"{argv[0]}.cli").main()
-        except SystemExit as end:
-            status = end.code if isinstance(end.code, int) else int(end.code is not None)
-    return subprocess.CompletedProcess(argv, status, out.getvalue(), err.getvalue())
-
-
 def succeed(*words: object, **how: Any) -> subprocess.CompletedProcess[str]:
     """Run a command that must end with status 0."""
     ended = run(*words, **how)
@@ -88,9 +94,9 @@ def succeed(*words: object, **how: Any) -> subprocess.CompletedProcess[str]:
     return ended
 
 
-def refuse(*words: object, naming: Iterable[object] = (), status: int = 2, runner: Runner = run, **how: Any) -> str:
+def refuse(*words: object, naming: Iterable[object] = (), status: int = 2, **how: Any) -> str:
     """Run a command that must print nothing but one line of error, which has every text of `naming`; returns it."""
-    ended = runner(*words, **how)
+    ended = run(*words, **how)
     assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (status, "", 1), ended
     assert ended.stderr.startswith("error: "), ended
     for text in naming:

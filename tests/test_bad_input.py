@@ -16,7 +16,7 @@ import calib
 import uwbsim
 from calib.errors import BadInputError
 from tests.boards import served
-from tests.processes import call, refuse, run, succeed
+from tests.processes import refuse, run, succeed
 from tests.shared_data import ROOT
 from uwblink import Contents, Exchanges, Poses
 from uwblink.boards.ports import Terminal
@@ -77,7 +77,7 @@ def refused(seeds, folder, line, naming, text="", status=2, **names):
     for own in {word for word in words if word.startswith("own.")}:
         (folder / own).write_text(text)
     before = listed(folder), listed(seeds)
-    told = refuse(*words, cwd=folder, naming=naming, status=status, runner=call)
+    told = refuse(*words, cwd=folder, naming=naming, status=status)
     assert (listed(folder), listed(seeds)) == before
     return told
 

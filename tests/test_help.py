@@ -206,5 +206,5 @@ def test_interrupted_while_it_is_imported(package, module):
 def test_status_and_output_of_a_fork_are_those_of_a_new_process(words, monkeypatch):
     monkeypatch.chdir(processes.ROOT)
     plain = subprocess.run([processes.BIN / words[0], *words[1:]], capture_output=True, text=True)
-    forked = processes.run(*words)
+    forked = processes.fork(*words)
     assert (forked.returncode, forked.stdout, forked.stderr) == (plain.returncode, plain.stdout, plain.stderr)

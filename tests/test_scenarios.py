@@ -14,7 +14,7 @@ def test_scenario_runs(name, tmp_path):
     output = tmp_path / "out.uwb"
     # Thirty hours of an exchange every twenty seconds have none in the first three seconds.
     seconds = 300 if name.startswith("wrap/") else 3
-    done = processes.call("uwbsim", "run", SCENARIOS[name], "-o", output, "--set", f"run.duration_s={seconds}")
+    done = processes.run("uwbsim", "run", SCENARIOS[name], "-o", output, "--set", f"run.duration_s={seconds}")
     assert done.returncode == 0, done
     with Recording.open(output) as recording:
         assert all((len(recording.exchanges()), len(recording.poses()), recording.tags()))

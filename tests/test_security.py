@@ -17,7 +17,7 @@ import calib
 import uwblink
 import uwbsim
 from tests.boards import served
-from tests.processes import call, refuse, run, succeed
+from tests.processes import refuse, run, succeed
 from tests.shared_data import ROOT
 from uwblink.database import STORAGE_VERSION
 from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
@@ -51,7 +51,7 @@ def place(seeds, tmp_path):
 
 def refused(*words, naming=(), **how):
     """Run a command that must end with one line, which names what it must and quotes no secret."""
-    assert SECRET not in refuse(*words, naming=naming, runner=call, **how)
+    assert SECRET not in refuse(*words, naming=naming, **how)
 
 
 def names(folder):

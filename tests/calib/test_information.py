@@ -6,7 +6,7 @@ from scipy.integrate import quad
 from scipy.stats import exponnorm, norm
 
 from calib.errors import BadInputError
-from calib.information import InformationColumn, judge, reduced
+from calib.information import InformationColumn, judge
 from calib.range_errors.densities import LongDetours, densities, error_slopes
 
 DELAYS = [InformationColumn("delay", str(tag)) for tag in range(1, 5)]
@@ -69,32 +69,10 @@ def test_free_directions_are_found_and_named(rows, unknowns, free, kind, of):
     assert np.isnan(verdict.covariance[(~verdict.determined)]).all()
 
 
-def test_what_is_hardly_known_counts_as_free_by_the_scale_of_an_unknown():
-    information = np.diag([1e4, 1.0])
-    delays = [InformationColumn("delay", "1"), InformationColumn("delay", "2")]
-    assert judge(information, delays).named("delay") == ("2",)
-    assert not judge(information, delays, loosest=1.5).free
-    wide = [InformationColumn("delay", "1"), InformationColumn("delay", "2", scale=10.0)]
-    verdict = judge(information, wide)
-    assert not verdict.free
-    assert verdict.std[1] == pytest.approx(1.0)
-    assert judge(np.diag([1e4, 0.0025]), wide).named("delay") == ("2",)
-
-
 def test_a_known_unknown_beside_free_ones_keeps_its_variance():
     verdict = judge(from_rows([[1, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1]]), DELAYS)
     assert (verdict.determined.tolist(), verdict.std[2]) == ([False, False, True, True], pytest.approx(0.01))
     assert verdict.covariance[2, 3] == pytest.approx(-1e-4)
-
-
-def test_reducing_is_what_the_inverse_says_and_leaves_free_what_was():
-    rows = np.random.default_rng(3).normal(size=(9, 6))
-    information = rows.T @ rows
-    inner = np.linalg.inv(np.linalg.inv(information)[:3, :3])
-    np.testing.assert_allclose(reduced(information, [0, 1, 2]), inner, rtol=1e-8)
-    rows[:, 5] = rows[:, 0]  # a nuisance that cannot be told from the first
-    lost = judge(reduced(rows.T @ rows, np.arange(6) < 3), DELAYS[:3], loosest=10.0)
-    assert lost.named("delay") == ("1",)
 
 
 @pytest.mark.parametrize(

@@ -125,8 +125,14 @@ def test_registers_alone_leave_the_constant_of_delayed_replies(loop):
     assert {row["reply"] for row in rows.values()} == {16436}
 
 
-@pytest.mark.parametrize("protocol", ["ss", "ds"])
-@pytest.mark.parametrize("through", ["boards", "simulation"])
+@pytest.mark.parametrize(
+    ("through", "protocol"),
+    [
+        ("boards", "ds"),
+        ("simulation", "ss"),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("boards", "ss"), ("simulation", "ds"))),
+    ],
+)
 def test_stamps_are_those_of_the_firmware(tmp_path, protocol, through):
     """Registers go into the chip's stamps, the constant into those of delayed replies; by ticks, without noise."""
     rows = {1: (16446, 16449, 16436), 2: (16430, 16400, 16441), 3: (16436, 16436, 16436), 4: (17000, 15880, 17000)}

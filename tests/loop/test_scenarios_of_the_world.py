@@ -76,11 +76,11 @@ def test_obstacles_and_echoes_lengthen_ranges(tmp_path):
 @pytest.mark.parametrize(
     ("name", "settings"),
     [
-        ("icra2023/test2.toml", []),
+        pytest.param("icra2023/test2.toml", [], marks=pytest.mark.slow),
         ("noiseless.toml", []),
         ("anchors_and_tag/anchors_and_tag.toml", []),
         pytest.param("day30/train.toml", ["run.duration_s=60"], marks=pytest.mark.slow),
-        ("nlos_office/office.toml", []),
+        pytest.param("nlos_office/office.toml", [], marks=pytest.mark.slow),
         ("wrap/wrap.toml", []),
     ],
 )

@@ -18,20 +18,6 @@ def test_text_is_utf8_and_nothing_is_left_beside_it(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 
 
-def test_what_was_there_stays_where_the_disk_is_full(tmp_path, monkeypatch):
-    write_bytes(tmp_path / "a", b"first", force=False)
-
-    def full(self, data):
-        with self.open("wb") as file:
-            file.write(data[: len(data) // 2])
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(type(tmp_path), "write_bytes", full)
-    with pytest.raises(OutputError, match=r"a: cannot be written \(No space left"):
-        write_bytes(tmp_path / "a", b"second", force=True)
-    assert ((tmp_path / "a").read_bytes(), [path.name for path in tmp_path.iterdir()]) == (b"first", ["a"])
-
-
 def test_no_output_is_written_over_another_or_over_what_is_read(tmp_path):
     a, b = tmp_path / "a", tmp_path / "b"
     check_apart({"output": a, "pdf": b, "figures": None}, [tmp_path / "c"])

@@ -9,19 +9,19 @@ import pytest
 import uwbsim
 from uwblink import raw_range
 from uwblink.errors import ArgumentError
-from uwblink.receptions import Receptions, contradicted, exchange_of, exchanges_in, times_by_stamps
-from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S, elapsed
+from uwblink.receptions import Receptions, contradicted, exchanges_in, times_by_stamps
+from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 
 PLACES = np.array([[0.0, 0, 0], [5, 0, 0], [0, 7, 0], [4, 6, 1]])
 RATE = 1 + np.array([3.0, -8.0, 12.0, -1.0]) * 1e-6
 START = np.array([0.7, 3.1, 16.9, 9.0]) / TICK_S
 
 
-def broadcasts(rounds=20, lost=(), slot_s=0.005, bits=40, drift_ppm_per_s=(0.0, 0.0, 0.0, 0.0)):
-    """Return receptions of four tags that send in turn, by clocks that run at their own rates, which may change."""
+def broadcasts(rounds=20, lost=(), slot_s=0.005):
+    """Return receptions of four tags that send in turn, by clocks that run at their own rates."""
 
     def stamp(tag, t):
-        return int(np.rint(START[tag] + (RATE[tag] * t + drift_ppm_per_s[tag] * 5e-7 * t**2) / TICK_S)) % (1 << bits)
+        return int(np.rint(START[tag] + RATE[tag] * t / TICK_S)) % (1 << 40)
 
     rows = []
     for frame in range(4 * rounds):
@@ -31,49 +31,7 @@ def broadcasts(rounds=20, lost=(), slot_s=0.005, bits=40, drift_ppm_per_s=(0.0, 
                 arrival = t + np.linalg.norm(PLACES[k] - PLACES[sender]) / SPEED_OF_LIGHT
                 rows.append((round(t * 1e9), frame, sender + 10, k + 10, stamp(sender, t), stamp(k, arrival)))
     columns = dict(zip(("time_ns", "frame", "sender", "listener", "tx", "rx"), zip(*rows, strict=True), strict=True))
-    return Receptions.from_arrays(**{name: list(column) for name, column in columns.items()}, bits=bits)
-
-
-@pytest.mark.parametrize("bits", [40, 32])
-def test_broadcasts_in_turn_range_every_pair_and_overhear_it(bits):
-    exchanges, overheard = exchanges_in(broadcasts(bits=bits))
-    ends = np.column_stack([exchanges.initiator, exchanges.target])
-    assert {tuple(sorted(pair)) for pair in ends.tolist()} == {(a, b) for a in range(10, 14) for b in range(a + 1, 14)}
-    distance = np.linalg.norm(PLACES[ends[:, 0] - 10] - PLACES[ends[:, 1] - 10], axis=1)
-    # Four rounded stamps of 4.7 mm, two of them halved.
-    assert np.abs(raw_range(exchanges) - distance).max() < 0.01
-    # An exchange needs the round after it, and one more where its target comes first; two others hear each.
-    assert 6 * 18 <= len(exchanges) <= 6 * 19
-    assert len(overheard["time_ns"]) == 2 * len(exchanges)
-    assert (exchange_of(exchanges, overheard) >= 0).all()
-    assert not (overheard["listener"] == overheard["initiator"]).any()
-    assert not (overheard["listener"] == overheard["target"]).any()
-
-
-def test_clocks_that_warm_up_change_no_range_and_no_difference_of_arrival():
-    """The rate after the response is not that before it: by the final alone, ranges here would be 0.1 to 0.4 m off."""
-    r = broadcasts(slot_s=0.08, drift_ppm_per_s=(0.0, 0.12, -0.03, 0.05))
-    exchanges, overheard = exchanges_in(r)
-    first = exchanges.time_ns < 2e9  # of two roles one has no frame before its response
-    assert np.abs(errors_m(exchanges[~first])).max() < 0.015
-    h = {name: column[overheard["time_ns"] > 2e9] for name, column in overheard.items()}
-    i, j, k = (h[name] - 10 for name in ("initiator", "target", "listener"))
-    rate = elapsed(h["rx3"], h["rx2"], 40) / elapsed(h["tx3_n"], h["tx2_n"], 40)
-    late = elapsed(h["rx2"], h["rx1"], 40) - rate * elapsed(h["tx2_n"], h["rx1_n"], 40)
-    away = [np.linalg.norm(PLACES[a] - PLACES[b], axis=1) for a, b in ((i, j), (j, k), (i, k))]
-    assert np.abs(late * METRES_PER_TICK - away[0] - away[1] + away[2]).max() < 0.03
-
-
-def test_lost_frames_cost_their_exchanges_and_no_others_become_wrong():
-    everything, _ = exchanges_in(broadcasts())
-    exchanges, overheard = exchanges_in(broadcasts(lost={(5, 2), (8, 1), (10, 1)}))
-    ends = np.column_stack([exchanges.initiator, exchanges.target]) - 10
-    distance = np.linalg.norm(PLACES[ends[:, 0]] - PLACES[ends[:, 1]], axis=1)
-    assert np.abs(raw_range(exchanges) - distance).max() < 0.01
-    assert len(everything) - 6 <= len(exchanges) < len(everything)
-    assert len(overheard["time_ns"]) < 2 * len(exchanges)
-    polls = np.column_stack([ends, exchanges.tx1])
-    assert len(np.unique(polls, axis=0)) == len(exchanges), "a poll counts once, though the next one was lost"
+    return Receptions.from_arrays(**{name: list(column) for name, column in columns.items()}, bits=40)
 
 
 def test_a_counter_that_restarts_makes_no_range():
@@ -175,33 +133,6 @@ def test_times_are_those_of_the_clocks_that_stamped_last():
         ((r.sender == 13) | (r.listener == 13)) & (r.frame >= 400) & (r.frame < 1000)
     )  # 12 s: more than half a turn
     assert times_by_stamps(r[~silent])[-1] == pytest.approx(r.time_ns[-1] - r.time_ns[0], abs=72e9 * 12e-6)
-
-
-def receptions_of(e, overheard):
-    """Return the receptions of double-sided exchanges, and of what listeners overheard; frame k of row n is 3 n + k."""
-    whose, rows = exchange_of(e, overheard), []
-    for n, (time_ns, one, other) in enumerate(zip(e.time_ns, e.initiator, e.target, strict=True)):
-        for k, (sender, listener) in enumerate(((one, other), (other, one), (other, one))):
-            sent = time_ns, 3 * n + k, sender
-            stamps = [(listener, getattr(e, f"rx{k + 1}")[n])]
-            stamps += [(overheard["listener"][h], overheard[f"rx{k + 1}"][h]) for h in np.flatnonzero(whose == n)]
-            rows += [(*sent, heard, getattr(e, f"tx{k + 1}")[n], rx) for heard, rx in stamps]
-    names = ("time_ns", "frame", "sender", "listener", "tx", "rx")
-    return Receptions.from_arrays(**dict(zip(names, np.array(rows).T, strict=True)), bits=e.bits)
-
-
-def test_exchanges_give_their_receptions_and_those_of_listeners():
-    exchanges, overheard = exchanges_in(broadcasts(rounds=4))
-    own = receptions_of(exchanges, overheard)
-    # Three messages at their receivers, and at two listeners each.
-    assert len(own) == 9 * len(exchanges)
-    again = own[np.isin(own.frame, own.frame[own.frame // 3 == 0])]
-    assert len(np.unique(again.frame)) == 3
-    first, heard = exchanges_in(again)
-    assert {name: getattr(first, name).tolist() for name in ("tx1", "rx2", "rx3")} == {
-        name: getattr(exchanges[:1], name).tolist() for name in ("tx1", "rx2", "rx3")
-    }
-    assert len(heard["time_ns"]) == 2
 
 
 def test_receptions_that_cannot_be_are_refused_by_name():

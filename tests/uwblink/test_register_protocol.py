@@ -16,10 +16,9 @@ from uwblink.protocols.table import (
     check_protocol,
     half_delays,
     register_protocol,
-    single_sided,
 )
 from uwblink.ticks import TICK_S
-from uwblink.twr import delay_weights, intervals, of_protocol, raw_range, time_of_flight
+from uwblink.twr import delay_weights, intervals, raw_range, time_of_flight
 
 POLL = ProtocolMessage("initiator", "", "at once")
 REPLY = ProtocolMessage("target", "rx1", "scheduled")
@@ -77,16 +76,6 @@ def test_skew_and_delays_go_through_the_registered_formula():
         assert moved == pytest.approx(4000 * delay_weights(e)[1][0], abs=1e-3)
     finally:
         PROTOCOLS.remove("targets-clock")
-
-
-def test_roles_follow_from_the_row(registered):
-    from_target = registered.messages[2].sender == "target"
-    senders = of_protocol(np.array(["ss", registered.name]), lambda row: row.third_sender == "target")
-    assert senders.tolist() == [0.0, float(from_target)]
-    assert registered.name not in single_sided()
-    e = exchange(registered.name, 1000, 20_000_000, 98_320_384, 0, 0)
-    # dt64 is the initiator's from rx2 on, or the target's from tx2 on: longer by two flights.
-    assert intervals(e).dt64[0] - intervals(e).dt53[0] == (0 if from_target else 2000)
 
 
 def test_a_mixture_of_protocols_keeps_each_to_its_own_formula(registered):

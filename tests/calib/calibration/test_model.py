@@ -198,19 +198,6 @@ def test_every_table_is_there(corrected, table):
     assert repr(after) == repr(before)
 
 
-def test_apply_and_evaluate_correct_the_same_range_alike(corrected):
-    folder, exchanges, known, done = corrected
-    with Recording.open(folder / "c.uwb") as recording:
-        written = recording.exchanges().range_m
-    judged = calib.load_ranges(folder / "f.uwb")
-    kept = (exchanges.fpp1_dbm < 0) | (exchanges.fpp2_dbm < 0)
-    assert judged.excluded == {"no power": np.count_nonzero(~kept)}
-    assert done.count == len(exchanges)
-    np.testing.assert_array_equal(written[kept], known.apply(judged).corrected_m)
-    # And neither takes the 0 for a power: that would be 8 orders of magnitude of lifted power too much.
-    assert np.abs(written - exchanges.range_m)[kept].max() < 1
-
-
 def test_a_corrected_recording_is_not_corrected_again(corrected):
     folder, _, known, _ = corrected
     with pytest.raises(calib.BadInputError, match="corrected already"):

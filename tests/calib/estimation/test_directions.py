@@ -15,7 +15,7 @@ from calib.errors import BadInputError, DirectionWarning, UnanswerableError
 from calib.report import Picture
 from calib.report.results import Results
 from calib.report.sections import SECTIONS
-from tests.processes import call
+from tests.processes import run
 from uwblink.pages.figures import drawn
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import antennas_m, sights
@@ -79,7 +79,7 @@ def test_another_flight_is_corrected_by_directions_from_its_poses(own, tmp_path)
     recipe = replace(TEN, own=own)
     first, second = written(tmp_path / "a.uwb", recipe, 3), written(tmp_path / "b.uwb", recipe, 3, 1)
     for name, more in (("none", ["--pattern", "none"]), ("auto", [])):
-        done = call("calib", "fit", first, "-o", tmp_path / f"{name}.json", "--between", 0, *more)
+        done = run("calib", "fit", first, "-o", tmp_path / f"{name}.json", "--between", 0, *more)
         assert done.returncode == 0
         assert ("over direction" in done.stdout) == (name == "auto")
     without, known = (calib.load_calibration(tmp_path / f"{name}.json") for name in ("none", "auto"))
@@ -87,7 +87,7 @@ def test_another_flight_is_corrected_by_directions_from_its_poses(own, tmp_path)
     # Of 6 cm, 4 are noise.
     assert spread(there, known) < 0.75 * spread(there, without)
     assert 0.92 < calib.evaluate(second, known).overall.inside_95 < 0.98
-    done = call("calib", "apply", second, "-c", tmp_path / "auto.json", "-o", tmp_path / "c.uwb")
+    done = run("calib", "apply", second, "-c", tmp_path / "auto.json", "-o", tmp_path / "c.uwb")
     assert (done.returncode, done.stderr) == (0, "")
     assert uwblink.load(tmp_path / "c.uwb").exchanges.range_m == pytest.approx(known.apply(there).corrected_m, abs=1e-9)
     Contents(exchanges=uwblink.load(second).exchanges).save(tmp_path / "blind.uwb")
@@ -136,7 +136,7 @@ def test_power_that_explains_what_looks_like_direction_is_named():
 def test_a_pattern_that_attitudes_do_not_excite_is_refused_with_the_flight_that_would(tmp_path):
     still = written(tmp_path / "still.uwb", replace(TEN, turning=0.0), 5)
     for name in ("shared", "tag"):
-        done = call("calib", "fit", still, "-o", tmp_path / "x.json", "--pattern", name)
+        done = run("calib", "fit", still, "-o", tmp_path / "x.json", "--pattern", name)
         assert done.returncode == 1
         assert "tags 1, 2, 3, 4" in done.stderr
         assert "turns once around" in done.stderr
@@ -254,7 +254,7 @@ def test_a_tag_that_is_added_has_the_pattern_that_others_share_or_one_that_is_un
     assert [one.tags for one in known.patterns] == ([(1,), (2,), (3,), (4,)] if own else [(1, 2, 3, 4)])
     known.save(tmp_path / "known.json")
     second = written(tmp_path / "second.uwb", recipe, 3, 1)
-    done = call("calib", "add-tag", second, "-c", tmp_path / "known.json", "--tag", 5, "-o", tmp_path / "five.json")
+    done = run("calib", "add-tag", second, "-c", tmp_path / "known.json", "--tag", 5, "-o", tmp_path / "five.json")
     assert (done.returncode, "tag 5: its pattern over direction" in done.stderr) == (0, own)
     added, planted = calib.load_calibration(tmp_path / "five.json"), flown(recipe, 3)[0].meta["planted"]["delays_ns"]
     off = [added.delays_ns[tag] - planted[str(tag)] for tag in (1, 2, 3, 4, 5)]
@@ -289,7 +289,7 @@ def test_delays_of_calibrations_with_patterns_are_compared_for_the_same_directio
     for name, patterns in (("known", (pattern,)), ("turned", (turned,)), ("none", ())):
         replace(known, patterns=patterns).save(tmp_path / f"{name}.json")
     other, lone = (
-        call("calib", "compare", *(tmp_path / f"{n}.json" for n in ("known", to))) for to in ("turned", "none")
+        run("calib", "compare", *(tmp_path / f"{n}.json" for n in ("known", to))) for to in ("turned", "none")
     )
     assert float(other.stdout.split("rms apart, probability ")[1].split()[0]) < 1e-3
     assert (lone.returncode, lone.stderr.count("\n")) == (1, 1)

@@ -115,17 +115,6 @@ def test_pairs_have_constants_of_their_own_where_delays_cannot_explain_them():
         calib.export(found, "c-header")
 
 
-def test_pairs_are_fitted_where_they_do_not_determine_delays():
-    plan = Plan(robots=(1,))
-    found = calib.fit(ranges(plan), constants="pair").calibration
-    assert sorted(found.pair_offsets) == [(1, 11), (1, 12), (1, 13)]
-    of_tags = calib.fit(ranges(plan)).calibration
-    assert of_tags.pair_constants.keys() == found.pair_offsets.keys()
-    for pair, one in of_tags.pair_constants.items():
-        # Three delays and one split, or three constants: the same model.
-        assert one.offset_m == pytest.approx(found.pair_offsets[pair].offset_m, abs=0.3 * one.std_m)
-
-
 def test_one_power_makes_a_flat_curve_and_says_so():
     result = calib.fit(ranges(Plan(bias=bias_m, power_dbm=lambda _: -91.0)))
     near_planted(result.calibration, but=-bias_m(-91.0) / NS_M)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import calib
-from calib.checks import limits
 from calib.checks.limits import power_levels_db, unlike_powers
 from calib.data.ranges import concatenate
 from tests.calib import synthetic
@@ -132,22 +131,6 @@ def test_a_tag_that_reads_too_high_is_named_with_what_its_delay_holds():
     of_three = abs(away[2] - np.mean(np.delete(away, 2)))
     assert 1e3 * of_three == pytest.approx(held_ps, rel=0.2)
     assert held_ps > 50
-
-
-def test_tags_alike_are_not_named(monkeypatch):
-    sure = calib.fit(world(noise_db=1.0, tail=0.0, noise_m=0.02))
-    assert not [warning for warning in sure.warnings if "stand apart" in warning]
-    # A curve so flat that nothing of it would matter is not what these are to show.
-    monkeypatch.setattr(limits, "SMALLEST_NS", 0.0)
-    surest = replace(sure.calibration, delays_std_ns=dict.fromkeys(DELAYS_NS, 1e-4))
-    for seed in range(12):
-        # Levels that differ by chance, by as much as would matter to delays that are known so well.
-        few = world(noise_db=4.0, n=240, seed=seed)
-        assert not [*unlike_powers(few, surest)]
-    # Surely apart, and no more than boards of a kind are.
-    near = world(read={3: 0.45}, noise_db=0.1)
-    assert not [*unlike_powers(near, surest)]
-    assert [*unlike_powers(world(read={3: 0.7}, noise_db=0.1), surest)]
 
 
 # Lengths and powers in other units than metres and dBm: nothing is fitted to them, and the unit is named.

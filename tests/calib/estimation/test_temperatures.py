@@ -18,7 +18,7 @@ from calib.calibration.patterns import TemperatureSlope
 from calib.data.ranges import read_c
 from calib.errors import BadInputError, TemperatureWarning, UnanswerableError
 from tests.calib import overhearing
-from tests.processes import call, refuse, run
+from tests.processes import refuse, run
 from tests.uwblink.importers.test_table_forms import as_messages, flights, wrapped, write
 from uwblink.importers.guess import guess_map
 
@@ -75,7 +75,7 @@ def test_a_warmer_flight_is_corrected_by_its_readings(tmp_path):
     first = written(tmp_path / "a.uwb", WARM, 3)
     second = written(tmp_path / "b.uwb", replace(WARM, start_c=45.0, warmer_k=5.0), 3, 1)
     for name, more in (("none", ["--temperature", "none"]), ("auto", [])):
-        done = call("calib", "fit", first, "-o", tmp_path / f"{name}.json", "--between", 0, *more)
+        done = run("calib", "fit", first, "-o", tmp_path / f"{name}.json", "--between", 0, *more)
         assert ("mm/K over temperature" in done.stdout) == (name == "auto")
     without, known = (calib.load_calibration(tmp_path / f"{name}.json") for name in ("none", "auto"))
     with pytest.warns(TemperatureWarning, match=r"^tags 1, 2, 3, 4 were used more than 5 K beyond the 20 to 3\d °C"):
@@ -87,7 +87,7 @@ def test_a_warmer_flight_is_corrected_by_its_readings(tmp_path):
     assert said.count("warning: tags 1, 2, 3, 4 were used more than 5 K beyond") == 1
     corrected = uwblink.load(tmp_path / "c.uwb").exchanges.range_m - calib.load_ranges(second).truth_m
     assert np.std(corrected) == pytest.approx(judged.full.std_m, abs=1e-9)
-    assert "mm/K" in call("calib", "show", tmp_path / "auto.json").stdout
+    assert "mm/K" in run("calib", "show", tmp_path / "auto.json").stdout
 
 
 @pytest.mark.parametrize(("celsius", "why"), [(None, "no temperature is known"), (30.0, "vary too little")])
@@ -95,7 +95,7 @@ def test_a_slope_that_readings_do_not_determine_is_refused_and_said(tmp_path, ce
     read = flown(WARM, 3)[0].temperature
     flat = {**read, "temperature_c": np.full(len(read["tag"]), celsius)} if celsius else {}
     path = written(tmp_path / "a.uwb", WARM, 3, temperature=flat)
-    done = call("calib", "fit", path, "-o", tmp_path / "x.json", "--temperature", "shared")
+    done = run("calib", "fit", path, "-o", tmp_path / "x.json", "--temperature", "shared")
     assert (done.returncode, why in done.stderr, done.stderr.count("\n")) == (1, True, 1)
     known = calib.fit(path).calibration
     assert ((tmp_path / "x.json").exists(), known.temperatures, why in repr(known)) == (False, (), bool(celsius))
@@ -166,7 +166,7 @@ def test_an_added_tag_shares_the_slope_of_the_others():
 def test_what_a_stranger_wrote_into_the_provenance_is_refused_in_a_line(tmp_path, broken, why):
     table = json.loads(fitted(WARM, 3).to_json())
     (tmp_path / "c.json").write_text(json.dumps(table | {"provenance": table["provenance"] | broken}))
-    done = call("calib", "show", tmp_path / "c.json")
+    done = run("calib", "show", tmp_path / "c.json")
     assert (done.returncode, why in done.stderr, done.stderr.count("\n")) == (2, True, 1)
     with pytest.raises(BadInputError, match="provenance: held_out"):
         held_out_line(replace(fitted(WARM, 3), provenance={"held_out": broken}))
@@ -248,7 +248,7 @@ def test_temperatures_come_from_columns_of_a_table(tmp_path, header, answered):
     table = tmp_path / "t.csv"
     table.write_text("\n".join([header, *rows]))
     (tmp_path / "m.toml").write_text(answered or guess_map(table).text)
-    call("uwblink", "import", "csv", table, "--map", tmp_path / "m.toml", "-o", tmp_path / "t.uwb")
+    run("uwblink", "import", "csv", table, "--map", tmp_path / "m.toml", "-o", tmp_path / "t.uwb")
     read = uwblink.load(tmp_path / "t.uwb").temperature
     expected = [(k, 1, 20.0 + k) for k in range(60)] + [(k, 2, 40.0) for k in range(60) if k != 5]
     assert sorted(zip(read["time_ns"] // 10**9, read["tag"], read["temperature_c"], strict=True)) == sorted(expected)
@@ -263,10 +263,10 @@ def test_cells_that_are_no_temperature_are_named(tmp_path, cell, every):
         "column 'from_temperature_c' are no plain degrees",
     )
     if every > 2:
-        assert f"20 of 60 cells of {said}" in call(*words, cwd=tmp_path).stdout
+        assert f"20 of 60 cells of {said}" in run(*words, cwd=tmp_path).stdout
         assert len(uwblink.load(tmp_path / "t.uwb").temperature["tag"]) == 40
     else:
-        refuse(*words, cwd=tmp_path, naming=["t.csv", said, cell], runner=call)
+        refuse(*words, cwd=tmp_path, naming=["t.csv", said, cell])
         assert not (tmp_path / "t.uwb").exists()
 
 
@@ -278,7 +278,7 @@ def test_a_number_that_is_no_temperature_of_a_board_is_refused():
 
 def test_temperatures_of_rows_that_are_messages_are_named_as_not_read(tmp_path):
     write(tmp_path / "m.csv", [row | {"from_temperature_c": 25} for row in as_messages(wrapped(flights()))])
-    said = call("uwblink", "import", "csv", "m.csv", "-o", "m.uwb", cwd=tmp_path).stdout
+    said = run("uwblink", "import", "csv", "m.csv", "-o", "m.uwb", cwd=tmp_path).stdout
     assert "temperatures are read where a row is an exchange" in said
 
 

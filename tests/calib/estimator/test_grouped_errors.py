@@ -62,19 +62,6 @@ def drawn():
     return layout, RangeRows.of(error, np.zeros(count, dtype=np.int64), parts, Mixture(), layout)
 
 
-def test_the_model_tells_on_average_what_squares_of_slopes_do(drawn):
-    layout, rows = drawn
-    squares = sum_rows([rows], layout.start())
-    expected = sum_rows([replace(rows, errors=Mixture(expected=True))], layout.start())
-    k = layout.where[RESIDUAL].start
-    assert expected.gradient == pytest.approx(squares.gradient)
-    assert expected.information[k, k] == pytest.approx(squares.information[k, k], rel=0.03)
-    for other in ("noise", "odds", "detour"):
-        j = layout.where[other].start
-        size = np.sqrt(squares.information[k, k] * squares.information[j, j])
-        assert expected.information[k, j] == pytest.approx(squares.information[k, j], abs=0.03 * size)
-
-
 @pytest.mark.parametrize("spread_m", [0.03, pytest.param(100.0, marks=pytest.mark.slow)])
 def test_noise_is_that_of_restricted_likelihood_however_many_offsets_there_are(spread_m):
     # Six ranges for each of 100 offsets; without a prior that is the pooled variance, else an analysis of variance.

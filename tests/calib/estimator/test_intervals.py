@@ -29,15 +29,6 @@ def squares():
     return model, found, found.optimum.layout.indices(["delay"])
 
 
-def test_few_ranges_of_a_pair_have_students_intervals(squares):
-    model, found, delays = squares
-    cut = time_blocks(model.ranges.time_ns, model.ranges.session)
-    kept = {"few": Kept.delays(delays, 4, model.held), "many": Kept.delays(delays, 1e9, model.held)}
-    (few, last), (many, _) = sandwich(Slopes(found.rows, found.optimum, cut), kept).values()
-    assert last.freedom > 3
-    assert np.sqrt(np.diag(few) / np.diag(many)) == pytest.approx(student.ppf(0.975, 3) / last.quantile95, rel=1e-6)
-
-
 def test_what_a_fit_uses_of_the_data_is_given_back(squares):
     model, found, delays = squares
     cut = time_blocks(model.ranges.time_ns, model.ranges.session)

@@ -9,7 +9,7 @@ import pytest
 import calib
 from calib.errors import BadInputError, UnanswerableError
 from tests.calib.overhearing import bound_ns2, flight, least_squares_ns
-from tests.processes import call
+from tests.processes import run
 from tests.shared_data import miluv
 from uwblink import Tag
 from uwblink.importers import read_source
@@ -163,7 +163,7 @@ def test_what_cannot_be_fitted_is_refused(change, settings, error, said):
 def test_the_command_says_how_many_were_fitted(tmp_path):
     data, _ = flight(7600, count=400)
     data.save(tmp_path / "f.uwb")
-    done = call("calib", "fit", tmp_path / "f.uwb", "-o", tmp_path / "c.json", "--use", "receptions", "--delays-only")
+    done = run("calib", "fit", tmp_path / "f.uwb", "-o", tmp_path / "c.json", "--use", "receptions", "--delays-only")
     assert done.returncode == 0, done.stderr
     assert "400 exchanges, 1600 differences of arrival" in done.stdout
     assert calib.load_calibration(tmp_path / "c.json").provenance["settings"]["use"] == "receptions"

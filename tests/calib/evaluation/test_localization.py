@@ -1,6 +1,5 @@
 """The EKF: consistent on clean ranges, better for a calibration, never locked out."""
 
-import json
 import tomllib
 from dataclasses import replace
 from itertools import product
@@ -13,8 +12,6 @@ from calib import BadInputError, Calibration, UnanswerableError, fit, sample_fli
 from calib.data.sources import Flight, load_flight
 from calib.evaluation.localization import (
     fixed_std,
-    localization_json,
-    localization_text,
     localize,
     summarize,
     write_tum,
@@ -177,23 +174,6 @@ def test_settings_that_no_filter_can_run_with(name, value):
     with pytest.raises(BadInputError) as caught:
         Settings(**{name: value})
     assert caught.value.parameter == name
-
-
-def test_text_and_json_state_what_they_rest_on(flights):
-    flight, known = clean(beginning(flights["test1"], 2))
-    settings = Settings(seeds=2, velocity_std_mps=0.2)
-    found = localize(flight, known, settings)
-    text = localization_text(found, settings)
-    assert all(part in text for part in ("0.2 m/s", "2 seeds", "simulated flights"))
-    document = json.loads(json.dumps(localization_json(found)))
-    assert len(document["scenarios"][0]["rmse_by_seed_m"]["raw"]) == 2
-    assert set(document["summary"]["rmse_m"]) == {"raw", "calibrated", "variance"}, "reflections are unknown"
-    nees = [
-        np.mean(np.concatenate([one.tracks[name].nees for one in found])) for name in ("raw", "calibrated", "variance")
-    ]
-    assert list(document["summary"]["nees_by_filter"].values()) == pytest.approx(nees)
-    (row,) = (line for line in text.splitlines() if line.startswith("mean NEES (3 expected)"))
-    assert [float(cell) for cell in row.split()[4:]] == pytest.approx(nees, abs=0.06)
 
 
 def test_trajectories_are_written_in_tum_form_with_their_attitudes(flights, tmp_path):

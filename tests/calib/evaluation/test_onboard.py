@@ -11,10 +11,9 @@ from calib.calibration.error_model import ErrorModel
 from calib.calibration.formats import read_miluv
 from calib.calibration.patterns import Pattern
 from calib.data.samples import stamped
-from calib.evaluation.filters import Fix, InertialFilter, ProcessNoise, multilaterate
+from calib.evaluation.filters import ProcessNoise, multilaterate
 from calib.evaluation.localization import write_tum
 from calib.evaluation.onboard import onboard_json, onboard_text
-from calib.online import RangeErrors
 from tests.calib import synthetic
 from tests.shared_data import miluv, shared
 from uwblink import Contents, Exchanges, Poses, Tag
@@ -324,37 +323,6 @@ def test_differences_need_neither_truth_nor_what_they_do_not_hold():
         localize_onboard(heard, calibration(), OnboardSettings(noise=IMU))
     with pytest.raises(UnanswerableError, match="no listener overheard"):
         localize_onboard(flight(8.0), calibration(), settings)
-
-
-@pytest.mark.parametrize("inertial", [True, False])
-def test_an_update_by_a_difference_has_the_derivatives_of_finite_steps(inertial):
-    """By place, attitude and shared error, of a formula. Errors of 0.4 mm bend a distance of metres by 1e-7 m."""
-    rng = np.random.default_rng(7)
-    turned = attitude(np.array([0.3])).as_matrix() if inertial else np.eye(3)[None]
-    covariance = rng.normal(size=(17, 17))
-    covariance = covariance @ covariance.T * 1e-8
-    # A filter without an IMU is sure of its attitude.
-    covariance[6:9] *= inertial
-    covariance[:, 6:9] *= inertial
-    arm = np.array([0.3, -0.2, 0.1]) if inertial else np.array([0.0, 0.0, 0.1])
-    anchors, signs, common = ANCHORS[:2], np.array([1.0, -1.0]), 0.04
-
-    def expected(step):
-        antenna = np.array([0.4, -0.7, 1.2]) + step[:3] + turned[0] @ Rotation.from_rotvec(step[6:9]).apply(arm)
-        return np.linalg.norm(antenna - anchors, axis=1) @ signs + common * step[16]
-
-    steps = 1e-6 * np.eye(17)
-    slope = np.array([(expected(step) - expected(-step)) / 2e-6 for step in steps])
-    running = InertialFilter(Fix(np.array([0.4, -0.7, 1.2]), np.eye(3)), turned, IMU, inertial=inertial)
-    running.covariance = covariance[None].copy()
-    certain = RangeErrors(share=1e-12, least_m=0.0, detour_m=1.0, outlier=1e-12, outlier_m=1.0)
-    running.update_range(expected(np.zeros(17)) + 1e-4, 5e-4, certain, arm, anchors, signs, common)
-    gain = covariance @ slope / (slope @ covariance @ slope + 5e-4**2)
-    assert running.covariance[0] == pytest.approx(covariance - np.outer(gain, slope @ covariance), abs=1e-10)
-    assert running.state[0, :3] == pytest.approx(np.array([0.4, -0.7, 1.2]) + 1e-4 * gain[:3], abs=5e-7)
-    running.begin_exchange()
-    assert running.state[0, 16] == 0
-    assert running.covariance[0, 16] == pytest.approx(np.eye(17)[16])
 
 
 def test_multilateration_is_exact_and_leaves_a_reflection_out():

@@ -14,8 +14,7 @@ from calib.evaluation import Settings
 from calib.evaluation.filters import GaussianFilters
 from calib.evaluation.localization import consistency
 from calib.factors import Antenna, range_factor
-from calib.online import DelayStates, RangeUpdate, delay_slopes, ends_of, gated_update
-from tests.calib import overhearing
+from calib.online import DelayStates, RangeUpdate, gated_update
 from tests.calib.evaluation.drifting_flight import DELAYS_NS, LIGHT, PLACES, flight
 from tests.processes import refuse, succeed
 from tests.shared_data import ROOT
@@ -64,25 +63,6 @@ def test_constants_of_pairs_have_no_delays_to_follow(tmp_path):
     flight(9, 10.0)[0].save(tmp_path / "a.uwb")
     fit(tmp_path / "a.uwb", constants="pair").save(tmp_path / "pairs.json")
     refuse("calib", "localize", tmp_path / "a.uwb", "-c", tmp_path / "pairs.json", "--online", naming=["of pairs"])
-
-
-def test_derivatives_by_delays_are_those_of_corrected_ranges_and_differences():
-    ranges = load_ranges(overhearing.flight(3, count=60, tags=4)[0], use="receptions")
-    known = fit(overhearing.flight(4, count=600, tags=4)[0], use="receptions").calibration
-    change_m, states = np.array([0.3, -0.2, 0.5, 0.1]), DelayStates.of(known, range(4))
-    moved = replace(known, delays_ns={tag: known.delays_ns[tag] + change_m[tag] / LIGHT for tag in range(4)})
-    before, after = (
-        np.append(one.apply(ranges).corrected_m, one.correct_arrivals(ranges).corrected_m) for one in (known, moved)
-    )
-    # A delay that grew is corrected too little: what is measured lacks its part.
-    slopes = states.slopes(ends_of(ranges), delay_slopes(ranges))
-    np.testing.assert_allclose(before - after, slopes @ change_m, atol=1e-9)
-    assert np.ptp(slopes) > 0.9
-    # What the calibration leaves undetermined stays so.
-    split = DelayStates.of(replace(known, delays_std_ns=known.delays_std_ns | {1: np.inf}), (2, 1))
-    found = split.estimates(np.array([LIGHT, 0.0]), split.covariance_m2)
-    assert found[2] == pytest.approx((known.delays_ns[2] + 1, known.delays_std_ns[2]))
-    assert found[1] == (known.delays_ns[1], np.inf)
 
 
 def test_residuals_are_those_of_the_likelihood(known):

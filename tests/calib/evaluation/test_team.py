@@ -16,7 +16,7 @@ from calib.calibration.patterns import Pattern
 from calib.data.samples import stamped
 from calib.errors import WeakHeadingWarning
 from calib.evaluation import team
-from calib.evaluation.filters import IMUS, ProcessNoise, RelativeFilter
+from calib.evaluation.filters import IMUS, ProcessNoise
 from calib.evaluation.models import FilterRanges
 from calib.evaluation.team import team_json, team_text
 from calib.evaluation.tracking import distances_in
@@ -120,98 +120,6 @@ def test_without_errors_dead_reckoning_is_the_relative_motion():
     here, there = back["a"].tracks["dead reckoning"], found[1].tracks["dead reckoning"]
     undone = -Rotation.from_quat(there.attitude).inv().apply(there.estimate_m)
     assert np.abs(here.estimate_m - undone).max() < 0.03
-
-
-def some_filter(noise, spread=1e-3):
-    rng = np.random.default_rng(3)
-    start = rng.normal(size=(1, 2, 3)) * 3, Rotation.random(2, rng=rng).as_matrix()[None]
-    found = RelativeFilter(*start, np.full(2 * 15 + 6 + 1, spread), noise, moving=True)
-    found.state[:] += rng.normal(size=found.state.shape) * 0.3
-    return found
-
-
-def shifted(state, by):
-    """Return the filter with a state that is off: positions and so on add, attitudes turn about the body's axes."""
-    off = by.copy()
-    for body in range(2):
-        turn = slice(15 * body + 6, 15 * body + 9)
-        state.attitude[0, body] = state.attitude[0, body] @ Rotation.from_rotvec(by[turn]).as_matrix()
-        off[turn] = 0.0
-    state.state[0] += off
-    return state
-
-
-def apart(first, second):
-    by = first.state[0] - second.state[0]
-    for body in range(2):
-        turned = second.attitude[0, body].T @ first.attitude[0, body]
-        by[15 * body + 6 : 15 * body + 9] = Rotation.from_matrix(turned).as_rotvec()
-    return by
-
-
-def test_derivatives_are_those_of_finite_differences():
-    rng, none = np.random.default_rng(4), ProcessNoise(force=0.0, gyro=0.0, force_bias=0.0, gyro_bias=0.0)
-    read = rng.normal(size=(3, 6)) + np.array([0, 0, 0, 0, 0, 9.81])
-    size, dt, step = 37, 1e-3, 1e-6
-
-    def moved(by):
-        one = shifted(some_filter(none), by)
-        one.predict(dt, read[:2], read[2])
-        return one
-
-    middle = moved(np.zeros(size))
-    changes = [apart(moved(e), middle) - apart(moved(-e), middle) for e in step * np.eye(size)]
-    by_state = np.array(changes).T / (2 * step)
-    # Terms in the square of the step are left out: 1e-6 of derivatives of up to 10.
-    np.testing.assert_allclose(middle.covariance[0], 1e-6 * by_state @ by_state.T, atol=1e-6 * 1e-5)
-
-    bodies, arms, sign = np.array([[0, 1], [2, 1]]), rng.normal(size=(2, 2, 3)), np.array([1.0, -1.0])
-    _, row, bent_m = some_filter(none, 0.0).distances(bodies, arms, sign)
-    assert bent_m == pytest.approx(0.0)
-    for k, e in enumerate(step * np.eye(size)):
-        ends = [shifted(some_filter(none, 0.0), way * e).distances(bodies, arms, sign)[0][0] for way in (1, -1)]
-        assert row[0, k] == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-7)
-    # Mean and spread of distances between places that are off by chance, beside the terms of second order.
-    spread = np.r_[np.full(3, 0.3), np.zeros(12)]
-    vague = some_filter(none, 0.0)
-    vague.covariance[0, :15, :15] = np.diag(spread**2)
-    mean, row, bent_m = vague.distances(bodies[:1], arms[:1], np.ones(1))
-    drawn = rng.normal(size=(4000, size)) * np.r_[spread, np.zeros(size - 15)]
-    seen = [shifted(some_filter(none, 0.0), by).distances(bodies[:1], arms[:1], np.ones(1))[0][0] for by in drawn]
-    assert mean[0] == pytest.approx(np.mean(seen), abs=4 * 0.3 / np.sqrt(4000))
-    bend = np.array(seen) - value_of(some_filter(none, 0.0), bodies, arms) - drawn @ row[0]
-    assert bent_m[0, 0] == pytest.approx(np.std(bend), rel=0.15)
-    assert mean[0] - value_of(some_filter(none, 0.0), bodies, arms) == pytest.approx(np.mean(bend), rel=0.1)
-
-
-def value_of(one, bodies, arms):
-    return one.distances(bodies[:1], arms[:1], np.ones(1))[0][0]
-
-
-def test_noise_of_readings_moves_bodies_as_stated_and_that_of_the_reference_all_at_once():
-    rng, dt, count = np.random.default_rng(5), 0.04, 2000
-    loud = ProcessNoise(force=0.05, gyro=0.01, force_bias=0.0, gyro_bias=0.0)
-    where, turned = rng.normal(size=(1, 2, 3)) * 3, Rotation.random(2, rng=rng).as_matrix()[None]
-    stated, drawn = (
-        RelativeFilter(np.tile(where, (n, 1, 1)), np.tile(turned, (n, 1, 1, 1)), np.zeros(36), loud, moving=True)
-        for n in (1, count)
-    )
-    read = rng.normal(size=(3, 6)) * 0.5 + np.array([0, 0, 0, 0, 0, 9.81])
-    errors = np.r_[9:15, 24:30, 30:36]
-    for _ in range(25):
-        # A bias for one step is white noise.
-        drawn.state[:, errors] = rng.normal(size=(count, 18)) * np.tile(np.repeat([0.01, 0.05], 3), 3) / np.sqrt(dt)
-        for one in (stated, drawn):
-            one.predict(dt, read[:2], read[2])
-    apart = stated.attitude[:, :2].swapaxes(2, 3) @ drawn.attitude[:, :2]
-    turns = Rotation.from_matrix(apart.reshape(-1, 3, 3)).as_rotvec().reshape(count, 2, 3)
-    seen = np.concatenate([(drawn.own - stated.own)[..., :6], turns], axis=2).reshape(count, 18)
-    rows = np.r_[0:9, 15:24]
-    expected = stated.covariance[0][np.ix_(rows, rows)]
-    scale = np.sqrt(np.diag(expected))
-    # Two thousand draws know a covariance to 3 % of the product of the standard deviations.
-    np.testing.assert_allclose(np.cov(seen.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.12)
-    assert abs(expected[0, 9]) > 0.2 * scale[0] * scale[9]
 
 
 def batch(contents, t, ends, measured, start):
@@ -466,7 +374,7 @@ def test_a_body_with_one_tag_is_named():
 def test_an_option_of_another_model_is_refused(option, used_by, tmp_path):
     for model in ("poses", "imu", "constant-velocity", "team"):
         words = "calib", "localize", "a.uwb", "-c", tmp_path / "c.json", "--model", model, *option
-        said = processes.refuse(*words, runner=processes.call, naming=["c.json"] if model in used_by else used_by)
+        said = processes.refuse(*words, naming=["c.json"] if model in used_by else used_by)
         assert said.startswith(f"error: {option[0]}: goes with --model ") == (model not in used_by)
 
 
@@ -475,12 +383,12 @@ def test_the_command_prints_writes_and_refuses(known, tmp_path):
     simulated(307, 1.0).save(recording)
     known.save(document)
     words = "calib", "localize", recording, "-c", document, "--model", "team"
-    said = json.loads(processes.call(*words, "--use", "receptions", "--imu", "industrial", "--json").stdout)
+    said = json.loads(processes.run(*words, "--use", "receptions", "--imu", "industrial", "--json").stdout)
     assert [(one["body"], one["reference"]) for one in said["bodies"]] == [("robot2", "robot1"), ("robot3", "robot1")]
     assert said["summary"]["dead reckoning"]["accepted"] is None
     for less in (said["reduction_by_listening"][against] for against in ("own ranges", "ranges only")):
         assert set(less) == {"raw", "calibrated", "variance", "robust"}
-    text = processes.call(*words, "--start-std", "0.02", "1", "0.05", "--tum", tmp_path / "tum").stdout
+    text = processes.run(*words, "--start-std", "0.02", "1", "0.05", "--tum", tmp_path / "tum").stdout
     assert "start: relative poses within 0.02 m, 1 deg and 0.05 m/s" in text
     assert "by listening" not in text
     assert (tmp_path / "tum" / "three_uwb-robot2-from-robot1-dead-reckoning.tum").exists()
@@ -490,9 +398,9 @@ def test_the_command_prints_writes_and_refuses(known, tmp_path):
     assert np.abs(np.sum(truth[:, 4:] * close[:, 4:], axis=1)).min() > np.cos(np.radians(5) / 2)
     bare = tmp_path / "bare.uwb"
     replace(simulated(307, 1.0), imu={}).save(bare)
-    assert "bare.uwb" in processes.refuse(*words[:2], bare, *words[3:], status=1, runner=processes.call, naming=["imu"])
-    processes.refuse(*words, "--imu", "wooden", runner=processes.call, naming=["industrial"])
-    processes.refuse(*words, "--start-std", "0", "1", "1", runner=processes.call, naming=["--start-std:"])
+    assert "bare.uwb" in processes.refuse(*words[:2], bare, *words[3:], status=1, naming=["imu"])
+    processes.refuse(*words, "--imu", "wooden", naming=["industrial"])
+    processes.refuse(*words, "--start-std", "0", "1", "1", naming=["--start-std:"])
 
 
 def test_delays_that_a_calibration_has_wrong_within_its_errors_are_corrected_on_the_way():

@@ -153,17 +153,6 @@ def test_what_cannot_be_planned_is_refused(boards, settings, message):
         calib.plan(boards, **settings)
 
 
-def test_without_reflections_and_curve_a_prediction_is_the_inverse_of_the_information():
-    orders = in_orders((1, 2, 3, 4), (2, 1, 4, 3), (2, 4, 1, 3))
-    covariance = np.linalg.inv(sum(delay_information(given(4), one)[0] for one in orders))
-    last = predict(given(4), orders)[-1]
-    assert last.each == pytest.approx(np.sqrt(np.diag(covariance)))
-    assert last.common == pytest.approx(math.sqrt(covariance.mean()))
-    centre = np.eye(4) - 0.25
-    assert last.apart == pytest.approx(np.sqrt(np.diag(centre @ covariance @ centre)))
-    assert np.isinf(predict(given(4), orders)[0].common)
-
-
 def test_three_in_a_row_say_nothing_where_one_of_their_pairs_is_mostly_reflected():
     """All three are straight with 0.9^3 = 0.73 and 0.7^3 = 0.34; then the middle delay is what it always is."""
     row = in_orders((1, 2, 3))

@@ -10,10 +10,10 @@ from scipy.special import betaln, ndtr
 import calib
 from benchmarks.standing import standing_boards
 from calib.surveys.knowledge import Knowledge
-from calib.surveys.network import Case, Linear
+from calib.surveys.network import Case
 from calib.surveys.recordings import read_surveys
 from calib.surveys.reflections import Marks
-from calib.surveys.solution import first_start, optimize
+from calib.surveys.solution import first_start
 from calib.surveys.survey import network_of
 
 pytestmark = pytest.mark.slow
@@ -66,18 +66,6 @@ def test_the_search_and_the_weights_are_those_of_the_likelihood_written_out(line
     expected = np.exp(-0.5 * (value - value.min()))
     # The covariance written out has numbers from 1e-4 to 1e6.
     assert weight == pytest.approx(expected / expected.sum(), rel=5e-3)
-
-
-def test_sparse_matrices_of_many_unknowns_give_what_dense_ones_give(monkeypatch):
-    world, knowledge = standing_boards(3, boards=4, arrangements=3, each=20), Knowledge(shape="line")
-    network = network_of(read_surveys(world.ranges, knowledge), knowledge, {}, curve=False)
-    x = network.with_positions(network.layout.start(), np.concatenate(world.places))
-    case = Case(np.zeros(len(network.means.range_m), dtype=bool), PAIR_M, CURVE_M)
-    dense, unlikely = optimize(network, x, case)[0], Linear(network, x, case).unlikely()
-    for room in ("rows", "unknowns"):
-        monkeypatch.setattr(f"calib.estimator.{room}.MOST_DENSE", 10)
-    assert optimize(network, x, case)[0] == pytest.approx(dense, abs=1e-4)
-    assert Linear(network, x, case).unlikely() == pytest.approx(unlikely, rel=1e-9)
 
 
 def reflected(world, arrangement, first, second, longer_m):

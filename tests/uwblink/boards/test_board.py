@@ -2,7 +2,7 @@
 
 import pytest
 
-from uwblink.boards.board import ANSWER_S, FENCE, PATIENT_S, Board, Connection
+from uwblink.boards.board import FENCE, Board, Connection
 from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
 from uwblink.wire import messages as m
 from uwblink.wire.codec import encode
@@ -84,28 +84,9 @@ def asked(command=None):
     return connection
 
 
-@pytest.mark.parametrize("size", [1, 7, 1000])
-def test_a_reply_in_any_pieces_ends_the_command(size):
-    connection, outcome = asked(), None
-    for k in range(0, len(REPORT), size):
-        assert outcome is None
-        _, outcome = connection.receive(REPORT[k : k + size], 0.003)
-    assert outcome.reply.neighbour == 2
-    assert not connection.busy
-
-
 def test_only_one_command_is_outstanding():
     with pytest.raises(RefusedError, match="still waiting"):
         asked().send(m.GetId(), 0.001)
-
-
-def test_lines_of_bystanders_and_other_reports_do_not_end_it():
-    connection = asked()
-    noise = b"WARNING 0xC: TWR message is firing an interrupt when it shouldn't be.\r\nR01|7\r\nS06|\x02\x00hi\r\n"
-    events, outcome = connection.receive(noise, 0.001)
-    assert len(events) == 3
-    assert outcome is None
-    assert connection.receive(REPORT, 0.003)[1].reply is not None
 
 
 def test_a_line_of_failure_does_not_end_a_command_that_cannot_fail():
@@ -115,43 +96,7 @@ def test_a_line_of_failure_does_not_end_a_command_that_cannot_fail():
     assert connection.receive(b"R01|4\r\nR01|5\r\n", 0.002)[1].reply == m.IdReport(4)
 
 
-def test_time_runs_out_once_and_leaves_a_doubt_that_a_fence_settles():
-    connection = asked()
-    connection.receive(b"junk", 0.01)
-    assert connection.receive(b"", 0.1499)[1] is None
-    outcome = connection.receive(b"", 0.15)[1]
-    assert isinstance(outcome.error, NoAnswerError)
-    assert "b'C05|2|0|1|0\\r'" in str(outcome.error)
-    assert "'junk'" in str(outcome.error)
-    assert connection.doubtful
-    connection.send(FENCE, 0.2)
-    # The late reply comes before the fence's and is nobody's.
-    events, outcome = connection.receive(b"\r\n" + REPORT + b"R00\r\n", 0.21)
-    assert outcome.reply == m.IdleSet()
-    assert any(isinstance(e, m.RangeReport) for e in events)
-    assert not connection.doubtful
-
-
 CIR = encode(m.Cir(1, 2, 747_015, tuple(range(1016))))
-
-
-def test_a_command_is_waited_for_150_ms_and_a_fence_in_doubt_a_second():
-    connection = Connection("port")
-    assert (connection.busy, connection.deadline_s()) == (False, None)
-    connection.send(FENCE, 5.0)
-    assert (connection.busy, connection.deadline_s()) == (True, 5.0 + ANSWER_S)
-    assert connection.receive(b"", 5.0 + ANSWER_S - 1e-9)[1] is None
-    assert connection.receive(b"", 5.0 + ANSWER_S)[1].reply is None
-    assert connection.doubtful
-    assert connection.receive(b"", 9.0)[1] is None
-    connection.send(FENCE, 10.0)
-    assert connection.deadline_s() == 10.0 + PATIENT_S
-    silent = connection.receive(b"", 11.0)[1]
-    assert "within 1000 ms; heard nothing; " in str(silent.error)
-    assert str(silent.error).endswith("must be unplugged")
-    connection.send(m.GetId(), 12.0)
-    assert connection.deadline_s() == 12.0 + ANSWER_S
-    assert "must be unplugged" not in str(connection.receive(b"", 13.0)[1].error)
 
 
 def test_a_patient_connection_stays_patient():
@@ -184,22 +129,6 @@ def test_only_an_impulse_response_that_was_asked_for_keeps_the_board_quiet():
     # Once it is there, the report of a target may follow within 3 ms.
     with_cir.receive(CIR, 1.028)
     assert (with_cir.ready_s(1.03), with_cir.ready_s(1.04)) == (pytest.approx(0.003), 0.0)
-
-
-def test_an_impulse_response_of_others_is_waited_out_piece_by_piece():
-    connection = Connection("port")
-    connection.receive(CIR[:400], 2.0)
-    assert connection.ready_s(2.0) == pytest.approx(0.005)
-    assert connection.ready_s(2.004) == pytest.approx(0.001)
-    connection.receive(b"", 2.004)
-    assert connection.ready_s(2.004) == pytest.approx(0.001), "nothing came"
-    connection.receive(CIR[400:800], 2.004)
-    assert connection.ready_s(2.004) == pytest.approx(0.005)
-    connection.keep_quiet(2.5)
-    connection.keep_quiet(2.4)  # which does not cut it short
-    assert connection.ready_s(2.4) == pytest.approx(0.1)
-    connection.receive(CIR[800:], 2.41)
-    assert connection.ready_s(2.5) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ import pytest
 import uwblink
 from tests import processes
 from tests.boards import bench_scenario, served
-from tests.processes import run
+from tests.processes import fork
 from uwblink import Listener, RangingPlan, Recording
 from uwblink.boards.listeners import Progress
 from uwblink.boards.ports import SerialPorts, Terminal
@@ -185,8 +185,8 @@ def test_two_recorders_cannot_have_one_file(tmp_path):
     def second():
         with served() as other:
             words = ["uwblink", "record", *other.names.values(), "-o", path, "--pairs", "all", "--duration", "1"]
-            found.extend(run(*words, *force) for force in ((), ("--force",)))
-        found.append(run("uwblink", "import", "csv", "docs/examples/exchanges.csv", "-o", path, "--force"))
+            found.extend(fork(*words, *force) for force in ((), ("--force",)))
+        found.append(fork("uwblink", "import", "csv", "docs/examples/exchanges.csv", "-o", path, "--force"))
 
     ports = VirtualPorts(bench_scenario())
     record(ports.names.values(), path, RangingPlan(), duration_s=2.0, using=ports, listeners=[After(t20=second)])

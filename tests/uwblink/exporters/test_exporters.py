@@ -295,22 +295,6 @@ def test_bags_without_the_extra_are_refused(recording, tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
-def test_pandas_reads_the_tables(recording, tmp_path):
-    held = load(recording)
-    export_recording(recording, tmp_path / "parquet", to="parquet")
-    export_recording(recording, tmp_path / "csv", to="csv")
-    for frame in (
-        pd.read_parquet(tmp_path / "parquet" / "exchanges.parquet"),
-        pd.read_csv(tmp_path / "csv" / "exchanges.csv"),
-    ):
-        for name in ("time_ns", "initiator", "tx1", "rx3", "range_m", "fpp1_dbm"):
-            assert frame[name].tolist() == pytest.approx(getattr(held.exchanges, name).tolist(), rel=1e-15, abs=0)
-        assert frame["fpp2_dbm"].isna().all()
-    poses = pd.read_parquet(tmp_path / "parquet" / "poses.parquet")
-    assert poses["body"].tolist() == held.poses.body.tolist()
-    assert poses[["qx", "qy", "qz", "qw"]].to_numpy().tolist() == held.poses.quaternion.tolist()
-
-
 @pytest.fixture(scope="module")
 def corrected(tmp_path_factory):
     """A flight of three tags, before and after a calibration, and what that says of each range."""

@@ -148,18 +148,3 @@ def test_what_is_no_bag_is_said(tmp_path):
             read_source(tmp_path / name, **more)
     with pytest.raises(ArgumentError, match="takes one file, found 2"):
         read_source([tmp_path / "no.bag"] * 2, importer="bag")
-
-
-def test_an_array_of_distances_is_a_column_an_anchor(tmp_path):
-    distances = np.round(np.random.default_rng(5).uniform(2, 9, (20, 8)), 2).astype(np.float32)
-    distances[:, 5] = 0.0
-
-    def arrays(store, first):
-        for k, row in enumerate(distances):
-            yield WHEN + k, store.types["uwb_msgs/msg/Array"](header(store, WHEN + k, *first), 17, row)
-
-    ros2(tmp_path / "b", {"/uwb": ("uwb_msgs/msg/Array", arrays)})
-    (tmp_path / "m.toml").write_text('missing = [0]\n[columns]\nfrom_id = "tag"\n[wide]\nrange_m = "dis_arr.{to_id}"\n')
-    found = read_source(tmp_path / "b", importer="bag", map_file=tmp_path / "m.toml").exchanges
-    assert found.range_m == pytest.approx(distances[:, [0, 1, 2, 3, 4, 6, 7]].ravel())
-    assert found.target.tolist() == [0, 1, 2, 3, 4, 6, 7] * 20

@@ -1,7 +1,5 @@
 """What a table is taken for, and that the map says so in words that work."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,6 @@ from uwblink.importers.column_map import load_map
 from uwblink.importers.guess import guess_map
 from uwblink.recording.contents import load
 from uwblink.ticks import TICKS_PER_SECOND
-from uwblink.twr import raw_range
 
 POLL = ("poll_tx", "poll_rx", "resp_tx", "resp_rx", "final_tx", "final_rx")
 
@@ -48,17 +45,6 @@ def test_a_guess_reads_the_table_right(tmp_path, names, scale, third):
     same(found, rows)
     assert found.exchanges.fpp1_dbm.tolist() == [row["fpp1"] for row in rows]
     assert found.exchanges.time_ns.tolist() == [round(row["time_s"] * 1e9) for row in rows]
-
-
-def test_messages_ranges_and_units(tmp_path):
-    rows = flights()
-    assert len(guessed(tmp_path, write(tmp_path / "m.csv", as_messages(wrapped(rows)))).exchanges) == len(rows)
-    assert load_map(tmp_path / "map.toml").layout == "messages"
-    plain = [{"t_ms": k, "src": 1, "dst": 2, "dist_mm": 1500 + k, "rssi": -80} for k in range(30)]
-    found = guessed(tmp_path, write(tmp_path / "r.csv", plain))
-    assert found.exchanges.range_m[3] == pytest.approx(1.503)
-    assert found.exchanges.time_ns[3] == 3_000_000
-    assert found.powers["rxp2_dbm"][0] == -80
 
 
 def test_hostile_names_stay_text(tmp_path):
@@ -183,24 +169,6 @@ def test_messages_that_are_counted_from_zero(tmp_path, third):
         ]
 
 
-def test_messages_that_are_words_are_told_by_their_order(tmp_path):
-    rows = flights()
-    lines = as_messages(wrapped(rows))
-    words = [row | {"message": ("poll", "resp", "final")[row["message"] - 1]} for row in lines]
-    found = guessed(tmp_path, write(tmp_path / "m.csv", renamed(words, {"message": "msg"}))).exchanges
-    expected = {row["tx1"] % 2**32: row for row in rows}
-    assert len(found) == len(rows)
-    for k, row in enumerate(expected[int(tx1)] for tx1 in found.tx1):
-        assert [int(getattr(found, n)[k]) for n in HEADER[3:9]] == [row[n] % 2**32 for n in HEADER[3:9]]
-    found = guessed(tmp_path, write(tmp_path / "m.csv", words)).exchanges
-    assert [[int(getattr(found, n)[k]) for n in HEADER[3:9]] for k in range(len(rows))] == [
-        [row[n] % 2**32 for n in HEADER[3:9]] for row in sorted(rows, key=lambda row: row["time_s"])
-    ]
-    other = guess_map(write(tmp_path / "m.csv", [row | {"message": "red"} for row in words]))
-    assert not other.complete
-    assert "# a column of numbers is still needed: message" in other.text
-
-
 @pytest.mark.parametrize(
     ("ids", "todo"),
     [({"src": 1, "dst": 2}, "check it"), ({"src": 1}, "set to_id in it"), ({}, "set from_id and to_id")],
@@ -302,21 +270,6 @@ def test_what_is_not_there_is_said_and_nothing_is_made_up(tmp_path, rows, comple
     assert said in guess.text
 
 
-def test_hanyang_comes_in_whole_and_makes_sense(tmp_path):
-    source = shared("hanyang_sstwr.csv.gz")
-    count = import_recording(
-        source, tmp_path / "h.uwb", map_file=Path(__file__).parents[3] / "docs" / "maps" / "hanyang.toml"
-    )
-    assert count == 9876
-    e = load(tmp_path / "h.uwb").exchanges
-    assert set(e.protocol) == {"ss"}
-    assert np.nanmin(e.truth_m) == 2.0
-    assert np.nanmax(e.truth_m) == 60.0
-    # Uncorrected for skew, the ranges are off by metres, but all by about the same.
-    error = raw_range(e) - e.truth_m
-    assert np.median(np.abs(error - np.median(error))) < 2.0
-
-
 def test_third_stamps_of_the_initiator_in_exchanged_columns_are_not_those_of_the_target(tmp_path):
     """They look so, by a clock whose rate follows the range, and every range would be plausible and wrong."""
     random = np.random.default_rng(4)
@@ -334,17 +287,6 @@ def test_third_stamps_of_the_initiator_in_exchanged_columns_are_not_those_of_the
     ]
     assert 'protocol = "ds"' in guess_map(write(tmp_path / "plain.csv", wrapped(skewed))).text
     assert 'protocol = "ds-alt"' in guess_map(write(tmp_path / "alternative.csv", noisy)).text
-
-
-def test_one_temperature_a_row_is_of_the_initiator(tmp_path):
-    rows = [f"{k / 10},7,{k % 3},{300 + k},{290 + k},{20 + k / 50}" for k in range(60)]
-    text = "\n".join(["time_s,tag,anchor,measured_cm,true_cm,temperature", *rows])
-    (tmp_path / "t.csv").write_text(text)
-    found = guessed(tmp_path, tmp_path / "t.csv")
-    assert found.exchanges.range_m == pytest.approx(3 + np.arange(60) / 100)
-    warm = found.temperature
-    assert set(warm["tag"].tolist()) == {7}
-    assert warm["temperature_c"] == pytest.approx(20 + np.arange(60) / 50)
 
 
 OWN = {"time_s": "time_s", "at_id": "tag", "from_id": "anchor_a", "to_id": "anchor_b", "difference_m": "difference_m"}

@@ -2,7 +2,6 @@
 
 import gzip
 import json
-import random
 import subprocess
 import sys
 import tracemalloc
@@ -13,7 +12,6 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-import uwblink
 from tests import processes
 from tests.uwblink.importers.test_table_forms import as_messages, flights, mapped, read_table, repeated, wrapped, write
 from uwblink.errors import ImportTableError, RecordingError
@@ -178,20 +176,6 @@ def test_an_interrupted_import_leaves_nothing(tmp_path):
 # A table comes in as a whole or a few rows at a time, and what is in memory does not grow with it.
 
 
-SPOILT = ("", "nan", "x", "-1", "7.5", "99999999999999999999")
-
-
-def spoilt(share, **more):
-    """Rows of which some hold what cannot be used, and positions of antennas of which one moves."""
-    chance = random.Random(3)
-    rows = [row | {"from_x_m": k % 5, "from_y_m": 1, "from_z_m": 0, "to_x_m": 3} for k, row in enumerate(flights())]
-    rows = [dict(row) | {"to_y_m": 0, "to_z_m": 2, "rxp1": -80.5, **more} for row in wrapped(rows)]
-    for row in rows:
-        if chance.random() < share:
-            row[chance.choice(list(row))] = chance.choice(SPOILT)
-    return rows
-
-
 def told(contents):
     columns = [contents.exchanges.to_dict(), contents.poses.to_dict(), contents.powers]
     listed = [{name: np.asarray(column).tolist() for name, column in part.items()} for part in columns]
@@ -201,22 +185,6 @@ def told(contents):
 def few_at_once(monkeypatch, count=20):
     monkeypatch.setattr(staging, "ROWS_PER_BLOCK", count)
     monkeypatch.setattr(staging, "FAULTS_AT_ONCE", 5)
-
-
-@pytest.mark.parametrize("more", [{}, {"from_id": "a tag"}], ids=["numbers", "words"])
-def test_a_table_is_the_same_a_few_rows_at_a_time(tmp_path, monkeypatch, more):
-    table = write(tmp_path / "t.csv", spoilt(0.2, **more))
-    whole = read_table(table)
-    few_at_once(monkeypatch)
-    assert told(read_table(table)) == told(whole)
-    said = []
-    done = import_file(table, tmp_path / "t.uwb", watch=lambda what, _: said.append(what))
-    assert list(dict.fromkeys(said)) == ["reading", "checking", "writing"]
-    assert (done.counts, done.notes) == (whole.counts(), whole.meta["notes"])
-    written = uwblink.load(tmp_path / "t.uwb")
-    assert written.faults == sorted(whole.faults, key=lambda fault: fault.time_ns)
-    assert len(written.poses) == len(whole.poses) > len(whole.exchanges) / 2
-    np.testing.assert_array_equal(written.exchanges.rx3, whole.exchanges.rx3)
 
 
 def lines_of(layout):

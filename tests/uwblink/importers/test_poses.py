@@ -156,7 +156,12 @@ def test_poses_that_are_there_stay_unless_they_are_to_be_replaced(flight, copied
 
 @pytest.mark.parametrize(
     ("unit", "factor", "offset"),
-    [("mm", 1000.0, "-3.21"), ("cm", 100.0, "auto"), ("ft", 1 / 0.3048, "-3.21"), ("ft", 1 / 0.3048, "auto")],
+    [
+        ("mm", 1000.0, "-3.21"),
+        ("cm", 100.0, "auto"),
+        pytest.param("ft", 1 / 0.3048, "-3.21", marks=pytest.mark.slow),
+        ("ft", 1 / 0.3048, "auto"),
+    ],
 )
 def test_poses_in_other_units_are_refused(flight, copied, tmp_path, unit, factor, offset):
     other = scaled(flight / "p.csv", factor, tmp_path / "p.csv")

@@ -42,30 +42,6 @@ def test_python_knows_it_by_suffix_and_by_name(source, tmp_path):
     np.testing.assert_allclose(load(tmp_path / "a.uwb").exchanges.range_m, 4.690357, rtol=1e-6)
 
 
-def test_the_command_line_has_it(source, tmp_path, monkeypatch, capsys):
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["uwblink", "import", *map(str, words)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        return end.value.code, capsys.readouterr()
-
-    code, said = run("blanks", source, "-o", tmp_path / "c.uwb")
-    assert (code, said.out) == (0, f"{tmp_path / 'c.uwb'}: 2 exchanges\n")
-    code, said = run("--help")
-    assert "blanks" in said.out
-    assert "six numbers a line" in said.out
-    code, said = run("blanks", "--help")
-    assert "What they mean." in said.out
-    code, said = run("blanks", source, "-o", tmp_path / "c.uwb")
-    assert code == 2
-    assert said.err.startswith("error: ")
-    assert said.err.count("\n") == 1
-    source.write_text("1 2 3\n")
-    code, said = run("blanks", source, "-o", tmp_path / "d.uwb")
-    assert (code, said.err) == (2, f"error: {source}: expected six numbers a line\n")
-    assert not (tmp_path / "d.uwb").exists()
-
-
 def test_without_a_map_there_is_no_option_for_one(tmp_path, monkeypatch, capsys):
     register_importer(replace(BLANKS, name="plain", map_help=None))
     try:

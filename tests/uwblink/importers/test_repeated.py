@@ -147,19 +147,3 @@ def test_what_a_map_says_of_antenna_delays_is_not_overruled(tmp_path):
     path = table(tmp_path, undelayed(flights()))
     with pytest.raises(ImportTableError, match="antenna_delays"):
         read_table(path, mapped(tmp_path, f"[antenna_delays]\ntx = {PROGRAMMED}\nrx = {PROGRAMMED}\n"))
-
-
-def test_single_sided_ranges_with_the_carriers_skew(tmp_path):
-    """Clocks 20 ppm apart, of which the skew tells; replies of 3 ms make 9 m of it."""
-    table, reply = [], round(3e-3 * TICKS)
-    for row, skew in zip(flights(), np.random.default_rng(0).normal(20, 1, 60), strict=True):
-        # The initiator's clock counts the reply longer by the skew, which is that of the target's clock beside it.
-        there_and_back = 2 * round(row["truth"] / AIR * TICKS)
-        late = {"tx2": row["rx1"] + reply, "rx2": row["tx1"] + there_and_back + round(reply * (1 + skew * 1e-6))}
-        short = {name: (row | late)[name] % 2**32 for name in HEADER[3:7]}
-        ends = {name: row[name] for name in HEADER[:3]}
-        table.append({**ends, **short, "skew2": skew, "gt_range_m": row["truth"]})
-    path = write(tmp_path / "t.csv", table)
-    found = read_table(path, mapped(tmp_path, 'protocol = "ss-cfo"\n')).exchanges
-    assert set(found.protocol) == {"ss-cfo"}
-    assert found.range_m == pytest.approx(found.truth_m, abs=0.01)

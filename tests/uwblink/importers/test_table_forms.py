@@ -94,30 +94,6 @@ def test_any_delimiter_with_a_byte_order_mark_comments_and_windows_lines(tmp_pat
     same(read_table(path), rows)
 
 
-def test_decimal_comma(tmp_path):
-    rows = flights()
-    write(tmp_path / "t.csv.gz", wrapped(rows), ";", lambda value: str(value).replace(".", ","))
-    found = read_table(tmp_path / "t.csv.gz")
-    same(found, rows)
-    assert found.exchanges.fpp1_dbm.tolist() == [row["fpp1"] for row in rows]
-    assert found.exchanges.time_ns[1] == 10_250_000_000
-
-
-def test_parquet_and_json_lines(tmp_path):
-    rows = flights()
-    write(tmp_path / "t.csv", wrapped(rows))
-    with duckdb.connect() as db:
-        db.read_csv(str(tmp_path / "t.csv")).write_parquet(str(tmp_path / "t.parquet"))
-    same(read_table(tmp_path / "t.parquet"), rows)
-    nested = [{"time_s": r["time_s"], "ids": {"a/b": r["from_id"], "to": r["to_id"]}, "s": r} for r in wrapped(rows)]
-    (tmp_path / "t.jsonl").write_text("\n".join(json.dumps(row) for row in nested) + "\n")
-    names = "\n".join(f'{n} = "s.{n}"' for n in HEADER[3:])
-    found = read_table(
-        tmp_path / "t.jsonl", mapped(tmp_path, f'[columns]\nfrom_id = "ids.a/b"\nto_id = "ids.to"\n{names}\n')
-    )
-    same(found, rows)
-
-
 def test_several_files_are_one_table(tmp_path):
     rows = flights()
     paths = [write(tmp_path / f"{k}.csv", wrapped(rows[k::2])) for k in (0, 1)]
@@ -187,25 +163,6 @@ def test_swapped_columns_are_named(tmp_path):
         read_table(write(tmp_path / "r.csv", reversed_roles))
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".csv.gz", ".jsonl"])
-def test_lines_are_counted_past_empty_ones_and_rows_with_too_many_cells(tmp_path, suffix):
-    rows = wrapped(flights())
-    rows[20]["tx2"] = ""
-    lines = [json.dumps(row) for row in rows]
-    if suffix != ".jsonl":
-        lines = ["\ufeff# a comment", ",".join(HEADER), *(",".join(str(row[n]) for n in HEADER) for row in rows)]
-    expected = 22 if suffix == ".jsonl" else 25
-    lines.insert(10, "")
-    if suffix != ".jsonl":
-        lines[5] += ",7"
-        lines.insert(12, " ")
-    data = "\r\n".join(lines).encode()
-    (tmp_path / f"t{suffix}").write_bytes(gzip.compress(data) if suffix.endswith("gz") else data)
-    details = [fault.detail for fault in read_table(tmp_path / f"t{suffix}").faults]
-    assert f"row {expected}, column 'tx2': found '', expected a whole number" in details
-    assert ("row 6: more cells than the header has" in details) == (suffix != ".jsonl")
-
-
 def test_corrupt_rows_are_faults_with_their_place(tmp_path):
     rows = flights(count=200)
     write(tmp_path / "t.csv", wrapped(rows))
@@ -255,13 +212,6 @@ def test_iso_times_names_and_programmed_delays(tmp_path):
     assert {tag.body for tag in found.tags} >= {"AA:1", "AA:2", "AA:3"}
     # 07:08:10 two hours east of Greenwich; zones are shifts of a time whose fraction DuckDB keeps to microseconds.
     assert abs(int(found.exchanges.time_ns[0]) - 1714972090_000000000) < 1000
-
-
-def test_large_ids_get_numbers(tmp_path):
-    rows = [{**row, "from_id": row["from_id"] + 2**60, "to_id": row["to_id"] + 2**60} for row in wrapped(flights())]
-    found = read_table(write(tmp_path / "t.csv", rows))
-    assert set(found.exchanges.initiator) == {1, 2, 3}
-    assert found.meta["tag_names"]["1"] == str(2**60 + 1)
 
 
 def test_headers_that_two_columns_share_and_nobody_uses(tmp_path):

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -68,26 +67,6 @@ def contents(seed=1):
 def path(tmp_path):
     contents().save(tmp_path / "r.uwb")
     return tmp_path / "r.uwb"
-
-
-@pytest.mark.parametrize("rows", [90, 10_000])
-def test_each_row_is_in_one_piece_and_later_ones_are_in_later_pieces(path, rows):
-    with Recording.open(path) as recording:
-        found = list(pieces(recording, rows))
-        tables = {"poses": recording.poses().time_ns, "imu": recording.columns("imu")["time_ns"]}
-        tables |= {"exchanges": np.sort(recording.exchanges().time_ns)}
-    assert (len(found) == 1) == (rows > 1000)
-    times = [
-        np.concatenate([held.exchanges.time_ns, held.poses.time_ns, held.imu["time_ns"], held.corrected["time_ns"]])
-        for held in found
-    ]
-    ends = [(part.min(), part.max()) for part in times if len(part)]
-    assert all(before[1] < after[0] for before, after in pairwise(ends))
-    np.testing.assert_array_equal(np.concatenate([held.poses.time_ns for held in found]), tables["poses"])
-    np.testing.assert_array_equal(np.concatenate([held.imu["time_ns"] for held in found]), tables["imu"])
-    np.testing.assert_array_equal(np.sort(np.concatenate([h.exchanges.time_ns for h in found])), tables["exchanges"])
-    assert sum(len(held.faults) for held in found) == 50
-    assert sum(len(held.temperature["time_ns"]) + len(held.height["time_ns"]) for held in found) == 600
 
 
 def test_corrections_of_other_exchanges_are_left_out(tmp_path):

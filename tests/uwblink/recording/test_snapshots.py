@@ -37,7 +37,7 @@ class Reader(uwblink.Listener):
         if self.turns == self.at:
             until_s = time.monotonic() + 60.0  # the writer commits every 0.1 s, and on a busy machine later
             while self.found != self.at and time.monotonic() < until_s:
-                shown = processes.succeed("uwblink", "show", "--json", self.path).stdout
+                shown = processes.fork("uwblink", "show", "--json", self.path).stdout
                 self.found = json.loads(shown)["counts"]["exchanges"]
 
 

@@ -322,7 +322,7 @@ def test_what_boards_overhear_is_streamed_with_the_ranges(overheard, tmp_path):
 
 def test_the_command_prints_differences_in_lines_of_their_own(overheard, calibration):
     words = ["uwblink", "stream", overheard, "-c", calibration, "--speed", "inf", "--use", "receptions"]
-    rows = [json.loads(line) for line in processes.call(*words).stdout.splitlines()]
+    rows = [json.loads(line) for line in processes.run(*words).stdout.splitlines()]
     lines = [row for row in rows if "listener" in row]
     assert len(lines) == len(uwblink.load(overheard).overheard["time_ns"])
     assert all("range_m" in row for row in rows if "listener" not in row)

@@ -323,15 +323,6 @@ def test_reports_become_rows_in_their_order_with_the_time_of_their_piece():
         assert getattr(e, name).tolist() == [value] * 5
 
 
-def test_a_single_sided_report_ends_with_its_response():
-    single = b"R05|2|3.8601|2795254324|1672694065|1771014196|2893576102|0|0|-87.6187|-88.0293|-3.5203|3.5054\r\n"
-    for pieces in ((single,), (single[:9], single[9:])):
-        e, _ = columns_of(*pieces)
-        assert e.protocol.tolist() == ["ss"]
-        took_ns = round((2893576102 - 2795254324) / 63.8976)
-        assert e.time_ns.tolist() == [10**9 * (len(pieces) - 1) - took_ns]
-
-
 @pytest.mark.parametrize("place", range(6))
 def test_a_stamp_of_33_bits_in_any_place_is_no_report(place):
     stamps = [b"%d" % (1000 + k) for k in range(6)]

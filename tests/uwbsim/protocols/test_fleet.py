@@ -110,6 +110,6 @@ def test_predict_and_compare_print_the_fleet(tmp_path, monkeypatch):
     processes.refuse("uwbsim", "predict", "--tags", "1", naming=["--tags"])
     with pytest.raises(uwbsim.UwbsimError, match="tags"):
         uwbsim.predict_fleet(uwbsim.State(), 300)
-    done = processes.call("uwbsim", "compare", "broadcast", "-o", tmp_path / "c", "--protocols", "ds", "-n", "1000")
+    done = processes.run("uwbsim", "compare", "broadcast", "-o", tmp_path / "c", "--protocols", "ds", "-n", "1000")
     assert "6 tags" in done.stdout
     assert "A fleet of 6 tags" in (tmp_path / "c" / "compare.html").read_text()

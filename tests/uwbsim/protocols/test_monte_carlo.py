@@ -20,6 +20,7 @@ from uwbsim.scenario.radio import SIGMA, Radio
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 NAMES = list(PROTOCOLS)
+SOME_SLOW = [pytest.param(name, marks=[] if name in ("ss", "ds") else pytest.mark.slow) for name in NAMES]
 
 
 def world(count=16_384, **values):
@@ -40,7 +41,7 @@ def test_without_contention_the_stamps_are_those_of_the_event_loop(name):
     np.testing.assert_array_equal(loop.truth_m, columns.truth_m)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SOME_SLOW)
 def test_means_and_variances_are_those_of_integer_stamps(name):
     settings = [f"ranging.protocol={name}", "ranging.rate_hz=100", "run.duration_s=300", "radio.tx_noise_ps=40"]
     scenario = load(SCENARIOS / "icra2023" / "test1.toml", settings)
@@ -55,9 +56,7 @@ def test_means_and_variances_are_those_of_integer_stamps(name):
     assert exact.var() == pytest.approx(fast.var(), rel=0.06)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in ("ss", "ds") else pytest.mark.slow) for name in NAMES]
-)
+@pytest.mark.parametrize("name", SOME_SLOW)
 @pytest.mark.parametrize(
     "values",
     [

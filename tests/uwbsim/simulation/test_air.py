@@ -175,7 +175,8 @@ def test_an_answer_leaves_at_the_first_grid_point_after_its_latency():
 
 
 @pytest.mark.parametrize(
-    ("plan", "rate_hz", "sync_error_ms"), [("aloha", 40.0, 0.0), ("aloha", 150.0, 0.0), ("tdma", 120.0, 6.0)]
+    ("plan", "rate_hz", "sync_error_ms"),
+    [pytest.param("aloha", 40.0, 0.0, marks=pytest.mark.slow), ("aloha", 150.0, 0.0), ("tdma", 120.0, 6.0)],
 )
 def test_what_is_one_event_ends_as_message_by_message(monkeypatch, plan, rate_hz, sync_error_ms):
     settings = {

@@ -16,7 +16,7 @@ from uwbsim.cli.commands import _print_table, app
 from uwbsim.pages import TWIN_COLUMNS
 from uwbsim.scenario.radio import Radio
 from uwbsim.twins import TWIN_LEVEL
-from uwbsim.twins.flight import TwinFlight, effective_size, lag_one, lasting, some_rows
+from uwbsim.twins.flight import TwinFlight, effective_size, lag_one, some_rows
 from uwbsim.twins.range_errors import fit_range_errors, read_calibration
 from uwbsim.world.radio import reception_bias_s
 
@@ -360,16 +360,6 @@ def test_values_are_worth_what_their_dependence_leaves():
     assert r == pytest.approx(0.8, abs=0.02)
     # Bartlett: the error of the coefficient of such a sequence is sqrt((1 - a^2)/n).
     assert error == pytest.approx(np.sqrt((1 - 0.8**2) / 60_000), rel=0.15)
-
-
-def test_a_life_is_found_below_noise_and_between_uneven_times():
-    rng = np.random.default_rng(9)
-    time_s = np.sort(rng.uniform(0, 2000, 40_000))
-    value = autoregressive(rng.normal(size=len(time_s)), np.exp(-np.diff(time_s, prepend=0.0) / 0.7))
-    noisy = value + rng.normal(0, 1.5, len(value))
-    variance, life_s = lasting(time_s, np.zeros(len(time_s), dtype=np.int64), noisy)
-    assert life_s == pytest.approx(0.7, rel=0.1)
-    assert variance == pytest.approx(1.0, rel=0.1)
 
 
 # Twins of worlds with anchors, antennas of tags, fading, losses in bursts, plans of other kinds and two messages.

@@ -90,19 +90,6 @@ def test_the_noises_of_two_clocks_have_nothing_to_do_with_each_other():
     assert abs(np.corrcoef(*(np.diff(ahead_s(c, time, k)) for k in (0, 1)))[0, 1]) < 0.015
 
 
-def test_the_walk_goes_on_to_its_last_step_and_stands_from_there():
-    c, tenth = clocks(5.0, drift_ppm_per_sqrt_s=0.1), SUBTICKS_PER_SECOND // 10
-    last = 50 + 20 - 1  # two seconds beyond the run: the last exchange may end after it
-    steps = np.arange(last + 30)
-    which = np.zeros(len(steps), dtype=np.int64)
-    rate = c.rate(which, steps * tenth + tenth // 2)
-    assert len(np.unique(rate)) == len(np.unique(rate[: last + 1])) == last + 1, "every step has a rate of its own"
-    assert set(rate[last:]) == {rate[last]}
-    # The clock's reading is the integral of it, across the end, too; before the run it is as at its first step.
-    np.testing.assert_allclose(np.diff(ahead_s(c, steps * tenth, 0)), rate[:-1] * 0.1, atol=2 / SUBTICKS_PER_SECOND)
-    assert c.rate(which[:1], np.array([-5 * tenth]))[0] == rate[0]
-
-
 @pytest.mark.parametrize("span_s", [130e-6, 0.1])
 def test_the_rate_of_a_noisy_clock_is_what_its_reading_gains_over_a_preamble_or_an_exchange(span_s):
     c, span = clocks(white_ppm_sqrt_s=0.01, flicker_ppm=0.01), round(span_s * SUBTICKS_PER_SECOND)
