@@ -70,7 +70,7 @@ def test_a_table_of_poses_is_sent_to_the_command_for_poses(tmp_path):
 def test_recordings_one_after_the_other_in_a_table_are_noted(tmp_path):
     rows = [f"{k % 10 * 3},1,2,3.{k % 10}" for k in range(20)]
     (tmp_path / "t.csv").write_text("\n".join(["time_s,from_id,to_id,range_m", *rows]) + "\n")
-    assert any("by up to 27.0 s; if the clock" in note for note in read_table(tmp_path / "t.csv").meta["notes"])
+    assert any("by up to 27.0 s: if the clock" in note for note in read_table(tmp_path / "t.csv").meta["notes"])
 
 
 def test_hostile_names_stay_text(tmp_path):
