@@ -23,7 +23,7 @@ from uwblink.protocols.table import PROTOCOLS, single_sided
 from uwblink.recording import clock_skews, target_faster_ppm
 from uwblink.recording.summary import failures_by_pair
 from uwblink.ticks import SPEED_OF_LIGHT, TICKS_PER_SECOND
-from uwblink.twr import Exchanges, board_range, intervals, raw_range, without_stamps
+from uwblink.twr import Exchanges, board_range, intervals, names_in, raw_range, without_stamps
 
 PLAUSIBLE_M: Final = 1000.0
 """Longer than any range of a UWB radio."""
@@ -122,13 +122,45 @@ def corrupted(view: RecordingView) -> Iterator[Candidate]:
     """Exchanges that are impossible, or contradict themselves; the other checks do without them."""
     bad = impossible(view)
     count = int(np.count_nonzero(bad))
-    if count < 0.5 * len(bad):
+    yield Candidate(
+        "corrupted exchanges" if count < 0.5 * len(bad) else "impossible stamps",
+        f"{count} of {len(bad)} exchanges have impossible stamps, or stamps that contradict the "
+        "range reported with them or the clocks of their pair; what else is said here is said without them",
+        more_often(count, len(bad), 0.001),
+    )
+
+
+def mixed(view: RecordingView) -> Iterator[Candidate]:
+    """Recordings that host times lay over each other: initiators' stamps go to another time and back, row by row."""
+    e, half_s = view.exchanges, 2.0 ** (view.exchanges.bits - 1) / TICKS_PER_SECOND
+    each = [e[e.initiator == tag] for tag in np.unique(e.initiator[e.tx1 != 0])]
+    away_s = [
+        (np.diff(own.tx1) / TICKS_PER_SECOND - np.diff(own.time_ns) * 1e-9 + half_s) % (2 * half_s) - half_s
+        for own in each
+    ]
+    # USB is late by less than half a second, which 32 bits do not count to.
+    returned = sum(int(np.sum((np.abs(one[1:]) > 0.5) & (np.abs(one[1:] + one[:-1]) < 0.05))) for one in away_s)
+    if returned > max(5, 0.02 * len(e)):
         yield Candidate(
-            "corrupted exchanges",
-            f"{count} of {len(bad)} exchanges have impossible stamps, or stamps that contradict the "
-            "range reported with them or the clocks of their pair; what else is said here is said without them",
-            more_often(count, len(bad), 0.001),
+            "recordings mixed by their times",
+            f"{returned} of {len(e)} exchanges lie in time between two of their initiator that its stamps count as "
+            "next to each other",
         )
+
+
+def rare_poses(view: RecordingView) -> Iterator[Candidate]:
+    """Poses so far apart in time that bodies do not move straight between them."""
+    rare = {
+        body: one.position_m
+        for body in names_in(view.poses.body)
+        if np.ptp((one := view.poses[view.poses.body == body]).time_ns) > 5e7 * len(one) > 5e7 * 2
+    }
+    # Over half of the time a steady acceleration moves a body by a quarter; noise of frequent poses is no motion.
+    off_m = {
+        body: np.median(np.linalg.norm(at[1:-1] - (at[2:] + at[:-2]) / 2, axis=1)) / 4 for body, at in rare.items()
+    }
+    if bent := [f"{body} by {100 * off:.0f} cm" for body, off in off_m.items() if off > 0.02]:
+        yield Candidate("rare poses", f"between two poses bodies leave a straight line: {', '.join(bent)}")
 
 
 def contradicting(view: RecordingView) -> Iterator[Candidate]:

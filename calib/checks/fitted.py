@@ -308,7 +308,7 @@ def sentence_of(finding: FoundOffset) -> str:
         "whose": " or ".join(finding.names),
         "size": f"{100 * abs(finding.offset_m):.1f} cm",
         "way": "long" if finding.offset_m > 0 else "short",
-        "worst": f"delays by up to {1e3 * finding.largest_ns:.0f} ps",
+        "worst": f"delays by up to {max(1e3 * finding.largest_ns, 1):.0f} ps",
         "p": finding.p_value,
         "own": own,
         "others": others,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from heapq import nlargest
 from typing import Any, Final
 
 import numpy as np
@@ -20,7 +19,7 @@ from calib.information import LOOSEST
 from calib.spread import medians, robust_spread
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
-from uwblink.recording.distances import antennas_m, distances_m, find_offset
+from uwblink.recording.distances import antennas_m, distances_m, find_offset, sights
 from uwblink.recording.schema import Poses, Tag
 
 
@@ -55,24 +54,61 @@ def _trials(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]
             seen = Candidate(fault, f"of body {body}: times {length:g}", words={"body": body, "length": length})
             yield seen, view.poses, _with_arms(view.tags, {tag: length * arm for tag, arm in arms.items()})
     if len(view.poses):
-        turned = replace(view.poses, quaternion=view.poses.quaternion[:, [1, 2, 3, 0]])
-        yield Candidate("wxyz quaternion", "of the poses: undone"), turned, view.tags
+        attitude = view.poses.quaternion
+        for fault, mended in (("wxyz", attitude[:, [1, 2, 3, 0]]), ("inverse", attitude * [-1, -1, -1, 1])):
+            turned = replace(view.poses, quaternion=mended)
+            yield Candidate(f"{fault} quaternion", "of the poses: undone"), turned, view.tags
+
+
+def _displacements(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]:
+    """Bodies that move, and tags on them, where their ranges fit best, each with poses and tags as they would be then.
+
+    What is nearer than twice `TOLERANCE_M` may be an antenna whose delay depends on the direction.
+    """
+    if (fit := view.quick_fit) is None:
+        return
+    e, standing = view.exchanges[fit.rows], places_m(view)
+    away_m, ways = sights(view.poses, view.tags, e.initiator, e.target, e.time_ns)
+    arms = {f"tag {tag.tag}": tag for tag in view.tags if tag.body not in standing}
+    ends = {name: np.stack([e.initiator == tag.tag, e.target == tag.tag], axis=1) for name, tag in arms.items()}
+    sides = {name: -away_m[:, None] * np.where(own[..., None], ways, 0.0).sum(axis=1) for name, own in ends.items()}
+    for name, side in (sides | _sides(view, fit, {tag.body for tag in arms.values()})).items():
+        rows, few = side.any(axis=1), np.count_nonzero(side.any(axis=1)) < 200
+        shift = _place(side[rows], fit.error[rows], fit.model.pairs.number[rows], [np.zeros(3)])
+        if (size := float(np.linalg.norm(shift))) > 2 * TOLERANCE_M and not few:
+            own = {arms[name].tag: np.round(arms[name].lever_arm_m + shift, 3)} if name in arms else {}
+            tags = _with_arms(view.tags, own)
+            yield (
+                Candidate(
+                    "wrong lever arm" if own else "body stands elsewhere",
+                    f"with {name} {size:.2f} m away ({', '.join(f'{one:+.2f}' for one in shift)} m)",
+                    words={"name": name, "line": "".join(_line(view, tag) for tag in tags if tag.tag in own)},
+                ),
+                replace(
+                    view.poses,
+                    position_m=view.poses.position_m + np.where(view.poses.body[:, None] == name, shift, 0.0),
+                ),
+                tags,
+            )
 
 
 def _with_arms(tags: list[Tag], arms: dict[int, Floats]) -> list[Tag]:
     """Return all tags, some with other lever arms (3,)."""
-    return [replace(tag, lever_arm_m=tuple(arms.get(tag.tag, tag.lever_arm_m))) for tag in tags]
+    return [replace(tag, lever_arm_m=tuple(np.round(arms.get(tag.tag, tag.lever_arm_m), 4).tolist())) for tag in tags]
 
 
 def geometry(view: RecordingView) -> Iterator[Candidate]:
     """Try every suspected fault of geometry; of those that explain the ranges, the one that does so best."""
-    if view.posed:
-        e, trials = view.exchanges, list(_trials(view))
+    for suspected in (_trials, _displacements) if view.posed else ():
+        e, trials = view.exchanges, list(suspected(view))
         found = [
             _undone(view, seen, distances_m(poses, tags, e.initiator, e.target, e.time_ns), tried=len(trials))
             for seen, poses, tags in trials
         ]
-        yield from nlargest(1, (one for one in found if one.p_value < 1), key=lambda one: one.gain)
+        # Where a simple fault explains the ranges, any place is fitted in vain.
+        if sure := [one for one in found if one.p_value < BUDGET]:
+            yield max(sure, key=lambda one: one.gain)
+            return
 
 
 def _undone(view: RecordingView, seen: Candidate, truth_m: Floats, *, tried: int = 1) -> Candidate:

@@ -174,7 +174,8 @@ def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: 
     typical = float(np.median(np.abs(ranges.raw_m)))
     largest = max(map(abs, delays_ns.values()), default=0.0)
     spread = robust_spread(residuals_m)
-    if largest < REGISTER_NS and spread < max(typical, LOUD_M):
+    # No UWB radio measures a kilometre, and then true distances may be in that unit, too.
+    if largest < REGISTER_NS and spread < max(typical, LOUD_M) and (typical < 1000.0 or spread < LOUD_M):
         return
     ratio = typical / max(float(np.median(np.abs(ranges.truth_m))), 1e-9)
     guess = look_like("ranges", ratio) or "they may be in another unit, or of other tags"

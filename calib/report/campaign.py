@@ -45,10 +45,15 @@ def check_places(output: Path | None, pdf: Path | None, figures: Path | None, *,
     """Check the output files of a report before anything is computed.
 
     Raises what `check_output` and, for a folder of `figures`, `check_folder` raise, and `BadInputError` for a `pdf`
-    that is the `output` and for a folder that holds figures already.
+    that is the `output`, for endings other than .html, .htm and .pdf, and for a folder that holds figures already.
     """
-    for path in filter(None, (output, pdf)):
-        check_output(path, force=force)
+    for name, path, allowed in (("output", output, (".html", ".htm", ".pdf")), ("pdf", pdf, (".pdf",))):
+        if path is not None and path.suffix.lower() not in allowed:
+            raise BadInputError(
+                f"{path}: found {path.suffix or 'no ending'}, expected {' or '.join(allowed)}", parameter=name
+            )
+        if path is not None:
+            check_output(path, force=force)
     if pdf is not None and output is not None and output.resolve() == pdf.resolve():
         raise BadInputError(f"{output} is the page already; give the PDF another name", parameter="pdf")
     if figures is not None:

@@ -124,7 +124,11 @@ def _notes(
         ),
         (perhaps, f"may be reflected, too: {perhaps}; intervals are wider by that"),
         (not found.settled, "the search stopped before it settled: delays and places are not final"),
-        (verdict.free, f"not determined, and left out: {'; '.join(verdict.free)}"),
+        (
+            verdict.free,
+            f"not determined: {'; '.join(verdict.free)}"
+            + f"; left out: tags {', '.join(verdict.named('delay'))}" * bool(verdict.named("delay")),
+        ),
         (
             found.network.curve is not None,
             "a constant of the curve and one of all delays are the same to ranges: what the delays share is known only "

@@ -208,8 +208,13 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
     Raises `ImportTableError` if half of the rows or more are unusable.
     """
     column_map, path = staging.column_map, staging.paths[0]
-    if back := rows_back(staging.rows):
-        notes.append(f"{back} rows are earlier than the row before, and are sorted by time")
+    if (back := rows_back(staging.rows))[0]:
+        # Rows of a log that are out of order are so by less; logs of several files begin anew.
+        more = (
+            f"; times go back by up to {back[1]:.1f} s: if the clock was set back, or recordings stand "
+            "one after the other, import the parts apart"
+        ) * (back[1] > 1 and len(staging.paths) == 1)
+        notes.append(f"{back[0]} rows are earlier than the row before, and are sorted by time{more}")
     layout, protocol = column_map.layout or _layout(staging), column_map.protocol
     if layout == "broadcasts":
         rows, protocol = broadcast_exchanges(staging, faults, notes)

@@ -290,6 +290,8 @@ def _proposal(
         for name in (ALL_IDS if layout == "differences" else IDS)
         if name not in columns
     }
+    if layout == "nothing" and {"qw", "qx", "qy", "qz"} <= {name.lower() for name in names}:
+        raise ImportTableError(f"{path}: holds poses, not ranges; add them to a recording: `uwblink poses`")
     lacking = [name for name in needed if name not in cells or name in words]
     lacking += ["message"] if layout == "messages" and "message" in words & cells.keys() else []
     unplaced = [name for name in POSITIONS if name not in columns]

@@ -357,7 +357,9 @@ def _from_text(path: Path, file: TextIO, body: str | None, stated: ColumnMap) ->
             texts = [cells[k] if k < len(cells) else "" for k in (layout.time, *places)]
             texts[0] = _iso_ns(texts[0]) if layout.iso else texts[0]
             found = [number_in(text) for text in texts]
-            if layout.gaps and (not any(map(math.isfinite, found[1:])) or not any(found[1:])):
+            if ({text.strip().lower() for text in texts[1:]} <= {"", "nan"} and len(cells) == len(layout.names)) or (
+                layout.gaps and (not any(map(math.isfinite, found[1:])) or not any(found[1:]))
+            ):
                 continue
             named = name or (body or cells[layout.body or 0].strip())
             columns = zip((layout.time, *places), texts, found, strict=True)

@@ -313,17 +313,18 @@ def numbers_of(words: Iterable[str]) -> dict[str, int]:
     return {word: int(match[1]) for word, match in matches.items() if match and int(match[1]) <= LARGEST_ID}
 
 
-def rows_back(rows: StagedRows) -> int:
-    """Return how many rows are earlier than the one before."""
+def rows_back(rows: StagedRows) -> tuple[int, float]:
+    """Return how many rows are earlier than the one before, and by how many seconds at most."""
     if not rows.has("time_s"):
-        return 0
-    steps = f"SELECT time_ns < lag(time_ns) OVER () AS back FROM {rows.name} WHERE {rows.condition}"
-    return int(rows.db.execute(f"SELECT count(*) FROM ({steps}) WHERE back").fetchall()[0][0])
+        return 0, 0.0
+    steps = f"SELECT lag(time_ns) OVER () - time_ns AS back FROM {rows.name} WHERE {rows.condition}"
+    count, most_ns = rows.db.execute(f"SELECT count(*), max(back) FROM ({steps}) WHERE back > 0").fetchall()[0]
+    return int(count), (most_ns or 0) * 1e-9
 
 
 def in_time_order(rows: StagedRows) -> StagedRows:
     """Return the rows in order of time, those of one time in their order."""
-    if not rows_back(rows):
+    if not rows_back(rows)[0]:
         return rows
     listed = f"SELECT {', '.join(rows.columns)} FROM {rows.name} WHERE {rows.condition} ORDER BY time_ns, rowid"
     rows.db.execute(f"CREATE TABLE ordered AS {listed}")

@@ -25,13 +25,22 @@ class PoseTrack:
         apart = np.sum(quaternion[:, 1:] * quaternion[:, :-1], axis=0) < 0
         quaternion[:, 1:] *= np.cumprod(np.where(apart, -1.0, 1.0))
         self.columns[:, ~quaternion.any(axis=0)] = np.nan
-        self._time = self.time_ns.astype(np.float64)
+        self._time, self._columns = self.time_ns.astype(np.float64), self.columns
+        if len(order) > 2 and not np.ptp(self.columns[:3], axis=1).max() <= 0.02:
+            # Motion capture that loses a body leaves a gap; in half a second robots change their course.
+            lost = np.flatnonzero((steps := np.diff(self._time)) > max(0.5e9, 10 * np.median(steps))) + 1
+            # A microsecond is more than the last digit of times since 1970.
+            self._time, self._columns = (
+                np.insert(self._time, lost, self._time[lost - 1] + 1000),
+                np.insert(self.columns, lost, np.nan, axis=1),
+            )
 
     def point_m(self, time_ns: Ints, lever_arm_m: Floats) -> Floats:
         """Return where a point of the body is at some times (n,), shape (3, n), NaN outside its poses.
 
         Positions are interpolated linearly, attitudes along the chord of their quaternions; a body with a single pose
-        does not move.
+        does not move. Gaps in the poses of a body that moves, of half a second and ten times their spacing, are
+        outside of them.
         """
         place, attitude, known = self._at(time_ns)
         return np.where(known, place + attitude.apply(lever_arm_m).T, np.nan)
@@ -52,7 +61,7 @@ class PoseTrack:
     def _at(self, time_ns: Ints) -> tuple[Floats, Rotation, Bools]:
         """Return places (3, n) and attitudes at some times (n,), and where they are known (n,)."""
         time, outside = time_ns.astype(np.float64), None if len(self._time) == 1 else np.nan
-        found = np.array([np.interp(time, self._time, column, outside, outside) for column in self.columns])
+        found = np.array([np.interp(time, self._time, column, outside, outside) for column in self._columns])
         known = np.isfinite(found).all(axis=0)
         return found[:3], Rotation.from_quat(np.where(known, found[3:], 1.0).T), known
 
@@ -69,7 +78,7 @@ def tracks_of(poses: Poses) -> Tracks:
 
 
 def poses_around(tracks: Tracks, start_ns: int, end_ns: int) -> Poses:
-    """Return the poses from `start_ns` to `end_ns`, and each body's next ones on either side, in order of time.
+    """Return the poses from `start_ns` to `end_ns`, and each body's next two on either side, in order of time.
 
     In between positions are those of all poses. Of a body that has no poses at these times there are none, of one
     that does not move there is its only one.
@@ -80,7 +89,7 @@ def poses_around(tracks: Tracks, start_ns: int, end_ns: int) -> Poses:
         low = max(int(np.searchsorted(time, start_ns, side="right")) - 1, 0)
         high = int(np.searchsorted(time, end_ns, side="left")) + 1
         if len(time) == 1 or (time[0] <= end_ns and time[-1] >= start_ns):
-            some = slice(low, high)
+            some = slice(max(low - 1, 0), high + 1)
             parts.append(Poses(time[some], np.full(len(time[some]), body), columns[some, :3], columns[some, 3:]))
     return Poses.concatenate(parts).in_time_order()
 

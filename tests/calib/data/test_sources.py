@@ -279,11 +279,15 @@ def test_a_frame_with_plain_names_needs_no_map_and_says_what_it_assumed():
             BadInputError,
             r"data frame: state to_id in `map`.*\n(.*\n)*.*\[columns\]",
         ),
-        (lambda _: calib.fit(pd.DataFrame({"a": [1.0], "b": [2.0]})), BadInputError, "no column whose name is known"),
+        (
+            lambda _: calib.fit(pd.DataFrame({"a": [1.0], "b": [2.0]})),
+            BadInputError,
+            "^data frame: no column whose name",
+        ),
         (
             lambda _: calib.Ranges.from_dataframe(frame(), {"columns": {"nonsense": "a"}}),
             BadInputError,
-            r"columns\.nonsense",
+            r"^data frame: columns\.nonsense",
         ),
         (
             lambda folder: uwblink.import_recording(folder / "t.csv", folder / "t.uwb", map_file=MAP),
@@ -296,6 +300,21 @@ def test_a_frame_that_does_not_tell_everything_is_refused_with_what_is_missing(t
     with pytest.raises(error, match=said):
         call(tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_ranges_and_true_distances_that_are_both_in_millimetres_are_refused():
+    rng, pair = np.random.default_rng(5), np.array([(1, 2), (1, 3), (2, 3)])[np.arange(N) % 3]
+    truth_mm = rng.uniform(1000, 6000, N)
+    ranges = calib.Ranges.from_arrays(
+        truth_mm + rng.normal(0, 50, N),
+        initiator=pair[:, 0],
+        target=pair[:, 1],
+        truth_m=truth_mm,
+        fpp1_dbm=rng.uniform(-95, -80, N),
+        time_ns=np.arange(N) * 50_000_000,
+    )
+    with pytest.raises(calib.UnanswerableError, match="check the units of the true distances and of the ranges"):
+        calib.fit(ranges)
 
 
 def test_results_become_frames():

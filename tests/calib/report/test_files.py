@@ -217,6 +217,9 @@ def test_one_file_does_not_take_the_place_of_another(folder, tmp_path):
     done = run(folder, "report", "a.uwb", "-o", "same.pdf", "--pdf", "same.pdf", "--loss", "huber", status=2)
     assert "same.pdf" in done.stderr
     assert not (folder / "same.pdf").exists()
+    done = run(folder, "report", "a.uwb", "-o", "report.txt", "--loss", "huber", status=2)
+    assert "report.txt: found .txt, expected .html or .htm or .pdf" in done.stderr
+    assert not (folder / "report.txt").exists()
     with pytest.raises(calib.BadInputError, match=r"a\.pdf"):
         check_places(tmp_path / "a.pdf", tmp_path / "a.pdf", None, force=True)
     pictures = [Picture("same", lambda width: sheet(width)[0], text) for text in ("one", "two")]

@@ -47,6 +47,18 @@ def test_a_guess_reads_the_table_right(tmp_path, names, scale, third):
     assert found.exchanges.time_ns.tolist() == [round(row["time_s"] * 1e9) for row in rows]
 
 
+def test_a_table_of_poses_is_sent_to_the_command_for_poses(tmp_path):
+    (tmp_path / "p.csv").write_text("time_s,body,x,y,z,qx,qy,qz,qw\n0,a,1,2,3,0,0,0,1\n1,a,1,2,3,0,0,0,1\n")
+    with pytest.raises(ImportTableError, match="uwblink poses"):
+        guess_map(tmp_path / "p.csv")
+
+
+def test_recordings_one_after_the_other_in_a_table_are_noted(tmp_path):
+    rows = [f"{k % 10 * 3},1,2,3.{k % 10}" for k in range(20)]
+    (tmp_path / "t.csv").write_text("\n".join(["time_s,from_id,to_id,range_m", *rows]) + "\n")
+    assert any("by up to 27.0 s: if the clock" in note for note in read_table(tmp_path / "t.csv").meta["notes"])
+
+
 def test_hostile_names_stay_text(tmp_path):
     rows = flights()
     name = 'tx1_raw"\n[constants]\nfrom_id = 9 #'

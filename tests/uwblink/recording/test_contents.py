@@ -173,9 +173,9 @@ def test_a_span_of_time_is_cut_out_with_the_poses_that_it_needs():
     assert [(row.time_ns - START) / SECOND for row in part.cirs] == [3, 4]
     assert [(row.time_ns - START) / SECOND for row in part.frames] == [3, 4]
     assert [(row.time_ns - START) / SECOND for row in part.faults] == [3, 4]
-    # From the pose before the span to the one at its end; the mast's only pose says where it always is.
+    # From two poses before the span to two beyond it; the mast's only pose says where it always is.
     drone = part.poses[part.poses.body == "drone"]
-    assert ((drone.time_ns - START) / SECOND).tolist() == [2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0]
+    assert ((drone.time_ns - START) / SECOND).tolist() == [1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5]
     assert np.count_nonzero(part.poses.body == "mast") == 1
     assert part.meta == {"place": "hall", "selected": {"start_s": 2.25, "stop_s": 5}}
     assert len(part.tags) == 3

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwblink.recording.distances import distances_m
+from uwblink.recording.distances import distances_m, poses_around, tracks_of
 from uwblink.recording.schema import Poses, Tag
 
 LEVEL = (0, 0, 0, 1)
@@ -28,3 +28,19 @@ def test_distances_are_those_of_antennas_on_their_way(begin, end, stands, time_n
     tags = [Tag(1, "a", (1.0, 0.0, 0.0)), Tag(2, "b", (0.0, 0.0, 0.0))]
     (found,) = distances_m(poses, tags, np.array([1]), np.array([2]), np.array([time_ns]))
     assert found == pytest.approx(expected, nan_ok=True)
+
+
+@pytest.mark.parametrize(("step_m", "stands"), [(0.1, False), (0.0, True)])
+def test_a_body_that_moves_is_nowhere_where_its_poses_have_a_gap(step_m, stands):
+    seconds = np.r_[0:2:0.1, 5:7:0.1]
+    poses = Poses.from_arrays(
+        [*(seconds * 1e9).astype(int), 0],
+        ["a"] * len(seconds) + ["b"],
+        [*((step_m * k, 0, 0) for k in range(len(seconds))), (0, 4, 0)],
+    )
+    tags, ones = [Tag(1, "a", (0.0, 0.0, 0.0)), Tag(2, "b", (0.0, 0.0, 0.0))], np.ones(4, np.int64)
+    at_ns = np.array([1_500_000_000, 1_950_000_000, 3_000_000_000, 6_000_000_000])
+    for some in (poses, poses_around(tracks_of(poses), 2_500_000_000, 3_500_000_000)):
+        lost = ~np.isfinite(distances_m(some, tags, ones, 2 * ones, at_ns))
+        assert lost[1:3].tolist() == [not stands] * 2
+    assert np.isfinite(distances_m(poses, tags, ones, 2 * ones, at_ns))[[0, 3]].all()
