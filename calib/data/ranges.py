@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -433,8 +432,7 @@ def contents_of_frame(frame: Any, map_source: MapSource | None = None) -> Conten
     try:
         found = read_source(frame, map_file=map_source)
     except (ImportTableError, ArgumentError) as error:
-        # A frame is read from a file, whose place says nothing.
-        raise BadInputError(re.sub(r"\S*[/\\](data frame)\.\w+", r"\1", str(error))) from error
+        raise BadInputError(str(error)) from error
     for note in found.meta.get("notes", ()):
         warnings.warn(note, stacklevel=3)
     return found

@@ -10,7 +10,8 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -243,8 +244,8 @@ def import_file(
     """
     check_output(Path(output), force=force, recording=True)
     if is_frame(source):
-        with TemporaryDirectory(prefix="uwblink-") as folder:
-            table = _write_frame(source, Path(folder))
+        with _folder("data frame") as folder:
+            table = _write_frame(source, folder)
             map_file = _map_of_frame(table, map_file)
             return import_file(table, output, importer="csv", map_file=map_file, force=force, watch=watch)
     if isinstance(map_file, Mapping):
@@ -252,17 +253,12 @@ def import_file(
             "found a mapping, which goes with a data frame; give the path of a file", parameter="map_file"
         )
     sources, row, explained = _choose(source, importer, map_file)
-    with IMPORTERS.calling(row.name, ImportTableError), TemporaryDirectory(prefix="uwblink-") as folder:
+    with IMPORTERS.calling(row.name, ImportTableError), _folder(", ".join(map(str, sources))) as folder:
         if row.tables is not None:
             watch("reading", 0.0)
-            paths, column_map = row.tables(sources, explained, Path(folder))
+            paths, column_map = row.tables(sources, explained, folder)
             meta = {"source": f"import {row.name}", "imported_from": ", ".join(path.name for path in sources)}
-            try:
-                return import_tables(paths, column_map, Path(output), meta, watch, force=force)
-            except ImportTableError as error:
-                named = ", ".join(map(str, sources))  # in place of what was written for the import
-                error.args = (re.sub(rf"{re.escape(folder)}[^:]*", lambda _: named, str(error)),)
-                raise
+            return import_tables(paths, column_map, Path(output), meta, watch, force=force)
         read: Any = row.read
         contents = read(sources[0], explained)
         if not isinstance(contents, Contents):
@@ -280,6 +276,17 @@ def read_source(source: Source | Any, *, importer: str | None = None, map_file: 
         output = Path(folder) / "imported.uwb"
         import_file(source, output, importer=importer, map_file=map_file)
         return load(output)
+
+
+@contextmanager
+def _folder(named: str) -> Iterator[Path]:
+    """Return a folder for what an import writes for itself; errors have a name instead of its files."""
+    with TemporaryDirectory(prefix="uwblink-") as folder:
+        try:
+            yield Path(folder)
+        except ImportTableError as error:
+            error.args = (re.sub(rf"{re.escape(folder)}[^:]*", lambda _: named, str(error)),)
+            raise
 
 
 def _choose(
@@ -306,7 +313,7 @@ def _choose(
 
 def _write_frame(frame: Any, folder: Path) -> Path:
     """Write a data frame as Parquet into a folder, named indices as columns; raises `ImportTableError`."""
-    path = folder / "data frame.parquet"  # what messages and recordings call it
+    path = folder / "data frame.parquet"  # what recordings call it
     if any(name is not None for name in getattr(getattr(frame, "index", None), "names", [])):
         frame = frame.reset_index()
     with (

@@ -79,38 +79,6 @@ def poses_times(many):
     return lambda f, _: replace(f, poses=replace(f.poses, position_m=f.poses.position_m * many))
 
 
-def inverse_attitudes(flight, _):
-    return replace(flight, poses=replace(flight.poses, quaternion=flight.poses.quaternion * [-1, -1, -1, 1]))
-
-
-def turned_arm(flight, _):
-    """Plant a lever arm of one of two tags of a body with the wrong sign."""
-    one = flight.tags[2]
-    tags = [replace(tag, lever_arm_m=tuple(-x for x in tag.lever_arm_m)) if tag is one else tag for tag in flight.tags]
-    return replace(flight, tags=tags)
-
-
-def other_origin(flight, _):
-    """Plant poses of a body from another origin, 0.4 m away."""
-    mine = flight.poses.body == flight.tags[2].body
-    position_m = flight.poses.position_m + np.where(mine[:, None], [0.4, 0.0, 0.0], 0.0)
-    return replace(flight, poses=replace(flight.poses, position_m=position_m))
-
-
-def clock_set_back(flight, _):
-    """Plant a host's clock that is set back by 7 s in the middle, and the sorting by its times."""
-    e, at_ns = flight.exchanges, int(np.median(flight.exchanges.time_ns))
-    told_ns = np.where(e.time_ns > at_ns, e.time_ns - 7 * 10**9, e.time_ns)
-    return replace(flight, exchanges=replace(e, time_ns=told_ns)[np.argsort(told_ns, kind="stable")])
-
-
-def rare_poses(flight, _):
-    bodies = np.unique(flight.poses.body)
-    kept = [np.flatnonzero(flight.poses.body == body) for body in bodies]
-    every = [rows[:: round(2e9 / np.median(np.diff(flight.poses.time_ns[rows])))] for rows in kept]
-    return replace(flight, poses=flight.poses[np.sort(np.concatenate(every))])
-
-
 def late_poses(by_ns):
     return lambda f, _: replace(f, poses=replace(f.poses, time_ns=f.poses.time_ns + by_ns))
 
@@ -160,11 +128,11 @@ UNREAD = "single-sided without carrier readings"
         (SHORT, planted.turned_arms, "lever arm sign", "drone3"),
         (SHORT, planted.arms_in_mm, "lever arm unit", "0.001"),
         (SHORT, planted.wxyz, "wxyz quaternion", ""),
-        (SHORT, inverse_attitudes, "inverse quaternion", "signs of x y z"),
-        (SHORT, turned_arm, "wrong lever arm", "lever_arm_m"),
-        (replace(SHORT, seconds=120), other_origin, "body stands elsewhere", r"\(-0\.(3|4)"),
-        (replace(SHORT, bits=40), clock_set_back, "recordings mixed by their times", ""),
-        (SHORT, rare_poses, "rare poses", "drone1 by"),
+        (SHORT, planted.inverse_attitudes, "inverse quaternion", "signs of x y z"),
+        (SHORT, planted.turned_arm, "wrong lever arm", "lever_arm_m"),
+        (replace(SHORT, seconds=120), planted.other_origin, "body stands elsewhere", r"0\.7\d m away \(-0\.0\d, -0\.7"),
+        (replace(SHORT, bits=40), planted.clock_set_back, "recordings mixed by their times", ""),
+        (SHORT, planted.rare_poses, "rare poses", "drone1 by"),
         (SHORT, columns(lambda e: {"rx2": e.rx2 // 10**7 * 10**7}), "impossible stamps", "of 3200"),
         (SHORT, late_poses(400_000_000), "pose time offset", "--offset -0.4|--offset -0.39"),
         (BRIEF, late_poses(LATE_NS), "no true distances", ""),

@@ -19,7 +19,7 @@ from calib.data.clocks import clocks_apart
 from calib.data.samples import DELAYS_NS, sample_flight
 from calib.data.sources import load_flight, load_ranges
 from uwblink import Contents, Poses, Recording
-from uwblink.errors import ArgumentError, RecordingError
+from uwblink.errors import ArgumentError, ImportTableError, RecordingError
 from uwblink.recording.contents import exchanges_with_poses
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 
@@ -287,6 +287,11 @@ def test_a_frame_with_plain_names_needs_no_map_and_says_what_it_assumed():
         (
             lambda _: calib.Ranges.from_dataframe(frame(), {"columns": {"nonsense": "a"}}),
             BadInputError,
+            r"^data frame: columns\.nonsense",
+        ),
+        (
+            lambda folder: uwblink.import_recording(frame(), folder / "t.uwb", map_file={"columns": {"nonsense": "a"}}),
+            ImportTableError,
             r"^data frame: columns\.nonsense",
         ),
         (
