@@ -73,7 +73,8 @@ def refused(seeds, folder, line, naming, text="", status=2, **names):
     """Run a line in a folder in which nothing may change but the row's own file, which is written before."""
     names |= {path.name.replace(".", "_"): path for path in seeds.iterdir()} | {"here": folder, "long": "a" * 5000}
     words = [word.format(**names, bench=BENCH, no=NO_UTF8) if "{" in word else word for word in line.split()]
-    (folder / "mine").write_text("mine")
+    for name in ("mine", "mine.html", "mine.pdf"):
+        (folder / name).write_text("mine")
     for own in {word for word in words if word.startswith("own.")}:
         (folder / own).write_text(text)
     before = listed(folder), listed(seeds)
@@ -135,8 +136,8 @@ WORDS = [
     ("uwblink import guess {wide_csv}", ["wide.csv", "UTF-16", "UTF-8"]),
     ("uwblink import csv {wide_csv} --map {log_toml} -o o.uwb", ["wide.csv", "UTF-16", "UTF-8"]),
     ("calib apply {f_uwb} -c {c_json} -o mine", ["mine", "--force"]),
-    ("calib evaluate {f_uwb} -c {c_json} --report mine", ["mine", "--force"]),
-    ("calib report {f_uwb} -o r.html --pdf mine", ["mine", "--force"]),
+    ("calib evaluate {f_uwb} -c {c_json} --report mine.html", ["mine.html", "--force"]),
+    ("calib report {f_uwb} -o r.html --pdf mine.pdf", ["mine.pdf", "--force"]),
     ("calib report {f_uwb} -o r.html --figures mine", ["mine", "is a file"]),
     ("calib report {f_uwb} -o r.html --figures no/figures", ["no", "does not exist"]),
     ("calib report {f_uwb} -o r.html --loss mixture --sequential", ["--sequential"]),
