@@ -143,8 +143,7 @@ def mixed(view: RecordingView) -> Iterator[Candidate]:
     if returned > max(5, 0.02 * len(e)):
         yield Candidate(
             "recordings mixed by their times",
-            f"{returned} of {len(e)} exchanges lie in time between two of their initiator that its stamps count as "
-            "next to each other",
+            f"in time order, stamps of initiators jump to another time and back at {returned} of {len(e)} exchanges",
         )
 
 

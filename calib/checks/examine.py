@@ -126,7 +126,7 @@ CHECKS: Final = (
         {
             "corrupted exchanges": "a robust fit leaves them out; check cables and USB load, and decode the recording "
             "again if it has bytes",
-            "impossible stamps": "see whether their columns are in the right order, with all digits, and of this "
+            "impossible stamps": "check that their columns are in the right order, with all digits, and of this "
             "protocol; import again",
         },
         columns.corrupted,
@@ -135,8 +135,8 @@ CHECKS: Final = (
         "rows",
         "Do initiators' stamps of 40 bits follow the times?",
         "share of rows between two that stamps count as neighbours, above 2 %", CERTAIN,
-        {"recordings mixed by their times": "import recordings with overlapping times, or parts before and after a "
-         "clock was set, apart"},
+        {"recordings mixed by their times": "import each recording, or the parts before and after the clock was set, "
+         "separately"},
         columns.mixed,
     ),
     Check(
@@ -200,7 +200,7 @@ CHECKS: Final = (
             "wxyz quaternion": "quaternions are w x y z: reorder the columns to x y z w",
             "inverse quaternion": "quaternions turn the world into the body: change the signs of x y z",
             "wrong lever arm": "measure the lever arm of {name}, in the frame of its body; these ranges give{line}",
-            "body stands elsewhere": "see to the frame and the origin of the poses of {name}, and of the others",
+            "body stands elsewhere": "check the frame and the origin of the poses of {name} and of the others",
         },
         geometry.geometry,
     ),
@@ -450,7 +450,7 @@ def _examined(view: RecordingView) -> tuple[list[Finding], RecordingView | None]
             return misread, None
     findings = _run("rows", view)
     bad = columns.impossible(view)
-    # What a few possible rows of many say is chance.
+    # The rest may be possible by chance.
     if bad.mean() >= 0.5:
         return findings, None
     view = view.chosen(~bad)

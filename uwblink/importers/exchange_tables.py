@@ -209,10 +209,10 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
     """
     column_map, path = staging.column_map, staging.paths[0]
     if (back := rows_back(staging.rows))[0]:
-        # Rows of a log that are out of order are so by less; logs of several files begin anew.
+        # Rows of one log are out of order by less; each of several files begins anew.
         more = (
-            f"; times go back by up to {back[1]:.1f} s: if the clock was set back, or recordings stand "
-            "one after the other, import the parts apart"
+            f"; times go back by up to {back[1]:.1f} s: if the clock was set back, or the table has several "
+            "recordings, import the parts separately"
         ) * (back[1] > 1 and len(staging.paths) == 1)
         notes.append(f"{back[0]} rows are earlier than the row before, and are sorted by time{more}")
     layout, protocol = column_map.layout or _layout(staging), column_map.protocol
