@@ -139,11 +139,16 @@ def mixed(view: RecordingView) -> Iterator[Candidate]:
         for own in each
     ]
     # USB is late by less than half a second, which 32 bits do not count to.
-    returned = sum(int(np.sum((np.abs(one[1:]) > 0.5) & (np.abs(one[1:] + one[:-1]) < 0.05))) for one in away_s)
-    if returned > max(5, 0.02 * len(e)):
+    returns = [one[1:][(np.abs(one[1:]) > 0.5) & (np.abs(one[1:] + one[:-1]) < 0.05)] for one in away_s]
+    jumps_s = np.abs(np.concatenate([*returns, np.zeros(0)]))
+    if len(jumps_s):
+        # Damaged stamps jump by any time, those of another recording by the same.
+        same = int(np.count_nonzero(np.abs(jumps_s - np.median(jumps_s)) < 0.1))
         yield Candidate(
             "recordings mixed by their times",
-            f"in time order, stamps of initiators jump to another time and back at {returned} of {len(e)} exchanges",
+            f"in time order, stamps of initiators jump by {np.median(jumps_s):.1f} s and back at {same} of {len(e)} "
+            "exchanges",
+            more_often(same - 1, len(jumps_s) - 1, 0.2 / half_s),
         )
 
 

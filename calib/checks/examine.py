@@ -134,7 +134,7 @@ CHECKS: Final = (
     Check(
         "rows",
         "Do initiators' stamps of 40 bits follow the times?",
-        "share of rows between two that stamps count as neighbours, above 2 %", CERTAIN,
+        "count of jumps by one time among those to another time and back", "binomial",
         {"recordings mixed by their times": "import each recording, or the parts before and after the clock was set, "
          "separately"},
         columns.mixed,

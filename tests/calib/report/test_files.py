@@ -97,12 +97,12 @@ def campaign(folder):
 def test_ranges_alone_are_fitted_and_judged(campaign, tmp_path):
     assert (campaign.findings, campaign.tracks) == ([], [])
     assert (len(campaign.training[0]), campaign.evaluation.overall.full.n) == (900, 270)
-    (tmp_path / "mine.html").write_text("mine")
+    (tmp_path / "mine.pdf").write_text("mine")
     with pytest.raises(FileExistsError):
-        campaign.write(tmp_path / "r.html", tmp_path / "mine.html")
+        campaign.write(tmp_path / "r.html", tmp_path / "mine.pdf")
     with pytest.raises(UwblinkError, match="is a file"):
-        campaign.write(tmp_path / "r.html", figures=tmp_path / "mine.html")
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.html"]
+        campaign.write(tmp_path / "r.html", figures=tmp_path / "mine.pdf")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.pdf"]
 
 
 def test_without_tests_errors_are_those_of_ranges_that_were_held_out(campaign, folder, tmp_path, sections):
