@@ -84,13 +84,11 @@ class Mixture:
     """Direct, reflected or an outlier (`calib.range_errors.densities`): the likelihood of ranges.
 
     With `expected` what a residual tells is what the model says on average (Fisher's information), not the square of
-    its slope: where few ranges determine an unknown, such as a place on a path, their squares are too unsteady. `used`
-    is the share of the ranges that such unknowns use up: noise is estimated as larger by it (restricted likelihood).
-    With `restricted` each range counts what unknowns use up of it (`RangeRows.with_uncertainty`).
+    its slope: where few ranges determine an unknown, such as a place on a path, their squares are too unsteady. With
+    `restricted` noise is estimated by a restricted likelihood (`RangeRows.with_uncertainty`).
     """
 
     expected: bool = False
-    used: float = 0.0
     restricted: bool = False
     dispersion: float = 1.0
     parameters: tuple[str, ...] = OF_ERRORS
@@ -98,9 +96,6 @@ class Mixture:
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
         """Return log densities (n,) and slopes by each parameter (n,)."""
         found = error_slopes(values[RESIDUAL], values)
-        if self.used:
-            more = found.by | {"noise": found.by["noise"] + self.used}
-            found = replace(found, log_density=found.log_density + self.used * values["noise"], by=more)
         if not self.expected:
             return found.log_density, found.by, None
         typical = {name: np.atleast_1d(np.median(values[name])) for name in self.parameters}

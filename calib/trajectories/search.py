@@ -15,6 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from calib.estimator.grouped_errors import NOISE_M, NOISE_WORTH
+from calib.estimator.inverse import diagonal_of
 from calib.estimator.losses import LOSSES
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import RangeModel
@@ -166,6 +167,14 @@ class Search:
             scale = float(np.sqrt((free * spread**2 + NOISE_WORTH * NOISE_M**2) / (free + NOISE_WORTH)))
         self.update_sensor_errors()
 
+    def _restrict(self) -> None:
+        """Make the likelihood of noise a restricted one: residuals have variances of the mean leverage of all ranges.
+
+        The leverage of a single range is known to some 14 % (`diagonal_of`).
+        """
+        noise = self.rows.values(self.x, ("noise",))["noise"][self.rows.order]
+        self.rows = replace(self.rows, unsure_m2=np.mean(self.leverage) * np.exp(2 * noise))
+
     def residuals(self) -> Floats:
         """Return the residuals of the ranges (n,), divided by the root of 1 - leverage."""
         return np.asarray(self.rows.residuals(self.x) / np.sqrt(1 - self.leverage))
@@ -236,8 +245,10 @@ class Search:
         # The parameters of errors are unknowns as well: the covariance contains them.
         self.build(errors, unknowns, parts)
         if not few:
-            self.optimize(replace(mixture, used=float(np.mean(self.leverage))), tolerance=0.03, steps=20)
-        found = self.optimize(replace(errors, used=float(np.mean(self.leverage))), tolerance=np.inf)
+            self._restrict()
+            self.optimize(mixture, tolerance=0.03, steps=20)
+        self._restrict()
+        found = self.optimize(errors, tolerance=np.inf)
         self.optimum = replace(found, success=settled)
 
     def missed_motion_m(self) -> float:
@@ -299,8 +310,6 @@ def leverages(rows: RangeRows, found: Optimum) -> Floats:
         # The information of a residual is at most that of normal errors (Stam 1959).
         weight = np.minimum(weight, np.exp(-2 * values["noise"][rows.order]))
     reach = sparse.csr_matrix(sparse.diags_array(np.sqrt(weight)) @ sparse.vstack([matrix for matrix, _ in parts]))
-    # 48 random vectors are exact to about 10 % (Hutchinson 1990; Bekas, Kokiopoulou and Saad 2007).
-    probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(rows), 48))
     shares = np.empty(len(rows))
-    shares[rows.order] = np.mean(probes * (reach @ (found.covariance @ (reach.T @ probes))), axis=1)
+    shares[rows.order] = diagonal_of(reach, found.covariance)
     return np.clip(shares, 0.0, MAX_LEVERAGE)

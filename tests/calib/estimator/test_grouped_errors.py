@@ -95,10 +95,13 @@ def test_noise_is_that_of_restricted_likelihood_however_many_offsets_there_are(s
     assert joint < best - 0.03
 
 
-def test_noise_is_larger_by_the_share_that_other_unknowns_use_up(drawn):
+def test_noise_is_larger_by_what_other_unknowns_use_up(drawn):
     layout, rows = drawn
+    noise = rows.values(layout.start(), ("noise",))["noise"]
     plain, used = (
-        sum_rows([replace(rows, errors=Mixture(used=share))], layout.start()).gradient[layout.where["noise"].start]
+        sum_rows([replace(rows, unsure_m2=share * np.exp(2 * noise))], layout.start()).gradient[
+            layout.where["noise"].start
+        ]
         for share in (0.0, 0.1)
     )
     assert used - plain == pytest.approx(0.1 * len(rows))
