@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from traceback import walk_stack
 
 
 class OfParameter(Exception):  # noqa: N818 - the base of the bases
@@ -32,6 +35,14 @@ class ArgumentError(UwblinkError, ValueError):
 
 class PlainWarning(UserWarning):
     """Base of the warnings of all three packages, which commands print as a line."""
+
+
+def warn(text: str, category: type[Warning] = UserWarning) -> None:
+    """Give a warning at the line that called one of the three packages, through context managers, too."""
+    own = {"uwblink", "calib", "uwbsim", "contextlib"}
+    names = (str(frame.f_globals.get("__name__")).partition(".")[0] for frame, _ in walk_stack(sys._getframe()))
+    level = next((k for k, name in enumerate(names, 1) if name not in own), 1)
+    warnings.warn(text, category, stacklevel=level)
 
 
 class PluginWarning(PlainWarning):

@@ -11,12 +11,11 @@ my-protocol = "my_package.ranging:MY_PROTOCOL"
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Final, Generic, Protocol, TypeVar
 
-from uwblink.errors import ArgumentError, PluginWarning, UwblinkError
+from uwblink.errors import ArgumentError, PluginWarning, UwblinkError, warn
 
 NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9-]{0,40}")
 """Names of rows, which are typed on command lines and stored in files."""
@@ -136,10 +135,9 @@ class Registry(Mapping[str, Row], Generic[Row]):
                     self.register(row)
             except Exception as error:  # a plug-in must not stop the project
                 origin = entry.dist.name if entry.dist else "an unnamed distribution"
-                warnings.warn(
+                warn(
                     f"plug-in {entry.name!r} of {origin} (group {self._group}) is left out: {_line(error)}",
                     PluginWarning,
-                    stacklevel=4,
                 )
 
 

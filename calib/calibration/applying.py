@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple
 
@@ -18,6 +17,7 @@ from calib.errors import BadInputError, LeftOutWarning
 from calib.pairs import pairs_of
 from uwblink.arrays import Bools, ColumnTable, Floats
 from uwblink.display import as_text, excerpt, first_few
+from uwblink.errors import warn
 
 if TYPE_CHECKING:
     from calib.calibration.model import Calibration
@@ -236,7 +236,7 @@ def keep_determined(calibration: Calibration, ranges: Ranges) -> Ranges:
     if good.all() or not good.any():
         return ranges
     text = f"{within_text(calibration, ranges, good)}; {np.count_nonzero(~good)} of {len(good)} ranges are left out"
-    warnings.warn(text, LeftOutWarning, stacklevel=3)
+    warn(text, LeftOutWarning)
     return ranges[good]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,6 +21,7 @@ from calib.data.sources import RecordedSource
 from calib.errors import BadInputError, LeftOutWarning
 from uwblink.arrays import Floats
 from uwblink.corrections import Columns, Correction
+from uwblink.errors import warn
 from uwblink.exporters import check_export, export_recording
 from uwblink.output import check_output
 from uwblink.recording.contents import READING_MB, Contents, exchanges_with_poses
@@ -114,9 +114,9 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
     *applied, lacking = counts.tolist()
     warn_of_directions(lacking, applied[0], Path(source).name)
     if left_out:
-        warnings.warn(f"{why}; {left_out} ranges are left out", LeftOutWarning, stacklevel=3)
+        warn(f"{why}; {left_out} ranges are left out", LeftOutWarning)
     if bare:
-        warnings.warn(f"{bare} differences of arrival without stamps stay as they were", LeftOutWarning, stacklevel=3)
+        warn(f"{bare} differences of arrival without stamps stay as they were", LeftOutWarning)
     return Applied(*applied)
 
 

@@ -4,7 +4,6 @@ an antenna; and on temperature."""
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
@@ -15,6 +14,7 @@ from calib.calibration.document import Celsius, Matrix, Metres, Number, StdM, Ta
 from calib.errors import DirectionWarning, TemperatureWarning
 from uwblink.arrays import Bools, Floats
 from uwblink.display import first_few
+from uwblink.errors import warn
 
 if TYPE_CHECKING:
     from calib.calibration.model import Calibration
@@ -155,11 +155,10 @@ def lack_direction(calibration: Calibration, ranges: Ranges) -> Bools:
 def warn_of_directions(lacking: int, count: int, source: str) -> None:
     """Give a `DirectionWarning` where some of `count` ranges are `lacking` directions that a calibration asks for."""
     if lacking:
-        warnings.warn(
+        warn(
             f"{source}: {100 * lacking / count:.3g} % of the ranges lack the directions that patterns depend on: they "
             "are corrected without these, and their total sigma is larger",
             DirectionWarning,
-            stacklevel=3,
         )
 
 
@@ -176,5 +175,4 @@ def warn_of_temperatures(calibration: Calibration, ranges: Ranges, beyond_k: flo
         if tags := sorted(fitted & {*ends[outside].tolist()}):
             named = first_few(map(str, tags))
             text = f"tags {named} were used more than {beyond_k:.0f} K beyond the {low:.0f} to {high:.0f} °C at which"
-            # From here, and not from the caller's place: Python shows a text once for each place.
-            warnings.warn(f"{text} the calibration was fitted: it extrapolates there", TemperatureWarning, stacklevel=1)
+            warn(f"{text} the calibration was fitted: it extrapolates there", TemperatureWarning)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -20,7 +19,7 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.pairs import pairs_of
 from calib.spread import less_medians, robust_spread
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
-from uwblink.errors import ArgumentError, ImportTableError, raising
+from uwblink.errors import ArgumentError, ImportTableError, raising, warn
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, known_delays
 from uwblink.recording.contents import Contents
@@ -434,7 +433,7 @@ def contents_of_frame(frame: Any, map_source: MapSource | None = None) -> Conten
     except (ImportTableError, ArgumentError) as error:
         raise BadInputError(str(error)) from error
     for note in found.meta.get("notes", ()):
-        warnings.warn(note, stacklevel=3)
+        warn(note)
     return found
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -31,6 +30,7 @@ from calib.data.ranges import (
 from calib.errors import BadInputError, TemperatureWarning, UnanswerableError
 from uwblink.arrays import Floats, is_frame
 from uwblink.display import printable
+from uwblink.errors import warn
 from uwblink.recording.antenna_delays import AntennaDelays, delays_in_meta
 from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
@@ -177,7 +177,8 @@ def each(data: Data | Iterable[Data]) -> list[Data]:
     one: Any = data
     if isinstance(data, str | os.PathLike | Recording | Ranges | Exchanges | Source) or is_frame(data):
         return [one]
-    if not isinstance(data, Iterable):
+    # The names of a mapping are no paths.
+    if not isinstance(data, Iterable) or isinstance(data, Mapping):
         raise _no_recording(data)
     found = list(data)
     if not found:
@@ -342,13 +343,13 @@ def load_flight(
         )
         if len(found) and warm and len(warm["tag"]) and not np.isfinite(found.temperature_c).any():
             text = f"{name}: no reading of a temperature is of a tag that ranges, within 30 s of it: none is used"
-            warnings.warn(text, TemperatureWarning, stacklevel=1)
+            warn(text, TemperatureWarning)
         celsius = found.temperature_c[np.isfinite(found.temperature_c)]
         # Boards in rooms are colder, and 45 °F are 7 °C.
         if len(celsius) and celsius.min() > 45:
             read = f"{name}: temperatures are {celsius.min():.0f} to {celsius.max():.0f} °C"
             text = f"{read}; if they are degrees Fahrenheit, import them again as (F - 32) / 1.8"
-            warnings.warn(text, TemperatureWarning, stacklevel=1)
+            warn(text, TemperatureWarning)
         found = replace(found, features=features_of(exchanges, source))
         heard = getattr(source, "overheard", None)
         if heard and len(heard["time_ns"]):

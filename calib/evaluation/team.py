@@ -8,7 +8,6 @@ error. Several filters run at once, which differ in what they take ranges for, a
 
 from __future__ import annotations
 
-import warnings
 import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -46,6 +45,7 @@ from calib.pairs import pairs_of
 from calib.settings import CheckedSettings
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import first_few, printable
+from uwblink.errors import warn
 from uwblink.recording.distances import tracks_of
 from uwblink.recording.schema import Poses, Tag
 from uwblink.settings import setting
@@ -234,11 +234,10 @@ def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, A
         raise UnanswerableError(f"{name}: the tags of {', '.join(bodies)} do not range with each other")
     single = [one for one, count in Counter(numbers[np.unique(found.ends)].tolist()).items() if count == 1]
     if single:
-        warnings.warn(
+        warn(
             f"{name}: {first_few(bodies[one] for one in single)} has one tag that ranges or listens: without a second, "
             "its heading follows from motion alone, weakly",
             WeakHeadingWarning,
-            stacklevel=3,
         )
     time_ns, body = found.time_ns, numbers[found.ends]
     readings = [inertial_readings(imu, one, int(time_ns[0])) for one in bodies]

@@ -24,6 +24,7 @@ from calib.estimator.covariates import (
     WARMTH,
     Covariate,
 )
+from calib.estimator.inverse import positive_part
 from calib.estimator.known_distances import KnownDistances, fit_known_distances
 from calib.estimator.optimize import Optimum
 from calib.estimator.range_model import OFFSETS
@@ -243,7 +244,8 @@ def log_likelihood(tested: Tested, steps: Floats, variances: Floats, centre: Flo
     which noise makes a part that errors which last multiply; with alternatives of covariance S they have F S F more.
     """
     information, lasting = tested.information, 1 - 1 / max(tested.lasting.factor, 1.0)
-    covariance = information + lasting * tested.covariance
+    # Rounding makes it indefinite where ranges are exact.
+    covariance = positive_part(information + lasting * tested.covariance)
     covariance = covariance + 1e-9 * np.trace(covariance) * np.eye(len(covariance))
     root = np.linalg.cholesky(covariance)
     whitened = np.linalg.solve(root, information @ steps)

@@ -193,3 +193,8 @@ def test_a_delay_that_nothing_determines_is_a_circle_without_an_interval(fitted)
 def test_planted_delays_are_drawn_moved_by_the_common_shift(fitted):
     axes = axes_of(lambda axes: delays(fitted.calibration, {1: 0.1, 2: -0.2, 3: 0.0, 7: 0.3}, 0.05, axes))
     assert labelled(axes, "planted, same gauge").get_ydata() == pytest.approx([0.15, -0.15, 0.05, 0.35])
+
+
+def test_a_dictionary_is_no_list_of_paths():
+    with pytest.raises(calib.BadInputError, match="`data`: found dict, expected a path"):
+        calib.fit({"range_m": [3.1], "initiator": [1], "target": [2]})

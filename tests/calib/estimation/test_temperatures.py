@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pandas
 import pytest
 
 import calib
@@ -301,3 +302,26 @@ def test_degrees_fahrenheit_are_doubted(celsius, doubted):
         warnings.simplefilter("always")
         calib.load_ranges(replace(flight, temperature=readings))
     assert ["Fahrenheit" in str(one.message) for one in caught] == [True] * doubted
+
+
+def test_exact_ranges_of_a_data_frame_with_hot_boards_fit_and_warn_at_the_line_of_the_caller():
+    rng = np.random.default_rng(3)
+    away = rng.uniform(1, 5, 300)
+    first, next_one = rng.integers(0, 3, 300), rng.integers(1, 3, 300)
+    hot = pandas.DataFrame(
+        {
+            "t": 0.1 * np.arange(300),
+            "initiator": first,
+            "target": (first + next_one) % 3,
+            "range": away + 0.1,
+            "true": away,
+            "fpp1": rng.uniform(-95, -80, 300),
+            "fpp2": rng.uniform(-95, -80, 300),
+            "temp": rng.uniform(60, 70, 300),
+        }
+    )
+    with pytest.warns(TemperatureWarning, match="Fahrenheit") as caught:
+        found = calib.fit(hot).calibration
+    assert {one.filename for one in caught} == {__file__}
+    assert list(found.delays_ns.values()) == pytest.approx([-0.1 / 0.299702547] * 3, abs=1e-6)
+    assert not found.temperatures
