@@ -47,7 +47,7 @@ class Kept:
         intervals are those of Student's t with as many degrees of freedom as a pair has ranges beyond one.
         """
         count = len(indices)
-        told = np.eye(count) - (held @ np.linalg.pinv(held) if held.size else 0.0)
+        told = np.eye(count) - (held @ np.linalg.pinv(held) if held.size and count else 0.0)
         apart = told - told.sum(axis=0) / max(count, 1)
         # Clock skews leave some 1e-5 of a difference that ranges of one pair do not determine.
         apart = apart if np.linalg.norm(apart) > 1e-3 else told

@@ -220,6 +220,7 @@ class RangeModel:
         return [
             NormalRows(value=np.zeros(1), std=np.full(1, HELD_NS), entries=one[None], columns=delays)
             for one in self.held.T
+            if delays.size
         ]
 
     def at_reference(self, values: Mapping[str, Floats]) -> dict[str, Floats]:
