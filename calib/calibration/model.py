@@ -200,7 +200,8 @@ class Calibration:
         if self.uncertainty is not None:
             rows = np.flatnonzero(np.isin(tags, self.uncertainty.tags))
             own = [self.uncertainty.tags.index(tag) for tag in tags if tag in self.uncertainty.tags]
-            found[np.ix_(rows, rows)] = np.array(self.uncertainty.delays_ns2)[np.ix_(own, own)]
+            stated = np.reshape(self.uncertainty.delays_ns2, (len(self.uncertainty.tags),) * 2)
+            found[np.ix_(rows, rows)] = stated[np.ix_(own, own)]
         return found
 
     @property
