@@ -207,7 +207,7 @@ def test_the_other_sign_is_noticed_by_poses(folder, words):
         (-1.0, False, "the other sign"),
         (1 / METRES_A_NS, False, "nanoseconds"),
         (100.0, False, "centimetres"),
-        (100.0, True, "longer than their anchors are apart"),
+        (100.0, True, "longer than the distances of their anchors"),
     ],
 )
 def test_another_unit_or_sign_is_found_before_a_fit(folder, factor, blind, words):
@@ -278,7 +278,7 @@ def test_ranges_and_differences_are_used_together_and_fitted_apart(folder):
     when_ns = np.rint(time_s * 1e9).astype(np.int64)
     ranges = uwblink.Exchanges.from_arrays(TAG, 1, time_ns=when_ns, protocol="ss", range_m=truth, **none)
     both = replace(contents, exchanges=ranges)
-    with pytest.raises(calib.CalibError, match="fit each alone"):
+    with pytest.raises(calib.CalibError, match="fit them separately"):
         calib.fit(both, use="receptions", delays_only=True)
     known = replace(
         calib.load_calibration(folder / "fit.json"),

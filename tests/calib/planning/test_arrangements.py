@@ -145,7 +145,7 @@ def test_the_command_prints_steps_and_json():
         (4, {"on": "plane", "anchors": [9]}, "anchors"),
         (4, {"on": "line", "anchors": [1]}, "anchors"),
         (4, {"rate_hz": 0.0}, "rate_hz"),
-        (30, {"on": "plane", "size_m": (0.5, 0.5)}, "find no room"),
+        (30, {"on": "plane", "size_m": (0.5, 0.5)}, "there is no room"),
     ],
 )
 def test_what_cannot_be_planned_is_refused(boards, settings, message):
@@ -205,5 +205,5 @@ def test_a_plan_says_what_reflections_and_a_curve_cost():
     curved = plain.with_curve_ns
     assert curved.each > max(plain.half_ns.values())
     assert curved.each == pytest.approx(math.hypot(curved.apart, curved.common), rel=1e-6)
-    assert f"what all share ± {curved.common:.3f} ns." in str(plain)
+    assert f"common part ± {curved.common:.3f} ns." in str(plain)
     assert reflected.to_dict()["with_curve_ns"]["common"] > plain.to_dict()["with_curve_ns"]["common"]
