@@ -57,7 +57,7 @@ def test_a_plan_that_seats_other_boards_is_refused_before_anything_is_recorded(t
     ports, out = VirtualPorts(bench_scenario()), tmp_path / "a.uwb"
     seats = [Tag(number, "drone", (0.1, 0.0, 0.0)) for number in (20, 10)]
     with pytest.raises(
-        PlanError, match="the plan has places of the tags 10, 20, but the boards at the ports are 1, 2, 3"
+        PlanError, match="the plan has positions of the tags 10, 20, but the boards at the ports are 1, 2, 3"
     ):
         record(ports.names.values(), out, RangingPlan(tags=tuple(seats)), duration_s=0.5, using=ports)
     assert not out.exists()
