@@ -297,8 +297,8 @@ SENTENCES = {
     "of the listeners, or fit with `use` exchanges",
     "path": "{whose}: paths of overheard frames are {size} too {way}, which changes {worst}; check the positions of "
     "both tags",
-    "scale": "ranges grow by {size} too {way} over the recorded distances, which changes {worst}; check scale, unit "
-    "and lever arms of the true distances",
+    "scale": "ranges grow with the distance by {size} too {way} over the recorded distances, which changes {worst}; "
+    "check scale, unit and lever arms of the true distances",
     "late": "ranges change by {size} with the speed at which true distances change (root mean square): the times of "
     "motion capture and ranges differ; check the clocks (`calib doctor` states the difference)",
 }

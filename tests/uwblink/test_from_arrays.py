@@ -26,7 +26,7 @@ def test_ranges_without_stamps_are_those_of_a_table_without_stamps(tmp_path):
         np.testing.assert_array_equal(getattr(mine, name), getattr(table, name), err_msg=name)
     cases: tuple[tuple[dict[str, Any], str], ...] = (({"tx1": [3]}, "rx1"), ({"rx1": [3]}, "tx1"))
     for stamps, missing in cases:
-        with pytest.raises(ArgumentError, match=f"{missing}: is not given"):
+        with pytest.raises(ArgumentError, match=f"{missing}: is missing"):
             Exchanges.from_arrays(1, 2, **stamps, range_m=[3.1])
     with pytest.raises(ArgumentError, match="tx1: is missing; give the stamps, or range_m"):
         Exchanges.from_arrays(1, 2)

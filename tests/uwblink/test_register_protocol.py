@@ -93,7 +93,7 @@ def test_exchanges_of_an_unknown_protocol_are_refused_by_name():
 
 
 def test_names_are_taken_once(registered):
-    with pytest.raises(ArgumentError, match=r"already registered; choose another name, or replace=True"):
+    with pytest.raises(ArgumentError, match=r"already registered; choose another name, or use replace=True"):
         register_protocol(registered)
     register_protocol(replace(registered, title="better"), replace=True)
     assert PROTOCOLS[registered.name].title == "better"

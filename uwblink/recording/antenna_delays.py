@@ -150,7 +150,7 @@ def load_antenna_delays(path: Path) -> dict[int | None, AntennaDelay]:
     file.known(file.table, ("antenna_delays",))
     found = read_antenna_delays(file)
     if not found:
-        raise PlanError(f"{path}: contains no [antenna_delays]; `calib export --to registers` writes this file")
+        raise PlanError(f"{path}: contains no [antenna_delays]; `calib export` writes such a file, for registers")
     return found
 
 

@@ -78,7 +78,7 @@ def test_a_warmer_flight_is_corrected_by_its_readings(tmp_path):
         done = run("calib", "fit", first, "-o", tmp_path / f"{name}.json", "--between", 0, *more)
         assert ("mm/K over temperature" in done.stdout) == (name == "auto")
     without, known = (calib.load_calibration(tmp_path / f"{name}.json") for name in ("none", "auto"))
-    with pytest.warns(TemperatureWarning, match=r"^tags 1, 2, 3, 4 were used more than 5 K beyond the 20 to 3\d °C"):
+    with pytest.warns(TemperatureWarning, match=r"^tags 1, 2, 3, 4 were used more than 5 K outside the 20 to 3\d °C"):
         judged = calib.evaluate(second, known).overall
     assert 0.92 < judged.inside_95 < 0.98
     # At 18 K above the fitted mean ranges are 18 cm too long; the slope's standard error leaves 0.5 cm.
@@ -287,7 +287,7 @@ def test_readings_that_are_of_no_range_are_named(tag, later_s):
     flight = calib.sample_flight()
     readings = {"time_ns": flight.exchanges.time_ns + later_s * 10**9, "tag": np.full(len(flight.exchanges), tag)}
     readings |= {name: np.full(len(flight.exchanges), 25.0) for name in ("temperature_c", "supply_v")}
-    with pytest.warns(TemperatureWarning, match="memory: no reading .* none is used"):
+    with pytest.warns(TemperatureWarning, match="memory: no temperatures .* not used"):
         calib.load_ranges(replace(flight, temperature=readings))
 
 

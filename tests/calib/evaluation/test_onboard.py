@@ -284,7 +284,7 @@ FEW = [f"anchor{k}" for k in range(4)]
             lambda flown: {"poses": flown.poses[np.flatnonzero(~np.isin(flown.poses.body, FEW))]},
             {},
             UnanswerableError,
-            "2 tags stay in one place",
+            "by its poses 2 tags stand still",
         ),
         (lambda _: {}, {"model": "magic"}, BadInputError, "`model`: found 'magic', allowed: imu, constant-velocity"),
         (lambda _: {}, {"start_m": (0.0, np.nan, 1.0)}, BadInputError, "`start_m`"),

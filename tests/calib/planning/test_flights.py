@@ -163,9 +163,9 @@ def test_a_tape_between_robots_that_stand_says_what_all_delays_share():
     free, taped = calib.plan_flight(2, **given), calib.plan_flight(2, taped=1, **given)
     assert free.common_ns > 0.7
     assert taped.common_ns < 0.3 * free.common_ns
-    said = next(best for best in free.next_best if "by tape" in best.what)
+    said = next(best for best in free.next_best if best.what.startswith("a measured distance"))
     (pair,) = taped.taped
-    assert said.what == f"the distance of tags {pair[0]} and {pair[1]} by tape"
+    assert said.what == f"a measured distance of tags {pair[0]} and {pair[1]}"
     assert said.mean_ns == pytest.approx(taped.next_best[0].instead_of_ns, rel=1e-6)
     assert f"--distance {pair[0]}-{pair[1]}=METRES@0..4" in "\n".join(taped.commands("PORTS"))
 
@@ -228,7 +228,7 @@ def test_the_command_prints_steps_and_what_a_fit_is_told():
         (3, {"size_m": (3.0, 2.0)}, "size_m"),
         (3, {"noise_m": 0.0}, "noise_m"),
         (3, {"taped": -1}, "taped"),
-        (3, {"taped": 1, "seconds": 8.0}, "only 0 can be measured"),
+        (3, {"taped": 1, "seconds": 8.0}, "only 0 distances can be measured"),
         (3, {"still_s": -1.0}, "still_s"),
         (3, {"still_s": 40.0}, "still_s"),
         (3, {"tape_sigma_m": 0.0}, "tape_sigma_m"),

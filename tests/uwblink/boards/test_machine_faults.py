@@ -124,7 +124,7 @@ def test_a_disk_that_is_late_is_still_told(live, monkeypatch):
     with RecordingWriter(live) as writer:
         monkeypatch.setattr(time, "monotonic", lambda: plain() + later[0])
         monkeypatch.setattr(writer, "_write", lambda: None)
-        with pytest.raises(RecordingError, match=r"the disk is 2\d s behind"):
+        with pytest.raises(RecordingError, match=r"the disk is 2\d s late"):
             for _ in range(60):  # the loop asks all the while
                 later[0] += 0.5
                 writer.check()

@@ -182,7 +182,7 @@ def test_two_boards_with_one_id_and_absent_ports_are_refused_before_anything_is_
             record([one.names[1], two.names[1]], path, RangingPlan())
         with pytest.raises(PortMissingError, match="no such port"):
             record([one.names[1], "/dev/nothing"], path, RangingPlan())
-        with pytest.raises(PlanError, match="names 9"):
+        with pytest.raises(PlanError, match="contains 9"):
             record([one.names[1], one.names[2]], path, RangingPlan(((1, 9),)))
         path.write_text("mine")
         with pytest.raises(RecordingExistsError):

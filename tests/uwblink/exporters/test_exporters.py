@@ -74,7 +74,7 @@ def test_what_cannot_be_exported_leaves_nothing(whole, tmp_path):
     (tmp_path / "out" / "mine").write_text("mine")
     with pytest.raises(RecordingExistsError, match="already exists"):
         export_recording(whole, tmp_path / "out", to="csv")
-    with pytest.raises(RecordingError, match="holds mine"):
+    with pytest.raises(RecordingError, match="contains mine"):
         export_recording(whole, tmp_path / "out", to="csv", force=True)
     assert (tmp_path / "out" / "mine").read_text() == "mine"
     (tmp_path / "out" / "mine").rename(tmp_path / "out" / "meta.csv")

@@ -49,7 +49,7 @@ def test_without_a_map_there_is_no_option_for_one(tmp_path, monkeypatch, capsys)
         with pytest.raises(SystemExit):
             main()
         assert "--map" not in capsys.readouterr().out
-        with pytest.raises(ArgumentError, match="`map_file`: importer 'plain' takes none"):
+        with pytest.raises(ArgumentError, match="`map_file`: importer 'plain' uses none"):
             import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb", importer="plain", map_file=tmp_path / "m")
     finally:
         IMPORTERS.remove("plain")

@@ -222,8 +222,8 @@ def test_mistakes_are_one_line(tmp_path, flown):
         (["--udp", "127.0.0.1:0"], "--udp"),
         (["--udp", "no.such.host.invalid:9870"], "no such host"),
         (["--foxglove", "x:y"], "--foxglove"),
-        (["--rate", "5"], "for boards"),
-        (["-o", tmp_path / "g.uwb"], "for boards"),
+        (["--rate", "5"], "only be used with boards"),
+        (["-o", tmp_path / "g.uwb"], "only be used with boards"),
     ):
         processes.refuse("uwblink", "stream", flown, *words, naming=[named])
 

@@ -38,7 +38,7 @@ def centred(values):
 def test_broadcasts_have_no_twin():
     """Their replies wait for slots, for longer than boards can."""
     flight = uwbsim.simulate(uwbsim.load("broadcast", {"run.duration_s": 3.0}))
-    with pytest.raises(uwbsim.ScenarioError, match=r"waits 30\.\d ms in its exchanges.*broadcasts"):
+    with pytest.raises(uwbsim.ScenarioError, match=r"reply delays of 30\.\d ms.*broadcasts"):
         uwbsim.twin(flight, known(world()))
 
 
