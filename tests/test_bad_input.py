@@ -381,7 +381,7 @@ FIT = "calib fit {here}/bad.uwb -o c.json"
         (
             nothing("fpp1_dbm", "fpp2_dbm"),
             "calib localize {here}/bad.uwb -c {c_json}",
-            ["bad.uwb", "no power; a calibration without a curve needs no power: `calib fit --delays-only`"],
+            ["bad.uwb", "no power; a calibration without a curve needs no power: use `calib fit --delays-only`"],
         ),
     ],
 )
