@@ -1,4 +1,4 @@
-"""How far delays are to be trusted where errors belong to places: the table of rooms in docs/accuracy.md.
+"""How far delays are to be trusted where errors depend on places: the table of rooms in docs/accuracy.md.
 
 Scenarios whose errors all come from one room's geometry, others that have nothing of it, and fields of errors of
 `tests.calib.estimation.fields`, which share nothing with the simulator. Seeds are those from `FIRST_REPORTED` on, which
@@ -25,7 +25,7 @@ from tests.calib.estimation.fields import ranges_with_field
 
 PAGE: Final = Path(__file__).parents[1] / "docs" / "accuracy.md"
 FIRST_REPORTED: Final = 10_000
-NAMED: Final = "errors belong to places"
+NAMED: Final = "errors depend on places"
 Floats = NDArray[np.float64]
 
 SCENARIOS: Final = {

@@ -190,7 +190,7 @@ def labels_row(name: str, outcomes: dict[int, Outcome]) -> str:
     found = others = 0
     for one in outcomes.values():
         where, two = one.exchanged.split(": ")
-        told = one.refused.split(" stand")[0]
+        told = one.refused.split(" are exchanged")[0]
         good = told.startswith(f"{where}: boards ") and two in told
         found, others = found + good, others + (good and ", or " in told)
     return f"| {name.removesuffix(', labels exchanged')} | {found} | {others} |"

@@ -12,28 +12,30 @@ class BadInputError(CalibError, ValueError):
 
 
 class UnanswerableError(CalibError, ValueError):
-    """Good input that does not determine what was asked: exit status 1.
+    """Valid input that does not determine the requested result: exit status 1.
 
-    `undetermined` are groups of tags whose delays the data leave free, where that is the reason.
+    `undetermined` are groups of tags whose delays the data do not determine, if that is the reason.
     """
 
     def __init__(self, text: str, *, parameter: str | None = None, undetermined: list[list[int]] | None = None) -> None:
-        """Say what, where and what to do."""
+        """Store the text: what was found, where, and what to do."""
         super().__init__(text, parameter=parameter)
         self.undetermined = undetermined or []
 
 
 class LeftOutWarning(PlainWarning):
-    """Measurements that are not corrected: ranges of pairs that a calibration does not determine, differences."""
+    """Warning of measurements that are not corrected: ranges of pairs that a calibration cannot correct,
+    differences.
+    """
 
 
 class DirectionWarning(PlainWarning):
-    """Ranges whose directions are not known, of tags with a pattern over direction; names the recording."""
+    """Warning of ranges with unknown directions although a tag has a pattern over direction; names the recording."""
 
 
 class TemperatureWarning(PlainWarning):
-    """Tags at temperatures at which a calibration was not fitted, or readings that are of none of them; names them."""
+    """Warning of tags at temperatures outside the fitted ones, or of readings of other tags; names the tags."""
 
 
 class WeakHeadingWarning(PlainWarning):
-    """Robots with a single tag, whose heading ranges tell only from motion; names the robots."""
+    """Warning of robots with a single tag, whose heading is observable only from motion; names the robots."""

@@ -36,7 +36,9 @@ def range_factor(update: RangeUpdate, delays: DelayStates, key: int, first: Ante
     except ImportError:
         raise BadInputError("GTSAM is not installed: pip install 'uwbcal[gtsam]'") from None
     if len(update.measured_m) != 1:
-        raise BadInputError(f"found an update of {len(update.measured_m)} ranges, expected of one: `update.at([row])`")
+        raise BadInputError(
+            f"found an update of {len(update.measured_m)} ranges, expected one range: `update.at([row])`"
+        )
     slopes, ends = delays.slopes(update.ends, update.delay_slopes)[0], (first, second)
 
     def error(_: Any, values: Any, jacobians: list[Floats] | None) -> Floats:

@@ -123,7 +123,7 @@ def cumulative(ranges: Ranges, applied: CorrectedRanges, axes: Axes | None = Non
         series(axes, np.quantile(error, shares), 100 * shares, **STAGE_LINES[stage])
     full, raw = (float(np.quantile(errors[stage], 0.99)) for stage in ("full", "raw"))
     axes.set(xlim=(0, max(full, min(raw, 4 * full), 1e-9)), ylim=(0, 100), yticks=[0, 25, 50, 75, 95])
-    label(axes, "size of the range error (cm)", "ranges with less (%)")
+    label(axes, "absolute range error (cm)", "ranges with smaller error (%)")
     return _explained(axes)
 
 
@@ -205,7 +205,7 @@ def delays(
     """
     known_std = calibration.interval_std_ns()
     if not known_std:
-        raise UnanswerableError("the delay of no single tag is determined, so that there is none to draw")
+        raise UnanswerableError("no delay of a single tag is determined, so there is nothing to draw")
     axes, tags = axes or new_axes(), [*known_std]
     place = np.arange(len(tags), dtype=np.float64)
     values = np.array([calibration.delays_ns[tag] for tag in tags])
@@ -273,7 +273,7 @@ def patterns(width_in: float, calibration: Calibration, ranges: Ranges | None = 
             text = f"elevation {np.degrees(up):.0f}°".replace("-", "−")
             series(axes, around, longer, (low, high), band="" if k else "95 % band", label=text, **line)
         axes.plot(around, np.zeros(len(around)), color=MUTED, lw=1.0)
-        axes.set_title(f"tag{'s' * (len(pattern.tags) > 1)} {first_few(map(str, pattern.tags))}: longer by (cm)")
+        axes.set_title(f"tag{'s' * (len(pattern.tags) > 1)} {first_few(map(str, pattern.tags))}: excess range (cm)")
     for axes in panels:
         axes.set(theta_zero_location="N", ylim=(-1.05 * reach_cm, 1.05 * reach_cm), rlabel_position=-22)
         axes.set_xticks(np.radians(np.arange(0, 360, 90)), ["ahead", "left", "behind", "right"])
@@ -341,7 +341,7 @@ def z_scores(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figur
     left.stairs(density, grid, fill=True, color=BLUE, alpha=0.55, label="ranges")
     left.plot(grid, norm.pdf(grid), color=INK, lw=1.2, label="noise alone (standard normal)")
     beyond = 100 * float(np.mean(np.abs(z) > 6))
-    label(left, f"error over its σ ({beyond:.1f} % are beyond ± 6)", "density")
+    label(left, f"error divided by its σ ({beyond:.1f} % outside ± 6)", "density")
     size = np.sort(np.abs(z))
     # The largest errors are single ones: the line ends where ten are left.
     shown = slice(None, max(1, len(size) - 10), len(size) // 1000 + 1)
@@ -350,7 +350,7 @@ def z_scores(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figur
     right.plot(grid, 200 * norm.sf(grid), color=INK, lw=1.2)
     right.set(xlim=(0, None), ylim=(1000 / len(z), 100) if len(z) > 10 else None)
     right.yaxis.set_major_formatter("{x:g}")
-    label(right, "size of the error over its σ", "ranges beyond (%)")
+    label(right, "absolute error divided by its σ", "ranges with larger errors (%)")
     legend(figure, left)
     return figure
 
@@ -447,7 +447,7 @@ def both_curves(width_in: float, known: Sequence[Calibration], names: Sequence[s
         _curve(left, one, "bias", grid, bias - bias.mean(), label=name, **line)
         grid = np.linspace(*one.sigma_curve.range, 200)
         _curve(right, one, "sigma", grid, 100 * one.sigma_curve(grid), label=name, **line)
-    label(left, "lifted power", "bias, mean taken out (cm)")
+    label(left, "lifted power", "bias, mean removed (cm)")
     label(right, "lifted power", "standard deviation (cm)")
     right.set_ylim(bottom=0)
     legend(figure, left, texts=names)

@@ -1,4 +1,4 @@
-"""What a finding is, what a check is, and the tests that turn a statistic into a p-value.
+"""Findings and checks, and the tests that turn a statistic into a p-value.
 
 A check asks one question of a recording or of a fit. Its statistic has a known distribution if nothing is wrong, which
 gives a p-value; all checks share one budget of false alarms. What a sound recording may show besides chance (the delay
@@ -42,7 +42,7 @@ CERTAIN: Final = "none: no chance is involved"
 class Finding:
     """A fault: its name, the evidence, the remedy, and the probability that sound data show as much evidence.
 
-    `p_value` is 0 where no chance is involved: numbers that contradict each other, or a design that leaves unknowns.
+    `p_value` is 0 if no chance is involved, as for numbers that contradict each other.
     """
 
     fault: str
@@ -71,7 +71,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """A row of the table of checks: when it is run, question, statistic, its distribution on sound data, and remedies.
+    """A row of the table of checks: stage, question, statistic, its distribution on sound data, and remedies.
 
     `remedies` maps names of faults to what to do, with fields for the words of a candidate; `look` yields candidates.
     """

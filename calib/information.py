@@ -1,4 +1,4 @@
-"""Which directions an information matrix determines, and a description in words of those it leaves free.
+"""Directions that an information matrix determines, and a description of those it does not.
 
 An information matrix (the inverse of a covariance, J' W J of a fit) is singular along directions without information,
 and nearly singular along directions with little. A direction is judged in units of prior knowledge (`scale` of each
@@ -70,7 +70,7 @@ class Verdict:
 
     def __str__(self) -> str:
         """Return what is free, a line each."""
-        return "\n".join(self.free) or "everything is determined"
+        return "\n".join(self.free) or "all unknowns are determined"
 
 
 def judge(information: Floats, unknowns: Sequence[InformationColumn], *, loosest: float = LOOSEST) -> Verdict:
@@ -134,7 +134,7 @@ def _checked(information: Floats, unknowns: Sequence[InformationColumn], loosest
     if not count or np.shape(information) != (count, count):
         wrong = f"has the shape {np.shape(information)}, expected {count} rows and columns, one an unknown"
     elif not np.all(np.isfinite(information)):
-        wrong = "holds a number that is not finite"
+        wrong = "contains a number that is not finite"
     elif np.abs(information - information.T).max() > 1e-6 * np.abs(information).max():
         wrong = "is not symmetric"
     if wrong:

@@ -201,9 +201,7 @@ class DelayStates:
         without delays of single tags.
         """
         if calibration.pair_offsets:
-            raise BadInputError(
-                "the calibration has constants of pairs and no delays that could change; fit it with `constants` tag"
-            )
+            raise BadInputError("the calibration has constants of pairs instead of delays; fit it with `constants` tag")
         return cls(
             tags=tuple(tags),
             covariance_m2=(1e-9 * calibration.speed_of_light) ** 2 * calibration.covariance_ns2(tags),
@@ -267,7 +265,7 @@ class RangeUpdate:
         measured_m = calibration.apply(ranges).corrected_m - errors.location_m
         if not np.isfinite(measured_m + noise).all():
             row = int(np.argmin(np.isfinite(measured_m + noise)))
-            raise BadInputError(f"{ranges.source}: range {row} has no power, on which the calibration depends")
+            raise BadInputError(f"{ranges.source}: range {row} has no power, which the calibration needs")
         return cls(
             measured_m=measured_m, noise_m=noise, errors=errors, ends=ends_of(ranges), delay_slopes=delay_slopes(ranges)
         )

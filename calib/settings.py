@@ -1,4 +1,4 @@
-"""The settings of a fit, once for Python and for the command line, and the checks of what they may be."""
+"""The settings of fits, for Python and for the command line, and their checks."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ NUMBERS: Final = {
 """The least and the largest value of settings that state no `bounds` themselves, and what is expected."""
 
 FIXED: Any = {
-    "help": "Known delay of a tag, which stays as it is, as in 1=-0.36. May be repeated.",
+    "help": "Known delay of a tag, which is not fitted, such as 1=-0.36. May be repeated.",
     "flag": "--fix",
     "kind": list[str] | None,
     "tags": "{}=",
@@ -45,8 +45,8 @@ FIXED: Any = {
 }
 """The option of known delays."""
 
-ERRORS_PANEL: Final = "How errors count"
-MODEL_PANEL: Final = "What is fitted"
+ERRORS_PANEL: Final = "Error model"
+MODEL_PANEL: Final = "Fitted model"
 FLIGHT_PANEL: Final = "Without known distances (--truth ranges)"
 
 
@@ -57,7 +57,7 @@ def check_choice(parameter: str, value: str, allowed: Iterable[str]) -> None:
 
 
 def check_tag(tag: object) -> None:
-    """Raise `BadInputError` for what cannot be the id of a tag."""
+    """Raise `BadInputError` unless a value can be the id of a tag."""
     if not is_tag(tag):
         raise BadInputError(f"found {tag!r}, expected the id of a tag, 0 to 65535", parameter="tag")
 
@@ -94,7 +94,7 @@ def read_fixed(texts: Iterable[str]) -> dict[int, float]:
         if not (equals and tag.strip().isdecimal() and math.isfinite(delay)):
             raise BadInputError(f"found {text!r}, expected TAG=NS, as in 1=-0.36", parameter="fixed_ns")
         if int(tag) in fixed:
-            raise BadInputError(f"tag {int(tag)} is pinned twice", parameter="fixed_ns")
+            raise BadInputError(f"tag {int(tag)} has two known delays", parameter="fixed_ns")
         fixed[int(tag)] = delay
     return fixed
 
@@ -113,12 +113,12 @@ def read_groups(path: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class CheckedSettings:
-    """Settings that results repeat."""
+    """Base of settings: checks them, and states those that differ from the defaults."""
 
     def __post_init__(self) -> None:
         """Check choices, numbers and known delays; a number may be None if it is by default.
 
-        A setting that is no word by default may be another than its names, as a loss that was registered.
+        A choice whose default is None may have other values than its names, such as a registered loss.
         """
         for one in fields(self):
             name, value, bounds = one.name, getattr(self, one.name), one.metadata.get("bounds")
@@ -138,14 +138,14 @@ class CheckedSettings:
                 object.__setattr__(self, name, {int(tag): float(delay) for tag, delay in (value or {}).items()})
 
     def changed(self) -> dict[str, Any]:
-        """Return the settings that are not the defaults, as JSON has them: what calibrations and reports repeat."""
+        """Return the settings that differ from the defaults, as JSON values for calibrations and reports."""
         given = {one.name: getattr(self, one.name) for one in fields(self)}
         default = type(self)()
         return {name: _as_json(value) for name, value in given.items() if value != getattr(default, name)}
 
 
 def _as_json(value: object) -> object:
-    """Return the value of a setting as JSON has it; of an object a word."""
+    """Return the value of a setting as a JSON value; an object becomes a word."""
     if isinstance(value, Mapping):
         return {str(key): _as_json(one) for key, one in value.items()}
     if isinstance(value, tuple):
@@ -156,25 +156,25 @@ def _as_json(value: object) -> object:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitSettings(CheckedSettings):
-    """The settings of `fit`, which it takes as keyword arguments, too; raises `BadInputError` that names the setting.
+    """Settings of `fit`, which also takes them as keyword arguments; raises `BadInputError` that names the setting.
 
     `loss` is "mixture", the likelihood of direct ranges, reflections and outliers with a share of reflections by pair,
     or a robust loss of residuals: "cauchy", "huber", "soft_l1", "l2", one that `register_loss` added; None chooses the
     mixture, and "cauchy" for a sequential fit and for one without a curve. `scale_ns` is the scale of a robust
-    loss in time of flight, None to estimate it. `between_m` is the standard deviation of what stays in the ranges of a
-    pair for a recording and is another in the next; None to estimate it from several recordings, or for 5 cm with one
-    (more where eight parts of it differ by more).
-    `lift` and `alpha_dbm` make the lifted power of an exchange.
+    loss in time of flight, None to estimate it. `between_m` is the standard deviation of the errors that are constant
+    for a pair in one recording and differ in the next; None estimates it from several recordings, or assumes 5 cm with
+    one (more if its eight parts differ by more). `lift` and `alpha_dbm` make the lifted power of an exchange.
 
     `fixed_ns` are known delays by tag; `groups` are tags that share curves, by name (all do by default); `sequential`
-    fits delays first and then the curve to what they leave (ICRA 2023, sections III and IV). The curve is zero at
+    fits delays first and then the curve to the residuals (ICRA 2023, sections III and IV). The curve is zero at
     `reference_power_dbm`, `alpha_dbm` by default; `delays_only` fits no curve; `delays_from` is a calibration, or its
-    path, whose delays are taken over; `constants` "pair" gives each pair a constant instead of each tag a delay. `use`
-    "receptions" also fits what third tags overheard of the exchanges, which determines the delay of each target alone.
-    `pattern` is the delay of an antenna over direction: "shared" by all tags on bodies that turn, one of each "tag",
-    "none", or "auto": that for which the data are evidence of 100 to 1. `temperature` is the growth of ranges with the
-    readings of tags' temperatures, likewise. With `hold_out` a second fit, to the other ranges, is judged on such a
-    share of them, by `fold`; what was found is in the provenance of the calibration, which is fitted to all.
+    path, whose delays are used and not fitted; `constants` "pair" gives each pair a constant instead of each tag a
+    delay. `use` "receptions" also fits the frames that third tags overheard, which determine the delay of each target
+    separately. `pattern` is the dependence of delays on direction: "shared" by all tags on bodies that turn, one for
+    each "tag", "none", or "auto", which takes a model if the odds for it are 100 to 1. `temperature` is the dependence
+    of ranges on the temperatures that tags measure, with the same choices. `hold_out` is the share of ranges, selected
+    by `fold`, on which a second fit to the other ranges is evaluated; the result is in the provenance of the
+    calibration, which is fitted to all ranges.
 
     >>> import calib
     >>> settings = calib.FitSettings(loss="huber", fixed_ns={1: -0.3})
@@ -191,7 +191,7 @@ class FitSettings(CheckedSettings):
     )
     scale_ns: float | None = setting(
         None,
-        "Error in ns of flight beyond which a robust loss discounts a range; auto: estimated from the data.",
+        "Scale of a robust loss in ns of time of flight: larger errors get less weight. auto: estimated from the data.",
         flag="--scale",
         kind=str | None,
         parse=read_scale,
@@ -200,8 +200,8 @@ class FitSettings(CheckedSettings):
     )
     between_m: float | None = setting(
         None,
-        "Standard deviation in metres by which ranges of a pair differ between recordings; by default estimated if "
-        "several are fitted, else 0.05. Use 0 if nothing changes, as in simulated worlds.",
+        "Standard deviation (m) of a pair's mean error between recordings; by default estimated from several "
+        "recordings, or 0.05 with one. Use 0 if nothing changes, as in simulated worlds.",
         flag="--between",
         metavar="M",
         rich_help_panel=ERRORS_PANEL,
@@ -229,90 +229,93 @@ class FitSettings(CheckedSettings):
     )
     sequential: bool = setting(
         False,
-        "Fit the delays first, and then the curve to what they leave (ICRA 2023).",
+        "Fit the delays first, and then the curve to the residuals (ICRA 2023).",
         rich_help_panel=MODEL_PANEL,
     )
     reference_power_dbm: float | None = setting(
         None,
-        "Power in dBm at which the curve is zero, for which the delays are stated (default: -82, the published alpha).",
+        "Power in dBm at which the curve is zero, so that ranges at this power need only the delays (default: -82, "
+        "the published alpha).",
         flag="--reference-power",
         rich_help_panel=MODEL_PANEL,
     )
     delays_only: bool = setting(
         False,
-        "Fit no curve: for ranges without power, or whose power follows distance.",
+        "Fit no curve over power. Use it if the ranges have no power, or if their power depends only on distance.",
         rich_help_panel=MODEL_PANEL,
     )
     delays_from: Any = setting(  # a Calibration or its path
         None,
-        "Calibration whose delays are taken over (.json); with the delays of all tags only the curve is fitted.",
+        "Calibration whose delays are used and not fitted (.json). If it has the delays of all tags, only the curve "
+        "is fitted.",
         kind=Path | None,
         rich_help_panel=MODEL_PANEL,
     )
     constants: str = setting(
         "tag",
-        "What has a constant error: each tag (antenna delays), or each pair.",
+        "Constant errors to fit: one of each tag (its antenna delay), or one of each pair.",
         names=("tag", "pair"),
         rich_help_panel=MODEL_PANEL,
     )
     use: str = setting(
         "exchanges",
-        "What is fitted: exchanges, by their two ends; or receptions, with what other tags overheard of them.",
+        "Data to fit. exchanges: stamps of the two tags that range; receptions: also the stamps of tags that "
+        "overheard them.",
         names=("exchanges", "receptions"),
         rich_help_panel=MODEL_PANEL,
     )
     pattern: str = setting(
         "auto",
-        "Delay of an antenna over direction: none; a pattern that tags on bodies that turn share; one of each tag; or "
-        "auto, that for which the data are evidence.",
+        "Dependence of delays on direction. none: none; shared: one pattern for all tags on bodies that turn; tag: a "
+        "pattern for each of these tags; auto: the model that the data support.",
         names=("auto", "none", "shared", "tag"),
         rich_help_panel=MODEL_PANEL,
     )
     temperature: str = setting(
         "auto",
-        "Growth of ranges with the temperature that tags read: none; one slope for all tags; one of each tag; or auto, "
-        "that for which the data are evidence.",
+        "Dependence of ranges on the temperatures that tags measure. none: none; shared: one slope for all tags; "
+        "tag: a slope for each tag; auto: the model that the data support.",
         names=("auto", "none", "shared", "tag"),
         rich_help_panel=MODEL_PANEL,
     )
     hold_out: float = setting(
         0.0,
-        "Share of the data to hold out, such as 0.3; a second fit, to the rest, is judged on it.",
+        "Share of the data to hold out, such as 0.3; a second fit, to the other data, is evaluated on it.",
         metavar="SHARE",
         rich_help_panel=MODEL_PANEL,
     )
     fold: str = setting(
         "time",
-        "What is held out: tenths of each session's time, pairs, or sessions.",
+        "Parts that are held out: tenths of each session's time, pairs, or sessions.",
         names=("time", "pair", "session"),
         rich_help_panel=MODEL_PANEL,
     )
 
     def __post_init__(self) -> None:
-        """Check the settings; whether a loss is known, the fit checks."""
+        """Check the settings, except the name of the loss, which the fit checks."""
         CheckedSettings.__post_init__(self)
         beside = self.excludes_patterns
         clashes: list[tuple[object, str, str]] = [
             (
                 self.fold != "time" and not self.hold_out,
                 "fold",
-                f"{self.fold} says what is held out, and `hold_out` holds out nothing",
+                f"{self.fold} has no effect without `hold_out`; set the share to hold out",
             ),
             (
                 self.sequential and self.loss == "mixture",
                 "sequential",
-                "goes with a loss, not with the mixture; leave one of the two away",
+                "a sequential fit needs a robust loss, not the mixture; remove one of the two settings",
             ),
             (
                 self.use == "receptions" and beside != "use",
                 "use",
-                f"receptions go with delays of tags that are fitted at once, not with `{beside}`",
+                f"receptions cannot be fitted with `{beside}`",
             ),
             *(
                 (
                     mode in ("shared", "tag") and beside,
                     name,
-                    f"{mode} goes with delays of tags by ranges, not with `{beside}`",
+                    f"{mode} cannot be fitted with `{beside}`",
                 )
                 for name, mode in (("pattern", self.pattern), ("temperature", self.temperature))
             ),
@@ -333,7 +336,7 @@ class FitSettings(CheckedSettings):
 
     @property
     def excludes_patterns(self) -> str:
-        """The setting with which no pattern over direction or temperature can be fitted, "" if there is none."""
+        """The setting that excludes patterns over direction and slopes over temperature, "" if there is none."""
         if self.sequential:
             return "sequential"
         if self.constants == "pair":
@@ -365,7 +368,7 @@ def read_distances(texts: Iterable[str]) -> tuple[KnownDistance, ...]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightSettings(CheckedSettings):
-    """What is known of a flight without true distances: settings of `fit_from_ranges`, which explains them.
+    """Settings of `fit_from_ranges`, which explains them: known facts about a flight without true distances.
 
     Raises `BadInputError` that names the setting.
 
@@ -377,14 +380,14 @@ class FlightSettings(CheckedSettings):
 
     poses_until_s: float | None = setting(
         None,
-        "How long the poses' positions are known (all along by default).",
+        "Seconds from the start during which the positions of the poses are used (by default all).",
         flag="--poses-until",
         metavar="SECONDS",
         rich_help_panel=FLIGHT_PANEL,
     )
     attitudes: str = setting(
         "poses",
-        "Source of attitudes: the poses, all along; the IMU; or none.",
+        "Source of attitudes: the poses of the whole flight, the IMU, or none.",
         names=("poses", "imu", "none"),
         rich_help_panel=FLIGHT_PANEL,
     )
@@ -397,14 +400,14 @@ class FlightSettings(CheckedSettings):
     )
     anchors: str = setting(
         "given",
-        "Positions of bodies that stand still: given by the poses, or sought (estimated).",
+        "Positions of bodies that stand still. given: known from the poses; sought: estimated.",
         names=("given", "sought"),
         rich_help_panel=FLIGHT_PANEL,
     )
     distances: tuple[Any, ...] = setting(
         (),
-        "Distance of two antennas by a tape, as in 11-12=3.06 (good to 1 cm) or 3.06+-0.005; of tags that move, while "
-        "they stood still: 1-3=1.52@2..8 (seconds, or the name of an arrangement). May be repeated.",
+        "Measured distance of two antennas, such as 11-12=3.06 (standard deviation 1 cm) or 3.06+-0.005. If the tags "
+        "move, add when they stood still: 1-3=1.52@2..8 (seconds, or the name of an arrangement). May be repeated.",
         flag="--distance",
         kind=list[str] | None,
         parse=read_distances,
@@ -419,13 +422,13 @@ class FlightSettings(CheckedSettings):
     )
     curve_from: Any = setting(  # a Calibration or its path
         None,
-        "Calibration whose curve over power is taken over (.json).",
+        "Calibration whose curve over power is used and not fitted (.json).",
         kind=Path | None,
         rich_help_panel=FLIGHT_PANEL,
     )
     minimum_norm: bool = setting(
         False,
-        "Write the smallest delays that agree with the ranges also where these determine no delay.",
+        "If the ranges do not determine all delays, write the solution with the smallest delays.",
         rich_help_panel=FLIGHT_PANEL,
     )
 
@@ -437,13 +440,13 @@ class FlightSettings(CheckedSettings):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveySettings(CheckedSettings):
-    """What is known of boards that stand still, and the settings of `survey`, which it takes as keyword arguments, too.
+    """Settings of `survey`, which also takes them as keyword arguments, with the known facts about the boards.
 
     `known` is "line" or "plane" for all arrangements, the path of a TOML file (`load_knowledge`), or a `Knowledge`:
-    shapes, distances and positions, which stay what they are within their sigmas. `fixed_ns` are delays that are known,
-    `pair_error_m` is the constant error of a pair in an arrangement, estimated by default. `delays_only` looks for no
-    curve over power; `curve_from` is a calibration, or its path, whose curve is taken over. `regardless` surveys also
-    where ranges contradict what is said to be known. Raises `BadInputError` that names the setting.
+    shapes, distances and positions, with their standard deviations. `fixed_ns` are known delays,
+    `pair_error_m` is the constant error of a pair in an arrangement, estimated by default. `delays_only` fits no curve
+    over power; `curve_from` is a calibration, or its path, whose curve is used and not fitted. `regardless` writes a
+    calibration even if the ranges contradict the known facts. Raises `BadInputError` that names the setting.
 
     >>> import calib
     >>> string = calib.SurveySettings(known="line", pair_error_m=0.01)
@@ -453,7 +456,8 @@ class SurveySettings(CheckedSettings):
 
     known: Any = setting(  # a word, a path or a Knowledge
         "",
-        "What is known of the arrangements: all boards on a line or on a plane, or a file that says more (.toml).",
+        "Known geometry of the arrangements: all boards on a line or on a plane, or a file with known shapes, "
+        "distances and positions (.toml).",
         kind=str,
         metavar="line|plane|FILE",
     )
@@ -463,12 +467,12 @@ class SurveySettings(CheckedSettings):
     )
     delays_only: bool = setting(False, "Fit no curve over power.")
     curve_from: Any = setting(  # a Calibration or its path
-        None, "Calibration whose curve over power is taken over (.json).", kind=Path | None
+        None, "Calibration whose curve over power is used and not fitted (.json).", kind=Path | None
     )
-    regardless: bool = setting(False, "Survey even where ranges contradict what is known.")
+    regardless: bool = setting(False, "Write a calibration even if the ranges contradict the known geometry.")
 
     def __post_init__(self) -> None:
         """Check the settings."""
         CheckedSettings.__post_init__(self)
         if self.curve_from is not None and self.delays_only:
-            raise BadInputError("a curve is taken over, and `delays_only` asks for none", parameter="curve_from")
+            raise BadInputError("cannot be used with `delays_only`, which fits no curve", parameter="curve_from")

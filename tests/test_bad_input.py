@@ -114,7 +114,7 @@ GROUPS = [
     ("x = 1", ["expected one table [groups]"]),
     ("[groups]\na = 1", ["a:", "list of tag ids"]),
     ("[groups]\na = [1, 2]\nb = [2]", ["tag 2", "'a'", "'b'"]),
-    ("[groups]\na = [1, 2]", ["tag 3", "in no group"]),
+    ("[groups]\na = [1, 2]", ["tag 3", "not in any group"]),
     ("[groups]\na = [1]\n[group]\nb = [2]\n", ["own.toml", "groups"]),
 ]
 WORDS = [
@@ -279,14 +279,14 @@ def ports():
         ("passive {one} maybe", ["maybe", "on or off"]),
         ("send {one} " + "x" * 58, ["58 bytes", "at most 57", "one USB packet"]),
         ("cir {one} 2 --plot {here}/c.xyz", [".xyz", ".png"]),
-        ("record {one} {two} -o f.uwb --plan own.toml", ["names 9", "1, 2"]),
+        ("record {one} {two} -o f.uwb --plan own.toml", ["contains 9", "1, 2"]),
         ("record {one} {two} -o f.uwb", ["--plan", "--pairs"]),
         ("record {one} {two} -o f.uwb --pairs some", ["some"]),
         ("record {one} {two} -o f.uwb --plan no.toml", ["no.toml"]),
-        ("record {one} -o f.uwb --pairs all", ["no two boards"]),
+        ("record {one} -o f.uwb --pairs all", ["two boards that range"]),
         ("record {one} {two} -o f.uwb --pairs all -c no.json", ["--live"]),
         ("record {one} {two} -o f.uwb --pairs all --live --calibration no.json", ["no.json"]),
-        ("info {silent}", ["b'C07\\r'", "heard nothing", "is this a ranging board"]),
+        ("info {silent}", ["b'C07\\r'", "heard nothing", "check that this is a ranging board"]),
     ],
 )
 def test_what_a_board_or_a_recorder_cannot_do(seeds, ports, tmp_path, line, naming):
@@ -381,7 +381,7 @@ FIT = "calib fit {here}/bad.uwb -o c.json"
         (
             nothing("fpp1_dbm", "fpp2_dbm"),
             "calib localize {here}/bad.uwb -c {c_json}",
-            ["bad.uwb", "no power; a calibration without a curve needs none: `calib fit --delays-only`"],
+            ["bad.uwb", "no power; a calibration without a curve needs no power: use `calib fit --delays-only`"],
         ),
     ],
 )
@@ -438,7 +438,7 @@ def test_numbers_that_no_calibration_can_have_are_refused_and_named(seeds, path,
 def test_a_calibration_without_a_tag_of_the_recording_is_refused(seeds, tmp_path):
     table = json.loads((seeds / "c.json").read_text())
     del table["delays_ns"]["3"]
-    refused(seeds, tmp_path, "calib evaluate {f_uwb} -c own.json", ["no delay for tag 3"], json.dumps(table))
+    refused(seeds, tmp_path, "calib evaluate {f_uwb} -c own.json", ["no delay of tag 3"], json.dumps(table))
 
 
 def test_delays_without_standard_errors_are_not_taken_for_exact(seeds, tmp_path):
@@ -452,7 +452,7 @@ def test_delays_without_standard_errors_are_not_taken_for_exact(seeds, tmp_path)
     assert found["probability"] is None
     assert set(found["std_ns"].values()) == {None}
     assert found["difference_ns"]["2"] - found["difference_ns"]["1"] == pytest.approx(0.3)
-    assert "no verdict" in run(*words, cwd=tmp_path).stdout
+    assert "not tested" in run(*words, cwd=tmp_path).stdout
     assert "not stated" in run("calib", "show", "c.json", cwd=tmp_path).stdout
     rows = run("calib", "export", "c.json", "--to", "csv", cwd=tmp_path).stdout.splitlines()
     assert rows[1].endswith(",")
@@ -474,7 +474,7 @@ def test_a_tag_that_ranges_with_itself_is_named_and_left_out(share, tmp_path):
     path = changed(tmp_path / "f.uwb", target=np.where(rows, SAMPLE.initiator, SAMPLE.target))
     assert "a tag with itself" in {f.fault for f in calib.examine(path)}
     if share == 1:
-        with pytest.raises(calib.UnanswerableError, match="a tag with itself; look at from_id and to_id"):
+        with pytest.raises(calib.UnanswerableError, match="a tag with itself; check from_id and to_id"):
             calib.fit(path)
     else:
         assert calib.load_ranges(path).excluded == {"a tag with itself": rows.sum()}
@@ -497,7 +497,7 @@ def test_a_twin_does_without_exchanges_of_a_tag_with_itself(tmp_path):
 def test_delays_of_all_tags_and_no_curve_blame_the_calibration(seeds):
     with pytest.raises(calib.BadInputError, match="`delays_from`: it has the delays of all tags"):
         calib.fit(calib.sample_flight(COUNT), delays_from=seeds / "c.json", delays_only=True)
-    with pytest.raises(calib.BadInputError, match="`fixed_ns`: every tag is pinned"):
+    with pytest.raises(calib.BadInputError, match="`fixed_ns`: all delays are known"):
         calib.fit(calib.sample_flight(COUNT), fixed_ns={1: 0.0, 2: 0.0, 3: 0.0}, delays_only=True)
 
 

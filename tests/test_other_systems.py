@@ -53,5 +53,5 @@ def test_all_but_virtual_boards_works_without_what_linux_has(tmp_path):
         f"{status} {line}" for line, status in lines.items()
     ], done.stderr
     warning, error = done.stderr.splitlines()
-    assert warning.startswith("warning: 3 pairs determine the delays and nothing beside them")
+    assert warning.startswith("warning: 3 pairs are just enough to determine the delays")
     assert error == "error: this system has no pseudo-terminals; use Linux or macOS"

@@ -161,8 +161,8 @@ def test_entry_points_are_loaded_once_and_only_when_they_are_needed(table):
     texts = [str(w.message) for w in caught]
     assert len(texts) == 4
     assert all(text.count("\n") == 0 and "(group g) is left out: " in text for text in texts)
-    assert "'one': is registered already" in texts[0]
-    assert "'own': is one of the project's own" in texts[1]
+    assert "'one': is already registered" in texts[0]
+    assert "'own': this name is reserved" in texts[1]
     assert "row: found 'text', expected a Row" in texts[2]
     assert "AttributeError: " in texts[3]
     with warnings.catch_warnings():

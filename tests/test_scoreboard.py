@@ -125,7 +125,7 @@ def test_boards_that_stand_nowhere_known_are_judged_by_the_spread_within_pairs(f
         assert abs(number(row[1])) < 1.0
         assert number(row[2]) == pytest.approx(CM * spread(errors), rel=0.15)
         assert 92 < number(row[3]) < 99
-    assert page.count("% of the ranges lie beyond three sigmas of this fit") == 3
+    assert page.count("% of the ranges lie outside three sigmas of this fit") == 3
 
 
 def test_a_folder_without_any_data_set_is_one_line(tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""A correction of ranges and differences of arrival as they come, which other distributions make of a calibration."""
+"""The interface of corrections of arriving ranges, which other distributions implement."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Correction:
     not known. It raises a `ValueError` for exchanges that it cannot correct, for example of a tag that is not
     calibrated. `differences`, where there is one, takes exchanges and columns of the table `overheard`, and returns
     columns of differences of arrival, named like the fields of `uwblink.streaming.StreamedDifference`.
-    `antenna_delays` is what was programmed into the boards that it is for.
+    `antenna_delays` are the programmed antenna delays for which it is valid.
     """
 
     ranges: Callable[[Exchanges], Columns]

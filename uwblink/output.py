@@ -112,9 +112,7 @@ def take_name(partial: Path, path: Path) -> None:
         for place in path.rglob("*"):
             kept = place.relative_to(path)
             if not os.path.lexists(partial / kept):
-                raise RecordingError(
-                    f"{path}: holds {kept}, which is not written again; give another name or remove it"
-                )
+                raise RecordingError(f"{path}: contains {kept}, which would be lost; give another name or remove it")
         path.replace(partial.with_name(".before"))
     partial.replace(path)
 
@@ -165,13 +163,13 @@ def check_apart(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = ())
 
     `outputs` are files and folders by the parameter that names them.
     """
-    taken = {path.resolve(): "is what is read" for path in inputs}
+    taken = {path.resolve(): "is also an input" for path in inputs}
     for name, path in outputs.items():
         if path is not None:
             place = path.resolve()
             if place in taken:
                 raise ArgumentError(f"{path}: {taken[place]}; give another name", parameter=name)
-            taken[place] = f"is what `{name}` names already"
+            taken[place] = f"is also the output of `{name}`"
 
 
 def check_output(path: Path, *, force: bool, recording: bool = False) -> None:
@@ -187,8 +185,8 @@ def check_output(path: Path, *, force: bool, recording: bool = False) -> None:
         (
             recording and is_other,
             RecordingError,
-            f"a recording is written here, and {path.suffix} is the ending of another "
-            f"kind of file; name it {path.stem}.uwb (`uwblink export` makes tables of it)",
+            f"the output is a recording, but {path.suffix} is the ending of another kind of file; name it "
+            f"{path.stem}.uwb (`uwblink export` writes tables)",
         ),
         (path.is_dir(), RecordingError, "is a directory, expected the name of an output file"),
         (
@@ -199,7 +197,7 @@ def check_output(path: Path, *, force: bool, recording: bool = False) -> None:
         (
             path.exists() and not force,
             RecordingExistsError,
-            "exists already; give another name, or `force` to replace it",
+            "already exists; give another name, or replace it with `force`",
         ),
         (not path.parent.is_dir(), RecordingError, f"the folder {path.parent} does not exist; create it first"),
         (not os.access(path.parent, os.W_OK), RecordingError, f"no permission to write in {path.parent}"),

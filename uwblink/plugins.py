@@ -72,10 +72,10 @@ class Registry(Mapping[str, Row], Generic[Row]):
         """
         self._check(row)
         if row.name in self._own:
-            raise ArgumentError(f"{self._kind} {row.name!r}: is one of the project's own; choose another name")
+            raise ArgumentError(f"{self._kind} {row.name!r}: this name is reserved; choose another one")
         if row.name in self._rows and not replace:
             raise ArgumentError(
-                f"{self._kind} {row.name!r}: is registered already; choose another name, or replace=True"
+                f"{self._kind} {row.name!r}: is already registered; choose another name, or use replace=True"
             )
         self._rows[row.name] = row
 

@@ -1,4 +1,4 @@
-"""Receptions: one frame on the air as one listener received it, and what exchanges and receptions say of each other.
+"""Receptions: one frame on the air as received by one listener; conversion of broadcasts to exchanges.
 
 The reception stamp of a frame is its transmission stamp, moved to the listener's clock, plus the distance and both
 antenna delays. Three such rows make an exchange, and two more what a third tag overhears of it. Tags that broadcast in
@@ -154,7 +154,7 @@ def times_by_stamps(receptions: Receptions) -> Ints:
 
 
 def exchanges_in(receptions: Receptions) -> tuple[Exchanges, Columns]:
-    """Return the exchanges that broadcasts make, and what third tags overheard of them, in order of time.
+    """Return the exchanges in broadcasts, and the frames of these that third tags overheard, in order of time.
 
     A frame of i that j hears is a poll, j's first frame after it the response, j's next frame the final: an exchange of
     protocol `ds`. Of both roles a pair gets the one with the shorter replies, so that no stamp of a poll or response
@@ -189,7 +189,7 @@ def exchanges_in(receptions: Receptions) -> tuple[Exchanges, Columns]:
     rows, reply = rows[steady], reply[steady]
     if not len(rows):
         raise ArgumentError(
-            f"{len(r)} receptions make no exchange: two tags must hear each other, and one of them twice in a row"
+            f"{len(r)} receptions contain no exchange: two tags must hear each other, and one of them twice in a row"
         )
     rows = rows[_shorter_replies(r.sender[rows[:, 0]], r.sender[rows[:, 1]], reply)]
     rows = rows[np.argsort(r.time_ns[rows[:, 0]], kind="stable")]

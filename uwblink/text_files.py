@@ -82,7 +82,7 @@ class TomlReader:
         listed = list(names)
         for key in table:
             if key not in listed:
-                raise self.error(f"{self.path}: {prefix}{key}: unknown key; known are {', '.join(listed)}")
+                raise self.error(f"{self.path}: {prefix}{key}: unknown key; the known keys are {', '.join(listed)}")
 
     def section(self, name: str) -> dict[str, Any]:
         """Return a table of the file, empty where there is none."""

@@ -94,7 +94,7 @@ class Exchanges(ColumnTable):
         given = {"tx1": tx1, "rx1": rx1, "tx2": tx2, "rx2": rx2, "tx3": tx3, "rx3": rx3}
         bare = all(values is None for values in given.values())
         if (first := range_m if tx1 is None else tx1) is None:
-            raise ArgumentError("tx1: is not given; give the stamps, or range_m where a device has none")
+            raise ArgumentError("tx1: is missing; give the stamps, or range_m for a device without stamps")
         count = arrays.length("range_m" if tx1 is None else "tx1", first)
         if bits not in BITS:
             raise ArgumentError(f"bits: found {bits!r:.40}, allowed: {', '.join(map(str, BITS))}")
@@ -104,7 +104,7 @@ class Exchanges(ColumnTable):
             "target", chosen["target"], chosen["target"] == chosen["initiator"], "another tag than the initiator"
         )
         if protocol is None and (tx3 is None) != (rx3 is None):
-            raise ArgumentError(f"{'tx3' if tx3 is None else 'rx3'}: is not given; a third message has both stamps")
+            raise ArgumentError(f"{'tx3' if tx3 is None else 'rx3'}: is missing; a third message has both stamps")
         default = "ss" if tx3 is None else "ds"
         names = arrays.words("protocol", default if protocol is None else protocol, count)
         messages = of_protocol(names, lambda row: len(row.messages))
@@ -112,7 +112,7 @@ class Exchanges(ColumnTable):
         for name, values in given.items():
             needed = messages >= int(name[-1])
             if values is None and needed.any() and not bare:
-                raise ArgumentError(f"{name}: is not given, but protocol {str(names[int(np.argmax(needed))])!r} has it")
+                raise ArgumentError(f"{name}: is missing, but protocol {str(names[int(np.argmax(needed))])!r} needs it")
             found = arrays.whole_numbers(name, 0 if values is None else values, count, 0, (1 << bits) - 1, hint)
             chosen[name] = np.where(needed, found, 0)
         levels = {"fpp1_dbm": fpp1_dbm, "fpp2_dbm": fpp2_dbm, "skew1_ppm": skew1_ppm, "skew2_ppm": skew2_ppm}
@@ -171,7 +171,7 @@ def intervals(exchanges: Exchanges) -> Intervals:
 
 
 def range_ns(exchanges: Exchanges) -> Ints:
-    """Return the time (n,) in ns of the distance that a range measures while it changes.
+    """Return the time (n,) in ns at which a changing distance equals the range.
 
     It is a share of the initiator's round trip after the poll. With flights t1, t2, t3 that change with the distance
     the formulas give, to first order: (t1 + t2)/2 for two messages; t1 where the target sends the third, because the

@@ -1,4 +1,4 @@
-"""Everything `uwbsim` raises on bad input."""
+"""The errors of `uwbsim`."""
 
 from uwblink.errors import OfParameter
 
@@ -12,12 +12,12 @@ class ScenarioError(UwbsimError, ValueError):
 
 
 class TooFewDataError(ScenarioError):
-    """A sound recording with too little data for a twin: exit status 1."""
+    """A valid recording with too little data for a twin: exit status 1."""
 
 
 class ParameterError(ScenarioError):
-    """An argument that cannot be; `parameter` names it, and the text says what was found and what is allowed."""
+    """An invalid argument; `parameter` names it, and the text states what was found and what is allowed."""
 
 
 class UnknownKeyError(ScenarioError):
-    """A key path that leads nowhere in a scenario."""
+    """A key path that does not exist in a scenario."""

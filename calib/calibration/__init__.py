@@ -6,9 +6,9 @@ from calib.calibration.model import (
     age_line,
     delay_rows,
     held_out_line,
+    known_facts,
     pair_rows,
     pattern_rows,
-    rests_on,
     temperature_rows,
 )
 
@@ -19,10 +19,10 @@ __all__ = [
     "free_delays",
     "held_out_line",
     "keep_determined",
+    "known_facts",
     "pair_rows",
     "pattern_rows",
     "programmed",
     "read_miluv",
-    "rests_on",
     "temperature_rows",
 ]

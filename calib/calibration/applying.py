@@ -25,15 +25,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class CorrectedRanges(ColumnTable):
-    """Ranges in three stages, metres, and what is known of them, shape (n,).
+    """Raw, delay-corrected and fully corrected ranges in metres, with their expected errors, shape (n,).
 
-    `sigma_m` is the noise of direct ranges. `sigma_total_m` is the standard deviation of all of them, reflected ones
-    included, about a mean of `mean_error_m`; `tail_share` is the probability of a reflection by pair,
-    power and features. `tail_probability` is the same given the range itself, where its true distance is known, and
-    `outlier` marks what is then neither noise nor a reflection; elsewhere it equals `tail_share`, and nothing is
-    marked. `clamped` marks lifted powers at which the curves had no data and are held constant; `sigma_total_m` grows
-    there by the slope of the curve at its end, and by what directions and temperatures leave open. All but `sigma_m`
-    and `clamped` are NaN where a calibration has no error model (`Calibration.errors`), and without a power.
+    `sigma_m` is the noise of direct ranges. `sigma_total_m` is the standard deviation of all errors, reflections
+    included, about their mean `mean_error_m`; `tail_share` is the probability of a reflection by pair, power and
+    features. If the true distance of a range is known, `tail_probability` is the probability of a reflection given the
+    error, and `outlier` marks errors that are neither noise nor a reflection; otherwise `tail_probability` equals
+    `tail_share`, and `outlier` is False. `clamped` marks lifted powers outside the fitted ones, where the curves are
+    held constant; there `sigma_total_m` includes the slope of the curve at its end. It also includes the effect of
+    unknown directions and temperatures. All but `sigma_m` and `clamped` are NaN if the calibration has no error model
+    (`Calibration.errors`) or the range has no power.
 
     >>> import calib
     >>> flight = calib.load_ranges(calib.sample_flight())
@@ -60,12 +61,12 @@ class CorrectedRanges(ColumnTable):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class CorrectedArrivals(ColumnTable):
-    """Differences of arrival, metres, shape (n,): by how much farther from target than from initiator a listener is.
+    """Differences of arrival in metres, shape (n,): a listener's distance to the target minus that to the initiator.
 
-    `sigma_m` is the noise without reflections. Differences of one exchange share `shared_m` of it: the covariance of
-    two is its square. They do not correlate with the range of that exchange, nor with other exchanges. `late_share` and
-    `early_share` are the shares in which a reflection of the response makes the difference longer, and one of the poll
-    shorter; NaN where a calibration has no error model.
+    `sigma_m` is the noise without reflections. The covariance of two differences of one exchange is the square of
+    `shared_m`. Differences are not correlated with the range of their exchange, nor with other exchanges. `late_share`
+    is the probability that a reflection of the response makes the difference longer, `early_share` that a reflection of
+    the poll makes it shorter; NaN if the calibration has no error model.
     """
 
     raw_m: Floats
@@ -80,11 +81,11 @@ class CorrectedArrivals(ColumnTable):
 
 
 class CorrectedRange(NamedTuple, Generic[Value]):
-    """A corrected range and its standard deviation, metres; `clamped` where its power is beyond the curves'.
+    """A corrected range and its standard deviation, metres; `clamped` if its power is outside the fitted powers.
 
-    `sigma_m` is the noise of a direct range; `sigma_total_m` includes reflections, which are the share `tail_share` of
-    the ranges of this pair at this power; both are NaN without an error model. Without a power at either end the range
-    has the delays' part only, and its standard deviations are NaN. Each is a number, or an array (n,).
+    `sigma_m` is the noise of a direct range; `sigma_total_m` includes reflections, whose probability at this pair and
+    power is `tail_share`; the latter two are NaN without an error model. If neither end has a power, the range is
+    corrected for delays only, and its standard deviations are NaN. Each is a number, or an array (n,).
     """
 
     range_m: Value
@@ -100,7 +101,7 @@ class CorrectedRange(NamedTuple, Generic[Value]):
 
 
 def corrected_ranges(calibration: Calibration, ranges: Ranges) -> CorrectedRanges:
-    """Return what `Calibration.apply` returns, and raise what that raises."""
+    """Correct ranges: the function behind `Calibration.apply`, with the same result and errors."""
     delays = _without_delays(calibration, ranges)
     lifted = calibration.lifted(ranges)
     longer, unknown = dependences_m(calibration, ranges)
@@ -118,7 +119,9 @@ def corrected_ranges(calibration: Calibration, ranges: Ranges) -> CorrectedRange
 
 
 def corrected_arrivals(calibration: Calibration, ranges: Ranges) -> CorrectedArrivals:
-    """Return what `Calibration.correct_arrivals` returns, and raise what that raises."""
+    """Correct differences of arrival: the function behind `Calibration.correct_arrivals`, with the same result and
+    errors.
+    """
     heard, receptions = arrivals_in(ranges), heard_receptions(ranges)
     exchange = replace(ranges, arrivals=None)[heard.exchange]
     summed = sorted(
@@ -126,18 +129,18 @@ def corrected_arrivals(calibration: Calibration, ranges: Ranges) -> CorrectedArr
     )
     if summed:
         raise BadInputError(
-            f"{ranges.source}: the calibration knows the delays of tags {first_few(map(str, summed))} in sums only, "
-            "and differences of arrival need those of single tags; fit them with `use` receptions"
+            f"{ranges.source}: the calibration has only sums of the delays of tags {first_few(map(str, summed))}, "
+            f"and differences of arrival need the delay of each tag; fit them with `use` receptions"
         )
     if calibration.patterns:
         raise BadInputError(
-            f"{ranges.source}: the calibration has patterns over direction, which say nothing of overheard frames; fit "
-            "one with `pattern` none"
+            f"{ranges.source}: the calibration has patterns over direction, which cannot correct overheard frames; "
+            f"fit one with `pattern` none"
         )
     applied = corrected_ranges(calibration, exchange)
     delay_ns = np.array([calibration.delays_ns[tag] for tag in exchange.target.tolist()])
     late_m = 1e-9 * calibration.speed_of_light * delay_ns - reception_bias_m(calibration, receptions)
-    # A delay is twice what it takes off a range. Only the target's counts.
+    # A range contains half of each delay; a difference of arrival contains the whole delay of the target only.
     of_target = replace(exchange, temperature_c=np.where([False, True], exchange.temperature_c, np.float32(np.nan)))
     late_m -= 2 * dependences_m(calibration, of_target)[0]
     sigma, model = np.column_stack([noise_m(calibration, one) for one in receptions[:2]]), calibration.errors
@@ -156,9 +159,9 @@ def corrected_arrivals(calibration: Calibration, ranges: Ranges) -> CorrectedArr
 
 
 def arrivals_in(ranges: Ranges) -> Arrivals:
-    """Return the differences of arrival of ranges; raises `BadInputError` where nothing was overheard."""
+    """Return the differences of arrival of ranges; raises `BadInputError` if nothing was overheard."""
     if ranges.arrivals is None:
-        raise BadInputError(f"{ranges.source}: has no differences of arrival, because no tag overheard its ranges")
+        raise BadInputError(f"{ranges.source}: no differences of arrival, because no tag overheard these ranges")
     return ranges.arrivals
 
 
@@ -182,7 +185,9 @@ def heard_receptions(ranges: Ranges) -> tuple[Ranges, Ranges, Ranges]:
 
 
 def reception_bias_m(calibration: Calibration, receptions: tuple[Ranges, Ranges, Ranges]) -> Floats:
-    """Return by how much the bias of three receptions (`heard_receptions`) makes differences of arrival longer (n,)."""
+    """Return the bias (n,) of differences of arrival that follows from the bias of three receptions
+    (`heard_receptions`).
+    """
     response, poll, at_target = (_bias(calibration, one, calibration.lifted(one)) for one in receptions)
     return response - poll + at_target
 
@@ -210,8 +215,8 @@ def _without_delays(calibration: Calibration, ranges: Ranges) -> Floats:
     if missing:
         known = ", ".join(map(str, sorted(calibration.delays_ns)))
         raise BadInputError(
-            f"{ranges.source}: no delay for tag {', '.join(map(str, missing))} in the calibration, "
-            f"which knows {known}; fit one from a recording with all tags"
+            f"{ranges.source}: no delay of tag {', '.join(map(str, missing))} in the calibration, which has those of "
+            f"{known}; fit one from a recording with all tags"
         )
     if not (good := determined(calibration, ranges)).all():
         raise BadInputError(within_text(calibration, ranges, good))
@@ -222,7 +227,9 @@ def _without_delays(calibration: Calibration, ranges: Ranges) -> Floats:
 
 
 def determined(calibration: Calibration, ranges: Ranges) -> Bools:
-    """Return of which ranges (n,) a calibration knows the delays, and not only in sums with those of other tags."""
+    """Return a mask (n,) of the ranges that a calibration can correct: their delays, or the sums of them, are
+    determined.
+    """
     sides, pairs = calibration.sides, pairs_of(ranges.initiator, ranges.target)
     first, second = (
         np.array([[sides.get(tag, 0) for tag in pair] for pair in pairs.ends.tolist()], int).reshape(-1, 2).T
@@ -231,7 +238,9 @@ def determined(calibration: Calibration, ranges: Ranges) -> Bools:
 
 
 def keep_determined(calibration: Calibration, ranges: Ranges) -> Ranges:
-    """Return the ranges that a calibration determines, all if it determines none; a `LeftOutWarning` names others."""
+    """Return the ranges that a calibration can correct, or all if it can correct none; a `LeftOutWarning` names the
+    others.
+    """
     good = determined(calibration, ranges)
     if good.all() or not good.any():
         return ranges
@@ -241,14 +250,16 @@ def keep_determined(calibration: Calibration, ranges: Ranges) -> Ranges:
 
 
 def within_text(calibration: Calibration, ranges: Ranges, good: Bools) -> str:
-    """Return in words of which pairs a calibration does not determine the ranges, those that are not `good` (n,)."""
+    """Return a sentence that names the pairs whose ranges a calibration cannot correct: those not in the mask `good`
+    (n,).
+    """
     names = first_few(pairs_of(ranges.initiator[~good], ranges.target[~good]).names)
     why = split_text(calibration.undetermined_splits)
-    return f"{ranges.source}: the calibration does not determine the ranges of {names}: {why}"
+    return f"{ranges.source}: the calibration cannot correct the ranges of {names}: {why}"
 
 
 def _offsets_m(calibration: Calibration, ranges: Ranges) -> Floats:
-    """Return the constant of each range's pair (n,), zeros where the calibration has none for pairs."""
+    """Return the constant error of each range's pair (n,), zeros if the calibration has delays of tags instead."""
     offsets = calibration.pair_offsets
     if not offsets:
         return np.zeros(len(ranges))
@@ -257,7 +268,7 @@ def _offsets_m(calibration: Calibration, ranges: Ranges) -> Floats:
     missing = [pair_name(pair) for pair in ends if pair not in offsets]
     if missing:
         known = first_few(map(pair_name, sorted(offsets)))
-        raise BadInputError(f"no constant for pair {missing[0]} in the calibration, which knows {known}")
+        raise BadInputError(f"no constant of pair {missing[0]} in the calibration, which has those of {known}")
     return np.array([offsets[pair].offset_m for pair in ends])[pairs.number]
 
 
@@ -266,7 +277,7 @@ def _errors(
 ) -> dict[str, Any]:
     """Return the expected errors of ranges (n,), by the names of `CorrectedRanges`.
 
-    `unknown_m` (n,) is the standard deviation of what directions and temperatures leave open.
+    `unknown_m` (n,) is the standard deviation that unknown directions and temperatures add.
     """
     model = calibration.errors
     if model is None:
@@ -302,7 +313,7 @@ def _bias(calibration: Calibration, ranges: Ranges, lifted: Floats) -> Floats:
 def _curve(
     calibration: Calibration, ranges: Ranges, lifted: Floats, name: Literal["bias_curve", "sigma_curve"]
 ) -> Floats:
-    """Return a curve at lifted powers (n,): the mean of the curves of both tags' groups, where there are groups."""
+    """Return a curve at lifted powers (n,): if there are groups, the mean of the curves of both tags' groups."""
     if not calibration.groups:
         return np.asarray(getattr(calibration, name)(lifted))
     member = {tag for group in calibration.groups.values() for tag in group.tags}
@@ -318,7 +329,7 @@ def _curve(
 
 
 def columns_of(applied: CorrectedRanges) -> CorrectedRange[Floats]:
-    """Return corrected ranges as columns; those without a power have the delays' part only."""
+    """Return corrected ranges as columns; ranges without a power are corrected for delays only."""
     powered = np.isfinite(applied.lifted)
     return CorrectedRange(
         np.where(powered, applied.corrected_m, applied.delay_corrected_m),

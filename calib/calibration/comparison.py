@@ -1,4 +1,4 @@
-"""Comparison of two calibrations: whether their delays agree within their standard errors."""
+"""Comparison of two calibrations: a test whether their delays agree within their standard errors."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from uwblink.ticks import SPEED_OF_LIGHT
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class CalibrationComparison:
-    """Differences second minus first, after what delays share with other constants has been taken out.
+    """Differences of two calibrations, second minus first, without what other constants can compensate.
 
-    A shift common to all delays and a constant of the curve are the same thing, so only together do they mean anything:
-    `offset_m` is what the second calibration adds to every range beyond the first, at equal power. What a calibration's
-    `undetermined_splits` leave open is taken out, too. Where both have slopes over temperature or patterns over
-    direction, delays are those at the reference temperature and in the average direction of the first.
-    `pattern_rms_m` is the difference of the patterns over all directions, and `pattern_probability` that of a larger
-    one by chance; NaN where there are none. `std_ns` is NaN for tags of which a calibration states no standard error,
-    as published ones; `chi_square` has `degrees` of freedom, and where there are none, nothing can be tested, and
-    `chi_square` and `probability` are NaN.
+    A common shift of all delays has the same effect as a constant of the curve, so only their sum is compared:
+    `offset_m` is the additional correction of every range by the second calibration, at equal power. Shifts along
+    `undetermined_splits` are removed as well. If both have slopes over temperature or patterns over direction, delays
+    are compared at the reference temperature and in the average direction of the first. `pattern_rms_m` is the root
+    mean square of the difference of the patterns over all directions, and `pattern_probability` the probability of a
+    larger one by chance; NaN without patterns. `std_ns` is NaN for tags without a standard error in one of the
+    calibrations, such as published ones. `chi_square` has `degrees` of freedom; if there are none, nothing can be
+    tested, and `chi_square` and `probability` are NaN.
     """
 
     difference_ns: dict[int, float]
@@ -46,12 +46,12 @@ class CalibrationComparison:
 
     @property
     def same(self) -> bool:
-        """Whether differences as large as these come by chance more than once in twenty; False where not tested."""
+        """Whether differences as large as these occur by chance in more than 5 % of cases; False if not tested."""
         return self.probability >= 0.05
 
     @property
     def verdict(self) -> str:
-        """Return "same", "different", or "unknown" where no differences could be tested."""
+        """Return "same", "different", or "unknown" if no differences could be tested."""
         return "unknown" if np.isnan(self.probability) else "same" if self.same else "different"
 
     def __repr__(self) -> str:
@@ -75,7 +75,7 @@ class CalibrationComparison:
         sides = (first, self.only_first), (second, self.only_second)
         only = [f"only in {name}: tags {', '.join(map(str, tags))}" for name, tags in sides if tags]
         verdict = (
-            "no verdict: too few tags have a standard error in both calibrations"
+            "not tested: too few tags have a standard error in both calibrations"
             if self.verdict == "unknown"
             else f"the delays are {'the same' if self.same else 'different'}: chi-square {self.chi_square:.1f} with "
             f"{self.degrees} degrees of freedom, probability {self.probability:.3f}"
@@ -91,9 +91,9 @@ class CalibrationComparison:
 def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationComparison:
     """Test whether the delays of two calibrations differ by more than their standard errors explain, by chi-square.
 
-    Differences in ns are second minus first, less what is common to all delays and what undetermined splits leave open.
-    Raises `UnanswerableError` where fewer than two tags have a determined delay in both, and where one of them has a
-    pattern over direction or a slope over temperature in one of both only.
+    Differences in ns are second minus first, without the shift common to all delays and shifts along undetermined
+    splits. Raises `UnanswerableError` if fewer than two tags have a determined delay in both, and if a tag has a
+    pattern over direction or a slope over temperature in only one of them.
 
     >>> import calib
     >>> first, second = (calib.fit(calib.sample_flight(seed=seed)).calibration for seed in (1, 2))
@@ -102,16 +102,18 @@ def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationC
     """
     first, second = both = given_calibration(first, "first"), given_calibration(second, "second")
     if first.pair_offsets or second.pair_offsets:
-        raise UnanswerableError("constants of pairs are no delays, and only delays can be compared")
+        raise UnanswerableError(
+            "only delays of tags can be compared, and one of the calibrations has constants of pairs"
+        )
     known = [{t for t in c.delays_ns if t in c.sides or not np.isinf(c.delays_std_ns.get(t, np.nan))} for c in both]
     common = sorted(known[0] & known[1])
     if len(common) < 2:
         raise UnanswerableError(
-            f"{len(common)} tags have determined delays in both calibrations, at least two are needed to compare"
+            f"{len(common)} tags have determined delays in both calibrations; a comparison needs at least two"
         )
     stated = [t for t in common if all(_is_stated(c, t) for c in both)]
     tags = stated if len(stated) > 1 else common
-    moves = [_moved(first, second, common, name) for name in DEPENDENCES]
+    moves = [_reference_shift(first, second, common, name) for name in DEPENDENCES]
     moved_ns, moved_ns2 = (np.sum(of_all, axis=0) for of_all in zip(*moves, strict=True))
     delta = np.array([second.delays_ns[t] - first.delays_ns[t] for t in common]) - moved_ns
     loose = loose_shifts(both, common)
@@ -120,7 +122,7 @@ def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationC
     if len(stated) > 1:
         covariance = sum(c.covariance_ns2(stated) for c in both) + 1e-12 * np.eye(len(stated))
         covariance = covariance + moved_ns2[np.ix_(rows, rows)]
-    # Most likely values of what is loose; what is left has a covariance of as many ranks less.
+    # Subtract the most likely shifts; the rank of the residuals' covariance drops by their number.
     precision = np.linalg.inv(covariance)
     of_loose = np.linalg.pinv(loose[rows].T @ precision @ loose[rows], hermitian=True)
     taken = of_loose @ loose[rows].T @ precision @ delta[rows]
@@ -155,22 +157,23 @@ DEPENDENCES: Final = {
     "patterns": ("pattern over direction", "directions", "pattern"),
     "temperatures": ("slope over temperature", "temperatures", "temperature"),
 }
-"""What delays depend on, by the field of a calibration: what it is called, on what it depends, and its setting."""
+"""Dependences of delays, by the field of a calibration: the name, what the delays refer to, and the setting of the
+fit."""
 
 
-def _moved(first: Calibration, second: Calibration, tags: list[int], name: str) -> tuple[Floats, Floats]:
-    """Return by how much delays (tags,) of the second are longer where it states them than where the first does.
+def _reference_shift(first: Calibration, second: Calibration, tags: list[int], name: str) -> tuple[Floats, Floats]:
+    """Return the change of delays (tags,) from the reference of the first calibration to that of the second.
 
-    That is in the second's average direction, or at its reference temperature; in ns, with its covariance. Raises
-    `UnanswerableError` where a tag has a dependence in one of both only.
+    The reference is the average direction or the reference temperature. Values are in ns, with their covariance. Raises
+    `UnanswerableError` if a tag has a dependence in only one of them.
     """
     centres = {tag: one.centre for one in getattr(first, name) for tag in one.tags}
     later = {tag for one in getattr(second, name) for tag in one.tags}
     if lone := [tag for tag in tags if (tag in centres) != (tag in later)]:
         what, where, setting = DEPENDENCES[name]
         raise UnanswerableError(
-            f"tags {first_few(map(str, lone))} have a {what} in one of the calibrations only: their delays are those "
-            f"of other {where}; fit both with the same `{setting}`"
+            f"tags {first_few(map(str, lone))} have a {what} in only one of the calibrations, so their delays refer "
+            f"to different {where}; fit both with the same `{setting}`"
         )
     moved_ns, moved_ns2 = np.zeros(len(tags)), np.zeros((len(tags),) * 2)
     for one in getattr(second, name):
@@ -201,13 +204,13 @@ def _apart(first: Calibration, second: Calibration, tags: list[int]) -> dict[str
 
 
 def loose_shifts(calibrations: Iterable[Calibration], tags: list[int]) -> Floats:
-    """Return shifts of delays (tags, k) that say nothing: of all delays, and along each undetermined split."""
+    """Return the shifts of delays (tags, k) that are not compared: of all delays, and along each undetermined split."""
     splits = [sides for calibration in calibrations for sides in calibration.undetermined_splits]
     along = [np.isin(tags, first) * 1.0 - np.isin(tags, second) for first, second in splits]
     return np.column_stack([np.ones(len(tags)), *along])
 
 
 def _is_stated(calibration: Calibration, tag: int) -> bool:
-    """Return whether a calibration states how well it knows a delay."""
+    """Return whether a calibration states the standard error of a delay."""
     covered = calibration.uncertainty is not None and tag in calibration.uncertainty.tags
     return covered or np.isfinite(calibration.delays_std_ns.get(tag, np.nan))

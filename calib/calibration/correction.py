@@ -31,9 +31,9 @@ from uwblink.twr import Exchanges
 
 @dataclass(frozen=True, slots=True)
 class Applied:
-    """Number of corrected ranges, of those at powers outside the fitted range, and of those without power.
+    """Counts of corrected ranges: all, those at powers outside the fitted powers, and those without power.
 
-    A range without power is corrected by its delays alone if the calibration has curves, and has no sigma.
+    If the calibration has curves, a range without power is corrected for delays only, and has no sigma.
     """
 
     count: int
@@ -49,13 +49,13 @@ def apply(
     to: str | None = None,
     force: bool = False,
 ) -> Applied:
-    """Write a recording again with `range_m` of every exchange corrected, and every other row of every table as it was.
+    """Write a copy of a recording with corrected `range_m` of every exchange; all other data stay the same.
 
     The table `corrected` has the raw range of each exchange, its standard deviation and its flags. `to` writes a
     folder in a form of `uwblink.exporters` instead ("csv", "parquet", "mcap", "rosbag2"). Stamps stay as they were
-    recorded. An exchange without any power gets the delays' part only. Exchanges of pairs that the calibration does not
-    determine are left out, with a `LeftOutWarning`. Raises `BadInputError` for a recording that is
-    corrected already, and what `Recording.open`, `check_output` and `export_recording` raise.
+    recorded. An exchange without any power is corrected for delays only. Exchanges of pairs that the calibration cannot
+    correct are left out, with a `LeftOutWarning`. Raises `BadInputError` for a recording that is corrected already, and
+    what `Recording.open`, `check_output` and `export_recording` raise.
 
     >>> import calib, tempfile
     >>> from uwblink import Recording
@@ -82,17 +82,19 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
     check_output(output, force=force, recording=True)
     with Recording.open(source, memory_mb=READING_MB) as recording:
         if "calibration" in recording.meta():
-            raise BadInputError(f"{source}: its ranges are corrected already; apply to the original")
+            raise BadInputError(
+                f"{source}: its ranges are already corrected; apply the calibration to the original recording"
+            )
         if (bare := recording.count("differences")) and not recording.count("exchanges"):
             raise BadInputError(
-                f"{source}: holds {bare} differences of arrival and no ranges; `calib localize` corrects them as it "
-                "uses them, with `use` receptions"
+                f"{source}: holds {bare} differences of arrival and no ranges; `calib localize` with `use` "
+                f"receptions corrects them itself"
             )
         warm, first = recording.columns("temperature"), 0
         told = calibration.errors.features if calibration.errors else {}
         # A response may belong to an exchange of the block before.
         features = features_of(recording.exchanges(), RecordedSource(recording)) if told else None
-        # Corrected ranges, and of these the clamped ones, those without power, and those that lack a direction.
+        # Counts of corrected ranges: all, clamped, without power, without a direction.
         tags, counts, left_out, why = recording.tags(), np.zeros(4, dtype=np.int64), 0, ""
         meta = {"calibration": calibration.provenance}
         with recording.copying(output, without=("exchanges", "corrected"), meta=meta, force=force) as written:
@@ -116,12 +118,12 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
     if left_out:
         warn(f"{why}; {left_out} ranges are left out", LeftOutWarning)
     if bare:
-        warn(f"{bare} differences of arrival without stamps stay as they were", LeftOutWarning)
+        warn(f"{bare} differences of arrival without stamps are copied unchanged", LeftOutWarning)
     return Applied(*applied)
 
 
 def _append(written: Recording, exchanges: Exchanges, applied: CorrectedRanges) -> tuple[int, int, int]:
-    """Add corrected exchanges; returns how many there are, how many are clamped, how many have no power."""
+    """Add corrected exchanges; returns their number, and the numbers of clamped ones and of those without power."""
     powered = np.isfinite(applied.lifted)
     numbers = ("sigma_m", "sigma_total_m", "mean_error_m", "tail_share", "tail_probability")
     corrected_m = np.where(powered, applied.corrected_m, applied.delay_corrected_m)
@@ -142,11 +144,11 @@ def _append(written: Recording, exchanges: Exchanges, applied: CorrectedRanges) 
 
 
 def live_correction(path: Path) -> Correction:
-    """Return the correction of exchanges and of what tags overheard, as they come, by the calibration in a file.
+    """Return the correction of arriving exchanges and overheard frames by the calibration in a file.
 
-    Columns are `corrected_m` and what else `CorrectedRange` has, with the numbers of `calib.apply`. The correction
-    raises what `Calibration.apply` and `Calibration.correct_arrivals` raise, as for a tag that is not calibrated.
-    Raises what `load_calibration` raises.
+    Columns are `corrected_m` and the other fields of `CorrectedRange`, with the same numbers as `calib.apply`. The
+    correction raises the errors of `Calibration.apply` and `Calibration.correct_arrivals`, for example for a tag
+    without a delay. Raises what `load_calibration` raises.
     """
     calibration = load_calibration(path)
 

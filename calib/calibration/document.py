@@ -1,4 +1,4 @@
-"""The JSON of a calibration: its keys, the types of its values, and reading and writing dataclasses by them."""
+"""The JSON file of a calibration: its keys, the types of its values, reading and writing."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _curve_keys(name: str, of: str) -> tuple[FileKey, ...]:
             f"{name}.coefficients", "numbers, m", "needed", "Its coefficients, as many as knots less degree less 1."
         ),
         FileKey(f"{name}.degree", "whole number", "needed", "Degree of its pieces."),
-        FileKey(f"{name}.range", "2 numbers", "needed", "Lifted powers that it was fitted on; constant beyond them."),
+        FileKey(f"{name}.range", "2 numbers", "needed", "Fitted lifted powers; the curve is constant outside them."),
     )
 
 
@@ -48,108 +48,156 @@ CALIBRATION_KEYS: Final = (
         "2 with `groups`, 3 with `power_at` reception, 4 with `pair_offsets`, 5 with `undetermined_splits`, 6 with "
         "`patterns`, 7 with `temperatures`.",
     ),
-    FileKey("delays_ns.TAG", "number, ns", "needed", "Aggregate antenna delay of a tag, transmit less receive."),
-    FileKey("delays_std_ns.TAG", "number, ns, or null", "needed", "Its standard error; null where data leave it free."),
-    FileKey("loss", "text", "needed", "What the fit minimized."),
-    FileKey("scale_ns", "number, ns", "needed", "The loss's scale: beyond it a range counts less."),
+    FileKey("delays_ns.TAG", "number, ns", "needed", "Aggregate antenna delay of a tag, transmit minus receive."),
+    FileKey(
+        "delays_std_ns.TAG",
+        "number, ns, or null",
+        "needed",
+        "Its standard error; null if the data do not determine it.",
+    ),
+    FileKey("loss", "text", "needed", "Loss or likelihood of the fit."),
+    FileKey("scale_ns", "number, ns", "needed", "Scale of the loss: ranges with larger errors have less weight."),
     FileKey(
         "lift",
         '"mean-of-lifted" or "lift-of-mean"',
         "needed",
-        "How the two powers of an exchange make its lifted power.",
+        "Lifted power of an exchange from its two powers.",
     ),
     FileKey("alpha_dbm", "number, dBm", "needed", "Power whose lifted power is 1."),
-    FileKey("speed_of_light", "number, m/s", "needed", "With which times were made distances."),
-    *_curve_keys("bias_curve", "bias, which corrected ranges are less by"),
+    FileKey("speed_of_light", "number, m/s", "needed", "Speed of light of the conversion from times to distances."),
+    *_curve_keys("bias_curve", "bias, which is subtracted from ranges"),
     *_curve_keys("sigma_curve", "standard deviation of corrected ranges without reflections"),
-    FileKey("provenance.KEY", "anything", "needed", "Writer, recordings, counts, recipe, gauge, warnings: for people."),
+    FileKey(
+        "provenance.KEY",
+        "anything",
+        "needed",
+        "Program, recordings, counts, settings, gauge, warnings: information for people.",
+    ),
     FileKey(
         "power_at",
         '"exchange" or "reception"',
         '"exchange"',
-        "Where the bias curve is taken: at an exchange's lifted power, or half at each of both powers.",
+        "Argument of the bias curve: the lifted power of the exchange, or of each reception (half of the bias each).",
     ),
     FileKey("groups.NAME.tags", "whole numbers", "no groups", "Tags of one antenna design."),
     *_curve_keys("groups.NAME.bias_curve", "bias of these tags"),
     *_curve_keys("groups.NAME.sigma_curve", "standard deviation of these tags"),
-    FileKey("errors.lifted", "numbers, increasing", "no errors", "Lifted powers of the two next keys."),
+    FileKey("errors.lifted", "numbers, increasing", "no errors", "Lifted powers of the next two keys."),
     FileKey("errors.noise_m", "numbers, m", "needed", "Standard deviation without reflections there."),
-    FileKey("errors.tail_share", "numbers, 0 to 1", "needed", "Share of ranges on reflections there."),
+    FileKey("errors.tail_share", "numbers, 0 to 1", "needed", "Share of reflected ranges there."),
     FileKey("errors.least_m", "number, m", "needed", "Shortest detour of a reflection."),
-    FileKey("errors.detour_m", "number, m", "needed", "Mean of what reflections travel beyond that, exponential."),
-    FileKey("errors.long_share", "number, 0 to 1", "0", "Share of the reflections that are of the long kind."),
-    FileKey("errors.long_factor", "number, above 0", "1", "Mean of the long detours over that of the others."),
-    FileKey("errors.between_m", "number, m", "0", "Of the noise, what differs between recordings, by pair."),
-    FileKey("errors.outlier_share", "number, 0 to 1", "needed", "Share of ranges that belong to nothing else."),
-    FileKey("errors.outlier_m", "number, m", "needed", "Standard deviation of those."),
-    FileKey("errors.location_m", "number, m", "needed", "Where the middle of the noise lies."),
-    FileKey("errors.scale", "number", "needed", "Factor that makes the total standard deviation hold."),
+    FileKey("errors.detour_m", "number, m", "needed", "Mean of the additional detour, which is exponential."),
+    FileKey("errors.long_share", "number, 0 to 1", "0", "Share of the long kind among the reflections."),
+    FileKey("errors.long_factor", "number, above 0", "1", "Ratio of the mean long detour to the mean of the others."),
     FileKey(
-        "errors.levels", "pairs of numbers, 0 to 1", "needed", "Shares, and the model's levels that held for them."
+        "errors.between_m",
+        "number, m",
+        "0",
+        "Part of the noise that is constant for a pair in a recording and differs between recordings.",
+    ),
+    FileKey("errors.outlier_share", "number, 0 to 1", "needed", "Share of outliers."),
+    FileKey("errors.outlier_m", "number, m", "needed", "Standard deviation of outliers."),
+    FileKey("errors.location_m", "number, m", "needed", "Centre of the noise."),
+    FileKey("errors.scale", "number", "needed", "Correction factor of the total standard deviation."),
+    FileKey(
+        "errors.levels",
+        "pairs of numbers, 0 to 1",
+        "needed",
+        "Shares of errors, and the model's probabilities that correspond to them.",
     ),
     FileKey(
-        "errors.lasting.mean", "number", "no persistence", "Mean of errors within the gate of a filter, over sigma."
+        "errors.lasting.mean",
+        "number",
+        "no persistence",
+        "Mean of the errors within the gate of a filter, in units of sigma.",
     ),
-    FileKey("errors.lasting.own_variance", "number, above 0", "needed", "Variance of what each range has of its own."),
-    FileKey("errors.lasting.lasting_variance", "number, above 0", "needed", "Variance of what ranges of a pair share."),
-    FileKey("errors.lasting.time_s", "number, s", "needed", "Time in which that part forgets."),
-    FileKey("errors.lasting.renewal_s", "number, s", "0", "Time after which reflections are drawn anew."),
+    FileKey("errors.lasting.own_variance", "number, above 0", "needed", "Variance of the independent part of errors."),
+    FileKey(
+        "errors.lasting.lasting_variance",
+        "number, above 0",
+        "needed",
+        "Variance of the part that successive ranges of a pair share.",
+    ),
+    FileKey("errors.lasting.time_s", "number, s", "needed", "Correlation time of the shared part."),
+    FileKey("errors.lasting.renewal_s", "number, s", "0", "Mean time for which a reflection lasts."),
     FileKey(
         "errors.features.NAME.log_odds",
         "number",
         "no features",
-        "What a feature (`response_db`, `rise_taps`) adds to the log odds of a reflection for each unit.",
-    ),
-    FileKey("errors.features.NAME.centre", "number, dB or taps", "needed", "Where it adds nothing."),
-    FileKey(
-        "errors.features.NAME.bounds", "2 numbers, dB or taps", "needed", "Beyond them it adds as much as at them."
+        "Change of the log odds of a reflection per unit of a feature (`response_db`, `rise_taps`).",
     ),
     FileKey(
-        "errors.known_log_odds", "number", "0", "Log odds that ranges with a known feature have besides `tail_share`."
+        "errors.features.NAME.centre",
+        "number, dB or taps",
+        "needed",
+        "Value of the feature at which the change is zero.",
     ),
-    FileKey("errors.pairs.PAIR.noise", "number, above 0", "1", "Factor of a pair, as 1-2, on the noise."),
-    FileKey("errors.pairs.PAIR.odds", "number, above 0", "1", "Its factor on the odds of a reflection."),
-    FileKey("errors.pairs.PAIR.detour", "number, above 0", "1", "Its factor on the mean detour."),
-    FileKey("pair_offsets.PAIR.offset_m", "number, m", "no constants", "How much longer ranges of a pair read."),
+    FileKey(
+        "errors.features.NAME.bounds",
+        "2 numbers, dB or taps",
+        "needed",
+        "Bounds of the feature; the change is constant outside them.",
+    ),
+    FileKey(
+        "errors.known_log_odds",
+        "number",
+        "0",
+        "Additional log odds of ranges with a known feature, relative to `tail_share`.",
+    ),
+    FileKey("errors.pairs.PAIR.noise", "number, above 0", "1", "Factor on the noise of a pair, such as 1-2."),
+    FileKey("errors.pairs.PAIR.odds", "number, above 0", "1", "Factor on the pair's odds of a reflection."),
+    FileKey("errors.pairs.PAIR.detour", "number, above 0", "1", "Factor on the pair's mean detour."),
+    FileKey(
+        "pair_offsets.PAIR.offset_m",
+        "number, m",
+        "no constants",
+        "Constant error of the ranges of a pair, positive if they are too long.",
+    ),
     FileKey("pair_offsets.PAIR.std_m", "number, m", "needed", "Its standard error."),
     *(
-        FileKey(f"antenna_delays.TAG.{name}", "whole number, ticks", "not known", f"{what}, when it was recorded.")
+        FileKey(
+            f"antenna_delays.TAG.{name}", "whole number, ticks", "not known", f"{what}, at the time of the recording."
+        )
         for name, what in (
             ("tx", "Transmit antenna delay register of a tag"),
             ("rx", "Receive antenna delay register of a tag"),
-            ("reply", "What a tag's firmware added to the stamps of its delayed replies"),
+            ("reply", "Constant that a tag's firmware added to the stamps of its delayed replies"),
         )
     ),
     FileKey("uncertainty.tags", "whole numbers", "not known", "Tags in the order of the next key."),
     FileKey("uncertainty.delays_ns2", "matrix, ns²", "needed", "Covariance of the delays."),
     FileKey("uncertainty.bias_m2", "matrix, m²", "needed", "Covariance of the bias curve's coefficients."),
-    FileKey("uncertainty.sigma_m2", "matrix, m²", "needed", "Covariance of the other curve's coefficients."),
+    FileKey(
+        "uncertainty.sigma_m2", "matrix, m²", "needed", "Covariance of the standard-deviation curve's coefficients."
+    ),
     FileKey(
         "undetermined_splits",
         "pairs of lists of tags",
         "none",
-        "Sides that ranged only with each other: only ranges between the two sides can be corrected. Of a side without "
-        "another: only differences of arrival from its tags.",
+        "Two sides of tags that ranged only with each other: only ranges between the two sides can be corrected. If "
+        "one side is empty, only differences of arrival can be corrected.",
     ),
     FileKey(
         "patterns",
         "list of tables",
         "none",
-        "`tags`; `coefficients_m` of 8 spherical harmonics less their `centre`, by which ranges are longer; their "
-        "`covariance_m2`; `rms_m`, without directions.",
+        "`tags`; `coefficients_m` of 8 spherical harmonics minus their `centre`, whose sum makes ranges longer; "
+        "their `covariance_m2`; `rms_m`, the uncertainty without directions.",
     ),
     FileKey(
         "temperatures",
         "list of tables",
         "none",
-        "`tags`; `m_per_k` by which ranges are longer for each kelvin of an end above `reference_c`; its standard "
-        "error `std_m_per_k`; `span_c`, lowest and highest fitted temperature.",
+        "`tags`; `m_per_k`, the growth of ranges per kelvin of one end above `reference_c`; its standard error "
+        "`std_m_per_k`; `span_c`, lowest and highest fitted temperature.",
     ),
 )
 
 
 def number(least: float, most: float, what: str, kind: Callable[[float], Any] = float) -> PlainValidator:
-    """Return the check of a number between two bounds, which errors call `what`; `int` takes whole ones only."""
+    """Return the check of a number between two bounds; errors describe it by `what`; `int` accepts whole numbers
+    only.
+    """
 
     def good(value: Any) -> bool:
         within = isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= most
@@ -159,17 +207,17 @@ def number(least: float, most: float, what: str, kind: Callable[[float], Any] = 
 
 
 def one_of(allowed: Iterable[str]) -> PlainValidator:
-    """Return the check of a word that is one of those allowed."""
+    """Return the check of a word against the allowed ones."""
     return expect(f"one of {', '.join(allowed)}", lambda value: isinstance(value, str) and value in allowed)
 
 
 def expect(what: str, good: Callable[[Any], bool], kind: Callable[[Any], Any] = lambda value: value) -> PlainValidator:
-    """Return the check of a value that is `good`, which errors call `what`; `kind` makes of it what is kept."""
+    """Return the check of a value by the function `good`; errors describe it by `what`; `kind` converts it."""
     return PlainValidator(_checker(good, f"expected {what}", kind))
 
 
 def joint(good: Callable[[Any], bool], mistake: str) -> AfterValidator:
-    """Return the check of a dataclass whose fields fit each other; errors state the `mistake` after the key's name."""
+    """Return the check that the fields of a dataclass agree; errors state the `mistake` after the key's name."""
     return AfterValidator(_checker(good, mistake))
 
 
@@ -185,12 +233,12 @@ def _checker(
 
 
 def is_tag_key(text: object) -> bool:
-    """Whether a text is the id of a tag, as keys of calibrations are."""
+    """Return whether a text is the id of a tag, as in keys of calibrations."""
     return isinstance(text, str) and text.isascii() and text.isdecimal() and len(text) < 9 and int(text) <= LARGEST_ID
 
 
 def is_pair(text: object) -> bool:
-    """Whether a text names a pair of tags, as 1-2."""
+    """Return whether a text names a pair of tags, such as 1-2."""
     ends = str(text).split("-")
     return len(ends) == 2 and all(map(is_tag_key, ends))
 
@@ -207,7 +255,9 @@ def pair_name(pair: Sequence[int]) -> str:
 
 
 def known_of_splits(splits: Iterable[Split]) -> str:
-    """Return in words what undetermined splits leave known: ranges between two sides, or differences within one."""
+    """Return a sentence about what undetermined splits determine: ranges between two sides, or differences within
+    one.
+    """
 
     def named(tags: Sequence[int]) -> str:
         return f"tag{'s' * (len(tags) > 1)} {first_few(map(str, tags))}"
@@ -222,13 +272,13 @@ def known_of_splits(splits: Iterable[Split]) -> str:
 
 
 def split_text(splits: Iterable[Split]) -> str:
-    """Return in words what undetermined splits leave known, why, and what determines the rest."""
+    """Return a sentence about what undetermined splits determine, why, and what would determine the rest."""
     splits = list(splits)
     why = (
-        "the delays of one side can grow as those of the other shrink; ranges among three of these tags, or a known "
-        "delay (`fixed_ns`), determine the rest"
+        "delays of one side can increase by the amount by which those of the other decrease; ranges among three of "
+        "these tags, or a known delay (`fixed_ns`), would determine the rest"
         if any(map(all, splits))
-        else "what all of their delays have in common cancels in these; a known delay (`fixed_ns`) determines the rest"
+        else "a common shift of their delays cancels in these; a known delay (`fixed_ns`) would determine the rest"
     )
     return f"{known_of_splits(splits)}, because {why}"
 
@@ -265,7 +315,7 @@ FreeStdNs = Annotated[
     WrapValidator(lambda value, check: math.inf if value is None else check(value)),
     PlainSerializer(lambda value: value if math.isfinite(value) else None),
 ]
-"""A standard error, which is infinite (null in files) where data leave a delay free."""
+"""A standard error; infinite (null in files) if the data do not determine the delay."""
 
 Matrix = tuple[tuple[Number, ...], ...]
 """A matrix as a tuple of rows."""
@@ -284,13 +334,13 @@ IN_ORDER: Final = WrapSerializer(lambda table, write: write(dict(sorted(table.it
 def write(calibration: Value, adapter: TypeAdapter[Value]) -> str:
     """Return a calibration as JSON text.
 
-    The version is what a program must support to read it: 2 with groups of tags, 3 with a curve that is taken at each
-    reception (taken at the mean power it is wrong by up to a decimetre), 4 with constants of pairs, 5 with pairs that
-    cannot be corrected, 6 with patterns over direction (without them ranges are wrong by up to a decimetre), 7 with
-    slopes over temperature.
+    The version states what a program must support to read the file: 2 with groups of tags, 3 with a curve that is taken
+    at each reception (taken at the mean power it is wrong by up to a decimetre), 4 with constants of pairs, 5 with
+    pairs that cannot be corrected, 6 with patterns over direction (without them ranges are wrong by up to a decimetre),
+    7 with slopes over temperature.
     """
     table = adapter.dump_python(calibration, mode="json")
-    # These are left out where there is nothing to say; they stand last, in this order.
+    # These keys are left out if they are empty; they are the last ones, in this order.
     optional = ("power_at", "groups", "errors", "pair_offsets", "antenna_delays", "uncertainty", "undetermined_splits",
                 "patterns", "temperatures")  # fmt: skip
     used = {key: value for key in optional if (value := table.pop(key)) and value != "exchange"}
@@ -305,7 +355,7 @@ def write(calibration: Value, adapter: TypeAdapter[Value]) -> str:
 
 
 def read(adapter: TypeAdapter[Value], text: str, where: str) -> Value:
-    """Return what an adapter makes of JSON text; raises `BadInputError` that names `where` and the key."""
+    """Return the object that an adapter reads from JSON text; raises `BadInputError` that names `where` and the key."""
     try:
         table = json.loads(text, parse_float=finite, parse_constant=finite)
     except (ValueError, RecursionError) as error:
@@ -325,7 +375,7 @@ def read(adapter: TypeAdapter[Value], text: str, where: str) -> Value:
 
 
 def _explained(errors: list[ErrorDetails]) -> str:
-    """Return the first mistake, that of a key which is there if there is one."""
+    """Return the first mistake; wrong values come before missing keys."""
     first = min(errors, key=lambda one: one["type"] == "missing")
     path = [str(part) for part in first["loc"]]
     message = "missing" if first["type"] == "missing" else first["msg"].removeprefix("Value error, ")
@@ -334,14 +384,14 @@ def _explained(errors: list[ErrorDetails]) -> str:
 
 
 def for_json(value: Any) -> Any:
-    """Return a value of numbers and tables as JSON has it, with None for what is not finite."""
+    """Return numbers and tables as JSON values, with None for numbers that are not finite."""
     if isinstance(value, dict):
         return {str(key): for_json(inner) for key, inner in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def finite(text: str) -> float:
-    """Return a number of JSON; raises `ValueError` for infinities and NaN, which could not be written again."""
+    """Return a number of JSON; raises `ValueError` for infinities and NaN, which JSON cannot hold."""
     value = float(text)
     if not math.isfinite(value):
         raise ValueError(f"{text} is no finite number")

@@ -1,9 +1,9 @@
 """The error model of corrected ranges, by pair and power: direct ranges, reflections, outliers.
 
-An error is noise about `location_m`; with a probability of `tail_share` it also contains a detour, the sum of a least
-one and an exponential one of one of two kinds; rarely it is an outlier. Noise and share are stated at some lifted
-powers, and interpolated linearly as logarithm and log odds. Each pair has factors on noise, odds and detour; an unknown
-pair has the common values.
+An error is noise about `location_m`; with a probability of `tail_share` it also contains a detour, which is the sum of
+a shortest detour and an exponential one of two kinds; rarely it is an outlier. Noise and share are given at some lifted
+powers; the logarithm of the noise and the log odds of the share are interpolated linearly. Each pair has factors on
+noise, odds and detour; an unknown pair has the common values.
 
 Errors of a pair are not independent in time: short reflections, fading and power readings change slowly, so successive
 ranges share a part of their errors, and a filter that assumes independent ones is overconfident (`LastingErrors`).
@@ -53,8 +53,9 @@ LogOdds = Annotated[float, number(-50.0, 50.0, "a logarithm of odds, -50 to 50")
 @dataclass(frozen=True, slots=True)
 class LastingErrors:
     """Errors of ranges within the gate of a filter, in units of sigma: mean, variance of the independent part, variance
-    of the lasting part, and the time constant of the latter. After `renewal_s` on average it is drawn anew whether
-    ranges of a pair are reflected, and by what detour; 0: with each range."""
+    of the lasting part, and the time constant of the latter. A reflection of a pair and its detour last for `renewal_s`
+    on average; 0: they are independent for each range.
+    """
 
     mean: Metres
     own_variance: Positive
@@ -74,7 +75,7 @@ class PairErrors:
 
 @dataclass(frozen=True, slots=True)
 class FeatureSlope:
-    """What a feature adds to the log odds of a reflection for each unit above `centre`, between two `bounds`."""
+    """Change of the log odds of a reflection per unit of a feature above `centre`, between two `bounds`."""
 
     log_odds: LogOdds
     centre: Number
@@ -83,7 +84,7 @@ class FeatureSlope:
 
 CheckedFeature = Annotated[
     FeatureSlope,
-    joint(lambda slope: slope.bounds[0] <= slope.bounds[1], "bounds: expected the lower before the upper"),
+    joint(lambda slope: slope.bounds[0] <= slope.bounds[1], "bounds: expected the lower bound first"),
 ]
 
 
@@ -101,15 +102,15 @@ class ErrorModel:
     """Core, tail and outliers of the errors of corrected ranges, metres and shares of 1.
 
     `noise_m` and `tail_share` are those at `lifted` powers, for a pair that is not among `pairs` (named
-    "smaller-larger"). `levels` are shares of errors and the model's levels that these were found below while fitting:
-    what makes quantiles hold where the shape does not. `scale` does so for the total standard deviation. `detour_m` is
-    the mean of both kinds of exponential detour; `long_share` of the reflections are `long_factor` times as long as the
-    others. Without one there is one kind, as in calibrations of uwbcal up to 0.2.0. Of the noise `between_m` is what
-    stays in the ranges of a pair for a recording, or a spell of it, and changes by the next; the uncertainty of delays
-    and curve is in the noise, too.
-    `features` are slopes of the log odds of a reflection. A range with a known feature has `known_log_odds` besides,
-    because `tail_share` is the share of reflections among ranges without.
-    `lasting` says how long errors within the gate of a filter last; None where that is not known.
+    "smaller-larger"). `levels` are pairs of a share of the fitted errors and the model's probability of the same
+    quantile; they correct quantiles where the shape of the model is wrong. `scale` corrects the total standard
+    deviation. `detour_m` is the mean of both kinds of exponential detour; `long_share` of the reflections are
+    `long_factor` times as long as the others. Without `long_share` there is one kind, as in calibrations of uwbcal up
+    to 0.2.0. `between_m` is the part of the noise that is constant for a pair during a recording, or a part of it, and
+    differs in the next; the noise also includes the uncertainty of delays and curve. `features` are slopes of the log
+    odds of a reflection. A range with a known feature has `known_log_odds` in addition, because `tail_share` is the
+    share of reflections among ranges without features. `lasting` is the persistence of errors within the gate of a
+    filter; None if it is not known.
     """
 
     lifted: tuple[Number, ...]
@@ -131,9 +132,9 @@ class ErrorModel:
     known_log_odds: LogOdds = 0.0
 
     def log_odds_of(self, features: NDArray[np.floating]) -> Floats:
-        """Return what `FEATURES` (n, 2) of ranges add to the log odds of a reflection (n,), 0 where all are unknown.
+        """Return the log odds of a reflection (n,) that `FEATURES` (n, 2) of ranges add, 0 if all are unknown.
 
-        One that is unknown beside others counts as at its centre.
+        If only one feature is unknown, its centre is used.
         """
         found, known = np.zeros(len(features)), np.zeros(len(features), dtype=bool)
         for name, slope in self.features.items():
@@ -158,7 +159,7 @@ class ErrorModel:
         return replace(self, noise_m=tuple(noise_m.tolist()), between_m=between_m, pairs=pairs)
 
     def within_m(self, noise_m: Floats) -> Floats:
-        """Return the part of the noise of ranges (n,), metres, that varies within a recording: a tenth of it at least,
+        """Return the part of the noise of ranges (n,), metres, that varies within a recording: at least a tenth of it,
         because other calibrations may state less noise than `between_m`."""
         return np.sqrt(np.maximum(np.square(noise_m) - self.between_m**2, (0.1 * noise_m) ** 2))
 
@@ -276,7 +277,7 @@ class ErrorModel:
         wide = max(self.outlier_m, 1e-9)
         wild = self.outlier_share * np.exp(-0.5 * (error / wide) ** 2) / (wide * ROOT_2PI)
         total = core + tail + wild
-        # Where all three vanish, only an outlier is possible.
+        # If all three densities are zero, only an outlier is possible.
         nothing = total <= 0
         total = np.where(nothing, 1.0, total)
         return np.asarray(tail / total), np.where(nothing, 1.0, wild / total)
@@ -317,16 +318,16 @@ def _nodes_fit(model: ErrorModel) -> bool:
 
 
 CheckedErrors = Annotated[
-    ErrorModel, joint(_nodes_fit, "lifted: expected ascending powers, with as many noises and shares")
+    ErrorModel, joint(_nodes_fit, "lifted: expected ascending powers, with a noise and a share for each")
 ]
 
 
 def lasting_errors(ranges: Ranges, z: Floats, share: Floats, reflected: Floats) -> LastingErrors | None:
-    """Fit persistence to errors over sigma (n,), and to reflections, of which ranges have a share (n,) and, by their
-    errors, a probability (n,), by pair. None without enough products of errors within the gate.
+    """Fit the persistence, by pair, of errors over sigma (n,) and of reflections. Ranges have a share of reflections
+    (n,) and a probability given their errors (n,). Returns None without enough products of errors within the gate.
 
-    Probabilities with variance v leave the variance w of what they say (1 or 0). Two of one reflection have the
-    covariance v v/(v + w) if the shares are right, and more otherwise.
+    Let v be the variance of the probabilities and w the remaining variance of the true state (1 or 0). Two ranges of
+    one reflection have the covariance v v/(v + w) if the shares are right, and more otherwise.
     """
     inside = np.flatnonzero(z**2 < GATE)
     mean, total = float(np.mean(z[inside])), float(np.var(z[inside]))

@@ -48,28 +48,28 @@ def programmed(path: str | os.PathLike[str]) -> AntennaDelays:
     with Recording.open(path) as opened:
         found = antenna_delays_in(opened.meta(), str(path))
     if not found:
-        raise BadInputError(f"{path}: does not say what was programmed into its devices")
+        raise BadInputError(f"{path}: does not contain the antenna delays that were programmed into its devices")
     return found
 
 
 def registers(
     calibration: Calibration, base: AntennaDelays | None = None, *, firmware: bool = False
 ) -> dict[int | None, AntennaDelay]:
-    """Return what to program into tags, on top of what was programmed when they were recorded.
+    """Return the antenna delays to program into tags, given those programmed during the recording.
 
-    These are the calibration's `antenna_delays`, or `base` (`programmed`) where it has none. The chip adds the
+    The latter are the calibration's `antenna_delays`, or `base` (`programmed`) if it has none. The chip adds the
     transmitter's register to transmit stamps and takes the receiver's from receive stamps. A recorded stamp is the
     true one plus d_t = 0.44 d or d_r = -0.56 d, so both registers grow by their share of -d (docs/theory.md). With
     `firmware`, its constant for the stamps of delayed replies is that of the transmitter; without, it stays as it was.
-    Raises `BadInputError` for a value that 16 bits do not hold, for delays that the data left free (a device ranges
-    with any other, and its register would be right with some of them alone), where the programmed delays are unknown,
-    and where calibration and `base` contradict each other.
+    Raises `BadInputError` for a value that 16 bits do not hold, for delays that the data do not determine (their
+    registers would be right only with some other devices), if the programmed delays are unknown, and if calibration and
+    `base` contradict each other.
     """
     free = free_delays(calibration)
     if free:
         raise BadInputError(
-            f"the data leave the delay of tag {', '.join(map(str, free))} free, so no register is right; fix one that "
-            "is known (`fixed_ns`), or fit ranges between more tags (csv and json say what is known)",
+            f"the data do not determine the delay of tag {', '.join(map(str, free))}, so it has no register value; "
+            f"set a known delay (`fixed_ns`), or fit ranges between more tags (csv and json state what is known)",
             parameter="to",
         )
     found = _on_top(calibration, base)
@@ -84,9 +84,9 @@ def registers(
 
 
 def antenna_delays_warning(calibration: Calibration, path: str | os.PathLike[str]) -> str:
-    """Return a warning where a recording's tags had other antenna delays programmed than those of a calibration.
+    """Return a warning if the antenna delays programmed in a recording differ from those of a calibration.
 
-    Returns "" where they were the same or are unknown; raises what `Recording.open` raises.
+    Returns "" if they are equal or unknown; raises the errors of `Recording.open`.
     """
     with Recording.open(path) as opened:
         now, tags = antenna_delays_in(opened.meta(), str(path)), [tag.tag for tag in opened.tags()]
@@ -94,14 +94,14 @@ def antenna_delays_warning(calibration: Calibration, path: str | os.PathLike[str
 
 
 def free_delays(calibration: Calibration) -> list[int]:
-    """Return the tags whose delays the data left free: sums with those of some others may be known, they are not."""
+    """Return the tags whose own delays the data do not determine, even if sums with others are determined."""
     return [tag for tag, std in sorted(calibration.delays_std_ns.items()) if not math.isfinite(std)]
 
 
 def _on_top(calibration: Calibration, base: AntennaDelays | None) -> dict[int | None, AntennaDelay]:
-    """Return what to program by tag, determined or not; nothing for tags whose programmed delays are unknown.
+    """Return the antenna delays to program by tag, determined or not; without tags whose programmed delays are unknown.
 
-    The sum of both registers is rounded once: it is what ranges are made of.
+    The sum of both registers is rounded once, because ranges depend on the sum.
     """
     tags = sorted(calibration.delays_ns)
     if base is not None and (differ := delays_differ(calibration.antenna_delays, base, tags)):
@@ -115,8 +115,8 @@ def _on_top(calibration: Calibration, base: AntennaDelays | None) -> dict[int | 
         found[tag] = AntennaDelay(before.tx + tx, before.rx + ticks - tx, before.reply)
         if not all(0 <= value <= REGISTER_MAX for value in found[tag]):
             raise BadInputError(
-                f"tag {tag}: its registers would be {found[tag]}, which 16 bits do not hold; give the recording that "
-                "the calibration was fitted to",
+                f"tag {tag}: its registers would be {found[tag]}, outside 16 bits; give the recording that the "
+                f"calibration was fitted to",
                 parameter="base",
             )
     return found
@@ -401,10 +401,10 @@ static inline int uwb_errors(double fpp1_dbm, double fpp2_dbm, int initiator, in
 
 
 def c_header(calibration: Calibration) -> str:
-    """Return a header without anything but tables and static functions.
+    """Return a C header that contains only tables and static functions.
 
-    Curves are written as polynomials with 17 digits, so that C and Python differ by rounding only. Both delays count
-    half in a range, as in `Calibration.correct` without weights.
+    Curves are written as polynomials with 17 digits, so that C and Python differ only by rounding. A range contains
+    half of each delay, as in `Calibration.correct` without weights.
     """
     tags = sorted(calibration.delays_ns)
     metres = [calibration.delays_ns[tag] * 1e-9 * calibration.speed_of_light for tag in tags]
@@ -463,7 +463,7 @@ def _c_errors(model: ErrorModel, bias: Curve) -> list[str]:
 
 
 def _c_dependences(calibration: Calibration, tags: list[int]) -> list[str]:
-    """Return patterns over direction and slopes over temperature, and a row of zeros after the last of each."""
+    """Return the tables of patterns over direction and slopes over temperature, each with a last row of zeros."""
 
     def owners(several: Sequence[Pattern | TemperatureSlope]) -> list[str]:
         return [", ".join(str(int(tag in one.tags)) for tag in tags) for one in several]
@@ -492,10 +492,12 @@ def _c_dependences(calibration: Calibration, tags: list[int]) -> list[str]:
 
 
 def _c_curve(name: str, curve: Curve) -> list[str]:
-    """Return a curve as polynomials between its knots: where each begins, and its coefficients, the highest first."""
+    """Return a curve as polynomials between its knots: the start of each, and its coefficients, the highest first."""
     degree, count = curve.degree, len(curve.coefficients)
     whole = PPoly.from_spline((np.array(curve.knots), np.array(curve.coefficients), degree))
-    pieces = [k for k in range(degree, count) if whole.x[k + 1] > whole.x[k]]  # none between two equal knots
+    pieces = [
+        k for k in range(degree, count) if whole.x[k + 1] > whole.x[k]
+    ]  # equal knots have no polynomial between them
     low, high = curve.range
     return [
         f"static const double uwb_{name}_left[] = {{{_numbers(whole.x[pieces])}}};",
@@ -539,12 +541,12 @@ def export(
 ) -> str:
     """Return a calibration as text in another form, and write it to `path` where one is given.
 
-    `to` is "registers" (values for the DW1000's antenna-delay registers, as TOML), "firmware" (those, and the constants
-    of its build), "json", "csv" (delays), "miluv", "ros-yaml" or "c-header" (tables and a function that corrects a
-    range). Registers are on top of what was programmed when the devices were recorded: the calibration's
+    `to` is "registers" (values for the DW1000's antenna-delay registers, as TOML), "firmware" (the same, and the
+    constants of the firmware's build), "json", "csv" (delays), "miluv", "ros-yaml" or "c-header" (tables and a function
+    that corrects a range). Registers include the antenna delays programmed during the recording: the calibration's
     `antenna_delays`, or `base` (`programmed`). Raises `BadInputError` for another form, for a calibration with groups
-    of tags or patterns over direction in a form that has one curve, and for registers of tags whose delays the data
-    left free.
+    of tags or patterns over direction in a form that has one curve, and for registers of tags whose delays the data do
+    not determine.
 
     >>> import calib
     >>> print(calib.export(calib.fit(calib.sample_flight()).calibration, "registers").splitlines()[2])
@@ -554,22 +556,22 @@ def export(
     if to not in FORMATS:
         raise BadInputError(f"found {to!r}, allowed: {', '.join(FORMATS)}", parameter="to")
     lacking: tuple[tuple[Sized, Collection[str], str], ...] = (
-        (calibration.pair_offsets, FORMATS.keys() - {"json"}, "no place for constants of pairs; export it as json"),
+        (calibration.pair_offsets, FORMATS.keys() - {"json"}, "no fields for constants of pairs; export it as json"),
         (
             calibration.temperatures,
             ("miluv", "ros-yaml"),
-            "no place for slopes over temperature; export it as json, or fit with `temperature` none",
+            "no fields for slopes over temperature; export it as json, or fit with `temperature` none",
         ),
         (
             calibration.patterns,
             ("miluv", "ros-yaml"),
-            "no place for patterns over direction; export it as json, or fit with `pattern` none",
+            "no fields for patterns over direction; export it as json, or fit with `pattern` none",
         ),
         (
             calibration.groups,
             ("miluv", "ros-yaml", "c-header"),
-            f"one curve for all tags, this calibration one for each of the groups {', '.join(calibration.groups)}; "
-            "export it as json",
+            f"one curve for all tags, but this calibration has one for each group ({', '.join(calibration.groups)}); "
+            f"export it as json",
         ),
     )
     for there, forms, why in lacking:
@@ -587,9 +589,9 @@ CURVES_OF_MILUV: Final = ("bias_spline_m", "std_spline_m")
 def read_miluv(path: Path) -> Calibration:
     """Read the JSON form of MILUV's published calibration; raises `BadInputError`.
 
-    Its bias curve is meant for each reception (`power_at="reception"`), ours for the mean of an exchange's lifted
-    powers, and its delays are on top of 16436 in both registers, as the boards had them. What has no place here is
-    kept, so that exporting gives it back.
+    Its bias curve applies to each reception (`power_at="reception"`), while fitted curves here apply to the mean of an
+    exchange's lifted powers. Its delays are relative to 16436 in both registers, as programmed into the boards. Other
+    keys are kept and exported again.
     """
     text = read_text(path, BadInputError, "calibration of MILUV (.json)")
     try:

@@ -63,7 +63,7 @@ def matrix_of(values: Floats) -> Matrix:
 
 @dataclass(frozen=True, slots=True)
 class TagGroup:
-    """Tags of one design, and their curves; a range between groups gets the mean of both groups' curves."""
+    """Tags of one design, and their curves; a range between two groups uses the mean of both groups' curves."""
 
     tags: Tags
     bias_curve: BiasCurve
@@ -85,7 +85,7 @@ class Uncertainty:
 
 @dataclass(frozen=True, slots=True)
 class PairOffset:
-    """By how much the ranges of a pair are too long, and its standard error, in metres."""
+    """Constant error of the ranges of a pair (positive: too long), and its standard error, in metres."""
 
     offset_m: Metres
     std_m: StdM
@@ -111,21 +111,22 @@ Registers = Annotated[
 class Calibration:
     """Antenna delays of tags, in nanoseconds, and the curves of bias and standard deviation.
 
-    A standard error is infinite where the data did not determine the delay. `power_at` is where the bias curve is
-    taken: "exchange", at the lifted power of an exchange as `lift` makes it of two; or "reception", at each of the two
-    powers, half of either in a range, as curves are published that correct single stamps. With `groups`, each has its
-    own curves, and the plain ones are the groups' average, for display only. `errors` is the error model of corrected
-    ranges, by pair and power; None where that is not known, as in older and in imported calibrations. With
-    `pair_offsets`, by pair with the smaller id first, ranges of a pair read longer by its constant, in addition to
-    delays and curves, and a pair that has none cannot be corrected. `antenna_delays` is what was programmed into the
-    tags when they were recorded, which delays are on top of; empty where that is not known.
+    A standard error is infinite if the data did not determine the delay. `power_at` is the argument of the bias curve:
+    "exchange", the lifted power of the exchange, which `lift` computes from both powers; or "reception", each of the
+    two powers, with half of each bias in a range, as in published curves that correct single stamps. With `groups`,
+    each has its own curves, and the plain ones are the groups' average, for display only. `errors` is the error model
+    of corrected ranges, by pair and power; None if unknown, as in older and in imported calibrations. `pair_offsets`,
+    by pair with the smaller id first, are constant errors in addition to delays and curves; a pair without one cannot
+    be corrected then. `antenna_delays` were programmed into the tags during the recording, and the delays are relative
+    to them; empty if unknown.
 
-    `undetermined_splits` are pairs of sides, as anchors and robots, that ranged only with each other: the delays of one
-    side may be longer and those of the other shorter by as much. Ranges between two sides can be corrected, and no
-    others of their tags. With an empty side all delays of the other may be longer alike: they are stated less their
-    mean, and correct differences of arrival without stamps only. `patterns` say how ranges depend on the directions in
-    which antennas see each other, and `temperatures` how they grow with the temperatures of their ends; where these
-    are not known, ranges are corrected without them, and `sigma_total_m` contains what is missing.
+    `undetermined_splits` are pairs of sides, such as anchors and robots, that ranged only with each other: all delays
+    of one side can be larger and those of the other smaller by the same amount. Of their tags, only ranges between the
+    two sides can be corrected. If one side is empty, all delays of the other can be shifted together: they are stated
+    relative to their mean, and correct only differences of arrival without stamps. `patterns` describe the dependence
+    of ranges on the directions between the antennas, and `temperatures` that on the temperatures of both ends; if
+    directions or temperatures are unknown, ranges are corrected without them, and `sigma_total_m` includes the missing
+    effect.
     """
 
     delays_ns: Annotated[dict[TagKey, DelayNs], IN_ORDER]
@@ -150,7 +151,9 @@ class Calibration:
 
     @property
     def sides(self) -> dict[int, int]:
-        """Return the side of each tag in a split, by its number from 1 and by the sign: two opposite ones add to 0."""
+        """Return the side of each tag in a split: the number of the split, from 1, positive for one side and negative
+        for the other.
+        """
         return {
             tag: sign * number
             for number, sides in enumerate(self.undetermined_splits, 1)
@@ -159,9 +162,9 @@ class Calibration:
         }
 
     def interval_std_ns(self) -> dict[int, float]:
-        """Return the standard errors of the delays that are not only known as parts of pairs.
+        """Return the standard errors of the delays, except those known only through constants of pairs.
 
-        Of delays of which only differences are known those are of the delays less their mean.
+        If only differences of delays are known, they are the standard errors of the delays minus their mean.
         """
         alone = {tag for sides in self.undetermined_splits if not all(sides) for tags in sides for tag in tags}
         return {
@@ -172,9 +175,9 @@ class Calibration:
 
     @property
     def pair_constants(self) -> dict[tuple[int, int], PairOffset]:
-        """Return by how much ranges of a pair are too long, where constants of pairs are known and delays are not.
+        """Return the constant errors of pairs whose delays are not known separately.
 
-        Those are `pair_offsets`, and the pairs between the sides of `undetermined_splits`.
+        These are `pair_offsets`, and the pairs between the sides of `undetermined_splits`.
         """
         found, half_m = dict(self.pair_offsets), 0.5e-9 * self.speed_of_light
         for one, other in self.undetermined_splits:
@@ -184,7 +187,7 @@ class Calibration:
         return found
 
     def std_of_sum_ns(self, tags: Collection[int]) -> float:
-        """Return the standard error of the sum of some tags' delays, NaN where it is not known."""
+        """Return the standard error of the sum of some tags' delays, NaN if it is not known."""
         if self.uncertainty is None:
             return math.nan
         own = np.isin(self.uncertainty.tags, list(tags))
@@ -193,7 +196,7 @@ class Calibration:
     def covariance_ns2(self, tags: Sequence[int]) -> Floats:
         """Return the covariance of some delays (tags, tags), zero where nothing is stated.
 
-        It is that of the fit where it is known, else has the squares of the standard errors alone.
+        It is that of the fit if known; otherwise diagonal, with the squares of the standard errors.
         """
         std_ns = np.array([self.delays_std_ns.get(tag, math.nan) for tag in tags])
         found = np.diag(np.where(np.isfinite(std_ns), std_ns, 0.0) ** 2)
@@ -206,19 +209,19 @@ class Calibration:
 
     @property
     def stopped(self) -> bool:
-        """Whether the fit behind it stopped before it settled, so that delays and intervals are not final."""
+        """Whether the fit stopped before it converged, so that delays and intervals are not final."""
         return self.provenance.get("converged") is False
 
     @property
     def needs_power(self) -> bool:
-        """Whether ranges without any power cannot be corrected whole."""
+        """Whether the full correction of a range needs its power."""
         curves: tuple[Calibration | TagGroup, ...] = (self, *self.groups.values())
         return not all(one.bias_curve.flat and one.sigma_curve.flat for one in curves)
 
     def lifted(self, ranges: Ranges) -> Floats:
         """Return the lifted power of each range, as this calibration defines it."""
         lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, self.lift, self.alpha_dbm)
-        # Where nothing depends on power, a range without any is as good as another.
+        # If nothing depends on power, a range without power gets the full correction.
         return lifted if self.needs_power else np.where(np.isfinite(lifted), lifted, self.bias_curve.range[0])
 
     def __repr__(self) -> str:
@@ -243,15 +246,16 @@ class Calibration:
         return corrected_ranges(self, ranges)
 
     def correct_arrivals(self, ranges: Ranges) -> CorrectedArrivals:
-        """Correct what listeners overheard of ranges: the target's delay, the bias of each reception, the range.
+        """Correct differences of arrival at listeners: for the target's delay, the bias of each reception, and the
+        range.
 
         The result has a row for each of the ranges' `arrivals`. With initiator i, target j, listener k, and bias b and
         noise e of receptions of poll (1) and response (2), a difference of arrival is d_jk - d_ik - c d_j + b1_j + b2_k
         - b1_k; the corrected range in place of d_ij leaves (e1_j - e2_i)/2 + e2_k - e1_k. With sigma of the curve at
         the powers of exchange, response and poll its variance is sigma_ij^2 + 2 sigma_jk^2 + 2 sigma_ik^2, because
         a reception has twice the variance of a range; where the rate of the clocks comes from a third message, one
-        factor is above 2 and one below (`applying.reception_gains`). The listener's delay has no part. Raises
-        `BadInputError` where a delay is not known, or only in a sum with others.
+        factor is above 2 and one below (`applying.reception_gains`). The listener's delay cancels. Raises
+        `BadInputError` if a delay is not known, or only in a sum with others.
 
         >>> import calib
         >>> ranges = calib.load_ranges(calib.sample_flight())
@@ -263,11 +267,11 @@ class Calibration:
         return corrected_arrivals(self, ranges)
 
     def quantiles(self, ranges: Ranges, shares: Sequence[float] = (0.025, 0.975)) -> Floats:
-        """Return the errors (n, k), in metres, below which shares (k,) of the errors of such corrected ranges lie.
+        """Return the quantiles (n, k) of the errors of corrected ranges, in metres, for shares (k,).
 
-        By pair, power and features; the truth lies with 95 % between a corrected range less its 97.5 % and less its
-        2.5 % quantile. NaN without a power. Raises `UnanswerableError` for a calibration without `errors`,
-        `BadInputError` for shares that are not between 0 and 1.
+        They depend on pair, power and features. With 95 % probability the true distance lies between the corrected
+        range minus its 97.5 % quantile and the corrected range minus its 2.5 % quantile. NaN without a power. Raises
+        `UnanswerableError` for a calibration without `errors`, `BadInputError` for shares that are not between 0 and 1.
 
         >>> import calib
         >>> known = calib.fit(calib.sample_flight()).calibration
@@ -277,7 +281,7 @@ class Calibration:
         (2, 1)
         """
         if self.errors is None:
-            raise UnanswerableError("the calibration does not say what errors are made of; fit anew from a recording")
+            raise UnanswerableError("the calibration has no error model; fit it again from a recording")
         lifted = self.lifted(ranges)
         where = (lifted, ranges.initiator, ranges.target, self.errors.log_odds_of(ranges.features))
         found = self.errors.quantiles(shares, *where)
@@ -328,15 +332,16 @@ class Calibration:
         elevation_deg: tuple[Any, Any] = (0.0, 0.0),
         temperature_c: tuple[Any, Any] = (math.nan, math.nan),
     ) -> CorrectedRange[Any]:
-        """Correct one range, or arrays of them (n,): the corrected range and its standard deviations, in metres.
+        """Correct one range, or arrays of them (n,); returns the corrected range and its standard deviations, in
+        metres.
 
-        `range_m` is as the board gives it, powers are in dBm, NaN or 0 where a board has none. A call takes
+        `range_m` is the range that the board reports; powers are in dBm, NaN or 0 if the board has none. A call takes
         less than a millisecond, for one range or for hundreds. `weights` are those of the two delays
-        (`uwblink.twr.delay_weights`); halves take both clocks for equally fast (K = 1), wrong by a millionth of the
-        delays, a hundredth of a millimetre at most. `azimuth_deg` and `elevation_deg` are the directions from the
-        antennas of initiator and target to each other, in the frames of their bodies, NaN where they are not known;
-        only a calibration with `patterns` uses them, and only one with `temperatures` the temperatures `temperature_c`
-        of both. Equals `apply` otherwise, and raises what that raises.
+        (`uwblink.twr.delay_weights`); the default, one half each, assumes equal clock rates (K = 1), which causes an
+        error of a millionth of the delays, at most a hundredth of a millimetre. `azimuth_deg` and `elevation_deg` are
+        the directions from the antennas of initiator and target to each other, in the frames of their bodies, NaN if
+        unknown; only a calibration with `patterns` uses them. `temperature_c` are the temperatures of both, used only
+        by a calibration with `temperatures`. Results and errors are those of `apply`.
 
         >>> import calib
         >>> known = calib.fit(calib.sample_flight()).calibration
@@ -364,12 +369,12 @@ class Calibration:
 
     @property
     def curve_covariance_m2(self) -> Floats:
-        """The covariance (m, m) of the coefficients of the bias curve, zero where it is not stated."""
+        """The covariance (m, m) of the coefficients of the bias curve, zero if it is not stated."""
         size = len(self.bias_curve.coefficients)
         return np.zeros((size, size)) if self.uncertainty is None else np.array(self.uncertainty.bias_m2)
 
     def band(self, lifted: Floats, which: Literal["bias", "sigma"]) -> Floats | None:
-        """Return the standard error of a curve at lifted powers (n,), in metres; None where it is not known."""
+        """Return the standard error of a curve at lifted powers (n,), in metres; None if it is not known."""
         if self.uncertainty is None:
             return None
         curve = self.bias_curve if which == "bias" else self.sigma_curve
@@ -388,7 +393,7 @@ class Calibration:
 
 
 def _checked(calibration: Calibration) -> Calibration:
-    """Return a calibration; raises `ValueError` where splits, dependences or sizes of covariances do not fit."""
+    """Return a calibration; raises `ValueError` if splits, dependences or sizes of covariances do not agree."""
     parts = {
         "undetermined_splits": [tags for sides in calibration.undetermined_splits for tags in sides],
         "patterns": [one.tags for one in calibration.patterns],
@@ -397,7 +402,7 @@ def _checked(calibration: Calibration) -> Calibration:
     for key, some in parts.items():
         named = [tag for tags in some for tag in tags]
         if len(set(named)) < len(named) or not calibration.delays_ns.keys() >= set(named):
-            raise ValueError(f"{key}: expected calibrated tags, each of them once")
+            raise ValueError(f"{key}: expected calibrated tags, each one once")
     age_line(calibration)
     known = calibration.uncertainty
     if known is None:
@@ -411,7 +416,9 @@ def _checked(calibration: Calibration) -> Calibration:
         rows = getattr(known, name)
         # A variance of 0 may come out of a decomposition a little below 0.
         if len(rows) != size or any(len(row) != size or row[k] < -1e-9 for k, row in enumerate(rows)):
-            raise ValueError(f"uncertainty: {name}: expected {size} rows of {size} numbers, and no variance below 0")
+            raise ValueError(
+                f"uncertainty: {name}: expected {size} rows of {size} numbers, with variances of 0 or more"
+            )
     return calibration
 
 
@@ -431,18 +438,18 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
 
 
 class CalibrationResult:
-    """Base of what a fit and a survey return: a calibration, how it came about, and warnings."""
+    """Base of the results of a fit and a survey: a calibration, its origin, and warnings."""
 
     __slots__ = ()
     calibration: Calibration
     warnings: Sequence[str]
 
     def headline(self) -> str:
-        """Return what the calibration rests on, in one line."""
+        """Return one line about the data of the calibration."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
-        """Return the calibration as a table, below what it rests on, above the warnings."""
+        """Return the headline, the calibration as a table, and the warnings."""
         return "\n".join([self.headline(), repr(self.calibration), *(f"warning: {text}" for text in self.warnings)])
 
     def _repr_html_(self) -> str:
@@ -462,7 +469,7 @@ CalibrationSource = Calibration | CalibrationResult | str | os.PathLike[str]
 def given_calibration(source: CalibrationSource, parameter: str = "calibration") -> Calibration:
     """Return the calibration that an argument gives.
 
-    Raises `BadInputError` that names `parameter` where it gives none, and what `load_calibration` raises.
+    Raises `BadInputError` that names `parameter` if it gives none, and the errors of `load_calibration`.
     """
     known = load_calibration(source) if isinstance(source, str | os.PathLike) else source
     known = getattr(known, "calibration", known)
@@ -491,7 +498,7 @@ def _tables(calibration: Calibration) -> dict[str, list[tuple[str, ...]]]:
 
 
 def interval(std: float, digits: int = 4) -> str:
-    """Return in words the 95 % interval of a value with such a standard error."""
+    """Return the text of the 95 % interval of a value with this standard error."""
     words = {0.0: "pinned", math.inf: "undetermined"}
     known = f"± {TWO_SIDED_95 * std:.{digits}f} (95 %)" if math.isfinite(std) else "standard error not stated"
     return words.get(std, known)
@@ -504,9 +511,9 @@ def pair_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 
 def delay_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """Return tag, delay in ns, and its interval in words, of tags whose delays are not only known as parts of pairs.
+    """Return tag, delay in ns, and the text of its interval, except for tags known only through constants of pairs.
 
-    Delays of which only differences are known are those less their mean.
+    If only differences of delays are known, the delays are relative to their mean.
     """
     if calibration.pair_offsets and not any(calibration.delays_ns.values()):
         return []
@@ -521,7 +528,9 @@ def delay_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 
 def pattern_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """Return the tags of each pattern over direction, its root mean square in cm, and where it is largest."""
+    """Return the tags of each pattern over direction, its root mean square in cm, and its largest value and
+    direction.
+    """
     around = np.radians(np.arange(360))
     level = np.column_stack([np.cos(around), np.sin(around), np.zeros(360)])
     rows = []
@@ -535,7 +544,9 @@ def pattern_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 
 def temperature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """Return the tags of each slope over temperature, the slope, and its interval in words and where delays hold."""
+    """Return the tags of each slope over temperature, the slope, and the text of its interval and reference
+    temperature.
+    """
     why = _sentence(calibration, "temperature", lambda told: told.get("why") or "", BadInputError)
     rows = [
         (
@@ -549,7 +560,7 @@ def temperature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 
 def feature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """Return each feature that tells reflections, by which factor a unit changes their odds, and its bounds."""
+    """Return each feature that indicates reflections, the factor on their odds per unit, and its bounds."""
     rows = []
     for name, one in (calibration.errors.features if calibration.errors else {}).items():
         low, high = one.bounds
@@ -559,7 +570,7 @@ def feature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 
 def curve_rows(calibration: Calibration) -> list[tuple[str, ...]]:
-    """Return lifted powers, and the curves there: of each group of tags, or the one of all."""
+    """Return lifted powers, and the values of the curves there: for each group of tags, or for all tags."""
     shown = np.linspace(*calibration.bias_curve.range, 6)
     named: dict[str, Calibration | TagGroup] = dict(calibration.groups) or {"": calibration}
     rows = [("lifted power", *(f"{power:.3g}" for power in shown))]
@@ -576,36 +587,38 @@ def _headline(calibration: Calibration) -> str:
     return (
         f"Calibration of {len(calibration.delays_ns)} tags{of}: {calibration.loss} loss, scale "
         f"{calibration.scale_ns:.3g} ns, {calibration.lift} power above {calibration.alpha_dbm:g} dBm"
-        f"{'; NOT SETTLED, its fit stopped' if calibration.stopped else ''}"
+        f"{'; NOT CONVERGED, its fit stopped' if calibration.stopped else ''}"
     )
 
 
-def rests_on(provenance: Mapping[str, Any]) -> str:
-    """Return what replaces known distances; nothing where distances were known."""
+def known_facts(provenance: Mapping[str, Any]) -> str:
+    """Return the facts that replace known distances; none if distances were known."""
     known = provenance.get("rests_on")
     if provenance.get("truth") != "ranges" or not isinstance(known, Mapping):
         return ""
     off, seconds = provenance.get("distance_std_m"), known.get("known_s")
     anchors = {"given": known.get("anchors_given"), "found": known.get("anchors_sought")}
     parts = [
-        f"ranges alone, of {_listed(known.get('moving'), 'moving body', 'moving bodies')}",
+        f"ranges only, of {_listed(known.get('moving'), 'moving body', 'moving bodies')}",
         f"positions known for {seconds:.1f} s" if isinstance(seconds, int | float) and seconds > 0 else "",
-        *(f"{_listed(one, 'anchor', 'anchors')} at places that were {how}" for how, one in anchors.items() if one),
+        *(f"{_listed(one, 'anchor', 'anchors')} at positions that were {how}" for how, one in anchors.items() if one),
         f"attitudes from {known.get('attitudes', 'nowhere')}",
-        f"distances found to {100 * off:.1f} cm (standard error)" if isinstance(off, int | float) else "",
+        f"standard error of the distances: {100 * off:.1f} cm" if isinstance(off, int | float) else "",
     ]
     return ", ".join(filter(None, parts))
 
 
 def held_out_line(calibration: Calibration) -> str:
-    """Return how a fit without the ranges that were held out did on them, "" where none were."""
+    """Return one line about the fit without the held-out ranges, evaluated on these; "" if none were held out."""
     return _sentence(calibration, "held_out", _held_out, BadInputError)
 
 
 def _sentence(
     calibration: Calibration, key: str, told: Callable[[Mapping[str, Any]], str], error: type[Exception]
 ) -> str:
-    """Return what is `told` of an entry of the provenance, "" without one; raises an error where it cannot be."""
+    """Return the text that `told` makes of an entry of the provenance, "" without an entry; raises an error for a bad
+    one.
+    """
     entry = calibration.provenance.get(key)
     if not isinstance(entry, Mapping):
         return ""
@@ -616,14 +629,16 @@ def _sentence(
 def _held_out(told: Mapping[str, Any]) -> str:
     inside = "" if told["inside_95"] is None else f", {100 * told['inside_95']:.0f} % within their 95 % intervals"
     return (
-        f"judged on {told['ranges']} ranges held out by {told['fold']}: median {100 * told['raw_median_m']:+.1f} to "
+        f"evaluated on {told['ranges']} ranges held out by {told['fold']}: median {100 * told['raw_median_m']:+.1f} to "
         f"{100 * told['median_m']:+.1f} cm, robust deviation {100 * told['raw_robust_std_m']:.1f} to "
         f"{100 * told['robust_std_m']:.1f} cm{inside}"
     )
 
 
 def age_line(calibration: Calibration) -> str:
-    """Return in how many days 95 % of delays change ranges by less than 2 cm, "" without several dated sessions."""
+    """Return one line: the days in which 95 % of delays change ranges by less than 2 cm; "" without several dated
+    sessions.
+    """
     return _sentence(calibration, "drift", _age, ValueError)
 
 

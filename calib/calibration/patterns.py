@@ -1,5 +1,6 @@
-"""The parts of delays that depend on something else: on direction, as low-order harmonics in the frame of the body of
-an antenna; and on temperature."""
+"""Dependences of delays: on direction, as low-order harmonics in the frame of the antenna's body; and on
+temperature.
+"""
 
 from __future__ import annotations
 
@@ -38,10 +39,11 @@ def harmonics(toward: Floats | NDArray[np.float32]) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """By how much ranges of some tags are longer in a direction than on average over the fitted ones.
+    """Dependence of ranges on direction for some tags, relative to the average over the fitted directions.
 
-    That is the sum of `coefficients_m` (8,) times `harmonics` less `centre` (8,), of each end; `covariance_m2` (8, 8)
-    is that of the coefficients. `rms_m` is the root mean square over the fitted directions, what is unknown included.
+    Each end of a range contributes the sum of `coefficients_m` (8,) times (`harmonics` - `centre`) (8,);
+    `covariance_m2` (8, 8) is the covariance of the coefficients. `rms_m` is the root mean square over the fitted
+    directions, uncertainty included.
     """
 
     covariate: ClassVar[str] = "toward"
@@ -75,10 +77,10 @@ CheckedPattern = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class TemperatureSlope:
-    """By how much ranges of some tags are longer for each kelvin that an end is warmer than `reference_c`.
+    """Growth of ranges of some tags per kelvin of one end above `reference_c`.
 
-    That is `m_per_k` for each end, of which `std_m_per_k` is the standard error. `span_c` are the lowest and the
-    highest of the fitted temperatures.
+    The slope is `m_per_k` for each end, with the standard error `std_m_per_k`. `span_c` are the lowest and the highest
+    of the fitted temperatures.
     """
 
     covariate: ClassVar[str] = "temperature_c"
@@ -90,22 +92,24 @@ class TemperatureSlope:
 
     @property
     def coefficients_m(self) -> tuple[float]:
-        """Return the slope, in a tuple as the coefficients of a `Pattern`."""
+        """Return the slope as a tuple, like the coefficients of a `Pattern`."""
         return (self.m_per_k,)
 
     @property
     def centre(self) -> tuple[float]:
-        """Return the reference, likewise."""
+        """Return the reference temperature, like the centre of a `Pattern`."""
         return (self.reference_c,)
 
     @property
     def covariance_m2(self) -> tuple[tuple[float]]:
-        """Return the variance of the slope, likewise."""
+        """Return the variance of the slope, like the covariance of a `Pattern`."""
         return ((self.std_m_per_k**2,),)
 
     @property
     def rms_m(self) -> float:
-        """Return the standard deviation of an end whose temperature is not known: the slope times the fitted span."""
+        """Return the standard deviation of an end with unknown temperature: the slope times the standard deviation of
+        the fitted span.
+        """
         return math.hypot(self.m_per_k, self.std_m_per_k) * (self.span_c[1] - self.span_c[0])
 
     def values(self, temperature_c: Floats | NDArray[np.float32]) -> Floats:
@@ -124,11 +128,11 @@ CheckedSlope = Annotated[
 
 
 def dependences_m(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Floats]:
-    """Return by how much directions and temperatures make ranges longer (n,), and the standard deviation (n,) of what
-    is unknown of that.
+    """Return the effect of directions and temperatures on ranges (n,), and its standard deviation (n,).
 
-    Where a direction is not known the first is 0, and the second has the mean square of the pattern; where a
-    temperature is not known the second has the slope times the fitted temperatures' span.
+    An unknown direction has the effect 0, and its variance includes the mean square of the pattern; an unknown
+    temperature also has the effect 0, and its standard deviation is the slope times the spread of the fitted
+    temperatures.
     """
     longer, variance = np.zeros((2, len(ranges)))
     every: tuple[Pattern | TemperatureSlope, ...] = (*calibration.patterns, *calibration.temperatures)
@@ -146,24 +150,24 @@ def dependences_m(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Flo
 
 
 def lack_direction(calibration: Calibration, ranges: Ranges) -> Bools:
-    """Return which ranges (n,) have an end with a pattern over direction whose direction is not known."""
+    """Return a mask (n,) of the ranges with a pattern over direction at an end whose direction is unknown."""
     tags = [tag for one in calibration.patterns for tag in one.tags]
     ends = np.column_stack([ranges.initiator, ranges.target])
     return np.asarray((np.isin(ends, tags) & np.isnan(ranges.toward).any(axis=2)).any(axis=1))
 
 
 def warn_of_directions(lacking: int, count: int, source: str) -> None:
-    """Give a `DirectionWarning` where some of `count` ranges are `lacking` directions that a calibration asks for."""
+    """Give a `DirectionWarning` if some of `count` ranges have no direction although the calibration has a pattern."""
     if lacking:
         warn(
-            f"{source}: {100 * lacking / count:.3g} % of the ranges lack the directions that patterns depend on: they "
-            "are corrected without these, and their total sigma is larger",
+            f"{source}: {100 * lacking / count:.3g} % of the ranges have no known direction: they are corrected "
+            "without the patterns over direction, and their total sigma is larger",
             DirectionWarning,
         )
 
 
 def warn_of_temperatures(calibration: Calibration, ranges: Ranges, beyond_k: float = 5.0) -> None:
-    """Give a `TemperatureWarning` that names the tags whose temperatures are beyond the fitted ones.
+    """Give a `TemperatureWarning` that names the tags whose temperatures are outside the fitted ones.
 
     A slope that is known to half of the manual's 2.15 mm/K is off by 5 mm after 5 K, less than ranges repeat to.
     """
@@ -174,5 +178,5 @@ def warn_of_temperatures(calibration: Calibration, ranges: Ranges, beyond_k: flo
         fitted = {tag for one in calibration.temperatures if one.span_c == (low, high) for tag in one.tags}
         if tags := sorted(fitted & {*ends[outside].tolist()}):
             named = first_few(map(str, tags))
-            text = f"tags {named} were used more than {beyond_k:.0f} K beyond the {low:.0f} to {high:.0f} °C at which"
-            warn(f"{text} the calibration was fitted: it extrapolates there", TemperatureWarning)
+            text = f"tags {named} were used more than {beyond_k:.0f} K outside the {low:.0f} to {high:.0f} °C at which"
+            warn(f"{text} the calibration was fitted; the correction is extrapolated", TemperatureWarning)

@@ -16,7 +16,7 @@ ALPHA_DBM: Final = -82.0
 """The power whose lifted power is 1 (ICRA 2023, section IV)."""
 
 DEGREE: Final = 3
-"""Curves that are fitted are cubic splines: smooth to the second derivative, which their roughness is measured by."""
+"""Degree of fitted curves: cubic splines have a continuous second derivative, which measures their roughness."""
 
 SIGMA_SEGMENTS: Final = 4
 """Segments of the curve of the noise, which a prior on its roughness makes as straight as the data allow."""
@@ -35,16 +35,17 @@ LIFTS: Final[dict[str, Callable[[Floats, Floats, float], Floats]]] = {
     "mean-of-lifted": lambda fpp1, fpp2, alpha: (lift(fpp1, alpha) + lift(fpp2, alpha)) / 2,
     "lift-of-mean": lambda fpp1, fpp2, alpha: lift((fpp1 + fpp2) / 2, alpha),
 }
-"""How the powers of both ends (n,) make the lifted power of an exchange: the authors' code, and the paper's formula."""
+"""Functions from the powers of both ends (n,) to the lifted power of an exchange: the authors' code, and the paper's
+formula."""
 
 
 def lifted_power(fpp1_dbm: Floats, fpp2_dbm: Floats, how: str, alpha_dbm: float) -> Floats:
-    """Lifted power of exchanges (n,); where one end's power is missing, the other's serves."""
+    """Return the lifted power of exchanges (n,); a missing power of one end is replaced by that of the other."""
     return LIFTS[how](*ends(fpp1_dbm, fpp2_dbm), alpha_dbm)
 
 
 def ends(fpp1_dbm: Floats, fpp2_dbm: Floats) -> tuple[Floats, Floats]:
-    """Return the powers of both ends (n,); where one is missing, the other's serves."""
+    """Return the powers of both ends (n,); a missing power of one end is replaced by that of the other."""
     return (
         np.where(np.isfinite(fpp1_dbm), fpp1_dbm, fpp2_dbm),
         np.where(np.isfinite(fpp2_dbm), fpp2_dbm, fpp1_dbm),
@@ -55,7 +56,7 @@ def ends(fpp1_dbm: Floats, fpp2_dbm: Floats) -> tuple[Floats, Floats]:
 class Curve:
     """A B-spline over lifted power, held constant outside `range`, where nothing was measured.
 
-    A flat one has the same value at any power, also where none was measured.
+    A flat curve has the same value at any power, and for ranges without power.
     """
 
     knots: tuple[Number, ...]
@@ -78,13 +79,16 @@ class Curve:
         return min(self.coefficients) == max(self.coefficients)
 
     def inside(self, lifted: Floats) -> Bools:
-        """Return which lifted powers (n,) the curve was fitted at; a flat one holds at all, measured or not."""
+        """Return a mask (n,) of the lifted powers within the fitted range; a flat curve holds at all powers, measured
+        or not.
+        """
         return np.asarray(self.flat | ((lifted >= self.range[0]) & (lifted <= self.range[1])))
 
     def beyond(self, lifted: Floats | float) -> Floats:
-        """Return by how much the curve would go on (n,) where it is held constant, straight on from its ends, metres.
+        """Return the change (n,) of a linear extrapolation beyond the ends, where the curve is held constant, in
+        metres.
 
-        Zero at powers that it was fitted at. It is what a range there may be off by.
+        It is zero at fitted powers, and estimates the error of a range outside them.
         """
         low, high = self.range
         away = np.asarray(lifted - np.clip(lifted, low, high))
@@ -100,12 +104,12 @@ def _is_spline(curve: Curve) -> bool:
     return fits and len(curve.coefficients) > curve.degree and curve.range[0] < curve.range[1]
 
 
-BiasCurve = Annotated[Curve, joint(_is_spline, "knots, coefficients, degree, range do not fit")]
+BiasCurve = Annotated[Curve, joint(_is_spline, "knots, coefficients, degree and range do not agree")]
 SigmaCurve = Annotated[
     BiasCurve,
     joint(
         lambda curve: min(curve.coefficients) >= 0 or bool(np.all(curve(np.linspace(*curve.range, 200)) >= 0)),
-        "coefficients: expected a standard deviation that is nowhere below 0 m",
+        "coefficients: expected a standard deviation of 0 m or more everywhere",
     ),
 ]
 

@@ -46,7 +46,9 @@ MIN_VALUES_OF_UNIT: Final = 20
 
 
 def arrivals(view: RecordingView) -> Iterator[Candidate]:
-    """Differences of arrival without stamps that no fit takes: another unit or sign, anchors without places."""
+    """Find differences of arrival without stamps that cannot be fitted: wrong unit or sign, anchors without
+    positions.
+    """
     if len(view.differences.get("time_ns", ())):
         try:
             Ranges.from_differences(view.differences, poses=view.poses, tags=view.tags, source=view.name)
@@ -55,7 +57,7 @@ def arrivals(view: RecordingView) -> Iterator[Candidate]:
 
 
 def empty(view: RecordingView) -> Iterator[Candidate]:
-    """Recordings without an exchange."""
+    """Find recordings without an exchange."""
     if not len(view.exchanges):
         count = len(view.differences.get("time_ns", ()))
         alone = f"{count} differences of arrival and " if count else ""
@@ -63,7 +65,7 @@ def empty(view: RecordingView) -> Iterator[Candidate]:
 
 
 def ticks(view: RecordingView) -> Iterator[Candidate]:
-    """Stamps in nanoseconds taken for ticks make every duration 64 times too short."""
+    """Find stamps in nanoseconds that were read as ticks: every duration is 64 times too short."""
     spans, third = intervals(view.exchanges), view.exchanges.tx3 != 0
     legs = [float(np.median(spans.dt41)), float(np.median(spans.dt53[third])) if third.any() else 0.0]
     longest_us, per_ns = max(legs) / TICKS_PER_SECOND * 1e6, TICKS_PER_SECOND * 1e-9
@@ -76,7 +78,7 @@ def ticks(view: RecordingView) -> Iterator[Candidate]:
 
 
 def single_as_double(view: RecordingView) -> Iterator[Candidate]:
-    """Double-sided exchanges without a third message."""
+    """Find double-sided exchanges without a third message."""
     e = view.exchanges
     empty = 100 * float(np.mean(~np.isin(e.protocol, single_sided()) & (e.tx3 == 0) & (e.rx3 == 0)))
     if empty > 50:
@@ -100,7 +102,7 @@ def impossible(view: RecordingView) -> Bools:
 
 
 def with_itself(view: RecordingView) -> Iterator[Candidate]:
-    """Exchanges of a tag with itself, which no radio makes."""
+    """Find exchanges of a tag with itself, which are impossible."""
     e = view.exchanges
     same = e.initiator == e.target
     if same.any():
@@ -111,7 +113,7 @@ def with_itself(view: RecordingView) -> Iterator[Candidate]:
 
 
 def doubled(view: RecordingView) -> Iterator[Candidate]:
-    """Rows that repeat another one: two robots log an exchange, and both logs were imported."""
+    """Find repeated rows, as when two robots logged an exchange and both logs were imported."""
     if view.doubled:
         yield Candidate(
             "doubled exchanges", f"{view.doubled} of {view.doubled + len(view.exchanges)} rows repeat another one"
@@ -119,19 +121,19 @@ def doubled(view: RecordingView) -> Iterator[Candidate]:
 
 
 def corrupted(view: RecordingView) -> Iterator[Candidate]:
-    """Exchanges that are impossible, or contradict themselves; the other checks do without them."""
+    """Find exchanges that are impossible or contradict themselves; the other checks leave them out."""
     bad = impossible(view)
     count = int(np.count_nonzero(bad))
     yield Candidate(
         "corrupted exchanges" if count < 0.5 * len(bad) else "impossible stamps",
         f"{count} of {len(bad)} exchanges have impossible stamps, or stamps that contradict the "
-        "range reported with them or the clocks of their pair; what else is said here is said without them",
+        "range reported with them or the clocks of their pair; all other findings are computed without these",
         more_often(count, len(bad), 0.001),
     )
 
 
 def mixed(view: RecordingView) -> Iterator[Candidate]:
-    """Recordings that host times lay over each other: initiators' stamps go to another time and back, row by row."""
+    """Find recordings that were merged by host time: initiators' stamps jump to another time and back, row by row."""
     e, half_s = view.exchanges, 2.0 ** (view.exchanges.bits - 1) / TICKS_PER_SECOND
     each = [e[e.initiator == tag] for tag in np.unique(e.initiator[e.tx1 != 0])]
     away_s = [
@@ -153,7 +155,7 @@ def mixed(view: RecordingView) -> Iterator[Candidate]:
 
 
 def rare_poses(view: RecordingView) -> Iterator[Candidate]:
-    """Poses so far apart in time that bodies do not move straight between them."""
+    """Find poses so far apart in time that bodies do not move on a straight line between them."""
     rare = {
         body: one.position_m
         for body in names_in(view.poses.body)
@@ -164,11 +166,15 @@ def rare_poses(view: RecordingView) -> Iterator[Candidate]:
         body: np.median(np.linalg.norm(at[1:-1] - (at[2:] + at[:-2]) / 2, axis=1)) / 4 for body, at in rare.items()
     }
     if bent := [f"{body} by {100 * off:.0f} cm" for body, off in off_m.items() if off > 0.02]:
-        yield Candidate("rare poses", f"between two poses bodies leave a straight line: {', '.join(bent)}")
+        yield Candidate(
+            "rare poses", f"bodies do not move on straight lines between two poses, but deviate: {', '.join(bent)}"
+        )
 
 
 def contradicting(view: RecordingView) -> Iterator[Candidate]:
-    """Initiator and target that report one exchange differently: they print the same numbers, so a line was damaged."""
+    """Find exchanges that initiator and target report differently; both print the same numbers, so a line was
+    damaged.
+    """
     if view.contradictions:
         yield Candidate(
             "contradicting reports",
@@ -185,11 +191,11 @@ def _reported_over_stamps(view: RecordingView) -> Floats:
 
 
 def reported(view: RecordingView) -> Iterator[Candidate]:
-    """Reported ranges that were computed with the speed of light in vacuum, or are in another unit than metres."""
+    """Find reported ranges computed with the speed of light in vacuum, or in another unit than metres."""
     ratios = _reported_over_stamps(view)
     ratio = float(np.median(ratios)) if len(ratios) >= MIN_VALUES_OF_UNIT else 1.0
     evidence = f"reported ranges are {ratio:.5g} times those from the stamps"
-    # So many medians of ratios tell the speed of light in air from that in vacuum.
+    # This number of ratios is needed to distinguish the speeds of light in air and in vacuum.
     if len(ratios) >= 100 and abs(ratio * SPEED_OF_LIGHT / 299_792_458.0 - 1) < 5e-5:
         yield Candidate("speed of light in vacuum", f"{evidence}: 299 792 458 m/s instead of 299 702 547")
     for unit, many in UNITS_A_METRE.items():
@@ -199,7 +205,9 @@ def reported(view: RecordingView) -> Iterator[Candidate]:
 
 
 def another(view: RecordingView) -> Iterator[Candidate]:
-    """Try every other protocol with as many messages, and every width of the counter."""
+    """Find a wrong protocol or counter width: try each other protocol with the same number of messages, and each
+    width.
+    """
     e = view.exchanges[:: max(len(view.exchanges) // 4000, 1)]
     names, counts = np.unique(e.protocol, return_counts=True)
     said = str(names[int(np.argmax(counts))])
@@ -218,7 +226,7 @@ def another(view: RecordingView) -> Iterator[Candidate]:
     # A wrong width spoils only exchanges during which the counter wraps; a wrong protocol spoils most.
     if share < max(0.5, own + (0.01 if name == said else 0.2)):
         return
-    numbers = f"{100 * share:.1f} % of the ranges are possible, {100 * own:.1f} % as the recording has it"
+    numbers = f"{100 * share:.1f} % of the ranges are possible, {100 * own:.1f} % with the settings of the recording"
     if name == said:
         yield Candidate("timestamp width", f"as {bits}-bit stamps {numbers}", words={"bits": bits})
     else:
@@ -239,15 +247,17 @@ def _possible_share(e: Exchanges) -> float:
 
 
 def _sound_clocks(e: Exchanges) -> Bools:
-    """Return where the third leg says that clocks run alike as crystals do, (n,); so they do where there is none."""
+    """Return a mask (n,) of exchanges whose third leg gives a clock ratio that crystals can have; True without a third
+    leg.
+    """
     return np.asarray(np.isin(e.protocol, single_sided()) | (np.abs(target_faster_ppm(e)) < 100.0))
 
 
 def lengths(view: RecordingView) -> Iterator[Candidate]:
-    """Ranges and true distances of which one is many times the other.
+    """Find ranges and true distances in different units.
 
-    The unit is the one that leaves the least between them; where the ranges have no stamps, and none that a radio can
-    measure, theirs is wrong.
+    The unit is the one with the smallest residuals. If the ranges have no stamps and are longer than a radio can
+    measure, their unit is wrong; otherwise that of the distances.
     """
     good = np.isfinite(view.ranges.raw_m) & np.isfinite(view.ranges.truth_m)
     raw, truth = view.ranges.raw_m[good], view.ranges.truth_m[good]
@@ -259,8 +269,8 @@ def lengths(view: RecordingView) -> Iterator[Candidate]:
     elif unit := _unit(raw, truth):
         whose = "poses" if view.posed else "true distances"
         evidence = (
-            f"true distances have a median of {np.median(truth):.6g}, ranges one of {np.median(raw):.6g} m: they agree "
-            f"if {whose} are in {unit}"
+            f"the median true distance is {np.median(truth):.6g}, the median range {np.median(raw):.6g} m: they "
+            f"agree if {whose} are in {unit}"
         )
         yield Candidate(f"unit of the {whose}", evidence, words={"unit": unit, "many": f"{UNITS_A_METRE[unit]:g}"})
     elif bare and (unit := _unit(truth, raw)):
@@ -269,7 +279,7 @@ def lengths(view: RecordingView) -> Iterator[Candidate]:
 
 
 def _unit(metres: Floats, others: Floats) -> str | None:
-    """Return the unit of others (n,) with which they agree best with metres (n,); None where metres are as good."""
+    """Return the unit of others (n,) in which they agree best with metres (n,); None if metres are as good."""
     left = {name: robust_spread(metres - others / many) for name, many in UNITS_A_METRE.items()}
     best = min(left, key=lambda name: left[name])
     # Distances that say nothing are best when they are divided by most.
@@ -283,28 +293,28 @@ def _unit(metres: Floats, others: Floats) -> str | None:
 
 
 def powers(view: RecordingView) -> Iterator[Candidate]:
-    """Powers that cannot be dBm at an antenna."""
+    """Find powers that cannot be dBm at an antenna."""
     every = np.concatenate([view.exchanges.fpp1_dbm, view.exchanges.fpp2_dbm])
     known = np.isfinite(np.concatenate([view.ranges.fpp1_dbm, view.ranges.fpp2_dbm]))
     given = np.isfinite(every) & (every != 0)
     if np.count_nonzero(given) < MIN_VALUES_OF_UNIT or np.mean(known[given]) > 0.5:
         return
     middle = float(np.median(every[given]))
-    guess, factor = "no usual factor makes them so", "give fpp1 and fpp2 in dBm"
+    guess, factor = "no usual factor explains them", "give fpp1 and fpp2 in dBm"
     for name, times in POWER_FACTORS.items():
         # From their sensitivity to a metre apart.
         if -115 < times * middle < -55:
-            guess = f"they look like {name}: times {times:g} they would be {times * middle:.0f} dBm"
+            guess = f"they are probably {name}: multiplied by {times:g} they would be {times * middle:.0f} dBm"
             factor = f"multiply fpp1 and fpp2 by {times:g}"
     yield Candidate(
         "unit of the powers",
-        f"the median power is {middle:+.5g} dBm, where these radios receive -115 to -55; {guess}",
+        f"the median power is {middle:+.5g} dBm, but these radios receive -115 to -55; {guess}",
         words={"factor": factor},
     )
 
 
 def undetermined(view: RecordingView) -> Iterator[Candidate]:
-    """Pairs that leave antenna delays undetermined."""
+    """Find pairs that do not determine all antenna delays."""
     some = view.ranges[np.isfinite(view.ranges.weight_initiator) & np.isfinite(view.ranges.weight_target)]
     if len(some):
         _, free = free_directions(some.tags(), some)
@@ -313,17 +323,17 @@ def undetermined(view: RecordingView) -> Iterator[Candidate]:
 
 
 def silent(view: RecordingView) -> Iterator[Candidate]:
-    """A tag whose exchanges nearly all fail, where those of others do not."""
+    """Find a tag with many more failed exchanges than others."""
     e, failed = view.exchanges, failures_by_pair(view.faults)
     tags = sorted({tag.tag for tag in view.tags})
     for tag in sorted(tags, key=lambda tag: -sum(n for pair, n in failed.items() if tag in pair)):
         bad = sum(n for pair, n in failed.items() if tag in pair)
         done = int(np.count_nonzero((e.initiator == tag) | (e.target == tag)))
-        # What fails with a dead tag is no fault of the other one.
+        # Failures with a dead tag do not count for its partner.
         failed = {pair: n for pair, n in failed.items() if tag not in pair or bad <= done}
         others, others_bad = len(e) - done, sum(n for pair, n in failed.items() if tag not in pair)
         if others + others_bad:
-            # A tag that answers half of the time is at the edge of its range, and no worse.
+            # A tag that answers half of the time may only be at the edge of the radio range.
             usual = max(0.5, others_bad / (others + others_bad))
             evidence = f"tag {tag} took part in {done} exchanges, {bad} failed"
             p_value = more_often(bad, bad + done, usual, tried=len(tags))
@@ -331,13 +341,13 @@ def silent(view: RecordingView) -> Iterator[Candidate]:
 
 
 def still(view: RecordingView) -> Iterator[Candidate]:
-    """Tags that keep their distances."""
+    """Find recordings in which no distance changes."""
     if view.standing_m is not None:
         yield Candidate("static data", f"no distance changes by more than {100 * view.standing_m:.0f} cm")
 
 
 def missing(view: RecordingView) -> Iterator[Candidate]:
-    """Exchanges without a first-path power at either end, of which no curve can be fitted, or without true distance."""
+    """Find recordings that mostly lack first-path powers, which a curve needs, or true distances."""
     powers, truth = np.stack([view.ranges.fpp1_dbm, view.ranges.fpp2_dbm]), view.ranges.truth_m
     powered, true = (100 * float(np.mean(known)) for known in (np.isfinite(powers).any(axis=0), np.isfinite(truth)))
     if powered < 50:
@@ -345,12 +355,12 @@ def missing(view: RecordingView) -> Iterator[Candidate]:
     if true < 50 and not view.standing:
         yield Candidate(
             "no true distances",
-            f"{true:.0f} % of the exchanges have one: poses are missing or do not cover the recording",
+            f"{true:.0f} % of the exchanges have a true distance: poses are missing or do not cover the recording",
         )
 
 
 def confounded(view: RecordingView) -> Iterator[Candidate]:
-    """Power that is a function of distance and nothing else lets the curve learn distance.
+    """Find power that depends only on distance: then a curve over power cannot be separated from distance.
 
     The scatter of readings is no power that varies, and is taken off: readings of a pair within 0.2 s, in which a robot
     turns its antenna by a few degrees, differ by their noise. So is what groups of distances explain by chance, as
@@ -365,7 +375,7 @@ def confounded(view: RecordingView) -> Iterator[Candidate]:
     pair, time_ns, shares, groups = pairs[rows], view.exchanges.time_ns[rows], [0.0], 40
     alone = len(np.unique(np.column_stack([pair, time_ns // 2_000_000_000]), axis=0))
     together = (np.diff(pair) == 0) & (np.diff(time_ns) < 200_000_000)
-    # Lifted powers near the antennas outweigh all others, their decibels do not; either way is too much.
+    # Lifted powers at short distances dominate; decibels do not. Either share can be too large.
     for power in (lifted[rows], np.log(lifted[rows])):
         noise = float(np.mean(np.diff(power)[together] ** 2)) / 2 if np.count_nonzero(together) >= 100 else 0.0
         parts = np.array_split(power[np.argsort(view.ranges.truth_m[rows], kind="stable")], groups)
@@ -381,7 +391,7 @@ def confounded(view: RecordingView) -> Iterator[Candidate]:
 
 
 def swapped_roles(view: RecordingView) -> Iterator[Candidate]:
-    """Carriers and stamps that say the opposite of which clock of a pair is faster.
+    """Find carrier readings and stamps that disagree about which clock of a pair is faster.
 
     The readings' own offset of a tenth of a ppm, which is no noise, hides no slope of 1.
     """
@@ -399,20 +409,21 @@ def swapped_roles(view: RecordingView) -> Iterator[Candidate]:
     if slope < -0.5:
         yield Candidate(
             "swapped roles",
-            "the carriers say that the targets' clocks are slower where the stamps say faster, and the other way round",
+            "by the carrier readings the targets' clocks are slower where they are faster by the stamps, and vice "
+            "versa",
             exceeds(slope, float(np.sqrt(max(left, 1.0) / square)), np.inf, tolerance=0.5),
         )
 
 
 def unread(view: RecordingView) -> Iterator[Candidate]:
-    """Single-sided ranges whose carriers were not read: nothing says how much skew is left in them."""
+    """Find single-sided ranges without carrier readings, whose clock skew is unknown."""
     left = left_skew(view.exchanges)
     if left and not np.isfinite(left.told_m):
         yield Candidate("single-sided without carrier readings", str(left))
 
 
 def carriers(view: RecordingView) -> Iterator[Candidate]:
-    """Carriers' readings that do not follow the clocks' ratios by the stamps."""
+    """Find carrier readings that do not agree with the clock ratios from the stamps."""
     known = sorted(
         (one.residual_ppm, one.count, one.pair)
         for one in clock_skews(view.exchanges)

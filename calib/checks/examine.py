@@ -1,8 +1,8 @@
-"""The table of checks, each with its question, statistic, distribution on sound data and remedies; and examinations.
+"""The table of checks, each with its question, statistic, distribution on sound data and remedies; `examine` runs it.
 
-Checks of geometry suspect the true distances (poses, lever arms, ids, clocks), and work by trial: they undo the
-suspected fault, and if the ranges then agree better with the distances, it was there; of several, the one that explains
-most.
+Checks of geometry suspect the true distances (poses, lever arms, ids, clocks), and work by trial: they undo a suspected
+fault, and report it if the ranges then agree better with the distances; of several, the one that explains most is
+reported.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from calib.surveys.survey import survey
 
 
 def surveyed(recordings: list[Data]) -> Iterator[Candidate]:
-    """Yield what a survey of recordings finds wrong: with what is known, with places, with powers.
+    """Yield the faults that a survey of recordings finds: in known facts, positions and powers.
 
-    The survey itself has judged: what it says is not tested again.
+    The survey has tested these itself, so they are not tested again.
     """
     contradictions: tuple[Finding, ...] = ()
     found: SurveyResult | None = None
@@ -54,10 +54,10 @@ def surveyed(recordings: list[Data]) -> Iterator[Candidate]:
         yield Candidate("delays that a survey leaves open", f"the arrangements do not determine the delays of {who}")
     likely = [f"{one.first}-{one.second} in {one.arrangement}" for one in found.reflected if one.chance > 0.5]
     if len(likely) > 0.1 * made["pairs"]:
-        evidence = f"{len(likely)} of {made['pairs']} pairs are believed to be reflected: {', '.join(likely)}"
+        evidence = f"{len(likely)} of {made['pairs']} pairs are probably reflected: {', '.join(likely)}"
         yield Candidate("many reflected pairs", evidence)
     if second is not None and second.ambiguous:
-        evidence = f"{second.arrangement}: boards {', '.join(map(str, second.tags))} could as well be elsewhere"
+        evidence = f"{second.arrangement}: boards {', '.join(map(str, second.tags))} have a second possible position"
         yield Candidate("two solutions of a survey", evidence)
 
 
@@ -91,18 +91,18 @@ CHECKS: Final = (
     ),
     Check(
         "reading",
-        "Does a frame last as long as frames do?",
-        "longest leg, shorter than a frame as ticks and not as ns", CERTAIN,
+        "Are durations of exchanges long enough for frames?",
+        "longest leg; a fault if too short for a frame as ticks, but not as ns", CERTAIN,
         {"unit slip": 'the stamps are nanoseconds, not ticks: import again with [units] stamps = "ns"'},
         columns.ticks,
     ),
     Check(
         "reading",
         "Are true distances and ranges in one unit?",
-        "spread of ranges less true distances, halved by mm, cm, in or ft", CERTAIN,
+        "spread of ranges minus true distances; a fault if mm, cm, in or ft halve it", CERTAIN,
         {
-            "unit of the poses": "divide x y z of the poses by {many}, add them again: uwblink poses ... --from FILE; "
-            'or import again with [units] distance = "{unit}" where the table has them',
+            "unit of the poses": "divide x y z of the poses by {many} and add them again (uwblink poses); "
+            'or import again with [units] distance = "{unit}" if the table contains them',
             "unit of the true distances": 'import again with [units] distance = "{unit}", or divide gt_range_m by '
             "{many}",
             "unit of the ranges": 'import again with [units] distance = "{unit}"',
@@ -111,8 +111,8 @@ CHECKS: Final = (
     ),
     Check(
         "reading",
-        "Do the stamps make ranges as the recording says?",
-        "share of possible ranges by another protocol or width", CERTAIN,
+        "Do the stamps give possible ranges with the protocol and counter width of the recording?",
+        "share of possible ranges with another protocol or width", CERTAIN,
         {
             "another protocol": "import again with {settings}",
             "timestamp width": "import again with bits = {bits}",
@@ -121,44 +121,43 @@ CHECKS: Final = (
     ),
     Check(
         "rows",
-        "Are more rows damaged than one in a thousand?",
+        "Is more than one row in a thousand damaged?",
         "count of impossible rows", "binomial",
         {
-            "corrupted exchanges": "a robust fit leaves them out; check cables and USB load, and decode the recording "
-            "again if it has bytes",
-            "impossible stamps": "check that their columns are in the right order, with all digits, and of this "
+            "corrupted exchanges": "nothing for a fit, which leaves them out; check cables and USB load, and decode "
+            "the recording again if it contains bytes",
+            "impossible stamps": "check that the columns are in the right order, have all digits, and belong to this "
             "protocol; import again",
         },
         columns.corrupted,
     ),
     Check(
         "rows",
-        "Do initiators' stamps of 40 bits follow the times?",
-        "count of jumps by one time among those to another time and back", "binomial",
-        {"recordings mixed by their times": "import each recording, or the parts before and after the clock was set, "
-         "separately"},
+        "Do initiators' 40-bit stamps agree with the times of the exchanges?",
+        "number of equal jumps among those to another time and back", "binomial",
+        {"recordings mixed by their times": "import each recording separately, and separate the parts before and "
+        "after the clock was set"},
         columns.mixed,
     ),
     Check(
         "rows",
-        "Are poses as frequent as motion needs?",
-        "a quarter of what a pose is off the line between its neighbours, above 2 cm", CERTAIN,
-        {"rare poses": "export poses at a higher rate, or move slowly; true distances are wrong by about as much"},
+        "Are poses frequent enough for the motion?",
+        "a quarter of a pose's deviation from the line between its neighbours, above 2 cm", CERTAIN,
+        {"rare poses": "export poses at a higher rate, or move slowly; true distances have about this error"},
         columns.rare_poses,
     ),
     Check(
         "rows",
-        "Is each exchange there once?",
-        "rows with all stamps of another", CERTAIN,
-        {"doubled exchanges": "import one log of each exchange; what is said here counts each once"},
+        "Is each exchange recorded only once?",
+        "rows with the same stamps as another row", CERTAIN,
+        {"doubled exchanges": "import one log of each exchange; other findings count each exchange once"},
         columns.doubled,
     ),
     Check(
         "rows",
         "Do both reports of an exchange agree?",
-        "reports that differ", CERTAIN,
-        {"contradicting reports": "look at the cables and ports of the two boards; what a damaged line says is not "
-         "known"},
+        "number of differing reports", CERTAIN,
+        {"contradicting reports": "check the cables and ports of the two boards; damaged lines cannot be repaired"},
         columns.contradicting,
     ),
     Check(
@@ -171,142 +170,142 @@ CHECKS: Final = (
     ),
     Check(
         "rows",
-        "Does a tag fail in more than half of its exchanges, and more than others?",
-        "count of failures", "binomial, for all tags",
+        "Do more than half of a tag's exchanges fail, and more than those of others?",
+        "number of failures", "binomial, for all tags",
         {"dead or deaf tag": "check power, antenna and USB of tag {tag}"},
         columns.silent,
     ),
     Check(
         "rows",
-        "Are powers dBm at an antenna?",
-        "median outside of -140 to -30 dBm", CERTAIN,
+        "Are powers in dBm at an antenna?",
+        "median; a fault outside -140 to -30 dBm", CERTAIN,
         {"unit of the powers": "{factor}, and import again"},
         columns.powers,
     ),
     Check(
         "geometry",
-        "Do poses fit better more than 30 ms earlier or later?",
-        "log of the spread before over after", OVER_STRETCHES,
+        "Do ranges agree better with poses that are more than 30 ms earlier or later?",
+        "log of the ratio of spreads before and after the shift", OVER_STRETCHES,
         {"pose time offset": "shift the poses: uwblink poses ... --offset {shift}"},
         geometry.pose_clock,
     ),
     Check(
         "geometry",
-        "Do other lever arms or quaternions fit better?",
-        "log of the spread before over after, the best trial", f"{OVER_STRETCHES}, for all trials",
+        "Do ranges agree better with other lever arms or quaternions?",
+        "log of the ratio of spreads before and after, of the best trial", f"{OVER_STRETCHES}, for all trials",
         {
             "lever arm sign": "change the sign of the lever arms of body {body}",
             "lever arm unit": "multiply the lever arms of body {body} by {length}",
             "wxyz quaternion": "quaternions are w x y z: reorder the columns to x y z w",
             "inverse quaternion": "quaternions turn the world into the body: change the signs of x y z",
-            "wrong lever arm": "measure the lever arm of {name}, in the frame of its body; these ranges give{line}",
-            "body stands elsewhere": "check the frame and the origin of the poses of {name} and of the others",
+            "wrong lever arm": "measure the lever arm of {name} in the frame of its body; the ranges give{line}",
+            "body stands elsewhere": "check that the poses of {name} have the same frame and origin as the others",
         },
         geometry.geometry,
     ),
     Check(
         "geometry",
-        "Are tags at places of others, or anchors more than 5 cm elsewhere?",
-        "log of the spread before over after, tags assigned to places; displacement that ranges ask for",
+        "Are tags exchanged, or anchors more than 5 cm away from their given positions?",
+        "log of the ratio of spreads before and after an assignment of tags to positions; displacement of an anchor",
         f"{OVER_STRETCHES}, for all exchanges; F(3, 9), variances by stretches of time, for all anchors",
         {
             "swapped tag ids": "{remedy}",
-            "anchor stands elsewhere": "measure the place of {body} again, and see whose number it has; these ranges "
-            "give{lines}"
+            "anchor stands elsewhere": "measure the position of {body} again, and check its id; the ranges give{lines}"
         },
         geometry.anchors,
     ),
     Check(
         "radio",
-        "Do ranges follow the true distances within 30 cm?",
-        "mean absolute error of a pair, its median aside", f"{OVER_STRETCHES}, for all pairs",
+        "Do ranges agree with true distances within 30 cm?",
+        "mean absolute deviation of a pair's errors from their median", f"{OVER_STRETCHES}, for all pairs",
         {
-            "ranges that do not follow the distances": "see whether numbers of anchors belong to other places, and "
-            "times to another clock; or whether a wall stands between these tags"
+            "ranges that do not follow the distances": "check ids and positions of anchors, and the clock of the "
+            "times; or there is a wall between these tags"
         },
-        residuals.astray,
+        residuals.unrelated_ranges,
     ),
     Check(
         "radio",
-        "Do errors follow the clocks' skew?",
-        "slope over the carriers' readings above 0.5, or ranges by who initiates above 5 cm",
+        "Do errors depend on clock skew?",
+        "slope of errors over carrier readings, above 0.5; or difference of ranges by initiator, above 5 cm",
         "normal, or Student's t among pairs",
         {"skew in single-sided ranges": "{more}", "carrier readings with the wrong sign": "{more}"},
         residuals.skew,
     ),
     Check(
         "radio",
-        "Do all pairs of a tag shift by more than 2 cm at one time, and no others?",
-        "mean shift at the best of 47 times, and all tags", OVER_BLOCKS,
+        "Do ranges of all pairs of one tag, and no others, shift by more than 2 cm at one time?",
+        "mean shift, the largest of 47 times and all tags", OVER_BLOCKS,
         {
-            "delay changed mid-flight": "look for a loose antenna or another voltage on tag {tag}; calibrate the "
-            "two parts apart",
-            "delay drifts": "{readings}let tag {tag} warm up, see to its supply; calibrate short parts apart",
+            "delay changed mid-flight": "check antenna and supply voltage of tag {tag}; calibrate the two parts "
+            "separately",
+            "delay drifts": "{readings}let tag {tag} warm up, check its supply; calibrate short parts separately",
         },
         residuals.changed_delays,
     ),
     Check(
         "radio",
-        "Is a pair more than 4 cm off what delays of tags explain, and places of anchors not?",
-        "a pair's own offset, the largest; places beside it (F)", f"{OVER_BLOCKS}, for all pairs",
+        "Does a pair have an offset of more than 4 cm that neither delays of tags nor positions of anchors explain?",
+        "largest offset of a pair; displacements of anchors as the alternative (F)", f"{OVER_BLOCKS}, for all pairs",
         {
-            "pairs that do not close": "look for a wall or a body between these two, and at their lever arms and "
-            "places; record the pair anew, or fit with `constants` pair",
-            "places that do not close": "measure the places of anchors again, all from one point; these ranges "
+            "pairs that do not close": "look for a wall or a body between the two tags, and check their lever arms "
+            "and positions; record the pair again, or fit with `constants` pair",
+            "places that do not close": "measure the positions of the anchors again, all from one point; the ranges "
             "give{lines}",
         },
         residuals.closures,
     ),
     Check(
         "radio",
-        "Are more than 15 % of the ranges reflected, or of one tag 15 % more than of others, or do reflections last?",
-        "share of ranges that are 12 cm long; long ranges after long ones",
+        "Are more than 15 % of the ranges reflected, or those of one tag 15 % more often than others, or do "
+        "reflections last?",
+        "share of ranges that are 12 cm too long; long ranges that follow long ranges",
         f"{OVER_STRETCHES}; binomial, for all tags or pairs",
         {
             "reflections": "{more}",
-            "reflections that last": "such ranges do not average out within a spell: record for many spells, move "
-            "walls, bodies or antennas",
+            "reflections that last": "such errors do not average out while a reflection lasts: record for longer, or "
+            "move walls, bodies or antennas",
         },
         residuals.reflections,
     ),
     Check(
         "structure",
-        "Do carriers and stamps call the same clocks faster?",
-        "slope of the one over the other below -0.5", "normal",
+        "Do carrier readings and stamps agree about which clocks are faster?",
+        "slope of carrier readings over stamps, below -0.5", "normal",
         {
             "swapped roles": "initiator and target (ids, powers and skews) are exchanged, or the readings have the "
-            "other sign: change it on import"
+            "wrong sign: correct it on import"
         },
         columns.swapped_roles,
     ),
     Check(
         "structure",
-        "Are reported ranges those of the stamps, in metres?",
+        "Do reported ranges in metres agree with the stamps?",
         "median of their ratio", CERTAIN,
         {
             "speed of light in vacuum": "nothing for a fit, which uses the stamps; multiply reported ranges by 0.9997 "
             "before using them",
-            "unit of the reported ranges": 'nothing for a fit, which uses stamps; else import again with [units] '
-            'distance = "{unit}"',
+            "unit of the reported ranges": 'nothing for a fit, which uses the stamps; for other uses import again '
+            'with [units] distance = "{unit}"',
         },
         columns.reported,
     ),
     Check(
         "structure",
-        "Were carriers read where one reply is all that there is?",
-        "single-sided exchanges without", CERTAIN,
+        "Do single-sided exchanges have carrier readings?",
+        "number of single-sided exchanges without readings", CERTAIN,
         {
-            "single-sided without carrier readings": "range in both directions of every pair, so that half of the "
-            "skew's sign is the other way; or record the carrier integrator, or use double-sided ranging"
+            "single-sided without carrier readings": "let both tags of every pair initiate, so that the effect of "
+            "skew cancels; or record the carrier integrator, or use double-sided ranging"
         },
         columns.unread,
     ),
     Check(
         "structure",
-        "Do carriers' readings scatter by more than 1.5 ppm?",
+        "Do carrier readings scatter by more than 1.5 ppm?",
         "log of the median pair's scatter", "normal",
         {
-            "carrier readings that say little": "do not correct single-sided ranges with them; see to their unit and "
+            "carrier readings that say little": "do not correct single-sided ranges with them; check their unit and "
             "register"
         },
         columns.carriers,
@@ -316,8 +315,8 @@ CHECKS: Final = (
         "Do the pairs determine all delays?",
         "null space of the design", CERTAIN,
         {
-            "too few pairs": "nothing if ranges stay between these sides; else record three tags that all range with "
-            "each other, or pin a known delay with `fixed_ns`"
+            "too few pairs": "nothing if only ranges between these sides are corrected; otherwise record three tags "
+            "that all range with each other, or set a known delay with `fixed_ns`"
         },
         columns.undetermined,
     ),
@@ -331,10 +330,11 @@ CHECKS: Final = (
     Check(
         "structure",
         "Does distance explain more than 90 % of the power?",
-        "share of variance between distances, noise of readings aside (variance inflation of 10)", CERTAIN,
+        "share of the variance of power that distance explains, without the noise of readings (variance inflation of "
+        "10)", CERTAIN,
         {
-            "power confounded with distance": "turn the antennas while recording; until then the curve may hold "
-            "what belongs to distance, and `delays_only` fits none"
+            "power confounded with distance": "turn the antennas while recording; without this the curve may contain "
+            "effects of distance, or fit without a curve by `delays_only`"
         },
         columns.confounded,
     ),
@@ -344,8 +344,9 @@ CHECKS: Final = (
         "share of exchanges with one, below a half", CERTAIN,
         {
             "no powers": "import powers as fpp1 and fpp2; without them only delays can be fitted, by `delays_only`",
-            "no true distances": "add motion capture with uwblink poses, or measured distances in gt_range_m; without "
-            "any, survey boards that stood still, and fit moving ones with the truth from ranges",
+            "no true distances": "add motion capture with uwblink poses, or measured distances in gt_range_m; "
+            "without true distances use calib survey for boards that stand still, and calib fit --truth ranges for "
+            "moving ones",
         },
         columns.missing,
     ),
@@ -354,34 +355,38 @@ CHECKS: Final = (
         "Did an anchor or a delay change between recordings?",
         "displacement of an anchor; mean change of a tag's pairs above 2 cm", f"as above; {OVER_BLOCKS}, for all tags",
         {
-            "anchor moved between recordings": "measure the place of {body} anew, and fit recordings apart until then",
-            "delay changed between recordings": "was the antenna of tag {tag} touched, or its board replaced? "
-            "calibrate the recordings apart",
+            "anchor moved between recordings": "measure the position of {body} again, and fit the recordings "
+            "separately until then",
+            "delay changed between recordings": "check whether the antenna of tag {tag} was touched or its board "
+            "replaced; calibrate the recordings separately",
         },
-        residuals.compared,
+        residuals.between_recordings,
     ),
     Check(
         "survey",
-        "What does a survey of standing boards contradict?",
-        "contradictions of the survey, which has tested them", CERTAIN,
+        "Does a survey of boards that stand still contradict the known facts?",
+        "contradictions that the survey found by its own tests", CERTAIN,
         {
-            "board moved within an arrangement": "record that arrangement again, or end it before",
-            "arrangement not as it is said to be": "put the boards straight, or record without `known`",
+            "board moved within an arrangement": "record this arrangement again, or end it before the movement",
+            "arrangement not as it is said to be": "move the boards onto the line or plane, or record without `known`",
             "wrong known distance": "measure it again, antenna to antenna, or leave it out",
-            "exchanged labels": "look at the labels of these two boards",
-            "survey determines nothing": "make the arrangements that calib plan advises",
-            "delays that a survey leaves open": "make another arrangement, or tape a distance: calib plan says which",
-            "many reflected pairs": "put boards where they see each other, away from walls and metal",
-            "two solutions of a survey": "tape a distance that tells them apart, and give it as known",
-            "powers that hardly vary": "make arrangements with nearer and farther boards, or take the curve of another "
-            "calibration (`curve_from`)",
+            "exchanged labels": "check the labels of these two boards",
+            "survey determines nothing": "record the arrangements that calib plan survey proposes",
+            "delays that a survey leaves open": "record another arrangement, or measure a distance: calib plan "
+            "survey proposes which",
+            "many reflected pairs": "place the boards in line of sight of each other, away from walls and metal",
+            "two solutions of a survey": "measure a distance that differs between the two solutions, and give it as "
+            "known",
+            "powers that hardly vary": "record arrangements with nearer and farther boards, or use the curve of "
+            "another calibration (`curve_from`)",
         },
         surveyed,
     ),
 )  # fmt: skip
 
 FINDING_LEVEL: Final = (BUDGET - OF_A_FIT) / sum(not check.certain for check in CHECKS)
-"""p-value below which a candidate is a finding: checks have equal shares of the budget, beside that of a fit."""
+"""p-value below which a candidate is a finding: the checks share one half of the budget equally, the checks of a fit
+have the other."""
 
 OF_PAIRS: Final = {"pairs that do not close", "places that do not close", "reflections", "reflections that last"}
 IMPLIED: Final = {
@@ -398,20 +403,19 @@ IMPLIED: Final = {
     "unit of the powers": {"no powers"},
     "unit of the reported ranges": {"corrupted exchanges"},
 }
-"""Faults that follow from a fault, and are not reported beside it."""
+"""Faults that are consequences of another fault, and are not reported together with it."""
 
 
 # Small matrices: several threads make them slower, and the last digits another.
 @threadpool_limits.wrap(limits=1, user_api="blas")  # type: ignore[untyped-decorator]  # it has no types
 def examine(data: Data | Iterable[Data]) -> list[Finding]:
-    """Return what is wrong with a recording, the gravest first: each fault with its evidence and what to do about it.
+    """Return the faults of a recording, the most serious first, each with its evidence and remedy.
 
     `data` is the path of a recording, an open `Recording`, or anything with `exchanges`, `poses` and `tags`, or several
-    of those, which are then compared, too; ranges alone do not say enough. Recordings of arrangements without poses are
-    surveyed, all together. Rows that cannot be are set aside before anything else is judged, and what would only follow
-    from a graver fault is not looked for. Of a recording with more than 160,000 exchanges about so many are looked at,
-    in 40 stretches over all of its time. Raises what
-    `Recording.open` raises.
+    of those, which are then also compared with each other; `Ranges` are not enough. Recordings of arrangements without
+    poses are surveyed together. Impossible rows are left out before the other checks, and consequences of a more
+    serious fault are not reported. Of a longer recording about 160,000 exchanges are examined, in 40 stretches over all
+    of its time. Raises the errors of `Recording.open`.
 
     >>> import calib
     >>> [finding.fault for finding in calib.examine(calib.sample_flight())]
@@ -421,34 +425,34 @@ def examine(data: Data | Iterable[Data]) -> list[Finding]:
     for one in recordings:
         with opened(one) as (name, source):
             whole = view_of(name, source)
-        found, view = _examined(whole)
+        found, view = _examine_recording(whole)
         prefix = f"{name}: " if len(recordings) > 1 else ""
         findings += [replace(finding, evidence=prefix + finding.evidence) for finding in found]
         views += [view] if view else []
     if len(views) > 1:
-        between = _run("between", views, FINDING_LEVEL)
+        between = _run_stage("between", views, FINDING_LEVEL)
         # What moved between two recordings is no fault of either one.
         moved = any(finding.fault == "anchor moved between recordings" for finding in between)
         findings = [one for one in findings if not (moved and one.fault == "anchor stands elsewhere")] + between
     if views and len(views) == len(recordings) and all(view.standing for view in views):
-        findings += _run("survey", recordings)
+        findings += _run_stage("survey", recordings)
     order = [fault for check in CHECKS for fault in check.remedies]
     return sorted(findings, key=lambda finding: order.index(finding.fault))
 
 
-def _run(stage: str, *given: Any) -> list[Finding]:
+def _run_stage(stage: str, *given: Any) -> list[Finding]:
     return [
         found for check in CHECKS if check.stage == stage for found in check.findings(check.look(*given), FINDING_LEVEL)
     ]
 
 
-def _examined(view: RecordingView) -> tuple[list[Finding], RecordingView | None]:
-    """Return what is wrong with one recording, and the recording without its impossible rows, if that can be used."""
+def _examine_recording(view: RecordingView) -> tuple[list[Finding], RecordingView | None]:
+    """Return the faults of one recording, and the recording without its impossible rows, if it can be used."""
     for check in CHECKS:
         # With such a fault, the other numbers of a recording mean something else.
         if check.stage == "reading" and (misread := check.findings(check.look(view), FINDING_LEVEL)):
             return misread, None
-    findings = _run("rows", view)
+    findings = _run_stage("rows", view)
     bad = columns.impossible(view)
     # The rest may be possible by chance.
     if bad.mean() >= 0.5:
@@ -457,15 +461,15 @@ def _examined(view: RecordingView) -> tuple[list[Finding], RecordingView | None]
     if any(finding.fault == "unit of the powers" for finding in findings):
         unknown = np.full(len(view.exchanges), np.nan)
         view = replace(view, ranges=replace(view.ranges, fpp1_dbm=unknown, fpp2_dbm=unknown))
-    # Only stamps that make sense can say something about poses, and only right poses something about radios.
-    findings += _best(view) or _run("radio", view)
-    findings += _run("structure", view)
+    # Checks of poses need sound stamps, and checks of radios need sound poses.
+    findings += _best_geometry_fault(view) or _run_stage("radio", view)
+    findings += _run_stage("structure", view)
     implied = set[str]().union(*(IMPLIED.get(finding.fault, ()) for finding in findings))
     return [finding for finding in findings if finding.fault not in implied], view
 
 
-def _best(view: RecordingView) -> list[Finding]:
-    """Return the fault of poses and lever arms that explains most of the errors."""
+def _best_geometry_fault(view: RecordingView) -> list[Finding]:
+    """Return the fault of poses or lever arms that explains most of the errors."""
     tried = [check for check in CHECKS if check.stage == "geometry"]
     seen = [(check, [one for one in check.look(view) if one.p_value < FINDING_LEVEL]) for check in tried]
     check, best = max(seen, key=lambda one: sum(fault.gain for fault in one[1]))

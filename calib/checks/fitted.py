@@ -1,4 +1,4 @@
-"""Checks of a fit against its own residuals: would one more unknown be improbable, and what would it do to delays?
+"""Checks of a fit by its residuals: is one more unknown significant, and how much would it change the delays?
 
 All questions share one false-alarm budget. Offsets that are draws of one variance (pairs, sessions) are unknowns of the
 fit, so their variance is in the intervals whether one of them stands out or not.
@@ -14,7 +14,7 @@ from scipy import sparse
 from scipy.special import expit, ndtr
 
 from calib.calibration.power_curves import basis
-from calib.checks.places import of_places
+from calib.checks.places import place_covariance
 from calib.estimator.arrival_rows import OFFSET_OF_PATH, PATH_SIGNS
 from calib.estimator.covariance import of_few_draws
 from calib.estimator.inverse import positive_part
@@ -37,8 +37,8 @@ MATTERS, CLEARLY = 1.0, 4.0
 small one by so many (one in 16 000 by chance)."""
 
 SMALLEST_M = 0.01
-"""An offset of less is nobody's fault, as a lever arm by a ruler is no better: it widens intervals, and is not named
-unless it matters clearly."""
+"""A smaller offset may come from a lever arm measured by a ruler: it widens intervals, and is named only if its effect
+is large."""
 
 HIDDEN, OFTEN = 0.8, 0.45
 """Shares of reflected ranges of a pair that is named, and of a tag's pairs on average. Judgements: delays rest on the
@@ -49,9 +49,10 @@ UNIT = np.ones((1, 1))
 
 
 def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
-    """Hold a fit against alternatives.
+    """Test a fit against alternatives with one more unknown each.
 
-    Returns the covariance (tags, tags) of the stated delays in ns^2 with what does not fit, and what to say of it.
+    Returns the covariance (tags, tags) of the delays in ns^2, which includes the effect of misfits, and sentences about
+    them.
     """
     slopes, louder, alone = found.slopes, change_per_decibel(found), len(found.searches) > 1
     readings = None if alone else errors_of_readings(found.model, louder)
@@ -63,7 +64,7 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
         tested = [*(one.beside([-1]).turned(np.eye(len(one.total))[:-1]) for one in tested), noise]
     if found.slopes_of_heard is not None:
         tested += found.slopes_of_heard.tests(list(_of_heard(found)))
-    findings = _without_repeats(search(tested, OF_A_FIT))
+    findings = _without_explained(search(tested, OF_A_FIT))
     plain = found.covariances["delay"]
     for one in tested:
         if one.family.kind in ("pair", "session") and not len(one.family.fitted):
@@ -71,18 +72,18 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
     places_ns2, said = np.zeros_like(plain), list[str]()
     if not alone and found.model.curve is not None:
         pairs = next(one for one in tested if one.family.kind == "pair")
-        places_ns2, said = of_places(found, slopes, pairs, plain)
-    covariance, sentences = _weighed(plain, findings, places_ns2, said)
+        places_ns2, said = place_covariance(found, slopes, pairs, plain)
+    covariance, sentences = _covariance_and_sentences(plain, findings, places_ns2, said)
     # Few pairs tell little of how large their offsets are. What findings added already is not added again.
     optimum = found.searches[0].optimum
     few_ns2 = of_few_draws(optimum, optimum.layout.indices(["delay"]))
     covariance = covariance + positive_part(few_ns2 - (covariance - found.covariances["delay"]))
     return covariance, [
         *sentences,
-        *_reflected(found),
-        *_short(found),
-        *_saturated(found.model),
-        *_confounded(found, slopes),
+        *_reflection_warnings(found),
+        *_persistence_warning(found),
+        *_redundancy_warning(found.model),
+        *_confounding_warning(found, slopes),
     ]
 
 
@@ -121,7 +122,7 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
         yield of_tags("decibels", louder_m[:, None] / size)
     forth = np.where(ranges.initiator < ranges.target, 1.0, -1.0)
     yield of_tags("skew", forth[:, None] * [1.0, -1.0])
-    shared, reach = late(model), float(np.ptp(ranges.truth_m))
+    shared, reach = distance_speeds(model), float(np.ptp(ranges.truth_m))
     if beside_curve and reach > 0:
         shared = {"scale": (ranges.truth_m - float(np.median(ranges.truth_m))) / reach} | shared
     if shared:
@@ -144,7 +145,7 @@ def _of_heard(found: KnownDistances) -> Iterator[Family]:
 
 
 def of_pairs(found: KnownDistances) -> Family:
-    """Return the offsets of pairs."""
+    """Return the alternatives: an offset of each pair."""
     pairs = found.model.pairs
     return Family(
         kind="pair",
@@ -194,8 +195,8 @@ def errors_of_readings(model: RangeModel, louder_m: Floats) -> Floats | None:
     return np.asarray(missing / max(_root_mean_square(missing), 1e-12))
 
 
-def late(model: RangeModel) -> dict[str, Floats]:
-    """Return by how many metres a second the true distance of each range (n,) changes, over its root mean square.
+def distance_speeds(model: RangeModel) -> dict[str, Floats]:
+    """Return the speed at which the true distance of each range (n,) changes, divided by its root mean square.
 
     Speeds are those by the neighbours of each pair; nothing is returned where no distance changes.
     """
@@ -218,13 +219,13 @@ def _root_mean_square(values: Floats) -> float:
 
 
 def change_per_decibel(found: KnownDistances) -> Floats:
-    """Return by how much ranges (n,) would read otherwise, had their powers been a decibel higher."""
+    """Return the change of ranges (n,) if their powers were a decibel higher."""
     curves, lifted = list(bias_curves(found).values()), found.model.lifted
     return np.asarray(np.mean([curve(10**0.1 * lifted) - curve(lifted) for curve in curves], axis=0))
 
 
-def _without_repeats(findings: list[FoundOffset]) -> list[FoundOffset]:
-    """Leave out what a tag does for a while where a difference between sessions says the same more surely."""
+def _without_explained(findings: list[FoundOffset]) -> list[FoundOffset]:
+    """Leave out changes of a tag during a part of the time if a difference between sessions explains them better."""
     between = {name: abs(one.deviation) for one in findings if one.kind == "session" for name in one.names}
     return [
         one
@@ -233,19 +234,19 @@ def _without_repeats(findings: list[FoundOffset]) -> list[FoundOffset]:
     ]
 
 
-def _weighed(
+def _covariance_and_sentences(
     plain: Floats, findings: list[FoundOffset], places_ns2: Floats, of_places: list[str]
 ) -> tuple[Floats, list[str]]:
     """Return the delays' covariance (tags, tags) with what findings add, and those that matter as sentences.
 
-    `of_places` says what places do, if that is certain, and `places_ns2` (tags, tags) is the covariance that they add.
+    `of_places` is a sentence on errors of places, if they are certain; `places_ns2` (tags, tags) is their covariance.
     """
     if of_places:
         # Offsets of pairs are then draws like the others; one of them is no fault of its own.
         findings = [one for one in findings if one.kind != "pair"]
     covariance, matter, said = plain + places_ns2, dict[tuple[str, tuple[str, ...]], FoundOffset](), of_places
     for one in findings:
-        moved, large = _moved(one, plain), abs(one.offset_m) > SMALLEST_M
+        moved, large = _largest_shift(one, plain), abs(one.offset_m) > SMALLEST_M
         # True distances of another time or scale than ranges move ranges, and hardly delays.
         cause = one.kind == "shared" and (bool(of_places) or large)
         if moved > MATTERS:
@@ -260,15 +261,15 @@ def _weighed(
             matter.setdefault((one.kind, one.names), one)
     noise = ""
     if any(one.kind == "readings" for one in findings):
-        noise = "; or powers are read with noise, which changes ranges alike: turn the antennas while recording"
+        noise = "; or the powers are noisy, which has the same effect: turn the antennas while recording"
     return covariance, [
         *(sentence + noise for sentence in said),
         *(sentence_of(one) + noise * (one.kind == "shared") for one in matter.values()),
     ]
 
 
-def _moved(finding: FoundOffset, covariance: Floats) -> float:
-    """Return by how many of its standard errors a finding moves some delay."""
+def _largest_shift(finding: FoundOffset, covariance: Floats) -> float:
+    """Return the largest shift of a delay by a finding, in standard errors of the delay."""
     std = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
     if not np.any(np.diag(covariance) > 0):
         # Without a delay in the fit the curve takes what an offset does.
@@ -281,28 +282,31 @@ def _moved(finding: FoundOffset, covariance: Floats) -> float:
 
 
 SENTENCES = {
-    "pair": "{whose}: ranges read {size} too {way} for the other pairs, which moves {worst}; record it anew",
-    "time": "{whose}: ranges are {size} too {way} for a part of the recording, which moves {worst}; touched?",
-    "session": "{whose}: ranges in {own} are {size} {way}er than in {others} (p = {p:.1g}), which moves {worst}; was "
-    "an antenna changed, or something moved, in between? Fit the recordings apart to see",
-    "power": "{whose}: errors change with power by {size} as no other tag's do, which moves {worst}",
-    "decibels": "{whose}: errors are as if its powers were wrong by some decibels, {size} in its ranges, which moves "
-    "{worst}; does it stand at another gain, or have another antenna?",
-    "skew": "{whose}: ranges read {size} too {way} as initiator and as much the other way as target, which moves "
-    "{worst}: clock skew is not corrected, or with the wrong sign",
-    "heard": "{whose}: what listeners overheard contradicts its ranges by {size}, which moves {worst}; see to the "
-    "places of the listeners, or fit with `use` exchanges",
-    "path": "{whose}: overheard frames travel {size} too {way}, which moves {worst}; see to the places of both tags",
-    "scale": "ranges grow with the distance by {size} too {way} over the recorded distances, which moves {worst}; see "
-    "to the scale, the unit and the lever arms of the true distances",
-    "late": "ranges change by {size} with the speed at which true distances change (root mean square): motion capture "
-    "and ranges are not of the same time; see to the clocks (`calib doctor` says by how much)",
+    "pair": "{whose}: ranges are {size} too {way} compared with the other pairs, which changes {worst}; record this "
+    "pair again",
+    "time": "{whose}: ranges are {size} too {way} during a part of the recording, which changes {worst}; check "
+    "whether the antenna was touched",
+    "session": "{whose}: ranges in {own} are {size} {way}er than in {others} (p = {p:.1g}), which changes {worst}; "
+    "check whether an antenna was changed, or something moved, in between, and fit the recordings separately",
+    "power": "{whose}: errors change with power by {size}, unlike those of other tags, which changes {worst}",
+    "decibels": "{whose}: its powers seem to be wrong by some decibels, which changes its ranges by {size} and "
+    "{worst}; check its gain and its antenna",
+    "skew": "{whose}: ranges are {size} too {way} if it initiates, with the opposite sign if it responds, which "
+    "changes {worst}: clock skew is not corrected, or corrected with the wrong sign",
+    "heard": "{whose}: overheard frames contradict its ranges by {size}, which changes {worst}; check the positions "
+    "of the listeners, or fit with `use` exchanges",
+    "path": "{whose}: paths of overheard frames are {size} too {way}, which changes {worst}; check the positions of "
+    "both tags",
+    "scale": "ranges grow with the distance by {size} too {way} over the recorded distances, which changes {worst}; "
+    "check scale, unit and lever arms of the true distances",
+    "late": "ranges change by {size} with the speed at which true distances change (root mean square): the times of "
+    "motion capture and ranges differ; check the clocks (`calib doctor` states the difference)",
 }
-"""What to say of findings, by their kinds, or by the names of what all ranges share."""
+"""Sentences about findings, by their kinds, or by the names of errors that all ranges share."""
 
 
 def sentence_of(finding: FoundOffset) -> str:
-    """Return a finding as a sentence; where two causes leave the same trace, both are named."""
+    """Return a finding as a sentence; if two causes have the same effect, both are named."""
     own, others = finding.sessions
     words = {
         "whose": " or ".join(finding.names),
@@ -317,8 +321,9 @@ def sentence_of(finding: FoundOffset) -> str:
     return "; or ".join(SENTENCES[name].format(**words) for name in names)
 
 
-def _reflected(found: KnownDistances) -> Iterator[str]:
-    """Name the pairs of which hardly a range is direct, or else a tag about half of whose ranges are not.
+def _reflection_warnings(found: KnownDistances) -> Iterator[str]:
+    """Return sentences about pairs with hardly any direct range, or else about a tag with about half of its ranges
+    reflected.
 
     The log odds of a pair are held against their standard errors, with errors that last.
     """
@@ -339,41 +344,42 @@ def _reflected(found: KnownDistances) -> Iterator[str]:
         # Among four tags a pair's offset and that of the two others leave the same trace.
         either = f" or pair {others[0]}-{others[1]}" if len(tags) == 4 else ""
         yield (
-            f"pair {a}-{b}{either}: {100 * share[number]:.0f} % of its ranges are reflected, or off by "
-            f"{100 * detour_m[number]:.0f} cm; record it anew, delays rest on the other pairs"
+            f"pair {a}-{b}{either}: {100 * share[number]:.0f} % of its ranges are reflected, or "
+            f"{100 * detour_m[number]:.0f} cm too long; record it again, the delays depend on the other pairs"
         )
     means = {tag: float(np.where(far, share, 0.0)[np.any(ends == tag, axis=1)].mean()) for tag in tags}
     often = [tag for tag in tags if means[tag] > OFTEN and not hidden]
     for tag in often[:1]:
-        yield f"tag {tag}: {100 * means[tag]:.0f} % of its ranges are reflected; what stands near its antenna?"
+        yield f"tag {tag}: {100 * means[tag]:.0f} % of its ranges are reflected; check for objects near its antenna"
 
 
-def _short(found: KnownDistances) -> Iterator[str]:
-    """Say where errors last so long that a recording holds few independent stretches of time."""
+def _persistence_warning(found: KnownDistances) -> Iterator[str]:
+    """Return a sentence if errors last so long that a recording has few independent stretches of time."""
     lasting = found.persistence
     if lasting.stretches < FEWEST_STRETCHES:
         yield (
             f"errors last for {lasting.stretch_s:.1f} s, so the recording holds only {lasting.stretches:.0f} "
-            f"independent stretches of time; intervals are widened for it, and a guess below {FEWEST_STRETCHES:.0f}: "
-            "record for longer"
+            f"independent stretches of time; intervals are widened for this, and unreliable with fewer than "
+            f"{FEWEST_STRETCHES:.0f} stretches: record for longer"
         )
 
 
-def _saturated(model: RangeModel) -> Iterator[str]:
-    """Say where so few pairs range that offsets of pairs pass for delays."""
+def _redundancy_warning(model: RangeModel) -> Iterator[str]:
+    """Return a sentence if there are so few pairs that offsets of pairs cannot be separated from delays."""
     count, told = len(model.pairs.ends), any(unknown.kind == "offset of pair" for unknown in model.unknowns)
     if model.settings.constants == "tag" and count > 2 and not told:
         slopes = 0.5 * METRES_A_NS * free_ends(model.pairs, model.tags, model.settings)
         moved_ns = TYPICAL_OFFSET_M * float(np.linalg.norm(np.linalg.pinv(slopes), axis=1).max())
         yield (
-            f"{count} pairs determine the delays and nothing beside them: offsets of pairs of "
-            f"{100 * TYPICAL_OFFSET_M:.1f} cm, as walls make them, would move delays by up to {1e3 * moved_ns:.0f} ps, "
-            "which intervals do not contain; record more tags, or anchors"
+            f"{count} pairs are just enough to determine the delays: offsets of pairs of "
+            f"{100 * TYPICAL_OFFSET_M:.1f} cm, which walls cause, would change delays by up to {1e3 * moved_ns:.0f} "
+            f"ps, "
+            "which the intervals do not include; record more tags, or anchors"
         )
 
 
-def _confounded(found: KnownDistances, slopes: Slopes) -> Iterator[str]:
-    """Say where a small error that grows with the distance would pass for a curve over power.
+def _confounding_warning(found: KnownDistances, slopes: Slopes) -> Iterator[str]:
+    """Return a sentence if a small error proportional to distance cannot be separated from a curve over power.
 
     The curve is fitted beside such an error of 1 %, which true distances may have without showing it (a judgement). It
     is named where it adds more to the variance of the curve than all else does.
@@ -394,7 +400,7 @@ def _confounded(found: KnownDistances, slopes: Slopes) -> Iterator[str]:
     band = float(np.sqrt(max(np.mean(np.einsum("ij,jk,ik->i", rows, found.covariances["curve"], rows)), 0.0)))
     if more >= band:
         yield (
-            f"power and distance are confounded: true distances 1 % off would pass for "
-            f"{1e3 * more:.0f} mm of the curve, whose band says {1e3 * band:.0f} mm; turn the antennas while "
-            "recording, or fit with `delays_only`"
+            f"power and distance are confounded: an error of 1 % in true distances would change the curve by "
+            f"{1e3 * more:.0f} mm, more than its band of {1e3 * band:.0f} mm; turn the antennas while recording, or "
+            f"fit with `delays_only`"
         )

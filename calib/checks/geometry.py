@@ -1,4 +1,6 @@
-"""Checks of poses, lever arms and places of anchors: each suspected fault is undone, and the spreads compared."""
+"""Checks of poses, lever arms and positions of anchors: each suspected fault is undone, and the spreads are
+compared.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ import numpy as np
 from scipy import optimize, sparse, special
 from scipy.sparse.csgraph import connected_components
 
-from calib.checks.fitted import late
+from calib.checks.fitted import distance_speeds
 from calib.checks.recording_view import QuickFit, RecordingView
 from calib.estimator.known_distances import ASTRAY_M
 from calib.estimator.score_tests import Tested
@@ -24,10 +26,10 @@ from uwblink.recording.schema import Poses, Tag
 
 
 def pose_clock(view: RecordingView) -> Iterator[Candidate]:
-    """Poses whose clock is off by up to a few seconds."""
+    """Find poses whose clock is off by up to a few seconds."""
     fit = view.quick_fit
     # Where poses are late, by less than bodies take for a turn, ranges follow the speeds at which distances change.
-    follow = [fit.offset(speeds)[1] for speeds in late(fit.model).values()] if fit else [0.0]
+    follow = [fit.offset(speeds)[1] for speeds in distance_speeds(fit.model).values()] if fit else [0.0]
     if not len(view.poses) or min(follow, default=1.0) > BUDGET:
         return
     # By how much is a search: motion over a second is not linear.
@@ -44,7 +46,7 @@ def pose_clock(view: RecordingView) -> Iterator[Candidate]:
 
 
 def _trials(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]:
-    """Suspected faults of geometry, each with poses and tags as they would be without it."""
+    """Yield suspected faults of geometry, each with the poses and tags that undo it."""
     for body in sorted({tag.body for tag in view.tags}):
         arms = {tag.tag: np.array(tag.lever_arm_m) for tag in view.tags if tag.body == body}
         longest = max(np.linalg.norm(arm) for arm in arms.values())
@@ -98,7 +100,7 @@ def _with_arms(tags: list[Tag], arms: dict[int, Floats]) -> list[Tag]:
 
 
 def geometry(view: RecordingView) -> Iterator[Candidate]:
-    """Try every suspected fault of geometry; of those that explain the ranges, the one that does so best."""
+    """Find the fault of geometry that explains the ranges best, by trying all suspected ones."""
     for suspected in (_trials, _displacements) if view.posed else ():
         e, trials = view.exchanges, list(suspected(view))
         found = [
@@ -129,7 +131,7 @@ def _undone(view: RecordingView, seen: Candidate, truth_m: Floats, *, tried: int
     old_cm, new_cm = (100 * robust_spread(errors[np.isfinite(errors)], 0.0) for errors in (before, after))
     return replace(
         seen,
-        evidence=f"{seen.evidence}, the ranges' spread is {new_cm:.1f} cm instead of {old_cm:.1f} cm",
+        evidence=f"{seen.evidence}, the spread of the ranges is {new_cm:.1f} cm instead of {old_cm:.1f} cm",
         p_value=positive(np.log(0.95) + np.log(old) - np.log(new), tried=tried),
         gain=_gain(before[rows], after[rows]),
     )
@@ -148,29 +150,31 @@ PAIR_M: Final = 0.04
 
 
 def anchors(view: RecordingView) -> Iterator[Candidate]:
-    """Tags that are at each other's places; then anchors that stand elsewhere, `away_m` (3,) among the words."""
+    """Find exchanged tags; then anchors at other positions, with the displacement `away_m` (3,) in the candidate."""
     # Where nothing moves, each pair has a level that is its own.
     if view.standing_m is not None or view.quick_fit is None:
         return
     moved, seen = _exchanged(view, view.quick_fit)
-    remedy = "exchange these numbers where the true distances come from"
+    remedy = "exchange these ids in the source of the true distances"
     if moved and view.posed:
         by_number = {tag.tag: tag for tag in view.tags}
-        view = _told(view, tags=[replace(by_number[moved.get(number, number)], tag=number) for number in by_number])
+        view = _with_truth(
+            view, tags=[replace(by_number[moved.get(number, number)], tag=number) for number in by_number]
+        )
         lines = "".join(_line(view, tag) for tag in view.tags if tag.tag in moved)
         remedy = (
-            f"in the file of uwblink poses --tags, replace those with these numbers; add poses with `force`:{lines}"
+            f"replace these tables in the file of uwblink poses --tags, and add the poses again with `force`:{lines}"
         )
     yield replace(seen, words={"remedy": remedy})
     if view.posed and view.quick_fit is not None:
         yield from _displaced(view, view.quick_fit)
     elif len(view.poses):
         # A table's own true distances are used, and its poses are what places tags when ranges are.
-        by_poses = anchors(_told(view, posed=True))
+        by_poses = anchors(_with_truth(view, posed=True))
         yield from (replace(one, evidence=f"by the poses, {one.evidence}") for one in by_poses)
 
 
-def _told(view: RecordingView, **said: Any) -> RecordingView:
+def _with_truth(view: RecordingView, **said: Any) -> RecordingView:
     """Return a view with other poses or tags, and true distances by them."""
     told, e = replace(view, **said), view.exchanges
     truth_m = distances_m(told.poses, told.tags, e.initiator, e.target, e.time_ns)
@@ -186,7 +190,7 @@ def _line(view: RecordingView, tag: Tag, away_m: Floats | float = 0.0) -> str:
 
 
 def _exchanged(view: RecordingView, fit: QuickFit) -> tuple[dict[int, int], Candidate]:
-    """Return which tags are at places of which others, and the finding.
+    """Yield the finding of exchanged tags, with the exchange that undoes it.
 
     A tag a at the place of b ranges with c as far as b is from c, by the true distances of b and c, which are
     interpolated. The logarithms of the pairs' spreads are the likelihood, were each scale its own: an assignment of
@@ -204,7 +208,7 @@ def _exchanged(view: RecordingView, fit: QuickFit) -> tuple[dict[int, int], Cand
         mended, moved = view.ranges.truth_m.copy(), at != right
         for (a, c), own in rows.items():
             mended[fit.rows[own]] = truth_m(own, rows.get((at[a], at[c]), own))
-        said = [f"{a} is where {b} is said to be" for a, b in zip(numbers[moved], numbers[at[moved]], strict=True)]
+        said = [f"{a} is at the given position of {b}" for a, b in zip(numbers[moved], numbers[at[moved]], strict=True)]
         return _undone(view, Candidate("swapped tag ids", f"tag {', '.join(said)}: undone"), mended, tried=count**2)
 
     known, spread, worse = sums = np.zeros((3, count, count))
@@ -255,7 +259,7 @@ def _displaced(view: RecordingView, fit: QuickFit) -> Iterator[Candidate]:
             away[body] = _place(sides[body][mine], error_m, fit.model.pairs.number[mine], starts)
             there_m = np.where(poses.body[:, None] == body, poses.position_m + away[body], poses.position_m)
             poses = replace(poses, position_m=there_m)
-    if not away or (moved := (told := _told(view, poses=poses)).quick_fit) is None:
+    if not away or (moved := (told := _with_truth(view, poses=poses)).quick_fit) is None:
         return
     # What ranges know of the other places, as they fit these.
     tested = moved.test_constants(_outward(_sides(told, moved, places)))
@@ -279,10 +283,10 @@ def _displaced(view: RecordingView, fit: QuickFit) -> Iterator[Candidate]:
         )
         yield Candidate(
             "anchor stands elsewhere",
-            f"ranges with {body} fit a place {size:.2f} m away {axes}: their "
-            f"spread is {100 * after:.1f} cm there instead of {100 * before:.1f} cm"
-            + (f"; they hardly tell {loose} from delays" if loose else "")
-            + (f"; there the recording has {others}: are numbers exchanged?" if others else ""),
+            f"ranges with {body} fit a position {size:.2f} m away {axes}: their spread is {100 * after:.1f} cm there "
+            f"instead of {100 * before:.1f} cm"
+            + (f"; they hardly separate {loose} from delays" if loose else "")
+            + (f"; {others} is given at that position: check whether the ids are exchanged" if others else ""),
             min(1.0, _p_of_place(own, own.information @ shift * (1 - TOLERANCE_M / size)) * len(sides)),
             {
                 "body": body,
@@ -363,7 +367,7 @@ def beside_places(view: RecordingView, fit: QuickFit, pairs: Sequence[int]) -> t
         lines += [_line(view, tag, shift) for tag in view.tags if tag.body == body]
     seen = Candidate(
         "places that do not close",
-        f"ranges contradict the places of {', '.join(sides)} together; they fit best with {'; '.join(said)}",
+        f"ranges contradict the positions of {', '.join(sides)} together; the best displacements are {'; '.join(said)}",
         _p_of_place(together, together.total),
         {"lines": "".join(lines)},
     )

@@ -1,6 +1,6 @@
-"""What a fit cannot know from the data that it had, and what hardware and arithmetic do not allow.
+"""Limits of a fit: what its data do not determine, and values that are physically impossible.
 
-Data that cannot be what they claim are refused, or named before they are believed.
+Impossible data are refused; doubtful data get a warning.
 """
 
 from __future__ import annotations
@@ -38,30 +38,32 @@ REGISTER_NS: Final = 65_536 * TICK_S * 1e9
 (514 ns). A delay beyond is a length in the wrong unit: 154 m of range a tag."""
 
 
-def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Mapping[int, float]) -> Iterator[str]:
-    """Yield what cannot be known, in sentences; `residuals_m` (n,) are fully corrected errors of the ranges."""
+def limit_warnings(
+    found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Mapping[int, float]
+) -> Iterator[str]:
+    """Yield sentences about what the data do not determine; `residuals_m` (n,) are fully corrected errors."""
     model, pairs, count = found.model, found.model.settings.constants == "pair", len(found.model.pairs.ends)
     bare = int(np.count_nonzero(ranges.protocol == NO_STAMPS))
     unread = any(is_single_sided(name) and not corrected(name) for name in names_in(ranges.protocol))
     notes = (
-        f"{'' if bare == len(ranges) else f'{bare} of {len(ranges)} '}ranges without stamps: clock skew, and what "
-        f"the device added or took off itself, are not known and are in the {'constants' if pairs else 'delays'}; "
-        "a damaged range cannot be told from a reflected one"
+        f"{'' if bare == len(ranges) else f'{bare} of {len(ranges)} '}ranges without stamps: clock skew, and "
+        f"corrections by the device itself, are unknown and contained in the {'constants' if pairs else 'delays'}; "
+        f"damaged ranges cannot be distinguished from reflected ones"
         if bare
         else "",
-        "single-sided ranges without their reply times and carrier readings: what clock skew has left in them "
-        "cannot be said, and looks like antenna delays"
+        "single-sided ranges without reply times and carrier readings: the effect of clock skew is unknown, and "
+        "contained in the antenna delays"
         if ranges.left_skew is None and unread
         else str(ranges.left_skew or ""),
         str(ranges.clocks_apart or ""),
-        f"{'the constant of one pair' if count == 1 else f'constants of {count} pairs'}: antenna delays stay "
-        "unknown, other pairs cannot be corrected, and what else is constant in the ranges of a pair (an obstacle, "
-        "a wrong lever arm) is in its constant"
+        f"{'the constant of one pair' if count == 1 else f'constants of {count} pairs'}: antenna delays are not "
+        f"determined, other pairs cannot be corrected, and other constant errors of a pair (an obstacle, a wrong "
+        f"lever arm) are in its constant"
         if pairs
         else "",
         _without_curve(found, ranges, residuals_m) if model.curve is None else "",
-        "curve only: the delays are those that were given; what they have in common that is wrong is in the curve, "
-        f"where they differ it stays in the ranges (medians of pairs lie within "
+        "curve only: the delays are the given ones; a common error of the delays is in the curve, and their "
+        "individual errors stay in the ranges (medians of pairs lie within "
         f"{as_length(float(np.ptp(medians(residuals_m, pairs_of(ranges.initiator, ranges.target).number))))})"
         if fixed and set(model.tags) <= set(fixed)
         else "",
@@ -73,14 +75,14 @@ def _without_curve(found: KnownDistances, ranges: Ranges, residuals_m: Floats) -
     if not found.model.settings.delays_only and found.model.powered.any():
         return (
             f"the first-path power never changes ({np.median(_mean_dbm(ranges)):.1f} dBm): the curve is flat, and "
-            "delays hold at this power only"
+            f"the delays are valid only at this power"
         )
     lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, "mean-of-lifted", ALPHA_DBM)
     known = np.isfinite(lifted)
     if not known.any():
         return (
-            f"{WITHOUT_CURVE}, without any power: how ranges change with power cannot be seen, is in delays and "
-            "errors, and delays from other distances will differ"
+            f"{WITHOUT_CURVE}, without any power: the effect of power is unknown and contained in delays and errors, "
+            f"so delays from other distances will differ"
         )
     low, high = np.percentile(_mean_dbm(ranges), (5, 95))
     number = equal_bins(lifted[known])
@@ -88,8 +90,8 @@ def _without_curve(found: KnownDistances, ranges: Ranges, residuals_m: Floats) -
     reach = float(np.ptp(np.percentile(middle, (5, 95)))) if len(middle) else 0.0
     return (
         f"{WITHOUT_CURVE}: errors that change with power stay in the ranges, here {as_length(reach)} between "
-        f"{low:.0f} and {high:.0f} dBm; delays hold for the recorded powers, and differ by up to "
-        f"{reach / SPEED_OF_LIGHT * 1e9:.2f} ns at others among them"
+        f"{low:.0f} and {high:.0f} dBm; delays are averages over the recorded powers, and differ by up to "
+        f"{reach / SPEED_OF_LIGHT * 1e9:.2f} ns at single powers"
     )
 
 
@@ -100,24 +102,24 @@ def _mean_dbm(ranges: Ranges) -> Floats:
 
 
 def refuse_impossible(ranges: Ranges) -> None:
-    """Raise `UnanswerableError` where ranges cannot be fitted whatever the settings."""
+    """Raise `UnanswerableError` if ranges cannot be fitted with any settings."""
     for reason in _impossible(ranges):
         raise UnanswerableError(f"{ranges.source}: {reason}")
 
 
 def _impossible(ranges: Ranges) -> Iterator[str]:
-    """Yield why ranges cannot be what they claim."""
+    """Yield the reasons why ranges are impossible."""
     missing = {reason: count for reason, count in ranges.excluded.items() if reason != STATIC}
     share = sum(missing.values()) / max(len(ranges) + sum(missing.values()), 1)
     if share > 0.5:
         worst = max(missing, key=lambda reason: missing[reason])
         yield (
-            f"{100 * share:.0f} % of the exchanges were left out, most for {worst}; more than half is no sample: see "
-            "to the protocol and the columns of the recording"
+            f"{100 * share:.0f} % of the exchanges were left out, most because of {worst}; check the protocol and "
+            f"the columns of the recording"
         )
     sessions = np.unique(ranges.session)
     if len(ranges) > 1 and not any(np.ptp(ranges.time_ns[ranges.session == number]) for number in sessions):
-        yield "all ranges have the same time, so nothing says how long errors last; give their times"
+        yield "all ranges have the same time, so the persistence of errors cannot be estimated; give their times"
     # How ranges and true distances spread: a unit or two columns may be wrong.
     if fault := growth_fault("ranges", ranges.raw_m, ranges.truth_m):
         yield f"{fault}; give both in metres"
@@ -127,13 +129,13 @@ def _impossible(ranges: Ranges) -> Iterator[str]:
     # Crystals of these boards keep 20 ppm each, over temperature and age.
     if skew > 100.0:
         yield (
-            f"clocks differ by {skew:.0f} ppm by their third messages, crystals by 40 at most; the third leg is longer "
-            "than stamps count before they wrap, or the columns of stamps are in another order"
+            f"clocks differ by {skew:.0f} ppm according to third messages, but crystals by at most 40 ppm; the third "
+            f"leg is longer than the period of the stamps' counter, or the columns of stamps are in the wrong order"
         )
 
 
-def one_way(ranges: Ranges) -> Iterator[str]:
-    """Name the pair whose ranges depend most on who initiates, as they do if clock skew is left in them.
+def initiator_warning(ranges: Ranges) -> Iterator[str]:
+    """Return a sentence about the pair whose ranges depend most on the initiator, a sign of uncorrected clock skew.
 
     Medians of raw errors show it also where a fit takes such ranges for reflections.
     """
@@ -148,9 +150,9 @@ def one_way(ranges: Ranges) -> Iterator[str]:
     if differ_m:
         a, b = max(differ_m, key=lambda pair: abs(differ_m[pair]))
         yield (
-            f"pair {a}-{b}: ranges read {100 * abs(differ_m[a, b]):.0f} cm "
+            f"pair {a}-{b}: ranges are {100 * abs(differ_m[a, b]):.0f} cm "
             f"{'longer' if differ_m[a, b] > 0 else 'shorter'} if tag {a} initiates: clock skew is not corrected, or "
-            "with the wrong sign of the carrier's reading"
+            f"the carrier reading has the wrong sign"
         )
 
 
@@ -166,7 +168,7 @@ def _medians_by_way(values: Floats, ranges: Ranges) -> dict[tuple[int, int], tup
 
 
 def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: Ranges) -> None:
-    """Raise `UnanswerableError` where a fit found what no radio has, so that its calibration is of no use.
+    """Raise `UnanswerableError` if a fit found impossible values, so that its calibration is useless.
 
     Delays beyond what registers hold, and errors as large as the ranges are: then true distances say nothing of the
     ranges, as they do in another unit where bodies move so little that how ranges grow with them is not seen.
@@ -178,10 +180,11 @@ def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: 
     if largest < REGISTER_NS and spread < max(typical, LOUD_M) and (typical < 1000.0 or spread < LOUD_M):
         return
     ratio = typical / max(float(np.median(np.abs(ranges.truth_m))), 1e-9)
-    guess = look_like("ranges", ratio) or "they may be in another unit, or of other tags"
+    guess = look_like("ranges", ratio) or "they may have another unit, or belong to other tags"
     raise UnanswerableError(
-        f"{ranges.source}: no radio has a delay of {largest:.0f} ns (registers hold {REGISTER_NS:.0f}) or errors that "
-        f"spread by {spread:.3g} m in ranges of {typical:.3g} m; check the units of the true distances and of the "
+        f"{ranges.source}: impossible for a radio: a delay of {largest:.0f} ns (registers hold {REGISTER_NS:.0f}), "
+        f"errors with a spread of {spread:.3g} m in ranges of {typical:.3g} m; check the units of the true distances "
+        f"and of the "
         f"ranges: {guess}"
     )
 
@@ -192,30 +195,31 @@ are reflected, delays rest on the fewer ones; places that were made up leave 0 t
 
 
 def refuse_contradicted(inliers: float, ranges: Ranges, findings: Sequence[str]) -> None:
-    """Raise `UnanswerableError`, with the findings, where most ranges contradict their own fit."""
+    """Raise `UnanswerableError`, with the findings, if most ranges contradict their own fit."""
     if inliers < LEAST_INLIERS:
         evidence = "; ".join(findings) or "no single tag or pair explains it"
         raise UnanswerableError(
-            f"{ranges.source}: {100 * (1 - inliers):.0f} % of the ranges lie beyond three sigmas of this fit, which "
-            f"therefore explains nothing; check the true distances, and which tag is where ({evidence})"
+            f"{ranges.source}: {100 * (1 - inliers):.0f} % of the ranges lie outside three sigmas of this fit, which "
+            f"is therefore useless; check the true distances, and which tag is at which position ({evidence})"
         )
 
 
-def implausible(delays_ns: Mapping[int, float], residuals_m: Floats) -> Iterator[str]:
-    """Yield sentences on fitted values that hardware does not have."""
+def implausible_values(delays_ns: Mapping[int, float], residuals_m: Floats) -> Iterator[str]:
+    """Yield sentences about fitted values that are implausible for hardware."""
     spread, worst = robust_spread(residuals_m), max(delays_ns, key=lambda tag: abs(delays_ns[tag]), default=-1)
     # Boards of one kind differ by less than 2.5 ns: four times what published ones differ by (0.6 ns).
     if abs(delays_ns.get(worst, 0.0)) > 2.5:
         yield (
-            f"tag {worst}: a delay of {delays_ns[worst]:+.1f} ns is more than boards differ by (2.5 ns); see to the "
-            "unit of true distances, the order of stamps, the carrier's sign and the configured antenna delays"
+            f"tag {worst}: the delay of {delays_ns[worst]:+.1f} ns is larger than differences of boards (2.5 ns); "
+            f"check the unit of true distances, the order of stamps, the sign of carrier readings and the configured "
+            f"antenna delays"
         )
     if spread > LOUD_M:
-        yield f"errors spread by {spread:.2f} m after the fit, those of UWB ranges by 10 cm: check the true distances"
+        yield f"errors spread by {spread:.2f} m after the fit, more than those of UWB ranges: check the true distances"
 
 
 def warnings_of(ranges: Ranges, inliers: float, seconds: float) -> Iterator[str]:
-    """Yield sentences on the data of a fit, the gravest first.
+    """Yield sentences about the data of a fit, the most serious first.
 
     `inliers` is the share of ranges within three sigmas, `seconds` the time that ranges cover.
     """
@@ -223,9 +227,9 @@ def warnings_of(ranges: Ranges, inliers: float, seconds: float) -> Iterator[str]
     apart = [f"{tag} ({one})" for tag, one in delays.items() if tag is not None and one.reply != one.tx]
     everything = len(ranges) + sum(ranges.excluded.values())
     notes = (
-        f"the stamps of tag{'s' * (len(apart) > 1)} {', '.join(apart)} carry two antenna delays, the register's "
-        "and another constant in those of delayed replies: no delay of a tag fits both; program the firmware's "
-        "constants, too (`calib export --to firmware`), and record anew"
+        f"the stamps of tag{'s' * (len(apart) > 1)} {', '.join(apart)} contain two antenna delays, that of the "
+        f"register and a different constant in delayed replies: no single delay of a tag fits both; program also the "
+        f"firmware's constants (`calib export --to firmware`), and record again"
         if apart
         else "",
         *(
@@ -233,10 +237,10 @@ def warnings_of(ranges: Ranges, inliers: float, seconds: float) -> Iterator[str]
             for reason, count in ranges.excluded.items()
             if reason != STATIC and count > 0.05 * everything
         ),
-        f"{100 * (1 - inliers):.0f} % of the ranges lie beyond three sigmas of the calibrated errors"
+        f"{100 * (1 - inliers):.0f} % of the ranges lie outside three sigmas of the calibrated errors"
         if inliers < 0.6
         else "",
-        f"only {seconds:.0f} s of data: errors that persist are few, so intervals may be too narrow"
+        f"only {seconds:.0f} s of data: too short to estimate persistent errors, so intervals may be too narrow"
         if seconds < 25.0
         else "",
     )
@@ -247,8 +251,8 @@ SAME_LEVEL_DB: Final = 0.5
 """Levels of tags that differ by less are taken for the same; medians of a pair's ranges are known to a tenth of it."""
 
 
-def unlike_powers(ranges: Ranges, calibration: Calibration) -> Iterator[str]:
-    """Name tags that read or send powers unlike the others, so much that their delays may hold more than they say.
+def power_level_warning(ranges: Ranges, calibration: Calibration) -> Iterator[str]:
+    """Return a sentence about tags whose powers differ from the others so much that their delays may contain an error.
 
     At the ends of a link a frame and its answer take the same way, so what differs is the tags' own: how strongly one
     sends and how high it reads. Only the sum is seen. A tag that reads powers too high has its ranges corrected as
@@ -271,14 +275,14 @@ def unlike_powers(ranges: Ranges, calibration: Calibration) -> Iterator[str]:
         named = ", ".join(f"{tag} ({level:+.1f} dB)" for tag, level in unlike.items())
         held_ps = 1e3 * each_ns * max(map(abs, unlike.values()))
         yield (
-            f"powers of tag{'s' * (len(unlike) > 1)} {named} stand apart from the others': they are read so, or sent "
-            f"the other way; a delay holds what its tag reads wrongly, up to {held_ps:.0f} ps here, which is right for "
-            "ranges and not for the antenna"
+            f"powers of tag{'s' * (len(unlike) > 1)} {named} differ from the others: the tags measure powers "
+            f"wrongly, or transmit with another power; wrong powers change a tag's delay by up to {held_ps:.0f} ps "
+            f"here, which is right for ranges but not for the antenna"
         )
 
 
 def power_levels_db(ranges: Ranges) -> dict[int, tuple[float, float]]:
-    """Return by how much each tag reads powers higher, less how much more strongly it sends, than most others.
+    """Return the excess of powers that each tag measures minus the excess that it transmits, relative to most others.
 
     In dB, each with its standard error; tags of which no pair has enough ranges with both powers are left out.
     """
@@ -298,7 +302,7 @@ def power_levels_db(ranges: Ranges) -> dict[int, tuple[float, float]]:
 
 
 def _ns_a_decibel(ranges: Ranges, calibration: Calibration) -> float:
-    """Return what a delay takes, in ns, where its tag reads powers a decibel too high: at one end of a range of two."""
+    """Return the change of a delay, in ns, if its tag measures powers a decibel too high."""
     lifted = [
         lifted_power(ranges.fpp1_dbm + first, ranges.fpp2_dbm + second, calibration.lift, calibration.alpha_dbm)
         for first, second in ((0, 0), (1, 0), (0, 1))

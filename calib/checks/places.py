@@ -1,4 +1,5 @@
-"""Errors that belong to places: what ranges between the same two bodies have in common, whichever of their tags range.
+"""Errors that depend on places: errors that all ranges between the same two bodies share, whichever of their tags
+range.
 
 A wall, a partition or a thing nearby lengthens all ranges between two bodies together, for as long as they are where
 they are. Part of it comes and goes as bodies move, and shows as residuals of different pairs of tags that go together.
@@ -30,8 +31,11 @@ SIZES_M = np.geomspace(3e-4, 0.2, 60)
 """Standard deviations of offsets that are thought of; an offset of more is a detour, and among reflections."""
 
 
-def of_places(found: KnownDistances, slopes: Slopes, pairs: Tested, before_ns2: Floats) -> tuple[Floats, list[str]]:
-    """Return the covariance (tags, tags) that places add to that of the delays, and a sentence where they matter.
+def place_covariance(
+    found: KnownDistances, slopes: Slopes, pairs: Tested, before_ns2: Floats
+) -> tuple[Floats, list[str]]:
+    """Return the covariance (tags, tags) that place-dependent errors add to that of the delays, and a sentence if they
+    matter.
 
     `pairs` are the slopes of offsets by pair, `before_ns2` is the covariance without places. Nothing is found where no
     body is known to carry two tags.
@@ -67,16 +71,16 @@ def of_places(found: KnownDistances, slopes: Slopes, pairs: Tested, before_ns2: 
     own, more = (np.diag(apart @ one @ apart) for one in (before_ns2, widening))
     if max(deviation, stays, together) <= CERTAIN_DEVIATION or not np.any(more > np.maximum(own, SMALLEST_NS**2)):
         return widening, []
-    near, directions = "as walls and things near them make it", "pattern" not in found.model.covariates
+    near, directions = "as near walls and objects", "pattern" not in found.model.covariates
     wrong, check = f"reflected together, {near}, and trajectories may have followed them", ""
     if certain:
         other = ", or an antenna whose delay depends on the direction" * directions
         wrong, check = f"wrong together, {near}, or a wrong lever arm{other}", "check the lever arms, then "
     return widening, [
-        f"errors belong to places{' or directions' * (certain and directions)}: ranges between the same two bodies are "
-        f"{wrong}, which may move differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals are widened "
-        f"for it; {check}record elsewhere too, or farther from walls: what all ranges are too long by in common no "
-        "range shows"
+        f"errors depend on places{' or directions' * (certain and directions)}: ranges between the same two bodies "
+        f"are {wrong}, which may change differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals are "
+        f"widened for this; {check}record also at other places, or farther from walls: a common error of all ranges "
+        f"cannot be detected"
     ]
 
 

@@ -137,7 +137,7 @@ twice as long as errors last in the worlds of `make worlds`."""
 
 
 def looked_at(source: Source) -> Source:
-    """Return what to look at of a source: all of it, or stretches of the exchanges of a long recording."""
+    """Return the part of a source to examine: all of it, or stretches of the exchanges of a long recording."""
     if not isinstance(source, RecordedSource) or source.recording.count("exchanges") <= EXAMINED_EXCHANGES:
         return source
     edges = source.recording.dividing_times("exchanges", EXAMINED_EXCHANGES // EXAMINED_STRETCHES)
@@ -148,10 +148,10 @@ def looked_at(source: Source) -> Source:
 
 
 def examined_part(count: int) -> str:
-    """Return how much `examine` looks at of a recording with `count` exchanges, in words; nothing where that is all."""
+    """Return a sentence about the part of a recording with `count` exchanges that `examine` uses; "" if it uses all."""
     return (
-        f"about {EXAMINED_EXCHANGES} of its {count} exchanges were looked at, in {EXAMINED_STRETCHES} stretches over "
-        "all of its time"
+        f"about {EXAMINED_EXCHANGES} of its {count} exchanges were examined, in {EXAMINED_STRETCHES} stretches over "
+        f"all of its time"
         if count > EXAMINED_EXCHANGES
         else ""
     )

@@ -44,19 +44,23 @@ by seeds below those of `benchmarks.flights.FIRST_REPORTED`."""
 LEFT, WRONG_SIGN = "skew in single-sided ranges", "carrier readings with the wrong sign"
 SLOPES: Final = {
     False: (
-        (1.0, LEFT, 'correct them with the readings: protocol "ss-cfo"; or use double-sided ranging'),
-        (-1.0, WRONG_SIGN, "the skew is in the ranges, and the readings have the other sign: change it on import"),
+        (1.0, LEFT, 'correct the ranges with the carrier readings (protocol "ss-cfo"), or use double-sided ranging'),
+        (
+            -1.0,
+            WRONG_SIGN,
+            "the ranges contain skew, and the carrier readings have the wrong sign: change it on import",
+        ),
     ),
     True: (
-        (-2.0, WRONG_SIGN, "the correction doubles the skew: change the readings' sign on import"),
-        (1.0, LEFT, "the readings do not reach the correction: see to their unit"),
+        (-2.0, WRONG_SIGN, "the correction doubles the skew: change the sign of the carrier readings on import"),
+        (1.0, LEFT, "the carrier readings have no effect on the correction: check their unit"),
     ),
 }
-"""What slopes of errors over the expected skew mean, by whether the protocol corrects the skew."""
+"""Meaning of the slopes of errors over the expected skew, for protocols without and with a correction of skew."""
 
 
-def astray(view: RecordingView) -> Iterator[Candidate]:
-    """Pairs whose ranges and true distances have little to do with each other."""
+def unrelated_ranges(view: RecordingView) -> Iterator[Candidate]:
+    """Find pairs whose ranges do not agree with the true distances."""
     fit, found = view.quick_fit, list[tuple[float, str]]()
     if fit is None:
         return
@@ -72,13 +76,16 @@ def astray(view: RecordingView) -> Iterator[Candidate]:
     more = f" and {len(wrong) - 6} pairs more" if wrong[6:] else ""
     yield Candidate(
         "ranges that do not follow the distances",
-        f"ranges of pairs {', '.join(wrong[:6])}{more} differ on average, each pair's median aside",
+        f"after removing each pair's median, ranges differ from the true distances: on average pairs "
+        f"{', '.join(wrong[:6])}{more}",
         p_value,
     )
 
 
 def skew(view: RecordingView) -> Iterator[Candidate]:
-    """Errors that follow the carriers' readings: skew that was not corrected, or with the wrong sign."""
+    """Find errors that depend on the carrier readings: skew that was not corrected, or corrected with the wrong
+    sign.
+    """
     e = view.exchanges
     single = np.isin(e.protocol, single_sided()) & np.isfinite(view.error_m) & ~without_stamps(e)
     taken = {corrected(name) for name in np.unique(e.protocol[single]).tolist()}
@@ -94,7 +101,7 @@ def skew(view: RecordingView) -> Iterator[Candidate]:
     # A target's reply lasts longer by the clock of a faster initiator, and so does the range.
     expected = PPM_TO_METRES * some.skew2_ppm * intervals(some).dt32 * TICK_S
     slope, p_value, _ = fit.offset(expected, tolerance=0.5)
-    evidence = f"errors grow by {slope:.2f} m in a metre of c/2 times carrier's skew times reply"
+    evidence = f"the slope of errors over c/2 times carrier skew times reply time is {slope:.2f}"
     for at, fault, remedy in SLOPES[taken.pop()]:
         # Halfway between the slopes of sound and of faulty ranges.
         if abs(slope - at) < 0.5:
@@ -102,7 +109,9 @@ def skew(view: RecordingView) -> Iterator[Candidate]:
 
 
 def _by_direction(single: RecordingView) -> Iterator[Candidate]:
-    """Where carriers were not read: skew makes ranges of a pair longer one way, and as much shorter the other way."""
+    """Find skew without carrier readings: ranges of a pair are longer in one direction, and shorter by as much in the
+    other.
+    """
     fit = quick_fit([single])
     if fit is None:
         return
@@ -114,15 +123,18 @@ def _by_direction(single: RecordingView) -> Iterator[Candidate]:
     size, p_value, _ = fit.offset(signs, own, tolerance=ONE_WAY_M, tried=len(own))
     yield Candidate(
         LEFT,
-        f"ranges of pair {fit.model.pairs.names[worst]} differ by {100 * abs(size):.0f} cm by who initiates, the "
-        "most of all",
+        f"ranges of pair {fit.model.pairs.names[worst]} differ by {100 * abs(size):.0f} cm between the two "
+        f"initiators, the most of all pairs",
         p_value,
-        {"more": "record the carrier integrator, or use double-sided ranging; until then take the mean of both ways"},
+        {
+            "more": "record the carrier integrator, or use double-sided ranging; until then use the mean of both "
+            "directions"
+        },
     )
 
 
 def reflections(view: RecordingView) -> Iterator[Candidate]:
-    """Pairs whose reflections last, and recordings or tags of whose ranges a large share is reflected."""
+    """Find pairs whose reflections last, and recordings or tags with a large share of reflected ranges."""
     fit = view.quick_fit or quick_fit([view], constants="tag", ranges_a_pair=1)
     if fit is None or len(fit.rows) < 150:
         return
@@ -138,7 +150,7 @@ def reflections(view: RecordingView) -> Iterator[Candidate]:
     p_value = positive(np.array([np.mean(far[s]) - MANY_SHARE for s in stretches(len(far))]))
     evidence, remedy = f"about {_in_words(fit, long)} on average", "move antennas away from bodies and walls"
     if view.quick_fit is None:
-        remedy = "see what stands near these antennas; pairs have too few ranges to say more: record for longer"
+        remedy = "check for objects near these antennas; pairs have too few ranges for more details: record for longer"
         for tag in (tags := np.unique(fit.ends).tolist()):
             mine = (fit.ends == tag).any(axis=1)
             usual = min(float(np.mean(far[~mine] if not mine.all() else far)) + MANY_SHARE, 1.0)
@@ -149,7 +161,7 @@ def reflections(view: RecordingView) -> Iterator[Candidate]:
 
 
 def _in_words(fit: QuickFit, long: Bools, mine: Bools | slice = slice(None)) -> str:
-    """Return which share of some ranges is long, and by how much, compared with the others among them."""
+    """Return a text with the share of long ranges among some, and their mean excess over the others."""
     return f"{100 * np.mean(long[mine]):.0f} % of the ranges, by {100 * _detour_m(fit, long, mine):.0f} cm"
 
 
@@ -191,7 +203,7 @@ def _life_s(reflected: Floats, step_s: float) -> float:
 
 
 def closures(view: RecordingView) -> Iterator[Candidate]:
-    """Pairs with an offset that the delays of their tags do not explain; those that explain it as well are named.
+    """Find pairs with an offset that the delays of their tags do not explain; equivalent pairs are named as well.
 
     The constants of pairs in a quick fit are what delays and offsets of pairs add up to. So offsets are found as those
     of the score tests of a fit are, and of any size: what delays take of constants is linear.
@@ -225,8 +237,8 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
             yield Candidate(
                 "pairs that do not close",
                 f"ranges of pair {' or pair '.join(one.names)} are {100 * abs(one.offset_m):.1f} cm too "
-                f"{'long' if one.offset_m > 0 else 'short'} for the delays of their tags, by closed loops of the other "
-                f"pairs{'' if certain else '; or anchors stand elsewhere, which ranges do not tell from it'}",
+                f"{'long' if one.offset_m > 0 else 'short'} compared with the delays of their tags, which other "
+                f"pairs determine{'' if certain else '; or anchors are at other positions, which has the same effect'}",
                 one.p_value,
             )
 
@@ -242,11 +254,11 @@ class Change:
 
     def __str__(self) -> str:
         """Return what it is in the tag's delay, and that it is the tag's."""
-        return f"({2e9 * abs(self.size_m) / SPEED_OF_LIGHT:.2f} ns in its delay), all its pairs alike, others"
+        return f"({2e9 * abs(self.size_m) / SPEED_OF_LIGHT:.2f} ns of its delay) in all its pairs, those of others"
 
 
 def changed_delays(view: RecordingView) -> Iterator[Candidate]:
-    """Tags whose delay changes during a recording, at one of many times or steadily."""
+    """Find tags whose delay changes during a recording, at once or steadily."""
     fit = view.quick_fit
     # Of a shorter recording the 32 stretches of scores would last for less than errors do.
     if fit is None or fit.blocks.seconds < 10.0:
@@ -257,7 +269,7 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
     # 1 % of its size; they are fewer for many pairs, for the sake of memory.
     cuts = np.linspace(1 / 8, 7 / 8, min(47, 1500 // len(fit.model.pairs.ends)))
     courses = np.column_stack([share[:, None] >= cuts, share])
-    by_readings = "fit how ranges grow with its temperature, which it reads (setting `temperature`); or "
+    by_readings = "fit the dependence on its measured temperature (setting `temperature`); or "
     for one in changes_of_tags(fit, courses):
         fault, what, when = "delay drifts", "drift", "over the recording"
         if one.course < len(cuts):
@@ -333,8 +345,8 @@ def _by_pair(fit: QuickFit, courses: Floats) -> sparse.csr_matrix:
     return sparse.csr_matrix(sparse.hstack([fit.by_pair.multiply(course[:, None]) for course in courses.T]))
 
 
-def compared(views: Sequence[RecordingView], level: float) -> Iterator[Candidate]:
-    """What differs between recordings, each compared with the one before it; `level` is that of a check."""
+def between_recordings(views: Sequence[RecordingView], level: float) -> Iterator[Candidate]:
+    """Find differences between consecutive recordings; `level` is the false-alarm level of a check."""
     displaced = [
         {one.words["body"]: one for one in anchors(view) if "body" in one.words and one.p_value < level}
         for view in views

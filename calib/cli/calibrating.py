@@ -98,7 +98,7 @@ def fit(
     check_choice("truth", truth, ("recorded", "ranges"))
     if truth == "recorded":
         for name in flight.changed():
-            raise BadInputError("goes with a fit whose `truth` is ranges", parameter=name)
+            raise BadInputError("can only be used if `truth` is ranges", parameter=name)
     check_output(output, force=force)
     with _undetermined_as_json(as_json):
         if truth == "ranges":
@@ -114,7 +114,7 @@ def fit(
 
 
 def _print_fit(result: calib.FitResult, output: Path, *, as_json: bool) -> None:
-    """Print what was fitted and the warnings; end with another status where the fit stopped before it settled."""
+    """Print the result of a fit and its warnings; exit with status 1 if the fit stopped before it converged."""
     found, left_out = result.calibration, result.ranges.excluded.items()
     if as_json:
         typer.echo(found.to_json(), nl=False)
@@ -133,7 +133,7 @@ def _print_fit(result: calib.FitResult, output: Path, *, as_json: bool) -> None:
 
 @contextmanager
 def _undetermined_as_json(as_json: bool) -> Iterator[None]:
-    """Print an `UnanswerableError` as JSON, too, where JSON was asked for."""
+    """Print an `UnanswerableError` also as JSON if JSON was requested."""
     try:
         yield
     except UnanswerableError as error:
@@ -147,9 +147,9 @@ def _fit_from_ranges(
 ) -> calib.FitResult:
     """Fit without known distances; raises `BadInputError` for settings that need them."""
     if len(recordings) != 1:
-        raise BadInputError("ranges takes one recording, of one flight", parameter="truth")
+        raise BadInputError("ranges needs exactly one recording, of one flight", parameter="truth")
     if trim_static:
-        raise BadInputError("goes with known distances only", parameter="trim_static")
+        raise BadInputError("can only be used with known distances", parameter="trim_static")
     with waiting(recordings[0].name) as report:
         return calib.fit_from_ranges(recordings[0], flight, settings, progress=report)
 
@@ -165,13 +165,13 @@ def delay_lines(found: calib.Calibration) -> list[str]:
 
 
 def add_tag(
-    recording: Annotated[Path, typer.Argument(help="Recording of the new tag with calibrated ones (.uwb).")],
+    recording: Annotated[Path, typer.Argument(help="Recording of the new tag with calibrated tags (.uwb).")],
     calibration: CalibrationFile,
     tag: Annotated[int, typer.Option(help="Id of the tag to add.", autocompletion=tags_of())],
     output: NewCalibration,
     force: Force = False,
 ) -> None:
-    """Fit the delay of one more tag from its ranges with calibrated ones, and leave everything else as it is."""
+    """Fit the delay of one new tag from its ranges with calibrated tags; all other values stay the same."""
     check_output(output, force=force)
     with waiting("fitting"):
         result = calib.add_tag(recording, known_calibration(calibration), tag)
@@ -187,7 +187,7 @@ def survey(
         str | None,
         typer.Option(
             metavar="[NAME=]FILE",
-            help="File for the positions of the boards, of the arrangement NAME where there are several: "
+            help="File for the positions of the boards; if there are several arrangements, NAME is the one to save: "
             "\\[\\[anchors]] (.toml) or for ROS (.yaml).",
         ),
     ] = None,
@@ -196,7 +196,7 @@ def survey(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Calibrate without true distances: boards that stand still, in arrangements of which little is known."""
+    """Calibrate without true distances, from boards that stand still in one or more arrangements."""
     arrangement, anchors = _named_file(save_anchors)
     written = {"output": output, "save_anchors": anchors, "plot": plot, "report": report}
     for path in filter(None, written.values()):
@@ -220,9 +220,9 @@ def survey(
         return
     contents = {
         output: result.headline(),
-        anchors: f"boards of {result.arrangement(arrangement).name}" if anchors else "",
-        plot: "where boards stood, with ellipses of 95 %",
-        report: "whether it is fit for use",
+        anchors: f"positions of the boards of {result.arrangement(arrangement).name}" if anchors else "",
+        plot: "positions of the boards with ellipses of 95 %",
+        report: "verdict",
     }
     headline, *others = [f"{file}: {what}" for file, what in contents.items() if file]
     lines = [*delay_lines(result.calibration), *_arrangement_lines(result)]
@@ -267,7 +267,7 @@ def show(
     if as_json:
         typer.echo(known.to_json(), nl=False)
         return
-    made, distances = known.provenance, calib.calibration.rests_on(known.provenance)
+    made, distances = known.provenance, calib.calibration.known_facts(known.provenance)
     told = {name: made.get(name) for name in ("fitted", "gauge", "recordings", "settings")}
     lines = [
         *(f"{name}: {_listed(value)}" for name, value in told.items() if value),
@@ -303,7 +303,7 @@ def sample(
     with_anchors: Annotated[bool, typer.Option("--with-anchors", help="One moving tag and four anchors.")] = False,
     force: Force = False,
 ) -> None:
-    """Write a small flight with known delays, to try the other commands with; no simulator is needed for it."""
+    """Write a small example flight with known delays, without the simulator."""
     check_output(output, force=force, recording=True)
     seed = 1 if seed is None else seed
     flight = calib.sample_flight(count, seed=seed, anchors=with_anchors)

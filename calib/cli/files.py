@@ -16,7 +16,7 @@ MILUV: Final = "calib import miluv uwb_calib.json -o calibration.json"
 
 imports = typer.Typer(
     cls=Group,
-    help="Turn calibrations of other programs into ones that apply and evaluate take.",
+    help="Convert calibrations of other programs into calibration files.",
     epilog=epilog(MILUV),
     no_args_is_help=True,
 )
@@ -45,22 +45,22 @@ def add_to(app: typer.Typer) -> None:
 def apply(
     recording: Annotated[Path, typer.Argument(help="Recording to correct (.uwb).")],
     calibration: CalibrationFile,
-    output: Annotated[Path, output("Recording to write (.uwb); with --to a folder.")],
+    output: Annotated[Path, output("Recording to write (.uwb), or folder to write with --to.")],
     to: Annotated[
         str | None,
         typer.Option(
-            help="Format to write, in a folder, instead of a recording.",
+            help="Write a folder in this format instead of a recording.",
             **choice("csv", "parquet", "mcap", "rosbag2", more=_exporters),
         ),
     ] = None,
     force: Force = False,
 ) -> None:
-    """Write a recording again with its ranges corrected (range_m); all else stays as it was."""
+    """Write a copy of a recording with corrected ranges (range_m); all other data stay the same."""
     with waiting("correcting"):
         applied = calib.apply(recording, known_calibration(calibration, [recording]), output, to=to, force=force)
-    typer.echo(f"{output}: {applied.count} ranges corrected, {applied.clamped} beyond the fitted power")
+    typer.echo(f"{output}: {applied.count} ranges corrected, {applied.clamped} outside the fitted powers")
     if applied.unpowered:
-        warn(f"{applied.unpowered} without power: corrected by delays alone, and without sigma")
+        warn(f"{applied.unpowered} without power: corrected for delays only, and without sigma")
 
 
 def export(
@@ -68,17 +68,17 @@ def export(
     to: Annotated[
         str,
         typer.Option(
-            help="Format to write. registers: antenna delays of the DW1000; firmware: those, and constants of its "
-            "build; csv: delays in ns; c-header: a function for a robot's code.",
+            help="Format to write. registers: antenna delays of the DW1000; firmware: the same, and constants of the "
+            "firmware's build; csv: delays in ns; c-header: a function for a robot's code.",
             **choice("registers", "firmware", "json", "csv", "miluv", "ros-yaml", "c-header"),
         ),
     ],
-    output: Annotated[Path | None, output("File to write; by default it is printed.")] = None,
+    output: Annotated[Path | None, output("File to write; by default the text is printed.")] = None,
     antenna_delays: Annotated[
         Path | None,
         typer.Option(
-            help="Antenna delays programmed into the boards when the calibration was fitted, where it does not say: "
-            "a recording (.uwb) or antenna delays (.toml)."
+            help="Antenna delays programmed into the boards when the calibration was fitted, if the calibration does "
+            "not contain them: from a recording (.uwb) or a file (.toml)."
         ),
     ] = None,
     force: Force = False,
@@ -90,7 +90,7 @@ def export(
     # These forms hold delays without their standard errors, and all but MILUV's have the splits.
     free = [tag for tag in calib.calibration.free_delays(known) if to == "miluv" or tag not in known.sides]
     if free and to in ("miluv", "ros-yaml", "c-header"):
-        warn(f"{to} does not say that the data leave the delay of tag {', '.join(map(str, free))} free")
+        warn(f"{to} cannot state that the data do not determine the delay of tag {', '.join(map(str, free))}")
     if output is None:
         typer.echo(text, nl=False)
     else:
@@ -102,7 +102,7 @@ def import_miluv(
     output: Annotated[Path, output("Calibration to write (.json).")],
     force: Force = False,
 ) -> None:
-    """Turn the calibration published with the MILUV dataset into one that apply and evaluate take."""
+    """Convert the calibration published with the MILUV dataset into a calibration file."""
     found = calib.calibration.read_miluv(source)
     found.save(output, force=force)
     typer.echo(f"{output}: {len(found.delays_ns)} tags")

@@ -67,11 +67,11 @@ def evaluate(
 
 
 def _warn_of_seen(evaluation: calib.evaluation.Evaluation) -> None:
-    """Warn where a calibration was judged on what it was fitted to."""
+    """Warn if a calibration was evaluated on the recordings of its fit."""
     if evaluation.seen:
         warn(
-            f"the calibration was fitted to {', '.join(evaluation.seen)}: errors there are smaller than where it is "
-            "used; judge it on recordings that the fit has not seen"
+            f"the calibration was fitted to {', '.join(evaluation.seen)}: errors there are smaller than in other "
+            f"recordings; evaluate it on recordings that were not fitted"
         )
 
 
@@ -106,15 +106,15 @@ def localize(
     use: Annotated[
         str,
         typer.Option(
-            help="What is used: exchanges, a body's ranges; or receptions, with what tags overheard, which also "
-            "localizes a body that only listens.",
+            help="Measurements. exchanges: ranges of the body; receptions: also overheard frames, which localize a "
+            "body that only listens as well.",
             **choice("exchanges", "receptions"),
         ),
     ] = "exchanges",
     training: Annotated[
         Path | None,
         _of_model(
-            "training", "Flight on which the fixed variances are tuned (.uwb); by default those of the fit are used."
+            "training", "Flight for tuning the fixed variances (.uwb); by default the variances of the fit are used."
         ),
     ] = None,
     process_noise: Annotated[
@@ -124,7 +124,7 @@ def localize(
         str,
         _of_model(
             "imu",
-            "Noise of the IMUs. drone: a consumer's that vibrates.",
+            "Noise of the IMUs. drone: a consumer IMU on a vibrating frame.",
             **choice("drone", "consumer", "industrial", "tactical"),
         ),
     ] = "drone",
@@ -132,8 +132,8 @@ def localize(
         tuple[float, float, float],
         _of_model(
             "start_std",
-            "How well relative positions (m), attitudes (deg) and velocities (m/s) are known at the first exchange, "
-            "standard deviations an axis.",
+            "Uncertainty of relative positions (m), attitudes (deg) and velocities (m/s) at the first exchange, "
+            "as standard deviations per axis.",
         ),
     ] = (0.1, 3.0, 0.1),
     seeds: Annotated[int, _of_model("seeds", "Number of simulated runs, each with another seed.", min=1)] = 3,
@@ -141,7 +141,7 @@ def localize(
         bool,
         typer.Option(
             "--online",
-            help="Compare with a filter that averages over fixed delays and delays that drift.",
+            help="Compare with a filter that also estimates drifting delays.",
         ),
     ] = False,
     tum: Annotated[
@@ -151,13 +151,13 @@ def localize(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Track each moving body by its ranges or what it hears, with and without calibration, and print the RMSE in m."""
+    """Track each moving body with and without the calibration, and print the errors of position (RMSE in m)."""
     models = calib.evaluation.MODELS
     check_choice("model", model, models)
     check_choice("imu", imu, calib.evaluation.IMUS)
     for option, own in OF_MODELS.items():
         if model not in own:
-            refuse_given(context, [option], f"goes with `model` {' or '.join(own)}, not with {model}")
+            refuse_given(context, [option], f"can only be used with `model` {' or '.join(own)}, not with {model}")
     check_report(None, figures, force=force)
     fields: dict[str, dict[str, Any]] = {
         "process_noise": {"velocity_std_mps": process_noise},
@@ -171,7 +171,7 @@ def localize(
     known = known_calibration(calibration, recordings)
     with waiting("localizing"):
         found = [one for path in recordings for one in track(path, known, settings)]
-        # The text first: where it cannot be made, nothing is written.
+        # The text comes first: if it fails, nothing is written.
         table, text = models[model].table(found), models[model].text(found, settings)
     if tum:
         calib.evaluation.write_tum(found, tum, force=force)
@@ -209,19 +209,21 @@ def doctor(
         lines += [f"{finding.fault}{by_chance}", f"  evidence: {finding.evidence}", f"  remedy:   {finding.remedy}"]
     for name, some in skews.items():
         lines += (
-            [f"clock skew in {name}, the second tag against the first", *(f"  {one}" for one in some)] if some else []
+            [f"clock skew in {name}, of the second tag relative to the first", *(f"  {one}" for one in some)]
+            if some
+            else []
         )
     typer.echo("\n".join(lines))
 
 
 def compare(
-    first: Annotated[Path, typer.Argument(help="Calibration to compare with (.json).")],
-    second: Annotated[Path, typer.Argument(help="Calibration that is compared with the first (.json).")],
+    first: Annotated[Path, typer.Argument(help="First calibration (.json).")],
+    second: Annotated[Path, typer.Argument(help="Calibration to compare with the first (.json).")],
     figures: Figures = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Test whether the delays of two calibrations differ by more than their standard errors explain (ns)."""
+    """Test whether the delays (ns) of two calibrations differ significantly."""
     check_report(None, figures, force=force)
     known = [known_calibration(path) for path in (first, second)]
     found = calib.compare(*known)
@@ -251,7 +253,7 @@ def report(
     settings: FitSettings,
     tests: Annotated[
         list[Path] | None,
-        typer.Option(help="Recordings to judge the calibration by, which the fit does not see (.uwb). Takes several."),
+        typer.Option(help="Recordings for the evaluation, which are not used in the fit (.uwb). Takes several."),
     ] = None,
     pdf: Annotated[Path | None, typer.Option(help="The same report as PDF (.pdf).")] = None,
     figures: Figures = None,
@@ -259,7 +261,7 @@ def report(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Fit, judge on other recordings, localize, and write everything as one page with tables and figures."""
+    """Fit a calibration, evaluate it on other recordings, and write a report with tables and figures."""
     check_report(output, figures, pdf=pdf, force=force)
     with waiting("loading") as progress:
         campaign = calib.run_campaign(
@@ -285,11 +287,11 @@ def report(
 
 
 def _remarks(evaluation: calib.evaluation.Evaluation) -> Iterator[str]:
-    """Yield lines below the table: quantiles, coverage, errors against planted values."""
+    """Yield the lines below the table: quantiles, coverage, differences from planted values."""
     group = evaluation.overall
     yield (
         f"95 % of the calibrated errors lie between {100 * group.full.low_m:+.1f} and {100 * group.full.high_m:+.1f} cm"
-        f"; {100 * group.rejected:.1f} % lie beyond what sigma explains at 95 % (5 % without reflections)"
+        f"; {100 * group.rejected:.1f} % lie outside the 95 % bounds of sigma (5 % expected without reflections)"
     )
     split = evaluation.split
     yield (
@@ -301,8 +303,8 @@ def _remarks(evaluation: calib.evaluation.Evaluation) -> Iterator[str]:
     yield f"sigma covers {covered}"
     if group.total_std == group.total_std:
         yield (
-            f"with reflections, of which {100 * group.tail_share:.1f} % are expected: errors over the total sigma have "
-            f"a standard deviation of {group.total_std:.2f}, and {100 * group.inside_95:.1f} % lie between their "
+            f"with {100 * group.tail_share:.1f} % of reflections expected: errors divided by the total sigma have a "
+            f"standard deviation of {group.total_std:.2f}, and {100 * group.inside_95:.1f} % lie between their "
             "quantiles for 95 %"
         )
     planted = evaluation.planted
@@ -312,4 +314,4 @@ def _remarks(evaluation: calib.evaluation.Evaluation) -> Iterator[str]:
         curve = (
             f", bias curve {curve_cm:.2f} cm, whole correction {whole_cm:.2f} cm rms" if curve_cm == curve_cm else ""
         )
-        yield f"from what was planted: delays {rms:.4f} ns rms{curve}"
+        yield f"difference from planted values: delays {rms:.4f} ns rms{curve}"

@@ -27,7 +27,7 @@ def add_to(app: typer.Typer) -> None:
     """Register the commands."""
     plans = typer.Typer(
         cls=_PlanGroup,
-        help="Plan a calibration without true distances: what to do, and how well delays will be known.",
+        help="Plan a calibration without true distances: its steps, and the expected accuracy of the delays.",
         epilog=epilog("calib plan survey 4 --on line", "calib plan flight 1,2/3,4/5,6 --duration 60"),
         no_args_is_help=True,
     )
@@ -65,10 +65,10 @@ def survey(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Plan arrangements of boards that stand still: the steps, and how well each delay will be known."""
+    """Plan arrangements of boards that stand still: the steps, and the expected accuracy of each delay."""
     check_report(output, figures, force=force)
     if boards.endswith(".uwb"):
-        raise BadInputError("a recording is planned from with `calib plan flight`", parameter="boards")
+        raise BadInputError("a plan that starts from a recording needs `calib plan flight`", parameter="boards")
     tags = read_whole(boards, "boards")
     with waiting("planning"):
         found = calib.plan(tags if "," in boards else tags[0], settings)
@@ -81,7 +81,7 @@ def flight(
         str,
         typer.Argument(
             metavar="COUNT|TAG,TAG/...|FILE",
-            help="Number of robots with two tags each, tags by robot (1,2/3,4), or a recording whose motion is taken "
+            help="Number of robots with two tags each, tags by robot (1,2/3,4), or a recording whose motion is used "
             "(.uwb).",
         ),
     ],
@@ -92,12 +92,12 @@ def flight(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Plan a flight without true distances: the steps, and how well each delay will be known."""
+    """Plan a flight without true distances: the steps, and the expected accuracy of each delay."""
     check_report(output, figures, force=force)
     who: Any = Path(robots)
     if robots.endswith(".uwb"):
         recorded = ("seconds", "rate_hz", "size_m", "speed_m_s", "apart_m", "anchors")
-        refuse_given(context, recorded, "the recording determines it; leave it out")
+        refuse_given(context, recorded, "is determined by the recording; remove this option")
     else:
         tags = [read_whole(robot, "robots") for robot in robots.split("/")]
         who = tags if "/" in robots or "," in robots else tags[0][0]

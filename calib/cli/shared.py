@@ -40,7 +40,7 @@ TrimStatic = Annotated[
     bool,
     typer.Option(
         "--trim-static",
-        rich_help_panel="How errors count",
+        rich_help_panel="Error model",
         help="Leave out spans of 2 s in which a pair's distance stays within 2 cm.",
     ),
 ]
@@ -82,7 +82,7 @@ def known_calibration(path: Path, recordings: Iterable[Path] = ()) -> calib.Cali
     """
     known = calib.load_calibration(path)
     if known.stopped:
-        warn(f"{path}: its fit stopped before it settled: delays and intervals are not final")
+        warn(f"{path}: its fit stopped before it converged: delays and intervals are not final")
     for recording in recordings:
         if warning := calib.calibration.antenna_delays_warning(known, recording):
             warn(f"{recording}: {path}: {warning}")

@@ -1,4 +1,4 @@
-"""Differences of arrival: what a listener that overhears an exchange knows of it.
+"""Differences of arrival, measured by a listener that overhears an exchange.
 
 A listener k hears the poll of i and the response of j. At the target's antenna these are its reply time dt32 less its
 delay d_j apart. So by the target's clock they arrive at k

@@ -31,10 +31,11 @@ class ClocksApart:
     moves_m: float
 
     def __str__(self) -> str:
-        """Return what is wrong as a sentence."""
+        """Return a sentence about the fault."""
         return (
-            f"pair {self.pair[0]}-{self.pair[1]}: clocks run apart by {self.stamps_ppm:+.1f} ppm by the third messages "
-            f"and by {self.carrier_ppm:+.1f} ppm by the carriers: if the stamps are wrong, so are its ranges, by "
+            f"pair {self.pair[0]}-{self.pair[1]}: the relative clock skew is {self.stamps_ppm:+.1f} ppm by the third "
+            f"messages and {self.carrier_ppm:+.1f} ppm by the carriers: if the stamps are wrong, the error of its "
+            f"ranges is "
             f"{100 * self.moves_m:.0f} cm"
         )
 
@@ -86,17 +87,17 @@ class LeftSkew:
     def __str__(self) -> str:
         """Return the bound as a sentence."""
         bound = (
-            f"clocks that are 20 ppm off each leave up to {as_length(self.bound_m)} "
+            f"two clocks with errors of 20 ppm each cause up to {as_length(self.bound_m)} "
             f"(c/2 x 40 ppm x {1e6 * self.reply_s:.0f} µs of reply)"
         )
         if not np.isfinite(self.told_m):
             return (
-                f"single-sided ranges without carrier readings: {bound}, which looks like an antenna delay and changes "
-                "its sign with who initiates"
+                f"single-sided ranges without carrier readings: {bound}, which has the effect of an antenna delay "
+                f"with opposite signs for the two initiators"
             )
         return (
             f"single-sided ranges with clock skew in them: {bound}, and by the carriers' readings up to "
-            f"{as_length(self.told_m)}; read as protocol ss-cfo they are corrected with those"
+            f"{as_length(self.told_m)}; imported with protocol ss-cfo they are corrected with the readings"
         )
 
 

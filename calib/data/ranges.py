@@ -230,7 +230,7 @@ class Ranges(ColumnTable):
             **told,
         }
         ints = {"initiator": initiator, "target": target, "time_ns": time_ns}
-        with raising(BadInputError, "arrays of ranges do not fit each other", TypeError, ValueError):
+        with raising(BadInputError, "arrays of ranges have different lengths", TypeError, ValueError):
             arrays = [np.asarray(column, dtype=np.float64) for column in floats.values()]
             arrays += [np.asarray(column).astype(np.int64, casting="same_kind") for column in ints.values()]
             rows = np.broadcast_arrays(*np.atleast_1d(*arrays))
@@ -240,7 +240,7 @@ class Ranges(ColumnTable):
         itself = columns["initiator"] == columns["target"]
         if itself.any():
             row = int(np.argmax(itself))
-            raise BadInputError(f"row {row} is of tag {columns['target'][row]} with itself", parameter="target")
+            raise BadInputError(f"row {row} has tag {columns['target'][row]} at both ends", parameter="target")
         columns |= {name: measured_powers(columns[name]) for name in ("fpp1_dbm", "fpp2_dbm")}
         warm, around, up = (np.array([columns.pop(f"{name} {end}") for end in (0, 1)]).T for name in both)
         columns["temperature_c"], around, up = measured_c(warm), np.radians(around), np.radians(up)
@@ -290,11 +290,11 @@ class Ranges(ColumnTable):
         lost = np.setdiff1d(np.append(first, second), [tag.tag for tag in tags if tag.body in places])
         if len(lost):
             raise BadInputError(
-                f"{source}: differences of arrival name anchor {lost[0]}, which has no place: state it with "
-                "`uwblink poses --tags`, or leave it out of the log"
+                f"{source}: differences of arrival contain anchor {lost[0]}, which has no position: give it with "
+                f"`uwblink poses --tags`, or remove the anchor from the log"
             )
         if (itself := first == second).any():
-            raise BadInputError(f"{source}: differences of arrival are of anchor {first[itself][0]} with itself")
+            raise BadInputError(f"{source}: a difference of arrival has anchor {first[itself][0]} at both ends")
         away, across = (distances_m(poses, tags, ends, table["listener"], table["time_ns"]) for ends in (second, first))
         found = cls.from_arrays(
             np.where(table["minus"] == first, 1.0, -1.0) * table["difference_m"],
@@ -313,9 +313,10 @@ class Ranges(ColumnTable):
         # Without poses of the listener: no difference is longer than the way between both anchors.
         if fault or np.count_nonzero(beyond_m > LARGEST_ERROR_M) > len(found) / 2:
             raise BadInputError(
-                f"{source}: by its poses {fault or 'differences of arrival are longer than their anchors are apart'}; "
-                "mend it in the map of their import (another unit as difference_m in [units], from_id and to_id "
-                "exchanged for the other sign)"
+                f"{source}: by its poses "
+                f"{fault or 'differences of arrival are longer than the distances of their anchors'}; "
+                "correct the column map of the import (the unit of difference_m in [units]; exchange from_id and "
+                "to_id to change the sign)"
             )
         return replace(found, protocol=np.full(len(found), NO_STAMPS), listener=table["listener"].astype(np.int64))
 
@@ -346,7 +347,7 @@ class Ranges(ColumnTable):
         """Return the table, and a figure of the errors over time, or of the ranges where no truth is known."""
         from uwblink.pages.figures import notebook_image, values_over_time
 
-        errors, name = 100 * (self.raw_m - self.truth_m), "raw range less truth (cm)"
+        errors, name = 100 * (self.raw_m - self.truth_m), "raw range minus true distance (cm)"
         values, name = (errors, name) if np.isfinite(errors).any() else (self.raw_m, "raw range (m)")
         draw = partial(values_over_time, time_ns=self.time_ns, values=values, name=name)
         return ColumnTable._repr_html_(self) + notebook_image(draw, f"{name} over time")
@@ -381,10 +382,10 @@ class Ranges(ColumnTable):
             raise UnanswerableError(f"{self.source}: holds no exchanges")
         hints = {
             "no true distance": why_no_truth
-            or "it needs poses and lever arms (`uwblink poses`), or measured distances (gt_range_m of a table); "
-            "without any see `calib survey`, or `calib fit --truth ranges`",
-            "no power": why_no_power or "a calibration without a curve needs none: `calib fit --delays-only` makes one",
-            "a tag with itself": "look at from_id and to_id of what was imported",
+            or "add poses and lever arms (`uwblink poses`), or measured distances (gt_range_m of a table); without "
+            "true distances use `calib survey`, or `calib fit --truth ranges`",
+            "no power": why_no_power or "a calibration without a curve needs no power: use `calib fit --delays-only`",
+            "a tag with itself": "check from_id and to_id of the import",
         }
         most = max(excluded, key=lambda reason: excluded[reason])
         hint = f"; {hints[most]}" if most in hints else ""
@@ -401,17 +402,19 @@ def growth_fault(what: str, raw_m: Floats, truth_m: Floats) -> str:
     # A foot is 0.305 m, and ranges that follow other distances grow by anything.
     if 0.75 < slope < 1.35 or abs(slope) * robust_spread(truth_m) < 3.0 * rest:
         return ""
-    guesses = ["they have the other sign" if slope < 0 else "", look_like("they", abs(slope))]
-    return "; ".join(filter(None, [f"{what} grow by {slope:.3g} m in a metre of true distance", *guesses]))
+    guesses = ["they have the wrong sign" if slope < 0 else "", look_like("they", abs(slope))]
+    return "; ".join(filter(None, [f"{what} change by {slope:.3g} m per metre of true distance", *guesses]))
 
 
 def look_like(what: str, ratio: float) -> str:
-    """Return what lengths that are so many times the true ones look like, an empty text where no unit is near."""
+    """Return a guess of the unit of lengths from their ratio to the true ones, "" if no unit is near."""
     whose, smaller = ("true distances", ratio) if ratio < 1 else (what, 1 / ratio)
     # Units are apart by factors of three or more, and delays change a range of metres by less than a fifth.
     # A nanosecond of flight is 0.300 m.
     units = {0.001: "millimetres", 0.01: "centimetres", 0.3: "feet or nanoseconds"}
-    near = (f"{whose} look like {unit}" for own, unit in units.items() if abs(np.log(max(smaller, 1e-9) / own)) < 0.2)
+    near = (
+        f"{whose} are probably {unit}" for own, unit in units.items() if abs(np.log(max(smaller, 1e-9) / own)) < 0.2
+    )
     return next(near, "")
 
 
@@ -528,7 +531,7 @@ def _antenna_delays_of_all(parts: Sequence[Ranges]) -> AntennaDelays:
             if known != delay:
                 raise BadInputError(
                     f"{part.source}: tag {tag} had antenna delays of {delay} ticks programmed, and {known} in {where}; "
-                    "take recordings with the same ones"
+                    "use recordings with equal antenna delays"
                 )
     return {tag: delay for tag, (delay, _) in found.items()}
 
@@ -573,7 +576,7 @@ def without_static(ranges: Ranges, *, span_s: float = 2.0, within_m: float = 0.0
     reach = ndimage.maximum(ranges.truth_m, group, every) - ndimage.minimum(ranges.truth_m, group, every)
     moves = reach[group] > within_m
     if not moves.any():
-        raise UnanswerableError(f"{ranges.source}: nothing moves, so `trim_static` leaves nothing")
+        raise UnanswerableError(f"{ranges.source}: nothing moves, so `trim_static` removes all ranges")
     count = int(np.count_nonzero(~moves))
     return replace(ranges[moves], excluded=ranges.excluded | ({STATIC: count} if count else {}))
 
@@ -597,6 +600,6 @@ def held_out(ranges: Ranges, share: float, fold: str) -> Bools:
     if not found.any() or found.all():
         raise UnanswerableError(
             f"{ranges.source}: {share:g} of its {int(unit.max()) + 1} parts by {fold} leaves nothing to fit or "
-            "nothing to judge by; choose another share or fold"
+            f"nothing to evaluate; choose another share or fold"
         )
     return np.asarray(found)

@@ -112,7 +112,7 @@ def opened(data: Data) -> Iterator[tuple[str, Source]]:
     elif is_frame(data):
         yield "data frame", contents_of_frame(data)
     elif isinstance(data, Ranges):
-        raise BadInputError("ranges do not say where bodies are; give the recording they come from", parameter="data")
+        raise BadInputError("Ranges contain no positions of bodies; give the recording instead", parameter="data")
     elif isinstance(data, Source):
         yield str(getattr(data, "name", IN_MEMORY)), data
     else:
@@ -167,7 +167,7 @@ def load_each(
     for part in (p for one, p in zip(given, parts, strict=True) if not isinstance(one, Ranges)):
         for name, found in part.recordings:
             if found in seen:
-                raise BadInputError(f"{name}: has the same exchanges as {seen[found]}; give each recording once")
+                raise BadInputError(f"{name}: contains the same exchanges as {seen[found]}; give each recording once")
             seen[found] = name
     return [without_static(part) for part in parts] if trim_static else parts
 
@@ -222,7 +222,8 @@ def _why_no_power(exchanges: Exchanges) -> str:
     if not len(given):
         return ""
     return (
-        f"its powers are {np.median(given):+.4g} dBm, received ones lie between {FAINTEST_DBM:.0f} and "
+        f"the median of its powers is {np.median(given):+.4g} dBm, but received powers lie between "
+        f"{FAINTEST_DBM:.0f} and "
         f"{LOUDEST_DBM:.0f} dBm; check their unit and sign"
     )
 
@@ -233,15 +234,15 @@ def _why_no_truth(source: Source) -> str:
     if not len(poses) or not len(time_ns):
         return ""
     if not tags:
-        return "it does not say which tag sits on which body; give tags with 'uwblink poses --tags'"
+        return "it has no tags with bodies and lever arms; add them with 'uwblink poses --tags'"
     missing = sorted({t.body for t in tags} - set(np.unique(poses.body).tolist()))
     if missing:
         return f"no poses of body {missing[0]}"
     start = int(poses.time_ns[0])
     spans = [((int(t.min()) - start) * 1e-9, (int(t.max()) - start) * 1e-9) for t in (poses.time_ns, time_ns)]
     return (
-        f"its poses cover {spans[0][0]:.1f} to {spans[0][1]:.1f} s, its exchanges {spans[1][0]:.1f} to "
-        f"{spans[1][1]:.1f} s after the first pose; shift the poses with 'uwblink poses --offset'"
+        f"its poses cover {spans[0][0]:.1f} to {spans[0][1]:.1f} s after the first pose, its exchanges "
+        f"{spans[1][0]:.1f} to {spans[1][1]:.1f} s; shift the poses with 'uwblink poses --offset'"
     )
 
 
@@ -276,7 +277,7 @@ def _numbers(values: ArrayLike) -> Floats:
 
 CURVE: Final = (_curve, "knots, coefficients and degree of a B-spline")
 FORMS: Final = {"delays_ns": (_delays, "numbers by tag"), "bias_curve": CURVE, "sigma_curve": CURVE}
-"""What a simulation may have planted: how it is checked, and what is expected."""
+"""Values that a simulation may have planted, with their checks and descriptions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,7 +299,7 @@ def require_times(ranges: Ranges) -> None:
     """Raise `UnanswerableError` if all ranges have the same time, as those without recorded times."""
     if len(ranges) > 1 and not np.ptp(ranges.time_ns):
         raise UnanswerableError(
-            f"{ranges.source}: all of its {len(ranges)} ranges have the same time, so nothing can be tracked; import "
+            f"{ranges.source}: all of its {len(ranges)} ranges have the same time, so tracking is impossible; import "
             "them with a column time_s"
         )
 
@@ -342,7 +343,7 @@ def load_flight(
             temperature=warm,
         )
         if len(found) and warm and len(warm["tag"]) and not np.isfinite(found.temperature_c).any():
-            text = f"{name}: no reading of a temperature is of a tag that ranges, within 30 s of it: none is used"
+            text = f"{name}: no temperatures of ranging tags within 30 s of their ranges: they are not used"
             warn(text, TemperatureWarning)
         celsius = found.temperature_c[np.isfinite(found.temperature_c)]
         # Boards in rooms are colder, and 45 °F are 7 °C.
@@ -376,8 +377,8 @@ def _with_differences(
     if use == "receptions":
         if need_power:
             raise UnanswerableError(
-                f"{found.source}: differences of arrival without stamps have no powers, so that no curve over power "
-                "goes with them: fit and use a calibration with `delays_only`"
+                f"{found.source}: differences of arrival without stamps have no powers, so a curve over power cannot "
+                f"correct them: use a calibration fitted with `delays_only`"
             )
         apart = Ranges.from_differences(bare, poses=source.poses, tags=list(source.tags), source=found.source)
         return Ranges.concatenate([found, apart])

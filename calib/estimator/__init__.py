@@ -1,1 +1,1 @@
-"""One estimator: unknowns, rows, one loop, one covariance."""
+"""The estimator of all fits: unknowns, kinds of rows, the search, the covariance."""

@@ -1,4 +1,4 @@
-"""Whether the pairs of tags determine the antenna delays, and which combinations of delays they leave free."""
+"""Combinations of antenna delays that the pairs of tags do not determine."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ Clock ratios differ from 1 by parts per million, which lifts a free direction to
 
 
 def free_directions(tags: list[int], ranges: Ranges) -> tuple[Floats, list[Split]]:
-    """Return the directions that ranges leave free, (tags, k) of length one, and the sides that they shift.
+    """Return the directions of delays that ranges do not determine, (tags, k) of length one, and the sides that they
+    shift.
 
     `tags` are those whose delays are not known. Where tags range only with tags of another side (anchors against
     robots, a single pair), the delays of the sides can shift by +a and -a without changing any range.

@@ -137,7 +137,7 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> KnownDistances
     model = model_of(ranges, settings)
     if model.curve is None and model.pinned:
         raise BadInputError(
-            "every tag is pinned and no curve is fitted, so nothing is left to fit", parameter="fixed_ns"
+            "all delays are known and no curve is fitted, so there is nothing to fit", parameter="fixed_ns"
         )
     error = model.ranges.raw_m - model.ranges.truth_m
     blocks = time_blocks(model.ranges.time_ns, model.ranges.session)
@@ -172,7 +172,7 @@ def model_of(ranges: Ranges, settings: FitSettings, *, offsets: bool = True, tri
     """
     if len(ranges) < FEWEST_RANGES:
         raise UnanswerableError(
-            f"{ranges.source}: {len(ranges)} usable exchanges are too few, at least {FEWEST_RANGES} are needed"
+            f"{ranges.source}: {len(ranges)} usable exchanges are too few; at least {FEWEST_RANGES} are needed"
         )
     return RangeModel.of(in_order(ranges), settings, offsets=offsets, trimmed=trimmed)
 

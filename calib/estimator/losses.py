@@ -53,12 +53,12 @@ TRIED_AT: Final = np.array([-7.3, -2.1, -0.83, -0.37, 0.37, 0.83, 2.1, 7.3])
 
 
 def register_loss(name: str, weights: Weights, *, replace: bool = False) -> None:
-    """Add a robust loss, which `fit`, `run_campaign`, `add_tag` and the command's `--loss` then know by its name.
+    """Add a robust loss, which `fit`, `run_campaign`, `add_tag` and the option `--loss` then accept by its name.
 
     `weights` maps residuals over scale u (n,), without a unit, to two arrays (n,): the weight rho'(u)/u, 1 at u = 0,
-    and the slope rho''(u) of u times the weight, from which the intervals follow. `replace` puts it in the place of one
-    registered before. Raises `BadInputError` for a name that is taken, and for weights and slopes that contradict each
-    other. Geman and McClure's, as an example:
+    and the slope rho''(u) of u times the weight, from which the intervals follow. `replace` replaces a registered loss
+    of the same name. Raises `BadInputError` for a name that is taken, and for weights and slopes that contradict each
+    other. For example the loss of Geman and McClure:
 
     >>> import calib
     >>> def geman_mcclure(u):
@@ -83,11 +83,11 @@ def known_losses() -> list[str]:
 
 
 def check_robust_loss(loss: RobustLoss) -> None:
-    """Raise `ArgumentError` where a name is taken, or weights and slopes are not those of one loss."""
+    """Raise `ArgumentError` if a name is taken, or if weights and slopes contradict each other."""
     if not isinstance(loss, RobustLoss):
         raise ArgumentError(f"loss: found {type(loss).__name__}, expected a RobustLoss")
     if loss.name == MIXTURE:
-        raise ArgumentError(f"loss {MIXTURE!r}: is one of the project's own; choose another name")
+        raise ArgumentError(f"loss {MIXTURE!r}: this name is reserved; choose another one")
     step = 1e-5
     u = np.concatenate([TRIED_AT - step, TRIED_AT, TRIED_AT + step, np.zeros(1)])
     what = f"loss {loss.name!r}: must return two arrays, weight and slope, as long as its argument"

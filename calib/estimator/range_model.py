@@ -367,10 +367,12 @@ def _check_tags(ranges: Ranges, tags: list[int], settings: FitSettings) -> None:
     member = {tag for own in groups.values() for tag in own}
     lonely = [tag for tag in tags if groups and tag not in member]
     if lonely:
-        raise BadInputError(f"tag {lonely[0]} is in no group; the groups are {', '.join(groups)}", parameter="groups")
+        raise BadInputError(
+            f"tag {lonely[0]} is not in any group; the groups are {', '.join(groups)}", parameter="groups"
+        )
     unused = [name for name, own in groups.items() if not set(own) & set(tags)]
     if unused:
-        raise BadInputError(f"no tag of group {unused[0]!r} ranges in {ranges.source}", parameter="groups")
+        raise BadInputError(f"no tag of group {unused[0]!r} has ranges in {ranges.source}", parameter="groups")
 
 
 def _shares(ranges: Ranges, groups: Mapping[str, tuple[int, ...]]) -> list[tuple[str, Floats | None]]:
@@ -380,7 +382,7 @@ def _shares(ranges: Ranges, groups: Mapping[str, tuple[int, ...]]) -> list[tuple
         share = 0.5 * np.isin(ranges.initiator, own) + 0.5 * np.isin(ranges.target, own)
         if np.count_nonzero(share) < MIN_RANGES_OF_GROUP:
             raise UnanswerableError(
-                f"group {name!r} has too few ranges for a curve, at least {MIN_RANGES_OF_GROUP} are needed",
+                f"group {name!r} has too few ranges for a curve; at least {MIN_RANGES_OF_GROUP} are needed",
                 parameter="groups",
             )
         shares.append((name, share))

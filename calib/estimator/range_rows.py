@@ -1,8 +1,8 @@
 """Ranges as rows: an error density for each range, whose parameters are sums of unknowns times known weights.
 
-The residual of a range (measured less predicted, with what is unknown of delays, curve and offsets), the logarithm of
-its noise, the log odds that it is reflected and the logarithm of the detour are such sums. What else a range may depend
-on is one more `Part` of one of them: an unknown for each tag, pair, session, direction or degree.
+The residual of a range (measured minus predicted, with the unknown delays, curve and offsets), the logarithm of its
+noise, the log odds that it is reflected and the logarithm of the detour are such sums. A further dependence of ranges
+is one more `Part` of one of them: an unknown for each tag, pair, session, direction or degree.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Part:
 
 
 class Geometry(Protocol):
-    """Distances that are unknown: of places that are searched for, of bodies that move."""
+    """Distances that depend on unknowns: on positions, or on trajectories."""
 
     @property
     def columns(self) -> Ints:
@@ -59,16 +59,16 @@ class Geometry(Protocol):
 
 
 class Errors(Protocol):
-    """What errors are made of, as a density of residuals."""
+    """The density of residuals."""
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Return which parameters it has beside the residual, for which there are parts."""
+        """Return the parameters of the density besides the residual, for which there are parts."""
         ...
 
     @property
     def dispersion(self) -> float:
-        """Return by how much sums of slopes vary more than those of as many independent draws of the density."""
+        """Return the ratio of the variance of sums of slopes to that of independent draws of the density."""
         ...
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:

@@ -1,7 +1,7 @@
-"""Rows of a fit: what was measured, as a log likelihood with its slopes by the unknowns.
+"""Rows of a fit: measurements as log likelihoods with slopes by the unknowns.
 
 A kind of row is a class with a method `terms` that yields, for some rows at a time, their log likelihood and slopes.
-All else (the search, the covariance, score tests) sums over these. Ranges are one kind (`calib.estimator.range_rows`);
+The search, the covariance and the score tests sum over them. Ranges are one kind (`calib.estimator.range_rows`);
 measurements with normal errors (tapes, anchors, poses, heights) are the other, `NormalRows`.
 """
 
@@ -71,11 +71,11 @@ class Rows(Protocol):
 
 @runtime_checkable
 class RestrictedRows(Rows, Protocol):
-    """Rows whose likelihood depends on how well residuals are known."""
+    """Rows whose likelihood depends on the uncertainty of their residuals."""
 
     @property
     def restricted(self) -> bool:
-        """Whether that matters."""
+        """Whether this dependence matters."""
         ...
 
     def expecting(self) -> Rows:
@@ -89,7 +89,7 @@ class RestrictedRows(Rows, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Sums:
-    """Log likelihood of all rows, its slope (p,), and what the rows know of the unknowns (p, p), sparse for many."""
+    """Log likelihood of all rows, its slope (p,), and the information of the rows (p, p), sparse for many unknowns."""
 
     value: float
     gradient: Floats
@@ -151,7 +151,7 @@ class NormalRows:
     columns: Ints
 
     def left(self, x: Floats) -> Floats:
-        """Return measured less predicted values (n,)."""
+        """Return measured minus predicted values (n,)."""
         return np.asarray(self.value - np.sum(self.entries * x[self.columns], axis=1))
 
     def terms(self, x: Floats) -> Iterator[Terms]:
@@ -161,7 +161,7 @@ class NormalRows:
 
 
 def normal_terms(left: Floats, std: Floats, derivative: Floats, columns: Ints) -> Terms:
-    """Return rows with normal errors from what is `left` (n,): measured less predicted.
+    """Return the terms of rows with normal errors from residuals `left` (n,), measured minus predicted.
 
     `derivative` (K, n) is that of the prediction by the unknowns `columns` (n, K), `std` (n,) the standard deviations.
     """

@@ -1,4 +1,4 @@
-"""Would one more unknown be improbable? Rao's score tests of a fit, without a second fit.
+"""Rao's score tests of a fit: is one more unknown significant? They need no second fit.
 
 An alternative is an offset that some ranges would have beside what was fitted. Its slope, less what the fitted unknowns
 would take of it, is summed over short blocks of time and held against its own variance, persistence included. Of

@@ -1,4 +1,4 @@
-"""The unknowns of a fit: blocks of numbers of one kind, what is known of them beforehand, and where they stand.
+"""The unknowns of a fit: blocks of numbers of one kind, their priors, and their indices in the vector of all unknowns.
 
 A block is a named vector with a start and Gaussian priors. The weight of a prior may be estimated with the unknowns, by
 the fixed point of Fellner and Schall as Wood and Fasiolo (Biometrics 2017) generalise it: the roughness of a curve, the
@@ -60,9 +60,9 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Unknown:
-    """A block of unknowns: `names` (k,) say of what each is, `start` (k,) where a search begins.
+    """A block of unknowns of one kind: `names` (k,) of the elements, `start` (k,) of the search.
 
-    `known` (k,) marks those that keep their start; `logarithm` says that they are logarithms of lengths, or log odds.
+    `known` (k,) marks elements that keep their start; `logarithm` is True for logarithms of lengths and log odds.
     """
 
     kind: str
@@ -100,7 +100,7 @@ class Layout:
         return sum(len(block.start) for block in self.blocks)
 
     def start(self, given: Mapping[str, Floats] | None = None) -> Floats:
-        """Return where a search begins (p,): at the values of the kinds that are `given`, else at the blocks' start."""
+        """Return the start of a search (p,): the `given` values of some kinds, and the start of the other blocks."""
         values = [(given or {}).get(block.kind, block.start) for block in self.blocks]
         return np.concatenate([np.asarray(own, dtype=np.float64).ravel() for own in values])
 
@@ -114,7 +114,7 @@ class Layout:
         return np.repeat([b.logarithm for b in self.blocks], [len(b.start) for b in self.blocks])
 
     def indices(self, kinds: Sequence[str]) -> Ints:
-        """Return the indices of some kinds, in the order given; kinds that are not there have none."""
+        """Return the indices of some kinds, in the order given; kinds that are not in the layout are skipped."""
         found = [np.arange(self.where[kind].start, self.where[kind].stop) for kind in kinds if kind in self.where]
         return np.concatenate([np.zeros(0, dtype=np.int64), *found])
 
@@ -123,7 +123,7 @@ class Priors:
     """The priors of a layout with their present weights, and their structures as matrices."""
 
     def __init__(self, layout: Layout, weights: Sequence[float] | None = None) -> None:
-        """Take the priors' own weights, or others in the order of blocks and priors."""
+        """Store the priors with their own weights, or with given ones in the order of blocks and priors."""
         self.layout = layout
         self.keys = [(block.kind, k) for block in layout.blocks for k in range(len(block.priors))]
         self.all = [(layout.where[block.kind], prior) for block in layout.blocks for prior in block.priors]
@@ -143,7 +143,7 @@ class Priors:
         return dict(zip(self.keys, self.weights, strict=True))
 
     def recall(self, known: Mapping[tuple[str, int], float]) -> None:
-        """Take the weights of an earlier search, where it had them."""
+        """Use the weights of an earlier search for the priors that it had."""
         self.weights = [known.get(key, weight) for key, weight in self.by_key().items()]
 
     def precision(self) -> Matrix:
@@ -168,7 +168,7 @@ class Priors:
         return found
 
     def update(self, x: Floats, covariance: Inverse) -> None:
-        """Estimate the weights that may be, from unknowns (p,) and their covariance (p, p)."""
+        """Estimate the weights with bounds from unknowns (p,) and their covariance (p, p)."""
         for k, (_, where, away, pulled) in enumerate(self._distances(x)):
             bounds = self.all[k][1].bounds
             if bounds is not None:

@@ -115,14 +115,14 @@ def localize(
     *,
     training: Data | Flight | None = None,
 ) -> list[Localization]:
-    """Track every body that moves and ranges in a recording, one at a time, with extended Kalman filters.
+    """Track every moving body of a recording that ranges, one at a time, with extended Kalman filters.
 
-    With `Settings(use="receptions")` also by what tags overheard, a body that only listens by that alone.
+    `Settings(use="receptions")` also uses overheard frames, which localize a body that only listens.
 
     `data` is the path of a recording, an open `Recording`, or anything with `exchanges`, `poses` and `tags`. The fixed
-    variances are the best ones on the flight `training`; without it those of the errors that the calibration was fitted
-    to, as it remembers them; never those of the flight itself, which a filter cannot know. Raises what
-    `Calibration.apply` raises, and `UnanswerableError` where no body moves or the recording has no poses.
+    variances are the best ones on the flight `training`; without it the variances of the fitted errors, which the
+    calibration contains; never those of the flight itself, which a filter cannot know. Raises the errors of
+    `Calibration.apply`, and `UnanswerableError` if no body moves or the recording has no poses.
 
     >>> import calib
     >>> known = calib.fit(calib.sample_flight()).calibration
@@ -141,8 +141,8 @@ def localize(
     bodies = problems(flight)
     if not bodies:
         raise UnanswerableError(
-            f"{flight.ranges.source}: no body moves among {len(flight.poses)} poses and ranges, so there is "
-            "nothing to localize; add poses (`uwblink poses`), one that only listens needs `use` receptions"
+            f"{flight.ranges.source}: no moving body among {len(flight.poses)} poses has ranges, so there is nothing "
+            f"to localize; add poses (`uwblink poses`); a body that only listens needs `use` receptions"
         )
     found = []
     for problem in bodies:
@@ -295,10 +295,10 @@ def fixed_std(calibration: Calibration, settings: Settings, training: Data | Fli
     known = calibration.provenance.get("error_std_m")
     if training is None and isinstance(known, dict) and {"raw", "corrected"} <= set(known):
         std = {"raw": float(known["raw"]), "calibrated": float(known["corrected"])}
-        return FixedStd(std, "of the errors that were fitted")
+        return FixedStd(std, "from the fitted errors")
     if training is None:
         middle = float(calibration.sigma_curve(np.array([np.mean(calibration.sigma_curve.range)]))[0])
-        return FixedStd(dict.fromkeys(("raw", "calibrated"), middle), "the sigma curve's middle")
+        return FixedStd(dict.fromkeys(("raw", "calibrated"), middle), "from the middle of the sigma curve")
     flight = _flight_for(training, calibration, settings)
     # About a minute of three bodies is enough: neighbouring candidates differ little.
     flight = replace(flight, ranges=flight.ranges[:7500])
@@ -310,7 +310,7 @@ def fixed_std(calibration: Calibration, settings: Settings, training: Data | Fli
         errors = [[track.rmse_m for track in own] for own in run_filters(problem, ranges, settings).values()]
         squares += np.sum(np.square(errors), axis=1).reshape(squares.shape)
     raw, calibrated = (TUNED_OVER[k] for k in np.argmin(squares, axis=1))
-    return FixedStd({"raw": raw, "calibrated": calibrated}, f"tuned on {flight.ranges.source}")
+    return FixedStd({"raw": raw, "calibrated": calibrated}, f"tuned on the flight {flight.ranges.source}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -374,7 +374,9 @@ def summarize(found: list[Localization]) -> LocalizationSummary:
     nees, nees_bounds, nees_inside = consistency(last)
     if not len(nis):
         names = ", ".join(f"{one.source}: {one.body}" for one in found)
-        raise UnanswerableError(f"{names}: no range agrees with the track within its gate; look at `calib doctor`")
+        raise UnanswerableError(
+            f"{names}: all ranges are outside the gate of the filter; check the recording with `calib doctor`"
+        )
     return LocalizationSummary(
         rmse_m=rmse,
         spread_m={name: float(np.std(over, ddof=1)) if len(over) > 1 else np.nan for name, over in means.items()},
@@ -440,11 +442,11 @@ def localization_text(found: list[Localization], settings: Settings) -> str:
     lines = [
         *table,
         f"process noise: velocity with {settings.velocity_std_mps:g} m/s an axis at {settings.velocity_rate_hz:g} Hz "
-        "(a choice, that of a small drone's optical flow; gains depend on it)",
+        "(chosen as for optical flow of a small drone; the gain of a calibration depends on it)",
         f"fixed standard deviations, {fixed.source}: raw {fixed.std_m['raw']:.3f} m, calibrated "
         f"{fixed.std_m['calibrated']:.3f} m",
-        f"ICRA 2023 has {paper} m for real flights of its own and another filter's noise; these are {what}: metres do "
-        "not compare",
+        f"ICRA 2023 reports {paper} m for its own real flights and another process noise; these are {what}, so the "
+        f"values in metres cannot be compared",
         f"with the calibrated variance: NIS {summary.nis:.2f} (1 expected, 95 % bounds {summary.nis_bounds[0]:.2f} to "
         f"{summary.nis_bounds[1]:.2f}), NEES {summary.nees:.2f} (3 expected, {summary.nees_bounds[0]:.2f} to "
         f"{summary.nees_bounds[1]:.2f}), {100 * summary.accepted:.1f} % of the ranges pass the gate",
@@ -496,7 +498,7 @@ def offset_lines(title: str, track: Track | None) -> list[str]:
     if track is None or not len(track.offsets) or track.offsets[-1] < 0.5:
         return []
     return [
-        f"pairs of {printable(title)} differ from the calibration by constants with a probability of "
+        f"pairs of {printable(title)} have constant differences from the calibration with a probability of "
         f"{100 * track.offsets[-1]:.0f} % at the end, {100 * np.mean(track.offsets):.0f} % on average"
     ]
 

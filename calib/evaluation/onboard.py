@@ -71,7 +71,7 @@ class OnboardSettings(CheckedSettings):
     'imu'
     """
 
-    model: str = setting("imu", "Motion between ranges.", names=("imu", "constant-velocity"))
+    model: str = setting("imu", "Motion model between ranges.", names=("imu", "constant-velocity"))
     height: bool = True
     start_m: tuple[float, float, float] | None = None
     start_std_m: float = 0.3
@@ -79,7 +79,7 @@ class OnboardSettings(CheckedSettings):
     headings: int = 8
     rate_hz: float = 50.0
     speed_m_s: float = 1.0
-    use: str = setting("exchanges", "What is used.", names=("exchanges", "receptions"))
+    use: str = setting("exchanges", "Measurements to use.", names=("exchanges", "receptions"))
     online: bool = False
     noise: ProcessNoise = field(default_factory=ProcessNoise)
 
@@ -117,7 +117,7 @@ class OnboardTrack(Track):
 
     def __repr__(self) -> str:
         """Return the inputs and the RMSE, on one line."""
-        off = f"rms error {self.rmse_m:.3f} m" if self.rmse_m == self.rmse_m else "no truth to judge by"
+        off = f"rms error {self.rmse_m:.3f} m" if self.rmse_m == self.rmse_m else "no true positions"
         return f"{self.body} of {self.source} by {self.used}: {off}"
 
 
@@ -181,8 +181,8 @@ def _readings(data: Data, calibration: Calibration, settings: OnboardSettings) -
     turned = {tag.tag: Rotation.from_quat(anchors[tag.body].quaternion[0]).as_matrix() for tag in mounted}
     if len(fixed) < MIN_ANCHORS:
         raise UnanswerableError(
-            f"{name}: {len(fixed)} tags stay in one place by its poses, at least {MIN_ANCHORS} are needed as "
-            "anchors; 'uwblink poses' adds them"
+            f"{name}: by its poses {len(fixed)} tags stand still, but at least {MIN_ANCHORS} anchors are needed; add "
+            f"their poses with 'uwblink poses'"
         )
     require_times(ranges)
     began = int(ranges.time_ns.min())
@@ -223,8 +223,8 @@ def _readings(data: Data, calibration: Calibration, settings: OnboardSettings) -
         ]
     if not found:
         raise UnanswerableError(
-            f"{name}: no moving body ranges with a fixed anchor, so there is nothing to localize; one that "
-            "only listens needs `use` receptions"
+            f"{name}: no moving body ranges with a fixed anchor, so there is nothing to localize; a body that only "
+            f"listens needs `use` receptions"
         )
     return found
 
@@ -239,8 +239,8 @@ def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilt
     inertial, first = settings.model == "imu", 0
     if inertial and len(one.imu_s) < 2:
         raise UnanswerableError(
-            f"{one.ranges.source}: no inertial readings of {one.body}; put imu.csv into an export (`uwblink import "
-            "exported`), or choose the model constant-velocity"
+            f"{one.ranges.source}: no inertial readings of {one.body}; add imu.csv to an export and import it "
+            f"(`uwblink import exported`), or use the model constant-velocity"
         )
     if settings.start_m is not None:
         fix = Fix(np.array(settings.start_m, dtype=np.float64), np.eye(3) * settings.start_std_m**2)
@@ -250,7 +250,7 @@ def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilt
         first = next(enough, 0) - 1
         if first < 0:
             raise UnanswerableError(
-                f"{one.ranges.source}: {one.body} ranges with too few anchors for a start; give it one"
+                f"{one.ranges.source}: {one.body} ranges with too few anchors for an initial position; give one"
             )
         fix = _fix(one, np.arange(first + 1), settings)
     near = np.abs(one.imu_s - float(one.time_s[first])) < 0.25  # s: the first tilt is that of half a second
@@ -419,15 +419,15 @@ def onboard_text(found: list[OnboardTrack], settings: OnboardSettings) -> str:
         lasts_s = float(np.ptp(one.range_time_ns)) * 1e-9
         if len(one.restarts_s) > max(lasts_s / PATIENCE_S, 3):
             lines.append(
-                f"  began anew {len(one.restarts_s)} times in {lasts_s:.0f} s: what was measured contradicts the "
-                "anchors' places, or differences without stamps have another unit or the other sign (from_id and to_id "
-                "of the import)"
+                f"  restarted {len(one.restarts_s)} times in {lasts_s:.0f} s: the measurements contradict the "
+                f"positions of the anchors, or differences without stamps have a wrong unit or sign (from_id and "
+                f"to_id of the import)"
             )
     noise = settings.noise
     moves = (
         f"accelerometer {noise.force:g} m/s^2 and gyro {noise.gyro:g} rad/s a root of Hz"
         if settings.model == "imu"
-        else f"velocity wanders by {noise.acceleration:g} m/s^2 a root of Hz"
+        else f"random walk of the velocity {noise.acceleration:g} m/s^2 per root of Hz"
     )
     lines += [line for one in found for line in delay_lines(f"{one.source} {one.body}", one)]
     return "\n".join([*lines, f"used: {found[0].used}; process noise: {moves}, speed about {settings.speed_m_s:g} m/s"])

@@ -85,9 +85,9 @@ class ErrorStatistics:
 
 @dataclass(frozen=True, slots=True)
 class PlantedComparison:
-    """The difference between a calibration and what a simulation planted, less the common constant.
+    """The difference between a calibration and the planted values of a simulation, without the common constant.
 
-    What undetermined splits of the calibration leave open is taken out of the delays, too.
+    Shifts along undetermined splits of the calibration are removed from the delays as well.
 
     `delay_error_ns` maps tags to fitted less planted delays, `curve_rms_m` is the rms of the bias curves' difference
     over the ranges inside the fitted power, `correction_rms_m` that of the whole correction of each range; NaN if no

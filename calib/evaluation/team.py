@@ -70,7 +70,7 @@ class TeamSettings(CheckedSettings):
     3.0
     """
 
-    use: str = setting("exchanges", "What is used.", names=("exchanges", "receptions"))
+    use: str = setting("exchanges", "Measurements to use.", names=("exchanges", "receptions"))
     reference: str | None = None
     start_std_m: float = 0.1
     start_std_deg: float = 3.0
@@ -217,8 +217,8 @@ def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, A
     name, sensing = ranges.source, sorted({tag.body for tag in tags} & set(np.unique(imu.get("body", [])).tolist()))
     if len(sensing) < 2:
         raise UnanswerableError(
-            f"{name}: inertial readings of {len(sensing)} bodies with tags ({', '.join(sensing) or 'none'}), relative "
-            "poses need two or more; record or import the table imu"
+            f"{name}: inertial readings of {len(sensing)} bodies with tags ({', '.join(sensing) or 'none'}), but "
+            f"relative poses need two or more; record or import the table imu"
         )
     reference = settings.reference or sensing[0]
     if reference not in sensing:
@@ -235,8 +235,8 @@ def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, A
     single = [one for one, count in Counter(numbers[np.unique(found.ends)].tolist()).items() if count == 1]
     if single:
         warn(
-            f"{name}: {first_few(bodies[one] for one in single)} has one tag that ranges or listens: without a second, "
-            "its heading follows from motion alone, weakly",
+            f"{name}: {first_few(bodies[one] for one in single)} has only one tag that ranges or listens: its heading "
+            "is weakly observable, from motion only",
             WeakHeadingWarning,
         )
     time_ns, body = found.time_ns, numbers[found.ends]
@@ -247,7 +247,7 @@ def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, A
         if time_s[0] > 0.1 or time_s[-1] < last_s - 0.1:
             raise UnanswerableError(
                 f"{name}: inertial readings of {one} cover {time_s[0]:.1f} to {time_s[-1]:.1f} s after the first "
-                f"exchange, not all exchanges to {last_s:.1f} s"
+                f"exchange, but the last exchange is at {last_s:.1f} s"
             )
     pairs, of_bodies = found.pair, pairs_of(*np.moveaxis(body, 2, 0)).number
     count = pairs.max() + 1
@@ -269,8 +269,8 @@ def _start(team: _Team, settings: TeamSettings, filters: int) -> RelativeFilter:
     lost = [body for body, one in zip(team.bodies, place + speed, strict=False) if not np.isfinite(one).all()]
     if lost:
         raise UnanswerableError(
-            f"{team.ranges.source}: no poses of {lost[0]} and {team.bodies[-1]} at the first exchange, near which "
-            "estimates begin; import poses that cover it"
+            f"{team.ranges.source}: no poses of {lost[0]} and {team.bodies[-1]} at the first exchange, where the "
+            f"estimate starts; import poses that cover it"
         )
     turn_std, noise = np.radians(settings.start_std_deg), settings.noise
     stds = settings.start_std_m, settings.start_std_m_s, turn_std, noise.gyro_start, noise.force_start
@@ -384,7 +384,7 @@ def team_text(found: list[RelativePose], settings: TeamSettings) -> str:
         )
     lines += [
         f"start: relative poses within {settings.start_std_m:g} m, {settings.start_std_deg:g} deg and "
-        f"{settings.start_std_m_s:g} m/s an axis (standard deviations); after it poses only serve as truth",
+        f"{settings.start_std_m_s:g} m/s per axis (standard deviations); later poses are used only as true poses",
         f"IMU: {noise.force:g} m/s^2 and {noise.gyro:g} rad/s a root of Hz, biases of {noise.force_start:g} m/s^2 and "
         f"{noise.gyro_start:g} rad/s that wander by {noise.force_bias:g} and {noise.gyro_bias:g} a root of a second",
         f"fixed standard deviations, {fixed.source}: raw {fixed.std_m['raw']:.3f} m, calibrated "
@@ -393,7 +393,10 @@ def team_text(found: list[RelativePose], settings: TeamSettings) -> str:
     lines += delay_lines(found[0].source, found[0].tracks.get("online"))
     for end, less in _reductions(rows).items():
         changes = ", ".join(f"{name} {-100 * share:+.0f} %" for name, share in less.items())
-        lines.append(f"position errors by listening, against {end}: {changes}; arXiv 2304.03837: up to -48 %")
+        lines.append(
+            f"change of position errors by overheard frames, compared with {end}: {changes}; arXiv "
+            f"2304.03837 reports up to -48 %"
+        )
     return "\n".join(lines)
 
 

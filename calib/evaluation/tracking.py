@@ -1,4 +1,4 @@
-"""Extended Kalman filters of one body: what they are given, how they run, and what they come to.
+"""Extended Kalman filters of one body: settings, measurements, the run, and the resulting tracks.
 
 State is the body's position; its velocity and attitude are inputs taken from motion capture, velocity with noise; the
 places of the other bodies are known (ICRA 2023, section V). A measurement is a sum of distances with signs: one of a
@@ -41,7 +41,7 @@ a position from these ranges alone is metres off.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings(CheckedSettings):
-    """How the filters are set up.
+    """Settings of the filters of `localize`.
 
     The velocity input comes at `velocity_rate_hz` with white noise of `velocity_std_mps` an axis; that is the process
     noise. Percentages depend on it: the noisier velocity, the more the ranges decide. Filters begin at the true place,
@@ -65,7 +65,7 @@ class Settings(CheckedSettings):
     reopen_s: float = 1.0
     seed: int = 0
     seeds: int = 3
-    use: str = setting("exchanges", "What is used.", names=("exchanges", "receptions"))
+    use: str = setting("exchanges", "Measurements to use.", names=("exchanges", "receptions"))
     online: bool = False
 
 

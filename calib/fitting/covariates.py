@@ -1,4 +1,4 @@
-"""Whether delays depend on direction, temperature or age: what data determine of it, and whether they are evidence."""
+"""Dependence of delays on direction, temperature or age: selection of the model by the evidence of the data."""
 
 from __future__ import annotations
 
@@ -47,20 +47,20 @@ RANGES_AN_UNKNOWN = 10
 
 MISSING = {
     "pattern": (
-        "no direction is known; a pattern needs poses with attitudes (`uwblink poses`)",
-        "attitudes vary too little to tell a pattern of the antenna from what belongs to places; record a flight in "
-        "which the robot turns once around in several places",
+        "no directions are known; a pattern needs poses with attitudes (`uwblink poses`)",
+        "attitudes vary too little to separate a pattern of the antenna from errors that depend on places; record a "
+        "flight in which the robot makes a full turn at several places",
     ),
     "temperature": (
-        "no temperature is known; a slope needs readings of tags within 30 s of ranges",
-        "temperatures vary too little to tell what they do to ranges; record while the boards warm up",
+        "no temperatures are known; a slope needs temperature readings of tags within 30 s of ranges",
+        "temperatures vary too little to estimate their effect on ranges; record while the boards warm up",
     ),
 }
 """What ranges lack that determine no dependence, by setting: values at all, and values that differ enough."""
 
 PASSES_FOR_POWER = (
-    "the pattern over direction may be one of power: errors of single tags that go with power explain as much; compare "
-    "with a fit with `pattern` none and `groups` of tags"
+    "the pattern over direction may be an effect of power: errors of single tags that depend on power explain the "
+    "data as well; compare with a fit with `pattern` none and `groups` of tags"
 )
 
 
@@ -104,7 +104,7 @@ def _with(
         why = _why(name, covariate, model.ranges, needed)
         if asked != "auto":
             raise UnanswerableError(f"{ranges.source}: {why}", parameter=name)
-        return plain, _told(name, covariate, why.rpartition(": ")[2].partition(";")[0]), []
+        return plain, _not_fitted(name, covariate, why.rpartition(": ")[2].partition(";")[0]), []
     warnings = [f"tags {first_few(map(str, vague))}: {MISSING[name][1]}"] if vague else []
     if asked != "auto":
         return fit_known_distances(ranges, replace(model.settings, **changes[asked])), {"kind": asked}, warnings
@@ -130,7 +130,7 @@ def _with(
         # Slopes of tags are about a common one: what speaks against that speaks against them, too.
         beside = min(evidence, 0.0) * (name == "temperature")
     if best is nothing:
-        return plain, _told(name, covariate, "{:+.2f} ± {:.2f} mm/K are no evidence of one".format(*slopes[0])), []
+        return plain, _not_fitted(name, covariate, "{:+.2f} ± {:.2f} mm/K is not significant".format(*slopes[0])), []
     return best
 
 
@@ -144,8 +144,8 @@ def supply_warnings(slopes: Sequence[TemperatureSlope], ranges: Ranges) -> list[
         moved = 0.0535 * float(np.mean(known)) if known else 0.0
         if abs(moved) > one.std_m_per_k:
             said.append(
-                f"tags {first_few(map(str, one.tags))}: their supply changes by {1e3 * np.mean(known):+.1f} mV/K as "
-                f"they warm, which may be {1e3 * moved:+.2f} mm/K of their slope over temperature (5.35 cm/V: DW1000 "
+                f"tags {first_few(map(str, one.tags))}: their supply voltage changes by {1e3 * np.mean(known):+.1f} "
+                f"mV/K, which may cause {1e3 * moved:+.2f} mm/K of their slope over temperature (5.35 cm/V: DW1000 "
                 "user manual); keep the supply constant while boards warm up"
             )
     return said
@@ -161,7 +161,7 @@ def _as_lasting(tested: Tested, known: Persistence) -> Tested:
     return replace(tested, covariance=factor * tested.covariance, lasting=longest)
 
 
-def _told(name: str, covariate: Covariate, why: str) -> dict[str, Any]:
+def _not_fitted(name: str, covariate: Covariate, why: str) -> dict[str, Any]:
     """Return what to remember of a slope over temperature that was not fitted although temperatures are known."""
     return {"why": why} if name == "temperature" and covariate.tags else {}
 
@@ -270,7 +270,7 @@ def _vague(name: str, covariate: Covariate, tested: Tested) -> list[int]:
 def _why(name: str, covariate: Covariate, ranges: Ranges, needed: int) -> str:
     """Return in words why ranges determine no dependence, and what would; `needed` ranges where they are too few."""
     if needed:
-        return f"too few ranges for a {name}, at least {needed} are needed"
+        return f"too few ranges for a {name}; at least {needed} are needed"
     known = np.isfinite(ranges.toward if name == "pattern" else ranges.temperature_c)
     if not known.any():
         return MISSING[name][0]

@@ -22,13 +22,13 @@ from calib.calibration.model import Calibration, CalibrationSource, given_calibr
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import (
     WITHOUT_CURVE,
-    implausible,
-    limits,
-    one_way,
+    implausible_values,
+    initiator_warning,
+    limit_warnings,
+    power_level_warning,
     refuse_contradicted,
     refuse_impossible,
     refuse_refuted,
-    unlike_powers,
     warnings_of,
 )
 from calib.data.ranges import Ranges, held_out
@@ -50,7 +50,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     """Fit antenna delays and the curves of bias and standard deviation to ranges with known truth.
 
     `data` is what `load_ranges` takes: paths of recordings, simulations in memory, `Ranges`, one or several. `settings`
-    and keyword arguments named like its fields (`FitSettings`, which explains them) say what is fitted and how.
+    and keyword arguments named like its fields select the model and its options (see `FitSettings`).
 
     `warnings` begin with what a fit of the chosen kind cannot know: without a curve (`delays_only`), with taken delays
     (`delays_from`), with constants by pair (`constants`). Where power never changes the curve is flat.
@@ -58,9 +58,9 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     Where tags range only with tags of another side (anchors with robots), a warning says so, and the calibration
     corrects ranges between the sides only (`Calibration.undetermined_splits`).
 
-    Raises `UnanswerableError` when there are too few ranges, or when what was found is beyond what any radio has (true
-    distances in millimetres, say), and `BadInputError` for pinned tags or groups that are not in the data, and for a
-    parameter that cannot be used.
+    Raises `UnanswerableError` when there are too few ranges, or when the result is impossible for a radio (for example
+    with true distances in millimetres), and `BadInputError` for known delays or groups of tags that are not in the
+    data, and for unusable parameters.
 
     >>> import calib
     >>> result = calib.fit(calib.sample_flight())
@@ -74,15 +74,15 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     ranges = load_ranges(data, need_power=not settings.delays_only, use=settings.use)
     if ranges.differences.any() and not ranges.differences.all():
         raise UnanswerableError(
-            f"{ranges.source}: ranges and differences of arrival without stamps have other errors: fit each alone, the "
-            "ranges with `use` exchanges, differences from recordings without exchanges"
+            f"{ranges.source}: ranges and differences of arrival without stamps have different errors: fit them "
+            f"separately, ranges with `use` exchanges, differences from recordings without exchanges"
         )
     heard = 0 if ranges.arrivals is None else len(ranges.arrivals)
     if settings.use == "exchanges":
         ranges = replace(ranges, arrivals=None)
     else:
         require_arrivals(ranges)
-    fixed = _taken_over(source, ranges, curve=not settings.delays_only) | dict(settings.fixed_ns)
+    fixed = _given_delays(source, ranges, curve=not settings.delays_only) | dict(settings.fixed_ns)
     refuse_impossible(ranges)
     # One thread: sums of several threads differ in the last digits, and threads slow small matrices down.
     with threadpool_limits(limits=1, user_api="blas"):
@@ -98,19 +98,9 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     # Differences of arrival determine delays that ranges between two sides leave open.
     unused = heard if settings.use == "exchanges" and calibration.undetermined_splits else 0
     held = _held_out(ranges, settings) if settings.hold_out else None
-    provenance = {
-        **({} if found.model.reference_dbm is None else {"reference_power_dbm": found.model.reference_dbm}),
-        "recordings": ranges.source.split(", "),
-        "recording_ids": [name for _, name in ranges.recordings],
-        "recipe": "sequential" if settings.sequential else "joint",
-        "fitted": what_was_fitted(found),
-        **({"arrivals": len(arrivals.residual)} if (arrivals := found.searches[0].arrivals) else {}),
-        **({"arrivals": len(ranges)} if ranges.differences.any() else {}),
-        "gauge": _gauge(found),
-        **dependences,
-        **({"drift": drift} if (drift := drift_of(found)) else {}),
-        **({"held_out": _judged(held, settings)} if held else {}),
-    }
+    provenance = _provenance(found, ranges, settings) | dependences
+    if held:
+        provenance["held_out"] = _evaluate_held_out(held, settings)
     result = result_of(
         found,
         replace(calibration, provenance=provenance),
@@ -119,17 +109,33 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         settings=settings,
         fixed=fixed,
         first=[
-            f"{unused} differences of arrival at other tags determine the delays of targets: fit with `use` receptions"
+            f"{unused} differences of arrival at other tags would determine the delays of targets: fit with `use` "
+            f"receptions"
         ]
         if unused
         else [],
-        more=[*vague, *supply_warnings(calibration.temperatures, ranges), *_stopped(found, settings.loss)],
+        more=[*vague, *supply_warnings(calibration.temperatures, ranges), *_convergence_warnings(found, settings.loss)],
     )
     return replace(result, held_out=held)
 
 
+def _provenance(found: KnownDistances, ranges: Ranges, settings: FitSettings) -> dict[str, Any]:
+    """Return the provenance of a fit to known distances: data, recipe, gauge and drift."""
+    return {
+        **({} if found.model.reference_dbm is None else {"reference_power_dbm": found.model.reference_dbm}),
+        "recordings": ranges.source.split(", "),
+        "recording_ids": [name for _, name in ranges.recordings],
+        "recipe": "sequential" if settings.sequential else "joint",
+        "fitted": fitted_quantities(found),
+        **({"arrivals": len(arrivals.residual)} if (arrivals := found.searches[0].arrivals) else {}),
+        **({"arrivals": len(ranges)} if ranges.differences.any() else {}),
+        "gauge": _gauge(found),
+        **({"drift": drift} if (drift := drift_of(found)) else {}),
+    }
+
+
 def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: int, loss: str = MIXTURE) -> FitResult:
-    """Fit the delay of one more tag; everything else in the calibration stays as it was.
+    """Fit the delay of one new tag; all other values of the calibration stay the same.
 
     `data` is what `load_ranges` takes. It is the fit of `calib.fit` to all exchanges of the tag with calibrated ones,
     whose delays and curve are known. A tag that ranges with one side of an undetermined split joins the other side.
@@ -145,36 +151,8 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
     """
     check_tag(tag)
     calibration = given_calibration(calibration)
-    if calibration.pair_offsets:
-        raise BadInputError("has constants of pairs, which say nothing of a tag; fit anew", parameter="calibration")
     ranges = load_ranges(data, need_power=calibration.needs_power)
-    if tag in calibration.delays_ns:
-        raise BadInputError(f"tag {tag} has a delay in the calibration already; fit anew to change it", parameter="tag")
-    differ = delays_differ(calibration.antenna_delays, ranges.antenna_delays, calibration.delays_ns)
-    if differ:
-        raise BadInputError(differ, parameter="calibration")
-    if tag not in ranges.tags():
-        raise BadInputError(
-            f"tag {tag} does not range in {ranges.source}; its tags are {', '.join(map(str, ranges.tags()))}",
-            parameter="tag",
-        )
-    known = list(calibration.delays_ns)
-    first, second = (np.isin(ends, known) for ends in (ranges.initiator, ranges.target))
-    some = ranges[(first & (ranges.target == tag)) | (second & (ranges.initiator == tag))]
-    if len(some) < MIN_OF_DELAY:
-        raise UnanswerableError(
-            f"{ranges.source}: {len(some)} exchanges of tag {tag} with calibrated tags are too few, "
-            f"at least {MIN_OF_DELAY} are needed"
-        )
-    directed = [one for pattern in calibration.patterns for one in pattern.tags]
-    blind = np.isnan(some.toward).any(axis=2) & np.isin(np.stack([some.initiator, some.target], axis=1), directed)
-    some = some[np.flatnonzero(~blind.any(axis=1))]
-    if len(some) < MIN_OF_DELAY:
-        raise UnanswerableError(
-            f"{ranges.source}: the calibration has patterns over direction, and directions are known of {len(some)} "
-            f"exchanges, at least {MIN_OF_DELAY} are needed: state poses with attitudes (`uwblink poses`), or fit with "
-            "`pattern` none"
-        )
+    some = _ranges_of_new_tag(calibration, tag, ranges)
     joined = _with_side(replace(calibration, delays_ns=calibration.delays_ns | {tag: 0.0}), tag, some)
     joined = with_new_tag(joined, tag, some)
     applied = joined.apply(some)
@@ -191,8 +169,8 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
     found = fit(straight, settings, lift=calibration.lift)
     added = {"tag": tag, "recording": ranges.source, "exchanges": len(some)}
     unshared = (
-        f"tag {tag}: its pattern over direction is none that other tags share, and is not known: total sigmas contain "
-        "one as large as theirs; fit all recordings together to find it"
+        f"tag {tag}: its pattern over direction differs from those of the other tags and is not known: total sigmas "
+        f"include a pattern of the same size; fit all recordings together to estimate it"
     )
     return replace(
         found,
@@ -213,6 +191,47 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
     )
 
 
+def _ranges_of_new_tag(calibration: Calibration, tag: int, ranges: Ranges) -> Ranges:
+    """Return the ranges of a new tag with calibrated tags that the calibration can correct but for its delay.
+
+    Raises the errors of `add_tag` for calibrations, tags and ranges that cannot be used.
+    """
+    if calibration.pair_offsets:
+        raise BadInputError(
+            "has constants of pairs and no delays of tags; fit all recordings again", parameter="calibration"
+        )
+    if tag in calibration.delays_ns:
+        raise BadInputError(
+            f"the calibration already has a delay of tag {tag}; fit all recordings again to change it", parameter="tag"
+        )
+    differ = delays_differ(calibration.antenna_delays, ranges.antenna_delays, calibration.delays_ns)
+    if differ:
+        raise BadInputError(differ, parameter="calibration")
+    if tag not in ranges.tags():
+        raise BadInputError(
+            f"tag {tag} has no ranges in {ranges.source}; its tags are {', '.join(map(str, ranges.tags()))}",
+            parameter="tag",
+        )
+    known = list(calibration.delays_ns)
+    first, second = (np.isin(ends, known) for ends in (ranges.initiator, ranges.target))
+    some = ranges[(first & (ranges.target == tag)) | (second & (ranges.initiator == tag))]
+    if len(some) < MIN_OF_DELAY:
+        raise UnanswerableError(
+            f"{ranges.source}: {len(some)} exchanges of tag {tag} with calibrated tags are too few; at least "
+            f"{MIN_OF_DELAY} are needed"
+        )
+    directed = [one for pattern in calibration.patterns for one in pattern.tags]
+    blind = np.isnan(some.toward).any(axis=2) & np.isin(np.stack([some.initiator, some.target], axis=1), directed)
+    some = some[np.flatnonzero(~blind.any(axis=1))]
+    if len(some) < MIN_OF_DELAY:
+        raise UnanswerableError(
+            f"{ranges.source}: the calibration has patterns over direction, but only {len(some)} exchanges have "
+            f"known directions; at least {MIN_OF_DELAY} are needed: add poses with attitudes (`uwblink poses`), or "
+            f"fit with `pattern` none"
+        )
+    return some
+
+
 def _with_side(calibration: Calibration, tag: int, ranges: Ranges) -> Calibration:
     """Return a calibration in which a tag has the side opposite to its partners', if they have one.
 
@@ -221,8 +240,8 @@ def _with_side(calibration: Calibration, tag: int, ranges: Ranges) -> Calibratio
     sides = {calibration.sides.get(partner, 0) for partner in ranges.tags() if partner != tag}
     if len(sides) > 1:
         raise UnanswerableError(
-            f"tag {tag} ranges with tags that the calibration holds for several sides, and its ranges may tell what "
-            f"that leaves open; fit all recordings together ({split_text(calibration.undetermined_splits)})"
+            f"tag {tag} ranges with tags of several sides of the calibration, so its ranges may determine more "
+            f"delays; fit all recordings together ({split_text(calibration.undetermined_splits)})"
         )
     (side,) = sides
     splits = list(calibration.undetermined_splits)
@@ -232,7 +251,7 @@ def _with_side(calibration: Calibration, tag: int, ranges: Ranges) -> Calibratio
     return replace(calibration, undetermined_splits=tuple(splits))
 
 
-def _taken_over(known: Calibration | None, ranges: Ranges, *, curve: bool) -> dict[int, float]:
+def _given_delays(known: Calibration | None, ranges: Ranges, *, curve: bool) -> dict[int, float]:
     """Return the delays that a calibration has for tags of these ranges.
 
     Raises `BadInputError` where it has none, and where it has all and no `curve` is fitted beside them.
@@ -244,17 +263,17 @@ def _taken_over(known: Calibration | None, ranges: Ranges, *, curve: bool) -> di
         raise BadInputError(text, parameter="delays_from")
     if known.patterns or known.temperatures:
         raise BadInputError(
-            "its delays are those in average directions or at a reference temperature; fit its recordings together "
-            "with these, or take over a fit with `pattern` and `temperature` none",
+            "its delays refer to average directions or a reference temperature; fit its recordings together with "
+            "these, or use a calibration fitted with `pattern` and `temperature` none",
             parameter="delays_from",
         )
     found = {tag: known.delays_ns[tag] for tag in ranges.tags() if tag in known.delays_ns}
     if not found:
         there, here = (", ".join(map(str, sorted(tags))) for tags in (known.delays_ns, ranges.tags()))
-        raise BadInputError(f"its tags are {there}, those of the ranges {here}", parameter="delays_from")
+        raise BadInputError(f"its tags are {there}, but those of the ranges are {here}", parameter="delays_from")
     if not curve and len(found) == len(ranges.tags()):
         raise BadInputError(
-            "it has the delays of all tags, and `delays_only` fits no curve, so nothing is left to fit",
+            "it has the delays of all tags, and `delays_only` fits no curve, so there is nothing to fit",
             parameter="delays_from",
         )
     return found
@@ -280,7 +299,7 @@ def result_of(
     residuals = applied.corrected_m - ranges.truth_m
     over_sigma = residuals / applied.sigma_m
     inliers: Bools = np.asarray(np.abs(over_sigma) < 3.0)
-    findings = [*findings, *one_way(ranges)]
+    findings = [*findings, *initiator_warning(ranges)]
     refuse_contradicted(float(np.mean(inliers)), ranges, findings)
     if calibration.errors is not None:
         known = replace(
@@ -290,12 +309,12 @@ def result_of(
     warnings = [
         *([split_text(calibration.undetermined_splits)] if calibration.undetermined_splits else []),
         *first,
-        *limits(found, ranges, residuals, fixed),
+        *limit_warnings(found, ranges, residuals, fixed),
         *more,
         *findings,
-        *implausible(calibration.delays_ns, residuals),
-        *unlike_powers(ranges, calibration),
-        *_beyond(found),
+        *implausible_values(calibration.delays_ns, residuals),
+        *power_level_warning(ranges, calibration),
+        *_reference_power_warning(found),
         *warnings_of(ranges, float(np.mean(inliers)), found.blocks.seconds),
     ]
     provenance: dict[str, Any] = {
@@ -333,11 +352,11 @@ def _held_out(ranges: Ranges, settings: FitSettings) -> HeldOut:
     try:
         known.apply(ranges[rows])
     except BadInputError as error:
-        raise UnanswerableError(f"what is held out cannot be judged: {error}", parameter="hold_out") from error
+        raise UnanswerableError(f"the held-out ranges cannot be evaluated: {error}", parameter="hold_out") from error
     return HeldOut(ranges[rows], known)
 
 
-def _judged(held: HeldOut, settings: FitSettings) -> dict[str, Any]:
+def _evaluate_held_out(held: HeldOut, settings: FitSettings) -> dict[str, Any]:
     """Return how a fit to a part of the ranges does on those that are held out, for the provenance."""
     found = evaluate(held.ranges, held.calibration).overall
     judged: dict[str, Any] = {
@@ -353,15 +372,18 @@ def _judged(held: HeldOut, settings: FitSettings) -> dict[str, Any]:
     return {name: for_json(value) for name, value in judged.items()}
 
 
-def _stopped(found: KnownDistances, asked_for: str | None) -> list[str]:
+def _convergence_warnings(found: KnownDistances, asked_for: str | None) -> list[str]:
     if asked_for == MIXTURE and found.searches[0].loss != MIXTURE:
-        return ["the likelihood left all ranges of a pair out, so a robust loss was fitted: compare with other losses"]
+        return [
+            "the likelihood treated all ranges of a pair as reflected, so a robust loss was fitted instead: "
+            "compare with other losses"
+        ]
     if found.success:
         return []
-    return [f"the fit stopped after {found.steps} steps before it settled: delays and intervals are not final"]
+    return [f"the fit stopped after {found.steps} steps before it converged: delays and intervals are not final"]
 
 
-def _beyond(found: KnownDistances) -> list[str]:
+def _reference_power_warning(found: KnownDistances) -> list[str]:
     """Return a warning if no range has the reference power, so that delays are stated at the nearest power."""
     model, settings = found.model, found.model.settings
     if model.reference is None or not _has_gauge(found):
@@ -370,9 +392,9 @@ def _beyond(found: KnownDistances) -> list[str]:
     if near == model.reference:
         return []
     return [
-        f"no ranges at the reference power of {model.reference_dbm:.1f} dBm: delays are stated at "
-        f"{settings.alpha_dbm + 10 * np.log10(near):.1f} dBm, the nearest recorded, and compare only with others "
-        "stated there"
+        f"no ranges at the reference power of {model.reference_dbm:.1f} dBm: delays refer to the nearest recorded "
+        f"power, {settings.alpha_dbm + 10 * np.log10(near):.1f} dBm, and can only be compared with delays at the "
+        f"same power"
     ]
 
 
@@ -381,8 +403,8 @@ def _has_gauge(found: KnownDistances) -> bool:
     return any(carrier is not None for carrier in found.model.carriers)
 
 
-def what_was_fitted(found: KnownDistances) -> str:
-    """Return what was fitted, in words."""
+def fitted_quantities(found: KnownDistances) -> str:
+    """Return the names of the fitted quantities."""
     model = found.model
     if model.settings.constants == "pair":
         return "constants of pairs" if model.curve is None else "constants of pairs and curve"
@@ -392,12 +414,12 @@ def what_was_fitted(found: KnownDistances) -> str:
 
 
 def _gauge(found: KnownDistances) -> str:
-    """Return in words how the common constant of delays and curve was chosen."""
+    """Return a sentence on the choice of the common constant of delays and curve."""
     carrier = "constants of pairs" if found.model.settings.constants == "pair" else "delays"
     if found.model.curve is None:
-        return f"no curve; the {carrier} carry the constant"
+        return f"no curve; the {carrier} contain the common constant"
     if not _has_gauge(found):
-        return "pinned delays; the curve carries the constant"
+        return "known delays; the curve contains the common constant"
     if found.model.reference is None:
-        return "that of the recipe: delays as fitted without a curve, which carries the constant"
-    return f"the bias curve is zero at {found.model.reference_dbm:g} dBm; the {carrier} carry the constant"
+        return "two steps: delays fitted without a curve; the curve contains the common constant"
+    return f"the bias curve is zero at {found.model.reference_dbm:g} dBm; the {carrier} contain the common constant"

@@ -1,4 +1,6 @@
-"""Antenna delays from overheard exchanges alone: what listeners say of each target, without any range."""
+"""Antenna delays from overheard exchanges only, without ranges: the delay of each target as its listeners measure
+it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a fit returns: a calibration, how it came about, and ways to look at it."""
+"""The result of a fit: a calibration, its origin, and figures."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class HeldOut:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class FitResult(CalibrationResult):
-    """A calibration and how it came about.
+    """The result of `fit`: a calibration with its warnings, residuals and figures.
 
     `ranges` are those that were fitted (n,), `residuals_m` their fully corrected errors, corrected range less truth;
-    `inliers` those within three sigmas. `message` says how the search ended, `warnings` what a user should know before
-    trusting it, the gravest first. `held_out` is there if `FitSettings.hold_out` asked for it. The `plot_` methods draw
+    `inliers` those within three sigmas. `message` states how the search ended; `warnings` are the known limits and
+    doubts, the most serious first. `held_out` is there if `FitSettings.hold_out` asked for it. The `plot_` methods draw
     into matplotlib axes, new ones if none are given, and return them.
 
     >>> import calib
@@ -49,7 +49,7 @@ class FitResult(CalibrationResult):
     held_out: HeldOut | None = None
 
     def headline(self) -> str:
-        """Return what was fitted, and how the search ended, in one line."""
+        """Return one line: the fitted ranges, and how the search ended."""
         return f"Fit of {len(self.ranges)} ranges of {self.ranges.source}: {self.message}"
 
     def correct(self, *columns: Any, **named: Any) -> Any:

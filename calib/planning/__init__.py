@@ -1,4 +1,4 @@
-"""What to measure with what one has, before anything is measured, and how well each delay will be known then."""
+"""Plans of calibrations without true distances: what to measure, and the expected accuracy of each delay."""
 
 from calib.planning.settings import FlightPlanSettings, SurveyPlanSettings, read_whole
 

@@ -117,7 +117,7 @@ def flight_of(
     model, scene = range_model(scene, FitSettings(), curve=curve, offsets=False)
     for number, name in enumerate(truth.moving):
         if np.count_nonzero(truth.places.body == number) < 2:
-            raise UnanswerableError(f"{truth.source}: no positions of body {name}; a plan takes its motion from them")
+            raise UnanswerableError(f"{truth.source}: no positions of body {name}, which a plan needs for its motion")
     # True attitudes, with the errors that a fit will assume.
     attitudes = {
         body: replace(known, time_s=truth.attitudes[body].time_s, quaternion=truth.attitudes[body].quaternion)
@@ -210,7 +210,7 @@ Robots = int | Sequence[Sequence[int]]
 
 
 def plan_flight(robots: Robots | Data, settings: FlightPlanSettings | None = None, **changes: Any) -> FlightPlan:
-    """Return how well `fit_from_ranges` will know the delays of a flight, and what one more measurement would bring.
+    """Plan a flight for `fit_from_ranges`: the expected accuracy of the delays, and the gain of further measurements.
 
     `robots` is how many there are, with two tags each, or the ids of the tags of each; or a recording of a flight with
     poses all along (a simulated one, or an earlier one), from which motion, lever arms and powers are taken. `settings`
@@ -277,8 +277,8 @@ def _information(asked: FlightPlanSettings, data: Data | None) -> Information:
         best = found.best_tape(asked.still_s, asked.tape_sigma_m)
         if best is None:
             raise BadInputError(
-                f"only {count} can be measured: of robots while they stand (`still_s`), and of anchors whose places "
-                "are sought",
+                f"only {count} distances can be measured: between robots while they stand still (`still_s`), and "
+                f"between anchors whose positions are sought",
                 parameter="taped",
             )
         found = Information(flight.taped([*found.flight.tapes, best], asked.still_s, asked.tape_sigma_m))
@@ -305,7 +305,9 @@ def _more(asked: FlightPlanSettings, data: Data | None, found: Information) -> I
     c, other_ns = found.covariance_ns2, 0.05
     means = [_mean_ns(c - np.outer(c[k], c[k]) / (c[k, k] + other_ns**2)) for k in range(len(c))]
     best = int(np.argmin(np.round(means, 6)))
-    yield NextBest(f"the delay of tag {found.tags[best]} from elsewhere, to {other_ns:g} ns", means[best], now)
+    yield NextBest(
+        f"the delay of tag {found.tags[best]} known to {other_ns:g} ns from another calibration", means[best], now
+    )
 
 
 def _changes(asked: FlightPlanSettings, flight: PlannedFlight) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -323,7 +325,7 @@ def _changes(asked: FlightPlanSettings, flight: PlannedFlight) -> Iterator[tuple
         given | {"anchors": (*asked.anchors, *range(max(tags, default=0) + 1, max(tags, default=0) + 1 + more))}
         for more in (1, more_anchors)
     )
-    standing = f"robots that stand for the first {stands_s:g} s, and the distance of two of their tags by tape"
+    standing = f"robots that stand still for the first {stands_s:g} s, with a measured distance of two of their tags"
     tape = {"taped": asked.taped + 1}
     rows: list[tuple[bool, str, dict[str, Any]]] = [
         (
@@ -331,19 +333,19 @@ def _changes(asked: FlightPlanSettings, flight: PlannedFlight) -> Iterator[tuple
             f"positions known for the first {longer:g} s",
             {"poses_until_s": longer},
         ),
-        (True, "the distance of tags {0[0]} and {0[1]} by tape", tape),
-        (bool(flight.scene.sought), "the places of the anchors, measured", given),
+        (True, "a measured distance of tags {0[0]} and {0[1]}", tape),
+        (bool(flight.scene.sought), "measured positions of the anchors", given),
         (
             poses and asked.heading_std_deg > heading_deg,
-            f"headings good to {heading_deg:g} degrees",
+            f"headings with errors of {heading_deg:g} degrees",
             {"heading_std_deg": heading_deg},
         ),
         (free and not asked.still_s, standing, tape | {"still_s": stands_s}),
         (free, f"a flight of {2 * asked.seconds:g} s", {"seconds": 2 * asked.seconds}),
-        (free and not asked.anchors, f"{more_anchors} anchors at known places", four),
+        (free and not asked.anchors, f"{more_anchors} anchors at known positions", four),
         (
             free and bool(asked.anchors) and asked.anchor_places == "given",
-            "one anchor more at a known place",
+            "one more anchor at a known position",
             one,
         ),
         (free and poses and asked.imu is None, "inertial readings", {"imu": "consumer"}),

@@ -1,4 +1,4 @@
-"""Plans: steps and commands, the interval that each delay will have, and what one more measurement would bring."""
+"""Plans: steps and commands, the expected interval of each delay, and the gain of one more measurement."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class _Plan:
         lines = [
             *self.steps,
             "",
-            f"Promised, if {assumed}:",
+            f"Expected accuracy, if {assumed}:",
             *(
                 f"  tag {tag:3d}  "
                 + (f"± {half:.3f} ns (95 %)" if math.isfinite(half) else wide.get(tag, "undetermined"))
@@ -141,7 +141,7 @@ class _Plan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan(_Plan):
-    """A plan of arrangements of boards that stand still.
+    """A plan for `survey`: arrangements of boards that stand still.
 
     `after_ns` has the intervals when only the first arrangement, the first two and so on are made; `with_curve_ns` all
     intervals where a curve over power is fitted along, as surveys do unless they are told otherwise. Of all pairs a
@@ -169,13 +169,14 @@ class Plan(_Plan):
     def _steps(self) -> list[str]:
         held = {"line": "Stretch a string and keep it straight", "plane": "Take a flat table or floor"}
         first = (
-            f"{held.get(self.on, 'Use the room')}. Places are guides: only what is taped is measured, orders matter."
+            f"{held.get(self.on, 'Use the room')}. The positions are only proposals, but the order matters; measure "
+            f"only the distances named below."
         )
         shape = f", known to be on a {self.on}" if self.on else ""
-        beside = " A file says what is known beside: the taped distances, the anchors' places."
+        beside = " Write the other known facts into a file: measured distances, positions of anchors."
         made = [
             f"Arrangement {one.name}: boards {one.where(self.on)}."
-            + "".join(f" Tape the distance of {i} and {j}, antenna to antenna." for i, j in one.taped)
+            + "".join(f" Measure the distance of {i} and {j} with a tape, antenna to antenna." for i, j in one.taped)
             + f" Record all pairs as arrangement {one.name} for {self.seconds_each:.0f} s."
             for one in self.arrangements
         ]
@@ -183,14 +184,16 @@ class Plan(_Plan):
 
     def _promise(self) -> tuple[str, list[str]]:
         share = f", and {100 * self.reflected:g} % of the pairs are reflected" if self.reflected else ""
-        shared = [f"  what all share ± {self.common_ns:.3f} ns"] if math.isfinite(self.common_ns) else []
+        shared = [f"  common part ± {self.common_ns:.3f} ns"] if math.isfinite(self.common_ns) else []
         halves = zip(
-            ("a delay", "one against their mean", "what all share"), asdict(self.with_curve_ns).values(), strict=True
+            ("a delay", "each relative to the mean", "the common part"),
+            asdict(self.with_curve_ns).values(),
+            strict=True,
         )
         curved = ", ".join(
             f"{what} ± {half:.3f} ns" if math.isfinite(half) else f"{what} undetermined" for what, half in halves
         )
-        shared.append(f"With a curve over power fitted along, as surveys do where powers vary: {curved}.")
+        shared.append(f"If a curve over power is fitted as well, as surveys do if powers vary: {curved}.")
         return f"the constant error of a pair is {100 * self.pair_error_m:.1f} cm{share}", shared
 
     def commands(self, ports: str) -> Iterator[str]:
@@ -247,26 +250,30 @@ class FlightPlan(_Plan):
         bodies = ", ".join(f"{' and '.join(map(str, tags))} on robot {k}" for k, tags in enumerate(robots, start=1))
         room = " x ".join(f"{v:g}" for v in flown.size_m)
         known = "are measured" if flown.anchor_places == "given" else "are found along"
-        standing = f", while robots stand for the first {flown.still_s:g} s" if flown.still_s else ""
+        standing = f", while the robots stand still for the first {flown.still_s:g} s" if flown.still_s else ""
         steps = [
-            (not robots, f"Fly as {self.source} does: {self.ranges} ranges in {self.seconds:.0f} s."),
-            (robots, f"Note where on its body each tag sits, to a centimetre: tags {bodies}."),
+            (not robots, f"Fly as in {self.source}: {self.ranges} ranges in {self.seconds:.0f} s."),
+            (robots, f"Measure the position of each tag on its body to a centimetre: tags {bodies}."),
             (flown.anchors, f"Fix anchors {', '.join(map(str, flown.anchors))} around the room, high and low in turn."),
             (
                 robots,
-                f"Fly for {self.seconds:.0f} s about a room of {room} m at about {flown.speed_m_s:g} m/s, turning to "
-                f"and fro; every pair of different robots ranges in turn, {flown.rate_hz:g} exchanges a second in all.",
+                f"Fly for {self.seconds:.0f} s in a room of {room} m at about {flown.speed_m_s:g} m/s, and turn left "
+                f"and right; all pairs of tags on different robots range in turn, {flown.rate_hz:g} exchanges per "
+                f"second in total.",
             ),
             (
                 flown.poses_until_s,
-                f"Let all positions be known for the first {flown.poses_until_s or 0:g} s, to about 2 cm.",
+                f"All positions must be known to about 2 cm for the first {flown.poses_until_s or 0:g} s.",
             ),
-            (self.stands, f"Places of the {len(self.stands)} anchors {known}."),
-            *((True, f"Tape the distance of tags {a} and {b}, antenna to antenna{standing}.") for a, b in self.taped),
+            (self.stands, f"The positions of the {len(self.stands)} anchors {known}."),
+            *(
+                (True, f"Measure the distance of tags {a} and {b} with a tape, antenna to antenna{standing}.")
+                for a, b in self.taped
+            ),
             (flown.attitudes == "imu", "Attitudes come from gyroscopes and accelerometers."),
             (
                 flown.attitudes == "poses",
-                f"Attitudes come all along, with headings good to {flown.heading_std_deg:g} degrees.",
+                f"Attitudes must be known all the time, with headings to {flown.heading_std_deg:g} degrees.",
             ),
             (True, "Fit delays, curve and trajectories together."),
         ]
@@ -275,7 +282,7 @@ class FlightPlan(_Plan):
     def _promise(self) -> tuple[str, list[str]]:
         which = "" if len(self.undetermined) in (0, len(self.half_ns)) else " of those that are determined"
         assumed = f"ranges have {100 * self.settings.noise_m:.1f} cm of noise and {100 * self.reflected:.0f} % are"
-        shared = f"  what all share{which} ± {self.common_ns:.3f} ns, each against the mean ± {self.apart_ns:.3f} ns"
+        shared = f"  common part{which} ± {self.common_ns:.3f} ns, each relative to the mean ± {self.apart_ns:.3f} ns"
         return f"{assumed} reflected", [shared]
 
     def commands(self, ports: str, recording: str = "") -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""The settings of plans, once for Python and for the command line, and the checks of what they may be."""
+"""The settings of plans, for Python and for the command line, and their checks."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _are_lengths(size_m: Sequence[float], dimensions: int) -> bool:
 OF_BOTH: Final[dict[str, Any]] = {
     "size_m": {"flag": "--size", "kind": str | None, "parse": read_numbers, "metavar": "M,M,M"},
     "anchors": {
-        "help": "Boards at known positions, which stay there.",
+        "help": "Boards at known, fixed positions.",
         "flag": "--anchor-tags",
         "kind": str | None,
         "parse": read_whole,
@@ -66,7 +66,7 @@ OF_BOTH: Final[dict[str, Any]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveyPlanSettings(CheckedSettings):
-    """The settings of `calib.plan`, which it takes as keyword arguments, too; raises `BadInputError`.
+    """Settings of `calib.plan`, which also takes them as keyword arguments; raises `BadInputError`.
 
     `on` is "line" (a string), "plane" (a table) or "space" (a room), of `size_m` (up to three lengths). `taped`
     distances will be measured to `tape_sigma_m`; `anchors` are boards that stay where they are, at places known to
@@ -87,7 +87,7 @@ class SurveyPlanSettings(CheckedSettings):
         names=tuple(ROOMS_M),
     )
     arrangements: int | None = setting(
-        None, "Number of arrangements; by default as many as are worth it.", bounds=(1, 26)
+        None, "Number of arrangements; by default as many as improve the accuracy.", bounds=(1, 26)
     )
     size_m: Sequence[float] | None = setting(
         None, "Length of the line, or sides of plane or room (m).", **OF_BOTH["size_m"]
@@ -110,7 +110,7 @@ class SurveyPlanSettings(CheckedSettings):
         """Check all values."""
         CheckedSettings.__post_init__(self)
         tags = self.tags
-        on_line = "stand in a plane or in space; on a line say how many distances are taped"
+        on_line = "anchors need a plane or space; on a line give the number of measured distances"
         wrong_size = self.size_m is not None and not _are_lengths(self.size_m, self.dimensions)
         several = 2 <= len(tags) <= 30 and len(set(tags)) == len(tags)
         strangers = [tag for tag in sorted(self.anchors) if tags and tag not in tags]
@@ -130,7 +130,7 @@ class SurveyPlanSettings(CheckedSettings):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightPlanSettings(CheckedSettings):
-    """The settings of `calib.plan_flight`, which it takes as keyword arguments, too; raises `BadInputError`.
+    """Settings of `calib.plan_flight`, which also takes them as keyword arguments; raises `BadInputError`.
 
     Without a recording robots fly for `seconds` about a room of `size_m` at about `speed_m_s`, tags of a robot are
     `apart_m` from each other, and all pairs but those of two `anchors` (ids of tags about the walls) range in turn,
@@ -155,7 +155,7 @@ class FlightPlanSettings(CheckedSettings):
     speed_m_s: float = setting(1.0, "Mean speed of the robots (m/s).", flag="--robot-speed", bounds=(0.05, 10.0))
     apart_m: float = setting(0.5, "Distance between the tags of a robot (m).", flag="--tag-spacing", bounds=(0.0, 3.0))
     poses_until_s: float | None = setting(
-        10.0, "How long positions are known at first.", flag="--poses-until", metavar="SECONDS"
+        10.0, "Time from the start for which positions are known.", flag="--poses-until", metavar="SECONDS"
     )
     attitudes: str = setting(
         "poses",
@@ -172,7 +172,7 @@ class FlightPlanSettings(CheckedSettings):
     )
     still_s: float = setting(
         0.0,
-        "How long the robots stand before they fly, for a tape.",
+        "Time for which the robots stand still at the start, for measured distances.",
         flag="--standstill",
         metavar="SECONDS",
         bounds=(0.0, 600.0),
@@ -205,7 +205,7 @@ class FlightPlanSettings(CheckedSettings):
             (
                 "seconds",
                 known and ranges > most_ranges,
-                f"{ranges:.0f} ranges are more than a plan takes, {most_ranges}",
+                f"{ranges:.0f} ranges are too many for a plan; at most {most_ranges} are allowed",
             ),
             (
                 "still_s",
@@ -214,11 +214,11 @@ class FlightPlanSettings(CheckedSettings):
             ),
             ("robots", known and not (robots and all(robots) and once), among),
             ("anchors", not others, "found {}, expected other tags than those of robots"),
-            ("robots", len(robots) == 1 and not anchors, "a single robot without anchors ranges with nobody"),
+            ("robots", len(robots) == 1 and not anchors, "a single robot without anchors has no partner for ranges"),
             (
                 "robots",
                 not all(0 < tag < 65536 for tag in (*tags, *anchors)),
-                "found a tag that is none, expected ids of 1 or more",
+                "found an id below 1, expected ids of 1 or more",
             ),
         ]
         _refuse(self, refused)

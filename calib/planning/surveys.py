@@ -1,4 +1,4 @@
-"""Plans of boards that stand still: which arrangements to make with what one has, and what comes of them.
+"""Plans of surveys: which arrangements of boards to record, and the expected accuracy of the delays.
 
 What comes of them is Fisher's information of a survey's own rows, without data. Places are unknown. With reflections,
 which pairs are reflected is drawn, and the prediction is the root mean square over the draws: a reflected pair has
@@ -153,7 +153,7 @@ def _averaged(informations: Floats, tags: Sequence[int]) -> Precision[Floats]:
 
 
 def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None, **changes: Any) -> Plan:
-    """Return how to calibrate boards without true distances: which arrangements to make, and what comes of them.
+    """Plan a calibration of boards without true distances: arrangements, and the expected accuracy of the delays.
 
     `boards` is how many there are, or their ids. `settings` and keyword arguments named like its fields
     (`SurveyPlanSettings`, which explains them) say what one has. Each of the arrangements is the best of sixty random
@@ -171,7 +171,7 @@ def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None
     # The best of sixty is in the best 5 % with a probability of 95 %.
     candidates = random_arrangements(inputs, 60)
     if not candidates:
-        raise UnanswerableError(f"{len(tags)} boards find no room: they must stand 0.4 m from each other")
+        raise UnanswerableError(f"there is no room for {len(tags)} boards, which must stand 0.4 m from each other")
     informations = [delay_information(inputs, one)[0] for one in candidates]
     chosen = [candidates[k] for k in _choose(informations, inputs.arrangements)]
     chosen = [replace(one, name=name) for name, one in zip(ascii_uppercase, chosen, strict=False)]
@@ -191,7 +191,7 @@ def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None
     best = _best_tape(inputs, chosen)
     if best is not None:
         i, j = best[1].taped[-1]
-        more.append((f"the distance of {i} and {j} in {best[1].name} by tape", best[0]))
+        more.append((f"a measured distance of {i} and {j} in {best[1].name}", best[0]))
     now, *means = (wide[-1] * mean_std_ns(information) for information in (total, *(one[1] for one in more)))
     next_best = [NextBest(what, mean, now) for (what, _), mean in zip(more, means, strict=True) if mean < now]
     each, apart = (wide[-1] * float(np.sqrt(np.mean(std**2))) for std in (curved.each, curved.apart))

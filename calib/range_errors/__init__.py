@@ -1,1 +1,1 @@
-"""The one model of what a range's error is made of."""
+"""The error model of ranges, used by all fits, checks and filters."""

@@ -55,11 +55,11 @@ def check_places(output: Path | None, pdf: Path | None, figures: Path | None, *,
         if path is not None:
             check_output(path, force=force)
     if pdf is not None and output is not None and output.resolve() == pdf.resolve():
-        raise BadInputError(f"{output} is the page already; give the PDF another name", parameter="pdf")
+        raise BadInputError(f"{output} is also the output of the report; give the PDF another name", parameter="pdf")
     if figures is not None:
         check_folder(figures)
         if not force and any(path.suffix in (".pdf", ".svg") for path in figures.glob("*.*")):
-            text = "holds figures already; give another folder, or `force` to replace them"
+            text = "already contains figures; give another folder, or replace them with `force`"
             raise BadInputError(f"{figures} {text}", parameter="figures")
 
 

@@ -28,22 +28,22 @@ def curves(results: Results) -> list[Block]:
     follows = (
         "The curve follows the mean of the errors, as least squares do; points are means, bin by bin."
         if calibration.loss == "l2"
-        else "The curve follows the core of the errors: noise, without reflections, which can only lengthen a range. "
-        "Points are the centre of that core (below: its spread), told from the tail bin by bin, without the curve. "
-        "Medians are drawn, too, and lie above: with a share s of reflected ranges about the quantile "
+        else "The curve is fitted to the core of the errors, that is noise without reflections, which can only "
+        "lengthen a range. Points are the centre of the core (below: its spread), estimated bin by bin without the "
+        "curve. Medians are also drawn, and lie above: with a share s of reflected ranges about the quantile "
         "0.5 / (1 − s) of the core."
     )
     mean_of_lifted = "the mean over both ends." if calibration.lift == "mean-of-lifted" else ""
     lifted = (
-        "Lifted power is the first-path power p on a scale that stretches where ranges are good and the bias "
-        f"changes: ψ = 10^((p − α) / 10 dB) with α = {calibration.alpha_dbm:g} dBm, so ψ = 1 at α and a tenth of "
+        "Lifted power is the first-path power p on a scale that expands high powers, where the bias changes most: ψ "
+        f"= 10^((p − α) / 10 dB) with α = {calibration.alpha_dbm:g} dBm, so ψ = 1 at α and a tenth of "
         f"it 10 dB lower; of an exchange, {mean_of_lifted or 'that of the mean power of both ends.'} Powers in dBm "
         "stand above the figures."
     )
     known = (results.trained, calibration.apply(results.trained), calibration)
     captions = {
-        "bias": "Bias over power: what the delay-corrected errors centre on, and the curve with its 95 % band.",
-        "sigma": "Standard deviation over power: that of the noise, and the curve with its 95 % band.",
+        "bias": "Bias over power: the centre of the delay-corrected errors, and the curve with its 95 % band.",
+        "sigma": "Standard deviation over power: the noise of the ranges, and the curve with its 95 % band.",
     }
     pictures = [Picture(which, _over_power(known, which), caption) for which, caption in captions.items()]
     return [Heading("Bias and standard deviation over power"), Text(follows, "note"), Text(lifted, "note"), *pictures]
@@ -62,9 +62,9 @@ def patterns(results: Results) -> list[Block]:
         return []
     draw = partial(figures.patterns, calibration=calibration, ranges=results.trained if results.recordings else None)
     caption = (
-        "By how much ranges are longer in a direction than on average, in the frame of the body that carries the tag: "
-        "outside the inner circle they are longer, inside it shorter, and where the band holds the circle, the data do "
-        "not tell which."
+        "Excess of ranges by direction, relative to the average, in the frame of the body that carries the tag: "
+        "outside the inner circle ranges are longer, inside it shorter. If the band includes the circle, the sign is "
+        "not significant."
     )
     rows = list(map(list, pattern_rows(calibration)))
     table = Table(["tags", "rms (cm)", "most, at the level of the body"], rows, words=True)
@@ -98,36 +98,35 @@ def before_after(results: Results) -> list[Block]:
         Table(header, [[name, *_error_cells(group)] for name, group in groups], above, total=True),
         Text(
             "Errors in cm. Means contain the reflections that remain; medians nearly exclude them. "
-            "Robust is 1.4826 median absolute deviations; 95 % |e| is what 95 % of the calibrated errors "
-            f"stay below in size (95 % of all lie between {low:+.1f} and {high:+.1f} cm). Noise: share of corrected "
-            "ranges that their own sigma explains at 95 %, 95 % without reflections; the rest are mostly reflected. In "
-            "95 %: share within the 95 % intervals that include reflections. New p: share at powers the curves "
-            "were not fitted at.",
+            "Robust is 1.4826 median absolute deviations; 95 % |e| is the 95 % quantile of the absolute calibrated "
+            f"errors (95 % of all lie between {low:+.1f} and {high:+.1f} cm). Noise: share of corrected ranges within "
+            "the 95 % bounds of their sigma, 95 % without reflections; the others are mostly reflected. In 95 %: "
+            "share within the 95 % intervals that include reflections. New p: share at powers outside the fitted ones.",
             "note",
         ),
         Table(["within nominal", *[f"{level} %" for level in levels]], covered, total=True),
         Text(
-            "Coverage: how many calibrated errors lie within the bounds that their sigma gives for a normal "
-            "distribution. Reflections take from the high levels.",
+            "Coverage: the share of calibrated errors within the bounds of a normal distribution with their sigma. "
+            "Reflections reduce the coverage at high levels.",
             "note",
         ),
         Picture(
             "errors",
             partial(figures.distribution, **known),
-            "Range errors: shares by size and sign (the outermost bins hold everything beyond them), and the share of "
-            "errors below each size.",
+            "Range errors: histogram (the outermost bins include all larger errors), and the share of absolute "
+            "errors below each value.",
         ),
         Picture(
             "z-scores",
             partial(figures.z_scores, **known),
-            "Calibrated errors over their sigma. Left: their density. Right: the share of errors larger than so many "
-            "sigmas, on a logarithmic axis. Reflections lie above the line of noise alone.",
+            "Calibrated errors divided by their sigma. Left: their density. Right: the share of errors larger than a "
+            "number of sigmas, on a logarithmic axis. Reflections lie above the line for noise only.",
         ),
         Picture(
             "residuals",
             partial(figures.residuals, **known, alpha_dbm=results.calibration.alpha_dbm),
-            "What is left over distance and over power, reflections included: they lift the medians off zero, the more "
-            "of them the higher; a slope or a wave would be a bias that is left. A hundredth of the points is beyond.",
+            "Calibrated errors over distance and over power, reflections included: these shift the medians above "
+            "zero. A slope or a wave would be a remaining bias. One per cent of the points is outside the figure.",
         ),
     ]
 
@@ -166,8 +165,8 @@ def outliers(results: Results) -> list[Block]:
             total=True,
         ),
         Text(
-            "Too long and too short: share of ranges beyond three sigmas. Noise, reflections, their mean detour and "
-            "outliers: what the errors of each pair are made of, by the likelihood of the fit.",
+            "Too long and too short: share of ranges outside three sigmas. Noise, reflections, their mean detour and "
+            "outliers: parts of the errors of each pair, by the likelihood of the fit.",
             "note",
         ),
     ]
@@ -197,7 +196,7 @@ def localization(results: Results) -> list[Block]:
     worst = max(found, key=lambda one: float(one.rmse_m["variance"].mean()))
     caption = (
         f"{worst.source}, {worst.body}, the body with the largest error after calibration: path from above, height, "
-        "and position error over time. Where the blue line is above three sigmas, the filter states too small an error."
+        f"and position error over time. If the blue line is above three sigmas, the filter underestimates its error."
     )
     return [
         Heading("Localization"),
@@ -223,11 +222,11 @@ def _filters(found: list[Localization]) -> str:
     return (
         "One body at a time is tracked by an EKF from its ranges to the others, whose positions are known; velocity "
         f"and attitude are inputs from the poses, velocity with white noise of {chosen.velocity_std_mps:g} m/s an axis "
-        f"at {chosen.velocity_rate_hz:g} Hz, as a small drone's optical flow has it. How much a calibration gains "
-        "depends on that choice: the better velocity is known, the less ranges decide. Fixed standard deviations, "
+        f"at {chosen.velocity_rate_hz:g} Hz, as for optical flow of a small drone. The gain of a calibration depends "
+        f"on this choice: with a better known velocity, ranges have less weight. Fixed standard deviations, "
         f"{fixed.source}: raw {100 * fixed.std_m['raw']:.0f} cm, calibrated {100 * fixed.std_m['calibrated']:.0f} cm. "
-        f"ICRA 2023 has {paper} m (raw, calibrated, with variance) for real flights of its own and another filter's "
-        f"noise; {own}, so metres do not compare, and percentages only as far as the filters' noise is alike."
+        f"ICRA 2023 has {paper} m (raw, calibrated, with variance) for its own real flights and another process "
+        f"noise; {own}, so values in metres cannot be compared, and percentages only if the process noise is similar."
     )
 
 
@@ -240,10 +239,10 @@ def over_time(results: Results) -> list[Block]:
     """Return a figure of the calibrated errors over time for each recording."""
     blocks: list[Block] = [Heading("Over time")]
     for k, recording in enumerate(results.recordings):
-        caption = f"{recording.source}: calibrated errors, and lines between which 95 % should lie without reflections."
+        caption = f"{recording.source}: calibrated errors, and the lines that should enclose 95 % without reflections."
         pairs, most = len(pair_rows(recording)), figures.MOST_PAIRS
         if pairs > most:
-            caption += f" Of {pairs} pairs the {most} whose errors spread most; others are left out."
+            caption += f" Only the {most} of {pairs} pairs with the largest spread of errors are drawn."
         draw = partial(figures.over_time, ranges=recording, applied=results.judged_calibration.apply(recording))
         blocks.append(Picture(f"over-time-{k + 1}", draw, caption))
     return blocks

@@ -196,8 +196,8 @@ def more(width_in: float, next_best: tuple[NextBest, ...]) -> Figure:
 def planned_delays(width_in: float, plan: FlightPlan) -> Figure:
     """Draw the interval of each delay, and the prior interval of undetermined ones."""
     figure, (axes,) = sheet(width_in, height_in=2.2)
-    left_open = {tag: plan.open_ns[tag] for tag, half in plan.half_ns.items() if not math.isfinite(half)}
-    _intervals(axes, plan.half_ns, left_open, ("determined", "stays open"))
+    undetermined_delays = {tag: plan.open_ns[tag] for tag, half in plan.half_ns.items() if not math.isfinite(half)}
+    _intervals(axes, plan.half_ns, undetermined_delays, ("determined", "stays open"))
     legend(figure)
     return figure
 

@@ -37,13 +37,13 @@ def write_plan(
 
 def _of_boards(plan: Plan) -> Iterator[Block]:
     yield Text(
-        f"{_known(plan)} if the constant error of a pair is {100 * plan.pair_error_m:.1f} cm. Places are guides; "
-        "nothing but what is taped is measured.",
+        f"{_known(plan)} if the constant error of a pair is {100 * plan.pair_error_m:.1f} cm. The positions are only "
+        f"proposals; measure only the distances named below.",
         "lead",
     )
     for k, one in enumerate(plan.arrangements):
         yield Heading(f"Step {k + 1}: arrangement {one.name}")
-        tapes = "".join(f" Tape the distance of {i} and {j}, antenna to antenna." for i, j in one.taped)
+        tapes = "".join(f" Measure the distance of {i} and {j} with a tape, antenna to antenna." for i, j in one.taped)
         places = f"Boards {one.where(plan.on)}".replace("Boards with", "Board")
         yield Text(f"{places}.{tapes} Record all pairs for {plan.seconds_each:.0f} s.")
         yield Picture(
@@ -56,7 +56,7 @@ def _of_boards(plan: Plan) -> Iterator[Block]:
 
 def _of_flight(plan: FlightPlan) -> Iterator[Block]:
     yield Text(
-        f"{_known(plan)}, and what they share to ± {plan.common_ns:.3f} ns, if ranges have "
+        f"{_known(plan)}, and their common part to ± {plan.common_ns:.3f} ns, if ranges have "
         f"{100 * plan.settings.noise_m:.1f} cm of noise and {100 * plan.reflected:.0f} % are reflected.",
         "lead",
     )
@@ -65,9 +65,9 @@ def _of_flight(plan: FlightPlan) -> Iterator[Block]:
     yield Picture(
         "flight",
         partial(flight, plan=plan),
-        "The flight from above and its heights, as a guide; thick where positions are known.",
+        "The flight from above and its heights, as a proposal; thick lines where positions are known.",
     )
-    yield Heading("What it promises")
+    yield Heading("Expected accuracy")
     yield Picture("delays", partial(planned_delays, plan=plan), "Half the interval (95 %) of each delay.")
     yield from _promise(plan)
 
@@ -81,11 +81,11 @@ def _promise(plan: Plan | FlightPlan) -> Iterator[Block]:
     if plan.undetermined:
         yield Text(f"Not determined: {'; '.join(plan.verdict.free)}.", "warning")
     if plan.next_best:
-        yield Heading("What one thing more would bring")
+        yield Heading("Gain of one more measurement")
         yield Picture(
             "more",
             partial(more, next_best=plan.next_best),
-            "The mean interval with each; 1.5 ns are taken for known of a delay that nothing determines.",
+            "The mean interval with each further measurement; an undetermined delay counts as known to 1.5 ns.",
         )
 
 

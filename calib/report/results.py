@@ -55,13 +55,12 @@ def origin_of(data: Iterable[Data], command: str = "") -> Origin:
 
 @dataclass(frozen=True, kw_only=True)
 class Results:
-    """What a report tells of: a calibration, and as much as there is of how it was fitted and how it does.
+    """The input of a report: a calibration, its fit, its recordings and its evaluation, as far as they are known.
 
-    `training` are the ranges it was fitted to, `tests` others that judge it; an `evaluated` one of the judged ranges
-    is not made again. `part` is a calibration fitted without the tests where those were held out from the recordings
-    that `calibration` was fitted to; it is the one that is judged. `heard` are delays as passive listeners see them;
-    `findings` the doctor's, by recording; `tracks` the bodies that were localized; `origin` says when the report was
-    made, and from what files.
+    `training` are the fitted ranges, `tests` those for the evaluation; `evaluated` is an existing evaluation of them.
+    If the tests were held out from the fitted recordings, `part` is the calibration fitted without them, which is the
+    one that is evaluated. `heard` are delays from passive listeners; `findings` those of the doctor, by recording;
+    `tracks` the localized bodies; `origin` the time of the report and its input files.
     """
 
     calibration: Calibration

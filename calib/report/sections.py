@@ -16,13 +16,13 @@ import numpy as np
 
 from calib import figures
 from calib.calibration.document import pair_name
+from calib.calibration.model import known_facts
 from calib.calibration.model import pair_rows as offset_rows
-from calib.calibration.model import rests_on
 from calib.errors import BadInputError
 from calib.evaluation.statistics import CORRECTION_STAGES, pair_rows
 from calib.report import error_sections
 from calib.report.results import Results
-from calib.report.verdict import left_open, started, verdict
+from calib.report.verdict import capitalized, undetermined_delays, verdict
 from calib.spread import TWO_SIDED_95
 from calib.surveys.figures import board_figure
 from calib.surveys.result import SurveyedArrangement
@@ -39,8 +39,8 @@ def of_recordings(section: Section) -> Section:
 
 def _verdict(results: Results) -> list[Block]:
     unjudged = (
-        "Nothing of this was compared with a true distance. If a recording has true distances, evaluate the "
-        "calibration on it: the report of that evaluation has this section, too."
+        "These results were not compared with true distances. If a recording has true distances, evaluate the "
+        "calibration on it: the report of that evaluation contains this section as well."
     )
     return [*verdict(results), Text(_summary(results) if results.recordings else unjudged, "lead")]
 
@@ -62,24 +62,27 @@ def _summary(results: Results) -> str:
         f"reflections that remain, goes from {means}; the standard "
         f"deviation from {100 * group.raw.std_m:.1f} to {100 * group.full.std_m:.1f} cm, its robust estimate from "
         f"{100 * group.raw.robust_std_m:.1f} to {100 * group.full.robust_std_m:.1f} cm. "
-        f"{100 * (1 - group.rejected):.1f} % of the corrected ranges are as near as noise alone explains (95 % would "
-        f"be without reflections), with a mean of {100 * group.accepted.mean_m:+.1f} cm and a standard deviation of "
-        f"{100 * group.accepted.std_m:.1f} cm; the other {100 * group.rejected:.1f} % are mostly reflected ones, which "
-        "no calibration shortens and a filter's gate leaves out."
+        f"{100 * (1 - group.rejected):.1f} % of the corrected ranges are within the bounds of noise (95 % "
+        f"without reflections), with a mean of {100 * group.accepted.mean_m:+.1f} cm and a standard deviation of "
+        f"{100 * group.accepted.std_m:.1f} cm; the other {100 * group.rejected:.1f} % are mostly reflected ranges, "
+        f"which a calibration cannot correct and a filter's gate rejects."
     )
 
 
 def _warnings(results: Results) -> list[Block]:
     told = [
         *results.warnings,
-        "no tests were given: the figures below are of the recordings that the fit has seen"
+        "no tests were given: the figures below are of the fitted recordings"
         if results.fit is not None and not results.tests
         else "",
-        "no tests were given: errors below are those of a second fit on a part of the recordings that it has not seen; "
-        "on another day they are larger"
+        "no tests were given: errors below are those of a second fit on held-out parts of the recordings; on another "
+        "day they are larger"
         if results.part is not None
         else "",
-        *(f"{name}: {one.fault}. {started(one.evidence)}. {started(one.remedy)}." for name, one in results.findings),
+        *(
+            f"{name}: {one.fault}. {capitalized(one.evidence)}. {capitalized(one.remedy)}."
+            for name, one in results.findings
+        ),
     ]
     return [Text(f"Warning: {sentence}", "warning") for sentence in told if sentence]
 
@@ -111,8 +114,8 @@ def _foundations(results: Results) -> list[Block]:
     """Return what replaces known distances; nothing where distances were known."""
     made = results.calibration.provenance
     if made.get("recipe") == "survey":
-        return [Heading("What it rests on"), *_of_survey(made)]
-    told = rests_on(made)
+        return [Heading("Known facts"), *_of_survey(made)]
+    told = known_facts(made)
     if not told:
         return []
     rests, off = made["rests_on"], made.get("distance_std_m")
@@ -124,16 +127,16 @@ def _foundations(results: Results) -> list[Block]:
         ["moving bodies", names("moving")],
         ["positions known for", f"{float(rests.get('known_s', 0.0)):.1f} s"],
         ["anchors at given places", names("anchors_given")],
-        ["anchors whose places were found", names("anchors_sought")],
+        ["anchors at estimated positions", names("anchors_sought")],
         ["attitudes from", str(rests.get("attitudes", "nowhere"))],
         ["distances by tape", str(rests.get("distances", 0))],
         ["heights of", names("heights")],
-        ["distances found to (standard error)", f"{100 * off:.1f} cm" if isinstance(off, int | float) else ""],
+        ["standard error of estimated distances", f"{100 * off:.1f} cm" if isinstance(off, int | float) else ""],
         ["left open", str(made.get("left_open", ""))],
     ]
     return [
         Heading("What it rests on"),
-        Text(f"No true distance was known: {told}. Trajectories were found together with the delays."),
+        Text(f"No true distance was known: {told}. Trajectories were estimated together with the delays."),
         Table(["what", "of this calibration"], [row for row in rows if row[1]], words=True),
     ]
 
@@ -151,8 +154,9 @@ def _of_survey(made: Any) -> list[Block]:
     blocks: list[Block] = [
         Text(
             f"No true distance was known. {counted(int(made['pairs']), 'mean range')} of pairs in "
-            f"{counted(len(rests['arrangements']), 'arrangement')} of boards that stood still must fit together in "
-            f"space, with {', '.join(beside)}. A pair has a constant error of {100 * float(rests['pair_error_m']):.1f} "
+            f"{counted(len(rests['arrangements']), 'arrangement')} of boards that stood still determine positions "
+            f"and delays, together with {', '.join(beside)}. A pair has a constant error of "
+            f"{100 * float(rests['pair_error_m']):.1f} "
             f"cm in an arrangement; {float(rests['freedom']):.0f} degrees of freedom are left."
         )
     ]
@@ -164,10 +168,10 @@ def _of_survey(made: Any) -> list[Block]:
         for one in surveyed
     ]
     caption = (
-        "Where boards stood, from above, with ellipses that hold them with 95 %; ten times as large and dashed where "
-        "they would not be seen."
+        "Positions of the boards from above, with 95 % ellipses; small ellipses are drawn dashed and ten times as "
+        "large."
     )
-    header = ["arrangement", "boards", "said to be", "places within (95 %)", "frame"]
+    header = ["arrangement", "boards", "known shape", "uncertainty of positions (95 %)", "frame"]
     blocks += [Table(header, rows, words=True), Picture("places", partial(board_figure, surveyed), caption)]
     reflected = [
         [row["arrangement"], pair_name(row["between"]), f"{100 * row['longer_m']:+.0f}", f"{100 * row['chance']:.0f} %"]
@@ -175,7 +179,7 @@ def _of_survey(made: Any) -> list[Block]:
     ]
     if reflected:
         blocks += [
-            Text("Pairs that are, or may be, longer by a reflection; they count for less by as much:"),
+            Text("Pairs that are, or may be, reflected; they have less weight:"),
             Table(["arrangement", "pair", "longer by (cm)", "probability"], reflected),
         ]
     return blocks
@@ -193,23 +197,23 @@ def _determined(results: Results) -> list[Block]:
     if results.fit is None:
         return []
     calibration, pairs = results.calibration, pair_rows(results.trained)
-    good = f"Yes: the {len(pairs)} pairs of {len(results.trained.tags())} tags determine every delay."
-    answer = f"No: {left_open(results)}." if left_open(results) else good
+    good = f"Yes: the {len(pairs)} pairs of {len(results.trained.tags())} tags determine all delays."
+    answer = f"No: {undetermined_delays(results)}." if undetermined_delays(results) else good
     counts = [int(np.count_nonzero(rows)) for rows in pairs.values()]
     changed = calibration.provenance.get("settings", {})
     settings = f" Settings: {', '.join(f'{name} = {value}' for name, value in changed.items())}." if changed else ""
     return [
-        Heading("Is it determined?"),
+        Heading("Are the delays determined?"),
         Text(
             f"{answer} The rarest pair has {min(counts)} ranges, the most frequent {max(counts)}. The fit "
             f"{results.fit.message}, with the {calibration.loss} loss at a scale of {calibration.scale_ns:.3f} ns; its "
-            f"standard errors are a {calibration.provenance.get('standard_errors', 'sandwich')}, so errors that "
-            "persist within a block are not counted as independent ones." + settings
+            f"standard errors are a {calibration.provenance.get('standard_errors', 'sandwich')}, so persistent "
+            f"errors do not count as independent." + settings
         ),
         Text(
-            "How a delay splits into transmission and reception is not determined: stamps of free-running clocks leave "
-            "it open, overheard exchanges included, because shifting a tag's clock shifts both. Where both are needed, "
-            "0.44 of a delay goes to transmission and 0.56 to reception by convention."
+            "The parts of a delay in transmission and reception cannot be determined from stamps of free-running "
+            "clocks, not even with overheard exchanges, because a shift of a tag's clock changes both. If both are "
+            "needed, 0.44 of a delay is transmission and 0.56 reception by convention."
         ),
     ]
 
@@ -238,14 +242,12 @@ def _delays(results: Results) -> list[Block]:
         "to": ["" if tag in unknown else f"{delay + half[tag]:+.4f}" for tag, delay in delays.items()],
         "planted, same gauge (ns)": [f"{known[tag] + shift:+.4f}" if tag in known else "" for tag in delays],
         "difference (ps)": [f"{1e3 * errors_ns[tag]:+.1f}" if tag in errors_ns else "" for tag in delays],
-        "heard by others (ns)": [f"{heard[tag].delay_ns:+.4f}" if tag in heard else "" for tag in delays],
+        "by listeners (ns)": [f"{heard[tag].delay_ns:+.4f}" if tag in heard else "" for tag in delays],
         "± 1 std": [f"{heard[tag].std_ns:.4f}" if tag in heard else "" for tag in delays],
     }
     columns = {name: cells for name, cells in columns.items() if any(cells)}
     table = Table(list(columns), list(map(list, zip(*columns.values(), strict=True))))
-    caption = "Antenna delays with their 95 % intervals" + (
-        ", and what was planted, in the same gauge." if known else "."
-    )
+    caption = "Antenna delays with their 95 % intervals" + (", and planted delays in the same gauge." if known else ".")
     draw = partial(figures.alone, partial(figures.delays, calibration, known, shift))
     blocks = [Heading("Antenna delays"), *of_pairs, table, Picture("delays", draw, caption)]
     if planted:
@@ -267,7 +269,12 @@ def _delays(results: Results) -> list[Block]:
 def _provenance(results: Results) -> list[Block]:
     """Return the origin of a report and its calibration."""
     origin, made = results.origin, results.calibration.provenance
-    known = {"report": origin.made, "version": origin.version, "command": origin.command, "distances": rests_on(made)}
+    known = {
+        "report": origin.made,
+        "version": origin.version,
+        "command": origin.command,
+        "distances": known_facts(made),
+    }
     known |= {path: f"SHA-256 {digest}" for path, digest in origin.files.items()}
     rows = [[name, text] for name, text in known.items() if text]
     # Sections show the rest as tables and figures.
@@ -313,7 +320,7 @@ def register_report_section(name: str, section: Section, *, before: str = "prove
     >>> del SECTIONS["weather"]
     """
     if name in SECTIONS:
-        raise BadInputError(f"a section {name!r} is there already; choose another name", parameter="name")
+        raise BadInputError(f"a section {name!r} already exists; choose another name", parameter="name")
     if before not in SECTIONS:
         raise BadInputError(f"found {before!r}, allowed: {', '.join(SECTIONS)}", parameter="before")
     if not callable(section):

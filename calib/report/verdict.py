@@ -1,4 +1,4 @@
-"""Whether a calibration is fit for use: criteria with thresholds and results, and a summary."""
+"""The verdict on a calibration: criteria with thresholds and results, and a summary."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 from scipy.stats import binomtest
 
 from calib.calibration.document import pair_name, split_text
-from calib.calibration.model import rests_on
+from calib.calibration.model import known_facts
 from calib.estimator.range_model import METRES_A_NS
 from calib.evaluation.statistics import Stats
 from calib.report.results import Results
@@ -40,8 +40,8 @@ def verdict(results: Results) -> list[Block]:
     bad, doubt, good = ("; ".join(one.told for one in found if one.grade == grade) for grade in (BAD, DOUBT, GOOD))
     also = f" Also: {doubt}." if doubt else ""
     sentences = (
-        (bad, BAD, f"Not fit for use. {started(bad)}.{also}"),
-        (doubt, DOUBT, f"Fit for use, with reservations. {started(doubt)}."),
+        (bad, BAD, f"Not fit for use. {capitalized(bad)}.{also}"),
+        (doubt, DOUBT, f"Fit for use, with reservations. {capitalized(doubt)}."),
         (True, GOOD, f"Fit for use. All {len(found)} criteria are met: {good}."),
     )
     kind, text = next((kind, text) for applies, kind, text in sentences if applies)
@@ -50,7 +50,7 @@ def verdict(results: Results) -> list[Block]:
     return [Text(text, kind), Table(["criterion", "met", "found", "asked for"], rows, words=True)]
 
 
-def started(text: str) -> str:
+def capitalized(text: str) -> str:
     """Return a text as a sentence begins."""
     return text[:1].upper() + text[1:]
 
@@ -64,14 +64,14 @@ def criteria(results: Results) -> Iterator[Criterion]:
         yield _bias(results)
         yield _interval(results)
     elif not made.get("converged", True):
-        yield Criterion("Did the search settle?", "yes", "no", BAD, "the search stopped before it settled")
+        yield Criterion("Did the search converge?", "yes", "no", BAD, "the search stopped before it converged")
     if not results.calibration.pair_offsets:
         yield _settled(results)
     if results.recordings:
         yield from _of_uses(results)
     if made.get("recipe") == "survey":
         yield from _of_survey(results)
-    elif rests_on(made) and isinstance(std_m := made.get("distance_std_m"), int | float):
+    elif known_facts(made) and isinstance(std_m := made.get("distance_std_m"), int | float):
         yield _distances(std_m)
     if results.recordings:
         yield _warned(results)
@@ -85,35 +85,39 @@ def _of_uses(results: Results) -> Iterator[Criterion]:
     """Yield whether the curves hold for the recordings' powers, and whether positions become better."""
     most, share = 0.05, results.evaluation.overall.clamped
     yield Criterion(
-        "Was the curve fitted at such powers?",
-        f"at most {100 * most:.0f} % of the ranges beyond them",
-        f"{100 * share:.1f} % beyond",
+        "Are the powers of the recordings within the fitted powers?",
+        f"at most {100 * most:.0f} % of the ranges outside",
+        f"{100 * share:.1f} % outside",
         _graded(share <= most, share <= 0.25),
-        f"{100 * share:.1f} % of the ranges have powers that the fit has not seen",
+        f"{100 * share:.1f} % of the ranges have powers outside the fitted ones",
     )
     if results.tracks:
         raw, best = (np.mean([one.rmse_m[name].mean() for one in results.tracks]) for name in ("raw", "variance"))
         yield Criterion(
-            "Do positions become better?",
+            "Do position errors decrease?",
             "RMSE of the position not larger than with raw ranges",
             f"from {raw:.3f} to {best:.3f} m over {len(results.tracks)} track{'s' * (len(results.tracks) > 1)}",
             _graded(bool(best < raw), False),
-            f"positions go from {100 * raw:.0f} to {100 * best:.0f} cm RMSE",
+            f"the RMSE of positions changes from {100 * raw:.0f} to {100 * best:.0f} cm",
         )
 
 
 def _held_out(results: Results) -> Criterion:
     judged = results.judged
-    found, told = f"{judged.source}: {len(judged)} ranges", "it was judged on recordings that the fit has not seen"
+    found, told = f"{judged.source}: {len(judged)} ranges", "it was evaluated on other recordings than the fitted ones"
     if results.part is not None:
         share = len(judged) / (len(judged) + int(results.part.provenance["exchanges"]))
-        found = f"in part: a second fit was judged on {100 * share:.0f} % of the same recordings, held out from it"
-        told = "it was judged on held-out parts of the recordings it was fitted to, not on another recording"
+        found = f"in part: a second fit was evaluated on {100 * share:.0f} % of the same recordings, held out from it"
+        told = "it was evaluated on held-out parts of the fitted recordings, not on another recording"
     elif not results.held_out:
-        found = "no: on those it was fitted to"
-        told = "it was not judged on recordings that the fit has not seen, so what follows is too good"
+        found = "no: on the fitted recordings"
+        told = "it was evaluated only on the fitted recordings, so the following results are too optimistic"
     return Criterion(
-        "Was it judged on recordings that the fit has not seen?", "yes", found, _graded(results.held_out, True), told
+        "Was it evaluated on other recordings than the fitted ones?",
+        "yes",
+        found,
+        _graded(results.held_out, True),
+        told,
     )
 
 
@@ -123,11 +127,11 @@ def _gain(results: Results) -> Criterion:
     raw, full = (float(np.median(np.abs(range_m - truth))) for range_m in (corrected.raw_m, corrected.corrected_m))
     less = 1 - full / raw if raw > 0 else 0.0
     return Criterion(
-        "Does it make ranges better?",
-        f"typical error at least {100 * least:.0f} % smaller than raw",
-        f"from {100 * raw:.1f} to {100 * full:.1f} cm ({-100 * less:+.0f} %); half of the errors are smaller",
+        "Do range errors decrease?",
+        f"median absolute error at least {100 * least:.0f} % smaller than raw",
+        f"from {100 * raw:.1f} to {100 * full:.1f} cm ({-100 * less:+.0f} %), median absolute error",
         _graded(less >= least, less >= 0),
-        f"the typical error goes from {100 * raw:.1f} to {100 * full:.1f} cm",
+        f"the median absolute error changes from {100 * raw:.1f} to {100 * full:.1f} cm",
     )
 
 
@@ -142,14 +146,14 @@ def _bias(results: Results) -> Criterion:
     name = max(ratios, key=lambda pair: ratios[pair])
     full, ratio = pairs[name], ratios[name]
     return Criterion(
-        "Is no pair left with a bias?",
-        f"median of each pair, less what chance explains, within {most:g} of its spread",
-        f"worst: {name} with {100 * full.median_m:+.1f} cm of {full.n} ranges; beyond chance {ratio:.2f} of its "
-        f"spread of {100 * full.robust_std_m:.1f} cm",
+        "Are all pairs free of bias?",
+        f"median error of each pair, minus its bound by chance, within {most:g} of its spread",
+        f"worst: {name} with {100 * full.median_m:+.1f} cm of {full.n} ranges; above its bound by chance {ratio:.2f} "
+        f"of its spread of {100 * full.robust_std_m:.1f} cm",
         _graded(ratio <= most, ratio <= 1.0),
-        f"no pair is sure to keep a bias beyond {most:g} of its spread"
+        f"no pair has a significant bias above {most:g} of its spread"
         if ratio <= most
-        else f"pair {name} keeps a bias of {100 * full.median_m:+.1f} cm",
+        else f"pair {name} has a remaining bias of {100 * full.median_m:+.1f} cm",
     )
 
 
@@ -167,13 +171,13 @@ def _interval(results: Results) -> Criterion:
     overall = results.evaluation.overall
     known = bool(np.isfinite(overall.inside_95))
     share = overall.inside_95 if known else overall.coverage["95"]
-    of_what = "reflections included" if known else "by sigma alone; the calibration does not describe reflections"
+    of_what = "reflections included" if known else "by sigma only; the calibration has no error model"
     low, high = 0.90, 0.985  # with less, a filter trusts the ranges too much; with more, too little
     # 99 % interval of the share (Wilson's), as of independent ranges.
     count = overall.full.n
     least, most = map(float, binomtest(round(share * count), count).proportion_ci(0.99, "wilson"))
     return Criterion(
-        "Does it say rightly how far ranges can be off?",
+        "Are the stated errors of ranges right?",
         f"{100 * low:.0f} to {100 * high:.1f} % of errors within their 95 % intervals",
         f"{100 * share:.1f} % ({of_what})",
         _graded(low <= most and least <= high, most >= 0.80),
@@ -185,7 +189,7 @@ def _settled(results: Results) -> Criterion:
     known = results.calibration
     asked = ("Are the antenna delays known well enough?", f"95 % interval of each within ± {MOST_NS:g} ns (3 cm)")
     if known.provenance.get("undetermined"):
-        return Criterion(*asked, left_open(results), BAD, left_open(results))
+        return Criterion(*asked, undetermined_delays(results), BAD, undetermined_delays(results))
     half = {f"tag {t}": TWO_SIDED_95 * std for t, std in known.delays_std_ns.items() if np.isfinite(std)}
     if known.undetermined_splits:
         of_pairs = {pair_name(pair): one.std_m for pair, one in known.pair_constants.items()}
@@ -194,7 +198,7 @@ def _settled(results: Results) -> Criterion:
         return Criterion(*asked, "the calibration states no intervals", DOUBT, "delays have no intervals")
     widest = max(half, key=lambda name: half[name])
     told = (
-        f"the delay of {widest} is known to ± {half[widest]:.2f} ns only"
+        f"the delay of {widest} is only known to ± {half[widest]:.2f} ns"
         if half[widest] > MOST_NS
         else f"delays are known to ± {half[widest]:.3f} ns or better"
     )
@@ -202,7 +206,7 @@ def _settled(results: Results) -> Criterion:
     return Criterion(*asked, f"widest: {widest}, ± {half[widest]:.3f} ns", grade, told)
 
 
-def left_open(results: Results) -> str:
+def undetermined_delays(results: Results) -> str:
     """Return in words the delays that the pairs do not determine, "" for none."""
     made, splits = results.calibration.provenance, results.calibration.undetermined_splits
     if splits and "left_open" not in made:
@@ -214,11 +218,11 @@ def left_open(results: Results) -> str:
 def _warned(results: Results) -> Criterion:
     found = [*results.warnings, *(f"{name}: {finding.fault}" for name, finding in results.findings)]
     return Criterion(
-        "Is there nothing to warn of?",
+        "Are there no warnings?",
         "no warning of the fit, no fault in a recording",
         "; ".join(found) or "nothing",
         _graded(not found, True),
-        f"{len(found)} warning{'s' * (len(found) > 1)}, below" if found else "nothing to warn of was found",
+        f"{len(found)} warning{'s' * (len(found) > 1)}, below" if found else "there are no warnings",
     )
 
 
@@ -228,11 +232,11 @@ def _of_survey(results: Results) -> Iterator[Criterion]:
     rests, pairs = made["rests_on"], int(made["pairs"])
     against = list(map(str, made.get("findings", [])))
     yield Criterion(
-        "Do the ranges agree with what is said to be known?",
-        "lines are straight, tapes are right, no labels are exchanged, no board was moved",
+        "Do the ranges agree with the known facts?",
+        "no contradiction to known shapes, distances, orders and labels; no board was moved",
         "; ".join(against) or "they do",
         _graded(not against, False),
-        f"{len(against)} contradiction{'s' * (len(against) > 1)} to what is known"
+        f"{len(against)} contradiction{'s' * (len(against) > 1)} to the known facts"
         if against
         else "nothing contradicts",
     )
@@ -240,15 +244,15 @@ def _of_survey(results: Results) -> Iterator[Criterion]:
     freedom, least = float(rests["freedom"]), 10.0
     yield Criterion(
         "Do the arrangements check each other?",
-        f"at least {least:g} ranges of pairs more than the unknowns take",
-        f"{freedom:.0f} more, of {pairs}",
+        f"at least {least:g} more mean ranges of pairs than unknowns",
+        f"{freedom:.0f} more, of {pairs} in total",
         _graded(freedom >= least, freedom >= 4.0),
-        f"{freedom:.0f} of {pairs} ranges of pairs are left to check the rest",
+        f"{freedom:.0f} of {pairs} mean ranges of pairs are redundant",
     )
     error, most_m = float(rests["pair_error_m"]), 0.03
     yield Criterion(
-        "Are the constant errors of pairs those of such boards?",
-        f"at most {100 * most_m:g} cm, beside reflections",
+        "Are the constant errors of pairs small enough?",
+        f"at most {100 * most_m:g} cm, without reflections",
         f"{100 * error:.1f} cm",
         _graded(error <= most_m, error <= 2 * most_m),
         f"a pair has a constant error of {100 * error:.1f} cm in an arrangement",
@@ -261,7 +265,7 @@ def _of_survey(results: Results) -> Iterator[Criterion]:
         f"at most {100 * most:g} % of them",
         f"{count:.1f} of {pairs} ({100 * share:.0f} %)",
         _graded(share <= most, share <= 0.2),
-        f"{100 * share:.0f} % of the pairs are believed to be reflected",
+        f"{100 * share:.0f} % of the pairs are probably reflected",
     )
     # Three standard deviations of a single unknown.
     second, clear = made.get("second_best"), 9.0
@@ -271,17 +275,19 @@ def _of_survey(results: Results) -> Iterator[Criterion]:
         f"the second-best worse by at least {clear:g} in -2 log likelihood: three standard deviations",
         f"{worse:.0f} worse" if math.isfinite(worse) else "none was found",
         _graded(worse >= clear, True),
-        "no other places of boards agree with the ranges" if worse >= clear else "other places of boards agree as well",
+        "no other positions of the boards agree with the ranges"
+        if worse >= clear
+        else "other positions of the boards agree with the ranges as well",
     )
     known = results.calibration.uncertainty
     if known is not None and known.tags:
         half = TWO_SIDED_95 * math.sqrt(max(float(np.mean(np.array(known.delays_ns2))), 0.0))
         yield Criterion(
-            "Is what all delays share known?",
-            f"95 % interval of their mean within ± {MOST_NS:g} ns; a taped distance or a known delay tells it",
+            "Is the common part of all delays known?",
+            f"95 % interval of their mean within ± {MOST_NS:g} ns; a measured distance or a known delay determines it",
             f"± {half:.3f} ns",
             _graded(half <= MOST_NS, half <= 3 * MOST_NS),
-            f"what all delays share is known to ± {half:.2f} ns",
+            f"the common part of all delays is known to ± {half:.2f} ns",
         )
 
 
@@ -293,5 +299,5 @@ def _distances(std_m: float) -> Criterion:
         f"standard error at most {100 * most_m:g} cm",
         f"{100 * std_m:.1f} cm",
         _graded(std_m <= most_m, std_m <= 0.05),
-        f"distances were found to {100 * std_m:.1f} cm",
+        f"distances were estimated to {100 * std_m:.1f} cm",
     )

@@ -1,4 +1,4 @@
-"""What is known of arrangements beside the ranges: shapes, distances, positions; and the file that says it."""
+"""Known facts about arrangements besides the ranges (shapes, distances, positions), and their file."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ class KnownPosition:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Knowledge:
-    """What is known of arrangements: `shapes` by name, stretches of time in seconds since the first exchange by name.
+    """Known facts about arrangements: `shapes` by name, and stretches of time by name, in seconds since the first
+    exchange.
 
     `shape` is that of all arrangements that `shapes` does not name; `orders` are the tags of a line as they were put
     along it, from either end, by name.
@@ -100,7 +101,7 @@ KEYS: Final[dict[str, dict[str, tuple[Callable[[Any], bool], str]]]] = {
         "arrangement": WORD,
     },
 }
-"""The keys of the tables of a file of what is known: which values are good, and what is expected."""
+"""The keys of the tables of a file of known facts: which values are good, and what is expected."""
 
 
 def load_knowledge(path: str | os.PathLike[str]) -> Knowledge:
@@ -167,7 +168,7 @@ def check_knowledge(knowledge: Knowledge, tags: Mapping[str, set[int]]) -> None:
     strangers = sorted(named - {"", *tags})
     bad = sorted({shape for shape in (knowledge.shape, *knowledge.shapes.values()) if shape not in SHAPES})
     wrong = [
-        *(f"names an arrangement {name!r:.40}; there are {', '.join(sorted(tags))}" for name in strangers),
+        *(f"contains an unknown arrangement {name!r:.40}; there are {', '.join(sorted(tags))}" for name in strangers),
         *(f"found {shape!r:.40}, allowed: line, plane" for shape in bad),
     ]
     for one in known:
@@ -176,7 +177,7 @@ def check_knowledge(knowledge: Knowledge, tags: Mapping[str, set[int]]) -> None:
         else:
             who, good = {one.tag}, all(abs(x) <= MAX_LENGTH_M for x in one.position_m)
         if not any(who <= there for name, there in tags.items() if one.arrangement in ("", name)):
-            wrong.append(f"{one}: its tags do not range in {one.arrangement or 'any arrangement'}")
+            wrong.append(f"{one}: its tags have no ranges in {one.arrangement or 'any arrangement'}")
         if not (good and MIN_SIGMA_M <= one.sigma_m <= MAX_LENGTH_M):
             wrong.append(f"{one}: expected more than 0 and up to {MAX_LENGTH_M:g} m ± {MIN_SIGMA_M:g} m or more")
     if wrong:

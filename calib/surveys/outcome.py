@@ -65,8 +65,8 @@ def result_of(
     free = verdict.named("delay")
     if len(free) == len(network.tags) - len(network.fixed_ns):
         raise UnanswerableError(
-            f"the arrangements determine no delay: {'; '.join(verdict.free)} can change without "
-            "changing any range; `calib plan` says which arrangements or distances would tell",
+            f"the arrangements determine no delay: {'; '.join(verdict.free)} can change without changing any range; "
+            f"`calib plan survey` proposes arrangements or distances that determine them",
             undetermined=[[int(tag) for tag in free]],
         )
     reflected = tuple(_reflected_pairs(found))
@@ -105,7 +105,7 @@ def _reflected_pairs(found: Solution) -> list[ReflectedPair]:
 def _notes(
     found: Solution, second: SecondBest | None, verdict: Verdict, reflected: Sequence[ReflectedPair]
 ) -> list[str]:
-    """Return what a user should know, a line each."""
+    """Return the warnings of a survey, one line each."""
     believed = [one for one in reflected if one.believed]
     perhaps = ", ".join(
         f"{one.first}-{one.second} in {one.arrangement} ({100 * one.chance:.0f} %)"
@@ -117,13 +117,14 @@ def _notes(
         *(
             (
                 True,
-                f"{one.arrangement}: the range of {one.first} and {one.second} is {100 * one.longer_m:+.0f} cm off "
-                f"what all others say: believed to be reflected ({100 * one.chance:.0f} %), and hardly counted",
+                f"{one.arrangement}: the range of {one.first} and {one.second} is {100 * one.longer_m:+.0f} cm too "
+                f"long compared with all others: probably reflected ({100 * one.chance:.0f} %), so it has little "
+                f"weight",
             )
             for one in believed
         ),
-        (perhaps, f"may be reflected, too: {perhaps}; intervals are wider by that"),
-        (not found.settled, "the search stopped before it settled: delays and places are not final"),
+        (perhaps, f"may also be reflected: {perhaps}; intervals are widened for this"),
+        (not found.settled, "the search stopped before it converged: delays and positions are not final"),
         (
             verdict.free,
             f"not determined: {'; '.join(verdict.free)}"
@@ -131,14 +132,14 @@ def _notes(
         ),
         (
             found.network.curve is not None,
-            "a constant of the curve and one of all delays are the same to ranges: what the delays share is known only "
-            "as well as the curve at its reference power; differences of delays are known better, and a "
-            "taped distance (`known`) tells what they share",
+            "a constant of the curve and a common shift of all delays cannot be separated by ranges: the common part "
+            "of the delays is only known as well as the curve at its reference power. Differences of delays are "
+            "known better, and a measured distance (`known`) determines the common part",
         ),
         (
             second is not None and second.ambiguous,
-            f"{where}: another solution agrees as well with the ranges (worse by {worse:.1f}), in which boards "
-            f"{', '.join(map(str, who))} are elsewhere",
+            f"{where}: another solution agrees with the ranges as well (worse by {worse:.1f}), with other positions "
+            f"of boards {', '.join(map(str, who))}",
         ),
     ]
     return [text for needed, text in notes if needed]
@@ -158,16 +159,16 @@ def _calibration(
     lifted = network.means.lifted[np.isfinite(network.means.lifted)]
     span = (float(lifted.min()), float(lifted.max())) if len(lifted) else (1.0, 1.0)
     curve, curve_covariance = flat_curve(0.0, span), np.zeros((DEGREE + 1,) * 2)
-    gauge = "no curve; the delays carry the constant"
+    gauge = "no curve; the delays contain the common constant"
     if taken is not None:
         curve, curve_covariance, span = taken.bias_curve, taken.curve_covariance_m2, taken.bias_curve.range
-        gauge = "that of the calibration whose curve was taken over"
+        gauge = "that of the calibration whose curve was used"
     elif network.curve is not None:
         where, knots = network.layout.where["curve"], network.curve.knots
         span = (float(knots[0]), float(knots[-1]))
         curve = Curve(tuple(knots.tolist()), tuple(found.x[where].tolist()), DEGREE, span)
         curve_covariance = found.covariance()[where, where] * students_factor(freedom) ** 2
-        gauge = f"the bias curve is zero at {ALPHA_DBM:g} dBm; the delays carry the constant"
+        gauge = f"the bias curve is zero at {ALPHA_DBM:g} dBm; the delays contain the common constant"
     fixed = {"fixed_ns": {str(tag): delay for tag, delay in sorted(network.fixed_ns.items())}}
     provenance = (fixed if network.fixed_ns else {}) | {
         "writer": f"uwbcal {uwblink.__version__}",

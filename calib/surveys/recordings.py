@@ -87,13 +87,13 @@ def read_surveys(data: Data | Iterable[Data], knowledge: Knowledge) -> SurveyDat
     """
     recordings = [_load(one) for one in each(data)]
     if knowledge.spans_s and len(recordings) > 1:
-        raise BadInputError("gives times of arrangements, which is for one recording only", parameter="known")
+        raise BadInputError("has times of arrangements, which need exactly one recording", parameter="known")
     arrangements, numbers, findings = dict[str, Arrangement](), list[Ints](), list[Finding]()
     for ranges, marked, _ in recordings:
         numbers.append(np.full(len(ranges), -1))
         for one in _arrangements(ranges, marked, knowledge, several=len(recordings) > 1):
             if one.name in arrangements:
-                text = f"two arrangements are called {one.name!r:.40}; give each its own name"
+                text = f"two arrangements have the name {one.name!r:.40}; give each its own name"
                 raise BadInputError(text, parameter="data")
             rows = (ranges.time_ns >= one.start_ns) & (ranges.time_ns < one.end_ns)
             numbers[-1][rows] = len(arrangements)
@@ -136,7 +136,8 @@ def _arrangements(
     found = still_stretches(ranges)
     if not found:
         raise UnanswerableError(
-            f"{ranges.source}: boards never stand still for 15 s; record while they do, or mark when they did"
+            f"{ranges.source}: boards never stand still for 15 s; record boards that stand still, or give the times "
+            f"of arrangements"
         )
     stem = PurePath(ranges.source).stem
     if len(found) == 1:
@@ -214,8 +215,8 @@ def find_motion(name: str, ranges: Ranges) -> list[Finding]:
     # Medians of long spans hardly tell when: those of short ones do.
     edge = np.argmax(np.nan_to_num(np.abs(_steps(median, WINDOW_BINS)[mine, 1:-1])).sum(axis=0))
     text = (
-        f"{name}: board {tag} was moved {(starts[edge + 1] - begin) * 1e-9:.0f} s after its beginning (ranges changed "
-        f"by up to {100 * by_m:.0f} cm)"
+        f"{name}: board {tag} was moved {(starts[edge + 1] - begin) * 1e-9:.0f} s after the start (ranges changed by "
+        f"up to {100 * by_m:.0f} cm)"
     )
     return [Finding("board moved within an arrangement", text, "record that arrangement again, or end it before", 0.0)]
 
@@ -232,7 +233,7 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
     # Of five ranges the spread is known to a third (the root of 1/8).
     kept = keys[counts >= 5]
     if not len(kept):
-        raise UnanswerableError(f"{ranges.source}: no two boards range five times while all stand still")
+        raise UnanswerableError(f"{ranges.source}: no pair of boards has five ranges while all stand still")
     rows = np.flatnonzero(np.isin(key, kept))
     rows = rows[np.lexsort((ranges.time_ns[rows], key[rows]))]
     own, group = ranges[rows], np.searchsorted(kept, key[rows])

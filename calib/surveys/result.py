@@ -1,4 +1,4 @@
-"""What a survey returns: a calibration, where boards stood, and what both rest on."""
+"""The result of a survey: a calibration, the positions of the boards, and the known facts behind both."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class ReflectedPair:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SurveyResult(CalibrationResult):
-    """A calibration from boards that stood still, and where they stood.
+    """The result of `survey`: a calibration, and the positions of the boards.
 
     `pair_error_m` is the constant error that a pair has in an arrangement, as a standard deviation; `verdict` says what
     of the delays (in ns) is determined; `contradictions` are those between the ranges and what was said to be
@@ -201,6 +201,6 @@ class SurveyResult(CalibrationResult):
         if name is None and len(known) == 1:
             return self.arrangements[0]
         if name not in known:
-            found = "none is named" if name is None else f"found {name!r:.40}"
+            found = "no name was given" if name is None else f"found {name!r:.40}"
             raise BadInputError(f"{found}, there are {', '.join(known)}", parameter="arrangement")
         return known[name]

@@ -1,4 +1,4 @@
-"""The survey: delays, power curve and places of boards that stood still, and what contradicts the ranges among them.
+"""The survey: delays, power curve and positions of boards that stood still, and known facts that the ranges contradict.
 
 Each check (wrong known distances, wrong shapes, exchanged labels) compares hypotheses of a fault with the survey as
 described, each with the reflections that fit it best: a few reflected pairs can look like a string that is not
@@ -61,7 +61,7 @@ def _distances(found: Solution) -> Iterator[tuple[str, Solution]]:
         where = f" in {one.arrangement}" if one.arrangement else ""
         off = 100 * float(np.mean(left[network.tapes[1][:, 2] == k]))
         yield (
-            f"the known distance of {one.first} and {one.second}{where} is {off:+.0f} cm off what the ranges say",
+            f"the known distance of {one.first} and {one.second}{where} differs from the ranges by {off:+.0f} cm",
             without,
         )
 
@@ -85,8 +85,8 @@ def _shapes(found: Solution) -> Iterator[tuple[str, Solution]]:
         away = freed.positions_m(without.x)[seats, beside]
         odd = boards.tags[int(np.argmax(np.abs(away - np.median(away))))]
         text = (
-            f"{boards.name} is said to be a {'line' if beside == 1 else 'plane'} and is none: its ranges fit if "
-            f"boards, {odd} first of all, stand up to {100 * np.ptp(away):.0f} cm beside it"
+            f"{boards.name}: the boards are not on a {'line' if beside == 1 else 'plane'}: board {odd} is farthest "
+            f"from it, and the deviations spread over {100 * np.ptp(away):.0f} cm"
         )
         yield text, without
 
@@ -112,14 +112,17 @@ def _exchanged(found: Solution) -> Iterator[tuple[str, Solution]]:
         )
         positions = tuple(replace(p, tag=swap.get(p.tag, p.tag)) for p in network.positions)
         changed = replace(network, distances=distances, positions=positions)
-        text = f"what is known fits if {one} and {other} are exchanged"
+        text = f"the known facts agree with the ranges if {one} and {other} are exchanged"
         yield text, adjust(changed, first_start(changed, found.delays))
 
 
 HYPOTHESES = {
-    "wrong known distance": (_distances, "measure it again or leave it out"),
-    "arrangement not as it is said to be": (_shapes, "put the boards as is said, or do not say so"),
-    "exchanged labels": (_exchanged, "look at the labels of these two boards"),
+    "wrong known distance": (_distances, "measure the distance again or leave it out"),
+    "arrangement not as it is said to be": (
+        _shapes,
+        "move the boards to the known shape, or remove it from the known facts",
+    ),
+    "exchanged labels": (_exchanged, "check the labels of these two boards"),
 }
 """The checks by the fault: the hypotheses, and what to do where one is true."""
 
@@ -145,16 +148,16 @@ def wrong_orders(found: Solution) -> Iterator[Finding]:
         seen = [said[n] for n in np.argsort(spots[same[0]]).tolist()]
         where = ", ".join(network.arrangements[k].name for k in same)
         words = ", or ".join(f"{i} and {j}" for i, j in sorted(both))
-        what = f"boards {words} stand in each other's place" if both else "boards stand in another order than said"
+        what = f"boards {words} are exchanged" if both else "boards stand in another order than stated"
         text = (
-            f"{where}: {what}: said was {'-'.join(map(str, said))}, the ranges of "
-            f"{network.arrangements[same[0]].name} say {'-'.join(map(str, seen))}"
+            f"{where}: {what}: the stated order is {'-'.join(map(str, said))}, but by the ranges of "
+            f"{network.arrangements[same[0]].name} it is {'-'.join(map(str, seen))}"
         )
-        yield Finding("exchanged labels", text, "look at their labels", BUDGET)
+        yield Finding("exchanged labels", text, "check their labels", BUDGET)
 
 
 def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, **changes: Any) -> SurveyResult:
-    """Return the delays, the power curve and the places of boards that stood still, from their ranges alone.
+    """Estimate delays, the power curve and positions of boards that stood still, from their ranges only.
 
     `data` is what `load_ranges` takes; true distances are not needed and not looked at. Arrangements are those that
     recordings mark (`uwblink record --arrangement`), those whose times `known` gives, or stretches in which nothing
@@ -191,7 +194,7 @@ def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, 
         findings += wrong_orders(found)
         if findings and not asked.regardless:
             text = "; ".join(map(str, findings))
-            raise UnanswerableError(f"{text} (`regardless` surveys all the same)")
+            raise UnanswerableError(f"{text} (`regardless` writes a calibration nevertheless)")
         found = averaged(in_frames(found))
         if taken is not None:
             found = widened_by(found, taken)
@@ -212,7 +215,7 @@ def _checked_curve(curve_from: Calibration | str | os.PathLike[str] | None) -> C
     """
     known = None if curve_from is None else given_calibration(curve_from, "curve_from")
     if known is not None and (known.lift != LIFT or known.alpha_dbm != ALPHA_DBM):
-        text = f"it lifts powers by {known.lift} above {known.alpha_dbm:g} dBm, expected {LIFT} above {ALPHA_DBM:g} dBm"
+        text = f"its power is {known.lift} above {known.alpha_dbm:g} dBm, expected {LIFT} above {ALPHA_DBM:g} dBm"
         raise BadInputError(text, parameter="curve_from")
     if known is not None and known.bias_curve.flat:
         raise BadInputError("it has no curve over power", parameter="curve_from")
@@ -223,9 +226,9 @@ def _less_curve(gathered: SurveyData, curve: Curve) -> SurveyData:
     """Return the means less a curve, with a warning of powers that it was not fitted at."""
     means = gathered.means
     if not np.isfinite(means.lifted).all():
-        raise UnanswerableError("pairs have no power, so no curve can be taken off (`curve_from`)")
+        raise UnanswerableError("some pairs have no power, so no curve can be applied (`curve_from`)")
     beyond = int(np.count_nonzero(~curve.inside(means.lifted)))
-    more = (f"{beyond} pairs have powers that the curve taken over was not fitted at",) if beyond else ()
+    more = (f"{beyond} pairs have powers outside the fitted powers of the given curve",) if beyond else ()
     less = replace(means, range_m=means.range_m - curve(means.lifted))
     return replace(gathered, means=less, warnings=(*gathered.warnings, *more))
 
@@ -247,9 +250,12 @@ def network_of(gathered: SurveyData, knowledge: Knowledge, fixed_ns: Mapping[int
             p.position_m[2] for p in knowledge.positions if p.arrangement in ("", one.name) and p.tag in boards.tags
         }
         for wrong, text in (
-            (heights and boards.dimensions == 1, "positions are for a plane or for space; on a line give distances"),
-            (len(heights) > 1 and boards.dimensions == 2, "a plane is that of x and y; its positions differ in z"),
-            (set(order) - set(tags[k]), "its order of boards has a tag that does not range there"),
+            (heights and boards.dimensions == 1, "known positions need a plane or space; on a line give distances"),
+            (
+                len(heights) > 1 and boards.dimensions == 2,
+                "the plane is that of x and y, but its positions differ in z",
+            ),
+            (set(order) - set(tags[k]), "its order of boards has a tag without ranges there"),
             (len(set(order)) < len(order), "its order of boards has a tag twice"),
         ):
             if wrong:

@@ -26,7 +26,7 @@ from calib.estimator.rows import sum_rows
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
 from calib.estimator.unknowns import Layout
-from calib.fitting.fitting import result_of, what_was_fitted
+from calib.fitting.fitting import fitted_quantities, result_of
 from calib.fitting.result import FitResult
 from calib.information import LOOSEST, InformationColumn, Verdict, judge
 from calib.settings import FitSettings, FlightSettings
@@ -110,12 +110,12 @@ def _settings(
     settings = replace(settings or FitSettings(), **{name: changes[name] for name in changes if name not in names})
     for name in settings.changed():
         if name not in COMMON_SETTINGS:
-            raise BadInputError("goes with known distances only", parameter=name)
+            raise BadInputError("can only be used with known distances", parameter=name)
     if flight.curve_from is None:
         return flight, settings, None
     known = given_calibration(flight.curve_from, "curve_from")
     if other := "delays_only" if settings.delays_only else "groups" if settings.groups else "":
-        raise BadInputError(f"gives the curve of all tags, and does not go with `{other}`", parameter="curve_from")
+        raise BadInputError(f"gives the curve of all tags, and cannot be used with `{other}`", parameter="curve_from")
     if known.groups or known.power_at != "exchange":
         what = "curves of groups of tags" if known.groups else "a curve of each reception"
         raise BadInputError(f"has {what}, expected one curve of all exchanges", parameter="curve_from")
@@ -182,9 +182,8 @@ def _result(
     left_open = _undetermined_text(free, [model.tags[k] for k in own], covariance[np.ix_(own, own)], model.free)
     if free and len(free) == len(own) and not flight.minimum_norm:
         raise UnanswerableError(
-            f"{scene.source}: {left_open}; let positions be known for some seconds "
-            "(`poses_until_s`), give the places of anchors, or pin a delay with `fixed_ns` (`minimum_norm` fits "
-            "regardless, and says so)",
+            f"{scene.source}: {left_open}; use known positions for some seconds (`poses_until_s`), give positions of "
+            f"anchors, or a known delay (`fixed_ns`); `minimum_norm` fits nevertheless, with a warning",
             undetermined=[free],
         )
     calibration = calibration_of(found, covariance)
@@ -197,7 +196,7 @@ def _result(
         delays_std_ns=calibration.delays_std_ns | dict.fromkeys(free, math.inf),
         provenance=provenance,
     )
-    unsettled = f"the fit stopped after {top.steps} steps before it settled: delays are not final"
+    unsettled = f"the fit stopped after {top.steps} steps before it converged: delays are not final"
     notes = [left_open, "" if top.optimum.success else unsettled, rival, *scene.tapes.left_out]
     return result_of(
         found,
@@ -225,7 +224,7 @@ def _provenance(found: KnownDistances, top: Search, flight: FlightSettings) -> d
         "recordings": [scene.source],
         "recipe": "trajectories",
         "truth": "ranges",
-        "fitted": what_was_fitted(found),
+        "fitted": fitted_quantities(found),
         "rests_on": {
             "known_s": float(np.ptp(places_s)) if len(places_s) else 0.0,
             "moving": list(scene.moving),
@@ -237,8 +236,8 @@ def _provenance(found: KnownDistances, top: Search, flight: FlightSettings) -> d
             "heights": sorted({scene.moving[body] for body in scene.heights.body.tolist()}),
         },
         "reference_power_dbm": reference_dbm,
-        "gauge": f"the bias curve{' was kept, and' if flight.curve_from else ''} is zero at {reference_dbm:g} dBm; the "
-        "delays carry the constant",
+        "gauge": f"the bias curve{' was given, and' if flight.curve_from else ''} is zero at {reference_dbm:g} dBm; "
+        f"the delays contain the common constant",
     }
 
 
@@ -298,8 +297,8 @@ def _undetermined_text(
         TWO_SIDED_95 * float(np.sqrt(np.max(np.diag(row @ covariance_ns2 @ row.T), initial=0.0))) for row in rows
     )
     return (
-        f"the ranges determine no delay: what all have in common is known to ± {spread:.2f} ns (95 %), and "
-        f"differences to ± {differences:.2f} ns"
+        f"the ranges determine no delay: the common part is known to ± {spread:.2f} ns (95 %), and differences to ± "
+        f"{differences:.2f} ns"
     )
 
 
@@ -332,9 +331,8 @@ def _of_motion(top: Search) -> Iterator[str]:
     missed_m = top.missed_motion_m()
     if missed_m:
         yield (
-            f"bodies move faster than control points every {top.motion.places.step_s:.1f} s follow: about "
-            f"{100 * missed_m:.0f} cm of their motion is not in the trajectories, and distances are off "
-            "by it; fly more calmly"
+            f"bodies move too fast for control points every {top.motion.places.step_s:.1f} s: trajectories and "
+            f"distances have errors of about {100 * missed_m:.0f} cm; fly more slowly"
         )
 
 
@@ -360,6 +358,6 @@ def _of_tapes(top: Search) -> Iterator[str]:
         if deviation >= 4.0 and abs(without) >= 0.03:
             yield (
                 f"the distance of tags {one.first} and {one.second}, {one.distance_m:.3f} m, is "
-                f"{100 * abs(without):.0f} cm {'more' if without > 0 else 'less'} than all else says ({deviation:.0f} "
-                "standard errors): measure it again"
+                f"{100 * abs(without):.0f} cm {'more' if without > 0 else 'less'} than by all other data "
+                f"({deviation:.0f} standard errors): measure it again"
             )

@@ -1,4 +1,4 @@
-"""What is known of a flight beside its ranges, as samples in time: positions, heights, tapes, attitudes and forces.
+"""Known facts about a flight besides its ranges, as samples in time: positions, heights, tapes, attitudes and forces.
 
 Attitudes are given, or integrated from gyroscopes; accelerometers give mean specific forces.
 """
@@ -136,8 +136,8 @@ def tapes_of(
             times = [np.nan]
         if not times:
             left_out.append(
-                f"the distance of tags {one.first} and {one.second} is not used: nothing says when its bodies stood "
-                "still; mark that arrangement, or say its seconds"
+                f"the distance of tags {one.first} and {one.second} is not used, because it is unknown when its "
+                f"bodies stood still; give an arrangement or its seconds"
             )
             continue
         std_m = one.sigma_m * np.sqrt(len(times))
@@ -155,7 +155,7 @@ def _unusable(one: KnownDistance, bodies: Mapping[int, str]) -> str:
         if tag not in bodies:
             return f"found tag {tag}, the tags that range are {', '.join(map(str, sorted(bodies)))}"
     if bodies[one.first] == bodies[one.second]:
-        return f"{pair} are on one body, whose lever arms say how far apart they are"
+        return f"{pair} are on one body, so their lever arms determine the distance"
     for value, what in ((one.distance_m, "distance"), (one.sigma_m, "standard error")):
         if not (np.isfinite(value) and value > 0):
             return f"found {value!r} as the {what} of {pair}, expected metres above 0"
@@ -173,8 +173,8 @@ def _instants(one: KnownDistance, spans: Mapping[str, tuple[float, float]], last
         chosen = [(float(seconds[1]), float(seconds[2]))]
     else:
         raise BadInputError(
-            f"found the arrangement {one.arrangement!r:.40}, the recording has {', '.join(spans) or 'none'}; or give "
-            "seconds, as in 2..8",
+            f"found the arrangement {one.arrangement!r:.40}, but the recording has {', '.join(spans) or 'none'}; or "
+            f"give seconds, as in 2..8",
             parameter="distances",
         )
     found = list[float]()

@@ -1,4 +1,4 @@
-"""The inputs of a fit of trajectories: ranges, lever arms, and what is known of positions and attitudes."""
+"""The inputs of a fit of trajectories: ranges, lever arms, known positions and attitudes."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
         imu, height = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))
         stated, arrangements = (tuple(getattr(source, one, ())) for one in ("known_distances", "arrangements"))
     if not tags:
-        raise UnanswerableError(f"{name}: does not say which tag sits on which body; 'uwblink poses --tags' adds that")
+        raise UnanswerableError(f"{name}: contains no bodies of tags; add them with 'uwblink poses --tags'")
     # The truth is not known. In its place stands the time to which a range belongs.
     ranges = Ranges.from_exchanges(
         exchanges,
@@ -136,7 +136,7 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     }
     moving = tuple(body for body in bodies if body not in still)
     if not moving:
-        raise UnanswerableError(f"{ranges.source}: no body moves; boards that stand still are what a survey is for")
+        raise UnanswerableError(f"{ranges.source}: no body moves; use `calib survey` for boards that stand still")
     for tag, (body, arm) in arms.items():
         if body in still and len(turned[body]):
             arms[tag] = body, Rotation.from_quat(turned[body].quaternion[0]).apply(arm)

@@ -180,10 +180,10 @@ def _second_solution(scene: Scene, best: MotionFit, tried: list[MotionFit], time
         # Positions among given anchors differ by half a metre, or distances by a decimetre, in the median.
         differs = away.max() >= 0.5 if given else longer >= 0.1
         if differs and best.value - one.value < EQUAL_LIKELIHOOD:
-            what = f"{scene.moving[int(np.argmax(away))]} {away.max():.1f} m elsewhere" if given else "other distances"
+            what = f"{scene.moving[int(np.argmax(away))]} {away.max():.1f} m away" if given else "other distances"
             return (
-                f"a second solution, with {what}, fits the first {time[-1] - time[0]:.0f} s as well: delays are those "
-                "of one of them; anchors out of one plane, heights or a known start tell which"
+                f"a second solution, with {what}, fits the first {time[-1] - time[0]:.0f} s as well: the delays may "
+                f"belong to the wrong one; anchors that are not in one plane, heights, or a known start resolve this"
             )
     return ""
 
@@ -263,7 +263,7 @@ def resolve_headings(scene: Scene, state: State) -> tuple[Scene, State, str]:
         if heading == before:
             break
     text = (
-        f"a second solution, with another heading of {', '.join(unsure)}, fits as well: delays are those of one of "
-        "them; attitudes or a known start tell which"
+        f"a second solution, with another heading of {', '.join(unsure)}, fits as well: the delays may belong to the "
+        f"wrong one; attitudes or a known start resolve this"
     )
     return scene.turned_by(heading), best.state, text if unsure else ""

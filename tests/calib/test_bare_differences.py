@@ -104,7 +104,7 @@ def test_the_fit_names_what_stays_free(folder):
     assert "0 exchanges, 9600 differences of arrival" in done.stdout
     assert done.stdout.count("less the mean of all") == 8
     assert "only differences of arrival from tags 1, 2, 3" in done.stderr
-    assert "have in common" in done.stderr
+    assert "a common shift of" in done.stderr
     pinned = calib.fit(folder / "fit/d.uwb", use="receptions", delays_only=True, fixed_ns={1: DELAYS_NS[0]}).calibration
     assert not pinned.undetermined_splits
     for tag in range(2, 9):
@@ -132,7 +132,7 @@ def test_an_anchor_with_itself_is_named(folder):
     contents = uwblink.load(folder / "fly/d.uwb")
     same = {**contents.differences, "plus": contents.differences["minus"]}
     replace(contents, differences=same).save(folder / "same.uwb", force=True)
-    processes.refuse("calib", "fit", "same.uwb", "-o", "x.json", *FIT, cwd=folder, naming=["same.uwb", "with itself"])
+    processes.refuse("calib", "fit", "same.uwb", "-o", "x.json", *FIT, cwd=folder, naming=["same.uwb", "at both ends"])
 
 
 def test_what_is_not_determined_is_not_corrected(folder):
@@ -196,7 +196,7 @@ def test_the_other_sign_is_noticed_by_poses(folder, words):
     if not (folder / "swapped").exists():
         imported(folder / "swapped", flown(3, 8.0), swapped=True)
     command, *others = words
-    naming = ["d.uwb", "the other sign", "from_id", "to_id"]
+    naming = ["d.uwb", "the wrong sign", "from_id", "to_id"]
     processes.refuse("calib", command, "d.uwb", *others, cwd=folder / "swapped", naming=naming, status=2)
     assert not (folder / "swapped" / "x.json").exists()
 
@@ -204,10 +204,10 @@ def test_the_other_sign_is_noticed_by_poses(folder, words):
 @pytest.mark.parametrize(
     ("factor", "blind", "words"),
     [
-        (-1.0, False, "the other sign"),
+        (-1.0, False, "the wrong sign"),
         (1 / METRES_A_NS, False, "nanoseconds"),
         (100.0, False, "centimetres"),
-        (100.0, True, "longer than their anchors are apart"),
+        (100.0, True, "longer than the distances of their anchors"),
     ],
 )
 def test_another_unit_or_sign_is_found_before_a_fit(folder, factor, blind, words):
@@ -238,8 +238,8 @@ def test_the_other_sign_is_doubted_without_poses(folder):
     doubted = imported(folder / "blind", rows, swapped=True, mocap=False)
     believed = imported(folder / "right", rows, mocap=False)
     words = ("-c", folder / "fit.json", "--use", "receptions", "--model", "constant-velocity")
-    assert "the other sign" in processes.succeed("calib", "localize", doubted, *words).stdout
-    assert "the other sign" not in processes.succeed("calib", "localize", believed, *words).stdout
+    assert "wrong unit or sign" in processes.succeed("calib", "localize", doubted, *words).stdout
+    assert "wrong unit or sign" not in processes.succeed("calib", "localize", believed, *words).stdout
 
 
 @pytest.mark.parametrize(
@@ -265,7 +265,7 @@ def test_an_anchor_without_a_place_is_named(folder, words):
     lost = contents.differences["plus"].copy()
     lost[7] = 77
     replace(contents, differences={**contents.differences, "plus": lost}).save(folder / "lost.uwb", force=True)
-    naming = ["lost.uwb", "anchor 77", "no place"]
+    naming = ["lost.uwb", "anchor 77", "no position"]
     processes.refuse("calib", words[0], "lost.uwb", *words[1:], cwd=folder, naming=naming, status=2)
 
 
@@ -278,7 +278,7 @@ def test_ranges_and_differences_are_used_together_and_fitted_apart(folder):
     when_ns = np.rint(time_s * 1e9).astype(np.int64)
     ranges = uwblink.Exchanges.from_arrays(TAG, 1, time_ns=when_ns, protocol="ss", range_m=truth, **none)
     both = replace(contents, exchanges=ranges)
-    with pytest.raises(calib.CalibError, match="fit each alone"):
+    with pytest.raises(calib.CalibError, match="fit them separately"):
         calib.fit(both, use="receptions", delays_only=True)
     known = replace(
         calib.load_calibration(folder / "fit.json"),

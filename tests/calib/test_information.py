@@ -27,7 +27,7 @@ def test_a_full_matrix_gives_the_inverse():
     information = from_rows(ring())
     verdict = judge(information, DELAYS)
     assert verdict.determined.all()
-    assert str(verdict) == "everything is determined"
+    assert str(verdict) == "all unknowns are determined"
     np.testing.assert_allclose(verdict.covariance, np.linalg.inv(information), rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(verdict.std, np.sqrt(np.diag(np.linalg.inv(information))), rtol=1e-9)
 

@@ -26,9 +26,9 @@ def test_ranges_without_stamps_are_those_of_a_table_without_stamps(tmp_path):
         np.testing.assert_array_equal(getattr(mine, name), getattr(table, name), err_msg=name)
     cases: tuple[tuple[dict[str, Any], str], ...] = (({"tx1": [3]}, "rx1"), ({"rx1": [3]}, "tx1"))
     for stamps, missing in cases:
-        with pytest.raises(ArgumentError, match=f"{missing}: is not given"):
+        with pytest.raises(ArgumentError, match=f"{missing}: is missing"):
             Exchanges.from_arrays(1, 2, **stamps, range_m=[3.1])
-    with pytest.raises(ArgumentError, match="tx1: is not given; give the stamps, or range_m"):
+    with pytest.raises(ArgumentError, match="tx1: is missing; give the stamps, or range_m"):
         Exchanges.from_arrays(1, 2)
 
 
@@ -60,8 +60,8 @@ def test_stamps_that_a_protocol_has_not_are_zero_and_mixed_protocols_keep_theirs
         ({"rx1": [True, False]}, "rx1: found 'True' .*, expected whole numbers"),
         ({"protocol": "tdoa"}, "protocol: found 'tdoa', allowed: ss, ss-cfo, ds"),
         ({"protocol": ["ss", 3]}, "protocol: found .*, expected text|protocol: found '3', allowed"),
-        ({"protocol": ["ss", "ds"]}, "tx3: is not given, but protocol 'ds' has it"),
-        ({"tx3": [1, 2]}, "rx3: is not given; a third message has both stamps"),
+        ({"protocol": ["ss", "ds"]}, "tx3: is missing, but protocol 'ds' needs it"),
+        ({"tx3": [1, 2]}, "rx3: is missing; a third message has both stamps"),
         ({"target": [3, 1]}, "target: row 1: found 1, expected another tag than the initiator"),
         ({"target": 70_000}, "target: row 0: found 70000, expected a whole number from 0 to 65535"),
         ({"bits": 33}, "bits: found 33, allowed: 32, 40"),

@@ -67,7 +67,7 @@ def test_a_sweep_says_that_what_was_done_is_kept_and_goes_on_with_it(tmp_path):
     wait_for(lambda: (results / "results.duckdb.wal").exists() or len(files(results)) > 0, process)
     out, _ = ended(process)
     assert process.returncode == 130
-    assert "interrupted; what was done is kept, and --resume goes on with it" in out
+    assert "interrupted; finished runs are kept, and --resume continues" in out
     assert not (results / "results.duckdb.wal").exists(), "the store is closed"
     assert not (results / "results.csv").exists(), "which is written when all is done"
 

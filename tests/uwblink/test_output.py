@@ -21,9 +21,9 @@ def test_text_is_utf8_and_nothing_is_left_beside_it(tmp_path):
 def test_no_output_is_written_over_another_or_over_what_is_read(tmp_path):
     a, b = tmp_path / "a", tmp_path / "b"
     check_apart({"output": a, "pdf": b, "figures": None}, [tmp_path / "c"])
-    with pytest.raises(ArgumentError, match=r"`pdf`: .*a: is what `output` names already"):
+    with pytest.raises(ArgumentError, match=r"`pdf`: .*a: is also the output of `output`"):
         check_apart({"output": a, "pdf": tmp_path / "x" / ".." / "a"})
-    with pytest.raises(ArgumentError, match=r"`output`: .*a: is what is read"):
+    with pytest.raises(ArgumentError, match=r"`output`: .*a: is also an input"):
         check_apart({"output": a}, [b, a])
 
 

@@ -138,5 +138,5 @@ def test_times_are_those_of_the_clocks_that_stamped_last():
 def test_receptions_that_cannot_be_are_refused_by_name():
     with pytest.raises(ArgumentError, match="listener: row 1"):
         Receptions.from_arrays([0, 1], [1, 2], [2, 2], tx=0, rx=1)
-    with pytest.raises(ArgumentError, match="2 receptions make no exchange"):
+    with pytest.raises(ArgumentError, match="2 receptions contain no exchange"):
         exchanges_in(Receptions.from_arrays([0, 1], [1, 2], [2, 1], tx=[0, 9], rx=[5, 20]))

@@ -93,11 +93,11 @@ def test_exchanges_of_an_unknown_protocol_are_refused_by_name():
 
 
 def test_names_are_taken_once(registered):
-    with pytest.raises(ArgumentError, match=r"registered already; choose another name, or replace=True"):
+    with pytest.raises(ArgumentError, match=r"already registered; choose another name, or use replace=True"):
         register_protocol(registered)
     register_protocol(replace(registered, title="better"), replace=True)
     assert PROTOCOLS[registered.name].title == "better"
-    with pytest.raises(ArgumentError, match="'ds': is one of the project's own"):
+    with pytest.raises(ArgumentError, match="'ds': this name is reserved"):
         register_protocol(replace(registered, name="ds"), replace=True)
     with pytest.raises(ArgumentError, match="'ss': was not registered"):
         PROTOCOLS.remove("ss")
@@ -131,8 +131,8 @@ def backwards(t):
         ({"name": ""}, "name: found ''"),
         ({"title": ""}, "title: found ''"),
         ({"messages": [POLL, REPLY]}, "expected a tuple of ProtocolMessage"),
-        ({"messages": (POLL,)}, "found 1, expected 2 or 3: an exchange is recorded with the six stamps"),
-        ({"messages": (*SYMMETRIC.messages, FOURTH)}, "found 4, expected 2 or 3: an exchange is recorded"),
+        ({"messages": (POLL,)}, "found 1, expected 2 or 3: a recording has six stamps"),
+        ({"messages": (*SYMMETRIC.messages, FOURTH)}, "found 4, expected 2 or 3: a recording has six stamps"),
         ({"messages": (REPLY, POLL)}, "1: found .*after='rx1'.*from the initiator after nothing"),
         ({"messages": (POLL, ProtocolMessage("initiator", "tx1", "at once"))}, "2: found .*after='tx1'"),
         (
@@ -142,7 +142,7 @@ def backwards(t):
         ({"messages": (POLL, SOON)}, "2: found .*timing='soon'.*at once or scheduled"),
         ({"flight_ticks": "(dt41 - dt32) / 2"}, "flight_ticks: found '.*', expected a function"),
         ({"delay_weights": None}, "delay_weights: found None, expected a function"),
-        ({"flight_ticks": doubled}, r"flight_ticks finds 2000 ticks where an exchange without noise took 1000$"),
+        ({"flight_ticks": doubled}, r"flight_ticks finds 2000 ticks for an exchange without noise of 1000 ticks$"),
         ({"flight_ticks": collapsed}, r"return shapes \(\) and \(\(2,\), \(2,\)\) for two exchanges"),
         ({"flight_ticks": failing}, r"fail on an exchange without noise: KeyError\('dt99'\)"),
         ({"delay_weights": backwards}, "delay_weights leave 936 ticks .* antenna delays of 64 and 0"),

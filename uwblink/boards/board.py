@@ -81,10 +81,12 @@ class _Pending:
 
 
 class Connection:
-    """The conversation with the board at one port. Bytes and times go in, bytes, events and outcomes come out."""
+    """The conversation with the board at one port, without I/O: it converts bytes and times into bytes, events and
+    outcomes.
+    """
 
     def __init__(self, name: str, answer_s: float = ANSWER_S) -> None:
-        """`name` is the name of the port, for error messages."""
+        """Start a conversation; `name` is the name of the port, for error messages."""
         self.name = name
         self.decoder = Decoder(REPORTS)
         self.doubtful = False
@@ -140,7 +142,7 @@ class Connection:
         sent = encode(pending.command)
         text = f"{self.name}: no answer to {sent!r} within {pending.answer_s * 1e3:.0f} ms; heard {heard}"
         if not pending.heard and pending.answer_s >= PATIENT_S:
-            text += "; is this a ranging board, and has it power? A board that hangs must be unplugged"
+            text += "; check that this is a ranging board and that it has power; a board that hangs must be unplugged"
         return CommandOutcome(pending.command, None, NoAnswerError(text))
 
     def _ended_by(self, pending: _Pending, event: Event, now_s: float) -> CommandOutcome | None:
@@ -244,7 +246,7 @@ class Board(Closing):
         return cls(SerialPort(port))
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         self._transport.close()
 
     @property

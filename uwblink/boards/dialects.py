@@ -49,7 +49,7 @@ class PrintedRange:
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """What boards of some firmware print: `parse` returns the ranges in some lines, none of any other lines.
+    """The text format of a firmware: `parse` returns the ranges in some lines, and ignores other lines.
 
     `start` is sent to a board once its port is open, so that it begins to print; `baud_rate` is that of the port.
     """
@@ -123,7 +123,7 @@ def dialect_of(name: str) -> Dialect:
     if name.endswith(".toml"):
         known = load_map(Path(name))
         if known.line is None:
-            raise ArgumentError(f"{name}: states no line, a template of what a board prints", parameter="dialect")
+            raise ArgumentError(f"{name}: has no key line, the template of a printed line", parameter="dialect")
         parse = parser_of(known)
         parse([])  # for the errors of the map
         return Dialect("lines", "a template", parse)
@@ -146,7 +146,9 @@ class Printed(Progress):
             taken = set(self.numbers.values())
             free = name if isinstance(name, int) else next(k for k in range(1, LARGEST_ID + 1) if k not in taken)
             if free in taken:
-                raise BoardError(f"device {free} has the number of a device whose id is a word; give it another id")
+                raise BoardError(
+                    f"device {free} has the number that was given to a device whose id is a word; change its id"
+                )
             self.numbers[name] = free
         return self.numbers[name]
 
@@ -170,16 +172,16 @@ def printed_ranges(
     using: Ports | None = None,
     seen: Printed | None = None,
 ) -> Iterator[list[Turn]]:
-    """Yield ranges that boards print as they arrive, as turns with reports without stamps; none for a while of silence.
+    """Yield ranges that boards print, as turns with reports without stamps; None if nothing arrives for a while.
 
-    Their time is the host's. `ids` are those of the boards at `ports`, for lines that do not say who ranged; 1, 2 ...
-    by default. `seen` counts. Raises the errors of opening ports, `BoardError` where a board prints lines and no range
-    in them, and `PlanError` for ids that do not fit the ports.
+    Their time is the host's. `ids` are those of the boards at `ports`, for lines without an initiator; 1, 2 ... by
+    default. `seen` counts. Raises the errors of opening ports, `BoardError` where a board prints lines and no range in
+    them, and `PlanError` for ids that do not fit the ports.
     """
     names, using, seen = list(ports), using or SerialPorts(dialect.baud_rate), seen or Printed()
     own = list(ids) or list(range(1, len(names) + 1))
     if len(own) != len(names) or len(set(own)) < len(own):
-        raise PlanError(f"{len(names)} ports and {len(own)} ids of boards; give each port an id of its own")
+        raise PlanError(f"{len(names)} ports, but {len(own)} ids of boards; give each port its own id")
     seen.numbers |= {one: one for one in own}
     with ExitStack() as stack:
         boards: dict[Transport, tuple[int, _Lines]] = {}
@@ -217,7 +219,7 @@ _REPORT: Final = RangeReport(
     neighbour=0, range_m=math.nan, fpp1_dbm=math.nan, fpp2_dbm=math.nan, skew1_ppm=math.nan, skew2_ppm=math.nan,
     **dict.fromkeys(STAMPS, 0),
 )  # fmt: skip
-"""A report of what boards that print ranges do not say."""
+"""A report with the default values that boards which print ranges do not send."""
 
 
 class _Lines:

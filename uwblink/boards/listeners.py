@@ -132,10 +132,10 @@ class Listener:
         """Take a fault."""
 
     def check(self) -> None:
-        """Raise to end the recording; called often."""
+        """Raise an exception to end the recording; called often."""
 
     def close(self) -> None:
-        """End: nothing follows."""
+        """End; no other method is called afterwards."""
 
 
 class CallbackListener(Listener):
@@ -295,8 +295,8 @@ class DelayCheck(Listener):
             elif len(rests) == 3 and len(set(rests)) == 1:
                 board, name = which
                 raise WrongDelayError(
-                    f"board {board}: {name} = {delay} was given, but its stamps show {delay + rest}; "
-                    "give the delays that are programmed into the boards",
+                    f"board {board}: {name} = {delay} was given, but by its stamps it is {delay + rest}; give the "
+                    f"delays that are programmed into the boards",
                     parameter="antenna_delays",
                 )
 

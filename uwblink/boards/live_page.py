@@ -1,4 +1,4 @@
-"""A page that shows a recording while it is made: a listener of the recorder, and a server for this computer alone.
+"""A live page of a recording: a listener of the recorder, and a server for this computer only.
 
 Plain HTML with pictures in SVG, drawn here and fetched once a second: counts, a row a pair with the last minute of its
 ranges, faults, the disk. Nothing comes from a network, and without scripts the page reloads itself. The server listens

@@ -1,4 +1,4 @@
-"""Who ranges with whom, how, and how often: the ranging plan of a recording.
+"""The ranging plan of a recording: which pairs range, how, and how often.
 
 ```toml
 pairs = [[10, 20], [10, 30]]   # initiator, target; or "all"
@@ -40,7 +40,7 @@ from uwblink.recording.schema import LARGEST_BOARD_ID, Tag, is_id, read_tags
 from uwblink.text_files import FileKey, TomlReader, heads, is_number
 
 PLAN_KEYS: Final = (
-    FileKey("pairs", '"all" or [[initiator, target], ...]', '"all"', "Who ranges with whom, in turns."),
+    FileKey("pairs", '"all" or [[initiator, target], ...]', '"all"', "The pairs that range, in turns."),
     FileKey("rate_hz", "number, Hz, above 0", "as fast as the boards answer", "Exchanges a second in total."),
     FileKey("protocol", '"ds" or "ss"', '"ds"', "Double-sided or single-sided ranging."),
     FileKey("target_reports", "true or false", "false", "Whether the target reports each exchange, too."),
@@ -101,8 +101,8 @@ class RangingPlan:
         found = known_delays(self.delays(), sorted(present))
         if unknown := sorted({*present} - found.keys()):
             raise PlanError(
-                f"antenna_delays: none are given for board {_listed(unknown)}; give what is programmed into it, or "
-                "tx, rx and reply for all boards that are not named"
+                f"antenna_delays: none are given for board {_listed(unknown)}; give its programmed delays, or tx, rx "
+                f"and reply for all other boards"
             )
         return found
 
@@ -117,13 +117,13 @@ class RangingPlan:
                 (a, b) for a, b in combinations(sorted(present), 2) if a not in body or body[a] != body.get(b)
             )
             if not turns:
-                raise PlanError(f"no two boards to range with each other; found {_listed(present)}")
+                raise PlanError(f"a plan needs two boards that range with each other; found {_listed(present)}")
             return turns
         if not self.pairs:
             return ()
         absent = sorted({tag for pair in self.pairs for tag in pair} - set(present))
         if absent:
-            raise PlanError(f"the plan names {_listed(absent)}, but the boards at the ports are {_listed(present)}")
+            raise PlanError(f"the plan contains {_listed(absent)}, but the boards at the ports are {_listed(present)}")
         return self.pairs
 
 

@@ -56,12 +56,11 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
 
     `ports` are names or pyserial URLs, `watch` is called four times a second, `listeners` are called with everything
     that the file gets (see `uwblink.boards.listeners`), and `using` are ports other than this computer's serial ports
-    (`VirtualPorts`). `arrangement` is a name for the places of boards that stand still, for a survey; `known` says that
-    they are on a "line" or a "plane", and `order` is the order of their ids along the line. The antenna delays of
-    `plan` are stored in the recording.
-    `KeyboardInterrupt` ends a recording like `stop`, with everything in the file. Raises the errors of `Board.open`,
-    `PlanError` (a tag of plan or order is absent, two boards have one id, a duration that is none, stamps of other
-    antenna delays than the plan's, whose recording is removed), and
+    (`VirtualPorts`). `arrangement` is a name for the places of boards that stand still, for a survey; `known` states
+    that they are on a "line" or a "plane", and `order` is the order of their ids along the line. The antenna delays of
+    `plan` are stored in the recording. `KeyboardInterrupt` ends a recording like `stop`, with everything in the file.
+    Raises the errors of `Board.open`, `PlanError` (a tag of plan or order is absent, two boards have the same id, an
+    invalid duration, or stamps with other antenna delays than the plan's, whose recording is removed), and
     `RecordingError` (cannot be written, disk full); the file stays readable.
 
     >>> import uwblink, uwbsim
@@ -123,10 +122,11 @@ def _check_boards(found: Mapping[int, str], plan: RangingPlan, mark: Arrangement
     """Raise `PlanError` for an arrangement that cannot be, an order or places of tags that are of other boards."""
     if mark.known not in SHAPES or (mark.known and not mark.name):
         raise PlanError(
-            f"found {mark.known!r:.40}, allowed: line, plane, of an `arrangement` that has a name", parameter="known"
+            f"found {mark.known!r:.40}, allowed: line, plane, and only for an `arrangement` with a name",
+            parameter="known",
         )
     if mark.order and mark.known != "line":
-        raise PlanError("is the order of boards that are `known` to be on a line", parameter="order")
+        raise PlanError("needs boards that are `known` to be on a line", parameter="order")
     there, placed = ", ".join(map(str, sorted(found))), {tag.tag for tag in plan.tags}
     if mark.order and sorted(mark.order) != sorted(found):
         raise PlanError(
@@ -136,7 +136,7 @@ def _check_boards(found: Mapping[int, str], plan: RangingPlan, mark: Arrangement
     if placed and not placed & found.keys():
         named = ", ".join(map(str, sorted(placed)))
         raise PlanError(
-            f"the plan has places of the tags {named}, but the boards at the ports are {there}; check the plan"
+            f"the plan has positions of the tags {named}, but the boards at the ports are {there}; check the plan"
         )
 
 
@@ -237,8 +237,8 @@ class RecordingWriter(Closing, Listener):
         self._checked_s = now_s
         if self.behind_s > LONGEST_BACKLOG_S:
             raise RecordingError(
-                f"{self._recording.path}: the disk is {self.behind_s:.0f} s behind; record to a faster one. "
-                "What was written before is kept"
+                f"{self._recording.path}: writing to the disk is {self.behind_s:.0f} s late; record to a faster "
+                f"disk. Data written before are kept"
             )
 
     def close(self) -> None:
@@ -279,4 +279,4 @@ class RecordingWriter(Closing, Listener):
         with suppress(OSError):
             if os.path.samestat(path.stat(), self._file):
                 return
-        raise RecordingError(f"{path}: was removed or replaced while it was being recorded; what it held is lost")
+        raise RecordingError(f"{path}: was removed or replaced during the recording; its contents are lost")

@@ -123,7 +123,7 @@ class Recorder(Closing):
         stop: Callable[[], bool] = lambda: False,
         watch: Callable[[Progress], None] | None = None,
     ) -> None:
-        """Play the plan until it is time to stop, then let the last exchange end."""
+        """Execute the plan until it is time to stop, then wait for the end of the last exchange."""
         watched_s = self._start_s
         with suppress(KeyboardInterrupt):
             for now_s in self.steps(duration_s, stop):
@@ -134,7 +134,7 @@ class Recorder(Closing):
         self.finish()
 
     def steps(self, duration_s: float = float("inf"), stop: Callable[[], bool] = lambda: False) -> Iterator[float]:
-        """Play the plan until it is time to stop; yields the ports' time, in seconds, whenever something was done."""
+        """Execute the plan until it is time to stop; yields the ports' time, in seconds, after each step."""
         end_s = self._start_s + duration_s
         while (now_s := self._ports.now_s()) < end_s and not stop():
             self._step(end_s)

@@ -270,7 +270,8 @@ def record(
     output: Annotated[Path, output("Recording to write (.uwb).")],
     plan: PlanFile = None,
     pairs: Annotated[
-        str | None, typer.Option(help="Range every two boards, or none: only listen.", **choice("all", "none"))
+        str | None,
+        typer.Option(help="all: every two boards range; none: the boards only listen.", **choice("all", "none")),
     ] = None,
     rate: Rate = None,
     duration: Duration = None,
@@ -288,12 +289,12 @@ def record(
         str, typer.Option(metavar="TAG,TAG...", help="Order of the boards along the line, from either end.")
     ] = "",
     antenna_delays: AntennaDelays = None,
-    passive: Annotated[bool, typer.Option("--passive", help="Record what boards overhear, too.")] = False,
-    cir: Annotated[bool, typer.Option("--cir", help="Record channel impulse responses, too.")] = False,
+    passive: Annotated[bool, typer.Option("--passive", help="Also record the frames that boards overhear.")] = False,
+    cir: Annotated[bool, typer.Option("--cir", help="Also record channel impulse responses.")] = False,
     live: Annotated[
-        bool, typer.Option("--live", help="Serve a page that shows the recording to this computer's browser.")
+        bool, typer.Option("--live", help="Serve a live page of the recording for browsers on this computer.")
     ] = False,
-    live_port: Annotated[int, typer.Option(min=0, max=65535, help="Port of that page; 0: a free one.")] = 0,
+    live_port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the live page; 0: any free port.")] = 0,
     calibration: OptionalCalibration = None,
     dialect: DialectName = None,
     ids: BoardIds = "",
@@ -301,8 +302,8 @@ def record(
 ) -> None:
     """Execute a ranging plan on boards and record everything they send.
 
-    Ends after --duration, else with Ctrl-C. The page of --live shows ranges that --calibration corrects, too. Without
-    --antenna-delays, and without those of a plan, 16436 ticks in each board are assumed.
+    Stops after --duration, or on Ctrl-C. With --calibration, the page of --live also shows corrected ranges. Antenna
+    delays are those of --antenna-delays or of the plan; by default 16436 ticks in each board.
     """
 
     check_output(output, force=force, recording=True)
@@ -324,7 +325,7 @@ def record(
     if pairs not in (None, "all", "none"):
         raise PlanError(f"--pairs: found {pairs!r}, expected all or none; a plan file can name pairs")
     if calibration and not live:
-        raise PlanError("--calibration: corrected ranges are shown on the page of --live; add --live")
+        raise PlanError("--calibration: corrected ranges are only shown on the live page; add --live")
     chosen = _plan(plan, antenna_delays, "all" if pairs == "all" else (), rate_hz=rate, get_cir=cir)
     with ExitStack() as stack:
         stop, watch = stack.enter_context(interrupts()), stack.enter_context(_watcher())
@@ -355,8 +356,8 @@ def stream(
     use: Annotated[
         str,
         typer.Option(
-            help="What is printed: exchanges, their ranges; or receptions, with corrected differences of arrival at "
-            "boards that overheard them.",
+            help="Lines to print. exchanges: ranges; receptions: also corrected differences of arrival at boards "
+            "that overheard an exchange.",
             **choice("exchanges", "receptions"),
         ),
     ] = "exchanges",
@@ -372,27 +373,27 @@ def stream(
         str | None,
         typer.Option(metavar="[HOST:]PORT", help="Address of a WebSocket for Foxglove (its default: 8765)."),
     ] = None,
-    output: Annotated[Path | None, output("Recording of the boards to write as well (.uwb).")] = None,
+    output: Annotated[Path | None, output("Also write a recording of the boards (.uwb).")] = None,
     dialect: DialectName = None,
     ids: BoardIds = "",
     force: Force = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print no ranges.")] = False,
 ) -> None:
-    """Print ranges as they arrive, one line of JSON each, and send them on.
+    """Print ranges as they arrive, one line of JSON each, or send them to other programs.
 
-    A line has the times and ids of an exchange, and range_m or, with --use receptions, difference_m: by how much
-    farther from the target than from the initiator the listener is. corrected_m has the standard deviation sigma_m;
-    differences of an exchange have the covariance shared_m squared, and none with its range. --udp and --foxglove send
-    ranges only.
+    A line has the times and ids of an exchange, and its range_m. With --use receptions there are also lines with
+    difference_m: the distance from the listener to the target minus that to the initiator. corrected_m has the standard
+    deviation sigma_m. Differences of one exchange have the covariance shared_m squared; they are not correlated with
+    its range. --udp and --foxglove send only ranges.
 
-    Without --plan, every two boards range. Ends after --duration, else with the recording or Ctrl-C. Without
-    --antenna-delays, and without those of a plan, 16436 ticks in each board are assumed.
+    Without --plan, every two boards range. Stops after --duration, at the end of the recording, or on Ctrl-C. Antenna
+    delays are those of --antenna-delays or of the plan; by default 16436 ticks in each board.
     """
     of_boards = not (len(source) == 1 and source[0].endswith(".uwb"))
     if not of_boards and (plan or rate or output or antenna_delays or dialect):
         raise PlanError(
-            f"{source[0]}: a recording takes no --plan, --rate, --antenna-delays, --dialect and --output; they are for "
-            "boards"
+            f"{source[0]}: --plan, --rate, --antenna-delays, --dialect and --output can only be used with boards, "
+            f"not with a recording"
         )
     _check_dialect(dialect, ids, plan=plan, rate=rate, antenna_delays=antenna_delays, use=use == "receptions")
     seen, count = uwblink.boards.Progress(), 0
@@ -450,12 +451,12 @@ def stream(
 def _check_dialect(dialect: str | None, ids: str, **others: Any) -> None:
     """Raise `PlanError` for options that plan exchanges, as boards of a dialect range by themselves, or ids without."""
     if ids and dialect is None:
-        raise PlanError("goes with --dialect; boards of this project's firmware are asked for theirs", parameter="ids")
+        raise PlanError(
+            "can only be used with --dialect; boards of this project's firmware report their ids", parameter="ids"
+        )
     for name, value in others.items() if dialect is not None else ():
         if value:
-            raise PlanError(
-                "boards of a dialect range by themselves, so this does not go with --dialect", parameter=name
-            )
+            raise PlanError("cannot be used with --dialect, because these boards range by themselves", parameter=name)
 
 
 def _plan(
@@ -468,7 +469,7 @@ def _plan(
     chosen = uwblink.boards.load_plan(path) if path else uwblink.RangingPlan(pairs)
     if antenna_delays and chosen.antenna_delays:
         raise PlanError(
-            f"{antenna_delays}: the plan has [antenna_delays], too; leave one of them out", parameter="antenna_delays"
+            f"{antenna_delays}: the plan also has [antenna_delays]; remove one of them", parameter="antenna_delays"
         )
     if antenna_delays:
         options["antenna_delays"] = uwblink.recording.load_antenna_delays(antenna_delays)

@@ -76,7 +76,7 @@ imports = typer.Typer(
 
 def guess(
     table: Annotated[Path, typer.Argument(help="Table, log, folder of them, or bag.")],
-    output: Annotated[Path | None, output("Map to write (.toml); else printed.")] = None,
+    output: Annotated[Path | None, output("Map to write (.toml); by default it is printed.")] = None,
     force: Force = False,
 ) -> None:
     """Propose the map of a table or a bag: topics, names and units of columns, with the reason for each line."""
@@ -102,7 +102,7 @@ def _pose_command(topics: Sequence[str], recording: str, bag: Path) -> str:
     """Return the command that adds the poses on some topics of a bag to a recording."""
     named = first_few(map(json.dumps, topics))
     command = f"uwblink poses {recording} --from {quote(str(bag))} --tags TAGS.toml"
-    return f"poses on {named} become true distances: {command} (where the tags sit)"
+    return f"the poses on {named} give true distances: {command} (TAGS.toml: bodies and lever arms of the tags)"
 
 
 def _importing(row: Importer) -> Callable[..., None]:
@@ -128,7 +128,7 @@ def _importing(row: Importer) -> Callable[..., None]:
         run(table, output, force=force)
 
     what = f"File to import ({' or '.join(row.suffixes)})." if row.suffixes else "Folder to import."
-    several = typer.Argument(help=f"{what} Several are one table.")
+    several = typer.Argument(help=f"{what} Several files are one table.")
     one = typer.Argument(help=what)
     command = run if row.map_help else without_map
     command.__doc__ = escape(row.help)
@@ -195,10 +195,11 @@ def poses(
         typer.Option("--from", help="Poses (.csv, .tsv, .tum or a ROS bag), or BODY=FILE. May be repeated."),
     ] = None,
     offset: Annotated[str, typer.Option(help="Seconds to add to the times of the poses, or auto.")] = "0",
-    tags: Annotated[Path | None, typer.Option(help="File with the tags and anchors to use (.toml, .json).")] = None,
+    tags: Annotated[Path | None, typer.Option(help="File with the tags and anchors (.toml, .json).")] = None,
     body: Annotated[str | None, typer.Option(help="Body of a TUM or EuRoC file.")] = None,
     topic: Annotated[
-        list[str] | None, typer.Option(help="BODY=TOPIC of a bag; else found by name. May be repeated.")
+        list[str] | None,
+        typer.Option(help="BODY=TOPIC of a bag; by default topics are found by their names. May be repeated."),
     ] = None,
     map_file: Annotated[Path | None, typer.Option("--map", help="Names and units of a CSV's columns (.toml).")] = None,
     force: Force = False,
@@ -235,7 +236,7 @@ def _by_body(option: str, what: str, words: list[str]) -> dict[str, str]:
 
 def replay(
     recording: Annotated[Path, typer.Argument(help="Recording of boards (.uwb).")],
-    output: Annotated[Path | None, output("Recording to write, decoded again (.uwb).")] = None,
+    output: Annotated[Path | None, output("Recording to write with the decoded messages (.uwb).")] = None,
     speed: PlaybackSpeed = 1.0,
     serve: Annotated[bool, typer.Option("--serve", help="Play back on pseudo-terminals.")] = False,
     link_dir: LinkDir = None,

@@ -1,4 +1,4 @@
-"""What the three commands share.
+"""Functions and options that the three commands share.
 
 Options, old names of options, examples, panels, completion, and options made of settings; version, errors as one line,
 interrupts, JSON, and the line that shows progress.
@@ -63,12 +63,15 @@ DialectName = Annotated[
     typer.Option(
         "--dialect",
         metavar="NAME|MAP",
-        help="Form in which boards of other firmware print ranges: dwm1001-lec, dwm1001-les, at-range, arduino, ..., "
+        help="Text format of boards with other firmware: dwm1001-lec, dwm1001-les, at-range, arduino, ..., "
         "or a column map with a line template (.toml).",
     ),
 ]
 BoardIds = Annotated[
-    str, typer.Option("--ids", metavar="ID,ID...", help="Ids of the boards at the ports, if their lines do not say.")
+    str,
+    typer.Option(
+        "--ids", metavar="ID,ID...", help="Ids of the boards, in the order of the ports, if their lines have no ids."
+    ),
 ]
 PlanFile = Annotated[Path | None, typer.Option("--plan", help="Ranging plan: which pairs range, and how (.toml).")]
 PlaybackSpeed = Annotated[
@@ -289,7 +292,7 @@ def new_app(text: str) -> typer.Typer:
     def top(
         ctx: typer.Context,
         version: Annotated[
-            bool, typer.Option("--version", help="Print the versions of this and of what it uses.")
+            bool, typer.Option("--version", help="Print the versions of this program and of its libraries.")
         ] = False,
     ) -> None:
         if version:
@@ -345,12 +348,12 @@ def _message(error: BaseException, mistakes: tuple[type[Exception], ...]) -> str
     if isinstance(error, mistakes):
         return str(error)
     if isinstance(error, RuntimeWarning):
-        return f"numbers beyond what can be computed with ({error}); nothing was written"
+        return f"numbers are too large for the computation ({error}); nothing was written"
     if isinstance(error, OSError):
         # For example a name that is too long, a folder that was removed, or a full disk.
         return f"{error.filename}: {error.strerror}" if error.filename else str(error)
     if isinstance(error, MemoryError):
-        return "not enough memory for that; nothing was written"
+        return "not enough memory; nothing was written"
     return None
 
 

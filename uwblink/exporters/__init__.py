@@ -95,7 +95,7 @@ def write_tum(recording: Path, folder: Path) -> dict[str, int]:
     with Recording.open(recording, memory_mb=READING_MB) as opened, ExitStack() as files:
         bodies = sorted(body for (body,) in opened.tally("poses", "body"))
         if not bodies:
-            raise RecordingError(f"{recording}: holds no poses")
+            raise RecordingError(f"{recording}: contains no poses")
         names = {body: f"{name}.tum" for body, name in zip(bodies, file_names(bodies), strict=True)}
         out = {body: files.enter_context((folder / name).open("w", encoding="utf-8")) for body, name in names.items()}
         written = dict.fromkeys(names.values(), 0)
@@ -180,7 +180,7 @@ def check_export(folder: str | os.PathLike[str], *, to: str, force: bool) -> Non
         raise ArgumentError(f"found {to!r:.40}, allowed: {', '.join(EXPORTERS)}", parameter="to")
     check_name(final)
     if final.exists() and (not force or not final.is_dir()):
-        raise RecordingExistsError(f"{final}: exists already; give another name, or `force` to replace it")
+        raise RecordingExistsError(f"{final}: already exists; give another name, or replace it with `force`")
     if not final.parent.is_dir():
         raise RecordingError(f"{final}: the folder {final.parent} does not exist; create it first")
 

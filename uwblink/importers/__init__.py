@@ -1,7 +1,7 @@
 """Import of files in other formats; programs and other distributions can register importers of their own.
 
 A registered reader takes a path and a map and returns `Contents`, or tables with a map. This module writes the
-recording, and never overwrites one unless it is told to. It also reads back what `uwblink export --to csv` or
+recording, and overwrites one only with `force`. It also reads back what `uwblink export --to csv` or
 `parquet` wrote, and data frames of pandas, Polars or Arrow, by DuckDB alone.
 """
 
@@ -102,7 +102,9 @@ def read_exported(folder: Path, _map_file: Path | None = None) -> Contents:
     places = [(table, folder / f"{table}{suffix}") for table in TABLES for suffix in (".parquet", ".csv")]
     paths = {table: path for table, path in places if path.is_file()}
     if "exchanges" not in paths:
-        raise ImportTableError(f"{folder}: holds no exchanges.csv or exchanges.parquet, as 'uwblink export' writes")
+        raise ImportTableError(
+            f"{folder}: contains no exchanges.csv or exchanges.parquet, which 'uwblink export' writes"
+        )
     with TemporaryDirectory() as place:
         path = Path(place) / "exported.uwb"
         with Recording.create(path) as recording:
@@ -179,7 +181,7 @@ IMPORTERS: Final[Registry[Importer]] = Registry(
 
 
 def register_importer(row: Importer, *, replace: bool = False) -> None:
-    """Add a kind of file to `IMPORTERS`: `import_recording` and the command `uwblink import` then know it.
+    """Add a kind of file to `IMPORTERS`, for `import_recording` and the command `uwblink import`.
 
     `replace` puts it in place of one registered before. Raises `ArgumentError` for a name that is taken, and for a row
     that cannot work.
@@ -250,7 +252,7 @@ def import_file(
             return import_file(table, output, importer="csv", map_file=map_file, force=force, watch=watch)
     if isinstance(map_file, Mapping):
         raise ArgumentError(
-            "found a mapping, which goes with a data frame; give the path of a file", parameter="map_file"
+            "found a mapping, which is only allowed for a data frame; give the path of a file", parameter="map_file"
         )
     sources, row, explained = _choose(source, importer, map_file)
     with IMPORTERS.calling(row.name, ImportTableError), _folder(", ".join(map(str, sources))) as folder:
@@ -302,12 +304,12 @@ def _choose(
     if (row := next((row for row in rows if importer or ending.endswith(row.suffixes)), None)) is None:
         known = ", ".join(suffix for row in rows for suffix in row.suffixes)
         raise ImportTableError(
-            f"{sources[0]}: no importer for such a file; known are {known}; or name one with importer="
+            f"{sources[0]}: no importer for this kind of file; the known ones are {known}; or choose one with importer="
         )
     if map_file is not None and row.map_help is None:
-        raise ArgumentError(f"importer {row.name!r} takes none", parameter="map_file")
+        raise ArgumentError(f"importer {row.name!r} uses none", parameter="map_file")
     if len(sources) > 1 and not row.several:
-        raise ArgumentError(f"importer {row.name!r} takes one file, found {len(sources)}", parameter="source")
+        raise ArgumentError(f"importer {row.name!r} needs one file, found {len(sources)}", parameter="source")
     return sources, row, None if map_file is None else Path(map_file)
 
 

@@ -66,8 +66,8 @@ DISTANCES: Final = ("range_m", "gt_range_m", "difference_m", *POSITIONS)
 TEMPERATURES: Final = ("from_temperature_c", "to_temperature_c")
 IDS: Final = {"from_id": "the initiator of each exchange", "to_id": "its target"}
 ALL_IDS: Final = IDS | {"at_id": "the tag at which a difference of arrival was measured"}
-SIGN: Final = "a difference is taken for the distance of at_id to to_id less that to from_id"
-"""What the order of the ids of a difference of arrival means."""
+SIGN: Final = "a difference is the distance from at_id to to_id minus that to from_id"
+"""The meaning of the order of the ids of a difference of arrival."""
 
 ASKED: Final = "?"
 """Placeholder of `uwblink import guess` for a value that the user must give."""
@@ -115,10 +115,10 @@ MAP_KEYS: Final = (
         "layout",
         '"exchanges", "messages", "stamps", "parts", "ranges", "differences" or "broadcasts"',
         "by the columns; parts and broadcasts must be stated",
-        "What a row is: an exchange; a message; a stamp with `message`, as devices log their own; a part of an "
-        "exchange, for example if both devices report; a range without stamps; a difference of arrival without stamps: "
-        "by how much farther at_id is from to_id than from from_id; what a broadcast (sequence, tx) of from_id says of "
-        "an earlier one (heard) of to_id: when from_id received it (rx).",
+        "Meaning of a row: an exchange; a message; a stamp with `message`, as devices log their own; a part of an "
+        "exchange, for example if both devices report; a range without stamps; a difference of arrival without "
+        "stamps (distance from at_id to to_id minus that to from_id); or a reception in a broadcast: the broadcast "
+        "(sequence, tx) of from_id contains when (rx) it received an earlier one (heard) of to_id.",
     ),
     FileKey("bits", "32 or 40", "32 if the stamps fit, else 40", "Width of the counter of the stamps, in bits."),
     FileKey(
@@ -161,7 +161,7 @@ MAP_KEYS: Final = (
         "missing",
         "list of numbers and words",
         "none",
-        "Values that mean that there is no range, power, skew or true distance. Rows without a range are left out.",
+        "Values that stand for a missing range, power, skew or true distance. Rows without a range are left out.",
     ),
     FileKey(
         "chip",
@@ -181,8 +181,8 @@ MAP_KEYS: Final = (
         "wide.NAME",
         "text with one place (two of difference_m); or a table of columns by device",
         "none",
-        "Columns that differ by a device: `r_AN{to_id}` makes a row of each, `d{from_id}-{to_id}` of each "
-        "difference_m. Families are joined by what differs; "
+        "Families of columns, one for each device: `r_AN{to_id}` makes a row of each column, `d{from_id}-{to_id}` of "
+        "each difference_m. Families are joined by what differs; "
         "`{_}` is no id. A column called mask has a bit for each device with a range.",
     ),
     FileKey(
@@ -214,8 +214,8 @@ MAP_KEYS: Final = (
         '"ppm", "-ppm", "integrator-2", "integrator-5", "integrator-9", "offset" or "-offset"',
         "ppm",
         "Unit of skews: the carrier integrator on a channel, or the clock offset register of the DW3000, needs a chip. "
-        "offset is positive if the receiver's clock is faster; sources contradict each other, and -offset is the "
-        "opposite.",
+        "offset is positive if the receiver's clock is faster; -offset is the opposite, because sources contradict "
+        "each other.",
     ),
     FileKey(
         "units.NAME",
@@ -234,7 +234,7 @@ MAP_KEYS: Final = (
         "antenna_delays.tx",
         "number",
         "not known; 16436 is assumed",
-        "Transmit antenna delay that was programmed into all devices.",
+        "Transmit antenna delay programmed into all devices.",
     ),
     FileKey(
         "antenna_delays.rx",

@@ -87,7 +87,7 @@ def find_tables(sources: Sequence[Path], map_file: Path | None, _folder: Path) -
     if len(paths) == 1 and paths[0].is_dir():
         paths = tables_in(paths[0], column_map)
     if column_map.topics:
-        raise ImportTableError(f"{map_file}: topics are of bags; {paths[0]} is a table")
+        raise ImportTableError(f"{map_file}: [topics] can only be used with bags; {paths[0]} is a table")
     return paths, column_map
 
 
@@ -168,7 +168,7 @@ def import_tables(
             }
             if first:
                 lost = counts["faults"]
-                notes.append(f"{lost} of {total + lost} rows cannot be used and are kept as faults; the first: {first}")
+                notes.append(f"{lost} of {total + lost} rows are unusable and stored as faults; the first: {first}")
             recording.append_meta({"notes": notes})
         return Imported({name: n for name, n in counts.items() if n or name == "exchanges"}, notes)
 
@@ -191,12 +191,12 @@ def _notes(staging: Staging) -> list[str]:
     if names:
         # The first dozen; a recording has all, as its tags' bodies.
         some = first_few((f"{name[:20]} = {number}" for number, name in names.items()), 12)
-        notes.append(f"{len(names)} ids are words or too large, and get numbers: {some}")
+        notes.append(f"{len(names)} ids are words or too large, and were numbered: {some}")
     if staging.blanks:
         total = staging.offsets[-1]
-        notes.append(f"{staging.blanks} of {total} rows or cells hold no range, and are left out")
+        notes.append(f"{staging.blanks} of {total} rows or cells have no range, and are left out")
     if not staging.rows.has("time_s"):
-        rows = "rows are taken as a millisecond apart, in their order"
+        rows = "rows are assumed to be one millisecond apart, in their order"
         timed = "frames are timed by their stamps" if staging.column_map.layout == "broadcasts" else rows
         notes.append(f"there are no times; {timed}")
     return notes
@@ -211,8 +211,8 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
     if (back := rows_back(staging.rows))[0]:
         # Rows of one log are out of order by less; each of several files begins anew.
         more = (
-            f"; times go back by up to {back[1]:.1f} s: if the clock was set back, or the table has several "
-            "recordings, import the parts separately"
+            f"; times go back by up to {back[1]:.1f} s: if the clock was set back, or the table contains several "
+            f"recordings, import the parts separately"
         ) * (back[1] > 1 and len(staging.paths) == 1)
         notes.append(f"{back[0]} rows are earlier than the row before, and are sorted by time{more}")
     layout, protocol = column_map.layout or _layout(staging), column_map.protocol
@@ -224,7 +224,7 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
     else:
         rows = faults.reject(staging.rows, SOUND_IDS)
     if layout not in ("exchanges", "ranges", "parts") and any(map(staging.rows.has, TEMPERATURES)):
-        notes.append(f"temperatures are read where a row is an exchange, and not of {layout}")
+        notes.append(f"temperatures are only read if a row is an exchange, not with layout {layout}")
     total = rows.count() + len(faults)
     watch("checking", 0.0)
     value = {"ranges": "range_m", "differences": "difference_m"}.get(layout)
@@ -232,7 +232,7 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
         name for name in (*DISTANCES, *POWERS, *SKEWS, *TEMPERATURES, *_BESIDE["quality"]) if name != value
     )
     if not any(map(rows.has, ("fpp1", "fpp2"))) and any(map(rows.has, ("rxp1", "rxp2"))):
-        notes.append("there is no first-path power; the received power serves in its place")
+        notes.append("there is no first-path power; the received power is used instead")
     if value:
         of_differences = OF_DIFFERENCES if layout == "differences" else ()
         staging.require(rows, [value, *(["at_id"] if of_differences else [])])
@@ -242,7 +242,7 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
         check_units(column_map, path, rows.sample(SAMPLE_ROWS), None)
         if of_differences:
             ends = ", ".join(f"{name} is {column_map.header(name)!r:.60}" for name in ("to_id", "from_id"))
-            notes.append(f"{SIGN} ({ends}): exchange the two in a map if the log has it the other way round")
+            notes.append(f"{SIGN} ({ends}): exchange the two in a map if the log has the opposite sign")
             return in_time_order(rows), None
         rows, note = _without_repeats(in_time_order(rows))
         notes += filter(None, [note])
@@ -325,7 +325,7 @@ def _without_repeats(rows: StagedRows) -> tuple[StagedRows, str]:
         return rows, ""
     said = f"of {rows.count()} ranges repeat the one before of the same two devices, {after:.3g} ms after it"
     if 2 * turned < count:
-        return rows, f"{count} {said}, and others follow after {others:.3g} ms: are exchanges there twice? All are kept"
+        return rows, f"{count} {said}, others follow after {others:.3g} ms: some may be logged twice; all are kept"
     rows.db.execute(
         f"CREATE TABLE repeats AS SELECT row FROM ({gaps}) WHERE equal AND turned AND gap_ms < {others / 2!r}"
     )

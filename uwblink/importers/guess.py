@@ -142,14 +142,14 @@ _LAYOUTS: Final = {
         "broadcasts have lists of what their senders heard",
     ),
     "messages": (("tx", "rx"), _OF_EXCHANGES, "a row has one stamp of a sender and one of a receiver"),
-    "stamps": (("message",), _OF_EXCHANGES, "a row has one stamp, and says whether it is of sending or of receiving"),
+    "stamps": (("message",), _OF_EXCHANGES, "a row has one stamp, and a word for transmission or reception"),
     "ranges": (("range_m",), (*OF_MESSAGES, *STAMPS), "there are ranges and no stamps"),
     "differences": (
         ("difference_m",),
         (*OF_MESSAGES, *TEMPERATURES, *STAMPS, "range_m"),
         f"{SIGN}: exchange the two if it is not",
     ),
-    "nothing": ((), OF_MESSAGES, "neither stamps nor ranges were recognised: rename columns below"),
+    "nothing": ((), OF_MESSAGES, "neither stamps nor ranges were recognised: name their columns below"),
 }
 """The layouts that are recognised: the columns that each needs, those that it does not have, and the reason."""
 
@@ -168,7 +168,7 @@ class Guess:
     importer: str = "csv"
     pose_topics: tuple[str, ...] = ()
     advice: str = ""
-    """What can be had without true distances, where there are no poses."""
+    """Remark on calibrations without true distances, for bags without poses."""
 
 
 def guess_map(path: Path) -> Guess:
@@ -291,7 +291,7 @@ def _proposal(
         if name not in columns
     }
     if layout == "nothing" and {"qw", "qx", "qy", "qz"} <= {name.lower() for name in names}:
-        raise ImportTableError(f"{path}: holds poses, not ranges; add them to a recording: `uwblink poses`")
+        raise ImportTableError(f"{path}: contains poses, not ranges; add them to a recording with `uwblink poses`")
     lacking = [name for name in needed if name not in cells or name in words]
     lacking += ["message"] if layout == "messages" and "message" in words & cells.keys() else []
     unplaced = [name for name in POSITIONS if name not in columns]
@@ -299,8 +299,8 @@ def _proposal(
     left = [json.dumps(name) for name in names if name not in used and not form.line and not form.wide]
     remarks = {
         why: layout == "nothing",
-        "without antenna delays that were programmed into the devices: give them in [antenna_delays]": not undelayed,
-        f"positions are used where all six columns are there; missing: {', '.join(unplaced)}": 0 < len(unplaced) < 6,
+        "antenna delays programmed into the devices are unknown: give them in [antenna_delays]": not undelayed,
+        f"positions need all six columns; missing: {', '.join(unplaced)}": 0 < len(unplaced) < 6,
         f"not used: {', '.join(left)[:300]}": left,
         f"a column of numbers is still needed: {', '.join(lacking)}": lacking,
     }
@@ -310,7 +310,7 @@ def _proposal(
     if layout == "ranges" and "range_m" in named and (others := _alike(columns["range_m"], names)):
         named["range_m"] = (
             ASKED,
-            f"write {' or '.join(json.dumps(one) for one in others)}: which did the device measure?",
+            f"write the column that the device measured: {' or '.join(json.dumps(one) for one in others)}",
         )
     if "gt_range_m" in words and "gt_range_m" in named:
         named["gt_range_m"] = (
@@ -318,7 +318,7 @@ def _proposal(
             f"{json.dumps(columns['gt_range_m'])} has no numbers: name a column, or delete the line",
         )
     named |= {ours: (keys, "") for ours, keys in registers.items()}
-    none: Entries = {"tx": (0, "by the true distances none were programmed into the devices"), "rx": (0, "")}
+    none: Entries = {"tx": (0, "according to the true distances, none were programmed into the devices"), "rx": (0, "")}
     wide: Entries = {ours: (stated, "") for ours, stated in form.wide.items()}
     sections = {"columns": named, "wide": wide, "units": units, "constants": constants}
     sections |= {"antenna_delays": none if undelayed else {}}
@@ -370,7 +370,7 @@ def _message_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> StampE
     full = _are_whole(stamps) and 0.9 * 2.0**bits < largest < 2.0**bits
     counter: Entries = {"bits": (bits, ""), "counter": (kind, "")}
     unit = ("ticks", f"whole numbers up to 2^{bits}") if full else (ASKED, _ANY_UNIT)
-    return counter, (named, "by the columns' names") if named else unit, False
+    return counter, (named, "by the names of the columns") if named else unit, False
 
 
 def _exchange_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> StampEntries:
@@ -457,13 +457,13 @@ def _of_bag(path: Path) -> Guess:
     advice = ""
     if not poses and not {"gt_range_m", *POSITIONS} & {*best.columns}:
         advice = (
-            "no poses and no true distances: ranges alone give delays of boards that stood still (`calib survey`); a "
-            "flight also needs attitudes, and anchors or first positions (calib.fit_from_ranges); constants of pairs "
-            "need true distances (docs/without-motion-capture.md)"
+            "no poses and no true distances: ranges only determine delays of boards that stood still (`calib "
+            "survey`); a flight also needs attitudes, and anchors or first positions (calib.fit_from_ranges); "
+            "constants of pairs need true distances (docs/without-motion-capture.md)"
         )
     others = [json.dumps(topic) for _, some in found if some is not chosen for topic in some]
     remarks = ["topics of the bag:", *(f"  {one}" for one in listed)]
-    remarks += [f"also with ranges, for maps of their own: {', '.join(others)}"] if others else []
+    remarks += [f"other topics with ranges, which need their own maps: {', '.join(others)}"] if others else []
     remarks += [f"poses, for `uwblink poses`: {first_few(map(json.dumps, poses))}"] if poses else []
     text = best.text + "".join(f"# {line}\n" for line in (*remarks, advice) if line)
     return replace(best, text=text, importer="bag", pose_topics=tuple(poses), advice=advice)

@@ -1,4 +1,4 @@
-"""Find out how numbers of a table are to be read: units of lengths and powers, format and protocol of stamps.
+"""Determine the meaning of numbers in a table: units of lengths and powers, format and protocol of stamps.
 
 Stamps have any unit and are wrapped, signed or unwrapped; they become ticks of one counter. A range is plausible
 between -2 m (antenna delays) and 2 km, extended for single-sided ranging by the error of clocks 50 ppm apart over the
@@ -184,8 +184,8 @@ def settle_reading(path: Path, column_map: ColumnMap, rows: Columns, reading: Re
             break
     else:
         return reading, (
-            f"the ranges are not plausible ({first}), and no other protocol, width or order of the columns makes "
-            "better ones; check the map"
+            f"the ranges are not plausible ({first}), and neither are they with another protocol, width or order of "
+            f"the columns; check the map"
         )
     # The larger share of plausible ranges, then the smaller spread.
     best = min(fitting, key=lambda trial: (-round(trial.plausible, 2), trial.error_m[1] - trial.error_m[0]))
@@ -314,12 +314,12 @@ def reason_against_metres(ranges: Floats) -> str:
     finite = ranges[np.isfinite(ranges)]
     middle = float(np.median(np.abs(finite))) if len(finite) >= MIN_ROWS else 0.0
     if middle > 300.0:  # DW1000 devices reach 290 m in the open by their data sheet
-        return f"the median range is {middle:.6g}, farther than devices reach in metres"
+        return f"the median range is {middle:.6g}, in metres longer than the reach of the devices"
     if 0.0 < middle < 1e-6:  # seconds: light travels 300 m in a microsecond
-        return f"the median is {middle:.3g}, nothing that could be measured in metres"
+        return f"the median is {middle:.3g}, impossible in metres"
     # With noise of centimetres, ranges are not all integers, unless one number repeats.
     if len(np.unique(finite)) > MIN_ROWS // 4 and np.array_equal(finite, np.rint(finite)) and middle:
-        return "all ranges are whole numbers, which measured metres are not"
+        return "all ranges are whole numbers, unlike ranges in metres"
     return ""
 
 
@@ -347,7 +347,7 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
     for name in ("range_m", "gt_range_m") if raw_m is None else ():
         factor = column_map.factor(name)
         for value, share in sentinels(np.round(optional(rows, name) / factor, 6)).items():
-            why = f"{share:.1%} of its numbers are {value:.10g}, which is no distance"
+            why = f"{share:.1%} of its numbers are {value:.10g}, which is not a distance"
             reasons[name] = why, f"missing = [{value:.10g}] in the map"
     for name in ("range_m", "difference_m"):
         if column_map.unit_of(name) is None and name not in reasons:

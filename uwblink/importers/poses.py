@@ -81,7 +81,7 @@ def _read(path: Path, body: str | None, topics: Mapping[str, str] | None, stated
     if kind in ("bag", "mcap", "db3"):
         poses = _from_bag(path, topics)
     elif topics:
-        raise ImportTableError(f"{path}: has no topics; only bags have")
+        raise ImportTableError(f"{path}: has no topics, because it is not a bag")
     else:
         with reading(path), path.open(encoding="utf-8-sig", newline="") as file:
             poses, turned = _from_text(path, file, body, stated)
@@ -233,13 +233,13 @@ def add_poses(
             found = ", ".join(sorted({tag.body for tag in placed})) or "none"
             lost = ", ".join(map(str, np.setdiff1d(np.append(first, second), [tag.tag for tag in placed])))
             raise ImportTableError(
-                f"{what}: its bodies are {', '.join(sorted(bodies))}, those of the tags {found}; "
-                f"give the bodies of {f'tags {lost}, which range,' if lost else 'the tags'} with `tags_from`"
+                f"{what}: its bodies are {', '.join(sorted(bodies))}, but those of the tags are {found}; give the "
+                f"bodies of {f'tags {lost}, which range,' if lost else 'the tags'} with `tags_from`"
             )
         if held := [tag for tag in with_poses if tag.body in unturned and any(tag.lever_arm_m)]:
             raise ImportTableError(
-                f"{what}: has no attitudes (qx, qy, qz, qw) of {held[0].body}, whose tag {held[0].tag} has a lever "
-                "arm; without attitudes lever arms must be zero"
+                f"{what}: has no attitudes (qx, qy, qz, qw) of {held[0].body}, but its tag {held[0].tag} has a lever "
+                f"arm; without attitudes lever arms must be zero"
             )
         if shift_ns is None:
             _check_units(what, exchanges, poses, placed, int(exchanges.time_ns.min() - poses.time_ns.min()))
@@ -249,8 +249,8 @@ def add_poses(
         covered = int(np.count_nonzero(np.isfinite(truth)))
         if not covered and files:
             raise ImportTableError(
-                f"{what}: no exchange lies within its poses, which end {_apart(time_ns, moved.time_ns)}; "
-                "give `offset` in seconds, or auto"
+                f"{what}: no exchange is within the time of its poses, which end {_apart(time_ns, moved.time_ns)}; "
+                f"give `offset` in seconds, or auto"
             )
         if len(exchanges):
             _check_units(what, exchanges, moved, placed)
@@ -407,7 +407,7 @@ def _single(path: Path, body: str | None, *, blanks: bool) -> PoseLayout:
     """Return the layout of TUM, whose cells have blanks between them, or of EuRoC."""
     form, unit, quaternion = ("TUM", "s", POSE[3:]) if blanks else ("EuRoC", "ns", ("qw", "qx", "qy", "qz"))
     if not body:
-        raise ImportTableError(f"{path}: a {form} file has no names of bodies; name its body with `body`")
+        raise ImportTableError(f"{path}: a {form} file has no names of bodies; give the name with `body`")
     names = (f"time_{unit}", *POSE[:3], *quaternion)
     return PoseLayout(
         form=form, names=names, time=0, ns=TIME_UNITS[unit], bodies={body: [names.index(name) for name in POSE]},

@@ -58,7 +58,7 @@ Watch = Callable[[str, float], object]
 
 
 def unwatched(_step: str, _share: float) -> None:
-    """Take no notice of progress."""
+    """Ignore progress."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +147,7 @@ class Staging:
                 db.execute(f"{into} SELECT {selected(cells)} FROM {table.source}")
             self.offsets.append(StagedRows(db, "staged", ()).count())
         if not self.offsets[-1]:
-            raise ImportTableError(f"{paths[0]}: a header and no rows")
+            raise ImportTableError(f"{paths[0]}: has a header but no rows")
         (self.blanks,) = StagedRows(db, "staged", ()).values("count(*) FILTER (blank)")
         """Rows without a range, such as an empty cell of a wide table, that are left out."""
         self.beside: dict[str, Columns] = {}
@@ -230,7 +230,9 @@ class Staging:
         return {word: numbers[word] for word in words}
 
     def _too_many_ids(self) -> ImportTableError:
-        return ImportTableError(f"{self.paths[0]}: more than {LARGEST_ID} different ids; are from_id and to_id ids?")
+        return ImportTableError(
+            f"{self.paths[0]}: more than {LARGEST_ID} different ids; check that from_id and to_id are ids"
+        )
 
 
 def staged_cells(table: SourceTable) -> dict[str, str]:
@@ -543,7 +545,7 @@ def broadcast_exchanges(staging: Staging, faults: Faults, notes: list[str]) -> t
         exchanges, overheard = exchanges_in(receptions)
     if wrong := np.count_nonzero(contradicted(receptions)):
         notes.append(
-            f"{wrong} of {len(receptions)} receptions make no range, because others of their link contradict them"
+            f"{wrong} of {len(receptions)} receptions are not used, because others of their link contradict them"
         )
     staging.beside = {"receptions": receptions.to_dict(), "overheard": overheard}
     db.register(

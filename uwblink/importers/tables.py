@@ -131,7 +131,7 @@ def check_lines(path: Path, delimiter: str) -> None:
             length, cells = (0, 0) if ends else (length + len(piece), cells + piece.count(delimiter.encode()))
             if length > MAX_LINE_BYTES or cells > MAX_CELLS:
                 most = f"{MAX_CELLS} cells" if cells > MAX_CELLS else f"{MAX_LINE_BYTES} bytes"
-                raise ImportTableError(f"{path}: row {line}: more than {most}; are lines ended as in a table?")
+                raise ImportTableError(f"{path}: row {line}: more than {most}; check the line ends of the table")
 
 
 @contextmanager
@@ -145,10 +145,10 @@ def connected(paths: Sequence[Path]) -> Iterator[duckdb.DuckDBPyConnection]:
             raise ImportTableError(f"{path}: its name and those of its folders must be UTF-8; rename it")
     full = raising(
         ImportTableError,
-        f"{gettempdir()}: what does not fit into memory cannot be written there",
+        f"{gettempdir()}: temporary data cannot be written there",
         duckdb.OutOfMemoryException,
         duckdb.IOException,
-        remedy="; TMPDIR names another folder",
+        remedy="; choose another folder with TMPDIR",
     )
     with (
         TemporaryDirectory(prefix="uwblink-") as folder,
@@ -251,7 +251,9 @@ class SourceTable:
 
     def _open_csv(self) -> None:
         if self.column_map.each:
-            raise ImportTableError(f"{self.path}: each is of JSON lines, bags and logs (with line), not of a table")
+            raise ImportTableError(
+                f"{self.path}: the key each is for JSON lines, bags and logs (with line), not for tables"
+            )
         self.names, mark, self._decimal_comma, self._skip = detect(self.path, self.column_map)
         check_lines(self.path, mark)
         self._cells = [f"c{k}" for k in range(len(self.names))]
@@ -373,7 +375,7 @@ class SourceTable:
             return
         values = Template(self.column_map.from_name).match(self.path.as_posix())
         if values is None:
-            raise ImportTableError(f"{self.path}: its name is not {self.column_map.from_name!r}, which the map states")
+            raise ImportTableError(f"{self.path}: its name does not match {self.column_map.from_name!r} of the map")
         self.named = frozenset(values)
         self.names = (*self.names, *values)
         self._cells += [self.variable(f"name{k}_", value) for k, value in enumerate(values.values())]
@@ -404,7 +406,7 @@ class SourceTable:
         """Return the error for a column that is not there."""
         remedy = "a `map_file` can rename columns or give constants, and `uwblink import guess` proposes one"
         if lacks_header(self.names):
-            remedy = "its first line is a row: state the numbers of its columns in a map, such as from_id = 2"
+            remedy = "its first line is a row of values: give the numbers of its columns in a map, such as from_id = 2"
         if {"qx", "qy", "qz", "qw"} <= {name.lower() for name in self.names}:
             remedy = "these are poses, which `uwblink poses` adds to a recording"
         there = ", ".join(self.names)[:400]

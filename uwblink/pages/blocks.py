@@ -152,7 +152,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """Preformatted text; lines of a `table` do not break on a screen."""
+    """Preformatted text; lines of a `table` are not broken on a screen."""
 
     text: str
     table: bool = False

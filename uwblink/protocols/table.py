@@ -198,8 +198,8 @@ def _check_messages(row: RangingProtocol) -> None:
     course = ([("initiator", "")], [("target", "rx1")], [("target", "tx2"), ("initiator", "rx2")])
     if not 2 <= len(row.messages) <= 3:
         raise ArgumentError(
-            f"{where}: found {len(row.messages)}, expected 2 or 3: an exchange is recorded with the six stamps of "
-            "three messages, and one message alone measures no round trip"
+            f"{where}: found {len(row.messages)}, expected 2 or 3: a recording has six stamps of three messages for "
+            f"an exchange, and a round trip needs two messages"
         )
     for number, (message, allowed) in enumerate(zip(row.messages, course, strict=False), start=1):
         if (message.sender, message.after) not in allowed or message.timing not in ("at once", "scheduled"):
@@ -227,8 +227,8 @@ def _check_formulas(row: RangingProtocol) -> None:
         if not np.allclose(corrected, tried, rtol=0, atol=1e-2):
             culprit = "delay_weights leave" if any(delays) else "flight_ticks finds"
             raise ArgumentError(
-                f"{where}: {culprit} {corrected[0]:.6g} ticks where an exchange without noise took "
-                f"{tried[0]:g}" + (f", with antenna delays of {delays[0]:g} and {delays[1]:g}" * any(delays))
+                f"{where}: {culprit} {corrected[0]:.6g} ticks for an exchange without noise of {tried[0]:g} "
+                f"ticks" + (f", with antenna delays of {delays[0]:g} and {delays[1]:g}" * any(delays))
             )
 
 
@@ -248,7 +248,7 @@ PROTOCOLS: Final[Registry[RangingProtocol]] = Registry("protocol", "uwbcal.proto
 
 
 def register_protocol(row: RangingProtocol, *, replace: bool = False) -> None:
-    """Add a protocol to `PROTOCOLS`: simulation, recording, calibration and comparison then know it by its name.
+    """Add a protocol to `PROTOCOLS`, for simulation, recording, calibration and comparison.
 
     `replace` puts it in place of one registered before. Raises `ArgumentError` for a name that is taken, for messages
     that a recording has no place for, and for formulas that are not exact without noise.

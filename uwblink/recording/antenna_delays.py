@@ -150,7 +150,7 @@ def load_antenna_delays(path: Path) -> dict[int | None, AntennaDelay]:
     file.known(file.table, ("antenna_delays",))
     found = read_antenna_delays(file)
     if not found:
-        raise PlanError(f"{path}: holds no [antenna_delays]; `calib export` writes one, for registers")
+        raise PlanError(f"{path}: contains no [antenna_delays]; `calib export` writes such a file, for registers")
     return found
 
 
@@ -179,6 +179,6 @@ def delays_differ(then: AntennaDelays, now: AntennaDelays, tags: Iterable[int]) 
     if not longer_m:
         return ""
     return (
-        "it was fitted with other programmed antenna delays than these ranges have, which makes them wrong by up to "
+        "it was fitted with other programmed antenna delays than those of these ranges, which causes errors of up to "
         f"{100 * max(longer_m.values()):.1f} cm for each tag ({first_few(longer_m, 3)}); fit again"
     )

@@ -179,7 +179,9 @@ def find_offset(exchanges: Exchanges, poses: Poses, tags: list[Tag], within_s: f
     offsets = range(low, high + step, step)
     spreads = np.array([loss(o) for o in offsets])
     if not np.isfinite(spreads).any():
-        raise ImportTableError("no offset puts the poses over the exchanges; are the bodies of the tags in the file?")
+        raise ImportTableError(
+            "no offset matches the poses to the exchanges; check that the file contains the bodies of the tags"
+        )
     typical, best = float(np.median(spreads[np.isfinite(spreads)])), offsets[int(np.argmin(spreads))]
     # Then the least Cauchy loss, which uses more of the data than their median: finer grids, then a parabola.
     scale_m = max(float(spreads.min()), 1e-6)  # one exchange, or exact ranges, have no spread
@@ -193,7 +195,7 @@ def find_offset(exchanges: Exchanges, poses: Poses, tags: list[Tag], within_s: f
     found_m = loss(best)
     if found_m > 0.7 * typical:
         raise ImportTableError(
-            f"the ranges do not tell the offset: their spread is {100 * found_m:.0f} cm at the best offset and "
+            f"the ranges do not determine the offset: their spread is {100 * found_m:.0f} cm at the best offset and "
             f"{100 * typical:.0f} cm at others; record bodies that move, or give `offset` in seconds"
         )
     return best

@@ -283,7 +283,7 @@ def load_places(path: Path) -> tuple[tuple[Tag, ...], dict[int, tuple[float, flo
         file.known(file.table, ("tags", "anchors", *plan))
     tags, rows = read_tags(file), file.rows("anchors", ("id", "position_m", "covariance_m2"))
     if not tags and not rows:
-        raise PlanError(f"{path}: holds no [[tags]] with id, body and lever_arm_m, and no [[anchors]]")
+        raise PlanError(f"{path}: contains neither [[tags]] with id, body and lever_arm_m nor [[anchors]]")
     found: dict[int, tuple[float, float, float]] = {}
     for k, row in enumerate(rows):
         number = _new_id(file, f"anchors[{k}].id", row, {*found, *(tag.tag for tag in tags)})

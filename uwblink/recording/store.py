@@ -80,8 +80,8 @@ def check_tables(ask: Ask, path: Path, size: int, tables: Mapping[str, Mapping[s
     for word, column, source in _REFUSED:
         if found := ask(f"SELECT {column} FROM system.main.{source}"):  # noqa: S608 - constants
             raise RecordingError(
-                f"{path}: holds {word}, {printable(str(found[0][0]))}, and such files consist of tables alone; "
-                "it is not read, because such objects are programs"
+                f"{path}: contains {word}, {printable(str(found[0][0]))}; it is not read, because a recording has "
+                f"only tables, and such objects are programs"
             )
     for table, column, kind_found in ask(COLUMNS_OF_FILE):
         expected = tables.get(table, {}).get(column)
@@ -156,14 +156,14 @@ def damaged(path: Path, error: Exception) -> RecordingError:
         writer = printable(file.read(84)[52:].split(b"\0")[0].decode(errors="replace"))
     return RecordingError(
         f"{path}: {f'DuckDB {writer}' if writer else 'another DuckDB'} stored it in a way that the installed DuckDB "
-        f"{duckdb.__version__} cannot read; update DuckDB, or export the recording where it was made"
+        f"{duckdb.__version__} cannot read; update DuckDB, or export the recording on the computer of the recording"
     )
 
 
 def _no_recording(path: Path, seen: str) -> RecordingError:
     form = IMPORTED_AS.get(path.suffix.lower())
     if form:
-        return RecordingError(f"{path}: is no recording yet; `uwblink import {form}` makes one of it")
+        return RecordingError(f"{path}: is not a recording; convert it with `uwblink import {form}`")
     return RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one ({seen})")
 
 
@@ -245,7 +245,7 @@ class Store:
             except duckdb.ConnectionException:
                 connection = connect(path, read_only=not update)
         except duckdb.ConnectionException as error:
-            raise RecordingError(f"{path}: is open in this program in another way; close it there first") from error
+            raise RecordingError(f"{path}: is already open in this program in another mode; close it first") from error
         except duckdb.Error as error:
             if isinstance(error, duckdb.IOException) and is_locked(path, update=update):
                 use = "has it open" if update else "is writing it"

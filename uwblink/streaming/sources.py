@@ -62,11 +62,11 @@ class Streamed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamedDifference(Streamed):
-    """A difference of arrival in metres: by how much farther from the target than from the initiator a listener is.
+    """A difference of arrival in metres: the distance from a listener to the target minus that to the initiator.
 
-    `difference_m` is by stamps alone, `corrected_m` and its standard deviation `sigma_m` with a calibration. Those of
-    one exchange share an error: `shared_m` squared is the covariance of two of them. They do not correlate with the
-    range of the exchange.
+    `difference_m` is by stamps alone, `corrected_m` and its standard deviation `sigma_m` with a calibration. The
+    covariance of two differences of one exchange is `shared_m` squared. They are not correlated with the range of the
+    exchange.
     """
 
     time_ns: int
@@ -85,7 +85,7 @@ class StreamedRange(Streamed):
 
     `range_m` is the reported range. `corrected_m` and its standard deviation `sigma_m` are NaN without a
     calibration, and for tags that are not calibrated; `more` are other columns of the correction, such as
-    `sigma_total_m`, which contains reflections and what directions would tell.
+    `sigma_total_m`, which includes reflections and unknown directions.
 
     >>> import uwblink
     >>> x = uwblink.Exchanges.from_arrays([1], [2], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
@@ -306,9 +306,9 @@ class RangeListener(Listener):
 def _recorded(path: Path, correct: Correction | None, *, listening: bool) -> tuple[Exchanges, dict[str, NDArray[Any]]]:
     with Recording.open(path) as recording:
         if correct and "calibration" in recording.meta():
-            raise ArgumentError(f"{path}: its ranges are corrected already; stream it without `calibration`")
+            raise ArgumentError(f"{path}: its ranges are already corrected; stream it without `calibration`")
         if (differences := recording.count("differences")) and not recording.count("exchanges"):
-            raise ArgumentError(f"{path}: holds {differences} differences of arrival, but no ranges to stream")
+            raise ArgumentError(f"{path}: contains {differences} differences of arrival, but no ranges to stream")
         found, heard = recording.exchanges(), recording.columns("overheard") if listening else {}
     if listening and not len(heard["time_ns"]):
         raise ArgumentError(f"{path}: nothing was overheard; record with passive boards", parameter="use")

@@ -1,4 +1,4 @@
-"""What the boards say: messages, fields, and the codec."""
+"""The wire format of the boards: messages, fields, and the codec."""
 
 from uwblink.wire.messages import GetMaxFrame, MaxFrameReport, RangeReport
 

@@ -69,7 +69,7 @@ class Decoder:
         self.skipped_bytes = 0
 
     def feed(self, data: bytes) -> list[Event]:
-        """Take in bytes and return what they complete; never raises on any bytes."""
+        """Add bytes and return the events that they complete; never raises an exception."""
         self._buffer += data
         return self._drain(final=False)
 

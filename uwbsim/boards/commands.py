@@ -190,12 +190,14 @@ def register_command(kind: type[Message], execute: Executor) -> None:
     A second registration replaces the first.
     """
     if COMMANDS.get(kind.KEY) is not kind:
-        raise UwbsimError(f"{kind.__name__}: not a command that uwblink knows; register the message there first")
+        raise UwbsimError(f"{kind.__name__}: not a registered command of uwblink; register the message first")
     readable = (*_UNTIL_BAR, BYTES, BROADCAST, RAW_FLOAT)
     for name, field in kind.FIELDS.items():
         if field not in readable:
             known = ", ".join(k.name for k in readable)
-            raise UwbsimError(f"{kind.__name__}.{name}: boards read no {field.name} from the host; they read {known}")
+            raise UwbsimError(
+                f"{kind.__name__}.{name}: boards cannot read {field.name} from the host; they read {known}"
+            )
     EXECUTORS[kind.KEY] = execute
 
 

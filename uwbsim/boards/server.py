@@ -211,7 +211,7 @@ class Server:
         """Open one pseudo-terminal a tag; raises `PortError` where a link cannot be made.
 
         `speed` is the rate of the boards' time relative to the wall clock. `tell` is called with a line about each
-        failure that does not end the server: a board's own program failed, or poses cannot be written any more.
+        failure that does not end the server: a command of a board failed, or poses cannot be written any more.
         """
         self._speed, self._tell = speed, tell
         self._faults = faults or FaultsFile()

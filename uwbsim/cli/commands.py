@@ -52,11 +52,11 @@ ScenarioFile = Annotated[
     Path, typer.Argument(help="Scenario file (.toml), or the name of a shipped one.", autocompletion=shipped)
 ]
 Overrides = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value; repeatable.")
+    list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value. May be repeated.")
 ]
 AllowFiles = Annotated[
     list[Path] | None,
-    typer.Option(metavar="DIR", help="Further folder in which files that the scenario names may lie; repeatable."),
+    typer.Option(metavar="DIR", help="Additional folder from which the scenario may read files. May be repeated."),
 ]
 
 
@@ -83,11 +83,11 @@ def run(
     ] = False,
     contention: Annotated[
         bool,
-        typer.Option(help="Simulate collisions of exchanges; without, none disturbs another, and it is faster."),
+        typer.Option(help="Simulate collisions of exchanges. Without collisions, the simulation is faster."),
     ] = True,
     force: Force = False,
 ) -> None:
-    """Simulate a scenario and write what its boards and motion capture record."""
+    """Simulate a scenario and write the recording of its boards and motion capture."""
     check_output(output, force=force, recording=True)
     loaded = _programmed(uwbsim.load(scenario, overrides or (), seed, allow_files=allow_files or ()), antenna_delays)
     with waiting(loaded.run.name) as report:
@@ -113,7 +113,11 @@ def _programmed(scenario: uwbsim.Scenario, path: Path | None) -> uwbsim.Scenario
 def scenarios(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME]...", help="Scenarios, or folders of them; else all.", autocompletion=shipped),
+        typer.Argument(
+            metavar="[NAME]...",
+            help="Names of scenarios, or of folders of scenarios; by default all.",
+            autocompletion=shipped,
+        ),
     ] = None,
     output: Annotated[Path | None, shared.output("Folder to copy them into.")] = None,
     as_json: AsJson = False,
@@ -141,7 +145,7 @@ def serve(
     allow_files: AllowFiles = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the poses if they exist.")] = False,
 ) -> None:
-    """Have the boards of a scenario answer on pseudo-terminals, as powered boards do on serial ports."""
+    """Run the boards of a scenario on pseudo-terminals, where they answer like real boards on serial ports."""
     if poses:
         check_output(poses, force=force)
     loaded = _programmed(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()), antenna_delays)
@@ -292,7 +296,7 @@ def predict(
         typer.Option(rich_help_panel="Tags", help="Antenna delay of the initiator; a positive one shortens ranges."),
     ] = 0.0,
     delay_target_ns: Annotated[
-        float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the target, likewise.")
+        float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the target; a positive one shortens ranges.")
     ] = 0.0,
     whole_ticks: Annotated[
         bool,
@@ -300,7 +304,7 @@ def predict(
     ] = False,
     tags: Annotated[
         int | None,
-        typer.Option(help="Also predict what a fleet of so many tags gets by each way of ranging."),
+        typer.Option(help="Also predict the rates and errors of a fleet of this many tags, for each way of ranging."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -338,7 +342,7 @@ def optimum(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Find the delay of the scheduled message at which the mean of a second of a pair's ranges errs least."""
+    """Find the delay of the scheduled message that minimises the error of a pair's ranges averaged over one second."""
     rows = _rows(protocols)
     loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
     if output:
@@ -354,12 +358,12 @@ def optimum(
     for one in found:
         typer.echo(
             f"{one.protocol:10s}{1e6 * one.delay_s:9.0f} µs{100 * one.rms_m:9.2f} cm{1e6 * one.duration_s:7.0f} µs"
-            f"{100 * one.second_rms_m:11.4f} cm" + ("  (the edge of what boards take)" if one.on_edge else "")
+            f"{100 * one.second_rms_m:11.4f} cm" + ("  (at the limit of the boards)" if one.on_edge else "")
         )
 
 
 def sweep(
-    plan: Annotated[Path, typer.Argument(help="Sweep file: what varies (.toml).")],
+    plan: Annotated[Path, typer.Argument(help="Sweep file with the varied keys (.toml).")],
     output: Annotated[Path, shared.output("Folder for the results.")],
     workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; by default one per core.")] = None,
     scheduler: Annotated[str | None, typer.Option(help="Address of a running Dask scheduler.")] = None,
@@ -382,12 +386,12 @@ def sweep(
                 loaded, output, workers=workers, scheduler=scheduler, resume=resume, progress=go_on
             )
         except KeyboardInterrupt:
-            typer.echo(f"{output}: interrupted; what was done is kept, and --resume goes on with it")
+            typer.echo(f"{output}: interrupted; finished runs are kept, and --resume continues")
             raise typer.Exit(INTERRUPTED) from None
     page = uwbsim.pages.write_sweep_page(loaded, output, figures=figures)
     typer.echo(
-        f"{output}: {summary.done} runs of {loaded.total}, {summary.failed} failed, {summary.skipped} were there "
-        f"already; results.csv, results.parquet, {page.name}"
+        f"{output}: {summary.done} runs of {loaded.total}, {summary.failed} failed, {summary.skipped} already done; "
+        f"results.csv, results.parquet, {page.name}"
     )
 
 
@@ -451,4 +455,4 @@ UWBSIM_FLAGS: Final = {
     "overrides": "--set",
     "evaluate": "evaluate",
 }
-"""Of parameters that are spelt otherwise; what evaluates a sweep is a plug-in, which no flag names."""
+"""Flags of parameters that differ from the parameter's name; plug-ins that evaluate sweeps have no flag."""

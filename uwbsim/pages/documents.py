@@ -138,7 +138,65 @@ def write_comparison(
 
 def comparison(found: ProtocolComparison) -> Document:
     """Return the page of a comparison: errors, costs, the best protocol by delay, and curves of errors."""
-    scenario, outcomes, samples = found.scenario, found.outcomes, found.samples
+    outcomes, names = found.outcomes, [row.name for row in found.protocols]
+    # Two tables, errors and costs, each narrow enough for a screen.
+    cut = list(COMPARISON_COLUMNS).index("messages")
+    halves = [list(COMPARISON_COLUMNS)[:cut], ["protocol", *list(COMPARISON_COLUMNS)[cut:]]]
+    winners = [
+        [
+            str(row["scheduled_us"]),
+            row["rmse"],
+            row["per_second"],
+            *(f"{100 * row[f'rmse_m {name}']:.2f}" for name in names),
+        ]
+        for row in found.winners
+    ]
+    blocks: list[Block] = [
+        Text(
+            f"{outcomes[0].ranges:,} raw ranges per protocol, in the same world and with the same noise. Errors are "
+            "those of raw ranges, with antenna delays, power bias and reflections."
+        ),
+        *(Table(half, [[COMPARISON_COLUMNS[name](one) for name in half] for one in outcomes]) for half in halves),
+        Text(
+            "Predicted: analytically, without simulation. Air: total duration of the frames; duration: from the start "
+            "of the first frame to the end of the last; radio on: time for which the two radios send or listen, a "
+            "proxy of energy; rate: exchanges per second, one after the other.",
+            "note",
+        ),
+        Picture(
+            "errors",
+            partial(figures.histograms, samples=found.samples),
+            "Distribution of errors. The outermost bins include all values beyond them.",
+        ),
+        Heading("Best protocol by delay"),
+        Text(
+            "Predicted, after calibration of delays and power bias, without reflections. One range: the protocol "
+            "with the smallest error of a single range. Per second: the protocol with the smallest error of the mean "
+            "of all ranges in a second."
+        ),
+        Table(["scheduled delay (µs)", "one range", "per second", *(f"{name} (cm)" for name in names)], winners),
+        Heading(f"A fleet of {found.fleet[0].tags} tags"),
+        Text(
+            "Predicted, after calibration and without reflections. Protocols: the pairs range in turn. broadcast: "
+            "each tag sends a frame in turn, which all others receive. tdoa: the tags are anchors that broadcast, "
+            "and any number of listeners measure differences of arrival. Air and radio on: per range, or per "
+            "difference at a listener. Updates: highest rate at which all pairs range, or a listener gets all "
+            "differences."
+        ),
+        Table([*FLEET_COLUMNS], [[show(one) for show in FLEET_COLUMNS.values()] for one in found.fleet]),
+        Heading("Errors over skew, delay, distance and power"),
+        Text(
+            "Points are simulated, lines predicted; the first two figures are without antenna delays, power bias and "
+            "reflections. Axes that cover decades are logarithmic and labelled so; the axis of biases is linear up "
+            "to ± 1 cm and logarithmic beyond."
+        ),
+    ]
+    return Document(f"Protocols in {found.scenario.run.name}", [*blocks, *_error_curves(found)])
+
+
+def _error_curves(found: ProtocolComparison) -> list[Picture]:
+    """Return figures of the errors over skew, delay, distance and power, without quantities that do not vary."""
+    scenario, samples = found.scenario, found.samples
     protocols = {row.name: row for row in found.protocols}
     states = conditions_of(scenario)
     over = [
@@ -164,58 +222,7 @@ def comparison(found: ProtocolComparison) -> Document:
             "Error over first-path power, in bins of equal numbers of ranges.",
         ),
     ]
-    # Two tables, errors and costs, each narrow enough for a screen.
-    cut = list(COMPARISON_COLUMNS).index("messages")
-    halves = [list(COMPARISON_COLUMNS)[:cut], ["protocol", *list(COMPARISON_COLUMNS)[cut:]]]
-    winners = [
-        [
-            str(row["scheduled_us"]),
-            row["rmse"],
-            row["per_second"],
-            *(f"{100 * row[f'rmse_m {name}']:.2f}" for name in protocols),
-        ]
-        for row in found.winners
-    ]
-    blocks: list[Block] = [
-        Text(
-            f"{outcomes[0].ranges:,} raw ranges per protocol, in the same world and with the same noise. Errors are "
-            "those of raw ranges, with antenna delays, power bias and reflections."
-        ),
-        *(Table(names, [[COMPARISON_COLUMNS[name](one) for name in names] for one in outcomes]) for names in halves),
-        Text(
-            "Predicted: analytically, without simulation. Air: total duration of the frames; duration: from the start "
-            "of the first frame to the end of the last; radio on: time for which the two radios send or listen, a "
-            "proxy of energy; rate: exchanges per second, one after the other.",
-            "note",
-        ),
-        Picture(
-            "errors",
-            partial(figures.histograms, samples=samples),
-            "Distribution of errors. The outermost bins include all values beyond them.",
-        ),
-        Heading("Best protocol by delay"),
-        Text(
-            "Predicted, after calibration of delays and power bias, without reflections. One range: the protocol with "
-            "the least error of a single range. Per second: that with the least error of the mean of the ranges of a "
-            "second."
-        ),
-        Table(["scheduled delay (µs)", "one range", "per second", *(f"{name} (cm)" for name in protocols)], winners),
-        Heading(f"A fleet of {found.fleet[0].tags} tags"),
-        Text(
-            "Predicted, after calibration and without reflections. Protocols: the pairs range in turn. broadcast: each "
-            "tag sends a frame in turn, which all others hear. tdoa: the tags are anchors that do so; any number of "
-            "listeners have the differences of arrival. Air and radio on: per range, or per difference at a listener. "
-            "Updates: how often a second, at most, all pairs range, or a listener has all differences."
-        ),
-        Table([*FLEET_COLUMNS], [[show(one) for show in FLEET_COLUMNS.values()] for one in found.fleet]),
-        Heading("Errors over skew, delay, distance and power"),
-        Text(
-            "Points are simulated, lines predicted; the first two figures are without antenna delays, power bias and "
-            "reflections. Axes that cover decades are logarithmic and labelled so; the axis of biases is linear up "
-            "to ± 1 cm and logarithmic beyond."
-        ),
-    ]
-    blocks += [
+    return [
         Picture(
             f"over {x.partition(' (')[0]}".replace(" ", "-"),
             partial(figures.error_over, curves=curves, x=x, logarithmic=x.startswith("delay")),
@@ -224,7 +231,6 @@ def comparison(found: ProtocolComparison) -> Document:
         for curves, x, caption in over
         if any(np.ptp(c.x) > 0 for c in curves.values())  # of boards that stand still there is one distance
     ]
-    return Document(f"Protocols in {scenario.run.name}", blocks)
 
 
 def optimum_file(protocol: str) -> str:
@@ -284,7 +290,7 @@ def write_sweep_page(plan: SweepDesign, folder: Path, *, figures: Path | None = 
         rows = list(islice(store, most + 1))
     path, document = folder / "results.html", _swept(plan, rows)
     if len(rows) > most:
-        document.blocks.append(Text(f"Only the first {most:,} rows are drawn; the tables have all.", "warning"))
+        document.blocks.append(Text(f"Only the first {most:,} rows are drawn; the tables contain all.", "warning"))
     write_document(document, path, figures=figures, force=True)
     return path
 
@@ -297,13 +303,13 @@ def _swept(plan: SweepDesign, rows: Sequence[Mapping[str, Any]]) -> Document:
         Text(
             f"{plan.total:,} runs over {', '.join(plan.keys) or 'nothing'}, {len(plan.seeds)} "
             f"seed{'s' * (len(plan.seeds) > 1)} each, of which {failed:,} failed. Lines are medians, bands the full "
-            "range over seeds and over all other keys; maps are medians over seeds. The tables beside this page have "
-            "every run."
+            "range over seeds and over all other keys; maps are medians over seeds. The tables in this folder "
+            "contain every run."
         ),
     ]
     found = _results(good, plan.keys) if varied else {}
     if not found:
-        blocks.append(Text("Nothing to draw: no result of a run is a number that changes.", "warning"))
+        blocks.append(Text("Nothing to draw: no numerical result varies between runs.", "warning"))
     protocols = [str(row.get("protocol", "")) for row in good]
     spelled = {key: _spelled(key) for key in varied}
     columns = {
@@ -400,8 +406,12 @@ def write_twin(found: Twin, compared: Sequence[Compared], path: Path, *, force: 
         cells = [[key, *(_shown(row[column]) for column in columns)] for key, row in rows.items()]
         blocks.append(Table([name[:-1], *columns], cells))
     blocks += [
-        Heading("What the recording does not determine"),
-        Table(["kept at its default, or chosen without the recording"], [[text] for text in found.unknown], words=True),
+        Heading("Properties that the recording does not determine"),
+        Table(
+            ["they keep their defaults, or are chosen without the recording"],
+            [[text] for text in found.unknown],
+            words=True,
+        ),
     ]
     write_text(path, to_html(Document(f"The twin of {Path(found.measured.where).name}", blocks)), force=force)
 

@@ -79,16 +79,16 @@ class ProtocolComparison:
 
     @cached_property
     def fleet(self) -> list[FleetFigures]:
-        """Return by prediction what the scenario's tags get from each protocol, from broadcasts and as anchors."""
+        """Predict errors and rates of the scenario's tags with each protocol, with broadcasts and as anchors."""
         scenario, world = self.scenario, calibrated(conditions_of(self.scenario, 2048))
         return fleet_figures(world, self.protocols, len(scenario.senders()), scenario.radio.preamble_symbols)
 
     @cached_property
     def winners(self) -> list[dict[str, Any]]:
-        """Return by prediction which protocol has the least error at some delays of the scheduled reply.
+        """Predict the protocol with the smallest error at some delays of the scheduled reply.
 
-        After a calibration; by `rmse`, a single range; by `per_second`, the mean of as many as one pair has in a second
-        of its own (`PredictedErrors.mean_of`), which is what counts where the air is full and ranges are averaged.
+        Errors are those after a calibration. `rmse` compares single ranges; `per_second` compares the mean of all
+        ranges of a pair in a second (`PredictedErrors.mean_of`), which matters if ranges are averaged.
         """
         world = calibrated(conditions_of(self.scenario, 2048))
         rows = []
@@ -281,7 +281,7 @@ class BestDelay:
 
     def __repr__(self) -> str:
         """Return one line."""
-        edge = " (the edge of what boards take)" if self.on_edge else ""
+        edge = " (at the limit of the boards)" if self.on_edge else ""
         return (
             f"{self.protocol}: best delay {1e6 * self.delay_s:.0f} µs{edge}, one range {100 * self.rms_m:.2f} cm in "
             f"{1e6 * self.duration_s:.0f} µs, mean of a second {1e3 * self.second_rms_m:.3f} mm"

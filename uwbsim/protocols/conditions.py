@@ -164,7 +164,9 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
     scenario = scenario.model_copy(update={"radio": scenario.radio.model_copy(update={"outages": None})})
     plan = schedule(scenario)
     if not len(plan.start):
-        raise ScenarioError(f"run.duration_s: no exchange is planned in {scenario.run.duration_s:g} s; fly longer")
+        raise ScenarioError(
+            f"run.duration_s: no exchange is planned in {scenario.run.duration_s:g} s; use a longer run"
+        )
     rows = np.unique(np.linspace(0, len(plan.start) - 1, min(count, len(plan.start))).astype(np.int64))
     marker = round(before_marker_s(scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)
     start, i, j = plan.start[rows] + marker, plan.initiator[rows], plan.target[rows]

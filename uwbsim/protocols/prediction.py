@@ -226,9 +226,9 @@ def conditions_of_state(q: State, protocol: RangingProtocol) -> Conditions:
     timings = [message.timing for message in protocol.messages]
     target_waits, final_at_once = timings[1] == "scheduled", timings[1:] == ["scheduled", "at once"]
     if q.final_delay_us is not None and target_waits and not final_at_once:
-        what = "has no third message" if len(timings) < 3 else "waits as long with its third message as with its reply"
+        what = "has no third message" if len(timings) < 3 else "has equal delays of reply and third message"
         raise ParameterError(
-            f"{protocol.name} {what}; leave it out, and give that of the reply", parameter="final_delay_us"
+            f"{protocol.name} {what}; remove it, and give the delay of the reply", parameter="final_delay_us"
         )
     # The boards' firmware waits by default 1500 of its own microseconds (512/499.2 us), and a step of its clock.
     final_us = 1538.7 if q.final_delay_us is None else q.final_delay_us
@@ -282,7 +282,7 @@ class FleetFigures:
 
 
 def predict_fleet(q: State, tags: int) -> list[FleetFigures]:
-    """Predict what a fleet of `tags` tags, or of as many anchors and any listeners, gets by each way of ranging.
+    """Predict errors and rates of a fleet of `tags` tags, or of as many anchors with listeners, by each way of ranging.
 
     The state's `reply_delay_us` is that of replies at once, also between broadcasts, and `final_delay_us` that of
     scheduled messages, which single-sided responses are. Raises `ParameterError` for a number out of range.

@@ -1,4 +1,4 @@
-"""Scenarios: their models, and the way from a file to them."""
+"""Scenarios: their models, and how files are read into them."""
 
 from uwbsim.scenario.devices import with_antenna_delays
 from uwbsim.scenario.loading import copy_scenarios, listed, shipped_scenarios

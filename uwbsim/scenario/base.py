@@ -59,7 +59,7 @@ def check_limits(key: str, value: Any) -> None:
         for one in value:
             check_limits(key, one)
     elif isinstance(value, int | float) and abs(value) > limit_of(key)[0]:
-        (most, reason), shown = limit_of(key), f"{value:g}" if value < 1e300 else "a number of hundreds of digits"
+        (most, reason), shown = limit_of(key), f"{value:g}" if value < 1e300 else "a number with hundreds of digits"
         raise ValueError(f"{key}: found {shown}, at most {most:g} is allowed ({reason})")
 
 

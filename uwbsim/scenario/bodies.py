@@ -66,7 +66,9 @@ class Waypoints(Section):
 
 
 class Figure(Section):
-    """A structured training figure around a centre, turning all the way: every direction and distance comes up."""
+    """A structured training figure around a centre with a steady turn, which covers all directions and many
+    distances.
+    """
 
     model: Literal["figure"] = Field(description="A training figure, with a steady turn of the body.")
     shape: Literal["circle", "eight", "helix"] = Field(description="Which figure.")
@@ -87,9 +89,9 @@ class Static(Section):
 
 
 class Carried(Section):
-    """A body that stands still in one place after the other, and is carried from each to the next; then stays."""
+    """A body that stands still at several places in turn, and is carried from one to the next; it stays at the last."""
 
-    model: Literal["carried"] = Field(description="Stands still in one place after the other.")
+    model: Literal["carried"] = Field(description="Stands still at several places in turn.")
     places_m: Annotated[tuple[Vector, ...], Field(min_length=1)] = Field(
         description="The places, one or more, in the order of its stays."
     )
@@ -190,7 +192,7 @@ wet tissue). Excess delay is (index - 1) times the thickness."""
 
 
 class Material(Section):
-    """What an obstacle is made of: loss in dB a metre, and refractive index."""
+    """Material of an obstacle: loss in dB per metre, and refractive index."""
 
     loss_db_per_m: NotNegative = Field(description="Loss of waves inside.")
     index: Annotated[float, Field(ge=1)] = Field(1.0, description="Refractive index.")

@@ -42,7 +42,7 @@ class WarmUp(Section):
     model: Literal["warm-up"] = Field(description="From one value towards another, exponentially.")
     start: float = Field(description="The value before.")
     end: float = Field(description="The value in the limit.")
-    time_constant_s: Positive = Field(description="Time in which the difference shrinks by e.")
+    time_constant_s: Positive = Field(description="Time in which the difference decreases by the factor e.")
     begin_s: float = Field(0.0, description="When it begins; negative: part of it is over when the run begins.")
 
 
@@ -75,7 +75,7 @@ def _constant(value: Any) -> Any:
 Profile = Annotated[
     Annotated[Constant | Ramp | WarmUp | ProfileTable, Field(discriminator="model")], BeforeValidator(_constant)
 ]
-"""Something over the time of a run."""
+"""A quantity as a function of time."""
 
 
 class Devices(Section):
@@ -170,9 +170,9 @@ Register = Annotated[int, Field(ge=0, le=REGISTER_MAX)]
 
 
 class Body(Section):
-    """Something that carries tags, and may stand in the way of waves."""
+    """A body that carries tags, and may attenuate waves."""
 
-    name: Annotated[str, Field(min_length=1)] = Field(description="What the body is called; no two have the same name.")
+    name: Annotated[str, Field(min_length=1)] = Field(description="Name of the body; names must differ.")
     motion: Motion = Field(description="How it moves.")
     shadow: Shadow | None = Field(
         None,
@@ -209,7 +209,7 @@ class ScenarioTag(Section):
     do to a tag is in `Devices`.
     """
 
-    id: TagId = Field(description="Number of the board; no two have the same.")
+    id: TagId = Field(description="Id of the board; ids must differ.")
     body: str = Field(description="Name of the body that carries it.")
     lever_arm_m: Vector = Field((0.0, 0.0, 0.0), description="Position of its antenna in the frame of the body.")
     delay_ns: float | None = Field(

@@ -56,7 +56,7 @@ def _folder() -> Path:
 
 
 def listed(names: Iterable[str] = ()) -> dict[str, str]:
-    """Return titles of shipped scenarios by name; raises what `copy_scenarios` raises for `names`.
+    """Return titles of shipped scenarios by name; raises the errors of `copy_scenarios` for `names`.
 
     A title is the first sentence of the comment at the head of the file.
     """
@@ -99,7 +99,7 @@ def _chosen(names: list[str]) -> Mapping[str, Path]:
 
 
 Source = str | os.PathLike[str] | Mapping[str, Any]
-"""A scenario before it is checked: a file, TOML text (more than one line), or the same as nested tables."""
+"""A scenario that is not validated yet: a file, TOML text (more than one line), or nested tables."""
 
 Overrides = Sequence[str] | Mapping[str, Any]
 
@@ -236,7 +236,7 @@ def validated(model: type[Model], table: Mapping[str, Any], path: str | Path) ->
 
 def _explain(where: str, first: Mapping[str, Any]) -> str:
     if first["type"] == "missing":
-        return f"{where}: missing, and it must be given"
+        return f"{where}: missing; this key is required"
     message, found = str(first["msg"]).removeprefix("Value error, "), repr(first["input"])
     if first["type"] == "value_error":
         # A table's own check begins with the key it is about; that of a single value begins with what was found.
@@ -317,7 +317,10 @@ def check_linked(path: Path, where: str, beside: Path, folders: Folders) -> Path
         raise ScenarioError(f"{where}, but there is no such file beside the scenario") from error
     if not inside:
         # The message does not reveal whether the file exists.
-        raise ScenarioError(f"{where}, which is not below the naming file's folder; `allow_files` names other folders")
+        raise ScenarioError(
+            f"{where}, which is not in the folder of the file that names it, nor below; allow other "
+            f"folders with `allow_files`"
+        )
     if not place.exists():
         raise ScenarioError(f"{where}, but there is no such file beside the scenario")
     if not place.is_file():

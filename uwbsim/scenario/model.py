@@ -1,4 +1,4 @@
-"""The scenario: what a TOML file may say, validated. Units are in the key names, and leave here as SI properties.
+"""The scenario: the validated contents of a TOML file. Units are in the key names, and leave here as SI properties.
 
 `uwbsim.scenario.loading.load` turns every mistake into one `ScenarioError` line. The models here and in `ranging`,
 `radio`, `devices` and `bodies` are the whole schema, with descriptions of all keys.
@@ -109,7 +109,7 @@ class Scenario(Section):
         )
         require(
             self.pairs(),
-            "ranging.pairs: no two tags sit on different bodies, or send broadcasts, so no exchange is possible",
+            "ranging.pairs: no exchange is possible, because no two tags are on different bodies, or send broadcasts",
         )
         return self
 
@@ -133,12 +133,12 @@ class Scenario(Section):
             return
         if self.room and self.room.reflection_loss_db is not None:
             raise ValueError(
-                f"room.reflection_loss_db: found {self.room.reflection_loss_db:g}, but in the geometric model surfaces "
-                "reflect as room.material does; leave it out"
+                f"room.reflection_loss_db: found {self.room.reflection_loss_db:g}, but in the geometric model "
+                f"reflections follow from room.material; remove this key"
             )
         require(
             self.room or not model.scatterers,
-            f"radio.multipath.scatterers: found {model.scatterers} and no room to put them into; give room, or 0",
+            f"radio.multipath.scatterers: found {model.scatterers} but no room for them; give room, or 0",
         )
 
     def _check_places(self) -> None:
@@ -185,7 +185,7 @@ class Scenario(Section):
         require(
             first <= self.run.duration_s,
             f"ranging.plan: its first slot is at {first:g} s, after the end of the run (run.duration_s = "
-            f"{self.run.duration_s:g}); fly longer",
+            f"{self.run.duration_s:g}); use a longer run",
         )
 
     def pairs(self) -> list[tuple[int, int]]:
@@ -201,7 +201,7 @@ class Scenario(Section):
         return [tag.id for tag in self.tags if not tag.passive or self.ranging.plan != "broadcast"]
 
     def planted(self) -> dict[str, Any]:
-        """Return what a calibration of this scenario should find, JSON-ready."""
+        """Return the planted values that a calibration of this scenario should find, as JSON values."""
         delays = {str(t.id): t.delays_ns()[0] - t.delays_ns()[1] for t in self.tags}
         bias = self.radio.bias if isinstance(self.radio.bias, Spline) else None
         sigma = self.radio.sigma

@@ -154,7 +154,7 @@ class PlanFile(Section):
 
 
 class Ranging(Section):
-    """Who ranges with whom, how, and how often."""
+    """The ranging plan: pairs, protocol, order and rate."""
 
     protocol: ProtocolName = Field(
         "ds",

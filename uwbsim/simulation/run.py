@@ -1,4 +1,4 @@
-"""Simulation of a scenario (plan, event loop, stamps, reports of the boards), and what to expect of it without."""
+"""Simulation of a scenario (plan, event loop, stamps, reports of the boards), and its preview."""
 
 from __future__ import annotations
 
@@ -274,7 +274,7 @@ def through_wire(simulated: Simulated) -> tuple[Simulated, list[FrameRow]]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairPreview:
-    """What to expect of a pair: rate, distances and first-path powers over the run, and its bias by skew in SS-TWR."""
+    """The preview of a pair: rate, distances and first-path powers over the run, and its bias by skew in SS-TWR."""
 
     initiator: int
     target: int
@@ -288,7 +288,7 @@ class PairPreview:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Preview:
-    """What to expect of a run of `scenario`; `air_share` is the share of time in which some frame is on the air."""
+    """The preview of a run of `scenario`; `air_share` is the share of time in which a frame is on the air."""
 
     scenario: Scenario
 
@@ -300,7 +300,7 @@ class Preview:
     duration_s: float
 
     def __repr__(self) -> str:
-        """Return what to expect, a line each; warnings begin with "warning:"."""
+        """Return the preview as lines; warnings begin with "warning:"."""
         scenario, ranging = self.scenario, self.scenario.ranging
         plan = ranging.plan if isinstance(ranging.plan, str) else ranging.plan.file
         lines = [
@@ -340,7 +340,7 @@ class Preview:
 
 
 def preview(scenario: Scenario | Source) -> Preview:
-    """Predict what a scenario will do, without running it; raises `ScenarioError`.
+    """Predict exchanges, distances and powers of a scenario without running it; raises `ScenarioError`.
 
     `scenario` is whatever `load` takes, or a `Scenario`.
 

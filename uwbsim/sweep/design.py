@@ -31,7 +31,7 @@ Count = Annotated[int, Field(strict=True, ge=1, le=MOST_RUNS)]
 
 
 def evaluators() -> dict[str, EntryPoint]:
-    """Return what installed distributions offer to do with the flights of a sweep, by the kind of sweep."""
+    """Return the evaluations of flights that installed distributions offer, by the kind of sweep."""
     return {entry.name: entry for entry in entry_points(group=EVALUATORS)}
 
 
@@ -55,8 +55,8 @@ class SweepSettings(_Table):
     )
     kind: Annotated[str, AfterValidator(_known_kind)] = Field(
         "compare",
-        description="What a run does: compare protocols; or simulate a flight, and calibrate and evaluate it, or what "
-        "an installed distribution offers by that name.",
+        description="Task of a run: compare protocols; calibrate, which simulates a flight, calibrates and evaluates "
+        "it; or the name of an evaluation of an installed distribution.",
     )
     protocols: Annotated[tuple[ProtocolName, ...], Field(min_length=1)] | None = Field(
         None, description='The protocols of each run; by default all, or ["ds"] to calibrate.'
@@ -83,7 +83,7 @@ class Span(_Table):
 class SweepFile(_Table):
     """The file of a sweep."""
 
-    sweep: SweepSettings = Field(description="What a run does, and the number of runs.")
+    sweep: SweepSettings = Field(description="Task of the runs, and their number.")
     vary: dict[str, Any] = Field(
         {},
         description='By key of the scenario, such as "radio.tx_noise_ps": a list of values of a grid, or the span of '
@@ -110,7 +110,7 @@ class Run:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepDesign:
-    """A sweep as its file has it, and where its runs come from: all combinations of a choice from each of the `axes`.
+    """A sweep as in its file; its runs are all combinations of a choice from each of the `axes`.
 
     A choice is the values of some keys. A grid has an axis for each key; a list or a Latin hypercube is a single axis.
     """
@@ -222,7 +222,7 @@ def _axes(path: Path, file: SweepFile) -> list[list[dict[str, Any]]]:
             raise ScenarioError(f"{path}: a list needs tables [[list]], and no [vary]")
         return [file.points]
     if file.points:
-        raise ScenarioError(f'{path}: list: goes with design = "list"')
+        raise ScenarioError(f'{path}: list: can only be used with design = "list"')
     if file.sweep.design == "latin-hypercube":
         return [_hypercube(path, file)]
     for key, values in file.vary.items():

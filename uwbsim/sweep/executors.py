@@ -90,8 +90,8 @@ class Work:
             module = sys.modules.get(getattr(function, "__module__", None) or "")
             if getattr(module, getattr(function, "__qualname__", ""), None) is not function:
                 raise ParameterError(
-                    f"found {function!r}, which other processes cannot import; "
-                    "give a function at the top of a module, or work in this process (workers = 1)",
+                    f"found {function!r}, which other processes cannot import; use a function at the top level of a "
+                    f"module, or one process (workers = 1)",
                     parameter=what,
                 )
 
@@ -237,8 +237,8 @@ class Processes(Workers):
         except BrokenProcessPool as error:
             self._held.close()
             raise WorkersLostError(
-                "`workers`: a process ended as it began: is there memory for so many, and does the script begin its "
-                "work below `if __name__ == '__main__':`? With 1 the work is done in this process"
+                "`workers`: a process ended at its start; check that there is enough memory, and that the script "
+                "starts its work below `if __name__ == '__main__':`; with 1 the work is done in this process"
             ) from error
         return pool
 
@@ -307,7 +307,8 @@ class Cluster(Workers):
             return super().finished()
         except (CancelledError, OSError, TimeoutError) as error:
             raise ClusterLostError(
-                f"{self._address}: the scheduler is gone; results so far are kept, go on with `resume`"
+                f"{self._address}: the connection to the scheduler is lost; results so far are kept, continue with "
+                f"`resume`"
             ) from error
 
     def close(self) -> None:

@@ -86,7 +86,9 @@ def run_sweep(
     if kind != "compare":
         evaluate = evaluate or evaluator(kind)
     elif evaluate is not None:
-        raise ParameterError("goes with sweeps of flights, and the kind of this one is 'compare'", parameter="evaluate")
+        raise ParameterError(
+            "can only be used with sweeps of flights, but the kind of this one is 'compare'", parameter="evaluate"
+        )
     if workers is not None and workers < 1:
         raise ParameterError(f"found {workers}, expected 1 or more", parameter="workers")
     work = Work.of_here(plan.scenario.stem, plan.protocols, plan.settings.ranges, evaluate)
@@ -112,20 +114,20 @@ def _check(plan: SweepDesign, folder: Path, *, resume: bool) -> None:
         with ResultStore.open(path, own) as store:
             known, begun = store.identity(), bool(store.done())
     elif resume:
-        raise ParameterError(f"{folder} holds no sweep to go on with", parameter="resume")
+        raise ParameterError(f"{folder} contains no sweep to continue", parameter="resume")
     elif folder.is_dir() and any(folder.iterdir()):
         raise ScenarioError(f"{folder}: holds other files; give an empty folder or a new one")
     told = {
         "plan": f"holds the results of another sweep, {known.get('plan')}",
         "fingerprint": f"{plan.path.name} or its scenario has changed since its results were made",
-        "uwbcal": f"its results are of uwbcal {known.get('uwbcal')}, this is {uwblink.__version__}",
+        "uwbcal": f"its results were made with uwbcal {known.get('uwbcal')}, but this is {uwblink.__version__}",
     }
     for key, text in told.items():
         if known and known.get(key) != own[key]:
             raise ScenarioError(f"{folder}: {text}; give another folder")
     if begun and not resume:
         raise ParameterError(
-            f"{folder} holds results of this sweep; go on with it, or give another folder", parameter="resume"
+            f"{folder} already contains results of this sweep; continue it, or give another folder", parameter="resume"
         )
 
 
@@ -197,7 +199,7 @@ class ResultStore:
         if not is_utf8(path):
             raise TableError(f"{path}: its name and those of its folders must be UTF-8; give another one")
         if path.is_symlink():
-            raise TableError(f"{path}: is a link; give the folder in which the sweep was begun")
+            raise TableError(f"{path}: is a link; give the folder in which the sweep was started")
         try:
             db = connect(path)
         except duckdb.Error as error:

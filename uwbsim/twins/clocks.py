@@ -21,7 +21,7 @@ from uwbsim.twins.flight import TwinFlight
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockFit:
-    """What clocks did: rates in ppm at the start by tag's place, their walks in ppm a root of a second, (tags,) each.
+    """Fitted clocks: rates in ppm at the start and random walks in ppm per root of a second, (tags,) each.
 
     Clocks ran faster by `warm_up_ppm` (tags,) at first, which decayed with the time constant `warm_up_s`, None where
     none did. The mean of all rates at the start, without that, is zero by choice: nothing in a recording says what true

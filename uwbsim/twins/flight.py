@@ -230,28 +230,30 @@ class TwinFlight:
         names, counts = np.unique(flown.exchanges.protocol, return_counts=True)
         row = PROTOCOLS[str(names[np.argmax(counts)])]
         x = flown.exchanges[np.flatnonzero(flown.exchanges.protocol == row.name)]
-        require(len(x) >= fewest, f"holds {len(x)} exchanges, a twin needs {fewest} or more; record longer")
+        require(len(x) >= fewest, f"has {len(x)} exchanges, but a twin needs {fewest} or more; record longer")
         spans = intervals(x)
         legs = (spans.dt32, spans.dt53) if row.third_sender else (spans.dt32,)
         longest_ms = max(float(np.median(leg)) for leg in legs) * TICK_S * 1e3
         require(
-            longest_ms < 6.7, f"waits {longest_ms:.1f} ms in its exchanges, boards 6.7 at most; broadcasts have no twin"
+            longest_ms < 6.7,
+            f"has reply delays of {longest_ms:.1f} ms, but boards reply within 6.7 ms; twins of "
+            f"broadcasts are not supported",
         )
         require(len(flown.poses), "holds no poses; add motion capture with `uwblink poses`")
         x = x[np.argsort(x.time_ns, kind="stable")]
         powers = np.array([x.fpp1_dbm, x.fpp2_dbm])
         good = np.all(np.isfinite(powers) & (powers < 0), axis=0)
-        require(good.any(), "no exchange has both first-path powers, and a twin is made from powers")
+        require(good.any(), "no exchange has both first-path powers, which a twin needs")
         ids = np.unique([x.initiator, x.target]).tolist()
         lacking = ", ".join(str(tag) for tag in ids if tag not in {tag.tag for tag in flown.tags})
-        require(not lacking, f"does not say on which body tag {lacking} sits; give tags with 'uwblink poses --tags'")
+        require(not lacking, f"has no body of tag {lacking}; add it with 'uwblink poses --tags'")
         known.require(ids)
         distance, towards = sights(flown.poses, list(flown.tags), x.initiator, x.target, x.time_ns)
         good &= np.isfinite(distance) & ~without_stamps(x) & (x.initiator != x.target)
         require(
             np.count_nonzero(good) >= fewest,
-            f"{np.count_nonzero(good)} of {len(good)} exchanges have stamps, both powers and poses around them, a twin "
-            f"needs {fewest} or more; record longer, and with motion capture all the time",
+            f"{np.count_nonzero(good)} of {len(good)} exchanges have stamps, both powers and poses, but a twin needs "
+            f"{fewest} or more; record longer, with motion capture all the time",
         )
         x, distance = x[good], distance[good]
         # In order of their numbers, so that places in it can be searched.

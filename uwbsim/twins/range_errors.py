@@ -50,8 +50,8 @@ class KnownDevices:
         if missing:
             known = ", ".join(map(str, sorted(self.calibration.delays_ns)))
             raise ScenarioError(
-                f"{self.where}: no delay for tag {', '.join(map(str, missing))} of the recording; it knows {known}; "
-                "fit one from a recording with all tags"
+                f"{self.where}: no delay of tag {', '.join(map(str, missing))} of the recording; it has delays of "
+                f"{known}; fit one from a recording with all tags"
             )
 
 
@@ -66,8 +66,8 @@ def read_calibration(source: CalibrationSource) -> KnownDevices:
         known = Calibration.from_json(json.dumps(source), where) if isinstance(source, Mapping) else source
         found = known if isinstance(known, Calibration) else load_calibration(known)
     for key, text in (
-        ("groups", "its tags have curves by group, and a scenario has one; fit one curve for all tags"),
-        ("pair_offsets", "it knows constants of pairs, and a scenario has delays of tags; fit delays"),
+        ("groups", "it has curves by group, but a scenario has only one; fit one curve for all tags"),
+        ("pair_offsets", "it has constants of pairs, but a scenario has delays of tags; fit delays"),
     ):
         if getattr(found, key):
             raise ScenarioError(f"{where}: {key}: {text}")
@@ -127,7 +127,7 @@ def fit_range_errors(flight: TwinFlight, receive_noise_s: Floats) -> FittedRange
         # The twin has the errors of this recording: what pairs differ by between recordings is left out.
         found = fit(ranges, between_m=0.0).calibration
     if found.errors is None:
-        raise TooFewDataError(f"{flight.where}: the errors of its ranges have no spread")
+        raise TooFewDataError(f"{flight.where}: the errors of its ranges are all equal")
     applied = found.apply(ranges)
     shapes = found.errors.shapes(applied.lifted, x.initiator, x.target)
     excess, reflected = found.errors.least_m + shapes.detour_m, applied.tail_probability

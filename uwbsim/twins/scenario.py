@@ -265,8 +265,8 @@ def _cut(mine: Poses, origin_ns: int, duration_s: float) -> Poses:
 
 NOT_DETERMINED: Final = (
     "The common rate of all clocks: skew_ppm is relative to their mean at the start, on which no range depends.",
-    "White and flicker noise of clocks (white_ppm_sqrt_s, flicker_ppm: none): in a flight they cannot be told from "
-    "noise of stamps and from a random walk of the rate.",
+    "White and flicker noise of clocks (white_ppm_sqrt_s, flicker_ppm: none): in a flight they cannot be separated "
+    "from noise of stamps and a random walk of the rate.",
     "Noise of transmit stamps (tx_noise_ps: none): it is included in that of receive stamps.",
     "The split of a delay into transmission and reception: 0.44 to 0.56.",
     "Effects of reflections on total power and on impulse responses (total_loss_db, rise_ns).",

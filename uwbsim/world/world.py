@@ -256,8 +256,8 @@ def _trajectories(scenario: Scenario) -> dict[str, Trajectory]:
                 break
         else:
             raise ScenarioError(
-                f"min_separation_m: body {body.name!r} comes nearer than {least:g} m to another in {tries} tries; "
-                "give bodies more room, or less separation"
+                f"min_separation_m: in {tries} tries body {body.name!r} comes closer than {least:g} m to another; "
+                f"give bodies more space, or less separation"
             )
         found[body.name] = path
     return found

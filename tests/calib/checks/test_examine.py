@@ -321,7 +321,7 @@ def test_places_that_the_true_distances_of_a_table_contradict_are_named():
     assert faults(planted.changed(flight, truth_m=truth_m + 0.01)) == ["too few pairs"]
     wrong = planted.exchanged_anchors(flight, RNG(5), given=False)
     found = only(planted.changed(wrong, truth_m=truth_m + 0.01), "swapped tag ids")
-    assert found.evidence.startswith("by the poses, tag 101 is where 103")
+    assert found.evidence.startswith("by the poses, tag 101 is at the given position of 103")
 
 
 def test_true_distances_of_an_anchor_that_is_nobodys_place_are_named():
@@ -396,7 +396,7 @@ def test_a_wall_between_anchors_is_named_and_places_where_they_explain_it(seed, 
     (found,) = calib.examine(wall(flight, None))
     assert found.fault == "pairs that do not close"
     assert f"pair {pair[0]}-{pair[1]} " in found.evidence
-    assert ("or anchors stand elsewhere" in found.evidence) is either
+    assert ("or anchors are at other positions" in found.evidence) is either
 
 
 def test_an_anchor_that_moved_between_recordings_is_named():

@@ -56,7 +56,7 @@ def test_stretches_are_over_all_of_the_time_and_their_distances_are_those_of_all
 def test_nothing_is_found_where_nothing_was_planted_and_it_is_said_what_was_looked_at(path):
     assert calib.examine(path) == []
     assert examined_part(24_000) == (
-        "about 6000 of its 24000 exchanges were looked at, in 12 stretches over all of its time"
+        "about 6000 of its 24000 exchanges were examined, in 12 stretches over all of its time"
     )
 
 

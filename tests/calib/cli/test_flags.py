@@ -115,9 +115,9 @@ def test_a_distance_is_read_as_one_types_it(text, found):
     ("words", "said"),
     [
         (("--truth", "tape"), "--truth: found 'tape', allowed: recorded, ranges"),
-        (("--poses-until", "6"), "--poses-until: goes with a fit whose --truth is ranges"),
-        (("--truth", "ranges", "--loss", "huber"), "--loss: goes with known distances only"),
-        (("--truth", "ranges", "--trim-static"), "--trim-static: goes with known distances only"),
+        (("--poses-until", "6"), "--poses-until: can only be used if --truth is ranges"),
+        (("--truth", "ranges", "--loss", "huber"), "--loss: can only be used with known distances"),
+        (("--truth", "ranges", "--trim-static"), "--trim-static: can only be used with known distances"),
         (("--truth", "ranges", "--anchors", "lost"), "--anchors: found 'lost', allowed: given, sought"),
         (("--truth", "ranges", "--distance", "1:3=2"), "--distance: found '1:3=2', expected TAG-TAG=METRES"),
         (("--truth", "ranges", "--distance", "1-9=2"), "--distance: found tag 9, the tags that range are 1, 2, 3"),
@@ -190,7 +190,7 @@ def test_one_pair_is_evaluated_without_a_number_between_pairs(folder):
     assert "nan" not in told
 
 
-# A fit that stopped before it settled says so wherever its calibration goes, and does not end as if all were well.
+# A fit that stopped before it converged says so wherever its calibration goes, and does not end as if all were well.
 
 
 @pytest.fixture
@@ -214,9 +214,9 @@ def test_the_command_writes_it_marks_it_and_ends_with_1(stopped, stopped_flight,
     done, path = stopped
     assert done.exit_code == 1
     assert "stopped after" in done.stdout
-    assert "before it settled" in done.stderr
+    assert "before it converged" in done.stderr
     assert json.loads(path.read_text())["provenance"]["converged"] is False
-    assert "NOT SETTLED" in repr(calib.load_calibration(path))
+    assert "NOT CONVERGED" in repr(calib.load_calibration(path))
     as_json = run_stopped("fit", stopped_flight, "-o", tmp_path / "d.json", "--json")
     assert as_json.exit_code == 1
     assert json.loads(as_json.stdout)["provenance"]["converged"] is False
@@ -232,8 +232,8 @@ def test_commands_that_use_it_warn(stopped, stopped_flight, tmp_path):
     ):
         done = run_stopped(*words)
         assert done.exit_code == 0, done.output
-        assert "stopped before it settled" in done.stderr, words[0]
-    assert "NOT SETTLED" in run_stopped("show", path).stdout
+        assert "stopped before it converged" in done.stderr, words[0]
+    assert "NOT CONVERGED" in run_stopped("show", path).stdout
 
 
 def test_a_fit_that_settled_is_quiet(stopped_flight, tmp_path):

@@ -1,4 +1,4 @@
-"""Worlds whose errors belong to places: boards in twos on bodies that swim, a smooth field of errors between any two.
+"""Worlds whose errors depend on places: boards in twos on bodies that swim, a smooth field of errors between any two.
 
 Nothing here is shared with the simulator or the fit: no walls and no paths, but waves over the places of both ends.
 """

@@ -34,7 +34,7 @@ NAMED = {
     "a tag's delay goes with power": "tag 1",
     "uncorrected skew": "clock skew",
     "truth 2 % short": "grow with the distance",
-    "antenna delays of 514 ns not configured": "more than boards differ by",
+    "antenna delays of 514 ns not configured": "larger than differences of boards",
 }
 """What the first sentences must name; the others need only be right, or doubted."""
 
@@ -144,6 +144,6 @@ def test_noise_of_powers_that_follow_the_distance_is_not_called_places_alone(noi
     radio = {"first_path_at_1m_dbm": -78.0, "shadowing_db": 0.0, "saturation_dbm": -50.0, "power_noise_db": noise_db}
     settings = {"run.duration_s": 12.0, "run.seed": seed} | {f"radio.{name}": value for name, value in radio.items()}
     warnings = calib.fit(uwbsim.simulate(uwbsim.load("broadcast", settings))).warnings
-    places = [text for text in warnings if text.startswith(("errors belong", "ranges grow", "pair"))]
+    places = [text for text in warnings if text.startswith(("errors depend", "ranges grow", "pair"))]
     assert len(places) == place
-    assert all("or powers are read with noise" in text for text in places)
+    assert all("or the powers are noisy" in text for text in places)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import calib
-from calib.checks.limits import power_levels_db, unlike_powers
+from calib.checks.limits import power_level_warning, power_levels_db
 from calib.data.ranges import concatenate
 from tests.calib import synthetic
 from tests.calib.estimation.fields import ranges_with_field
@@ -25,7 +25,7 @@ def apart(result, planted):
 
 
 def named(result):
-    return [warning for warning in result.warnings if warning.startswith("errors belong to places")]
+    return [warning for warning in result.warnings if warning.startswith("errors depend on places")]
 
 
 def test_offsets_between_bodies_that_last_are_in_the_intervals_and_named():
@@ -118,13 +118,13 @@ def test_ranges_without_powers_have_no_levels():
     r = world()
     bare = replace(r, fpp2_dbm=np.full(len(r), np.nan))
     assert power_levels_db(bare) == {}
-    assert not [*unlike_powers(bare, calib.fit(r).calibration)]
+    assert not [*power_level_warning(bare, calib.fit(r).calibration)]
 
 
 def test_a_tag_that_reads_too_high_is_named_with_what_its_delay_holds():
     result = calib.fit(world(read=READ_DB, noise_db=0.3, tail=0.0, noise_m=0.02))
-    (said,) = [warning for warning in result.warnings if "stand apart" in warning]
-    assert said.startswith("powers of tag 3 (+2.0 dB) stand apart")
+    (said,) = [warning for warning in result.warnings if "differ from the others" in warning]
+    assert said.startswith("powers of tag 3 (+2.0 dB) differ from the others")
     held_ps = float(re.search(r"up to (\d+) ps", said)[1])
     away = np.array([result.calibration.delays_ns[tag] - delay for tag, delay in DELAYS_NS.items()])
     # A shift common to all is the curve's constant, so the others are the reference; a fifth for how the curve bends.

@@ -153,4 +153,4 @@ def test_a_likelihood_that_leaves_a_pair_out_is_not_believed(monkeypatch):
 
     monkeypatch.setattr(known_distances, "likeliest", lost)
     assert fit(r).calibration.loss == "cauchy"
-    assert any("left all ranges of a pair out" in warning for warning in fit(r, loss="mixture").warnings)
+    assert any("treated all ranges of a pair as reflected" in warning for warning in fit(r, loss="mixture").warnings)

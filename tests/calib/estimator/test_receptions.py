@@ -128,7 +128,7 @@ def test_a_target_whose_ranges_contradict_what_is_overheard_is_named():
     told = replace(data, overheard=dict(data.overheard) | {"rx2": data.overheard["rx2"] + late})
     told.overheard["rx3"] += late
     said = [w for w in calib.fit(told, use="receptions").warnings if "overheard" in w]
-    assert [w for w in said if w.startswith("tag 3: what listeners overheard contradicts its ranges")], said
+    assert [w for w in said if w.startswith("tag 3: overheard frames contradict its ranges")], said
 
 
 def test_two_messages_take_the_rate_from_the_carrier():

@@ -211,7 +211,7 @@ def test_no_truth_is_needed(tmp_path):
     assert [path.name for path in (tmp_path / "blind").iterdir()] == ["f_uwb-drone-imu.tum"]
     assert onboard_json([track])[0]["rmse_m"] is None
     assert "used: ranges, imu, height" in onboard_text([track], OnboardSettings())
-    assert "no truth to judge by" in repr(track)
+    assert "no true positions" in repr(track)
     (known,) = localize_onboard(contents, calibration(), OnboardSettings(noise=IMU))
     np.testing.assert_allclose(track.estimate_m, known.estimate_m, atol=1e-6)
     write_tum([known], tmp_path / "both")
@@ -284,7 +284,7 @@ FEW = [f"anchor{k}" for k in range(4)]
             lambda flown: {"poses": flown.poses[np.flatnonzero(~np.isin(flown.poses.body, FEW))]},
             {},
             UnanswerableError,
-            "2 tags stay in one place",
+            "by its poses 2 tags stand still",
         ),
         (lambda _: {}, {"model": "magic"}, BadInputError, "`model`: found 'magic', allowed: imu, constant-velocity"),
         (lambda _: {}, {"start_m": (0.0, np.nan, 1.0)}, BadInputError, "`start_m`"),

@@ -356,7 +356,7 @@ def test_missing_sensors_are_named(change, settings, error, said):
 def test_a_body_with_one_tag_is_named():
     contents = flight(2.0)
     two = (contents.exchanges.initiator != 6) & (contents.exchanges.target != 6)
-    with pytest.warns(WeakHeadingWarning, match="memory: c has one tag that ranges"):
+    with pytest.warns(WeakHeadingWarning, match="memory: c has only one tag"):
         found = localize_team(replace(contents, exchanges=contents.exchanges[two]), PLANTED, CLOSE)
     assert found[1].tracks["variance"].rmse_m < 0.2
 
@@ -390,7 +390,7 @@ def test_the_command_prints_writes_and_refuses(known, tmp_path):
         assert set(less) == {"raw", "calibrated", "variance", "robust"}
     text = processes.run(*words, "--start-std", "0.02", "1", "0.05", "--tum", tmp_path / "tum").stdout
     assert "start: relative poses within 0.02 m, 1 deg and 0.05 m/s" in text
-    assert "by listening" not in text
+    assert "by overheard frames" not in text
     assert (tmp_path / "tum" / "three_uwb-robot2-from-robot1-dead-reckoning.tum").exists()
     truth = np.loadtxt(tmp_path / "tum" / "three_uwb-robot3-from-robot1-truth.tum")
     close = np.loadtxt(tmp_path / "tum" / "three_uwb-robot3-from-robot1-variance.tum")

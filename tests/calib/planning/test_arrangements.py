@@ -84,7 +84,7 @@ def test_delays_stay_open_until_something_tells_them(boards, settings, undetermi
 
 def test_a_taped_distance_brings_what_it_is_said_to_bring():
     without = calib.plan(5, on="plane", arrangements=3)
-    tape = next(best for best in without.next_best if "by tape" in best.what)
+    tape = next(best for best in without.next_best if "a measured distance" in best.what)
     with_it = calib.plan(5, on="plane", arrangements=3, taped=1)
     mean = math.sqrt(np.mean(np.square(list(with_it.half_ns.values()))))
     assert mean == pytest.approx(tape.mean_ns, rel=0.05)
@@ -145,7 +145,7 @@ def test_the_command_prints_steps_and_json():
         (4, {"on": "plane", "anchors": [9]}, "anchors"),
         (4, {"on": "line", "anchors": [1]}, "anchors"),
         (4, {"rate_hz": 0.0}, "rate_hz"),
-        (30, {"on": "plane", "size_m": (0.5, 0.5)}, "find no room"),
+        (30, {"on": "plane", "size_m": (0.5, 0.5)}, "there is no room"),
     ],
 )
 def test_what_cannot_be_planned_is_refused(boards, settings, message):
@@ -205,5 +205,5 @@ def test_a_plan_says_what_reflections_and_a_curve_cost():
     curved = plain.with_curve_ns
     assert curved.each > max(plain.half_ns.values())
     assert curved.each == pytest.approx(math.hypot(curved.apart, curved.common), rel=1e-6)
-    assert f"what all share ± {curved.common:.3f} ns." in str(plain)
+    assert f"common part ± {curved.common:.3f} ns." in str(plain)
     assert reflected.to_dict()["with_curve_ns"]["common"] > plain.to_dict()["with_curve_ns"]["common"]

@@ -100,7 +100,7 @@ def test_sought_anchors_stay_open_and_given_ones_do_not():
     seen = flight(seconds=8.0, anchors=CORNERS, rate=60)
     sought = calib.plan_flight(seen, poses_until_s=3.0, anchor_places="sought")
     assert sought.undetermined == ANCHORS
-    assert sought.next_best[0].what == "the places of the anchors, measured"
+    assert sought.next_best[0].what == "measured positions of the anchors"
     assert 1.96 * mean_ns(seen, poses_until_s=3.0) == pytest.approx(sought.next_best[0].mean_ns, rel=0.02)
 
 
@@ -163,9 +163,9 @@ def test_a_tape_between_robots_that_stand_says_what_all_delays_share():
     free, taped = calib.plan_flight(2, **given), calib.plan_flight(2, taped=1, **given)
     assert free.common_ns > 0.7
     assert taped.common_ns < 0.3 * free.common_ns
-    said = next(best for best in free.next_best if "by tape" in best.what)
+    said = next(best for best in free.next_best if best.what.startswith("a measured distance"))
     (pair,) = taped.taped
-    assert said.what == f"the distance of tags {pair[0]} and {pair[1]} by tape"
+    assert said.what == f"a measured distance of tags {pair[0]} and {pair[1]}"
     assert said.mean_ns == pytest.approx(taped.next_best[0].instead_of_ns, rel=1e-6)
     assert f"--distance {pair[0]}-{pair[1]}=METRES@0..4" in "\n".join(taped.commands("PORTS"))
 
@@ -215,20 +215,20 @@ def test_the_command_prints_steps_and_what_a_fit_is_told():
     ("robots", "settings", "message"),
     [
         (0, {}, "robots"),
-        (1, {}, "ranges with nobody"),
+        (1, {}, "has no partner for ranges"),
         ([[1, 2], [2]], {}, "robots"),
         ([[1], []], {}, "robots"),
         ([[-1], [2]], {}, "robots"),
         (3, {"anchors": [1]}, "anchors"),
         (3, {"seconds": 1.0}, "seconds"),
-        (3, {"seconds": 3600.0}, "more than a plan takes"),
+        (3, {"seconds": 3600.0}, "too many for a plan"),
         (3, {"rate_hz": math.nan}, "rate_hz"),
         (3, {"speed_m_s": 0.0}, "speed_m_s"),
         (3, {"apart_m": -1.0}, "apart_m"),
         (3, {"size_m": (3.0, 2.0)}, "size_m"),
         (3, {"noise_m": 0.0}, "noise_m"),
         (3, {"taped": -1}, "taped"),
-        (3, {"taped": 1, "seconds": 8.0}, "only 0 can be measured"),
+        (3, {"taped": 1, "seconds": 8.0}, "only 0 distances can be measured"),
         (3, {"still_s": -1.0}, "still_s"),
         (3, {"still_s": 40.0}, "still_s"),
         (3, {"tape_sigma_m": 0.0}, "tape_sigma_m"),
@@ -281,6 +281,6 @@ def test_four_anchors_more_are_at_known_places_whatever_is_said_of_anchors_that_
     short: Any = {"seconds": 6.0, "rate_hz": 20.0, "poses_until_s": 0.0}
     given, sought = (calib.plan_flight(2, **short, anchor_places=places) for places in ("given", "sought"))
     mean = [
-        {best.what: best.mean_ns for best in plan.next_best}["4 anchors at known places"] for plan in (given, sought)
+        {best.what: best.mean_ns for best in plan.next_best}["4 anchors at known positions"] for plan in (given, sought)
     ]
     assert mean[0] == pytest.approx(mean[1], rel=1e-9)

@@ -153,7 +153,7 @@ def test_a_section_of_ones_own_is_in_the_report(campaign, tmp_path, sections):
     campaign.write(tmp_path / "r.html", tmp_path / "r.pdf")
     page = (tmp_path / "r.html").read_text()
     titles = re.findall("<h2 id='s[0-9]+'>(.*?)</h2>", page)
-    assert titles[titles.index("Weather") + 1] == "Is it determined?"
+    assert titles[titles.index("Weather") + 1] == "Are the delays determined?"
     assert "Dry over 270 ranges; &lt;wet&gt; tomorrow." in page
     printed = PdfReader(tmp_path / "r.pdf")
     outline: list[Any] = printed.outline
@@ -209,7 +209,7 @@ def test_commands_draw_what_they_find_and_replace_nothing(folder, words, names, 
     done = command(app, words, catch_exceptions=False)
     assert done.exit_code == 0, done.output
     assert {f"{name}-{form}" for name in names for form in FORMS} <= {path.name for path in (folder / "out").iterdir()}
-    with pytest.raises(calib.BadInputError, match="out holds figures already"):
+    with pytest.raises(calib.BadInputError, match="out already contains figures"):
         command(app, words, catch_exceptions=False)
 
 
@@ -259,7 +259,7 @@ def test_a_planned_flight_has_its_path_its_intervals_and_what_brings_more(tmp_pa
     words = ["plan", "flight", "2", "--duration", "8", "--rate", "40", "--anchor-tags", "11,12,13,14"]
     run(tmp_path, *words, "--anchors", "sought", "--poses-until", "4", "-o", "plan.html")
     text = (tmp_path / "plan.html").read_text(encoding="utf-8")
-    assert {"anchor12", "stays open", "+ the places of the anchors, measured"} <= set(words_of(text))
+    assert {"anchor12", "stays open", "+ measured positions of the anchors"} <= set(words_of(text))
     assert "Fit delays, curve and trajectories together." in text
 
 

@@ -162,9 +162,7 @@ def found_of(tables, question):
 
 def test_the_verdict_has_the_numbers_that_it_rests_on(page, tables):
     raw, full = (100 * np.median(np.abs(error - page.truth)) for error in (page.raw, page.full))
-    before, after, change = map(
-        float, re.findall(r"[-+]?\d+\.?\d*", found_of(tables, "Does it make ranges better?"))[:3]
-    )
+    before, after, change = map(float, re.findall(r"[-+]?\d+\.?\d*", found_of(tables, "Do range errors decrease?"))[:3])
     assert [before, after, change] == pytest.approx([raw, full, 100 * (full / raw - 1)], abs=0.51)
     assert change < 0
     groups = {name: page.of(rows)["full"] for name, rows in page.groups().items() if name != "all"}
@@ -175,7 +173,7 @@ def test_the_verdict_has_the_numbers_that_it_rests_on(page, tables):
         for n in (np.count_nonzero(page.groups()[name]),)
     }
     worst = max(groups, key=lambda name: sure[name])
-    told = found_of(tables, "Is no pair left with a bias?")
+    told = found_of(tables, "Are all pairs free of bias?")
     assert worst in told
     stats = groups[worst]
     numbers = [float(x) for x in re.findall(r"(?<![\d-])[-+]?\d+\.\d+", told)]
@@ -183,7 +181,10 @@ def test_the_verdict_has_the_numbers_that_it_rests_on(page, tables):
     assert numbers == pytest.approx(expected, abs=0.051)
     assert numbers[0] < 0
     of = page.of(page.groups()["all"])
-    for question, share in (("how far ranges can be off", of["inside_95"]), ("at such powers", of["clamped"])):
+    for question, share in (
+        ("stated errors of ranges right", of["inside_95"]),
+        ("within the fitted powers", of["clamped"]),
+    ):
         row = next(row for row in tables.having("criterion") if question in row[0])
         assert number(row[2]) == pytest.approx(100 * share, abs=0.051)
     row = next(row for row in tables.having("criterion") if "delays known" in row[0])
@@ -274,7 +275,7 @@ def test_the_errors_of_ros_yaml_are_what_the_model_says(folder, page):
 # The verdict on worlds of which it is known how they stand: judged on recordings, or made without known distances.
 
 
-CONTRADICTED = "Do the ranges agree with what is said to be known?"
+CONTRADICTED = "Do the ranges agree with the known facts?"
 
 
 @pytest.fixture(scope="module")
@@ -309,12 +310,12 @@ def test_what_fits_what_it_has_not_seen_is_fit_for_use(known, unseen):
 
 def test_without_a_test_and_with_warnings_there_are_reservations(known, unseen):
     text, met = told(known, unseen, tests=[], training=[unseen])
-    assert (text.kind, met["Was it judged on recordings that the fit has not seen?"]) == ("doubt", "! in part")
+    assert (text.kind, met["Was it evaluated on other recordings than the fitted ones?"]) == ("doubt", "! in part")
     clock = Finding(fault="clock", evidence="it jumps", remedy="leave it out", p_value=0.0)
     text, met = told(changed(known, warnings=["only 3 s of data"]), unseen, findings=[("a.uwb", clock)])
     assert text.kind == "doubt"
     assert "2 warnings, below" in text.text
-    assert [question for question, how in met.items() if how != "✓ yes"] == ["Is there nothing to warn of?"]
+    assert [question for question, how in met.items() if how != "✓ yes"] == ["Are there no warnings?"]
 
 
 def longer(known, unseen):
@@ -328,7 +329,7 @@ def noisier(known, unseen):
     return known, replace(unseen, raw_m=unseen.raw_m + noise)
 
 
-def left_open(known, unseen):
+def undetermined_delays(known, unseen):
     return changed(known, undetermined=[[1, 2], [3, 7]]), unseen
 
 
@@ -345,11 +346,11 @@ def of_other_boards(known, unseen):
 @pytest.mark.parametrize(
     ("change", "question", "words"),
     [
-        (longer, "Is no pair left with a bias?", "keeps a bias of +1"),
-        (noisier, "Does it say rightly how far ranges can be off?", ""),
-        (left_open, "Are the antenna delays known well enough?", "tags 1, 2; 3, 7 are not determined"),
-        (stronger, "Was the curve fitted at such powers?", ""),
-        (of_other_boards, "Does it make ranges better?", ""),
+        (longer, "Are all pairs free of bias?", "has a remaining bias of +1"),
+        (noisier, "Are the stated errors of ranges right?", ""),
+        (undetermined_delays, "Are the antenna delays known well enough?", "tags 1, 2; 3, 7 are not determined"),
+        (stronger, "Are the powers of the recordings within the fitted powers?", ""),
+        (of_other_boards, "Do range errors decrease?", ""),
     ],
 )
 def test_what_changed_since_makes_it_unfit(known, unseen, change, question, words):
@@ -367,11 +368,14 @@ def test_a_few_ranges_of_a_pair_do_not_make_it_unfit(known, unseen):
         raw_m = unseen.raw_m.copy()
         raw_m[mine] += 0.15
         text, met = told(known, replace(unseen, raw_m=raw_m)[others])
-        assert (met["Is no pair left with a bias?"], text.kind == "bad") == (mark, mark == "✗ no")
+        assert (met["Are all pairs free of bias?"], text.kind == "bad") == (mark, mark == "✗ no")
 
 
 def test_few_powers_that_were_not_fitted_are_a_reservation(known, unseen):
-    assert told(*stronger(known, unseen, 0.12))[1]["Was the curve fitted at such powers?"] == "! in part"
+    assert (
+        told(*stronger(known, unseen, 0.12))[1]["Are the powers of the recordings within the fitted powers?"]
+        == "! in part"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -393,9 +397,9 @@ def test_each_criterion_of_a_survey_fails_where_it_should(surveyed):
     assert set(grades(known).values()) == {"good"}
     rests = known.provenance["rests_on"]
     sick = {
-        CONTRADICTED: {"findings": ["A is said to be a line and is none"]},
+        CONTRADICTED: {"findings": ["A: the boards are not on a line"]},
         "Do the arrangements check each other?": {"rests_on": rests | {"freedom": 2.0}},
-        "Are the constant errors of pairs those of such boards?": {"rests_on": rests | {"pair_error_m": 0.2}},
+        "Are the constant errors of pairs small enough?": {"rests_on": rests | {"pair_error_m": 0.2}},
         "Are few pairs reflected?": {"reflected": [{"chance": 1.0}] * 9},
     }
     for question, parts in sick.items():
@@ -403,7 +407,7 @@ def test_each_criterion_of_a_survey_fails_where_it_should(surveyed):
     assert grades(changed(known, second_best=2.0))["Is there no other solution?"] == "doubt"
     wide = tuple(tuple(0.04 for _ in row) for row in known.uncertainty.delays_ns2)
     unsure = replace(known, uncertainty=replace(known.uncertainty, delays_ns2=wide))
-    assert grades(unsure)["Is what all delays share known?"] == "bad"
+    assert grades(unsure)["Is the common part of all delays known?"] == "bad"
 
 
 def foundations(known: Calibration):
@@ -412,7 +416,7 @@ def foundations(known: Calibration):
 
 def test_the_section_has_the_places_and_the_reflected_pair(surveyed):
     heading, text, places, picture, *rest = foundations(surveyed.calibration)
-    assert heading == Heading("What it rests on")
+    assert heading == Heading("Known facts")
     assert isinstance(text, Text)
     assert "36 mean ranges of pairs in 6 arrangements" in text.text
     assert isinstance(places, Table)
@@ -446,7 +450,7 @@ def test_reports_of_a_survey_and_of_its_evaluation_say_what_it_rests_on(surveyed
     write_survey_report(page, surveyed.calibration)
     text = page.read_text(encoding="utf-8")
     assert "Fit for use" in text
-    assert "What it rests on" in text
+    assert "Known facts" in text
     assert '"surveyed"' not in text
     with pytest.raises(UwblinkError, match=r"page\.html"):
         write_survey_report(page, surveyed.calibration)
@@ -455,4 +459,4 @@ def test_reports_of_a_survey_and_of_its_evaluation_say_what_it_rests_on(surveyed
     judged = replace(surveyed.calibration, delays_ns=delays, delays_std_ns={}, uncertainty=None)
     results = Results(calibration=judged, tests=[flight])
     assert CONTRADICTED in [one.question for one in criteria(results)]
-    assert Heading("What it rests on") in SECTIONS["foundations"](results)
+    assert Heading("Known facts") in SECTIONS["foundations"](results)

@@ -43,10 +43,10 @@ def test_the_campaign_has_every_section_in_order(campaign):
     page = (campaign / "r.html").read_text()
     sections = re.findall("<h2 id='s[0-9]+'>(.*?)</h2>", page)
     assert sections == [
-        "What was recorded", "Is it determined?", "Antenna delays", "Bias and standard deviation over power",
+        "What was recorded", "Are the delays determined?", "Antenna delays", "Bias and standard deviation over power",
         "Before and after", "Outliers", "Localization", "Over time", "Provenance",
     ]  # fmt: skip
-    assert "these flights are simulated, so metres do not compare" in page
+    assert "these flights are simulated, so values in metres cannot be compared" in page
     assert page.count("class='many'") == 2, "tables of recordings and by pair and stage are set smaller"
     assert not re.findall(r"(?:src|href)=['\"](?!data:|#)|@import|url\((?!#)", page), "it needs no other file"
     assert not re.findall(r"\b(?:fetch|XMLHttpRequest|WebSocket|import)\b\(", page)
@@ -153,7 +153,7 @@ def test_planted_delays_stand_beside_fitted_ones(campaign):
         tag, fitted, known, difference_ps = row[0], *(number(row[k]) for k in (1, 4, 5))
         assert known == pytest.approx(planted[tag] + shift, abs=2e-4), "moved by what is common to all"
         assert fitted - known == pytest.approx(1e-3 * difference_ps, abs=2e-4)
-    assert "heard by others (ns)" in header
+    assert "by listeners (ns)" in header
     unplanted = Results(calibration=fit(ranges(600)).calibration, tests=[ranges(600)])
     (table,) = [block for block in SECTIONS["delays"](unplanted) if isinstance(block, Table)]
     assert table.header == ["tag", "delay (ns)", "95 % from", "to"]

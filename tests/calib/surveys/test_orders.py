@@ -44,7 +44,7 @@ def test_exchanged_labels_are_named_and_the_ranges_are_believed(right):
     pair = f"{min(order[:2])} and {max(order[:2])}"
     # Those that are exchanged in all arrangements are one mistake.
     for wrong, text in (
-        ([("3", *order[:2])], f"3: boards {pair} stand in each other's place: said was"),
+        ([("3", *order[:2])], f"3: boards {pair} are exchanged: the stated order"),
         ([(str(k), 2, 5) for k in range(1, 6)], "1, 2, 3, 4, 5: boards 2 and 5 "),
     ):
         found = calib.survey(FIVE.ranges, known=said_with(FIVE, wrong), regardless=True)

@@ -114,7 +114,7 @@ def test_what_cannot_be_told_is_said_and_widens():
     # Of three boards on a line, any of the three ranges may be the wrong one, longer or too short.
     who = [(one.first, one.second) for one in result.reflected if one.arrangement == "2"]
     assert len(who) > 1
-    assert any(text.startswith("may be reflected, too: ") for text in result.warnings)
+    assert any(text.startswith("may also be reflected: ") for text in result.warnings)
     clean = calib.survey(world.ranges, known="line").calibration
     for tag, delay in result.calibration.delays_ns.items():
         assert abs(delay - world.delays_ns[tag]) < 3 * result.calibration.delays_std_ns[tag]

@@ -46,7 +46,7 @@ def test_a_tape_tells_what_delays_have_in_common_and_without_it_the_interval_is_
     error, std = common(without)
     assert abs(error) < 1.96 * std
     assert without.calibration.provenance["undetermined"] == [list(DELAYS_NS)]
-    assert float(re.findall(r"in common is known to ± ([\d.]+) ns", without.warnings[0])[0]) == pytest.approx(
+    assert float(re.findall(r"common part is known to ± ([\d.]+) ns", without.warnings[0])[0]) == pytest.approx(
         1.96 * std, abs=0.01
     )
     result = calib.fit_from_ranges(flown, distances=[by_tape(flown, 1, 3)], **given)
@@ -135,7 +135,7 @@ def test_heights_tell_on_which_side_of_anchors_in_one_plane_bodies_are():
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"shaken": (0.05, 4.0)}, "bodies move faster than control points every 0.1 s follow"),
+        ({"shaken": (0.05, 4.0)}, "bodies move too fast for control points every 0.1 s"),
         ({"late_m": {(1, 3): 0.3}}, "pair 1-3: "),
     ],
     ids=["too quick", "a pair reflected all along"],
@@ -156,7 +156,7 @@ def test_walls_between_bodies_are_named_and_in_the_intervals(between_m):
         late |= {(2 * robot + own, 11 + anchor): offset for own in (1, 2)}
     flown = flight(seconds=6.0, rate=120, anchors=CORNERS, late_m=late)
     result = calib.fit_from_ranges(flown, poses_until_s=4.0, heading_std_deg=0.0)
-    assert bool([text for text in result.warnings if text.startswith("errors belong to places")]) == (between_m > 0)
+    assert bool([text for text in result.warnings if text.startswith("errors depend on places")]) == (between_m > 0)
     found = result.calibration
     errors = [found.delays_ns[int(tag)] - delay for tag, delay in flown.planted["delays_ns"].items()]
     assert np.abs(np.array(errors) / list(found.delays_std_ns.values())).max() < 2.5

@@ -159,7 +159,7 @@ def test_another_form_ends_with_a_line_and_no_file(tmp_path):
         refuse(*words, "--dialect", "arduino", cwd=tmp_path, naming=[port, "no range in", "hello 1", "dialect"])
         refuse(*words, "--dialect", "nonsense", cwd=tmp_path, naming=["--dialect", "dwm1001-lec"])
         refuse(*words, "--dialect", "arduino", "--pairs", "all", cwd=tmp_path, naming=["--pairs", "--dialect"])
-        refuse(*words, "--dialect", "arduino", "--ids", "1,2", cwd=tmp_path, naming=["1 ports and 2 ids"])
+        refuse(*words, "--dialect", "arduino", "--ids", "1,2", cwd=tmp_path, naming=["1 ports, but 2 ids"])
     # It is the only device that answers: of others, what was recorded would be kept.
     with printing(BOTH.splitlines(keepends=True)[0]) as port:
         same = ("uwblink", "record", port, "--duration", "30", "-o", "r.uwb", "--dialect", "arduino")

@@ -124,7 +124,7 @@ def test_a_disk_that_is_late_is_still_told(live, monkeypatch):
     with RecordingWriter(live) as writer:
         monkeypatch.setattr(time, "monotonic", lambda: plain() + later[0])
         monkeypatch.setattr(writer, "_write", lambda: None)
-        with pytest.raises(RecordingError, match=r"the disk is 2\d s behind"):
+        with pytest.raises(RecordingError, match=r"the disk is 2\d s late"):
             for _ in range(60):  # the loop asks all the while
                 later[0] += 0.5
                 writer.check()
@@ -143,7 +143,7 @@ def test_a_file_that_is_removed_under_the_recorder_is_told_within_a_second(tmp_p
             path.write_text("mine")
         begun.append(time.monotonic())
 
-    with served() as server, pytest.raises(RecordingError, match=r"f\.uwb: was removed or replaced while"):
+    with served() as server, pytest.raises(RecordingError, match=r"f\.uwb: was removed or replaced during"):
         record(server.names.values(), path, RangingPlan(), duration_s=60.0, listeners=[After(t20=remove)])
     assert time.monotonic() < begun[0] + 20.0  # a second on a machine that has nothing else to do
     assert not replaced or path.read_text() == "mine"
@@ -191,7 +191,7 @@ def test_two_recorders_cannot_have_one_file(tmp_path):
     ports = VirtualPorts(bench_scenario())
     record(ports.names.values(), path, RangingPlan(), duration_s=2.0, using=ports, listeners=[After(t20=second)])
     assert [ended.returncode for ended in found] == [2, 2, 2]
-    assert "exists already" in found[0].stderr
+    assert "already exists" in found[0].stderr
     for ended in found[1:]:
         assert ended.stderr == f"error: {path}: another process is writing it; give another name\n"
     exchanges, kinds = exchanges_of(path)

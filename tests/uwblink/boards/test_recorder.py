@@ -57,7 +57,7 @@ def test_a_plan_that_seats_other_boards_is_refused_before_anything_is_recorded(t
     ports, out = VirtualPorts(bench_scenario()), tmp_path / "a.uwb"
     seats = [Tag(number, "drone", (0.1, 0.0, 0.0)) for number in (20, 10)]
     with pytest.raises(
-        PlanError, match="the plan has places of the tags 10, 20, but the boards at the ports are 1, 2, 3"
+        PlanError, match="the plan has positions of the tags 10, 20, but the boards at the ports are 1, 2, 3"
     ):
         record(ports.names.values(), out, RangingPlan(tags=tuple(seats)), duration_s=0.5, using=ports)
     assert not out.exists()
@@ -182,7 +182,7 @@ def test_two_boards_with_one_id_and_absent_ports_are_refused_before_anything_is_
             record([one.names[1], two.names[1]], path, RangingPlan())
         with pytest.raises(PortMissingError, match="no such port"):
             record([one.names[1], "/dev/nothing"], path, RangingPlan())
-        with pytest.raises(PlanError, match="names 9"):
+        with pytest.raises(PlanError, match="contains 9"):
             record([one.names[1], one.names[2]], path, RangingPlan(((1, 9),)))
         path.write_text("mine")
         with pytest.raises(RecordingExistsError):

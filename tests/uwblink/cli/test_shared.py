@@ -37,7 +37,7 @@ class WorseError(MineError):
         (WorseError("worse"), 1, "error: worse\n"),
         (MineError("a\nb\x1b[31m \ud800"), 2, "error: a\\nb\\x1b[31m \\ud800\n"),
         (OSError(36, "File name too long", "aaa"), 2, "error: aaa: File name too long\n"),
-        (MemoryError(), 2, "error: not enough memory for that; nothing was written\n"),
+        (MemoryError(), 2, "error: not enough memory; nothing was written\n"),
     ],
 )
 def test_an_error_is_one_line_and_a_status(error, code, line, capsys):
@@ -67,7 +67,7 @@ def test_numbers_beyond_numbers_are_an_error_and_not_a_result(capsys):
     assert end.value.code == 2
     out, err = capsys.readouterr()
     assert out == ""
-    assert err.startswith("error: numbers beyond what can be computed with (overflow")
+    assert err.startswith("error: numbers are too large for the computation (overflow")
 
 
 def test_an_error_of_nobody_is_not_swallowed():

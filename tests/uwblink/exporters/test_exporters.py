@@ -72,9 +72,9 @@ def test_what_cannot_be_exported_leaves_nothing(whole, tmp_path):
     assert sorted(tmp_path.iterdir()) == before
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").write_text("mine")
-    with pytest.raises(RecordingExistsError, match="exists already"):
+    with pytest.raises(RecordingExistsError, match="already exists"):
         export_recording(whole, tmp_path / "out", to="csv")
-    with pytest.raises(RecordingError, match="holds mine"):
+    with pytest.raises(RecordingError, match="contains mine"):
         export_recording(whole, tmp_path / "out", to="csv", force=True)
     assert (tmp_path / "out" / "mine").read_text() == "mine"
     (tmp_path / "out" / "mine").rename(tmp_path / "out" / "meta.csv")
@@ -83,7 +83,7 @@ def test_what_cannot_be_exported_leaves_nothing(whole, tmp_path):
 
 
 def test_a_folder_that_is_no_export(whole, tmp_path):
-    with pytest.raises(ImportTableError, match=r"holds no exchanges\.csv"):
+    with pytest.raises(ImportTableError, match=r"contains no exchanges\.csv"):
         import_recording(tmp_path, tmp_path / "o.uwb", importer="exported")
     export_recording(whole, tmp_path / "out", to="csv")
     imu, path = tmp_path / "out" / "imu.csv", tmp_path / "out" / "exchanges.csv"
@@ -108,7 +108,7 @@ def test_a_form_of_ones_own(whole, tmp_path):
         assert export_recording(whole, tmp_path / "out", to="names") == {"name.txt": 1}
     finally:
         EXPORTERS.remove("names")
-    with pytest.raises(ArgumentError, match="the project's own"):
+    with pytest.raises(ArgumentError, match="this name is reserved"):
         register_exporter(Exporter("csv", write, "mine"))
 
 

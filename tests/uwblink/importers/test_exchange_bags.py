@@ -142,9 +142,9 @@ def test_what_is_no_bag_is_said(tmp_path):
         ("no.bag", {}, "cannot be read as a bag"),
         ("folder", {"importer": "bag"}, "cannot be read as a bag"),
         ("absent.mcap", {}, "no such bag"),
-        ("t.csv", {"map_file": tmp_path / "m.toml"}, "each is of JSON lines, bags and logs"),
+        ("t.csv", {"map_file": tmp_path / "m.toml"}, "the key each is for JSON lines, bags and logs"),
     ):
         with pytest.raises(ImportTableError, match=said):
             read_source(tmp_path / name, **more)
-    with pytest.raises(ArgumentError, match="takes one file, found 2"):
+    with pytest.raises(ArgumentError, match="needs one file, found 2"):
         read_source([tmp_path / "no.bag"] * 2, importer="bag")

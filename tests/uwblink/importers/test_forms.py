@@ -340,7 +340,7 @@ def test_a_form_comes_in_by_its_guess(tmp_path, name):
     np.testing.assert_allclose(truths, [row[3] if form.truth else np.nan for row in want], atol=1e-9)
     # Powers of registers have the digits of a float; a total power serves where there is none of the first path.
     np.testing.assert_allclose(powers, [row[4] if form.powers else np.nan for row in want], atol=1e-4)
-    assert any("received power serves" in note for note in found.meta["notes"]) == (form.powers == "rxp")
+    assert any("received power is used" in note for note in found.meta["notes"]) == (form.powers == "rxp")
     assert form.noted in " ".join(found.meta["notes"])
     assert found.meta.get("chip") == form.answers.get("chip")
 
@@ -387,8 +387,8 @@ def test_a_number_that_often_stands_for_no_range_is_refused_until_the_map_states
         ('line = "{range_m} {range_m}"', "different places"),
         ('[wide]\nrange_m = "zz{to_id}"', "wide.range_m: no column 'zz{to_id}'"),
         ('[wide]\nrange_m = "zz"', "wide.range_m"),
-        ('from_name = "x{from_id}.csv"', "its name is not 'x{from_id}.csv'"),
-        ('each = "rows"', "each is of JSON lines"),
+        ('from_name = "x{from_id}.csv"', "its name does not match 'x{from_id}.csv'"),
+        ('each = "rows"', "the key each is for JSON lines"),
         ('[columns]\nrange_m = 4\nfrom_id = "from_id"', "for all their numbers"),
         ("[columns]\nrange_m = 9\nfrom_id = 2\nto_id = 3", "column '9' is missing"),
         ('[columns]\nfpp2 = {f1 = "a", n = "b"}', "columns of f1, f2, f3 and n"),

@@ -195,7 +195,7 @@ def test_the_command_says_what_to_do_and_how_to_go_on(tmp_path, ids, todo):
 def test_words_for_ids_are_told_with_their_numbers(tmp_path):
     rows = [{"t_s": k, "src": chr(65 + k % 13), "dst": chr(66 + k % 13), "range_m": 3.0} for k in range(60)]
     (note,) = guessed(tmp_path, write(tmp_path / "t.csv", rows)).meta["notes"]
-    assert note.startswith("14 ids are words or too large, and get numbers: A = 1, B = 2,")
+    assert note.startswith("14 ids are words or too large, and were numbered: A = 1, B = 2,")
     assert note.endswith(", L = 12 and 2 more")
 
 
@@ -328,7 +328,7 @@ def test_differences_of_arrival_without_stamps_are_read(tmp_path, header, named,
     (tmp_path / "d.csv").write_text(f"{header}\n{rows}")
     guess = guess_map(tmp_path / "d.csv")
     assert guess.asked == (() if "tag" in header else ("at_id",))
-    assert "distance of at_id to to_id less that to from_id" in guess.text
+    assert "distance from at_id to to_id minus that to from_id" in guess.text
     (tmp_path / "map.toml").write_text(guess.text.replace('at_id = "?"', "at_id = 9"))
     found_map = load_map(tmp_path / "map.toml")
     assert found_map.layout == "differences"
@@ -338,7 +338,7 @@ def test_differences_of_arrival_without_stamps_are_read(tmp_path, header, named,
         "uwblink", "import", "csv", "d.csv", "--map", "map.toml", "-o", "d.uwb", cwd=tmp_path
     ).stdout
     assert "0 exchanges, 30 differences" in said
-    assert "distance of at_id to to_id less that to from_id" in said
+    assert "distance from at_id to to_id minus that to from_id" in said
     found = load(tmp_path / "d.uwb").differences
     assert [found[name].tolist() for name in ("minus", "plus", "listener")] == [[1] * 30, [2] * 30, [9] * 30]
     scale = 0.299702547 if units else 1.0

@@ -147,7 +147,7 @@ def test_the_file_that_was_given_is_named_and_not_what_a_plug_in_made_of_it(tmp_
     (tmp_path / "a.flux").touch()
     register_importer(Importer("flux", (".flux",), None, "Import flux.", tables=tables))
     try:
-        with pytest.raises(ImportTableError, match=rf"^{tmp_path}/a.flux: a header and no rows$"):
+        with pytest.raises(ImportTableError, match=rf"^{tmp_path}/a.flux: has a header but no rows$"):
             import_recording(tmp_path / "a.flux", tmp_path / "o.uwb")
     finally:
         IMPORTERS.remove("flux")

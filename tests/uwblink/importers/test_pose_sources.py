@@ -108,7 +108,7 @@ def test_bodies_without_poses_are_named_whether_some_or_no_ranges_have_both_ends
     places.write_text("".join(f'[[tags]]\nid = {k}\nbody = "{name}"\n' for k, name in ((1, "Car"), (2, "car"))))
     done = processes.run("uwblink", "poses", recording, *files, "--tags", places, "--offset", "auto", "--force")
     assert (done.returncode, done.stdout) == (2, "")
-    assert "bodies are car, those of the tags Car, car; give the bodies of tags 9, which range," in done.stderr
+    assert "bodies are car, but those of the tags are Car, car; give the bodies of tags 9, which range," in done.stderr
 
 
 def test_trajectories_of_several_bodies_and_anchors(recording, tmp_path):

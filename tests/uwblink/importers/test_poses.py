@@ -75,8 +75,8 @@ def test_rows_in_which_motion_capture_lost_a_body_are_left_out(tmp_path, cell):
         ),
         ("a.csv", HEADER, "holds no poses"),
         ("a.csv", HEADER + "0,b,1,2,3,0,0,0,0\n", "quaternion has length 0"),
-        ("a.tum", "0 1 2 3\n", "name its body with `body`"),
-        ("a.csv", "#timestamp [ns], x\n1,2,3\n", "name its body with `body`"),
+        ("a.tum", "0 1 2 3\n", "give the name with `body`"),
+        ("a.csv", "#timestamp [ns], x\n1,2,3\n", "give the name with `body`"),
         ("a.xyz", "", "expected one of"),
     ],
 )
@@ -132,7 +132,7 @@ def test_the_command_says_what_it_did_and_refuses_what_cannot_be(flight, copied,
     assert (done.returncode, done.stderr.count("\n"), "--offset" in done.stderr) == (2, 1, True)
     for more, error, fragment in (
         ({"source": tmp_path / "no.csv"}, ImportTableError, "no such file"),
-        ({"offset": "500000"}, ImportTableError, "no exchange lies within"),
+        ({"offset": "500000"}, ImportTableError, "no exchange is within"),
         ({"tags_from": tmp_path / "no.toml"}, PlanError, "no such file"),
     ):
         with pytest.raises(error, match=fragment):

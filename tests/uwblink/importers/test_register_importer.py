@@ -49,7 +49,7 @@ def test_without_a_map_there_is_no_option_for_one(tmp_path, monkeypatch, capsys)
         with pytest.raises(SystemExit):
             main()
         assert "--map" not in capsys.readouterr().out
-        with pytest.raises(ArgumentError, match="`map_file`: importer 'plain' takes none"):
+        with pytest.raises(ArgumentError, match="`map_file`: importer 'plain' uses none"):
             import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb", importer="plain", map_file=tmp_path / "m")
     finally:
         IMPORTERS.remove("plain")
@@ -57,7 +57,8 @@ def test_without_a_map_there_is_no_option_for_one(tmp_path, monkeypatch, capsys)
 
 def test_what_cannot_be_imported_says_so(source, tmp_path):
     with pytest.raises(
-        ImportTableError, match=r"t\.xls: no importer for such a file; known are \.csv, \.csv\.gz, .*\.ranges"
+        ImportTableError,
+        match=r"t\.xls: no importer for this kind of file; the known ones are \.csv, \.csv\.gz, .*\.ranges",
     ):
         import_recording(tmp_path / "t.xls", tmp_path / "x.uwb")
     with pytest.raises(ArgumentError, match="importer: found 'xls', allowed: csv"):
@@ -71,7 +72,7 @@ def test_what_cannot_be_imported_says_so(source, tmp_path):
     ("change", "expected"),
     [
         ({"name": "a b"}, "name: found 'a b', expected a word"),
-        ({"name": "csv"}, "importer 'csv': is one of the project's own"),
+        ({"name": "csv"}, "importer 'csv': this name is reserved"),
         ({"suffixes": ".csv"}, "suffixes: found '.csv', expected a tuple"),
         ({"suffixes": ("csv",)}, "suffixes: found .*, expected a tuple"),
         ({"read": None}, "read: found None, expected a function"),

@@ -79,7 +79,7 @@ def test_ranges_that_are_repeated_from_the_same_end_are_told_and_kept(tmp_path):
     ]
     found = read_table(write(tmp_path / "t.csv", rows))
     assert len(found.exchanges) == len(rows)
-    assert any("exchanges there twice" in note for note in found.meta["notes"])
+    assert any("may be logged twice" in note for note in found.meta["notes"])
 
 
 @pytest.mark.parametrize(("quantum", "noise"), [(0.1, 0.03), (0.01, 0.0)])

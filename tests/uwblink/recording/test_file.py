@@ -43,7 +43,7 @@ def recording(written, tmp_path):
 
 def test_an_existing_file_is_not_replaced_without_force(recording):
     before = recording.read_bytes()
-    with pytest.raises(RecordingExistsError, match="or `force` to replace it"):
+    with pytest.raises(RecordingExistsError, match="or replace it with `force`"):
         Recording.create(recording)
     assert recording.read_bytes() == before
     with Recording.create(recording, force=True):
@@ -128,7 +128,7 @@ def test_a_damaged_file_with_the_word_lock_in_its_path_is_damaged(recording, tmp
 def test_a_table_given_for_a_recording_is_told_how_to_become_one(tmp_path, name, command, size):
     path = tmp_path / name
     path.write_bytes(b"a" * size)
-    with pytest.raises(RecordingError, match=f"{name}: is no recording yet; `uwblink import {command}` makes one"):
+    with pytest.raises(RecordingError, match=f"{name}: is not a recording; convert it with `uwblink import {command}`"):
         Recording.open(path)
 
 

@@ -92,7 +92,7 @@ def test_a_trigger_in_a_file_is_refused(file, tmp_path):
         db.execute("COPY FROM DATABASE plain TO stranger")
         db.execute("USE stranger")
         db.execute("CREATE TRIGGER t AFTER INSERT ON poses FOR EACH STATEMENT DELETE FROM tags")
-    with pytest.raises(RecordingError, match=r"stranger2\.uwb: holds a trigger, t,"):
+    with pytest.raises(RecordingError, match=r"stranger2\.uwb: contains a trigger, t;"):
         Recording.open(tmp_path / "stranger2.uwb", update=True)
 
 

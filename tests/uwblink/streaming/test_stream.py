@@ -111,14 +111,14 @@ def test_a_recording_of_another_protocol_and_stamp_size_is_corrected_as_apply_do
 
 
 def test_a_tag_that_is_not_calibrated_is_told_before_the_first_range(tmp_path, flown, of_two):
-    with pytest.raises(ValueError, match=r"two\.json: no delay for tag 3"):
+    with pytest.raises(ValueError, match=r"two\.json: no delay of tag 3"):
         uwblink.stream(flown, calibration=of_two)
     ports = VirtualPorts(bench_scenario())
     names = list(ports.names.values())
-    with pytest.raises(PlanError, match="no delay for tag 3"):
+    with pytest.raises(PlanError, match="no delay of tag 3"):
         uwblink.stream(names, calibration=of_two, using=ports)
     for listener in (RangeListener(print, of_two), LivePage(tmp_path / "g.uwb", correct=load_correction(of_two))):
-        with pytest.raises(PlanError, match="no delay for tag 3"):
+        with pytest.raises(PlanError, match="no delay of tag 3"):
             uwblink.record(names, tmp_path / "g.uwb", uwblink.RangingPlan(), using=ports, listeners=[listener])
     assert not list(tmp_path.iterdir()), "nothing was written"
     plan = uwblink.RangingPlan(((1, 2),), rate_hz=50.0)
@@ -177,7 +177,7 @@ def test_ports_that_are_not_there_and_ranges_that_are_corrected_already(tmp_path
     flight(tmp_path / "f.uwb")
     with uwblink.Recording.open(tmp_path / "f.uwb", update=True) as opened:
         opened.append_meta({"calibration": {}})
-    with pytest.raises(ArgumentError, match="corrected already"):
+    with pytest.raises(ArgumentError, match="already corrected"):
         uwblink.stream(tmp_path / "f.uwb", calibration=calibration)
 
 
@@ -222,8 +222,8 @@ def test_mistakes_are_one_line(tmp_path, flown):
         (["--udp", "127.0.0.1:0"], "--udp"),
         (["--udp", "no.such.host.invalid:9870"], "no such host"),
         (["--foxglove", "x:y"], "--foxglove"),
-        (["--rate", "5"], "for boards"),
-        (["-o", tmp_path / "g.uwb"], "for boards"),
+        (["--rate", "5"], "only be used with boards"),
+        (["-o", tmp_path / "g.uwb"], "only be used with boards"),
     ):
         processes.refuse("uwblink", "stream", flown, *words, naming=[named])
 

@@ -305,5 +305,5 @@ def test_the_command_copies_and_replaces_only_when_told(tmp_path):
         f"s/icra2023/{n}.toml" for n in ("test1", "test2", "train")
     ]
     again = ("uwbsim", "scenarios", "icra2023", "-o", "s")
-    processes.refuse(*again, cwd=tmp_path, naming=["s/icra2023/test1.toml: exists already", "--force"])
+    processes.refuse(*again, cwd=tmp_path, naming=["s/icra2023/test1.toml: already exists", "--force"])
     assert run("icra2023", "-o", "s", "--force").returncode == 0

@@ -134,7 +134,9 @@ def test_a_scheduler_that_goes_away_is_named_and_what_was_done_is_kept(tmp_path)
     words = [sys.executable, "-c", SCHEDULER]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as cluster:
         address = cluster.stdout.readline().strip()
-        gone = pytest.raises(ClusterLostError, match=rf"^{address}: the scheduler is gone; results so far are kept")
+        gone = pytest.raises(
+            ClusterLostError, match=rf"^{address}: the connection to the scheduler is lost; results so far are kept"
+        )
         # The client tries to come back for so long, half a minute otherwise.
         with dask.config.set({"distributed.comm.timeouts.connect": "1s"}), gone:
             run_sweep(p, tmp_path / "out", scheduler=address, progress=lambda _: cluster.kill())

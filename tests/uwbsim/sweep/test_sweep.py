@@ -237,7 +237,7 @@ def test_functions_that_other_processes_cannot_import_are_refused(tmp_path, stra
             "`evaluate`: found <function .*lambda.* cannot import",
         ),
         ((CALIBRATE,), {"workers": 0, "evaluate": stranger.figures}, "`workers`: found 0"),
-        ((), {"evaluate": stranger.figures}, "`evaluate`: goes with sweeps of flights"),
+        ((), {"evaluate": stranger.figures}, "`evaluate`: can only be used with sweeps of flights"),
     ):
         with pytest.raises(ParameterError, match=f"^{said}"):
             run_sweep(plan(tmp_path, *text), tmp_path / "out", **more)
@@ -256,10 +256,10 @@ def test_folders_and_files_that_do_not_fit_are_refused(alone, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "x").write_text("mine")
     for design, folder, resume, said in (
-        (p, out, False, r"^`resume`: .* holds results of this sweep"),
+        (p, out, False, r"^`resume`: .* already contains results of this sweep"),
         (plan(tmp_path, name="other.toml"), out, True, r"another sweep, plan\.toml"),
         (plan(tmp_path, HEAD + "ranges = 3001\nseeds = 2\n" + GRID), out, True, "has changed"),
-        (p, tmp_path / "new", True, "holds no sweep"),
+        (p, tmp_path / "new", True, "contains no sweep"),
         (p, tmp_path / "full", False, "other files"),
     ):
         with pytest.raises(ScenarioError, match=said):

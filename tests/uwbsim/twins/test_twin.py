@@ -38,7 +38,7 @@ def centred(values):
 def test_broadcasts_have_no_twin():
     """Their replies wait for slots, for longer than boards can."""
     flight = uwbsim.simulate(uwbsim.load("broadcast", {"run.duration_s": 3.0}))
-    with pytest.raises(uwbsim.ScenarioError, match=r"waits 30\.\d ms in its exchanges.*broadcasts"):
+    with pytest.raises(uwbsim.ScenarioError, match=r"reply delays of 30\.\d ms.*broadcasts"):
         uwbsim.twin(flight, known(world()))
 
 
@@ -92,7 +92,7 @@ def test_a_saved_twin_flies_the_same_ways(found, flight, tmp_path):
     assert len(again.exchanges) == len(flight.exchanges)
     # Poses of a motion capture at 100 Hz lie 1.5 cm apart; between them a cubic is followed.
     assert np.max(np.abs(again.truth_m - flight.truth_m)) < 1e-3
-    with pytest.raises(UwblinkError, match="exists already"):
+    with pytest.raises(UwblinkError, match="already exists"):
         found.save(tmp_path / "t.toml")
 
 
@@ -133,7 +133,7 @@ def test_the_command_writes_a_scenario_and_a_page(tmp_path, monkeypatch):
     assert done.exit_code == 0, done.output
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c.json", "f.uwb", "t.html", "t.poses.uwb", "t.toml"]
     page = (tmp_path / "t.html").read_text()
-    assert "What the recording does not determine" in page
+    assert "Properties that the recording does not determine" in page
     assert "residual of calibrated ranges" in page
     assert uwbsim.load(tmp_path / "t.toml").run.name == "twin of f"
 
@@ -144,8 +144,8 @@ WRONG = {
         lambda f: replace(f, exchanges=replace(f.exchanges, fpp1_dbm=np.full(len(f.exchanges), np.nan))),
         "no exchange has both first-path powers",
     ),
-    "length": (lambda f: replace(f, exchanges=f.exchanges[:99]), "99 exchanges, a twin needs 100 or more"),
-    "tags": (lambda f: replace(f, tags=f.tags[:2]), "on which body tag 13 sits"),
+    "length": (lambda f: replace(f, exchanges=f.exchanges[:99]), "99 exchanges, but a twin needs 100 or more"),
+    "tags": (lambda f: replace(f, tags=f.tags[:2]), "no body of tag 13"),
 }
 
 
@@ -161,7 +161,7 @@ def test_a_recording_that_says_too_little_ends_with_status_1(tmp_path):
     (tmp_path / "c.json").write_text(json.dumps(known(world())))
     done = processes.run("uwbsim", "twin", "short.uwb", "-c", "c.json", "-o", "twin.toml", cwd=tmp_path)
     assert done.returncode == 1
-    assert "exchanges, a twin needs 100 or more" in done.stderr
+    assert "exchanges, but a twin needs 100 or more" in done.stderr
 
 
 CURVE = known(world())["bias_curve"]
@@ -207,7 +207,7 @@ def test_nothing_is_written_where_something_is_wrong(flight, tmp_path):
     flight.save(tmp_path / "f.uwb")
     (tmp_path / "c.json").write_text("{}")
     (tmp_path / "t.html").write_text("mine")
-    for output, message in (("t.toml", "exists already"), ("u.txt", "found .txt"), ("u.toml", "no schema_version")):
+    for output, message in (("t.toml", "already exists"), ("u.txt", "found .txt"), ("u.toml", "no schema_version")):
         command = ["twin", str(tmp_path / "f.uwb"), "-c", str(tmp_path / "c.json"), "-o", str(tmp_path / output)]
         assert message in str(CliRunner().invoke(app, command).exception)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c.json", "f.uwb", "t.html"]

@@ -256,7 +256,7 @@ def test_weak_first_paths_have_noisier_stamps():
     ("more", "fragment"),
     [
         ({"room": ROOM | {"reflection_loss_db": 6.0}}, "room.reflection_loss_db: found 6, but in the geometric model"),
-        ({"scatterers": 3}, "radio.multipath.scatterers: found 3 and no room"),
+        ({"scatterers": 3}, "radio.multipath.scatterers: found 3 but no room"),
         ({"room": ROOM | {"floor": "cheese"}}, "room.floor.*cheese.*known are air"),
     ],
 )
